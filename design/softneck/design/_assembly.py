@@ -1,0 +1,113 @@
+"""From one controller for each axis to the arrays of the linear controller's runtime."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from softneck.core import Matrix, SettingsError, Vector
+from softneck.signals import redefinition_matrix
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class AxisController:
+    """`v = C x + Dr r + Dy y`, `x+ = A x + Br r + By y` of one axis, with the gain of its conditioning.
+
+    Attributes:
+        A: (n, n).
+        Br, By: (n, 1) from reference and angle.
+        C: (1, n).
+        Dr, Dy: direct gains [rad/rad].
+        L: (n, 1) gain on what the limits took away; None for Hanus' `Br / Dr`.
+    """
+
+    A: Matrix
+    Br: Matrix
+    By: Matrix
+    C: Matrix
+    Dr: float
+    Dy: float
+    L: Matrix | None = None
+
+    def conditioning(self) -> Matrix:
+        """Return L (n, 1).
+
+        Raises:
+            SettingsError: no direct gain from the reference and no L given, or an unstable conditioned state.
+        """
+        if self.L is None and self.Dr == 0.0:
+            raise SettingsError("a controller without direct gain from the reference needs `L` for its conditioning.")
+        L = self.Br / self.Dr if self.L is None else self.L
+        radius = float(np.abs(np.linalg.eigvals(self.A - L @ self.C)).max(initial=0.0))
+        if radius >= 1.0:
+            raise SettingsError(
+                f"the conditioned controller would be unstable at its limits (spectral radius {radius:.3f}); "
+                "give another `L` or a controller whose zeros from the reference are stable."
+            )
+        return L
+
+
+def pi_axis(gain: float, integral_time: float, sample_time: float) -> AxisController:
+    """Return `v = K (e + s)`, `s+ = s + Ts/Ti e` with e = r - y.
+
+    Args:
+        gain: K [rad/rad].
+        integral_time: Ti [s].
+        sample_time: Ts [s].
+    """
+    one = np.eye(1)
+    rate = sample_time / integral_time
+    return AxisController(A=one, Br=rate * one, By=-rate * one, C=gain * one, Dr=gain, Dy=-gain)
+
+
+def assemble(
+    axes: tuple[AxisController, AxisController],
+    *,
+    reference_times: tuple[float, float, float],
+    sample_time: float,
+    tendon_angles: tuple[float, float, float],
+) -> tuple[Matrix, ...]:
+    """Return the arrays that `_linear_controller_runtime` reads.
+
+    Args:
+        axes: controllers of pitch and roll.
+        reference_times: time constants of the reference filters of pitch, roll, co-contraction [s]; 0 for none.
+        sample_time: [s].
+        tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
+    """
+    a = np.array([math.exp(-sample_time / time) if time > 0.0 else 0.0 for time in reference_times])
+    # rf_k = a rf_k-1 + (1 - a) r_k, with state a rf_k-1: what is asked now acts now.
+    Af, Bf, Cf, Df = np.diag(a), np.diag(a * (1.0 - a)), np.eye(3), np.diag(1.0 - a)
+    A, Br, By, C, L = (
+        np.asarray(block_diag(*parts), dtype=np.float64)
+        for parts in (
+            [axis.A for axis in axes],
+            [axis.Br for axis in axes],
+            [axis.By for axis in axes],
+            [axis.C for axis in axes],
+            [axis.conditioning() for axis in axes],
+        )
+    )
+    Dr, Dy = np.diag([axis.Dr for axis in axes]), np.diag([axis.Dy for axis in axes])
+    T = redefinition_matrix(np.array(tendon_angles))
+    align = _alignment(A, Br + By, C, Dr + Dy)
+    # The filter's state at rest, where rf = r.
+    rest = np.diag(a)
+    constants: Vector = np.array([sample_time])
+    return (Af, Bf, Cf, Df, A, Br, By, C, Dr, Dy, L, align, rest, T, np.linalg.inv(T), constants)
+
+
+def _alignment(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> Matrix:
+    """Return M (n, 4) with x = M (y, v): the state nearest to rest under r = y that gives exactly v.
+
+    x minimises |(I - A) x - B y| subject to C x = v - D y, by its Lagrange conditions.
+    """
+    n = A.shape[0]
+    E = np.eye(n) - A
+    top = np.hstack([E.T @ E, C.T])
+    bottom = np.hstack([C, np.zeros((2, 2))])
+    right = np.block([[E.T @ B, np.zeros((n, 2))], [-D, np.eye(2)]])
+    return np.linalg.lstsq(np.vstack([top, bottom]), right, rcond=None)[0][:n]

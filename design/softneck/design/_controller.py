@@ -1,0 +1,201 @@
+"""The linear controller: what every linear design becomes, in loops, FMUs and files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import control
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.io import savemat
+
+from softneck.core import Block, FileFormatError, Matrix, Port, State, Vector, atomic_write, write_archive
+
+_RUNTIME = "softneck.design._linear_controller_runtime"
+_ARRAYS = (
+    "Af",
+    "Bf",
+    "Cf",
+    "Df",
+    "A",
+    "Br",
+    "By",
+    "C",
+    "Dr",
+    "Dy",
+    "L",
+    "align",
+    "rest",
+    "T",
+    "T_inverse",
+    "constants",
+)
+# The neck's inclination stays below 0.7 rad; motors within 6 rad (paper, section 5).
+_MAX_REFERENCE = 0.8
+_MAX_MOTOR = 6.0
+_MAX_SLEW = 1000.0
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class LinearController:
+    """A designed controller of pitch and roll with reference filter, limits, conditioning and allocation.
+
+    Attributes:
+        kind: name in the table of kinds.
+        sample_time: [s].
+        arrays: what the runtime reads, see `_linear_controller_runtime`.
+        position_limit: of each motor [rad].
+        slew_limit: of each motor [rad/s].
+        order: of the loop it is for.
+        design: JSON values: the settings, gains and margins by axis, for `summary` and the header.
+    """
+
+    kind: str
+    sample_time: float
+    arrays: tuple[Matrix, ...]
+    position_limit: float
+    slew_limit: float
+    order: str
+    design: Mapping[str, Any]
+
+    def block(self) -> Block:
+        """Return the controller as a block of role "controller"."""
+        return Block(
+            kind=self.kind,
+            role="controller",
+            runtime=_RUNTIME,
+            sample_time=self.sample_time,
+            arrays=self.arrays,
+            inputs=_inputs(),
+            outputs=tuple(_motor(f"motor_setpoint_{j}", "set-point of motor") for j in (1, 2, 3)),
+            parameters=(
+                Port(name="position_limit", unit="rad", start=self.position_limit, minimum=0.01, maximum=_MAX_MOTOR),
+                Port(name="slew_limit", unit="rad/s", start=self.slew_limit, minimum=0.01, maximum=_MAX_SLEW),
+            ),
+        )
+
+    def initial_state(self, **parameters: float) -> State:
+        """Return the state at the start; parameters are the limits by name."""
+        return self.block().initial_state(**parameters)
+
+    def step(self, state: State, inputs: ArrayLike) -> tuple[State, Vector]:
+        """Return the next state and the set-points valid now; inputs and outputs as in `block()`."""
+        return self.block().step(state, inputs)
+
+    def ss(self) -> control.StateSpace:
+        """Return it without limits, from (pitch_reference, roll_reference, pitch, roll) to (theta_i, phi_i)."""
+        Af, Bf, Cf, Df, A, Br, By, C, Dr, Dy = self.arrays[:10]
+        Af, Bf, Cf, Df = Af[:2, :2], Bf[:2, :2], Cf[:2, :2], Df[:2, :2]
+        states = np.block([[Af, np.zeros((2, A.shape[0]))], [Br @ Cf, A]])
+        inputs = np.block([[Bf, np.zeros((2, 2))], [Br @ Df, By]])
+        return control.StateSpace(
+            states,
+            inputs,
+            np.hstack([Dr @ Cf, C]),
+            np.hstack([Dr @ Df, Dy]),
+            self.sample_time,
+            inputs=["pitch_reference", "roll_reference", "pitch", "roll"],
+            outputs=["theta_i", "phi_i"],
+            name=self.kind,
+        )
+
+    def to_mat(self, path: str | Path, *, force: bool = False) -> None:
+        """Write `ss()` to a MATLAB file: A, B, C, D, Ts, InputName, OutputName."""
+        system = self.ss()
+        values = {
+            "A": system.A, "B": system.B, "C": system.C, "D": system.D, "Ts": self.sample_time,
+            "InputName": np.array(system.input_labels, dtype=object),
+            "OutputName": np.array(system.output_labels, dtype=object),
+        }  # fmt: skip
+        with atomic_write(path, force=force) as temporary, temporary.open("wb") as file:
+            savemat(file, values)
+
+    def summary(self) -> str:
+        """Return some lines for people."""
+        lines = [
+            f"{self.kind} controller, {self.sample_time * 1e3:g} ms, {self.order} order, "
+            f"{self.design.get('extra_delay', 0)} samples of delay added to the plant for it",
+            f"  limits: |P| <= {self.position_limit:g} rad, slew {self.slew_limit:g} rad/s "
+            f"({self.slew_limit * self.sample_time:g} rad per sample)",
+        ]
+        for axis in ("pitch", "roll"):
+            item = self.design.get(axis, {})
+            settings = ", ".join(f"{name} {value:.4g}" for name, value in item.get("gains", {}).items())
+            margins = item.get("margins", {})
+            lines.append(f"  {axis}: {settings}")
+            if margins:
+                lines.append(
+                    f"    gain margin {_number(margins['gain'])}, "
+                    f"phase margin {_number(margins['phase'], math.degrees(1.0))} deg, "
+                    f"Ms {margins['sensitivity']:.3f}, crossover {_number(margins['crossover'])} rad/s, "
+                    f"delay margin {_number(margins['delay'], 1e3)} ms"
+                )
+        return "\n".join(lines)
+
+    def save(self, path: str | Path, *, force: bool = False) -> None:
+        """Write the controller to one `.npz` file."""
+        block = self.block()
+        header = {
+            "kind": self.kind,
+            "sample_time": self.sample_time,
+            "position_limit": self.position_limit,
+            "slew_limit": self.slew_limit,
+            "order": self.order,
+            "design": dict(self.design),
+            "inputs": [port.name for port in block.inputs],
+            "outputs": [port.name for port in block.outputs],
+            "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
+        }
+        write_archive(path, header, dict(zip(_ARRAYS, self.arrays, strict=True)), force=force)
+
+    @classmethod
+    def from_archive(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> LinearController:
+        """Return the controller that `save` wrote; `softneck.core.load` calls this."""
+        items = tuple(np.ascontiguousarray(arrays[name], dtype=np.float64) for name in _ARRAYS)
+        m, n = items[0].shape[0], items[4].shape[0]
+        shapes = (
+            (m, m), (m, 3), (3, m), (3, 3), (n, n), (n, 2), (n, 2), (2, n), (2, 2), (2, 2), (n, 2),
+            (n, 4), (m, 3), (3, 3), (3, 3), (1,),
+        )  # fmt: skip
+        if any(item.shape != shape or not np.isfinite(item).all() for item, shape in zip(items, shapes, strict=True)):
+            raise FileFormatError("the controller's arrays have wrong shapes or are not finite; design it again.")
+        return cls(
+            kind=str(header["kind"]),
+            sample_time=float(header["sample_time"]),
+            arrays=items,
+            position_limit=float(header["position_limit"]),
+            slew_limit=float(header["slew_limit"]),
+            order=str(header["order"]),
+            design=dict(header["design"]),
+        )
+
+
+def _inputs() -> tuple[Port, ...]:
+    references = tuple(
+        Port(name=f"{axis}_reference", unit="rad", minimum=-_MAX_REFERENCE, maximum=_MAX_REFERENCE,
+             description=f"wanted {axis}") for axis in ("pitch", "roll")
+    )  # fmt: skip
+    cocontraction = Port(
+        name="cocontraction_reference", unit="rad", minimum=-_MAX_MOTOR, maximum=_MAX_MOTOR,
+        description="wanted delta_i (Eq. 11)",
+    )  # fmt: skip
+    angles = tuple(Port(name=axis, unit="rad", description=f"{axis} of the neck") for axis in ("pitch", "roll"))
+    motors = tuple(_motor(f"motor_position_{j}", "measured position of motor") for j in (1, 2, 3))
+    flags = (
+        Port(name="healthy", description="the angles can be trusted", start=1.0, boolean=True),
+        Port(name="enabled", description="may move the motors", start=1.0, boolean=True),
+    )
+    return (*references, cocontraction, *angles, *motors, *flags)
+
+
+def _motor(name: str, what: str) -> Port:
+    return Port(name=name, unit="rad", description=f"{what} {name[-1]}", minimum=-_MAX_MOTOR, maximum=_MAX_MOTOR)
+
+
+def _number(value: float | None, factor: float = 1.0) -> str:
+    """Return a margin as text; None stands for infinity, which JSON does not have."""
+    return "inf" if value is None else f"{factor * value:.3g}"

@@ -1,0 +1,112 @@
+"""PI control of both axes: as much integral action as the asked robustness allows."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from softneck.core import SettingsError, require_between, require_one_of, require_positive
+from softneck.estimation import ORDERS, AxisPlant, HasTransferFunctions, axis_plant
+from softneck.signals import TENDON_ANGLES
+
+from ._assembly import assemble, pi_axis
+from ._controller import LinearController
+from ._margins import loop_margins
+from ._tuning import Gains, open_loop, reference_time, tune_pi
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PiSettings:
+    """PI on the exact-delay discrete plant, `v = K (e + 1/Ti int e)`, tuned for robustness.
+
+    Among all K, Ti whose loop keeps the sensitivity and the phase margin, that with the largest K/Ti is taken:
+    it rejects loads best (Astrom and Hagglund 2006, Advanced PID Control, sec. 6.8). What overshoot that
+    leaves, a reference filter takes away.
+
+    Attributes:
+        max_sensitivity: bound on Ms.
+        phase_margin: least phase margin [rad].
+        reference_time: time constant of the reference filter [s]; None for the least with which no plant within
+            `gain_spread` overshoots by more than `overshoot_pct`.
+        overshoot_pct: of a step, without limits.
+        gain_spread: relative spread of the plant's gain that the filter allows for.
+        position_limit: of each motor [rad].
+        slew_limit: of each motor [rad/s]; the default is 0.25 rad in 20 ms.
+        order: of the loop; "jacobi" adds one sample for the controller and one for the observer.
+        observer: whether the loop will have an observer.
+        tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
+    """
+
+    max_sensitivity: float = 1.35
+    phase_margin: float = math.radians(60.0)
+    reference_time: float | None = None
+    overshoot_pct: float = 2.0
+    gain_spread: float = 0.2
+    position_limit: float = 6.0
+    slew_limit: float = 12.5
+    order: str = "sequential"
+    observer: bool = True
+    tendon_angles: tuple[float, float, float] = tuple(TENDON_ANGLES.tolist())
+
+    def __post_init__(self) -> None:
+        require_between("max_sensitivity", self.max_sensitivity, 1.05, 4.0)
+        require_between("phase_margin", self.phase_margin, 0.1, 1.5, "rad")
+        if self.reference_time is not None:
+            require_between("reference_time", self.reference_time, 0.0, 60.0, "s")
+        require_between("overshoot_pct", self.overshoot_pct, 0.1, 100.0, "%")
+        require_between("gain_spread", self.gain_spread, 0.0, 0.9)
+        require_between("position_limit", self.position_limit, 0.01, 6.0, "rad")
+        require_positive("slew_limit", self.slew_limit, "rad/s")
+        require_one_of("order", self.order, ORDERS)
+
+    @property
+    def extra_delay(self) -> int:
+        """Samples that the loop's order adds to the plant's delay."""
+        return 0 if self.order == "sequential" else 1 + int(self.observer)
+
+    def design(self, model: HasTransferFunctions) -> LinearController:
+        """Return the controller for `model`, anything with `tf("pitch")` and `tf("roll")`.
+
+        Raises:
+            SettingsError: a model that is not linear, discrete and stable, or no gains that keep the robustness.
+        """
+        plants = [axis_plant(model, axis) for axis in ("pitch", "roll")]
+        times = [plant.sample_time for plant in plants]
+        if not math.isclose(*times, rel_tol=1e-9):
+            raise SettingsError(f"pitch and roll have different sample times, {times[0]:g} s and {times[1]:g} s.")
+        tuned = [tune_pi(p, self.extra_delay, self.max_sensitivity, self.phase_margin) for p in plants]
+        filters = [self._filter(plant, gains) for plant, gains in zip(plants, tuned, strict=True)]
+        found = {
+            axis: _findings(plant, self.extra_delay, gains, time)
+            for axis, plant, gains, time in zip(("pitch", "roll"), plants, tuned, filters, strict=True)
+        }
+        first, second = (pi_axis(gains.gain, gains.integral_time, times[0]) for gains in tuned)
+        return LinearController(
+            kind="pi",
+            sample_time=times[0],
+            arrays=assemble(
+                (first, second),
+                reference_times=(filters[0], filters[1], max(filters)),
+                sample_time=times[0],
+                tendon_angles=self.tendon_angles,
+            ),
+            position_limit=self.position_limit,
+            slew_limit=self.slew_limit,
+            order=self.order,
+            design={"settings": asdict(self), "extra_delay": self.extra_delay, **found},
+        )
+
+    def _filter(self, plant: AxisPlant, gains: Gains) -> float:
+        if self.reference_time is not None:
+            return self.reference_time
+        return reference_time(
+            plant, self.extra_delay, gains, gain_spread=self.gain_spread, overshoot=self.overshoot_pct / 100.0
+        )
+
+
+def _findings(plant: AxisPlant, extra_delay: int, gains: Gains, filter_time: float) -> dict[str, Any]:
+    """Return gains and margins of one axis as JSON values; None stands for infinity."""
+    margins = asdict(loop_margins(open_loop(plant, extra_delay, gains)))
+    named = {"K": gains.gain, "Ti_s": gains.integral_time, "reference_time_s": filter_time}
+    return {"gains": named, "margins": {name: v if math.isfinite(v) else None for name, v in margins.items()}}

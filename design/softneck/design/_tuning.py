@@ -1,0 +1,133 @@
+"""Robust PI gains and a reference filter for one axis, on its exact-delay discrete response."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import control
+import numpy as np
+from scipy.signal import lfilter
+
+from softneck.core import SettingsError, Vector
+from softneck.estimation import AxisPlant
+
+from ._margins import frequencies
+
+# Loop gains that are tried, in units of the plant's static gain, 5 % apart and refined to 0.1 % at the border.
+_SIZES = np.geomspace(1e-2, 1e2, 190)
+_REFINEMENTS = 6
+# Integral times that are tried, in units of the plant's lag and delay together.
+_TIMES = np.geomspace(0.2, 3.0, 40)
+# A step response is judged over this long [s]; slower than any neck settles.
+_HORIZON = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class Gains:
+    """PI gains of `v = K (e + 1/Ti int e)`.
+
+    Attributes:
+        gain: K [rad/rad].
+        integral_time: Ti [s].
+    """
+
+    gain: float
+    integral_time: float
+
+
+def tune_pi(plant: AxisPlant, extra_delay: int, max_sensitivity: float, phase_margin: float) -> Gains:
+    """Return the gains with the largest K/Ti that keep Ms and the phase margin [rad].
+
+    Raises:
+        SettingsError: none do.
+    """
+    w = frequencies(plant.sample_time)
+    z = np.exp(1j * w * plant.sample_time)
+    G = plant.response(w, extra_delay=extra_delay) / plant.static_gain
+    lag = _slowest_time(plant) + (plant.delay + 1 + extra_delay) * plant.sample_time
+    best, best_rate = Gains(0.0, lag), 0.0
+    for integral_time in lag * _TIMES:
+        shape = G * (1.0 + plant.sample_time / integral_time / (z - 1.0))
+        size = _largest(shape, max_sensitivity, phase_margin)
+        if size / integral_time > best_rate:
+            best, best_rate = Gains(size / plant.static_gain, float(integral_time)), size / integral_time
+    if best_rate == 0.0:
+        raise SettingsError(
+            f"no PI gains keep Ms <= {max_sensitivity:g} and a phase margin of {math.degrees(phase_margin):g} deg; "
+            "ask for less."
+        )
+    return best
+
+
+def reference_time(plant: AxisPlant, extra_delay: int, gains: Gains, *, gain_spread: float, overshoot: float) -> float:
+    """Return the least time constant [s] of a reference filter with which no plant overshoots by more.
+
+    Args:
+        plant: the axis.
+        extra_delay: samples added to its delay.
+        gains: of the PI.
+        gain_spread: relative; the plant's gain is taken at both ends and in the middle.
+        overshoot: part of the step.
+
+    Raises:
+        SettingsError: none of up to a second does.
+    """
+    rows = math.ceil(_HORIZON / plant.sample_time)
+    steps = [_step_response(plant, extra_delay, gains, rows, scale) for scale in (1 - gain_spread, 1, 1 + gain_spread)]
+    for samples in range(1 + math.ceil(1.0 / plant.sample_time)):
+        a = math.exp(-1.0 / samples) if samples else 0.0
+        peak = max(float(np.max(lfilter([1.0 - a], [1.0, -a], step))) for step in steps)
+        if peak <= 1.0 + overshoot:
+            return samples * plant.sample_time
+    raise SettingsError("no reference filter keeps the overshoot; lower `max_sensitivity` or `gain_spread`.")
+
+
+def open_loop(plant: AxisPlant, extra_delay: int, gains: Gains) -> control.TransferFunction:
+    """Return the discrete open loop of a PI with the plant, its delay exact."""
+    rate = plant.sample_time / gains.integral_time
+    pi = control.TransferFunction([gains.gain, gains.gain * (rate - 1.0)], [1.0, -1.0], plant.sample_time)
+    return pi * plant.tf(extra_delay=extra_delay)
+
+
+def _largest(shape: Vector, max_sensitivity: float, phase_margin: float) -> float:
+    """Return the largest size up to which all loops size * shape keep both bounds; 0 if none does.
+
+    A small loop around a stable plant is stable, and one that keeps Ms all the way up has never crossed -1;
+    a search by halves alone could end beyond the border of stability.
+    """
+    low = 0.0
+    for size in _SIZES:
+        if not _keeps(size * shape, max_sensitivity, phase_margin):
+            break
+        low = float(size)
+    else:
+        return low
+    high = float(size)
+    for _ in range(_REFINEMENTS if low > 0.0 else 0):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if _keeps(middle * shape, max_sensitivity, phase_margin) else (low, middle)
+    return low
+
+
+def _keeps(loop: Vector, max_sensitivity: float, phase_margin: float) -> bool:
+    """Return whether the loop's response keeps both bounds."""
+    if np.min(np.abs(1.0 + loop)) * max_sensitivity < 1.0:
+        return False
+    below = np.abs(loop) < 1.0
+    crossing = np.flatnonzero(~below[:-1] & below[1:]) + 1
+    return bool(np.all(np.abs(np.angle(-loop[crossing])) >= phase_margin))
+
+
+def _slowest_time(plant: AxisPlant) -> float:
+    """Return the time constant [s] of the slowest pole."""
+    radius = float(np.abs(np.roots(plant.denominator)).max(initial=1e-9))
+    return -plant.sample_time / math.log(max(radius, 1e-9))
+
+
+def _step_response(plant: AxisPlant, extra_delay: int, gains: Gains, rows: int, scale: float) -> Vector:
+    """Return the closed loop's step response (rows,), the plant's gain scaled, without limits."""
+    loop = open_loop(plant, extra_delay, gains)
+    numerator, denominator = scale * np.asarray(loop.num[0][0]), np.asarray(loop.den[0][0])
+    padded = np.concatenate([np.zeros(denominator.size - numerator.size), numerator])
+    return np.asarray(lfilter(padded, denominator + padded, np.ones(rows)))

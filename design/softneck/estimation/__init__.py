@@ -1,0 +1,13 @@
+"""Estimation: the inclinometer's Kalman filter over an identified linear model."""
+
+from ._axis import AxisPlant as AxisPlant
+from ._axis import HasTransferFunctions as HasTransferFunctions
+from ._axis import LinearNeck as LinearNeck
+from ._axis import axis_plant as axis_plant
+from ._kalman import Estimates as Estimates
+from ._kalman import KalmanObserver as KalmanObserver
+from ._sensors import SENSORS as SENSORS
+from ._sensors import Sensor as Sensor
+from ._sensors import find_sensor as find_sensor
+from ._settings import ORDERS as ORDERS
+from ._settings import KalmanSettings as KalmanSettings

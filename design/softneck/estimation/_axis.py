@@ -1,0 +1,126 @@
+"""One axis of an identified linear model: a strictly proper part behind a pure delay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import control
+import numpy as np
+
+from softneck.core import DataError, Matrix, SettingsError, Vector
+
+AXES = ("pitch", "roll")
+
+
+class HasTransferFunctions(Protocol):
+    """Any linear model of the neck: an identified one, or a `LinearNeck`."""
+
+    def tf(self, output: str, /) -> Any:
+        """Return the discrete transfer function to "pitch" (from theta_i) or "roll" (from phi_i)."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearNeck:
+    """Two transfer functions of one's own as a model of the neck, dead time as poles at zero.
+
+    Attributes:
+        pitch: discrete `control.TransferFunction` from theta_i [rad] to pitch [rad] (Eq. 9).
+        roll: the same from phi_i to roll (Eq. 10).
+    """
+
+    pitch: control.TransferFunction
+    roll: control.TransferFunction
+
+    def tf(self, output: str, /) -> control.TransferFunction:
+        """Return the transfer function to `output`."""
+        if output not in AXES:
+            raise SettingsError(f"`output` must be pitch or roll; got {output!r}.")
+        return self.pitch if output == "pitch" else self.roll
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AxisPlant:
+    """`y(z) = z^-delay B(z)/A(z) u(z)` with deg B < deg A; monic A.
+
+    Attributes:
+        numerator: (n,) coefficients of B, highest power z^(n-1) first.
+        denominator: (n + 1,) coefficients of A, the first is 1.
+        delay: samples beyond the one that B/A has itself.
+        sample_time: [s].
+    """
+
+    numerator: Vector
+    denominator: Vector
+    delay: int
+    sample_time: float
+
+    @property
+    def order(self) -> int:
+        """n, the number of states without the delay."""
+        return self.numerator.size
+
+    @property
+    def static_gain(self) -> float:
+        """Angle over input in steady state [rad/rad]."""
+        return float(np.sum(self.numerator) / np.sum(self.denominator))
+
+    def observable_form(self) -> tuple[Matrix, Vector, Vector]:
+        """Return A (n, n), B (n,), C (n,) without the delay; the first state is the angle (Kailath 1980, sec. 2.1)."""
+        n = self.order
+        A = np.zeros((n, n))
+        A[:, 0] = -self.denominator[1:]
+        A[:-1, 1:] = np.eye(n - 1)
+        C = np.zeros(n)
+        C[0] = 1.0
+        return A, self.numerator.copy(), C
+
+    def response(self, frequency: Vector, *, extra_delay: int = 0) -> Vector:
+        """Return the exact complex response (m,) at `frequency` [rad/s] with `extra_delay` samples more."""
+        z = np.exp(1j * np.asarray(frequency) * self.sample_time)
+        ratio = np.polyval(self.numerator, z) / np.polyval(self.denominator, z)
+        return ratio * z ** (-(self.delay + extra_delay))
+
+    def tf(self, *, extra_delay: int = 0) -> control.TransferFunction:
+        """Return it as a `control.TransferFunction` with `extra_delay` samples more."""
+        denominator = np.concatenate([self.denominator, np.zeros(self.delay + extra_delay)])
+        return control.TransferFunction(self.numerator, denominator, self.sample_time)
+
+
+def axis_plant(model: HasTransferFunctions, axis: str) -> AxisPlant:
+    """Return `axis` ("pitch" or "roll") of a linear model, its dead time split off.
+
+    Raises:
+        SettingsError: the model is not linear, not discrete, or not stable.
+        DataError: its transfer function is not strictly proper or not finite.
+    """
+    if not hasattr(model, "tf"):
+        raise SettingsError(f"a linear model is needed, one with `tf`; got {type(model).__name__}. Identify `rls`.")
+    system: Any = model.tf(axis)
+    if not isinstance(system, control.TransferFunction) or system.ninputs != 1 or system.noutputs != 1:
+        raise SettingsError(f"the model's `tf({axis!r})` must be a scalar control.TransferFunction; got {system!r}.")
+    dt = system.dt
+    if dt is None or isinstance(dt, bool) or not dt > 0:
+        raise SettingsError(f"the model's {axis} must be discrete; its dt is {dt}. Use control.sample_system.")
+    numerator = np.trim_zeros(np.asarray(system.num[0][0], dtype=np.float64), "f")
+    denominator = np.trim_zeros(np.asarray(system.den[0][0], dtype=np.float64), "f")
+    _check(axis, numerator, denominator)
+    poles_at_zero = denominator.size - np.trim_zeros(denominator, "b").size
+    # One sample stays with B/A, so that it is strictly proper.
+    delay = min(poles_at_zero, denominator.size - numerator.size - 1)
+    A = denominator[: denominator.size - delay]
+    B = np.concatenate([np.zeros(A.size - 1 - numerator.size), numerator])
+    return AxisPlant(B / A[0], A / A[0], delay, float(dt))
+
+
+def _check(axis: str, numerator: Vector, denominator: Vector) -> None:
+    if not (np.isfinite(numerator).all() and np.isfinite(denominator).all()):
+        raise DataError(f"the model's {axis} has coefficients that are not finite; identify it again.")
+    if numerator.size == 0 or denominator.size <= numerator.size:
+        raise DataError(f"the model's {axis} must be strictly proper and not zero; an input acts one sample later.")
+    radius = float(np.abs(np.roots(denominator)).max())
+    if radius >= 1.0:
+        raise SettingsError(
+            f"the model's {axis} is not stable (spectral radius {radius:.4f}); identify it on a longer recording."
+        )

@@ -1,0 +1,43 @@
+"""The inclinometers in use and how much they scatter."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from softneck.core import SettingsError
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """An inclinometer.
+
+    Attributes:
+        name: what users type.
+        noise_std: standard deviation of pitch and of roll at rest [rad].
+        source: where the number comes from.
+    """
+
+    name: str
+    noise_std: float
+    source: str
+
+
+# Upper ends of what the recordings show on plateaus: a filter that trusts too little lags a little,
+# one that trusts too much rejects good samples.
+SENSORS: dict[str, Sensor] = {
+    sensor.name: sensor
+    for sensor in (
+        Sensor("mpu9250", math.radians(0.29), "Arduino with MPU-9250: 0.26 to 0.29 deg on plateaus of the recordings"),
+        Sensor("3dm-gx5-10", math.radians(0.04), "3DM-GX5-10, 50 Hz: 0.02 to 0.04 deg on plateaus of the recordings"),
+        Sensor("paper", math.radians(0.05), "the virtual neck's inclinometer in the paper preset"),
+    )
+}
+
+
+def find_sensor(name: str) -> Sensor:
+    """Return the sensor of that name; raise SettingsError with the known ones if there is none."""
+    try:
+        return SENSORS[name]
+    except KeyError:
+        raise SettingsError(f"`{name}` is no sensor that softneck knows; use one of {', '.join(SENSORS)}.") from None

@@ -1,0 +1,277 @@
+"""The neck's differential equation: link, three tendons, three drives, attitude filter.
+
+x is (b1, b2, s, their rates w1, w2, v, hysteresis z1, z2, positions, speeds and integrals of the drives,
+filtered pitch, filtered roll), 19 numbers. Inertia is constant: that of a platform on a link bent by
+small angles, M (L0/2 + c)^2 + J; what a bend adds to it is below 5 % at 0.5 rad, and the neck is
+overdamped.
+"""
+
+import math
+
+import numpy as np
+
+from softneck.plant._drive_runtime import drive_rates
+from softneck.plant._geometry_runtime import bend_functions, lean_angles, tilt_rotation
+from softneck.plant._index_runtime import (
+    NECK_ATTACHMENT_RADIUS,
+    NECK_AXIAL_DAMPING,
+    NECK_AXIAL_STIFFENING,
+    NECK_AXIAL_STIFFNESS,
+    NECK_BENDING_DAMPING,
+    NECK_BENDING_STIFFENING,
+    NECK_BENDING_STIFFNESS,
+    NECK_COMPRESSION_LIMIT,
+    NECK_CURRENT_LIMIT,
+    NECK_GEAR_EFFICIENCY,
+    NECK_GEAR_FRICTION,
+    NECK_GEAR_RATIO,
+    NECK_GUIDE_FRICTION,
+    NECK_GUIDE_SPEED,
+    NECK_HYSTERESIS_ANGLE,
+    NECK_HYSTERESIS_TORQUE,
+    NECK_LINK_LENGTH,
+    NECK_LINK_MASS,
+    NECK_MOTOR_RESISTANCE,
+    NECK_PAYLOAD_HEIGHT,
+    NECK_PLATFORM_HEIGHT,
+    NECK_PLATFORM_MASS,
+    NECK_PLATFORM_RADIUS,
+    NECK_POSITION_GAIN,
+    NECK_PRETENSION,
+    NECK_REST_PITCH,
+    NECK_REST_ROLL,
+    NECK_ROTOR_INERTIA,
+    NECK_SENSOR_LAG,
+    NECK_SPEED_BANDWIDTH,
+    NECK_SPEED_INTEGRAL_TIME,
+    NECK_SPEED_LIMIT,
+    NECK_STIFFNESS_ASYMMETRY,
+    NECK_SUPPLY_VOLTAGE,
+    NECK_TENDON_ANGLE_1,
+    NECK_TENDON_ANGLE_2,
+    NECK_TENDON_ANGLE_3,
+    NECK_TENDON_DAMPING,
+    NECK_TENDON_STIFFNESS,
+    NECK_TORQUE_CONSTANT,
+    NECK_WINCH_RADIUS,
+)
+from softneck.plant._link_runtime import LINK_WALL_RATIO, link_elastic, link_hysteresis, link_weight
+from softneck.plant._tendon_runtime import tendon_chord, tendon_tension
+
+NECK_ODE_SIZE = 19
+NECK_GRAVITY = 9.80665
+# Winch speed over which the gear's Coulomb friction is smoothed [rad/s]; numerical.
+NECK_GEAR_EDGE = 0.2
+# Runge-Kutta 4 is stable to 2.78 along both axes; half of that keeps the fastest modes accurate enough.
+NECK_STABLE = 1.4
+NECK_MOST_SUBSTEPS = 2000
+
+
+def neck_constants(q: np.ndarray) -> tuple:  # pyright: ignore
+    """Return (link, hysteresis, tendon, geometry, directions, drive, filter) from the parameters."""
+    k = float(q[NECK_BENDING_STIFFNESS])
+    asymmetry = float(q[NECK_STIFFNESS_ASYMMETRY])
+    link = (
+        k * (1.0 + asymmetry),
+        k * (1.0 - asymmetry),
+        float(q[NECK_BENDING_STIFFENING]),
+        float(q[NECK_BENDING_DAMPING]),
+        float(q[NECK_REST_PITCH]),
+        float(q[NECK_REST_ROLL]),
+        float(q[NECK_AXIAL_STIFFNESS]),
+        float(q[NECK_AXIAL_STIFFENING]),
+        float(q[NECK_AXIAL_DAMPING]),
+        float(q[NECK_COMPRESSION_LIMIT]),
+    )
+    hysteresis = (float(q[NECK_HYSTERESIS_TORQUE]), float(q[NECK_HYSTERESIS_ANGLE]))
+    tendon = (
+        float(q[NECK_TENDON_STIFFNESS]),
+        float(q[NECK_TENDON_DAMPING]),
+        float(q[NECK_GUIDE_FRICTION]),
+        float(q[NECK_GUIDE_SPEED]),
+    )
+    geometry = (float(q[NECK_LINK_LENGTH]), float(q[NECK_ATTACHMENT_RADIUS]))
+    directions = (
+        (math.cos(q[NECK_TENDON_ANGLE_1]), math.sin(q[NECK_TENDON_ANGLE_1])),
+        (math.cos(q[NECK_TENDON_ANGLE_2]), math.sin(q[NECK_TENDON_ANGLE_2])),
+        (math.cos(q[NECK_TENDON_ANGLE_3]), math.sin(q[NECK_TENDON_ANGLE_3])),
+    )
+    rest = (float(q[NECK_WINCH_RADIUS]), float(q[NECK_SENSOR_LAG]), float(q[NECK_PRETENSION]))
+    return link, hysteresis, tendon, geometry, directions, neck_drive(q), rest
+
+
+def neck_drive(q: np.ndarray) -> tuple[float, float, float, float, float, float, float, float, float, float]:
+    """Return the constants of `drive_rates` at the winch."""
+    ratio = float(q[NECK_GEAR_RATIO])
+    constant = float(q[NECK_TORQUE_CONSTANT])
+    per_ampere = constant * ratio * float(q[NECK_GEAR_EFFICIENCY])
+    resistance = float(q[NECK_MOTOR_RESISTANCE])
+    return (
+        float(q[NECK_POSITION_GAIN]),
+        float(q[NECK_SPEED_LIMIT]),
+        float(q[NECK_SPEED_BANDWIDTH]),
+        1.0 / float(q[NECK_SPEED_INTEGRAL_TIME]),
+        float(q[NECK_CURRENT_LIMIT]) * per_ampere,
+        float(q[NECK_SUPPLY_VOLTAGE]) / resistance * per_ampere,
+        constant * ratio / resistance * per_ampere,
+        float(q[NECK_ROTOR_INERTIA]) * ratio * ratio,
+        float(q[NECK_GEAR_FRICTION]),
+        NECK_GEAR_EDGE,
+    )
+
+
+def neck_load(
+    q: np.ndarray, payload: float, push_x: float, push_y: float, base_pitch: float, base_roll: float
+) -> tuple:  # pyright: ignore
+    """Return (weight and push, vertical in the base's frame, base rotation, bending inertia, axial mass)."""
+    # A quarter of the link's mass at its end has the gravity moment of the whole; its inertia differs by 25 %.
+    platform = float(q[NECK_PLATFORM_MASS])
+    link = 0.25 * float(q[NECK_LINK_MASS])
+    carried = max(payload, 0.0)
+    height = float(q[NECK_PLATFORM_HEIGHT])
+    above = float(q[NECK_PAYLOAD_HEIGHT])
+    half = 0.5 * float(q[NECK_LINK_LENGTH])
+    mass = platform + link + carried
+    weight = (
+        NECK_GRAVITY * mass,
+        NECK_GRAVITY * (platform * height + carried * above),
+        push_x,
+        push_y,
+    )
+    R = tilt_rotation(base_pitch, base_roll)
+    disc = 0.25 * platform * float(q[NECK_PLATFORM_RADIUS]) ** 2
+    inertia = platform * (half + height) ** 2 + link * half**2 + carried * (half + above) ** 2 + disc
+    return weight, (R[6], R[7], R[8]), R, inertia, mass
+
+
+def neck_rates(
+    x: tuple,  # pyright: ignore
+    command: tuple[float, float, float],
+    free: tuple[float, float, float],
+    c: tuple,  # pyright: ignore
+    load: tuple,  # pyright: ignore
+) -> tuple:  # pyright: ignore
+    """Return the time derivatives of the 19 continuous states."""
+    b1, b2, s, w1, w2, v, z1, z2, p1, p2, p3, o1, o2, o3, i1, i2, i3, f1, f2 = x
+    link, hysteresis, _, geometry, directions, drive, rest = c
+    winch = rest[0]
+    body = (b1, b2, s, w1, w2, v)
+    f = bend_functions(b1 * b1 + b2 * b2)
+    q1, q2, qs = link_elastic(body, link)
+    g1, g2, gs = link_weight((b1, b2, geometry[0] - s), f, load[1], load[0])
+    t1, a1, c1, cs1 = neck_pull(body, f, directions[0], p1, o1, free[0], c)
+    t2, a2, c2, cs2 = neck_pull(body, f, directions[1], p2, o2, free[1], c)
+    t3, a3, c3, cs3 = neck_pull(body, f, directions[2], p3, o3, free[2], c)
+    stuck = hysteresis[0] / hysteresis[1]
+    dz1, dz2 = link_hysteresis(z1, z2, w1, w2, hysteresis[1])
+    inertia = load[3]
+    u1, d1 = drive_rates((p1, o1, i1), command[0], winch * t1, drive)
+    u2, d2 = drive_rates((p2, o2, i2), command[1], winch * t2, drive)
+    u3, d3 = drive_rates((p3, o3, i3), command[2], winch * t3, drive)
+    pitch, roll, _, _ = lean_angles((b1, b2, w1, w2), f, load[2])
+    return (
+        w1,
+        w2,
+        v,
+        (q1 + g1 + a1 + a2 + a3 - stuck * z1) / inertia,
+        (q2 + g2 + c1 + c2 + c3 - stuck * z2) / inertia,
+        (qs + gs + cs1 + cs2 + cs3) / load[4],
+        dz1,
+        dz2,
+        o1,
+        o2,
+        o3,
+        u1,
+        u2,
+        u3,
+        d1,
+        d2,
+        d3,
+        (pitch - f1) / rest[1],
+        (roll - f2) / rest[1],
+    )
+
+
+def neck_pull(
+    body: tuple[float, float, float, float, float, float],
+    f: tuple[float, float, float, float, float, float],
+    direction: tuple[float, float],
+    position: float,
+    speed: float,
+    free: float,
+    c: tuple,  # pyright: ignore
+) -> tuple[float, float, float, float]:
+    """Return (tension at the winch [N], its forces on b1, b2 and s) of one tendon."""
+    winch = c[6][0]
+    length, slide, g1, g2, gs = tendon_chord(body, f, direction, c[3])
+    at_winch, at_platform = tendon_tension(length - free + winch * position, slide + winch * speed, slide, c[2])
+    return at_winch, -at_platform * g1, -at_platform * g2, -at_platform * gs
+
+
+def neck_tensions(x: tuple, free: tuple[float, float, float], c: tuple) -> tuple[float, float, float]:  # pyright: ignore
+    """Return the three tensions at the winches [N]."""
+    body = (x[0], x[1], x[2], x[3], x[4], x[5])
+    f = bend_functions(x[0] * x[0] + x[1] * x[1])
+    t1, _, _, _ = neck_pull(body, f, c[4][0], x[8], x[11], free[0], c)
+    t2, _, _, _ = neck_pull(body, f, c[4][1], x[9], x[12], free[1], c)
+    t3, _, _, _ = neck_pull(body, f, c[4][2], x[10], x[13], free[2], c)
+    return t1, t2, t3
+
+
+def neck_rest(q: np.ndarray, c: tuple) -> tuple[float, float, float, float, float, float]:  # pyright: ignore
+    """Return (b1, b2, s, free lengths of the tendons) at rest: all tensions at the pretension, no payload.
+
+    A fixed point: bending from the link's stiffness, compression by Newton. It contracts while the
+    pretension and the weights stay below the load that buckles the link, which `NeckParameters` checks.
+    """
+    link = c[0]
+    pretension = c[6][2]
+    load = neck_load(q, 0.0, 0.0, 0.0, 0.0, 0.0)
+    b1 = link[4]
+    b2 = link[5]
+    s = 0.0
+    for _ in range(200):
+        body = (b1, b2, s, 0.0, 0.0, 0.0)
+        f = bend_functions(b1 * b1 + b2 * b2)
+        q1, q2, qs = link_elastic(body, link)
+        g1, g2, gs = link_weight((b1, b2, c[3][0] - s), f, load[1], load[0])
+        q1 += g1
+        q2 += g2
+        qs += gs
+        for i in range(3):
+            _, _, t1, t2, ts = tendon_chord(body, f, c[4][i], c[3])
+            q1 -= pretension * t1
+            q2 -= pretension * t2
+            qs -= pretension * ts
+        slope = link[6] + 3.0 * link[7] * s * s
+        if s > link[9]:
+            slope += LINK_WALL_RATIO * link[6]
+        b1 += q1 / (link[0] + 3.0 * link[2] * (b1 * b1 + b2 * b2))
+        b2 += q2 / (link[1] + 3.0 * link[2] * (b1 * b1 + b2 * b2))
+        s += qs / slope
+    f = bend_functions(b1 * b1 + b2 * b2)
+    body = (b1, b2, s, 0.0, 0.0, 0.0)
+    stretch = pretension / c[2][0]
+    l1, _, _, _, _ = tendon_chord(body, f, c[4][0], c[3])
+    l2, _, _, _, _ = tendon_chord(body, f, c[4][1], c[3])
+    l3, _, _, _, _ = tendon_chord(body, f, c[4][2], c[3])
+    return b1, b2, s, l1 - stretch, l2 - stretch, l3 - stretch
+
+
+def neck_substeps(c: tuple, load: tuple, sample_time: float, wanted: int) -> int:  # pyright: ignore
+    """Return substeps per sample: `wanted`, or more where the stiffest mode asks for it."""
+    link, hysteresis, tendon, geometry, _, drive, rest = c
+    winch = rest[0]
+    pull = 1.5 * max(drive[4] / winch, rest[2])
+    loss = 3.0 * (tendon[1] + tendon[2] * pull / tendon[3])
+    arm = geometry[1] ** 2
+    stiffness = max(link[0], link[1]) + 3.0 * link[2] + hysteresis[0] / hysteresis[1] + 3.0 * tendon[0] * arm
+    bending = (link[3] + loss * arm) / load[3] + math.sqrt(stiffness / load[3])
+    wall = link[6] * (1.0 + LINK_WALL_RATIO) + 3.0 * link[7] * link[9] ** 2 + 3.0 * tendon[0]
+    axial = (link[8] + loss) / load[4] + math.sqrt(wall / load[4])
+    inertia = drive[7]
+    damped = tendon[1] * winch * winch / inertia + drive[8] / (drive[9] * inertia)
+    driven = drive[2] + damped + math.sqrt(tendon[0] * winch * winch / inertia)
+    fastest = max(max(bending, axial), max(driven, 1.0 / rest[1]))
+    needed = math.ceil(sample_time * fastest / NECK_STABLE)
+    return min(max(wanted, needed), NECK_MOST_SUBSTEPS)

@@ -1,0 +1,61 @@
+"""Regressor matrices for training: the same lags as the runtime takes, no row across a run's border."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from softneck.core import DataError, Matrix, SettingsError, Vector
+from softneck.signals import Recording
+
+from ._drive import DriveModel
+
+# Eq. 21: y(k-1); u_i(k-2), u_i(k-3); M_i(k-3). Rows are (source, channel, lag): 0 own output, 1 u, 2 M.
+PAPER_EQ21 = np.array(
+    [
+        [0, 0, 1],
+        [1, 0, 2], [1, 0, 3],
+        [1, 1, 2], [1, 1, 3],
+        [1, 2, 2], [1, 2, 3],
+        [2, 0, 3], [2, 1, 3], [2, 2, 3],
+    ],
+    dtype=np.float64,
+)  # fmt: skip
+
+
+def history_length(table: Matrix, drive: DriveModel) -> int:
+    """Return how many samples the runtime must remember for this table and drive."""
+    return int(max(table[:, 2].max(), drive.delay.max(), 1))
+
+
+def motor_signals(recording: Recording, drive: DriveModel) -> Recording:
+    """Return the recording with motor positions: the logged ones, else those of the drive model."""
+    if recording.has_motor_positions:
+        return recording
+    runs = [drive.simulate(run.set_points, run.set_points[0]) for run in recording.runs()]
+    positions = np.concatenate(runs)
+    return recording.with_channels(**{f"motor_position_{j + 1}": positions[:, j] for j in range(3)})
+
+
+def regression(recording: Recording, table: Matrix, axis: int) -> tuple[Matrix, Vector]:
+    """Return regressors (rows, n) and targets y(k) (rows,) of one axis; rows with a missed sample are left out.
+
+    Raises:
+        DataError: nothing is left.
+    """
+    if table.shape[1] != 3 or table[:, 2].min() < 1:
+        raise SettingsError("each row of a regressor table is (source, channel, lag) with lag >= 1.")
+    X, y = zip(*[_run_regression(run, table, axis) for run in recording.runs()], strict=True)
+    regressors, targets = np.concatenate(X), np.concatenate(y)
+    good = np.isfinite(regressors).all(axis=1) & np.isfinite(targets)
+    if good.sum() < 2:
+        raise DataError(f"the recording is too short: {len(recording)} rows leave {good.sum()} to fit.")
+    return regressors[good], targets[good]
+
+
+def _run_regression(run: Recording, table: Matrix, axis: int) -> tuple[Matrix, Vector]:
+    lag = int(table[:, 2].max())
+    if len(run) <= lag:
+        return np.zeros((0, table.shape[0])), np.zeros(0)
+    sources = (run.outputs[:, [axis, axis, axis]], run.set_points, run.motor_positions)
+    columns = [sources[int(s)][lag - int(back) : len(run) - int(back), int(c)] for s, c, back in table]
+    return np.column_stack(columns), run.outputs[lag:, axis]

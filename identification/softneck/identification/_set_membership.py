@@ -1,0 +1,178 @@
+"""Nonlinear set membership identification (section 3): the data set is the model."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from softneck.core import (
+    DataError,
+    Matrix,
+    Progress,
+    SettingsError,
+    Vector,
+    load_functions,
+    require_one_of,
+    require_positive,
+    silent,
+)
+from softneck.signals import Recording, concatenate
+
+from ._checks import check_training
+from ._drive import fit_drive
+from ._model import WARM_UP, Model
+from ._regressors import PAPER_EQ21, history_length, motor_signals, regression
+from ._rows import row_hashes
+from ._scores import nrmse_fit
+
+_CONES = "softneck.identification._cones_runtime"
+_AXES = ("pitch", "roll")
+# The knee of gamma*(epsilon) lies at 3 to 5 sigma of the noise (measured; docs, "Set membership").
+_EPSILON_SIGMAS = (3.0, 4.0, 5.0, 6.0, 8.0)
+# Weight of the output in the regressor: the paper logs angles in degrees beside motors in radians, which
+# is 57.3 here; lower ones trust the fed-back output less. The hold-out decides.
+_OUTPUT_WEIGHTS = (3.0, 10.0, 57.29577951308232)
+# The end of the training rows on which epsilon and the weight are chosen, in free run.
+_HOLD_OUT = 0.2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetMembership:
+    """The estimator of Eq. 12-20 and Algorithm 1 over the regressor of Eq. 21, one set for each axis.
+
+    Attributes:
+        form: "paper_eq21".
+        epsilon: noise bound of Eq. 15 [rad]; None chooses it on the data.
+        output_weight: weight of y(k-1) in the regressor's norm, motors having 1; None chooses it on the data.
+    """
+
+    form: str = "paper_eq21"
+    epsilon: float | None = None
+    output_weight: float | None = None
+
+    def __post_init__(self) -> None:
+        require_one_of("form", self.form, ("paper_eq21",))
+        if self.epsilon is not None:
+            require_positive("epsilon", self.epsilon, "rad")
+        if self.output_weight is not None:
+            require_positive("output_weight", self.output_weight)
+
+    def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
+        """Store the data set and find gamma and epsilon that are consistent with all of it.
+
+        gamma is the paper's: the least for which f_u(i) >= y(i) and f_l(i) <= y(i) at every point. epsilon and
+        the output's weight are chosen by the free run over the last fifth of the training rows.
+
+        Raises:
+            DataError: too short, constant, or `epsilon` so small that no function fits the data.
+        """
+        recording = concatenate(recordings if isinstance(recordings, list) else [recordings])
+        check_training(recording)
+        recording = motor_signals(recording, fit_drive(recording))
+        noise = np.array([noise_level(recording, axis) for axis in range(2)])
+        choice = self._choose(recording, noise, progress)
+        arrays, findings = self._arrays(recording, *choice)
+        progress(1.0, "done")
+        return Model(
+            kind="nlsm",
+            sample_time=recording.sample_time,
+            arrays=arrays,
+            settings=asdict(self),
+            findings={"noise_deg": np.degrees(noise).tolist(), **findings},
+            training_rows=row_hashes(recording),
+        )
+
+    def _choose(self, recording: Recording, noise: Vector, progress: Progress) -> tuple[float, Vector]:
+        """Return the output weight and epsilon (2,) of the best free run on the hold-out."""
+        weights = _OUTPUT_WEIGHTS if self.output_weight is None else (self.output_weight,)
+        sigmas = _EPSILON_SIGMAS if self.epsilon is None else (0.0,)
+        if len(weights) * len(sigmas) == 1:
+            return weights[0], np.full(2, self.epsilon)
+        head, tail = recording.split(1.0 - _HOLD_OUT)
+        if tail is None or len(tail) <= 2 * WARM_UP:
+            raise DataError(
+                "the record is too short to choose epsilon; record longer, or set epsilon and output_weight."
+            )
+        best: tuple[float, float, Vector] | None = None
+        for number, weight in enumerate(weights):
+            progress(number / (len(weights) + 1), f"output weight {weight:.3g}")
+            epsilons = [s * noise if self.epsilon is None else np.full(2, self.epsilon) for s in sigmas]
+            for epsilon, gamma in zip(epsilons, self._gammas(head, weight, epsilons), strict=True):
+                if gamma.max() > 1e100:
+                    continue
+                score = self._free_run_score(head, tail, weight, epsilon, gamma)
+                if best is None or score > best[0]:
+                    best = (score, weight, epsilon)
+        if best is None:
+            raise DataError("equal regressors have unequal outputs beyond any epsilon tried; set `epsilon` higher.")
+        return best[1], best[2]
+
+    def _gammas(self, recording: Recording, weight: float, epsilons: list[Vector]) -> list[Vector]:
+        """Return gamma (2,) for each epsilon (2,)."""
+        columns = []
+        for axis in range(2):
+            points, values = _points(recording, weight, axis)
+            slacks = np.array([epsilon[axis] for epsilon in epsilons])
+            worst = np.zeros((slacks.size, 2))
+            columns.append(load_functions(_CONES).least_gammas(points, values, slacks, worst))
+        return [np.array(pair) for pair in zip(*columns, strict=True)]
+
+    def _free_run_score(self, head: Recording, tail: Recording, weight: float, epsilon: Vector, gamma: Vector) -> float:
+        arrays = _build(head, weight, epsilon, gamma)
+        outputs = Model(kind="nlsm", sample_time=head.sample_time, arrays=arrays).simulate(tail)[:, :2]
+        return sum(nrmse_fit(tail.outputs[WARM_UP:, axis], outputs[WARM_UP:, axis]) for axis in range(2))
+
+    def _arrays(self, recording: Recording, weight: float, epsilon: Vector) -> tuple[dict[str, Matrix], dict]:
+        gamma = self._gammas(recording, weight, [epsilon])[0]
+        if gamma.max() > 1e100:
+            raise DataError(
+                f"epsilon {np.degrees(epsilon).round(4).tolist()} deg is below the noise: equal regressors have "
+                "outputs further apart, so no function fits the data. Set `epsilon` higher."
+            )
+        findings = {
+            "epsilon_deg": np.degrees(epsilon).tolist(),
+            "gamma": gamma.tolist(),
+            "output_weight": weight,
+            "points": int(_points(recording, weight, 0)[1].size),
+        }
+        return _build(recording, weight, epsilon, gamma), findings
+
+
+def noise_level(recording: Recording, axis: int) -> float:
+    """Return the standard deviation [rad] of white noise on one output, from its third differences.
+
+    A motion of 4 rad/s sampled at 20 ms leaves almost nothing there; the median is not moved by jerks.
+    """
+    differences = [np.diff(run.outputs[:, axis], 3) for run in recording.runs() if len(run) > 3]
+    d = np.concatenate(differences)
+    d = d[np.isfinite(d)]
+    # 20 = 1 + 9 + 9 + 1, squares of the binomials; 0.6745 is the quartile of a standard normal.
+    sigma = float(np.median(np.abs(d))) / 0.6745 / np.sqrt(20.0)
+    return max(sigma, 1e-7)  # a noise-free simulation: rounding is left
+
+
+def _points(recording: Recording, weight: float, axis: int) -> tuple[Matrix, Vector]:
+    X, y = regression(recording, PAPER_EQ21, axis)
+    return np.ascontiguousarray((X * _scale(weight)).T), np.ascontiguousarray(y)
+
+
+def _scale(weight: float) -> Vector:
+    return np.where(PAPER_EQ21[:, 0] == 0, weight, 1.0)
+
+
+def _build(recording: Recording, weight: float, epsilon: Vector, gamma: Vector) -> dict[str, Matrix]:
+    drive = fit_drive(recording)
+    points = [_points(recording, weight, axis) for axis in range(2)]
+    rows = min(values.size for _, values in points)
+    if rows < 2:
+        raise SettingsError("a set needs at least 2 points.")
+    return {
+        "history": np.array([float(history_length(PAPER_EQ21, drive))]),
+        "drive": drive.array,
+        "table": PAPER_EQ21,
+        "scale": _scale(weight),
+        "points": np.array([p[:, :rows] for p, _ in points]),
+        "values": np.array([values[:rows] for _, values in points]),
+        "bounds": np.column_stack([gamma, epsilon]),
+    }

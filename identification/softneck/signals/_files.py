@@ -1,0 +1,142 @@
+"""Recordings as CSV and Parquet files with units in the column titles."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from softneck.core import DataError, FileFormatError, SoftneckError, Vector, atomic_write, to_si
+
+from ._channels import column_name, file_unit, known_channels, may_miss, parse_column
+from ._recording import Recording
+
+
+def write_recording(path: str | Path, recording: Recording, *, force: bool = False) -> None:
+    """Write a `.csv` or `.parquet` recording; a missing sample becomes an empty cell.
+
+    Raises:
+        OutputError: the file exists (and not `force`) or cannot be written.
+        DataError: another ending than `.csv` or `.parquet`.
+    """
+    suffix = _suffix(path)
+    frame = recording_frame(recording)
+    with atomic_write(path, force=force) as temporary:
+        if suffix == ".csv":
+            frame.to_csv(temporary, index=False)
+        else:
+            frame.to_parquet(temporary, index=False)
+
+
+def recording_frame(recording: Recording) -> pd.DataFrame:
+    """Return the recording as a table whose columns say their unit, as in its file."""
+    columns: dict[str, np.ndarray] = {column_name("time"): recording.time}
+    for name in known_channels():
+        if name in recording.channels:
+            columns[column_name(name)] = recording.channels[name] / to_si(file_unit(name))[0]
+    if recording.run.any():
+        columns["run"] = recording.run
+    return pd.DataFrame(columns)
+
+
+def read_recording(path: str | Path) -> Recording:
+    """Read a recording that `write_recording` wrote or that follows its form.
+
+    Raises:
+        FileFormatError: no such file, or no table.
+        DataError: columns, units, numbers or times are not those of a recording; the line says which.
+    """
+    source = Path(path)
+    frame = read_table(source, _suffix(source), header=True)
+    try:
+        return _from_frame(frame)
+    except SoftneckError as error:
+        raise DataError(f"{source}: {error}") from error
+
+
+def read_table(source: Path, suffix: str, *, header: bool, delimiter: str = ",") -> pd.DataFrame:
+    """Read a table as text-free columns of floats where they are numbers.
+
+    Raises:
+        FileFormatError: no such file, or it is no table.
+    """
+    if not source.is_file():
+        raise FileFormatError(f"{source}: no such file.")
+    try:
+        if suffix == ".parquet":
+            return pd.read_parquet(source)
+        return pd.read_csv(
+            source,
+            header=0 if header else None,
+            sep=delimiter,
+            skipinitialspace=True,
+            keep_default_na=False,
+            na_values=[""],
+            float_precision="round_trip",
+        )
+    except (ValueError, OSError, ArithmeticError, MemoryError) as error:
+        reason = (str(error).splitlines() or [""])[0][:120]
+        raise FileFormatError(f"{source}: cannot be read as a table ({reason}).") from error
+
+
+def _from_frame(frame: pd.DataFrame) -> Recording:
+    run = np.zeros(0, dtype=np.int64)
+    channels: dict[str, Vector] = {}
+    for title in map(str, frame.columns):
+        if title.strip() == "run":
+            run = _integers(pd.Series(frame[title]))
+            continue
+        name, factor = parse_column(title)
+        if name in channels:
+            raise DataError(f"channel `{name}` stands in two columns; drop one.")
+        channels[name] = factor * numbers(pd.Series(frame[title]), name, missing=may_miss(name))
+    if "time" not in channels:
+        raise DataError("there is no column `time [s]`.")
+    time = channels.pop("time")
+    return Recording(time, median_step(time, run), channels, run)
+
+
+def numbers(column: pd.Series, name: str, *, missing: bool) -> Vector:
+    """Return a column as floats; an empty cell is NaN where `missing` samples are allowed.
+
+    Raises:
+        DataError: text, a written-out NaN, or an empty cell where none is allowed.
+    """
+    values = np.asarray(pd.to_numeric(column, errors="coerce"), dtype=np.float64)
+    bad = np.isnan(values) & (~column.isna().to_numpy() if missing else True)
+    if bad.any():
+        row = int(np.argmax(bad))
+        cell = "an empty cell" if pd.isna(column.iloc[row]) else f"`{column.iloc[row]}`"
+        hint = " (a missing sample is an empty cell)" if missing else ""
+        raise DataError(f"column `{name}` holds {cell} at row {row}, where a number is needed{hint}.")
+    return values
+
+
+def median_step(time: Vector, run: np.ndarray) -> float:
+    """Return the sample time [s] of a time column: the mean step of its longest regular part."""
+    if time.size < 2:
+        raise DataError(f"a recording needs at least 2 rows; got {time.size}.")
+    step = np.diff(time)
+    inside = step[np.diff(run) == 0] if run.size else step
+    positive = inside[inside > 0]
+    if positive.size == 0:
+        raise DataError("`time` never increases; it must rise by the sample time from row to row.")
+    typical = float(np.median(positive))
+    near = positive[np.abs(positive - typical) < 0.5 * typical]
+    # The mean removes the rounding of printed times; ten digits are more than any clock has.
+    return float(f"{near.mean():.10g}")
+
+
+def _integers(column: pd.Series) -> np.ndarray:
+    values = numbers(column, "run", missing=False)
+    if not np.array_equal(values, np.round(values)):
+        raise DataError("column `run` must hold integers.")
+    return values.astype(np.int64)
+
+
+def _suffix(path: str | Path) -> str:
+    suffix = Path(path).suffix.lower()
+    if suffix not in (".csv", ".parquet"):
+        raise DataError(f"{path}: a recording is a `.csv` or a `.parquet` file; got `{suffix or 'no ending'}`.")
+    return suffix

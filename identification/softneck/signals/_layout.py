@@ -1,0 +1,225 @@
+"""Foreign logs become recordings through a layout: a TOML file that says which column is what."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from softneck.core import DataError, FileFormatError, SettingsError, SoftneckError, Vector, to_si
+
+from ._channels import known_channels, may_miss, si_unit
+from ._files import median_step, numbers, read_table
+from ._recording import Recording
+from ._tilt import pitch_roll
+
+Column = str | int
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """One column times a factor."""
+
+    column: Column
+    factor: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Where a channel comes from: the sum of terms, in `unit`, times `sign`."""
+
+    terms: tuple[Term, ...]
+    unit: str
+    sign: float = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layout:
+    """How a log is read.
+
+    Attributes:
+        channels: channel name -> source.
+        inclination, orientation: sources of the tilt vector, instead of pitch and roll.
+        time: the time column's source, or None.
+        sample_time: true sample time [s]; None takes it from the time column.
+        new_run_at_restart: a time that goes back starts a new run.
+        header: whether the first line names the columns.
+        delimiter: between cells.
+        rows: first and last row (not included) to take.
+    """
+
+    channels: Mapping[str, Source]
+    inclination: Source | None = None
+    orientation: Source | None = None
+    time: Source | None = None
+    sample_time: float | None = None
+    new_run_at_restart: bool = False
+    header: bool = True
+    delimiter: str = ","
+    rows: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Imported:
+    """A recording and what the importer did that a user should know."""
+
+    recording: Recording
+    notes: tuple[str, ...] = field(default=())
+
+
+def read_layout(path: str | Path) -> Layout:
+    """Read a layout file (docs, "Layouts").
+
+    Raises:
+        FileFormatError: no such file or no TOML.
+        SettingsError: a key, channel or unit that a layout does not have.
+    """
+    source = Path(path)
+    try:
+        table = tomllib.loads(source.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise FileFormatError(f"{source}: no such file.") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
+        raise FileFormatError(f"{source}: is no TOML file ({error}).") from error
+    try:
+        return _layout(table)
+    except SoftneckError as error:
+        raise SettingsError(f"{source}: {error}") from error
+
+
+def import_log(path: str | Path, layout: Layout) -> Imported:
+    """Read a foreign table as a recording.
+
+    Raises:
+        FileFormatError: no such file or no table.
+        DataError: a column is missing, holds no numbers, or the times do not fit.
+    """
+    source = Path(path)
+    suffix = ".parquet" if source.suffix.lower() == ".parquet" else ".csv"
+    frame = read_table(source, suffix, header=layout.header, delimiter=layout.delimiter)
+    frame.columns = [name.strip() if isinstance(name, str) else name for name in frame.columns]
+    if layout.rows is not None:
+        frame = frame.iloc[layout.rows[0] : layout.rows[1]].reset_index(drop=True)
+    try:
+        return _imported(frame, layout)
+    except SoftneckError as error:
+        raise DataError(f"{source}: {error}") from error
+
+
+def _imported(frame: pd.DataFrame, layout: Layout) -> Imported:
+    channels = {name: _values(frame, source, name) for name, source in layout.channels.items()}
+    if layout.inclination is not None and layout.orientation is not None:
+        i = _values(frame, layout.inclination, "pitch")
+        o = _values(frame, layout.orientation, "pitch")
+        channels["pitch"], channels["roll"] = pitch_roll(i, o)
+    time, run, sample_time, notes = _times(frame, layout)
+    return Imported(Recording(time, sample_time, channels, run), notes)
+
+
+def _times(frame: pd.DataFrame, layout: Layout) -> tuple[Vector, np.ndarray, float, tuple[str, ...]]:
+    run = np.zeros(len(frame), dtype=np.int64)
+    notes: list[str] = []
+    logged = None
+    if layout.time is not None:
+        logged = _values(frame, layout.time, "time")
+        if layout.new_run_at_restart:
+            run[1:] = np.cumsum(np.diff(logged) <= 0)
+            notes.append(f"{run[-1] + 1 if run.size else 0} run(s), by restarts of the time column")
+    if layout.sample_time is None:
+        if logged is None:
+            raise DataError("the layout gives neither a time column nor `sample_time_s`; give one.")
+        return logged, run, median_step(logged, run), tuple(notes)
+    if logged is not None and run.size > 1:
+        nominal = median_step(logged, run)
+        if abs(nominal - layout.sample_time) > 1e-3 * layout.sample_time:
+            notes.append(
+                f"the time column says {1e3 * nominal:g} ms a sample; "
+                f"the layout's {1e3 * layout.sample_time:g} ms is used"
+            )
+    first = np.concatenate([[0], np.flatnonzero(np.diff(run)) + 1]) if run.size else np.zeros(0, dtype=np.int64)
+    within = np.arange(run.size) - np.repeat(first, np.diff(np.append(first, run.size)))
+    return within * layout.sample_time, run, layout.sample_time, tuple(notes)
+
+
+def _values(frame: pd.DataFrame, source: Source, channel: str) -> Vector:
+    total = np.zeros(len(frame))
+    for term in source.terms:
+        if term.column not in frame.columns:
+            listed = ", ".join(str(name) for name in frame.columns)
+            raise DataError(f"column `{term.column}` for `{channel}` is not in the file; it has {listed}.")
+        column = pd.Series(frame[term.column])
+        total = total + term.factor * numbers(column, str(term.column), missing=may_miss(channel))
+    return source.sign * to_si(source.unit)[0] * total
+
+
+def _layout(table: dict[str, Any]) -> Layout:
+    _known_keys(table, {"file", "time", "channels", "tilt"}, "the layout")
+    file, time = table.get("file", {}), table.get("time", {})
+    tilt = table.get("tilt", {})
+    _known_keys(file, {"header", "delimiter", "rows"}, "[file]")
+    _known_keys(time, {"column", "unit", "sample_time_s", "new_run_at_restart"}, "[time]")
+    _known_keys(tilt, {"inclination", "orientation"}, "[tilt]")
+    if len(tilt) == 1:
+        raise SettingsError("[tilt] needs both `inclination` and `orientation`.")
+    rows = file.get("rows")
+    if rows is not None and not (isinstance(rows, list) and len(rows) == 2 and 0 <= rows[0] < rows[1]):
+        raise SettingsError(f"[file] rows must be [first, last] with 0 <= first < last; got {rows}.")
+    return Layout(
+        channels={name: _channel_source(name, entry) for name, entry in table.get("channels", {}).items()},
+        inclination=_source(tilt["inclination"], "rad", "[tilt] inclination") if tilt else None,
+        orientation=_source(tilt["orientation"], "rad", "[tilt] orientation") if tilt else None,
+        time=_source({"unit": "s", **_only(time, "column", "unit")}, "s", "[time]") if "column" in time else None,
+        sample_time=_positive(time.get("sample_time_s")),
+        new_run_at_restart=bool(time.get("new_run_at_restart", False)),
+        header=bool(file.get("header", True)),
+        delimiter=str(file.get("delimiter", ",")),
+        rows=(rows[0], rows[1]) if rows is not None else None,
+    )
+
+
+def _channel_source(name: str, entry: Any) -> Source:
+    if name not in known_channels() or name == "time":
+        raise SettingsError(f"[channels.{name}]: no channel of a recording; known: {', '.join(known_channels())}.")
+    return _source(entry, si_unit(name), f"[channels.{name}]")
+
+
+def _source(entry: Any, quantity: str, where: str) -> Source:
+    if not isinstance(entry, dict):
+        raise SettingsError(f"{where} must be a table with `column` (or `terms`) and `unit`.")
+    _known_keys(entry, {"column", "terms", "unit", "sign", "factor"}, where)
+    terms = entry.get("terms", [_only(entry, "column", "factor")])
+    for term in terms:
+        if not isinstance(term, dict) or not isinstance(term.get("column"), str | int):
+            raise SettingsError(f"{where} needs `column`: a name, or an index from 0 for a file without header.")
+        _known_keys(term, {"column", "factor"}, where)
+    if "unit" not in entry:
+        raise SettingsError(f"{where} names no unit.")
+    if to_si(entry["unit"])[1] != quantity:
+        raise SettingsError(f"{where} cannot be in `{entry['unit']}`; its SI unit is {quantity}.")
+    parsed = tuple(Term(term["column"], float(term.get("factor", 1.0))) for term in terms)
+    return Source(parsed, entry["unit"], float(entry.get("sign", 1.0)))
+
+
+def _only(entry: dict[str, Any], *keys: str) -> dict[str, Any]:
+    return {key: entry[key] for key in keys if key in entry}
+
+
+def _positive(value: Any) -> float | None:
+    if value is None:
+        return None
+    if not isinstance(value, int | float) or not 0 < value < float("inf"):
+        raise SettingsError(f"[time] sample_time_s must be a positive number; got {value!r}.")
+    return float(value)
+
+
+def _known_keys(table: Any, known: set[str], where: str) -> None:
+    if not isinstance(table, dict):
+        raise SettingsError(f"{where} must be a table.")
+    unknown = sorted(set(table) - known)
+    if unknown:
+        raise SettingsError(f"{where} has the unknown key `{unknown[0]}`; known: {', '.join(sorted(known))}.")

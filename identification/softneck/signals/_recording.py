@@ -1,0 +1,170 @@
+"""The recording: named channels over time, in SI, as several runs that are never joined."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from softneck.core import DataError, Matrix, Vector, require_positive
+
+from ._channels import MOTOR_POSITIONS, OUTPUTS, REQUIRED, SET_POINTS, known_channels, may_miss
+
+# A logger's jitter; above it the samples are not equidistant and a discrete-time fit would be wrong.
+_MAX_JITTER = 0.02
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording:
+    """Samples of one or more experiments at one sample time.
+
+    Attributes:
+        time: (time,) [s], equidistant within each run; may restart at a new run.
+        sample_time: [s].
+        channels: name -> (time,) in SI; the set-points, pitch and roll are always there. NaN: sample missed.
+        run: (time,) integers, constant over each experiment; 0 everywhere when not given.
+    """
+
+    time: Vector
+    sample_time: float
+    channels: Mapping[str, Vector]
+    run: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    def __post_init__(self) -> None:
+        require_positive("sample_time", self.sample_time, "s")
+        time = np.ascontiguousarray(self.time, dtype=np.float64)
+        run = np.zeros(time.size, dtype=np.int64) if self.run.size == 0 else self.run.astype(np.int64)
+        channels = {name: np.ascontiguousarray(c, dtype=np.float64) for name, c in self.channels.items()}
+        object.__setattr__(self, "time", time)
+        object.__setattr__(self, "run", run)
+        object.__setattr__(self, "channels", channels)
+        self._check_channels()
+        self._check_time()
+
+    def __len__(self) -> int:
+        return self.time.size
+
+    @property
+    def set_points(self) -> Matrix:
+        """(time, 3) motor set-points [rad]."""
+        return np.column_stack([self.channels[name] for name in SET_POINTS])
+
+    @property
+    def outputs(self) -> Matrix:
+        """(time, 2) pitch and roll [rad]; NaN where a sample was missed."""
+        return np.column_stack([self.channels[name] for name in OUTPUTS])
+
+    @property
+    def has_motor_positions(self) -> bool:
+        """Whether motor positions were logged."""
+        return all(name in self.channels for name in MOTOR_POSITIONS)
+
+    @property
+    def motor_positions(self) -> Matrix:
+        """(time, 3) measured motor positions [rad]; the set-points where none were logged."""
+        if not self.has_motor_positions:
+            return self.set_points
+        return np.column_stack([self.channels[name] for name in MOTOR_POSITIONS])
+
+    def runs(self) -> tuple[Recording, ...]:
+        """Return each experiment as a recording of its own."""
+        borders = np.flatnonzero(np.diff(self.run)) + 1
+        edges = [0, *borders.tolist(), len(self)]
+        return tuple(self.rows(start, stop) for start, stop in itertools.pairwise(edges))
+
+    def rows(self, start: int, stop: int) -> Recording:
+        """Return rows start to stop (not included)."""
+        part = slice(start, stop)
+        channels = {name: values[part] for name, values in self.channels.items()}
+        return Recording(self.time[part], self.sample_time, channels, self.run[part])
+
+    def split(self, fraction: float) -> tuple[Recording, Recording | None]:
+        """Return the first `fraction` of each run's rows and the rest (None when nothing is left).
+
+        Raises:
+            DataError: `fraction` is not in (0, 1].
+        """
+        if not 0.0 < fraction <= 1.0:
+            raise DataError(f"the part to train on must be in (0, 1]; got {fraction}.")
+        heads: list[Recording] = []
+        tails: list[Recording] = []
+        for run in self.runs():
+            border = round(fraction * len(run))
+            if border > 0:
+                heads.append(run.rows(0, border))
+            if border < len(run):
+                tails.append(run.rows(border, len(run)))
+        return concatenate(heads), concatenate(tails) if tails else None
+
+    def with_channels(self, **channels: Vector) -> Recording:
+        """Return the same recording with channels added or replaced."""
+        return replace(self, channels={**self.channels, **channels})
+
+    def _check_channels(self) -> None:
+        missing = [name for name in REQUIRED if name not in self.channels]
+        if missing:
+            raise DataError(f"a recording needs the channels {', '.join(REQUIRED)}; missing: {', '.join(missing)}.")
+        if len(self) == 0:
+            raise DataError("the recording has no rows.")
+        for name, values in self.channels.items():
+            if name not in known_channels() or name == "time":
+                raise DataError(f"`{name}` is no channel of a recording; known: {', '.join(known_channels())}.")
+            if values.shape != (len(self),):
+                raise DataError(f"channel `{name}` has shape {values.shape}; time has {(len(self),)}.")
+            bad = np.isinf(values) if may_miss(name) else ~np.isfinite(values)
+            if bad.any():
+                row = int(np.argmax(bad))
+                raise DataError(
+                    f"channel `{name}` is {values[row]} at row {row} (t = {self.time[row]:g} s); "
+                    "it must be finite. Mend the log or cut it before that row."
+                )
+        if self.run.shape != (len(self),):
+            raise DataError(f"`run` has shape {self.run.shape}; time has {(len(self),)}.")
+
+    def _check_time(self) -> None:
+        if not np.isfinite(self.time).all():
+            raise DataError(f"`time` is not finite at row {int(np.argmax(~np.isfinite(self.time)))}.")
+        step = np.diff(self.time)
+        inside = np.diff(self.run) == 0
+        back = inside & (step <= 0)
+        if back.any():
+            row = int(np.argmax(back)) + 1
+            raise DataError(
+                f"`time` runs backwards or stands still at row {row} ({self.time[row - 1]:g} to {self.time[row]:g} s); "
+                "where a new experiment starts there, give it another number in the `run` column."
+            )
+        jump = inside & (np.abs(step - self.sample_time) > max(_MAX_JITTER * self.sample_time, 1e-9))
+        if jump.any():
+            row = int(np.argmax(jump)) + 1
+            raise DataError(
+                f"`time` jumps by {step[row - 1]:.6g} s at row {row} (t = {self.time[row]:g} s) where the "
+                f"sample time is {self.sample_time:.6g} s; fill the gap, or split the record there by the `run` column."
+            )
+
+
+def concatenate(recordings: list[Recording] | tuple[Recording, ...]) -> Recording:
+    """Put recordings of one sample time behind each other as separate runs; channels that all have are kept.
+
+    Raises:
+        DataError: none given, or sample times differ.
+    """
+    if not recordings:
+        raise DataError("there is no recording to work on; the part to train on is empty.")
+    first = recordings[0]
+    parts: list[Recording] = []
+    for recording in recordings:
+        if not np.isclose(recording.sample_time, first.sample_time, rtol=1e-6):
+            raise DataError(
+                f"recordings of different sample times cannot be used together: {first.sample_time:g} s and "
+                f"{recording.sample_time:g} s. Resample one of them."
+            )
+        parts.extend(recording.runs())
+    names = [name for name in first.channels if all(name in part.channels for part in parts)]
+    return Recording(
+        np.concatenate([part.time for part in parts]),
+        first.sample_time,
+        {name: np.concatenate([part.channels[name] for part in parts]) for name in names},
+        np.concatenate([np.full(len(part), number, dtype=np.int64) for number, part in enumerate(parts)]),
+    )

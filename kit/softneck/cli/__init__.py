@@ -1,0 +1,3 @@
+"""The `softneck` command."""
+
+from ._main import main as main

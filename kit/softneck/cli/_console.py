@@ -1,0 +1,74 @@
+"""What the commands print: tables for people, one JSON object for programs, progress on stderr."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from softneck.core import Progress as ProgressCallback
+from softneck.core import silent
+
+
+def print_json(value: Any) -> None:
+    """Print one JSON object; numbers that JSON does not have become null."""
+    click.echo(json.dumps(_plain(value), indent=2, sort_keys=False, allow_nan=False))
+
+
+def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table on stdout, the first column to the left and the others to the right."""
+    table = Table(title=title, title_justify="left", header_style="bold", pad_edge=False)
+    for index, name in enumerate(head):
+        table.add_column(name, justify="left" if index == 0 else "right", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    # A pipe or a log has no width: never cut a table there.
+    Console(width=None if sys.stdout.isatty() else 200).print(table)
+
+
+def note(message: str) -> None:
+    """Print a remark for people on stderr."""
+    click.echo(message, err=True)
+
+
+@contextlib.contextmanager
+def progress(what: str, *, quiet: bool = False) -> Iterator[ProgressCallback]:
+    """Yield a callback (part done, word) that draws a bar on stderr; a line where stderr is no terminal."""
+    if quiet:
+        yield silent
+        return
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        note(f"{what} ...")
+        yield silent
+        return
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(what, total=1.0)
+        yield lambda done, word: bar.update(task, completed=done, description=f"{what}: {word}")
+
+
+def percent(value: float | None) -> str:
+    """Return a fit for a table cell."""
+    return "diverged" if value is None else f"{value:.1f}"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, float) and (value != value or abs(value) == float("inf")):
+        return None
+    if isinstance(value, str | int | float | bool) or value is None:
+        return value
+    return str(value)

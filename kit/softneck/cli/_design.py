@@ -1,0 +1,40 @@
+"""softneck design: a controller from an identified linear model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from softneck.core import KINDS, find_kind, kinds_of, refuse_existing, resolve
+from softneck.identification import load_model
+
+from ._console import print_json, progress
+from ._options import apply_settings, force_option, json_option, output_option, set_option, target
+
+_KINDS = "\n".join(f"  {name:6} {KINDS[name].summary}" for name in kinds_of("controller"))
+
+
+@click.command(
+    "design",
+    help=f"Design a controller of KIND on an identified linear MODEL.\n\n\b\nKinds:\n{_KINDS}",
+    epilog="Example: softneck design pi rls.npz -o pi.npz --set phase_margin_deg=60",
+)
+@click.argument("kind")
+@click.argument("model", type=click.Path(path_type=Path))
+@output_option("controller", "CONTROLLER")
+@set_option
+@force_option
+@json_option
+def command(kind: str, model: Path, output: Path | None, settings: tuple[str, ...], force: bool, as_json: bool) -> None:
+    """Design a controller of KIND on an identified linear MODEL."""
+    entry = find_kind(kind, "controller")
+    path, replace = target(output, f"controllers/{kind}.npz", force=force)
+    refuse_existing(path, force=replace)
+    with progress(f"design {kind}", quiet=as_json):
+        controller = apply_settings(resolve(entry.settings), settings).design(load_model(model))
+    controller.save(path, force=replace)
+    if as_json:
+        print_json({"controller": str(path), "kind": kind, "summary": controller.summary()})
+        return
+    click.echo(f"{path}\n{controller.summary()}")

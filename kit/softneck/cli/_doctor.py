@@ -1,0 +1,87 @@
+"""softneck doctor: what of this machine works."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from importlib import metadata
+
+import click
+
+from ._console import print_json, print_table
+from ._options import json_option
+
+_NEEDED = ("numpy", "scipy", "control", "casadi", "filterpy", "fmpy", "pythonfmu", "numba", "pandas", "pyarrow",
+           "matplotlib", "click", "rich", "jinja2", "platformdirs")  # fmt: skip
+_EXTRAS = {"slycot": "H-infinity by SLICOT", "can": "CAN buses by python-can", "canopen": "SDO and EDS"}
+
+
+@click.command("doctor", epilog="Example: softneck doctor --json")
+@json_option
+def command(as_json: bool) -> None:
+    """Say what of this machine works: packages, compilers, FMU platforms, CAN, extras."""
+    checks = [_python(), *_packages(), _compiler(), _fmu_platform(), _can(), *_extras()]
+    bad = [check for check in checks if check["state"] == "missing"]
+    if as_json:
+        print_json({"checks": checks, "healthy": not bad})
+    else:
+        rows = [[check["name"], check["state"], check["detail"]] for check in checks]
+        print_table("softneck doctor", ["what", "state", "detail"], rows)
+    sys.exit(1 if bad else 0)
+
+
+def _check(name: str, state: str, detail: str) -> dict[str, str]:
+    return {"name": name, "state": state, "detail": detail}
+
+
+def _python() -> dict[str, str]:
+    return _check("python", "ok", f"{platform.python_version()} on {platform.system()} {platform.machine()}")
+
+
+def _packages() -> list[dict[str, str]]:
+    found = []
+    for name in _NEEDED:
+        try:
+            found.append(_check(name, "ok", metadata.version(name)))
+        except metadata.PackageNotFoundError:
+            found.append(_check(name, "missing", f"pip install {name}"))
+    return found
+
+
+def _compiler() -> dict[str, str]:
+    compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+    if compiler:
+        return _check("C compiler", "ok", compiler)
+    if importlib.util.find_spec("ziglang"):
+        return _check("C compiler", "ok", "ziglang wheel")
+    return _check("C compiler", "absent", "not needed yet; compiled FMUs will come prebuilt")
+
+
+def _fmu_platform() -> dict[str, str]:
+    from pythonfmu.builder import FmuBuilder
+
+    if FmuBuilder.has_binary():
+        return _check("pythonfmu binary", "ok", f"{platform.system()} {platform.machine()}")
+    return _check("pythonfmu binary", "missing", "pythonfmu ships linux64 and win64 only; FMUs will not run here")
+
+
+def _can() -> dict[str, str]:
+    ip = shutil.which("ip")
+    if ip is None or not sys.platform.startswith("linux"):
+        return _check("CAN interfaces", "absent", "iproute2 is not installed" if ip is None else "no SocketCAN here")
+    shown = subprocess.run([ip, "-o", "link", "show", "type", "can"], capture_output=True, text=True, check=False)
+    names = [line.split(":")[1].strip() for line in shown.stdout.splitlines() if ":" in line]
+    return _check("CAN interfaces", "ok" if names else "absent", ", ".join(names) or "none; drives can be simulated")
+
+
+def _extras() -> list[dict[str, str]]:
+    checks = [
+        _check(f"extra {name}", "ok" if importlib.util.find_spec(name) else "absent", what)
+        for name, what in _EXTRAS.items()
+    ]
+    jit = "off by NUMBA_DISABLE_JIT" if os.environ.get("NUMBA_DISABLE_JIT", "0") != "0" else "on"
+    return [*checks, _check("compiled runtimes", "ok" if jit == "on" else "absent", f"numba {jit}")]

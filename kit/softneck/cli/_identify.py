@@ -1,0 +1,86 @@
+"""softneck identify: a model from recordings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from softneck.core import KINDS, find_kind, kinds_of, refuse_existing, resolve
+from softneck.identification import INFINITE, Model, Validation, validate
+from softneck.signals import Recording, concatenate, read_recording
+
+from ._console import percent, print_json, progress
+from ._options import apply_settings, force_option, json_option, output_option, set_option, target
+
+_KINDS = "\n".join(f"  {name:6} {KINDS[name].summary}" for name in kinds_of("model"))
+
+
+@click.command(
+    "identify",
+    help=f"Identify a model of KIND from one or more recordings.\n\n\b\nKinds:\n{_KINDS}",
+    epilog="Example: softneck identify rls neck.csv -o rls.npz --set na=1 --set delay=0.08",
+)
+@click.argument("kind")
+@click.argument("recordings", nargs=-1, required=True, type=click.Path(path_type=Path))
+@output_option("model", "MODEL")
+@click.option("--train", default=0.7, show_default=True, help="Part of each run, from its start, to train on.")
+@click.option("--seed", type=int, help="Seed of kinds that start at random.")
+@set_option
+@force_option
+@json_option
+def command(
+    kind: str,
+    recordings: tuple[Path, ...],
+    output: Path | None,
+    train: float,
+    seed: int | None,
+    settings: tuple[str, ...],
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Identify a model of KIND from one or more recordings."""
+    entry = find_kind(kind, "model")
+    estimator = apply_settings(resolve(entry.settings), settings, seed=seed)
+    path, replace = target(output, f"models/{kind}.npz", force=force)
+    refuse_existing(path, force=replace)
+    whole = concatenate([read_recording(source) for source in recordings])
+    head, tail = whole.split(train)
+    with progress(f"identify {kind}", quiet=as_json) as report:
+        model = estimator.fit(head, progress=report)
+    model.save(path, force=replace)
+    with progress("hold-out", quiet=as_json):
+        held_out = _hold_out(model, tail)
+    if as_json:
+        print_json(_facts(path, model, held_out))
+        return
+    click.echo(f"{path}\n{model.summary()}")
+    if held_out is None:
+        click.echo("nothing was held out: judge it with `softneck validate` on another recording")
+        return
+    one, free = held_out.fits["1"], held_out.fits[INFINITE]
+    held = held_out.persistence["1"]
+    click.echo(f"hold-out of {held_out.rows_scored} rows, fit [%] pitch/roll:")
+    click.echo(f"  persistence {percent(held['pitch'])}/{percent(held['roll'])}")
+    click.echo(f"  one step    {percent(one['pitch'])}/{percent(one['roll'])}")
+    click.echo(f"  free run    {percent(free['pitch'])}/{percent(free['roll'])}")
+
+
+def _hold_out(model: Model, tail: Recording | None) -> Validation | None:
+    # A hold-out of a second or less says nothing.
+    if tail is None or all(len(run) < 75 for run in tail.runs()):
+        return None
+    return validate(model, tail, horizons=(1, INFINITE))
+
+
+def _facts(path: Path, model: Model, held_out: Validation | None) -> dict:
+    return {
+        "model": str(path),
+        "kind": model.kind,
+        "sample_time_s": model.sample_time,
+        "rows_trained": int(model.training_rows.size),
+        "settings": dict(model.settings),
+        "findings": dict(model.findings),
+        "summary": model.summary(),
+        "hold_out": None if held_out is None else held_out.as_dict(),
+    }

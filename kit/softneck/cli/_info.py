@@ -1,0 +1,89 @@
+"""softneck info: what a file is."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+import fmpy
+
+from softneck.core import FileFormatError, file_hash, load, read_archive
+from softneck.signals import read_recording
+
+from ._console import print_json
+from ._options import json_option
+
+
+@click.command("info", epilog="Example: softneck info build/demo/models/rls.npz")
+@click.argument("file", type=click.Path(path_type=Path))
+@json_option
+def command(file: Path, as_json: bool) -> None:
+    """Say what FILE is: a recording, model, observer, controller, FMU, layout or certificate."""
+    if not file.is_file():
+        raise FileFormatError(f"{file}: no such file.")
+    facts = {"file": str(file), **_describe(file), "sha256": file_hash(file)}
+    if as_json:
+        print_json(facts)
+        return
+    for key, value in facts.items():
+        text = "\n  ".join(str(value).splitlines()) if isinstance(value, str) else value
+        click.echo(f"{key}: {text}")
+
+
+def _describe(file: Path) -> dict[str, Any]:
+    match file.suffix.lower():
+        case ".csv" | ".parquet":
+            return _recording(file)
+        case ".npz":
+            header, _ = read_archive(file)
+            thing = load(file)
+            return {"type": type(thing).__name__.lower(), "kind": header["kind"], "summary": thing.summary()}
+        case ".fmu":
+            return _fmu(file)
+        case ".json":
+            return _certificate(file)
+        case _:
+            raise FileFormatError(f"{file}: softneck has no files with the ending `{file.suffix}`.")
+
+
+def _recording(file: Path) -> dict[str, Any]:
+    recording = read_recording(file)
+    return {
+        "type": "recording",
+        "rows": len(recording),
+        "runs": len(recording.runs()),
+        "duration_s": len(recording) * recording.sample_time,
+        "sample_time_s": recording.sample_time,
+        "channels": ", ".join(recording.channels),
+    }
+
+
+def _fmu(file: Path) -> dict[str, Any]:
+    try:
+        description = fmpy.read_model_description(str(file), validate=False)
+    except Exception as error:  # fmpy raises bare Exception
+        raise FileFormatError(
+            f"{file}: is no FMU ({str(error).splitlines()[0] if str(error) else error!r})."
+        ) from error
+    by_causality = {
+        f"{causality}s": ", ".join(v.name for v in description.modelVariables if v.causality == causality)
+        for causality in ("input", "output", "parameter")
+    }
+    return {
+        "type": "FMU",
+        "model": description.modelName,
+        "fmi_version": description.fmiVersion,
+        "description": description.description or "",
+        "tool": description.generationTool or "",
+        **by_causality,
+    }
+
+
+def _certificate(file: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise FileFormatError(f"{file}: is no JSON file ({error}).") from error
+    return {"type": "certificate" if "limits" in content else "JSON", "keys": ", ".join(content)}

@@ -1,0 +1,61 @@
+"""Options that several subcommands share."""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from softneck.core import SettingsError
+
+json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout and nothing else.")
+force_option = click.option("--force", is_flag=True, help="Replace an existing file.")
+set_option = click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="A setting of the kind.")
+
+
+def output_option(what: str, metavar: str, *, required: bool = False) -> Callable:
+    """Return the option `-o`; without it a command writes under build/."""
+    help_text = f"Where to write the {what}." + ("" if required else " [default: under build/]")
+    return click.option(
+        "-o", "--output", type=click.Path(path_type=Path), metavar=metavar, required=required, help=help_text
+    )
+
+
+def target(output: Path | None, default: str, *, force: bool) -> tuple[Path, bool]:
+    """Return where to write and whether what stands there may be replaced: always under build/."""
+    return (output, force) if output is not None else (Path("build") / default, True)
+
+
+def apply_settings(settings_class: type, assignments: Sequence[str], **more: Any) -> Any:
+    """Return `settings_class` with `KEY=VALUE` assignments and `more`, both checked against its fields.
+
+    Raises:
+        SettingsError: no `=`, an unknown key, or a value that does not fit.
+    """
+    values: dict[str, Any] = {}
+    fields = {field.name for field in dataclasses.fields(settings_class)}
+    for assignment in assignments:
+        key, separator, text = assignment.partition("=")
+        if not separator:
+            raise SettingsError(f"--set takes KEY=VALUE; got `{assignment}`.")
+        values[key.strip()] = _value(text.strip())
+    values |= {key: value for key, value in more.items() if value is not None and key in fields}
+    unknown = sorted(set(values) - fields)
+    if unknown:
+        raise SettingsError(f"there is no setting `{unknown[0]}`; this kind has {', '.join(sorted(fields))}.")
+    try:
+        return settings_class(**values)
+    except TypeError as error:
+        raise SettingsError(f"a setting has a value of the wrong type ({error}).") from error
+
+
+def _value(text: str) -> Any:
+    """Read a value as TOML does (number, true, [list]); anything else is a string."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text

@@ -1,0 +1,53 @@
+"""softneck record: an experiment on the virtual neck."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from softneck.core import refuse_existing, require_between
+from softneck.plant import VirtualNeck, record
+from softneck.signals import signal, signal_names, write_recording
+
+from ._console import print_json, progress
+from ._neck import load_neck
+from ._options import force_option, json_option, output_option
+
+
+@click.command(
+    "record",
+    help="Record SIGNAL on the virtual neck.\n\nSignals: " + ", ".join(signal_names()) + ".",
+    epilog="Example: softneck record eq22 -o eq22.csv --neck paper --seed 1",
+)
+@click.argument("signal_name", metavar="SIGNAL")
+@output_option("recording", "REC", required=True)
+@click.option("--neck", default="paper", show_default=True, metavar="paper|lab|NECK.toml", help="Which neck.")
+@click.option("--duration", type=float, metavar="S", help="Length in seconds. [default: the signal's own]")
+@click.option("--seed", type=click.IntRange(0, 2**31 - 2), default=0, show_default=True, help="Of noise and signal.")
+@click.option("--payload", type=float, default=0.0, show_default=True, metavar="KG", help="On the platform.")
+@click.option("--no-noise", is_flag=True, help="A perfect inclinometer.")
+@force_option
+@json_option
+def command(
+    signal_name: str,
+    output: Path,
+    neck: str,
+    duration: float | None,
+    seed: int,
+    payload: float,
+    no_noise: bool,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Record SIGNAL on the virtual neck."""
+    refuse_existing(output, force=force)
+    require_between("--payload", payload, 0.0, 1.0, "kg")
+    excitation = signal(signal_name, duration=duration, seed=seed)
+    with progress("record", quiet=as_json):
+        recording = record(excitation, VirtualNeck(load_neck(neck)), seed=seed, payload=payload, noise=not no_noise)
+    write_recording(output, recording, force=force)
+    if as_json:
+        print_json({"recording": str(output), "rows": len(recording), "sample_time_s": recording.sample_time})
+        return
+    click.echo(f"{output}: {len(recording)} rows of {signal_name} at {1e3 * recording.sample_time:g} ms")

@@ -1,0 +1,75 @@
+"""Our one binary file form: a numpy `.npz` with a JSON header, never a pickle."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ._errors import FileFormatError
+from ._files import atomic_write
+
+FORMAT_VERSION = 1
+_HEADER = "header"
+# A header is a few kB and a model a few MB; more is an archive that wants to fill the memory.
+_MAX_BYTES = 4 * 2**30
+
+
+def write_archive(
+    path: str | Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], *, force: bool = False
+) -> None:
+    """Write `header` (JSON values) and `arrays` to `path` in one piece.
+
+    Raises:
+        OutputError: the file exists (and not `force`) or cannot be written.
+    """
+    text = json.dumps({"format": "softneck", "format_version": FORMAT_VERSION, **header}, sort_keys=True)
+    contents = {_HEADER: np.frombuffer(text.encode(), dtype=np.uint8), **arrays}
+    with atomic_write(path, force=force) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **contents)
+
+
+def read_archive(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Return the header and the arrays of a file that `write_archive` wrote.
+
+    Raises:
+        FileFormatError: no such file, no archive of ours, another version, damaged.
+    """
+    source = Path(path)
+    if not source.is_file():
+        raise FileFormatError(f"{source}: no such file.")
+    try:
+        _refuse_bomb(source)
+        with np.load(source, allow_pickle=False) as archive:
+            contents = {name: archive[name] for name in archive.files}
+        header = json.loads(contents.pop(_HEADER).tobytes().decode())
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, NotImplementedError) as error:
+        raise FileFormatError(f"{source}: is no softneck file or is damaged ({_short(error)}).") from error
+    _check_header(source, header)
+    return header, contents
+
+
+def _check_header(source: Path, header: object) -> None:
+    if not isinstance(header, dict) or header.get("format") != "softneck":
+        raise FileFormatError(f"{source}: is no softneck file; expected one that softneck wrote.")
+    version = header.get("format_version")
+    if version != FORMAT_VERSION:
+        raise FileFormatError(
+            f"{source}: has format version {version}; this softneck reads {FORMAT_VERSION}. "
+            "Write it again with this version or use the softneck that wrote it."
+        )
+
+
+def _refuse_bomb(source: Path) -> None:
+    with zipfile.ZipFile(source) as archive:
+        total = sum(entry.file_size for entry in archive.infolist())
+    if total > _MAX_BYTES:
+        raise ValueError(f"it unpacks to {total} bytes")
+
+
+def _short(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:120]

@@ -1,0 +1,107 @@
+"""Runtime bundles as callable functions: compiled by numba where it is installed, plain Python where not."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from types import FunctionType, ModuleType
+
+import platformdirs
+
+from ._bundle import bundle, content_name
+from ._files import atomic_write
+
+
+@dataclass(frozen=True, slots=True)
+class Runtime:
+    """The functions of one kind; see `_loops_runtime` for the loops.
+
+    Attributes:
+        state_size: (arrays) -> length of the state vector.
+        initialise: (arrays, parameters, state, outputs) fills the state and the outputs at t_0.
+        step: (arrays, parameters, state, inputs, outputs) advances by one sample, in place.
+        run_steps: the same over rows of inputs.
+        run_horizon: predictions a number of steps ahead from every row.
+        compiled: whether numba compiled them.
+    """
+
+    state_size: Callable[..., int]
+    initialise: Callable[..., None]
+    step: Callable[..., None]
+    run_steps: Callable[..., None]
+    run_horizon: Callable[..., None]
+    compiled: bool
+
+
+@cache
+def load_runtime(module: str, *, compiled: bool = True) -> Runtime:
+    """Return the functions of runtime module `module`; `compiled=False` gives plain Python.
+
+    The bundle is written to the user's cache folder so that numba keeps the compiled code between runs.
+    """
+    namespace = _import_text(bundle(module), compiled=compiled)
+    done = compiled and _compile(namespace)
+    names = ("state_size", "initialise", "step", "run_steps", "run_horizon")
+    return Runtime(*(getattr(namespace, name) for name in names), compiled=done)
+
+
+@cache
+def load_functions(module: str, *, compiled: bool = True) -> ModuleType:
+    """Return a namespace with the functions of runtime module `module`, which has no `step` of its own."""
+    namespace = _import_text(bundle(module, loops=False), compiled=compiled)
+    if compiled:
+        _compile(namespace)
+    return namespace
+
+
+def have_numba() -> bool:
+    """Return whether numba is installed, without importing it."""
+    return importlib.util.find_spec("numba") is not None
+
+
+def _compile(namespace: ModuleType) -> bool:
+    if not have_numba():
+        return False
+    from numba import njit
+
+    for name, value in list(vars(namespace).items()):
+        if isinstance(value, FunctionType):
+            # No fast-math: compiled and plain Python must agree to rounding.
+            setattr(namespace, name, njit(cache=True, error_model="numpy")(value))
+    return True
+
+
+def _import_text(text: str, *, compiled: bool) -> ModuleType:
+    name = content_name(text)
+    path = _cache_folder() / f"{name}.py"
+    if not path.is_file() or path.read_text(encoding="utf-8") != text:
+        with atomic_write(path, force=True) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    alias = f"{name}_compiled" if compiled else name
+    spec = importlib.util.spec_from_file_location(alias, path)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"cannot import the runtime bundle {path}")
+    namespace = importlib.util.module_from_spec(spec)
+    sys.modules[alias] = namespace  # numba rebuilds cached functions by their module's name
+    spec.loader.exec_module(namespace)
+    return namespace
+
+
+def _cache_folder() -> Path:
+    folder = Path(platformdirs.user_cache_dir("softneck", appauthor=False)) / "runtime"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
+    except OSError:
+        return _temporary_folder()
+
+
+@cache
+def _temporary_folder() -> Path:
+    return Path(tempfile.mkdtemp(prefix="softneck-runtime-"))

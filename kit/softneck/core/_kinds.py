@@ -1,0 +1,93 @@
+"""The table of kinds: a constant, resolved on demand, read by the command line, FMU builder and validation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from ._archive import read_archive
+from ._errors import FileFormatError, SettingsError
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """One kind of thing that can be saved and stepped.
+
+    Attributes:
+        name: what users type and what a file's header says.
+        role: "model", "observer" or "controller".
+        settings: dotted path of the settings class whose `fit` or `design` makes it.
+        result: dotted path of the class that a file becomes, by its `from_archive`.
+        runtime: dotted name of the runtime module (see `core.bundle`).
+        summary: one line for `--help` and the docs.
+    """
+
+    name: str
+    role: str
+    settings: str
+    result: str
+    runtime: str
+    summary: str
+
+
+_MODEL = "softneck.identification:Model"
+KINDS: dict[str, Kind] = {
+    kind.name: kind
+    for kind in (
+        Kind("rls", "model", "softneck.identification:Rls", _MODEL, "softneck.identification._rls_runtime",
+             "recursive least squares over the redefined inputs, with dead time (Eq. 23-30)"),
+        Kind("nlsm", "model", "softneck.identification:SetMembership", _MODEL, "softneck.identification._nlsm_runtime",
+             "nonlinear set membership (Eq. 12-21, Algorithm 1)"),
+        Kind("nn", "model", "softneck.identification:Network", _MODEL, "softneck.identification._nn_runtime",
+             "NLARX neural network, two hidden layers of 25 (section 6.2)"),
+        Kind("kalman", "observer", "softneck.estimation:KalmanSettings", "softneck.estimation:KalmanObserver",
+             "softneck.estimation._kalman_runtime",
+             "Kalman filter over an identified linear model with a disturbance state"),
+        Kind("pi", "controller", "softneck.design:PiSettings", "softneck.design:LinearController",
+             "softneck.design._linear_controller_runtime",
+             "PI with reference filter, anti-windup and tendon allocation"),
+    )
+}  # fmt: skip
+
+
+def kinds_of(role: str) -> tuple[str, ...]:
+    """Return the names of all kinds of one role."""
+    return tuple(kind.name for kind in KINDS.values() if kind.role == role)
+
+
+def find_kind(name: str, role: str) -> Kind:
+    """Return the kind of that name; raise SettingsError with the known ones if there is none."""
+    kind = KINDS.get(name)
+    if kind is None or kind.role != role:
+        raise SettingsError(f"`{name}` is no kind of {role}; use one of {', '.join(kinds_of(role))}.")
+    return kind
+
+
+def resolve(path: str) -> Any:
+    """Import `package.module:name` and return the object."""
+    module, _, name = path.partition(":")
+    return getattr(import_module(module), name)
+
+
+def load(path: str | Path, *, role: str | None = None) -> Any:
+    """Open any model, observer or controller file of ours.
+
+    Args:
+        path: the `.npz` file.
+        role: "model", "observer" or "controller" when only that will do.
+
+    Raises:
+        FileFormatError: no file of ours, another version, damaged, or of another role.
+    """
+    header, arrays = read_archive(path)
+    kind = KINDS.get(str(header.get("kind")))
+    if kind is None:
+        raise FileFormatError(f"{path}: holds the unknown kind `{header.get('kind')}`; a newer softneck wrote it?")
+    if role is not None and kind.role != role:
+        raise FileFormatError(f"{path}: is a {kind.role} ({kind.name}), not a {role}.")
+    try:
+        return resolve(kind.result).from_archive(header, arrays)
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise FileFormatError(f"{path}: its header and arrays do not fit together ({error}).") from error

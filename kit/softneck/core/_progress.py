@@ -1,0 +1,12 @@
+"""How long work reports itself: a callable that takes the part done and a word on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+Progress = Callable[[float, str], None]
+
+
+def silent(done: float, what: str) -> None:
+    """Report nothing."""
+    del done, what

@@ -1,0 +1,32 @@
+"""Units that files may carry, and their factors to SI."""
+
+from __future__ import annotations
+
+import math
+
+from ._errors import DataError
+
+# unit -> (factor to SI, SI unit). Angles are dimensionless in SI but kept apart as "rad".
+_TO_SI: dict[str, tuple[float, str]] = {
+    "rad": (1.0, "rad"),
+    "deg": (math.pi / 180.0, "rad"),
+    "rad/s": (1.0, "rad/s"),
+    "deg/s": (math.pi / 180.0, "rad/s"),
+    "s": (1.0, "s"),
+    "ms": (1e-3, "s"),
+    "m": (1.0, "m"),
+    "mm": (1e-3, "m"),
+    "N": (1.0, "N"),
+    "kg": (1.0, "kg"),
+    "g": (1e-3, "kg"),
+    "1": (1.0, "1"),
+}
+
+
+def to_si(unit: str) -> tuple[float, str]:
+    """Return (factor, SI unit) such that SI value = factor * value; raise DataError for no unit of ours."""
+    try:
+        return _TO_SI[unit]
+    except KeyError:
+        known = ", ".join(_TO_SI)
+        raise DataError(f"`{unit}` is no unit that softneck knows; use one of {known}.") from None

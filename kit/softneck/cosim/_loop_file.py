@@ -1,0 +1,191 @@
+"""Loop files: a TOML text that describes a loop."""
+
+from __future__ import annotations
+
+import sys
+import tomllib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from softneck.core import Block, DataError, FileFormatError, SettingsError, SoftneckError, file_hash, load
+from softneck.loop import BlockPart, Loop, Part, RecordingReference, Reference, make_reference
+from softneck.signals import read_recording
+
+from ._fmu_part import FmuPart
+from ._simulate import LoopSetup
+
+_TOP = ("duration_s", "sample_time_s", "order", "plant", "observer", "controller", "reference", "limits", "fault")
+# Table -> (the keys that say where the part comes from, the role of a file of ours).
+_SOURCES = {
+    "plant": (("fmu", "model", "python"), "model"),
+    "observer": (("fmu", "file", "python"), "observer"),
+    "controller": (("fmu", "file", "python"), "controller"),
+}
+_REFERENCES = ("step", "ramp", "sine", "rotation", "recording")
+_SAME_SAMPLE_TIME = 1e-6
+
+
+def load_loop(path: str | Path) -> LoopSetup:
+    """Read a loop file and open all it names; relative paths start at the file's folder.
+
+    Raises:
+        FileFormatError: no such file or no TOML.
+        SettingsError: unknown or missing keys, or values that do not fit; the line names the key.
+    """
+    source = Path(path)
+    table = _read(source)
+    try:
+        return _Reader(source).setup(table)
+    except SoftneckError as error:
+        if str(error).startswith(str(source)):
+            raise
+        raise type(error)(f"{source}: {error}") from error
+
+
+class _Reader:
+    """Reads one loop file and remembers the hash of each file that it opens."""
+
+    def __init__(self, source: Path) -> None:
+        self.folder = source.parent
+        self.files: dict[str, tuple[str, str]] = {"loop": (str(source), file_hash(source))}
+
+    def setup(self, table: Mapping[str, Any]) -> LoopSetup:
+        if "fault" in table:
+            raise SettingsError("`[[fault]]` is not yet in this version of softneck; remove it.")
+        _refuse_unknown("the file", table, _TOP)
+        for key in ("duration_s", "plant", "controller", "reference"):
+            if key not in table:
+                raise SettingsError(f"`{key}` is missing.")
+        parts = {name: self._part(name, table[name]) for name in _SOURCES if name in table}
+        chosen = {name: _numbers(f"[{name}] parameters", table[name].get("parameters", {})) for name in parts}
+        # What the file calls a parameter of the plant may be one of its inputs, held constant.
+        ports = {port.name for port in parts["plant"].inputs}
+        constants = {name: value for name, value in chosen["plant"].items() if name in ports}
+        loop = Loop(
+            plant=parts["plant"],
+            observer=parts.get("observer"),
+            controller=parts["controller"],
+            reference=self._reference(table["reference"]),
+            duration=_number("duration_s", table["duration_s"]),
+            order=table.get("order", "sequential"),
+            plant_parameters={name: value for name, value in chosen["plant"].items() if name not in ports},
+            plant_inputs=constants,
+            observer_parameters=chosen.get("observer", {}),
+            controller_parameters=chosen["controller"],
+        )
+        _check_sample_time(loop, table.get("sample_time_s"))
+        return LoopSetup(loop=loop, limits=_numbers("[limits]", table.get("limits", {})), files=dict(self.files))
+
+    def _part(self, name: str, table: Any) -> Part:
+        keys, role = _SOURCES[name]
+        if not isinstance(table, dict):
+            raise SettingsError(f"`{name}` must be a table: [{name}].")
+        _refuse_unknown(f"[{name}]", table, (*keys, "parameters"))
+        given = [key for key in keys if key in table]
+        if len(given) != 1:
+            raise SettingsError(
+                f"[{name}] needs exactly one of {', '.join(keys)}; it has {', '.join(given) or 'none'}."
+            )
+        key, value = given[0], table[given[0]]
+        if not isinstance(value, str):
+            raise SettingsError(f"[{name}] {key} must be a text; got {value!r}.")
+        if key == "python":
+            return self._from_python(name, value)
+        file = self._file(name, value)
+        if key == "fmu":
+            return FmuPart(file, role=name)
+        return BlockPart(load(file, role=role).block())
+
+    def _from_python(self, name: str, path: str) -> Part:
+        """Call `package.module:factory`; modules beside the loop file are found too."""
+        module_name, _, factory = path.partition(":")
+        try:
+            with _importable(self.folder):
+                module = import_module(module_name)
+            made = getattr(module, factory)()
+        except (ImportError, AttributeError, ValueError) as error:
+            raise SettingsError(
+                f"[{name}] python = `{path}` cannot be called ({error}); write package.module:factory."
+            ) from error
+        if module.__file__:
+            self.files[name] = (module.__file__, file_hash(module.__file__))
+        made = made.block() if hasattr(made, "block") and not hasattr(made, "advance") else made
+        if isinstance(made, Block):
+            return BlockPart(made)
+        if not all(hasattr(made, item) for item in ("inputs", "outputs", "sample_time", "start", "advance", "close")):
+            raise SettingsError(f"[{name}] python = `{path}` returned a {type(made).__name__}, not a Block or a Part.")
+        return made
+
+    def _reference(self, table: Any) -> Reference:
+        if not isinstance(table, dict) or table.get("kind") not in _REFERENCES:
+            raise SettingsError(f"[reference] kind must be one of {', '.join(_REFERENCES)}.")
+        values = {key: value for key, value in table.items() if key != "kind"}
+        if table["kind"] != "recording":
+            return make_reference(table["kind"], values)
+        _refuse_unknown("[reference]", values, ("file",))
+        recording = read_recording(self._file("reference", str(values.get("file", ""))))
+        if len(recording.runs()) > 1:
+            raise DataError("[reference] file: the recording has several runs; cut out the one to follow.")
+        channels = recording.channels
+        pitch, roll = (channels.get(f"{axis}_reference", channels[axis]) for axis in ("pitch", "roll"))
+        time = recording.time - recording.time[0]
+        return RecordingReference(
+            time=time, pitch=pitch, roll=roll, cocontraction=channels.get("cocontraction_reference")
+        )
+
+    def _file(self, role: str, name: str) -> Path:
+        path = self.folder / name
+        if not path.is_file():
+            raise FileFormatError(f"[{role}]: there is no file {path}.")
+        self.files[role] = (str(path), file_hash(path))
+        return path
+
+
+def _read(source: Path) -> dict[str, Any]:
+    if not source.is_file():
+        raise FileFormatError(f"{source}: no such file.")
+    try:
+        return tomllib.loads(source.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise FileFormatError(f"{source}: is no TOML ({error}).") from error
+    except OSError as error:
+        raise FileFormatError(f"{source}: cannot be read: {error.strerror}.") from error
+
+
+@contextmanager
+def _importable(folder: Path) -> Iterator[None]:
+    before = list(sys.path)
+    sys.path.insert(0, str(folder.resolve()))
+    try:
+        yield
+    finally:
+        sys.path[:] = before
+
+
+def _refuse_unknown(where: str, table: Mapping[str, Any], known: tuple[str, ...]) -> None:
+    unknown = [key for key in table if key not in known]
+    if unknown:
+        raise SettingsError(f"`{unknown[0]}` is no key of {where}; it takes {', '.join(known)}.")
+
+
+def _numbers(where: str, table: Any) -> dict[str, float]:
+    if not isinstance(table, dict):
+        raise SettingsError(f"{where} must be a table of numbers; got {table!r}.")
+    return {name: _number(f"{where} {name}", value) for name, value in table.items()}
+
+
+def _number(name: str, value: Any) -> float:
+    if not isinstance(value, bool | int | float):
+        raise SettingsError(f"`{name}` must be a number; got {value!r}.")
+    return float(value)
+
+
+def _check_sample_time(loop: Loop, given: Any) -> None:
+    if given is None:
+        return
+    step = min(part.sample_time for part in loop.parts.values())
+    if abs(_number("sample_time_s", given) - step) > _SAME_SAMPLE_TIME * step:
+        raise SettingsError(f"`sample_time_s` is {given:g}, but the fastest part runs at {step:g} s; state that.")

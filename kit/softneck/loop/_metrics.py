@@ -1,0 +1,117 @@
+"""How well a loop did, in numbers, and whether limits hold."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from softneck.core import SettingsError, Vector
+
+from ._result import LoopResult
+
+# Settling is to 5 % of the step, as in the lab's reports and the bake-off of `softneck.design`.
+SETTLING_BAND = 0.05
+_RISE = (0.1, 0.9)
+# The steady state is judged on the last quarter of what follows the step.
+_STEADY_PART = 0.25
+
+Metrics = dict[str, dict[str, float | None]]
+
+
+def metrics(result: LoopResult) -> Metrics:
+    """Return the metrics of a run: a table each for `pitch`, `roll` and `motors`.
+
+    Angles are the plant's true ones where it offers them. For an axis:
+
+    - `rise_s`: from 10 to 90 % of the step [s], first samples at or beyond; `settling_s`: from the step to the
+      first sample from which the error stays below 5 % of it [s]; `overshoot_pct`: of the step, zero if none.
+      All three are None where the reference makes no single step, and where the level is never reached.
+    - `rms_error_deg`, `iae` [rad s]: of reference minus angle, over the whole run.
+    - `steady_rms_deg`: rms error over the last quarter of the time after the step (of the run without one).
+
+    For the motors, of the set-points: `max_rad`, `max_rate_rad_s` between samples, and
+    `effort` = integral of P1^2 + P2^2 + P3^2 [rad^2 s].
+    """
+    P = np.column_stack([result[f"motor_setpoint_{j}"] for j in (1, 2, 3)])
+    rates = np.abs(np.diff(P, axis=0)) / result.sample_time
+    return {
+        "pitch": _axis(result, "pitch"),
+        "roll": _axis(result, "roll"),
+        "motors": {
+            "max_rad": float(np.abs(P).max()),
+            "max_rate_rad_s": float(rates.max(initial=0.0)),
+            "effort": float(np.sum(P**2) * result.sample_time),
+        },
+    }
+
+
+def check_limits(values: Mapping[str, Any], limits: Mapping[str, float]) -> list[dict[str, Any]]:
+    """Compare metrics with upper limits named as in a loop file, such as "pitch.overshoot_pct".
+
+    Returns:
+        For each limit {"metric", "limit", "value", "holds"}; a metric that is None does not hold.
+
+    Raises:
+        SettingsError: no such metric, or a limit that is no number.
+    """
+    known = {f"{group}.{name}": value for group, table in values.items() for name, value in table.items()}
+    rows = []
+    for name, limit in limits.items():
+        if name not in known:
+            raise SettingsError(f"limit on unknown metric `{name}`; use one of {', '.join(known)}.")
+        if isinstance(limit, bool) or not isinstance(limit, int | float) or math.isnan(limit):
+            raise SettingsError(f"the limit of `{name}` must be a number; got {limit!r}.")
+        value = known[name]
+        holds = value is not None and value <= limit
+        rows.append({"metric": name, "limit": float(limit), "value": value, "holds": bool(holds)})
+    return rows
+
+
+def _axis(result: LoopResult, axis: str) -> dict[str, float | None]:
+    r, y = result[f"{axis}_reference"], result.angle(axis)
+    step = _find_step(r)
+    first = 0 if step is None else step[0]
+    tail = (r - y)[first + math.floor((1.0 - _STEADY_PART) * (r.size - first)) :]
+    shape: dict[str, float | None] = {"rise_s": None, "settling_s": None, "overshoot_pct": None}
+    if step is not None:
+        k, low, high = step
+        shape = _step_shape((y[k:] - low) / (high - low), result.sample_time)
+    return {
+        **shape,
+        "rms_error_deg": _rms_deg(r - y),
+        "iae": float(np.sum(np.abs(r - y)) * result.sample_time),
+        "steady_rms_deg": _rms_deg(tail),
+    }
+
+
+def _find_step(r: Vector) -> tuple[int, float, float] | None:
+    """Return (row, level before, level after) if the reference makes exactly one step, else None.
+
+    A constant reference other than zero is a step from zero at the first row.
+    """
+    jumps = np.flatnonzero(np.diff(r))
+    if jumps.size == 0:
+        return (0, 0.0, float(r[0])) if r[0] != 0.0 else None
+    if jumps.size == 1 and jumps[0] + 2 < r.size:
+        k = int(jumps[0]) + 1
+        return k, float(r[0]), float(r[k])
+    return None
+
+
+def _step_shape(y: Vector, sample_time: float) -> dict[str, float | None]:
+    """Return rise, settling and overshoot of a response `y` (n,) that should go from 0 to 1."""
+    low, high = (np.flatnonzero(y >= level) for level in _RISE)
+    outside = np.flatnonzero(np.abs(y - 1.0) >= SETTLING_BAND)
+    settled = 0 if outside.size == 0 else int(outside[-1]) + 1
+    return {
+        "rise_s": float(high[0] - low[0]) * sample_time if high.size else None,
+        "settling_s": settled * sample_time if settled < y.size else None,
+        "overshoot_pct": max(0.0, 100.0 * (float(y.max()) - 1.0)),
+    }
+
+
+def _rms_deg(error: Vector) -> float:
+    return math.degrees(math.sqrt(float(np.mean(error**2))))

@@ -1,0 +1,226 @@
+"""References: what pitch, roll and co-contraction shall be at a time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Protocol
+
+import numpy as np
+
+from softneck.core import (
+    DataError,
+    SettingsError,
+    Vector,
+    require_between,
+    require_finite,
+    require_one_of,
+    require_positive,
+    to_si,
+)
+
+Triple = tuple[float, float, float]
+# The neck bends by at most 40 deg = 0.7 rad (paper, section 5); more is a value in degrees.
+_MAX_ANGLE = 0.8
+
+
+class Reference(Protocol):
+    """Anything that returns pitch [rad], roll [rad] and co-contraction delta_i [rad] at `time` [s]."""
+
+    def __call__(self, time: float, /) -> Triple:
+        """Return the reference at `time`."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StepReference:
+    """All three jump from zero at `at`.
+
+    Attributes:
+        pitch, roll: [rad].
+        cocontraction: delta_i [rad].
+        at: [s].
+    """
+
+    pitch: float = 0.0
+    roll: float = 0.0
+    cocontraction: float = 0.0
+    at: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check_angles(self.pitch, self.roll, self.cocontraction)
+        require_finite("at", self.at, "s")
+
+    def __call__(self, time: float, /) -> Triple:
+        """Return the reference at `time`."""
+        # Times are multiples of a sample time; half a nanosecond covers their rounding.
+        on = time >= self.at - 5e-10
+        return (self.pitch, self.roll, self.cocontraction) if on else (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RampReference:
+    """All three rise linearly from zero over `rise`, from `at` on.
+
+    Attributes:
+        pitch, roll: end values [rad].
+        cocontraction: end value [rad].
+        at: [s].
+        rise: [s].
+    """
+
+    pitch: float = 0.0
+    roll: float = 0.0
+    cocontraction: float = 0.0
+    at: float = 0.0
+    rise: float = 1.0
+
+    def __post_init__(self) -> None:
+        _check_angles(self.pitch, self.roll, self.cocontraction)
+        require_finite("at", self.at, "s")
+        require_positive("rise", self.rise, "s")
+
+    def __call__(self, time: float, /) -> Triple:
+        """Return the reference at `time`."""
+        part = min(1.0, max(0.0, (time - self.at) / self.rise))
+        return self.pitch * part, self.roll * part, self.cocontraction * part
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SineReference:
+    """Pitch and roll swing in phase from `at` on; co-contraction is constant.
+
+    Attributes:
+        pitch, roll: amplitudes [rad].
+        cocontraction: delta_i [rad].
+        frequency: [Hz].
+        at: [s].
+    """
+
+    pitch: float = 0.0
+    roll: float = 0.0
+    cocontraction: float = 0.0
+    frequency: float = 0.2
+    at: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check_angles(self.pitch, self.roll, self.cocontraction)
+        require_positive("frequency", self.frequency, "Hz")
+        require_finite("at", self.at, "s")
+
+    def __call__(self, time: float, /) -> Triple:
+        """Return the reference at `time`."""
+        wave = math.sin(2.0 * math.pi * self.frequency * max(0.0, time - self.at))
+        return self.pitch * wave, self.roll * wave, self.cocontraction
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RotationReference:
+    """The tilt goes around: pitch = A cos(w t), roll = A sin(w t), A rising from zero over `rise`.
+
+    Attributes:
+        inclination: A [rad].
+        cocontraction: delta_i [rad].
+        frequency: turns a second [Hz].
+        at: [s].
+        rise: [s].
+    """
+
+    inclination: float = 0.0
+    cocontraction: float = 0.0
+    frequency: float = 0.2
+    at: float = 0.0
+    rise: float = 3.0
+
+    def __post_init__(self) -> None:
+        _check_angles(self.inclination, 0.0, self.cocontraction)
+        require_positive("frequency", self.frequency, "Hz")
+        require_finite("at", self.at, "s")
+        require_positive("rise", self.rise, "s")
+
+    def __call__(self, time: float, /) -> Triple:
+        """Return the reference at `time`."""
+        elapsed = max(0.0, time - self.at)
+        A = self.inclination * min(1.0, elapsed / self.rise)
+        angle = 2.0 * math.pi * self.frequency * elapsed
+        return A * math.cos(angle), A * math.sin(angle), self.cocontraction
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RecordingReference:
+    """Recorded angles, each held until the next; the last one is held to the end.
+
+    Attributes:
+        time: (N,) [s], rising.
+        pitch, roll: (N,) [rad].
+        cocontraction: (N,) delta_i [rad]; None for zero.
+    """
+
+    time: Vector
+    pitch: Vector
+    roll: Vector
+    cocontraction: Vector | None = None
+
+    def __post_init__(self) -> None:
+        columns = [self.pitch, self.roll] + ([] if self.cocontraction is None else [self.cocontraction])
+        if self.time.ndim != 1 or self.time.size == 0 or any(c.shape != self.time.shape for c in columns):
+            shapes = [self.time.shape, *(c.shape for c in columns)]
+            raise DataError(f"a recorded reference needs columns of one shape (time,) with a row; got {shapes}.")
+        if np.any(np.diff(self.time) <= 0) or not all(np.isfinite(c).all() for c in (self.time, *columns)):
+            raise DataError("a recorded reference must be finite with rising time; mend the recording.")
+
+    def __call__(self, time: float, /) -> Triple:
+        """Return the reference at `time`."""
+        k = max(0, int(np.searchsorted(self.time, time + 5e-10, side="right")) - 1)
+        third = 0.0 if self.cocontraction is None else float(self.cocontraction[k])
+        return float(self.pitch[k]), float(self.roll[k]), third
+
+
+_Setting = type[StepReference] | type[RampReference] | type[SineReference] | type[RotationReference]
+_KINDS: dict[str, _Setting] = {
+    "step": StepReference,
+    "ramp": RampReference,
+    "sine": SineReference,
+    "rotation": RotationReference,
+}
+
+
+def make_reference(kind: str, values: Mapping[str, float]) -> Reference:
+    """Return a reference from the keys of a loop file, which end in their unit: `pitch_deg`, `at_s`.
+
+    The kinds are step, ramp, sine and rotation; a recorded one is made of its arrays by `RecordingReference`.
+
+    Raises:
+        SettingsError: unknown kind or key, or a value out of range.
+    """
+    require_one_of("kind", kind, tuple(_KINDS))
+    setting = _KINDS[kind]
+    names = [item.name for item in fields(setting)]
+    chosen: dict[str, float] = {}
+    for key, value in values.items():
+        name, factor = _split(key)
+        if name not in names:
+            raise SettingsError(f"`{key}` is no key of a {kind} reference; it takes {', '.join(names)} with a unit.")
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise SettingsError(f"`{key}` must be a number; got {value!r}.")
+        chosen[name] = factor * value
+    return setting(**chosen)
+
+
+def _split(key: str) -> tuple[str, float]:
+    """Return the field's name and the factor to SI of `key`, such as `pitch_deg`."""
+    name, _, unit = key.rpartition("_")
+    if unit == "hz":
+        return name, 1.0
+    if unit in ("deg", "rad", "s", "ms"):
+        return name, to_si(unit)[0]
+    return key, 1.0
+
+
+def _check_angles(pitch: float, roll: float, cocontraction: float) -> None:
+    for name, value in (("pitch", pitch), ("roll", roll)):
+        require_finite(name, value, "rad")
+        if abs(value) > _MAX_ANGLE:
+            raise SettingsError(f"`{name}` must be within +-{_MAX_ANGLE} rad; got {value:g}: degrees?")
+    require_between("cocontraction", cocontraction, -6.0, 6.0, "rad")

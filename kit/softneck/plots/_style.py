@@ -1,0 +1,29 @@
+"""One look for all figures: made without a display, colours that colour-blind readers can tell apart."""
+
+from __future__ import annotations
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+# Okabe and Ito's palette.
+BLUE, ORANGE, GREEN, RED, PURPLE, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#666666"
+MOTOR_COLOURS = (BLUE, ORANGE, GREEN)
+
+
+def new_figure(rows: int, *, width: float = 10.0, row_height: float = 2.3) -> tuple[Figure, list[Axes]]:
+    """Return a figure with `rows` axes under each other that share their time axis."""
+    figure = Figure(figsize=(width, row_height * rows + 0.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
+    for ax in axes:
+        ax.grid(alpha=0.3)
+        ax.spines[["top", "right"]].set_visible(False)
+    return figure, list(axes)
+
+
+def label(ax: Axes, ylabel: str, *, legend: bool = True) -> None:
+    """Name the y axis and show the legend beside the curves."""
+    ax.set_ylabel(ylabel)
+    if legend:
+        ax.legend(loc="upper right", fontsize="small", ncols=4, framealpha=0.8)

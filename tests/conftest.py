@@ -1,0 +1,46 @@
+"""Settings of all tests, and what several of them share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, settings
+
+from softneck.identification import Model, Network, Rls, SetMembership
+from softneck.signals import Recording
+
+from .data import ROOT, neck_recording, short_neck
+
+# The same examples on every machine and run; a busy machine is no failure.
+settings.register_profile(
+    "softneck", derandomize=True, database=None, deadline=None, max_examples=40, print_blob=False,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+)  # fmt: skip
+settings.load_profile("softneck")
+
+
+@pytest.fixture(scope="session")
+def neck() -> Recording:
+    """2,400 rows of the synthetic ARX neck with noise and motor positions."""
+    return neck_recording()
+
+
+@pytest.fixture(scope="session")
+def models() -> dict[str, Model]:
+    """One small model of each kind, all trained on the same 500 rows."""
+    recording = short_neck()
+    return {
+        "rls": Rls(max_delay=0.12).fit(recording),
+        "nlsm": SetMembership(epsilon=0.01, output_weight=10.0).fit(recording),
+        "nn": Network(hidden=(4, 3), iterations=8).fit(recording),
+    }
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The recordings made on hardware, which lie beside the project and are no part of it."""
+    folder = ROOT.parent / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip("the real recordings (../shared/data) are absent on this machine")
+    return folder

@@ -1,0 +1,69 @@
+"""Toy parts and their FMUs for loops."""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from softneck.fmu import build_fmu
+from softneck.signals import Recording
+
+_TOYS = str(Path(__file__).parents[1] / "fmu" / "toys")
+if _TOYS not in sys.path:
+    sys.path.append(_TOYS)  # where the bundler finds the toy runtimes
+
+LOOP = """
+duration_s = 4.0
+sample_time_s = 0.02
+[plant]
+fmu = "Neck.fmu"
+parameters = { payload = 0.5, pitch_start = 0.01 }
+[controller]
+fmu = "Pi.fmu"
+[reference]
+kind = "step"
+pitch_deg = 15.0
+at_s = 1.0
+[limits]
+"pitch.overshoot_pct" = 5.0
+"pitch.settling_s" = 1.0
+"""
+
+
+@pytest.fixture(scope="session")
+def toys() -> Any:
+    return import_module("toy_blocks")
+
+
+@pytest.fixture(scope="session")
+def fmus(toys: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of Lag.fmu, Gain.fmu, Neck.fmu and Pi.fmu."""
+    folder = tmp_path_factory.mktemp("fmus")
+    for name, block in (("Lag", toys.lag()), ("Gain", toys.controller()), ("Neck", toys.neck()), ("Pi", toys.pi())):
+        build_fmu(block, folder / f"{name}.fmu")
+    return folder
+
+
+@pytest.fixture
+def loop_file(fmus: Path, tmp_path: Path) -> Path:
+    """A loop file beside its two FMUs."""
+    for name in ("Neck.fmu", "Pi.fmu"):
+        (tmp_path / name).write_bytes((fmus / name).read_bytes())
+    path = tmp_path / "loop.toml"
+    path.write_text(LOOP)
+    return path
+
+
+@pytest.fixture
+def recording() -> Recording:
+    """Two runs of random set-points."""
+    P = np.random.default_rng(5).uniform(-2.0, 2.0, (90, 3))
+    time = np.concatenate([np.arange(50), np.arange(40)]) * 0.02
+    channels = {f"motor_setpoint_{j + 1}": P[:, j] for j in range(3)}
+    channels |= {"pitch": np.zeros(90), "roll": np.zeros(90)}
+    return Recording(time, 0.02, channels, np.repeat([0, 1], [50, 40]))

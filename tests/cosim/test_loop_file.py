@@ -1,0 +1,170 @@
+"""A loop file describes a loop: the same as one written in Python, and it says what is wrong with it."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from softneck.core import FileFormatError, SettingsError, SoftneckError, file_hash
+from softneck.cosim import FmuPart, Loop, load_loop, simulate
+from softneck.loop import BlockPart, StepReference
+from softneck.signals import read_recording, write_recording
+
+
+def _python_loop(toys: Any, order: str = "sequential") -> Loop:
+    return Loop(
+        plant=BlockPart(toys.neck()),
+        controller=BlockPart(toys.pi()),
+        reference=StepReference(pitch=math.radians(15.0), at=1.0),
+        duration=4.0,
+        order=order,
+        plant_inputs={"payload": 0.5},
+        plant_parameters={"pitch_start": 0.01},
+    )
+
+
+@pytest.mark.parametrize("order", ["sequential", "jacobi"])
+def test_a_loop_over_fmus_is_the_loop_over_their_blocks(order: str, loop_file: Path, toys: Any) -> None:
+    loop_file.write_text(f'order = "{order}"\n{loop_file.read_text()}')
+    over_fmus = simulate(load_loop(loop_file))
+    in_python = simulate(_python_loop(toys, order))
+    assert set(over_fmus.signals.signals) == set(in_python.signals.signals)
+    for name in in_python.signals.signals:
+        np.testing.assert_array_equal(over_fmus[name], in_python[name], err_msg=name)
+    assert over_fmus.order == order
+
+
+def test_jacobi_differs_from_sequential(toys: Any) -> None:
+    one, two = simulate(_python_loop(toys)), simulate(_python_loop(toys, "jacobi"))
+    assert not np.array_equal(one["pitch"], two["pitch"])
+
+
+def test_the_result_states_metrics_and_limits(loop_file: Path) -> None:
+    result = simulate(load_loop(loop_file))
+    assert [(row["metric"], row["limit"]) for row in result.limits] == [
+        ("pitch.overshoot_pct", 5.0),
+        ("pitch.settling_s", 1.0),
+    ]
+    assert result.holds
+    assert result.real_time_factor > 1.0
+    report = result.report()
+    assert set(report) == {"metrics", "limits", "real_time_factor"}
+    assert set(report["metrics"]) == {"pitch", "roll", "motors"}
+    json.dumps(report, allow_nan=False)
+    loop_file.write_text(loop_file.read_text().replace('settling_s" = 1.0', 'settling_s" = 0.1'))
+    broken = simulate(load_loop(loop_file))
+    assert not broken.holds
+    assert [row["holds"] for row in broken.limits] == [True, False]
+
+
+def test_the_frame_and_the_recording_say_their_units(loop_file: Path, tmp_path: Path) -> None:
+    result = simulate(load_loop(loop_file))
+    frame = result.frame
+    assert list(frame.columns[:3]) == ["time [s]", "pitch [deg]", "roll [deg]"]
+    assert "motor_setpoint_1 [rad]" in frame.columns
+    # degrees(radians(x)) is x but for rounding of the last digit
+    np.testing.assert_allclose(np.radians(frame["pitch [deg]"]), result["pitch"], rtol=1e-14)
+    np.testing.assert_array_equal(frame["motor_setpoint_2 [rad]"], result["motor_setpoint_2"])
+    write_recording(tmp_path / "run.csv", result.recording())
+    back = read_recording(tmp_path / "run.csv")
+    np.testing.assert_allclose(back.outputs[:, 0], result["pitch"], rtol=1e-14)
+    np.testing.assert_array_equal(back.set_points[:, 1], result["motor_setpoint_2"])
+
+
+def test_the_certificate_holds_the_hash_of_every_file(loop_file: Path) -> None:
+    setup = load_loop(loop_file)
+    expected = {name: file_hash(loop_file.parent / f"{stem}") for name, stem in (
+        ("loop", "loop.toml"), ("plant", "Neck.fmu"), ("controller", "Pi.fmu"))}  # fmt: skip
+    certificate = simulate(setup).certificate()
+    assert {name: file["sha256"] for name, file in certificate["files"].items()} == expected
+    assert certificate["holds"] is True
+    assert certificate["duration_s"] == pytest.approx(4.0, rel=1e-12)
+    json.dumps(certificate, allow_nan=False)
+
+
+def test_a_recorded_reference_is_followed(loop_file: Path, toys: Any) -> None:
+    first = simulate(load_loop(loop_file))
+    write_recording(loop_file.parent / "wish.csv", first.recording())
+    text = loop_file.read_text()
+    begin, end = text.index("[reference]"), text.index("[limits]")
+    loop_file.write_text(f'{text[:begin]}[reference]\nkind = "recording"\nfile = "wish.csv"\n')
+    again = simulate(load_loop(loop_file))
+    np.testing.assert_allclose(again["pitch_reference"], first["pitch_reference"], rtol=1e-14)
+    assert again.certificate()["files"]["reference"]["sha256"] == file_hash(loop_file.parent / "wish.csv")
+    assert end > begin
+
+
+def test_a_plant_written_in_python_stands_beside_the_file(loop_file: Path, toys: Any) -> None:
+    (loop_file.parent / "my_loop_parts.py").write_text(
+        "import toy_blocks\n\n\ndef plant():\n    return toy_blocks.neck()\n\n\ndef wrong():\n    return 3\n"
+    )
+    text = loop_file.read_text().replace('fmu = "Neck.fmu"', 'python = "my_loop_parts:plant"')
+    loop_file.write_text(text)
+    result = simulate(load_loop(loop_file))
+    np.testing.assert_array_equal(result["pitch"], simulate(_python_loop(toys))["pitch"])
+    assert result.certificate()["files"]["plant"]["path"].endswith("my_loop_parts.py")
+    for name, message in (("wrong", "returned a int"), ("absent", "cannot be called"), ("", "cannot be called")):
+        loop_file.write_text(text.replace("my_loop_parts:plant", f"my_loop_parts:{name}"))
+        with pytest.raises(SettingsError, match=message):
+            load_loop(loop_file)
+
+
+def test_parts_of_one_loop_may_be_mixed(loop_file: Path, toys: Any) -> None:
+    mixed = _python_loop(toys)
+    mixed = Loop(
+        plant=FmuPart(loop_file.parent / "Neck.fmu"),
+        controller=mixed.controller,
+        reference=mixed.reference,
+        duration=mixed.duration,
+        plant_inputs=mixed.plant_inputs,
+        plant_parameters=mixed.plant_parameters,
+    )
+    np.testing.assert_array_equal(simulate(mixed)["roll"], simulate(_python_loop(toys))["roll"])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("duration_s = 4.0", "duration = 4.0", "`duration` is no key of the file; it takes duration_s"),
+        ("duration_s = 4.0", "", "`duration_s` is missing"),
+        ("duration_s = 4.0", 'duration_s = "4"', "`duration_s` must be a number; got '4'"),
+        ("duration_s = 4.0", "duration_s = -1.0", "`duration` must be positive"),
+        ("sample_time_s = 0.02", "sample_time_s = 0.01", "the fastest part runs at 0.02 s"),
+        ("sample_time_s = 0.02", 'order = "random"', "`order` must be one of sequential, jacobi"),
+        ('fmu = "Neck.fmu"', 'fmu = "absent.fmu"', r"\[plant\]: there is no file"),
+        ('fmu = "Neck.fmu"', "fmu = 3", r"\[plant\] fmu must be a text"),
+        ('fmu = "Neck.fmu"', "", "needs exactly one of fmu, model, python; it has none"),
+        ('fmu = "Neck.fmu"', 'fmu = "Neck.fmu"\nmodel = "a.npz"', "it has fmu, model"),
+        ('fmu = "Neck.fmu"', 'model = "Neck.fmu"', "is no softneck file"),
+        ('fmu = "Neck.fmu"', 'fmu = "Neck.fmu"\nspeed = 1', r"`speed` is no key of \[plant\]"),
+        ("payload = 0.5", "mass = 0.5", "`mass` is no parameter"),
+        ("payload = 0.5", 'payload = "heavy"', "must be a number; got 'heavy'"),
+        ('kind = "step"', 'kind = "jump"', r"\[reference\] kind must be one of step, ramp"),
+        ('kind = "step"', 'kind = "recording"', r"`pitch_deg` is no key of \[reference\]"),
+        ("pitch_deg = 15.0", "pitch = 15.0", "degrees"),
+        ('"pitch.overshoot_pct"', '"pitch.beauty"', "limit on unknown metric `pitch.beauty`"),
+        ("[limits]", "[[fault]]\nkind = 'bias'\n[limits]", r"`\[\[fault\]\]` is not yet in this version"),
+        ("[limits]", "[bounds]", "`bounds` is no key of the file"),
+    ],
+)
+def test_a_wrong_loop_file_is_refused_in_one_line(old: str, new: str, message: str, loop_file: Path) -> None:
+    text = loop_file.read_text()
+    assert old in text
+    loop_file.write_text(text.replace(old, new, 1))
+    with pytest.raises(SoftneckError, match=message) as caught:
+        result = simulate(load_loop(loop_file))
+        assert result.limits is None  # a wrong limit shows when it is judged
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_is_no_loop_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match="no such file"):
+        load_loop(tmp_path / "absent.toml")
+    (tmp_path / "text.toml").write_text("no = toml =")
+    with pytest.raises(FileFormatError, match="is no TOML"):
+        load_loop(tmp_path / "text.toml")

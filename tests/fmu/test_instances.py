@@ -1,0 +1,97 @@
+"""Several FMUs in one process do not touch each other, nor the process."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from softneck.fmu import build_fmu
+
+TS = 0.02
+
+
+def _rows(u: np.ndarray) -> np.ndarray:
+    return np.column_stack([u, np.ones(u.size), np.full(u.size, np.nan)])
+
+
+def test_two_of_one_kind_with_other_data_run_interleaved(toys: Any, tmp_path: Path, running: Any) -> None:
+    blocks = [toys.lag(pole=0.5), toys.lag(pole=0.95), toys.controller()]
+    paths = [build_fmu(block, tmp_path / f"Toy{i}.fmu") for i, block in enumerate(blocks)]
+    u = 0.5 * np.random.default_rng(4).standard_normal(100)
+    expected = [block.run(block.initial_state(), _rows(u))[1][:, 0] for block in blocks[:2]]
+    expected.append(blocks[2].run(blocks[2].initial_state(), np.column_stack([u, np.zeros(100)]))[1][:, 0])
+    with ExitStack() as stack:
+        fmus = [stack.enter_context(running(path)) for path in (*paths, paths[0])]
+        drives, shown = ["motor_setpoint_1"] * 2 + ["pitch_reference", "motor_setpoint_1"], ["pitch"] * 2
+        shown += ["motor_setpoint_1", "pitch"]
+        for fmu in fmus:
+            fmu.begin()
+        seen = []
+        for k, value in enumerate(u):
+            for fmu, name in zip(fmus, drives, strict=True):
+                fmu.set(**{name: value})
+            for fmu in fmus:
+                fmu.fmu.doStep(k * TS, TS)
+            seen.append([fmu.get(name)[0] for fmu, name in zip(fmus, shown, strict=True)])
+    np.testing.assert_array_equal(np.array(seen).T, [*expected, expected[0]])
+
+
+def test_the_search_path_is_left_clean(lag_fmu: Path, controller_fmu: Path, running: Any) -> None:
+    before = list(sys.path)
+    for path in (lag_fmu, controller_fmu, lag_fmu):
+        with running(path) as fmu:
+            fmu.begin()
+            assert sys.path == before
+            fmu.fmu.reset()
+            fmu.begin()
+    assert sys.path == before
+
+
+_MANY = """
+import sys, shutil
+import fmpy
+from fmpy.fmi2 import FMU2Slave
+for path in sys.argv[1:] * 20:
+    folder = fmpy.extract(path)
+    model = fmpy.read_model_description(str(folder))
+    fmu = FMU2Slave(guid=model.guid, unzipDirectory=str(folder),
+                    modelIdentifier=model.coSimulation.modelIdentifier, instanceName="many")
+    fmu.instantiate(loggingOn=True)
+    fmu.setupExperiment(startTime=0.0)
+    fmu.enterInitializationMode()
+    fmu.exitInitializationMode()
+    for k in range(5):
+        fmu.doStep(k * 0.02, 0.02)
+    try:
+        fmu.setReal([0], [float("nan")])
+    except Exception:
+        pass
+    fmu.reset()
+    fmu.freeInstance()
+    shutil.rmtree(folder)
+print(len([p for p in sys.path if "resources" in p]))
+"""
+
+
+def test_a_process_of_many_instances_and_errors_ends_cleanly(lag_fmu: Path, controller_fmu: Path) -> None:
+    child = subprocess.run(
+        [sys.executable, "-c", _MANY, str(lag_fmu), str(controller_fmu)], capture_output=True, text=True, check=False
+    )
+    assert (child.returncode, child.stdout.splitlines()[-1]) == (0, "0")
+
+
+@pytest.mark.parametrize("kind", ["lag", "controller"])
+def test_fmpy_s_own_simulation_runs_them(kind: str, toys: Any, tmp_path: Path) -> None:
+    import fmpy
+
+    path = build_fmu(getattr(toys, kind)(), tmp_path / "Toy.fmu")
+    starts = {"extra": 0.0, "pitch_start": 0.25} if kind == "lag" else {"pitch_reference": 0.1}
+    result = fmpy.simulate_fmu(str(path), stop_time=1.0, start_values=starts)
+    assert len(result) == 51
+    assert np.isfinite(np.array(result.tolist(), dtype=float)).all()
