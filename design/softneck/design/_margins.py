@@ -19,7 +19,7 @@ class Margins:
     Attributes:
         gain: factor on the loop gain until instability; inf where there is none.
         phase: [rad]; inf where the gain never reaches 1.
-        sensitivity: Ms, the largest |1/(1 + L)|.
+        sensitivity: Ms, the largest `|1/(1 + L)|`.
         crossover: gain crossover [rad/s]; NaN where there is none.
         delay: [s] that the loop stands beyond its own.
     """

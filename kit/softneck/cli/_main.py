@@ -46,7 +46,7 @@ class _LazyGroup(click.Group):
 
 @click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.version_option(metadata.version("softneck"), prog_name="softneck")
-def _group() -> None:
+def group() -> None:
     """From a logged experiment on a tendon-driven soft robotic neck to a verified controller.
 
     \b
@@ -62,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code; an error is one line on stderr."""
     try:
-        code = _group.main(args=arguments, prog_name="softneck", standalone_mode=False)
+        code = group.main(args=arguments, prog_name="softneck", standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message(), err=True)
         return _BAD_INPUT

@@ -15,7 +15,7 @@ _M2 = 4294944443.0
 
 def random_seed(s: np.ndarray, seed: float) -> None:
     """Fill the state `s` (6,) from an integer seed >= 0; equal seeds give equal streams."""
-    z = float(int(seed) % 2147483647) + 1.0
+    z = float(int(seed) % 2147483646) + 1.0  # 1 to 2^31 - 2: neither 0 nor the modulus
     for i in range(6):
         # Park-Miller minimal standard generator: exact in float64, never 0.
         z = (16807.0 * z) % 2147483647.0

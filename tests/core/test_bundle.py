@@ -1,0 +1,111 @@
+"""The bundle: one text that runs with numpy alone, and that names decide by content."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softneck.core import KINDS, SettingsError, bundle, content_name, load_runtime, resolve
+from softneck.core import _bundle as bundle_module
+
+RUNTIMES = sorted({kind.runtime for kind in KINDS.values()} | {"softneck.plant._neck_runtime"})
+
+
+@pytest.fixture
+def runtime_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder on the path, whose modules no cache remembers."""
+    monkeypatch.syspath_prepend(tmp_path)
+    bundle.cache_clear()
+    bundle_module._source.cache_clear()
+    return tmp_path
+
+
+STEP = """
+def state_size(arrays):
+    return 1
+
+
+def initialise(arrays, parameters, state, outputs):
+    outputs[:] = 0.0
+
+
+def step(arrays, parameters, state, inputs, outputs):
+    outputs[0] = state[0]
+    state[0] = inputs[0]
+"""
+
+
+@pytest.mark.parametrize("imported", ["import os", "from scipy import signal", "from . import x", "import softneck.core"])
+def test_a_foreign_import_is_refused(runtime_folder: Path, imported: str) -> None:
+    (runtime_folder / "foreign_a_runtime.py").write_text(f"{imported}\n{STEP}")
+    with pytest.raises(SettingsError, match="foreign_a_runtime imports .*only numpy and math are allowed"):
+        bundle("foreign_a_runtime")
+
+
+def test_two_definitions_of_one_name_are_refused(runtime_folder: Path) -> None:
+    text = "from softneck.core._random_runtime import random_normal\n\n\ndef random_seed(s):\n    return 0\n" + STEP
+    (runtime_folder / "twice_a_runtime.py").write_text(text)
+    with pytest.raises(SettingsError, match=r"_random_runtime and twice_a_runtime both define `random_seed`"):
+        bundle("twice_a_runtime")
+
+
+def test_a_module_that_is_not_there_is_refused() -> None:
+    with pytest.raises(SettingsError, match="there is no runtime module `softneck_absent_runtime`"):
+        bundle("softneck_absent_runtime")
+
+
+@pytest.mark.parametrize("runtime", RUNTIMES)
+def test_a_bundle_runs_with_numpy_alone(runtime: str, tmp_path: Path) -> None:
+    (tmp_path / "carried.py").write_text(bundle(runtime), encoding="utf-8")
+    code = (
+        "import sys, carried\n"
+        "names = ('state_size', 'initialise', 'step', 'run_steps', 'run_horizon')\n"
+        "assert all(callable(getattr(carried, name)) for name in names)\n"
+        "foreign = [m for m in sys.modules if m.split('.')[0] in ('softneck', 'numba', 'scipy', 'pandas')]\n"
+        "assert not foreign, foreign"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_bundle_says_the_same_each_time_and_names_follow_content() -> None:
+    texts = [bundle(runtime) for runtime in RUNTIMES]
+    bundle.cache_clear()
+    assert [bundle(runtime) for runtime in RUNTIMES] == texts
+    names = [content_name(text) for text in texts]
+    assert len(set(names)) == len(set(texts))
+    assert all(name.isidentifier() for name in names)
+    assert content_name(texts[0] + "\n") != names[0]
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_the_table_of_kinds_leads_somewhere(kind: str) -> None:
+    entry = KINDS[kind]
+    assert entry.name == kind
+    assert hasattr(resolve(entry.result), "from_archive")
+    assert hasattr(resolve(entry.settings), {"model": "fit"}.get(entry.role, "design")) or entry.role != "model"
+    assert load_runtime(entry.runtime, compiled=False).compiled is False
+
+
+def test_a_compiled_bundle_is_kept_in_a_folder_of_the_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, runtime_folder: Path
+) -> None:
+    monkeypatch.setattr("platformdirs.user_cache_dir", lambda *_a, **_k: str(tmp_path / "cache"))
+    (runtime_folder / "kept_a_runtime.py").write_text(STEP)
+    runtime = load_runtime("kept_a_runtime", compiled=False)
+    assert [path.suffix for path in (tmp_path / "cache" / "runtime").glob("*.py")] == [".py"]
+    y = np.zeros((3, 1))
+    runtime.run_steps((), np.zeros(0), np.zeros(1), np.array([[1.0], [2.0], [3.0]]), y)
+    assert y.ravel().tolist() == [0.0, 1.0, 2.0]
+
+
+def test_a_cache_folder_that_cannot_be_written_is_no_hindrance(
+    monkeypatch: pytest.MonkeyPatch, runtime_folder: Path
+) -> None:
+    monkeypatch.setattr("platformdirs.user_cache_dir", lambda *_a, **_k: "/proc/nowhere")
+    (runtime_folder / "other_a_runtime.py").write_text(STEP)
+    assert load_runtime("other_a_runtime", compiled=False).state_size(()) == 1

@@ -1,0 +1,74 @@
+"""Units and the checks at the public edge."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from softneck.core import (
+    DataError,
+    SettingsError,
+    finite_vector,
+    require_between,
+    require_finite,
+    require_one_of,
+    require_positive,
+    to_si,
+)
+
+PAIRS = [("deg", "rad", math.pi / 180), ("deg/s", "rad/s", math.pi / 180), ("ms", "s", 1e-3), ("mm", "m", 1e-3),
+         ("g", "kg", 1e-3)]  # fmt: skip
+
+
+@pytest.mark.parametrize(("unit", "si", "factor"), PAIRS)
+def test_a_unit_has_its_si_unit_and_factor(unit: str, si: str, factor: float) -> None:
+    assert to_si(unit) == (factor, si)
+    # An SI unit is its own: converting twice changes nothing.
+    assert to_si(si) == (1.0, si)
+
+
+@given(value=st.floats(-1e6, 1e6), unit=st.sampled_from([pair[0] for pair in PAIRS]))
+def test_a_value_survives_the_way_to_si_and_back(value: float, unit: str) -> None:
+    factor, _ = to_si(unit)
+    # One product and one quotient: two roundings, half a unit in the last place each; below 1e-300 digits are lost.
+    assert value * factor / factor == pytest.approx(value, rel=2.3e-16, abs=1e-300)
+
+
+@pytest.mark.parametrize("unit", ["", "degrees", "Deg", "rad ", "°"])
+def test_an_unknown_unit_names_those_that_are_known(unit: str) -> None:
+    with pytest.raises(DataError, match=r"is no unit that softneck knows; use one of rad, deg"):
+        to_si(unit)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_every_check_refuses_what_is_not_finite(value: float) -> None:
+    for check in (
+        lambda: require_finite("gain", value, "N"),
+        lambda: require_positive("gain", value, "N"),
+        lambda: require_between("gain", value, 0, 1, "N"),
+    ):
+        with pytest.raises(SettingsError, match=r"`gain` must be a finite number \[N\]; got"):
+            check()
+
+
+def test_checks_name_the_argument_the_rule_and_what_came() -> None:
+    with pytest.raises(SettingsError, match=r"`mass` must be positive \[kg\]; got 0"):
+        require_positive("mass", 0.0, "kg")
+    with pytest.raises(SettingsError, match=r"`part` must be between 0 and 1; got 1\.5"):
+        require_between("part", 1.5, 0, 1)
+    with pytest.raises(SettingsError, match="`form` must be one of a, b; got 'c'"):
+        require_one_of("form", "c", ("a", "b"))
+    with pytest.raises(DataError, match="`inputs` must have 3 entries; got 2"):
+        finite_vector("inputs", [1, 2], 3)
+    with pytest.raises(DataError, match="`inputs` must be finite"):
+        finite_vector("inputs", [1, math.nan, 2], 3)
+
+
+def test_borders_belong_to_the_range() -> None:
+    for value in (0.0, 1.0):
+        require_between("part", value, 0, 1)
+    np.testing.assert_array_equal(finite_vector("inputs", [[1, 2, 3]], 3), [1.0, 2.0, 3.0])

@@ -1,0 +1,138 @@
+"""The line of the main job: an identified model, its observer and controller, over files and over FMUs."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softneck.core import load
+from softneck.cosim import load_loop, simulate
+from softneck.design import PiSettings
+from softneck.estimation import KalmanSettings
+from softneck.fmu import build_fmu, unpacked
+from softneck.identification import Rls
+from softneck.plant import NeckParameters, VirtualNeck
+from softneck.signals import Recording, redefine, signal
+
+TS = 0.02
+LOOP = """
+duration_s = 2.0
+[plant]
+{plant}
+[observer]
+{observer}
+[controller]
+{controller}
+[reference]
+kind = "step"
+pitch_deg = 6.0
+roll_deg = -4.0
+at_s = 0.4
+[limits]
+"pitch.rms_error_deg" = 6.0
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Files and FMUs of an RLS model, its Kalman filter and PI controller, and the virtual neck's FMU."""
+    place = tmp_path_factory.mktemp("line")
+    P = signal("eq22").set_points[:800]
+    drive, y = redefine(P), np.zeros((800, 2))
+    for k in range(799):
+        y[k + 1] = 0.9 * y[k] + 0.01 * drive[k, :2] + 1e-3 * math.sin(k)
+    channels = {f"motor_setpoint_{j + 1}": P[:, j] for j in range(3)} | {"pitch": y[:, 0], "roll": y[:, 1]}
+    model = Rls().fit(Recording(np.arange(800) * TS, TS, channels))
+    model.save(place / "rls.npz")
+    KalmanSettings().design(model).save(place / "kalman.npz")
+    PiSettings().design(model).save(place / "pi.npz")
+    for name in ("rls", "kalman", "pi"):
+        build_fmu(load(place / f"{name}.npz").block(), place / f"{name}.fmu")
+    build_fmu(VirtualNeck(NeckParameters.paper()).block(), place / "VirtualNeck.fmu")
+    return place
+
+
+def _loop(folder: Path, plant: str, ending: str) -> Path:
+    key = "file" if ending == "npz" else "fmu"
+    path = folder / f"{plant.partition('.')[0]}_{ending}.toml"
+    source = f'{"model" if plant.endswith("npz") else "fmu"} = "{plant}"'
+    parts = {name: f'{key} = "{file}.{ending}"' for name, file in (("observer", "kalman"), ("controller", "pi"))}
+    path.write_text(LOOP.format(plant=source, **parts))
+    return path
+
+
+@pytest.mark.parametrize("order", ["sequential", "jacobi"])
+def test_files_and_fmus_make_the_same_loop(order: str, folder: Path) -> None:
+    paths = [_loop(folder, "rls.npz", "npz"), _loop(folder, "rls.fmu", "fmu")]
+    results = []
+    for path in paths:
+        path.write_text(f'order = "{order}"\n{path.read_text()}')
+        results.append(simulate(load_loop(path)))
+    assert set(results[0].signals.signals) == set(results[1].signals.signals)
+    for name in results[0].signals.signals:
+        # Compiled and plain Python differ by rounding only; the loop is stable.
+        np.testing.assert_allclose(results[0][name], results[1][name], rtol=0, atol=1e-12, err_msg=name)
+
+
+def test_the_loop_closes_over_the_virtual_neck_s_fmu(folder: Path) -> None:
+    result = simulate(load_loop(_loop(folder, "VirtualNeck.fmu", "fmu")))
+    assert np.isfinite(result.frame.to_numpy()).all()
+    assert {"pitch", "pitch_measured", "pitch_estimate", "tension_1"} <= set(result.signals.signals)
+    assert set(result.certificate()["files"]) == {"loop", "plant", "observer", "controller"}
+    assert np.abs(result["motor_setpoint_1"]).max() > 0.1  # the controller does act
+
+
+_HOST = """
+import sys
+for name in ("softneck", "numba", "scipy", "control", "filterpy", "casadi", "pandas"):
+    sys.modules[name] = None  # a host with numpy alone
+import json
+import fmpy
+from fmpy.fmi2 import FMU2Slave
+seen = {}
+for folder in sys.argv[1:]:
+    model = fmpy.read_model_description(folder)
+    name = model.coSimulation.modelIdentifier
+    fmu = FMU2Slave(guid=model.guid, unzipDirectory=folder, modelIdentifier=name, instanceName=name)
+    fmu.instantiate(loggingOn=True)
+    fmu.setupExperiment(startTime=0.0)
+    fmu.enterInitializationMode()
+    fmu.exitInitializationMode()
+    drives = [v.valueReference for v in model.modelVariables if v.causality == "input" and v.type == "Real"]
+    outputs = [v.valueReference for v in model.modelVariables if v.causality == "output" and v.type == "Real"]
+    for k in range(20):
+        fmu.setReal(drives, [0.05] * len(drives))
+        fmu.doStep(k * 0.02, 0.02)
+    seen[name] = [value.hex() for value in fmu.getReal(outputs)]
+    fmu.terminate()
+    fmu.freeInstance()
+print(json.dumps(seen))
+"""
+
+
+def test_a_host_with_numpy_alone_runs_every_fmu(folder: Path) -> None:
+    names = ("rls", "kalman", "pi", "VirtualNeck")
+    blocks = [load(folder / f"{name}.npz").block() for name in names[:3]]
+    blocks.append(VirtualNeck(NeckParameters.paper()).block())
+    with (
+        unpacked(folder / "rls.fmu") as a,
+        unpacked(folder / "kalman.fmu") as b,
+        unpacked(folder / "pi.fmu") as c,
+        unpacked(folder / "VirtualNeck.fmu") as d,
+    ):
+        command = [sys.executable, "-c", _HOST, *map(str, (a, b, c, d))]
+        child = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (child.returncode, child.stderr) == (0, "")
+    seen = json.loads(child.stdout)
+    for name, block in zip(names, blocks, strict=True):
+        row = [port.start if port.boolean else 0.05 for port in block.inputs]
+        outputs = block.run(block.initial_state(), np.tile(row, (20, 1)))[1][-1]
+        expected = [y for y, port in zip(outputs, block.outputs, strict=True) if not port.boolean]
+        # Compiled here, plain there: rounding only.
+        np.testing.assert_allclose([float.fromhex(text) for text in seen[name]], expected, rtol=1e-12, atol=1e-12)
