@@ -25,7 +25,9 @@ JSON = st.recursive(
 
 def archive(folder: Path, header: dict[str, Any] | None = None) -> Path:
     path = folder / "a.npz"
-    write_archive(path, header or {"kind": "rls"}, {"a": np.arange(300.0).reshape(3, 100), "b": np.zeros(0)}, force=True)
+    write_archive(
+        path, header or {"kind": "rls"}, {"a": np.arange(300.0).reshape(3, 100), "b": np.zeros(0)}, force=True
+    )
     return path
 
 

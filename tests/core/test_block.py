@@ -132,7 +132,9 @@ def test_wrong_inputs_are_named(block_of: Callable[[str], Block]) -> None:
     with pytest.raises(DataError, match=r"rls takes 8 inputs \(motor_setpoint_1, .*; got shape \(1, 3\)"):
         block.step(state, u[:3])
     for bad in (np.nan, np.inf):
-        with pytest.raises(DataError, match=r"input `motor_setpoint_2` of rls is (nan|inf) at row 0; it must be finite"):
+        with pytest.raises(
+            DataError, match=r"input `motor_setpoint_2` of rls is (nan|inf) at row 0; it must be finite"
+        ):
             block.step(state, [0, bad, *u[2:]])
     with pytest.raises(DataError, match="input `pitch_measured` of rls is inf"):
         block.step(state, [0, 0, 0, np.inf, *u[4:]])

@@ -39,7 +39,9 @@ def step(arrays, parameters, state, inputs, outputs):
 """
 
 
-@pytest.mark.parametrize("imported", ["import os", "from scipy import signal", "from . import x", "import softneck.core"])
+@pytest.mark.parametrize(
+    "imported", ["import os", "from scipy import signal", "from . import x", "import softneck.core"]
+)
 def test_a_foreign_import_is_refused(runtime_folder: Path, imported: str) -> None:
     (runtime_folder / "foreign_a_runtime.py").write_text(f"{imported}\n{STEP}")
     with pytest.raises(SettingsError, match="foreign_a_runtime imports .*only numpy and math are allowed"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import tempfile
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -67,3 +68,9 @@ def recording() -> Recording:
     channels = {f"motor_setpoint_{j + 1}": P[:, j] for j in range(3)}
     channels |= {"pitch": np.zeros(90), "roll": np.zeros(90)}
     return Recording(time, 0.02, channels, np.repeat([0, 1], [50, 40]))
+
+
+@pytest.fixture(autouse=True)
+def own_temporary_folder(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Unpack FMUs where no test of another process does, so that leftovers can be counted."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path_factory.mktemp("unpacked")))

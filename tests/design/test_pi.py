@@ -44,7 +44,8 @@ class DelayedNeck:
         self.gain, self.delay, self.noise = gain, delay, math.radians(noise_deg)
 
     def start(self, time: float, parameters: Mapping[str, float]) -> Vector:  # noqa: ARG002
-        self.angles, self.line = np.zeros(2), [np.zeros(2)] * self.delay
+        self.angles: Vector = np.zeros(2)
+        self.line: list[Vector] = [np.zeros(2)] * self.delay
         self.random = np.random.default_rng(0)
         return np.zeros(7)
 

@@ -63,9 +63,9 @@ def test_units_come_back_exactly(
     assert to_units(from_units(units, scale), scale) == units
 
 
-def test_the_position_quantum_is_that_of_the_recordings() -> None:
-    # Read off the recordings as 1.278e-4 rad, four digits.
-    assert counts_to_position(1, DriveScale(peak_current=10.0)) == pytest.approx(1.278e-4, rel=2e-3)
+def test_the_recordings_were_scaled_with_the_gear_as_it_is_sold() -> None:
+    # Their quantum is 1.278e-4 rad (four digits): that of 24:1, not of 1539/65.
+    assert counts_to_position(1, DriveScale(peak_current=10.0, gear=24.0)) == pytest.approx(1.278e-4, rel=5e-4)
 
 
 def test_a_turn_of_the_winch_is_48490_counts() -> None:
@@ -89,8 +89,8 @@ def test_the_peak_current_is_half_the_range() -> None:
 
 def test_a_reversed_drive_counts_backwards() -> None:
     there, back = DriveScale(peak_current=10.0), DriveScale(peak_current=10.0, reversed=True)
-    for convert, _, value in ((p.values[0], p.values[1], p.values[2]) for p in PAIRS):
-        assert convert(value, back) == -convert(value, there)
+    for convert in (position_to_counts, speed_to_internal, acceleration_to_internal, current_to_internal):
+        assert convert(1.5, back) == -convert(1.5, there)
 
 
 @pytest.mark.parametrize(

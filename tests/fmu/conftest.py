@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
@@ -101,3 +102,9 @@ def lag_inputs() -> np.ndarray:
     u[:, 1] = generator.random(200) > 0.1
     u[generator.random(200) > 0.5, 2] = np.nan
     return u
+
+
+@pytest.fixture(autouse=True)
+def own_temporary_folder(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Unpack FMUs where no test of another process does, so that leftovers can be counted."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path_factory.mktemp("unpacked")))

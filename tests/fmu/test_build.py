@@ -7,14 +7,14 @@ import sys
 import zipfile
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import fmpy
 import pytest
 from fmpy.validation import validate_fmu
 
-from softneck.core import OutputError, Port, SettingsError
-from softneck.fmu import FmuInfo, build_fmu
+from softneck.core import Block, OutputError, Port, SettingsError
+from softneck.fmu import FmuInfo, build_fmu, describe
 
 KINDS = ["lag", "controller", "neck", "pi"]
 
@@ -157,3 +157,19 @@ def test_a_port_name_or_role_that_fmi_cannot_carry_is_refused(toys: Any, tmp_pat
         build_fmu(replace(toys.lag(), inputs=(Port(name="a b"),)), tmp_path / "Toy.fmu")
     with pytest.raises(SettingsError, match="role `wheel` must be one of"):
         build_fmu(replace(toys.lag(), role="wheel"), tmp_path / "Toy.fmu")
+
+
+def test_what_is_told_of_a_model_escapes_what_it_was_told(toys: Any) -> None:
+    class Thing:
+        settings: ClassVar[dict[str, str]] = {"form": "<b>"}
+
+        def block(self) -> Block:
+            return toys.lag()
+
+        def summary(self) -> str:
+            return "a lag & more\nsecond line"
+
+    info = describe(Thing(), scores="fit < 90 %", stop_time=4.0)
+    assert (info.description, info.stop_time) == ("a lag & more", 4.0)
+    for text in ("a lag &amp; more", "&lt;b&gt;", "fit &lt; 90 %", "What it is not good for"):
+        assert text in info.documentation

@@ -124,16 +124,11 @@ class LinearController:
         ]
         for axis in ("pitch", "roll"):
             item = self.design.get(axis, {})
-            settings = ", ".join(f"{name} {value:.4g}" for name, value in item.get("gains", {}).items())
-            margins = item.get("margins", {})
-            lines.append(f"  {axis}: {settings}")
-            if margins:
-                lines.append(
-                    f"    gain margin {_number(margins['gain'])}, "
-                    f"phase margin {_number(margins['phase'], math.degrees(1.0))} deg, "
-                    f"Ms {margins['sensitivity']:.3f}, crossover {_number(margins['crossover'])} rad/s, "
-                    f"delay margin {_number(margins['delay'], 1e3)} ms"
-                )
+            gains = ", ".join(f"{name} {value:.4g}" for name, value in item.get("gains", {}).items())
+            lines.append(f"  {axis}: {gains}; designed for a dead time of {1e3 * item.get('dead_time_s', 0.0):g} ms")
+            for title, key in (("as identified", "margins"), ("small moves", "margins_small_moves")):
+                if key in item:
+                    lines.append(f"    {title}: {_margins(item[key])}")
         return "\n".join(lines)
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
@@ -196,6 +191,13 @@ def _motor(name: str, what: str) -> Port:
     return Port(name=name, unit="rad", description=f"{what} {name[-1]}", minimum=-_MAX_MOTOR, maximum=_MAX_MOTOR)
 
 
-def _number(value: float | None, factor: float = 1.0) -> str:
-    """Return a margin as text; None stands for infinity, which JSON does not have."""
-    return "inf" if value is None else f"{factor * value:.3g}"
+def _margins(values: Mapping[str, float | None]) -> str:
+    """Return margins as text; None stands for infinity, which JSON does not have."""
+    units = (("gain margin", "gain", 1.0, ""), ("phase margin", "phase", math.degrees(1.0), " deg"),
+             ("Ms", "sensitivity", 1.0, ""), ("crossover", "crossover", 1.0, " rad/s"),
+             ("delay margin", "delay", 1e3, " ms"))  # fmt: skip
+    parts = []
+    for title, key, factor, unit in units:
+        value = values.get(key)
+        parts.append(f"{title} inf" if value is None else f"{title} {factor * value:.3g}{unit}")
+    return ", ".join(parts)

@@ -12,8 +12,8 @@ from softneck.signals import TENDON_ANGLES
 
 from ._assembly import assemble, pi_axis
 from ._controller import LinearController
-from ._margins import loop_margins
-from ._tuning import Gains, open_loop, reference_time, tune_pi
+from ._margins import Margins, loop_margins
+from ._tuning import Gains, Plants, open_loop, reference_time, tune_pi
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,8 +25,12 @@ class PiSettings:
     leaves, a reference filter takes away.
 
     Attributes:
-        max_sensitivity: bound on Ms.
-        phase_margin: least phase margin [rad].
+        max_sensitivity: bound on Ms, on the identified plant and on its faster form.
+        phase_margin: least phase margin [rad], on both.
+        least_delay: the dead time is taken as at least this [s]; a fit of free runs hides it in the pole.
+        small_move_pole: the design must hold as well where the slowest pole is as fast as this [1/s] at the same
+            static gain; 0 for the identified plant alone. Fits to large moves come out slower than small moves
+            are, for there the drives run at their current limit.
         reference_time: time constant of the reference filter [s]; None for the least with which no plant within
             `gain_spread` overshoots by more than `overshoot_pct`.
         overshoot_pct: of a step, without limits.
@@ -40,6 +44,9 @@ class PiSettings:
 
     max_sensitivity: float = 1.35
     phase_margin: float = math.radians(60.0)
+    # The paper's own dead time and pole (Eq. 31: 0.08 s, 5.293 1/s).
+    least_delay: float = 0.08
+    small_move_pole: float = 5.3
     reference_time: float | None = None
     overshoot_pct: float = 2.0
     gain_spread: float = 0.2
@@ -52,6 +59,8 @@ class PiSettings:
     def __post_init__(self) -> None:
         require_between("max_sensitivity", self.max_sensitivity, 1.05, 4.0)
         require_between("phase_margin", self.phase_margin, 0.1, 1.5, "rad")
+        require_between("least_delay", self.least_delay, 0.0, 1.0, "s")
+        require_between("small_move_pole", self.small_move_pole, 0.0, 1000.0, "1/s")
         if self.reference_time is not None:
             require_between("reference_time", self.reference_time, 0.0, 60.0, "s")
         require_between("overshoot_pct", self.overshoot_pct, 0.1, 100.0, "%")
@@ -75,11 +84,12 @@ class PiSettings:
         times = [plant.sample_time for plant in plants]
         if not math.isclose(*times, rel_tol=1e-9):
             raise SettingsError(f"pitch and roll have different sample times, {times[0]:g} s and {times[1]:g} s.")
-        tuned = [tune_pi(p, self.extra_delay, self.max_sensitivity, self.phase_margin) for p in plants]
-        filters = [self._filter(plant, gains) for plant, gains in zip(plants, tuned, strict=True)]
+        families = [self._family(plant) for plant in plants]
+        tuned = [tune_pi(f, self.extra_delay, self.max_sensitivity, self.phase_margin) for f in families]
+        filters = [self._filter(family, gains) for family, gains in zip(families, tuned, strict=True)]
         found = {
-            axis: _findings(plant, self.extra_delay, gains, time)
-            for axis, plant, gains, time in zip(("pitch", "roll"), plants, tuned, filters, strict=True)
+            axis: _findings(family, self.extra_delay, gains, time)
+            for axis, family, gains, time in zip(("pitch", "roll"), families, tuned, filters, strict=True)
         }
         first, second = (pi_axis(gains.gain, gains.integral_time, times[0]) for gains in tuned)
         return LinearController(
@@ -97,16 +107,27 @@ class PiSettings:
             design={"settings": asdict(self), "extra_delay": self.extra_delay, **found},
         )
 
-    def _filter(self, plant: AxisPlant, gains: Gains) -> float:
+    def _family(self, plant: AxisPlant) -> Plants:
+        """Return what the axis may be: as identified, and faster; both with at least the least delay."""
+        late = plant.delayed(self.least_delay)
+        faster = late.faster(self.small_move_pole) if self.small_move_pole > 0.0 else late
+        return (late,) if faster is late else (late, faster)
+
+    def _filter(self, family: Plants, gains: Gains) -> float:
         if self.reference_time is not None:
             return self.reference_time
         return reference_time(
-            plant, self.extra_delay, gains, gain_spread=self.gain_spread, overshoot=self.overshoot_pct / 100.0
+            family, self.extra_delay, gains, gain_spread=self.gain_spread, overshoot=self.overshoot_pct / 100.0
         )
 
 
-def _findings(plant: AxisPlant, extra_delay: int, gains: Gains, filter_time: float) -> dict[str, Any]:
+def _findings(family: Plants, extra_delay: int, gains: Gains, filter_time: float) -> dict[str, Any]:
     """Return gains and margins of one axis as JSON values; None stands for infinity."""
-    margins = asdict(loop_margins(open_loop(plant, extra_delay, gains)))
+    margins = [_json(loop_margins(open_loop(plant, extra_delay, gains))) for plant in family]
     named = {"K": gains.gain, "Ti_s": gains.integral_time, "reference_time_s": filter_time}
-    return {"gains": named, "margins": {name: v if math.isfinite(v) else None for name, v in margins.items()}}
+    dead_time = (family[0].delay + extra_delay) * family[0].sample_time
+    return {"gains": named, "dead_time_s": dead_time, "margins": margins[0], "margins_small_moves": margins[-1]}
+
+
+def _json(margins: Margins) -> dict[str, float | None]:
+    return {name: value if math.isfinite(value) else None for name, value in asdict(margins).items()}

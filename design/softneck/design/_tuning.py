@@ -9,7 +9,7 @@ import control
 import numpy as np
 from scipy.signal import lfilter
 
-from softneck.core import SettingsError, Vector
+from softneck.core import Matrix, SettingsError, Vector
 from softneck.estimation import AxisPlant
 
 from ._margins import frequencies
@@ -21,6 +21,10 @@ _REFINEMENTS = 6
 _TIMES = np.geomspace(0.2, 3.0, 40)
 # A step response is judged over this long [s]; slower than any neck settles.
 _HORIZON = 4.0
+# A reference filter slower than this [s] would be no answer to overshoot.
+_SLOWEST_FILTER = 2.0
+
+Plants = tuple[AxisPlant, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,15 +40,19 @@ class Gains:
     integral_time: float
 
 
-def tune_pi(plant: AxisPlant, extra_delay: int, max_sensitivity: float, phase_margin: float) -> Gains:
-    """Return the gains with the largest K/Ti that keep Ms and the phase margin [rad].
+def tune_pi(plants: Plants, extra_delay: int, max_sensitivity: float, phase_margin: float) -> Gains:
+    """Return the gains with the largest K/Ti that keep Ms and the phase margin [rad] on all `plants`.
+
+    The plants share sample time and the sign of their gain; times and gains are tried around the first.
 
     Raises:
         SettingsError: none do.
     """
+    plant = plants[0]
     w = frequencies(plant.sample_time)
     z = np.exp(1j * w * plant.sample_time)
-    G = plant.response(w, extra_delay=extra_delay) / plant.static_gain
+    # (plants, frequencies)
+    G = np.array([item.response(w, extra_delay=extra_delay) for item in plants]) / plant.static_gain
     lag = _slowest_time(plant) + (plant.delay + 1 + extra_delay) * plant.sample_time
     best, best_rate = Gains(0.0, lag), 0.0
     for integral_time in lag * _TIMES:
@@ -60,26 +68,28 @@ def tune_pi(plant: AxisPlant, extra_delay: int, max_sensitivity: float, phase_ma
     return best
 
 
-def reference_time(plant: AxisPlant, extra_delay: int, gains: Gains, *, gain_spread: float, overshoot: float) -> float:
+def reference_time(plants: Plants, extra_delay: int, gains: Gains, *, gain_spread: float, overshoot: float) -> float:
     """Return the least time constant [s] of a reference filter with which no plant overshoots by more.
 
     Args:
-        plant: the axis.
-        extra_delay: samples added to its delay.
+        plants: what the axis may be.
+        extra_delay: samples added to their delay.
         gains: of the PI.
-        gain_spread: relative; the plant's gain is taken at both ends and in the middle.
+        gain_spread: relative; the gain of each plant is taken at both ends and in the middle.
         overshoot: part of the step.
 
     Raises:
-        SettingsError: none of up to a second does.
+        SettingsError: none does that is fast enough.
     """
-    rows = math.ceil(_HORIZON / plant.sample_time)
-    steps = [_step_response(plant, extra_delay, gains, rows, scale) for scale in (1 - gain_spread, 1, 1 + gain_spread)]
-    for samples in range(1 + math.ceil(1.0 / plant.sample_time)):
+    sample_time = plants[0].sample_time
+    rows = math.ceil(_HORIZON / sample_time)
+    scales = (1.0 - gain_spread, 1.0, 1.0 + gain_spread)
+    steps = [_step_response(plant, extra_delay, gains, rows, scale) for plant in plants for scale in scales]
+    for samples in range(1 + math.ceil(_SLOWEST_FILTER / sample_time)):
         a = math.exp(-1.0 / samples) if samples else 0.0
         peak = max(float(np.max(lfilter([1.0 - a], [1.0, -a], step))) for step in steps)
         if peak <= 1.0 + overshoot:
-            return samples * plant.sample_time
+            return samples * sample_time
     raise SettingsError("no reference filter keeps the overshoot; lower `max_sensitivity` or `gain_spread`.")
 
 
@@ -90,8 +100,8 @@ def open_loop(plant: AxisPlant, extra_delay: int, gains: Gains) -> control.Trans
     return pi * plant.tf(extra_delay=extra_delay)
 
 
-def _largest(shape: Vector, max_sensitivity: float, phase_margin: float) -> float:
-    """Return the largest size up to which all loops size * shape keep both bounds; 0 if none does.
+def _largest(shape: Matrix, max_sensitivity: float, phase_margin: float) -> float:
+    """Return the largest size up to which all loops size * shape (plants, frequencies) keep both bounds, or 0.
 
     A small loop around a stable plant is stable, and one that keeps Ms all the way up has never crossed -1;
     a search by halves alone could end beyond the border of stability.
@@ -110,13 +120,13 @@ def _largest(shape: Vector, max_sensitivity: float, phase_margin: float) -> floa
     return low
 
 
-def _keeps(loop: Vector, max_sensitivity: float, phase_margin: float) -> bool:
-    """Return whether the loop's response keeps both bounds."""
-    if np.min(np.abs(1.0 + loop)) * max_sensitivity < 1.0:
+def _keeps(loops: Matrix, max_sensitivity: float, phase_margin: float) -> bool:
+    """Return whether the responses of all loops keep both bounds."""
+    if np.min(np.abs(1.0 + loops)) * max_sensitivity < 1.0:
         return False
-    below = np.abs(loop) < 1.0
-    crossing = np.flatnonzero(~below[:-1] & below[1:]) + 1
-    return bool(np.all(np.abs(np.angle(-loop[crossing])) >= phase_margin))
+    below = np.abs(loops) < 1.0
+    crossing = loops[:, 1:][~below[:, :-1] & below[:, 1:]]
+    return bool(np.all(np.abs(np.angle(-crossing)) >= phase_margin))
 
 
 def _slowest_time(plant: AxisPlant) -> float:

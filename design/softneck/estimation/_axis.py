@@ -82,6 +82,26 @@ class AxisPlant:
         ratio = np.polyval(self.numerator, z) / np.polyval(self.denominator, z)
         return ratio * z ** (-(self.delay + extra_delay))
 
+    def faster(self, pole: float) -> AxisPlant:
+        """Return the same plant with its slowest pole moved to `pole` [1/s], gain and delay kept; itself if faster.
+
+        A complex pair is left as it is.
+        """
+        poles = np.roots(self.denominator)
+        slowest = complex(poles[int(np.argmax(np.abs(poles)))])
+        moved = float(np.exp(-pole * self.sample_time))
+        if abs(slowest.imag) > 0.0 or slowest.real <= moved:
+            return self
+        a = float(slowest.real)
+        rest = np.real(np.poly(np.delete(poles, int(np.argmax(np.abs(poles))))))
+        numerator = self.numerator * (1.0 - moved) / (1.0 - a)
+        return AxisPlant(numerator, np.convolve(rest, [1.0, -moved]), self.delay, self.sample_time)
+
+    def delayed(self, least: float) -> AxisPlant:
+        """Return the same plant with a dead time of at least `least` [s], in whole samples."""
+        delay = max(self.delay, round(least / self.sample_time))
+        return AxisPlant(self.numerator, self.denominator, delay, self.sample_time)
+
     def tf(self, *, extra_delay: int = 0) -> control.TransferFunction:
         """Return it as a `control.TransferFunction` with `extra_delay` samples more."""
         denominator = np.concatenate([self.denominator, np.zeros(self.delay + extra_delay)])

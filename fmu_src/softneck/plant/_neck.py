@@ -89,3 +89,15 @@ class VirtualNeck:
             outputs=_outputs(),
             parameters=(*self.parameters.ports(), seed),
         )
+
+    def summary(self) -> str:
+        """Return a few lines on the neck, for people."""
+        p = self.parameters
+        return "\n".join(
+            [
+                "virtual neck: a physics model of the tendon-driven soft neck",
+                f"link {1e3 * p.link_length:.1f} mm, tendons at {1e3 * p.attachment_radius:.1f} mm, "
+                f"winch {1e3 * p.winch_radius:.1f} mm",
+                f"inclinometer noise {math.degrees(p.noise_std):.3f} deg",
+            ]
+        )

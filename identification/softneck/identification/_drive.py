@@ -55,6 +55,8 @@ def _pole(runs: list[tuple[Vector, Vector]], d: int) -> float:
     """Least squares of `m(k+1) - u = a (m(k) - u)` with u = u(k+1-d)."""
     above = below = 0.0
     for u, m in runs:
+        if u.size <= d:
+            continue
         target = u[: u.size - d]
         ahead, now = m[d:] - target, m[d - 1 : -1] - target
         above += float(ahead @ now)

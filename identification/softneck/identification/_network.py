@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, Progress, SettingsError, require_positive, silent
+from softneck.core import DataError, Matrix, Progress, SettingsError, require_positive, require_whole, silent
 from softneck.signals import Recording, concatenate
 
 from ._checks import check_training
@@ -35,10 +35,12 @@ class Network:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hidden", tuple(self.hidden))
-        if len(self.hidden) != 2 or min(self.hidden) < 1:
+        if len(self.hidden) != 2:
             raise SettingsError(f"`hidden` must be two numbers of neurons; got {self.hidden}.")
-        if self.iterations < 1:
-            raise SettingsError(f"`iterations` must be at least 1; got {self.iterations}.")
+        for neurons in self.hidden:
+            require_whole("hidden", neurons, 1, 1000)
+        require_whole("iterations", self.iterations, 1, 100_000)
+        require_whole("seed", self.seed, 0, 2**63)
         require_positive("decay", self.decay)
 
     def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:

@@ -11,12 +11,12 @@ from softneck.core import (
     DataError,
     Matrix,
     Progress,
-    SettingsError,
     Vector,
     load_functions,
     require_between,
     require_one_of,
     require_positive,
+    require_whole,
     silent,
 )
 from softneck.signals import TENDON_ANGLES, Recording, concatenate, redefine, redefinition_matrix
@@ -52,8 +52,9 @@ class Rls:
     forgetting: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.na < 1 or self.nb < 1:
-            raise SettingsError(f"`na` and `nb` must be at least 1; got {self.na} and {self.nb}.")
+        # A hundred samples are 2 s: no neck remembers longer.
+        require_whole("na", self.na, 1, 100)
+        require_whole("nb", self.nb, 1, 100)
         if self.delay is not None:
             require_between("delay", self.delay, 0.0, 2.0, "s")
         require_one_of("delay_by", self.delay_by, ("free_run", "one_step"))

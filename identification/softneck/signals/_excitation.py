@@ -144,10 +144,10 @@ def _low_crest(t: Vector, tones: Vector, rng: np.random.Generator) -> Vector:
     coarse = t[::5]
     phases = min(
         (rng.uniform(0.0, 2.0 * np.pi, tones.size) for _ in range(200)),
-        key=lambda phase: np.abs(np.cos(np.outer(coarse, tones) + phase).sum(axis=1)).max(),
+        key=lambda phase: np.abs(np.cos(np.outer(coarse, tones) + phase).sum(axis=1)).max(initial=0.0),
     )
     s = np.cos(np.outer(t, tones) + phases).sum(axis=1)
-    return 3.2 * s / np.abs(s).max()
+    return 3.2 * s / np.abs(s).max(initial=1e-12)
 
 
 def _mixed(t: Vector, rng: np.random.Generator) -> Matrix:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from pyarrow import ArrowException
 
 from softneck.core import DataError, FileFormatError, SoftneckError, Vector, atomic_write, to_si
 
@@ -66,16 +68,20 @@ def read_table(source: Path, suffix: str, *, header: bool, delimiter: str = ",")
     try:
         if suffix == ".parquet":
             return pd.read_parquet(source)
-        return pd.read_csv(
-            source,
-            header=0 if header else None,
-            sep=delimiter,
-            skipinitialspace=True,
-            keep_default_na=False,
-            na_values=[""],
-            float_precision="round_trip",
-        )
-    except (ValueError, OSError, ArithmeticError, MemoryError) as error:
+        with warnings.catch_warnings():
+            # pandas only warns of rows that are longer than the header; their cells cannot be told apart.
+            warnings.simplefilter("error", pd.errors.ParserWarning)
+            return pd.read_csv(
+                source,
+                header=0 if header else None,
+                sep=delimiter,
+                index_col=False,
+                skipinitialspace=True,
+                keep_default_na=False,
+                na_values=[""],
+                low_memory=False,
+            )
+    except (ValueError, OSError, ArithmeticError, MemoryError, ArrowException, pd.errors.ParserWarning) as error:
         reason = (str(error).splitlines() or [""])[0][:120]
         raise FileFormatError(f"{source}: cannot be read as a table ({reason}).") from error
 

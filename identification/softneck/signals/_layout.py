@@ -15,7 +15,7 @@ from softneck.core import DataError, FileFormatError, SettingsError, SoftneckErr
 
 from ._channels import known_channels, may_miss, si_unit
 from ._files import median_step, numbers, read_table
-from ._recording import Recording
+from ._recording import Recording, check_times
 from ._tilt import pitch_roll
 
 Column = str | int
@@ -90,6 +90,8 @@ def read_layout(path: str | Path) -> Layout:
         return _layout(table)
     except SoftneckError as error:
         raise SettingsError(f"{source}: {error}") from error
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise SettingsError(f"{source}: a value is of the wrong type ({error}).") from error
 
 
 def import_log(path: str | Path, layout: Layout) -> Imported:
@@ -136,6 +138,8 @@ def _times(frame: pd.DataFrame, layout: Layout) -> tuple[Vector, np.ndarray, flo
         return logged, run, median_step(logged, run), tuple(notes)
     if logged is not None and run.size > 1:
         nominal = median_step(logged, run)
+        # The layout knows the sample time better than this column, but a gap in it is one in the samples.
+        check_times(logged, nominal, run, tolerance=0.5)
         if abs(nominal - layout.sample_time) > 1e-3 * layout.sample_time:
             notes.append(
                 f"the time column says {1e3 * nominal:g} ms a sample; "
@@ -167,7 +171,7 @@ def _layout(table: dict[str, Any]) -> Layout:
     if len(tilt) == 1:
         raise SettingsError("[tilt] needs both `inclination` and `orientation`.")
     rows = file.get("rows")
-    if rows is not None and not (isinstance(rows, list) and len(rows) == 2 and 0 <= rows[0] < rows[1]):
+    if rows is not None and not (isinstance(rows, list) and [type(row) for row in rows] == [int, int] and 0 <= rows[0] < rows[1]):
         raise SettingsError(f"[file] rows must be [first, last] with 0 <= first < last; got {rows}.")
     return Layout(
         channels={name: _channel_source(name, entry) for name, entry in table.get("channels", {}).items()},

@@ -41,7 +41,7 @@ class Recording:
         object.__setattr__(self, "run", run)
         object.__setattr__(self, "channels", channels)
         self._check_channels()
-        self._check_time()
+        check_times(time, self.sample_time, run)
 
     def __len__(self) -> int:
         return self.time.size
@@ -123,25 +123,34 @@ class Recording:
         if self.run.shape != (len(self),):
             raise DataError(f"`run` has shape {self.run.shape}; time has {(len(self),)}.")
 
-    def _check_time(self) -> None:
-        if not np.isfinite(self.time).all():
-            raise DataError(f"`time` is not finite at row {int(np.argmax(~np.isfinite(self.time)))}.")
-        step = np.diff(self.time)
-        inside = np.diff(self.run) == 0
-        back = inside & (step <= 0)
-        if back.any():
-            row = int(np.argmax(back)) + 1
-            raise DataError(
-                f"`time` runs backwards or stands still at row {row} ({self.time[row - 1]:g} to {self.time[row]:g} s); "
-                "where a new experiment starts there, give it another number in the `run` column."
-            )
-        jump = inside & (np.abs(step - self.sample_time) > max(_MAX_JITTER * self.sample_time, 1e-9))
-        if jump.any():
-            row = int(np.argmax(jump)) + 1
-            raise DataError(
-                f"`time` jumps by {step[row - 1]:.6g} s at row {row} (t = {self.time[row]:g} s) where the "
-                f"sample time is {self.sample_time:.6g} s; fill the gap, or split the record there by the `run` column."
-            )
+
+def check_times(time: Vector, sample_time: float, run: np.ndarray, *, tolerance: float = _MAX_JITTER) -> None:
+    """Raise DataError where `time` (time,) runs backwards or jumps inside a run.
+
+    Args:
+        time: [s].
+        sample_time: [s].
+        run: (time,) numbers of the runs.
+        tolerance: how much of a sample time a step may be off.
+    """
+    if not np.isfinite(time).all():
+        raise DataError(f"`time` is not finite at row {int(np.argmax(~np.isfinite(time)))}.")
+    step = np.diff(time)
+    inside = np.diff(run) == 0
+    back = inside & (step <= 0)
+    if back.any():
+        row = int(np.argmax(back)) + 1
+        raise DataError(
+            f"`time` runs backwards or stands still at row {row} ({time[row - 1]:g} to {time[row]:g} s); "
+            "where a new experiment starts there, give it another number in the `run` column."
+        )
+    jump = inside & (np.abs(step - sample_time) > max(tolerance * sample_time, 1e-9))
+    if jump.any():
+        row = int(np.argmax(jump)) + 1
+        raise DataError(
+            f"`time` jumps by {step[row - 1]:.6g} s at row {row} (t = {time[row]:g} s) where the "
+            f"sample time is {sample_time:.6g} s; fill the gap, or split the record there by the `run` column."
+        )
 
 
 def concatenate(recordings: list[Recording] | tuple[Recording, ...]) -> Recording:

@@ -20,9 +20,11 @@ def redefinition_matrix(angles: Vector = TENDON_ANGLES) -> Matrix:
         SettingsError: the angles do not span the plane, so that T has no inverse.
     """
     gamma = np.asarray(angles, dtype=np.float64)
+    if gamma.shape != (3,) or not np.isfinite(gamma).all():
+        raise SettingsError(f"three finite tendon angles are needed [rad]; got {gamma.tolist()}.")
     T = np.array([np.cos(gamma), np.sin(gamma), np.full(3, 1.0 / 3.0)])
     # Below this two tendons all but coincide and the inverse would ask for huge motor angles.
-    if gamma.shape != (3,) or not np.isfinite(gamma).all() or abs(np.linalg.det(T)) < 1e-3:
+    if abs(np.linalg.det(T)) < 1e-3:
         raise SettingsError(f"three tendon angles that span the plane are needed [rad]; got {gamma.tolist()}.")
     T[np.abs(T) < 1e-15] = 0.0
     return T

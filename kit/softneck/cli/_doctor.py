@@ -31,7 +31,7 @@ def command(as_json: bool) -> None:
     else:
         rows = [[check["name"], check["state"], check["detail"]] for check in checks]
         print_table("softneck doctor", ["what", "state", "detail"], rows)
-    sys.exit(1 if bad else 0)
+    click.get_current_context().exit(1 if bad else 0)
 
 
 def _check(name: str, state: str, detail: str) -> dict[str, str]:

@@ -86,4 +86,6 @@ def _certificate(file: Path) -> dict[str, Any]:
         content = json.loads(file.read_text(encoding="utf-8"))
     except ValueError as error:
         raise FileFormatError(f"{file}: is no JSON file ({error}).") from error
+    if not isinstance(content, dict):
+        raise FileFormatError(f"{file}: holds no JSON object, so it is no file of softneck.")
     return {"type": "certificate" if "limits" in content else "JSON", "keys": ", ".join(content)}

@@ -13,6 +13,7 @@ from ._checks import require_between as require_between
 from ._checks import require_finite as require_finite
 from ._checks import require_one_of as require_one_of
 from ._checks import require_positive as require_positive
+from ._checks import require_whole as require_whole
 from ._compile import Runtime as Runtime
 from ._compile import have_numba as have_numba
 from ._compile import load_functions as load_functions

@@ -31,6 +31,12 @@ def require_between(name: str, value: float, low: float, high: float, unit: str 
         raise SettingsError(f"`{name}` must be between {low:g} and {high:g}{_in(unit)}; got {value:g}.")
 
 
+def require_whole(name: str, value: object, low: int, high: int) -> None:
+    """Raise SettingsError unless `value` is an integer between `low` and `high`."""
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or not low <= value <= high:
+        raise SettingsError(f"`{name}` must be a whole number between {low} and {high}; got {value!r}.")
+
+
 def require_one_of(name: str, value: object, allowed: tuple[str, ...]) -> None:
     """Raise SettingsError unless `value` is one of `allowed`."""
     if value not in allowed:

@@ -1,0 +1,215 @@
+"""The commands at work: exit codes, JSON, files kept and replaced, and the real recordings."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import pytest
+
+from softneck.cli import _main
+from softneck.core import CheckFailedError, load
+from softneck.signals import read_recording
+
+from ..data import LAYOUTS
+from .conftest import Call, Said
+
+COMMANDS = tuple(_main._COMMANDS)
+
+
+def one_object(said: Said) -> dict:
+    """The JSON that is all of stdout; a second object or a stray line would not parse."""
+    assert said.code == 0, said.err
+    value = json.loads(said.out)
+    assert isinstance(value, dict)
+    return value
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_helps_with_an_example(call: Call, command: str) -> None:
+    said = call(command, "--help")
+    assert said.code == 0
+    assert "Example: softneck " + command in " ".join(said.out.split())
+    assert "--json" in said.out
+
+
+def test_help_lists_every_command_and_the_exit_codes(call: Call) -> None:
+    said = call("--help")
+    assert said.code == 0
+    assert all(f"  {command} " in said.out for command in COMMANDS)
+    assert "2 bad input" in said.out
+    assert call("--version").out.startswith("softneck, version ")
+    assert call().code == 2
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "line"),
+    [
+        (CheckFailedError("pitch overshoots."), 1, "pitch overshoots."),
+        (FileNotFoundError(2, "No such file or directory", "x.csv"), 2, "x.csv: No such file or directory"),
+        (click.UsageError("odd"), 2, "odd"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (click.Abort(), 130, "interrupted"),
+        (RuntimeError("two\nlines"), 3, "a fault of softneck, not of yours: RuntimeError: two lines"),
+    ],
+)
+def test_every_error_is_one_line_and_its_exit_code(
+    call: Call, monkeypatch: pytest.MonkeyPatch, error: BaseException, code: int, line: str
+) -> None:
+    def fail(*_args: object, **_more: object) -> None:
+        raise error
+
+    monkeypatch.delenv("SOFTNECK_TRACEBACK", raising=False)
+    monkeypatch.setattr("softneck.cli._info._describe", fail)
+    Path("a.csv").write_text("")
+    said = call("info", "a.csv")
+    assert (said.code, said.out) == (code, "")
+    assert said.error.startswith(f"softneck: {line}")
+
+
+def test_ctrl_c_during_identify_leaves_no_file(
+    call: Call, tmp_path: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_args: object, **_more: object) -> None:
+        raise KeyboardInterrupt
+
+    for where in ("softneck.identification._rls.Rls._fit_axis", "numpy.savez_compressed"):
+        with monkeypatch.context() as patch:
+            patch.setattr(where, interrupted)
+            said = call("identify", "rls", recording, "-o", "m.npz", "--json")
+        assert said.code == 130
+        assert said.error.startswith("softneck: interrupted")
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_identify_and_validate_print_one_object(call: Call, recording: Path) -> None:
+    facts = one_object(call("identify", "rls", recording, "-o", "m.npz", "--set", "delay=0.06", "--json"))
+    assert (facts["kind"], facts["rows_trained"], facts["settings"]["delay"]) == ("rls", 420, 0.06)
+    judged = one_object(call("validate", "m.npz", "--data", recording, "--json", "--horizon", "1,5,inf"))
+    (entry,) = judged["models"]
+    assert entry["fits"]["model"] == facts["hold_out"]["fits"]["model"] | {"5": entry["fits"]["model"]["5"]}
+    assert set(entry["fits"]["persistence"]) == {"1", "5"}
+    assert set(entry) >= {"model", "data", "rows_scored", "fits", "rmse_deg", "diverged", "residuals"}
+    assert (entry["rows_scored"], entry["rows_left_out"]) == (180 - 25, 420)
+    assert one_object(call("validate", "m.npz", "--data", recording, "--include-training", "--json"))
+
+
+def test_what_stands_under_o_is_replaced_by_force_only(call: Call, recording: Path) -> None:
+    arguments = ("identify", "rls", recording, "-o", "m.npz", "--set", "delay=0.06", "--json")
+    one_object(call(*arguments))
+    before = Path("m.npz").read_bytes()
+    refused = call(*arguments)
+    assert refused.code == 2
+    assert "m.npz: exists already; use --force" in refused.error
+    assert Path("m.npz").read_bytes() == before
+    one_object(call(*arguments, "--force"))
+
+
+def test_without_o_a_command_writes_under_build_and_may_replace(call: Call, recording: Path) -> None:
+    for _ in range(2):
+        facts = one_object(call("identify", "rls", recording, "--set", "delay=0.06", "--json"))
+        assert facts["model"] == "build/models/rls.npz"
+        assert load("build/models/rls.npz").kind == "rls"
+
+
+def test_several_recordings_are_several_runs(call: Call, recording: Path) -> None:
+    facts = one_object(
+        call("identify", "rls", recording, recording, "-o", "m.npz", "--set", "delay=0.06", "--train", "0.5", "--json")
+    )
+    assert facts["rows_trained"] == 600
+
+
+def test_people_get_a_table_and_progress_stays_on_stderr(call: Call, recording: Path, rls_file: Path) -> None:
+    said = call("identify", "rls", recording, "-o", "m.npz", "--set", "delay=0.06")
+    assert said.code == 0
+    assert said.out.startswith("m.npz\nrls:")
+    assert "free run" in said.out
+    assert "identify rls ..." in said.err
+    table = call("validate", rls_file, "--data", recording, "--html", "page.html")
+    assert "persistence 25" in table.out
+    assert "model inf" in table.out
+    page = Path("page.html").read_text()
+    assert "<html" in page
+    # Self-contained: nothing is fetched when the page is opened.
+    assert 'src="http' not in page
+    assert 'href="http' not in page
+    assert call("validate", rls_file, "--data", recording, "--html", "page.html").code == 2
+
+
+def test_info_knows_recordings_models_and_certificates(call: Call, recording: Path, rls_file: Path) -> None:
+    facts = one_object(call("info", recording, "--json"))
+    assert (facts["type"], facts["rows"], facts["sample_time_s"]) == ("recording", 600, 0.02)
+    facts = one_object(call("info", rls_file, "--json"))
+    assert (facts["type"], facts["kind"]) == ("model", "rls")
+    Path("c.json").write_text('{"limits": []}')
+    assert one_object(call("info", "c.json", "--json"))["type"] == "certificate"
+    assert "rows: 600" in call("info", recording).out
+
+
+def test_the_doctor_tells_of_every_dependency(call: Call) -> None:
+    facts = one_object(call("doctor", "--json"))
+    states = {check["name"]: check["state"] for check in facts["checks"]}
+    assert facts["healthy"] is True
+    assert all(states[name] == "ok" for name in ("python", "numpy", "control", "pythonfmu binary"))
+    assert "extra slycot" in call("doctor").out
+
+
+def test_the_doctor_fails_when_something_is_missing(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("softneck.cli._doctor._NEEDED", ("a-package-that-is-none",))
+    said = call("doctor", "--json")
+    assert said.code == 1
+    assert json.loads(said.out)["healthy"] is False
+
+
+def test_record_gives_what_its_seed_says(call: Call) -> None:
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        facts = one_object(call("record", "eq22", "-o", f"{name}.csv", "--duration", "4", "--seed", seed, "--json"))
+        assert (facts["rows"], facts["sample_time_s"]) == (200, 0.02)
+    assert Path("a.csv").read_bytes() == Path("b.csv").read_bytes()
+    assert Path("a.csv").read_bytes() != Path("c.csv").read_bytes()
+    assert read_recording("a.csv").has_motor_positions
+
+
+def test_observer_controller_and_fmu_from_one_model(call: Call, rls_file: Path) -> None:
+    one_object(call("observer", rls_file, "-o", "o.npz", "--json"))
+    one_object(call("design", "pi", rls_file, "-o", "c.npz", "--json"))
+    assert load("o.npz", role="observer").summary()
+    assert load("c.npz", role="controller").summary()
+    one_object(call("fmu", rls_file, "-o", "Rls.fmu", "--json"))
+    facts = one_object(call("info", "Rls.fmu", "--json"))
+    assert (facts["type"], facts["model"]) == ("FMU", "Rls")
+    assert facts["inputs"].startswith("motor_setpoint_1, motor_setpoint_2, motor_setpoint_3, pitch_measured")
+    wrong = call("observer", "c.npz", "-o", "x.npz", "--json")
+    assert wrong.code == 2
+    assert "c.npz: is a controller (pi), not a model" in wrong.error
+
+
+def test_the_installed_command_says_the_same() -> None:
+    tool = Path(sys.executable).with_name("softneck")
+    done = subprocess.run([tool, "info", "none.csv"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "softneck: none.csv: no such file.\n"
+
+
+def test_the_real_neck_from_log_to_free_run(call: Call, shared_data: Path) -> None:
+    log = shared_data / "neck_openloop/spring_test_0gr.csv"
+    facts = one_object(call("import", log, "--layout", LAYOUTS / "neck_openloop.toml", "-o", "n.csv", "--json"))
+    assert (facts["rows"], facts["runs"], facts["missed_samples"]) == (7000, 1, 0)
+    one_object(call("identify", "rls", "n.csv", "-o", "m.npz", "--train", "1", "--json"))
+    judged = one_object(call("validate", "m.npz", "--data", "n.csv", "--include-training", "--json"))
+    free = judged["models"][0]["fits"]["model"]["inf"]
+    # Issue 2 asks for 92 and 88; the data's README reports 93.1 and 89.8 of such a model.
+    assert free["pitch"] >= 92.0
+    assert free["roll"] >= 88.0
+    # Static gain 0.1177 deg of pitch per deg of theta_i there, by output error; least squares differs by its bias.
+    gain = load("m.npz").tf("pitch").dcgain()
+    assert gain == pytest.approx(0.1177, rel=0.03)
+
+
+def test_the_arm_is_imported_to_its_first_13000_rows(call: Call, shared_data: Path) -> None:
+    log = shared_data / "arm_multisine/arm_multisine_400s.csv"
+    facts = one_object(call("import", log, "--layout", LAYOUTS / "arm_multisine.toml", "-o", "a.csv", "--json"))
+    assert facts["rows"] == 13_000

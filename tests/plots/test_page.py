@@ -1,0 +1,59 @@
+"""Pages stand on their own and escape what they are given."""
+
+from __future__ import annotations
+
+import base64
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softneck.core import OutputError
+from softneck.plots import Section, Table, delay_figure, loop_figure, page, recording_figure, validation_figure
+from softneck.plots import write_page as write
+
+
+def _wave(columns: int) -> np.ndarray:
+    t = np.arange(100) * 0.02
+    return np.column_stack([np.sin(t + j) for j in range(columns)])
+
+
+def test_a_page_needs_nothing_from_outside_and_holds_its_pictures() -> None:
+    t = np.arange(100) * 0.02
+    figures = [
+        ("experiment", recording_figure(t, _wave(3), _wave(2), "experiment")),
+        ("validation", validation_figure(t, _wave(2), {"model": 0.9 * _wave(2)}, "validation")),
+        ("delay", delay_figure({"pitch": [[0.0, 80.0, 0.01], [0.02, 81.0, 0.009]]}, "delay")),
+    ]
+    html = page("Title", [Section("First", figures=figures)])
+    assert not re.search(r"(src|href)=\"(?!data:|#)", html)
+    pictures = re.findall(r"base64,([^\"]+)", html)
+    assert len(pictures) == len(figures)
+    assert all(base64.b64decode(picture).startswith(b"\x89PNG") for picture in pictures)
+
+
+def test_text_is_escaped_and_verdicts_are_marked() -> None:
+    table = Table("<b>", ["a"], [["holds"], ["fails"], ["<script>alert(1)</script>"]])
+    html = page("<i>", [Section("s", text=["<u>"], tables=[table])])
+    assert "<script>" not in html
+    assert "<u>" not in html
+    assert 'class="holds"' in html
+    assert 'class="fails"' in html
+
+
+@pytest.mark.parametrize("tension", [False, True], ids=["foreign plant", "virtual neck"])
+def test_a_loop_is_drawn_with_what_the_plant_offers(tension: bool) -> None:
+    signals = {f"motor_setpoint_{j}": np.zeros(50) for j in (1, 2, 3)} | {"pitch": np.ones(50), "roll": np.ones(50)}
+    if tension:
+        signals |= {f"tension_{j}": np.ones(50) for j in (1, 2, 3)}
+    figure = loop_figure(np.arange(50) * 0.02, signals, "loop")
+    assert len(figure.axes) == (4 if tension else 3)
+
+
+def test_an_existing_page_is_kept_without_force(tmp_path: Path) -> None:
+    target = tmp_path / "report.html"
+    write(target, "first")
+    with pytest.raises(OutputError, match="exists already"):
+        write(target, "second")
+    assert target.read_text(encoding="utf-8") == "first"

@@ -1,0 +1,187 @@
+"""Recordings as files: round trips, and one clear line for everything that is no recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from softneck.core import DataError, FileFormatError, OutputError, SoftneckError
+from softneck.identification import row_hashes
+from softneck.signals import (
+    SET_POINTS,
+    Recording,
+    concatenate,
+    known_channels,
+    read_recording,
+    write_recording,
+)
+
+from ..data import changed, csv_lines, neck_recording
+
+VALUES = st.floats(-1e3, 1e3)
+MISSABLE = ("pitch", "roll", "pitch_rate", "compression", "motor_velocity_2", "tension_1")
+
+
+@st.composite
+def recordings(draw: st.DrawFn) -> Recording:
+    runs = draw(st.lists(st.integers(2, 6), min_size=1, max_size=3))
+    n, Ts = sum(runs), draw(st.sampled_from([0.001, 0.02, 0.021, 1.0]))
+    optional = draw(st.sets(st.sampled_from(known_channels()[1:]), max_size=5))
+    column = st.lists(VALUES, min_size=n, max_size=n)
+    channels = {name: np.array(draw(column)) for name in {*SET_POINTS, "pitch", "roll", *optional}}
+    for name in set(MISSABLE) & set(channels):
+        channels[name][draw(st.lists(st.integers(0, n - 1), max_size=3))] = np.nan
+    time = np.concatenate([np.arange(rows) * Ts for rows in runs])
+    return Recording(time, Ts, channels, np.repeat(np.arange(len(runs)), runs))
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+@given(recording=recordings())
+@settings(max_examples=25)
+def test_a_recording_survives_its_file(tmp_path: Path, suffix: str, recording: Recording) -> None:
+    path = tmp_path / f"a.{suffix}"
+    write_recording(path, recording, force=True)
+    back = read_recording(path)
+    assert set(back.channels) == set(recording.channels)
+    assert [len(run) for run in back.runs()] == [len(run) for run in recording.runs()]
+    assert back.sample_time == pytest.approx(recording.sample_time, rel=1e-9)  # ten digits, see `median_step`
+    np.testing.assert_array_equal(back.time, recording.time)
+    for name, values in recording.channels.items():
+        # Degrees in the file: one quotient and one product, half an ulp each. NaN stays NaN.
+        np.testing.assert_allclose(back.channels[name], values, rtol=2.3e-16, atol=1e-300)
+
+
+def test_a_models_memory_of_rows_survives_the_file(tmp_path: Path) -> None:
+    recording = concatenate([neck_recording(300), neck_recording(200, seed=7)])
+    write_recording(tmp_path / "a.csv", recording)
+    np.testing.assert_array_equal(row_hashes(read_recording(tmp_path / "a.csv")), row_hashes(recording))
+
+
+def test_radians_are_read_as_well(tmp_path: Path) -> None:
+    r = neck_recording(150)
+    lines = csv_lines(r)
+    radians = [lines[0].replace("pitch [deg]", "pitch [rad]")]
+    radians += [",".join([*line.split(",")[:4], repr(float(r.outputs[k, 0])), line.split(",")[5]])
+                for k, line in enumerate(lines[1:])]  # fmt: skip
+    (tmp_path / "deg.csv").write_text("\n".join(lines))
+    (tmp_path / "rad.csv").write_text("\n".join(radians))
+    one, other = read_recording(tmp_path / "deg.csv"), read_recording(tmp_path / "rad.csv")
+    np.testing.assert_allclose(one.outputs, other.outputs, rtol=2.3e-16, atol=0)
+
+
+Edit = Callable[[list[str]], list[str]]
+BAD: dict[str, tuple[Edit, str]] = {
+    "missing column": (lambda s: [",".join(line.split(",")[:5]) for line in s], "missing: roll"),
+    "no time": (lambda s: [line.split(",", 1)[1] for line in s], r"there is no column `time \[s\]`"),
+    "unknown column": (lambda s: changed(s, -1, 5, "yaw [deg]"), "column `yaw` is no channel of a recording"),
+    "no unit": (lambda s: changed(s, -1, 5, "roll"), r"column `roll` names no unit; write `roll \[deg\]`"),
+    "unit that is none": (lambda s: changed(s, -1, 5, "roll [grad]"), "`grad` is no unit that softneck knows"),
+    "unit of another quantity": (lambda s: changed(s, -1, 5, "roll [mm]"), "column `roll` cannot be in `mm`"),
+    "twice": (lambda s: changed(s, -1, 5, "pitch [rad]"), "channel `pitch` stands in two columns"),
+    "text": (lambda s: changed(s, 9, 1, "abc"), "column `motor_setpoint_1` holds `abc` at row 9"),
+    "NaN": (lambda s: changed(s, 9, 1, "NaN"), "column `motor_setpoint_1` holds `NaN` at row 9"),
+    "NaN in a sensor": (
+        lambda s: changed(s, 9, 4, "nan"),
+        r"holds `nan` at row 9, .*a missing sample is an empty cell",
+    ),
+    "gap in a set-point": (lambda s: changed(s, 9, 2, ""), "column `motor_setpoint_2` holds an empty cell at row 9"),
+    "infinite": (lambda s: changed(s, 9, 4, "inf"), "channel `pitch` is inf at row 9"),
+    "backwards": (lambda s: changed(s, 9, 0, "0.01"), "`time` runs backwards or stands still at row 9"),
+    "gap": (lambda s: [*s[:50], *s[80:]], "`time` jumps by 0.62 s at row 49"),
+    "time stands still": (
+        lambda s: [s[0], *[changed(s, k, 0, "0")[k + 1] for k in range(99)]],
+        "`time` never increases",
+    ),
+    "one row": (lambda s: s[:2], "a recording needs at least 2 rows; got 1"),
+    "header only": (lambda s: s[:1], "a recording needs at least 2 rows; got 0"),
+    "long rows": (lambda s: [s[0], *[f"{line},7.0" for line in s[1:]]], "cannot be read as a table"),
+    "one long row": (lambda s: changed(s, 9, 5, "1,2,3"), "cannot be read as a table"),
+    "short row": (lambda s: [*s[:10], s[10].rsplit(",", 3)[0], *s[11:]], "holds an empty cell at row 9"),
+    "run is no integer": (lambda s: [f"{line},{'run' if k == 0 else '0.5'}" for k, line in enumerate(s)], "integers"),
+    "nothing": (lambda s: [], "cannot be read as a table"),
+    "a poem": (lambda s: ["roses are red", "violets are blue"], "names no unit; use `softneck import`"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_is_no_recording_is_one_clear_line(tmp_path: Path, case: str) -> None:
+    edit, message = BAD[case]
+    path = tmp_path / "bad.csv"
+    path.write_text("\n".join(edit(csv_lines(neck_recording(150)))))
+    with pytest.raises(SoftneckError, match=message) as caught:
+        read_recording(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_trailing_comma_moves_no_column(tmp_path: Path) -> None:
+    lines = csv_lines(neck_recording(150))
+    (tmp_path / "a.csv").write_text("\n".join([lines[0], *[f"{line}," for line in lines[1:]]]))
+    np.testing.assert_allclose(read_recording(tmp_path / "a.csv").time, neck_recording(150).time)
+
+
+def test_a_late_word_in_a_long_file_is_an_error_without_a_warning(tmp_path: Path) -> None:
+    """pandas reads in chunks and warned of mixed types on stderr, beside the one line there may be."""
+    lines = csv_lines(neck_recording(150)) * 1
+    body = lines[1:] * 400
+    (tmp_path / "a.csv").write_text("\n".join([lines[0], *body[:-1], changed([lines[0], body[-1]], 0, 1, "x")[1]]))
+    with pytest.raises(DataError, match="column `motor_setpoint_1` holds `x` at row 59999"):
+        read_recording(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.parquet"])
+def test_a_file_that_is_absent_or_binary(tmp_path: Path, name: str) -> None:
+    with pytest.raises(FileFormatError, match="no such file"):
+        read_recording(tmp_path / name)
+    (tmp_path / name).write_bytes(bytes(range(256)) * 20)
+    with pytest.raises(SoftneckError, match=r"cannot be read as a table"):
+        read_recording(tmp_path / name)
+
+
+def test_another_ending_is_refused(tmp_path: Path) -> None:
+    for name in ("a.xlsx", "a"):
+        with pytest.raises(DataError, match=r"a recording is a `\.csv` or a `\.parquet` file"):
+            read_recording(tmp_path / name)
+        with pytest.raises(DataError, match=r"a recording is a `\.csv` or a `\.parquet` file"):
+            write_recording(tmp_path / name, neck_recording(120))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_recording_is_kept(tmp_path: Path) -> None:
+    write_recording(tmp_path / "a.csv", neck_recording(120))
+    before = (tmp_path / "a.csv").read_bytes()
+    with pytest.raises(OutputError, match="exists already; use --force"):
+        write_recording(tmp_path / "a.csv", neck_recording(130))
+    assert (tmp_path / "a.csv").read_bytes() == before
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+@given(data=st.data())
+@settings(max_examples=120)
+def test_damaged_bytes_are_a_clear_error_and_nothing_else(tmp_path: Path, suffix: str, data: st.DataObject) -> None:
+    whole = tmp_path / f"whole.{suffix}"
+    if not whole.exists():
+        write_recording(whole, neck_recording(40))
+    content = bytearray(whole.read_bytes())
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = data.draw(st.integers(0, len(content) - 1))
+        content[at : at + data.draw(st.integers(0, 2))] = data.draw(st.binary(max_size=3))
+    damaged = tmp_path / f"damaged.{suffix}"
+    damaged.write_bytes(content[: data.draw(st.integers(len(content) // 2, len(content)))])
+    try:
+        read_recording(damaged)
+    except SoftneckError as error:
+        assert str(error).startswith(str(damaged))
+
+
+@pytest.mark.parametrize("cell", ["text", None, [1.0]])
+def test_a_parquet_file_of_something_else(tmp_path: Path, cell: object) -> None:
+    pd.DataFrame({"time [s]": [0.0, 0.02], "pitch [deg]": [cell, cell]}).to_parquet(tmp_path / "a.parquet")
+    with pytest.raises(DataError, match="pitch|missing"):
+        read_recording(tmp_path / "a.parquet")
