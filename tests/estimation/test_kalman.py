@@ -94,7 +94,7 @@ def test_without_noise_and_model_error_the_estimate_is_the_angle_itself() -> Non
 def test_a_right_model_filters_noise() -> None:
     record = recording(noise_deg=0.3)
     observer = KalmanSettings(
-        measurement_noise_std=math.radians(0.3), input_noise_std=0.01, disturbance_noise_std=math.radians(0.005)
+        measurement_noise_std=math.radians(0.3), model_noise_std=0.01, disturbance_noise_std=math.radians(0.005)
     ).design(neck())
     error = observer.estimate(record).pitch - record.channels["pitch"]
     raw = record.channels["pitch_measured"] - record.channels["pitch"]
@@ -109,7 +109,7 @@ def test_the_innovation_is_chi_square_when_the_model_is_right() -> None:
         pitch_measured=record.channels["pitch_measured"] + walk[0],
         roll_measured=record.channels["roll_measured"] + walk[1],
     )
-    observer = KalmanSettings(measurement_noise_std=math.radians(0.1), input_noise_std=1e-6).design(neck())
+    observer = KalmanSettings(measurement_noise_std=math.radians(0.1), model_noise_std=1e-6).design(neck())
     nis = observer.estimate(record).innovation[100:]
     # Mean 2 and 95 % below 5.99 for two degrees of freedom; over 2,900 samples the mean's std is 0.037 and
     # that of the share 0.4 %: four of them.
@@ -257,7 +257,7 @@ def test_a_model_without_transfer_functions_is_refused() -> None:
         ({"sensor": "imu"}, "`imu` is no sensor"),
         ({"measurement_noise_std": 0.0}, "`measurement_noise_std` must be positive"),
         ({"measurement_noise_std": 5.0}, "got 5: degrees"),
-        ({"input_noise_std": -1.0}, "`input_noise_std` must be positive"),
+        ({"model_noise_std": -1.0}, "`model_noise_std` must be positive"),
         ({"disturbance_noise_std": math.nan}, "`disturbance_noise_std` must be a finite"),
         ({"gate_level": 1.0}, "`gate_level` must be between"),
         ({"order": "random"}, "`order` must be one of"),

@@ -50,6 +50,7 @@ class LinearController:
         arrays: what the runtime reads, see `_linear_controller_runtime`.
         position_limit: of each motor [rad].
         slew_limit: of each motor [rad/s].
+        lead_limit: how far a set-point may be from its motor [rad].
         order: of the loop it is for.
         design: JSON values: the settings, gains and margins by axis, for `summary` and the header.
     """
@@ -59,6 +60,7 @@ class LinearController:
     arrays: tuple[Matrix, ...]
     position_limit: float
     slew_limit: float
+    lead_limit: float
     order: str
     design: Mapping[str, Any]
 
@@ -75,6 +77,7 @@ class LinearController:
             parameters=(
                 Port(name="position_limit", unit="rad", start=self.position_limit, minimum=0.01, maximum=_MAX_MOTOR),
                 Port(name="slew_limit", unit="rad/s", start=self.slew_limit, minimum=0.01, maximum=_MAX_SLEW),
+                Port(name="lead_limit", unit="rad", start=self.lead_limit, minimum=0.01, maximum=2.0 * _MAX_MOTOR),
             ),
         )
 
@@ -120,7 +123,8 @@ class LinearController:
             f"{self.kind} controller, {self.sample_time * 1e3:g} ms, {self.order} order, "
             f"{self.design.get('extra_delay', 0)} samples of delay added to the plant for it",
             f"  limits: |P| <= {self.position_limit:g} rad, slew {self.slew_limit:g} rad/s "
-            f"({self.slew_limit * self.sample_time:g} rad per sample)",
+            f"({self.slew_limit * self.sample_time:g} rad per sample), "
+            f"lead {self.lead_limit:g} rad before the motors",
         ]
         for axis in ("pitch", "roll"):
             item = self.design.get(axis, {})
@@ -139,6 +143,7 @@ class LinearController:
             "sample_time": self.sample_time,
             "position_limit": self.position_limit,
             "slew_limit": self.slew_limit,
+            "lead_limit": self.lead_limit,
             "order": self.order,
             "design": dict(self.design),
             "inputs": [port.name for port in block.inputs],
@@ -164,6 +169,7 @@ class LinearController:
             arrays=items,
             position_limit=float(header["position_limit"]),
             slew_limit=float(header["slew_limit"]),
+            lead_limit=float(header["lead_limit"]),
             order=str(header["order"]),
             design=dict(header["design"]),
         )

@@ -42,7 +42,7 @@ def step(
 
     inputs: pitch, roll and co-contraction reference, pitch, roll, motor_position_1..3, healthy, enabled.
     outputs: motor_setpoint_1..3.
-    parameters: position limit [rad], slew limit [rad/s].
+    parameters: position limit [rad], slew limit [rad/s], lead limit [rad].
     """
     m, n = arrays[0].shape[0], arrays[4].shape[0]
     if state[-1] == 0.0:
@@ -86,7 +86,11 @@ def linear_control(
     wanted = np.empty(3)
     wanted[:2] = np.dot(arrays[7], x) + np.dot(arrays[8], rf[:2]) + np.dot(arrays[9], y)
     wanted[2] = rf[2]
-    linear_limit(arrays[14], wanted, parameters[0], parameters[1] * arrays[15][0], held)
+    target = np.empty(3)
+    linear_allocate(arrays[14], wanted, parameters[0], target)
+    for j in range(3):
+        target[j] = min(max(target[j], inputs[5 + j] - parameters[2]), inputs[5 + j] + parameters[2])
+    linear_move(target, parameters[1] * arrays[15][0], held)
 
     excess = np.dot(arrays[13], held)[:2] - wanted[:2]
     state[:m] = np.dot(arrays[0], xf) + np.dot(arrays[1], r)
@@ -94,11 +98,11 @@ def linear_control(
     state[m : m + n] = x
 
 
-def linear_limit(inverse: np.ndarray, wanted: np.ndarray, position: float, move: float, held: np.ndarray) -> None:
-    """Move `held` (3,) towards the motors of `wanted` (theta_i, phi_i, delta_i) as far as the limits let it.
+def linear_allocate(inverse: np.ndarray, wanted: np.ndarray, position: float, target: np.ndarray) -> None:
+    """Fill `target` (3,) with the motors of `wanted` (theta_i, phi_i, delta_i), within +-position.
 
-    Limits are shared: the tilt is scaled as a whole, so its direction stays, and so is the move of one sample.
-    Co-contraction comes before tilt; `inverse` is that of Eq. 9-11.
+    The limit is shared: the tilt is scaled as a whole, so its direction stays. Co-contraction comes before
+    tilt; `inverse` is that of Eq. 9-11.
     """
     common = np.empty(3)
     tilt = np.empty(3)
@@ -110,10 +114,15 @@ def linear_limit(inverse: np.ndarray, wanted: np.ndarray, position: float, move:
             scale = min(scale, (position - common[j]) / tilt[j])
         elif tilt[j] < 0.0:
             scale = min(scale, (position + common[j]) / -tilt[j])
+    for j in range(3):
+        target[j] = common[j] + scale * tilt[j]
+
+
+def linear_move(target: np.ndarray, move: float, held: np.ndarray) -> None:
+    """Move `held` (3,) straight towards `target`, no motor further than `move` [rad]."""
     largest = 0.0
     for j in range(3):
-        tilt[j] = common[j] + scale * tilt[j] - held[j]
-        largest = max(largest, abs(tilt[j]))
+        largest = max(largest, abs(target[j] - held[j]))
     share = 1.0 if largest <= move else move / largest
     for j in range(3):
-        held[j] += share * tilt[j]
+        held[j] += share * (target[j] - held[j])

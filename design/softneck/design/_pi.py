@@ -37,21 +37,25 @@ class PiSettings:
         gain_spread: relative spread of the plant's gain that the filter allows for.
         position_limit: of each motor [rad].
         slew_limit: of each motor [rad/s]; the default is 0.25 rad in 20 ms.
+        lead_limit: how far a set-point may be from its measured motor [rad]; keeps the integral from winding up
+            while a drive at its current limit falls behind.
         order: of the loop; "jacobi" adds one sample for the controller and one for the observer.
         observer: whether the loop will have an observer.
         tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
     """
 
-    max_sensitivity: float = 1.35
+    max_sensitivity: float = 1.5
     phase_margin: float = math.radians(60.0)
     # The paper's own dead time and pole (Eq. 31: 0.08 s, 5.293 1/s).
     least_delay: float = 0.08
     small_move_pole: float = 5.3
-    reference_time: float | None = None
+    # About the time constant of the paper's neck, 1/5.293 s: what is asked faster only runs into limits.
+    reference_time: float | None = 0.2
     overshoot_pct: float = 2.0
     gain_spread: float = 0.2
     position_limit: float = 6.0
     slew_limit: float = 12.5
+    lead_limit: float = 0.4
     order: str = "sequential"
     observer: bool = True
     tendon_angles: tuple[float, float, float] = tuple(TENDON_ANGLES.tolist())
@@ -67,6 +71,7 @@ class PiSettings:
         require_between("gain_spread", self.gain_spread, 0.0, 0.9)
         require_between("position_limit", self.position_limit, 0.01, 6.0, "rad")
         require_positive("slew_limit", self.slew_limit, "rad/s")
+        require_between("lead_limit", self.lead_limit, 0.01, 12.0, "rad")
         require_one_of("order", self.order, ORDERS)
 
     @property
@@ -103,6 +108,7 @@ class PiSettings:
             ),
             position_limit=self.position_limit,
             slew_limit=self.slew_limit,
+            lead_limit=self.lead_limit,
             order=self.order,
             design={"settings": asdict(self), "extra_delay": self.extra_delay, **found},
         )

@@ -16,8 +16,8 @@ from softneck.core import Block, DataError, FileFormatError, Matrix, Port, State
 from softneck.signals import Recording
 
 _RUNTIME = "softneck.estimation._kalman_runtime"
-_ARRAYS = ("F", "B", "H", "input_noise", "disturbance_noise", "P0", "redefinition", "constants")
-_NOISE = ("measurement_noise_std", "input_noise_std", "disturbance_noise_std")
+_ARRAYS = ("F", "B", "H", "model_noise", "disturbance_noise", "P0", "redefinition", "constants")
+_NOISE = ("measurement_noise_std", "model_noise_std", "disturbance_noise_std")
 _MEASURED = ("pitch", "roll")
 
 
@@ -50,9 +50,9 @@ class KalmanObserver:
 
     Attributes:
         sample_time: [s].
-        arrays: F (n, n), B (n, 2), H (2, n), unit covariances of input and disturbance noise (n, n), P0 (n, n),
+        arrays: F (n, n), B (n, 2), H (2, n), unit covariances of model and disturbance noise (n, n), P0 (n, n),
             rows 1 and 2 of the redefinition (2, 3), constants (delays, gate, rejections, timeout, sample time).
-        noise: measurement, input and disturbance noise, standard deviations [rad].
+        noise: measurement, model and disturbance noise, standard deviations [rad].
         sensor: name of the preset, "none" where the noise was given.
         order: of the loop it is for.
         gate_level: chi-square level of the gate.
@@ -110,11 +110,11 @@ class KalmanObserver:
         Give `predict(u)` the inputs that act, (2, 1), and `update(None)` where nothing was measured: a NaN in
         `update` would stay in its state for good.
         """
-        F, B, H, QU, QW, P0 = self.arrays[:6]
-        measurement, inputs, disturbance = self.noise
+        F, B, H, QM, QW, P0 = self.arrays[:6]
+        measurement, model, disturbance = self.noise
         kf: Any = KalmanFilter(dim_x=F.shape[0], dim_z=2, dim_u=2)
         kf.F, kf.B, kf.H, kf.P = F.copy(), B.copy(), H.copy(), P0.copy()
-        kf.Q = inputs**2 * QU + disturbance**2 * QW
+        kf.Q = model**2 * QM + disturbance**2 * QW
         kf.R = measurement**2 * np.eye(2)
         return kf
 
@@ -166,7 +166,7 @@ class KalmanObserver:
 
     def summary(self) -> str:
         """Return some lines for people."""
-        measurement, inputs, disturbance = (math.degrees(value) for value in self.noise)
+        measurement, model, disturbance = (math.degrees(value) for value in self.noise)
         n = self.arrays[0].shape[0]
         d = self.delays
         return "\n".join(
@@ -174,7 +174,7 @@ class KalmanObserver:
                 f"kalman observer, {self.sample_time * 1e3:g} ms, {self.order} order, sensor {self.sensor}",
                 f"  {n} states: model and disturbance of pitch and roll; set-points act after "
                 f"{d[0] + 1} and {d[1] + 1} samples",
-                f"  noise: measured {measurement:.3g} deg, input {inputs:.3g} deg, disturbance {disturbance:.3g} deg",
+                f"  noise: measured {measurement:.3g} deg, model {model:.3g} deg, disturbance {disturbance:.3g} deg",
                 f"  gate: chi-square level {self.gate_level:g} (innovation <= {self.arrays[7][2]:.3g}); "
                 f"by force after {self.arrays[7][3]:g} rejections",
                 f"  healthy until {self.arrays[7][4] * self.sample_time * 1e3:g} ms without an accepted measurement",

@@ -44,16 +44,16 @@ def step(
 
     inputs: motor_setpoint_1..3, pitch_measured, roll_measured, measurement_valid.
     outputs: pitch, roll, pitch_rate, roll_rate, innovation, healthy.
-    parameters: measurement, input and disturbance noise (standard deviations).
+    parameters: measurement, model and disturbance noise (standard deviations).
     """
-    F, B, H, QU, QW, c = arrays[0], arrays[1], arrays[2], arrays[3], arrays[4], arrays[7]
+    F, B, H, QM, QW, c = arrays[0], arrays[1], arrays[2], arrays[3], arrays[4], arrays[7]
     n = F.shape[0]
     u = np.zeros(2)
     kalman_delay(arrays, state, inputs, u)
 
     x = np.dot(F, state[:n]) + np.dot(B, u)
     P = np.dot(np.dot(F, state[n : n + n * n].reshape((n, n))), F.T)
-    P = P + parameters[1] * parameters[1] * QU + parameters[2] * parameters[2] * QW
+    P = P + parameters[1] * parameters[1] * QM + parameters[2] * parameters[2] * QW
     forced = state[-2] >= c[3]
     if forced or state[-1] < kalman_line_length(arrays):
         # So many rejections, or set-points from before the start still on their way: the model has no say.

@@ -60,7 +60,7 @@ class NeckParameters:
     platform_height: float = _number(0.01, "m", -0.05, 0.2, "its centre of mass above the link's end", "guess")
     platform_radius: float = _number(0.06, "m", 0.0, 0.3, "radius of the platform, a disc", "guess")
     payload_height: float = _number(
-        0.03, "m", -0.05, 0.3, "centre of mass of the payload above the link's end", "guess"
+        0.02, "m", -0.05, 0.3, "centre of mass of the payload above the link's end", "guess"
     )
     link_mass: float = _number(
         0.10, "kg", 0.0, 2.0, "mass of the link; a quarter of it moves with the platform", "guess"
