@@ -24,8 +24,8 @@ class Said:
 
     @property
     def error(self) -> str:
-        """The one line on stderr."""
-        lines = [line for line in self.err.splitlines() if line.strip()]
+        """The one line on stderr, beside lines of progress, which end in dots."""
+        lines = [line for line in self.err.splitlines() if line.strip() and not line.endswith(" ...")]
         assert len(lines) == 1, self.err
         return lines[0]
 

@@ -33,15 +33,15 @@ RECORDINGS: dict[str, tuple[Edit, str]] = {
         lambda s: [s[0], *[",".join([*c.split(",")[:4], "3", c.split(",")[5]]) for c in s[1:]]],
         "`pitch` is constant; is its sensor connected?",
     ),
-    "no recording": (lambda s: ["a picture", "of a neck"], "column `a picture` names no unit"),
-    "empty": (lambda s: [], "cannot be read as a table"),
+    "no recording": (lambda _: ["a picture", "of a neck"], "column `a picture` names no unit"),
+    "empty": (lambda _: [], "cannot be read as a table"),
 }
 
 
 def refused(said: Said, message: str, folder: Path, left: set[str]) -> None:
     assert said.code == 2, said
     assert said.out == ""
-    assert said.err.startswith("softneck: ")
+    assert said.error.startswith("softneck: ")
     assert message in said.error
     assert {path.name for path in folder.rglob("*") if path.is_file()} == left
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import zipfile
 from pathlib import Path
@@ -117,11 +118,8 @@ def test_damaged_bytes_are_a_format_error_and_nothing_else(
         content[int(where * len(content))] ^= change
     damaged = tmp_path / "damaged.npz"
     damaged.write_bytes(content[: max(1, int(cut * len(content)))] if cut < 0.5 else content)
-    try:
+    with contextlib.suppress(FileFormatError):  # anything else fails the test
         header, _ = read_archive(damaged)
-    except FileFormatError as error:
-        assert "\n" not in str(error)
-    else:
         assert header["format"] == "softneck"
 
 
@@ -135,10 +133,8 @@ def test_every_byte_of_the_first_member_may_be_wrong(tmp_path: Path, at: int) ->
         damaged = bytearray(content)
         damaged[start + at // 2] ^= change
         (tmp_path / "damaged.npz").write_bytes(damaged)
-        try:
+        with contextlib.suppress(FileFormatError):
             read_archive(tmp_path / "damaged.npz")
-        except FileFormatError:
-            continue
 
 
 def test_an_archive_that_would_fill_the_memory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -44,7 +44,7 @@ def step(arrays, parameters, state, inputs, outputs):
 )
 def test_a_foreign_import_is_refused(runtime_folder: Path, imported: str) -> None:
     (runtime_folder / "foreign_a_runtime.py").write_text(f"{imported}\n{STEP}")
-    with pytest.raises(SettingsError, match="foreign_a_runtime imports .*only numpy and math are allowed"):
+    with pytest.raises(SettingsError, match=r"foreign_a_runtime imports .*only numpy and math are allowed"):
         bundle("foreign_a_runtime")
 
 

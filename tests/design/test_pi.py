@@ -139,8 +139,52 @@ def test_stored_margins_are_those_of_the_exact_delay(settings: PiSettings, extra
 def test_the_design_takes_what_robustness_allows() -> None:
     settings = PiSettings()
     margins = settings.design(neck()).design["pitch"]["margins"]
+    # The bounds are met on grids: sizes to 0.1 %, frequencies to 1 %.
     at_bound = math.isclose(margins["sensitivity"], settings.max_sensitivity, rel_tol=5e-3)
     assert at_bound or math.isclose(margins["phase"], settings.phase_margin, rel_tol=2e-2)
+
+
+def test_a_slow_fit_is_made_robust_for_small_moves() -> None:
+    """A pole of 1.65 1/s without dead time is what a fit to large moves of the virtual neck gives."""
+    slow = math.exp(-1.65 * TS)
+    b = math.radians(4.6) * (1.0 - slow)
+    axis = control.TransferFunction([b], [1.0, -slow], TS)
+    settings = PiSettings()
+    item = settings.design(LinearNeck(pitch=axis, roll=axis)).design["pitch"]
+    assert item["dead_time_s"] == pytest.approx(0.08)
+    for key in ("margins", "margins_small_moves"):
+        assert item[key]["sensitivity"] <= settings.max_sensitivity * 1.001
+        assert item[key]["phase"] >= settings.phase_margin - 1e-2
+    # The small moves are written out: same static gain, pole 5.293 1/s, four samples late.
+    w = np.geomspace(0.05, math.pi / TS, 20_000)
+    z = np.exp(1j * w * TS)
+    G = math.radians(4.6) * (1.0 - POLE) / (z - POLE) * z**-4
+    gains = item["gains"]
+    S = 1.0 / (1.0 + gains["K"] * (1.0 + TS / gains["Ti_s"] / (z - 1.0)) * G)
+    assert item["margins_small_moves"]["sensitivity"] == pytest.approx(np.abs(S).max(), rel=1e-3)
+    alone = PiSettings(small_move_pole=0.0, least_delay=0.0).design(LinearNeck(pitch=axis, roll=axis))
+    assert alone.design["pitch"]["gains"]["K"] > 3.0 * gains["K"]
+
+
+def test_an_automatic_reference_filter_is_the_least_that_keeps_the_overshoot() -> None:
+    settings = PiSettings(reference_time=None, gain_spread=0.0, overshoot_pct=1.0)
+    time = settings.design(neck()).design["pitch"]["gains"]["reference_time_s"]
+    assert time > 0.0
+
+    def peak(reference_time: float) -> float:
+        controller = PiSettings(reference_time=reference_time).design(neck())
+        plant: Any = control.ss(neck().tf("pitch"))
+        first: Any = controller.ss()[0, [0, 2]]
+        return float(np.max(control.step_response(_closed(first, plant), np.arange(200) * TS).outputs))
+
+    assert peak(time) <= 1.01 + 1e-9
+    assert peak(time - TS) > 1.01
+
+
+def _closed(controller: Any, plant: Any) -> Any:
+    """The closed loop of a controller (reference, angle) -> input and a plant input -> angle."""
+    forward, back = controller[0, 0] * plant, controller[0, 1] * plant
+    return control.feedback(1, back, sign=1) * forward
 
 
 @pytest.mark.parametrize("scale", [2.0, 0.25, -1.0], ids=["strong", "weak", "reversed"])
@@ -186,7 +230,14 @@ def test_matlab_gets_the_same_system(tmp_path: Path) -> None:
 
 def test_the_summary_names_margins_and_order() -> None:
     text = PiSettings(order="jacobi").design(neck()).summary()
-    for part in ("jacobi order, 2 samples of delay", "gain margin", "phase margin", "Ms 1.3", "slew 12.5 rad/s"):
+    for part in (
+        "jacobi order, 2 samples of delay",
+        "gain margin",
+        "phase margin",
+        "Ms 1.",
+        "slew 12.5 rad/s",
+        "120 ms",
+    ):
         assert part in text
 
 
@@ -196,6 +247,8 @@ def test_the_summary_names_margins_and_order() -> None:
         ({"max_sensitivity": 1.0}, "`max_sensitivity` must be between"),
         ({"phase_margin": 60.0}, r"`phase_margin` must be between 0\.1 and 1\.5 \[rad\]; got 60"),
         ({"position_limit": 7.0}, "`position_limit` must be between 0.01 and 6"),
+        ({"lead_limit": 0.0}, "`lead_limit` must be between"),
+        ({"least_delay": -0.1}, "`least_delay` must be between"),
         ({"slew_limit": 0.0}, "`slew_limit` must be positive"),
         ({"reference_time": -1.0}, "`reference_time` must be between"),
         ({"order": "other"}, "`order` must be one of"),

@@ -29,7 +29,8 @@ def neck() -> LinearNeck:
     )
 
 
-CONTROLLER: LinearController = PiSettings().design(neck())
+# Motors are told not to lag here, but for the tests of that limit.
+CONTROLLER: LinearController = PiSettings(lead_limit=12.0).design(neck())
 ANGLES = st.floats(-0.6, 0.6)
 MOTORS = st.tuples(*[st.floats(-5.0, 5.0)] * 3)
 
@@ -134,8 +135,30 @@ def test_conditioning_leaves_the_limit_at_once() -> None:
     state, P = block.run(block.initial_state(position_limit=1.0), there)
     assert np.abs(P[-1]).max() == pytest.approx(1.0)
     # A neck that stood still below the reference for 10 s has wound nothing up: when the reference turns, so do
-    # the motors, as soon as the filtered reference does (some 0.15 s), not after seconds.
+    # the motors, as soon as the filtered reference does (0.2 s), not after seconds.
     _, Q = block.run(state, back)
+    assert np.flatnonzero(Q[:, 0] < P[-1, 0] - 1e-9)[0] <= 10
+
+
+@given(references=st.lists(st.tuples(ANGLES, ANGLES, st.floats(-3.0, 3.0)), min_size=3, max_size=12), motors=MOTORS)
+def test_no_setpoint_runs_away_from_its_motor(
+    references: list[tuple[float, float, float]], motors: tuple[float, float, float]
+) -> None:
+    block = CONTROLLER.block()
+    state = block.initial_state(lead_limit=0.3)
+    for reference in references:
+        state, P = block.step(state, inputs(reference, motors=motors))
+        # Motors that stand still, as at their current limit; 1e-12 for values up to 6.
+        assert np.abs(P - motors).max() <= 0.3 + 1e-12
+
+
+def test_a_motor_that_cannot_follow_winds_nothing_up() -> None:
+    block = CONTROLLER.block()
+    stuck = np.tile(inputs((0.6, 0.0, 0.0)), (500, 1))
+    state, P = block.run(block.initial_state(lead_limit=0.3), stuck)
+    assert np.abs(P[-1]).max() == pytest.approx(0.3)
+    _, Q = block.run(state, np.tile(inputs((-0.6, 0.0, 0.0)), (50, 1)))
+    # As soon as the filtered reference turns, see above.
     assert np.flatnonzero(Q[:, 0] < P[-1, 0] - 1e-9)[0] <= 10
 
 

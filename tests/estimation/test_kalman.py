@@ -94,7 +94,7 @@ def test_without_noise_and_model_error_the_estimate_is_the_angle_itself() -> Non
 def test_a_right_model_filters_noise() -> None:
     record = recording(noise_deg=0.3)
     observer = KalmanSettings(
-        measurement_noise_std=math.radians(0.3), model_noise_std=0.01, disturbance_noise_std=math.radians(0.005)
+        measurement_noise_std=math.radians(0.3), model_noise_std=1e-4, disturbance_noise_std=math.radians(0.005)
     ).design(neck())
     error = observer.estimate(record).pitch - record.channels["pitch"]
     raw = record.channels["pitch_measured"] - record.channels["pitch"]

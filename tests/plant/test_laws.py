@@ -76,9 +76,12 @@ def test_energy_never_rises_with_locked_winches(payload: float) -> None:
 )
 def test_statics_are_the_minimum_of_potential_energy(motors: tuple[float, float, float], payload: float) -> None:
     # Hysteresis remembers how the neck got here, so it is off; friction vanishes with speed.
-    parameters = quiet(hysteresis_torque=0.0, gear_friction=0.0, rest_pitch=0.02, stiffness_asymmetry=0.1)
+    # The link is stiff enough to carry 1 kg by itself: a buckled neck has many minima.
+    parameters = quiet(
+        hysteresis_torque=0.0, gear_friction=0.0, rest_pitch=0.02, stiffness_asymmetry=0.1, bending_stiffness=1.2
+    )
     block = VirtualNeck(parameters).block()
-    state, Y = block.run(block.initial_state(), inputs(600, motors, payload))
+    state, Y = block.run(block.initial_state(), inputs(1000, motors, payload))
     positions, free = state.values[8:11], free_lengths(state)
     found = minimize(
         lambda q: potential_energy(parameters, q * [1, 1, 0.01], positions, free, payload=payload),
@@ -86,7 +89,7 @@ def test_statics_are_the_minimum_of_potential_energy(motors: tuple[float, float,
         method="BFGS",
         options={"gtol": 1e-9, "xrtol": 1e-12},
     )
-    # BFGS by differences finds the minimum to about sqrt(eps) of 0.3 rad, and 12 s settle to 1e-7.
+    # BFGS by differences finds the minimum to about sqrt(eps) of 0.3 rad, and 20 s settle to 1e-7.
     np.testing.assert_allclose(state.values[:3], found.x * [1, 1, 0.01], atol=3e-6)
     assert Y[-1, 13] == state.values[2]
 
@@ -191,7 +194,7 @@ def test_stiff_necks_take_more_substeps_and_soft_ones_do_not() -> None:
         return neck_substeps(neck_constants(q), neck_load(q, 0.0, 0.0, 0.0, 0.0, 0.0), 0.02, 20)
 
     assert count(NeckParameters.paper()) == count(NeckParameters.lab()) == 20
-    assert count(quiet(tendon_stiffness=2e5)) > 40
+    assert count(quiet(tendon_stiffness=2e5)) > 30
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_does_not() -> None:

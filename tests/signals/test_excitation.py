@@ -115,5 +115,5 @@ def test_a_wrong_duration_is_refused(duration: float) -> None:
 
 
 def test_an_unknown_signal_is_refused() -> None:
-    with pytest.raises(SettingsError, match="`signal` must be one of eq22, steps, .*; got 'prbs'"):
+    with pytest.raises(SettingsError, match=r"`signal` must be one of eq22, steps, .*; got 'prbs'"):
         signal("prbs")

@@ -48,7 +48,7 @@ class PiSettings:
     phase_margin: float = math.radians(60.0)
     # The paper's own dead time and pole (Eq. 31: 0.08 s, 5.293 1/s).
     least_delay: float = 0.08
-    small_move_pole: float = 5.3
+    small_move_pole: float = 5.293
     # About the time constant of the paper's neck, 1/5.293 s: what is asked faster only runs into limits.
     reference_time: float | None = 0.2
     overshoot_pct: float = 2.0

@@ -90,7 +90,8 @@ class AxisPlant:
         poles = np.roots(self.denominator)
         slowest = complex(poles[int(np.argmax(np.abs(poles)))])
         moved = float(np.exp(-pole * self.sample_time))
-        if abs(slowest.imag) > 0.0 or slowest.real <= moved:
+        # 1e-9: the same pole, but for the rounding of its root.
+        if abs(slowest.imag) > 0.0 or slowest.real <= moved + 1e-9:
             return self
         a = float(slowest.real)
         rest = np.real(np.poly(np.delete(poles, int(np.argmax(np.abs(poles))))))

@@ -96,9 +96,7 @@ def free_lengths(state: State) -> Vector:
     return state.values[19:22].copy()
 
 
-def _potentials(
-    p: dict[str, float], q: Vector, P: Vector, free: Vector, payload: float
-) -> tuple[float, float, float]:
+def _potentials(p: dict[str, float], q: Vector, P: Vector, free: Vector, payload: float) -> tuple[float, float, float]:
     """Return (link, tendons, gravity) [J]."""
     b, s = q[:2], q[2]
     beta = float(np.hypot(b[0], b[1]))

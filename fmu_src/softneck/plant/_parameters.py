@@ -11,7 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import FileFormatError, Port, SettingsError, Vector, require_between
+from softneck.core import FileFormatError, Port, SettingsError, Vector, require_between, require_one_of
+
+from ._presets import LAB, SENSORS
+
+# What `sample` scales: nobody has measured these on the neck.
+_UNCERTAIN = (
+    "bending_stiffness", "bending_stiffening", "bending_damping", "axial_stiffness", "axial_damping",
+    "hysteresis_torque", "hysteresis_angle", "platform_mass", "link_mass", "tendon_stiffness", "tendon_damping",
+    "pretension", "guide_friction", "position_gain", "gear_friction", "sensor_lag", "sensor_delay", "drive_latency",
+)  # fmt: skip
 
 
 def _number(default: float, unit: str, low: float, high: float, text: str, source: str) -> Any:
@@ -213,11 +222,42 @@ class NeckParameters:
             self.about(name)
         return dataclasses.replace(self, **changes)
 
+    def with_sensor(self, name: str) -> NeckParameters:
+        """Return the same neck with one of the lab's inclinometers, `mpu9250` or `3dm-gx5`."""
+        require_one_of("sensor", name, tuple(SENSORS))
+        return self.replace(**SENSORS[name])
+
+    def sample(self, rng: np.random.Generator, *, spread: float = 0.2) -> NeckParameters:
+        """Return a plausible neck around this one, for robustness studies.
+
+        What is measured with a ruler, fixed by a data sheet or a setting stays; stiffnesses, losses,
+        masses, friction, gains and delays are scaled by exp(spread n) with n standard normal, cut at 2.5;
+        the link's asymmetry and rest bend are shifted by 0.05 and 0.005 rad times n.
+
+        Args:
+            rng: random generator.
+            spread: relative standard deviation.
+        """
+        require_between("spread", spread, 0.0, 0.5)
+        for _ in range(100):
+            changes = {name: self._scaled(name, spread, rng) for name in _UNCERTAIN}
+            for name, size in (("stiffness_asymmetry", 0.05), ("rest_pitch", 0.005), ("rest_roll", 0.005)):
+                changes[name] = getattr(self, name) + size * spread / 0.2 * float(rng.standard_normal())
+            try:
+                return self.replace(**changes)
+            except SettingsError:  # this draw would buckle or leaves a range: not plausible, draw again
+                continue
+        raise SettingsError(f"no plausible neck within a spread of {spread:g} was found; lower `spread`.")
+
     def without_noise(self) -> NeckParameters:
         """Return the same neck with a perfect sensor: its lag and delay stay, all that is random goes."""
         return self.replace(
             noise_std=0.0, noise_quantum=0.0, drift_std=0.0, rate_noise_std=0.0, rate_bias_std=0.0, dropout_rate=0.0
         )
+
+    def _scaled(self, name: str, spread: float, rng: np.random.Generator) -> float:
+        number = float(np.clip(rng.standard_normal(), -2.5, 2.5))
+        return float(getattr(self, name)) * math.exp(spread * number)
 
     def _check_geometry(self) -> None:
         if self.compression_limit >= 0.9 * self.link_length:
@@ -245,7 +285,3 @@ class NeckParameters:
                 f"`bending_stiffness` must exceed {lost / 0.9 / (1 - abs(self.stiffness_asymmetry)):.3g} N m/rad to "
                 f"carry pretension and platform without buckling; got {self.bending_stiffness:g}."
             )
-
-
-# The lab's neck: version 1 with a central spring, winch of 10 mm, MPU-9250 (see the docs page).
-LAB: dict[str, float] = {"winch_radius": 0.010, "link_length": 0.099}

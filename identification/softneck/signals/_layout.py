@@ -171,7 +171,9 @@ def _layout(table: dict[str, Any]) -> Layout:
     if len(tilt) == 1:
         raise SettingsError("[tilt] needs both `inclination` and `orientation`.")
     rows = file.get("rows")
-    if rows is not None and not (isinstance(rows, list) and [type(row) for row in rows] == [int, int] and 0 <= rows[0] < rows[1]):
+    if rows is not None and not (
+        isinstance(rows, list) and [type(row) for row in rows] == [int, int] and 0 <= rows[0] < rows[1]
+    ):
         raise SettingsError(f"[file] rows must be [first, last] with 0 <= first < last; got {rows}.")
     return Layout(
         channels={name: _channel_source(name, entry) for name, entry in table.get("channels", {}).items()},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,7 +15,13 @@ from softneck.core import SettingsError
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout and nothing else.")
 force_option = click.option("--force", is_flag=True, help="Replace an existing file.")
-set_option = click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="A setting of the kind.")
+set_option = click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="A setting of the kind; angles in rad, or KEY_deg=VALUE.",
+)
 
 
 def output_option(what: str, metavar: str, *, required: bool = False) -> Callable:
@@ -42,7 +49,8 @@ def apply_settings(settings_class: type, assignments: Sequence[str], **more: Any
         key, separator, text = assignment.partition("=")
         if not separator:
             raise SettingsError(f"--set takes KEY=VALUE; got `{assignment}`.")
-        values[key.strip()] = _value(text.strip())
+        name, value = _in_radians(key.strip(), _value(text.strip()), fields)
+        values[name] = value
     values |= {key: value for key, value in more.items() if value is not None and key in fields}
     unknown = sorted(set(values) - fields)
     if unknown:
@@ -51,6 +59,14 @@ def apply_settings(settings_class: type, assignments: Sequence[str], **more: Any
         return settings_class(**values)
     except TypeError as error:
         raise SettingsError(f"a setting has a value of the wrong type ({error}).") from error
+
+
+def _in_radians(key: str, value: Any, fields: set[str]) -> tuple[str, Any]:
+    """Return `key` and `value`; an angle may be given as `key_deg` in degrees."""
+    angle = key.removesuffix("_deg")
+    if key in fields or angle not in fields or isinstance(value, bool) or not isinstance(value, int | float):
+        return key, value
+    return angle, math.radians(value)
 
 
 def _value(text: str) -> Any:

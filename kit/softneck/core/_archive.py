@@ -37,7 +37,7 @@ def write_archive(
     Raises:
         OutputError: the file exists (and not `force`) or cannot be written.
     """
-    text = json.dumps({"format": "softneck", "format_version": FORMAT_VERSION, **header}, sort_keys=True)
+    text = json.dumps({"format": "softneck", "format_version": FORMAT_VERSION, **header})
     contents = {_HEADER: np.frombuffer(text.encode(), dtype=np.uint8), **arrays}
     with atomic_write(path, force=force) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **contents)

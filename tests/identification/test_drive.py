@@ -1,0 +1,48 @@
+"""The drive model: pole and delay behind clean positions, and runs of any length."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from softneck.identification import Rls, fit_drive
+from softneck.signals import concatenate, signal
+
+from ..data import TRUTH, drive_positions, neck_recording, recording_from
+
+
+def test_pole_and_delay_behind_clean_positions_are_found() -> None:
+    drive = fit_drive(neck_recording(800))
+    assert drive.delay.tolist() == list(TRUTH.drive_delay)
+    # Positions are free of noise: a ratio of two sums, to rounding.
+    np.testing.assert_allclose(drive.pole, TRUTH.drive_pole, rtol=0, atol=1e-10)
+
+
+def test_it_simulates_as_the_plain_loop_does() -> None:
+    drive = fit_drive(neck_recording(800))
+    P = signal("aprbs", duration=5.0, seed=11).set_points
+    np.testing.assert_allclose(drive.simulate(P, P[0]), drive_positions(P), rtol=0, atol=1e-9)
+
+
+def test_without_positions_the_position_is_the_set_point() -> None:
+    r = neck_recording(200, positions=False)
+    drive = fit_drive(r)
+    assert drive.delay.tolist() == [0, 0, 0]
+    np.testing.assert_array_equal(drive.simulate(r.set_points, r.set_points[0]), r.set_points)
+
+
+@pytest.mark.parametrize("rows", [2, 3, 5, 6, 9])
+def test_a_run_shorter_than_the_longest_delay_does_no_harm(rows: int) -> None:
+    long = neck_recording(400)
+    both = concatenate([long, long.rows(20, 20 + rows)])
+    assert fit_drive(both).delay.tolist() == list(TRUTH.drive_delay)
+    Rls(delay=0.06).fit(both)
+
+
+def test_the_models_free_run_moves_its_motors_by_the_drive_model(models: dict) -> None:
+    P = signal("aprbs", duration=5.0, seed=11).set_points
+    r = recording_from(P)
+    for model in models.values():
+        motors = model.simulate(r, warm_up=0)[:, 2:5]
+        # The drive of a model is identified from noise-free positions.
+        np.testing.assert_allclose(motors, drive_positions(P), rtol=0, atol=1e-8)

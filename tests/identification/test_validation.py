@@ -1,0 +1,156 @@
+"""Validation: honest about rows that were trained on, about divergence, and about residuals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from softneck.core import DataError, SettingsError
+from softneck.identification import WARM_UP, Model, Rls, nrmse_fit, rmse, row_hashes, validate
+from softneck.identification._validation import _is_uncorrelated, _is_white
+from softneck.signals import concatenate, signal
+
+from ..data import neck_recording, recording_from, short_neck
+
+CLEAN = recording_from(signal("aprbs", duration=16.0, seed=4).set_points)
+
+
+def perfect() -> Model:
+    return Rls(delay=None, max_delay=0.1).fit(recording_from(signal("aprbs", duration=30.0, seed=2).set_points))
+
+
+def test_the_fit_is_the_papers() -> None:
+    y = np.array([1.0, 2.0, 4.0, 1.0])
+    assert nrmse_fit(y, y) == 100.0
+    assert nrmse_fit(y, np.full(4, y.mean())) == pytest.approx(0.0, abs=1e-13)
+    assert nrmse_fit(y, y + 1) == pytest.approx(100 * (1 - 2 / np.linalg.norm(y - 2)))
+    assert rmse(y, y + 1) == 1.0
+    gap = np.array([1.0, np.nan, 4.0, 1.0])
+    assert nrmse_fit(gap, gap + 1) == nrmse_fit(y[[0, 2, 3]], y[[0, 2, 3]] + 1)
+    assert np.isnan(nrmse_fit(np.ones(3), np.ones(3)))
+
+
+def test_a_perfect_model_scores_100_at_every_horizon() -> None:
+    result = validate(perfect(), CLEAN)
+    for fits in result.fits.values():
+        # 1e-7 of error in the parameters is 1e-5 % of fit.
+        assert fits["pitch"] == pytest.approx(100, abs=1e-4)
+        assert fits["roll"] == pytest.approx(100, abs=1e-4)
+    assert result.diverged is None
+    assert (result.rows_scored, result.rows_left_out) == (len(CLEAN) - WARM_UP, 0)
+
+
+@pytest.mark.parametrize("horizon", [1, 5, 25])
+def test_persistence_repeats_the_sample_before(horizon: int) -> None:
+    result = validate(perfect(), CLEAN, horizons=(horizon,))
+    y = CLEAN.outputs
+    for axis, name in enumerate(("pitch", "roll")):
+        expected = nrmse_fit(y[WARM_UP:, axis], y[WARM_UP - horizon : len(y) - horizon, axis])
+        assert result.persistence[str(horizon)][name] == pytest.approx(expected, abs=1e-12)
+
+
+def test_rows_of_the_training_are_never_scored(models: dict[str, Model]) -> None:
+    """A set membership model remembers its data: scored on it, it would look far better than it is."""
+    seen, unseen = short_neck(), neck_recording(300, seed=31)
+    model = models["nlsm"]
+    with pytest.raises(DataError, match="nothing is left to judge: all 500 rows were used to train the model"):
+        validate(model, seen)
+    flattered = validate(model, seen, horizons=(1,), include_training=True)
+    assert (flattered.rows_scored, flattered.rows_left_out) == (500 - WARM_UP, 0)
+    honest = validate(model, concatenate([seen, unseen]), horizons=(1,))
+    assert (honest.rows_scored, honest.rows_left_out) == (300 - WARM_UP, 500)
+    alone = validate(model, unseen, horizons=(1,))
+    assert honest.fits == alone.fits
+
+
+def test_the_end_of_a_run_is_judged_alone() -> None:
+    whole = neck_recording(600, seed=41)
+    head, tail = whole.split(0.7)
+    assert tail is not None
+    model = Rls(delay=0.06).fit(head)
+    both, rest = validate(model, whole), validate(model, tail)
+    assert (both.rows_scored, both.rows_left_out) == (180 - WARM_UP, 420)
+    assert both.fits == rest.fits
+    assert both.time[0] == tail.time[0]
+
+
+def test_rows_are_known_in_any_order_and_by_their_past() -> None:
+    a, b = neck_recording(60, seed=1), neck_recording(60, seed=2)
+    hashes = row_hashes(concatenate([a, b]))
+    assert np.isin(row_hashes(concatenate([b, a])), hashes).all()
+    # At rest all rows look alike; after five of them they do, and are not told apart.
+    assert np.unique(row_hashes(a)[10:]).size == 50
+    assert not np.isin(row_hashes(neck_recording(60, seed=3))[15:], hashes).any()
+
+
+def test_several_runs_are_scored_together_and_started_apart() -> None:
+    model = perfect()
+    runs = [neck_recording(150, seed=s, noise=2e-3) for s in (5, 6)]
+    result = validate(model, concatenate(runs), horizons=("inf",))
+    assert result.rows_scored == 2 * (150 - WARM_UP)
+    y = np.concatenate([r.outputs[WARM_UP:] for r in runs])
+    free = np.concatenate([model.simulate(r)[WARM_UP:, :2] for r in runs])
+    assert result.fits["inf"]["pitch"] == pytest.approx(nrmse_fit(y[:, 0], free[:, 0]), abs=1e-12)
+    assert result.rmse_deg["inf"]["roll"] == pytest.approx(np.degrees(rmse(y[:, 1], free[:, 1])), rel=1e-12)
+
+
+def test_divergence_is_reported_with_its_time() -> None:
+    stable = perfect()
+    model = Model(kind="rls", sample_time=stable.sample_time, arrays={**stable.arrays, "a": np.full((2, 1), -1.2)})
+    result = validate(model, CLEAN)
+    assert result.fits["inf"] == {"pitch": None, "roll": None}
+    assert result.rmse_deg["inf"] == {"pitch": None, "roll": None}
+    free = model.simulate(CLEAN)[:, :2]
+    first = np.argmax((np.abs(free) >= np.pi).any(axis=1))
+    assert result.diverged == CLEAN.time[first]
+    assert result.as_dict()["diverged"] == result.diverged
+    assert result.fits["1"]["pitch"] is not None
+
+
+def test_missed_samples_are_not_scored_and_do_no_harm() -> None:
+    pitch = CLEAN.channels["pitch"].copy()
+    pitch[100:140:2] = np.nan
+    result = validate(perfect(), CLEAN.with_channels(pitch=pitch))
+    assert result.fits["inf"]["pitch"] == pytest.approx(100, abs=1e-4)
+    assert np.isfinite(result.persistence["1"]["pitch"])
+
+
+def test_what_is_too_short_or_unknown_is_refused() -> None:
+    with pytest.raises(DataError, match="nothing is left to judge: 25 rows are too few"):
+        validate(perfect(), CLEAN.rows(0, WARM_UP))
+    with pytest.raises(SettingsError, match="`motors` must be one of simulated, measured"):
+        validate(perfect(), CLEAN, motors="felt")
+
+
+def test_white_errors_pass_and_coloured_ones_do_not() -> None:
+    verdicts = []
+    for seed in range(40):
+        white = np.random.default_rng(seed).standard_normal((1500, 2))
+        verdicts.append(_is_white(white))
+        assert not _is_white(np.asarray(lfilter([1.0], [1.0, -0.3], white, axis=0)))
+    # Two axes at 99 %: 0.98 of 40 pass, 39.2 +- 0.9; four standard deviations below is 35.
+    assert sum(verdicts) >= 35
+
+
+def test_errors_that_follow_an_input_are_told_from_those_that_do_not() -> None:
+    verdicts = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        u, e = rng.standard_normal((1500, 3)), rng.standard_normal((1500, 2))
+        verdicts.append(_is_uncorrelated(e, u))
+        late = e.copy()
+        late[7:, 1] += 0.3 * u[:-7, 2]
+        assert not _is_uncorrelated(late, u)
+    # 99 % for all tests together: 39.6 +- 0.6.
+    assert sum(verdicts) >= 36
+
+
+def test_the_residuals_of_an_exact_structure_are_white() -> None:
+    """ARX noise enters before the pole here: one-step errors of the true model are the white noise itself."""
+    rng = np.random.default_rng(6)
+    model, r = perfect(), CLEAN
+    y = r.outputs + np.column_stack([lfilter([1], [1, -p], 1e-3 * rng.standard_normal(len(r))) for p in (0.88, 0.92)])
+    result = validate(model, r.with_channels(pitch=y[:, 0], roll=y[:, 1]), horizons=(1,))
+    assert result.white
+    assert result.uncorrelated
