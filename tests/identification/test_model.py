@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -82,10 +83,26 @@ def test_a_file_keeps_every_bit(models: dict[str, Model], kind: str, tmp_path: P
     assert load(tmp_path / "m.npz").kind == kind
 
 
-def test_a_model_that_is_not_finite_is_refused(models: dict[str, Model], tmp_path: Path) -> None:
-    model = models["rls"]
-    Model(kind="rls", sample_time=TS, arrays={**model.arrays, "a": model.arrays["a"] * np.nan}).save(tmp_path / "m.npz")
-    with pytest.raises(FileFormatError, match="arrays are not finite"):
+CRAFTED = [
+    ("rls", "a", lambda a: a * np.nan, "`a` is not of finite floats"),
+    ("rls", "history", lambda a: a * 0 + 1e12, "history of 1e\\+12 samples"),
+    ("rls", "delay", lambda a: a + 1e6, "a dead time is no whole number"),
+    ("rls", "drive", lambda a: a - 50.0, "a drive's delay"),
+    ("rls", "redefinition", lambda a: a[:1], "`redefinition` has shape"),
+    ("nlsm", "table", lambda a: a + 100.0, "a regressor's source"),
+    ("nlsm", "points", lambda a: a[:, :, :5], "`points` has shape"),
+    ("nn", "W2", lambda a: a[:, :, :-1], "`W2` has shape"),
+]
+
+
+@pytest.mark.parametrize(("kind", "name", "change", "message"), CRAFTED)
+def test_a_crafted_file_never_reaches_the_compiled_code(
+    kind: str, name: str, change: Callable, message: str, models: dict[str, Model], tmp_path: Path
+) -> None:
+    arrays = dict(models[kind].arrays)
+    arrays[name] = np.ascontiguousarray(change(arrays[name]))
+    Model(kind=kind, sample_time=TS, arrays=arrays).save(tmp_path / "m.npz")
+    with pytest.raises(FileFormatError, match=message):
         load_model(tmp_path / "m.npz")
 
 

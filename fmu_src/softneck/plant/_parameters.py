@@ -46,51 +46,51 @@ class NeckParameters:
     tendon_angle_2: float = _number(2 * math.pi / 3, "rad", -7.0, 7.0, "direction of tendon 2", "paper, Eq. 5")
     tendon_angle_3: float = _number(4 * math.pi / 3, "rad", -7.0, 7.0, "direction of tendon 3", "paper, Eq. 5")
     # link
-    bending_stiffness: float = _number(0.6, "N m/rad", 0.01, 20.0, "stiffness against bending", "guess")
-    bending_stiffening: float = _number(0.5, "N m/rad^3", 0.0, 100.0, "cubic term of the stiffness", "guess")
-    bending_damping: float = _number(0.6, "N m s/rad", 0.001, 10.0, "viscous loss of bending", "calibrated")
-    axial_stiffness: float = _number(900.0, "N/m", 50.0, 1e5, "stiffness against compression", "calibrated")
+    bending_stiffness: float = _number(0.61, "N m/rad", 0.01, 20.0, "stiffness against bending", "calibrated")
+    bending_stiffening: float = _number(0.2, "N m/rad^3", 0.0, 100.0, "cubic term of the stiffness", "calibrated")
+    bending_damping: float = _number(0.06, "N m s/rad", 0.001, 10.0, "viscous loss of bending", "calibrated")
+    axial_stiffness: float = _number(475.0, "N/m", 50.0, 1e5, "stiffness against compression", "calibrated")
     axial_stiffening: float = _number(0.0, "N/m^3", 0.0, 1e9, "cubic term of the axial stiffness", "guess")
-    axial_damping: float = _number(60.0, "N s/m", 0.1, 1e3, "viscous loss of compression", "guess")
+    axial_damping: float = _number(25.0, "N s/m", 0.1, 1e3, "viscous loss of compression", "calibrated")
     compression_limit: float = _number(0.04, "m", 0.002, 0.2, "compression at which the link rests on itself", "guess")
     hysteresis_torque: float = _number(
-        0.05, "N m", 0.0, 5.0, "largest torque of the rate-independent hysteresis", "calibrated"
+        0.019, "N m", 0.0, 5.0, "largest torque of the rate-independent hysteresis", "calibrated"
     )
-    hysteresis_angle: float = _number(0.08, "rad", 0.005, 1.0, "bending over which the hysteresis builds up", "guess")
+    hysteresis_angle: float = _number(
+        0.045, "rad", 0.005, 1.0, "bending over which the hysteresis builds up", "calibrated"
+    )
     stiffness_asymmetry: float = _number(
-        0.0, "1", -0.9, 0.9, "stiffness is (1 + this) in pitch, (1 - this) in roll", "calibrated"
+        -0.05, "1", -0.9, 0.9, "stiffness is (1 + this) in pitch, (1 - this) in roll", "calibrated"
     )
     rest_pitch: float = _number(
-        0.0, "rad", -0.3, 0.3, "bend of the unloaded printed link towards tendon 1", "calibrated"
+        -0.0152, "rad", -0.3, 0.3, "bend of the unloaded printed link towards tendon 1", "calibrated"
     )
-    rest_roll: float = _number(0.0, "rad", -0.3, 0.3, "bend of the unloaded printed link across it", "calibrated")
+    rest_roll: float = _number(0.0135, "rad", -0.3, 0.3, "bend of the unloaded printed link across it", "calibrated")
     # masses
     platform_mass: float = _number(0.25, "kg", 0.02, 5.0, "platform with sensor", "guess")
     platform_height: float = _number(0.01, "m", -0.05, 0.2, "its centre of mass above the link's end", "guess")
     platform_radius: float = _number(0.06, "m", 0.0, 0.3, "radius of the platform, a disc", "guess")
     payload_height: float = _number(
-        0.02, "m", -0.05, 0.3, "centre of mass of the payload above the link's end", "guess"
+        0.005, "m", -0.05, 0.3, "centre of mass of the payload above the link's end", "guess"
     )
     link_mass: float = _number(
         0.10, "kg", 0.0, 2.0, "mass of the link; a quarter of it moves with the platform", "guess"
     )
     # tendons
     tendon_stiffness: float = _number(
-        2500.0, "N/m", 100.0, 2e5, "stiffness of tendon, anchors and guides in series", "calibrated"
+        1620.0, "N/m", 100.0, 2e5, "stiffness of tendon, anchors and guides in series", "calibrated"
     )
     tendon_damping: float = _number(4.0, "N s/m", 0.0, 500.0, "viscous loss of the tendon", "guess")
-    pretension: float = _number(
-        2.0, "N", 0.0, 50.0, "tension of each tendon at rest, after homing", "guess; lab code homes at 0.01 N m"
-    )
+    pretension: float = _number(3.25, "N", 0.0, 50.0, "tension of each tendon at rest, after homing", "calibrated")
     guide_friction: float = _number(
-        0.05, "1", 0.0, 0.5, "Coulomb friction of the guide as a part of the tension", "guess"
+        0.055, "1", 0.0, 0.5, "Coulomb friction of the guide as a part of the tension", "calibrated"
     )
     guide_speed: float = _number(0.01, "m/s", 0.0005, 0.1, "speed over which that friction is smoothed", "numerical")
     # drives
     drive_latency: float = _number(
-        0.02, "s", 0.0, 0.1, "from set-point to drive: bus cycle and slow loop", "calibrated"
+        0.05, "s", 0.0, 0.1, "from set-point to drive: bus cycle and slow loop", "calibrated"
     )
-    position_gain: float = _number(12.0, "1/s", 0.5, 200.0, "gain of the position loop", "calibrated")
+    position_gain: float = _number(10.5, "1/s", 0.5, 200.0, "gain of the position loop", "calibrated")
     speed_limit: float = _number(15.6, "rad/s", 0.1, 100.0, "limit of the winch's speed", "lab code")
     speed_bandwidth: float = _number(150.0, "1/s", 10.0, 2000.0, "bandwidth of the speed loop", "guess")
     speed_integral_time: float = _number(0.05, "s", 0.002, 10.0, "integral time of the speed loop", "guess")
@@ -107,8 +107,8 @@ class NeckParameters:
     encoder_counts: float = _number(48490.0, "1", 0.0, 1e7, "counts per turn of the winch; 0: exact", "maxon 201937")
     position_limit: float = _number(6.0, "rad", 0.1, 100.0, "set-points are clamped to this", "paper, section 3.1")
     # inclinometer
-    sensor_lag: float = _number(0.02, "s", 0.002, 1.0, "time constant of the attitude filter", "calibrated")
-    sensor_delay: float = _number(0.02, "s", 0.0, 0.2, "transport delay", "calibrated")
+    sensor_lag: float = _number(0.01, "s", 0.002, 1.0, "time constant of the attitude filter", "calibrated")
+    sensor_delay: float = _number(0.05, "s", 0.0, 0.2, "transport delay", "calibrated")
     noise_std: float = _number(
         math.radians(0.05), "rad", 0.0, 0.2, "white noise of the angles", "paper preset: 0.05 deg"
     )

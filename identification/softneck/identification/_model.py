@@ -15,20 +15,22 @@ from softneck.core import (
     KINDS,
     Block,
     DataError,
-    FileFormatError,
     Matrix,
     State,
     Vector,
     finite_vector,
+    require_one_of,
     write_archive,
 )
 from softneck.core import load as load_file
 from softneck.signals import Recording
 
 from . import _linear, _ports
+from ._arrays import check_arrays
 
 # A free run starts from this many measured samples, for every kind; they are not scored.
 WARM_UP = 25
+_MOTORS = ("simulated", "measured")
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -119,6 +121,7 @@ class Model:
             warm_up: samples at the start of each run in which the measured outputs are fed.
         """
         self._check(recording)
+        require_one_of("motors", motors, _MOTORS)
         return np.concatenate([self._free_run(run, motors, warm_up) for run in recording.runs()])
 
     def predict(self, recording: Recording, horizon: int = 1, *, motors: str = "simulated") -> Matrix:
@@ -127,6 +130,7 @@ class Model:
         The first rows of each run, with no such past, are predicted from its first row.
         """
         self._check(recording)
+        require_one_of("motors", motors, _MOTORS)
         if horizon < 1:
             raise DataError(f"`horizon` must be at least 1 sample; got {horizon}.")
         parts: list[Matrix] = []
@@ -181,8 +185,7 @@ class Model:
             findings=header["findings"],
             training_rows=arrays["training_rows"],
         )
-        if not all(np.isfinite(array).all() for array in model.arrays.values()):
-            raise FileFormatError("the model's arrays are not finite.")
+        check_arrays(model.kind, model.arrays)
         return model
 
     def _check(self, recording: Recording) -> None:

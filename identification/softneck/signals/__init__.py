@@ -13,6 +13,7 @@ from ._excitation import signal as signal
 from ._excitation import signal_names as signal_names
 from ._files import read_recording as read_recording
 from ._files import recording_frame as recording_frame
+from ._files import recording_suffix as recording_suffix
 from ._files import write_recording as write_recording
 from ._layout import Imported as Imported
 from ._layout import Layout as Layout

@@ -22,7 +22,7 @@ def write_recording(path: str | Path, recording: Recording, *, force: bool = Fal
         OutputError: the file exists (and not `force`) or cannot be written.
         DataError: another ending than `.csv` or `.parquet`.
     """
-    suffix = _suffix(path)
+    suffix = recording_suffix(path)
     frame = recording_frame(recording)
     with atomic_write(path, force=force) as temporary:
         if suffix == ".csv":
@@ -50,7 +50,7 @@ def read_recording(path: str | Path) -> Recording:
         DataError: columns, units, numbers or times are not those of a recording; the line says which.
     """
     source = Path(path)
-    frame = read_table(source, _suffix(source), header=True)
+    frame = read_table(source, recording_suffix(source), header=True)
     try:
         return _from_frame(frame)
     except SoftneckError as error:
@@ -141,7 +141,8 @@ def _integers(column: pd.Series) -> np.ndarray:
     return values.astype(np.int64)
 
 
-def _suffix(path: str | Path) -> str:
+def recording_suffix(path: str | Path) -> str:
+    """Return `.csv` or `.parquet`; raise DataError for a path with another ending."""
     suffix = Path(path).suffix.lower()
     if suffix not in (".csv", ".parquet"):
         raise DataError(f"{path}: a recording is a `.csv` or a `.parquet` file; got `{suffix or 'no ending'}`.")

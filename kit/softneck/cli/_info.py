@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,8 @@ import click
 import fmpy
 
 from softneck.core import FileFormatError, file_hash, load, read_archive
-from softneck.signals import read_recording
+from softneck.plant import NeckParameters, VirtualNeck
+from softneck.signals import read_layout, read_recording
 
 from ._console import print_json
 from ._options import json_option
@@ -20,7 +22,7 @@ from ._options import json_option
 @click.argument("file", type=click.Path(path_type=Path))
 @json_option
 def command(file: Path, as_json: bool) -> None:
-    """Say what FILE is: a recording, model, observer, controller, FMU, layout or certificate."""
+    """Say what FILE is: a recording, model, observer, controller, FMU, loop, layout, neck or certificate."""
     if not file.is_file():
         raise FileFormatError(f"{file}: no such file.")
     facts = {"file": str(file), **_describe(file), "sha256": file_hash(file)}
@@ -42,6 +44,8 @@ def _describe(file: Path) -> dict[str, Any]:
             return {"type": type(thing).__name__.lower(), "kind": header["kind"], "summary": thing.summary()}
         case ".fmu":
             return _fmu(file)
+        case ".toml":
+            return _toml(file)
         case ".json":
             return _certificate(file)
         case _:
@@ -79,6 +83,22 @@ def _fmu(file: Path) -> dict[str, Any]:
         "tool": description.generationTool or "",
         **by_causality,
     }
+
+
+def _toml(file: Path) -> dict[str, Any]:
+    """Say what a TOML file is: a loop names a plant, a layout names channels, all else must be a neck."""
+    try:
+        table = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise FileFormatError(f"{file}: is no TOML file ({error}).") from error
+    if "plant" in table:
+        return {"type": "loop", "parts": ", ".join(name for name in table if isinstance(table[name], dict))}
+    if "channels" in table:
+        layout = read_layout(file)
+        tilt = ["pitch, roll (from the tilt)"] if layout.inclination else []
+        return {"type": "layout", "channels": ", ".join([*layout.channels, *tilt])}
+    neck = NeckParameters.from_toml(file)
+    return {"type": "neck", "summary": VirtualNeck(neck).summary()}
 
 
 def _certificate(file: Path) -> dict[str, Any]:

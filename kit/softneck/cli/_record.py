@@ -8,7 +8,7 @@ import click
 
 from softneck.core import refuse_existing, require_between
 from softneck.plant import VirtualNeck, record
-from softneck.signals import signal, signal_names, write_recording
+from softneck.signals import recording_suffix, signal, signal_names, write_recording
 
 from ._console import print_json, progress
 from ._neck import load_neck
@@ -41,6 +41,7 @@ def command(
     as_json: bool,
 ) -> None:
     """Record SIGNAL on the virtual neck."""
+    recording_suffix(output)
     refuse_existing(output, force=force)
     require_between("--payload", payload, 0.0, 1.0, "kg")
     excitation = signal(signal_name, duration=duration, seed=seed)

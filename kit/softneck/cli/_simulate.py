@@ -10,7 +10,7 @@ import click
 from softneck.core import CheckFailedError, atomic_write, refuse_existing
 from softneck.cosim import Result, load_loop, simulate
 from softneck.plots import Section, Table, loop_figure, page, write_page
-from softneck.signals import write_recording
+from softneck.signals import recording_suffix, write_recording
 
 from ._console import print_json, print_table, progress
 from ._options import force_option, json_option, output_option, target
@@ -28,6 +28,7 @@ def command(
 ) -> None:
     """Close the loop that LOOP.toml describes; exit code 1 if one of its limits does not hold."""
     path, replace = target(output, f"results/{loop_file.stem}.csv", force=force)
+    recording_suffix(path)
     refuse_existing(path, force=replace)
     for extra in (certificate, html):
         if extra is not None:

@@ -89,5 +89,7 @@ def load(path: str | Path, *, role: str | None = None) -> Any:
         raise FileFormatError(f"{path}: is a {kind.role} ({kind.name}), not a {role}.")
     try:
         return resolve(kind.result).from_archive(header, arrays)
+    except FileFormatError as error:
+        raise FileFormatError(f"{path}: {error}") from error
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise FileFormatError(f"{path}: its header and arrays do not fit together ({error}).") from error

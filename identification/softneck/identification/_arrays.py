@@ -1,0 +1,83 @@
+"""What a model file's arrays must be before compiled code indexes them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from softneck.core import FileFormatError, Matrix
+
+# In the runtimes' order (see each kind's `_runtime` module).
+_ORDER = {
+    "rls": ("history", "drive", "redefinition", "a", "b", "delay"),
+    "nlsm": ("history", "drive", "table", "scale", "points", "values", "bounds"),
+    "nn": ("history", "drive", "table", "W1", "b1", "W2", "b2", "w3", "b3", "input_scale", "output_scale"),
+}
+# A minute at 1 ms: far beyond any lag of a neck, far below what memory holds.
+_LONGEST_HISTORY = 60_000
+
+
+def check_arrays(kind: str, arrays: Mapping[str, Matrix]) -> None:
+    """Raise FileFormatError unless the arrays are finite, in order, and of shapes that fit each other."""
+    if tuple(arrays) != _ORDER[kind]:
+        raise FileFormatError(
+            f"a model of kind {kind} has the arrays {', '.join(_ORDER[kind])}; got {', '.join(arrays)}."
+        )
+    for name, array in arrays.items():
+        if array.dtype != np.float64 or not np.isfinite(array).all():
+            raise FileFormatError(f"its array `{name}` is not of finite floats.")
+    _expect(arrays, "history", (1,))
+    _expect(arrays, "drive", (3, 2))
+    history = float(arrays["history"][0])
+    if history != int(history) or not 1 <= history <= _LONGEST_HISTORY:
+        raise FileFormatError(f"its history of {history:g} samples is no number from 1 to {_LONGEST_HISTORY}.")
+    _within(arrays["drive"][:, 1], 0, history, "a drive's delay")
+    {"rls": _check_rls, "nlsm": _check_nlsm, "nn": _check_nn}[kind](arrays, history)
+
+
+def _check_rls(arrays: Mapping[str, Matrix], history: float) -> None:
+    na, nb = arrays["a"].shape[-1], arrays["b"].shape[-1]
+    for name, shape in {"redefinition": (3, 3), "a": (2, na), "b": (2, nb), "delay": (2,)}.items():
+        _expect(arrays, name, shape)
+    _within(arrays["delay"], 0, history - nb, "a dead time")
+    _within(np.array([na]), 1, history, "the order")
+
+
+def _check_nlsm(arrays: Mapping[str, Matrix], history: float) -> None:
+    n = _check_table(arrays["table"], history)
+    rows = arrays["values"].shape[-1]
+    for name, shape in {"scale": (n,), "points": (2, n, rows), "values": (2, rows), "bounds": (2, 2)}.items():
+        _expect(arrays, name, shape)
+    _within(np.array([rows]), 1, np.inf, "the number of points")
+
+
+def _check_nn(arrays: Mapping[str, Matrix], history: float) -> None:
+    n = _check_table(arrays["table"], history)
+    h1, h2 = arrays["b1"].shape[-1], arrays["b2"].shape[-1]
+    shapes = {
+        "W1": (2, h1, n), "b1": (2, h1), "W2": (2, h2, h1), "b2": (2, h2), "w3": (2, h2), "b3": (2,),
+        "input_scale": (2, 2, n), "output_scale": (2, 2),
+    }  # fmt: skip
+    for name, shape in shapes.items():
+        _expect(arrays, name, shape)
+
+
+def _check_table(table: Matrix, history: float) -> int:
+    """Check rows (source, channel, lag) and return their number."""
+    if table.ndim != 2 or table.shape[1] != 3 or not len(table):
+        raise FileFormatError(f"its regressor table has shape {table.shape}; (n, 3) is needed.")
+    _within(table[:, 0], 0, 2, "a regressor's source")
+    _within(table[:, 1], 0, 2, "a regressor's channel")
+    _within(table[:, 2], 1, history, "a regressor's lag")
+    return len(table)
+
+
+def _expect(arrays: Mapping[str, Matrix], name: str, shape: tuple[int, ...]) -> None:
+    if arrays[name].shape != shape:
+        raise FileFormatError(f"its array `{name}` has shape {arrays[name].shape}; {shape} is needed.")
+
+
+def _within(values: Matrix, low: float, high: float, what: str) -> None:
+    if (values != np.round(values)).any() or not ((values >= low) & (values <= high)).all():
+        raise FileFormatError(f"{what} is no whole number from {low:g} to {high:g}.")
