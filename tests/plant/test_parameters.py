@@ -116,7 +116,9 @@ def test_times_and_seeds_that_do_not_fit_are_refused(settings: dict, what: str) 
         VirtualNeck(NeckParameters.paper()).block(**settings)
 
 
-@pytest.mark.parametrize(("value", "what"), [(6.5, "is 6.5 rad at t = 0.04 s"), (np.nan, "is nan rad"), (-np.inf, "is -inf rad")])
+@pytest.mark.parametrize(
+    ("value", "what"), [(6.5, "is 6.5 rad at t = 0.04 s"), (np.nan, "is nan rad"), (-np.inf, "is -inf rad")]
+)
 def test_set_points_beyond_the_limit_or_not_finite_are_refused(value: float, what: str) -> None:
     P = np.zeros((5, 3))
     P[2, 1] = value

@@ -137,7 +137,11 @@ class Model:
         for run in recording.runs():
             start = self.initial_state(run)
             rows = _input_rows(run, "measured")
-            predicted = self.block().run_horizon(start, rows, _input_rows(run, motors, outputs=False), horizon)
+            if horizon == 1:
+                _, predicted = self.block().run(start, rows)
+            else:
+                free = _input_rows(run, motors, outputs=False)
+                predicted = self.block().run_horizon(start, rows, free, horizon)
             parts.append(np.vstack([start.outputs, predicted[:-1]]))
         return np.concatenate(parts)
 

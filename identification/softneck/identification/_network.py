@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from softneck.core import DataError, Matrix, Progress, SettingsError, require_positive, require_whole, silent
 from softneck.signals import Recording, concatenate
@@ -87,7 +88,9 @@ class Network:
         output_scale = np.array([y.mean(), max(float(y.std()), 1e-9)])
         Z = (X - input_scale[0]) / input_scale[1]
         target = (y - output_scale[0]) / output_scale[1]
-        net, _ = train(start, Z, target, iterations=self.iterations, decay=self.decay, progress=progress)
+        # One thread: matrices this small gain nothing from more, and lose much where another process takes a core.
+        with threadpool_limits(limits=1):
+            net, _ = train(start, Z, target, iterations=self.iterations, decay=self.decay, progress=progress)
         return net.W1, net.b1, net.W2, net.b2, net.w3, net.b3, input_scale, output_scale
 
 

@@ -34,7 +34,7 @@ def command(out: Path | None, quick: bool, force: bool, as_json: bool) -> None:
     with _Stages(quiet=as_json) as stages:
         demo = run_demo(settings, tell=stages.begin)
     if as_json:
-        print_json(demo.as_dict())
+        print_json(demo.as_dict() | {"seconds": demo.seconds})
     else:
         _print(demo)
     if not demo.holds:

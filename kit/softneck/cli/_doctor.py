@@ -8,22 +8,29 @@ import platform
 import shutil
 import subprocess
 import sys
+import tempfile
 from importlib import metadata
+from pathlib import Path
 
 import click
 
-from ._console import print_json, print_table
+from softneck.core import silent
+
+from ._console import print_json, print_table, progress
 from ._options import json_option
 
 _NEEDED = ("numpy", "scipy", "control", "casadi", "filterpy", "fmpy", "pythonfmu", "numba", "pandas", "pyarrow",
-           "matplotlib", "click", "rich", "jinja2", "platformdirs")  # fmt: skip
+           "matplotlib", "click", "rich", "jinja2", "platformdirs", "threadpoolctl")  # fmt: skip
 _EXTRAS = {"slycot": "H-infinity by SLICOT", "can": "CAN buses by python-can", "canopen": "SDO and EDS"}
 
 
 @click.command("doctor", epilog="Example: softneck doctor --json")
+@click.option("--compile", "compile_now", is_flag=True, help="Compile the models' code now.")
 @json_option
-def command(as_json: bool) -> None:
+def command(compile_now: bool, as_json: bool) -> None:
     """Say what of this machine works: packages, compilers, FMU platforms, CAN, extras."""
+    if compile_now:
+        _compile(quiet=as_json)
     checks = [_python(), *_packages(), _compiler(), _fmu_platform(), _can(), *_extras()]
     bad = [check for check in checks if check["state"] == "missing"]
     if as_json:
@@ -32,6 +39,15 @@ def command(as_json: bool) -> None:
         rows = [[check["name"], check["state"], check["detail"]] for check in checks]
         print_table("softneck doctor", ["what", "state", "detail"], rows)
     click.get_current_context().exit(1 if bad else 0)
+
+
+def _compile(*, quiet: bool) -> None:
+    """Run the shortest demo once: numba keeps what it compiled on the way."""
+    from softneck.report import DemoSettings, run_demo
+
+    with progress("compile", quiet=quiet) as report, tempfile.TemporaryDirectory() as folder:
+        settings = DemoSettings(out=Path(folder), duration=40.0, iterations=1, compare_rows=2)
+        run_demo(settings, tell=lambda what: report(0.0, what) or silent)
 
 
 def _check(name: str, state: str, detail: str) -> dict[str, str]:

@@ -12,19 +12,20 @@ import click
 
 from softneck.core import SoftneckError
 
-# Subcommand -> module; each is imported when it is called, so that `softneck --help` answers at once.
+# Subcommand -> module and what it does; a module is imported when its command is called, so that
+# `softneck --help` answers at once.
 _COMMANDS = {
-    "demo": "_demo",
-    "doctor": "_doctor",
-    "info": "_info",
-    "record": "_record",
-    "import": "_import",
-    "identify": "_identify",
-    "validate": "_validate",
-    "fmu": "_fmu",
-    "observer": "_observer",
-    "design": "_design",
-    "simulate": "_simulate",
+    "demo": ("_demo", "Run the main job: experiment, models, FMUs, controller, closed loop, report."),
+    "doctor": ("_doctor", "Say what of this machine works."),
+    "info": ("_info", "Say what a file is."),
+    "record": ("_record", "Record a signal on the virtual neck."),
+    "import": ("_import", "Turn any logger's table into a recording, by a layout file."),
+    "identify": ("_identify", "Identify a model from recordings."),
+    "validate": ("_validate", "Judge models on rows that they were not trained on."),
+    "fmu": ("_fmu", "Package models, observers, controllers or the virtual neck as FMUs."),
+    "observer": ("_observer", "Build a Kalman filter over a linear model."),
+    "design": ("_design", "Design a controller on a linear model."),
+    "simulate": ("_simulate", "Close the loop that a TOML file describes and judge it."),
 }
 _INTERRUPTED, _BAD_INPUT, _OUR_FAULT = 130, 2, 3
 
@@ -40,8 +41,14 @@ class _LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import and return one subcommand."""
         del ctx
-        module = _COMMANDS.get(cmd_name)
-        return import_module(f"softneck.cli.{module}").command if module else None
+        entry = _COMMANDS.get(cmd_name)
+        return import_module(f"softneck.cli.{entry[0]}").command if entry else None
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List all subcommands without importing them."""
+        del ctx
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, text) in _COMMANDS.items()])
 
 
 @click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})

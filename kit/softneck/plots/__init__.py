@@ -4,6 +4,7 @@ from ._figures import delay_figure as delay_figure
 from ._figures import loop_figure as loop_figure
 from ._figures import recording_figure as recording_figure
 from ._figures import validation_figure as validation_figure
+from ._neck3d import neck_view as neck_view
 from ._page import Section as Section
 from ._page import Table as Table
 from ._page import figure_png as figure_png

@@ -90,6 +90,8 @@ def delay_figure(curves: Mapping[str, list[list[float]]], title: str) -> Figure:
         table = np.array(rows)
         fit.plot(1e3 * table[:, 0], table[:, 1], "o-", ms=3, color=colour, label=name)
         rms.plot(1e3 * table[:, 0], np.degrees(table[:, 2]), "o-", ms=3, color=colour, label=name)
+    best = max(row[1] for rows in curves.values() for row in rows)
+    fit.set_ylim(best - 12.0, best + 1.0)  # what lies below is no candidate
     label(fit, "free-run fit [%]")
     label(rms, "one-step rms [deg]")
     rms.set_xlabel("dead time [ms]")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from softneck.core import OutputError, SettingsError, atomic_write
@@ -76,7 +76,6 @@ class Demo:
             "holds": self.holds,
             "experiment_s": self.settings.duration,
             "shortened": self.settings.duration < FULL_DURATION,
-            "seconds": self.seconds,
             "report": str(self.settings.out / "report.html"),
         }
 
@@ -120,10 +119,10 @@ def run_demo(settings: DemoSettings, *, tell: Tell) -> Demo:
         packaged=packaged,
         designed=designed,
         loops=loops,
-        seconds=time.monotonic() - begin,
+        seconds=0.0,
     )
     _write_results(demo, tell)
-    return demo
+    return replace(demo, seconds=time.monotonic() - begin)
 
 
 def _write_recordings(folder: Path, experiments: Experiments) -> None:
@@ -148,6 +147,6 @@ def _write_results(demo: Demo, tell: Tell) -> None:
             loops=demo.loops,
             shortened=demo.settings.duration < FULL_DURATION,
         ),
-        footer=f"Written by `softneck demo` in {demo.seconds:.0f} s.",
+        footer="Written by `softneck demo`.",
     )
     write_page(out / "report.html", html, force=True)

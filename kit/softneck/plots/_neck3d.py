@@ -1,0 +1,106 @@
+"""The neck in three dimensions: link, tendons coloured by tension and platform, played in one HTML file.
+
+The page needs no network and no library: a canvas and a short renderer that it carries along.
+"""
+
+from __future__ import annotations
+
+import html
+import json
+from importlib.resources import files
+
+import numpy as np
+
+from softneck.core import DataError, Matrix, Vector, require_between, require_positive
+from softneck.signals import Recording
+
+# The lab's neck (hardware facts): link length and attachment radius [m], tendons at 0, 120, 240 deg.
+LINK_LENGTH, ATTACHMENT_RADIUS = 0.107, 0.052
+# Samples a page carries at most per second; 50 Hz is more than a screen shows of this neck.
+_FRAME_TIME = 0.02
+
+
+def neck_view(
+    recording: Recording,
+    *,
+    title: str = "The neck",
+    link_length: float = LINK_LENGTH,
+    attachment_radius: float = ATTACHMENT_RADIUS,
+) -> str:
+    """Return an HTML page that plays the neck of a recording or simulation result.
+
+    Pitch and roll give the bend of a link of constant curvature; `compression` shortens it where it was
+    recorded. Tendons are coloured by `tension_1..3` where those were recorded, else by the motors.
+
+    Args:
+        recording: its first run is played.
+        title: of the page.
+        link_length, attachment_radius: of the drawing [m].
+
+    Raises:
+        DataError: no sample of pitch and roll, or a tilt beyond 90 deg.
+    """
+    require_positive("link_length", link_length, "m")
+    require_between("attachment_radius", attachment_radius, 1e-3, 1.0, "m")
+    run = recording.runs()[0]
+    keep = slice(None, None, max(1, round(_FRAME_TIME / run.sample_time)))
+    angles = _held(run.outputs[keep])
+    frames = {
+        "time": _rounded(run.time[keep] - run.time[0], 4),
+        "bend": _rounded(bend_of(angles), 5),
+        "angles": _rounded(np.degrees(angles), 2),
+        "compression": _rounded(_channel(run, "compression", keep), 6),
+        "pull": _rounded(_pulls(run)[keep], 3),
+        "motors": _rounded(run.motor_positions[keep], 3),
+        "unit": "N" if _has_tensions(run) else "rad",
+        "length": link_length,
+        "radius": attachment_radius,
+    }
+    template = files("softneck.plots").joinpath("_neck3d.html").read_text(encoding="utf-8")
+    # `</` inside a script would end it; in JSON `<\/` is the same text.
+    data = json.dumps(frames).replace("</", "<\\/")
+    return template.replace("@@TITLE@@", html.escape(title)).replace("@@DATA@@", data)
+
+
+def bend_of(angles: Matrix) -> Matrix:
+    """Return the bending vectors (time, 2) [rad] of a link whose end is at pitch and roll (time, 2) [rad].
+
+    The platform's normal is (tan pitch, tan roll, 1), normalised; the vector points where it leans and is
+    as long as its angle from the vertical.
+    """
+    lean = np.tan(angles)
+    size = np.hypot(lean[:, 0], lean[:, 1])
+    # atan(x) / x, with its limit at the straight neck.
+    factor = np.divide(np.arctan(size), size, out=np.ones_like(size), where=size > 1e-12)
+    return lean * factor[:, None]
+
+
+def _held(angles: Matrix) -> Matrix:
+    """Fill missed samples with the last one before (the first one after, at the start)."""
+    good = np.isfinite(angles).all(axis=1)
+    if not good.any():
+        raise DataError("the recording has no sample of pitch and roll to draw.")
+    if np.abs(angles[good]).max() >= np.pi / 2:
+        raise DataError("pitch or roll exceeds 90 deg; a neck does not bend so far. Are the angles in degrees?")
+    last = np.maximum.accumulate(np.where(good, np.arange(good.size), int(np.argmax(good))))
+    return angles[last]
+
+
+def _has_tensions(run: Recording) -> bool:
+    return all(f"tension_{j}" in run.channels for j in (1, 2, 3))
+
+
+def _pulls(run: Recording) -> Matrix:
+    if not _has_tensions(run):
+        return np.maximum(run.motor_positions, 0.0)
+    return np.nan_to_num(np.column_stack([run.channels[f"tension_{j}"] for j in (1, 2, 3)]))
+
+
+def _channel(run: Recording, name: str, keep: slice) -> Vector:
+    if name not in run.channels:
+        return np.zeros(run.time[keep].size)
+    return np.nan_to_num(run.channels[name][keep])
+
+
+def _rounded(values: np.ndarray, digits: int) -> list:
+    return np.round(values, digits).tolist()
