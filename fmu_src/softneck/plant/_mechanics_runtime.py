@@ -67,7 +67,7 @@ NECK_STABLE = 1.4
 NECK_MOST_SUBSTEPS = 2000
 
 
-def neck_constants(q: np.ndarray) -> tuple:  # pyright: ignore
+def neck_constants(q: np.ndarray) -> tuple:
     """Return (link, hysteresis, tendon, geometry, directions, drive, filter) from the parameters."""
     k = float(q[NECK_BENDING_STIFFNESS])
     asymmetry = float(q[NECK_STIFFNESS_ASYMMETRY])
@@ -122,7 +122,7 @@ def neck_drive(q: np.ndarray) -> tuple[float, float, float, float, float, float,
 
 def neck_load(
     q: np.ndarray, payload: float, push_x: float, push_y: float, base_pitch: float, base_roll: float
-) -> tuple:  # pyright: ignore
+) -> tuple:
     """Return (weight and push, vertical in the base's frame, base rotation, bending inertia, axial mass)."""
     # A quarter of the link's mass at its end has the gravity moment of the whole; its inertia differs by 25 %.
     platform = float(q[NECK_PLATFORM_MASS])
@@ -145,12 +145,12 @@ def neck_load(
 
 
 def neck_rates(
-    x: tuple,  # pyright: ignore
+    x: tuple,
     command: tuple[float, float, float],
     free: tuple[float, float, float],
-    c: tuple,  # pyright: ignore
-    load: tuple,  # pyright: ignore
-) -> tuple:  # pyright: ignore
+    c: tuple,
+    load: tuple,
+) -> tuple:
     """Return the time derivatives of the 19 continuous states."""
     b1, b2, s, w1, w2, v, z1, z2, p1, p2, p3, o1, o2, o3, i1, i2, i3, f1, f2 = x
     link, hysteresis, _, geometry, directions, drive, rest = c
@@ -199,7 +199,7 @@ def neck_pull(
     position: float,
     speed: float,
     free: float,
-    c: tuple,  # pyright: ignore
+    c: tuple,
 ) -> tuple[float, float, float, float]:
     """Return (tension at the winch [N], its forces on b1, b2 and s) of one tendon."""
     winch = c[6][0]
@@ -208,7 +208,7 @@ def neck_pull(
     return at_winch, -at_platform * g1, -at_platform * g2, -at_platform * gs
 
 
-def neck_tensions(x: tuple, free: tuple[float, float, float], c: tuple) -> tuple[float, float, float]:  # pyright: ignore
+def neck_tensions(x: tuple, free: tuple[float, float, float], c: tuple) -> tuple[float, float, float]:
     """Return the three tensions at the winches [N]."""
     body = (x[0], x[1], x[2], x[3], x[4], x[5])
     f = bend_functions(x[0] * x[0] + x[1] * x[1])
@@ -218,7 +218,7 @@ def neck_tensions(x: tuple, free: tuple[float, float, float], c: tuple) -> tuple
     return t1, t2, t3
 
 
-def neck_rest(q: np.ndarray, c: tuple) -> tuple[float, float, float, float, float, float]:  # pyright: ignore
+def neck_rest(q: np.ndarray, c: tuple) -> tuple[float, float, float, float, float, float]:
     """Return (b1, b2, s, free lengths of the tendons) at rest: all tensions at the pretension, no payload.
 
     A fixed point: bending from the link's stiffness, compression by Newton. It contracts while the
@@ -258,7 +258,7 @@ def neck_rest(q: np.ndarray, c: tuple) -> tuple[float, float, float, float, floa
     return b1, b2, s, l1 - stretch, l2 - stretch, l3 - stretch
 
 
-def neck_substeps(c: tuple, load: tuple, sample_time: float, wanted: int) -> int:  # pyright: ignore
+def neck_substeps(c: tuple, load: tuple, sample_time: float, wanted: int) -> int:
     """Return substeps per sample: `wanted`, or more where the stiffest mode asks for it."""
     link, hysteresis, tendon, geometry, _, drive, rest = c
     winch = rest[0]

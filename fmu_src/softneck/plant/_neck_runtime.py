@@ -160,8 +160,8 @@ def neck_measure(setup: np.ndarray, parameters: np.ndarray, state: np.ndarray) -
 def neck_outputs(
     parameters: np.ndarray,
     state: np.ndarray,
-    c: tuple,  # pyright: ignore
-    load: tuple,  # pyright: ignore
+    c: tuple,
+    load: tuple,
     outputs: np.ndarray,
 ) -> None:
     """Fill `outputs` from the state: truth, measurement, encoders, tensions, compression."""
@@ -184,7 +184,7 @@ def neck_outputs(
     outputs[13] = x[2]
 
 
-def neck_read(state: np.ndarray) -> tuple:  # pyright: ignore
+def neck_read(state: np.ndarray) -> tuple:
     """Return the 19 continuous states as a tuple of floats."""
     return (
         float(state[0]), float(state[1]), float(state[2]), float(state[3]), float(state[4]), float(state[5]),
@@ -194,13 +194,13 @@ def neck_read(state: np.ndarray) -> tuple:  # pyright: ignore
     )  # fmt: skip
 
 
-def neck_write(state: np.ndarray, x: tuple) -> None:  # pyright: ignore
+def neck_write(state: np.ndarray, x: tuple) -> None:
     """Write the 19 continuous states back."""
     for i in range(NECK_ODE_SIZE):
         state[i] = x[i]
 
 
-def neck_along(x: tuple, k: tuple, h: float) -> tuple:  # pyright: ignore
+def neck_along(x: tuple, k: tuple, h: float) -> tuple:
     """Return x + h k, entry by entry."""
     return (
         x[0] + h * k[0], x[1] + h * k[1], x[2] + h * k[2], x[3] + h * k[3], x[4] + h * k[4],
@@ -211,13 +211,13 @@ def neck_along(x: tuple, k: tuple, h: float) -> tuple:  # pyright: ignore
 
 
 def neck_runge_kutta(
-    x: tuple,  # pyright: ignore
+    x: tuple,
     h: float,
     command: tuple[float, float, float],
     free: tuple[float, float, float],
-    c: tuple,  # pyright: ignore
-    load: tuple,  # pyright: ignore
-) -> tuple:  # pyright: ignore
+    c: tuple,
+    load: tuple,
+) -> tuple:
     """Return the continuous states `h` later by the classical method of order four."""
     k1 = neck_rates(x, command, free, c, load)
     k2 = neck_rates(neck_along(x, k1, 0.5 * h), command, free, c, load)
