@@ -90,7 +90,7 @@ class SetMembership:
         if len(weights) * len(sigmas) == 1:
             return weights[0], np.full(2, self.epsilon)
         head, tail = recording.split(1.0 - _HOLD_OUT)
-        if tail is None or len(tail) <= 2 * WARM_UP:
+        if len(tail) <= 2 * WARM_UP:
             raise DataError(
                 "the record is too short to choose epsilon; record longer, or set epsilon and output_weight."
             )

@@ -80,14 +80,14 @@ class Recording:
         channels = {name: values[part] for name, values in self.channels.items()}
         return Recording(self.time[part], self.sample_time, channels, self.run[part])
 
-    def split(self, fraction: float) -> tuple[Recording, Recording | None]:
-        """Return the first `fraction` of each run's rows and the rest (None when nothing is left).
+    def split(self, fraction: float) -> tuple[Recording, Recording]:
+        """Return the first `fraction` of each run's rows and the rest.
 
         Raises:
-            DataError: `fraction` is not in (0, 1].
+            DataError: `fraction` is not in (0, 1), or one of the parts is empty.
         """
-        if not 0.0 < fraction <= 1.0:
-            raise DataError(f"the part to train on must be in (0, 1]; got {fraction}.")
+        if not 0.0 < fraction < 1.0:
+            raise DataError(f"the part to split off must be between 0 and 1, without both; got {fraction:g}.")
         heads: list[Recording] = []
         tails: list[Recording] = []
         for run in self.runs():
@@ -96,7 +96,9 @@ class Recording:
                 heads.append(run.rows(0, border))
             if border < len(run):
                 tails.append(run.rows(border, len(run)))
-        return concatenate(heads), concatenate(tails) if tails else None
+        if not heads or not tails:
+            raise DataError(f"{len(self)} rows cannot be split at {fraction:g}: one part would be empty.")
+        return concatenate(heads), concatenate(tails)
 
     def with_channels(self, **channels: Vector) -> Recording:
         """Return the same recording with channels added or replaced."""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from softneck.core import KINDS, find_kind, kinds_of, refuse_existing, resolve
+from softneck.core import KINDS, SettingsError, find_kind, kinds_of, refuse_existing, resolve
 from softneck.identification import INFINITE, Model, Validation, validate
 from softneck.signals import Recording, concatenate, read_recording
 
@@ -42,10 +42,13 @@ def command(
     """Identify a model of KIND from one or more recordings."""
     entry = find_kind(kind, "model")
     estimator = apply_settings(resolve(entry.settings), settings, seed=seed)
+    if not 0.0 < train <= 1.0:
+        raise SettingsError(f"--train: the part to train on must be in (0, 1]; got {train:g}.")
     path, replace = target(output, f"models/{kind}.npz", force=force)
     refuse_existing(path, force=replace)
     whole = concatenate([read_recording(source) for source in recordings])
-    head, tail = whole.split(train)
+    # All of it to train on leaves nothing to hold out.
+    head, tail = (whole, None) if train == 1.0 else whole.split(train)
     with progress(f"identify {kind}", quiet=as_json) as report:
         model = estimator.fit(head, progress=report)
     model.save(path, force=replace)
