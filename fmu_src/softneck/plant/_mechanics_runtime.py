@@ -2,8 +2,7 @@
 
 x is (b1, b2, s, their rates w1, w2, v, hysteresis z1, z2, positions, speeds and integrals of the drives,
 filtered pitch, filtered roll), 19 numbers. Inertia is constant: that of a platform on a link bent by
-small angles, M (L0/2 + c)^2 + J; what a bend adds to it is below 5 % at 0.5 rad, and the neck is
-overdamped.
+small angles, M (L0/2 + c)^2 + J; how it changes with the bend is left out, as the neck is overdamped.
 """
 
 import math
