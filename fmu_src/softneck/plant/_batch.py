@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, SettingsError, load_runtime
+from softneck.core import DataError, Matrix, SettingsError
 
-from ._neck import INTERNAL_STEP, RUNTIME, VirtualNeck
+from ._neck import INTERNAL_STEP, VirtualNeck
 from ._parameters import NeckParameters
 
 
@@ -51,34 +50,14 @@ def simulate_batch(
     if U.ndim != 3 or U.shape[0] != len(necks):
         raise DataError(f"`inputs` must have shape (time, 8) or ({len(necks)}, time, 8); got {np.shape(inputs)}.")
 
-    run_steps = _unlocked_steps()
-
     def one(index: int) -> Matrix:
         block = VirtualNeck(necks[index]).block(
             noise_seed=chosen[index], sample_time=sample_time, internal_step=internal_step
         )
-        start, rows = block.initial_state(), block.checked_inputs(U[index])
-        outputs = np.zeros((len(rows), len(block.outputs)))
-        run_steps(block.arrays, start.parameters, start.values, rows, outputs)
-        return outputs
+        # Compiled runtimes hold no GIL, so that threads run at the same time.
+        return block.run(block.initial_state(), U[index])[1]
 
     # The first run compiles; two threads compiling the same function would do it twice.
     first = one(0)
     with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
         return np.stack([first, *pool.map(one, range(1, len(necks)))])
-
-
-@cache
-def _unlocked_steps() -> Callable[..., None]:
-    """Return the runtime's loop such that threads run it at the same time."""
-    runtime = load_runtime(RUNTIME)
-    if not runtime.compiled:
-        return runtime.run_steps
-    from numba import njit
-
-    steps = runtime.run_steps
-
-    def unlocked(arrays, parameters, state, inputs, outputs) -> None:  # type: ignore[no-untyped-def]
-        steps(arrays, parameters, state, inputs, outputs)
-
-    return njit(nogil=True)(unlocked)

@@ -71,8 +71,8 @@ def _compile(namespace: ModuleType) -> bool:
 
     for name, value in list(vars(namespace).items()):
         if isinstance(value, FunctionType):
-            # No fast-math: compiled and plain Python must agree to rounding.
-            setattr(namespace, name, njit(cache=True, error_model="numpy")(value))
+            # No fast-math: compiled and plain Python must agree to rounding. No GIL: batches run on all cores.
+            setattr(namespace, name, njit(cache=True, nogil=True, error_model="numpy")(value))
     return True
 
 
