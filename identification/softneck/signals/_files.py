@@ -114,8 +114,8 @@ def numbers(column: pd.Series, name: str, *, missing: bool) -> Vector:
     if bad.any():
         row = int(np.argmax(bad))
         cell = "an empty cell" if pd.isna(column.iloc[row]) else f"`{column.iloc[row]}`"
-        hint = " (a missing sample is an empty cell)" if missing else ""
-        raise DataError(f"column `{name}` holds {cell} at row {row}, where a number is needed{hint}.")
+        hint = "A missing sample is an empty cell." if missing else "Mend the log or cut it before that row."
+        raise DataError(f"column `{name}` holds {cell} at row {row} (the first is 0), where a number is needed. {hint}")
     return values
 
 

@@ -17,6 +17,10 @@ from ._bundle import bundle, content_name
 from ._files import atomic_write
 
 
+# No fast-math: compiled and plain Python must agree to rounding. No GIL: batches run on all cores.
+_OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
+
+
 @dataclass(frozen=True, slots=True)
 class Runtime:
     """The functions of one kind; see `_loops_runtime` for the loops.
@@ -71,13 +75,13 @@ def _compile(namespace: ModuleType) -> bool:
 
     for name, value in list(vars(namespace).items()):
         if isinstance(value, FunctionType):
-            # No fast-math: compiled and plain Python must agree to rounding. No GIL: batches run on all cores.
-            setattr(namespace, name, njit(cache=True, nogil=True, error_model="numpy")(value))
+            setattr(namespace, name, njit(**_OPTIONS)(value))
     return True
 
 
 def _import_text(text: str, *, compiled: bool) -> ModuleType:
-    name = content_name(text)
+    # numba's cache does not look at its options: they belong to the name.
+    name = content_name(f"{text}\n# {_OPTIONS}")
     path = _cache_folder() / f"{name}.py"
     if not path.is_file() or path.read_text(encoding="utf-8") != text:
         with atomic_write(path, force=True) as temporary:
