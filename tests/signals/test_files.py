@@ -89,7 +89,7 @@ BAD: dict[str, tuple[Edit, str]] = {
     "NaN": (lambda s: changed(s, 9, 1, "NaN"), "column `motor_setpoint_1` holds `NaN` at row 9"),
     "NaN in a sensor": (
         lambda s: changed(s, 9, 4, "nan"),
-        r"holds `nan` at row 9, .*A missing sample is an empty cell",
+        r"holds `nan` at row 9 .*A missing sample is an empty cell",
     ),
     "gap in a set-point": (lambda s: changed(s, 9, 2, ""), "column `motor_setpoint_2` holds an empty cell at row 9"),
     "infinite": (lambda s: changed(s, 9, 4, "inf"), "channel `pitch` is inf at row 9"),

@@ -16,7 +16,6 @@ import platformdirs
 from ._bundle import bundle, content_name
 from ._files import atomic_write
 
-
 # No fast-math: compiled and plain Python must agree to rounding. No GIL: batches run on all cores.
 _OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
 
