@@ -12,7 +12,7 @@ from softneck.core import OutputError, SettingsError, atomic_write
 from softneck.cosim import Result
 from softneck.identification import Model
 from softneck.plant import NeckParameters, VirtualNeck
-from softneck.plots import page, write_page
+from softneck.plots import neck_view, page, write_page
 from softneck.signals import write_recording
 
 from ._closing import Designed, close_loops, design
@@ -110,7 +110,9 @@ def run_demo(settings: DemoSettings, *, tell: Tell) -> Demo:
     designed.observer.save(out / "models" / "kalman.npz", force=True)
     loops = close_loops(out / "loops", sample_time=models["rls"].sample_time, tell=tell)
     for name, result in loops.items():
-        write_recording(out / "results" / f"{name}.csv", result.recording(), force=True)
+        recording = result.recording()
+        write_recording(out / "results" / f"{name}.csv", recording, force=True)
+        write_page(out / "results" / f"{name}_3d.html", neck_view(recording, title=name), force=True)
     demo = Demo(
         settings=settings,
         experiments=experiments,
