@@ -32,7 +32,7 @@ nav { display: flex; flex-wrap: wrap; gap: .2rem 1rem; } a { color: inherit; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .9rem; margin: .6rem 0; }
 th, td { padding: .25rem .7rem; border-bottom: 1px solid var(--line); text-align: right; white-space: nowrap; }
 th { white-space: normal; vertical-align: bottom; }
-th:first-child, td:first-child, td.text { text-align: left; }
+th.text, td.text { text-align: left; }
 caption { text-align: left; font-weight: 600; padding: .3rem 0; }
 td.holds { color: var(--good); font-weight: 600; } td.fails { color: var(--bad); font-weight: 600; }
 figure { margin: 1rem 0; } figure img { width: 100%; background: #fff; border-radius: 4px; display: block; }
@@ -48,9 +48,11 @@ figcaption { font-size: .9rem; } footer { margin-top: 3rem; font-size: .85rem; b
 {% for paragraph in section.text %}<p>{{ paragraph }}</p>{% endfor %}
 {% for table in section.tables %}
 <div class="scroll"><table><caption>{{ table.caption }}</caption>
-<thead><tr>{% for cell in table.head %}<th>{{ cell }}</th>{% endfor %}</tr></thead>
+<thead><tr>{% for cell in table.head -%}
+<th{% if loop.index <= table.text %} class="text"{% endif %}>{{ cell }}</th>{% endfor %}</tr></thead>
 <tbody>{% for row in table.rows %}<tr>{% for cell in row %}<td{% if cell in ("holds", "fails") %} class="{{ cell }}"
-{%- elif cell|length > 24 %} class="text"{% endif %}>{{ cell }}</td>{% endfor %}</tr>{% endfor %}</tbody></table></div>
+{%- elif loop.index <= table.text %} class="text"{% endif %}>{{ cell }}</td>{% endfor %}</tr>{% endfor %}
+</tbody></table></div>
 {% endfor %}
 {% for figure in section.figures %}
 <figure><img alt="{{ figure.caption }}" src="data:image/png;base64,{{ figure.data }}">
@@ -66,11 +68,19 @@ figcaption { font-size: .9rem; } footer { margin-top: 3rem; font-size: .85rem; b
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table of text; a cell "holds" or "fails" is coloured."""
+    """A table of text; a cell "holds" or "fails" is coloured.
+
+    Attributes:
+        caption: above it.
+        head: titles of the columns.
+        rows: of cells.
+        text: so many columns, from the first, hold words and not numbers.
+    """
 
     caption: str
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
+    text: int = 1
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,4 +26,4 @@ def label(ax: Axes, ylabel: str, *, legend: bool = True) -> None:
     """Name the y axis and show the legend beside the curves."""
     ax.set_ylabel(ylabel)
     if legend:
-        ax.legend(loc="upper right", fontsize="small", ncols=4, framealpha=0.8)
+        ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), fontsize="small", ncols=4, frameon=False)

@@ -79,7 +79,7 @@ def _model_section(models: Mapping[str, Model]) -> Section:
     curve = delay_figure(models["rls"].findings["delay_curve"], "Dead time of the linear model")
     caption = "The dead time's cost: a flat curve says that hysteresis lag hides in the pole."
     return Section(
-        "Models", tables=[Table("What was identified", ["model", "finding"], rows)], figures=[(caption, curve)]
+        "Models", tables=[Table("What was identified", ["model", "finding"], rows, text=2)], figures=[(caption, curve)]
     )
 
 
@@ -100,7 +100,9 @@ def _design_section(designed: Designed) -> Section:
     rows = [["controller", line] for line in designed.controller.summary().splitlines()]
     rows += [["observer", line] for line in designed.observer.summary().splitlines()]
     words = ["Both were designed on the identified linear model and run below against the virtual neck, another plant."]
-    return Section("Design", text=words, tables=[Table("Controller and Kalman filter", ["part", "finding"], rows)])
+    return Section(
+        "Design", text=words, tables=[Table("Controller and Kalman filter", ["part", "finding"], rows, text=2)]
+    )
 
 
 def _loop_section(name: str, result: Result) -> Section:
