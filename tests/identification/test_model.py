@@ -91,6 +91,8 @@ CRAFTED = [
     ("rls", "redefinition", lambda a: a[:1], "`redefinition` has shape"),
     ("nlsm", "table", lambda a: a + 100.0, "a regressor's source"),
     ("nlsm", "points", lambda a: a[:, :, :5], "`points` has shape"),
+    ("nlsm", "nodes", lambda a: a[:, :4], "`nodes` is not the tree over its points"),
+    ("nlsm", "nodes", lambda a: a * 0.0, "`nodes` is not the tree over its points"),
     ("nn", "W2", lambda a: a[:, :, :-1], "`W2` has shape"),
 ]
 
@@ -104,6 +106,16 @@ def test_a_crafted_file_never_reaches_the_compiled_code(
     Model(kind=kind, sample_time=TS, arrays=arrays).save(tmp_path / "m.npz")
     with pytest.raises(FileFormatError, match=message):
         load_model(tmp_path / "m.npz")
+
+
+def test_a_file_from_before_the_tree_still_loads(models: dict[str, Model], tmp_path: Path) -> None:
+    arrays = dict(models["nlsm"].arrays)
+    shuffled = np.random.default_rng(0).permutation(arrays["values"].shape[1])
+    del arrays["nodes"]
+    arrays["points"], arrays["values"] = arrays["points"][:, :, shuffled], arrays["values"][:, shuffled]
+    Model(kind="nlsm", sample_time=TS, arrays=arrays).save(tmp_path / "m.npz")
+    # The same set in another order has the same bounds, to the bit.
+    assert load_model(tmp_path / "m.npz").simulate(UNSEEN).tobytes() == models["nlsm"].simulate(UNSEEN).tobytes()
 
 
 def test_another_sample_time_is_refused(models: dict[str, Model]) -> None:

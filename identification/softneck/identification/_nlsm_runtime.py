@@ -1,8 +1,10 @@
-"""Set membership (Eq. 18-20, Algorithm 1); arrays: H, drive, regressor table, scale, W, y, (gamma, epsilon)."""
+"""Set membership (Eq. 18-20, Algorithm 1); arrays: H, drive, table, scale, W, y, (gamma, epsilon), tree nodes."""
 
 import numpy as np
 
+from softneck.core._compiled_runtime import COMPILED
 from softneck.identification._narx_runtime import narx_advance, narx_observe, narx_regressor
+from softneck.identification._tree_runtime import tree_bounds
 
 
 def nlsm_bounds(
@@ -15,6 +17,16 @@ def nlsm_bounds(
         squared += gap * gap
     cone = gamma * np.sqrt(squared)
     return np.max(values - cone) - epsilon, np.min(values + cone) + epsilon
+
+
+def nlsm_query(arrays: tuple[np.ndarray, ...], axis: int, x: np.ndarray) -> tuple[float, float]:
+    """Return f_l(x), f_u(x) of one axis: by the tree where loops are fast, else over all points by numpy."""
+    gamma = arrays[6][axis, 0]
+    epsilon = arrays[6][axis, 1]
+    if COMPILED:
+        low, high = tree_bounds(arrays[4][axis], arrays[5][axis], arrays[7][axis], gamma, x)
+        return low - epsilon, high + epsilon
+    return nlsm_bounds(arrays[4][axis], arrays[5][axis], gamma, epsilon, x)
 
 
 def step(
@@ -32,9 +44,7 @@ def step(
     angles = np.empty(2)
     for axis in range(2):
         narx_regressor(arrays, table, state, axis, x)
-        gamma = arrays[6][axis, 0]
-        epsilon = arrays[6][axis, 1]
-        low, high = nlsm_bounds(arrays[4][axis], arrays[5][axis], gamma, epsilon, x * scale)
+        low, high = nlsm_query(arrays, axis, x * scale)
         angles[axis] = 0.5 * (low + high)
         outputs[5 + 2 * axis] = low
         outputs[6 + 2 * axis] = high

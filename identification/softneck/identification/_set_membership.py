@@ -12,7 +12,6 @@ from softneck.core import (
     Progress,
     SettingsError,
     Vector,
-    load_functions,
     require_one_of,
     require_positive,
     silent,
@@ -21,12 +20,13 @@ from softneck.signals import Recording, concatenate
 
 from ._checks import check_training
 from ._drive import fit_drive
+from ._gamma import least_gammas
 from ._model import WARM_UP, Model
 from ._regressors import PAPER_EQ21, history_length, motor_signals, regression
 from ._rows import row_hashes
 from ._scores import nrmse_fit
+from ._tree import tree_nodes, tree_order
 
-_CONES = "softneck.identification._cones_runtime"
 _AXES = ("pitch", "roll")
 # The knee of gamma*(epsilon) lies at 3 to 5 sigma of the noise (measured; docs, "Set membership").
 _EPSILON_SIGMAS = (3.0, 4.0, 5.0, 6.0, 8.0)
@@ -113,9 +113,7 @@ class SetMembership:
         columns = []
         for axis in range(2):
             points, values = _points(recording, weight, axis)
-            slacks = np.array([epsilon[axis] for epsilon in epsilons])
-            worst = np.zeros((slacks.size, 2))
-            columns.append(load_functions(_CONES).least_gammas(points, values, slacks, worst))
+            columns.append(least_gammas(points, values, np.array([epsilon[axis] for epsilon in epsilons]))[0])
         return [np.array(pair) for pair in zip(*columns, strict=True)]
 
     def _free_run_score(self, head: Recording, tail: Recording, weight: float, epsilon: Vector, gamma: Vector) -> float:
@@ -167,12 +165,19 @@ def _build(recording: Recording, weight: float, epsilon: Vector, gamma: Vector) 
     rows = min(values.size for _, values in points)
     if rows < 2:
         raise SettingsError("a set needs at least 2 points.")
+    sets = [_in_tree_order(W[:, :rows], y[:rows]) for W, y in points]
     return {
         "history": np.array([float(history_length(PAPER_EQ21, drive))]),
         "drive": drive.array,
         "table": PAPER_EQ21,
         "scale": _scale(weight),
-        "points": np.array([p[:, :rows] for p, _ in points]),
-        "values": np.array([values[:rows] for _, values in points]),
+        "points": np.array([W for W, _ in sets]),
+        "values": np.array([y for _, y in sets]),
         "bounds": np.column_stack([gamma, epsilon]),
+        "nodes": np.array([tree_nodes(W, y) for W, y in sets]),
     }
+
+
+def _in_tree_order(points: Matrix, values: Vector) -> tuple[Matrix, Vector]:
+    order = tree_order(points)
+    return np.ascontiguousarray(points[:, order]), values[order]
