@@ -8,12 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softneck.core import DataError, SettingsError, load_functions
-from softneck.identification import PAPER_EQ21, SetMembership, gamma_curve, noise_level, offending_pair
+from softneck.identification import PAPER_EQ21, Model, SetMembership, gamma_curve, noise_level, offending_pair
 from softneck.identification._gamma import least_gammas
 from softneck.identification._regressors import regression
 from softneck.identification._tree import LEAF, tree_nodes, tree_order
 
-from ..data import neck_recording, recording_from, short_neck
+from ..data import TS, neck_recording, recording_from, short_neck
 
 BOUNDS = load_functions("softneck.identification._nlsm_runtime")
 TREE = load_functions("softneck.identification._tree_runtime")
@@ -219,12 +219,49 @@ def test_the_fitted_set_contains_every_point_and_gamma_is_no_larger_than_it_must
         assert gap == pytest.approx(0.0, abs=1e-12)
 
 
-def test_the_estimate_lies_in_the_middle_of_its_bounds(models: dict) -> None:
-    Y = models["nlsm"].simulate(short_neck())[25:]
+@pytest.mark.parametrize("form", ["nlsm", "residual"])
+def test_the_estimate_lies_in_the_middle_of_its_bounds(models: dict, form: str) -> None:
+    Y = models[form].simulate(short_neck())[25:]
     for axis in range(2):
         low, high = Y[:, 5 + 2 * axis], Y[:, 6 + 2 * axis]
         np.testing.assert_allclose(Y[:, axis], (low + high) / 2, rtol=0, atol=1e-14)
         assert (low <= high).all()
+
+
+def test_the_residual_form_is_its_base_and_a_set_over_its_signals(models: dict) -> None:
+    """The free run again from its parts: the base's own free run, then Algorithm 1 on it, row by row."""
+    arrays, recording = models["residual"].arrays, short_neck()
+    Y = models["residual"].simulate(recording, warm_up=0)
+    names = ("history", "drive", "redefinition", "a", "b", "delay")
+    base = Model(kind="rls", sample_time=TS, arrays={name: arrays[name] for name in names}).simulate(
+        recording, warm_up=0
+    )
+    sources = {2: base[:, 2:5], 3: base[:, :2]}
+    # The base of the residual form starts from its outputs less what the set says there: by row 200 of 500
+    # a pole of 0.92 leaves 1e-7 of that.
+    for k in (200, 311, 499):
+        x = np.array([sources[int(s)][k - int(lag), int(c)] for s, c, lag in arrays["table"]]) * arrays["scale"]
+        for axis in range(2):
+            gamma, epsilon = arrays["bounds"][axis]
+            bounds = algorithm_1(x, arrays["points"][axis].T, arrays["values"][axis], gamma, epsilon)
+            np.testing.assert_allclose(Y[k, 5 + 2 * axis : 7 + 2 * axis], base[k, axis] + np.array(bounds), atol=1e-7)
+
+
+def test_a_residual_cannot_drift(models: dict) -> None:
+    """Wherever the free run starts, it forgets it at the base's own pace: the set feeds nothing back."""
+    model, U = models["residual"], np.zeros((600, 8))
+    U[:, :3], U[:, 3:] = neck_recording(600, seed=9).set_points, np.nan
+    runs = [model.block().run(model.initial_state(pitch_start=p, roll_start=-p), U)[1] for p in (0.0, 0.7)]
+    # A pole of 0.92 leaves 0.7 * 0.92^550 < 1e-20; the sums round.
+    np.testing.assert_allclose(runs[0][-10:], runs[1][-10:], rtol=0, atol=1e-12)
+
+
+def test_the_residual_form_is_reached_by_its_name_and_says_so(models: dict) -> None:
+    assert models["residual"].kind == "nlsm"
+    assert models["residual"].settings["form"] == "residual"
+    assert models["nlsm"].settings["form"] == "paper_eq21"
+    with pytest.raises(DataError, match="every run is too short for form `residual`"):
+        SetMembership(form="residual").fit([neck_recording(78, seed=s) for s in (1, 2, 3)])
 
 
 def test_the_regressor_is_eq21() -> None:
@@ -278,7 +315,7 @@ def test_epsilon_and_weight_are_chosen_on_the_data_and_told() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [({"epsilon": 0.0}, "`epsilon` must be positive"), ({"output_weight": -1.0}, "`output_weight` must be positive"),
-     ({"form": "residual"}, "`form` must be one of paper_eq21; got 'residual'")],
+     ({"form": "magic"}, "`form` must be one of paper_eq21, residual; got 'magic'")],
 )  # fmt: skip
 def test_wrong_settings_are_refused(settings: dict, message: str) -> None:
     with pytest.raises(SettingsError, match=message):

@@ -18,16 +18,21 @@ from softneck.core import (
 )
 from softneck.signals import Recording, concatenate
 
+from ._arrays import no_base
 from ._checks import check_training
 from ._drive import fit_drive
 from ._gamma import least_gammas
 from ._model import WARM_UP, Model
 from ._regressors import PAPER_EQ21, history_length, motor_signals, regression
+from ._residual import ANGLE_WEIGHT, residual_points, residual_table
+from ._rls import Rls
 from ._rows import row_hashes
 from ._scores import nrmse_fit
 from ._tree import tree_nodes, tree_order
 
-_AXES = ("pitch", "roll")
+FORMS = ("paper_eq21", "residual")
+# Free run of form `residual` hardly depends on it (docs, "Set membership").
+_RESIDUAL_SIGMAS = 4.0
 # The knee of gamma*(epsilon) lies at 3 to 5 sigma of the noise (measured; docs, "Set membership").
 _EPSILON_SIGMAS = (3.0, 4.0, 5.0, 6.0, 8.0)
 # Weight of the output in the regressor: the paper logs angles in degrees beside motors in radians, which
@@ -42,9 +47,11 @@ class SetMembership:
     """The estimator of Eq. 12-20 and Algorithm 1 over the regressor of Eq. 21, one set for each axis.
 
     Attributes:
-        form: "paper_eq21".
+        form: "paper_eq21", or "residual": set membership over simulated signals on what the free run of `Rls`
+            leaves over, which has nothing to feed back and so cannot drift.
         epsilon: noise bound of Eq. 15 [rad]; None chooses it on the data.
-        output_weight: weight of y(k-1) in the regressor's norm, motors having 1; None chooses it on the data.
+        output_weight: weight of y(k-1) (of the base's angles) in the regressor's norm, motors having 1; None
+            chooses it on the data (takes 5).
     """
 
     form: str = "paper_eq21"
@@ -52,7 +59,7 @@ class SetMembership:
     output_weight: float | None = None
 
     def __post_init__(self) -> None:
-        require_one_of("form", self.form, ("paper_eq21",))
+        require_one_of("form", self.form, FORMS)
         if self.epsilon is not None:
             require_positive("epsilon", self.epsilon, "rad")
         if self.output_weight is not None:
@@ -69,10 +76,12 @@ class SetMembership:
         """
         recording = concatenate(recordings if isinstance(recordings, list) else [recordings])
         check_training(recording)
-        recording = motor_signals(recording, fit_drive(recording))
         noise = np.array([noise_level(recording, axis) for axis in range(2)])
-        choice = self._choose(recording, noise, progress)
-        arrays, findings = self._arrays(recording, *choice)
+        if self.form == "residual":
+            arrays, findings = self._fit_residual(recording, noise, progress)
+        else:
+            recording = motor_signals(recording, fit_drive(recording))
+            arrays, findings = self._arrays(recording, *self._choose(recording, noise, progress))
         progress(1.0, "done")
         return Model(
             kind="nlsm",
@@ -121,19 +130,32 @@ class SetMembership:
         outputs = Model(kind="nlsm", sample_time=head.sample_time, arrays=arrays).simulate(tail)[:, :2]
         return sum(nrmse_fit(tail.outputs[WARM_UP:, axis], outputs[WARM_UP:, axis]) for axis in range(2))
 
+    def _fit_residual(self, recording: Recording, noise: Vector, progress: Progress) -> tuple[dict[str, Matrix], dict]:
+        progress(0.0, "linear base")
+        base = Rls().fit(recording)
+        progress(0.5, "set membership on what it leaves over")
+        weight = ANGLE_WEIGHT if self.output_weight is None else self.output_weight
+        epsilon = _RESIDUAL_SIGMAS * noise if self.epsilon is None else np.full(2, self.epsilon)
+        table = residual_table(recording.sample_time)
+        scale = np.where(table[:, 0] == 3, weight, 1.0)
+        points = [residual_points(recording, base, table, scale, axis) for axis in range(2)]
+        gamma = np.array([least_gammas(*points[i], epsilon[i : i + 1])[0][0] for i in range(2)])
+        _require_consistent(gamma, epsilon)
+        history = max(float(base.arrays["history"][0]), table[:, 2].max())
+        arrays = {
+            "history": np.array([history]),
+            "drive": base.arrays["drive"],
+            "table": table,
+            "scale": scale,
+            **_set_arrays(points, gamma, epsilon),
+            **{name: base.arrays[name] for name in ("redefinition", "a", "b", "delay")},
+        }
+        return arrays, _findings(gamma, epsilon, weight, points[0][1].size)
+
     def _arrays(self, recording: Recording, weight: float, epsilon: Vector) -> tuple[dict[str, Matrix], dict]:
         gamma = self._gammas(recording, weight, [epsilon])[0]
-        if gamma.max() > 1e100:
-            raise DataError(
-                f"epsilon {np.degrees(epsilon).round(4).tolist()} deg is below the noise: equal regressors have "
-                "outputs further apart, so no function fits the data. Set `epsilon` higher."
-            )
-        findings = {
-            "epsilon_deg": np.degrees(epsilon).tolist(),
-            "gamma": gamma.tolist(),
-            "output_weight": weight,
-            "points": int(_points(recording, weight, 0)[1].size),
-        }
+        _require_consistent(gamma, epsilon)
+        findings = _findings(gamma, epsilon, weight, _points(recording, weight, 0)[1].size)
         return _build(recording, weight, epsilon, gamma), findings
 
 
@@ -162,20 +184,44 @@ def _scale(weight: float) -> Vector:
 def _build(recording: Recording, weight: float, epsilon: Vector, gamma: Vector) -> dict[str, Matrix]:
     drive = fit_drive(recording)
     points = [_points(recording, weight, axis) for axis in range(2)]
-    rows = min(values.size for _, values in points)
-    if rows < 2:
-        raise SettingsError("a set needs at least 2 points.")
-    sets = [_in_tree_order(W[:, :rows], y[:rows]) for W, y in points]
     return {
         "history": np.array([float(history_length(PAPER_EQ21, drive))]),
         "drive": drive.array,
         "table": PAPER_EQ21,
         "scale": _scale(weight),
+        **_set_arrays(points, gamma, epsilon),
+        **no_base(),
+    }
+
+
+def _set_arrays(points: list[tuple[Matrix, Vector]], gamma: Vector, epsilon: Vector) -> dict[str, Matrix]:
+    rows = min(values.size for _, values in points)
+    if rows < 2:
+        raise SettingsError("a set needs at least 2 points.")
+    sets = [_in_tree_order(W[:, :rows], y[:rows]) for W, y in points]
+    return {
         "points": np.array([W for W, _ in sets]),
         "values": np.array([y for _, y in sets]),
         "bounds": np.column_stack([gamma, epsilon]),
         "nodes": np.array([tree_nodes(W, y) for W, y in sets]),
     }
+
+
+def _findings(gamma: Vector, epsilon: Vector, weight: float, points: int) -> dict:
+    return {
+        "epsilon_deg": np.degrees(epsilon).tolist(),
+        "gamma": gamma.tolist(),
+        "output_weight": weight,
+        "points": points,
+    }
+
+
+def _require_consistent(gamma: Vector, epsilon: Vector) -> None:
+    if gamma.max() > 1e100:
+        raise DataError(
+            f"epsilon {np.degrees(epsilon).round(4).tolist()} deg is below the noise: equal regressors have "
+            "outputs further apart, so no function fits the data. Set `epsilon` higher."
+        )
 
 
 def _in_tree_order(points: Matrix, values: Vector) -> tuple[Matrix, Vector]:
