@@ -54,6 +54,10 @@ def _nlsm() -> Block:
     return SetMembership().fit(_recording()).block()
 
 
+def _residual() -> Block:
+    return SetMembership(form="residual").fit(_recording()).block()
+
+
 def _nn() -> Block:
     return Network(hidden=(5, 5), iterations=3).fit(_recording()).block()
 
@@ -74,6 +78,7 @@ def _pi() -> Block:
 _KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...]]] = {
     "rls": (_rls, _MOTORS, ["pitch", "roll", "motor_position_1"], _MODEL),
     "nlsm": (_nlsm, _MOTORS, ["pitch", "roll", "pitch_lower", "pitch_upper", "roll_lower", "roll_upper"], _MODEL),
+    "residual": (_residual, _MOTORS, ["pitch", "pitch_lower", "roll_upper", "motor_position_2"], _MODEL),
     "nn": (_nn, _MOTORS, ["pitch", "roll", "motor_position_3"], _MODEL),
     "neck": (
         _neck,

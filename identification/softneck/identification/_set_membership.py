@@ -89,7 +89,7 @@ class SetMembership:
             sample_time=recording.sample_time,
             arrays=arrays,
             settings=asdict(self),
-            findings={"noise_deg": np.degrees(noise).tolist(), **findings},
+            findings={"form": self.form, "noise_deg": np.degrees(noise).tolist(), **findings},
             training_rows=row_hashes(recording),
         )
 
