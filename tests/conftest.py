@@ -33,6 +33,7 @@ def models() -> dict[str, Model]:
     return {
         "rls": Rls(max_delay=0.12).fit(recording),
         "nlsm": SetMembership(epsilon=0.01, output_weight=10.0).fit(recording),
+        "residual": SetMembership(form="residual").fit(recording),
         "nn": Network(hidden=(4, 3), iterations=8).fit(recording),
     }
 

@@ -15,6 +15,7 @@ import pytest
 from fmpy.validation import validate_fmu
 
 from softneck.core import Block, load_runtime
+from softneck.cosim import drive_fmu
 from softneck.design import PiSettings
 from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.fmu import build_fmu
@@ -54,6 +55,10 @@ def _nlsm() -> Block:
     return SetMembership().fit(_recording()).block()
 
 
+def _residual() -> Block:
+    return SetMembership(form="residual").fit(_recording()).block()
+
+
 def _nn() -> Block:
     return Network(hidden=(5, 5), iterations=3).fit(_recording()).block()
 
@@ -74,6 +79,7 @@ def _pi() -> Block:
 _KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...]]] = {
     "rls": (_rls, _MOTORS, ["pitch", "roll", "motor_position_1"], _MODEL),
     "nlsm": (_nlsm, _MOTORS, ["pitch", "roll", "pitch_lower", "pitch_upper", "roll_lower", "roll_upper"], _MODEL),
+    "residual": (_residual, _MOTORS, ["pitch", "pitch_lower", "roll_upper", "motor_position_2"], _MODEL),
     "nn": (_nn, _MOTORS, ["pitch", "roll", "motor_position_3"], _MODEL),
     "neck": (
         _neck,
@@ -202,3 +208,19 @@ def test_measurements_are_ignored_unless_asked_for(tmp_path: Path, running: Any)
         expected = _run(one, block, u)
         np.testing.assert_array_equal(_run(two, block, free), expected)
         assert not np.array_equal(_run(three, block, free), expected)
+
+
+@pytest.mark.parametrize("make", [_rls, _nlsm, _nn], ids=["rls", "nlsm", "nn"])
+def test_a_measured_input_that_nobody_sets_was_not_measured(make: Callable[[], Block], tmp_path: Path) -> None:
+    block, recording = make(), _recording()
+    path = build_fmu(block, tmp_path / "Plant.fmu")
+    given = {name: recording.channels[name][:60] for name in _MOTORS}
+    given |= {f"{axis}_measured": recording.channels[axis][:60] for axis in ("pitch", "roll")}
+    part = drive_fmu(path, given, parameters={"use_measurement": 1.0})
+    rows = np.full((60, len(block.inputs)), np.nan)
+    rows[:, :5] = np.column_stack(list(given.values()))
+    start = block.initial_state(use_measurement=1.0)
+    expected = np.vstack([start.outputs, block.run(start, rows)[1][:-1]])
+    # The same text compiled and plain: BLAS may sum in another order.
+    np.testing.assert_allclose(part, expected, rtol=0, atol=1e-12)
+    assert np.abs(expected[1:, :2]).max() > 0.0

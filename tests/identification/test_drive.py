@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softneck.identification import Rls, fit_drive
+from softneck.identification import Network, Rls, SetMembership, fit_drive
 from softneck.signals import concatenate, signal
 
 from ..data import TRUTH, drive_positions, neck_recording, recording_from
@@ -46,3 +46,27 @@ def test_the_models_free_run_moves_its_motors_by_the_drive_model(models: dict) -
         motors = model.simulate(r, warm_up=0)[:, 2:5]
         # The drive of a model is identified from noise-free positions.
         np.testing.assert_allclose(motors, drive_positions(P), rtol=0, atol=1e-8)
+
+
+SETTINGS = {
+    "rls": Rls(),
+    "nlsm": SetMembership(),
+    "residual": SetMembership(form="residual"),
+    "nn": Network(iterations=2, hidden=(3, 3)),
+}
+
+
+@pytest.mark.parametrize("kind", SETTINGS)
+def test_without_logged_positions_the_position_is_the_set_point_for_every_kind(kind: str) -> None:
+    model = SETTINGS[kind].fit(neck_recording(400, positions=False))
+    np.testing.assert_array_equal(model.arrays["drive"], np.zeros((3, 2)))
+
+
+def test_missed_positions_do_not_move_the_drive() -> None:
+    whole = neck_recording(600)
+    m = whole.channels["motor_position_2"].copy()
+    m[[0, 50, 51, 300]] = np.nan
+    full, gappy = fit_drive(whole), fit_drive(whole.with_channels(motor_position_2=m))
+    # Four of 600 samples less change a noisy pole in its third digit.
+    np.testing.assert_allclose(gappy.pole, full.pole, rtol=1e-2)
+    np.testing.assert_array_equal(gappy.delay, full.delay)

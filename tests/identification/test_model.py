@@ -14,7 +14,8 @@ from softneck.signals import Recording, concatenate
 
 from ..data import TS, neck_recording
 
-KINDS = ("rls", "nlsm", "nn")
+# By the name of the shared models: "residual" is the other form of kind "nlsm".
+KINDS = ("rls", "nlsm", "residual", "nn")
 UNSEEN = neck_recording(120, seed=21)
 
 
@@ -80,7 +81,7 @@ def test_a_file_keeps_every_bit(models: dict[str, Model], kind: str, tmp_path: P
     assert back.simulate(UNSEEN).tobytes() == model.simulate(UNSEEN).tobytes()
     assert back.summary() == model.summary()
     np.testing.assert_array_equal(back.training_rows, model.training_rows)
-    assert load(tmp_path / "m.npz").kind == kind
+    assert load(tmp_path / "m.npz").kind == model.kind
 
 
 CRAFTED = [
@@ -91,6 +92,11 @@ CRAFTED = [
     ("rls", "redefinition", lambda a: a[:1], "`redefinition` has shape"),
     ("nlsm", "table", lambda a: a + 100.0, "a regressor's source"),
     ("nlsm", "points", lambda a: a[:, :, :5], "`points` has shape"),
+    ("nlsm", "nodes", lambda a: a[:, :4], "`nodes` is not the tree over its points"),
+    ("nlsm", "nodes", lambda a: a * 0.0, "`nodes` is not the tree over its points"),
+    ("residual", "delay", lambda a: a + 1e6, "a dead time"),
+    ("residual", "a", lambda a: a[:1], "`a` has shape"),
+    ("residual", "table", lambda a: np.where(a == [3, 1, 1], [3, 2, 1], a), "a regressor's output"),
     ("nn", "W2", lambda a: a[:, :, :-1], "`W2` has shape"),
 ]
 
@@ -101,9 +107,20 @@ def test_a_crafted_file_never_reaches_the_compiled_code(
 ) -> None:
     arrays = dict(models[kind].arrays)
     arrays[name] = np.ascontiguousarray(change(arrays[name]))
-    Model(kind=kind, sample_time=TS, arrays=arrays).save(tmp_path / "m.npz")
+    Model(kind=models[kind].kind, sample_time=TS, arrays=arrays).save(tmp_path / "m.npz")
     with pytest.raises(FileFormatError, match=message):
         load_model(tmp_path / "m.npz")
+
+
+def test_a_file_from_before_the_tree_still_loads(models: dict[str, Model], tmp_path: Path) -> None:
+    arrays = dict(models["nlsm"].arrays)
+    shuffled = np.random.default_rng(0).permutation(arrays["values"].shape[1])
+    for name in ("nodes", "redefinition", "a", "b", "delay"):
+        del arrays[name]
+    arrays["points"], arrays["values"] = arrays["points"][:, :, shuffled], arrays["values"][:, shuffled]
+    Model(kind="nlsm", sample_time=TS, arrays=arrays).save(tmp_path / "m.npz")
+    # The same set in another order has the same bounds, to the bit.
+    assert load_model(tmp_path / "m.npz").simulate(UNSEEN).tobytes() == models["nlsm"].simulate(UNSEEN).tobytes()
 
 
 def test_another_sample_time_is_refused(models: dict[str, Model]) -> None:

@@ -8,12 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softneck.core import DataError, SettingsError, load_functions
-from softneck.identification import PAPER_EQ21, SetMembership, noise_level
+from softneck.identification import PAPER_EQ21, Model, SetMembership, gamma_curve, noise_level, offending_pair
+from softneck.identification._gamma import least_gammas
 from softneck.identification._regressors import regression
+from softneck.identification._tree import LEAF, tree_nodes, tree_order
 
-from ..data import neck_recording, recording_from, short_neck
+from ..data import TS, neck_recording, recording_from, short_neck
 
 BOUNDS = load_functions("softneck.identification._nlsm_runtime")
+TREE = load_functions("softneck.identification._tree_runtime")
 CONES = load_functions("softneck.identification._cones_runtime")
 
 
@@ -51,6 +54,140 @@ def test_the_bounds_are_those_of_algorithm_1(data: tuple[np.ndarray, np.ndarray]
         np.testing.assert_allclose(BOUNDS.nlsm_bounds(points, y, gamma, epsilon, x), expected, rtol=0, atol=1e-12)
 
 
+@st.composite
+def hard_sets(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray]:
+    """What trees get wrong: clusters, duplicates, collinear points, ties, huge and tiny scales, a few leaves deep."""
+    rng = np.random.default_rng(draw(st.integers(0, 10_000)))
+    rows, n = draw(st.integers(1, 200)), draw(st.integers(1, 11))
+    shape = draw(st.sampled_from(["normal", "clusters", "duplicates", "line", "ties", "one point"]))
+    W = rng.standard_normal((rows, n))
+    if shape == "clusters":
+        W = 1e-3 * W + rng.integers(0, 3, (rows, 1)) * 100.0
+    elif shape == "duplicates":
+        W = W[rng.integers(0, max(rows // 5, 1), rows)]
+    elif shape == "line":
+        W = rng.standard_normal((rows, 1)) * rng.standard_normal(n)
+    elif shape == "ties":
+        W = rng.integers(-1, 2, (rows, n)).astype(float)
+    elif shape == "one point":
+        W = np.tile(W[:1], (rows, 1))
+    scale = draw(st.sampled_from([1.0, 1e-100, 1e-9, 1e9, 1e100]))
+    y = rng.integers(-2, 3, rows).astype(float) if draw(st.booleans()) else rng.standard_normal(rows)
+    return W * scale, y
+
+
+def in_tree_order(omega: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    order = tree_order(np.ascontiguousarray(omega.T))
+    points = np.ascontiguousarray(omega[order].T)
+    return points, y[order], tree_nodes(points, y[order])
+
+
+@given(data=hard_sets(), slope=st.sampled_from([0.0, 0.1, 1.0, 50.0]), epsilon=st.sampled_from([0.0, 0.05]))
+def test_the_tree_gives_the_bounds_of_algorithm_1(
+    data: tuple[np.ndarray, np.ndarray], slope: float, epsilon: float
+) -> None:
+    omega, y = data
+    points, values, nodes = in_tree_order(omega, y)
+    size = max(float(np.abs(omega).max()), 1e-300)
+    gamma = slope / size
+    for x in (omega[0], omega.mean(axis=0), omega[-1] + 0.3 * size, -5.0 * omega[len(y) // 2]):
+        low, high = TREE.tree_bounds(points, values, nodes, gamma, np.ascontiguousarray(x))
+        expected = algorithm_1(x, omega, y, gamma, epsilon)
+        # Squares by ** or *, roots by ** or sqrt: some ulp of cones up to 50 * 6 * sqrt(11) = 1,000.
+        np.testing.assert_allclose((low - epsilon, high + epsilon), expected, rtol=1e-12, atol=1e-12)
+        # And those of all points in one stretch, to the bit: the tree leaves nothing out.
+        one = np.zeros((2, nodes.shape[1]))
+        one[1] = nodes[1]
+        if len(y) > LEAF:
+            assert TREE.tree_bounds(points, values, one, gamma, np.ascontiguousarray(x)) == (low, high)
+
+
+@given(data=hard_sets())
+def test_the_leaves_hold_every_point_once_and_are_neither_full_nor_empty(data: tuple[np.ndarray, np.ndarray]) -> None:
+    omega, y = data
+    points, _, nodes = in_tree_order(omega, y)
+    assert sorted(map(tuple, points.T)) == sorted(map(tuple, omega))
+    leaves = len(nodes) // 2
+    sizes = np.diff(np.arange(leaves + 1) * len(y) // leaves)
+    assert sizes.max() <= LEAF
+    assert leaves == 1 or sizes.min() >= LEAF // 2
+
+
+@given(data=hard_sets(), slack=st.sampled_from([0.0, 0.1, 1.0]))
+def test_gamma_by_branch_and_bound_is_that_of_all_pairs(data: tuple[np.ndarray, np.ndarray], slack: float) -> None:
+    omega, y = data
+    points, slacks = np.ascontiguousarray(omega.T), np.array([slack, 0.3, 3.0])
+    if len(y) < 2:
+        return
+    expected = CONES.least_gammas(points, y, slacks, np.zeros((3, 2)))
+    got, pairs = least_gammas(points, y, slacks)
+    for m in range(3):
+        if expected[m] > 1e200:
+            assert got[m] > 1e200
+            continue
+        # rise - slack cancels: an ulp of the outputs over the distance of the pair that decides.
+        (j, k), spread = pairs[m], float(np.linalg.norm(omega[pairs[m, 0]] - omega[pairs[m, 1]]))
+        assert got[m] == pytest.approx(expected[m], rel=1e-12, abs=1e-15 / spread if spread > 0 else 0.0)
+        if got[m] > 0:
+            assert abs(y[j] - y[k]) - slacks[m] == pytest.approx(got[m] * spread, rel=1e-12, abs=1e-15)
+
+
+def test_the_gamma_curve_falls_is_convex_and_knows_both_rules() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-2, 2, (2, 1500))
+    clean = np.sin(points[0]) + 0.5 * points[1]
+    sigma = 0.01
+    values = clean + sigma * rng.standard_normal(1500)
+    curve = gamma_curve(points, values)
+    assert (np.diff(curve.gamma) <= 0).all()
+    slopes = np.diff(curve.gamma) / np.diff(curve.epsilon)
+    # A maximum of falling straight lines; 1e-9 of the steepest slope is rounding.
+    assert (np.diff(slopes) >= -1e-9 * np.abs(slopes).max()).all()
+    # Milanese and Novara's 2 epsilon is the paper's curve at twice the epsilon.
+    other = gamma_curve(points, values, curve.epsilon / 2, rule="milanese_novara")
+    np.testing.assert_array_equal(other.gamma, curve.gamma)
+    gamma, epsilon = curve.recommended
+    # The knee stands where the noise ends: the function's own slope is sqrt(1 + 0.25) = 1.118.
+    assert 2 * sigma < epsilon < 10 * sigma
+    assert 0.9 < gamma < 1.5
+
+
+def test_the_pair_that_denies_gamma_is_named() -> None:
+    points = np.array([[0.0, 1.0, 2.0, 3.0]])
+    values = np.array([0.0, 1.0, 4.0, 4.5])
+    assert offending_pair(points, values, 3.0, 0.0) is None
+    assert sorted(offending_pair(points, values, 2.9, 0.0) or ()) == [1, 2]
+    # |4 - 1| <= epsilon + gamma: 2.5 passes with 0.5 by the paper's rule and with 0.25 by Milanese and Novara's.
+    assert offending_pair(points, values, 2.5, 0.5) is None
+    assert offending_pair(points, values, 2.5, 0.25) is not None
+    assert offending_pair(points, values, 2.5, 0.25, rule="milanese_novara") is None
+
+
+def test_without_the_compiler_gamma_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(1)
+    points, values = rng.standard_normal((4, 300)), rng.standard_normal(300)
+    slacks = np.array([0.5, 0.0, 1.0])
+    fast, fast_pairs = least_gammas(points, values, slacks)
+    monkeypatch.setattr("softneck.identification._gamma.have_numba", lambda: False)
+    slow, slow_pairs = least_gammas(points, values, slacks)
+    np.testing.assert_allclose(fast, slow, rtol=1e-12)
+    np.testing.assert_array_equal(np.sort(fast_pairs), np.sort(slow_pairs))
+
+
+@pytest.mark.parametrize(
+    ("points", "values", "message"),
+    [
+        (np.zeros((2, 1)), np.zeros(1), "a set needs at least 2 points; got 1"),
+        (np.zeros((2, 3)), np.zeros(4), r"got \(2, 3\) and \(4,\)"),
+        (np.full((1, 3), np.nan), np.zeros(3), "must be finite"),
+        (np.zeros((1, 3)), np.zeros(3), "the outputs are constant"),
+    ],
+)
+def test_a_curve_over_bad_data_is_refused(points: np.ndarray, values: np.ndarray, message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        gamma_curve(points, values)
+
+
 @given(data=data_sets(), slack=st.sampled_from([0.0, 0.1, 1.0]))
 def test_gamma_is_the_least_over_all_pairs(data: tuple[np.ndarray, np.ndarray], slack: float) -> None:
     omega, y = data
@@ -82,12 +219,49 @@ def test_the_fitted_set_contains_every_point_and_gamma_is_no_larger_than_it_must
         assert gap == pytest.approx(0.0, abs=1e-12)
 
 
-def test_the_estimate_lies_in_the_middle_of_its_bounds(models: dict) -> None:
-    Y = models["nlsm"].simulate(short_neck())[25:]
+@pytest.mark.parametrize("form", ["nlsm", "residual"])
+def test_the_estimate_lies_in_the_middle_of_its_bounds(models: dict, form: str) -> None:
+    Y = models[form].simulate(short_neck())[25:]
     for axis in range(2):
         low, high = Y[:, 5 + 2 * axis], Y[:, 6 + 2 * axis]
         np.testing.assert_allclose(Y[:, axis], (low + high) / 2, rtol=0, atol=1e-14)
         assert (low <= high).all()
+
+
+def test_the_residual_form_is_its_base_and_a_set_over_its_signals(models: dict) -> None:
+    """The free run again from its parts: the base's own free run, then Algorithm 1 on it, row by row."""
+    arrays, recording = models["residual"].arrays, short_neck()
+    Y = models["residual"].simulate(recording, warm_up=0)
+    names = ("history", "drive", "redefinition", "a", "b", "delay")
+    base = Model(kind="rls", sample_time=TS, arrays={name: arrays[name] for name in names}).simulate(
+        recording, warm_up=0
+    )
+    sources = {2: base[:, 2:5], 3: base[:, :2]}
+    # The base of the residual form starts from its outputs less what the set says there: by row 200 of 500
+    # a pole of 0.92 leaves 1e-7 of that.
+    for k in (200, 311, 499):
+        x = np.array([sources[int(s)][k - int(lag), int(c)] for s, c, lag in arrays["table"]]) * arrays["scale"]
+        for axis in range(2):
+            gamma, epsilon = arrays["bounds"][axis]
+            bounds = algorithm_1(x, arrays["points"][axis].T, arrays["values"][axis], gamma, epsilon)
+            np.testing.assert_allclose(Y[k, 5 + 2 * axis : 7 + 2 * axis], base[k, axis] + np.array(bounds), atol=1e-7)
+
+
+def test_a_residual_cannot_drift(models: dict) -> None:
+    """Wherever the free run starts, it forgets it at the base's own pace: the set feeds nothing back."""
+    model, U = models["residual"], np.zeros((600, 8))
+    U[:, :3], U[:, 3:] = neck_recording(600, seed=9).set_points, np.nan
+    runs = [model.block().run(model.initial_state(pitch_start=p, roll_start=-p), U)[1] for p in (0.0, 0.7)]
+    # A pole of 0.92 leaves 0.7 * 0.92^550 < 1e-20; the sums round.
+    np.testing.assert_allclose(runs[0][-10:], runs[1][-10:], rtol=0, atol=1e-12)
+
+
+def test_the_residual_form_is_reached_by_its_name_and_says_so(models: dict) -> None:
+    assert models["residual"].kind == "nlsm"
+    assert models["residual"].settings["form"] == "residual"
+    assert models["nlsm"].settings["form"] == "paper_eq21"
+    with pytest.raises(DataError, match="every run is too short for form `residual`"):
+        SetMembership(form="residual").fit([neck_recording(78, seed=s) for s in (1, 2, 3)])
 
 
 def test_the_regressor_is_eq21() -> None:
@@ -141,7 +315,7 @@ def test_epsilon_and_weight_are_chosen_on_the_data_and_told() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [({"epsilon": 0.0}, "`epsilon` must be positive"), ({"output_weight": -1.0}, "`output_weight` must be positive"),
-     ({"form": "residual"}, "`form` must be one of paper_eq21; got 'residual'")],
+     ({"form": "magic"}, "`form` must be one of paper_eq21, residual; got 'magic'")],
 )  # fmt: skip
 def test_wrong_settings_are_refused(settings: dict, message: str) -> None:
     with pytest.raises(SettingsError, match=message):

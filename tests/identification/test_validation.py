@@ -113,7 +113,28 @@ def test_missed_samples_are_not_scored_and_do_no_harm() -> None:
     pitch[100:140:2] = np.nan
     result = validate(perfect(), CLEAN.with_channels(pitch=pitch))
     assert result.fits["inf"]["pitch"] == pytest.approx(100, abs=1e-4)
-    assert np.isfinite(result.persistence["1"]["pitch"])
+    assert result.persistence["1"]["pitch"] is not None
+
+
+def test_an_axis_that_was_never_measured_has_no_fit() -> None:
+    result = validate(perfect(), CLEAN.with_channels(pitch=np.full(len(CLEAN), np.nan)))
+    assert result.fits["inf"]["pitch"] is None
+    assert result.diverged is None
+    assert result.fits["inf"]["roll"] == pytest.approx(100, abs=1e-4)
+
+
+def test_a_horizon_is_scored_only_where_there_is_so_much_past() -> None:
+    model, horizon = perfect(), len(CLEAN) - 10
+    jumped = CLEAN.with_channels(pitch=np.where(np.arange(len(CLEAN)) < horizon, 1.0, CLEAN.channels["pitch"]))
+    told = validate(model, jumped, horizons=(horizon,)).fits[str(horizon)]["pitch"]
+    predicted = model.predict(jumped, horizon)[horizon:, 0]
+    assert told == pytest.approx(nrmse_fit(jumped.outputs[horizon:, 0], predicted))
+
+
+def test_the_residual_tests_do_not_depend_on_the_horizons_asked_for() -> None:
+    all_of_them, free_only = validate(perfect(), CLEAN), validate(perfect(), CLEAN, horizons=("inf",))
+    assert (all_of_them.white, all_of_them.uncorrelated) == (free_only.white, free_only.uncorrelated)
+    assert set(free_only.fits) == {"inf"}
 
 
 def test_what_is_too_short_or_unknown_is_refused() -> None:

@@ -45,9 +45,9 @@ def test_the_bend_that_is_drawn_is_the_one_that_was_measured() -> None:
 
 
 def test_what_cannot_be_drawn_is_refused(recording: Recording) -> None:
-    degrees = recording.with_channels(pitch=np.degrees(recording.channels["pitch"]))
+    upside_down = recording.with_channels(pitch=recording.channels["pitch"] + 2.0)
     with pytest.raises(DataError, match="exceeds 90 deg"):
-        neck_view(degrees)
+        neck_view(upside_down)
     lost = recording.with_channels(pitch=np.full(len(recording), np.nan))
     with pytest.raises(DataError, match="no sample of pitch and roll"):
         neck_view(lost)

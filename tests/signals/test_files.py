@@ -36,6 +36,8 @@ def recordings(draw: st.DrawFn) -> Recording:
     optional = draw(st.sets(st.sampled_from(known_channels()[1:]), max_size=5))
     column = st.lists(VALUES, min_size=n, max_size=n)
     channels = {name: np.array(draw(column)) for name in {*SET_POINTS, "pitch", "roll", *optional}}
+    for name in ("pitch", "roll"):
+        channels[name] = np.clip(channels[name], -3.0, 3.0)  # beyond half a turn is refused
     for name in set(MISSABLE) & set(channels):
         channels[name][draw(st.lists(st.integers(0, n - 1), max_size=3))] = np.nan
     time = np.concatenate([np.arange(rows) * Ts for rows in runs])

@@ -66,7 +66,7 @@ def test_a_missing_channel_is_named(name: str) -> None:
     ("name", "value", "message"),
     [
         ("motor_setpoint_1", np.nan, r"channel `motor_setpoint_1` is nan at row 7 \(t = 0\.14 s\)"),
-        ("motor_position_3", np.nan, "channel `motor_position_3` is nan at row 7"),
+        ("motor_position_3", np.inf, "channel `motor_position_3` is inf at row 7"),
         ("pitch", np.inf, "channel `pitch` is inf at row 7"),
     ],
 )
@@ -129,3 +129,9 @@ def test_a_loggers_jitter_of_two_percent_is_allowed() -> None:
     with_time(r, r.time + 0.019 * TS * jitter)
     with pytest.raises(DataError, match="`time` jumps by"):
         with_time(r, r.time + 0.021 * TS * jitter)
+
+
+def test_angles_beyond_half_a_turn_are_taken_for_degrees() -> None:
+    whole = neck_recording(100)
+    with pytest.raises(DataError, match=r"channel `roll` is 20 rad at row 4, more than half a turn; is it in degrees"):
+        whole.with_channels(roll=np.where(np.arange(100) == 4, 20.0, 0.0))

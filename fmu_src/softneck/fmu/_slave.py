@@ -91,6 +91,8 @@ class SoftneckSlave(Fmi2Slave):
         self.sample_time = self.facts["sample_time"]
         self.start, self.count, self.running, self.stale = 0.0, 0, False, True
         self.variables = np.array([port["start"] for port in self.ports], dtype=np.float64)
+        # What nobody connects or sets was not measured.
+        self.variables[:n_in][[port["missing"] for port in self.facts["inputs"]]] = np.nan
         self.pending = np.zeros(n_out)
         self.memory = np.zeros(state_size(self.arrays))
         self._view()
@@ -184,7 +186,11 @@ class SoftneckSlave(Fmi2Slave):
         """Return values of any variables."""
         self._initialise()
         values = self.variables.tolist()
-        return [values[reference] for reference in references]
+        return [self._shown(values[reference], reference) for reference in references]
+
+    def _shown(self, value: float, reference: int) -> float:
+        """Return an input that was never set as its start value: hosts expect a number."""
+        return self.ports[reference]["start"] if value != value and reference < self.n_in else value
 
     @_fmu_guarded
     def get_boolean(self, references: list[int]) -> list[bool]:

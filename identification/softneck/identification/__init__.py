@@ -2,6 +2,9 @@
 
 from ._drive import DriveModel as DriveModel
 from ._drive import fit_drive as fit_drive
+from ._gamma import GammaCurve as GammaCurve
+from ._gamma import gamma_curve as gamma_curve
+from ._gamma import offending_pair as offending_pair
 from ._linear import continuous_parameters as continuous_parameters
 from ._model import WARM_UP as WARM_UP
 from ._model import Model as Model

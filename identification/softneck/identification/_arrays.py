@@ -8,12 +8,19 @@ import numpy as np
 
 from softneck.core import FileFormatError, Matrix
 
+from ._tree import tree_nodes, tree_order
+
 # In the runtimes' order (see each kind's `_runtime` module).
 _ORDER = {
     "rls": ("history", "drive", "redefinition", "a", "b", "delay"),
-    "nlsm": ("history", "drive", "table", "scale", "points", "values", "bounds"),
+    "nlsm": (
+        "history", "drive", "table", "scale", "points", "values", "bounds", "nodes",
+        "redefinition", "a", "b", "delay",
+    ),
     "nn": ("history", "drive", "table", "W1", "b1", "W2", "b2", "w3", "b3", "input_scale", "output_scale"),
-}
+}  # fmt: skip
+# Before the tree and the base.
+_FIRST_NLSM = _ORDER["nlsm"][:7]
 # A minute at 1 ms: far beyond any lag of a neck, far below what memory holds.
 _LONGEST_HISTORY = 60_000
 
@@ -36,12 +43,38 @@ def check_arrays(kind: str, arrays: Mapping[str, Matrix]) -> None:
     {"rls": _check_rls, "nlsm": _check_nlsm, "nn": _check_nn}[kind](arrays, history)
 
 
+def completed(kind: str, arrays: Mapping[str, Matrix]) -> dict[str, Matrix]:
+    """Return the arrays with what files of the first format do not have: tree and (empty) base of kind nlsm."""
+    made = dict(arrays)
+    if kind != "nlsm" or tuple(made) != _FIRST_NLSM:
+        return made
+    W, y = made["points"], made["values"]
+    if W.ndim != 3 or y.shape != (W.shape[0], W.shape[2]) or not y.size:
+        raise FileFormatError(f"its points {W.shape} and values {y.shape} do not fit together.")
+    orders = [tree_order(axis) for axis in W]
+    made["points"] = np.array([axis[:, order] for axis, order in zip(W, orders, strict=True)])
+    made["values"] = np.array([axis[order] for axis, order in zip(y, orders, strict=True)])
+    made["nodes"] = np.array([tree_nodes(*axis) for axis in zip(made["points"], made["values"], strict=True)])
+    return made | no_base()
+
+
+def no_base() -> dict[str, Matrix]:
+    """Return the arrays of a set that stands alone."""
+    empty = np.zeros((2, 0))
+    return {"redefinition": np.zeros((3, 3)), "a": empty, "b": empty, "delay": np.zeros(2)}
+
+
 def _check_rls(arrays: Mapping[str, Matrix], history: float) -> None:
+    _check_linear(arrays, history)
+    _within(np.array([arrays["a"].shape[-1]]), 1, history, "the order")
+
+
+def _check_linear(arrays: Mapping[str, Matrix], history: float) -> None:
     na, nb = arrays["a"].shape[-1], arrays["b"].shape[-1]
     for name, shape in {"redefinition": (3, 3), "a": (2, na), "b": (2, nb), "delay": (2,)}.items():
         _expect(arrays, name, shape)
     _within(arrays["delay"], 0, history - nb, "a dead time")
-    _within(np.array([na]), 1, history, "the order")
+    _within(np.array([na]), 0, history, "the order")
 
 
 def _check_nlsm(arrays: Mapping[str, Matrix], history: float) -> None:
@@ -50,6 +83,11 @@ def _check_nlsm(arrays: Mapping[str, Matrix], history: float) -> None:
     for name, shape in {"scale": (n,), "points": (2, n, rows), "values": (2, rows), "bounds": (2, 2)}.items():
         _expect(arrays, name, shape)
     _within(np.array([rows]), 1, np.inf, "the number of points")
+    nodes = np.array([tree_nodes(*axis) for axis in zip(arrays["points"], arrays["values"], strict=True)])
+    # A tree of another shape would be read beyond its end, and one of other numbers would leave points out.
+    if not np.array_equal(arrays["nodes"], nodes):
+        raise FileFormatError("its array `nodes` is not the tree over its points; identify the model again.")
+    _check_linear(arrays, history)
 
 
 def _check_nn(arrays: Mapping[str, Matrix], history: float) -> None:
@@ -67,8 +105,9 @@ def _check_table(table: Matrix, history: float) -> int:
     """Check rows (source, channel, lag) and return their number."""
     if table.ndim != 2 or table.shape[1] != 3 or not len(table):
         raise FileFormatError(f"its regressor table has shape {table.shape}; (n, 3) is needed.")
-    _within(table[:, 0], 0, 2, "a regressor's source")
+    _within(table[:, 0], 0, 3, "a regressor's source")
     _within(table[:, 1], 0, 2, "a regressor's channel")
+    _within(table[table[:, 0] == 3, 1], 0, 1, "a regressor's output")
     _within(table[:, 2], 1, history, "a regressor's lag")
     return len(table)
 

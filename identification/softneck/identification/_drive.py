@@ -59,13 +59,20 @@ def _pole(runs: list[tuple[Vector, Vector]], d: int) -> float:
             continue
         target = u[: u.size - d]
         ahead, now = m[d:] - target, m[d - 1 : -1] - target
-        above += float(ahead @ now)
-        below += float(now @ now)
+        there = np.isfinite(ahead) & np.isfinite(now)
+        above += float(ahead[there] @ now[there])
+        below += float(now[there] @ now[there])
     return float(np.clip(above / below, 0.0, 0.999)) if below > 0 else 0.0
 
 
 def _error(runs: list[tuple[Vector, Vector]], a: float, d: int) -> float:
-    return sum(float(np.sum((_simulate(u, m[0], a, d) - m) ** 2)) for u, m in runs)
+    return sum(float(np.nansum((_simulate(u, _first(m, u), a, d) - m) ** 2)) for u, m in runs)
+
+
+def _first(m: Vector, u: Vector) -> float:
+    """Return the first position that was not missed; the first set-point where all were."""
+    there = np.isfinite(m)
+    return float(m[np.argmax(there)]) if there.any() else float(u[0])
 
 
 def _simulate(u: Vector, start: float, a: float, d: int) -> Vector:

@@ -15,7 +15,9 @@ from softneck.core import (
     KINDS,
     Block,
     DataError,
+    FileFormatError,
     Matrix,
+    SettingsError,
     State,
     Vector,
     finite_vector,
@@ -26,7 +28,7 @@ from softneck.core import load as load_file
 from softneck.signals import Recording
 
 from . import _linear, _ports
-from ._arrays import check_arrays
+from ._arrays import check_arrays, completed
 
 # A free run starts from this many measured samples, for every kind; they are not scored.
 WARM_UP = 25
@@ -75,9 +77,12 @@ class Model:
         """
         block = self.block()
         if recording is None:
-            return block.initial_state(use_measurement=1.0, **parameters)
+            return block.initial_state(**{"use_measurement": 1.0, **parameters})
+        if parameters:
+            raise SettingsError("`initial_state` takes a recording or start values, not both.")
         y0 = np.nan_to_num(recording.outputs[0])
-        m0 = recording.motor_positions[0]
+        logged = recording.motor_positions[0]
+        m0 = np.where(np.isfinite(logged), logged, recording.set_points[0])
         start = block.initial_state(use_measurement=1.0, pitch_start=y0[0], roll_start=y0[1])
         held = np.tile(np.concatenate([m0, y0, m0]), (int(self.arrays["history"][0]), 1))
         state, _ = block.run(start, held)
@@ -184,12 +189,13 @@ class Model:
         model = cls(
             kind=header["kind"],
             sample_time=float(header["sample_time"]),
-            arrays={name: arrays[name] for name in header["arrays"]},
+            arrays=completed(header["kind"], {name: arrays[name] for name in header["arrays"]}),
             settings=header["settings"],
             findings=header["findings"],
             training_rows=arrays["training_rows"],
         )
         check_arrays(model.kind, model.arrays)
+        _check_header(model)
         return model
 
     def _check(self, recording: Recording) -> None:
@@ -207,6 +213,15 @@ class Model:
         rows[:warm_up] = _input_rows(run, "measured")[:warm_up]
         _, outputs = self.block().run(start, rows)
         return np.vstack([start.outputs, outputs[:-1]])
+
+
+def _check_header(model: Model) -> None:
+    if not 0.0 < model.sample_time < 10.0:
+        raise FileFormatError(f"its sample time of {model.sample_time} s is none of a neck.")
+    if not isinstance(model.settings, dict) or not isinstance(model.findings, dict):
+        raise FileFormatError("its settings and findings must be tables.")
+    if model.training_rows.dtype != np.uint64 or model.training_rows.ndim != 1:
+        raise FileFormatError("its training rows are no hashes.")
 
 
 def load_model(path: str | Path) -> Model:

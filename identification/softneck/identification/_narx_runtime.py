@@ -1,8 +1,10 @@
 """What all NARX plants share: histories, the drive model, measured or simulated signals, output noise.
 
 State: set-points u (H, 3), motor positions m (H, 3), outputs y (H, 2), newest first; then the motor
-positions and outputs of now, and the random generator. arrays[0] = [H], arrays[1] = drive (3, 2): pole a
-and delay d of `m(k+1) = a m(k) + (1 - a) u(k+1-d)`; d = 0 says that the position is the set-point.
+positions and outputs of now, the random generator (6), and how far each output of now is above what goes
+into its history (2): form `residual` of set membership remembers only its base there, all else keeps 0.
+arrays[0] = [H], arrays[1] = drive (3, 2): pole a and delay d of `m(k+1) = a m(k) + (1 - a) u(k+1-d)`;
+d = 0 says that the position is the set-point.
 """
 
 import numpy as np
@@ -18,7 +20,7 @@ NARX_NOISE_SEED = 4
 
 def state_size(arrays: tuple[np.ndarray, ...]) -> int:
     """Return the length of the state vector."""
-    return 8 * int(arrays[0][0]) + 11
+    return 8 * int(arrays[0][0]) + 13
 
 
 def initialise(arrays: tuple[np.ndarray, ...], parameters: np.ndarray, state: np.ndarray, outputs: np.ndarray) -> None:
@@ -30,10 +32,13 @@ def initialise(arrays: tuple[np.ndarray, ...], parameters: np.ndarray, state: np
         state[6 * h + 2 * j + 1] = parameters[NARX_START + 1]
     state[8 * h + 3] = parameters[NARX_START]
     state[8 * h + 4] = parameters[NARX_START + 1]
-    random_seed(state[8 * h + 5 :], parameters[NARX_NOISE_SEED])
+    random_seed(state[8 * h + 5 : 8 * h + 11], parameters[NARX_NOISE_SEED])
     outputs[:] = 0.0
     outputs[0] = parameters[NARX_START]
     outputs[1] = parameters[NARX_START + 1]
+    if outputs.shape[0] == 9:  # bounds, which hold nothing but the start yet
+        outputs[5:7] = parameters[NARX_START]
+        outputs[7:9] = parameters[NARX_START + 1]
 
 
 def narx_observe(arrays: tuple[np.ndarray, ...], parameters: np.ndarray, state: np.ndarray, inputs: np.ndarray) -> None:
@@ -56,7 +61,7 @@ def narx_observe(arrays: tuple[np.ndarray, ...], parameters: np.ndarray, state: 
     state[6 * h + 2 : 8 * h] = state[6 * h : 8 * h - 2].copy()
     state[:3] = inputs[:3]
     state[3 * h : 3 * h + 3] = state[now : now + 3]
-    state[6 * h : 6 * h + 2] = state[now + 3 : now + 5]
+    state[6 * h : 6 * h + 2] = state[now + 3 : now + 5] - state[now + 11 : now + 13]
 
 
 def narx_advance(
@@ -89,7 +94,7 @@ def narx_advance(
 def narx_regressor(
     arrays: tuple[np.ndarray, ...], table: np.ndarray, state: np.ndarray, axis: int, regressor: np.ndarray
 ) -> None:
-    """Fill the regressor of y(k+1); row (source, channel, lag) of `table`: source 0 own output, 1 u, 2 m."""
+    """Fill the regressor of y(k+1); row (source, channel, lag) of `table`: source 0 own output, 1 u, 2 m, 3 outputs."""
     h = int(arrays[0][0])
     for i in range(table.shape[0]):
         source = int(table[i, 0])
@@ -99,5 +104,7 @@ def narx_regressor(
             regressor[i] = state[6 * h + 2 * back + axis]
         elif source == 1:
             regressor[i] = state[3 * back + channel]
-        else:
+        elif source == 2:
             regressor[i] = state[3 * h + 3 * back + channel]
+        else:
+            regressor[i] = state[6 * h + 2 * back + channel]

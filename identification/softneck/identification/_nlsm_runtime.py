@@ -1,8 +1,16 @@
-"""Set membership (Eq. 18-20, Algorithm 1); arrays: H, drive, regressor table, scale, W, y, (gamma, epsilon)."""
+"""Set membership (Eq. 18-20, Algorithm 1), alone or on a linear base.
+
+Arrays: H, drive, table, scale, W, y, (gamma, epsilon), tree nodes; then the base: redefinition, a, b, delay. An
+empty base is the paper's Eq. 21, fed back what it puts out. With one, the histories hold the base's outputs: what
+the set adds to them is never fed back, and what is measured moves the base alone.
+"""
 
 import numpy as np
 
+from softneck.core._compiled_runtime import COMPILED
+from softneck.identification._arx_runtime import arx_output
 from softneck.identification._narx_runtime import narx_advance, narx_observe, narx_regressor
+from softneck.identification._tree_runtime import tree_bounds
 
 
 def nlsm_bounds(
@@ -17,6 +25,16 @@ def nlsm_bounds(
     return np.max(values - cone) - epsilon, np.min(values + cone) + epsilon
 
 
+def nlsm_query(arrays: tuple[np.ndarray, ...], axis: int, x: np.ndarray) -> tuple[float, float]:
+    """Return f_l(x), f_u(x) of one axis: by the tree where loops are fast, else over all points by numpy."""
+    gamma = arrays[6][axis, 0]
+    epsilon = arrays[6][axis, 1]
+    if COMPILED:
+        low, high = tree_bounds(arrays[4][axis], arrays[5][axis], arrays[7][axis], gamma, x)
+        return low - epsilon, high + epsilon
+    return nlsm_bounds(arrays[4][axis], arrays[5][axis], gamma, epsilon, x)
+
+
 def step(
     arrays: tuple[np.ndarray, ...],
     parameters: np.ndarray,
@@ -26,16 +44,19 @@ def step(
 ) -> None:
     """Advance by one sample; the bounds of pitch and roll follow the motor positions in `outputs`."""
     narx_observe(arrays, parameters, state, inputs)
+    h = int(arrays[0][0])
     table = arrays[2]
     scale = arrays[3]
     x = np.empty(table.shape[0])
     angles = np.empty(2)
     for axis in range(2):
         narx_regressor(arrays, table, state, axis, x)
-        gamma = arrays[6][axis, 0]
-        epsilon = arrays[6][axis, 1]
-        low, high = nlsm_bounds(arrays[4][axis], arrays[5][axis], gamma, epsilon, x * scale)
-        angles[axis] = 0.5 * (low + high)
-        outputs[5 + 2 * axis] = low
-        outputs[6 + 2 * axis] = high
+        low, high = nlsm_query(arrays, axis, x * scale)
+        base = arx_output(arrays[8], arrays[9][axis], arrays[10][axis], int(arrays[11][axis]), h, state, axis)
+        middle = 0.5 * (low + high)
+        angles[axis] = base + middle
+        outputs[5 + 2 * axis] = base + low
+        outputs[6 + 2 * axis] = base + high
+        if arrays[10].shape[1] > 0:
+            state[8 * h + 11 + axis] = middle
     narx_advance(arrays, parameters, state, angles[0], angles[1], outputs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -12,22 +13,27 @@ from softneck.core import (
     Progress,
     SettingsError,
     Vector,
-    load_functions,
     require_one_of,
     require_positive,
     silent,
 )
 from softneck.signals import Recording, concatenate
 
+from ._arrays import no_base
 from ._checks import check_training
-from ._drive import fit_drive
+from ._drive import DriveModel, fit_drive
+from ._gamma import least_gammas
 from ._model import WARM_UP, Model
 from ._regressors import PAPER_EQ21, history_length, motor_signals, regression
+from ._residual import ANGLE_WEIGHT, residual_points, residual_table
+from ._rls import Rls
 from ._rows import row_hashes
 from ._scores import nrmse_fit
+from ._tree import tree_nodes, tree_order
 
-_CONES = "softneck.identification._cones_runtime"
-_AXES = ("pitch", "roll")
+FORMS = ("paper_eq21", "residual")
+# Free run of form `residual` hardly depends on it (docs, "Set membership").
+_RESIDUAL_SIGMAS = 4.0
 # The knee of gamma*(epsilon) lies at 3 to 5 sigma of the noise; in free run more is better, as the model's own
 # errors stand in the regressor too. The hold-out decides.
 _EPSILON_SIGMAS = (3.0, 5.0, 8.0, 12.0)
@@ -43,9 +49,11 @@ class SetMembership:
     """The estimator of Eq. 12-20 and Algorithm 1 over the regressor of Eq. 21, one set for each axis.
 
     Attributes:
-        form: "paper_eq21".
+        form: "paper_eq21", or "residual": set membership over simulated signals on what the free run of `Rls`
+            leaves over, which has nothing to feed back and so cannot drift.
         epsilon: noise bound of Eq. 15 [rad]; None chooses it on the data.
-        output_weight: weight of y(k-1) in the regressor's norm, motors having 1; None chooses it on the data.
+        output_weight: weight of y(k-1) (of the base's angles) in the regressor's norm, motors having 1; None
+            chooses it on the data (takes 5).
     """
 
     form: str = "paper_eq21"
@@ -53,7 +61,7 @@ class SetMembership:
     output_weight: float | None = None
 
     def __post_init__(self) -> None:
-        require_one_of("form", self.form, ("paper_eq21",))
+        require_one_of("form", self.form, FORMS)
         if self.epsilon is not None:
             require_positive("epsilon", self.epsilon, "rad")
         if self.output_weight is not None:
@@ -70,21 +78,26 @@ class SetMembership:
         """
         recording = concatenate(recordings if isinstance(recordings, list) else [recordings])
         check_training(recording)
-        recording = motor_signals(recording, fit_drive(recording))
         noise = np.array([noise_level(recording, axis) for axis in range(2)])
-        choice = self._choose(recording, noise, progress)
-        arrays, findings = self._arrays(recording, *choice)
+        if self.form == "residual":
+            arrays, findings = self._fit_residual(recording, noise, progress)
+        else:
+            drive = fit_drive(recording)  # before `motor_signals` puts the drive model's own positions in
+            recording = motor_signals(recording, drive)
+            arrays, findings = self._arrays(recording, drive, *self._choose(recording, drive, noise, progress))
         progress(1.0, "done")
         return Model(
             kind="nlsm",
             sample_time=recording.sample_time,
             arrays=arrays,
             settings=asdict(self),
-            findings={"noise_deg": np.degrees(noise).tolist(), **findings},
+            findings={"form": self.form, "noise_deg": np.degrees(noise).tolist(), **findings},
             training_rows=row_hashes(recording),
         )
 
-    def _choose(self, recording: Recording, noise: Vector, progress: Progress) -> tuple[float, Vector]:
+    def _choose(
+        self, recording: Recording, drive: DriveModel, noise: Vector, progress: Progress
+    ) -> tuple[float, Vector]:
         """Return the output weight and epsilon (2,) of the best free run on the hold-out."""
         weights = _OUTPUT_WEIGHTS if self.output_weight is None else (self.output_weight,)
         sigmas = _EPSILON_SIGMAS if self.epsilon is None else (0.0,)
@@ -102,7 +115,7 @@ class SetMembership:
             for epsilon, gamma in zip(epsilons, self._gammas(head, weight, epsilons), strict=True):
                 if gamma.max() > 1e100:
                     continue
-                score = self._free_run_score(head, tail, weight, epsilon, gamma)
+                score = _free_run_score((head, tail), drive, weight, epsilon, gamma)
                 if best is None or score > best[0]:
                     best = (score, weight, epsilon)
         if best is None:
@@ -114,30 +127,38 @@ class SetMembership:
         columns = []
         for axis in range(2):
             points, values = _points(recording, weight, axis)
-            slacks = np.array([epsilon[axis] for epsilon in epsilons])
-            worst = np.zeros((slacks.size, 2))
-            columns.append(load_functions(_CONES).least_gammas(points, values, slacks, worst))
+            columns.append(least_gammas(points, values, np.array([epsilon[axis] for epsilon in epsilons]))[0])
         return [np.array(pair) for pair in zip(*columns, strict=True)]
 
-    def _free_run_score(self, head: Recording, tail: Recording, weight: float, epsilon: Vector, gamma: Vector) -> float:
-        arrays = _build(head, weight, epsilon, gamma)
-        outputs = Model(kind="nlsm", sample_time=head.sample_time, arrays=arrays).simulate(tail)[:, :2]
-        return sum(nrmse_fit(tail.outputs[WARM_UP:, axis], outputs[WARM_UP:, axis]) for axis in range(2))
-
-    def _arrays(self, recording: Recording, weight: float, epsilon: Vector) -> tuple[dict[str, Matrix], dict]:
-        gamma = self._gammas(recording, weight, [epsilon])[0]
-        if gamma.max() > 1e100:
-            raise DataError(
-                f"epsilon {np.degrees(epsilon).round(4).tolist()} deg is below the noise: equal regressors have "
-                "outputs further apart, so no function fits the data. Set `epsilon` higher."
-            )
-        findings = {
-            "epsilon_deg": np.degrees(epsilon).tolist(),
-            "gamma": gamma.tolist(),
-            "output_weight": weight,
-            "points": int(_points(recording, weight, 0)[1].size),
+    def _fit_residual(self, recording: Recording, noise: Vector, progress: Progress) -> tuple[dict[str, Matrix], dict]:
+        progress(0.0, "linear base")
+        base = Rls().fit(recording)
+        progress(0.5, "set membership on what it leaves over")
+        weight = ANGLE_WEIGHT if self.output_weight is None else self.output_weight
+        epsilon = _RESIDUAL_SIGMAS * noise if self.epsilon is None else np.full(2, self.epsilon)
+        table = residual_table(recording.sample_time)
+        scale = np.where(table[:, 0] == 3, weight, 1.0)
+        points = [residual_points(recording, base, table, scale, axis) for axis in range(2)]
+        gamma = np.array([least_gammas(*points[i], epsilon[i : i + 1])[0][0] for i in range(2)])
+        _require_consistent(gamma, epsilon)
+        history = max(float(base.arrays["history"][0]), table[:, 2].max())
+        arrays = {
+            "history": np.array([history]),
+            "drive": base.arrays["drive"],
+            "table": table,
+            "scale": scale,
+            **_set_arrays(points, gamma, epsilon),
+            **{name: base.arrays[name] for name in ("redefinition", "a", "b", "delay")},
         }
-        return _build(recording, weight, epsilon, gamma), findings
+        return arrays, _findings(gamma, epsilon, weight, points[0][1].size)
+
+    def _arrays(
+        self, recording: Recording, drive: DriveModel, weight: float, epsilon: Vector
+    ) -> tuple[dict[str, Matrix], dict]:
+        gamma = self._gammas(recording, weight, [epsilon])[0]
+        _require_consistent(gamma, epsilon)
+        findings = _findings(gamma, epsilon, weight, _points(recording, weight, 0)[1].size)
+        return _build(recording, drive, weight, epsilon, gamma), findings
 
 
 def noise_level(recording: Recording, axis: int) -> float:
@@ -162,18 +183,56 @@ def _scale(weight: float) -> Vector:
     return np.where(PAPER_EQ21[:, 0] == 0, weight, 1.0)
 
 
-def _build(recording: Recording, weight: float, epsilon: Vector, gamma: Vector) -> dict[str, Matrix]:
-    drive = fit_drive(recording)
+def _free_run_score(
+    parts: tuple[Recording, Recording], drive: DriveModel, weight: float, epsilon: Vector, gamma: Vector
+) -> float:
+    """Return the sum of both axes' free-run fits [%] on the second part, of a set made of the first."""
+    head, tail = parts
+    arrays = _build(head, drive, weight, epsilon, gamma)
+    outputs = Model(kind="nlsm", sample_time=head.sample_time, arrays=arrays).simulate(tail)[:, :2]
+    return sum(nrmse_fit(tail.outputs[WARM_UP:, axis], outputs[WARM_UP:, axis]) for axis in range(2))
+
+
+def _build(recording: Recording, drive: DriveModel, weight: float, epsilon: Vector, gamma: Vector) -> dict[str, Matrix]:
     points = [_points(recording, weight, axis) for axis in range(2)]
-    rows = min(values.size for _, values in points)
-    if rows < 2:
-        raise SettingsError("a set needs at least 2 points.")
     return {
         "history": np.array([float(history_length(PAPER_EQ21, drive))]),
         "drive": drive.array,
         "table": PAPER_EQ21,
         "scale": _scale(weight),
-        "points": np.array([p[:, :rows] for p, _ in points]),
-        "values": np.array([values[:rows] for _, values in points]),
-        "bounds": np.column_stack([gamma, epsilon]),
+        **_set_arrays(points, gamma, epsilon),
+        **no_base(),
     }
+
+
+def _set_arrays(points: Sequence[tuple[Matrix, Vector]], gamma: Vector, epsilon: Vector) -> dict[str, Matrix]:
+    rows = min(values.size for _, values in points)
+    if rows < 2:
+        raise SettingsError("a set needs at least 2 points.")
+    W = np.empty((len(points), points[0][0].shape[0], rows))
+    y = np.empty((len(points), rows))
+    # Filled in place: with the data at hand and the tree, memory holds 2.3 times the data.
+    for axis, (given, values) in enumerate(points):
+        order = tree_order(given[:, :rows])
+        for row, given_row in zip(W[axis], given, strict=True):
+            row[:] = given_row[order]
+        y[axis] = values[order]
+    nodes = np.array([tree_nodes(*axis) for axis in zip(W, y, strict=True)])
+    return {"points": W, "values": y, "bounds": np.column_stack([gamma, epsilon]), "nodes": nodes}
+
+
+def _findings(gamma: Vector, epsilon: Vector, weight: float, points: int) -> dict:
+    return {
+        "epsilon_deg": np.degrees(epsilon).tolist(),
+        "gamma": gamma.tolist(),
+        "output_weight": weight,
+        "points": points,
+    }
+
+
+def _require_consistent(gamma: Vector, epsilon: Vector) -> None:
+    if gamma.max() > 1e100:
+        raise DataError(
+            f"epsilon {np.degrees(epsilon).round(4).tolist()} deg is below the noise: equal regressors have "
+            "outputs further apart, so no function fits the data. Set `epsilon` higher."
+        )

@@ -31,7 +31,7 @@ class Validation:
     Attributes:
         model, data: their names.
         rows_scored, rows_left_out: rows judged, and rows left out because the model was trained on them.
-        persistence, fits: horizon -> axis -> fit [%]; None where it diverged.
+        persistence, fits: horizon -> axis -> fit [%]; None where it diverged or nothing was measured or moved.
         rmse_deg: horizon -> axis -> root mean square error [deg].
         diverged: time [s] at which the free run left the neck's range, or None.
         white, uncorrelated: verdicts of the residual tests on the one-step errors.
@@ -42,7 +42,7 @@ class Validation:
     data: str
     rows_scored: int
     rows_left_out: int
-    persistence: dict[str, dict[str, float]]
+    persistence: dict[str, dict[str, float | None]]
     fits: dict[str, dict[str, float | None]]
     rmse_deg: dict[str, dict[str, float | None]]
     diverged: float | None
@@ -86,23 +86,28 @@ def validate(
     """
     require_one_of("motors", motors, ("simulated", "measured"))
     stretches, seen = _stretches(model, recording, include_training)
-    runs = [_predictions(model, stretch, horizons, motors) for stretch, _ in stretches]
+    # One step ahead is always computed: the residual tests need it.
+    runs = [_predictions(model, stretch, (1, *horizons), motors) for stretch, _ in stretches]
     scored = [mask for _, mask in stretches]
     y = np.concatenate([np.where(m[:, None], s.outputs, np.nan) for (s, _), m in zip(stretches, scored, strict=True)])
     joined = {h: np.concatenate([run[h] for run in runs]) for h in runs[0]}
     time = np.concatenate([stretch.time for stretch, _ in stretches])
     diverged = _divergence(time, joined[INFINITE]) if INFINITE in joined else None
-    finite = [h for h in joined if h != INFINITE]
+    finite = [str(h) for h in horizons if h != INFINITE]
     held = {h: np.concatenate([_persistence(s, int(h)) for s, _ in stretches]) for h in finite}
-    error = (y - joined["1"])[np.isfinite(y).all(axis=1)] if "1" in joined else np.zeros((0, 2))
-    inputs = np.concatenate([stretch.set_points for stretch, _ in stretches])[np.isfinite(y).all(axis=1)]
-    scores = {h: _scores(y, yhat, lost=h == INFINITE and diverged is not None) for h, yhat in joined.items()}
+    there = np.isfinite(y).all(axis=1)
+    error = (y - joined["1"])[there]
+    inputs = np.concatenate([stretch.set_points for stretch, _ in stretches])[there]
+    since = np.concatenate([np.arange(len(stretch)) for stretch, _ in stretches])
+    # A row with less past than the horizon was not predicted from that far back.
+    judged = {h: np.where((since >= (0 if h == INFINITE else int(h)))[:, None], y, np.nan) for h in map(str, horizons)}
+    scores = {h: _scores(judged[h], joined[h], lost=h == INFINITE and diverged is not None) for h in judged}
     return Validation(
         model=names[0],
         data=names[1],
         rows_scored=int(sum(mask.sum() for mask in scored)),
         rows_left_out=seen,
-        persistence={h: {a: nrmse_fit(y[:, i], held[h][:, i]) for i, a in enumerate(_AXES)} for h in finite},
+        persistence={h: _scores(judged[h], held[h], lost=False)[0] for h in finite},
         fits={h: fit for h, (fit, _) in scores.items()},
         rmse_deg={h: error_deg for h, (_, error_deg) in scores.items()},
         diverged=diverged,
@@ -111,7 +116,7 @@ def validate(
         time=time,
         measured=y,
         free_run=joined.get(INFINITE, np.full_like(y, np.nan)),
-        one_step=joined.get("1", np.full_like(y, np.nan)),
+        one_step=joined["1"],
     )
 
 
@@ -188,8 +193,7 @@ def _is_white(error: Matrix) -> bool:
     if n <= 2 * _LAGS:
         return False
     for e in (error - error.mean(axis=0)).T:
-        power = float(e @ e)
-        r = np.array([float(e[k:] @ e[:-k]) for k in range(1, _LAGS + 1)]) / max(power, 1e-300)
+        r = _autocorrelation(e)
         statistic = n * (n + 2) * float(np.sum(r**2 / (n - np.arange(1, _LAGS + 1))))
         if statistic > chi2.ppf(_LEVEL, _LAGS):
             return False
@@ -197,7 +201,10 @@ def _is_white(error: Matrix) -> bool:
 
 
 def _is_uncorrelated(error: Matrix, inputs: Matrix) -> bool:
-    """Correlation with each input at lags 0 to 25 within its 99 % band, Bonferroni over all of them (Ljung 16.6)."""
+    """Correlation with each input at lags 0 to 25 within its 99 % band, Bonferroni over all of them (Ljung 16.6).
+
+    The band is that of a coloured error: variance `sum_k R_e(k) R_u(k)` over k = -25..25.
+    """
     n = error.shape[0]
     if n <= 2 * _LAGS:
         return False
@@ -205,9 +212,18 @@ def _is_uncorrelated(error: Matrix, inputs: Matrix) -> bool:
     # Two-sided normal bound through chi-square with one degree of freedom.
     bound = float(np.sqrt(chi2.ppf(1.0 - (1.0 - _LEVEL) / tests, 1)))
     for e in (error - error.mean(axis=0)).T:
+        r_e = _autocorrelation(e)
         for u in (inputs - inputs.mean(axis=0)).T:
             scale = max(float(np.linalg.norm(e) * np.linalg.norm(u)), 1e-300)
             r = np.array([float(e[k:] @ u[: n - k]) for k in range(_LAGS + 1)]) / scale
-            if np.abs(r).max() * np.sqrt(n) > bound:
+            # Truncation may leave the sum below that of a white error, which it never is.
+            variance = max(1.0, 1.0 + 2.0 * float(r_e @ _autocorrelation(u)))
+            if np.abs(r).max() * np.sqrt(n / variance) > bound:
                 return False
     return True
+
+
+def _autocorrelation(x: Vector) -> Vector:
+    """Return the autocorrelation at lags 1 to 25 of a signal without mean."""
+    power = max(float(x @ x), 1e-300)
+    return np.array([float(x[k:] @ x[:-k]) for k in range(1, _LAGS + 1)]) / power

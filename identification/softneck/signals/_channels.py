@@ -35,7 +35,7 @@ _TABLE: dict[str, str] = {
     "measurement_valid": "1",
 }  # fmt: skip
 # Channels in which an empty cell is a sample that the sensor missed.
-_MAY_MISS = re.compile(r"(pitch|roll|motor_velocity|compression|tension)")
+_MAY_MISS = re.compile(r"(pitch|roll|motor_position|motor_velocity|compression|tension)")
 _COLUMN = re.compile(r"^(?P<name>[^\[\]]+?)\s*\[(?P<unit>[^\[\]]*)\]$")
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softneck.core import Matrix, Vector, require_one_of, require_positive
+from softneck.core import Matrix, SettingsError, Vector, require_one_of, require_positive
 
 from ._redefinition import motors_from
 
@@ -60,8 +60,8 @@ def signal(name: str, *, duration: float | None = None, seed: int = 0) -> Excita
     require_one_of("signal", name, signal_names())
     length = _DURATIONS[name] if duration is None else duration
     require_positive("duration", length, "s")
-    if name in _FIXED:
-        length = min(length, _DURATIONS[name])
+    if name in _FIXED and length > _DURATIONS[name]:
+        raise SettingsError(f"`{name}` is {_DURATIONS[name]:g} s long by definition; got a duration of {length:g} s.")
     t = np.arange(round(length / SAMPLE_TIME)) * SAMPLE_TIME
     rng = np.random.default_rng(seed)
     makers = {

@@ -122,6 +122,14 @@ class Recording:
                     f"channel `{name}` is {values[row]} at row {row} (t = {self.time[row]:g} s); "
                     "it must be finite. Mend the log or cut it before that row."
                 )
+        for name in OUTPUTS:
+            far = np.abs(self.channels[name]) > np.pi
+            if far.any():
+                row = int(np.argmax(far))
+                raise DataError(
+                    f"channel `{name}` is {self.channels[name][row]:g} rad at row {row}, more than half a turn; "
+                    "is it in degrees? Say so in its unit."
+                )
         if self.run.shape != (len(self),):
             raise DataError(f"`run` has shape {self.run.shape}; time has {(len(self),)}.")
 

@@ -56,8 +56,8 @@ def progress(what: str, *, quiet: bool = False) -> Iterator[ProgressCallback]:
 
 
 def percent(value: float | None) -> str:
-    """Return a fit for a table cell."""
-    return "diverged" if value is None else f"{value:.1f}"
+    """Return a fit for a table cell; `-` where there is none: it diverged, or nothing was measured or moved."""
+    return "-" if value is None else f"{value:.1f}"
 
 
 def _plain(value: Any) -> Any:

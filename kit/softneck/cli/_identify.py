@@ -51,9 +51,9 @@ def command(
     head, tail = (whole, None) if train == 1.0 else whole.split(train)
     with progress(f"identify {kind}", quiet=as_json) as report:
         model = estimator.fit(head, progress=report)
-    model.save(path, force=replace)
     with progress("hold-out", quiet=as_json):
         held_out = _hold_out(model, tail)
+    model.save(path, force=replace)
     if as_json:
         print_json(_facts(path, model, held_out))
         return

@@ -75,6 +75,9 @@ def command(
         print_json({"models": [result.as_dict() for result in results]})
         return
     print_table("Fit [%], pitch/roll", *_table(results, horizons))
+    for result in results:
+        if result.diverged is not None:
+            click.echo(f"the free run of {result.model} on {result.data} diverged at {result.diverged:.2f} s")
     click.echo(_NOTE)
 
 

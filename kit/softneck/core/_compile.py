@@ -72,6 +72,8 @@ def _compile(namespace: ModuleType) -> bool:
         return False
     from numba import njit
 
+    if "COMPILED" in vars(namespace):
+        vars(namespace)["COMPILED"] = 1  # see `_compiled_runtime`; numba takes it as a constant
     for name, value in list(vars(namespace).items()):
         if isinstance(value, FunctionType):
             setattr(namespace, name, njit(**_OPTIONS)(value))

@@ -101,7 +101,9 @@ def _rows(part: FmuPart, inputs: Mapping[str, Vector]) -> Matrix:
     sizes = {len(column) for column in inputs.values()}
     if len(sizes) != 1 or 0 in sizes:
         raise DataError(f"the inputs must have one length of at least 1; got {sorted(sizes)}.")
-    rows = np.tile([port.start for port in part.inputs], (sizes.pop(), 1)).astype(np.float64)
+    # What no column gives was not measured, where that is allowed.
+    held = [np.nan if port.missing else port.start for port in part.inputs]
+    rows = np.tile(np.array(held), (sizes.pop(), 1))
     for name, column in inputs.items():
         if name not in names:
             raise DataError(f"`{name}` is no input of {part.path}; it has {', '.join(names)}.")

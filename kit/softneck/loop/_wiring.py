@@ -6,6 +6,7 @@ selection of it, so that a step costs one gather.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
@@ -136,7 +137,7 @@ def _source(
 ) -> tuple[str, str] | float:
     """Return (part, output) that feeds `port` of part `name`, or the constant that it gets."""
     if name == "plant" and not port.name.startswith("motor_setpoint_"):
-        return float(constants.get(port.name, port.start))
+        return float(constants.get(port.name, math.nan if port.missing else port.start))
     for candidate in _candidates(name, port.name, parts):
         if candidate in slots:
             return candidate

@@ -95,7 +95,7 @@ def score_line(judged: Mapping[tuple[str, str], Judged], model: str) -> str:
 
 
 def _pair(values: Mapping[str, float | None]) -> str:
-    return "/".join("diverged" if value is None else f"{value:.1f}" for value in values.values())
+    return "/".join("-" if value is None else f"{value:.1f}" for value in values.values())
 
 
 def _published(pair: tuple[float, float] | None) -> str:
