@@ -89,7 +89,7 @@ def test_a_parquet_log_gives_its_numbers(tmp_path: Path, by_name: bool) -> None:
 def test_a_mat_file_without_the_variable(tmp_path: Path, version: str, by_name: bool, head: str, message: str) -> None:
     write_log(tmp_path / "log.mat", version, by_name=by_name)
     if by_name:
-        content = dict(zip(NAMES[:-1], TABLE.T[:-1], strict=True))
+        content: dict[str, np.ndarray] = dict(zip(NAMES[:-1], TABLE.T[:-1], strict=True))
         savemat(tmp_path / "log.mat", content) if version == "v5" else write_v73(tmp_path / "log.mat", content)
     with pytest.raises(DataError, match=message) as caught:
         load(tmp_path, "log.mat", layout_text(by_name, head))

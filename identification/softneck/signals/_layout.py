@@ -17,6 +17,7 @@ from ._channels import known_channels, may_miss, si_unit
 from ._files import integers, median_step, numbers, read_table
 from ._mat import read_mat
 from ._recording import Recording, check_times
+from ._sample_time import estimate_sample_time
 from ._tilt import pitch_roll
 
 Column = str | int
@@ -48,6 +49,7 @@ class Layout:
         inclination, orientation: sources of the tilt vector, instead of pitch and roll.
         time: the time column's source, or None.
         sample_time: true sample time [s]; None takes it from the time column.
+        estimate: take the sample time at which logged positions and velocities agree.
         new_run_at_restart: a time that goes back starts a new run.
         run: the column that numbers the runs, or None.
         variable: the matrix of a MAT file; None takes its vectors by name.
@@ -61,6 +63,7 @@ class Layout:
     orientation: Source | None = None
     time: Source | None = None
     sample_time: float | None = None
+    estimate: bool = False
     new_run_at_restart: bool = False
     run: Column | None = None
     variable: str | None = None
@@ -149,11 +152,32 @@ def _imported(frame: pd.DataFrame, layout: Layout) -> Imported:
         i = _values(frame, layout.inclination, "pitch")
         o = _values(frame, layout.orientation, "pitch")
         channels["pitch"], channels["roll"] = pitch_roll(i, o)
-    time, run, sample_time, notes = _times(frame, layout)
+    time, run, sample_time, notes = _times(frame, layout, channels)
     return Imported(Recording(time, sample_time, channels, run), notes)
 
 
-def _times(frame: pd.DataFrame, layout: Layout) -> tuple[Vector, np.ndarray, float, tuple[str, ...]]:
+def _sample_time(
+    layout: Layout, channels: Mapping[str, Vector], run: np.ndarray, nominal: float | None
+) -> tuple[float | None, tuple[str, ...]]:
+    """Return the sample time that overrules the column's `nominal`, and what velocities say of either."""
+    given = layout.sample_time
+    if layout.estimate:
+        found = estimate_sample_time(channels, run)
+        return found.value, (f"sample time estimated from positions and velocities: {found}",)
+    judged = given if given is not None else nominal
+    try:
+        found = estimate_sample_time(channels, run)
+    except DataError:
+        return given, ()
+    if judged is None or not found.contradicts(judged):
+        return given, ()
+    hint = 'write `sample_time_s = "estimate"` in [time] to use it'
+    return given, (f"warning: {1e3 * judged:g} ms does not fit: positions and velocities agree at {found}; {hint}",)
+
+
+def _times(
+    frame: pd.DataFrame, layout: Layout, channels: Mapping[str, Vector]
+) -> tuple[Vector, np.ndarray, float, tuple[str, ...]]:
     run = np.zeros(len(frame), dtype=np.int64)
     notes: list[str] = []
     logged = None
@@ -164,22 +188,24 @@ def _times(frame: pd.DataFrame, layout: Layout) -> tuple[Vector, np.ndarray, flo
         if layout.new_run_at_restart:
             run[1:] = np.cumsum((np.diff(logged) <= 0) | (np.diff(run) != 0))
             notes.append(f"{run[-1] + 1 if run.size else 0} run(s), by restarts of the time column")
-    if layout.sample_time is None:
+    nominal = median_step(logged, run) if logged is not None and logged.size > 1 else None
+    sample_time, remarks = _sample_time(layout, channels, run, nominal)
+    notes.extend(remarks)
+    if sample_time is None:
         if logged is None:
             raise DataError("the layout gives neither a time column nor `sample_time_s`; give one.")
         return logged, run, median_step(logged, run), tuple(notes)
-    if logged is not None and run.size > 1:
-        nominal = median_step(logged, run)
+    if logged is not None and nominal is not None:
         # The layout knows the sample time better than this column, but a gap in it is one in the samples.
         check_times(logged, nominal, run, tolerance=0.5)
-        if abs(nominal - layout.sample_time) > 1e-3 * layout.sample_time:
+        whose = "the estimated" if layout.estimate else "the layout's"
+        if abs(nominal - sample_time) > 1e-3 * sample_time:
             notes.append(
-                f"the time column says {1e3 * nominal:g} ms a sample; "
-                f"the layout's {1e3 * layout.sample_time:g} ms is used"
+                f"the time column says {1e3 * nominal:g} ms a sample; {whose} {1e3 * sample_time:.4g} ms is used"
             )
     first = np.concatenate([[0], np.flatnonzero(np.diff(run)) + 1]) if run.size else np.zeros(0, dtype=np.int64)
     within = np.arange(run.size) - np.repeat(first, np.diff(np.append(first, run.size)))
-    return within * layout.sample_time, run, layout.sample_time, tuple(notes)
+    return within * sample_time, run, sample_time, tuple(notes)
 
 
 def _values(frame: pd.DataFrame, source: Source, channel: str) -> Vector:
@@ -224,7 +250,8 @@ def _layout(table: dict[str, Any]) -> Layout:
         inclination=_source(tilt["inclination"], "rad", "[tilt] inclination") if tilt else None,
         orientation=_source(tilt["orientation"], "rad", "[tilt] orientation") if tilt else None,
         time=_source({"unit": "s", **_only(time, "column", "unit")}, "s", "[time]") if "column" in time else None,
-        sample_time=_positive(time.get("sample_time_s")),
+        sample_time=None if time.get("sample_time_s") == "estimate" else _positive(time.get("sample_time_s")),
+        estimate=time.get("sample_time_s") == "estimate",
         new_run_at_restart=bool(time.get("new_run_at_restart", False)),
         run=time.get("run_column"),
         variable=str(file["variable"]) if "variable" in file else None,
@@ -265,7 +292,7 @@ def _positive(value: Any) -> float | None:
     if value is None:
         return None
     if not isinstance(value, int | float) or not 0 < value < float("inf"):
-        raise SettingsError(f"[time] sample_time_s must be a positive number; got {value!r}.")
+        raise SettingsError(f"[time] sample_time_s must be a positive number or `estimate`; got {value!r}.")
     return float(value)
 
 

@@ -116,7 +116,7 @@ def _members(group: Any, prefix: str, depth: int) -> Iterator[tuple[str, np.ndar
         elif isinstance(item, h5py.Dataset) and _is_numbers(item):
             if item.external or item.is_virtual:
                 raise DataError(f"variable `{prefix}{name}` lies in another file; softneck reads what is in this one.")
-            if item.size > _MAX_NUMBERS:
+            if item.size is not None and item.size > _MAX_NUMBERS:
                 raise DataError(f"variable `{prefix}{name}` declares {item.size} numbers; that is no log.")
             # MATLAB stores columns first: the file's shape is the transpose.
             yield f"{prefix}{name}", np.asarray(item[()], dtype=np.float64).T
