@@ -89,7 +89,7 @@ def test_a_gap_in_the_time_column_is_one_under_any_sample_time(tmp_path: Path) -
         ('"p", unit = "deg"', '"p", unit = "deg", sign = "x"', "wrong type"),
         ("pitch =", "yaw =", r"\[channels\.yaw\]: no channel of a recording"),
         ("[time]", "[times]", "the layout has the unknown key `times`"),
-        ("[time]", "[time]\nsample_time_s = -1", "sample_time_s must be a positive number; got -1"),
+        ("[time]", "[time]\nsample_time_s = -1", "sample_time_s must be a positive number or `estimate`; got -1"),
         ("[time]", "[file]\nrows = [5, 2]\n[time]", r"rows must be \[first, last\]"),
         ("[time]", "[file]\nrows = ['a', 'b']\n[time]", r"rows must be \[first, last\]"),
         (

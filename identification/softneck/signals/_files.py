@@ -91,7 +91,7 @@ def _from_frame(frame: pd.DataFrame) -> Recording:
     channels: dict[str, Vector] = {}
     for title in map(str, frame.columns):
         if title.strip() == "run":
-            run = _integers(pd.Series(frame[title]))
+            run = integers(pd.Series(frame[title]))
             continue
         name, factor = parse_column(title)
         if name in channels:
@@ -134,9 +134,11 @@ def median_step(time: Vector, run: np.ndarray) -> float:
     return float(f"{near.mean():.10g}")
 
 
-def _integers(column: pd.Series) -> np.ndarray:
+def integers(column: pd.Series) -> np.ndarray:
+    """Return the column `run`; raise DataError where it holds no integers."""
     values = numbers(column, "run", missing=False)
-    if not np.array_equal(values, np.round(values)):
+    # Beyond 2^53 a float names no single integer.
+    if not (np.abs(values) < 2**53).all() or not np.array_equal(values, np.round(values)):
         raise DataError("column `run` must hold integers.")
     return values.astype(np.int64)
 

@@ -14,8 +14,10 @@ import pandas as pd
 from softneck.core import DataError, FileFormatError, SettingsError, SoftneckError, Vector, to_si
 
 from ._channels import known_channels, may_miss, si_unit
-from ._files import median_step, numbers, read_table
+from ._files import integers, median_step, numbers, read_table
+from ._mat import read_mat
 from ._recording import Recording, check_times
+from ._sample_time import estimate_sample_time
 from ._tilt import pitch_roll
 
 Column = str | int
@@ -47,7 +49,10 @@ class Layout:
         inclination, orientation: sources of the tilt vector, instead of pitch and roll.
         time: the time column's source, or None.
         sample_time: true sample time [s]; None takes it from the time column.
+        estimate: take the sample time at which logged positions and velocities agree.
         new_run_at_restart: a time that goes back starts a new run.
+        run: the column that numbers the runs, or None.
+        variable: the matrix of a MAT file; None takes its vectors by name.
         header: whether the first line names the columns.
         delimiter: between cells.
         rows: first and last row (not included) to take.
@@ -58,7 +63,10 @@ class Layout:
     orientation: Source | None = None
     time: Source | None = None
     sample_time: float | None = None
+    estimate: bool = False
     new_run_at_restart: bool = False
+    run: Column | None = None
+    variable: str | None = None
     header: bool = True
     delimiter: str = ","
     rows: tuple[int, int] | None = None
@@ -102,9 +110,7 @@ def import_log(path: str | Path, layout: Layout) -> Imported:
         DataError: a column is missing, holds no numbers, or the times do not fit.
     """
     source = Path(path)
-    suffix = ".parquet" if source.suffix.lower() == ".parquet" else ".csv"
-    frame = read_table(source, suffix, header=layout.header, delimiter=layout.delimiter)
-    frame.columns = [name.strip() if isinstance(name, str) else name for name in frame.columns]
+    frame = read_log(source, layout)
     if layout.rows is not None:
         frame = frame.iloc[layout.rows[0] : layout.rows[1]].reset_index(drop=True)
     try:
@@ -113,63 +119,127 @@ def import_log(path: str | Path, layout: Layout) -> Imported:
         raise DataError(f"{source}: {error}") from error
 
 
+def read_log(source: Path, layout: Layout) -> pd.DataFrame:
+    """Return a log's table by its ending: `.parquet`, `.mat`, or else text.
+
+    Raises:
+        FileFormatError: no such file or no table.
+        DataError: a MAT file without the variable.
+    """
+    suffix = source.suffix.lower()
+    if suffix == ".mat":
+        if not source.is_file():
+            raise FileFormatError(f"{source}: no such file.")
+        return read_mat(source, layout.variable, tuple(str(c) for c in _columns(layout)))
+    if layout.variable is not None:
+        raise DataError(f"{source}: the layout's `variable` is for a `.mat` file.")
+    kind = ".parquet" if suffix == ".parquet" else ".csv"
+    frame = read_table(source, kind, header=layout.header, delimiter=layout.delimiter)
+    frame.columns = [name.strip() if isinstance(name, str) else name for name in frame.columns]
+    return frame
+
+
+def _columns(layout: Layout) -> tuple[Column, ...]:
+    """Return all columns that a layout names."""
+    sources = [*layout.channels.values(), layout.inclination, layout.orientation, layout.time]
+    named = [term.column for source in sources if source is not None for term in source.terms]
+    return (*named, layout.run) if layout.run is not None else tuple(named)
+
+
 def _imported(frame: pd.DataFrame, layout: Layout) -> Imported:
     channels = {name: _values(frame, source, name) for name, source in layout.channels.items()}
     if layout.inclination is not None and layout.orientation is not None:
         i = _values(frame, layout.inclination, "pitch")
         o = _values(frame, layout.orientation, "pitch")
         channels["pitch"], channels["roll"] = pitch_roll(i, o)
-    time, run, sample_time, notes = _times(frame, layout)
+    time, run, sample_time, notes = _times(frame, layout, channels)
     return Imported(Recording(time, sample_time, channels, run), notes)
 
 
-def _times(frame: pd.DataFrame, layout: Layout) -> tuple[Vector, np.ndarray, float, tuple[str, ...]]:
+def _sample_time(
+    layout: Layout, channels: Mapping[str, Vector], run: np.ndarray, nominal: float | None
+) -> tuple[float | None, tuple[str, ...]]:
+    """Return the sample time that overrules the column's `nominal`, and what velocities say of either."""
+    given = layout.sample_time
+    if layout.estimate:
+        found = estimate_sample_time(channels, run)
+        return found.value, (f"sample time estimated from positions and velocities: {found}",)
+    judged = given if given is not None else nominal
+    try:
+        found = estimate_sample_time(channels, run)
+    except DataError:
+        return given, ()
+    if judged is None or not found.contradicts(judged):
+        return given, ()
+    hint = 'write `sample_time_s = "estimate"` in [time] to use it'
+    return given, (f"warning: {1e3 * judged:g} ms does not fit: positions and velocities agree at {found}; {hint}",)
+
+
+def _times(
+    frame: pd.DataFrame, layout: Layout, channels: Mapping[str, Vector]
+) -> tuple[Vector, np.ndarray, float, tuple[str, ...]]:
     run = np.zeros(len(frame), dtype=np.int64)
     notes: list[str] = []
     logged = None
+    if layout.run is not None:
+        run = integers(_column(frame, layout.run, "run"))
     if layout.time is not None:
         logged = _values(frame, layout.time, "time")
         if layout.new_run_at_restart:
-            run[1:] = np.cumsum(np.diff(logged) <= 0)
+            run[1:] = np.cumsum((np.diff(logged) <= 0) | (np.diff(run) != 0))
             notes.append(f"{run[-1] + 1 if run.size else 0} run(s), by restarts of the time column")
-    if layout.sample_time is None:
+    nominal = median_step(logged, run) if logged is not None and logged.size > 1 else None
+    sample_time, remarks = _sample_time(layout, channels, run, nominal)
+    notes.extend(remarks)
+    if sample_time is None:
         if logged is None:
             raise DataError("the layout gives neither a time column nor `sample_time_s`; give one.")
         return logged, run, median_step(logged, run), tuple(notes)
-    if logged is not None and run.size > 1:
-        nominal = median_step(logged, run)
+    if logged is not None and nominal is not None:
         # The layout knows the sample time better than this column, but a gap in it is one in the samples.
         check_times(logged, nominal, run, tolerance=0.5)
-        if abs(nominal - layout.sample_time) > 1e-3 * layout.sample_time:
+        whose = "the estimated" if layout.estimate else "the layout's"
+        if abs(nominal - sample_time) > 1e-3 * sample_time:
             notes.append(
-                f"the time column says {1e3 * nominal:g} ms a sample; "
-                f"the layout's {1e3 * layout.sample_time:g} ms is used"
+                f"the time column says {1e3 * nominal:g} ms a sample; {whose} {1e3 * sample_time:.4g} ms is used"
             )
     first = np.concatenate([[0], np.flatnonzero(np.diff(run)) + 1]) if run.size else np.zeros(0, dtype=np.int64)
     within = np.arange(run.size) - np.repeat(first, np.diff(np.append(first, run.size)))
-    return within * layout.sample_time, run, layout.sample_time, tuple(notes)
+    return within * sample_time, run, sample_time, tuple(notes)
 
 
 def _values(frame: pd.DataFrame, source: Source, channel: str) -> Vector:
     total = np.zeros(len(frame))
     for term in source.terms:
-        if term.column not in frame.columns:
-            listed = ", ".join(str(name) for name in frame.columns)
-            raise DataError(f"column `{term.column}` for `{channel}` is not in the file; it has {listed}.")
-        column = pd.Series(frame[term.column])
+        column = _column(frame, term.column, channel)
         total = total + term.factor * numbers(column, str(term.column), missing=may_miss(channel))
     return source.sign * to_si(source.unit)[0] * total
+
+
+def _column(frame: pd.DataFrame, name: Column, channel: str) -> pd.Series:
+    """Return a column by its name, or by its index where names are words."""
+    places = [place for place, title in enumerate(frame.columns) if title == name]
+    if len(places) > 1:
+        raise DataError(f"column `{name}` for `{channel}` stands {len(places)} times in the file; use its index.")
+    if not places and isinstance(name, int) and 0 <= name < frame.shape[1]:
+        places = [name]
+    if not places:
+        listed = ", ".join(str(title) for title in frame.columns)
+        raise DataError(f"column `{name}` for `{channel}` is not in the file; it has {listed}.")
+    return frame.iloc[:, places[0]]
 
 
 def _layout(table: dict[str, Any]) -> Layout:
     _known_keys(table, {"file", "time", "channels", "tilt"}, "the layout")
     file, time = table.get("file", {}), table.get("time", {})
     tilt = table.get("tilt", {})
-    _known_keys(file, {"header", "delimiter", "rows"}, "[file]")
-    _known_keys(time, {"column", "unit", "sample_time_s", "new_run_at_restart"}, "[time]")
+    _known_keys(file, {"header", "delimiter", "rows", "variable"}, "[file]")
+    _known_keys(time, {"column", "unit", "sample_time_s", "new_run_at_restart", "run_column"}, "[time]")
     _known_keys(tilt, {"inclination", "orientation"}, "[tilt]")
     if len(tilt) == 1:
         raise SettingsError("[tilt] needs both `inclination` and `orientation`.")
+    if not isinstance(time.get("run_column", ""), str | int):
+        raise SettingsError(f"[time] run_column must be a name or an index; got {time['run_column']!r}.")
     rows = file.get("rows")
     if rows is not None and not (
         isinstance(rows, list) and [type(row) for row in rows] == [int, int] and 0 <= rows[0] < rows[1]
@@ -180,8 +250,11 @@ def _layout(table: dict[str, Any]) -> Layout:
         inclination=_source(tilt["inclination"], "rad", "[tilt] inclination") if tilt else None,
         orientation=_source(tilt["orientation"], "rad", "[tilt] orientation") if tilt else None,
         time=_source({"unit": "s", **_only(time, "column", "unit")}, "s", "[time]") if "column" in time else None,
-        sample_time=_positive(time.get("sample_time_s")),
+        sample_time=None if time.get("sample_time_s") == "estimate" else _positive(time.get("sample_time_s")),
+        estimate=time.get("sample_time_s") == "estimate",
         new_run_at_restart=bool(time.get("new_run_at_restart", False)),
+        run=time.get("run_column"),
+        variable=str(file["variable"]) if "variable" in file else None,
         header=bool(file.get("header", True)),
         delimiter=str(file.get("delimiter", ",")),
         rows=(rows[0], rows[1]) if rows is not None else None,
@@ -219,7 +292,7 @@ def _positive(value: Any) -> float | None:
     if value is None:
         return None
     if not isinstance(value, int | float) or not 0 < value < float("inf"):
-        raise SettingsError(f"[time] sample_time_s must be a positive number; got {value!r}.")
+        raise SettingsError(f"[time] sample_time_s must be a positive number or `estimate`; got {value!r}.")
     return float(value)
 
 

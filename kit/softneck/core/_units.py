@@ -12,6 +12,7 @@ _TO_SI: dict[str, tuple[float, str]] = {
     "deg": (math.pi / 180.0, "rad"),
     "rad/s": (1.0, "rad/s"),
     "deg/s": (math.pi / 180.0, "rad/s"),
+    "rpm": (math.pi / 30.0, "rad/s"),
     "s": (1.0, "s"),
     "ms": (1e-3, "s"),
     "m": (1.0, "m"),

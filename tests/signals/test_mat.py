@@ -1,0 +1,165 @@
+"""MATLAB logs, Parquet logs and hostile files: the same recording as from text, or one clear line."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.io import savemat
+
+from softneck.core import DataError, FileFormatError, SettingsError, SoftneckError
+from softneck.signals import Recording, import_log, read_layout
+
+CHANNELS = ("motor_setpoint_1", "motor_setpoint_2", "motor_setpoint_3", "pitch", "roll")
+K = np.arange(30.0)
+TABLE = np.column_stack([0.02 * K, np.sin(K), np.cos(K), 0.1 * K, 0.01 * K, -0.02 * K])
+NAMES = ("t", "a", "b", "c", "p", "r")
+
+
+def layout_text(by_name: bool, head: str = "") -> str:
+    key = [f'"{name}"' if by_name else str(place) for place, name in enumerate(NAMES)]
+    lines = [f"{channel} = {{ column = {key[j + 1]}, unit = 'rad' }}" for j, channel in enumerate(CHANNELS)]
+    return "\n".join([head, "[time]", f"column = {key[0]}", "[channels]", *lines])
+
+
+def load(folder: Path, log: str, layout: str) -> Recording:
+    (folder / "layout.toml").write_text(layout)
+    return import_log(folder / log, read_layout(folder / "layout.toml")).recording
+
+
+def write_v73(path: Path, content: dict[str, np.ndarray]) -> None:
+    """As MATLAB does: a user block of 512 bytes, shapes transposed, the class as an attribute."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, array in content.items():
+            file[name] = np.atleast_2d(array).T if array.ndim == 2 else array[None, :]
+            file[name].attrs["MATLAB_class"] = np.bytes_("char" if array.dtype == np.uint16 else "double")
+    head = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
+    path.write_bytes(head.ljust(512, b"\0") + path.read_bytes()[512:])
+
+
+def write_log(path: Path, version: str, *, by_name: bool) -> None:
+    content = dict(zip(NAMES, TABLE.T, strict=True)) if by_name else {"log": TABLE}
+    content |= {"gain": np.array([[3.0]]), "note": np.array([1, 2, 3], dtype=np.uint16)}
+    if version == "v5":
+        savemat(path, {**content, "title": "a word"}, oned_as="column", do_compression=True)
+    else:
+        write_v73(path, content)
+
+
+@pytest.mark.parametrize("by_name", [True, False], ids=["vectors", "matrix"])
+@pytest.mark.parametrize("version", ["v5", "v7.3"])
+def test_a_mat_file_gives_its_numbers(tmp_path: Path, version: str, by_name: bool) -> None:
+    write_log(tmp_path / "log.mat", version, by_name=by_name)
+    r = load(tmp_path, "log.mat", layout_text(by_name, "" if by_name else '[file]\nvariable = "log"'))
+    np.testing.assert_array_equal(np.column_stack([r.time, r.set_points, r.outputs]), TABLE)
+
+
+def test_fields_of_a_structure_are_variables(tmp_path: Path) -> None:
+    savemat(tmp_path / "five.mat", {"run": {"log": TABLE}})
+    with h5py.File(tmp_path / "seven.mat", "w") as file:
+        file["run/log"] = TABLE.T
+    layout = layout_text(False, '[file]\nvariable = "run.log"')
+    for name in ("five.mat", "seven.mat"):
+        np.testing.assert_array_equal(load(tmp_path, name, layout).outputs, TABLE[:, 4:])
+
+
+@pytest.mark.parametrize("by_name", [True, False], ids=["names", "indices"])
+def test_a_parquet_log_gives_its_numbers(tmp_path: Path, by_name: bool) -> None:
+    pd.DataFrame(TABLE, columns=list(NAMES)).to_parquet(tmp_path / "log.parquet")
+    r = load(tmp_path, "log.parquet", layout_text(by_name))
+    np.testing.assert_array_equal(np.column_stack([r.time, r.set_points, r.outputs]), TABLE)
+
+
+@pytest.mark.parametrize("version", ["v5", "v7.3"])
+@pytest.mark.parametrize(
+    ("by_name", "head", "message"),
+    [
+        (False, '[file]\nvariable = "lag"', r"no variable `lag` with numbers; the file has .*log \(30 x 6\)"),
+        (False, '[file]\nvariable = "title"', "no variable `title` with numbers"),
+        (True, "", r"column `r` for `roll` is not in the file; it has .*t"),
+    ],
+    ids=["absent", "text", "vector absent"],
+)
+def test_a_mat_file_without_the_variable(tmp_path: Path, version: str, by_name: bool, head: str, message: str) -> None:
+    write_log(tmp_path / "log.mat", version, by_name=by_name)
+    if by_name:
+        content: dict[str, np.ndarray] = dict(zip(NAMES[:-1], TABLE.T[:-1], strict=True))
+        savemat(tmp_path / "log.mat", content) if version == "v5" else write_v73(tmp_path / "log.mat", content)
+    with pytest.raises(DataError, match=message) as caught:
+        load(tmp_path, "log.mat", layout_text(by_name, head))
+    assert str(caught.value).startswith(str(tmp_path / "log.mat"))
+
+
+def test_vectors_of_different_length_and_a_matrix_without_a_name(tmp_path: Path) -> None:
+    content = dict(zip(NAMES, TABLE.T, strict=True)) | {"p": K[:-1]}
+    savemat(tmp_path / "a.mat", content)
+    with pytest.raises(DataError, match=r"differ in length: .*p \(29\)"):
+        load(tmp_path, "a.mat", layout_text(True))
+    savemat(tmp_path / "a.mat", {"log": TABLE})
+    with pytest.raises(DataError, match=r"no vectors of numbers; name the matrix by `\[file\] variable`"):
+        load(tmp_path, "a.mat", layout_text(True))
+    pd.DataFrame(TABLE).to_csv(tmp_path / "a.csv")
+    with pytest.raises(DataError, match=r"`variable` is for a `\.mat` file"):
+        load(tmp_path, "a.csv", layout_text(False, '[file]\nvariable = "log"'))
+
+
+def test_a_link_to_another_file_is_not_followed(tmp_path: Path) -> None:
+    write_v73(tmp_path / "secret.mat", {"log": TABLE})
+    with h5py.File(tmp_path / "a.mat", "w") as file:
+        file["log"] = h5py.ExternalLink("secret.mat", "/log")
+    with pytest.raises(DataError, match="no variable `log`"):
+        load(tmp_path, "a.mat", layout_text(False, '[file]\nvariable = "log"'))
+    (tmp_path / "raw").write_bytes(TABLE.tobytes())
+    with h5py.File(tmp_path / "a.mat", "w") as file:
+        file.create_dataset("log", TABLE.shape, "f8", external=[(str(tmp_path / "raw"), 0, h5py.h5f.UNLIMITED)])
+    with pytest.raises(DataError, match="variable `log` lies in another file"):
+        load(tmp_path, "a.mat", layout_text(False, '[file]\nvariable = "log"'))
+
+
+def test_a_small_file_that_declares_a_huge_table(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.mat", "w") as file:
+        file.create_dataset("log", (2**40, 6), "f8", chunks=(1024, 6))
+    with pytest.raises(DataError, match=r"declares \d+ numbers; that is no log"):
+        load(tmp_path, "a.mat", layout_text(False, '[file]\nvariable = "log"'))
+
+
+def test_what_is_no_mat_file(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match="no such file"):
+        load(tmp_path, "none.mat", layout_text(True))
+    for content in (b"", b"t,a\n1,2\n" * 50, bytes(range(256)) * 9, b"\x89HDF\r\n\x1a\n" + bytes(600)):
+        (tmp_path / "a.mat").write_bytes(content)
+        with pytest.raises(FileFormatError, match="cannot be read as a MAT file"):
+            load(tmp_path, "a.mat", layout_text(True))
+
+
+def test_a_run_column_numbers_the_runs(tmp_path: Path) -> None:
+    frame = pd.DataFrame(TABLE, columns=list(NAMES)).assign(n=np.repeat([4, 2, 4], 10))
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    layout = layout_text(True).replace("[time]", '[time]\nrun_column = "n"')
+    assert [len(run) for run in load(tmp_path, "a.csv", layout).runs()] == [10, 10, 10]
+    with pytest.raises(DataError, match="column `run` must hold integers"):
+        load(tmp_path, "a.csv", layout.replace('"n"', '"a"'))
+    with pytest.raises(SettingsError, match="run_column must be a name or an index"):
+        load(tmp_path, "a.csv", layout.replace('"n"', "[1]"))
+
+
+@pytest.mark.parametrize("version", ["v5", "v7.3"])
+@given(data=st.data())
+@settings(max_examples=100)
+def test_damaged_bytes_are_a_clear_error_and_nothing_else(tmp_path: Path, version: str, data: st.DataObject) -> None:
+    whole = tmp_path / f"{version}.mat"
+    if not whole.exists():
+        write_log(whole, version, by_name=True)
+    content = bytearray(whole.read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(content) - 1))
+        content[at : at + data.draw(st.integers(0, 2))] = data.draw(st.binary(max_size=3))
+    (tmp_path / "damaged.mat").write_bytes(content[: data.draw(st.integers(len(content) // 2, len(content)))])
+    with contextlib.suppress(SoftneckError):  # anything else fails the test
+        load(tmp_path, "damaged.mat", layout_text(True))
