@@ -195,3 +195,11 @@ def test_the_arm_gives_13000_rows_whose_pitch_follows_theta(shared_data: Path) -
     # Targets and logged positions agree: the layout's sums of columns are right in scale and sign.
     for j in range(3):
         assert np.corrcoef(r.set_points[:, j], P[:, j])[0, 1] > 0.95
+
+
+@pytest.mark.parametrize("line", ['header = "false"', "header = 0"])
+def test_a_flag_is_true_or_false(line: str, tmp_path: Path) -> None:
+    path = tmp_path / "layout.toml"
+    path.write_text(f"[file]\n{line}\n[time]\nsample_time_s = 0.02\n[channels]\n", encoding="utf-8")
+    with pytest.raises(SettingsError, match="`header` must be true or false"):
+        read_layout(path)

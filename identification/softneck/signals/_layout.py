@@ -252,10 +252,10 @@ def _layout(table: dict[str, Any]) -> Layout:
         time=_source({"unit": "s", **_only(time, "column", "unit")}, "s", "[time]") if "column" in time else None,
         sample_time=None if time.get("sample_time_s") == "estimate" else _positive(time.get("sample_time_s")),
         estimate=time.get("sample_time_s") == "estimate",
-        new_run_at_restart=bool(time.get("new_run_at_restart", False)),
+        new_run_at_restart=_flag(time, "new_run_at_restart", default=False),
         run=time.get("run_column"),
         variable=str(file["variable"]) if "variable" in file else None,
-        header=bool(file.get("header", True)),
+        header=_flag(file, "header", default=True),
         delimiter=str(file.get("delimiter", ",")),
         rows=(rows[0], rows[1]) if rows is not None else None,
     )
@@ -302,3 +302,10 @@ def _known_keys(table: Any, known: set[str], where: str) -> None:
     unknown = sorted(set(table) - known)
     if unknown:
         raise SettingsError(f"{where} has the unknown key `{unknown[0]}`; known: {', '.join(sorted(known))}.")
+
+
+def _flag(table: dict[str, Any], key: str, *, default: bool) -> bool:
+    value = table.get(key, default)
+    if not isinstance(value, bool):
+        raise SettingsError(f"`{key}` must be true or false; got {value!r}.")
+    return value
