@@ -112,17 +112,6 @@ def test_a_crafted_file_never_reaches_the_compiled_code(
         load_model(tmp_path / "m.npz")
 
 
-def test_a_file_from_before_the_tree_still_loads(models: dict[str, Model], tmp_path: Path) -> None:
-    arrays = dict(models["nlsm"].arrays)
-    shuffled = np.random.default_rng(0).permutation(arrays["values"].shape[1])
-    for name in ("nodes", "redefinition", "a", "b", "delay"):
-        del arrays[name]
-    arrays["points"], arrays["values"] = arrays["points"][:, :, shuffled], arrays["values"][:, shuffled]
-    Model(kind="nlsm", sample_time=TS, arrays=arrays).save(tmp_path / "m.npz")
-    # The same set in another order has the same bounds, to the bit.
-    assert load_model(tmp_path / "m.npz").simulate(UNSEEN).tobytes() == models["nlsm"].simulate(UNSEEN).tobytes()
-
-
 def test_another_sample_time_is_refused(models: dict[str, Model]) -> None:
     slow = Recording(UNSEEN.time * 1.05, 0.021, UNSEEN.channels)
     for judge in (models["rls"].simulate, models["rls"].predict):

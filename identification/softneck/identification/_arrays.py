@@ -8,7 +8,7 @@ import numpy as np
 
 from softneck.core import FileFormatError, Matrix
 
-from ._tree import tree_nodes, tree_order
+from ._tree import tree_nodes
 
 # In the runtimes' order (see each kind's `_runtime` module).
 _ORDER = {
@@ -19,8 +19,6 @@ _ORDER = {
     ),
     "nn": ("history", "drive", "table", "W1", "b1", "W2", "b2", "w3", "b3", "input_scale", "output_scale"),
 }  # fmt: skip
-# Before the tree and the base.
-_FIRST_NLSM = _ORDER["nlsm"][:7]
 # A minute at 1 ms: far beyond any lag of a neck, far below what memory holds.
 _LONGEST_HISTORY = 60_000
 
@@ -41,21 +39,6 @@ def check_arrays(kind: str, arrays: Mapping[str, Matrix]) -> None:
         raise FileFormatError(f"its history of {history:g} samples is no number from 1 to {_LONGEST_HISTORY}.")
     _within(arrays["drive"][:, 1], 0, history, "a drive's delay")
     {"rls": _check_rls, "nlsm": _check_nlsm, "nn": _check_nn}[kind](arrays, history)
-
-
-def completed(kind: str, arrays: Mapping[str, Matrix]) -> dict[str, Matrix]:
-    """Return the arrays with what files of the first format do not have: tree and (empty) base of kind nlsm."""
-    made = dict(arrays)
-    if kind != "nlsm" or tuple(made) != _FIRST_NLSM:
-        return made
-    W, y = made["points"], made["values"]
-    if W.ndim != 3 or y.shape != (W.shape[0], W.shape[2]) or not y.size:
-        raise FileFormatError(f"its points {W.shape} and values {y.shape} do not fit together.")
-    orders = [tree_order(axis) for axis in W]
-    made["points"] = np.array([axis[:, order] for axis, order in zip(W, orders, strict=True)])
-    made["values"] = np.array([axis[order] for axis, order in zip(y, orders, strict=True)])
-    made["nodes"] = np.array([tree_nodes(*axis) for axis in zip(made["points"], made["values"], strict=True)])
-    return made | no_base()
 
 
 def no_base() -> dict[str, Matrix]:

@@ -28,7 +28,7 @@ from softneck.core import load as load_file
 from softneck.signals import Recording
 
 from . import _linear, _ports
-from ._arrays import check_arrays, completed
+from ._arrays import check_arrays
 
 # A free run starts from this many measured samples, for every kind; they are not scored.
 WARM_UP = 25
@@ -189,7 +189,7 @@ class Model:
         model = cls(
             kind=header["kind"],
             sample_time=float(header["sample_time"]),
-            arrays=completed(header["kind"], {name: arrays[name] for name in header["arrays"]}),
+            arrays={name: arrays[name] for name in header["arrays"]},
             settings=header["settings"],
             findings=header["findings"],
             training_rows=arrays["training_rows"],
