@@ -116,7 +116,7 @@ def _page(results: list[Validation], horizons: tuple[int | str, ...]) -> str:
     for r in results:
         title = f"{Path(r.model).stem} on {Path(r.data).stem}"
         curves = {"one step": r.one_step, "free run": r.free_run}
-        figure = validation_figure(r.time, r.measured, curves, title, joined=True)
+        figure = validation_figure(r.time, r.measured, curves, title)
         diverged = "" if r.diverged is None else f" The free run diverged at {r.diverged:.2f} s."
         words = (
             f"One-step residuals: {'white' if r.white else 'not white'}, "

@@ -1,6 +1,9 @@
-"""One look for all figures: made without a display, colours that colour-blind readers can tell apart."""
+"""One look for all figures: colours that colour-blind readers can tell apart, angles in degrees."""
 
 from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
 
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -8,7 +11,15 @@ from matplotlib.figure import Figure
 
 # Okabe and Ito's palette.
 BLUE, ORANGE, GREEN, RED, PURPLE, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#666666"
+SKY = "#56B4E9"
+COLOURS = (BLUE, ORANGE, GREEN, RED, PURPLE, SKY)
 MOTOR_COLOURS = (BLUE, ORANGE, GREEN)
+AXES = ("pitch", "roll")
+
+
+def looks() -> Iterator[tuple[str, str]]:
+    """Return (colour, style) of one curve after the other: all colours drawn through, then dashed, then dotted."""
+    return itertools.cycle([(colour, style) for style in ("line", "dashed", "dotted") for colour in COLOURS])
 
 
 def new_figure(rows: int, *, width: float = 10.0, row_height: float = 2.3) -> tuple[Figure, list[Axes]]:

@@ -1,0 +1,144 @@
+"""A plot as plain data: curves in panels in a chart, which a matplotlib figure or an interactive page then draws."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from softneck.core import DataError, Vector, require_one_of
+
+from ._style import BLUE, GREY
+
+# How a curve is drawn. `step` holds each value until the next sample, as a motor holds its set-point; `marked` is a
+# line with its samples as points; `stems` are thin bars from zero.
+STYLES = ("line", "dashed", "dotted", "points", "marked", "step", "bars", "stems", "band")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Curve:
+    """One set of points, drawn in one style; a NaN breaks lines and bands, nothing is drawn across it.
+
+    Attributes:
+        x: (n,), in the unit that the panel's label says.
+        y: (n,); of a `band` its lower edge, of `bars` and `stems` their heights.
+        label: in the legend; empty: not in it. Curves of one chart with one label are shown and hidden together.
+        colour: as #rrggbb, or "black".
+        style: one of `STYLES`.
+        width: of lines, or of the points' diameter / 3 [points].
+        upper: (n,) upper edge of a `band`; None for all other styles.
+    """
+
+    x: Vector
+    y: Vector
+    label: str = ""
+    colour: str = BLUE
+    style: str = "line"
+    width: float = 1.0
+    upper: Vector | None = None
+
+    def __post_init__(self) -> None:
+        require_one_of("style", self.style, STYLES)
+        if (self.upper is not None) != (self.style == "band"):
+            raise DataError(
+                f"curve `{self.label}`: `upper` belongs to a band and only there; its style is {self.style}."
+            )
+        for name in ("x", "y", "upper"):
+            values = getattr(self, name)
+            if values is not None:
+                object.__setattr__(self, name, np.ascontiguousarray(values, dtype=np.float64))
+        shapes = {values.shape for values in (self.x, self.y, self.upper) if values is not None}
+        if len(shapes) > 1 or self.x.ndim != 1:
+            raise DataError(f"curve `{self.label}`: x and y must have one shape (n,); got {sorted(shapes)}.")
+
+    @property
+    def upper_edge(self) -> Vector:
+        """Upper edge of a band; of another style its y."""
+        return self.y if self.upper is None else self.upper
+
+
+@dataclass(frozen=True, slots=True)
+class Level:
+    """A straight line through a whole panel: a bound, a limit, or where one part of the data ends.
+
+    Attributes:
+        value: y of a horizontal line, x of a `vertical` one.
+        label: in the legend; empty: not in it.
+        colour: as #rrggbb.
+        dashed: or drawn through.
+        vertical: whether it stands.
+    """
+
+    value: float
+    label: str = ""
+    colour: str = GREY
+    dashed: bool = True
+    vertical: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """One pair of axes.
+
+    Attributes:
+        curves: drawn in this order, the last on top.
+        y_label: with its unit, such as "pitch [deg]".
+        x_label: with its unit; empty: the chart's, under its lowest panels.
+        levels: straight lines.
+        title: above the panel; often empty.
+        legend: whether the curves' labels are shown in this panel.
+        y_range: lowest and highest y to start with; None: what the curves need.
+        log_x, log_y: logarithmic axes.
+        equal: one unit is as long on both axes, as a path over pitch and roll needs.
+    """
+
+    curves: Sequence[Curve]
+    y_label: str
+    x_label: str = ""
+    levels: Sequence[Level] = ()
+    title: str = ""
+    legend: bool = True
+    y_range: tuple[float, float] | None = None
+    log_x: bool = False
+    log_y: bool = False
+    equal: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """Panels under each other (or in several columns) that belong together.
+
+    Attributes:
+        title: above them.
+        panels: row by row.
+        x_label: of the lowest panels, unless they have their own.
+        columns: panels beside each other.
+        linked: whether all panels share their x axis; zooming one zooms all.
+        caption: a sentence or two for under the chart in a page.
+        row_height: of one panel [inch].
+    """
+
+    title: str
+    panels: Sequence[Panel]
+    x_label: str = "time [s]"
+    columns: int = 1
+    linked: bool = True
+    caption: str = ""
+    row_height: float = 2.3
+
+    def __post_init__(self) -> None:
+        if not self.panels:
+            raise DataError(f"chart `{self.title}` has no panels.")
+        if self.columns < 1:
+            raise DataError(f"chart `{self.title}`: `columns` must be at least 1; got {self.columns}.")
+
+    @property
+    def rows(self) -> int:
+        """How many rows of panels there are."""
+        return -(-len(self.panels) // self.columns)
+
+    def x_label_of(self, number: int) -> str:
+        """Return the x label of a panel: its own, or the chart's where nothing is below it."""
+        own = self.panels[number].x_label
+        return own or (self.x_label if number + self.columns >= len(self.panels) else "")

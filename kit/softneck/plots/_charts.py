@@ -1,0 +1,140 @@
+"""The charts of recordings, validations and loops, and the same as matplotlib figures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from softneck.core import Matrix, Vector
+
+from ._chart import Chart, Curve, Level, Panel
+from ._style import AXES, BLUE, COLOURS, GREEN, GREY, MOTOR_COLOURS, ORANGE, SKY, looks
+from ._timeline import Timeline, timeline
+
+BLACK = "black"
+_ZERO = Level(0.0, dashed=False)
+
+
+def recording_chart(
+    time: Vector, set_points: Matrix, outputs: Matrix, title: str, *, run: np.ndarray | None = None
+) -> Chart:
+    """Describe an experiment.
+
+    Args:
+        time: (time,) [s].
+        set_points: (time, 3) [rad], held between samples.
+        outputs: (time, 2) pitch and roll [rad], drawn in degrees; NaN where a sample was missed.
+        title: of the chart.
+        run: (time,) numbers of the runs; None where there is one.
+    """
+    line = timeline(time, run)
+    motors = [
+        Curve(line.x, line.spread(set_points[:, j]), f"motor {j + 1}", MOTOR_COLOURS[j], "step", 0.9) for j in range(3)
+    ]
+    angles = [
+        Curve(line.x, line.spread(np.degrees(outputs[:, i])), AXES[i], colour, width=0.9)
+        for i, colour in enumerate((BLUE, ORANGE))
+    ]
+    borders = _borders(line)
+    panels = [Panel(motors, "set-point [rad]", levels=borders), Panel(angles, "angle [deg]", levels=borders)]
+    return Chart(title, panels, line.x_label)
+
+
+def validation_chart(
+    time: Vector,
+    measured: Matrix,
+    predictions: Mapping[str, Matrix],
+    title: str,
+    *,
+    bounds: tuple[Matrix, Matrix] | None = None,
+    run: np.ndarray | None = None,
+    caption: str = "",
+) -> Chart:
+    """Describe measured and predicted pitch and roll, each with its error (measured - predicted) below.
+
+    Args:
+        time: (time,) [s].
+        measured: (time, 2) [rad], NaN where a row is not scored.
+        predictions: name -> (time, 2) [rad]; NaN where there is none.
+        title: of the chart.
+        bounds: lower and upper (time, 2) [rad] that a model promises, drawn as a band.
+        run: (time,) numbers of the stretches, which no line joins; None: wherever the time jumps.
+        caption: for under the chart.
+    """
+    line = timeline(time, run)
+    panels = []
+    for i, axis in enumerate(AXES):
+        y = line.spread(np.degrees(measured[:, i]))
+        curves, errors = [], []
+        if bounds is not None:
+            lower, upper = (line.spread(np.degrees(edge[:, i])) for edge in bounds)
+            curves.append(Curve(line.x, lower, "bounds", SKY, "band", upper=upper))
+        curves.append(Curve(line.x, y, "measured", BLACK, width=1.2))
+        for (name, values), (colour, style) in zip(predictions.items(), looks(), strict=False):
+            yhat = line.spread(np.degrees(values[:, i]))
+            curves.append(Curve(line.x, yhat, name, colour, style, 0.9))
+            errors.append(Curve(line.x, y - yhat, name, colour, style, 0.8))
+        panels.append(Panel(curves, f"{axis} [deg]", y_range=_range_for(y, curves)))
+        panels.append(Panel(errors, "error [deg]", levels=(_ZERO,), legend=False))
+    return Chart(title, panels, line.x_label, caption=caption, row_height=1.9)
+
+
+def _range_for(measured: Vector, curves: list[Curve]) -> tuple[float, float] | None:
+    """Keep what was measured readable beside a prediction that runs far off; None where none does."""
+    seen = measured[np.isfinite(measured)]
+    if seen.size == 0:
+        return None
+    low, high = float(seen.min()), float(seen.max())
+    room = max(high - low, 1.0)
+    far = max((float(np.nanmax(np.abs(c.y), initial=0.0)) for c in curves), default=0.0)
+    return (low - 0.5 * room, high + 0.5 * room) if far > max(abs(low), abs(high)) + 2.0 * room else None
+
+
+def loop_chart(time: Vector, signals: Mapping[str, Vector], title: str) -> Chart:
+    """Describe a closed loop: reference, true, measured and estimated angles, motors, tensions where there are any.
+
+    Args:
+        time: (time,) [s].
+        signals: name -> (time,): pitch, roll (with _reference, _measured, _estimate), motor_setpoint_1..3,
+            motor_position_1..3 [rad], tension_1..3 [N].
+        title: of the chart.
+    """
+    panels = [_angle_panel(time, signals, axis) for axis in AXES]
+    motors = []
+    for j, colour in enumerate(MOTOR_COLOURS, start=1):
+        motors.append(Curve(time, signals[f"motor_setpoint_{j}"], f"set-point {j}", colour, "step"))
+        if f"motor_position_{j}" in signals:
+            motors.append(Curve(time, signals[f"motor_position_{j}"], f"position {j}", colour, "dashed", 0.8))
+    panels.append(Panel(motors, "motor [rad]"))
+    if "tension_1" in signals:
+        pulls = [Curve(time, signals[f"tension_{j}"], f"tendon {j}", MOTOR_COLOURS[j - 1]) for j in (1, 2, 3)]
+        panels.append(Panel(pulls, "tension [N]"))
+    return Chart(title, panels)
+
+
+def _angle_panel(time: Vector, signals: Mapping[str, Vector], axis: str) -> Panel:
+    looks_of = (("_measured", GREEN, 0.6), ("", BLUE, 1.4), ("_estimate", ORANGE, 0.9), ("_reference", BLACK, 1.0))
+    curves = [
+        Curve(time, np.degrees(signals[f"{axis}{end}"]), end.strip("_") or "true", colour, width=width)
+        for end, colour, width in looks_of
+        if f"{axis}{end}" in signals
+    ]
+    return Panel(curves, f"{axis} [deg]")
+
+
+def delay_chart(curves: Mapping[str, list[list[float]]], title: str) -> Chart:
+    """Describe the cost curve of the dead time: rows of (delay [s], free-run fit [%], one-step rms [rad])."""
+    tables = {name: np.array(rows) for name, rows in curves.items()}
+    fits, errors = [], []
+    for (name, table), colour in zip(tables.items(), COLOURS, strict=False):
+        fits.append(Curve(1e3 * table[:, 0], table[:, 1], name, colour, "marked"))
+        errors.append(Curve(1e3 * table[:, 0], np.degrees(table[:, 2]), name, colour, "marked"))
+    best = max(float(table[:, 1].max()) for table in tables.values())
+    # What lies far below the best is no candidate.
+    fit = Panel(fits, "free-run fit [%]", y_range=(best - 12.0, best + 1.0))
+    return Chart(title, [fit, Panel(errors, "one-step rms [deg]", legend=False)], "dead time [ms]", row_height=1.9)
+
+
+def _borders(line: Timeline) -> tuple[Level, ...]:
+    return tuple(Level(float(x), colour=GREY, vertical=True) for x in line.starts)
