@@ -8,10 +8,16 @@ from ._charts import delay_chart as delay_chart
 from ._charts import loop_chart as loop_chart
 from ._charts import recording_chart as recording_chart
 from ._charts import validation_chart as validation_chart
+from ._figures import cost_figure as cost_figure
 from ._figures import delay_figure as delay_figure
+from ._figures import histogram_figure as histogram_figure
 from ._figures import loop_figure as loop_figure
 from ._figures import recording_figure as recording_figure
+from ._figures import residual_figure as residual_figure
 from ._figures import validation_figure as validation_figure
+from ._judgement_charts import cost_chart as cost_chart
+from ._judgement_charts import histogram_chart as histogram_chart
+from ._judgement_charts import residual_chart as residual_chart
 from ._matplotlib import chart_figure as chart_figure
 from ._neck3d import neck_view as neck_view
 from ._page import Section as Section
