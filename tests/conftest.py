@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -10,7 +12,11 @@ from hypothesis import HealthCheck, settings
 from softneck.identification import Model, Network, Rls, SetMembership
 from softneck.signals import Recording
 
+from .browser import chromium_path, started
 from .data import ROOT, neck_recording, short_neck
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
 
 # The same examples on every machine and run; a busy machine is no failure.
 settings.register_profile(
@@ -45,3 +51,16 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip("the real recordings (../shared/data) are absent on this machine")
     return folder
+
+
+@pytest.fixture(scope="session")
+def chromium() -> str:
+    """The path of the system's Chromium."""
+    return chromium_path()
+
+
+@pytest.fixture(scope="session")
+def browser(chromium: str) -> Iterator[Browser]:
+    """A headless Chromium that shows pages."""
+    with started(chromium) as running:
+        yield running

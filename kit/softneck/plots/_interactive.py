@@ -6,6 +6,7 @@ the first page with a chart is made, for the command line to start fast.
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,10 +16,10 @@ import numpy as np
 
 from softneck.core import Vector
 
-from ._chart import Chart, Curve, Panel
+from ._chart import Chart, Curve, Panel, bar_width
 
 if TYPE_CHECKING:
-    from bokeh.models import ColumnDataSource, DataRenderer, Legend, UIElement
+    from bokeh.models import ColumnDataSource, GlyphRenderer, Legend, UIElement
     from bokeh.plotting import figure as Plot
 
 _PIXELS_PER_INCH = 96
@@ -26,6 +27,18 @@ _PIXELS_PER_INCH = 96
 _MARGIN = 72
 _FONT = "system-ui, sans-serif"
 _DASHES = {"dashed": [6, 4], "dotted": [2, 3]}
+# Draws the charts, and lets curves of one name vanish together in all panels of theirs. (Bokeh's own links are compiled
+# in the browser, which the page's security policy forbids.)
+_START = """
+for (const chart of document.querySelectorAll(".chart"))
+  Bokeh.embed.embed_item(JSON.parse(document.getElementById(chart.id + "-data").textContent), chart.id).then(() => {
+    const named = Bokeh.documents.at(-1).roots()[0].children.flatMap(([plot]) => plot.renderers).filter(r => r.name);
+    for (const one of named)
+      one.properties.visible.change.connect(() => {
+        for (const other of named) if (other.name === one.name) other.visible = one.visible;
+      });
+  });
+"""
 _TOOLS = "box_zoom,pan,reset,save"
 
 
@@ -46,7 +59,7 @@ def library() -> str:
     """Return the JavaScript that draws charts: Bokeh's core, one copy for a page, without widgets or tables."""
     from bokeh.resources import Resources
 
-    return "\n".join(Resources(mode="inline", components=["bokeh"], log_level="error").js_raw)
+    return "\n".join([*Resources(mode="inline", components=["bokeh"], log_level="error").js_raw, _START])
 
 
 def draw(chart: Chart) -> Drawn:
@@ -59,15 +72,13 @@ def draw(chart: Chart) -> Drawn:
     from bokeh.models import BoxZoomTool, ToolProxy
 
     plots: list[Plot] = []
-    shown: dict[str, list[DataRenderer]] = {}
     sources = _Sources()
     for number, panel in enumerate(chart.panels):
         plot = _plot(panel, chart, number)
         if chart.linked and plots:
             plot.x_range = plots[0].x_range
-        _fill(plot, panel, sources, shown)
+        _fill(plot, panel, sources, panel.x_label or chart.x_label)
         plots.append(plot)
-    _link(shown)
     rows: list[list[UIElement | None]] = [
         [*plots[first : first + chart.columns]] for first in range(0, len(plots), chart.columns)
     ]
@@ -95,12 +106,13 @@ class _Sources:
             source = ColumnDataSource({"x": x})
             self._known.append((x, source))
         column = f"y{len(source.column_names)}"
-        source.add(y.astype(np.float32), column)
+        values: Any = y.astype(np.float32)  # Bokeh's own type hint forgets arrays
+        source.add(values, column)
         return source, column
 
 
 def _plot(panel: Panel, chart: Chart, number: int) -> Plot:
-    from bokeh.models import Range1d, Title, WheelZoomTool
+    from bokeh.models import BoxZoomTool, Range1d, Title, WheelZoomTool
     from bokeh.plotting import figure
 
     x_label = chart.x_label_of(number)
@@ -120,12 +132,13 @@ def _plot(panel: Panel, chart: Chart, number: int) -> Plot:
         min_border_bottom=4,
         outline_line_color=None,
     )
+    plot.toolbar.active_drag = next(tool for tool in plot.tools if isinstance(tool, BoxZoomTool))
     # A bare wheel scrolls the page; with Ctrl (a pinch on a touchpad) it zooms along x.
     plot.add_tools(WheelZoomTool(dimensions="both" if panel.equal else "width", modifiers={"ctrl": True}))
     if panel.y_range is None:
         plot.y_range.update(only_visible=True)  # a hidden curve leaves its room to the others
     else:
-        plot.y_range = Range1d(*panel.y_range)
+        plot.y_range = Range1d(start=panel.y_range[0], end=panel.y_range[1])
     plot.x_range.update(range_padding=0.01)
     plot.grid.grid_line_alpha = 0.4
     for axis in plot.axis:
@@ -138,17 +151,18 @@ def _plot(panel: Panel, chart: Chart, number: int) -> Plot:
     return plot
 
 
-def _fill(plot: Plot, panel: Panel, sources: _Sources, shown: dict[str, list[DataRenderer]]) -> None:
-    from bokeh.models import HoverTool, Legend, LegendItem, Span
+def _fill(plot: Plot, panel: Panel, sources: _Sources, x_name: str) -> None:
+    from bokeh.models import Legend, LegendItem, Span
 
-    items: dict[str, list[DataRenderer]] = {}
-    touched: list[DataRenderer] = []
+    items: dict[str, list[Any]] = {}
+    told: dict[ColumnDataSource, list[tuple[str, str]]] = {}
     for curve in panel.curves:
-        drawn, hovered = _draw_curve(plot, curve, sources)
-        touched += hovered
+        drawn, column = _draw_curve(plot, curve, sources)
         if curve.label:
             items.setdefault(curve.label, []).extend(drawn)
-            shown.setdefault(curve.label, []).extend([*drawn, *hovered])
+        if column:
+            source: Any = drawn[0].data_source
+            told.setdefault(source, []).append((curve.label or panel.y_label, f"@{column}{{%.4g}}"))
     for level in panel.levels:
         dash = [6, 4] if level.dashed else []
         dimension = "height" if level.vertical else "width"
@@ -159,14 +173,32 @@ def _fill(plot: Plot, panel: Panel, sources: _Sources, shown: dict[str, list[Dat
             # A Span has no entry in a legend; an empty line with its look has.
             sample = plot.line([np.nan], [np.nan], color=level.colour, line_dash=dash)
             items.setdefault(level.label, []).append(sample)
-    if touched:
-        text = "<div><b>$name</b> $snap_y{%.4g} <span style='color:#666'>at $snap_x{%.6g}</span></div>"
-        hover = HoverTool(tooltips=text, mode="vline", line_policy="nearest", description="values")
-        hover.update(renderers=touched, formatters={"$snap_y": "printf", "$snap_x": "printf"})
-        plot.add_tools(hover)
+    _tell(plot, told, x_name)
     if panel.legend and items:
         legend = Legend(items=[LegendItem(label=name, renderers=drawn) for name, drawn in items.items()])
         plot.add_layout(_dressed(legend), "above")
+
+
+def _tell(plot: Plot, told: Mapping[ColumnDataSource, Sequence[tuple[str, str]]], x_name: str) -> None:
+    """Show the values of all curves at the last sample left of the mouse in one box.
+
+    Bokeh's own hover makes a box for each curve, and they hide each other. What answers here is a line that is not
+    seen: it has every sample, is never hidden and does not count for the axis.
+    """
+    from bokeh.models import DataRange1d, HoverTool
+
+    seen: Any = list(plot.renderers)
+    if isinstance(plot.y_range, DataRange1d):
+        plot.y_range.renderers = seen
+    sides = itertools.cycle(("right", "left", "below", "above"))
+    for (source, rows), side in zip(told.items(), sides, strict=False):
+        silent = plot.line("x", "x", source=source, line_color=None)
+        hover = HoverTool(tooltips=[(x_name, "@x{%.6g}"), *rows], mode="vline")
+        hover.update(
+            renderers=[silent], formatters={"@x": "printf"} | {name[: name.index("{")]: "printf" for _, name in rows}
+        )
+        hover.update(line_policy="none", point_policy="follow_mouse", attachment=side, description="values")
+        plot.add_tools(hover)
 
 
 def _dressed(legend: Legend) -> Legend:
@@ -177,37 +209,31 @@ def _dressed(legend: Legend) -> Legend:
     return legend
 
 
-def _draw_curve(plot: Plot, curve: Curve, sources: _Sources) -> tuple[list[DataRenderer], list[DataRenderer]]:
-    """Return what is drawn, and what answers to the mouse."""
+def _draw_curve(plot: Plot, curve: Curve, sources: _Sources) -> tuple[list[GlyphRenderer[Any]], str]:
+    """Return what is drawn, and the column of its values in its source (empty: none to tell)."""
     from bokeh.models import ColumnDataSource
 
-    colour, width, name = curve.colour, 1.3 * curve.width, curve.label or " "
+    colour, width, name = curve.colour, 1.3 * curve.width, curve.label or None
     if curve.style == "band":
-        source = ColumnDataSource(_outlines(curve))
-        band = plot.patches("xs", "ys", source=source, color=colour, fill_alpha=0.25, line_color=None, name=name)
-        return [band], []
+        outlines: Any = _outlines(curve)
+        source = ColumnDataSource(outlines)
+        return [plot.patches("xs", "ys", source=source, color=colour, fill_alpha=0.25, line_color=None, name=name)], ""
     source, y = sources.add(curve.x, curve.y)
     places: dict[str, Any] = {"source": source, "name": name, "color": colour}
     match curve.style:
         case "bars":
-            bars = plot.vbar("x", top=y, width=_pitch(curve.x), fill_alpha=0.6, line_color=None, **places)
-            return [bars], [bars]
+            return [plot.vbar("x", top=y, width=bar_width(curve.x), fill_alpha=0.6, line_color=None, **places)], y
         case "stems":
-            stems = plot.vbar("x", top=y, width=0.3 * _pitch(curve.x), line_color=None, **places)
-            return [stems], [stems]
+            return [plot.vbar("x", top=y, width=0.3 * bar_width(curve.x), line_color=None, **places)], y
         case "points":
-            points = plot.scatter("x", y, size=4.0 * curve.width, **places)
-            return [points], [points]
+            return [plot.scatter("x", y, size=4.0 * curve.width, **places)], y
         case "marked":
             line = plot.line("x", y, line_width=width, **places)
-            return [line, plot.scatter("x", y, size=5.0 * curve.width, **places)], [line]
+            return [line, plot.scatter("x", y, size=5.0 * curve.width, **places)], y
         case "step":
-            # Bokeh's steps do not answer to the mouse; a line that is not seen does, at the samples.
-            step = plot.step("x", y, mode="after", line_width=width, **places)
-            return [step], [plot.line("x", y, line_alpha=0.0, **places)]
+            return [plot.step("x", y, mode="after", line_width=width, **places)], y
         case _:
-            line = plot.line("x", y, line_width=width, line_dash=_DASHES.get(curve.style, []), **places)
-            return [line], [line]
+            return [plot.line("x", y, line_width=width, line_dash=_DASHES.get(curve.style, []), **places)], y
 
 
 def _outlines(curve: Curve) -> dict[str, list[Vector]]:
@@ -218,16 +244,3 @@ def _outlines(curve: Curve) -> dict[str, list[Vector]]:
     xs = [np.concatenate([curve.x[a:b], curve.x[a:b][::-1]]) for a, b in edges]
     ys = [np.concatenate([lower[a:b], upper[a:b][::-1]]).astype(np.float32) for a, b in edges]
     return {"xs": xs, "ys": ys}
-
-
-def _pitch(x: Vector) -> float:
-    return float(np.min(np.diff(np.sort(x)))) if x.size > 1 else 1.0
-
-
-def _link(shown: Mapping[str, Sequence[DataRenderer]]) -> None:
-    """Let curves of one label appear and vanish together, in all panels of a chart."""
-    for renderers in shown.values():
-        ring = list(dict.fromkeys(renderers))
-        for one, other in zip(ring, [*ring[1:], ring[0]], strict=True):
-            if one is not other:
-                one.js_link("visible", other, "visible")

@@ -65,7 +65,8 @@ def _stems(lags: np.ndarray, values: Vector, bound: float, title: str) -> Panel:
         Curve(x, np.where(out, values, np.nan), "outside", RED, "stems"),
     ]
     levels = (Level(0.0, dashed=False), Level(bound, _BOUND), Level(-bound))
-    return Panel(curves, "correlation", levels=levels, title=title, legend=False)
+    edge = 1.15 * max(bound, float(np.nanmax(np.abs(values), initial=0.0)))
+    return Panel(curves, "correlation", levels=levels, title=title, legend=False, y_range=(-edge, edge))
 
 
 def histogram_chart(errors: Matrix, title: str, *, caption: str = "") -> Chart:

@@ -81,11 +81,7 @@ curves; the tools beside a plot move and reset it, and save it as a picture.</p>
 {% endfor %}
 <footer>{{ footer }}</footer>
 {% if library %}
-<script>{{ library }}</script>
-<script>
-for (const chart of document.querySelectorAll(".chart"))
-  Bokeh.embed.embed_item(JSON.parse(document.getElementById(chart.id + "-data").textContent), chart.id)
-</script>
+<script id="library">{{ library }}</script>
 {% endif %}
 </body>
 </html>
