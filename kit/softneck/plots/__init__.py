@@ -25,5 +25,10 @@ from ._page import Table as Table
 from ._page import figure_png as figure_png
 from ._page import page as page
 from ._page import write_page as write_page
+from ._style import BLUE as BLUE
+from ._style import GREEN as GREEN
+from ._style import GREY as GREY
+from ._style import MOTOR_COLOURS as MOTOR_COLOURS
+from ._style import ORANGE as ORANGE
 from ._timeline import Timeline as Timeline
 from ._timeline import timeline as timeline
