@@ -152,7 +152,7 @@ def _outputs(number: int, found: Reproduction, data: str, axis: int, *, measured
         values = _shown(model, result.measured.free_run, result.free.free_run, result.free.one_step, measured_motors)
         colour = _COLOURS[model]
         curves.append(Curve(first.time, np.degrees(values[:, axis]), name, colour, width=0.9))
-        error = np.degrees(values[:, axis] - first.measured[:, axis])
+        error = np.degrees(first.measured[:, axis] - values[:, axis])
         errors.append(Curve(first.time, error, name, colour, width=0.8))
     what = f"{'Validation' if data == 'validation' else _TITLES[data]}, {AXES[axis]}"
     if measured_motors:
