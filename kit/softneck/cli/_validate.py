@@ -8,7 +8,7 @@ import click
 
 from softneck.core import SettingsError, refuse_existing
 from softneck.identification import INFINITE, Validation, load_model, validate
-from softneck.plots import Section, Table, page, validation_figure, write_page
+from softneck.plots import write_page
 from softneck.signals import read_recording
 
 from ._console import percent, print_json, print_table, progress
@@ -70,7 +70,7 @@ def command(
                     )
                 )
     if html is not None:
-        write_page(html, _page(results, horizons), force=force)
+        write_page(html, _page(results), force=force)
     if as_json:
         print_json({"models": [result.as_dict() for result in results]})
         return
@@ -111,16 +111,7 @@ def _table(results: list[Validation], horizons: tuple[int | str, ...]) -> tuple[
     return head, rows
 
 
-def _page(results: list[Validation], horizons: tuple[int | str, ...]) -> str:
-    sections = [Section("Fits", text=[_NOTE], tables=[Table("Fit [%], pitch/roll", *_table(results, horizons))])]
-    for r in results:
-        title = f"{Path(r.model).stem} on {Path(r.data).stem}"
-        curves = {"one step": r.one_step, "free run": r.free_run}
-        figure = validation_figure(r.time, r.measured, curves, title)
-        diverged = "" if r.diverged is None else f" The free run diverged at {r.diverged:.2f} s."
-        words = (
-            f"One-step residuals: {'white' if r.white else 'not white'}, "
-            f"{'un' if r.uncorrelated else ''}correlated with the inputs (99 %).{diverged}"
-        )
-        sections.append(Section(title, text=[words], figures=[(title, figure)]))
-    return page("Validation", sections)
+def _page(results: list[Validation]) -> str:
+    from softneck.report import validation_page  # it draws in all of the project, which the table does not need
+
+    return validation_page(results)
