@@ -14,8 +14,9 @@ from softneck.plots import Chart, Section, Table, histogram_chart, page, residua
 
 VALIDATION_NOTE = (
     "Fit is 100 (1 - |y - yhat| / |y - mean y|) in %, pitch/roll. Persistence repeats the last sample: a one-step fit "
-    "that is not above it says nothing. The free run has the set-points alone (or the logged motors, where that was "
-    "asked for); that is what an FMU of the plant does. Rows that a model was trained on are left out."
+    "that is not above it says nothing. Best linear was fitted on the judged rows themselves: no linear model of the "
+    "set-points has a better free run on them. The free run has the set-points alone (or the logged motors, if asked "
+    "for); that is what an FMU of the plant does. Rows that a model was trained on are left out."
 )
 _ERROR = "Error is measured minus predicted; where a row is not scored, or was not recorded, nothing is drawn."
 _RESIDUALS = (
@@ -23,16 +24,10 @@ _RESIDUALS = (
     "dashed bounds. Positive lags: the error follows the set-point; a bar outside there is a lag or a gain the model "
     "misses. Negative lags show feedback, which an experiment without a controller has none of."
 )
-# Column of the table, field of Validation, digits; a field that no result has makes no column.
-_COLUMNS = (
-    ("persistence", "persistence", 1),
-    ("best linear", "best_linear", 1),
-    ("model", "fits", 1),
-    ("95 % interval", "intervals", 1),
-    ("rms [deg]", "rmse_deg", 2),
-    ("worst [deg]", "worst_deg", 1),
-    ("R2", "r2", 3),
-)
+_HEAD = [
+    "model on data", "samples ahead", "persistence", "best linear", "model", "95 % interval", "rms [deg]",
+    "worst [deg]", "R2",
+]  # fmt: skip
 # A free run beyond this has diverged [rad]; it is not drawn from there on, for the rest to stay readable.
 _DRAWN = np.pi
 
@@ -51,13 +46,21 @@ def validation_page(results: Sequence[Validation], *, title: str = "Validation")
 
 
 def _overview(results: Sequence[Validation]) -> Section:
-    fields = [column for column in _COLUMNS if any(getattr(r, column[1], None) for r in results)]
     rows = []
     for r in results:
-        for horizon in r.fits:
-            cells = [_cell(getattr(r, field, {}).get(horizon, {}), digits) for _, field, digits in fields]
-            rows.append([_name(r), "free run" if horizon == INFINITE else horizon, *cells])
-    fits = Table("Fits, pitch/roll", ["model on data", "samples ahead", *(head for head, _, _ in fields)], rows)
+        for h in r.fits:
+            tables = (r.persistence, r.best_linear, r.fits, r.intervals)
+            rows.append(
+                [
+                    _name(r),
+                    "free run" if h == INFINITE else h,
+                    *(_cell(table.get(h, {}), 1) for table in tables),
+                    _cell(r.rmse_deg[h], 2),
+                    _cell(r.worst_deg[h], 1),
+                    _cell(r.r2[h], 3),
+                ]
+            )
+    fits = Table("Fit in %, errors in deg, pitch/roll", _HEAD, rows)
     counts = [[_name(r), str(r.rows_scored), str(r.rows_left_out), *_verdicts(r)] for r in results]
     head = ["model on data", "rows judged", "left out", "one-step errors white", "follow no input", "free run diverged"]
     return Section("Fits", text=[VALIDATION_NOTE], tables=[fits, Table("What was judged", head, counts)])
@@ -81,7 +84,7 @@ def _comparisons(results: Sequence[Validation]) -> list[Section]:
             runs = {Path(r.model).stem: _drawable(r.free_run) for r in group}
             runs = runs if len(runs) == len(group) else {r.model: _drawable(r.free_run) for r in group}
             chart = validation_chart(
-                group[0].time, group[0].measured, runs, "Free runs", run=_run_of(group[0]), caption=_ERROR
+                group[0].time, group[0].measured, runs, "Free runs", run=group[0].run, caption=_ERROR
             )
             sections.append(Section(f"All models on {data}", charts=[chart]))
     return sections
@@ -94,9 +97,9 @@ def _section(r: Validation) -> Section:
     bounds = _bounds_of(r)
     caption = _ERROR + (" The band holds the model's bounds of its free run." if bounds else "")
     curves = validation_chart(
-        r.time, r.measured, predictions, "Measured and predicted", bounds=bounds, run=_run_of(r), caption=caption
+        r.time, r.measured, predictions, "Measured and predicted", bounds=bounds, run=r.run, caption=caption
     )
-    charts = [curves, *_residuals(r)]
+    charts = [curves, _residuals(r)]
     for name, values in predictions.items():
         errors = r.measured - values
         if np.isfinite(errors).any(axis=0).all():
@@ -104,36 +107,34 @@ def _section(r: Validation) -> Section:
     return Section(_name(r), text=_remarks(r), tables=_run_tables(r), charts=charts)
 
 
-def _residuals(r: Validation) -> list[Chart]:
-    tests: Any = getattr(r, "residual_tests", None)
-    if tests is None:
-        return []
-    return [
-        residual_chart(
-            (tests.lags, tests.autocorrelation, tests.bound),
-            (tests.cross_lags, tests.cross_correlation, tests.cross_bound),
-            "Residual tests of the one-step errors",
-            caption=_RESIDUALS,
-        )
-    ]
+def _residuals(r: Validation) -> Chart:
+    tests = r.residual_tests
+    return residual_chart(
+        (tests.lags, tests.autocorrelation, tests.bound),
+        (tests.cross_lags, tests.cross_correlation, tests.cross_bound),
+        "Residual tests of the one-step errors",
+        caption=_RESIDUALS,
+    )
 
 
 def _remarks(r: Validation) -> list[str]:
+    p_values = "/".join(f"{p:.2g}" for p in r.residual_tests.p_value)
     words = [
-        f"One step ahead the errors are {'white' if r.white else 'not white'} and "
+        f"One step ahead the errors are {'white' if r.white else 'not white'} (portmanteau p {p_values}) and "
         f"{'follow no set-point' if r.uncorrelated else 'follow the set-points'} (99 %)."
     ]
     if r.diverged is not None:
         words.append(f"The free run diverged at {r.diverged:.2f} s and is not drawn beyond half a turn.")
-    ceiling = getattr(r, "noise_ceiling", None)
-    if ceiling and any(fit is not None for fit in ceiling.values()):
-        words.append(f"Repeated set-points say that a perfect model would fit {_cell(ceiling, 1)} % (noise ceiling).")
-    coverage = getattr(r, "coverage_pct", None)
-    if coverage:
-        words.append(f"The bounds of the free run hold {_cell(coverage, 1)} % of the samples.")
-    known = getattr(r, "novelty", None)
-    if known is not None:
-        p50, p90, p99, most = (f"{value:.1f}" for value in known.ratio.max(axis=0))
+    if any(fit is not None for fit in r.noise_ceiling.values()):
+        ceiling = _cell(r.noise_ceiling, 1)
+        words.append(f"Repeated set-points say that a perfect model would fit {ceiling} % (noise ceiling).")
+    if r.coverage_pct is not None and r.mean_width_deg is not None:
+        words.append(
+            f"The bounds of the free run hold {_cell(r.coverage_pct, 1)} % of the samples and are "
+            f"{_cell(r.mean_width_deg, 1)} deg wide in the mean."
+        )
+    if r.novelty is not None:
+        p50, p90, p99, most = (f"{value:.1f}" for value in r.novelty.ratio.max(axis=0))
         words.append(
             f"Novelty: the judged rows lie {p50} (median), {p90} (90 %), {p99} (99 %), {most} (largest) times as far "
             "from the training rows as these from each other."
@@ -143,14 +144,13 @@ def _remarks(r: Validation) -> list[str]:
 
 def _run_tables(r: Validation) -> list[Table]:
     """Return the scores of each stretch, where there are several."""
-    entries: Sequence[Any] = getattr(r, "per_run", ())
-    if len(entries) < 2:
+    if len(r.per_run) < 2:
         return []
     horizons = [str(horizon) for horizon in r.fits]
     head = ["run", "from [s]", "rows", *("free run" if h == INFINITE else f"{h} ahead" for h in horizons)]
     rows = [
         [str(e["run"]), f"{e['start_s']:.2f}", str(e["rows_scored"]), *(_cell(e["fits"][h], 1) for h in horizons)]
-        for e in entries
+        for e in r.per_run
     ]
     return [Table("Fit [%] of each run, pitch/roll", head, rows)]
 
@@ -176,12 +176,7 @@ def _drawable(values: Matrix) -> Matrix:
         return np.where(np.abs(values) < _DRAWN, values, np.nan)
 
 
-def _run_of(r: Validation) -> np.ndarray | None:
-    return getattr(r, "run", None)
-
-
 def _bounds_of(r: Validation) -> tuple[Matrix, Matrix] | None:
-    lower, upper = getattr(r, "lower", None), getattr(r, "upper", None)
-    if lower is None or upper is None or not np.isfinite(lower).any():
+    if not np.isfinite(r.lower).any():
         return None
-    return _drawable(lower), _drawable(upper)
+    return _drawable(r.lower), _drawable(r.upper)
