@@ -54,8 +54,8 @@ def test_a_histogram_is_a_density_beside_the_normal_curve_of_its_moments() -> No
         width = np.diff(bars.x)[0]
         assert bars.y.sum() * width == pytest.approx(1.0, abs=1e-12)
         assert np.trapezoid(normal.y, normal.x) == pytest.approx(1.0, abs=1e-2)
-        # 20,000 samples in about 60 bins: each is known to 5 % of the peak.
-        np.testing.assert_allclose(bars.y, np.interp(bars.x, normal.x, normal.y), atol=0.05 * normal.y.max())
+        # About 600 of 20,000 samples in the fullest bin are known to 4 %; 3 of these.
+        np.testing.assert_allclose(bars.y, np.interp(bars.x, normal.x, normal.y), atol=0.12 * normal.y.max())
     assert len(histogram_figure(errors, "h").axes) == 2
 
 

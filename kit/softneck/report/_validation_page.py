@@ -21,8 +21,9 @@ VALIDATION_NOTE = (
 _ERROR = "Error is measured minus predicted; where a row is not scored, or was not recorded, nothing is drawn."
 _RESIDUALS = (
     "A model that has caught everything leaves white errors that no set-point foretells: 99 of 100 bars within the "
-    "dashed bounds. Positive lags: the error follows the set-point; a bar outside there is a lag or a gain the model "
-    "misses. Negative lags show feedback, which an experiment without a controller has none of."
+    "dashed bounds. Positive lags: the error follows the set-point, so that a bar outside is a gain or a lag that the "
+    "model misses; slow or periodic set-points spread it over many lags, negative ones too. Set-points made by a "
+    "controller from the outputs show at negative lags."
 )
 _HEAD = [
     "model on data", "samples ahead", "persistence", "best linear", "model", "95 % interval", "rms [deg]",
