@@ -1,5 +1,7 @@
 """Models of the neck from recordings, judged honestly."""
 
+from ._compare import Comparison as Comparison
+from ._compare import compare as compare
 from ._drive import DriveModel as DriveModel
 from ._drive import fit_drive as fit_drive
 from ._gamma import GammaCurve as GammaCurve
@@ -10,13 +12,17 @@ from ._model import WARM_UP as WARM_UP
 from ._model import Model as Model
 from ._model import load_model as load_model
 from ._network import Network as Network
+from ._novelty import Novelty as Novelty
 from ._regressors import PAPER_EQ21 as PAPER_EQ21
+from ._residual_tests import ResidualTests as ResidualTests
 from ._rls import Rls as Rls
 from ._rows import row_hashes as row_hashes
 from ._scores import nrmse_fit as nrmse_fit
+from ._scores import r_squared as r_squared
 from ._scores import rmse as rmse
 from ._set_membership import SetMembership as SetMembership
 from ._set_membership import noise_level as noise_level
 from ._validation import INFINITE as INFINITE
+from ._validation import Rules as Rules
 from ._validation import Validation as Validation
 from ._validation import validate as validate

@@ -64,8 +64,10 @@ def _stems(lags: np.ndarray, values: Vector, bound: float, title: str) -> Panel:
         Curve(x, np.where(out, np.nan, values), "within", BLUE, "stems"),
         Curve(x, np.where(out, values, np.nan), "outside", RED, "stems"),
     ]
-    levels = (Level(0.0, dashed=False), Level(bound, _BOUND), Level(-bound))
-    edge = 1.15 * max(bound, float(np.nanmax(np.abs(values), initial=0.0)))
+    levels = [Level(0.0, dashed=False)]
+    if np.isfinite(bound):  # too few rows have none
+        levels += [Level(bound, _BOUND), Level(-bound)]
+    edge = 1.15 * max(float(np.nan_to_num(bound)), float(np.nan_to_num(np.abs(values)).max(initial=0.0)), 1e-3)
     return Panel(curves, "correlation", levels=levels, title=title, legend=False, y_range=(-edge, edge))
 
 
