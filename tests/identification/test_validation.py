@@ -13,6 +13,7 @@ from softneck.identification._scores import worst_error
 from softneck.signals import concatenate, signal
 
 from ..data import neck_recording, recording_from, short_neck
+from ._numbers import number
 
 CLEAN = recording_from(signal("aprbs", duration=16.0, seed=4).set_points)
 
@@ -37,7 +38,7 @@ def test_r2_is_another_word_for_the_fit_and_the_worst_error_has_its_time() -> No
     for h, fits in result.fits.items():
         for axis, fit in fits.items():
             # Both are sums of the same 375 squares: rounding.
-            assert result.r2[h][axis] == pytest.approx(1 - (1 - fit / 100) ** 2, abs=1e-12)
+            assert result.r2[h][axis] == pytest.approx(1 - (1 - number(fit) / 100) ** 2, abs=1e-12)
     error = np.degrees(np.abs(result.measured - result.free_run)[:, 1])
     assert result.worst_deg["inf"]["roll"] == np.nanmax(error)
     assert result.worst_time["inf"]["roll"] == result.time[np.nanargmax(error)]
@@ -177,7 +178,7 @@ def test_a_gain_that_is_twice_too_high_has_not_diverged() -> None:
     result = validate(Model(kind="rls", sample_time=0.02, arrays={**model.arrays, "b": 2 * model.arrays["b"]}), CLEAN)
     assert result.diverged is None
     # Twice the signal: the error is the signal itself, whose mean square is no less than that about its mean.
-    assert -50.0 < result.fits["inf"]["pitch"] <= 1.0
+    assert -50.0 < number(result.fits["inf"]["pitch"]) <= 1.0
 
 
 def test_missed_samples_are_not_scored_and_do_no_harm() -> None:
