@@ -36,6 +36,7 @@ class Validation:
     Attributes:
         model, data: their names.
         rows_scored, rows_left_out: rows judged, and rows left out because the model was trained on them.
+        rows_by_horizon: rows judged at each horizon: those with so much past, and of long records not all.
         persistence, fits: fit [%] of repeating the last sample, and of the model.
         rmse_deg, r2: root mean square error [deg]; R2 = 1 - SSE/SST.
         worst_deg, worst_time: largest absolute error [deg] and when it was [s].
@@ -58,6 +59,7 @@ class Validation:
     data: str
     rows_scored: int
     rows_left_out: int
+    rows_by_horizon: dict[str, int]
     persistence: Scores
     fits: Scores
     rmse_deg: Scores
@@ -98,6 +100,7 @@ class Validation:
             "data": self.data,
             "rows_scored": self.rows_scored,
             "rows_left_out": self.rows_left_out,
+            "rows_by_horizon": self.rows_by_horizon,
             "fits": {
                 "persistence": self.persistence,
                 "model": self.fits,
@@ -220,7 +223,7 @@ def judge(
 ) -> Validation:
     """Return the validation of a model on its parts of a recording."""
     rows, horizons = parts.rows, [str(h) for h in rules.horizons]
-    outputs = _predictions(model, parts.stretches, rules)
+    outputs = _predictions(model, parts, rules)
     lost: list[float | None] = [None] * len(parts.stretches)
     if INFINITE in outputs:
         lost = divergence(rows.time, rows.stretch, outputs[INFINITE][:, :2], rows.measured)
@@ -237,6 +240,7 @@ def judge(
         data=names[1],
         rows_scored=int(sum(stretch.scored.sum() for stretch in parts.stretches)),
         rows_left_out=parts.left_out,
+        rows_by_horizon={h: int(np.isfinite(y).any(axis=1).sum()) for h, y in measured.items()},
         persistence=parts.baselines.persistence,
         **scores,
         intervals=interval_tables(rows, measured, predicted, model.sample_time, lost=first is not None),
@@ -258,13 +262,14 @@ def judge(
     )
 
 
-def _predictions(model: Model, stretches: Sequence[Stretch], rules: Rules) -> dict[str, Matrix]:
+def _predictions(model: Model, parts: Parts, rules: Rules) -> dict[str, Matrix]:
     """Return horizon -> outputs (time, n_out) of all stretches; one step ahead always, for the residual tests."""
+    runs = [stretch.recording for stretch in parts.stretches]
     result: dict[str, Matrix] = {}
     for horizon in dict.fromkeys((1, *rules.horizons)):
         if horizon == INFINITE:
-            free = [model.simulate(s.recording, motors=rules.motors) for s in stretches]
-            result[INFINITE] = np.concatenate(free)
+            result[INFINITE] = np.concatenate([model.simulate(run, motors=rules.motors) for run in runs])
         else:
-            result[str(horizon)] = predict(model, [s.recording for s in stretches], int(horizon), motors=rules.motors)
+            k = int(horizon)
+            result[str(k)] = predict(model, runs, k, motors=rules.motors, stride=parts.rows.stride(k))
     return result
