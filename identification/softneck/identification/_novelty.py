@@ -65,8 +65,8 @@ def novelty(model: Model, stretches: Sequence[Stretch], training: Recording | No
     Args:
         model: whose drive model fills in motor positions where none were logged.
         stretches: the rows judged.
-        training: recording with the rows that the model was trained on; others in it do not count. None takes the points that a set membership model stores, in the
-            space that it works in.
+        training: recording with the rows that the model was trained on; others in it do not count. None takes the
+            points that a set membership model stores, in the space that it works in.
     """
     if training is None:
         if "points" not in model.arrays:
