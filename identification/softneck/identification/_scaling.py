@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,7 @@ _OUTPUTS, _MOTORS = (0, 3), 2
 AS_GOOD = 1.0
 # Issue 5 asks it of the bounds on data like those they were made of.
 COVERAGE = 0.97
+_THREADS = 2
 
 
 def grouped_scale(table: Matrix, output_weight: float, motor_weight: float = 1.0) -> Vector:
@@ -93,15 +95,9 @@ class HoldOut:
 
     def choose(self, outputs: Sequence[float], motors: Sequence[float], progress: Progress) -> list[Tried]:
         """Return all that was tried, the best first: weights of outputs, then of motors beside the best of those."""
-        total = len(outputs) + len(motors)
-        tried: list[Tried] = []
-        for number, weight in enumerate(outputs):
-            progress(number / total, f"output weight {weight:.3g}")
-            tried += self._weights(weight, 1.0)
+        tried = self._try([(weight, 1.0) for weight in outputs], progress)
         best = self.best_first(tried)[0]
-        for number, weight in enumerate(motors, start=len(outputs)):
-            progress(number / total, f"motor weight {weight:.3g}")
-            tried += self._weights(best.output_weight or 1.0, weight)
+        tried += self._try([(best.output_weight or 1.0, weight) for weight in motors], progress)
         return self.best_first(tried)
 
     def fixed(self, scale: Vector) -> list[Tried]:
@@ -119,8 +115,17 @@ class HoldOut:
             ranked = [chosen, *(one for one in ranked if one is not chosen)]
         return ranked
 
-    def _weights(self, output: float, motor: float) -> Iterator[Tried]:
-        return self._scale(grouped_scale(self.ground.table, output, motor), output, motor)
+    def _try(self, weights: Sequence[tuple[float, float]], progress: Progress) -> list[Tried]:
+        tried: list[Tried] = []
+        # Queries and the search for gamma are compiled and let go of Python's lock.
+        with ThreadPoolExecutor(_THREADS) as pool:
+            for number, part in enumerate(pool.map(self._weights, weights), start=1):
+                progress(number / (len(weights) + 1), f"weights of outputs and motors {weights[number - 1]}")
+                tried += part
+        return tried
+
+    def _weights(self, weights: tuple[float, float]) -> list[Tried]:
+        return list(self._scale(grouped_scale(self.ground.table, *weights), *weights))
 
     def _scale(self, scale: Vector, output: float | None, motor: float | None) -> Iterator[Tried]:
         for epsilon, gamma in zip(self.epsilons, gammas(self.data, scale, self.epsilons), strict=True):

@@ -37,8 +37,9 @@ _EPSILON_SIGMAS = (3.0, 5.0, 8.0, 12.0)
 # logs angles in degrees beside motors in radians. A high weight trusts the fed-back output and drifts in free run.
 _OUTPUT_WEIGHTS = (3.0, 10.0, 30.0, 57.29577951308232)
 # Weights of measured motors beside set-points, tried with the best weight of the output. A position is what bends
-# the neck, a set-point what will: 3 gains 5 to 10 points in free run (virtual neck, `paper`).
-_MOTOR_WEIGHTS = (0.3, 3.0, 10.0)
+# the neck, a set-point what will: 10 gains 10 points in free run on sine and rotation (virtual neck, `paper`), 0.3
+# lost as many.
+_MOTOR_WEIGHTS = (3.0, 10.0)
 # Of the base's angles: a radian of motor tilts the neck by about 0.2 rad, so that 5 makes the two equal in the norm.
 _ANGLE_WEIGHTS = (1.0, 2.0, 5.0, 10.0)
 # The end of the training rows on which epsilon and the scale are chosen, in free run.
