@@ -193,21 +193,24 @@ class _Runner:
         self.done: dict[tuple[int, ...], Trial] = {}
 
     def run(self, indices: Iterator[tuple[int, ...]] | list[tuple[int, ...]]) -> None:
-        """Do all trials of `indices` that are not done yet."""
+        """Do all trials of `indices` that are not done yet; on Ctrl-C those that are done stay done."""
         todo = [index for index in indices if index not in self.done]
+        ready: dict[tuple[int, ...], Trial] = {}
         with ThreadPoolExecutor(self.workers) as pool:
-            futures: dict[Future[Trial], tuple[int, ...]] = {}
             try:
-                for index in todo:
-                    settings = settings_of(self.vary, index)
-                    futures[pool.submit(attempt, self.estimator, settings, self.train, self.hold_out)] = index
-                for number, future in enumerate(as_completed(futures), start=1):
-                    self.done[futures[future]] = trial = future.result()
-                    self.progress(number / len(todo), ", ".join(f"{k}={v}" for k, v in trial.settings.items()))
-            except BaseException:
+                futures: dict[Future[Trial], tuple[int, ...]] = {
+                    pool.submit(attempt, self.estimator, settings_of(self.vary, i), self.train, self.hold_out): i
+                    for i in todo
+                }
+                for future in as_completed(futures):
+                    ready[futures[future]] = trial = future.result()
+                    words = ", ".join(f"{name}={value}" for name, value in trial.settings.items())
+                    self.progress(len(ready) / len(todo), words)
+            finally:
                 # What runs ends by itself; what waits never starts.
                 pool.shutdown(wait=False, cancel_futures=True)
-                raise
+                # In their order, whichever thread was first.
+                self.done |= {index: ready[index] for index in todo if index in ready}
 
     def sweep(self) -> None:
         """Go along one coordinate after the other, forth and back, until nothing changes."""

@@ -8,7 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import DataError, Progress, SettingsError, Vector, require_one_of, require_positive, silent
+from softneck.core import (
+    KINDS,
+    DataError,
+    Progress,
+    SettingsError,
+    Vector,
+    find_kind,
+    require_one_of,
+    require_positive,
+    resolve,
+    silent,
+)
 from softneck.signals import Recording, concatenate
 
 from ._checks import check_training
@@ -16,13 +27,14 @@ from ._drive import DriveModel, fit_drive
 from ._model import WARM_UP, Model
 from ._regressors import lag_table
 from ._residual import residual_lags
-from ._rls import Rls
 from ._rows import row_hashes
 from ._scaling import RULES, HoldOut, Tried, grouped_scale, ruled_scale
 from ._set_ground import Ground, gammas
 
 FORMS = ("paper_eq21", "lags", "residual")
 _MOTORS = ("measured", "simulated")
+# Kinds whose arrays hold `a`, `b`, `delay` over the redefined set-points, as the runtime runs them.
+_BASES = tuple(name for name in ("rls", "oe") if name in KINDS)
 # Eq. 21: y(k-1); u_i(k-2), u_i(k-3); M_i(k-3).
 _EQ21_LAGS = ((1,), (2, 3), (3,))
 # A lag is a sample; a minute at 1 ms is the longest history a file may hold.
@@ -52,7 +64,7 @@ class SetMembership:
 
     Attributes:
         form: "paper_eq21"; "lags", the same estimator over other lags; or "residual": set membership over simulated
-            signals on what the free run of `Rls` leaves over, which has nothing to feed back and so cannot drift.
+            signals on what the free run of a linear base leaves over, where nothing is fed back and so nothing drifts.
         output_lags, setpoint_lags, motor_lags: lags [samples] in the regressor, of the output (both outputs of the
             base in form "residual"), of all set-points and of all motor positions; None takes the form's own. Not
             for "paper_eq21", whose lags are Eq. 21's.
@@ -64,6 +76,7 @@ class SetMembership:
             bounds are narrowest among equal fits).
         motors: whose positions M the set is made of: "measured", logged ones where there are any, or "simulated",
             the drive model's, as in every free run. None: "simulated" for form "residual", else "measured".
+        base: linear kind of one pole that form "residual" stands on.
     """
 
     form: str = "paper_eq21"
@@ -74,6 +87,7 @@ class SetMembership:
     output_weight: float | None = None
     epsilon: float | None = None
     motors: str | None = None
+    base: str = "rls"
 
     def __post_init__(self) -> None:
         require_one_of("form", self.form, FORMS)
@@ -91,6 +105,7 @@ class SetMembership:
                 raise SettingsError("`output_weight` is a scale of its own; leave `scale` at auto beside it.")
         if self.motors is not None:
             require_one_of("motors", self.motors, _MOTORS)
+        require_one_of("base", self.base, _BASES)
 
     def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
         """Store the data set and find gamma and epsilon that are consistent with all of it.
@@ -137,7 +152,7 @@ class SetMembership:
         return Ground(
             table=lag_table(*lags, both_outputs=residual),
             drive=drive,
-            base=Rls().fit(recording) if residual else None,
+            base=resolve(find_kind(self.base, "model").settings)().fit(recording) if residual else None,
             measured=(self.motors or ("simulated" if residual else "measured")) == "measured",
         )
 
