@@ -63,11 +63,10 @@ def test_the_table_and_the_curves_hold_every_trial(found: Search) -> None:
     table = found.frame()
     assert list(table["na"]) == [1, 1, 1, 2, 2, 2]
     assert list(table["score"]) == [t.score for t in found.trials]
-    assert table["chosen"].sum() == 1
+    assert list(table["chosen"]) == [t is found.chosen for t in found.trials]
     for value, pitch, roll, *_ in found.curves["delay"]:
-        there = table[table["delay"] == value]
-        best = there.loc[there["score"].idxmax()]
-        assert (pitch, roll) == (best["free_run_pitch"], best["free_run_roll"])
+        best = max((t for t in found.trials if t.settings["delay"] == value), key=lambda trial: trial.score)
+        assert {"pitch": pitch, "roll": roll} == best.free_run
 
 
 def test_threads_and_coordinates_change_no_fit(found: Search) -> None:

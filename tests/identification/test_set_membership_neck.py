@@ -106,10 +106,10 @@ def _laguerre_fit(train: Recording, test: Recording, pole: float, order: int) ->
     u = np.concatenate([train.set_points, test.set_points])
     columns = [np.ones(len(u))]
     for motor in u.T:
-        x = lfilter([0.0, np.sqrt(1.0 - pole**2)], [1.0, -pole], motor)
+        x = np.asarray(lfilter([0.0, np.sqrt(1.0 - pole**2)], [1.0, -pole], motor))
         columns.append(x)
         for _ in range(order - 1):
-            x = lfilter([-pole, 1.0], [1.0, -pole], x)
+            x = np.asarray(lfilter([-pole, 1.0], [1.0, -pole], x))
             columns.append(x)
     X, n = np.column_stack(columns), len(train)
     # 10 s for the filters to forget that they started from nothing.
