@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from softneck.core import DataError, SettingsError, load
 from softneck.identification import INFINITE, Model, Rls, Search, SetMembership, row_hashes, search, validate
+from softneck.signals import Recording
 
 from ..data import Truth, neck_recording
 
@@ -99,6 +101,29 @@ def test_a_hold_out_of_training_rows_is_refused_and_one_of_the_same_excitation_r
     (remark,) = search(Rls(), {"na": [1]}, head, tail).remarks
     assert "same excitation" in remark
     assert search(Rls(), {"na": [1]}, TRAIN, HOLD_OUT).remarks == ()
+
+
+def test_a_hold_out_too_short_to_run_free_is_refused() -> None:
+    with pytest.raises(DataError, match="no run of the hold-out is longer than 50 rows"):
+        search(Rls(), GRID, TRAIN, HOLD_OUT.rows(0, 50))
+
+
+def test_a_free_run_that_leaves_all_bounds_is_no_fit_but_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    fit = Rls.fit
+
+    def run_away(settings: Rls, recording: Recording) -> Model:
+        model = fit(settings, recording)
+        # A pole of 1.05 multiplies what it starts from by 10 in 47 samples.
+        unstable = {"a": np.full((2, 1), -1.05)} if settings.delay == 0.02 else {}
+        return dataclasses.replace(model, arrays={**model.arrays, **unstable})
+
+    monkeypatch.setattr(Rls, "fit", run_away)
+    diverged, fitted = search(Rls(), {"delay": [0.02, 0.06]}, TRAIN, HOLD_OUT).trials
+    assert diverged.free_run == {"pitch": None, "roll": None}
+    assert diverged.diverged is not None
+    assert 0.5 < diverged.diverged < 8.0
+    assert "the free run left the neck's range at" in diverged.reason
+    assert fitted.diverged is None
 
 
 def test_ctrl_c_keeps_what_is_done() -> None:

@@ -16,7 +16,7 @@ import pandas as pd
 from softneck.core import DataError, Progress, SettingsError, require_one_of, require_whole, silent
 from softneck.signals import Recording
 
-from ._model import Model
+from ._model import WARM_UP, Model
 from ._rows import known_rows, row_hashes
 from ._trials import Estimator, Trial, attempt, settings_of
 
@@ -24,6 +24,8 @@ STRATEGIES = ("grid", "coordinate")
 RULES = ("one_standard_error", "best")
 # A table of more fits than this is no search but a mistake; coordinates need far fewer.
 _MOST_TRIALS = 20_000
+# Half is aligned and not scored; what is left of fewer says nothing of a free run.
+MIN_HOLD_OUT = 2 * WARM_UP
 _SAME_EXCITATION = (
     "the hold-out goes on where the training rows end: it is the same excitation, on which a choice looks better than "
     "it is. Hold out a recording of another signal."
@@ -149,13 +151,15 @@ def search(
 
     Raises:
         SettingsError: an unknown field, nothing to vary, or too many trials.
-        DataError: rows of the hold-out are training rows, or no trial can run free.
+        DataError: a hold-out that is too short or holds training rows, or no trial can run free.
     """
     require_one_of("strategy", strategy, STRATEGIES)
     require_one_of("rule", rule, RULES)
     require_whole("workers", workers, 1, 256)
     given = {name: list(values) for name, values in vary.items()}
     _check(estimator, given, strategy)
+    if all(len(run) <= MIN_HOLD_OUT for run in hold_out.runs()):
+        raise DataError(f"no run of the hold-out is longer than {MIN_HOLD_OUT} rows; record a longer one.")
     seen = int(known_rows(hold_out, row_hashes(train)).sum())
     if seen:
         raise DataError(f"{seen} rows of the hold-out are training rows; hold out a recording of another excitation.")

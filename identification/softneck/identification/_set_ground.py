@@ -59,7 +59,7 @@ class Ground:
             "drive": self.drive.array,
             "table": self.table,
             "scale": scale,
-            **_set_arrays([(scaled(X, scale), y) for X, y in data], gamma, epsilon),
+            **set_arrays([(scaled(X, scale), y) for X, y in data], gamma, epsilon),
             **base,
         }
 
@@ -90,7 +90,7 @@ def scaled(points: Matrix, scale: Vector) -> Matrix:
     return np.ascontiguousarray(points * scale[:, None])
 
 
-def _set_arrays(points: Data, gamma: Vector, epsilon: Vector) -> dict[str, Matrix]:
+def set_arrays(points: Data, gamma: Vector, epsilon: Vector) -> dict[str, Matrix]:
     rows = min(values.size for _, values in points)
     if rows < 2:
         raise SettingsError("a set needs at least 2 points.")

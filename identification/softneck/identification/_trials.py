@@ -10,12 +10,15 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, Progress, SoftneckError
+from softneck.core import Matrix, Progress, SoftneckError
 from softneck.signals import Recording
 
-from ._model import Model
-from ._validation import INFINITE, Validation, validate
+from ._model import WARM_UP, Model
+from ._scores import nrmse_fit
 
+AXES: tuple[str, ...] = ("pitch", "roll")
+# [rad] Half a turn: a free run beyond it left any neck's range.
+FARTHEST = np.pi
 # Errors within 2 s of each other belong together: that is ten time constants of the neck.
 _BLOCK = 100
 # The standard error itself is then known to 5 %.
@@ -73,24 +76,26 @@ def attempt(estimator: Any, settings: Mapping[str, Any], train: Recording, hold_
     try:
         model = dataclasses.replace(estimator, **settings).fit(train)
         seconds = time.perf_counter() - begin
-        judged = validate(model, hold_out, horizons=(1, INFINITE))
+        free_run = model.simulate(hold_out)[:, :2]
+        one_step = model.predict(hold_out)[:, :2]
     except (SoftneckError, np.linalg.LinAlgError, FloatingPointError) as error:
         return _failed(settings, time.perf_counter() - begin, str(error))
-    if judged.rows_left_out:
-        raise DataError(
-            f"{judged.rows_left_out} rows of the hold-out were trained on; hold out a recording of another excitation."
-        )
-    score, error = _score(judged)
+    y = _scored(hold_out)
+    gone = ~(np.abs(free_run) < FARTHEST).all(axis=1)
+    diverged = float(hold_out.time[np.argmax(gone)]) if gone.any() else None
+    fits = dict.fromkeys(AXES) if gone.any() else _fits(y, free_run)
+    there = [fit for fit in fits.values() if fit is not None]
+    whole = len(there) == len(AXES)
     return Trial(
         settings=settings,
-        free_run=judged.fits[INFINITE],
-        one_step=judged.fits["1"],
-        score=score,
-        error=error,
+        free_run=fits,
+        one_step=_fits(y, one_step),
+        score=float(np.mean(there)) if whole else -np.inf,
+        error=_standard_error(y, free_run) if whole else float("nan"),
         size=model_size(model),
         seconds=seconds,
-        diverged=judged.diverged,
-        reason="" if np.isfinite(score) else _why(judged),
+        diverged=diverged,
+        reason="" if whole else _why(diverged),
     )
 
 
@@ -105,18 +110,26 @@ def model_size(model: Model) -> int:
     return int(sum(sizes)) if sizes else int(sum(a.size for a in arrays.values()))
 
 
-def _score(judged: Validation) -> tuple[float, float]:
-    """Return the mean of both free-run fits [%] and its standard error by resampling blocks of the hold-out."""
-    fits = list(judged.fits[INFINITE].values())
-    if any(fit is None for fit in fits):
-        return -np.inf, float("nan")
-    y = judged.measured
-    wrong, spread = _block_sums((y - judged.free_run) ** 2), _block_sums((y - np.nanmean(y, axis=0)) ** 2)
+def _scored(hold_out: Recording) -> Matrix:
+    """Return the measured outputs (time, 2), NaN where the start of a run is aligned and not scored."""
+    parts = [run.outputs.copy() for run in hold_out.runs()]
+    for part in parts:
+        part[:WARM_UP] = np.nan
+    return np.concatenate(parts)
+
+
+def _fits(y: Matrix, outputs: Matrix) -> dict[str, float | None]:
+    fits = [nrmse_fit(y[:, axis], outputs[:, axis]) for axis in range(len(AXES))]
+    return {name: fit if np.isfinite(fit) else None for name, fit in zip(AXES, fits, strict=True)}
+
+
+def _standard_error(y: Matrix, outputs: Matrix) -> float:
+    """Return the standard error of the mean of both fits [%], by resampling blocks of the hold-out."""
+    wrong, spread = _block_sums((y - outputs) ** 2), _block_sums((y - np.nanmean(y, axis=0)) ** 2)
     # Any generator will do, but the same search must give the same answer.
     drawn = np.random.default_rng(0).integers(len(wrong), size=(_RESAMPLES, len(wrong)))
     ratio = wrong[drawn].sum(axis=1) / np.maximum(spread[drawn].sum(axis=1), 1e-300)
-    resampled = 100.0 * (1.0 - np.sqrt(ratio)).mean(axis=1)
-    return float(np.mean([fit for fit in fits if fit is not None])), float(resampled.std())
+    return float((100.0 * (1.0 - np.sqrt(ratio))).mean(axis=1).std())
 
 
 def _block_sums(squares: Matrix) -> Matrix:
@@ -125,14 +138,14 @@ def _block_sums(squares: Matrix) -> Matrix:
     return np.add.reduceat(np.nan_to_num(squares), borders, axis=0)
 
 
-def _why(judged: Validation) -> str:
-    if judged.diverged is not None:
-        return f"the free run left the neck's range at {judged.diverged:g} s"
+def _why(diverged: float | None) -> str:
+    if diverged is not None:
+        return f"the free run left the neck's range at {diverged:g} s"
     return "an axis of the hold-out was not measured or never moved"
 
 
 def _failed(settings: Mapping[str, Any], seconds: float, reason: str) -> Trial:
-    none: dict[str, float | None] = {"pitch": None, "roll": None}
+    none: dict[str, float | None] = dict.fromkeys(AXES)
     return Trial(
         settings=settings,
         free_run=none,
