@@ -18,7 +18,7 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from softneck.core import load_functions, load_runtime
 from softneck.identification import PAPER_EQ21, gamma_curve
 from softneck.identification._arrays import no_base
-from softneck.identification._set_membership import _set_arrays
+from softneck.identification._set_ground import set_arrays
 
 RUNTIME = "softneck.identification._nlsm_runtime"
 STEPS = 2000
@@ -59,7 +59,7 @@ def arrays_of(rows: int) -> tuple[np.ndarray, ...]:
         np.zeros((3, 2)),
         PAPER_EQ21,
         np.ones(10),
-        *_set_arrays(points, np.full(2, GAMMA), np.full(2, EPSILON)).values(),
+        *set_arrays(points, np.full(2, GAMMA), np.full(2, EPSILON)).values(),
         *no_base().values(),
     )
 
@@ -147,7 +147,7 @@ def test_building_a_million(benchmark: BenchmarkFixture) -> None:
     size = points[0].nbytes + points[1].nbytes
 
     def build() -> dict[str, np.ndarray]:
-        return _set_arrays([points], np.array([GAMMA]), np.array([EPSILON]))
+        return set_arrays([points], np.array([GAMMA]), np.array([EPSILON]))
 
     started = time.perf_counter()
     built = benchmark.pedantic(build, rounds=1)

@@ -315,7 +315,7 @@ def test_epsilon_and_weight_are_chosen_on_the_data_and_told() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [({"epsilon": 0.0}, "`epsilon` must be positive"), ({"output_weight": -1.0}, "`output_weight` must be positive"),
-     ({"form": "magic"}, "`form` must be one of paper_eq21, residual; got 'magic'")],
+     ({"form": "magic"}, "`form` must be one of paper_eq21, lags, residual; got 'magic'")],
 )  # fmt: skip
 def test_wrong_settings_are_refused(settings: dict, message: str) -> None:
     with pytest.raises(SettingsError, match=message):

@@ -21,7 +21,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
 
 
 def test_every_fmu_runs_free_as_its_python_model_does(demo: Demo) -> None:
-    assert set(demo.packaged) == {"rls", "nlsm", "nn", "virtual_neck"}
+    assert set(demo.packaged) == {"rls", "nlsm", "nlsm_residual", "nn", "virtual_neck"}
     for name, item in demo.packaged.items():
         # The public promise; the same text runs in both, so that only the order of BLAS sums may differ.
         assert item.difference <= 1e-9, name
@@ -29,7 +29,8 @@ def test_every_fmu_runs_free_as_its_python_model_does(demo: Demo) -> None:
 
 def test_the_table_has_every_model_on_every_unseen_recording(demo: Demo) -> None:
     names = [row[0] for row in fit_rows(demo.judged)]
-    assert names == [f"{m} on {d}" for m in ("rls", "nlsm", "nn") for d in ("validation", "steps", "sine", "rotation")]
+    models = ("rls", "nlsm", "nlsm_residual", "nn")
+    assert names == [f"{m} on {d}" for m in models for d in ("validation", "steps", "sine", "rotation")]
 
 
 def test_a_user_finds_the_same_scores_in_the_files(demo: Demo) -> None:
@@ -52,7 +53,7 @@ def test_the_report_and_the_summary_agree_and_stand_alone(demo: Demo) -> None:
     assert "shorter than the paper" in html
     summary = json.loads((out / "results" / "summary.json").read_text(encoding="utf-8"))
     assert summary["shortened"] is True
-    assert {entry["model"] for entry in summary["models"]} == {"rls", "nlsm", "nn"}
+    assert {entry["model"] for entry in summary["models"]} == {"rls", "nlsm", "nlsm_residual", "nn"}
     assert summary["holds"] == demo.holds
 
 

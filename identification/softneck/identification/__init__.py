@@ -20,8 +20,11 @@ from ._rows import row_hashes as row_hashes
 from ._scores import nrmse_fit as nrmse_fit
 from ._scores import r_squared as r_squared
 from ._scores import rmse as rmse
+from ._search import Search as Search
+from ._search import search as search
 from ._set_membership import SetMembership as SetMembership
 from ._set_membership import noise_level as noise_level
+from ._trials import Trial as Trial
 from ._validation import INFINITE as INFINITE
 from ._validation import Rules as Rules
 from ._validation import Validation as Validation

@@ -25,6 +25,7 @@ from ._page import Table as Table
 from ._page import figure_png as figure_png
 from ._page import page as page
 from ._page import write_page as write_page
+from ._search_figures import search_figure as search_figure
 from ._style import BLUE as BLUE
 from ._style import GREEN as GREEN
 from ._style import GREY as GREY
