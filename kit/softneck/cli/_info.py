@@ -10,22 +10,39 @@ from typing import Any
 import click
 import fmpy
 
-from softneck.core import FileFormatError, file_hash, load, read_archive
+from softneck.core import FileFormatError, SettingsError, file_hash, load, read_archive, refuse_existing
 from softneck.plant import NeckParameters, VirtualNeck
-from softneck.signals import read_layout, read_recording
+from softneck.signals import Quality, Recording, quality, read_layout, read_recording
 
-from ._console import print_json
-from ._options import json_option
+from ._console import print_json, progress
+from ._options import force_option, json_option
+
+_RECORDINGS = (".csv", ".parquet")
+# Reading and checking a smaller file takes well under 2 s.
+_LARGE = 20_000_000
 
 
-@click.command("info", epilog="Example: softneck info build/demo/models/rls.npz")
+@click.command("info", epilog="Example: softneck info eq22.csv --html quality.html")
 @click.argument("file", type=click.Path(path_type=Path))
+@click.option("--html", type=click.Path(path_type=Path), metavar="FILE", help="Page on a recording's quality.")
+@force_option
 @json_option
-def command(file: Path, as_json: bool) -> None:
-    """Say what FILE is: a recording, model, observer, controller, FMU, loop, layout, neck or certificate."""
+def command(file: Path, html: Path | None, force: bool, as_json: bool) -> None:
+    """Say what FILE is: a recording, model, observer, controller, FMU, loop, layout, neck or certificate.
+
+    Of a recording it tells the quality too: faults of its channels, and what its inputs can teach a model.
+    """
     if not file.is_file():
         raise FileFormatError(f"{file}: no such file.")
-    facts = {"file": str(file), **_describe(file), "sha256": file_hash(file)}
+    if file.suffix.lower() in _RECORDINGS:
+        _tell_recording(file, html, force=force, as_json=as_json)
+        return
+    if html is not None:
+        raise SettingsError(f"{file}: `--html` shows the quality of a recording (`.csv`, `.parquet`) only.")
+    _tell({"file": str(file), **_describe(file), "sha256": file_hash(file)}, as_json=as_json)
+
+
+def _tell(facts: dict[str, Any], *, as_json: bool) -> None:
     if as_json:
         print_json(facts)
         return
@@ -34,10 +51,38 @@ def command(file: Path, as_json: bool) -> None:
         click.echo(f"{key}: {text}")
 
 
+def _tell_recording(file: Path, html: Path | None, *, force: bool, as_json: bool) -> None:
+    """Print what a recording holds and its quality below, and write the page."""
+    if html is not None:
+        refuse_existing(html, force=force)
+    quick = html is None and file.stat().st_size < _LARGE
+    with progress("info", quiet=as_json or quick) as report:
+        report(0.0, "reading")
+        recording = read_recording(file)
+        report(0.6, "checking")
+        found = quality(recording)
+        if html is not None:
+            report(0.8, "drawing")
+            _write_page(html, file, recording, found, force=force)
+    page = {} if html is None else {"html": str(html)}
+    facts = {"file": str(file), **_recording(recording), "sha256": file_hash(file), **page}
+    if as_json:
+        print_json({**facts, "quality": found.as_dict()})
+        return
+    _tell(facts, as_json=False)
+    click.echo("\nquality:")
+    for line in found.lines():
+        click.echo(f"  {line}" if line else "")
+
+
+def _write_page(html: Path, file: Path, recording: Recording, found: Quality, *, force: bool) -> None:
+    from softneck.plots import quality_page, write_page  # matplotlib takes a while to import
+
+    write_page(html, quality_page(recording, found, f"Quality of {file.name}"), force=force)
+
+
 def _describe(file: Path) -> dict[str, Any]:
     match file.suffix.lower():
-        case ".csv" | ".parquet":
-            return _recording(file)
         case ".npz":
             header, _ = read_archive(file)
             thing = load(file)
@@ -52,8 +97,7 @@ def _describe(file: Path) -> dict[str, Any]:
             raise FileFormatError(f"{file}: softneck has no files with the ending `{file.suffix}`.")
 
 
-def _recording(file: Path) -> dict[str, Any]:
-    recording = read_recording(file)
+def _recording(recording: Recording) -> dict[str, Any]:
     return {
         "type": "recording",
         "rows": len(recording),
