@@ -47,7 +47,7 @@ def spectrum_figure(quality: Quality, title: str) -> Figure:
                 textcoords="offset points", fontsize="small")  # fmt: skip
     ax.set_ylim(1e-7 * top, 3.0 * top)
     ax.set_xlabel("frequency [rad/s]")
-    label(ax, "density [rad$^2$ s/rad]")
+    label(ax, "density [rad$^2$ s/rad]", legend=len(ax.lines) > 1)
     figure.suptitle(title)
     return figure
 
