@@ -57,7 +57,7 @@ def test_the_page_of_any_recording_holds_five_pictures_and_every_finding(case: t
     assert "&lt;Quality&gt;" in html
     assert not re.search(r"(src|href)=\"(?!data:|#)", html)
     assert html.count("data:image/png") == 5
-    assert html.count('<td class="text">ok</td>') == sum(finding.severity == "ok" for finding in found.findings)
+    assert html.count("<p>ok: ") == sum(finding.severity == "ok" for finding in found.findings)
 
 
 def test_the_spectrum_has_its_line_at_the_bandwidth() -> None:

@@ -206,10 +206,10 @@ def test_what_the_real_recordings_are_told(shared_data: Path) -> None:
         recording = import_log(shared_data / path, read_layout(LAYOUTS / f"{layout}.toml")).recording
         return {(f.severity, f.topic) for f in quality(recording).findings if f.severity != "ok"}
 
-    shaken = report("neck_openloop/spring_test_0gr.csv", "neck_openloop")
-    assert {("warning", "outliers"), ("note", "co-contraction"), ("note", "regressors")} <= shaken
-    assert not {("warning", "frozen"), ("warning", "clipping"), ("warning", "dropouts")} & shaken
+    # The platform shakes at times, by up to 4 deg at 24.8 s: that is motion, and no sample of it is a spike.
+    steps = report("neck_openloop/spring_test_0gr.csv", "neck_openloop")
+    assert steps == {("note", topic) for topic in ("co-contraction", "regressors", "region")}
     loop = report("neck_closedloop/frontier_test_000gr.csv", "neck_closedloop")
-    assert loop == {(("note"), topic) for topic in ("co-contraction", "regressors", "region", "correlation")}
+    assert loop == {("note", topic) for topic in ("co-contraction", "regressors", "region", "correlation")}
     arm = report("arm_multisine/arm_multisine_400s.csv", "arm_multisine")
     assert {("warning", "excitation"), ("warning", "regressors"), ("note", "co-contraction")} <= arm

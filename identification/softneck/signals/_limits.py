@@ -21,10 +21,10 @@ class Limits:
     """Bounds on every motor's set-point; infinite: none.
 
     Attributes:
-        position: largest |P| [rad]; 6 in the paper (section 3.1).
-        speed: largest |dP/dt| between samples [rad/s].
-        slack: how far a winch may pay out below rest, the largest -P [rad]: a tendon that is paid out further than
-            the neck's motion takes up goes slack and may leave its winch.
+        position: largest size of a set-point [rad]; 6 in the paper (section 3.1).
+        speed: largest change between samples by the sample time [rad/s].
+        slack: how far a winch may pay out below rest, the size of the lowest set-point [rad]: a tendon that is paid
+            out further than the neck's motion takes up goes slack and may leave its winch.
     """
 
     position: float = 6.0
@@ -48,7 +48,7 @@ class Changes:
 
     Attributes:
         ramp: faded in or out.
-        position: clipped at the largest |P|.
+        position: clipped at the largest size.
         slack: clipped at the largest pay-out.
         speed: moved because the motor would have been too fast.
     """

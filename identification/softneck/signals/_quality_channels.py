@@ -29,8 +29,7 @@ _MOVED, _MOVED_PER_SAMPLE, _MOVED_AT_TOP = 0.25, 0.01, 0.05
 _DEAD_SAMPLES = 10
 # Half-width of the median filter that removes spikes of one or two samples and keeps steps and ramps.
 _SPIKE_WINDOW = 5
-# In standard deviations of what the median filter removes elsewhere; Gaussian noise reaches 6 once in 5e8 samples,
-# and the local estimate of 51 samples scatters by a third.
+# In standard deviations of what the median filter removes elsewhere; Gaussian noise reaches 6 once in 5e8 samples.
 _SPIKE_LIMIT = 9.0
 # Part of the channel's range below which a spike is of no consequence.
 _SPIKE_FLOOR = 0.02
@@ -282,9 +281,9 @@ def _outliers(recording: Recording, y: Vector, quantum: float, noise: float) -> 
     whole = max(_MAD_TO_STD * float(np.median(size[np.isfinite(y)])), 2.0 / 3.0 * noise)
     candidates = size > max(floor, _SPIKE_LIMIT * whole)
     for start, stop in true_stretches(candidates, recording.run):
-        near = size[max(0, start - 25) : stop + 25]
-        # Where all around is as rough (vibration) a large residual is no spike.
-        if _SPIKE_LIMIT * _MAD_TO_STD * float(np.median(near)) < size[start:stop].max():
+        near = np.concatenate([size[max(0, start - 12) : max(0, start - 2)], size[stop + 2 : stop + 12]])
+        # Where the platform shakes, every other sample has a large residual, and none is a spike.
+        if near.size == 0 or np.percentile(near, 75) < 0.25 * size[start:stop].max():
             rows = _spike(y, recording.run, start, stop)
             spikes[rows] = True
     return _where(spikes, recording)
@@ -301,14 +300,15 @@ def _spike(y: Vector, run: np.ndarray, start: int, stop: int) -> slice:
         return best
     for a in range(start, stop):
         for b in range(a + 1, min(a + 3, stop + 1)):
-            beside = (a - 2, a - 1, b, b + 1)
+            # Three to either side: a sensor slower than the log shows each of its values twice.
+            beside = (a - 3, a - 2, a - 1, b, b + 1, b + 2)
             around = np.array([y[k] if 0 <= k < y.size and run[k] == run[a] else np.nan for k in beside])
-            line = np.interp(np.arange(a, b), [a - 1, b], around[1:3])
+            line = np.interp(np.arange(a, b), [a - 1, b], around[2:4])
             above = y[a:b] - line
             high = float(np.abs(above).min())
             same_side = bool((above > 0).all() or (above < 0).all())
-            flank = np.nanmax(np.abs(np.diff(around)), initial=0.0)
-            if np.isfinite(around[1:3]).all() and same_side and flank < 0.35 * high and high > height:
+            flank = np.nanmax(np.abs(around - around[[2, 2, 2, 2, 3, 3]]), initial=0.0)
+            if np.isfinite(around[2:4]).all() and same_side and flank < 0.35 * high and high > height:
                 best, height = slice(a, b), high
     return best
 

@@ -43,7 +43,7 @@ def spectrum_figure(quality: Quality, title: str) -> Figure:
             name = f"{_INPUT_NAMES[i]} ({share:.0f} % below {BANDWIDTH:g} rad/s)"
             ax.loglog(omega, np.maximum(density[:, i], 1e-12 * top), color=_INPUT_COLOURS[i], lw=1.2, label=name)
     ax.axvline(BANDWIDTH, color="black", ls="--", lw=1.0)
-    ax.annotate("bandwidth of the neck", (BANDWIDTH, 0.03), xycoords=("data", "axes fraction"), xytext=(5, 0),
+    ax.annotate("bandwidth of the neck", (BANDWIDTH, 0.93), xycoords=("data", "axes fraction"), xytext=(5, 0),
                 textcoords="offset points", fontsize="small")  # fmt: skip
     ax.set_ylim(1e-7 * top, 3.0 * top)
     ax.set_xlabel("frequency [rad/s]")
@@ -83,7 +83,7 @@ def _behaviours(ax: Axes, quality: Quality) -> None:
     rows = np.arange(len(names))
     ax.barh(rows, seconds, color=np.where(never, RED, BLUE))
     for row in rows:
-        text = " never" if never[row] else f" {seconds[row]:.1f} s"
+        text = " never" if seconds[row] == 0.0 else f" {seconds[row]:.1f} s" + (": too little" if never[row] else "")
         ax.annotate(text, (seconds[row], row), va="center", fontsize="small", color=RED if never[row] else "black")
     ax.set_yticks(rows, names)
     ax.invert_yaxis()

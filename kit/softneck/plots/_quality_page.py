@@ -20,12 +20,6 @@ _INPUTS = ("theta_i", "phi_i", "delta_i")
 
 def quality_page(recording: Recording, quality: Quality, title: str) -> str:
     """Return the HTML text of a recording's quality: findings, tables and figures."""
-    said = Table(
-        "Findings, warnings first",
-        ["severity", "what", "channel", "finding", "what to do"],
-        [[f.severity, f.topic, f.channel, f.message, f.advice] for f in quality.findings],
-        text=5,
-    )
     runs = len(recording.runs())
     summary = (
         f"{quality.rows} rows in {runs} run{'s' if runs > 1 else ''} at {1e3 * quality.sample_time:g} ms, "
@@ -40,7 +34,7 @@ def quality_page(recording: Recording, quality: Quality, title: str) -> str:
         "the paper's models failed at the behaviours beside it (section 7.4.2)."
     ]
     sections = [
-        Section("Findings", [summary], [said]),
+        Section("Findings", [summary, *(str(finding) for finding in quality.findings)]),
         Section("Channels", [], [_channels(quality)], [
             ("Measured channels; faults are marked.", faults_figure(recording, quality, "Faults")),
             ("How often each value occurs, with faults at the edges.", histogram_figure(recording, quality, "Values")),
