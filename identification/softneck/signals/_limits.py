@@ -96,6 +96,8 @@ def prepare(excitation: Excitation, limits: Limits | None = None, *, ramp_s: flo
         SettingsError: a ramp that is negative or longer than half of the signal.
     """
     wanted = np.asarray(excitation.set_points, dtype=np.float64)
+    if wanted.size == 0:
+        return excitation, Changes()
     ramped = _ramp(wanted, excitation.sample_time, ramp_s)
     clipped, P = ramped, ramped
     shares = {"ramp": _share(ramped, wanted)}
@@ -156,7 +158,7 @@ def _slew_one(wanted: Vector, step: float) -> Vector:
 
 
 def _share(changed: Matrix, before: Matrix) -> float:
-    return float(np.mean(changed != before)) if before.size else 0.0
+    return float(np.mean(changed != before))
 
 
 def _require_bound(name: str, value: float, unit: str, *, zero: bool) -> None:

@@ -12,7 +12,7 @@ import fmpy
 
 from softneck.core import FileFormatError, SettingsError, file_hash, load, read_archive, refuse_existing
 from softneck.plant import NeckParameters, VirtualNeck
-from softneck.signals import Quality, Recording, quality, read_layout, read_recording
+from softneck.signals import quality, read_layout, read_recording
 
 from ._console import print_json, progress
 from ._options import force_option, json_option
@@ -34,55 +34,29 @@ def command(file: Path, html: Path | None, force: bool, as_json: bool) -> None:
     """
     if not file.is_file():
         raise FileFormatError(f"{file}: no such file.")
-    if file.suffix.lower() in _RECORDINGS:
-        _tell_recording(file, html, force=force, as_json=as_json)
-        return
     if html is not None:
-        raise SettingsError(f"{file}: `--html` shows the quality of a recording (`.csv`, `.parquet`) only.")
-    _tell({"file": str(file), **_describe(file), "sha256": file_hash(file)}, as_json=as_json)
-
-
-def _tell(facts: dict[str, Any], *, as_json: bool) -> None:
+        if file.suffix.lower() not in _RECORDINGS:
+            raise SettingsError(f"{file}: `--html` shows the quality of a recording (`.csv`, `.parquet`) only.")
+        refuse_existing(html, force=force)
+    described = _describe(file, html, force=force, quiet=as_json)
+    found = described.pop("quality", None)
+    facts = {"file": str(file), **described, "sha256": file_hash(file)}
     if as_json:
-        print_json(facts)
+        print_json(facts if found is None else {**facts, "quality": found.as_dict()})
         return
     for key, value in facts.items():
         text = "\n  ".join(str(value).splitlines()) if isinstance(value, str) else value
         click.echo(f"{key}: {text}")
+    if found is not None:
+        click.echo("\nquality:")
+        for line in found.lines():
+            click.echo(f"  {line}" if line else "")
 
 
-def _tell_recording(file: Path, html: Path | None, *, force: bool, as_json: bool) -> None:
-    """Print what a recording holds and its quality below, and write the page."""
-    if html is not None:
-        refuse_existing(html, force=force)
-    quick = html is None and file.stat().st_size < _LARGE
-    with progress("info", quiet=as_json or quick) as report:
-        report(0.0, "reading")
-        recording = read_recording(file)
-        report(0.6, "checking")
-        found = quality(recording)
-        if html is not None:
-            report(0.8, "drawing")
-            _write_page(html, file, recording, found, force=force)
-    page = {} if html is None else {"html": str(html)}
-    facts = {"file": str(file), **_recording(recording), "sha256": file_hash(file), **page}
-    if as_json:
-        print_json({**facts, "quality": found.as_dict()})
-        return
-    _tell(facts, as_json=False)
-    click.echo("\nquality:")
-    for line in found.lines():
-        click.echo(f"  {line}" if line else "")
-
-
-def _write_page(html: Path, file: Path, recording: Recording, found: Quality, *, force: bool) -> None:
-    from softneck.plots import quality_page, write_page  # matplotlib takes a while to import
-
-    write_page(html, quality_page(recording, found, f"Quality of {file.name}"), force=force)
-
-
-def _describe(file: Path) -> dict[str, Any]:
+def _describe(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dict[str, Any]:
     match file.suffix.lower():
+        case ".csv" | ".parquet":
+            return _recording(file, html, force=force, quiet=quiet)
         case ".npz":
             header, _ = read_archive(file)
             thing = load(file)
@@ -97,7 +71,19 @@ def _describe(file: Path) -> dict[str, Any]:
             raise FileFormatError(f"{file}: softneck has no files with the ending `{file.suffix}`.")
 
 
-def _recording(recording: Recording) -> dict[str, Any]:
+def _recording(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dict[str, Any]:
+    """Return what a recording holds and its quality, and write the page."""
+    quick = html is None and file.stat().st_size < _LARGE
+    with progress("info", quiet=quiet or quick) as report:
+        report(0.0, "reading")
+        recording = read_recording(file)
+        report(0.6, "checking")
+        found = quality(recording)
+        if html is not None:
+            from softneck.plots import quality_page, write_page  # matplotlib takes a while to import
+
+            report(0.8, "drawing")
+            write_page(html, quality_page(recording, found, f"Quality of {file.name}"), force=force)
     return {
         "type": "recording",
         "rows": len(recording),
@@ -105,6 +91,8 @@ def _recording(recording: Recording) -> dict[str, Any]:
         "duration_s": len(recording) * recording.sample_time,
         "sample_time_s": recording.sample_time,
         "channels": ", ".join(recording.channels),
+        **({} if html is None else {"html": str(html)}),
+        "quality": found,
     }
 
 
