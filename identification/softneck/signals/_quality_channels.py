@@ -156,10 +156,11 @@ def check_channel(recording: Recording, name: str) -> ChannelQuality:
         if name.startswith("tension"):
             flats, long = flats[y[flats[:, 0]] != 0.0], long[y[long[:, 0]] != 0.0]  # a slack tendon rests at zero
         inputs = _inputs(recording, name)
+        std = inputs.std(axis=0)
         frozen = tuple(
             _stretch(recording, *flat)
             for flat in long
-            if chance or _moved(inputs[flat[0] : flat[1] - _DEAD_SAMPLES], inputs) > _MOVED
+            if chance or _moved(inputs[flat[0] : flat[1] - _DEAD_SAMPLES], std) > _MOVED
         )
         clipped = _clipped(recording, y, flats, quantum or 0.0, inputs, chance)
         if _SMOOTH.match(name):
@@ -214,9 +215,8 @@ def _inputs(recording: Recording, name: str) -> np.ndarray:
     return inputs[:, 1:2] if name.startswith("roll") else inputs
 
 
-def _moved(part: np.ndarray, inputs: np.ndarray) -> float:
-    """Return by how many standard deviations of the whole record the inputs moved in a part of it."""
-    std = inputs.std(axis=0)
+def _moved(part: np.ndarray, std: Vector) -> float:
+    """Return by how many standard deviations `std` of the whole record the inputs moved in a part of it."""
     return float(np.max(np.divide(np.ptp(part, axis=0), std, out=np.zeros_like(std), where=std > 0)))
 
 
@@ -229,6 +229,7 @@ def _clipped(
         return ()
     steps = np.abs(np.diff(y))
     steps = steps[np.isfinite(steps) & (steps > 0)]
+    std = inputs.std(axis=0)
     # A natural turn is entered with steps of a quantum at most, a flat top with the speed of the motion.
     slope = max(2.0 * quantum, 0.25 * float(np.sqrt(np.mean(steps**2))))
     found = []
@@ -242,10 +243,11 @@ def _clipped(
             fast = max(_speed(y, start, -1), _speed(y, stop - 1, 1)) > slope
             seen = inputs[start : max(stop - _DEAD_SAMPLES, start + CLIPPED_SAMPLES)]
             enough = min(_MOVED_PER_SAMPLE * (stop - start), _MOVED_AT_TOP)
-            if chance or (fast and _moved(seen, inputs) > enough):
+            if chance or (fast and _moved(seen, std) > enough):
                 found.append(_stretch(recording, start, stop))
     # One short flat top alone is chance.
-    return tuple(sorted(found, key=lambda stretch: stretch.start)) if count_rows(found) > 4 else ()
+    chosen = tuple(sorted(found, key=lambda stretch: stretch.start))
+    return chosen if len(chosen) > 1 or count_rows(chosen) > 7 else ()
 
 
 def _speed(y: Vector, row: int, direction: int) -> float:
