@@ -13,6 +13,10 @@ from softneck.core import DataError, FileFormatError, SoftneckError, Vector, ato
 
 from ._channels import column_name, file_unit, known_channels, may_miss, parse_column
 from ._recording import Recording
+from ._times import median_step
+
+# The delimiter that means any number of blanks or tabs.
+WHITESPACE = "whitespace"
 
 
 def write_recording(path: str | Path, recording: Recording, *, force: bool = False) -> None:
@@ -57,7 +61,7 @@ def read_recording(path: str | Path) -> Recording:
         raise DataError(f"{source}: {error}") from error
 
 
-def read_table(source: Path, suffix: str, *, header: bool, delimiter: str = ",") -> pd.DataFrame:
+def read_table(source: Path, suffix: str, *, header: bool, delimiter: str = ",", decimal: str = ".") -> pd.DataFrame:
     """Read a table as text-free columns of floats where they are numbers.
 
     Raises:
@@ -74,7 +78,8 @@ def read_table(source: Path, suffix: str, *, header: bool, delimiter: str = ",")
             return pd.read_csv(
                 source,
                 header=0 if header else None,
-                sep=delimiter,
+                sep=r"\s+" if delimiter == WHITESPACE else delimiter,
+                decimal=decimal,
                 index_col=False,
                 skipinitialspace=True,
                 keep_default_na=False,
@@ -103,35 +108,31 @@ def _from_frame(frame: pd.DataFrame) -> Recording:
     return Recording(time, median_step(time, run), channels, run)
 
 
-def numbers(column: pd.Series, name: str, *, missing: bool) -> Vector:
+def numbers(column: pd.Series, name: str, *, missing: bool, nan_words: bool = False) -> Vector:
     """Return a column as floats; an empty cell is NaN where `missing` samples are allowed.
+
+    Args:
+        column: of a table.
+        name: of the column, for the error.
+        missing: whether samples may be missing.
+        nan_words: whether a missing sample may be written as `NaN`, as MATLAB and numpy write it.
 
     Raises:
         DataError: text, a written-out NaN, or an empty cell where none is allowed.
     """
     values = np.asarray(pd.to_numeric(column, errors="coerce"), dtype=np.float64)
-    bad = np.isnan(values) & (~column.isna().to_numpy() if missing else True)
+    bad = np.isnan(values)
+    if missing and bad.any():
+        gap = column.isna().to_numpy()
+        bad = bad & ~gap
+        if nan_words and bad.any():
+            bad[bad] = [str(cell).strip().lower() != "nan" for cell in column[bad]]
     if bad.any():
         row = int(np.argmax(bad))
         cell = "an empty cell" if pd.isna(column.iloc[row]) else f"`{column.iloc[row]}`"
         hint = "A missing sample is an empty cell." if missing else "Mend the log or cut it before that row."
         raise DataError(f"column `{name}` holds {cell} at row {row} (the first is 0), where a number is needed. {hint}")
     return values
-
-
-def median_step(time: Vector, run: np.ndarray) -> float:
-    """Return the sample time [s] of a time column: the mean step of its longest regular part."""
-    if time.size < 2:
-        raise DataError(f"a recording needs at least 2 rows; got {time.size}.")
-    step = np.diff(time)
-    inside = step[np.diff(run) == 0] if run.size else step
-    positive = inside[inside > 0]
-    if positive.size == 0:
-        raise DataError("`time` never increases; it must rise by the sample time from row to row.")
-    typical = float(np.median(positive))
-    near = positive[np.abs(positive - typical) < 0.5 * typical]
-    # The mean removes the rounding of printed times; ten digits are more than any clock has.
-    return float(f"{near.mean():.10g}")
 
 
 def integers(column: pd.Series) -> np.ndarray:
