@@ -15,6 +15,8 @@ from ._files import read_recording as read_recording
 from ._files import recording_frame as recording_frame
 from ._files import recording_suffix as recording_suffix
 from ._files import write_recording as write_recording
+from ._guess import Guess as Guess
+from ._guess import guess_layout as guess_layout
 from ._layout import Layout as Layout
 from ._layout import parse_layout as parse_layout
 from ._layout import read_layout as read_layout

@@ -11,7 +11,7 @@ from pyarrow import ArrowException
 
 from softneck.core import DataError, FileFormatError, SoftneckError, Vector, atomic_write, to_si
 
-from ._channels import column_name, file_unit, known_channels, may_miss, parse_column
+from ._channels import MOTOR_POSITIONS, OUTPUTS, column_name, file_unit, known_channels, may_miss, parse_column
 from ._recording import Recording
 from ._times import median_step
 
@@ -24,9 +24,10 @@ def write_recording(path: str | Path, recording: Recording, *, force: bool = Fal
 
     Raises:
         OutputError: the file exists (and not `force`) or cannot be written.
-        DataError: another ending than `.csv` or `.parquet`.
+        DataError: another ending than `.csv` or `.parquet`, or a channel without a sample.
     """
     suffix = recording_suffix(path)
+    _require_samples(recording)
     frame = recording_frame(recording)
     with atomic_write(path, force=force) as temporary:
         if suffix == ".csv":
@@ -105,7 +106,19 @@ def _from_frame(frame: pd.DataFrame) -> Recording:
     if "time" not in channels:
         raise DataError("there is no column `time [s]`.")
     time = channels.pop("time")
-    return Recording(time, median_step(time, run), channels, run)
+    recording = Recording(time, median_step(time, run), channels, run)
+    _require_samples(recording)
+    return recording
+
+
+def _require_samples(recording: Recording) -> None:
+    """Raise DataError where a channel that models are made from has no sample at all."""
+    for name in (*OUTPUTS, *MOTOR_POSITIONS):
+        if name in recording.channels and np.isnan(recording.channels[name]).all():
+            hint = "Leave the column out" if name in MOTOR_POSITIONS else "A recording needs it; record it again"
+            raise DataError(
+                f"channel `{name}` has no sample in any of its {len(recording)} rows; is its sensor connected? {hint}."
+            )
 
 
 def numbers(column: pd.Series, name: str, *, missing: bool, nan_words: bool = False) -> Vector:

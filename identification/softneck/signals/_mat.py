@@ -31,6 +31,23 @@ def read_mat(source: Path, variable: str | None, wanted: tuple[str, ...] = ()) -
         FileFormatError: no MAT file.
         DataError: the variable is not there, is no matrix of numbers, or vectors differ in length.
     """
+    return mat_table(source, mat_arrays(source), variable, wanted)
+
+
+def mat_table(
+    source: Path, arrays: dict[str, np.ndarray], variable: str | None, wanted: tuple[str, ...] = ()
+) -> pd.DataFrame:
+    """Return the table of `read_mat` from the file's arrays."""
+    return _vectors(source, arrays, wanted) if variable is None else _matrix(source, arrays, variable)
+
+
+def mat_arrays(source: Path) -> dict[str, np.ndarray]:
+    """Return all arrays (rows, columns) of numbers in a MAT file by their names.
+
+    Raises:
+        FileFormatError: no MAT file.
+        DataError: a variable lies in another file or declares a size that is none.
+    """
     import h5py  # slow to import, and few logs need it
 
     try:
@@ -40,8 +57,7 @@ def read_mat(source: Path, variable: str | None, wanted: tuple[str, ...] = ()) -
     except Exception as error:  # the parsers raise whatever the damaged bytes lead to
         reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
         raise FileFormatError(f"{source}: cannot be read as a MAT file ({reason}).") from error
-    arrays = {name: array for name, array in found.items() if array.ndim == 2 and array.size}
-    return _vectors(source, arrays, wanted) if variable is None else _matrix(source, arrays, variable)
+    return {name: array for name, array in found.items() if array.ndim == 2 and array.size}
 
 
 def _matrix(source: Path, arrays: dict[str, np.ndarray], variable: str) -> pd.DataFrame:

@@ -108,7 +108,7 @@ class Recording:
             DataError: no such run, or one of the parts is empty.
         """
         parts = self.runs()
-        if isinstance(runs, float):
+        if isinstance(runs, int | float):
             if not 0.0 < runs < 1.0:
                 raise DataError(f"the part of the runs must be between 0 and 1, without both; got {runs:g}.")
             count = max(1, round(runs * len(parts)))
