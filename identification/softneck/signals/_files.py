@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 from pyarrow import ArrowException, Table
 from pyarrow.csv import WriteOptions, write_csv
+from pyarrow.parquet import ParquetFile
 
 from softneck.core import DataError, FileFormatError, SoftneckError, Vector, atomic_write, to_si
 
@@ -80,7 +81,8 @@ def read_table(source: Path, suffix: str, *, header: bool, delimiter: str = ",",
         raise FileFormatError(f"{source}: no such file.")
     try:
         if suffix == ".parquet":
-            return pd.read_parquet(source)
+            # Without pandas' own remarks, which fail in any way where damaged; an index is a column like others.
+            return ParquetFile(source).read().to_pandas(ignore_metadata=True)
         with warnings.catch_warnings():
             # pandas only warns of rows that are longer than the header; their cells cannot be told apart.
             warnings.simplefilter("error", pd.errors.ParserWarning)
