@@ -150,3 +150,12 @@ def test_a_channel_without_a_number_is_named(tmp_path: Path) -> None:
     time = TS * np.arange(40)
     with pytest.raises(DataError, match=r"column `p` for `pitch` holds no number in any of its 40 rows"):
         imported(tmp_path, time, p=np.full(40, np.nan))
+
+
+def test_numbers_beyond_all_bounds_are_refused_without_a_warning(tmp_path: Path) -> None:
+    time = TS * np.arange(40)
+    time[9] += 0.003
+    step = np.linspace(0, 1.5e308, 40)  # steeper than the largest number a second
+    layout = LAYOUT.replace("[channels]", '[channels]\nmotor_position_1 = { column = "s1", unit = "rad" }')
+    with pytest.raises(DataError, match=r"a channel reaches 1\.5e\+308 within .* is the log damaged"):
+        imported(tmp_path, time, layout, s1=step)

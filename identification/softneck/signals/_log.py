@@ -42,7 +42,9 @@ def import_log(path: str | Path, layout: Layout) -> Imported:
     if layout.rows is not None:
         frame = frame.iloc[layout.rows[0] : layout.rows[1]].reset_index(drop=True)
     try:
-        return _imported(frame, layout)
+        # Damaged logs hold numbers beyond all bounds; what comes of them is refused below, without a warning beside it.
+        with np.errstate(all="ignore"):
+            return _imported(frame, layout)
     except SoftneckError as error:
         raise DataError(f"{source}: {error}") from error
 

@@ -140,7 +140,15 @@ def _measured(t: Vector, x: Vector, grid: Vector, before: np.ndarray, after: np.
     """Return x (time,) at `grid` (instants,) between its samples `before` and `after`."""
     seen = np.isfinite(x)
     missed = ~(seen[before] & seen[after])
+    values = x[before]
     # Two points make a line; fewer leave nothing between samples.
-    values = PchipInterpolator(t[seen], x[seen])(grid) if seen.sum() > 1 else x[before]
+    if seen.sum() > 1:
+        try:
+            values = PchipInterpolator(t[seen], x[seen])(grid)
+        except ValueError as error:  # slopes between damaged numbers are not finite
+            largest = float(np.abs(x[seen]).max())
+            raise DataError(
+                f"a channel reaches {largest:.3g} within {np.ptp(t):.3g} s and cannot be resampled; is the log damaged?"
+            ) from error
     values = np.where(before == after, x[before], values)
     return np.where(missed, np.nan, values)
