@@ -15,13 +15,17 @@ from ._files import read_recording as read_recording
 from ._files import recording_frame as recording_frame
 from ._files import recording_suffix as recording_suffix
 from ._files import write_recording as write_recording
-from ._layout import Imported as Imported
+from ._guess import Guess as Guess
+from ._guess import guess_layout as guess_layout
 from ._layout import Layout as Layout
-from ._layout import import_log as import_log
+from ._layout import parse_layout as parse_layout
 from ._layout import read_layout as read_layout
+from ._layout_text import layout_toml as layout_toml
 from ._limits import Changes as Changes
 from ._limits import Limits as Limits
 from ._limits import prepare as prepare
+from ._log import Imported as Imported
+from ._log import import_log as import_log
 from ._quality import Quality as Quality
 from ._quality import quality as quality
 from ._quality_channels import ChannelQuality as ChannelQuality
@@ -43,3 +47,4 @@ from ._sample_time import SampleTime as SampleTime
 from ._sample_time import estimate_sample_time as estimate_sample_time
 from ._scaling import Scaling as Scaling
 from ._tilt import pitch_roll as pitch_roll
+from ._trend import Trend as Trend

@@ -25,9 +25,9 @@ from ._page import Table as Table
 from ._page import figure_png as figure_png
 from ._page import page as page
 from ._page import write_page as write_page
+from ._quality_figures import channels_figure as channels_figure
 from ._quality_figures import correlation_figure as correlation_figure
 from ._quality_figures import faults_figure as faults_figure
-from ._quality_figures import histogram_figure as histogram_figure
 from ._quality_figures import region_figure as region_figure
 from ._quality_figures import spectrum_figure as spectrum_figure
 from ._quality_page import quality_page as quality_page

@@ -93,7 +93,7 @@ def _behaviours(ax: Axes, quality: Quality) -> None:
     ax.set_title("behaviours that the paper names", fontsize="medium")
 
 
-def histogram_figure(recording: Recording, quality: Quality, title: str) -> Figure:
+def channels_figure(recording: Recording, quality: Quality, title: str) -> Figure:
     """Draw how often each value occurs: a clipped channel piles up at its edge, a quantised one shows its levels."""
     names = _shown(recording)
     columns = 3

@@ -8,9 +8,9 @@ from softneck.signals import BANDWIDTH, Quality, Recording, file_unit
 
 from ._page import Section, Table, page
 from ._quality_figures import (
+    channels_figure,
     correlation_figure,
     faults_figure,
-    histogram_figure,
     region_figure,
     spectrum_figure,
 )
@@ -37,7 +37,7 @@ def quality_page(recording: Recording, quality: Quality, title: str) -> str:
         Section("Findings", [summary, *(str(finding) for finding in quality.findings)]),
         Section("Channels", [], [_channels(quality)], [
             ("Measured channels; faults are marked.", faults_figure(recording, quality, "Faults")),
-            ("How often each value occurs, with faults at the edges.", histogram_figure(recording, quality, "Values")),
+            ("How often each value occurs, with faults at the edges.", channels_figure(recording, quality, "Values")),
         ]),
         Section("Excitation", spectrum, [_inputs(quality)], [
             ("Spectrum of the inputs.", spectrum_figure(quality, "Excitation")),
