@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib.util
 import os
 import subprocess
@@ -22,8 +23,14 @@ ROWS = 60
 
 
 def need(package: str) -> None:
-    if importlib.util.find_spec(package) is None:
-        message = f"{package} is not installed"
+    lacking = [] if importlib.util.find_spec(package) else [package]
+    if package == "ecospy":
+        try:
+            ctypes.CDLL("libtbb.so.12")
+        except OSError:
+            lacking.append("libtbb.so.12 (Debian: libtbb12)")
+    if lacking:
+        message = f"not installed: {', '.join(lacking)}"
         pytest.fail(message) if os.environ.get("CI") else pytest.skip(message)
 
 
