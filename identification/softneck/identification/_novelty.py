@@ -21,7 +21,7 @@ from softneck.signals import Recording, concatenate
 from ._drive import DriveModel
 from ._model import WARM_UP, Model
 from ._regressors import PAPER_EQ21, motor_signals, regression
-from ._residual import residual_points
+from ._residual import residual_rows
 from ._rows import known_rows
 from ._stretches import Stretch
 
@@ -72,7 +72,7 @@ def novelty(model: Model, stretches: Sequence[Stretch], training: Recording | No
         if "points" not in model.arrays:
             return None
         if not np.array_equal(model.arrays["table"], PAPER_EQ21):
-            return _residual_novelty(model, stretches)
+            return _set_novelty(model, stretches)
     drive = model.arrays.get("drive", np.zeros((3, 2)))
     motors = DriveModel(drive[:, 0], drive[:, 1])
     trained = training if training is None else _trained_rows(motor_signals(training, motors), model.training_rows)
@@ -141,17 +141,33 @@ def _scale(known: Matrix) -> Vector:
     return np.where(output, max(float(spread[output].max()), 1e-6), max(motors, 1e-6))
 
 
-def _residual_novelty(model: Model, stretches: Sequence[Stretch]) -> Novelty:
-    """Return the novelty in the space of form `residual`: simulated motors and angles of its base, by its weights."""
-    names = ("history", "drive", "redefinition", "a", "b", "delay")
-    base = Model(kind="rls", sample_time=model.sample_time, arrays={name: model.arrays[name] for name in names})
+def _set_novelty(model: Model, stretches: Sequence[Stretch]) -> Novelty:
+    """Return the novelty in the space of a set's own regressor, by its weights: form `lags` or `residual`."""
     table, scale = model.arrays["table"], model.arrays["scale"]
-    settled = 2 * int(table[:, 2].max())
-    tests = [stretch.recording for stretch in stretches if len(stretch.recording) > settled + 2]
+    residual = model.arrays["b"].shape[1] > 0
+    # The base settles over twice the longest lag; without one, regressors need the lags alone.
+    first = int(table[:, 2].max()) * (2 if residual else 1)
+    tests = [stretch.recording for stretch in stretches if len(stretch.recording) > first + 2]
     distance, spacing = np.full((2, len(QUANTILES)), np.nan), np.full((2, len(QUANTILES)), np.nan)
     for axis in range(2):
-        asked = [test for test in tests if np.isfinite(test.outputs[settled:, axis]).sum() > 1]
+        asked = [test for test in tests if np.isfinite(test.outputs[first:, axis]).sum() > 1]
         if asked:
-            points = [residual_points(test, base, table, scale, axis)[0].T for test in asked]
-            distance[axis], spacing[axis] = _distances(model.arrays["points"][axis].T, np.concatenate(points))
+            rows = [(_base_rows if residual else _lag_rows)(model, test, axis) for test in asked]
+            distance[axis], spacing[axis] = _distances(model.arrays["points"][axis].T, np.concatenate(rows) * scale)
     return Novelty(distance, spacing)
+
+
+def _base_rows(model: Model, test: Recording, axis: int) -> Matrix:
+    """Return regressors (rows, n) of form `residual`: simulated motors and angles of its base."""
+    names = ("history", "drive", "redefinition", "a", "b", "delay")
+    base = Model(kind="rls", sample_time=model.sample_time, arrays={name: model.arrays[name] for name in names})
+    return residual_rows(test, base, model.arrays["table"], axis)[0].T
+
+
+def _lag_rows(model: Model, test: Recording, axis: int) -> Matrix:
+    """Return regressors (rows, n) of form `lags`: measured outputs, set-points and motors."""
+    drive = model.arrays["drive"]
+    test = motor_signals(test, DriveModel(drive[:, 0], drive[:, 1]))
+    # What aligns a free run is not judged.
+    start = max(WARM_UP - int(model.arrays["table"][:, 2].max()), 0)
+    return regression(test.rows(start, len(test)), model.arrays["table"], axis)[0]
