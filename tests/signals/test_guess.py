@@ -63,6 +63,7 @@ def layouts(draw: st.DrawFn) -> Layout:
         header=draw(st.booleans()),
         delimiter=draw(st.sampled_from([",", ";", "\t", "|", '"', "\\", "whitespace"])),
         decimal=draw(st.sampled_from([".", ","])),
+        skip=draw(st.integers(0, 9)),
         rows=draw(st.none() | st.just((first, first + 5))),
     )
 
@@ -138,6 +139,18 @@ def test_milliseconds_decimal_commas_and_columns_that_are_something_else(tmp_pat
                   "column 'yaw': because yaw is no channel", "column 'note': because it holds words",
                   "column 'fan': because it never changes"):  # fmt: skip
         assert any(line.startswith(f"ignored: {start}") for line in guess.lines), start
+
+
+@pytest.mark.parametrize("remarks", [["# made by the lab's logger"], ["logger 3, 2026", "", "neck with spring"]])
+@pytest.mark.parametrize("header", [True, False])
+def test_remarks_before_the_table_are_left_out(tmp_path: Path, remarks: list[str], header: bool) -> None:
+    columns = {f"target{name[1]}" if name[0] == "s" else name: c for name, c in table(degrees=False).items()}
+    text = pd.DataFrame(columns).to_csv(index=False, header=header)
+    (tmp_path / "log.csv").write_text("\n".join([*remarks, text]))
+    guess = guess_layout(tmp_path / "log.csv")
+    assert (guess.layout.skip, guess.layout.header) == (len(remarks), header)
+    assert parse_layout(guess.text) == guess.layout
+    assert len(import_log(tmp_path / "log.csv", guess.layout).recording) == 1200
 
 
 def test_the_set_points_are_those_that_the_positions_follow(tmp_path: Path) -> None:

@@ -94,6 +94,11 @@ def test_a_gap_in_the_time_column_splits_the_run_under_any_sample_time(tmp_path:
         ("pitch =", "yaw =", r"\[channels\.yaw\]: no channel of a recording"),
         ("[time]", "[times]", "the layout has the unknown key `times`"),
         ("[time]", "[time]\nsample_time_s = -1", "sample_time_s must be a positive number or `estimate`; got -1"),
+        ("[time]", "[file]\nskip = -1\n[time]", "skip must be a number of lines; got -1"),
+        ("[time]", "[file]\ndelimiter = '(a+)+$'\n[time]", "delimiter must be one character or `whitespace`"),
+        ("[time]", "[file]\ndecimal = ';'\n[time]", r"`decimal` must be one of \., ,; got ';'"),
+        ("[time]", "[time]\nduplicates = 'mean'", "`duplicates` must be one of first, last; got 'mean'"),
+        ('unit = "deg", sign = -1', 'unit = "deg", sign = nan', "a factor or sign must be a finite number; got nan"),
         ("[time]", "[file]\nrows = [5, 2]\n[time]", r"rows must be \[first, last\]"),
         ("[time]", "[file]\nrows = ['a', 'b']\n[time]", r"rows must be \[first, last\]"),
         (

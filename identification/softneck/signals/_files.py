@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -64,14 +65,24 @@ def read_recording(path: str | Path) -> Recording:
         DataError: columns, units, numbers or times are not those of a recording; the line says which.
     """
     source = Path(path)
-    frame = read_table(source, recording_suffix(source), header=True)
+    frame = read_table(source, recording_suffix(source), TextForm())
     try:
         return _from_frame(frame)
     except SoftneckError as error:
         raise DataError(f"{source}: {error}") from error
 
 
-def read_table(source: Path, suffix: str, *, header: bool, delimiter: str = ",", decimal: str = ".") -> pd.DataFrame:
+@dataclass(frozen=True, slots=True)
+class TextForm:
+    """How a text is a table; as it stands here, that of a recording."""
+
+    header: bool = True
+    delimiter: str = ","
+    decimal: str = "."
+    skip: int = 0
+
+
+def read_table(source: Path, suffix: str, form: TextForm) -> pd.DataFrame:
     """Read a table as text-free columns of floats where they are numbers.
 
     Raises:
@@ -88,9 +99,10 @@ def read_table(source: Path, suffix: str, *, header: bool, delimiter: str = ",",
             warnings.simplefilter("error", pd.errors.ParserWarning)
             return pd.read_csv(
                 source,
-                header=0 if header else None,
-                sep=r"\s+" if delimiter == WHITESPACE else delimiter,
-                decimal=decimal,
+                header=0 if form.header else None,
+                sep=r"\s+" if form.delimiter == WHITESPACE else form.delimiter,
+                decimal=form.decimal,
+                skiprows=form.skip,
                 index_col=False,
                 skipinitialspace=True,
                 keep_default_na=False,

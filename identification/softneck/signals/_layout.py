@@ -12,7 +12,7 @@ from typing import Any
 from softneck.core import FileFormatError, SettingsError, SoftneckError, to_si
 
 from ._channels import known_channels, si_unit
-from ._files import WHITESPACE
+from ._files import WHITESPACE, TextForm
 
 Column = str | int
 DUPLICATES = ("first", "last")
@@ -52,6 +52,7 @@ class Layout:
         header: whether the first line names the columns.
         delimiter: between cells, one character or `whitespace`.
         decimal: the decimal mark, `.` or `,`.
+        skip: lines before the table.
         rows: first and last row (not included) to take.
     """
 
@@ -68,7 +69,13 @@ class Layout:
     header: bool = True
     delimiter: str = ","
     decimal: str = "."
+    skip: int = 0
     rows: tuple[int, int] | None = None
+
+    @property
+    def form(self) -> TextForm:
+        """How a text is a table."""
+        return TextForm(self.header, self.delimiter, self.decimal, self.skip)
 
 
 def read_layout(path: str | Path) -> Layout:
@@ -116,7 +123,7 @@ def _layout(table: dict[str, Any]) -> Layout:
     _known_keys(table, {"file", "time", "channels", "tilt"}, "the layout")
     file, time = table.get("file", {}), table.get("time", {})
     tilt = table.get("tilt", {})
-    _known_keys(file, {"header", "delimiter", "decimal", "rows", "variable"}, "[file]")
+    _known_keys(file, {"header", "delimiter", "decimal", "skip", "rows", "variable"}, "[file]")
     _known_keys(
         time,
         {"column", "unit", "factor", "sample_time_s", "new_run_at_restart", "duplicates", "run_column"},
@@ -148,6 +155,7 @@ def _layout(table: dict[str, Any]) -> Layout:
         header=_flag(file, "header", default=True),
         delimiter=_delimiter(file.get("delimiter", ",")),
         decimal=_choice(file, "decimal", (".", ","), ".") or ".",
+        skip=_skip(file.get("skip", 0)),
         rows=(rows[0], rows[1]) if rows is not None else None,
     )
 
@@ -219,6 +227,12 @@ def _choice(table: dict[str, Any], key: str, allowed: tuple[str, ...], default: 
     value = table.get(key, default)
     if value is not default and value not in allowed:
         raise SettingsError(f"`{key}` must be one of {', '.join(allowed)}; got {value!r}.")
+    return value
+
+
+def _skip(value: Any) -> int:
+    if type(value) is not int or not 0 <= value < 10**6:
+        raise SettingsError(f"[file] skip must be a number of lines; got {value!r}.")
     return value
 
 

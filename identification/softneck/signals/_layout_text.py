@@ -44,6 +44,8 @@ def layout_toml(layout: Layout, *, remarks: Mapping[str, str] | None = None, ope
 def _file(layout: Layout, why: Mapping[str, str]) -> list[str]:
     plain = Layout(channels={})
     lines = [f"variable = {_text(layout.variable)}"] if layout.variable is not None else []
+    if layout.skip:
+        lines.append(f"skip = {layout.skip}")
     if layout.header != plain.header:
         lines.append("header = false")
     if layout.delimiter != plain.delimiter:

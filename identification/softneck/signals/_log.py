@@ -64,7 +64,7 @@ def read_log(source: Path, layout: Layout) -> pd.DataFrame:
     if layout.variable is not None:
         raise DataError(f"{source}: the layout's `variable` is for a `.mat` file.")
     kind = ".parquet" if suffix == ".parquet" else ".csv"
-    frame = read_table(source, kind, header=layout.header, delimiter=layout.delimiter, decimal=layout.decimal)
+    frame = read_table(source, kind, layout.form)
     frame.columns = [name.strip() if isinstance(name, str) else name for name in frame.columns]
     return frame
 

@@ -12,7 +12,7 @@ import pandas as pd
 
 from softneck.core import DataError, FileFormatError, Vector
 
-from ._files import WHITESPACE, read_table
+from ._files import WHITESPACE, TextForm, read_table
 from ._layout import Column, Layout
 from ._mat import mat_arrays, mat_table
 
@@ -56,10 +56,10 @@ def sniff(path: str | Path) -> Sniffed:
     if suffix == ".mat":
         frame, form, lines = _mat(source)
     elif suffix == ".parquet":
-        frame, form, lines = read_table(source, suffix, header=True), Layout(channels={}), ()
+        frame, form, lines = read_table(source, suffix, TextForm()), Layout(channels={}), ()
     else:
         form, lines = _text_form(source)
-        frame = read_table(source, ".csv", header=form.header, delimiter=form.delimiter, decimal=form.decimal)
+        frame = read_table(source, ".csv", form.form)
         if form.header:
             frame.columns = [str(name).strip() for name in frame.columns]
     columns: dict[Column, Vector] = {}
@@ -111,31 +111,36 @@ def _mat(source: Path) -> tuple[pd.DataFrame, Layout, tuple[str, ...]]:
 def _text_form(source: Path) -> tuple[Layout, tuple[str, ...]]:
     with source.open("rb") as file:
         head = file.read(_HEAD_BYTES)
-    lines = [line for line in head.decode("utf-8-sig", errors="replace").splitlines() if line.strip()]
+    raw = head.decode("utf-8-sig", errors="replace").splitlines()
     if len(head) == _HEAD_BYTES:
-        lines = lines[:-1]
+        raw = raw[:-1]
+    lines = [line for line in raw if line.strip()]
     if not lines:
         raise FileFormatError(f"{source}: cannot be read as a table (it is empty).")
-    delimiter = _delimiter(lines)
+    delimiter, cells = _delimiter(lines)
+    # A logger's remarks before the table are cut into another number of cells.
+    skip = next((place for place, line in enumerate(raw) if len(_cells(line, delimiter)) == cells), 0)
+    lines = [line for line in raw[skip:] if line.strip()]
     body = [cell.strip() for line in lines[1:] for cell in _cells(line, delimiter)]
     comma = delimiter != "," and any(map(_COMMA_NUMBER.fullmatch, body)) and not any("." in cell for cell in body)
     first = [cell.strip().replace(",", ".") if comma else cell.strip() for cell in _cells(lines[0], delimiter)]
     header = any(cell and not _NUMBER.fullmatch(cell) for cell in first)
     why = f"file: cells are parted by {_NAMES[delimiter]}, because that cuts the lines into equally many"
     second = "the first line holds words: names" if header else "no header line, because the first line holds numbers"
-    form = Layout(channels={}, header=header, delimiter=delimiter, decimal="," if comma else ".")
-    return form, (why, f"file: {second}", *(("file: decimal commas",) if comma else ()))
+    form = Layout(channels={}, header=header, delimiter=delimiter, decimal="," if comma else ".", skip=skip)
+    before = (f"file: the first {skip} line(s) are no part of the table",) if skip else ()
+    return form, (why, *before, f"file: {second}", *(("file: decimal commas",) if comma else ()))
 
 
 def _cells(line: str, delimiter: str) -> list[str]:
     return line.split() if delimiter == WHITESPACE else [cell.strip('"') for cell in line.split(delimiter)]
 
 
-def _delimiter(lines: list[str]) -> str:
-    """Return what cuts nearly all lines into equally many cells; a comma last, as it may be a decimal mark."""
+def _delimiter(lines: list[str]) -> tuple[str, int]:
+    """Return what cuts nearly all lines into equally many cells, and how many; a comma may be a decimal mark: late."""
     for delimiter in ("\t", ";", ",", WHITESPACE):
         counts = Counter(len(_cells(line, delimiter)) for line in lines)
         cells, often = counts.most_common(1)[0]
         if cells >= _FEWEST and often >= 0.9 * len(lines):
-            return delimiter
-    return ","
+            return delimiter, cells
+    return ",", len(_cells(lines[0], ","))
