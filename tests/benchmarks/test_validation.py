@@ -66,12 +66,13 @@ def test_import_validate_and_report(
         for step in steps:
             assert run([str(word) for word in step]) == 0
 
-    started = time.perf_counter()
+    started, busy = time.perf_counter(), time.process_time()
     benchmark.pedantic(job, rounds=1)
-    seconds = time.perf_counter() - started
+    seconds, busy = time.perf_counter() - started, time.process_time() - busy
     assert '"best_linear"' in capsys.readouterr().out
-    benchmark.extra_info["s"] = round(seconds, 1)
-    assert seconds < 20.0
+    benchmark.extra_info |= {"s": round(seconds, 1), "s of processor": round(busy, 1)}
+    # The time of all cores together: a machine that others use shows no other.
+    assert busy < 20.0
 
 
 @pytest.mark.benchmark(group="bootstrap")

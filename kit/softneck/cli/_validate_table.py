@@ -12,7 +12,7 @@ from ._console import percent
 Head = list[str]
 Cells = list[list[str]]
 # What is left of 120 columns beside the numbers.
-_NAME = 22
+_NAME = 18
 
 
 def fit_table(results: Sequence[Validation]) -> tuple[Head, Cells]:
