@@ -13,6 +13,7 @@ from softneck.identification._scores import worst_error
 from softneck.signals import concatenate, signal
 
 from ..data import neck_recording, recording_from, short_neck
+from ._numbers import number, span
 
 CLEAN = recording_from(signal("aprbs", duration=16.0, seed=4).set_points)
 
@@ -37,7 +38,7 @@ def test_r2_is_another_word_for_the_fit_and_the_worst_error_has_its_time() -> No
     for h, fits in result.fits.items():
         for axis, fit in fits.items():
             # Both are sums of the same 375 squares: rounding.
-            assert result.r2[h][axis] == pytest.approx(1 - (1 - fit / 100) ** 2, abs=1e-12)
+            assert result.r2[h][axis] == pytest.approx(1 - (1 - number(fit) / 100) ** 2, abs=1e-12)
     error = np.degrees(np.abs(result.measured - result.free_run)[:, 1])
     assert result.worst_deg["inf"]["roll"] == np.nanmax(error)
     assert result.worst_time["inf"]["roll"] == result.time[np.nanargmax(error)]
@@ -69,6 +70,41 @@ def test_rows_shared_out_to_threads_are_predicted_as_by_one(
             shared = predict(models[kind], [run, run], horizon, motors="simulated")
             alone = models[kind].predict(run, horizon)
             np.testing.assert_array_equal(shared, np.vstack([alone, alone]))
+
+
+@pytest.mark.parametrize("kind", ["rls", "nlsm", "residual", "nn"])
+def test_of_a_long_record_every_nth_row_is_predicted_as_before(
+    models: dict[str, Model], kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = neck_recording(100, seed=78)
+    every = models[kind].predict(run, 25)
+    for workers, stride in ((1, 3), (2, 7), (3, 40)):
+        monkeypatch.setattr("os.cpu_count", lambda n=workers: n)
+        some = predict(models[kind], [run], 25, motors="simulated", stride=stride)
+        rows = np.arange(25, 100, stride)
+        np.testing.assert_array_equal(some[rows], every[rows])
+        assert np.isnan(np.delete(some, rows, axis=0)).all()
+
+
+def test_rows_of_a_long_record_are_judged_alike_for_model_and_baselines(monkeypatch: pytest.MonkeyPatch) -> None:
+    recording, model = neck_recording(1500, seed=8, noise=2e-3), perfect()
+    whole = validate(model, recording)
+    monkeypatch.setattr("softneck.identification._stretches._MOST_STEPS", 7500)
+    some = validate(model, recording)
+    assert whole.rows_by_horizon == {"1": 1475, "5": 1475, "25": 1475, "inf": 1475}
+    assert some.rows_by_horizon == {"1": 1475, "5": 1475, "25": 295, "inf": 1475}
+    assert (some.fits["5"], some.fits["inf"], some.intervals["1"]) == (
+        whole.fits["5"],
+        whole.fits["inf"],
+        whole.intervals["1"],
+    )
+    rows, y = np.arange(25, 1500, 5), recording.outputs
+    held = nrmse_fit(y[rows, 0], y[rows - 25, 0])
+    assert some.persistence["25"]["pitch"] == pytest.approx(held, abs=1e-12)
+    # A fifth of the rows tells the fit to a few hundredths of what is left to 100.
+    assert some.fits["25"]["pitch"] == pytest.approx(number(whole.fits["25"]["pitch"]), abs=0.3)
+    low, high = span(some.intervals["25"]["pitch"])
+    assert low < number(some.fits["25"]["pitch"]) < high
 
 
 def test_a_perfect_model_scores_100_at_every_horizon() -> None:
@@ -177,7 +213,7 @@ def test_a_gain_that_is_twice_too_high_has_not_diverged() -> None:
     result = validate(Model(kind="rls", sample_time=0.02, arrays={**model.arrays, "b": 2 * model.arrays["b"]}), CLEAN)
     assert result.diverged is None
     # Twice the signal: the error is the signal itself, whose mean square is no less than that about its mean.
-    assert -50.0 < result.fits["inf"]["pitch"] <= 1.0
+    assert -50.0 < number(result.fits["inf"]["pitch"]) <= 1.0
 
 
 def test_missed_samples_are_not_scored_and_do_no_harm() -> None:

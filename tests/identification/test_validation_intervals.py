@@ -10,6 +10,7 @@ from softneck.identification import Rls, nrmse_fit, validate
 from softneck.identification._bootstrap import _block_sums, block_length, fit_intervals
 
 from ..data import neck_recording
+from ._numbers import number, span
 
 TS = 0.02
 
@@ -32,7 +33,7 @@ def test_the_true_fit_lies_inside_as_often_as_told(motion: float, error: float, 
     for seed in range(150):
         rng = np.random.default_rng(seed)
         y, e = ar1(motion, rows, rng), 0.2 * ar1(error, rows, rng)
-        for low, high in fit_intervals([y], [y - e], np.zeros(rows, dtype=int), TS)[0]:
+        for low, high in map(span, fit_intervals([y], [y - e], np.zeros(rows, dtype=int), TS)[0]):
             held += low <= 80.0 <= high
     assert held / 300 >= least
 
@@ -42,7 +43,7 @@ def test_an_interval_holds_the_fit_and_narrows_with_the_length_of_the_record() -
     for rows in (2_000, 32_000):
         rng = np.random.default_rng(rows)
         y, e = ar1(0.9, rows, rng), 0.2 * ar1(0.9, rows, rng)
-        (((low, high), _),) = fit_intervals([y], [y - e], np.zeros(rows, dtype=int), TS)
+        low, high = span(fit_intervals([y], [y - e], np.zeros(rows, dtype=int), TS)[0][0])
         assert low < nrmse_fit(y[:, 0], y[:, 0] - e[:, 0]) < high
         widths.append(high - low)
     # 16 times the rows, a quarter of the width; each width is known to some 15 %.
@@ -75,7 +76,7 @@ def test_a_validation_has_intervals_where_it_has_a_fit() -> None:
     assert result.intervals == again.intervals
     for horizon, fits in result.fits.items():
         for axis, fit in fits.items():
-            low, high = result.intervals[horizon][axis]
-            assert low < fit < high
+            low, high = span(result.intervals[horizon][axis])
+            assert low < number(fit) < high
     short = validate(model, neck_recording(300, seed=8))
     assert short.intervals["inf"] == {"pitch": None, "roll": None}

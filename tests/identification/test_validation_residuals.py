@@ -32,12 +32,12 @@ def test_one_run_without_gaps_is_as_in_statsmodels(pole: float) -> None:
     ours = resid(errors, inputs)
     for axis, e in enumerate(errors.T):
         # Sums of 700 products in another order (statsmodels' ccf by FFT): 1e-12 is 700 roundings.
-        np.testing.assert_allclose(ours.autocorrelation[axis], acf(e, nlags=LAGS, fft=False), atol=1e-12)
+        np.testing.assert_allclose(ours.autocorrelation[axis], np.asarray(acf(e, nlags=LAGS, fft=False)), atol=1e-12)
         box = acorr_ljungbox(e, lags=[LAGS])
         assert ours.p_value[axis] == pytest.approx(float(box["lb_pvalue"].iloc[0]), rel=1e-9, abs=1e-300)
         for j, u in enumerate(inputs.T):
-            late = ccf(e, u, adjusted=False)[: LAGS + 1]
-            early = ccf(u, e, adjusted=False)[: LAGS + 1]
+            late = np.asarray(ccf(e, u, adjusted=False))[: LAGS + 1]
+            early = np.asarray(ccf(u, e, adjusted=False))[: LAGS + 1]
             np.testing.assert_allclose(ours.cross_correlation[axis, j, LAGS:], late, atol=1e-12)
             np.testing.assert_allclose(ours.cross_correlation[axis, j, LAGS::-1], early, atol=1e-12)
 

@@ -9,6 +9,7 @@ from softneck.identification import WARM_UP, Model, SetMembership, validate
 from softneck.signals import Recording, concatenate
 
 from ..data import neck_recording
+from ._numbers import number
 
 KINDS = ["rls", "nlsm", "residual", "nn"]
 
@@ -41,8 +42,8 @@ def test_every_kind_starts_from_the_same_25_rows_and_none_of_them_is_scored(
 def test_each_run_starts_by_itself(models: dict[str, Model], kind: str) -> None:
     runs = [neck_recording(120, seed=s, noise=1e-3) for s in (16, 17)]
     both = validate(models[kind], concatenate(runs))
-    for number, run in enumerate(runs):
-        np.testing.assert_array_equal(both.free_run[both.run == number], validate(models[kind], run).free_run)
+    for index, run in enumerate(runs):
+        np.testing.assert_array_equal(both.free_run[both.run == index], validate(models[kind], run).free_run)
 
 
 def memoriser(recording: Recording) -> Model:
@@ -71,8 +72,8 @@ def test_a_model_that_memorises_is_not_scored_on_what_it_has_seen() -> None:
         k: v for k, v in expected.items() if k != "rows_left_out"
     }
     flattered = validate(model, seen, horizons=(1,), include_training=True)
-    assert flattered.fits["1"]["pitch"] > 99.9  # it has seen exactly these rows
-    assert flattered.fits["1"]["pitch"] > clean.fits["1"]["pitch"] + 5
+    assert number(flattered.fits["1"]["pitch"]) > 99.9  # it has seen exactly these rows
+    assert number(flattered.fits["1"]["pitch"]) > number(clean.fits["1"]["pitch"]) + 5
     assert flattered.rows_left_out == 0
 
 

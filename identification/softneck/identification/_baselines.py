@@ -33,7 +33,7 @@ def baselines(
     """Return the baselines of the stretches judged; repeats are looked for in all of the recording."""
     names = [str(h) for h in horizons]
     steps = [None if h == "inf" else int(h) for h in horizons]
-    bounds = best_linear(stretches, steps)
+    bounds = best_linear(stretches, rows, steps)
     held: dict[str, dict[str, float | None]] = {}
     for name, k in zip(names, steps, strict=True):
         if k is not None:

@@ -19,7 +19,7 @@ from softneck.signals import Recording
 
 from ._persistence import held_outputs
 from ._scores import nrmse_fit
-from ._stretches import Stretch
+from ._stretches import Rows, Stretch
 
 # Dead times of a neck and its drives: the response is free, tap by tap, for so long [s].
 _FREE_SECONDS = 0.3
@@ -33,23 +33,20 @@ _PAST = 10
 _ROWS_PER_PARAMETER = 10
 
 
-def best_linear(stretches: Sequence[Stretch], horizons: Sequence[int | None]) -> list[list[float | None]]:
+def best_linear(stretches: Sequence[Stretch], rows: Rows, horizons: Sequence[int | None]) -> list[list[float | None]]:
     """Return for each horizon (None: free run) the fit [%] of pitch and roll; None where rows are too few.
 
     For a finite horizon persistence and, in free run, every stable linear model of the set-points lies below.
     """
     inputs = np.concatenate([_response_columns(stretch.recording) for stretch in stretches])
     columns = np.column_stack([np.ones(len(inputs)), inputs, _decay_columns(stretches)])
-    measured = np.concatenate([np.where(s.scored[:, None], s.recording.outputs, np.nan) for s in stretches])
     result: list[list[float | None]] = []
     for horizon in horizons:
         if horizon is None:
-            result.append(_fits(columns, measured))
+            result.append(_fits(columns, rows.measured))
             continue
         past = np.concatenate([_past_columns(stretch.recording, horizon) for stretch in stretches])
-        since = np.concatenate([np.arange(len(stretch.recording)) for stretch in stretches])
-        judged = np.where((since >= horizon)[:, None], measured, np.nan)
-        result.append(_fits(np.column_stack([columns, past]), judged))
+        result.append(_fits(np.column_stack([columns, past]), rows.judged(horizon)))
     return result
 
 

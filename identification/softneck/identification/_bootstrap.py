@@ -53,9 +53,9 @@ def block_length(signals: Matrix, stretch: np.ndarray, sample_time: float) -> in
     """Return the samples of a block: three correlation times of the slowest of the signals (time, n), at least 1 s.
 
     The correlation time is the first lag at which the autocorrelation is below 1/e. Never more than an eighth of
-    the rows that are judged; None where that is less than 1 s.
+    the rows; None where that is less than 1 s.
     """
-    rows = int(np.isfinite(signals).any(axis=1).sum())
+    rows = len(signals)
     least, most = round(_LEAST_SECONDS / sample_time), rows // _FEWEST_BLOCKS
     if most < max(least, 1):
         return None
@@ -67,7 +67,8 @@ def _correlation_time(signal: Vector, stretch: np.ndarray, most: int) -> int:
     there = np.isfinite(signal)
     if not there.any():
         return 0
-    e = np.where(there, signal - signal[there].mean(), 0.0)
+    # Rows between those that are judged hold what is around them.
+    e = np.interp(np.arange(signal.size), np.flatnonzero(there), signal[there] - signal[there].mean())
     covariance = np.zeros(most + 1)
     for part in np.split(e, np.flatnonzero(np.diff(stretch)) + 1):
         spectrum = np.abs(np.fft.rfft(part, 2 * part.size)) ** 2
@@ -92,9 +93,10 @@ def _block_sums(table: Matrix, stretch: np.ndarray, length: int) -> Matrix:
     parts = []
     for part in np.split(table, np.flatnonzero(np.diff(stretch)) + 1):
         # Rows at its ends that no horizon judges (the warm-up) belong to no block.
-        rows = part[(part != 0.0).any(axis=1)]
-        if not len(rows):
+        judged = np.flatnonzero((part != 0.0).any(axis=1))
+        if not judged.size:
             continue
+        rows = part[judged[0] : judged[-1] + 1]
         wrapped = np.resize(rows, (len(rows) + length - 1, rows.shape[1]))
         total = np.vstack([np.zeros(rows.shape[1]), np.cumsum(wrapped, axis=0)])
         parts.append(total[length:] - total[:-length])

@@ -28,8 +28,8 @@ from ._stretches import Stretch
 QUANTILES = (0.5, 0.9, 0.99, 1.0)
 _NAMES = ("p50", "p90", "p99", "max")
 _AXES = ("pitch", "roll")
-# More training points than this are thinned: a tenth of the distance is not worth ten times the time.
-_MOST_POINTS = 20_000
+# More points than this are thinned evenly: quantiles of a distribution need no more.
+_MOST_KNOWN, _MOST_ASKED = 20_000, 10_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,8 +65,8 @@ def novelty(model: Model, stretches: Sequence[Stretch], training: Recording | No
     Args:
         model: whose drive model fills in motor positions where none were logged.
         stretches: the rows judged.
-        training: recording with the rows that the model was trained on; others in it do not count. None takes the points that a set membership model stores, in the
-            space that it works in.
+        training: recording with the rows that the model was trained on; others in it do not count. None takes the
+            points that a set membership model stores, in the space that it works in.
     """
     if training is None:
         if "points" not in model.arrays:
@@ -124,11 +124,12 @@ def _quantiles(known: Matrix, asked: Matrix) -> tuple[Vector, Vector]:
 
 def _distances(known: Matrix, asked: Matrix) -> tuple[Vector, Vector]:
     """Return the quantiles of distances from `asked` (rows, n) to `known` and inside `known`."""
-    points = known[:: -(-len(known) // _MOST_POINTS)]
+    points = known[:: -(-len(known) // _MOST_KNOWN)]
+    some = asked[:: -(-len(asked) // _MOST_ASKED)]
     tree = KDTree(points)
     # A point that is in the training itself is compared with the others.
-    own = tree.query(points, k=2)[0][:, 1]
-    near = tree.query(asked, k=2)[0]
+    own = tree.query(points, k=2, workers=-1)[0][:, 1]
+    near = tree.query(some, k=2, workers=-1)[0]
     distance = np.where(near[:, 0] == 0.0, near[:, 1], near[:, 0])
     return np.quantile(distance, QUANTILES), np.quantile(own, QUANTILES)
 

@@ -12,20 +12,16 @@ from softneck.core import DataError, Matrix, Vector, require_one_of
 from softneck.signals import Recording
 
 from ._baselines import Baselines, baselines
-from ._bootstrap import fit_intervals
 from ._divergence import divergence
 from ._horizons import predict
 from ._model import Model
 from ._novelty import Novelty, novelty
 from ._residual_tests import ResidualTests, residual_tests
-from ._scores import nrmse_fit, r_squared, rmse, worst_error
+from ._score_tables import INFINITE as INFINITE
+from ._score_tables import coverage_tables, free_run_bounds, interval_tables, run_tables, score_tables
 from ._stretches import Rows, Stretch, pooled, unseen_stretches
 
-INFINITE = "inf"
-_AXES = ("pitch", "roll")
 _HORIZONS = (1, 5, 25, INFINITE)
-# Bounds of set membership follow pitch, roll and three motors in its outputs.
-_LOWER, _UPPER = (5, 7), (6, 8)
 
 Scores = dict[str, dict[str, float | None]]
 
@@ -40,6 +36,7 @@ class Validation:
     Attributes:
         model, data: their names.
         rows_scored, rows_left_out: rows judged, and rows left out because the model was trained on them.
+        rows_by_horizon: rows judged at each horizon: those with so much past, and of long records not all.
         persistence, fits: fit [%] of repeating the last sample, and of the model.
         rmse_deg, r2: root mean square error [deg]; R2 = 1 - SSE/SST.
         worst_deg, worst_time: largest absolute error [deg] and when it was [s].
@@ -62,6 +59,7 @@ class Validation:
     data: str
     rows_scored: int
     rows_left_out: int
+    rows_by_horizon: dict[str, int]
     persistence: Scores
     fits: Scores
     rmse_deg: Scores
@@ -102,6 +100,7 @@ class Validation:
             "data": self.data,
             "rows_scored": self.rows_scored,
             "rows_left_out": self.rows_left_out,
+            "rows_by_horizon": self.rows_by_horizon,
             "fits": {
                 "persistence": self.persistence,
                 "model": self.fits,
@@ -224,29 +223,30 @@ def judge(
 ) -> Validation:
     """Return the validation of a model on its parts of a recording."""
     rows, horizons = parts.rows, [str(h) for h in rules.horizons]
-    outputs = _predictions(model, parts.stretches, rules)
+    outputs = _predictions(model, parts, rules)
     lost: list[float | None] = [None] * len(parts.stretches)
     if INFINITE in outputs:
         lost = divergence(rows.time, rows.stretch, outputs[INFINITE][:, :2], rows.measured)
     first = min((t for t in lost if t is not None), default=None)
     measured = {h: rows.judged(None if h == INFINITE else int(h)) for h in horizons}
     predicted = {h: outputs[h][:, :2] for h in horizons}
-    scores = _scores(rows.time, measured, predicted, lost=first is not None)
+    scores = score_tables(rows.time, measured, predicted, lost=first is not None)
     tests = residual_tests(rows.measured - outputs["1"][:, :2], rows.set_points, rows.stretch)
     free = outputs.get(INFINITE, np.full((rows.time.size, 2), np.nan))
-    lower, upper = _bounds(free)
-    coverage, width = _coverage(rows.measured, lower, upper)
+    lower, upper = free_run_bounds(free)
+    coverage, width = coverage_tables(rows.measured, lower, upper)
     return Validation(
         model=names[0],
         data=names[1],
         rows_scored=int(sum(stretch.scored.sum() for stretch in parts.stretches)),
         rows_left_out=parts.left_out,
+        rows_by_horizon={h: int(np.isfinite(y).any(axis=1).sum()) for h, y in measured.items()},
         persistence=parts.baselines.persistence,
         **scores,
-        intervals=_intervals(rows, measured, predicted, model.sample_time, lost=first is not None),
+        intervals=interval_tables(rows, measured, predicted, model.sample_time, lost=first is not None),
         best_linear=parts.baselines.best_linear,
         noise_ceiling=parts.baselines.noise_ceiling,
-        per_run=_per_run(parts, measured, predicted, lost),
+        per_run=run_tables(parts.stretches, rows, measured, predicted, lost),
         diverged=first,
         residual_tests=tests,
         novelty=novelty(model, parts.stretches, training),
@@ -262,94 +262,14 @@ def judge(
     )
 
 
-def _predictions(model: Model, stretches: Sequence[Stretch], rules: Rules) -> dict[str, Matrix]:
+def _predictions(model: Model, parts: Parts, rules: Rules) -> dict[str, Matrix]:
     """Return horizon -> outputs (time, n_out) of all stretches; one step ahead always, for the residual tests."""
+    runs = [stretch.recording for stretch in parts.stretches]
     result: dict[str, Matrix] = {}
     for horizon in dict.fromkeys((1, *rules.horizons)):
         if horizon == INFINITE:
-            free = [model.simulate(s.recording, motors=rules.motors) for s in stretches]
-            result[INFINITE] = np.concatenate(free)
+            result[INFINITE] = np.concatenate([model.simulate(run, motors=rules.motors) for run in runs])
         else:
-            result[str(horizon)] = predict(model, [s.recording for s in stretches], int(horizon), motors=rules.motors)
+            k = int(horizon)
+            result[str(k)] = predict(model, runs, k, motors=rules.motors, stride=parts.rows.stride(k))
     return result
-
-
-def _scores(time: Vector, measured: dict[str, Matrix], predicted: dict[str, Matrix], *, lost: bool) -> dict[str, Any]:
-    """Return the tables of scores by their names in `Validation`; a lost free run has none."""
-    tables: dict[str, Any] = {name: {} for name in ("fits", "rmse_deg", "r2", "worst_deg", "worst_time")}
-    for h, y in measured.items():
-        for table in tables.values():
-            table[h] = dict.fromkeys(_AXES)
-        if lost and h == INFINITE:
-            continue
-        for i, axis in enumerate(_AXES):
-            pair = (y[:, i], predicted[h][:, i])
-            worst, row = worst_error(*pair)
-            tables["fits"][h][axis] = _number(nrmse_fit(*pair))
-            tables["rmse_deg"][h][axis] = _number(np.degrees(rmse(*pair)))
-            tables["r2"][h][axis] = _number(r_squared(*pair))
-            tables["worst_deg"][h][axis] = _number(np.degrees(worst))
-            tables["worst_time"][h][axis] = float(time[row]) if row >= 0 else None
-    return tables
-
-
-def _per_run(
-    parts: Parts, measured: dict[str, Matrix], predicted: dict[str, Matrix], lost: list[float | None]
-) -> list[dict[str, Any]]:
-    entries = []
-    for number, stretch in enumerate(parts.stretches):
-        rows = parts.rows.stretch == number
-        scores = _scores(
-            parts.rows.time[rows],
-            {h: y[rows] for h, y in measured.items()},
-            {h: y[rows] for h, y in predicted.items()},
-            lost=lost[number] is not None,
-        )
-        scores["worst_time_s"] = scores.pop("worst_time")
-        entries.append(
-            {
-                "stretch": number,
-                "run": stretch.run,
-                "start_s": float(stretch.recording.time[0]),
-                "rows_scored": int(stretch.scored.sum()),
-                "diverged": lost[number],
-                **scores,
-            }
-        )
-    return entries
-
-
-def _intervals(
-    rows: Rows, measured: dict[str, Matrix], predicted: dict[str, Matrix], sample_time: float, *, lost: bool
-) -> dict[str, dict[str, list[float] | None]]:
-    result: dict[str, dict[str, list[float] | None]] = {h: dict.fromkeys(_AXES) for h in measured}
-    kept = [h for h in measured if not (lost and h == INFINITE)]
-    if kept:
-        found = fit_intervals([measured[h] for h in kept], [predicted[h] for h in kept], rows.stretch, sample_time)
-        result |= {h: dict(zip(_AXES, pair, strict=True)) for h, pair in zip(kept, found, strict=True)}
-    return result
-
-
-def _bounds(free: Matrix) -> tuple[Matrix, Matrix]:
-    if free.shape[1] <= max(_UPPER):
-        nothing = np.full((len(free), 2), np.nan)
-        return nothing, nothing
-    return free[:, list(_LOWER)], free[:, list(_UPPER)]
-
-
-def _coverage(
-    measured: Matrix, lower: Matrix, upper: Matrix
-) -> tuple[dict[str, float] | None, dict[str, float] | None]:
-    """Return how many measured samples lie within the bounds [%], and how wide these are [deg]."""
-    there = np.isfinite(measured) & np.isfinite(lower) & np.isfinite(upper)
-    if not there.any():
-        return None, None
-    inside = (measured >= lower) & (measured <= upper) & there
-    count = np.maximum(there.sum(axis=0), 1)
-    width = np.where(there, upper - lower, 0.0).sum(axis=0) / count
-    coverage = 100.0 * inside.sum(axis=0) / count
-    return dict(zip(_AXES, coverage.tolist(), strict=True)), dict(zip(_AXES, np.degrees(width).tolist(), strict=True))
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
