@@ -14,6 +14,7 @@ from softneck.cli import _main
 from softneck.core import CheckFailedError, load
 from softneck.signals import read_recording
 
+from ..browser import own_text
 from ..data import LAYOUTS
 from .conftest import Call, Said
 
@@ -133,7 +134,7 @@ def test_people_get_a_table_and_progress_stays_on_stderr(call: Call, recording: 
     assert "free run" in table.out
     assert "rows judged, 0 left out as the model was trained on them" in table.out
     assert max(len(line) for line in table.out.splitlines() if line[:1] in "┏┃┡│└") <= 120
-    page = Path("page.html").read_text()
+    page = own_text(Path("page.html").read_text(encoding="utf-8"))
     assert "<html" in page
     # Self-contained: nothing is fetched when the page is opened.
     assert 'src="http' not in page

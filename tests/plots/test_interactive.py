@@ -20,7 +20,7 @@ from PIL import Image
 from softneck.plots import Chart, Curve, Level, Panel, Section, page
 from softneck.plots._style import BLUE, GREEN, ORANGE, PURPLE, RED, SKY
 
-from ..browser import Shown, shown
+from ..browser import Shown, own_text, shown
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -66,8 +66,7 @@ def view(html: str, browser: Browser, tmp_path: Path) -> Iterator[Shown]:
 
 def test_a_page_has_one_library_and_refers_to_nothing_outside(html: str) -> None:
     assert html.count("Copyright (c) Anaconda, Inc., and Bokeh Contributors") == 1  # its licence asks for that
-    # The library's own text holds addresses that it only uses when asked to; the browser test watches that it is not.
-    own = re.sub(r'<script id="library">.*?</script>', "", html, flags=re.DOTALL)
+    own = own_text(html)
     assert len(own) < 200_000
     assert not re.search(r"https?://|@import|fetch\(|(src|href)=\"(?!data:|#)", own)
     assert "default-src 'none'" in own

@@ -13,6 +13,8 @@ from softneck.identification import INFINITE, validate
 from softneck.report import Demo, DemoSettings, fit_rows, run_demo
 from softneck.signals import read_recording
 
+from ..browser import own_text
+
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
@@ -48,7 +50,7 @@ def test_a_user_finds_the_same_scores_in_the_files(demo: Demo) -> None:
 
 def test_the_report_and_the_summary_agree_and_stand_alone(demo: Demo) -> None:
     out = demo.settings.out
-    html = (out / "report.html").read_text(encoding="utf-8")
+    html = own_text((out / "report.html").read_text(encoding="utf-8"))
     assert not re.search(r"(src|href)=\"(?!data:|#)", html)
     assert "shorter than the paper" in html
     summary = json.loads((out / "results" / "summary.json").read_text(encoding="utf-8"))
