@@ -1,5 +1,7 @@
 """Models of the neck from recordings, judged honestly."""
 
+from ._cone_set import ConeSet as ConeSet
+from ._cones import Cones as Cones
 from ._drive import DriveModel as DriveModel
 from ._drive import fit_drive as fit_drive
 from ._gamma import GammaCurve as GammaCurve
@@ -10,6 +12,8 @@ from ._model import WARM_UP as WARM_UP
 from ._model import Model as Model
 from ._model import load_model as load_model
 from ._network import Network as Network
+from ._online import OnlineCones as OnlineCones
+from ._online import Tracked as Tracked
 from ._regressors import PAPER_EQ21 as PAPER_EQ21
 from ._rls import Rls as Rls
 from ._rows import row_hashes as row_hashes

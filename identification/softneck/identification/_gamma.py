@@ -85,7 +85,8 @@ def least_gammas(points: Matrix, values: Vector, slacks: Vector) -> tuple[Vector
     Compiled by branch and bound; without numba over all pairs by numpy, some hundred times slower.
     A gamma beyond 1e200 says that equal regressors have outputs further apart than the slack.
     """
-    gammas = np.zeros(slacks.size)
+    rising = np.argsort(slacks, kind="stable")
+    gammas, found = np.zeros(slacks.size), np.zeros((slacks.size, 2), dtype=np.int64)
     if not have_numba():
         pairs = np.zeros((slacks.size, 2))
         gammas = load_functions(_ALL_PAIRS).least_gammas(points, values, slacks, pairs)
@@ -93,9 +94,10 @@ def least_gammas(points: Matrix, values: Vector, slacks: Vector) -> tuple[Vector
     order = tree_order(points)
     sorted_points, sorted_values = np.ascontiguousarray(points[:, order]), values[order]
     nodes = tree_nodes(sorted_points, sorted_values)
-    found = np.zeros((slacks.size, 2), dtype=np.int64)
-    load_functions(_TREE_SEARCH).gamma_search(sorted_points, sorted_values, nodes, slacks, gammas, found)
-    return gammas, order[found]
+    search = load_functions(_TREE_SEARCH).gamma_search
+    search(sorted_points, sorted_values, nodes, np.ascontiguousarray(slacks[rising]), gammas, found)
+    back = np.argsort(rising)
+    return gammas[back], order[found[back]]
 
 
 def _checked(points: Matrix, values: Vector) -> tuple[Matrix, Vector]:
