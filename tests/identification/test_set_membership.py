@@ -14,24 +14,11 @@ from softneck.identification._regressors import regression
 from softneck.identification._tree import LEAF, tree_nodes, tree_order
 
 from ..data import TS, neck_recording, recording_from, short_neck
+from .hard_sets import algorithm_1, hard_sets
 
 BOUNDS = load_functions("softneck.identification._nlsm_runtime")
 TREE = load_functions("softneck.identification._tree_runtime")
 CONES = load_functions("softneck.identification._cones_runtime")
-
-
-def algorithm_1(x: np.ndarray, omega: np.ndarray, y: np.ndarray, gamma: float, epsilon: float) -> tuple[float, float]:
-    """Algorithm 1 line by line; omega is (N, n)."""
-    f_u, f_l = np.inf, -np.inf
-    for k in range(len(y)):
-        distance = sum((x[i] - omega[k][i]) ** 2 for i in range(len(x))) ** 0.5
-        P_u = y[k] + epsilon + gamma * distance
-        P_l = y[k] - epsilon - gamma * distance
-        if P_u <= f_u:
-            f_u = P_u
-        if P_l >= f_l:
-            f_l = P_l
-    return f_l, f_u
 
 
 @st.composite
@@ -52,28 +39,6 @@ def test_the_bounds_are_those_of_algorithm_1(data: tuple[np.ndarray, np.ndarray]
         expected = algorithm_1(x, omega, y, gamma, epsilon)
         # Sums of four squares in one order or another: a few ulp of numbers of order ten.
         np.testing.assert_allclose(BOUNDS.nlsm_bounds(points, y, gamma, epsilon, x), expected, rtol=0, atol=1e-12)
-
-
-@st.composite
-def hard_sets(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray]:
-    """What trees get wrong: clusters, duplicates, collinear points, ties, huge and tiny scales, a few leaves deep."""
-    rng = np.random.default_rng(draw(st.integers(0, 10_000)))
-    rows, n = draw(st.integers(1, 200)), draw(st.integers(1, 11))
-    shape = draw(st.sampled_from(["normal", "clusters", "duplicates", "line", "ties", "one point"]))
-    W = rng.standard_normal((rows, n))
-    if shape == "clusters":
-        W = 1e-3 * W + rng.integers(0, 3, (rows, 1)) * 100.0
-    elif shape == "duplicates":
-        W = W[rng.integers(0, max(rows // 5, 1), rows)]
-    elif shape == "line":
-        W = rng.standard_normal((rows, 1)) * rng.standard_normal(n)
-    elif shape == "ties":
-        W = rng.integers(-1, 2, (rows, n)).astype(float)
-    elif shape == "one point":
-        W = np.tile(W[:1], (rows, 1))
-    scale = draw(st.sampled_from([1.0, 1e-100, 1e-9, 1e9, 1e100]))
-    y = rng.integers(-2, 3, rows).astype(float) if draw(st.booleans()) else rng.standard_normal(rows)
-    return W * scale, y
 
 
 def in_tree_order(omega: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

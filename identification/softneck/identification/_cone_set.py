@@ -70,8 +70,8 @@ class ConeSet:
     def outside(self, X: ArrayLike, *, workers: int | None = None) -> np.ndarray:
         """Return (rows,) whether a query is unlike what was seen: bounds wider than usual, in any output."""
         low, high = self.bounds(X, workers=workers)
-        wider = 0.5 * (high - low) > (self.usual_width[0] if self.single else self.usual_width)
-        return wider if self.single else wider.any(axis=1)
+        width = (0.5 * (high - low)).reshape(-1, self.epsilon.size)
+        return np.asarray((width > self.usual_width).any(axis=1))
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write the set to an `.npz` file."""

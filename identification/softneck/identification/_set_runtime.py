@@ -27,10 +27,10 @@ def set_bounds(
     """Return `bounds` tightened by the cones of all regions, each with its own slope; see `tree_tighten`."""
     regions = gammas.shape[0]
     home = set_home(tree[2], regions, x)
-    bounds = tree_tighten(tree, (home, column), gammas[home - regions], x, bounds, hidden)
+    bounds = tree_tighten(tree, (home, column), float(gammas[home - regions]), x, bounds, hidden)
     for region in range(regions):
         if regions + region != home:
-            bounds = tree_tighten(tree, (regions + region, column), gammas[region], x, bounds, hidden)
+            bounds = tree_tighten(tree, (regions + region, column), float(gammas[region]), x, bounds, hidden)
     return bounds
 
 

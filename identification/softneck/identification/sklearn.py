@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -46,7 +46,8 @@ class SetMembershipRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> SetMembershipRegressor:
         """Store the data (N, n) and (N,) or (N, m), and find what gamma and epsilon leave open."""
-        X, y = validate_data(self, X, y, multi_output=True, y_numeric=True, dtype=np.float64, ensure_min_samples=2)
+        given: tuple[Any, Any] = (X, y)  # scikit-learn's own annotation knows strings only
+        X, y = validate_data(self, *given, multi_output=True, y_numeric=True, dtype=np.float64, ensure_min_samples=2)
         y = np.asarray(y, dtype=np.float64)
         epsilon = self.epsilon
         if epsilon is None and self.gamma is None and (np.ptp(y, axis=0) == 0.0).any():
@@ -62,7 +63,7 @@ class SetMembershipRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def predict(self, X: ArrayLike, *, return_bounds: bool = False) -> Any:
         """Return the central estimate, or with `return_bounds` (estimate, f_l, f_u)."""
         check_is_fitted(self)
-        X = validate_data(self, X, reset=False, dtype=np.float64)
+        X = validate_data(self, cast(Any, X), reset=False, dtype=np.float64)
         low, high = self.cones_.bounds(X, workers=self._workers())
         estimate = 0.5 * (low + high)
         return (estimate, low, high) if return_bounds else estimate
