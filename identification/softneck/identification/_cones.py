@@ -11,7 +11,7 @@ from softneck.core import DataError, SettingsError, Vector, require_between, req
 
 from ._cone_set import ConeSet, as_matrix, as_outputs
 from ._forest import Points, all_cores, plant, region_gammas, tighten
-from ._gamma import RULES, gamma_curve, least_gammas
+from ._gamma import RULES, curve_over, least_gammas
 from ._memory import require_memory
 from ._offending import require_allowed
 
@@ -72,7 +72,8 @@ class Cones:
             raise DataError(f"a set needs at least 2 points of at least 1 regressor; got {X.shape[0]} x {X.shape[1]}.")
         require_memory(X.shape[0], X.shape[1], Y.shape[1])
         scale = weights(self.scale, X.shape[1])
-        points = plant(np.ascontiguousarray((X * scale).T), Y.T, np.arange(len(X), dtype=np.float64))
+        scaled = np.multiply(X.T, scale[:, None], out=np.empty((X.shape[1], len(X))))
+        points = plant(scaled, np.array(Y.T, order="C"), np.arange(len(X), dtype=np.float64))
         regions = min(self.regions, len(points.nodes) // 2)
         cores = all_cores() if workers is None else workers
         outputs = range(Y.shape[1])
@@ -86,14 +87,15 @@ class Cones:
         P, y = points.points, points.values[output]
         gamma, epsilon = pick(self.gamma, output), pick(self.epsilon, output)
         if gamma is None and epsilon is None:
-            gamma, epsilon = gamma_curve(P, y, rule=self.rule).recommended
+            gamma, epsilon = curve_over(P, y, rule=self.rule, nodes=points.own_nodes(output)).recommended
         elif epsilon is None:
             gamma = float(gamma or 0.0)
             # f_u(w_i) >= y_i: what the cones alone, without epsilon, leave to be made up.
             bounds = tighten([points], output, np.array([gamma]), np.ascontiguousarray(P.T), workers=workers)
             epsilon = float(np.max(y - bounds[:, 1], initial=0.0)) / RULES[self.rule]
         elif gamma is None:
-            gamma = float(least_gammas(P, y, np.array([RULES[self.rule] * epsilon]))[0][0])
+            slack = np.array([RULES[self.rule] * epsilon])
+            gamma = float(least_gammas(P, y, slack, nodes=points.own_nodes(output))[0][0])
         require_allowed(points, output, gamma, epsilon, self.rule)
         if regions == 1:
             return np.array([gamma]), epsilon

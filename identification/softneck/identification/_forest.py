@@ -46,6 +46,12 @@ class Points:
         """Return the column of an output's ymin."""
         return 2 * (len(self.points) + output)
 
+    def own_nodes(self, output: int) -> Matrix:
+        """Return the nodes (2^(depth+1), 2 n + 2) of one output alone."""
+        n = len(self.points)
+        columns = [*range(2 * n), 2 * (n + output), 2 * (n + output) + 1]
+        return self.nodes if len(self.values) == 1 else np.ascontiguousarray(self.nodes[:, columns])
+
     def in_time_order(self) -> tuple[Matrix, Matrix, Vector]:
         """Return points, values and ages, oldest first."""
         order = np.argsort(self.ages)
@@ -53,9 +59,13 @@ class Points:
 
 
 def plant(points: Matrix, values: Matrix, ages: Vector) -> Points:
-    """Return the tree over points (n, N), values (m, N) and ages (N,)."""
+    """Return the tree over points (n, N), values (m, N) and ages (N,), which are put in its order where they lie.
+
+    In place, so that memory holds the points once.
+    """
     order = tree_order(points)
-    points, values = np.ascontiguousarray(points[:, order]), np.ascontiguousarray(values[:, order])
+    for row in (*points, *values):
+        row[:] = row[order]
     return Points(points, values, tree_nodes(points, values), ages[order])
 
 

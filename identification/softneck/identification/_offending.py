@@ -13,7 +13,7 @@ from ._gamma import RULES, least_gammas
 def require_allowed(points: Points, output: int, gamma: float, epsilon: float, rule: str) -> None:
     """Raise DataError, naming the pair, unless the data allow (gamma, epsilon): else no function fits (FSS empty)."""
     P, y = points.points, points.values[output]
-    least, pairs = least_gammas(P, y, np.array([RULES[rule] * epsilon]))
+    least, pairs = least_gammas(P, y, np.array([RULES[rule] * epsilon]), nodes=points.own_nodes(output))
     # A gamma beyond 1e200 stands for none; the distance and its reciprocal round once each.
     if least[0] <= min(gamma * (1.0 + 1e-12), 1e200):
         return

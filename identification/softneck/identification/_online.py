@@ -201,7 +201,7 @@ class OnlineCones:
 
     def _learn(self, points: Matrix, values: Matrix) -> None:
         ages = self._total + np.arange(points.shape[1], dtype=np.float64)
-        new = plant(points, values, ages)
+        new = plant(np.array(points, order="C"), np.array(values, order="C"), ages)
         # What was forgotten before a row came denies it nothing.
         capacity = np.inf if self._capacity is None else self._capacity
         windows = np.column_stack([np.full(ages.size, -1.0), ages + 1.0 - capacity])
