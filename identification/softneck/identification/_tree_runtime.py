@@ -22,49 +22,22 @@ def tree_distance(nodes: np.ndarray, node: int, x: np.ndarray) -> float:
 
 def tree_children(nodes: np.ndarray, node: int, x: np.ndarray) -> tuple[float, float]:
     """Return `tree_distance` of both children of a node, side by side: the processor works on the two at once."""
-    lefts = nodes[2 * node]
-    rights = nodes[2 * node + 1]
+    a = 2 * node
+    b = 2 * node + 1
     left = 0.0
     right = 0.0
     for i in range(x.shape[0]):
-        below = lefts[2 * i] - x[i]
-        above = x[i] - lefts[2 * i + 1]
+        below = nodes[a, 2 * i] - x[i]
+        above = x[i] - nodes[a, 2 * i + 1]
         gap = below if below > above else above
         gap = gap if gap > 0.0 else 0.0
         left += gap * gap
-        below = rights[2 * i] - x[i]
-        above = x[i] - rights[2 * i + 1]
+        below = nodes[b, 2 * i] - x[i]
+        above = x[i] - nodes[b, 2 * i + 1]
         gap = below if below > above else above
         gap = gap if gap > 0.0 else 0.0
         right += gap * gap
     return math.sqrt(left), math.sqrt(right)
-
-
-def tree_leaf(
-    points: np.ndarray,
-    values: np.ndarray,
-    stretch: tuple[int, int],
-    gamma: float,
-    x: np.ndarray,
-    bounds: tuple[float, float],
-    hidden: tuple[np.ndarray, float, float],
-) -> tuple[float, float]:
-    """Return the bounds tightened by the cones of one stretch of points."""
-    low, high = bounds
-    ages, start, stop = hidden
-    for k in range(stretch[0], stretch[1]):
-        if start < stop and start <= ages[k] < stop:
-            continue
-        squared = 0.0
-        for i in range(x.shape[0]):
-            gap = points[i, k] - x[i]
-            squared += gap * gap
-        distance = gamma * math.sqrt(squared)
-        if values[k] + distance < high:
-            high = values[k] + distance
-        if values[k] - distance > low:
-            low = values[k] - distance
-    return low, high
 
 
 def tree_tighten(
@@ -88,7 +61,9 @@ def tree_tighten(
     points, values, nodes = tree
     node, column = place
     low, high = bounds
+    ages, start, stop = hidden
     rows = values.shape[0]
+    n = x.shape[0]
     leaves = nodes.shape[0] // 2
     # Left for later: one node a level at most, and 2^64 nodes are more than any memory holds.
     waiting = np.empty(64, dtype=np.int64)
@@ -102,15 +77,31 @@ def tree_tighten(
         cone = cones[top]
         while nodes[node, column] + cone < high or nodes[node, column + 1] - cone > low:
             if node >= leaves:
-                stretch = ((node - leaves) * rows // leaves, (node + 1 - leaves) * rows // leaves)
-                low, high = tree_leaf(points, values, stretch, gamma, x, (low, high), hidden)
+                for k in range((node - leaves) * rows // leaves, (node + 1 - leaves) * rows // leaves):
+                    if start < stop and start <= ages[k] < stop:
+                        continue
+                    squared = 0.0
+                    for i in range(n):
+                        gap = points[i, k] - x[i]
+                        squared += gap * gap
+                    cone = gamma * math.sqrt(squared)
+                    if values[k] + cone < high:
+                        high = values[k] + cone
+                    if values[k] - cone > low:
+                        low = values[k] - cone
                 break
             left, right = tree_children(nodes, node, x)
             # The nearer child now, the other one later, if ever.
-            node = 2 * node if left <= right else 2 * node + 1
-            other = node ^ 1
-            cone = gamma * min(left, right)
-            later = gamma * max(left, right)
+            if left <= right:
+                node = 2 * node
+                other = node + 1
+                cone = gamma * left
+                later = gamma * right
+            else:
+                other = 2 * node
+                node = other + 1
+                cone = gamma * right
+                later = gamma * left
             if nodes[other, column] + later < high or nodes[other, column + 1] - later > low:
                 waiting[top] = other
                 cones[top] = later
