@@ -12,6 +12,7 @@ import matplotlib as mpl
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 
 from softneck.identification import Cones, OnlineCones, gamma_curve
 
@@ -24,7 +25,7 @@ def truth(x: np.ndarray) -> np.ndarray:
     return np.sin(1.5 * x)
 
 
-def save(figure: plt.Figure, path: Path) -> None:
+def save(figure: Figure, path: Path) -> None:
     """Write one picture, without the date."""
     figure.savefig(path, metadata={"Date": None})
     plt.close(figure)

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from softneck.core import DataError, SettingsError, load_functions
-from softneck.identification import PAPER_EQ21, Model, SetMembership, gamma_curve, noise_level, offending_pair
+from softneck.identification import (
+    PAPER_EQ21,
+    Model,
+    SetMembership,
+    gamma_curve,
+    noise_level,
+    offending_pair,
+    outside_seen,
+)
 from softneck.identification._gamma import least_gammas
 from softneck.identification._regressors import regression
 from softneck.identification._tree import LEAF, tree_nodes, tree_order
@@ -193,6 +203,22 @@ def test_the_estimate_lies_in_the_middle_of_its_bounds(models: dict, form: str) 
         assert (low <= high).all()
 
 
+@pytest.mark.parametrize("form", ["nlsm", "residual"])
+def test_a_motion_like_the_data_is_known_and_a_wilder_one_is_not(models: dict, form: str) -> None:
+    model, trained = models[form], short_neck()
+    # The training data themselves are as near as can be.
+    assert outside_seen(model, model.predict(trained)).mean() < 0.05
+    wild = trained.with_channels(**{f"motor_setpoint_{j}": 3 * trained.set_points[:, j - 1] for j in (1, 2, 3)})
+    assert outside_seen(model, model.simulate(wild)[25:]).mean() > 0.5
+
+
+def test_only_set_membership_knows_what_it_has_seen(models: dict) -> None:
+    with pytest.raises(SettingsError, match="only a model of kind nlsm"):
+        outside_seen(models["rls"], np.zeros((3, 9)))
+    with pytest.raises(DataError, match=r"`outputs` must be \(rows, 9\).*got \(3, 5\)"):
+        outside_seen(models["nlsm"], np.zeros((3, 5)))
+
+
 def test_the_residual_form_is_its_base_and_a_set_over_its_signals(models: dict) -> None:
     """The free run again from its parts: the base's own free run, then Algorithm 1 on it, row by row."""
     arrays, recording = models["residual"].arrays, short_neck()
@@ -265,8 +291,16 @@ def test_an_epsilon_below_the_noise_is_refused() -> None:
     rest = {f"motor_{what}_{j}": np.where(np.arange(400) < 300, 0.0, r.channels[f"motor_{what}_{j}"])
             for what in ("setpoint", "position") for j in (1, 2, 3)}  # fmt: skip
     pitch = np.where(np.arange(400) < 300, np.where(np.arange(400) % 3 == 0, 0.01, 0.0), quiet)
-    with pytest.raises(DataError, match=r"epsilon \[.*\] deg is below the noise: equal regressors"):
-        SetMembership(epsilon=1e-4, output_weight=1.0).fit(r.with_channels(pitch=pitch, **rest))
+    resting = r.with_channels(pitch=pitch, **rest)
+    with pytest.raises(DataError, match=r"epsilon \[.*\] deg is below the noise: equal regressors") as caught:
+        SetMembership(epsilon=1e-4, output_weight=1.0).fit(resting)
+    # The two rows that it names have equal regressors and pitches as far apart as it says.
+    named = re.findall(r"row (\d+) \(run (\d+), ([\d.]+) s\)", str(caught.value))
+    rows = [int(row) for row, _, _ in named]
+    assert [f"{resting.time[row]:.6g}" for row in rows] == [seconds for _, _, seconds in named]
+    X, _ = regression(resting, PAPER_EQ21, 0)
+    np.testing.assert_array_equal(X[rows[0] - 3], X[rows[1] - 3])
+    assert f"differ by {np.degrees(abs(pitch[rows[0]] - pitch[rows[1]])):.4g} deg in pitch" in str(caught.value)
 
 
 def test_epsilon_and_weight_are_chosen_on_the_data_and_told() -> None:

@@ -14,6 +14,7 @@ from ._model import load_model as load_model
 from ._network import Network as Network
 from ._online import OnlineCones as OnlineCones
 from ._online import Tracked as Tracked
+from ._outside import outside_seen as outside_seen
 from ._regressors import PAPER_EQ21 as PAPER_EQ21
 from ._rls import Rls as Rls
 from ._rows import row_hashes as row_hashes

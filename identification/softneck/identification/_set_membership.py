@@ -24,6 +24,8 @@ from ._checks import check_training
 from ._drive import DriveModel, fit_drive
 from ._gamma import least_gammas
 from ._model import WARM_UP, Model
+from ._offending import require_feasible
+from ._outside import usual_widths
 from ._regressors import PAPER_EQ21, history_length, motor_signals, regression
 from ._residual import ANGLE_WEIGHT, residual_points, residual_table
 from ._rls import Rls
@@ -140,7 +142,7 @@ class SetMembership:
         scale = np.where(table[:, 0] == 3, weight, 1.0)
         points = [residual_points(recording, base, table, scale, axis) for axis in range(2)]
         gamma = np.array([least_gammas(*points[i], epsilon[i : i + 1])[0][0] for i in range(2)])
-        _require_consistent(gamma, epsilon)
+        require_feasible(recording, table, points, gamma, epsilon)
         history = max(float(base.arrays["history"][0]), table[:, 2].max())
         arrays = {
             "history": np.array([history]),
@@ -150,14 +152,17 @@ class SetMembership:
             **_set_arrays(points, gamma, epsilon),
             **{name: base.arrays[name] for name in ("redefinition", "a", "b", "delay")},
         }
-        return arrays, _findings(gamma, epsilon, weight, points[0][1].size)
+        findings = _findings(gamma, epsilon, weight, points[0][1].size)
+        return arrays, findings | usual_widths(points, gamma, epsilon)
 
     def _arrays(
         self, recording: Recording, drive: DriveModel, weight: float, epsilon: Vector
     ) -> tuple[dict[str, Matrix], dict]:
         gamma = self._gammas(recording, weight, [epsilon])[0]
-        _require_consistent(gamma, epsilon)
+        points = [_points(recording, weight, axis) for axis in range(2)]
+        require_feasible(recording, PAPER_EQ21, points, gamma, epsilon)
         findings = _findings(gamma, epsilon, weight, _points(recording, weight, 0)[1].size)
+        findings |= usual_widths(points, gamma, epsilon)
         return _build(recording, drive, weight, epsilon, gamma), findings
 
 
@@ -228,11 +233,3 @@ def _findings(gamma: Vector, epsilon: Vector, weight: float, points: int) -> dic
         "output_weight": weight,
         "points": points,
     }
-
-
-def _require_consistent(gamma: Vector, epsilon: Vector) -> None:
-    if gamma.max() > 1e100:
-        raise DataError(
-            f"epsilon {np.degrees(epsilon).round(4).tolist()} deg is below the noise: equal regressors have "
-            "outputs further apart, so no function fits the data. Set `epsilon` higher."
-        )
