@@ -2,6 +2,8 @@
 
 from ._compare import Comparison as Comparison
 from ._compare import compare as compare
+from ._cone_set import ConeSet as ConeSet
+from ._cones import Cones as Cones
 from ._drive import DriveModel as DriveModel
 from ._drive import fit_drive as fit_drive
 from ._gamma import GammaCurve as GammaCurve
@@ -13,6 +15,9 @@ from ._model import Model as Model
 from ._model import load_model as load_model
 from ._network import Network as Network
 from ._novelty import Novelty as Novelty
+from ._online import OnlineCones as OnlineCones
+from ._online import Tracked as Tracked
+from ._outside import outside_seen as outside_seen
 from ._regressors import PAPER_EQ21 as PAPER_EQ21
 from ._residual_tests import ResidualTests as ResidualTests
 from ._rls import Rls as Rls

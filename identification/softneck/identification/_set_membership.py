@@ -25,11 +25,13 @@ from softneck.signals import Recording, concatenate
 from ._checks import check_training
 from ._drive import DriveModel, fit_drive
 from ._model import WARM_UP, Model
+from ._offending import require_feasible
+from ._outside import usual_widths
 from ._regressors import lag_table
 from ._residual import residual_lags
 from ._rows import row_hashes
 from ._scaling import RULES, HoldOut, Tried, grouped_scale, ruled_scale
-from ._set_ground import Ground, gammas
+from ._set_ground import Ground, gammas, scaled
 
 FORMS = ("paper_eq21", "lags", "residual")
 _MOTORS = ("measured", "simulated")
@@ -125,11 +127,13 @@ class SetMembership:
         chosen, tried = self._choose(ground, recording, noise, progress)
         scale = chosen.scale if chosen.scale.size else ruled_scale(self.scale, ground.table, data)
         gamma = gammas(data, scale, [chosen.epsilon])[0]
-        _require_consistent(gamma, chosen.epsilon)
+        sets = [(scaled(X, scale), y) for X, y in data]
+        require_feasible(recording, ground.table, sets, gamma, chosen.epsilon)
         arrays = ground.arrays(data, scale, gamma, chosen.epsilon)
         progress(1.0, "done")
         findings = {"form": self.form, "noise_deg": np.degrees(noise).tolist(), **_findings(chosen, tried, scale)}
         findings |= {"gamma": gamma.tolist(), "points": int(arrays["values"].shape[1])}
+        findings |= usual_widths(sets, gamma, chosen.epsilon)
         return Model(
             kind="nlsm",
             sample_time=recording.sample_time,
@@ -245,11 +249,3 @@ def _findings(chosen: Tried, tried: list[Tried], scale: Vector) -> dict[str, Any
             [t.output_weight, t.motor_weight, float(np.degrees(t.epsilon[0])), *t.judgement] for t in tried
         ],
     }
-
-
-def _require_consistent(gamma: Vector, epsilon: Vector) -> None:
-    if gamma.max() > 1e100:
-        raise DataError(
-            f"epsilon {np.degrees(epsilon).round(4).tolist()} deg is below the noise: equal regressors have "
-            "outputs further apart, so no function fits the data. Set `epsilon` higher."
-        )
