@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from softneck.signals import Recording, concatenate, write_recording
@@ -24,18 +23,12 @@ def without_positions(recording: Recording) -> Recording:
     return Recording(recording.time, recording.sample_time, kept)
 
 
-def unmeasured(*names: str) -> Recording:
-    return WHOLE.with_channels(**{name: np.full(len(WHOLE), np.nan) for name in names})
-
-
 CASES: dict[str, tuple[Recording, tuple[str, ...], str]] = {
     "runs shorter than the warm-up": (
         concatenate([WHOLE.rows(0, 20), WHOLE.rows(50, 75)]),
         (),
         "25 rows are too few, as the first 25 of each run set the initial state and are not scored; record longer",
     ),
-    "pitch never measured": (unmeasured("pitch"), (), "`pitch` holds no measured sample; nothing can be judged by it"),
-    "nothing measured": (unmeasured("pitch", "roll"), (), "`pitch` holds no measured sample"),
     "no motor positions to measure": (
         without_positions(WHOLE),
         ("--motors", "measured"),
@@ -78,6 +71,17 @@ def test_training_data_of_another_kind_is_refused(call: Call, rls_file: Path) ->
     write_recording("slow.csv", slower(WHOLE))
     said = call("validate", rls_file, "--data", "good.csv", "--training", "slow.csv", "--json")
     refused(said, "the recording is at 0.04 s")
+
+
+@pytest.mark.parametrize("name", ["pitch", "roll"])
+def test_an_angle_that_was_never_measured_is_named(call: Call, rls_file: Path, name: str) -> None:
+    write_recording("good.csv", WHOLE)
+    lines = [line.split(",") for line in Path("good.csv").read_text().splitlines()]
+    column = lines[0].index(f"{name} [deg]")
+    for line in lines[1:]:
+        line[column] = ""
+    Path("bad.csv").write_text("\n".join(map(",".join, lines)))
+    refused(call("validate", rls_file, "--data", "bad.csv", "--json"), f"channel `{name}` has no sample")
 
 
 def test_missing_columns_are_named(call: Call, rls_file: Path) -> None:

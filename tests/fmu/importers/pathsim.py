@@ -26,6 +26,6 @@ sources = [Source(signal(column)) for column in range(len(names))]
 scope = Scope(labels=outputs)
 connections = [Connection(source, part[name]) for source, name in zip(sources, names, strict=True)]
 connections += [Connection(part[name], scope[index]) for index, name in enumerate(outputs)]
-simulation = Simulation([part, *sources, scope], connections, dt=step, Solver=EUF, log=False)
-simulation.run(step * (len(inputs) - 1), adaptive=False)
+simulation = Simulation([part, *sources, scope], connections, dt=step, Solver=EUF, log=False)  # pyright: ignore[reportArgumentType]
+simulation.run(step * (len(inputs) - 1), adaptive=False)  # pyright: ignore[reportArgumentType]
 np.save(out, np.array(scope.read()[1]).T)
