@@ -17,10 +17,10 @@ class Kind:
 
     Attributes:
         name: what users type and what a file's header says.
-        role: "model", "observer" or "controller".
+        role: "model", "observer", "controller", "family" or "state".
         settings: dotted path of the settings class whose `fit` or `design` makes it.
         result: dotted path of the class that a file becomes, by its `from_archive`.
-        runtime: dotted name of the runtime module (see `core.bundle`).
+        runtime: dotted name of the runtime module (see `core.bundle`); "" for what no loop steps.
         summary: one line for `--help` and the docs.
     """
 
@@ -42,6 +42,8 @@ KINDS: dict[str, Kind] = {
              "nonlinear set membership (Eq. 12-21, Algorithm 1)"),
         Kind("nn", "model", "softneck.identification:Network", _MODEL, "softneck.identification._nn_runtime",
              "NLARX neural network, two hidden layers of 25 (section 6.2)"),
+        Kind("rls_state", "state", "softneck.identification:Recursion", "softneck.identification:RecursionState",
+             "", "what a recursive least squares remembers"),
         Kind("kalman", "observer", "softneck.estimation:KalmanSettings", "softneck.estimation:KalmanObserver",
              "softneck.estimation._kalman_runtime",
              "Kalman filter over an identified linear model with a disturbance state"),
