@@ -28,8 +28,8 @@ _LONGEST_HISTORY = 60_000
 
 def check_arrays(kind: str, arrays: Mapping[str, Matrix]) -> None:
     """Raise FileFormatError unless the arrays are finite, in order, and of shapes that fit each other."""
-    # `rls` over the motors is a state space as well.
-    form = "subspace" if kind == "rls" and "A" in arrays else kind
+    # `rls` over the motors and more than one pole are state spaces as well.
+    form = "subspace" if kind in ("rls", "oe", "srivc") and "A" in arrays else kind
     if tuple(arrays) != _ORDER[form]:
         raise FileFormatError(
             f"a model of kind {kind} has the arrays {', '.join(_ORDER[form])}; got {', '.join(arrays)}."

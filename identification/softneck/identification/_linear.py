@@ -52,7 +52,10 @@ def transfer_function(model: Linear, output: str, input: str | None, angle_unit:
         SettingsError: the kind is not linear, or an unknown input, output or unit.
     """
     name, scale = _checked(model, output, input, angle_unit)
-    if "A" in model.arrays:
+    axes = model.findings.get("transfer_functions")
+    if axes is not None:
+        numerator, denominator, delay = _of_findings(axes, _OUTPUTS.index(output), name)
+    elif "A" in model.arrays:
         numerator, denominator, delay = _of_state_space(model.arrays, _OUTPUTS.index(output), name)
     else:
         numerator, denominator, delay = _of_axis(model.arrays, _OUTPUTS.index(output), name)
@@ -70,7 +73,7 @@ def transfer_function(model: Linear, output: str, input: str | None, angle_unit:
 def state_space(model: Linear) -> control.StateSpace:
     """Return both outputs as one discrete state space, from the motors where the model has them as inputs."""
     _require_linear(model.kind)
-    if "A" in model.arrays:
+    if "A" in model.arrays and "transfer_functions" not in model.findings:
         A, B, C, _ = system_of(model.arrays)
         A, B, C = _delayed(A, B, C, int(model.arrays["delay"][0]))
         inputs = list(_MOTORS)
@@ -107,7 +110,7 @@ def continuous_function(
 
 def describe(model: Linear) -> list[str]:
     """Return each axis in the paper's form, `G = exp(-L s) K/(s + p)`, in degrees, where it has one real pole."""
-    if "A" in model.arrays:
+    if "A" in model.arrays and "transfer_functions" not in model.findings:
         poles = np.linalg.eigvals(model.arrays["A"])
         delay = model.arrays["delay"][0] * model.sample_time
         return [f"{poles.size} states, dead time {delay:.3g} s, poles {np.array2string(poles, precision=4)}"]
@@ -121,9 +124,10 @@ def _describe_axis(model: Linear, axis: int) -> str:
     if found is not None and len(found[name]["a"]) == 2:
         numbers = (found[name]["b"][0], found[name]["a"][1], found[name]["delay_s"])
     if numbers is None:
-        poles = np.roots(np.concatenate([[1.0], model.arrays["a"][axis]]))
-        gain = np.degrees(model.arrays["b"][axis].sum() / (1.0 + model.arrays["a"][axis].sum()))
-        delay = model.arrays["delay"][axis] * model.sample_time
+        G: Any = transfer_function(model, name, None, "deg")
+        poles = np.roots(np.trim_zeros(np.asarray(G.den[0][0]), "b"))
+        gain = float(G.dcgain())
+        delay = _dead_time(np.asarray(G.num[0][0]), np.asarray(G.den[0][0])) * model.sample_time
         return (
             f"{name}: discrete poles {np.array2string(poles, precision=4)}, "
             f"static gain {gain:.3f} deg/rad, dead time {delay:.2f} s"
@@ -159,8 +163,7 @@ def _continuous(model: Linear, output: str, name: str) -> tuple[Vector, Vector, 
     """Undo the zero-order hold: return numerator, denominator and dead time [s]."""
     G = transfer_function(model, output, name, "rad")
     below, above = np.asarray(G.den[0][0]), np.trim_zeros(np.asarray(G.num[0][0]), "f")
-    lost = below.size - np.trim_zeros(below, "b").size
-    delay = min(lost, below.size - above.size - 1) if above.size else 0
+    delay = _dead_time(above, below)
     S: Any = control.ss(control.TransferFunction(above, below[: below.size - delay], model.sample_time))
     poles = np.linalg.eigvals(S.A)
     if (np.abs(poles) < 1e-9).any() or ((np.abs(poles.imag) < 1e-12) & (poles.real <= 0.0)).any():
@@ -174,6 +177,25 @@ def _continuous(model: Linear, output: str, name: str) -> tuple[Vector, Vector, 
     L = np.real(logm(joint)) / model.sample_time
     continuous: Any = control.ss2tf(control.StateSpace(L[:n, :n], L[:n, n:], S.C, S.D))
     return np.asarray(continuous.num[0][0]), np.asarray(continuous.den[0][0]), delay * model.sample_time
+
+
+def _dead_time(numerator: Vector, denominator: Vector) -> int:
+    """Return the samples that poles at zero delay, beyond the one that a strictly proper system has itself."""
+    above = np.trim_zeros(numerator, "f")
+    at_zero = denominator.size - np.trim_zeros(denominator, "b").size
+    return min(at_zero, denominator.size - above.size - 1) if above.size else 0
+
+
+def _of_findings(axes: Mapping[str, Any], axis: int, name: str) -> tuple[Vector, Vector, int]:
+    """Return one axis of a model whose arrays hold both in one state space."""
+    entry = axes[_OUTPUTS[axis]]
+    arrays = {
+        "redefinition": redefinition_matrix(TENDON_ANGLES),
+        "a": np.array([entry["a"]] * 2),
+        "b": np.array([entry["b"]] * 2),
+        "delay": np.array([entry["delay"]] * 2),
+    }
+    return _of_axis(arrays, axis, name)
 
 
 def _of_axis(arrays: Mapping[str, Matrix], axis: int, name: str) -> tuple[Vector, Vector, int]:

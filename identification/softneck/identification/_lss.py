@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.linalg import null_space
+from scipy.linalg import block_diag, null_space, solve_discrete_are
 
-from softneck.core import Matrix
+from softneck.core import Matrix, Vector
+from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
 # A free run starts after 25 samples; an observer slower than this many starts from what it knows by then.
 _LONGEST_SETTLING = 200
+# What the Kalman gain of a model without a noise model takes for granted: inputs that act by 0.3 rad otherwise than
+# asked (slack, hysteresis), and 0.1 deg on the angles (the paper's inclinometer has 0.05 to 0.1).
+_INPUT_NOISE, _OUTPUT_NOISE = 0.3, 0.0017
 
 
 def lss_arrays(
@@ -73,6 +77,33 @@ def varx_system(A: Matrix, B: Matrix) -> tuple[Matrix, Matrix, Matrix, Matrix]:
     K = -A.reshape(n, 2)
     C = np.eye(2, n)
     return F + K @ C, B.reshape(n, B.shape[2]), C, K
+
+
+def axes_system(a: list[Vector], b: list[Vector]) -> tuple[Matrix, Matrix, Matrix, Matrix]:
+    """Return two transfer functions over theta_i and phi_i as one system over the motors, with a Kalman gain.
+
+    Args:
+        a: denominators without their leading ones.
+        b: numerators, b_1 first.
+    """
+    parts = [_observer_form(*axis) for axis in zip(a, b, strict=True)]
+    T = redefinition_matrix(TENDON_ANGLES)
+    A, C = block_diag(*(F for F, _, _ in parts)), np.zeros((2, sum(len(F) for F, _, _ in parts)))
+    B = np.vstack([np.outer(G, T[axis]) for axis, (_, G, _) in enumerate(parts)])
+    C[0, 0] = C[1, len(parts[0][0])] = 1.0
+    return A, B, C, block_diag(*(K[:, None] for _, _, K in parts))
+
+
+def _observer_form(a: Vector, b: Vector) -> tuple[Matrix, Vector, Vector]:
+    """Return A (n, n), B (n,) and the gain K (n,) of one axis, its output the first state."""
+    n = max(a.size, b.size)
+    F = np.eye(n, k=1)
+    F[: a.size, 0] = -a
+    G = np.zeros(n)
+    G[: b.size] = b
+    noise = _INPUT_NOISE**2 * np.outer(G, G) + 1e-12 * np.eye(n)
+    P = np.asarray(solve_discrete_are(F.T, np.eye(n, 1), noise, _OUTPUT_NOISE**2 * np.eye(1)))
+    return F, G, F @ P[:, 0] / (P[0, 0] + _OUTPUT_NOISE**2)
 
 
 def _standing(A: Matrix, C: Matrix) -> Matrix:
