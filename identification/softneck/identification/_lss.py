@@ -88,10 +88,10 @@ def axes_system(a: list[Vector], b: list[Vector]) -> tuple[Matrix, Matrix, Matri
     """
     parts = [_observer_form(*axis) for axis in zip(a, b, strict=True)]
     T = redefinition_matrix(TENDON_ANGLES)
-    A, C = block_diag(*(F for F, _, _ in parts)), np.zeros((2, sum(len(F) for F, _, _ in parts)))
+    A, C = np.asarray(block_diag(*(F for F, _, _ in parts))), np.zeros((2, sum(len(F) for F, _, _ in parts)))
     B = np.vstack([np.outer(G, T[axis]) for axis, (_, G, _) in enumerate(parts)])
     C[0, 0] = C[1, len(parts[0][0])] = 1.0
-    return A, B, C, block_diag(*(K[:, None] for _, _, K in parts))
+    return A, B, C, np.asarray(block_diag(*(K[:, None] for _, _, K in parts)))
 
 
 def _observer_form(a: Vector, b: Vector) -> tuple[Matrix, Vector, Vector]:

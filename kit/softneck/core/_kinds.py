@@ -40,6 +40,8 @@ KINDS: dict[str, Kind] = {
              "recursive least squares over the redefined inputs, with dead time (Eq. 23-30)"),
         Kind("oe", "model", "softneck.identification:OutputError", _MODEL, "softneck.identification._oe_runtime",
              "output error: transfer functions with dead time that simulate best (Gauss-Newton)"),
+        Kind("srivc", "model", "softneck.identification:Srivc", _MODEL, "softneck.identification._oe_runtime",
+             "continuous-time K exp(-L s)/(s + p) by refined instrumental variables, with confidence intervals"),
         Kind("nlsm", "model", "softneck.identification:SetMembership", _MODEL, "softneck.identification._nlsm_runtime",
              "nonlinear set membership (Eq. 12-21, Algorithm 1)"),
         Kind("nn", "model", "softneck.identification:Network", _MODEL, "softneck.identification._nn_runtime",
