@@ -19,7 +19,7 @@ from softneck.cosim import drive_fmu
 from softneck.design import PiSettings
 from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.fmu import build_fmu
-from softneck.identification import Network, Rls, SetMembership
+from softneck.identification import Network, OutputError, Rls, SetMembership, Srivc, Subspace
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.signals import Recording, redefine, signal
 
@@ -51,6 +51,22 @@ def _rls() -> Block:
     return Rls().fit(_recording()).block()
 
 
+def _miso() -> Block:
+    return Rls(structure="miso", nb=2, max_delay=0.1).fit(_recording()).block()
+
+
+def _oe() -> Block:
+    return OutputError(max_delay=0.1).fit(_recording()).block()
+
+
+def _srivc() -> Block:
+    return Srivc(order=2, resamples=0, max_delay=0.1).fit(_recording()).block()
+
+
+def _subspace() -> Block:
+    return Subspace(delay=0.0).fit(_recording()).block()
+
+
 def _nlsm() -> Block:
     return SetMembership().fit(_recording()).block()
 
@@ -78,6 +94,10 @@ def _pi() -> Block:
 # Kind -> its block, inputs, outputs and parameters that the public face names for it.
 _KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...]]] = {
     "rls": (_rls, _MOTORS, ["pitch", "roll", "motor_position_1"], _MODEL),
+    "miso": (_miso, _MOTORS, ["pitch", "roll", "motor_position_2"], _MODEL),
+    "oe": (_oe, _MOTORS, ["pitch", "roll", "motor_position_1"], _MODEL),
+    "srivc": (_srivc, _MOTORS, ["pitch", "roll", "motor_position_2"], _MODEL),
+    "subspace": (_subspace, _MOTORS, ["pitch", "roll", "motor_position_3"], _MODEL),
     "nlsm": (_nlsm, _MOTORS, ["pitch", "roll", "pitch_lower", "pitch_upper", "roll_lower", "roll_upper"], _MODEL),
     "residual": (_residual, _MOTORS, ["pitch", "pitch_lower", "roll_upper", "motor_position_2"], _MODEL),
     "nn": (_nn, _MOTORS, ["pitch", "roll", "motor_position_3"], _MODEL),

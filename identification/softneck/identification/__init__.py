@@ -22,6 +22,7 @@ from ._scores import rmse as rmse
 from ._set_membership import SetMembership as SetMembership
 from ._set_membership import noise_level as noise_level
 from ._srivc import Srivc as Srivc
+from ._subspace import Subspace as Subspace
 from ._validation import INFINITE as INFINITE
 from ._validation import Validation as Validation
 from ._validation import validate as validate

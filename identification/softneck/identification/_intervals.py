@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -105,7 +105,7 @@ def _model(theta: Vector, n: int) -> Continuous:
     return Continuous(a=theta[:n], b=theta[n:-1], delay=float(theta[-1]))
 
 
-def _draw(residuals: list[Vector], block: int, generator: np.random.Generator) -> list[Vector]:
+def _draw(residuals: Sequence[Vector], block: int, generator: np.random.Generator) -> list[Vector]:
     """Return residuals in blocks drawn from all runs, missing where they were missing."""
     pool = np.concatenate([e[np.isfinite(e)] for e in residuals])
     pool = pool - pool.mean()

@@ -42,6 +42,8 @@ KINDS: dict[str, Kind] = {
              "output error: transfer functions with dead time that simulate best (Gauss-Newton)"),
         Kind("srivc", "model", "softneck.identification:Srivc", _MODEL, "softneck.identification._oe_runtime",
              "continuous-time K exp(-L s)/(s + p) by refined instrumental variables, with confidence intervals"),
+        Kind("subspace", "model", "softneck.identification:Subspace", _MODEL, "softneck.identification._lss_runtime",
+             "state space from the three motors to both angles (N4SID), without redefinition"),
         Kind("nlsm", "model", "softneck.identification:SetMembership", _MODEL, "softneck.identification._nlsm_runtime",
              "nonlinear set membership (Eq. 12-21, Algorithm 1)"),
         Kind("nn", "model", "softneck.identification:Network", _MODEL, "softneck.identification._nn_runtime",
