@@ -2,10 +2,15 @@
 
 from ._drive import DriveModel as DriveModel
 from ._drive import fit_drive as fit_drive
+from ._envelope import envelope_weight as envelope_weight
+from ._family import AxisFamily as AxisFamily
+from ._family import Family as Family
+from ._family_fit import FamilySettings as FamilySettings
 from ._gamma import GammaCurve as GammaCurve
 from ._gamma import gamma_curve as gamma_curve
 from ._gamma import offending_pair as offending_pair
 from ._linear import continuous_parameters as continuous_parameters
+from ._lpv import Lpv as Lpv
 from ._model import WARM_UP as WARM_UP
 from ._model import Model as Model
 from ._model import load_model as load_model
