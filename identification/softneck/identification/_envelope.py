@@ -15,7 +15,7 @@ _FLOOR = 0.02
 
 
 def envelope_weight(frequency: Vector, envelope: Vector, order: int) -> tuple[Vector, Vector]:
-    """Return numerator and denominator of W(s) with |W(j w)| >= `envelope`, as close as its order allows.
+    """Return numerator and denominator of W(s) with `|W(j w)| >= envelope`, as close as its order allows.
 
     `|W|^2 = N(w^2)/D(w^2)`: for a given closeness gamma, `e^2 D <= N <= gamma^2 e^2 D` is linear in the coefficients;
     the least gamma is found by bisection, W by spectral factorisation (Balas et al. 2007, `ucover`).
@@ -96,4 +96,4 @@ def _factor(coefficients: Vector, middle: float) -> Vector:
     """Return the monic polynomial in s with roots in the left half plane whose |.|^2 is that in (w/middle)^2."""
     roots = np.roots(coefficients[::-1])
     left = -np.sqrt(-roots.astype(complex))
-    return np.real(np.poly(middle * np.where(left.real > 0, -left, left)))
+    return np.real(np.poly(middle * np.where(np.real(left) > 0, -left, left)))

@@ -30,7 +30,7 @@ class AxisFamily:
         used: (n,) 1 where the sample is in the uncertain plant, else 0.
         nominal: (3,) middle of the box, its dead time in whole samples.
         box: (2, 3) least and largest of the samples used.
-        weight: (2, order + 1) numerator and denominator of W(s): |G/G0 - 1| <= |W| for every sample used.
+        weight: (2, order + 1) numerator and denominator of W(s): `|G/G0 - 1| <= |W|` for every sample used.
         envelope: (m,) largest relative error of the samples used at the family's frequencies.
     """
 
@@ -88,12 +88,12 @@ class Family:
         return control.TransferFunction(np.trim_zeros(above, "f"), np.trim_zeros(below, "f"), name=f"W_{output}")
 
     def errors(self, output: str) -> Matrix:
-        """Return |G/G0 - 1| (n, m) of the samples used, at the family's frequencies."""
+        """Return `|G/G0 - 1|` (n, m) of the samples used, at the family's frequencies."""
         axis = self._axis(output)
         return relative_errors(axis.samples[axis.used > 0.5], axis.nominal, self.frequency, self.sample_time)
 
     def covered(self, output: str) -> float:
-        """Return the largest |G/G0 - 1| / |W| over all samples used and a dense grid; at most 1."""
+        """Return the largest `|G/G0 - 1| / |W|` over all samples used and a dense grid; at most 1."""
         axis = self._axis(output)
         w = np.geomspace(self.frequency[0], self.frequency[-1], 5 * self.frequency.size)
         W = np.abs(np.polyval(axis.weight[0], 1j * w) / np.polyval(axis.weight[1], 1j * w))
@@ -206,7 +206,7 @@ def one_pole(numbers: Vector) -> Continuous:
 
 
 def relative_errors(samples: Matrix, nominal: Vector, frequency: Vector, sample_time: float) -> Matrix:
-    """Return |G/G0 - 1| (n, m) of all samples at `frequency` [rad/s], inputs held between samples."""
+    """Return `|G/G0 - 1|` (n, m) of all samples at `frequency` [rad/s], inputs held between samples."""
     G0 = _response(one_pole(nominal), frequency, sample_time)
     return np.array([np.abs(_response(one_pole(row), frequency, sample_time) / G0 - 1.0) for row in samples])
 

@@ -9,12 +9,12 @@ def lpv_value(knots: np.ndarray, values: np.ndarray, at: float) -> float:
     """Return `values` (m,) linear between `knots` (m,), constant beyond."""
     m = knots.shape[0]
     if m == 1 or at <= knots[0]:
-        return values[0]
+        return float(values[0])
     for i in range(1, m):
         if at <= knots[i]:
             part = (at - knots[i - 1]) / (knots[i] - knots[i - 1])
-            return (1.0 - part) * values[i - 1] + part * values[i]
-    return values[m - 1]
+            return float((1.0 - part) * values[i - 1] + part * values[i])
+    return float(values[m - 1])
 
 
 def lpv_simulate(
