@@ -99,7 +99,7 @@ def test_a_folder_that_cannot_be_written(call: Call, tmp_path: Path, recording: 
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("speed=3", "there is no setting `speed`; this kind has delay, delay_by, forgetting, max_delay, na, nb"),
+        ("speed=3", "there is no setting `speed`; this kind has covariance_bound, dead_zone, delay"),
         ("na", "--set takes KEY=VALUE; got `na`"),
         ("na=0", "`na` must be a whole number between 1 and 100; got 0"),
         ("na=1.5", "`na` must be a whole number between 1 and 100; got 1.5"),

@@ -22,8 +22,8 @@ PAPER_HEAD = ["where", "model, axis", "what it is", "persistence", "paper", "our
 PAPER_NOTE = (
     "Fit 100 (1 - |y - yhat| / |y - mean y|) in %. SM and NN of Tables 3 and 4 are one step ahead, RLS a free run; "
     "section 7.4 is a free run with measured motors. SM's norm has no weights and the units of the paper's logs, "
-    "motors in rad and angles in deg; `scaling` is SM with weights chosen for free run. `Other necks` is the span of the same "
-    "estimator, trained anew, over the other plants. A figure of the paper inside these needs no other cause; "
+    "motors in rad and angles in deg; `scaling` is SM with weights chosen for free run. `Other necks` is the span of "
+    "the same estimator, trained anew, over the other plants. A figure of the paper inside these needs no other cause; "
     "`unexplained`: none tried here."
 )
 
