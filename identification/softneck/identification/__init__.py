@@ -16,6 +16,8 @@ from ._model import Model as Model
 from ._model import load_model as load_model
 from ._network import Network as Network
 from ._oe import OutputError as OutputError
+from ._online import OnlineRls as OnlineRls
+from ._online import OnlineState as OnlineState
 from ._recursion import Recursion as Recursion
 from ._recursion import RecursionHistory as RecursionHistory
 from ._recursion import RecursionState as RecursionState
