@@ -91,6 +91,16 @@ def test_too_little_excitation_is_refused_with_its_condition_number() -> None:
         Rls(structure="miso", delay=0.06).fit(recording_from(P, noise=1e-4))
 
 
+def test_a_neck_that_runs_away_is_no_stable_model() -> None:
+    r = neck_recording(600, noise=0.0)
+    pitch = np.zeros(600)
+    for k in range(599):  # 1.004^600 = 11: still within half a turn
+        pitch[k + 1] = 1.004 * pitch[k] + 1e-3 * redefine(r.set_points)[k, 0]
+    growing = r.with_channels(pitch=0.3 * pitch / np.abs(pitch).max())
+    with pytest.raises(DataError, match="no dead time gives a stable one-step model of pitch; record with more"):
+        Rls(delay=0.0).fit(growing)
+
+
 def redefined_only(P: np.ndarray) -> np.ndarray:
     return P - P.mean(axis=1, keepdims=True)
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from softneck.core import DataError, FileFormatError, Matrix, SettingsError, Vector, load, load_functions
 from softneck.identification import Recursion, RecursionState
+from softneck.plots import convergence_figure
 
 UD = "softneck.identification._ud_runtime"
 STANDARD = "softneck.identification._recursion_runtime"
@@ -185,3 +186,25 @@ def test_what_is_wrong_is_named(tmp_path: Path) -> None:
     )
     with pytest.raises(FileFormatError, match="`factor` is not of finite floats of shape"):
         load(tmp_path / "s.npz")
+
+
+def test_it_is_the_course_of_statsmodels() -> None:
+    """Their filter starts diffuse; ours from 1e12, which the first rows of unit size leave behind."""
+    module = pytest.importorskip("statsmodels.regression.recursive_ls")
+    Phi, y = rows(3, 60)
+    settings = Recursion(parameters=3)
+    _, course = settings.run(settings.initial_state(), Phi, y, keep=True)
+    theirs = module.RecursiveLS(y, Phi).fit().recursive_coefficients.filtered.T
+    # Its diffuse start is 1e6, so it is off by parts of 1e-6 until many rows are in.
+    np.testing.assert_allclose(course.theta[10:], theirs[10:], rtol=0, atol=1e-5)
+
+
+def test_a_course_can_be_drawn() -> None:
+    Phi, y = rows(2, 60)
+    settings = Recursion(parameters=2, forgetting=0.99)
+    state, course = settings.run(settings.initial_state(), Phi, y, keep=True)
+    std = state.noise_std * np.sqrt(course.covariance)
+    figure = convergence_figure(0.02 * np.arange(60), course.theta, std, ["a_1", "b_1"], "course", error=course.error)
+    assert len(figure.axes) == 3
+    # The last row's band is what the state itself says.
+    np.testing.assert_allclose(std[-1], state.parameter_std, rtol=1e-12)

@@ -23,6 +23,8 @@ from ._novelty import Novelty as Novelty
 from ._oe import OutputError as OutputError
 from ._online import OnlineCones as OnlineCones
 from ._online import Tracked as Tracked
+from ._online_rls import OnlineRls as OnlineRls
+from ._online_rls import OnlineState as OnlineState
 from ._outside import outside_seen as outside_seen
 from ._recursion import Recursion as Recursion
 from ._recursion import RecursionHistory as RecursionHistory

@@ -92,7 +92,7 @@ class OutputError:
                 "delay_curve": curves,
                 "parameter_std": [np.sqrt(np.diag(fit.covariance)).tolist() for fit in found],
                 "least_squares_beside": beside,
-                "warnings": _warnings(inputs, found),
+                **_warnings(inputs, found),
             },
             training_rows=row_hashes(recording),
         )
@@ -208,9 +208,10 @@ def _spread(runs: list[tuple[Vector, Vector]]) -> float:
     return float(np.sum((y - y.mean()) ** 2))
 
 
-def _warnings(runs: list[list[tuple[Vector, Vector]]], found: list[OutputErrorFit]) -> list[str]:
-    return [
+def _warnings(runs: list[list[tuple[Vector, Vector]]], found: list[OutputErrorFit]) -> dict[str, list[str]]:
+    said = [
         f"{name}: its slowest pole is at the bound of a third of the longest run, a drift; lower `nf` or record longer."
         for name, axis, fit in zip(AXES, runs, found, strict=True)
         if pole_radius(fit.f) > largest_radius(axis) - 1e-3 * (1.0 - largest_radius(axis))
     ]
+    return {"warnings": said} if said else {}

@@ -50,6 +50,8 @@ KINDS: dict[str, Kind] = {
              "NLARX neural network, two hidden layers of 25 (section 6.2)"),
         Kind("rls_state", "state", "softneck.identification:Recursion", "softneck.identification:RecursionState",
              "", "what a recursive least squares remembers"),
+        Kind("rls_online", "state", "softneck.identification:OnlineRls", "softneck.identification:OnlineState",
+             "", "what a neck identified sample by sample has learnt"),
         Kind("family", "family", "softneck.identification:FamilySettings", "softneck.identification:Family", "",
              "uncertain linear plant: nominal, box, samples and a weight over them"),
         Kind("kalman", "observer", "softneck.estimation:KalmanSettings", "softneck.estimation:KalmanObserver",
