@@ -56,6 +56,8 @@ def remarks(r: Validation) -> list[str]:
             f"{who}: free-run bounds hold {_pair(r.coverage_pct.values())} % of the samples, "
             f"{_pair(r.mean_width_deg.values())} deg wide"
         )
+    if r.outside_pct is not None and not lost:
+        lines.append(f"{who}: {_pair(r.outside_pct.values())} % of them lie outside what the model has seen")
     if r.novelty is not None:
         p50, p90, p99, most = (f"{value:.1f}" for value in r.novelty.ratio.max(axis=0))
         lines.append(

@@ -134,6 +134,11 @@ def _remarks(r: Validation) -> list[str]:
             f"The bounds of the free run hold {_cell(r.coverage_pct, 1)} % of the samples and are "
             f"{_cell(r.mean_width_deg, 1)} deg wide in the mean."
         )
+    if r.outside_pct is not None:
+        words.append(
+            f"At {_cell(r.outside_pct, 1)} % of the samples the bounds are wider than 99 % of the training rows have "
+            "them: the model has never seen that."
+        )
     if r.novelty is not None:
         p50, p90, p99, most = (f"{value:.1f}" for value in r.novelty.ratio.max(axis=0))
         words.append(
