@@ -13,6 +13,7 @@ import pytest
 from scipy.io import savemat
 
 from softneck.core import read_archive, write_archive
+from softneck.signals import Recording, write_recording
 
 from ..data import LAYOUTS, changed, csv_lines, neck_recording
 from .conftest import Call, Said
@@ -62,6 +63,17 @@ def test_a_file_that_is_not_there_is_named(call: Call, tmp_path: Path, rls_file:
         "info": ("info", "none.csv"),
     }[command]
     refused(call(*arguments), "none.csv: no such file", tmp_path, set())
+
+
+def test_recordings_of_two_sample_times_are_named(call: Call, tmp_path: Path, rls_file: Path) -> None:
+    (tmp_path / "a.csv").write_text("\n".join(csv_lines(neck_recording(300), 300)))
+    slow = neck_recording(300)
+    write_recording("b.csv", Recording(2 * slow.time, 2 * slow.sample_time, slow.channels))
+    message = "b.csv: is at 40 ms and a.csv at 20 ms; recordings are used together at one sample time only"
+    left = {"a.csv", "b.csv"}
+    refused(call("identify", "rls", "a.csv", "b.csv", "-o", "m.npz", "--json"), message, tmp_path, left)
+    training = ("--training", "a.csv", "--training", "b.csv")
+    refused(call("validate", rls_file, "--data", "a.csv", *training), message, tmp_path, left)
 
 
 def test_a_model_that_is_none(call: Call, tmp_path: Path, recording: Path) -> None:

@@ -37,7 +37,8 @@ CASES: dict[str, tuple[Recording, tuple[str, ...], str]] = {
     "another sample time": (
         slower(WHOLE),
         (),
-        "the model was identified at 0.02 s and the recording is at 0.04 s; resample it or identify again",
+        "on bad.csv: the model was identified at 0.02 s and the recording is at 0.04 s; resample it "
+        "(`softneck.signals.resampled`) or identify again",
     ),
     "a horizon longer than the run": (
         WHOLE,
