@@ -76,6 +76,13 @@ def test_recordings_of_two_sample_times_are_named(call: Call, tmp_path: Path, rl
     refused(call("validate", rls_file, "--data", "a.csv", *training), message, tmp_path, left)
 
 
+def test_a_model_under_another_ending_is_refused_before_any_work(call: Call, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("never read")
+    for name in ("m.csv", "m"):
+        said = call("identify", "rls", "a.csv", "-o", name, "--json")
+        refused(said, f"{name}: must end in `.npz`, by which softneck knows the file", tmp_path, {"a.csv"})
+
+
 def test_a_model_that_is_none(call: Call, tmp_path: Path, recording: Path) -> None:
     (tmp_path / "m.npz").write_bytes(b"PK\x03\x04 a zip that is none")
     said = call("validate", "m.npz", "--data", recording, "--json")
@@ -156,7 +163,7 @@ def test_a_wrong_setting_of_a_network(call: Call, tmp_path: Path, recording: Pat
         (("record", "song", "-o", "r.csv"), "`signal` must be one of eq22"),
         (("record", "steps", "-o", "r.csv", "--neck", "giraffe"), "`giraffe` is neither a neck preset"),
         (("record", "steps", "-o", "r.csv", "--payload", "-1"), "`--payload` must be between 0 and 1 [kg]"),
-        (("record", "steps", "-o", "r.csv", "--duration", "0"), "`duration` must be positive [s]"),
+        (("record", "steps", "-o", "r.csv", "--duration", "0"), "`duration` must be between 0.02 and 86400 [s]"),
         (("record", "eq22", "-o", "r.csv", "--duration", "0.001"), "r"),
         (("record", "steps", "-o", "r.xlsx", "--duration", "1"), "a recording is a `.csv` or a `.parquet` file"),
         (("design", "lqg", "MODEL", "-o", "c.npz"), "`lqg` is no kind of controller; use one of pi"),

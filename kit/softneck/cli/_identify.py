@@ -64,7 +64,7 @@ def command(
     options = SearchOptions(searches, hold_out, strategy, plot)
     if not 0.0 < train <= 1.0:
         raise SettingsError(f"--train: the part to train on must be in (0, 1]; got {train:g}.")
-    path, replace = target(output, f"models/{kind}.npz", force=force)
+    path, replace = target(output, f"models/{kind}.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
     if plot is not None:
         refuse_existing(plot, force=force)
