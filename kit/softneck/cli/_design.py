@@ -30,7 +30,7 @@ _KINDS = "\n".join(f"  {name:6} {KINDS[name].summary}" for name in kinds_of("con
 def command(kind: str, model: Path, output: Path | None, settings: tuple[str, ...], force: bool, as_json: bool) -> None:
     """Design a controller of KIND on an identified linear MODEL."""
     entry = find_kind(kind, "controller")
-    path, replace = target(output, f"controllers/{kind}.npz", force=force)
+    path, replace = target(output, f"controllers/{kind}.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
     with progress(f"design {kind}", quiet=as_json):
         controller = apply_settings(resolve(entry.settings), settings).design(_linear(model))
