@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
-from softneck.identification import Model, Network, Rls, SetMembership
+from softneck.identification import Model, Network, Play, Rls, SetMembership
 from softneck.signals import Recording
 
 from .data import ROOT, neck_recording, short_neck
@@ -34,6 +34,7 @@ def models() -> dict[str, Model]:
         "rls": Rls(max_delay=0.12).fit(recording),
         "nlsm": SetMembership(epsilon=0.01, output_weight=10.0).fit(recording),
         "residual": SetMembership(form="residual").fit(recording),
+        "play": Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording),
         "nn": Network(hidden=(4, 3), iterations=8).fit(recording),
     }
 

@@ -15,7 +15,7 @@ from softneck.signals import Recording, concatenate
 from ..data import TS, neck_recording
 
 # By the name of the shared models: "residual" is the other form of kind "nlsm".
-KINDS = ("rls", "nlsm", "residual", "nn")
+KINDS = ("rls", "nlsm", "residual", "play", "nn")
 UNSEEN = neck_recording(120, seed=21)
 
 
@@ -97,6 +97,10 @@ CRAFTED = [
     ("residual", "delay", lambda a: a + 1e6, "a dead time"),
     ("residual", "a", lambda a: a[:1], "`a` has shape"),
     ("residual", "table", lambda a: np.where(a == [3, 1, 1], [3, 2, 1], a), "a regressor's output"),
+    ("play", "table", lambda a: a + 100.0, "a term's signal"),
+    ("play", "chain", lambda a: a + 0.5, "the order of the filters"),
+    ("play", "echo", lambda a: a[:1], "`echo` has shape"),
+    ("play", "memory", lambda a: a * 1e9, "its memory in samples"),
     ("nn", "W2", lambda a: a[:, :, :-1], "`W2` has shape"),
 ]
 

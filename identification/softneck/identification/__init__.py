@@ -10,6 +10,7 @@ from ._model import WARM_UP as WARM_UP
 from ._model import Model as Model
 from ._model import load_model as load_model
 from ._network import Network as Network
+from ._play import Play as Play
 from ._regressors import PAPER_EQ21 as PAPER_EQ21
 from ._rls import Rls as Rls
 from ._rows import row_hashes as row_hashes

@@ -17,6 +17,9 @@ _ORDER = {
         "history", "drive", "table", "scale", "points", "values", "bounds", "nodes",
         "redefinition", "a", "b", "delay",
     ),
+    "play": (
+        "history", "drive", "load", "redefinition", "widths", "chain", "table", "weights", "range", "echo", "memory",
+    ),
     "nn": ("history", "drive", "table", "W1", "b1", "W2", "b2", "w3", "b3", "input_scale", "output_scale"),
 }  # fmt: skip
 # A minute at 1 ms: far beyond any lag of a neck, far below what memory holds.
@@ -38,7 +41,10 @@ def check_arrays(kind: str, arrays: Mapping[str, Matrix]) -> None:
     if history != int(history) or not 1 <= history <= _LONGEST_HISTORY:
         raise FileFormatError(f"its history of {history:g} samples is no number from 1 to {_LONGEST_HISTORY}.")
     _within(arrays["drive"][:, 1], 0, history, "a drive's delay")
-    {"rls": _check_rls, "nlsm": _check_nlsm, "nn": _check_nn}[kind](arrays, history)
+    if "memory" in arrays:
+        _expect(arrays, "memory", (1,))
+        _within(arrays["memory"], 1, _LONGEST_HISTORY, "its memory in samples")
+    _CHECKS[kind](arrays, history)
 
 
 def no_base() -> dict[str, Matrix]:
@@ -84,6 +90,20 @@ def _check_nn(arrays: Mapping[str, Matrix], history: float) -> None:
         _expect(arrays, name, shape)
 
 
+def _check_play(arrays: Mapping[str, Matrix], history: float) -> None:
+    widths, n, p = arrays["widths"].shape[0], len(arrays["table"]), arrays["echo"].shape[-1]
+    shapes = {
+        "load": (4,), "redefinition": (3, 3), "widths": (widths,), "chain": (2,), "table": (n, 3), "weights": (2, n),
+        "range": (2, 2), "echo": (2, p),
+    }  # fmt: skip
+    for name, shape in shapes.items():
+        _expect(arrays, name, shape)
+    _within(arrays["chain"][1:], 1, 1000, "the order of the filters")
+    signals = 3 * (1 + widths) * arrays["chain"][1]
+    _within(arrays["table"], -1, signals - 1, "a term's signal")
+    _within(np.array([p]), 1, history, "the length of the echo")
+
+
 def _check_table(table: Matrix, history: float) -> int:
     """Check rows (source, channel, lag) and return their number."""
     if table.ndim != 2 or table.shape[1] != 3 or not len(table):
@@ -103,3 +123,6 @@ def _expect(arrays: Mapping[str, Matrix], name: str, shape: tuple[int, ...]) -> 
 def _within(values: Matrix, low: float, high: float, what: str) -> None:
     if (values != np.round(values)).any() or not ((values >= low) & (values <= high)).all():
         raise FileFormatError(f"{what} is no whole number from {low:g} to {high:g}.")
+
+
+_CHECKS = {"rls": _check_rls, "nlsm": _check_nlsm, "play": _check_play, "nn": _check_nn}

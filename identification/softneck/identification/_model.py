@@ -84,7 +84,9 @@ class Model:
         logged = recording.motor_positions[0]
         m0 = np.where(np.isfinite(logged), logged, recording.set_points[0])
         start = block.initial_state(use_measurement=1.0, pitch_start=y0[0], roll_start=y0[1])
-        held = np.tile(np.concatenate([m0, y0, m0]), (int(self.arrays["history"][0]), 1))
+        # Long enough to fill all histories; kinds with filters say how long those remember.
+        rows = int(max(self.arrays["history"][0], *self.arrays.get("memory", np.zeros(1))))
+        held = np.tile(np.concatenate([m0, y0, m0]), (rows, 1))
         state, _ = block.run(start, held)
         outputs = start.outputs.copy()
         outputs[2:5] = m0

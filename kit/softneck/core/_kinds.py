@@ -42,6 +42,8 @@ KINDS: dict[str, Kind] = {
              "nonlinear set membership (Eq. 12-21, Algorithm 1)"),
         Kind("nn", "model", "softneck.identification:Network", _MODEL, "softneck.identification._nn_runtime",
              "NLARX neural network, two hidden layers of 25 (section 6.2)"),
+        Kind("play", "model", "softneck.identification:Play", _MODEL, "softneck.identification._play_runtime",
+             "play operators and low-pass filters, ridge on their polynomial; no feedback, strong in free run"),
         Kind("kalman", "observer", "softneck.estimation:KalmanSettings", "softneck.estimation:KalmanObserver",
              "softneck.estimation._kalman_runtime",
              "Kalman filter over an identified linear model with a disturbance state"),
