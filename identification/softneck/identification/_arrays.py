@@ -20,7 +20,10 @@ _ORDER = {
     "play": (
         "history", "drive", "load", "redefinition", "widths", "chain", "table", "weights", "range", "echo", "memory",
     ),
-    "nn": ("history", "drive", "table", "W1", "b1", "W2", "b2", "w3", "b3", "input_scale", "output_scale"),
+    "nn": (
+        "history", "drive", "table", "W1", "b1", "W2", "b2", "w3", "b3", "input_scale", "output_scale", "load",
+        "correction",
+    ),
 }  # fmt: skip
 # A minute at 1 ms: far beyond any lag of a neck, far below what memory holds.
 _LONGEST_HISTORY = 60_000
@@ -84,10 +87,13 @@ def _check_nn(arrays: Mapping[str, Matrix], history: float) -> None:
     h1, h2 = arrays["b1"].shape[-1], arrays["b2"].shape[-1]
     shapes = {
         "W1": (2, h1, n), "b1": (2, h1), "W2": (2, h2, h1), "b2": (2, h2), "w3": (2, h2), "b3": (2,),
-        "input_scale": (2, 2, n), "output_scale": (2, 2),
+        "input_scale": (2, 2, n), "output_scale": (2, 2), "load": (4,),
+        "correction": (2, 2),
     }  # fmt: skip
     for name, shape in shapes.items():
         _expect(arrays, name, shape)
+    if (arrays["correction"] < 0).any() or (arrays["correction"] >= 1).any():
+        raise FileFormatError("its correction's memory and gain are not from 0 to 1, so that it would not die out.")
 
 
 def _check_play(arrays: Mapping[str, Matrix], history: float) -> None:
