@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
-from softneck.identification import Model, Network, Play, Rls, SetMembership
+from softneck.identification import Model, Network, Play, Residual, Rls, SetMembership, combine
 from softneck.signals import Recording
 
 from .data import ROOT, neck_recording, short_neck
@@ -28,15 +28,17 @@ def neck() -> Recording:
 
 @pytest.fixture(scope="session")
 def models() -> dict[str, Model]:
-    """One small model of each kind, all trained on the same 500 rows."""
+    """One small model of each kind, all on the same 500 rows; "any" is kind `residual`, "residual" a form of `nlsm`."""
     recording = short_neck()
-    return {
+    made = {
         "rls": Rls(max_delay=0.12).fit(recording),
         "nlsm": SetMembership(epsilon=0.01, output_weight=10.0).fit(recording),
         "residual": SetMembership(form="residual").fit(recording),
         "play": Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording),
         "nn": Network(hidden=(4, 3), iterations=8).fit(recording),
+        "any": Residual(base="rls").fit(recording),
     }
+    return {**made, "ensemble": combine([made["play"], made["rls"], made["nn"]])}
 
 
 @pytest.fixture(scope="session")

@@ -19,7 +19,7 @@ from softneck.cosim import drive_fmu
 from softneck.design import PiSettings
 from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.fmu import build_fmu
-from softneck.identification import Network, Play, Rls, SetMembership
+from softneck.identification import Network, Play, Residual, Rls, SetMembership, combine
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.signals import Recording, redefine, signal
 
@@ -67,6 +67,15 @@ def _play() -> Block:
     return Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(_recording()).block()
 
 
+def _any() -> Block:
+    return Residual(base="rls").fit(_recording()).block()
+
+
+def _ensemble() -> Block:
+    play = Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(_recording())
+    return combine([play, Rls().fit(_recording())]).block()
+
+
 def _neck() -> Block:
     return VirtualNeck(NeckParameters.paper()).block(noise_seed=3)
 
@@ -86,6 +95,13 @@ _KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ..
     "residual": (_residual, _MOTORS, ["pitch", "pitch_lower", "roll_upper", "motor_position_2"], _MODEL),
     "nn": (_nn, _MOTORS, ["pitch", "roll", "motor_position_3"], _MODEL),
     "play": (_play, _MOTORS, ["pitch", "roll", "motor_position_3"], _MODEL),
+    "any": (_any, _MOTORS, ["pitch", "roll", "pitch_lower", "pitch_upper", "roll_lower", "roll_upper"], _MODEL),
+    "ensemble": (
+        _ensemble,
+        _MOTORS,
+        ["pitch", "roll", "pitch_lower", "pitch_upper", "roll_lower", "roll_upper"],
+        _MODEL,
+    ),
     "neck": (
         _neck,
         [*_MOTORS, "payload", "push_x", "push_y", "base_tilt_pitch", "base_tilt_roll"],

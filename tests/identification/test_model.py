@@ -15,7 +15,7 @@ from softneck.signals import Recording, concatenate
 from ..data import TS, neck_recording
 
 # By the name of the shared models: "residual" is the other form of kind "nlsm".
-KINDS = ("rls", "nlsm", "residual", "play", "nn")
+KINDS = ("rls", "nlsm", "residual", "play", "nn", "any", "ensemble")
 UNSEEN = neck_recording(120, seed=21)
 
 
@@ -101,6 +101,10 @@ CRAFTED = [
     ("play", "chain", lambda a: a + 0.5, "the order of the filters"),
     ("play", "echo", lambda a: a[:1], "`echo` has shape"),
     ("play", "memory", lambda a: a * 1e9, "its memory in samples"),
+    ("any", "table", lambda a: a - 1.0, "a regressor's"),
+    ("any", "0.rls.delay", lambda a: a + 1e6, "a dead time"),
+    ("ensemble", "memory", lambda a: a * 1e9, "its memory in samples"),
+    ("ensemble", "2.nn.w3", lambda a: a * np.nan, "`w3` is not of finite floats"),
     ("nn", "W2", lambda a: a[:, :, :-1], "`W2` has shape"),
 ]
 

@@ -2,6 +2,8 @@
 
 from ._drive import DriveModel as DriveModel
 from ._drive import fit_drive as fit_drive
+from ._ensemble import Ensemble as Ensemble
+from ._ensemble import combine as combine
 from ._gamma import GammaCurve as GammaCurve
 from ._gamma import gamma_curve as gamma_curve
 from ._gamma import offending_pair as offending_pair
@@ -12,6 +14,7 @@ from ._model import load_model as load_model
 from ._network import Network as Network
 from ._play import Play as Play
 from ._regressors import PAPER_EQ21 as PAPER_EQ21
+from ._residual_any import Residual as Residual
 from ._rls import Rls as Rls
 from ._rows import row_hashes as row_hashes
 from ._scores import nrmse_fit as nrmse_fit

@@ -8,6 +8,7 @@ import numpy as np
 
 from softneck.core import FileFormatError, Matrix
 
+from ._composed import COMPOSED, members, own_arrays
 from ._tree import tree_nodes
 
 # In the runtimes' order (see each kind's `_runtime` module).
@@ -17,6 +18,8 @@ _ORDER = {
         "history", "drive", "table", "scale", "points", "values", "bounds", "nodes",
         "redefinition", "a", "b", "delay",
     ),
+    "residual": ("history", "memory", "table", "scale", "points", "values", "bounds", "nodes"),
+    "ensemble": ("history", "memory"),
     "play": (
         "history", "drive", "load", "redefinition", "widths", "chain", "table", "weights", "range", "echo", "memory",
     ),
@@ -31,23 +34,52 @@ _LONGEST_HISTORY = 60_000
 
 def check_arrays(kind: str, arrays: Mapping[str, Matrix]) -> None:
     """Raise FileFormatError unless the arrays are finite, in order, and of shapes that fit each other."""
+    if kind in COMPOSED:
+        _check_composed(kind, arrays)
+        return
     if tuple(arrays) != _ORDER[kind]:
         raise FileFormatError(
             f"a model of kind {kind} has the arrays {', '.join(_ORDER[kind])}; got {', '.join(arrays)}."
         )
+    _check_finite(arrays)
+    history = _history(arrays)
+    _expect(arrays, "drive", (3, 2))
+    _within(arrays["drive"][:, 1], 0, history, "a drive's delay")
+    _CHECKS[kind](arrays, history)
+
+
+def _check_finite(arrays: Mapping[str, Matrix]) -> None:
     for name, array in arrays.items():
         if array.dtype != np.float64 or not np.isfinite(array).all():
             raise FileFormatError(f"its array `{name}` is not of finite floats.")
+
+
+def _history(arrays: Mapping[str, Matrix]) -> float:
+    """Check history and memory, and return the history."""
     _expect(arrays, "history", (1,))
-    _expect(arrays, "drive", (3, 2))
     history = float(arrays["history"][0])
     if history != int(history) or not 1 <= history <= _LONGEST_HISTORY:
         raise FileFormatError(f"its history of {history:g} samples is no number from 1 to {_LONGEST_HISTORY}.")
-    _within(arrays["drive"][:, 1], 0, history, "a drive's delay")
     if "memory" in arrays:
         _expect(arrays, "memory", (1,))
         _within(arrays["memory"], 1, _LONGEST_HISTORY, "its memory in samples")
-    _CHECKS[kind](arrays, history)
+    return history
+
+
+def _check_composed(kind: str, arrays: Mapping[str, Matrix]) -> None:
+    own, parts = own_arrays(arrays), members(arrays)
+    if tuple(arrays)[: len(own)] != _ORDER[kind]:
+        raise FileFormatError(f"a model of kind {kind} starts with the arrays {', '.join(_ORDER[kind])}.")
+    if len(parts) < 1 or (kind == "residual" and len(parts) != 1):
+        raise FileFormatError(f"a model of kind {kind} cannot have {len(parts)} members.")
+    _check_finite(own)
+    history = _history(own)
+    if kind == "residual":
+        n = _check_table(own["table"], history)
+        _within(own["table"][:, 0], 2, 3, "a regressor's source")
+        _check_set(own, n)
+    for member, part in parts:
+        check_arrays(member, part)
 
 
 def no_base() -> dict[str, Matrix]:
@@ -70,7 +102,11 @@ def _check_linear(arrays: Mapping[str, Matrix], history: float) -> None:
 
 
 def _check_nlsm(arrays: Mapping[str, Matrix], history: float) -> None:
-    n = _check_table(arrays["table"], history)
+    _check_set(arrays, _check_table(arrays["table"], history))
+    _check_linear(arrays, history)
+
+
+def _check_set(arrays: Mapping[str, Matrix], n: int) -> None:
     rows = arrays["values"].shape[-1]
     for name, shape in {"scale": (n,), "points": (2, n, rows), "values": (2, rows), "bounds": (2, 2)}.items():
         _expect(arrays, name, shape)
@@ -79,7 +115,6 @@ def _check_nlsm(arrays: Mapping[str, Matrix], history: float) -> None:
     # A tree of another shape would be read beyond its end, and one of other numbers would leave points out.
     if not np.array_equal(arrays["nodes"], nodes):
         raise FileFormatError("its array `nodes` is not the tree over its points; identify the model again.")
-    _check_linear(arrays, history)
 
 
 def _check_nn(arrays: Mapping[str, Matrix], history: float) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -179,7 +179,7 @@ def train_axis(
     Z, target = data.measured[rows], data.target[rows]
     ends: list[tuple[float, Layers, float]] = []
     for number, decay in enumerate(decays):
-        start = random_layers(Z.shape[1], hidden, rng)
+        start = _solved(random_layers(Z.shape[1], hidden, rng), Z, target)
         layers = _series_parallel(start, Z, target, decay, max(iterations // 3, 1), best, f"start {number + 1}")
         ends.append((best.hold_out.weights_fit(layers)[1], layers, decay))
         if best.stop():
@@ -192,6 +192,15 @@ def train_axis(
         length = max(round(seconds * data.window), 2)
         layers = _windows(layers, data, rows, decay, length, max(refine // len(_WINDOWS), 1), best)
     return best.layers or layers
+
+
+def _solved(layers: Layers, Z: Matrix, target: Vector) -> Layers:
+    """Return the layers with the output layer of least squares: Levenberg-Marquardt starts far closer then."""
+    H = np.tanh(np.tanh(Z @ layers.W1.T + layers.b1) @ layers.W2.T + layers.b2)
+    H = np.column_stack([H, np.ones(len(H))])
+    # Neurons are much alike at random: a thousandth of the rows keeps the weights of order one.
+    w = np.linalg.solve(H.T @ H + 1e-3 * len(H) * np.eye(H.shape[1]), H.T @ target)
+    return replace(layers, w3=w[:-1], b3=float(w[-1]))
 
 
 def _series_parallel(
