@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
-from softneck.identification import Model, Network, Play, Residual, Rls, SetMembership, combine
+from softneck.identification import GreyBox, Model, Network, Play, Residual, Rls, SetMembership, combine
 from softneck.signals import Recording
 
 from .data import ROOT, neck_recording, short_neck
@@ -36,6 +36,7 @@ def models() -> dict[str, Model]:
         "residual": SetMembership(form="residual").fit(recording),
         "play": Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording),
         "nn": Network(hidden=(4, 3), iterations=8).fit(recording),
+        "greybox": GreyBox(evaluations=4, sensor_delay=2).fit(recording),
         "any": Residual(base="rls").fit(recording),
     }
     return {**made, "ensemble": combine([made["play"], made["rls"], made["nn"]])}

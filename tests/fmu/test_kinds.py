@@ -19,7 +19,7 @@ from softneck.cosim import drive_fmu
 from softneck.design import PiSettings
 from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.fmu import build_fmu
-from softneck.identification import Network, Play, Residual, Rls, SetMembership, combine
+from softneck.identification import GreyBox, Network, Play, Residual, Rls, SetMembership, combine
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.signals import Recording, redefine, signal
 
@@ -67,6 +67,10 @@ def _play() -> Block:
     return Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(_recording()).block()
 
 
+def _greybox() -> Block:
+    return GreyBox(evaluations=3, sensor_delay=2).fit(_recording()).block()
+
+
 def _any() -> Block:
     return Residual(base="rls").fit(_recording()).block()
 
@@ -95,6 +99,7 @@ _KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ..
     "residual": (_residual, _MOTORS, ["pitch", "pitch_lower", "roll_upper", "motor_position_2"], _MODEL),
     "nn": (_nn, _MOTORS, ["pitch", "roll", "motor_position_3"], _MODEL),
     "play": (_play, _MOTORS, ["pitch", "roll", "motor_position_3"], _MODEL),
+    "greybox": (_greybox, _MOTORS, ["pitch", "roll", "motor_position_1"], _MODEL),
     "any": (_any, _MOTORS, ["pitch", "roll", "pitch_lower", "pitch_upper", "roll_lower", "roll_upper"], _MODEL),
     "ensemble": (
         _ensemble,

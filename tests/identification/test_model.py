@@ -15,7 +15,7 @@ from softneck.signals import Recording, concatenate
 from ..data import TS, neck_recording
 
 # By the name of the shared models: "residual" is the other form of kind "nlsm".
-KINDS = ("rls", "nlsm", "residual", "play", "nn", "any", "ensemble")
+KINDS = ("rls", "nlsm", "residual", "play", "nn", "greybox", "any", "ensemble")
 UNSEEN = neck_recording(120, seed=21)
 
 
@@ -101,6 +101,8 @@ CRAFTED = [
     ("play", "chain", lambda a: a + 0.5, "the order of the filters"),
     ("play", "echo", lambda a: a[:1], "`echo` has shape"),
     ("play", "memory", lambda a: a * 1e9, "its memory in samples"),
+    ("greybox", "neck", lambda a: a * 1e6, "drive_rate of .* is out of range"),
+    ("greybox", "sensor", lambda a: a + 0.5, "the sensor's dead time"),
     ("any", "table", lambda a: a - 1.0, "a regressor's"),
     ("any", "0.rls.delay", lambda a: a + 1e6, "a dead time"),
     ("ensemble", "memory", lambda a: a * 1e9, "its memory in samples"),

@@ -7,6 +7,7 @@ from ._ensemble import combine as combine
 from ._gamma import GammaCurve as GammaCurve
 from ._gamma import gamma_curve as gamma_curve
 from ._gamma import offending_pair as offending_pair
+from ._greybox import GreyBox as GreyBox
 from ._linear import continuous_parameters as continuous_parameters
 from ._model import WARM_UP as WARM_UP
 from ._model import Model as Model

@@ -9,6 +9,7 @@ import numpy as np
 from softneck.core import FileFormatError, Matrix
 
 from ._composed import COMPOSED, members, own_arrays
+from ._greybox_numbers import NUMBERS
 from ._tree import tree_nodes
 
 # In the runtimes' order (see each kind's `_runtime` module).
@@ -20,6 +21,7 @@ _ORDER = {
     ),
     "residual": ("history", "memory", "table", "scale", "points", "values", "bounds", "nodes"),
     "ensemble": ("history", "memory"),
+    "greybox": ("history", "drive", "neck", "sensor", "echo", "memory"),
     "play": (
         "history", "drive", "load", "redefinition", "widths", "chain", "table", "weights", "range", "echo", "memory",
     ),
@@ -145,6 +147,20 @@ def _check_play(arrays: Mapping[str, Matrix], history: float) -> None:
     _within(np.array([p]), 1, history, "the length of the echo")
 
 
+def _check_greybox(arrays: Mapping[str, Matrix], history: float) -> None:
+    p = arrays["echo"].shape[-1]
+    for name, shape in {"neck": (len(NUMBERS),), "sensor": (2,), "echo": (2, p)}.items():
+        _expect(arrays, name, shape)
+    _within(np.array([p]), 1, history, "the length of the echo")
+    _within(arrays["drive"][:, 1], 1, history, "a drive's delay")
+    _within(arrays["sensor"][:1], 0, 1000, "the sensor's dead time")
+    for number, value in zip(NUMBERS, arrays["neck"], strict=True):
+        # A thousandth for the rounding of logarithms.
+        margin = 1e-3 * max(abs(number.low), abs(number.high))
+        if not number.low - min(margin, 0.1 * abs(number.low)) <= value <= number.high + margin:
+            raise FileFormatError(f"its {number.name} of {value:g} {number.unit} is out of range.")
+
+
 def _check_table(table: Matrix, history: float) -> int:
     """Check rows (source, channel, lag) and return their number."""
     if table.ndim != 2 or table.shape[1] != 3 or not len(table):
@@ -166,4 +182,10 @@ def _within(values: Matrix, low: float, high: float, what: str) -> None:
         raise FileFormatError(f"{what} is no whole number from {low:g} to {high:g}.")
 
 
-_CHECKS = {"rls": _check_rls, "nlsm": _check_nlsm, "play": _check_play, "nn": _check_nn}
+_CHECKS = {
+    "rls": _check_rls,
+    "nlsm": _check_nlsm,
+    "play": _check_play,
+    "greybox": _check_greybox,
+    "nn": _check_nn,
+}
