@@ -1,5 +1,9 @@
 """Models of the neck from recordings, judged honestly."""
 
+from ._auto import Choice as Choice
+from ._auto import Tried as Tried
+from ._auto import choose as choose
+from ._auto import kinds_to_try as kinds_to_try
 from ._drive import DriveModel as DriveModel
 from ._drive import fit_drive as fit_drive
 from ._ensemble import Ensemble as Ensemble
