@@ -2,15 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import HealthCheck, settings
 
-from softneck.identification import GreyBox, Model, Network, Play, Residual, Rls, SetMembership, combine
+from softneck.identification import (
+    GreyBox,
+    Model,
+    Network,
+    OutputError,
+    Play,
+    Residual,
+    Rls,
+    SetMembership,
+    Srivc,
+    Subspace,
+    combine,
+)
 from softneck.signals import Recording
 
+from .browser import chromium_path, started
 from .data import ROOT, neck_recording, short_neck
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
 
 # The same examples on every machine and run; a busy machine is no failure.
 settings.register_profile(
@@ -32,12 +50,16 @@ def models() -> dict[str, Model]:
     recording = short_neck()
     made = {
         "rls": Rls(max_delay=0.12).fit(recording),
+        "mimo": Rls(structure="mimo", delay=0.06).fit(recording),
+        "oe": OutputError(delay=0.06, source="positions").fit(recording),
+        "srivc": Srivc(order=2, delay=0.06, resamples=0).fit(recording),
+        "subspace": Subspace(order=3, delay=0.06).fit(recording),
         "nlsm": SetMembership(epsilon=0.01, output_weight=10.0).fit(recording),
         "residual": SetMembership(form="residual").fit(recording),
         "play": Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording),
         "nn": Network(hidden=(4, 3), iterations=8).fit(recording),
         "greybox": GreyBox(evaluations=4, sensor_delay=2).fit(recording),
-        "any": Residual(base="rls").fit(recording),
+        "any": Residual(base="rls", epsilon=0.004).fit(recording),
     }
     return {**made, "ensemble": combine([made["play"], made["rls"], made["nn"]])}
 
@@ -49,3 +71,16 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip("the real recordings (../shared/data) are absent on this machine")
     return folder
+
+
+@pytest.fixture(scope="session")
+def chromium() -> str:
+    """The path of the system's Chromium."""
+    return chromium_path()
+
+
+@pytest.fixture(scope="session")
+def browser(chromium: str) -> Iterator[Browser]:
+    """A headless Chromium that shows pages."""
+    with started(chromium) as running:
+        yield running

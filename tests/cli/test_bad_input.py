@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from softneck.core import read_archive, write_archive
 
@@ -98,7 +99,7 @@ def test_a_folder_that_cannot_be_written(call: Call, tmp_path: Path, recording: 
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("speed=3", "there is no setting `speed`; this kind has delay, delay_by, forgetting, max_delay, na, nb"),
+        ("speed=3", "there is no setting `speed`; this kind has covariance_bound, dead_zone, delay"),
         ("na", "--set takes KEY=VALUE; got `na`"),
         ("na=0", "`na` must be a whole number between 1 and 100; got 0"),
         ("na=1.5", "`na` must be a whole number between 1 and 100; got 1.5"),
@@ -134,7 +135,10 @@ def test_a_wrong_setting_of_a_network(call: Call, tmp_path: Path, recording: Pat
         (("validate", "MODEL", "--data", "REC", "--horizon", "1,,inf"), "--horizon takes numbers of samples"),
         (("validate", "MODEL", "--data", "REC", "--motors", "felt"), "'felt' is not one of 'simulated', 'measured'"),
         (("validate", "MODEL"), "Missing option '--data'"),
-        (("import", "REC"), "Missing option '--layout'"),
+        (("import", "REC"), "import needs either --layout LAYOUT.toml or --guess; neither was given"),
+        (("import", "REC", "--guess", "--layout", "a.toml"), "either --layout LAYOUT.toml or --guess; both were given"),
+        (("import", "none.csv", "--guess"), "none.csv: no such file"),
+        (("import", "REC", "--guess", "-o", "r.xlsx"), "a recording is a `.csv` or a `.parquet` file"),
         (("import", "REC", "--layout", "none.toml"), "none.toml: no such file"),
         (("info", "neck.xyz"), "neck.xyz: no such file"),
         (("record", "song", "-o", "r.csv"), "`signal` must be one of eq22"),
@@ -177,6 +181,87 @@ def test_info_of_noise(call: Call, tmp_path: Path, name: str) -> None:
 def test_an_import_of_a_log_without_its_columns(call: Call, tmp_path: Path, recording: Path) -> None:
     said = call("import", recording, "--layout", LAYOUTS / "neck_openloop.toml", "-o", "r.csv", "--json")
     refused(said, "column `target_motor1` for `motor_setpoint_1` is not in the file", tmp_path, set())
+
+
+LOG_LAYOUT = """
+[time]
+column = "t"
+[channels]
+motor_setpoint_1 = { column = "a", unit = "rad" }
+motor_setpoint_2 = { column = "b", unit = "rad" }
+motor_setpoint_3 = { column = "c", unit = "rad" }
+pitch = { column = "p", unit = "rad" }
+roll = { column = "r", unit = "rad" }
+"""
+LOG = ["t,a,b,c,p,r", *[f"{k / 50},{k},{k % 3},{k % 5},{k / 100},{-k / 100}" for k in range(40)]]
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (changed(LOG, 9, 0, "0.16"), "`time` stands still at row 9: 0.16 s stands there twice (1 such row(s))"),
+        (changed(LOG, 9, 0, "0.1"), "`time` runs backwards or stands still at row 9 (0.16 to 0.1 s)"),
+        (changed(LOG, 9, 0, "soon"), "column `t` holds `soon` at row 9"),
+        (changed(LOG, 9, 0, "inf"), "`time` is not finite at row 9"),
+        ([LOG[0], *[",".join([*line.split(",")[:4], "", line.split(",")[5]]) for line in LOG[1:]]],
+         "column `p` for `pitch` holds no number in any of its 40 rows; is its sensor connected?"),
+        (LOG[:2], "a recording needs at least 2 rows; got 1"),
+        (LOG[:1], "a recording needs at least 2 rows; got 0"),
+    ],
+    ids=["duplicate", "backwards", "word", "infinite", "all NaN", "one row", "no row"],
+)  # fmt: skip
+def test_a_log_that_does_not_fit_its_layout(call: Call, tmp_path: Path, lines: list[str], message: str) -> None:
+    (tmp_path / "log.csv").write_text("\n".join(lines))
+    (tmp_path / "l.toml").write_text(LOG_LAYOUT)
+    said = call("import", "log.csv", "--layout", "l.toml", "-o", "r.csv", "--json")
+    refused(said, message, tmp_path, {"log.csv", "l.toml"})
+
+
+@pytest.mark.parametrize(
+    ("variable", "message"),
+    [("lag", "there is no variable `lag` with numbers; the file has log (40 x 6)"),
+     (None, "has no vectors of numbers; name the matrix by `[file] variable`; it has log (40 x 6)")],
+)  # fmt: skip
+def test_a_mat_file_without_the_named_variable(call: Call, tmp_path: Path, variable: str | None, message: str) -> None:
+    table = np.array([[float(cell) for cell in line.split(",")] for line in LOG[1:]])
+    savemat(tmp_path / "log.mat", {"log": table})
+    head = f'[file]\nvariable = "{variable}"\n' if variable else ""
+    (tmp_path / "l.toml").write_text(head + LOG_LAYOUT)
+    said = call("import", "log.mat", "--layout", "l.toml", "-o", "r.csv", "--json")
+    refused(said, message, tmp_path, {"log.mat", "l.toml"})
+
+
+def test_a_guess_proposes_imports_and_says_why(call: Call, tmp_path: Path, recording: Path) -> None:
+    said = call("import", recording, "--guess", "-o", "r.csv", "--json")
+    facts = json.loads(said.out)
+    assert (said.code, facts["rows"], facts["layout_file"]) == (0, 600, "r.layout.toml")
+    assert facts["layout"]["channels"]["pitch"] == {"column": "pitch [deg]", "unit": "deg"}
+    assert "pitch from column 'pitch [deg]' [deg]: because it is titled as in a recording" in said.err
+    again = call("import", recording, "--layout", "r.layout.toml", "-o", "again.csv")
+    assert again.code == 0, again.err
+    assert (tmp_path / "again.csv").read_bytes() == (tmp_path / "r.csv").read_bytes()
+    kept = call("import", recording, "--guess", "-o", "r.csv")
+    assert (kept.code, kept.error.split(": ")[1]) == (2, "r.csv")
+    (tmp_path / "r.csv").unlink()
+    (tmp_path / "r.layout.toml").write_text("# edited")
+    kept = call("import", recording, "--guess", "-o", "r.csv")
+    assert "r.layout.toml: exists already; use --force" in kept.error
+    assert (tmp_path / "r.layout.toml").read_text() == "# edited"
+
+
+def test_a_guess_that_lacks_something_is_written_as_far_as_it_goes(call: Call, tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("\n".join(["time,target1,target2,target3,pitch,wind", *LOG[1:]]))
+    said = call("import", "log.csv", "--guess", "-o", "r.csv", "--json")
+    assert (said.code, said.out) == (2, "")
+    last = said.err.splitlines()[-1]
+    assert last.startswith("softneck: log.csv: not found: roll: candidates are 'wind'")
+    assert last.endswith("Fill it into r.layout.toml, then use --layout r.layout.toml.")
+    assert {path.name for path in tmp_path.iterdir()} == {"log.csv", "r.layout.toml"}
+    text = (tmp_path / "r.layout.toml").read_text()
+    assert "# MISSING roll: candidates are 'wind'" in text
+    filled = text.replace("[channels]", '[channels]\nroll = { column = "wind", unit = "rad" }')
+    (tmp_path / "r.layout.toml").write_text(filled)
+    assert call("import", "log.csv", "--layout", "r.layout.toml", "-o", "r.csv").code == 0
 
 
 def test_a_model_that_knows_all_rows_has_nothing_to_show(call: Call, tmp_path: Path, recording: Path) -> None:

@@ -14,6 +14,7 @@ from softneck.cli import _main
 from softneck.core import CheckFailedError, load
 from softneck.signals import read_recording
 
+from ..browser import own_text
 from ..data import LAYOUTS
 from .conftest import Call, Said
 
@@ -76,7 +77,7 @@ def test_ctrl_c_during_identify_leaves_no_file(
     def interrupted(*_args: object, **_more: object) -> None:
         raise KeyboardInterrupt
 
-    for where in ("softneck.identification._rls.Rls._fit_axis", "numpy.savez_compressed"):
+    for where in ("softneck.identification._rls.Rls._search", "numpy.savez_compressed"):
         with monkeypatch.context() as patch:
             patch.setattr(where, interrupted)
             said = call("identify", "rls", recording, "-o", "m.npz", "--json")
@@ -129,9 +130,11 @@ def test_people_get_a_table_and_progress_stays_on_stderr(call: Call, recording: 
     assert "free run" in said.out
     assert "identify rls ..." in said.err
     table = call("validate", rls_file, "--data", recording, "--html", "page.html")
-    assert "persistence 25" in table.out
-    assert "model inf" in table.out
-    page = Path("page.html").read_text()
+    assert "best linear" in table.out
+    assert "free run" in table.out
+    assert "rows judged, 0 left out as the model was trained on them" in table.out
+    assert max(len(line) for line in table.out.splitlines() if line[:1] in "┏┃┡│└") <= 120
+    page = own_text(Path("page.html").read_text(encoding="utf-8"))
     assert "<html" in page
     # Self-contained: nothing is fetched when the page is opened.
     assert 'src="http' not in page

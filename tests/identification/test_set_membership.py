@@ -2,36 +2,33 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from softneck.core import DataError, SettingsError, load_functions
-from softneck.identification import PAPER_EQ21, Model, SetMembership, gamma_curve, noise_level, offending_pair
+from softneck.identification import (
+    PAPER_EQ21,
+    Model,
+    SetMembership,
+    gamma_curve,
+    noise_level,
+    offending_pair,
+    outside_seen,
+)
 from softneck.identification._gamma import least_gammas
 from softneck.identification._regressors import regression
 from softneck.identification._tree import LEAF, tree_nodes, tree_order
 
 from ..data import TS, neck_recording, recording_from, short_neck
+from .hard_sets import algorithm_1, hard_sets
 
 BOUNDS = load_functions("softneck.identification._nlsm_runtime")
 TREE = load_functions("softneck.identification._tree_runtime")
 CONES = load_functions("softneck.identification._cones_runtime")
-
-
-def algorithm_1(x: np.ndarray, omega: np.ndarray, y: np.ndarray, gamma: float, epsilon: float) -> tuple[float, float]:
-    """Algorithm 1 line by line; omega is (N, n)."""
-    f_u, f_l = np.inf, -np.inf
-    for k in range(len(y)):
-        distance = sum((x[i] - omega[k][i]) ** 2 for i in range(len(x))) ** 0.5
-        P_u = y[k] + epsilon + gamma * distance
-        P_l = y[k] - epsilon - gamma * distance
-        if P_u <= f_u:
-            f_u = P_u
-        if P_l >= f_l:
-            f_l = P_l
-    return f_l, f_u
 
 
 @st.composite
@@ -52,28 +49,6 @@ def test_the_bounds_are_those_of_algorithm_1(data: tuple[np.ndarray, np.ndarray]
         expected = algorithm_1(x, omega, y, gamma, epsilon)
         # Sums of four squares in one order or another: a few ulp of numbers of order ten.
         np.testing.assert_allclose(BOUNDS.nlsm_bounds(points, y, gamma, epsilon, x), expected, rtol=0, atol=1e-12)
-
-
-@st.composite
-def hard_sets(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray]:
-    """What trees get wrong: clusters, duplicates, collinear points, ties, huge and tiny scales, a few leaves deep."""
-    rng = np.random.default_rng(draw(st.integers(0, 10_000)))
-    rows, n = draw(st.integers(1, 200)), draw(st.integers(1, 11))
-    shape = draw(st.sampled_from(["normal", "clusters", "duplicates", "line", "ties", "one point"]))
-    W = rng.standard_normal((rows, n))
-    if shape == "clusters":
-        W = 1e-3 * W + rng.integers(0, 3, (rows, 1)) * 100.0
-    elif shape == "duplicates":
-        W = W[rng.integers(0, max(rows // 5, 1), rows)]
-    elif shape == "line":
-        W = rng.standard_normal((rows, 1)) * rng.standard_normal(n)
-    elif shape == "ties":
-        W = rng.integers(-1, 2, (rows, n)).astype(float)
-    elif shape == "one point":
-        W = np.tile(W[:1], (rows, 1))
-    scale = draw(st.sampled_from([1.0, 1e-100, 1e-9, 1e9, 1e100]))
-    y = rng.integers(-2, 3, rows).astype(float) if draw(st.booleans()) else rng.standard_normal(rows)
-    return W * scale, y
 
 
 def in_tree_order(omega: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -228,6 +203,22 @@ def test_the_estimate_lies_in_the_middle_of_its_bounds(models: dict, form: str) 
         assert (low <= high).all()
 
 
+@pytest.mark.parametrize("form", ["nlsm", "residual"])
+def test_a_motion_like_the_data_is_known_and_a_wilder_one_is_not(models: dict, form: str) -> None:
+    model, trained = models[form], short_neck()
+    # The training data themselves are as near as can be.
+    assert outside_seen(model, model.predict(trained)).mean() < 0.05
+    wild = trained.with_channels(**{f"motor_setpoint_{j}": 3 * trained.set_points[:, j - 1] for j in (1, 2, 3)})
+    assert outside_seen(model, model.simulate(wild)[25:]).mean() > 0.5
+
+
+def test_only_set_membership_knows_what_it_has_seen(models: dict) -> None:
+    with pytest.raises(SettingsError, match="only a model of kind nlsm"):
+        outside_seen(models["rls"], np.zeros((3, 9)))
+    with pytest.raises(DataError, match=r"`outputs` must be \(rows, 9\).*got \(3, 5\)"):
+        outside_seen(models["nlsm"], np.zeros((3, 5)))
+
+
 def test_the_residual_form_is_its_base_and_a_set_over_its_signals(models: dict) -> None:
     """The free run again from its parts: the base's own free run, then Algorithm 1 on it, row by row."""
     arrays, recording = models["residual"].arrays, short_neck()
@@ -300,8 +291,16 @@ def test_an_epsilon_below_the_noise_is_refused() -> None:
     rest = {f"motor_{what}_{j}": np.where(np.arange(400) < 300, 0.0, r.channels[f"motor_{what}_{j}"])
             for what in ("setpoint", "position") for j in (1, 2, 3)}  # fmt: skip
     pitch = np.where(np.arange(400) < 300, np.where(np.arange(400) % 3 == 0, 0.01, 0.0), quiet)
-    with pytest.raises(DataError, match=r"epsilon \[.*\] deg is below the noise: equal regressors"):
-        SetMembership(epsilon=1e-4, output_weight=1.0).fit(r.with_channels(pitch=pitch, **rest))
+    resting = r.with_channels(pitch=pitch, **rest)
+    with pytest.raises(DataError, match=r"epsilon \[.*\] deg is below the noise: equal regressors") as caught:
+        SetMembership(epsilon=1e-4, output_weight=1.0).fit(resting)
+    # The two rows that it names have equal regressors and pitches as far apart as it says.
+    named = re.findall(r"row (\d+) \(run (\d+), ([\d.]+) s\)", str(caught.value))
+    rows = [int(row) for row, _, _ in named]
+    assert [f"{resting.time[row]:.6g}" for row in rows] == [seconds for _, _, seconds in named]
+    X, _ = regression(resting, PAPER_EQ21, 0)
+    np.testing.assert_array_equal(X[rows[0] - 3], X[rows[1] - 3])
+    assert f"differ by {np.degrees(abs(pitch[rows[0]] - pitch[rows[1]])):.4g} deg in pitch" in str(caught.value)
 
 
 def test_epsilon_and_weight_are_chosen_on_the_data_and_told() -> None:
@@ -315,7 +314,7 @@ def test_epsilon_and_weight_are_chosen_on_the_data_and_told() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [({"epsilon": 0.0}, "`epsilon` must be positive"), ({"output_weight": -1.0}, "`output_weight` must be positive"),
-     ({"form": "magic"}, "`form` must be one of paper_eq21, residual; got 'magic'")],
+     ({"form": "magic"}, "`form` must be one of paper_eq21, lags, residual; got 'magic'")],
 )  # fmt: skip
 def test_wrong_settings_are_refused(settings: dict, message: str) -> None:
     with pytest.raises(SettingsError, match=message):

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import re
-import shutil
 import subprocess
 from pathlib import Path
 
@@ -17,8 +15,6 @@ from softneck.plant._geometry_runtime import bend_functions, lean_angles, tilt_r
 from softneck.plots import neck_view
 from softneck.plots._neck3d import bend_of
 from softneck.signals import Excitation, Recording, signal
-
-BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
 @pytest.fixture(scope="module")
@@ -56,16 +52,13 @@ def test_what_cannot_be_drawn_is_refused(recording: Recording) -> None:
 
 
 @pytest.mark.parametrize("plain", [False, True], ids=["with tensions", "set-points, pitch and roll only"])
-def test_a_browser_draws_and_plays_it(recording: Recording, tmp_path: Path, plain: bool) -> None:
-    if BROWSER is None and os.environ.get("CI") != "true":
-        pytest.skip("no Chromium here to play the page in; install the package `chromium`")
-    assert BROWSER is not None
+def test_a_browser_draws_and_plays_it(recording: Recording, tmp_path: Path, chromium: str, plain: bool) -> None:
     kept = ("motor_setpoint_1", "motor_setpoint_2", "motor_setpoint_3", "pitch", "roll")
     channels = {name: recording.channels[name] for name in kept} if plain else recording.channels
     page = tmp_path / "neck.html"
     page.write_text(neck_view(Recording(recording.time, 0.02, channels)), encoding="utf-8")
     command = [
-        BROWSER, "--headless=new", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=2500",
+        chromium, "--headless=new", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=2500",
         f"--user-data-dir={tmp_path / 'profile'}", "--enable-logging=stderr", "--dump-dom", page.as_uri(),
     ]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, timeout=90, check=True)

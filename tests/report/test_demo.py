@@ -13,6 +13,8 @@ from softneck.identification import INFINITE, validate
 from softneck.report import Demo, DemoSettings, fit_rows, run_demo
 from softneck.signals import read_recording
 
+from ..browser import own_text
+
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
@@ -21,7 +23,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
 
 
 def test_every_fmu_runs_free_as_its_python_model_does(demo: Demo) -> None:
-    assert set(demo.packaged) == {"rls", "nlsm", "nn", "virtual_neck"}
+    assert set(demo.packaged) == {"rls", "nlsm", "nlsm_residual", "nn", "virtual_neck"}
     for name, item in demo.packaged.items():
         # The public promise; the same text runs in both, so that only the order of BLAS sums may differ.
         assert item.difference <= 1e-9, name
@@ -29,7 +31,8 @@ def test_every_fmu_runs_free_as_its_python_model_does(demo: Demo) -> None:
 
 def test_the_table_has_every_model_on_every_unseen_recording(demo: Demo) -> None:
     names = [row[0] for row in fit_rows(demo.judged)]
-    assert names == [f"{m} on {d}" for m in ("rls", "nlsm", "nn") for d in ("validation", "steps", "sine", "rotation")]
+    models = ("rls", "nlsm", "nlsm_residual", "nn")
+    assert names == [f"{m} on {d}" for m in models for d in ("validation", "steps", "sine", "rotation")]
 
 
 def test_a_user_finds_the_same_scores_in_the_files(demo: Demo) -> None:
@@ -47,12 +50,12 @@ def test_a_user_finds_the_same_scores_in_the_files(demo: Demo) -> None:
 
 def test_the_report_and_the_summary_agree_and_stand_alone(demo: Demo) -> None:
     out = demo.settings.out
-    html = (out / "report.html").read_text(encoding="utf-8")
+    html = own_text((out / "report.html").read_text(encoding="utf-8"))
     assert not re.search(r"(src|href)=\"(?!data:|#)", html)
     assert "shorter than the paper" in html
     summary = json.loads((out / "results" / "summary.json").read_text(encoding="utf-8"))
     assert summary["shortened"] is True
-    assert {entry["model"] for entry in summary["models"]} == {"rls", "nlsm", "nn"}
+    assert {entry["model"] for entry in summary["models"]} == {"rls", "nlsm", "nlsm_residual", "nn"}
     assert summary["holds"] == demo.holds
 
 

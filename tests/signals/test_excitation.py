@@ -103,6 +103,31 @@ def test_the_multisine_has_no_power_beyond_4_rad_per_s_and_a_low_crest_factor() 
     assert (np.abs(P).max(axis=0) / P.std(axis=0)).max() < 3.0  # 32 tones in phase would reach 8
 
 
+def test_the_multisine_excites_all_of_the_band_alike() -> None:
+    P = signal("multisine").set_points
+    power = np.abs(np.fft.rfft(P, axis=0)) ** 2
+    omega = 2 * np.pi * np.fft.rfftfreq(len(P), 0.02)
+    for j in range(3):
+        lines = power[:, j] > 1e-6 * power[:, j].max()
+        # Whole periods: 32 lines of one height each, rounding apart, and no hole wider than two and a half spacings.
+        assert np.count_nonzero(lines) == 32
+        np.testing.assert_allclose(power[lines, j], power[lines, j].mean(), rtol=1e-9)
+        assert np.diff(omega[lines], prepend=0.0, append=4.0).max() < 2.5 * 4.0 / 32
+
+
+def test_mixed_has_its_five_parts() -> None:
+    P = signal("mixed", seed=4).set_points
+    edges = np.round(np.array([0.34, 0.66, 0.88, 0.95, 1.0]) * 7000).astype(int)
+    eq22, aprbs, multisine, single, together = np.split(P, edges[:-1])
+    np.testing.assert_array_equal(eq22, signal("eq22").set_points[: len(eq22)])
+    assert np.mean(np.diff(aprbs, axis=0) == 0) > 0.9  # levels that are held
+    assert np.mean(np.diff(multisine, axis=0) == 0) < 0.01
+    assert (np.count_nonzero(single, axis=1) <= 1).all()  # one tendon alone
+    assert all(np.ptp(single[:, j]) > 1.0 for j in range(3))
+    np.testing.assert_array_equal(together, together[:, [0]] * np.ones(3))  # all three alike
+    assert np.ptp(together[:, 0]) > 0.5
+
+
 def test_a_fixed_test_may_be_cut_but_not_made_longer() -> None:
     assert len(signal("steps", duration=2.0).time) == 100
     with pytest.raises(SettingsError, match="26 s long by definition; got a duration of 99 s"):

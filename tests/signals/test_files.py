@@ -39,7 +39,8 @@ def recordings(draw: st.DrawFn) -> Recording:
     for name in ("pitch", "roll"):
         channels[name] = np.clip(channels[name], -3.0, 3.0)  # beyond half a turn is refused
     for name in set(MISSABLE) & set(channels):
-        channels[name][draw(st.lists(st.integers(0, n - 1), max_size=3))] = np.nan
+        # The first sample stays: an angle without any sample is refused.
+        channels[name][draw(st.lists(st.integers(1, n - 1), max_size=3))] = np.nan
     time = np.concatenate([np.arange(rows) * Ts for rows in runs])
     return Recording(time, Ts, channels, np.repeat(np.arange(len(runs)), runs))
 

@@ -69,11 +69,15 @@ def test_the_true_sample_time_beats_the_column_and_is_told(tmp_path: Path) -> No
     np.testing.assert_allclose(done.recording.time, 0.021 * np.arange(30), rtol=1e-15)
 
 
-def test_a_gap_in_the_time_column_is_one_under_any_sample_time(tmp_path: Path) -> None:
+def test_a_gap_in_the_time_column_splits_the_run_under_any_sample_time(tmp_path: Path) -> None:
     gap = "\n".join(line for line in LOG.splitlines() if not line.startswith("200,"))
     for layout in (LAYOUT, LAYOUT.replace('unit = "ms"', 'unit = "ms"\nsample_time_s = 0.021')):
-        with pytest.raises(DataError, match=r"`time` jumps by 0\.04 s at row 10"):
-            imported(tmp_path, layout, gap)
+        done = imported(tmp_path, layout, gap)
+        assert [len(run) for run in done.recording.runs()] == [10, 19]
+        told = (
+            "1 gap(s) in the time column, the longest 0.04 s, the first at row 10 (t = 0.22 s): each starts a new run"
+        )
+        assert told in done.notes
 
 
 @pytest.mark.parametrize(
@@ -90,6 +94,11 @@ def test_a_gap_in_the_time_column_is_one_under_any_sample_time(tmp_path: Path) -
         ("pitch =", "yaw =", r"\[channels\.yaw\]: no channel of a recording"),
         ("[time]", "[times]", "the layout has the unknown key `times`"),
         ("[time]", "[time]\nsample_time_s = -1", "sample_time_s must be a positive number or `estimate`; got -1"),
+        ("[time]", "[file]\nskip = -1\n[time]", "skip must be a number of lines; got -1"),
+        ("[time]", "[file]\ndelimiter = '(a+)+$'\n[time]", "delimiter must be one character or `whitespace`"),
+        ("[time]", "[file]\ndecimal = ';'\n[time]", r"`decimal` must be one of \., ,; got ';'"),
+        ("[time]", "[time]\nduplicates = 'mean'", "`duplicates` must be one of first, last; got 'mean'"),
+        ('unit = "deg", sign = -1', 'unit = "deg", sign = nan', "a factor or sign must be a finite number; got nan"),
         ("[time]", "[file]\nrows = [5, 2]\n[time]", r"rows must be \[first, last\]"),
         ("[time]", "[file]\nrows = ['a', 'b']\n[time]", r"rows must be \[first, last\]"),
         (

@@ -15,6 +15,7 @@ from scipy.io import savemat
 
 from softneck.core import DataError, FileFormatError, SettingsError, SoftneckError
 from softneck.signals import Recording, import_log, read_layout
+from softneck.signals._mat import mat_arrays
 
 CHANNELS = ("motor_setpoint_1", "motor_setpoint_2", "motor_setpoint_3", "pitch", "roll")
 K = np.arange(30.0)
@@ -163,3 +164,51 @@ def test_damaged_bytes_are_a_clear_error_and_nothing_else(tmp_path: Path, versio
     (tmp_path / "damaged.mat").write_bytes(content[: data.draw(st.integers(len(content) // 2, len(content)))])
     with contextlib.suppress(SoftneckError):  # anything else fails the test
         load(tmp_path, "damaged.mat", layout_text(True))
+
+
+@given(data=st.data())
+@settings(max_examples=40)
+def test_version_5_is_read_as_scipy_wrote_it(tmp_path: Path, data: st.DataObject) -> None:
+    """Two independent ends: scipy's writer and our reader, over types, shapes, structures and compression."""
+    kinds = ["i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8", "?"]
+    content: dict[str, np.ndarray] = {}
+    for name in data.draw(st.lists(st.from_regex(r"[a-z][a-z0-9_]{0,9}", fullmatch=True), max_size=4, unique=True)):
+        shape = data.draw(st.tuples(st.integers(1, 5), st.integers(1, 5)))
+        kind = data.draw(st.sampled_from(kinds))
+        content[name] = np.random.default_rng(len(name)).integers(0, 100, shape).astype(kind)
+    extra = {
+        "word": "abc",
+        "cell": np.array([[1, "x"]], dtype=object),
+        "wave": np.array([1 + 2j]),
+        "none": np.zeros((0, 3)),
+    }
+    savemat(
+        tmp_path / "a.mat",
+        {**content, **extra, "deep": {"inner": content, "number": 3.0}} | ({} if content else {"x0": np.ones((2, 2))}),
+        do_compression=data.draw(st.booleans()),
+    )
+    found = mat_arrays(tmp_path / "a.mat")
+    assert found.pop("deep.number") == 3.0
+    expected = {**content, **{f"deep.inner.{name}": array for name, array in content.items()}}
+    expected |= {} if content else {"x0": np.ones((2, 2))}
+    assert set(found) == set(expected)
+    for name, array in expected.items():
+        np.testing.assert_array_equal(found[name], array.astype(np.float64))
+
+
+def test_version_4_and_two_variables_of_one_name_are_refused(tmp_path: Path) -> None:
+    savemat(tmp_path / "four.mat", {"log": TABLE}, format="4")
+    with pytest.raises(FileFormatError, match=r"neither version 5 nor 7\.3; save it with -v7"):
+        mat_arrays(tmp_path / "four.mat")
+    savemat(tmp_path / "a.mat", {"log": TABLE})
+    whole = (tmp_path / "a.mat").read_bytes()
+    (tmp_path / "a.mat").write_bytes(whole + whole[128:])
+    with pytest.raises(FileFormatError, match="the variable `log` stands there twice"):
+        mat_arrays(tmp_path / "a.mat")
+
+
+def test_a_small_file_that_unpacks_to_a_huge_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("softneck.signals._mat5._MAX_BYTES", 10_000)
+    savemat(tmp_path / "a.mat", {"log": np.zeros((2000, 6))}, do_compression=True)
+    with pytest.raises(FileFormatError, match="a compressed variable is cut off or too large"):
+        mat_arrays(tmp_path / "a.mat")

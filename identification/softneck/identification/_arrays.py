@@ -15,6 +15,9 @@ from ._tree import tree_nodes
 # In the runtimes' order (see each kind's `_runtime` module).
 _ORDER = {
     "rls": ("history", "drive", "redefinition", "a", "b", "delay"),
+    "oe": ("history", "drive", "redefinition", "a", "b", "delay", "source"),
+    "srivc": ("history", "drive", "redefinition", "a", "b", "delay", "source"),
+    "subspace": ("history", "drive", "A", "B", "K", "delay"),
     "nlsm": (
         "history", "drive", "table", "scale", "points", "values", "bounds", "nodes",
         "redefinition", "a", "b", "delay",
@@ -39,15 +42,17 @@ def check_arrays(kind: str, arrays: Mapping[str, Matrix]) -> None:
     if kind in COMPOSED:
         _check_composed(kind, arrays)
         return
-    if tuple(arrays) != _ORDER[kind]:
+    # `rls` over the motors and more than one pole are state spaces as well.
+    form = "subspace" if kind in ("rls", "oe", "srivc") and "A" in arrays else kind
+    if tuple(arrays) != _ORDER[form]:
         raise FileFormatError(
-            f"a model of kind {kind} has the arrays {', '.join(_ORDER[kind])}; got {', '.join(arrays)}."
+            f"a model of kind {kind} has the arrays {', '.join(_ORDER[form])}; got {', '.join(arrays)}."
         )
     _check_finite(arrays)
     history = _history(arrays)
     _expect(arrays, "drive", (3, 2))
     _within(arrays["drive"][:, 1], 0, history, "a drive's delay")
-    _CHECKS[kind](arrays, history)
+    _CHECKS[form](arrays, history)
 
 
 def _check_finite(arrays: Mapping[str, Matrix]) -> None:
@@ -93,6 +98,21 @@ def no_base() -> dict[str, Matrix]:
 def _check_rls(arrays: Mapping[str, Matrix], history: float) -> None:
     _check_linear(arrays, history)
     _within(np.array([arrays["a"].shape[-1]]), 1, history, "the order")
+
+
+def _check_oe(arrays: Mapping[str, Matrix], history: float) -> None:
+    _check_rls(arrays, history)
+    _expect(arrays, "source", (1,))
+    _within(arrays["source"], 0, 1, "the source")
+
+
+def _check_state_space(arrays: Mapping[str, Matrix], history: float) -> None:
+    n = arrays["A"].shape[-1]
+    for name, shape in {"A": (n, n), "B": (n, 3), "K": (n, 2), "delay": (2,)}.items():
+        _expect(arrays, name, shape)
+    _within(np.array([n]), 2, 2 * history, "the order")
+    _within(arrays["delay"][:1], 0, history - 1, "a dead time")
+    _within(arrays["delay"][1:], 0, 1, "the source")
 
 
 def _check_linear(arrays: Mapping[str, Matrix], history: float) -> None:
@@ -184,8 +204,11 @@ def _within(values: Matrix, low: float, high: float, what: str) -> None:
 
 _CHECKS = {
     "rls": _check_rls,
-    "nlsm": _check_nlsm,
     "play": _check_play,
     "greybox": _check_greybox,
+    "oe": _check_oe,
+    "srivc": _check_oe,
+    "subspace": _check_state_space,
+    "nlsm": _check_nlsm,
     "nn": _check_nn,
 }

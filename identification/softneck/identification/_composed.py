@@ -11,6 +11,8 @@ import numpy as np
 
 from softneck.core import KINDS, FileFormatError, Matrix, SettingsError, Vector, load_runtime
 
+from ._linear import STATE_SPACE
+
 COMPOSED = ("residual", "ensemble")
 # As in `_histories_runtime`: u, m, y behind each other, then those of now.
 _PER_SAMPLE = 8
@@ -51,8 +53,8 @@ def members(arrays: Mapping[str, Matrix]) -> list[tuple[str, dict[str, Matrix]]]
 def runtime_of(kind: str, arrays: Mapping[str, Matrix]) -> str:
     """Return the name of the runtime, with those of the members (see `softneck.core.bundle`)."""
     if kind not in COMPOSED:
-        return KINDS[kind].runtime
-    inner = ",".join(f"{KINDS[member].runtime}:{len(part)}" for member, part in members(arrays))
+        return STATE_SPACE if "A" in arrays else KINDS[kind].runtime
+    inner = ",".join(f"{runtime_of(member, part)}:{len(part)}" for member, part in members(arrays))
     return f"{KINDS[kind].runtime}({inner})"
 
 
@@ -76,6 +78,6 @@ def set_now(kind: str, arrays: Mapping[str, Matrix], values: Vector, m: Vector, 
         values[now : now + 5] = np.concatenate([m, y])
         at = now + 13
     for member, part in members(arrays):
-        size = load_runtime(KINDS[member].runtime).state_size(tuple(part.values()))
+        size = load_runtime(runtime_of(member, part)).state_size(tuple(part.values()))
         set_now(member, part, values[at : at + size], m, y)
         at += size

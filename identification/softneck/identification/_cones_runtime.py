@@ -25,7 +25,7 @@ def least_gammas(points: np.ndarray, values: np.ndarray, slacks: np.ndarray, wor
         distance = np.sqrt(squared)
         rise = np.abs(values[i + 1 :] - values[i])
         for m in range(slacks.shape[0]):
-            needed = np.maximum(rise - slacks[m], 0.0) / np.maximum(distance, 1e-300)
+            needed = np.minimum(np.maximum(rise - slacks[m], 0.0) / np.maximum(distance, 1e-300), 1e300)
             j = int(np.argmax(needed))
             if needed[j] > gammas[m]:
                 gammas[m] = needed[j]

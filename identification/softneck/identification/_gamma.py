@@ -54,8 +54,14 @@ def gamma_curve(points: Matrix, values: Vector, epsilon: Vector | None = None, *
     Raises:
         DataError: fewer than two points, shapes that do not fit, numbers that are not finite, constant outputs.
     """
+    return curve_over(*_checked(points, values), epsilon, rule=rule)
+
+
+def curve_over(
+    points: Matrix, values: Vector, epsilon: Vector | None = None, *, rule: str, nodes: Matrix | None = None
+) -> GammaCurve:
+    """Return `gamma_curve` of checked points; with `nodes`, of points in tree order."""
     require_one_of("rule", rule, tuple(RULES))
-    points, values = _checked(points, values)
     if epsilon is None:
         span = float(np.ptp(values))
         if span == 0.0:
@@ -64,7 +70,7 @@ def gamma_curve(points: Matrix, values: Vector, epsilon: Vector | None = None, *
     epsilon = np.sort(np.atleast_1d(np.asarray(epsilon, dtype=np.float64)))
     if not (np.isfinite(epsilon).all() and (epsilon >= 0.0).all()):
         raise DataError("each `epsilon` must be finite and at least 0.")
-    gamma, pairs = least_gammas(points, values, RULES[rule] * epsilon)
+    gamma, pairs = least_gammas(points, values, RULES[rule] * epsilon, nodes=nodes)
     return GammaCurve(epsilon, np.where(gamma > 1e200, np.inf, gamma), pairs, _knee(epsilon, gamma))
 
 
@@ -79,23 +85,30 @@ def offending_pair(
     return None if least[0] <= gamma * (1.0 + 1e-12) else (int(pairs[0, 0]), int(pairs[0, 1]))
 
 
-def least_gammas(points: Matrix, values: Vector, slacks: Vector) -> tuple[Vector, np.ndarray]:
+def least_gammas(
+    points: Matrix, values: Vector, slacks: Vector, *, nodes: Matrix | None = None
+) -> tuple[Vector, np.ndarray]:
     """Return for each slack the least gamma (m,) with `|y_j - y_k| <= slack + gamma |w_j - w_k|`, and its pair (m, 2).
 
     Compiled by branch and bound; without numba over all pairs by numpy, some hundred times slower.
-    A gamma beyond 1e200 says that equal regressors have outputs further apart than the slack.
+    With `nodes` (2^l, 2 n + 2) the points are in tree order already. A gamma beyond 1e200 says that equal regressors
+    have outputs further apart than the slack.
     """
-    gammas = np.zeros(slacks.size)
+    rising = np.argsort(slacks, kind="stable")
+    gammas, found = np.zeros(slacks.size), np.zeros((slacks.size, 2), dtype=np.int64)
     if not have_numba():
         pairs = np.zeros((slacks.size, 2))
         gammas = load_functions(_ALL_PAIRS).least_gammas(points, values, slacks, pairs)
         return gammas, pairs.astype(np.int64)
-    order = tree_order(points)
-    sorted_points, sorted_values = np.ascontiguousarray(points[:, order]), values[order]
-    nodes = tree_nodes(sorted_points, sorted_values)
-    found = np.zeros((slacks.size, 2), dtype=np.int64)
-    load_functions(_TREE_SEARCH).gamma_search(sorted_points, sorted_values, nodes, slacks, gammas, found)
-    return gammas, order[found]
+    order = None
+    if nodes is None:
+        order = tree_order(points)
+        points, values = np.ascontiguousarray(points[:, order]), values[order]
+        nodes = tree_nodes(points, values)
+    search = load_functions(_TREE_SEARCH).gamma_search
+    search(points, values, nodes, np.ascontiguousarray(slacks[rising]), gammas, found)
+    back = np.argsort(rising)
+    return gammas[back], found[back] if order is None else order[found[back]]
 
 
 def _checked(points: Matrix, values: Vector) -> tuple[Matrix, Vector]:

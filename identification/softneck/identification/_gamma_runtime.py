@@ -16,39 +16,67 @@ def gamma_gap(nodes: np.ndarray, a: int, b: int, n: int) -> float:
 
 
 def gamma_allowed(distance: float, slacks: np.ndarray, gammas: np.ndarray) -> float:
-    """Return how far apart outputs may be at this distance before any of the gammas (m,) is too small."""
-    allowed = np.inf
-    for m in range(slacks.shape[0]):
-        allowed = min(allowed, slacks[m] + gammas[m] * distance)
-    return allowed
+    """Return how far apart outputs may be at this distance before any of the gammas (m,) is too small.
+
+    That is the least `slack + gamma distance`. Each gamma is the largest of the same falling lines in its slack, so
+    the sum is convex over rising slacks and its bottom is found by halving.
+    """
+    first = 0
+    last = slacks.shape[0] - 1
+    while first < last:
+        middle = (first + last) // 2
+        if slacks[middle] + gammas[middle] * distance <= slacks[middle + 1] + gammas[middle + 1] * distance:
+            last = middle
+        else:
+            first = middle + 1
+    # Less some rounding: what is left out then needs no gamma above those found, to the last bit.
+    return (1.0 - 1e-14) * (slacks[first] + gammas[first] * distance)
+
+
+def gamma_need(rise: float, slack: float, distance: float) -> float:
+    """Return the gamma that two outputs `rise` apart need; beyond 1e200 where the points are equal."""
+    return min((rise - slack) / max(distance, 1e-300), 1e300)
 
 
 def gamma_leaves(
     points: np.ndarray,
     values: np.ndarray,
-    leaves: tuple[int, int, int],
-    nearest: float,
+    nodes: np.ndarray,
+    leaves: tuple[int, int],
     slacks: np.ndarray,
     gammas: np.ndarray,
     pairs: np.ndarray,
 ) -> None:
-    """Raise the gammas to what the pairs between two leaves need; `leaves` is (a, b, how many there are)."""
+    """Raise the gammas to what the pairs between two nodes of the last level need."""
     rows = values.shape[0]
-    a, b, count = leaves
-    # Gammas only rise, so what this says stays on the safe side.
-    allowed = gamma_allowed(nearest, slacks, gammas)
+    n = points.shape[0]
+    count = nodes.shape[0] // 2
+    a = leaves[0] - count
+    b = leaves[1]
+    first = (b - count) * rows // count
+    last = (b + 1 - count) * rows // count
     for j in range(a * rows // count, (a + 1) * rows // count):
-        for k in range(b * rows // count, (b + 1) * rows // count):
+        squared = 0.0
+        for i in range(n):
+            gap = max(max(nodes[b, 2 * i] - points[i, j], points[i, j] - nodes[b, 2 * i + 1]), 0.0)
+            squared += gap * gap
+        # Gammas only rise, so what this says stays on the safe side.
+        allowed = gamma_allowed(math.sqrt(squared), slacks, gammas)
+        if max(nodes[b, 2 * n + 1] - values[j], values[j] - nodes[b, 2 * n]) <= allowed:
+            continue
+        for k in range(first, last):
             rise = abs(values[j] - values[k])
             if rise <= allowed:
                 continue
             squared = 0.0
-            for i in range(points.shape[0]):
+            for i in range(n):
                 gap = points[i, j] - points[i, k]
                 squared += gap * gap
             distance = math.sqrt(squared)
+            if rise <= gamma_allowed(distance, slacks, gammas):
+                continue
             for m in range(slacks.shape[0]):
-                needed = (rise - slacks[m]) / max(distance, 1e-300)
+                needed = gamma_need(rise, slacks[m], distance)
                 if needed > gammas[m]:
                     gammas[m] = needed
                     pairs[m, 0] = j
@@ -64,7 +92,7 @@ def gamma_search(
         points: (n, N) in tree order.
         values: (N,).
         nodes: see `_tree`.
-        slacks: (m,) epsilon for the paper's rule f_u(i) >= y(i), 2 epsilon for Milanese and Novara's.
+        slacks: (m,) rising: epsilon for the paper's rule f_u(i) >= y(i), 2 epsilon for Milanese and Novara's.
         gammas: (m,) zeros; become the result, beyond 1e200 where equal points are further apart than the slack.
         pairs: (m, 2) become the pairs that decide.
     """
@@ -72,7 +100,7 @@ def gamma_search(
     leaves = nodes.shape[0] // 2
     # Neighbours need the largest gammas: the more of them are known, the less is left to search.
     for leaf in range(leaves):
-        gamma_leaves(points, values, (leaf, leaf, leaves), 0.0, slacks, gammas, pairs)
+        gamma_leaves(points, values, nodes, (leaves + leaf, leaves + leaf), slacks, gammas, pairs)
     # Pairs of nodes of one level, at most 3 left for later at each of at most 64 levels.
     waiting = np.empty((256, 2), dtype=np.int64)
     waiting[0, 0] = 1
@@ -88,7 +116,7 @@ def gamma_search(
             continue
         if a >= leaves:
             if a != b:
-                gamma_leaves(points, values, (a - leaves, b - leaves, leaves), nearest, slacks, gammas, pairs)
+                gamma_leaves(points, values, nodes, (a, b), slacks, gammas, pairs)
             continue
         # The last pushed is the first taken: a node with itself first.
         for p in range(2):

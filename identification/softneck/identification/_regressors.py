@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from softneck.core import DataError, Matrix, SettingsError, Vector
@@ -22,14 +24,37 @@ PAPER_EQ21 = np.array(
 )  # fmt: skip
 
 
+def lag_table(
+    outputs: Sequence[int], set_points: Sequence[int], motors: Sequence[int], *, both_outputs: bool = False
+) -> Matrix:
+    """Return the regressor of these lags [samples]: of the output, of all set-points and of all motor positions.
+
+    Args:
+        outputs: lags of y; empty for a regressor that nothing is fed back to.
+        set_points: lags of u_i.
+        motors: lags of M_i.
+        both_outputs: pitch and roll for either axis, as form `residual` takes them from its base.
+
+    Raises:
+        SettingsError: no lag at all.
+    """
+    own = [[3, c, lag] for lag in outputs for c in range(2)] if both_outputs else [[0, 0, lag] for lag in outputs]
+    rows = (
+        own + [[1, c, lag] for c in range(3) for lag in set_points] + [[2, c, lag] for lag in motors for c in range(3)]
+    )
+    if not rows:
+        raise SettingsError("the regressor is empty: give lags of outputs, set-points or motors.")
+    return np.array(rows, dtype=np.float64)
+
+
 def history_length(table: Matrix, drive: DriveModel) -> int:
     """Return how many samples the runtime must remember for this table and drive."""
     return int(max(table[:, 2].max(), drive.delay.max(), 1))
 
 
-def motor_signals(recording: Recording, drive: DriveModel) -> Recording:
-    """Return the recording with motor positions: the logged ones, else those of the drive model."""
-    if recording.has_motor_positions:
+def motor_signals(recording: Recording, drive: DriveModel, *, again: bool = False) -> Recording:
+    """Return the recording with motor positions: the logged ones, else (or `again`) those of the drive model."""
+    if recording.has_motor_positions and not again:
         return recording
     runs = [drive.simulate(run.set_points, run.set_points[0]) for run in recording.runs()]
     positions = np.concatenate(runs)

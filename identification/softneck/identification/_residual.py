@@ -12,21 +12,24 @@ from ._model import Model
 # How far back the neck's state shows in its inputs [s]: the newest sample, then about one, two and four of its
 # time constants of 0.2 s. Denser or longer ones moved no free run by more than 2 points (virtual neck, `paper`).
 _LOOKS_BACK = (0.02, 0.2, 0.4, 0.8)
-# A radian of motor tilts the neck by about 0.2 rad: this weight makes the two equal in the norm.
-ANGLE_WEIGHT = 5.0
 
 
-def residual_table(sample_time: float) -> Matrix:
-    """Return the regressor: rows (source, channel, lag) of the three motors and both angles of the base."""
-    lags = sorted({max(round(seconds / sample_time), 1) for seconds in _LOOKS_BACK})
-    motors = [[2.0, float(channel), float(lag)] for lag in lags for channel in range(3)]
-    return np.array(motors + [[3.0, float(channel), float(lag)] for lag in lags for channel in range(2)])
+def residual_lags(sample_time: float) -> tuple[int, ...]:
+    """Return the lags [samples] of the motors and of both angles of the base, where none were asked for."""
+    return tuple(sorted({max(round(seconds / sample_time), 1) for seconds in _LOOKS_BACK}))
 
 
-def residual_points(
-    recording: Recording, base: Model, table: Matrix, scale: Vector, axis: int
+def residual_rows(
+    recording: Recording, base: Model, table: Matrix, axis: int, *, measured: bool = False
 ) -> tuple[Matrix, Vector]:
-    """Return scaled regressors (n, N) and y(k) less the base's free run (N,), rows of no run before the base settled.
+    """Return regressors (n, N) and y(k) less the base's free run (N,), no row of a run before the base settled.
+
+    Args:
+        recording: what the set is made of.
+        base: the linear model.
+        table: the regressor; source 3 is the base's free run.
+        axis: 0 pitch, 1 roll.
+        measured: take logged motor positions instead of the drive model's.
 
     Raises:
         DataError: every run is too short.
@@ -38,12 +41,13 @@ def residual_points(
         if len(run) <= settled:
             continue
         simulated = base.simulate(run, warm_up=1)
-        sources = {2: simulated[:, 2:5], 3: simulated[:, :2]}
-        columns = [sources[int(s)][settled - int(lag) : len(run) - int(lag), int(c)] for s, c, lag in table]
+        motors = run.motor_positions if measured else simulated[:, 2:5]
+        sources = {1: run.set_points, 2: motors, 3: simulated[:, :2]}
+        columns = np.array([sources[int(s)][settled - int(lag) : len(run) - int(lag), int(c)] for s, c, lag in table])
         target = run.outputs[settled:, axis] - simulated[settled:, axis]
-        there = np.isfinite(target)
-        parts.append((np.array(columns) * scale[:, None])[:, there])
+        there = np.isfinite(target) & np.isfinite(columns).all(axis=0)
+        parts.append(columns[:, there])
         left.append(target[there])
     if sum(part.size for part in left) < 2:
         raise DataError("every run is too short for form `residual`; record runs of several seconds.")
-    return np.ascontiguousarray(np.concatenate(parts, axis=1)), np.concatenate(left)
+    return np.concatenate(parts, axis=1), np.concatenate(left)

@@ -17,10 +17,30 @@ def nrmse_fit(measured: Vector, predicted: Vector) -> float:
     return 100.0 * (1.0 - float(np.linalg.norm(y - yhat)) / spread) if spread > 0 else float("nan")
 
 
+def r_squared(measured: Vector, predicted: Vector) -> float:
+    """Return `R2 = 1 - SSE/SST = 1 - (1 - fit/100)^2`; NaN where nothing was measured or nothing moved."""
+    y, yhat = _paired(measured, predicted)
+    total = float(np.sum((y - y.mean()) ** 2)) if y.size else 0.0
+    return 1.0 - float(np.sum((y - yhat) ** 2)) / total if total > 0 else float("nan")
+
+
 def rmse(measured: Vector, predicted: Vector) -> float:
     """Return the root mean square error in the unit of the arguments, over the samples that were measured."""
     y, yhat = _paired(measured, predicted)
     return float(np.sqrt(np.mean((y - yhat) ** 2))) if y.size else float("nan")
+
+
+def worst_error(measured: Vector, predicted: Vector) -> tuple[float, int]:
+    """Return the largest absolute error, in the unit of the arguments, and its row; (NaN, -1) if nothing was measured.
+
+    A prediction that is no number is worse than any.
+    """
+    size = np.abs(measured - predicted)
+    size[np.isfinite(measured) & np.isnan(predicted)] = np.inf
+    if not np.isfinite(measured).any():
+        return float("nan"), -1
+    row = int(np.nanargmax(size))
+    return float(size[row]), row
 
 
 def _paired(measured: Vector, predicted: Vector) -> tuple[Vector, Vector]:

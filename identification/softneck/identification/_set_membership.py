@@ -3,162 +3,226 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from softneck.core import (
+    KINDS,
     DataError,
-    Matrix,
     Progress,
     SettingsError,
     Vector,
+    find_kind,
     require_one_of,
     require_positive,
+    resolve,
     silent,
 )
 from softneck.signals import Recording, concatenate
 
-from ._arrays import no_base
 from ._checks import check_training
 from ._drive import DriveModel, fit_drive
-from ._gamma import least_gammas
 from ._model import WARM_UP, Model
-from ._regressors import PAPER_EQ21, history_length, motor_signals, regression
-from ._residual import ANGLE_WEIGHT, residual_points, residual_table
-from ._rls import Rls
+from ._offending import require_feasible
+from ._outside import usual_widths
+from ._regressors import lag_table
+from ._residual import residual_lags
 from ._rows import row_hashes
-from ._scores import nrmse_fit
-from ._tree import tree_nodes, tree_order
+from ._scaling import RULES, HoldOut, Tried, grouped_scale, ruled_scale
+from ._set_ground import Ground, gammas, scaled
 
-FORMS = ("paper_eq21", "residual")
-# Free run of form `residual` hardly depends on it (docs, "Set membership").
-_RESIDUAL_SIGMAS = 4.0
+FORMS = ("paper_eq21", "lags", "residual")
+_MOTORS = ("measured", "simulated")
+# Kinds whose arrays hold `a`, `b`, `delay` over the redefined set-points, as the runtime runs them.
+_BASES = tuple(name for name in ("rls", "oe") if name in KINDS)
+# Eq. 21: y(k-1); u_i(k-2), u_i(k-3); M_i(k-3).
+_EQ21_LAGS = ((1,), (2, 3), (3,))
+# A lag is a sample; a minute at 1 ms is the longest history a file may hold.
+_LONGEST_LAG = 60_000
+# Free run of form `residual` hardly depends on it, the width of its bounds does: below what the base and the last
+# 0.8 s leave unexplained, gamma and the width grow a hundredfold.
+_RESIDUAL_SIGMAS = (4.0, 8.0, 16.0, 32.0)
 # The knee of gamma*(epsilon) lies at 3 to 5 sigma of the noise; in free run more is better, as the model's own
 # errors stand in the regressor too. The hold-out decides.
 _EPSILON_SIGMAS = (3.0, 5.0, 8.0, 12.0)
-# Weight of the output in the regressor, motors having 1: half a decade apart up to the paper's own, 57.3, which
+# Weight of the output in the regressor, set-points having 1: half a decade apart up to the paper's own, 57.3, which
 # logs angles in degrees beside motors in radians. A high weight trusts the fed-back output and drifts in free run.
 _OUTPUT_WEIGHTS = (3.0, 10.0, 30.0, 57.29577951308232)
-# The end of the training rows on which epsilon and the weight are chosen, in free run.
+# Weights of measured motors beside set-points, tried with the best weight of the output. A position is what bends
+# the neck, a set-point what will: 10 gains 10 points in free run on sine and rotation (virtual neck, `paper`), 0.3
+# lost as many.
+_MOTOR_WEIGHTS = (3.0, 10.0)
+# Of the base's angles: a radian of motor tilts the neck by about 0.2 rad, so that 5 makes the two equal in the norm.
+_ANGLE_WEIGHTS = (1.0, 2.0, 5.0, 10.0)
+# The end of the training rows on which epsilon and the scale are chosen, in free run.
 _HOLD_OUT = 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetMembership:
-    """The estimator of Eq. 12-20 and Algorithm 1 over the regressor of Eq. 21, one set for each axis.
+    """The estimator of Eq. 12-20 and Algorithm 1, one set for each axis, over the regressor of Eq. 21 or another.
 
     Attributes:
-        form: "paper_eq21", or "residual": set membership over simulated signals on what the free run of `Rls`
-            leaves over, which has nothing to feed back and so cannot drift.
-        epsilon: noise bound of Eq. 15 [rad]; None chooses it on the data.
-        output_weight: weight of y(k-1) (of the base's angles) in the regressor's norm, motors having 1; None
-            chooses it on the data (takes 5).
+        form: "paper_eq21"; "lags", the same estimator over other lags; or "residual": set membership over simulated
+            signals on what the free run of a linear base leaves over, where nothing is fed back and so nothing drifts.
+        output_lags, setpoint_lags, motor_lags: lags [samples] in the regressor, of the output (both outputs of the
+            base in form "residual"), of all set-points and of all motor positions; None takes the form's own. Not
+            for "paper_eq21", whose lags are Eq. 21's.
+        scale: weights of the regressor's components in the norm of Eq. 16: "auto" chooses one for outputs and one
+            for motors by free run on the last fifth of the training rows; "none" takes SI units as they are; "std"
+            divides each by its standard deviation (a trap, see docs); or a vector as long as the regressor.
+        output_weight: weight of the outputs, all others having 1: the scale without a choice.
+        epsilon: noise bound of Eq. 15 [rad]; None chooses it by the same free run (form "residual": so that the
+            bounds are narrowest among equal fits).
+        motors: whose positions M the set is made of: "measured", logged ones where there are any, or "simulated",
+            the drive model's, as in every free run. None: "simulated" for form "residual", else "measured".
+        base: linear kind of one pole that form "residual" stands on.
     """
 
     form: str = "paper_eq21"
-    epsilon: float | None = None
+    output_lags: tuple[int, ...] | None = None
+    setpoint_lags: tuple[int, ...] | None = None
+    motor_lags: tuple[int, ...] | None = None
+    scale: str | tuple[float, ...] = "auto"
     output_weight: float | None = None
+    epsilon: float | None = None
+    motors: str | None = None
+    base: str = "rls"
 
     def __post_init__(self) -> None:
         require_one_of("form", self.form, FORMS)
+        for name in ("output_lags", "setpoint_lags", "motor_lags"):
+            object.__setattr__(self, name, self._checked_lags(name))
+        if isinstance(self.scale, str):
+            require_one_of("scale", self.scale, RULES)
+        else:
+            object.__setattr__(self, "scale", _checked_scale(self.scale))
         if self.epsilon is not None:
             require_positive("epsilon", self.epsilon, "rad")
         if self.output_weight is not None:
             require_positive("output_weight", self.output_weight)
+            if self.scale != "auto":
+                raise SettingsError("`output_weight` is a scale of its own; leave `scale` at auto beside it.")
+        if self.motors is not None:
+            require_one_of("motors", self.motors, _MOTORS)
+        require_one_of("base", self.base, _BASES)
 
     def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
         """Store the data set and find gamma and epsilon that are consistent with all of it.
 
-        gamma is the paper's: the least for which f_u(i) >= y(i) and f_l(i) <= y(i) at every point. epsilon and
-        the output's weight are chosen by the free run over the last fifth of the training rows.
+        gamma is the paper's: the least for which f_u(i) >= y(i) and f_l(i) <= y(i) at every point.
 
         Raises:
             DataError: too short, constant, or `epsilon` so small that no function fits the data.
+            SettingsError: a `scale` of another length than the regressor.
         """
         recording = concatenate(recordings if isinstance(recordings, list) else [recordings])
         check_training(recording)
         noise = np.array([noise_level(recording, axis) for axis in range(2)])
-        if self.form == "residual":
-            arrays, findings = self._fit_residual(recording, noise, progress)
-        else:
-            drive = fit_drive(recording)  # before `motor_signals` puts the drive model's own positions in
-            recording = motor_signals(recording, drive)
-            arrays, findings = self._arrays(recording, drive, *self._choose(recording, drive, noise, progress))
+        drive = fit_drive(recording)
+        ground = self._ground(recording, drive)
+        data = ground.data(recording)
+        chosen, tried = self._choose(ground, recording, noise, progress)
+        scale = chosen.scale if chosen.scale.size else ruled_scale(self.scale, ground.table, data)
+        gamma = gammas(data, scale, [chosen.epsilon])[0]
+        sets = [(scaled(X, scale), y) for X, y in data]
+        require_feasible(recording, ground.table, sets, gamma, chosen.epsilon)
+        arrays = ground.arrays(data, scale, gamma, chosen.epsilon)
         progress(1.0, "done")
+        findings = {"form": self.form, "noise_deg": np.degrees(noise).tolist(), **_findings(chosen, tried, scale)}
+        findings |= {"gamma": gamma.tolist(), "points": int(arrays["values"].shape[1])}
+        findings |= usual_widths(sets, gamma, chosen.epsilon)
         return Model(
             kind="nlsm",
             sample_time=recording.sample_time,
             arrays=arrays,
             settings=asdict(self),
-            findings={"form": self.form, "noise_deg": np.degrees(noise).tolist(), **findings},
+            findings=findings,
             training_rows=row_hashes(recording),
         )
 
+    def _ground(self, recording: Recording, drive: DriveModel) -> Ground:
+        """Return the set's ground; the base of form `residual` is identified on `recording`."""
+        residual = self.form == "residual"
+        if residual:
+            own = residual_lags(recording.sample_time)
+            preset = (own, (), own)
+        else:
+            preset = _EQ21_LAGS
+        given = (self.output_lags, self.setpoint_lags, self.motor_lags)
+        lags = [known if lag is None else lag for lag, known in zip(given, preset, strict=True)]
+        return Ground(
+            table=lag_table(*lags, both_outputs=residual),
+            drive=drive,
+            base=resolve(find_kind(self.base, "model").settings)().fit(recording) if residual else None,
+            measured=(self.motors or ("simulated" if residual else "measured")) == "measured",
+        )
+
     def _choose(
-        self, recording: Recording, drive: DriveModel, noise: Vector, progress: Progress
-    ) -> tuple[float, Vector]:
-        """Return the output weight and epsilon (2,) of the best free run on the hold-out."""
-        weights = _OUTPUT_WEIGHTS if self.output_weight is None else (self.output_weight,)
-        sigmas = _EPSILON_SIGMAS if self.epsilon is None else (0.0,)
-        if len(weights) * len(sigmas) == 1:
-            return weights[0], np.full(2, self.epsilon)
+        self, ground: Ground, recording: Recording, noise: Vector, progress: Progress
+    ) -> tuple[Tried, list[Tried]]:
+        """Return scale and epsilon, and all that were tried; an empty scale is left to `ruled_scale`."""
+        table = ground.table
+        if self.epsilon is not None:
+            epsilons = [np.full(2, self.epsilon)]
+        elif self.form == "residual":
+            epsilons = [sigmas * noise for sigmas in _RESIDUAL_SIGMAS]
+        else:
+            epsilons = [sigmas * noise for sigmas in _EPSILON_SIGMAS]
+        weighted = self.output_weight is not None
+        if len(epsilons) == 1 and (weighted or self.scale != "auto"):
+            scale = np.zeros(0) if self.output_weight is None else grouped_scale(table, self.output_weight)
+            return Tried(self.output_weight, None, scale, epsilons[0], np.nan, np.nan, np.nan, np.nan), []
         head, tail = recording.split(1.0 - _HOLD_OUT)
         if len(tail) <= 2 * WARM_UP:
             raise DataError(
-                "the record is too short to choose epsilon; record longer, or set epsilon and output_weight."
+                "the record is too short to choose epsilon and the scale; record longer, or set epsilon and "
+                "output_weight."
             )
-        best: tuple[float, float, Vector] | None = None
-        for number, weight in enumerate(weights):
-            progress(number / (len(weights) + 1), f"output weight {weight:.3g}")
-            epsilons = [s * noise if self.epsilon is None else np.full(2, self.epsilon) for s in sigmas]
-            for epsilon, gamma in zip(epsilons, self._gammas(head, weight, epsilons), strict=True):
-                if gamma.max() > 1e100:
-                    continue
-                score = _free_run_score((head, tail), drive, weight, epsilon, gamma)
-                if best is None or score > best[0]:
-                    best = (score, weight, epsilon)
-        if best is None:
-            raise DataError("equal regressors have unequal outputs beyond any epsilon tried; set `epsilon` higher.")
-        return best[1], best[2]
+        # The drives are known from all rows: they are no part of what is chosen.
+        first = self._ground(head, ground.drive)
+        hold_out = HoldOut(first, first.data(head), tail, epsilons, narrow=self.form == "residual")
+        if self.scale != "auto":
+            tried = hold_out.fixed(ruled_scale(self.scale, table, hold_out.data))
+            return replace(tried[0], scale=np.zeros(0)), tried
+        outputs, motors = self._weights(table)
+        tried = hold_out.choose(outputs, motors, progress)
+        return tried[0], tried
 
-    def _gammas(self, recording: Recording, weight: float, epsilons: list[Vector]) -> list[Vector]:
-        """Return gamma (2,) for each epsilon (2,)."""
-        columns = []
-        for axis in range(2):
-            points, values = _points(recording, weight, axis)
-            columns.append(least_gammas(points, values, np.array([epsilon[axis] for epsilon in epsilons]))[0])
-        return [np.array(pair) for pair in zip(*columns, strict=True)]
+    def _weights(self, table: np.ndarray) -> tuple[Sequence[float], Sequence[float]]:
+        """Return the weights to try of outputs and of motors beside 1; what the regressor lacks has none."""
+        sources = set(table[:, 0].astype(int).tolist())
+        if self.output_weight is not None:
+            return (self.output_weight,), ()
+        if self.form == "residual":
+            return (_ANGLE_WEIGHTS if 3 in sources else (1.0,)), ()
+        # Without set-points, a weight of motors is that of outputs upside down.
+        motors = _MOTOR_WEIGHTS if {1, 2} <= sources else ()
+        return (_OUTPUT_WEIGHTS if 0 in sources else (1.0,)), motors
 
-    def _fit_residual(self, recording: Recording, noise: Vector, progress: Progress) -> tuple[dict[str, Matrix], dict]:
-        progress(0.0, "linear base")
-        base = Rls().fit(recording)
-        progress(0.5, "set membership on what it leaves over")
-        weight = ANGLE_WEIGHT if self.output_weight is None else self.output_weight
-        epsilon = _RESIDUAL_SIGMAS * noise if self.epsilon is None else np.full(2, self.epsilon)
-        table = residual_table(recording.sample_time)
-        scale = np.where(table[:, 0] == 3, weight, 1.0)
-        points = [residual_points(recording, base, table, scale, axis) for axis in range(2)]
-        gamma = np.array([least_gammas(*points[i], epsilon[i : i + 1])[0][0] for i in range(2)])
-        _require_consistent(gamma, epsilon)
-        history = max(float(base.arrays["history"][0]), table[:, 2].max())
-        arrays = {
-            "history": np.array([history]),
-            "drive": base.arrays["drive"],
-            "table": table,
-            "scale": scale,
-            **_set_arrays(points, gamma, epsilon),
-            **{name: base.arrays[name] for name in ("redefinition", "a", "b", "delay")},
-        }
-        return arrays, _findings(gamma, epsilon, weight, points[0][1].size)
+    def _checked_lags(self, name: str) -> tuple[int, ...] | None:
+        lags: Any = getattr(self, name)
+        if lags is None:
+            return None
+        if self.form == "paper_eq21":
+            raise SettingsError(f"form `paper_eq21` has the lags of Eq. 21; take form `lags` to set `{name}`.")
+        lags = (lags,) if isinstance(lags, int) else tuple(lags)
+        whole = all(isinstance(lag, int) and not isinstance(lag, bool) and 1 <= lag <= _LONGEST_LAG for lag in lags)
+        if not whole or len(set(lags)) != len(lags):
+            raise SettingsError(f"`{name}` must be different whole numbers of samples from 1 on; got {list(lags)}.")
+        return tuple(sorted(lags))
 
-    def _arrays(
-        self, recording: Recording, drive: DriveModel, weight: float, epsilon: Vector
-    ) -> tuple[dict[str, Matrix], dict]:
-        gamma = self._gammas(recording, weight, [epsilon])[0]
-        _require_consistent(gamma, epsilon)
-        findings = _findings(gamma, epsilon, weight, _points(recording, weight, 0)[1].size)
-        return _build(recording, drive, weight, epsilon, gamma), findings
+
+def _checked_scale(scale: Any) -> tuple[float, ...]:
+    try:
+        values = np.asarray(scale, dtype=np.float64)
+    except (TypeError, ValueError):
+        values = np.zeros(0)
+    if values.ndim != 1 or not values.size or not (np.isfinite(values) & (values > 0.0)).all():
+        raise SettingsError(f"`scale` must be one of {', '.join(RULES)}, or a list of positive numbers; got {scale!r}.")
+    return tuple(values.tolist())
 
 
 def noise_level(recording: Recording, axis: int) -> float:
@@ -174,65 +238,14 @@ def noise_level(recording: Recording, axis: int) -> float:
     return max(sigma, 1e-7)  # a noise-free simulation: rounding is left
 
 
-def _points(recording: Recording, weight: float, axis: int) -> tuple[Matrix, Vector]:
-    X, y = regression(recording, PAPER_EQ21, axis)
-    return np.ascontiguousarray((X * _scale(weight)).T), np.ascontiguousarray(y)
-
-
-def _scale(weight: float) -> Vector:
-    return np.where(PAPER_EQ21[:, 0] == 0, weight, 1.0)
-
-
-def _free_run_score(
-    parts: tuple[Recording, Recording], drive: DriveModel, weight: float, epsilon: Vector, gamma: Vector
-) -> float:
-    """Return the sum of both axes' free-run fits [%] on the second part, of a set made of the first."""
-    head, tail = parts
-    arrays = _build(head, drive, weight, epsilon, gamma)
-    outputs = Model(kind="nlsm", sample_time=head.sample_time, arrays=arrays).simulate(tail)[:, :2]
-    return sum(nrmse_fit(tail.outputs[WARM_UP:, axis], outputs[WARM_UP:, axis]) for axis in range(2))
-
-
-def _build(recording: Recording, drive: DriveModel, weight: float, epsilon: Vector, gamma: Vector) -> dict[str, Matrix]:
-    points = [_points(recording, weight, axis) for axis in range(2)]
+def _findings(chosen: Tried, tried: list[Tried], scale: Vector) -> dict[str, Any]:
+    weights = {"output_weight": chosen.output_weight, "motor_weight": chosen.motor_weight}
     return {
-        "history": np.array([float(history_length(PAPER_EQ21, drive))]),
-        "drive": drive.array,
-        "table": PAPER_EQ21,
-        "scale": _scale(weight),
-        **_set_arrays(points, gamma, epsilon),
-        **no_base(),
+        "epsilon_deg": np.degrees(chosen.epsilon).tolist(),
+        **{name: weight for name, weight in weights.items() if weight is not None},
+        "scale": scale.tolist(),
+        # Rows: both weights, epsilon of pitch [deg], sum of both fits [%], coverage, mean width [deg].
+        "hold_out_curve": [
+            [t.output_weight, t.motor_weight, float(np.degrees(t.epsilon[0])), *t.judgement] for t in tried
+        ],
     }
-
-
-def _set_arrays(points: Sequence[tuple[Matrix, Vector]], gamma: Vector, epsilon: Vector) -> dict[str, Matrix]:
-    rows = min(values.size for _, values in points)
-    if rows < 2:
-        raise SettingsError("a set needs at least 2 points.")
-    W = np.empty((len(points), points[0][0].shape[0], rows))
-    y = np.empty((len(points), rows))
-    # Filled in place: with the data at hand and the tree, memory holds 2.3 times the data.
-    for axis, (given, values) in enumerate(points):
-        order = tree_order(given[:, :rows])
-        for row, given_row in zip(W[axis], given, strict=True):
-            row[:] = given_row[order]
-        y[axis] = values[order]
-    nodes = np.array([tree_nodes(*axis) for axis in zip(W, y, strict=True)])
-    return {"points": W, "values": y, "bounds": np.column_stack([gamma, epsilon]), "nodes": nodes}
-
-
-def _findings(gamma: Vector, epsilon: Vector, weight: float, points: int) -> dict:
-    return {
-        "epsilon_deg": np.degrees(epsilon).tolist(),
-        "gamma": gamma.tolist(),
-        "output_weight": weight,
-        "points": points,
-    }
-
-
-def _require_consistent(gamma: Vector, epsilon: Vector) -> None:
-    if gamma.max() > 1e100:
-        raise DataError(
-            f"epsilon {np.degrees(epsilon).round(4).tolist()} deg is below the noise: equal regressors have "
-            "outputs further apart, so no function fits the data. Set `epsilon` higher."
-        )

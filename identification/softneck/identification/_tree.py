@@ -34,17 +34,20 @@ def tree_order(points: Matrix) -> np.ndarray:
     return order
 
 
-def tree_nodes(points: Matrix, values: Vector) -> Matrix:
+def tree_nodes(points: Matrix, values: Vector | Matrix) -> Matrix:
     """Return the nodes (2^(depth+1), 2 n + 2) over points (n, N) in tree order: low and high a side, ymin, ymax.
+
+    Several outputs, `values` (m, N), have a ymin and a ymax each.
 
     Node j of level l is row 2^l + j and holds the columns from `j N >> l` on; row 0 is unused and zero.
     """
     n, rows = points.shape
     depth = depth_of(rows)
-    nodes = np.zeros((2 << depth, 2 * n + 2))
+    values = np.atleast_2d(values)
+    nodes = np.zeros((2 << depth, 2 * n + 2 * len(values)))
     for level in range(depth + 1):
         borders = _borders(rows, level)
-        for i, row in enumerate((*points, values)):
+        for i, row in enumerate((*points, *values)):
             nodes[1 << level : 2 << level, 2 * i : 2 * i + 2] = _low_high(row, borders).T
     return nodes
 

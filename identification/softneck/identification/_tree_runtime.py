@@ -20,58 +20,98 @@ def tree_distance(nodes: np.ndarray, node: int, x: np.ndarray) -> float:
     return math.sqrt(squared)
 
 
-def tree_bounds(
-    points: np.ndarray, values: np.ndarray, nodes: np.ndarray, gamma: float, x: np.ndarray
+def tree_children(nodes: np.ndarray, node: int, x: np.ndarray) -> tuple[float, float]:
+    """Return `tree_distance` of both children of a node, side by side: the processor works on the two at once."""
+    a = 2 * node
+    b = 2 * node + 1
+    left = 0.0
+    right = 0.0
+    for i in range(x.shape[0]):
+        below = nodes[a, 2 * i] - x[i]
+        above = x[i] - nodes[a, 2 * i + 1]
+        gap = below if below > above else above
+        gap = gap if gap > 0.0 else 0.0
+        left += gap * gap
+        below = nodes[b, 2 * i] - x[i]
+        above = x[i] - nodes[b, 2 * i + 1]
+        gap = below if below > above else above
+        gap = gap if gap > 0.0 else 0.0
+        right += gap * gap
+    return math.sqrt(left), math.sqrt(right)
+
+
+def tree_tighten(
+    tree: tuple[np.ndarray, np.ndarray, np.ndarray],
+    place: tuple[int, int],
+    gamma: float,
+    x: np.ndarray,
+    bounds: tuple[float, float],
+    hidden: tuple[np.ndarray, float, float],
 ) -> tuple[float, float]:
-    """Return max(y - gamma d) and min(y + gamma d) over `points` (n, N) in tree order and their `values` (N,)."""
+    """Return `bounds` (low, high) tightened by max(y - gamma d) and min(y + gamma d) over the points under a node.
+
+    Args:
+        tree: points (n, N) in tree order, their values (N,), nodes.
+        place: the node, 1 for all points, and the column of `nodes` with the values' ymin (ymax is behind it).
+        gamma: slope of the cones.
+        x: (n,) where.
+        bounds: what is known already; (-inf, inf) at first.
+        hidden: ages (N,), start, stop: points with `start <= age < stop` do not count.
+    """
+    points, values, nodes = tree
+    node, column = place
+    low, high = bounds
+    ages, start, stop = hidden
     rows = values.shape[0]
     n = x.shape[0]
     leaves = nodes.shape[0] // 2
-    low = -np.inf
-    high = np.inf
     # Left for later: one node a level at most, and 2^64 nodes are more than any memory holds.
     waiting = np.empty(64, dtype=np.int64)
     cones = np.empty(64)
-    waiting[0] = 1
-    cones[0] = 0.0
+    waiting[0] = node
+    cones[0] = 0.0 if node == 1 else gamma * tree_distance(nodes, node, x)
     top = 1
     while top > 0:
         top -= 1
         node = waiting[top]
         cone = cones[top]
-        while nodes[node, 2 * n] + cone < high or nodes[node, 2 * n + 1] - cone > low:
+        while nodes[node, column] + cone < high or nodes[node, column + 1] - cone > low:
             if node >= leaves:
                 for k in range((node - leaves) * rows // leaves, (node + 1 - leaves) * rows // leaves):
+                    if start < stop and start <= ages[k] < stop:
+                        continue
                     squared = 0.0
                     for i in range(n):
                         gap = points[i, k] - x[i]
                         squared += gap * gap
-                    distance = gamma * math.sqrt(squared)
-                    high = min(high, values[k] + distance)
-                    low = max(low, values[k] - distance)
+                    cone = gamma * math.sqrt(squared)
+                    if values[k] + cone < high:
+                        high = values[k] + cone
+                    if values[k] - cone > low:
+                        low = values[k] - cone
                 break
-            left = gamma * tree_distance(nodes, 2 * node, x)
-            right = gamma * tree_distance(nodes, 2 * node + 1, x)
-            # The nearer child now, the other one later.
-            nearer = 0 if left <= right else 1
-            waiting[top] = 2 * node + 1 - nearer
-            cones[top] = max(left, right)
-            top += 1
-            node = 2 * node + nearer
-            cone = min(left, right)
+            left, right = tree_children(nodes, node, x)
+            # The nearer child now, the other one later, if ever.
+            if left <= right:
+                node = 2 * node
+                other = node + 1
+                cone = gamma * left
+                later = gamma * right
+            else:
+                other = 2 * node
+                node = other + 1
+                cone = gamma * right
+                later = gamma * left
+            if nodes[other, column] + later < high or nodes[other, column + 1] - later > low:
+                waiting[top] = other
+                cones[top] = later
+                top += 1
     return low, high
 
 
-def tree_batch(
-    points: np.ndarray,
-    values: np.ndarray,
-    nodes: np.ndarray,
-    gamma: float,
-    queries: np.ndarray,
-    bounds: np.ndarray,
-) -> None:
-    """Fill `bounds` (m, 2) with the bounds at each row of `queries` (m, n)."""
-    for k in range(queries.shape[0]):
-        low, high = tree_bounds(points, values, nodes, gamma, queries[k])
-        bounds[k, 0] = low
-        bounds[k, 1] = high
+def tree_bounds(
+    points: np.ndarray, values: np.ndarray, nodes: np.ndarray, gamma: float, x: np.ndarray
+) -> tuple[float, float]:
+    """Return max(y - gamma d) and min(y + gamma d) over `points` (n, N) in tree order and their `values` (N,)."""
+    nothing = (values, 0.0, 0.0)
+    return tree_tighten((points, values, nodes), (1, 2 * x.shape[0]), gamma, x, (-np.inf, np.inf), nothing)

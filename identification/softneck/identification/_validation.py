@@ -1,4 +1,4 @@
-"""Honest validation: every model beside persistence, one step and k steps ahead and in free run."""
+"""Honest validation: every model beside persistence and the best linear one, one step, k steps and in free run."""
 
 from __future__ import annotations
 
@@ -7,51 +7,91 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
 from softneck.core import DataError, Matrix, Vector, require_one_of
 from softneck.signals import Recording
 
-from ._model import WARM_UP, Model
-from ._rows import known_rows
-from ._scores import nrmse_fit, rmse
+from ._baselines import Baselines, baselines
+from ._divergence import divergence
+from ._horizons import predict
+from ._model import Model
+from ._novelty import Novelty, novelty
+from ._residual_tests import ResidualTests, residual_tests
+from ._score_tables import INFINITE as INFINITE
+from ._score_tables import coverage_tables, free_run_bounds, interval_tables, run_tables, score_tables
+from ._stretches import Rows, Stretch, pooled, unseen_stretches
 
-INFINITE = "inf"
-_AXES = ("pitch", "roll")
-# A free run further from zero than this has left any neck's range: it diverged.
-_DIVERGED = np.pi
-# Level of the residual tests, as in MATLAB's `resid`; lags as there.
-_LEVEL, _LAGS = 0.99, 25
+_HORIZONS = (1, 5, 25, INFINITE)
+
+Scores = dict[str, dict[str, float | None]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Validation:
     """One model on one recording.
 
+    Scores are tables horizon -> axis -> value ("1", ..., "inf"; "pitch", "roll"), None where the free run diverged or
+    nothing was measured or moved; all but `per_run` are over the rows of all runs together.
+
     Attributes:
         model, data: their names.
         rows_scored, rows_left_out: rows judged, and rows left out because the model was trained on them.
-        persistence, fits: horizon -> axis -> fit [%]; None where it diverged or nothing was measured or moved.
-        rmse_deg: horizon -> axis -> root mean square error [deg].
-        diverged: time [s] at which the free run left the neck's range, or None.
-        white, uncorrelated: verdicts of the residual tests on the one-step errors.
-        time, measured, free_run, one_step: for plots: (time,) and (time, 2) [rad], NaN where nothing is scored.
+        rows_by_horizon: rows judged at each horizon: those with so much past, and of long records not all.
+        persistence, fits: fit [%] of repeating the last sample, and of the model.
+        rmse_deg, r2: root mean square error [deg]; R2 = 1 - SSE/SST.
+        worst_deg, worst_time: largest absolute error [deg] and when it was [s].
+        intervals: 95 % interval [low, high] of `fits` by a bootstrap over blocks.
+        best_linear: fit [%] that no linear model of the set-points beats on these rows (see `best_linear`).
+        noise_ceiling: axis -> fit [%] of a perfect model; None where no set-points were repeated.
+        per_run: the same scores for each stretch of rows that follow each other, with its `stretch`, `run`,
+            `start_s`, `rows_scored` and `diverged`.
+        diverged: time [s] at which the first free run left the data's range, or None.
+        residual_tests: of the one-step errors; `white` and `uncorrelated` are their verdicts.
+        novelty: how far the judged rows lie from the training rows, where these are known.
+        coverage_pct, mean_width_deg: of set membership in free run: axis -> measured samples within the bounds [%],
+            and their mean distance [deg]; None for other kinds.
+        time, run: (time,) [s] and the number of the stretch, for plots: no line joins two of them.
+        measured, free_run, one_step: (time, 2) [rad], NaN where nothing is scored.
+        lower, upper: (time, 2) [rad] bounds of the free run, NaN where there are none.
     """
 
     model: str
     data: str
     rows_scored: int
     rows_left_out: int
-    persistence: dict[str, dict[str, float | None]]
-    fits: dict[str, dict[str, float | None]]
-    rmse_deg: dict[str, dict[str, float | None]]
+    rows_by_horizon: dict[str, int]
+    persistence: Scores
+    fits: Scores
+    rmse_deg: Scores
+    r2: Scores
+    worst_deg: Scores
+    worst_time: Scores
+    intervals: dict[str, dict[str, list[float] | None]]
+    best_linear: Scores
+    noise_ceiling: dict[str, float | None]
+    per_run: list[dict[str, Any]]
     diverged: float | None
-    white: bool
-    uncorrelated: bool
+    residual_tests: ResidualTests
+    novelty: Novelty | None
+    coverage_pct: dict[str, float] | None
+    mean_width_deg: dict[str, float] | None
     time: Vector
+    run: np.ndarray
     measured: Matrix
     free_run: Matrix
     one_step: Matrix
+    lower: Matrix
+    upper: Matrix
+
+    @property
+    def white(self) -> bool:
+        """Whether the one-step errors are white noise, as far as 25 lags tell (99 %)."""
+        return self.residual_tests.white
+
+    @property
+    def uncorrelated(self) -> bool:
+        """Whether the one-step errors follow no input at lags 0 to 25 (99 %)."""
+        return self.residual_tests.uncorrelated
 
     def as_dict(self) -> dict[str, Any]:
         """Return the entry of the public face's JSON."""
@@ -60,11 +100,44 @@ class Validation:
             "data": self.data,
             "rows_scored": self.rows_scored,
             "rows_left_out": self.rows_left_out,
-            "fits": {"persistence": self.persistence, "model": self.fits},
+            "rows_by_horizon": self.rows_by_horizon,
+            "fits": {
+                "persistence": self.persistence,
+                "model": self.fits,
+                "best_linear": self.best_linear,
+                "noise_ceiling": self.noise_ceiling,
+            },
+            "intervals": self.intervals,
             "rmse_deg": self.rmse_deg,
+            "worst_deg": self.worst_deg,
+            "worst_time_s": self.worst_time,
+            "r2": self.r2,
             "diverged": self.diverged,
-            "residuals": {"white": self.white, "uncorrelated_with_inputs": self.uncorrelated},
+            "residuals": {
+                "white": self.white,
+                "uncorrelated_with_inputs": self.uncorrelated,
+                **self.residual_tests.as_dict(),
+            },
+            "novelty": None if self.novelty is None else self.novelty.as_dict(),
+            "coverage_pct": self.coverage_pct,
+            "mean_width_deg": self.mean_width_deg,
+            "per_run": self.per_run,
         }
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """How models are judged; see `validate`."""
+
+    horizons: tuple[int | str, ...] = _HORIZONS
+    motors: str = "simulated"
+    include_training: bool = False
+
+    def __post_init__(self) -> None:
+        require_one_of("motors", self.motors, ("simulated", "measured"))
+        for horizon in self.horizons:
+            if horizon != INFINITE and (not isinstance(horizon, int) or horizon < 1):
+                raise DataError(f"a horizon is a number of samples from 1, or `inf`; got {horizon!r}.")
 
 
 def validate(
@@ -72,158 +145,131 @@ def validate(
     recording: Recording,
     *,
     names: tuple[str, str] = ("model", "data"),
-    horizons: Sequence[int | str] = (1, 5, 25, INFINITE),
+    horizons: Sequence[int | str] = _HORIZONS,
     motors: str = "simulated",
     include_training: bool = False,
+    training: Recording | None = None,
 ) -> Validation:
     """Judge a model on the rows of a recording that it was not trained on.
 
     Each stretch of unseen rows starts from 25 measured samples, which are not scored. A free run then has the
     set-points alone, or the logged motor positions as well (`motors="measured"`).
 
+    Args:
+        model: of any kind.
+        recording: at the model's sample time; its runs are never joined.
+        names: of model and data, for reports.
+        horizons: samples ahead; "inf" is the free run.
+        motors: "simulated" or "measured".
+        include_training: whether rows that the model was trained on are judged too.
+        training: what the model was trained on, for `novelty`.
+
     Raises:
-        DataError: nothing is left to judge, or another sample time.
+        DataError: nothing is left to judge, another sample time, no motor positions to measure, or a horizon longer
+            than every stretch.
     """
-    require_one_of("motors", motors, ("simulated", "measured"))
-    stretches, seen = _stretches(model, recording, include_training)
-    # One step ahead is always computed: the residual tests need it.
-    runs = [_predictions(model, stretch, (1, *horizons), motors) for stretch, _ in stretches]
-    scored = [mask for _, mask in stretches]
-    y = np.concatenate([np.where(m[:, None], s.outputs, np.nan) for (s, _), m in zip(stretches, scored, strict=True)])
-    joined = {h: np.concatenate([run[h] for run in runs]) for h in runs[0]}
-    time = np.concatenate([stretch.time for stretch, _ in stretches])
-    diverged = _divergence(time, joined[INFINITE]) if INFINITE in joined else None
-    finite = [str(h) for h in horizons if h != INFINITE]
-    held = {h: np.concatenate([_persistence(s, int(h)) for s, _ in stretches]) for h in finite}
-    there = np.isfinite(y).all(axis=1)
-    error = (y - joined["1"])[there]
-    inputs = np.concatenate([stretch.set_points for stretch, _ in stretches])[there]
-    since = np.concatenate([np.arange(len(stretch)) for stretch, _ in stretches])
-    # A row with less past than the horizon was not predicted from that far back.
-    judged = {h: np.where((since >= (0 if h == INFINITE else int(h)))[:, None], y, np.nan) for h in map(str, horizons)}
-    scores = {h: _scores(judged[h], joined[h], lost=h == INFINITE and diverged is not None) for h in judged}
+    rules = Rules(tuple(horizons), motors, include_training)
+    check_training_data(model, training)
+    parts = judged_parts(model, recording, rules)
+    return judge(model, parts, rules, names=names, training=training)
+
+
+def check_training_data(model: Model, training: Recording | None) -> None:
+    """Raise DataError where the training data is at another sample time than the model."""
+    if training is not None:
+        model._check(training)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Parts:
+    """What of a recording is judged, and what stands beside any model on it."""
+
+    stretches: list[Stretch]
+    left_out: int
+    rows: Rows
+    baselines: Baselines
+
+
+def judged_parts(
+    model: Model, recording: Recording, rules: Rules, known: dict[bytes, Baselines] | None = None
+) -> Parts:
+    """Return the stretches that a model has not seen; `known` keeps baselines for models that saw the same rows."""
+    model._check(recording)  # its sample time, before anything is computed
+    if rules.motors == "measured" and not recording.has_motor_positions:
+        raise DataError(
+            "motors=measured needs logged motor positions and the recording has none; judge it with --motors simulated."
+        )
+    if not np.isfinite(recording.outputs).any():
+        raise DataError("neither pitch nor roll was ever measured; there is nothing to judge.")
+    hashes = np.zeros(0, dtype=np.uint64) if rules.include_training else model.training_rows
+    stretches, left_out = unseen_stretches(recording, hashes)
+    longest = max(len(s.recording) for s in stretches)
+    finite = [int(h) for h in rules.horizons if h != INFINITE]
+    if finite and max(finite) >= longest:
+        raise DataError(
+            f"a horizon of {max(finite)} samples is longer than what is judged: the longest stretch of rows that the "
+            f"model was not trained on has {longest}."
+        )
+    rows = pooled(stretches)
+    key = np.isfinite(rows.measured).tobytes() + rows.stretch.tobytes() + rows.time.tobytes()
+    known = {} if known is None else known
+    if key not in known:
+        known[key] = baselines(recording, stretches, rows, rules.horizons)
+    return Parts(stretches, left_out, rows, known[key])
+
+
+def judge(
+    model: Model, parts: Parts, rules: Rules, *, names: tuple[str, str], training: Recording | None = None
+) -> Validation:
+    """Return the validation of a model on its parts of a recording."""
+    rows, horizons = parts.rows, [str(h) for h in rules.horizons]
+    outputs = _predictions(model, parts, rules)
+    lost: list[float | None] = [None] * len(parts.stretches)
+    if INFINITE in outputs:
+        lost = divergence(rows.time, rows.stretch, outputs[INFINITE][:, :2], rows.measured)
+    first = min((t for t in lost if t is not None), default=None)
+    measured = {h: rows.judged(None if h == INFINITE else int(h)) for h in horizons}
+    predicted = {h: outputs[h][:, :2] for h in horizons}
+    scores = score_tables(rows.time, measured, predicted, lost=first is not None)
+    tests = residual_tests(rows.measured - outputs["1"][:, :2], rows.set_points, rows.stretch)
+    free = outputs.get(INFINITE, np.full((rows.time.size, 2), np.nan))
+    lower, upper = free_run_bounds(free)
+    coverage, width = coverage_tables(rows.measured, lower, upper)
     return Validation(
         model=names[0],
         data=names[1],
-        rows_scored=int(sum(mask.sum() for mask in scored)),
-        rows_left_out=seen,
-        persistence={h: _scores(judged[h], held[h], lost=False)[0] for h in finite},
-        fits={h: fit for h, (fit, _) in scores.items()},
-        rmse_deg={h: error_deg for h, (_, error_deg) in scores.items()},
-        diverged=diverged,
-        white=_is_white(error),
-        uncorrelated=_is_uncorrelated(error, inputs),
-        time=time,
-        measured=y,
-        free_run=joined.get(INFINITE, np.full_like(y, np.nan)),
-        one_step=joined["1"],
+        rows_scored=int(sum(stretch.scored.sum() for stretch in parts.stretches)),
+        rows_left_out=parts.left_out,
+        rows_by_horizon={h: int(np.isfinite(y).any(axis=1).sum()) for h, y in measured.items()},
+        persistence=parts.baselines.persistence,
+        **scores,
+        intervals=interval_tables(rows, measured, predicted, model.sample_time, lost=first is not None),
+        best_linear=parts.baselines.best_linear,
+        noise_ceiling=parts.baselines.noise_ceiling,
+        per_run=run_tables(parts.stretches, rows, measured, predicted, lost),
+        diverged=first,
+        residual_tests=tests,
+        novelty=novelty(model, parts.stretches, training),
+        coverage_pct=coverage,
+        mean_width_deg=width,
+        time=rows.time,
+        run=rows.stretch,
+        measured=rows.measured,
+        free_run=free[:, :2],
+        one_step=outputs["1"][:, :2],
+        lower=lower,
+        upper=upper,
     )
 
 
-def _stretches(
-    model: Model, recording: Recording, include_training: bool
-) -> tuple[list[tuple[Recording, np.ndarray]], int]:
-    """Return stretches of unseen rows with a mask of what to score in each, and how many rows were seen before."""
-    parts: list[tuple[Recording, np.ndarray]] = []
-    left_out = 0
-    for run in recording.runs():
-        seen = np.zeros(len(run), dtype=bool) if include_training else known_rows(run, model.training_rows)
-        left_out += int(seen.sum())
-        for start, stop in _unseen(seen):
-            mask = ~seen[start:stop]
-            mask[:WARM_UP] = False
-            if mask.any():
-                parts.append((run.rows(start, stop), mask))
-    if not parts:
-        why = f"all {left_out} rows were used to train the model" if left_out else f"{len(recording)} rows are too few"
-        raise DataError(f"nothing is left to judge: {why}; use another recording or --include-training.")
-    return parts, left_out
-
-
-def _unseen(seen: np.ndarray) -> list[tuple[int, int]]:
-    """Return the borders of stretches between long parts that were seen; a few rows seen do not break one."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], seen.astype(np.int8), [0]])))
-    long = [(a, b) for a, b in edges.reshape(-1, 2).tolist() if b - a > WARM_UP]
-    starts = [0, *(b for _, b in long)]
-    stops = [*(a for a, _ in long), seen.size]
-    return [(a, b) for a, b in zip(starts, stops, strict=True) if b - a > WARM_UP]
-
-
-def _predictions(model: Model, run: Recording, horizons: Sequence[int | str], motors: str) -> dict[str, Matrix]:
-    result = {}
-    for horizon in horizons:
+def _predictions(model: Model, parts: Parts, rules: Rules) -> dict[str, Matrix]:
+    """Return horizon -> outputs (time, n_out) of all stretches; one step ahead always, for the residual tests."""
+    runs = [stretch.recording for stretch in parts.stretches]
+    result: dict[str, Matrix] = {}
+    for horizon in dict.fromkeys((1, *rules.horizons)):
         if horizon == INFINITE:
-            result[INFINITE] = model.simulate(run, motors=motors)[:, :2]
+            result[INFINITE] = np.concatenate([model.simulate(run, motors=rules.motors) for run in runs])
         else:
-            result[str(horizon)] = model.predict(run, int(horizon), motors=motors)[:, :2]
+            k = int(horizon)
+            result[str(k)] = predict(model, runs, k, motors=rules.motors, stride=parts.rows.stride(k))
     return result
-
-
-def _persistence(run: Recording, horizon: int) -> Matrix:
-    """Repeat what was measured `horizon` samples before, the last sample that was not missed."""
-    y = run.outputs.copy()
-    for axis in range(2):
-        last = np.maximum.accumulate(np.where(np.isfinite(y[:, axis]), np.arange(len(y)), 0))
-        y[:, axis] = y[last, axis]
-    return np.vstack([np.repeat(y[:1], min(horizon, len(y)), axis=0), y[:-horizon]])
-
-
-def _scores(y: Matrix, yhat: Matrix, *, lost: bool) -> tuple[dict[str, float | None], dict[str, float | None]]:
-    if lost:
-        return dict.fromkeys(_AXES), dict.fromkeys(_AXES)
-    fit: dict[str, float | None] = {a: _number(nrmse_fit(y[:, i], yhat[:, i])) for i, a in enumerate(_AXES)}
-    error: dict[str, float | None] = {
-        a: _number(float(np.degrees(rmse(y[:, i], yhat[:, i])))) for i, a in enumerate(_AXES)
-    }
-    return fit, error
-
-
-def _number(value: float) -> float | None:
-    return value if np.isfinite(value) else None
-
-
-def _divergence(time: Vector, outputs: Matrix) -> float | None:
-    gone = ~(np.abs(outputs) < _DIVERGED).all(axis=1)
-    return float(time[np.argmax(gone)]) if gone.any() else None
-
-
-def _is_white(error: Matrix) -> bool:
-    """Ljung-Box test of both axes at the 99 % level over 25 lags (Ljung and Box 1978)."""
-    n = error.shape[0]
-    if n <= 2 * _LAGS:
-        return False
-    for e in (error - error.mean(axis=0)).T:
-        r = _autocorrelation(e)
-        statistic = n * (n + 2) * float(np.sum(r**2 / (n - np.arange(1, _LAGS + 1))))
-        if statistic > chi2.ppf(_LEVEL, _LAGS):
-            return False
-    return True
-
-
-def _is_uncorrelated(error: Matrix, inputs: Matrix) -> bool:
-    """Correlation with each input at lags 0 to 25 within its 99 % band, Bonferroni over all of them (Ljung 16.6).
-
-    The band is that of a coloured error: variance `sum_k R_e(k) R_u(k)` over k = -25..25.
-    """
-    n = error.shape[0]
-    if n <= 2 * _LAGS:
-        return False
-    tests = error.shape[1] * inputs.shape[1] * (_LAGS + 1)
-    # Two-sided normal bound through chi-square with one degree of freedom.
-    bound = float(np.sqrt(chi2.ppf(1.0 - (1.0 - _LEVEL) / tests, 1)))
-    for e in (error - error.mean(axis=0)).T:
-        r_e = _autocorrelation(e)
-        for u in (inputs - inputs.mean(axis=0)).T:
-            scale = max(float(np.linalg.norm(e) * np.linalg.norm(u)), 1e-300)
-            r = np.array([float(e[k:] @ u[: n - k]) for k in range(_LAGS + 1)]) / scale
-            # Truncation may leave the sum below that of a white error, which it never is.
-            variance = max(1.0, 1.0 + 2.0 * float(r_e @ _autocorrelation(u)))
-            if np.abs(r).max() * np.sqrt(n / variance) > bound:
-                return False
-    return True
-
-
-def _autocorrelation(x: Vector) -> Vector:
-    """Return the autocorrelation at lags 1 to 25 of a signal without mean."""
-    power = max(float(x @ x), 1e-300)
-    return np.array([float(x[k:] @ x[:-k]) for k in range(1, _LAGS + 1)]) / power

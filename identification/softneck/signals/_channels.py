@@ -36,6 +36,8 @@ _TABLE: dict[str, str] = {
 }  # fmt: skip
 # Channels in which an empty cell is a sample that the sensor missed.
 _MAY_MISS = re.compile(r"(pitch|roll|motor_position|motor_velocity|compression|tension)")
+# Channels that are set, not measured: they hold their value until the next one.
+_HELD = re.compile(r"(motor_setpoint_\d|.*_reference|healthy|enabled|measurement_valid|payload)$")
 _COLUMN = re.compile(r"^(?P<name>[^\[\]]+?)\s*\[(?P<unit>[^\[\]]*)\]$")
 
 
@@ -62,6 +64,11 @@ def column_name(channel: str) -> str:
 def may_miss(channel: str) -> bool:
     """Return whether a sample of `channel` may be missing."""
     return bool(_MAY_MISS.match(channel)) and not channel.endswith("_reference")
+
+
+def is_held(channel: str) -> bool:
+    """Return whether `channel` is set or true-or-false, so that it holds its value between samples."""
+    return bool(_HELD.match(channel))
 
 
 def parse_column(title: str) -> tuple[str, float]:

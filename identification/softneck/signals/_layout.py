@@ -1,26 +1,21 @@
-"""Foreign logs become recordings through a layout: a TOML file that says which column is what."""
+"""The layout of a foreign log: a TOML file that says which column is what."""
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pandas as pd
+from softneck.core import FileFormatError, SettingsError, SoftneckError, to_si
 
-from softneck.core import DataError, FileFormatError, SettingsError, SoftneckError, Vector, to_si
-
-from ._channels import known_channels, may_miss, si_unit
-from ._files import integers, median_step, numbers, read_table
-from ._mat import read_mat
-from ._recording import Recording, check_times
-from ._sample_time import estimate_sample_time
-from ._tilt import pitch_roll
+from ._channels import known_channels, si_unit
+from ._files import WHITESPACE, TextForm
 
 Column = str | int
+DUPLICATES = ("first", "last")
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,10 +46,13 @@ class Layout:
         sample_time: true sample time [s]; None takes it from the time column.
         estimate: take the sample time at which logged positions and velocities agree.
         new_run_at_restart: a time that goes back starts a new run.
+        duplicates: which row to keep of those with one time stamp, `first` or `last`; None refuses them.
         run: the column that numbers the runs, or None.
         variable: the matrix of a MAT file; None takes its vectors by name.
         header: whether the first line names the columns.
-        delimiter: between cells.
+        delimiter: between cells, one character or `whitespace`.
+        decimal: the decimal mark, `.` or `,`.
+        skip: lines before the table.
         rows: first and last row (not included) to take.
     """
 
@@ -65,19 +63,19 @@ class Layout:
     sample_time: float | None = None
     estimate: bool = False
     new_run_at_restart: bool = False
+    duplicates: str | None = None
     run: Column | None = None
     variable: str | None = None
     header: bool = True
     delimiter: str = ","
+    decimal: str = "."
+    skip: int = 0
     rows: tuple[int, int] | None = None
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Imported:
-    """A recording and what the importer did that a user should know."""
-
-    recording: Recording
-    notes: tuple[str, ...] = field(default=())
+    @property
+    def form(self) -> TextForm:
+        """How a text is a table."""
+        return TextForm(self.header, self.delimiter, self.decimal, self.skip)
 
 
 def read_layout(path: str | Path) -> Layout:
@@ -89,156 +87,52 @@ def read_layout(path: str | Path) -> Layout:
     """
     source = Path(path)
     try:
-        table = tomllib.loads(source.read_text(encoding="utf-8"))
+        text = source.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise FileFormatError(f"{source}: no such file.") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
+    except (UnicodeDecodeError, OSError, ValueError) as error:  # ValueError: a null character in the path
         raise FileFormatError(f"{source}: is no TOML file ({error}).") from error
     try:
-        return _layout(table)
+        return parse_layout(text)
+    except FileFormatError as error:
+        raise FileFormatError(f"{source}: {error}") from error
     except SoftneckError as error:
         raise SettingsError(f"{source}: {error}") from error
+
+
+def parse_layout(text: str) -> Layout:
+    """Return the layout that a TOML text holds; the inverse of `layout_toml`.
+
+    Raises:
+        FileFormatError: no TOML.
+        SettingsError: a key, channel or unit that a layout does not have.
+    """
+    try:
+        table = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:  # int() refuses thousands of digits
+        raise FileFormatError(f"is no TOML file ({error}).") from error
+    try:
+        return _layout(table)
+    except SoftneckError:
+        raise
     except (TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise SettingsError(f"{source}: a value is of the wrong type ({error}).") from error
-
-
-def import_log(path: str | Path, layout: Layout) -> Imported:
-    """Read a foreign table as a recording.
-
-    Raises:
-        FileFormatError: no such file or no table.
-        DataError: a column is missing, holds no numbers, or the times do not fit.
-    """
-    source = Path(path)
-    frame = read_log(source, layout)
-    if layout.rows is not None:
-        frame = frame.iloc[layout.rows[0] : layout.rows[1]].reset_index(drop=True)
-    try:
-        return _imported(frame, layout)
-    except SoftneckError as error:
-        raise DataError(f"{source}: {error}") from error
-
-
-def read_log(source: Path, layout: Layout) -> pd.DataFrame:
-    """Return a log's table by its ending: `.parquet`, `.mat`, or else text.
-
-    Raises:
-        FileFormatError: no such file or no table.
-        DataError: a MAT file without the variable.
-    """
-    suffix = source.suffix.lower()
-    if suffix == ".mat":
-        if not source.is_file():
-            raise FileFormatError(f"{source}: no such file.")
-        return read_mat(source, layout.variable, tuple(str(c) for c in _columns(layout)))
-    if layout.variable is not None:
-        raise DataError(f"{source}: the layout's `variable` is for a `.mat` file.")
-    kind = ".parquet" if suffix == ".parquet" else ".csv"
-    frame = read_table(source, kind, header=layout.header, delimiter=layout.delimiter)
-    frame.columns = [name.strip() if isinstance(name, str) else name for name in frame.columns]
-    return frame
-
-
-def _columns(layout: Layout) -> tuple[Column, ...]:
-    """Return all columns that a layout names."""
-    sources = [*layout.channels.values(), layout.inclination, layout.orientation, layout.time]
-    named = [term.column for source in sources if source is not None for term in source.terms]
-    return (*named, layout.run) if layout.run is not None else tuple(named)
-
-
-def _imported(frame: pd.DataFrame, layout: Layout) -> Imported:
-    channels = {name: _values(frame, source, name) for name, source in layout.channels.items()}
-    if layout.inclination is not None and layout.orientation is not None:
-        i = _values(frame, layout.inclination, "pitch")
-        o = _values(frame, layout.orientation, "pitch")
-        channels["pitch"], channels["roll"] = pitch_roll(i, o)
-    time, run, sample_time, notes = _times(frame, layout, channels)
-    return Imported(Recording(time, sample_time, channels, run), notes)
-
-
-def _sample_time(
-    layout: Layout, channels: Mapping[str, Vector], run: np.ndarray, nominal: float | None
-) -> tuple[float | None, tuple[str, ...]]:
-    """Return the sample time that overrules the column's `nominal`, and what velocities say of either."""
-    given = layout.sample_time
-    if layout.estimate:
-        found = estimate_sample_time(channels, run)
-        return found.value, (f"sample time estimated from positions and velocities: {found}",)
-    judged = given if given is not None else nominal
-    try:
-        found = estimate_sample_time(channels, run)
-    except DataError:
-        return given, ()
-    if judged is None or not found.contradicts(judged):
-        return given, ()
-    hint = 'write `sample_time_s = "estimate"` in [time] to use it'
-    return given, (f"warning: {1e3 * judged:g} ms does not fit: positions and velocities agree at {found}; {hint}",)
-
-
-def _times(
-    frame: pd.DataFrame, layout: Layout, channels: Mapping[str, Vector]
-) -> tuple[Vector, np.ndarray, float, tuple[str, ...]]:
-    run = np.zeros(len(frame), dtype=np.int64)
-    notes: list[str] = []
-    logged = None
-    if layout.run is not None:
-        run = integers(_column(frame, layout.run, "run"))
-    if layout.time is not None:
-        logged = _values(frame, layout.time, "time")
-        if layout.new_run_at_restart:
-            run[1:] = np.cumsum((np.diff(logged) <= 0) | (np.diff(run) != 0))
-            notes.append(f"{run[-1] + 1 if run.size else 0} run(s), by restarts of the time column")
-    nominal = median_step(logged, run) if logged is not None and logged.size > 1 else None
-    sample_time, remarks = _sample_time(layout, channels, run, nominal)
-    notes.extend(remarks)
-    if sample_time is None:
-        if logged is None:
-            raise DataError("the layout gives neither a time column nor `sample_time_s`; give one.")
-        return logged, run, median_step(logged, run), tuple(notes)
-    if logged is not None and nominal is not None:
-        # The layout knows the sample time better than this column, but a gap in it is one in the samples.
-        check_times(logged, nominal, run, tolerance=0.5)
-        whose = "the estimated" if layout.estimate else "the layout's"
-        if abs(nominal - sample_time) > 1e-3 * sample_time:
-            notes.append(
-                f"the time column says {1e3 * nominal:g} ms a sample; {whose} {1e3 * sample_time:.4g} ms is used"
-            )
-    first = np.concatenate([[0], np.flatnonzero(np.diff(run)) + 1]) if run.size else np.zeros(0, dtype=np.int64)
-    within = np.arange(run.size) - np.repeat(first, np.diff(np.append(first, run.size)))
-    return within * sample_time, run, sample_time, tuple(notes)
-
-
-def _values(frame: pd.DataFrame, source: Source, channel: str) -> Vector:
-    total = np.zeros(len(frame))
-    for term in source.terms:
-        column = _column(frame, term.column, channel)
-        total = total + term.factor * numbers(column, str(term.column), missing=may_miss(channel))
-    return source.sign * to_si(source.unit)[0] * total
-
-
-def _column(frame: pd.DataFrame, name: Column, channel: str) -> pd.Series:
-    """Return a column by its name, or by its index where names are words."""
-    places = [place for place, title in enumerate(frame.columns) if title == name]
-    if len(places) > 1:
-        raise DataError(f"column `{name}` for `{channel}` stands {len(places)} times in the file; use its index.")
-    if not places and isinstance(name, int) and 0 <= name < frame.shape[1]:
-        places = [name]
-    if not places:
-        listed = ", ".join(str(title) for title in frame.columns)
-        raise DataError(f"column `{name}` for `{channel}` is not in the file; it has {listed}.")
-    return frame.iloc[:, places[0]]
+        raise SettingsError(f"a value is of the wrong type ({error}).") from error
 
 
 def _layout(table: dict[str, Any]) -> Layout:
     _known_keys(table, {"file", "time", "channels", "tilt"}, "the layout")
     file, time = table.get("file", {}), table.get("time", {})
     tilt = table.get("tilt", {})
-    _known_keys(file, {"header", "delimiter", "rows", "variable"}, "[file]")
-    _known_keys(time, {"column", "unit", "sample_time_s", "new_run_at_restart", "run_column"}, "[time]")
+    _known_keys(file, {"header", "delimiter", "decimal", "skip", "rows", "variable"}, "[file]")
+    _known_keys(
+        time,
+        {"column", "unit", "factor", "sample_time_s", "new_run_at_restart", "duplicates", "run_column"},
+        "[time]",
+    )
     _known_keys(tilt, {"inclination", "orientation"}, "[tilt]")
     if len(tilt) == 1:
         raise SettingsError("[tilt] needs both `inclination` and `orientation`.")
-    if not isinstance(time.get("run_column", ""), str | int):
+    if type(time.get("run_column", "")) not in (str, int):
         raise SettingsError(f"[time] run_column must be a name or an index; got {time['run_column']!r}.")
     rows = file.get("rows")
     if rows is not None and not (
@@ -249,16 +143,27 @@ def _layout(table: dict[str, Any]) -> Layout:
         channels={name: _channel_source(name, entry) for name, entry in table.get("channels", {}).items()},
         inclination=_source(tilt["inclination"], "rad", "[tilt] inclination") if tilt else None,
         orientation=_source(tilt["orientation"], "rad", "[tilt] orientation") if tilt else None,
-        time=_source({"unit": "s", **_only(time, "column", "unit")}, "s", "[time]") if "column" in time else None,
+        time=_source({"unit": "s", **_only(time, "column", "unit", "factor")}, "s", "[time]")
+        if "column" in time
+        else None,
         sample_time=None if time.get("sample_time_s") == "estimate" else _positive(time.get("sample_time_s")),
         estimate=time.get("sample_time_s") == "estimate",
         new_run_at_restart=_flag(time, "new_run_at_restart", default=False),
+        duplicates=_choice(time, "duplicates", DUPLICATES, None),
         run=time.get("run_column"),
         variable=str(file["variable"]) if "variable" in file else None,
         header=_flag(file, "header", default=True),
-        delimiter=str(file.get("delimiter", ",")),
+        delimiter=_delimiter(file.get("delimiter", ",")),
+        decimal=_choice(file, "decimal", (".", ","), ".") or ".",
+        skip=_skip(file.get("skip", 0)),
         rows=(rows[0], rows[1]) if rows is not None else None,
     )
+
+
+def _time_source(time: dict[str, Any]) -> Source | None:
+    if "column" not in time:
+        return None
+    return _source({"unit": "s", **_only(time, "column", "unit", "factor")}, "s", "[time]")
 
 
 def _channel_source(name: str, entry: Any) -> Source:
@@ -273,15 +178,22 @@ def _source(entry: Any, quantity: str, where: str) -> Source:
     _known_keys(entry, {"column", "terms", "unit", "sign", "factor"}, where)
     terms = entry.get("terms", [_only(entry, "column", "factor")])
     for term in terms:
-        if not isinstance(term, dict) or not isinstance(term.get("column"), str | int):
+        if not isinstance(term, dict) or type(term.get("column")) not in (str, int):
             raise SettingsError(f"{where} needs `column`: a name, or an index from 0 for a file without header.")
         _known_keys(term, {"column", "factor"}, where)
     if "unit" not in entry:
         raise SettingsError(f"{where} names no unit.")
     if to_si(entry["unit"])[1] != quantity:
         raise SettingsError(f"{where} cannot be in `{entry['unit']}`; its SI unit is {quantity}.")
-    parsed = tuple(Term(term["column"], float(term.get("factor", 1.0))) for term in terms)
-    return Source(parsed, entry["unit"], float(entry.get("sign", 1.0)))
+    parsed = tuple(Term(term["column"], _finite(term.get("factor", 1.0), where)) for term in terms)
+    return Source(parsed, entry["unit"], _finite(entry.get("sign", 1.0), where))
+
+
+def _finite(value: Any, where: str) -> float:
+    number = float(value)
+    if not math.isfinite(number):
+        raise SettingsError(f"{where}: a factor or sign must be a finite number; got {value}.")
+    return number
 
 
 def _only(entry: dict[str, Any], *keys: str) -> dict[str, Any]:
@@ -308,4 +220,24 @@ def _flag(table: dict[str, Any], key: str, *, default: bool) -> bool:
     value = table.get(key, default)
     if not isinstance(value, bool):
         raise SettingsError(f"`{key}` must be true or false; got {value!r}.")
+    return value
+
+
+def _choice(table: dict[str, Any], key: str, allowed: tuple[str, ...], default: str | None) -> str | None:
+    value = table.get(key, default)
+    if value is not default and value not in allowed:
+        raise SettingsError(f"`{key}` must be one of {', '.join(allowed)}; got {value!r}.")
+    return value
+
+
+def _skip(value: Any) -> int:
+    if type(value) is not int or not 0 <= value < 10**6:
+        raise SettingsError(f"[file] skip must be a number of lines; got {value!r}.")
+    return value
+
+
+def _delimiter(value: Any) -> str:
+    # More than one character would be a regular expression to the reader of tables, and some of those never end.
+    if value != WHITESPACE and not (isinstance(value, str) and len(value) == 1):
+        raise SettingsError(f"[file] delimiter must be one character or `{WHITESPACE}`; got {value!r}.")
     return value

@@ -1,8 +1,7 @@
-"""MATLAB files as tables: v5 through scipy, v7.3 (HDF5) through h5py; numbers only, no code, no other files."""
+"""MATLAB files as tables: v5, and v7.3 (HDF5) through h5py; numbers only, no code, no other files."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,8 @@ import numpy as np
 import pandas as pd
 
 from softneck.core import DataError, FileFormatError
+
+from ._mat5 import read_mat5
 
 # Structures of logs are one or two deep; deeper ones are loops or hostile.
 _MAX_DEPTH = 4
@@ -31,17 +32,42 @@ def read_mat(source: Path, variable: str | None, wanted: tuple[str, ...] = ()) -
         FileFormatError: no MAT file.
         DataError: the variable is not there, is no matrix of numbers, or vectors differ in length.
     """
+    return mat_table(source, mat_arrays(source), variable, wanted)
+
+
+def mat_table(
+    source: Path, arrays: dict[str, np.ndarray], variable: str | None, wanted: tuple[str, ...] = ()
+) -> pd.DataFrame:
+    """Return the table of `read_mat` from the file's arrays."""
+    return _vectors(source, arrays, wanted) if variable is None else _matrix(source, arrays, variable)
+
+
+def mat_arrays(source: Path) -> dict[str, np.ndarray]:
+    """Return all arrays (rows, columns) of numbers in a MAT file by their names.
+
+    Raises:
+        FileFormatError: no MAT file.
+        DataError: a variable lies in another file or declares a size that is none.
+    """
     import h5py  # slow to import, and few logs need it
 
     try:
-        found = dict(_hdf5(source) if h5py.is_hdf5(source) else _version5(source))
+        found = _by_name(_hdf5(source) if h5py.is_hdf5(source) else read_mat5(source.read_bytes()))
     except (DataError, FileFormatError):
         raise
     except Exception as error:  # the parsers raise whatever the damaged bytes lead to
         reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
         raise FileFormatError(f"{source}: cannot be read as a MAT file ({reason}).") from error
-    arrays = {name: array for name, array in found.items() if array.ndim == 2 and array.size}
-    return _vectors(source, arrays, wanted) if variable is None else _matrix(source, arrays, variable)
+    return {name: array for name, array in found.items() if array.ndim == 2 and array.size}
+
+
+def _by_name(arrays: Iterator[tuple[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    found: dict[str, np.ndarray] = {}
+    for name, array in arrays:
+        if name in found:
+            raise ValueError(f"the variable `{name}` stands there twice")
+        found[name] = array
+    return found
 
 
 def _matrix(source: Path, arrays: dict[str, np.ndarray], variable: str) -> pd.DataFrame:
@@ -68,31 +94,6 @@ def _vectors(source: Path, arrays: dict[str, np.ndarray], wanted: tuple[str, ...
 
 def _listed(arrays: dict[str, np.ndarray]) -> str:
     return ", ".join(f"{name} ({a.shape[0]} x {a.shape[1]})" for name, a in arrays.items()) or "none"
-
-
-def _version5(source: Path) -> Iterator[tuple[str, np.ndarray]]:
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatReadWarning
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        # Of two variables with one name scipy would take the last.
-        warnings.simplefilter("error", MatReadWarning)
-        content = loadmat(source, appendmat=False)
-    for name, value in content.items():
-        if not name.startswith("__"):
-            yield from _fields(name, value, 0)
-
-
-def _fields(name: str, value: Any, depth: int) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the numeric arrays in a variable; a structure of one element is opened."""
-    if not isinstance(value, np.ndarray) or depth > _MAX_DEPTH:
-        return
-    if value.dtype.names and value.size == 1:
-        for field in value.dtype.names:
-            yield from _fields(f"{name}.{field}", value.flat[0][field], depth + 1)
-    elif value.dtype.kind in "biuf":
-        yield name, np.asarray(value, dtype=np.float64)
 
 
 def _hdf5(source: Path) -> Iterator[tuple[str, np.ndarray]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -11,9 +11,7 @@ import numpy as np
 from softneck.core import DataError, Matrix, Vector, require_positive
 
 from ._channels import MOTOR_POSITIONS, OUTPUTS, REQUIRED, SET_POINTS, known_channels, may_miss
-
-# A logger's jitter; above it the samples are not equidistant and a discrete-time fit would be wrong.
-_MAX_JITTER = 0.02
+from ._times import check_times
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,6 +98,64 @@ class Recording:
             raise DataError(f"{len(self)} rows cannot be split at {fraction:g}: one part would be empty.")
         return concatenate(heads), concatenate(tails)
 
+    def split_runs(self, runs: Sequence[int] | float) -> tuple[Recording, Recording]:
+        """Return whole runs and the others: by their numbers in `run`, or the first part of them.
+
+        Args:
+            runs: numbers of the runs to pick, or a fraction of the runs in (0, 1), rounded, at least one.
+
+        Raises:
+            DataError: no such run, or one of the parts is empty.
+        """
+        parts = self.runs()
+        if isinstance(runs, int | float):
+            if not 0.0 < runs < 1.0:
+                raise DataError(f"the part of the runs must be between 0 and 1, without both; got {runs:g}.")
+            count = max(1, round(runs * len(parts)))
+            picked, rest = parts[:count], parts[count:]
+        else:
+            numbers = {int(part.run[0]) for part in parts}
+            unknown = sorted(set(runs) - numbers)
+            if unknown:
+                listed = ", ".join(map(str, sorted(numbers)))
+                raise DataError(f"there is no run {unknown[0]}; the recording has {listed}.")
+            picked = tuple(part for part in parts if int(part.run[0]) in set(runs))
+            rest = tuple(part for part in parts if int(part.run[0]) not in set(runs))
+        if not picked or not rest:
+            raise DataError(f"{len(parts)} run(s) cannot be split so: one part would be empty; split by time instead.")
+        return concatenate(picked), concatenate(rest)
+
+    def folds(self, count: int) -> tuple[tuple[Recording, Recording], ...]:
+        """Return `count` pairs (to train on, held out): each row is held out once, borders of runs stay borders.
+
+        Several runs are dealt out whole, so that the folds have about as many rows; one run is cut into blocks that
+        follow each other, and what lies before and after a block are two runs.
+
+        Raises:
+            DataError: fewer than 2 folds, or more than there are runs (or rows of the one run).
+        """
+        parts = self.runs()
+        most = len(parts) if len(parts) > 1 else len(self)
+        if not 2 <= count <= most:
+            what = f"{len(parts)} runs" if len(parts) > 1 else f"{most} rows"
+            raise DataError(f"{what} make 2 to {most} folds; got {count}.")
+        if len(parts) == 1:
+            edges = np.linspace(0, len(self), count + 1).round().astype(int).tolist()
+            return tuple(self._block(start, stop) for start, stop in itertools.pairwise(edges))
+        folds = _dealt([len(part) for part in parts], count)
+        return tuple(
+            (
+                concatenate([part for k, part in enumerate(parts) if k not in fold]),
+                concatenate([parts[k] for k in fold]),
+            )
+            for fold in folds
+        )
+
+    def _block(self, start: int, stop: int) -> tuple[Recording, Recording]:
+        """Return what lies around the rows `start` to `stop`, as runs of their own, and those rows."""
+        around = [self.rows(*edge) for edge in ((0, start), (stop, len(self))) if edge[0] < edge[1]]
+        return concatenate(around), concatenate([self.rows(start, stop)])
+
     def with_channels(self, **channels: Vector) -> Recording:
         """Return the same recording with channels added or replaced."""
         return replace(self, channels={**self.channels, **channels})
@@ -134,33 +190,15 @@ class Recording:
             raise DataError(f"`run` has shape {self.run.shape}; time has {(len(self),)}.")
 
 
-def check_times(time: Vector, sample_time: float, run: np.ndarray, *, tolerance: float = _MAX_JITTER) -> None:
-    """Raise DataError where `time` (time,) runs backwards or jumps inside a run.
-
-    Args:
-        time: [s].
-        sample_time: [s].
-        run: (time,) numbers of the runs.
-        tolerance: how much of a sample time a step may be off.
-    """
-    if not np.isfinite(time).all():
-        raise DataError(f"`time` is not finite at row {int(np.argmax(~np.isfinite(time)))}.")
-    step = np.diff(time)
-    inside = np.diff(run) == 0
-    back = inside & (step <= 0)
-    if back.any():
-        row = int(np.argmax(back)) + 1
-        raise DataError(
-            f"`time` runs backwards or stands still at row {row} ({time[row - 1]:g} to {time[row]:g} s); "
-            "where a new experiment starts there, give it another number in the `run` column."
-        )
-    jump = inside & (np.abs(step - sample_time) > max(tolerance * sample_time, 1e-9))
-    if jump.any():
-        row = int(np.argmax(jump)) + 1
-        raise DataError(
-            f"`time` jumps by {step[row - 1]:.6g} s at row {row} (t = {time[row]:g} s) where the "
-            f"sample time is {sample_time:.6g} s; fill the gap, or split the record there by the `run` column."
-        )
+def _dealt(rows: Sequence[int], count: int) -> list[list[int]]:
+    """Return which runs of `rows` rows go to each fold: the longest first, to the fold with the fewest rows."""
+    folds: list[list[int]] = [[] for _ in range(count)]
+    total = [0] * count
+    for k in sorted(range(len(rows)), key=lambda k: -rows[k]):
+        least = total.index(min(total))
+        folds[least].append(k)
+        total[least] += rows[k]
+    return [sorted(fold) for fold in folds]
 
 
 def concatenate(recordings: list[Recording] | tuple[Recording, ...]) -> Recording:

@@ -50,7 +50,7 @@ def estimate_sample_time(channels: Mapping[str, Vector], run: np.ndarray) -> Sam
     for j in (1, 2, 3):
         x, v = channels.get(f"motor_position_{j}"), channels.get(f"motor_velocity_{j}")
         if x is not None and v is not None:
-            period, correlation = _period(x, v, run)
+            period, correlation = velocity_period(x, v, run)
             if correlation > _AGREE:
                 periods.append(period)
     if not periods:
@@ -61,7 +61,8 @@ def estimate_sample_time(channels: Mapping[str, Vector], run: np.ndarray) -> Sam
     return SampleTime(float(np.median(periods)), min(periods), max(periods), len(periods))
 
 
-def _period(x: Vector, v: Vector, run: np.ndarray) -> tuple[float, float]:
+def velocity_period(x: Vector, v: Vector, run: np.ndarray) -> tuple[float, float]:
+    """Return the period [s] at which v is the rate of x, and the correlation of both motions; 0, 0 without motion."""
     moved, sums = [], []
     for border in np.split(np.arange(x.size), np.flatnonzero(np.diff(run)) + 1):
         if border.size > _WINDOW:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import time
-from contextlib import ExitStack
 from pathlib import Path
 
 import click
 
-from softneck.core import CheckFailedError, OutputError, Progress
+from softneck.core import CheckFailedError, OutputError
 from softneck.report import FIT_HEAD, FIT_NOTE, Demo, DemoSettings, fit_rows, fmu_rows, loop_rows, run_demo
 
-from ._console import note, print_json, print_table, progress
+from ._console import note, print_json, print_table
 from ._options import force_option, json_option
+from ._stages import Stages
 
 
 @click.command("demo", epilog="Example: softneck demo --out build/demo --quick")
@@ -31,7 +30,7 @@ def command(out: Path | None, quick: bool, force: bool, as_json: bool) -> None:
     settings = DemoSettings.quick(folder) if quick else DemoSettings(out=folder)
     if quick and not as_json:
         note(f"quick: the Eq. 22 experiment is {settings.duration:g} s long, not the paper's 200 s, and trained less")
-    with _Stages(quiet=as_json) as stages:
+    with Stages(quiet=as_json) as stages:
         demo = run_demo(settings, tell=stages.begin)
     if as_json:
         print_json(demo.as_dict() | {"seconds": demo.seconds})
@@ -39,34 +38,6 @@ def command(out: Path | None, quick: bool, force: bool, as_json: bool) -> None:
         _print(demo)
     if not demo.holds:
         raise CheckFailedError(f"a check of the demo did not hold; see {folder / 'report.html'}.")
-
-
-class _Stages:
-    """One progress bar after the other, and a line on stderr with the time of each stage."""
-
-    def __init__(self, *, quiet: bool) -> None:
-        self._quiet = quiet
-        self._stack = ExitStack()
-        self._name = ""
-        self._since = 0.0
-
-    def __enter__(self) -> _Stages:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._end()
-
-    def begin(self, name: str) -> Progress:
-        """End the stage before and start the next."""
-        self._end()
-        self._name, self._since = name, time.monotonic()
-        return self._stack.enter_context(progress(name, quiet=self._quiet))
-
-    def _end(self) -> None:
-        self._stack.close()
-        if self._name and not self._quiet:
-            note(f"{self._name}: {time.monotonic() - self._since:.1f} s")
-        self._name = ""
 
 
 def _refuse_foreign(folder: Path, *, force: bool) -> None:

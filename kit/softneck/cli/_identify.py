@@ -7,12 +7,22 @@ from pathlib import Path
 import click
 
 from softneck.core import KINDS, SettingsError, find_kind, kinds_of, refuse_existing, resolve
-from softneck.identification import INFINITE, Model, Validation, validate
+from softneck.identification import INFINITE, Model, Search, Validation, validate
 from softneck.signals import Recording, concatenate, read_recording
 
 from ._auto import identify_auto
-from ._console import percent, print_json, progress
+from ._console import note, percent, print_json, progress
 from ._options import apply_settings, force_option, json_option, output_option, set_option, target
+from ._search import (
+    SearchOptions,
+    hold_out_option,
+    plot_option,
+    print_search,
+    run_search,
+    search_option,
+    strategy_option,
+    write_plot,
+)
 
 _KINDS = "\n".join(f"  {name:8} {KINDS[name].summary}" for name in kinds_of("model"))
 _KINDS += "\n  auto     tries them all and takes the best in free run"
@@ -30,6 +40,10 @@ _KINDS += "\n  auto     tries them all and takes the best in free run"
 @click.option("--html", type=click.Path(path_type=Path), help="With KIND auto: write a page with the ranking.")
 @click.option("--seed", type=int, help="Seed of kinds that start at random.")
 @set_option
+@search_option
+@hold_out_option
+@strategy_option
+@plot_option
 @force_option
 @json_option
 def command(
@@ -40,6 +54,10 @@ def command(
     html: Path | None,
     seed: int | None,
     settings: tuple[str, ...],
+    searches: tuple[str, ...],
+    hold_out: Path | None,
+    strategy: str,
+    plot: Path | None,
     force: bool,
     as_json: bool,
 ) -> None:
@@ -55,28 +73,45 @@ def command(
         )
     entry = find_kind(kind, "model")
     estimator = apply_settings(resolve(entry.settings), settings, seed=seed)
+    options = SearchOptions(searches, hold_out, strategy, plot)
     if not 0.0 < train <= 1.0:
         raise SettingsError(f"--train: the part to train on must be in (0, 1]; got {train:g}.")
     path, replace = target(output, f"models/{kind}.npz", force=force)
     refuse_existing(path, force=replace)
+    if plot is not None:
+        refuse_existing(plot, force=force)
     whole = concatenate([read_recording(source) for source in recordings])
     # All of it to train on leaves nothing to hold out.
     head, tail = (whole, None) if train == 1.0 else whole.split(train)
+    found = run_search(estimator, head, options, quiet=as_json)
     with progress(f"identify {kind}", quiet=as_json) as report:
-        model = estimator.fit(head, progress=report)
+        model = found.model if found is not None else estimator.fit(head, progress=report)
     with progress("hold-out", quiet=as_json):
         held_out = _hold_out(model, tail)
     model.save(path, force=replace)
+    if found is not None and plot is not None:
+        write_plot(found, plot, force=force)
     if as_json:
-        print_json(_facts(path, model, held_out))
-        return
+        print_json(_facts(path, model, held_out, found))
+    else:
+        _print(path, model, held_out, found)
+    if found is not None and found.interrupted:
+        raise KeyboardInterrupt  # what was done is kept, and the exit code says that it is not all
+
+
+def _print(path: Path, model: Model, held_out: Validation | None, found: Search | None) -> None:
+    if found is not None:
+        print_search(found)
+        for remark in found.remarks:
+            note(remark)
     click.echo(f"{path}\n{model.summary()}")
     if held_out is None:
         click.echo("nothing was held out: judge it with `softneck validate` on another recording")
         return
     one, free = held_out.fits["1"], held_out.fits[INFINITE]
     held = held_out.persistence["1"]
-    click.echo(f"hold-out of {held_out.rows_scored} rows, fit [%] pitch/roll:")
+    what = "hold-out" if found is None else "end of the recording, which no trial saw,"
+    click.echo(f"{what} of {held_out.rows_scored} rows, fit [%] pitch/roll:")
     click.echo(f"  persistence {percent(held['pitch'])}/{percent(held['roll'])}")
     click.echo(f"  one step    {percent(one['pitch'])}/{percent(one['roll'])}")
     click.echo(f"  free run    {percent(free['pitch'])}/{percent(free['roll'])}")
@@ -89,14 +124,15 @@ def _hold_out(model: Model, tail: Recording | None) -> Validation | None:
     return validate(model, tail, horizons=(1, INFINITE))
 
 
-def _facts(path: Path, model: Model, held_out: Validation | None) -> dict:
-    return {
+def _facts(path: Path, model: Model, held_out: Validation | None, found: Search | None) -> dict:
+    facts = {
         "model": str(path),
         "kind": model.kind,
         "sample_time_s": model.sample_time,
         "rows_trained": int(model.training_rows.size),
         "settings": dict(model.settings),
-        "findings": dict(model.findings),
+        "findings": {name: value for name, value in model.findings.items() if name != "search"},
         "summary": model.summary(),
         "hold_out": None if held_out is None else held_out.as_dict(),
     }
+    return facts if found is None else facts | {"search": found.as_dict()}

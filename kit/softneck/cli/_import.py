@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
+from typing import Any
 
 import click
 
-from softneck.signals import import_log, read_layout, write_recording
+from softneck.core import DataError, SettingsError, atomic_write, refuse_existing
+from softneck.signals import Imported, guess_layout, import_log, read_layout, recording_suffix, write_recording
 
 from ._console import note, print_json
 from ._options import force_option, json_option, output_option, target
@@ -14,19 +17,59 @@ from ._options import force_option, json_option, output_option, target
 
 @click.command(
     "import",
-    epilog="Example: softneck import log.csv --layout examples/layouts/neck_openloop.toml -o neck.csv",
+    epilog="Example: softneck import log.csv --guess -o neck.csv, then edit neck.layout.toml and go on with "
+    "softneck import log.csv --layout neck.layout.toml -o neck.csv --force",
 )
 @click.argument("log", type=click.Path(path_type=Path))
-@click.option("--layout", "layout_file", type=click.Path(path_type=Path), required=True, help="How to read the log.")
+@click.option("--layout", "layout_file", type=click.Path(path_type=Path), help="How to read the log.")
+@click.option("--guess", is_flag=True, help="Propose a layout, say why, and write it beside the recording.")
 @output_option("recording", "REC")
 @force_option
 @json_option
-def command(log: Path, layout_file: Path, output: Path | None, force: bool, as_json: bool) -> None:
-    """Turn any logger's table LOG into a recording, by a layout file."""
-    imported = import_log(log, read_layout(layout_file))
-    recording = imported.recording
+def command(log: Path, layout_file: Path | None, guess: bool, output: Path | None, force: bool, as_json: bool) -> None:
+    """Turn any logger's table LOG into a recording, by a layout file or by a guess at one."""
+    if guess == (layout_file is not None):
+        what = "both were given" if guess else "neither was given"
+        raise SettingsError(f"import needs either --layout LAYOUT.toml or --guess; {what}.")
     path, replace = target(output, f"recordings/{log.stem}.csv", force=force)
-    write_recording(path, recording, force=replace)
+    recording_suffix(path)
+    refuse_existing(path, force=replace)
+    facts: dict[str, Any] = {}
+    if layout_file is None:
+        imported, facts = _by_guess(log, path, replace)
+    else:
+        imported = import_log(log, read_layout(layout_file))
+    write_recording(path, imported.recording, force=replace)
+    _tell(path, imported, facts, as_json)
+
+
+def _by_guess(log: Path, path: Path, replace: bool) -> tuple[Imported, dict[str, Any]]:
+    """Guess a layout, write it beside the recording, and import by it.
+
+    Raises:
+        DataError: what a recording needs was not found; the proposal is written as far as it goes.
+    """
+    proposal = path.with_suffix(".layout.toml")
+    refuse_existing(proposal, force=replace)
+    guess = guess_layout(log)
+    for line in guess.lines:
+        note(line)
+    with atomic_write(proposal, force=replace) as temporary:
+        temporary.write_text(guess.text, encoding="utf-8")
+    if guess.missing:
+        raise DataError(
+            f"{log}: not found: {'; '.join(guess.missing)}. Fill it into {proposal}, then use --layout {proposal}."
+        )
+    try:
+        imported = import_log(log, guess.layout)
+    except DataError as error:
+        raise DataError(f"{error} (The proposed layout is in {proposal}.)") from error
+    facts = {"layout_file": str(proposal), "layout": tomllib.loads(guess.text), "reasons": list(guess.lines)}
+    return imported, facts
+
+
+def _tell(path: Path, imported: Imported, more: dict[str, Any], as_json: bool) -> None:
+    recording = imported.recording
     missed = int((recording.outputs != recording.outputs).any(axis=1).sum())
     facts = {
         "recording": str(path),
@@ -35,12 +78,15 @@ def command(log: Path, layout_file: Path, output: Path | None, force: bool, as_j
         "sample_time_s": recording.sample_time,
         "missed_samples": missed,
         "notes": list(imported.notes),
+        **more,
     }
     if as_json:
         print_json(facts)
         return
     for remark in imported.notes:
         note(remark)
+    if more:
+        note(f"the proposed layout is in {more['layout_file']}; edit it and use --layout if anything is wrong")
     click.echo(
         f"{path}: {len(recording)} rows in {facts['runs']} run(s) at {1e3 * recording.sample_time:g} ms, "
         f"{missed} with a missed sample"

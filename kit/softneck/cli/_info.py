@@ -10,34 +10,53 @@ from typing import Any
 import click
 import fmpy
 
-from softneck.core import FileFormatError, file_hash, load, read_archive
+from softneck.core import FileFormatError, SettingsError, file_hash, load, read_archive, refuse_existing
 from softneck.plant import NeckParameters, VirtualNeck
-from softneck.signals import read_layout, read_recording
+from softneck.signals import quality, read_layout, read_recording
 
-from ._console import print_json
-from ._options import json_option
+from ._console import print_json, progress
+from ._options import force_option, json_option
+
+_RECORDINGS = (".csv", ".parquet")
+# Reading and checking a smaller file takes well under 2 s.
+_LARGE = 20_000_000
 
 
-@click.command("info", epilog="Example: softneck info build/demo/models/rls.npz")
+@click.command("info", epilog="Example: softneck info eq22.csv --html quality.html")
 @click.argument("file", type=click.Path(path_type=Path))
+@click.option("--html", type=click.Path(path_type=Path), metavar="FILE", help="Page on a recording's quality.")
+@force_option
 @json_option
-def command(file: Path, as_json: bool) -> None:
-    """Say what FILE is: a recording, model, observer, controller, FMU, loop, layout, neck or certificate."""
+def command(file: Path, html: Path | None, force: bool, as_json: bool) -> None:
+    """Say what FILE is: a recording, model, observer, controller, FMU, loop, layout, neck or certificate.
+
+    Of a recording it tells the quality too: faults of its channels, and what its inputs can teach a model.
+    """
     if not file.is_file():
         raise FileFormatError(f"{file}: no such file.")
-    facts = {"file": str(file), **_describe(file), "sha256": file_hash(file)}
+    if html is not None:
+        if file.suffix.lower() not in _RECORDINGS:
+            raise SettingsError(f"{file}: `--html` shows the quality of a recording (`.csv`, `.parquet`) only.")
+        refuse_existing(html, force=force)
+    described = _describe(file, html, force=force, quiet=as_json)
+    found = described.pop("quality", None)
+    facts = {"file": str(file), **described, "sha256": file_hash(file)}
     if as_json:
-        print_json(facts)
+        print_json(facts if found is None else {**facts, "quality": found.as_dict()})
         return
     for key, value in facts.items():
         text = "\n  ".join(str(value).splitlines()) if isinstance(value, str) else value
         click.echo(f"{key}: {text}")
+    if found is not None:
+        click.echo("\nquality:")
+        for line in found.lines():
+            click.echo(f"  {line}" if line else "")
 
 
-def _describe(file: Path) -> dict[str, Any]:
+def _describe(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dict[str, Any]:
     match file.suffix.lower():
         case ".csv" | ".parquet":
-            return _recording(file)
+            return _recording(file, html, force=force, quiet=quiet)
         case ".npz":
             header, _ = read_archive(file)
             thing = load(file)
@@ -52,8 +71,19 @@ def _describe(file: Path) -> dict[str, Any]:
             raise FileFormatError(f"{file}: softneck has no files with the ending `{file.suffix}`.")
 
 
-def _recording(file: Path) -> dict[str, Any]:
-    recording = read_recording(file)
+def _recording(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dict[str, Any]:
+    """Return what a recording holds and its quality, and write the page."""
+    quick = html is None and file.stat().st_size < _LARGE
+    with progress("info", quiet=quiet or quick) as report:
+        report(0.0, "reading")
+        recording = read_recording(file)
+        report(0.6, "checking")
+        found = quality(recording)
+        if html is not None:
+            from softneck.plots import quality_page, write_page  # matplotlib takes a while to import
+
+            report(0.8, "drawing")
+            write_page(html, quality_page(recording, found, f"Quality of {file.name}"), force=force)
     return {
         "type": "recording",
         "rows": len(recording),
@@ -61,6 +91,8 @@ def _recording(file: Path) -> dict[str, Any]:
         "duration_s": len(recording) * recording.sample_time,
         "sample_time_s": recording.sample_time,
         "channels": ", ".join(recording.channels),
+        **({} if html is None else {"html": str(html)}),
+        "quality": found,
     }
 
 

@@ -49,7 +49,7 @@ def apply_settings(settings_class: type, assignments: Sequence[str], **more: Any
         key, separator, text = assignment.partition("=")
         if not separator:
             raise SettingsError(f"--set takes KEY=VALUE; got `{assignment}`.")
-        name, value = _in_radians(key.strip(), _value(text.strip()), fields)
+        name, value = in_radians(key.strip(), value_of(text.strip()), fields)
         values[name] = value
     values |= {key: value for key, value in more.items() if value is not None and key in fields}
     unknown = sorted(set(values) - fields)
@@ -61,7 +61,7 @@ def apply_settings(settings_class: type, assignments: Sequence[str], **more: Any
         raise SettingsError(f"a setting has a value of the wrong type ({error}).") from error
 
 
-def _in_radians(key: str, value: Any, fields: set[str]) -> tuple[str, Any]:
+def in_radians(key: str, value: Any, fields: set[str]) -> tuple[str, Any]:
     """Return `key` and `value`; an angle may be given as `key_deg` in degrees."""
     angle = key.removesuffix("_deg")
     if key in fields or angle not in fields or isinstance(value, bool) or not isinstance(value, int | float):
@@ -69,7 +69,7 @@ def _in_radians(key: str, value: Any, fields: set[str]) -> tuple[str, Any]:
     return angle, math.radians(value)
 
 
-def _value(text: str) -> Any:
+def value_of(text: str) -> Any:
     """Read a value as TOML does (number, true, [list]); anything else is a string."""
     try:
         return tomllib.loads(f"value = {text}")["value"]

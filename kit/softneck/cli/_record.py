@@ -8,7 +8,7 @@ import click
 
 from softneck.core import refuse_existing, require_between
 from softneck.plant import VirtualNeck, record
-from softneck.signals import recording_suffix, signal, signal_names, write_recording
+from softneck.signals import Limits, prepare, recording_suffix, signal, signal_names, write_recording
 
 from ._console import print_json, progress
 from ._neck import load_neck
@@ -27,6 +27,10 @@ from ._options import force_option, json_option, output_option
 @click.option("--seed", type=click.IntRange(0, 2**31 - 2), default=0, show_default=True, help="Of noise and signal.")
 @click.option("--payload", type=float, default=0.0, show_default=True, metavar="KG", help="On the platform.")
 @click.option("--no-noise", is_flag=True, help="A perfect inclinometer.")
+@click.option("--ramp", type=float, default=0.0, metavar="S", help="Ramp in from rest and out to it. [default: none]")
+@click.option("--max-position", type=float, metavar="RAD", help="Clip set-points to +-RAD. [default: the signal's own]")
+@click.option("--max-speed", type=float, metavar="RAD/S", help="Slow set-points down to it. [default: none]")
+@click.option("--max-slack", type=float, metavar="RAD", help="Pay out no more than RAD below rest. [default: none]")
 @force_option
 @json_option
 def command(
@@ -37,6 +41,10 @@ def command(
     seed: int,
     payload: float,
     no_noise: bool,
+    ramp: float,
+    max_position: float | None,
+    max_speed: float | None,
+    max_slack: float | None,
     force: bool,
     as_json: bool,
 ) -> None:
@@ -44,11 +52,16 @@ def command(
     recording_suffix(output)
     refuse_existing(output, force=force)
     require_between("--payload", payload, 0.0, 1.0, "kg")
-    excitation = signal(signal_name, duration=duration, seed=seed)
+    bounds = {"position": max_position, "speed": max_speed, "slack": max_slack}
+    limits = Limits(**{name: value for name, value in bounds.items() if value is not None})
+    excitation, changes = prepare(signal(signal_name, duration=duration, seed=seed), limits, ramp_s=ramp)
     with progress("record", quiet=as_json):
         recording = record(excitation, VirtualNeck(load_neck(neck)), seed=seed, payload=payload, noise=not no_noise)
     write_recording(output, recording, force=force)
     if as_json:
-        print_json({"recording": str(output), "rows": len(recording), "sample_time_s": recording.sample_time})
+        facts = {"recording": str(output), "rows": len(recording), "sample_time_s": recording.sample_time}
+        print_json({**facts, "signal": signal_name, "changes": changes.as_dict()})
         return
     click.echo(f"{output}: {len(recording)} rows of {signal_name} at {1e3 * recording.sample_time:g} ms")
+    if ramp > 0 or limits != Limits():
+        click.echo(f"set-points: {changes}")

@@ -9,7 +9,7 @@ import click
 
 from softneck.core import CheckFailedError, atomic_write, refuse_existing
 from softneck.cosim import Result, load_loop, simulate
-from softneck.plots import Section, Table, loop_figure, page, write_page
+from softneck.plots import Section, Table, loop_chart, page, write_page
 from softneck.signals import recording_suffix, write_recording
 
 from ._console import print_json, print_table, progress
@@ -74,6 +74,6 @@ def _limits(result: Result) -> tuple[list[str], list[list[str]]]:
 
 def _page(name: str, result: Result) -> str:
     tables = [Table("Limits", *_limits(result)), Table("Metrics", *_metrics(result))]
-    figure = loop_figure(result.signals.time, result.signals.signals, name)
+    chart = loop_chart(result.signals.time, result.signals.signals, name)
     words = f"Order {result.order}, {result.real_time_factor:.0f} times real time."
-    return page(f"Loop {name}", [Section("Result", text=[words], tables=tables, figures=[(name, figure)])])
+    return page(f"Loop {name}", [Section("Result", text=[words], tables=tables, charts=[chart])])

@@ -5,18 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
+import numpy as np
 
-from softneck.core import SettingsError, refuse_existing
-from softneck.identification import INFINITE, Validation, load_model, validate
-from softneck.plots import Section, Table, page, validation_figure, write_page
-from softneck.signals import read_recording
+from softneck.core import DataError, SettingsError, refuse_existing
+from softneck.identification import INFINITE, Rules, Validation, compare, load_model
+from softneck.plots import write_page
+from softneck.signals import Recording, concatenate, read_recording
 
-from ._console import percent, print_json, print_table, progress
+from ._console import print_json, print_table, progress
 from ._options import force_option, json_option
+from ._validate_table import fit_table, remarks
 
 _NOTE = (
     "Fit is 100 (1 - |y - yhat| / |y - mean y|) in %. Persistence repeats the last sample; a one-step fit that is not "
-    "above it says nothing. The free run (inf) is what an FMU of the plant does."
+    "above it says nothing. The free run (inf) is what an FMU of the plant does. Best linear is fitted on the judged "
+    "rows: no linear model of the set-points has a better free run on them."
 )
 
 
@@ -35,6 +38,12 @@ _NOTE = (
     help="Free run from set-points alone, or with logged motor positions as the paper does.",
 )
 @click.option("--include-training", is_flag=True, help="Score rows that the model was trained on as well.")
+@click.option(
+    "--training",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    help="What the models were trained on, to say how novel the data is.",
+)
 @click.option("--html", type=click.Path(path_type=Path), help="Write a page with plots.")
 @force_option
 @json_option
@@ -44,6 +53,7 @@ def command(
     horizon: str,
     motors: str,
     include_training: bool,
+    training: tuple[Path, ...],
     html: Path | None,
     force: bool,
     as_json: bool,
@@ -52,33 +62,32 @@ def command(
     horizons = _horizons(horizon)
     if html is not None:
         refuse_existing(html, force=force)
-    loaded = [(path, load_model(path)) for path in models]
-    recordings = [(path, read_recording(path)) for path in data]
-    results: list[Validation] = []
+    loaded = {str(path): load_model(path) for path in models}
+    recordings = {str(path): _measured(path) for path in data}
+    rules = Rules(horizons, motors, include_training)
+    known = concatenate([read_recording(path) for path in training]) if training else None
     with progress("validate", quiet=as_json) as report:
-        for model_path, model in loaded:
-            for data_path, recording in recordings:
-                report(len(results) / (len(loaded) * len(recordings)), f"{model_path.name} on {data_path.name}")
-                results.append(
-                    validate(
-                        model,
-                        recording,
-                        names=(str(model_path), str(data_path)),
-                        horizons=horizons,
-                        motors=motors,
-                        include_training=include_training,
-                    )
-                )
+        comparison = compare(loaded, recordings, rules=rules, training=known, progress=report)
+    results = list(comparison.validations)
     if html is not None:
-        write_page(html, _page(results, horizons), force=force)
+        write_page(html, _page(results), force=force)
     if as_json:
-        print_json({"models": [result.as_dict() for result in results]})
+        print_json(comparison.as_dict())
         return
-    print_table("Fit [%], pitch/roll", *_table(results, horizons))
+    print_table("Fit in %, errors in deg, pitch/roll", *fit_table(results))
     for result in results:
-        if result.diverged is not None:
-            click.echo(f"the free run of {result.model} on {result.data} diverged at {result.diverged:.2f} s")
+        for line in remarks(result):
+            click.echo(line)
     click.echo(_NOTE)
+
+
+def _measured(path: Path) -> Recording:
+    """Read a recording whose outputs were both measured."""
+    recording = read_recording(path)
+    for axis, name in enumerate(("pitch", "roll")):
+        if not np.isfinite(recording.outputs[:, axis]).any():
+            raise DataError(f"{path}: `{name}` holds no measured sample; nothing can be judged by it.")
+    return recording
 
 
 def _horizons(text: str) -> tuple[int | str, ...]:
@@ -93,34 +102,7 @@ def _horizons(text: str) -> tuple[int | str, ...]:
     return tuple(dict.fromkeys(horizons))
 
 
-def _table(results: list[Validation], horizons: tuple[int | str, ...]) -> tuple[list[str], list[list[str]]]:
-    finite = [str(h) for h in horizons if h != INFINITE]
-    head = [
-        "model on data",
-        "rows",
-        "left out",
-        *(f"persistence {h}" for h in finite),
-        *(f"model {h}" for h in horizons),
-    ]
-    rows = []
-    for r in results:
-        row = [f"{Path(r.model).stem} on {Path(r.data).stem}", str(r.rows_scored), str(r.rows_left_out)]
-        row += [f"{percent(r.persistence[h]['pitch'])}/{percent(r.persistence[h]['roll'])}" for h in finite]
-        row += [f"{percent(r.fits[str(h)]['pitch'])}/{percent(r.fits[str(h)]['roll'])}" for h in horizons]
-        rows.append(row)
-    return head, rows
+def _page(results: list[Validation]) -> str:
+    from softneck.report import validation_page  # it draws in all of the project, which the table does not need
 
-
-def _page(results: list[Validation], horizons: tuple[int | str, ...]) -> str:
-    sections = [Section("Fits", text=[_NOTE], tables=[Table("Fit [%], pitch/roll", *_table(results, horizons))])]
-    for r in results:
-        title = f"{Path(r.model).stem} on {Path(r.data).stem}"
-        curves = {"one step": r.one_step, "free run": r.free_run}
-        figure = validation_figure(r.time, r.measured, curves, title)
-        diverged = "" if r.diverged is None else f" The free run diverged at {r.diverged:.2f} s."
-        words = (
-            f"One-step residuals: {'white' if r.white else 'not white'}, "
-            f"{'un' if r.uncorrelated else ''}correlated with the inputs (99 %).{diverged}"
-        )
-        sections.append(Section(title, text=[words], figures=[(title, figure)]))
-    return page("Validation", sections)
+    return validation_page(results)

@@ -142,3 +142,8 @@ class Chart:
         """Return the x label of a panel: its own, or the chart's where nothing is below it."""
         own = self.panels[number].x_label
         return own or (self.x_label if number + self.columns >= len(self.panels) else "")
+
+
+def bar_width(x: Vector) -> float:
+    """Return the width of bars at `x` that touch."""
+    return float(np.min(np.diff(np.sort(x)))) if x.size > 1 else 1.0

@@ -91,7 +91,7 @@ def _range_for(measured: Vector, curves: list[Curve]) -> tuple[float, float] | N
     return (low - 0.5 * room, high + 0.5 * room) if far > max(abs(low), abs(high)) + 2.0 * room else None
 
 
-def loop_chart(time: Vector, signals: Mapping[str, Vector], title: str) -> Chart:
+def loop_chart(time: Vector, signals: Mapping[str, Vector], title: str, *, caption: str = "") -> Chart:
     """Describe a closed loop: reference, true, measured and estimated angles, motors, tensions where there are any.
 
     Args:
@@ -99,6 +99,7 @@ def loop_chart(time: Vector, signals: Mapping[str, Vector], title: str) -> Chart
         signals: name -> (time,): pitch, roll (with _reference, _measured, _estimate), motor_setpoint_1..3,
             motor_position_1..3 [rad], tension_1..3 [N].
         title: of the chart.
+        caption: for under the chart.
     """
     panels = [_angle_panel(time, signals, axis) for axis in AXES]
     motors = []
@@ -110,7 +111,7 @@ def loop_chart(time: Vector, signals: Mapping[str, Vector], title: str) -> Chart
     if "tension_1" in signals:
         pulls = [Curve(time, signals[f"tension_{j}"], f"tendon {j}", MOTOR_COLOURS[j - 1]) for j in (1, 2, 3)]
         panels.append(Panel(pulls, "tension [N]"))
-    return Chart(title, panels)
+    return Chart(title, panels, caption=caption)
 
 
 def _angle_panel(time: Vector, signals: Mapping[str, Vector], axis: str) -> Panel:
@@ -123,7 +124,7 @@ def _angle_panel(time: Vector, signals: Mapping[str, Vector], axis: str) -> Pane
     return Panel(curves, f"{axis} [deg]")
 
 
-def delay_chart(curves: Mapping[str, list[list[float]]], title: str) -> Chart:
+def delay_chart(curves: Mapping[str, list[list[float]]], title: str, *, caption: str = "") -> Chart:
     """Describe the cost curve of the dead time: rows of (delay [s], free-run fit [%], one-step rms [rad])."""
     tables = {name: np.array(rows) for name, rows in curves.items()}
     fits, errors = [], []
@@ -133,7 +134,8 @@ def delay_chart(curves: Mapping[str, list[list[float]]], title: str) -> Chart:
     best = max(float(table[:, 1].max()) for table in tables.values())
     # What lies far below the best is no candidate.
     fit = Panel(fits, "free-run fit [%]", y_range=(best - 12.0, best + 1.0))
-    return Chart(title, [fit, Panel(errors, "one-step rms [deg]", legend=False)], "dead time [ms]", row_height=1.9)
+    panels = [fit, Panel(errors, "one-step rms [deg]", legend=False)]
+    return Chart(title, panels, "dead time [ms]", caption=caption, row_height=1.9)
 
 
 def _borders(line: Timeline) -> tuple[Level, ...]:

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from softneck.core import Matrix, Vector
 
 from ._charts import delay_chart, loop_chart, recording_chart, validation_chart
+from ._judgement_charts import cost_chart, histogram_chart, residual_chart
 from ._matplotlib import chart_figure
 
 
@@ -41,3 +42,22 @@ def loop_figure(time: Vector, signals: Mapping[str, Vector], title: str) -> Figu
 def delay_figure(curves: Mapping[str, list[list[float]]], title: str) -> Figure:
     """Draw `delay_chart`: the cost curve of the dead time."""
     return chart_figure(delay_chart(curves, title))
+
+
+def residual_figure(
+    autocorrelation: tuple[np.ndarray, Matrix, Vector], cross_correlation: tuple[np.ndarray, Matrix, Matrix], title: str
+) -> Figure:
+    """Draw `residual_chart`: correlation of one-step errors with themselves and with the set-points, with bounds."""
+    return chart_figure(residual_chart(autocorrelation, cross_correlation, title))
+
+
+def histogram_figure(errors: Matrix, title: str) -> Figure:
+    """Draw `histogram_chart`: how errors (time, 2) [rad] are spread, in degrees, beside a normal curve."""
+    return chart_figure(histogram_chart(errors, title))
+
+
+def cost_figure(
+    values: Vector, costs: Mapping[str, Vector], labels: tuple[str, str], title: str, *, chosen: float | None = None
+) -> Figure:
+    """Draw `cost_chart`: the cost curve of a search."""
+    return chart_figure(cost_chart(values, costs, labels, title, chosen=chosen))

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from ._chart import Chart, Curve, Panel
+from ._chart import Chart, Curve, Panel, bar_width
 
 _DASHES = {"dashed": "--", "dotted": ":"}
 
@@ -61,7 +60,7 @@ def _draw_curve(ax: Axes, curve: Curve) -> None:
             # A band is light, for the curves on it to be seen.
             ax.fill_between(x, y, curve.upper_edge, color=colour, alpha=0.25, lw=0, label=name)
         case "bars":
-            ax.bar(x, y, width=_pitch(x), color=colour, alpha=0.6, label=name)
+            ax.bar(x, y, width=bar_width(x), color=colour, alpha=0.6, label=name)
         case "stems":
             ax.vlines(x, 0.0, y, color=colour, lw=2.0 * curve.width, label=name)
         case "points":
@@ -72,8 +71,3 @@ def _draw_curve(ax: Axes, curve: Curve) -> None:
             ax.step(x, y, where="post", color=colour, lw=curve.width, label=name)
         case _:
             ax.plot(x, y, ls=_DASHES.get(curve.style, "-"), color=colour, lw=curve.width, label=name)
-
-
-def _pitch(x: np.ndarray) -> float:
-    """Return the width of bars at `x` that touch."""
-    return float(np.min(np.diff(np.sort(x)))) if x.size > 1 else 1.0

@@ -9,15 +9,22 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import jinja2
+from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from softneck.core import atomic_write
+
+from ._chart import Chart
+from ._interactive import draw, library
 
 _TEMPLATE = """<!doctype html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; script-src 'unsafe-inline';
+ style-src 'unsafe-inline'; img-src data: blob:">
+<link rel="icon" href="data:,">
 <title>{{ title }}</title>
 <style>
 :root { color-scheme: light dark; --ink: #1c2530; --paper: #fbfbf9; --line: #d5d9de; --good: #00734f; --bad: #b3400a; }
@@ -36,11 +43,15 @@ th.text, td.text { text-align: left; }
 caption { text-align: left; font-weight: 600; padding: .3rem 0; }
 td.holds { color: var(--good); font-weight: 600; } td.fails { color: var(--bad); font-weight: 600; }
 figure { margin: 1rem 0; } figure img { width: 100%; background: #fff; border-radius: 4px; display: block; }
-figcaption { font-size: .9rem; } footer { margin-top: 3rem; font-size: .85rem; border-top: 1px solid var(--line); }
+figcaption { font-size: .9rem; } .chart { background: #fff; border-radius: 4px; padding: .2rem; }
+figure h3 { font-size: 1rem; margin: .4rem 0; } .hint { font-size: .85rem; opacity: .8; }
+footer { margin-top: 3rem; font-size: .85rem; border-top: 1px solid var(--line); }
 </style>
 </head>
 <body>
 <h1>{{ title }}</h1>
+{% if library %}<p class="hint">Plots: drag to zoom, Ctrl and wheel to zoom along x, click a name to hide its
+curves; the tools beside a plot move and reset it, and save it as a picture.</p>{% endif %}
 <nav>{% for section in sections %}<a href="#s{{ loop.index }}">{{ section.title }}</a>{% endfor %}</nav>
 {% for section in sections %}
 <section id="s{{ loop.index }}">
@@ -54,6 +65,14 @@ figcaption { font-size: .9rem; } footer { margin-top: 3rem; font-size: .85rem; b
 {%- elif loop.index <= table.text %} class="text"{% endif %}>{{ cell }}</td>{% endfor %}</tr>{% endfor %}
 </tbody></table></div>
 {% endfor %}
+{% for chart in section.charts %}
+<figure><h3>{{ chart.title }}</h3>
+<div class="chart" id="{{ chart.id }}" role="img" aria-label="{{ chart.title }}"
+ style="min-height: {{ chart.height }}px">
+<noscript>This plot is drawn by JavaScript, which is switched off here.</noscript></div>
+{% if chart.caption %}<figcaption>{{ chart.caption }}</figcaption>{% endif %}</figure>
+<script type="application/json" id="{{ chart.id }}-data">{{ chart.data }}</script>
+{% endfor %}
 {% for figure in section.figures %}
 <figure><img alt="{{ figure.caption }}" src="data:image/png;base64,{{ figure.data }}">
 <figcaption>{{ figure.caption }}</figcaption></figure>
@@ -61,6 +80,9 @@ figcaption { font-size: .9rem; } footer { margin-top: 3rem; font-size: .85rem; b
 </section>
 {% endfor %}
 <footer>{{ footer }}</footer>
+{% if library %}
+<script id="library">{{ library }}</script>
+{% endif %}
 </body>
 </html>
 """
@@ -85,12 +107,13 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """One part of a page: paragraphs, then tables, then figures with captions."""
+    """One part of a page: paragraphs, then tables, then interactive charts, then figures with captions."""
 
     title: str
     text: Sequence[str] = ()
     tables: Sequence[Table] = ()
     figures: Sequence[tuple[str, Figure]] = field(default=())
+    charts: Sequence[Chart] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,19 +122,39 @@ class _Picture:
     data: str
 
 
+@dataclass(frozen=True, slots=True)
+class _Plot:
+    id: str
+    title: str
+    caption: str
+    data: Markup
+    height: int
+
+
 def page(title: str, sections: Sequence[Section], *, footer: str = "") -> str:
-    """Return the HTML text of a page; all text is escaped, figures are inside."""
+    """Return the HTML text of a page; all text is escaped, figures, charts and what draws them are inside.
+
+    The page forbids itself every request, by its content security policy.
+    """
     template = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(_TEMPLATE)
     parts = [
         {
             "title": section.title,
             "text": section.text,
             "tables": section.tables,
+            "charts": [_plot(f"c{number}-{k}", chart) for k, chart in enumerate(section.charts, start=1)],
             "figures": [_Picture(caption, figure_png(figure)) for caption, figure in section.figures],
         }
-        for section in sections
+        for number, section in enumerate(sections, start=1)
     ]
-    return template.render(title=title, sections=parts, footer=footer)
+    script = Markup(library()) if any(section.charts for section in sections) else ""
+    return template.render(title=title, sections=parts, footer=footer, library=script)
+
+
+def _plot(name: str, chart: Chart) -> _Plot:
+    drawn = draw(chart)
+    # Its JSON holds no `<`.
+    return _Plot(name, chart.title, chart.caption, Markup(drawn.data), drawn.height)
 
 
 def write_page(path: str | Path, html: str, *, force: bool = False) -> None:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from softneck.cosim import Result
 from softneck.identification import INFINITE, Model
-from softneck.plots import Section, Table, delay_figure, loop_figure, recording_figure, validation_figure
+from softneck.plots import Chart, Section, Table, delay_chart, loop_chart, recording_chart, validation_chart
 from softneck.signals import Recording
 
 from ._closing import Designed
@@ -66,21 +65,18 @@ def _overview(
 
 def _experiment_section(experiments: Experiments) -> Section:
     recordings = {"identification": experiments.identification, **experiments.judged}
-    pictures = [(_TITLES[name], _picture(recording, name)) for name, recording in recordings.items()]
-    return Section("Experiment", figures=pictures)
+    return Section("Experiment", charts=[_chart(recording, _TITLES[name]) for name, recording in recordings.items()])
 
 
-def _picture(recording: Recording, name: str) -> Figure:
-    return recording_figure(recording.time, recording.set_points, recording.outputs, name)
+def _chart(recording: Recording, title: str) -> Chart:
+    return recording_chart(recording.time, recording.set_points, recording.outputs, title, run=recording.run)
 
 
 def _model_section(models: Mapping[str, Model]) -> Section:
     rows = [[name, line] for name, model in models.items() for line in model.summary().splitlines()[1:]]
-    curve = delay_figure(models["rls"].findings["delay_curve"], "Dead time of the linear model")
     caption = "The dead time's cost: a flat curve says that hysteresis lag hides in the pole."
-    return Section(
-        "Models", tables=[Table("What was identified", ["model", "finding"], rows, text=2)], figures=[(caption, curve)]
-    )
+    curve = delay_chart(models["rls"].findings["delay_curve"], "Dead time of the linear model", caption=caption)
+    return Section("Models", tables=[Table("What was identified", ["model", "finding"], rows, text=2)], charts=[curve])
 
 
 def _validation_section(data: str, judged: Mapping[tuple[str, str], Judged], models: Mapping[str, Model]) -> Section:
@@ -89,11 +85,11 @@ def _validation_section(data: str, judged: Mapping[tuple[str, str], Judged], mod
     free = {name: r.free_run if r.fits[INFINITE]["pitch"] is not None else np.full_like(r.free_run, np.nan)
             for name, r in results.items()}  # fmt: skip
     one = {name: r.one_step for name, r in results.items()}
-    figures = [
-        ("Free run from set-points alone", validation_figure(first.time, first.measured, free, f"{data}: free run")),
-        ("One step ahead", validation_figure(first.time, first.measured, one, f"{data}: one step ahead")),
+    charts = [
+        validation_chart(first.time, first.measured, free, "Free run from set-points alone"),
+        validation_chart(first.time, first.measured, one, "One step ahead"),
     ]
-    return Section(f"Models on {data}", figures=figures)
+    return Section(f"Models on {data}", charts=charts)
 
 
 def _design_section(designed: Designed) -> Section:
@@ -106,6 +102,6 @@ def _design_section(designed: Designed) -> Section:
 
 
 def _loop_section(name: str, result: Result) -> Section:
-    figure = loop_figure(result.signals.time, result.signals.signals, name)
     caption = "Plant, observer and controller are FMUs in fmpy; the plant is the virtual neck with its inclinometer."
-    return Section(f"Loop {name}", figures=[(caption, figure)])
+    chart = loop_chart(result.signals.time, result.signals.signals, name, caption=caption)
+    return Section(f"Loop {name}", charts=[chart])

@@ -54,8 +54,13 @@ def record_experiments(neck: NeckParameters, *, duration: float, tell: Tell) -> 
 
 
 def identify(recording: Recording, *, iterations: int, seed: int, tell: Tell) -> dict[str, Model]:
-    """Identify the paper's three models from one recording."""
-    estimators = {"rls": Rls(), "nlsm": SetMembership(), "nn": Network(iterations=iterations, seed=seed)}
+    """Identify the paper's three models from one recording, and set membership's feed-forward form beside its own."""
+    estimators = {
+        "rls": Rls(),
+        "nlsm": SetMembership(form="paper_eq21"),
+        "nlsm_residual": SetMembership(form="residual"),
+        "nn": Network(iterations=iterations, seed=seed),
+    }
     return {name: estimator.fit(recording, progress=tell(f"identify {name}")) for name, estimator in estimators.items()}
 
 

@@ -29,3 +29,5 @@ FREE_RUN_MEASURED: dict[tuple[str, str], Pair] = {
     ("nn", "sine"): (13.5, 60.0),
     ("nn", "rotation"): (58.0, 87.5),
 }
+# Eq. 31: K [deg/(rad s)], pole [1/s], dead time [s].
+LINEAR: dict[str, tuple[float, float, float]] = {"pitch": (27.691, 5.293, 0.08), "roll": (25.424, 4.938, 0.08)}

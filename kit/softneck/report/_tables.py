@@ -23,7 +23,9 @@ FIT_NOTE = (
     "Fit 100 (1 - |y - yhat| / |y - mean y|) in %, pitch/roll. Persistence repeats the last sample: a one-step fit "
     "that is not above it says nothing. The free run has the set-points alone; that is what an FMU of the plant does. "
     "The paper's SM and NN figures of Tables 3 and 4 are one step ahead, its RLS figures free runs; its section 7.4 is "
-    "free run with measured motors. The paper's plant is the real neck, ours the virtual one."
+    "free run with measured motors. The paper's plant is the real neck, ours the virtual one. nlsm is set membership "
+    "over the paper's Eq. 21; nlsm_residual, which the paper does not have, is set membership on what the free run of "
+    "rls leaves over: nothing is fed back, so it cannot drift."
 )
 
 

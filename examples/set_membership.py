@@ -1,0 +1,133 @@
+"""Set membership in pictures: cones, bounds far from the data, the gamma curve, a drifting plant.
+
+Run `python examples/set_membership.py [FOLDER]`; the pictures go to `build/set_membership` (those of the docs are
+`docs/_static`).
+"""
+
+import sys
+from pathlib import Path
+
+import matplotlib as mpl
+
+mpl.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+from softneck.identification import Cones, OnlineCones, gamma_curve
+
+# The same file from the same numbers, so that a change of a picture shows a change of the method.
+mpl.rcParams["svg.hashsalt"] = "softneck"
+
+
+def truth(x: np.ndarray) -> np.ndarray:
+    """A curve with slopes up to 1.5."""
+    return np.sin(1.5 * x)
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write one picture, without the date."""
+    figure.savefig(path, metadata={"Date": None})
+    plt.close(figure)
+
+
+def cones_figure(path: Path) -> None:
+    """Five samples, their cones, and what they leave."""
+    X, x = np.array([0.4, 1.3, 2.2, 3.4, 4.1]), np.linspace(0, 4.5, 451)
+    y, gamma, epsilon = truth(X) + np.array([0.05, -0.08, 0.02, 0.09, -0.04]), 1.5, 0.1
+    low, high = Cones(gamma=gamma, epsilon=epsilon).fit(X[:, None], y).bounds(x[:, None])
+    figure, ax = plt.subplots(layout="constrained", figsize=(7, 3.6))
+    for w, value in zip(X, y, strict=True):
+        for sign in (1, -1):
+            ax.plot(x, value + sign * (epsilon + gamma * np.abs(x - w)), color="0.8", linewidth=0.8)
+    ax.fill_between(x, low, high, color="tab:blue", alpha=0.15, label="between f_l and f_u")
+    ax.plot(x, 0.5 * (low + high), color="tab:blue", label="estimate, their middle")
+    ax.plot(x, truth(x), "k--", linewidth=1, label="the unknown function")
+    ax.errorbar(X, y, epsilon, fmt="ko", capsize=3, label="samples, +- epsilon")
+    ax.set(xlabel="regressor", ylabel="output", ylim=(-2.2, 2.4))
+    ax.legend(loc="upper right", ncols=2, fontsize="small")
+    save(figure, path)
+
+
+def bounds_figure(path: Path) -> None:
+    """Bounds where the data are dense, sparse and absent, and where `outside` raises its flag."""
+    rng = np.random.default_rng(1)
+    X = np.concatenate([rng.uniform(0, 2, 120), rng.uniform(2, 3, 8), rng.uniform(4, 4.5, 30)])
+    y = truth(X) + rng.uniform(-0.05, 0.05, X.size)
+    fitted, x = Cones(epsilon=0.1).fit(X[:, None], y), np.linspace(-0.7, 5.2, 600)
+    low, high = fitted.bounds(x[:, None])
+    figure, ax = plt.subplots(layout="constrained", figsize=(7, 3.6))
+    ax.fill_between(x, low, high, color="tab:blue", alpha=0.2, label="between f_l and f_u")
+    outside = fitted.outside(x[:, None])
+    ax.fill_between(
+        x, -2.2, 2.2, where=outside, color="tab:red", alpha=0.12, linewidth=0, label="outside what was seen"
+    )
+    ax.plot(x, 0.5 * (low + high), color="tab:blue", label="estimate")
+    ax.plot(x, truth(x), "k--", linewidth=1, label="the unknown function")
+    ax.plot(X, y, "k.", markersize=3)
+    ax.set(xlabel="regressor", ylabel="output", ylim=(-2.2, 2.2))
+    ax.legend(loc="lower left", fontsize="small")
+    save(figure, path)
+
+
+def gamma_figure(path: Path) -> None:
+    """gamma*(epsilon) by both rules, and the pair at the knee."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-2, 2, (2, 2000))
+    sigma = 0.01
+    values = np.sin(points[0]) + 0.5 * points[1] + sigma * rng.standard_normal(2000)
+    figure, ax = plt.subplots(layout="constrained", figsize=(7, 3.6))
+    for rule, name in (
+        ("paper", "the paper's: s = epsilon"),
+        ("milanese_novara", "Milanese and Novara's: s = 2 epsilon"),
+    ):
+        curve = gamma_curve(points, values, rule=rule)
+        (line,) = ax.loglog(curve.epsilon, curve.gamma, label=name)
+        gamma, epsilon = curve.recommended
+        ax.plot(epsilon, gamma, "o", color=line.get_color())
+    ax.axvline(sigma, color="0.6", linewidth=0.8)
+    ax.text(sigma, ax.get_ylim()[1], " sigma of the noise", va="top", color="0.4")
+    ax.axhline(np.sqrt(1.25), color="0.6", linewidth=0.8)
+    ax.text(2e-3, np.sqrt(1.25), "slope of the function", va="top", color="0.4")
+    ax.set(xlabel="epsilon", ylabel="least gamma")
+    ax.legend(loc="upper right", fontsize="small")
+    save(figure, path)
+
+
+def drift_figure(path: Path) -> None:
+    """One step ahead of a plant whose gain falls: a frozen set, and one that learns and forgets."""
+    rng = np.random.default_rng(2)
+    u = np.repeat(rng.uniform(-1, 1, 300), 10)
+    gain = np.interp(np.arange(u.size), [500, 2500], [1.0, 0.5])
+    y = np.zeros(u.size + 1)
+    for k in range(u.size):
+        y[k + 1] = 0.6 * y[k] + gain[k] * u[k] + 1e-3 * rng.uniform(-1, 1)
+    X, target = np.column_stack([y[:-1], u]), y[1:]
+    online = OnlineCones(epsilon=0.01, capacity=400)
+    online.add(X[:500], target[:500])
+    frozen = Cones(epsilon=0.01).fit(X[:500], target[:500]).predict(X[500:])
+    followed = online.track(X[500:], target[500:]).estimate
+    figure, ax = plt.subplots(layout="constrained", figsize=(7, 3.2))
+    for name, estimate in (("frozen after 500 rows", frozen), ("online, the last 400 rows", followed)):
+        error = np.sqrt(np.convolve((estimate - target[500:]) ** 2, np.full(100, 0.01), mode="valid"))
+        ax.plot(np.arange(error.size) + 600, error, label=name)
+    ax.set(xlabel="row", ylabel="rms error of 100 rows")
+    ax.legend()
+    save(figure, path)
+
+
+def main(folder: Path) -> None:
+    """Draw all of them."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, draw in (
+        ("cones", cones_figure),
+        ("bounds", bounds_figure),
+        ("gamma", gamma_figure),
+        ("drift", drift_figure),
+    ):
+        draw(folder / f"set_membership_{name}.svg")
+    print(f"set_membership_cones.svg, _bounds, _gamma and _drift are in {folder}")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "build/set_membership"))

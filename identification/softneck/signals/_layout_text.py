@@ -1,0 +1,112 @@
+"""A layout as TOML text, with a remark on each line: what `softneck import --guess` writes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+
+from softneck.core import SettingsError
+
+from ._layout import Layout, Source
+
+
+def layout_toml(layout: Layout, *, remarks: Mapping[str, str] | None = None, open_ends: Sequence[str] = ()) -> str:
+    """Return the TOML text of which `parse_layout` makes `layout` again.
+
+    Args:
+        layout: to write.
+        remarks: channel (or `time`, `file`, `inclination`, `orientation`) -> why; becomes a comment.
+        open_ends: lines that become comments at the end: what is still to be filled in.
+
+    Raises:
+        SettingsError: the time column is a sum of columns or has a sign, which a file cannot say.
+    """
+    why = remarks or {}
+    blocks = [_file(layout, why), _time(layout, why)]
+    simple = {name: source for name, source in layout.channels.items() if len(source.terms) == 1}
+    # An empty table is written too: it tells a layout from other TOML files.
+    lines = ["[channels]"]
+    for name, source in simple.items():
+        lines += [*_comment(why.get(name)), f"{name} = {_inline(source)}"]
+    blocks.append(lines)
+    for name, source in layout.channels.items():
+        if name not in simple:
+            blocks.append([*_comment(why.get(name)), f"[channels.{name}]", *_sum(source)])
+    if layout.inclination is not None and layout.orientation is not None:
+        tilt = ["[tilt]"]
+        for name, source in (("inclination", layout.inclination), ("orientation", layout.orientation)):
+            tilt += [*_comment(why.get(name)), f"{name} = {_inline(source)}"]
+        blocks.append(tilt)
+    blocks.append([line for end in open_ends for line in _comment(end)])
+    return "\n\n".join("\n".join(block) for block in blocks if block) + "\n"
+
+
+def _file(layout: Layout, why: Mapping[str, str]) -> list[str]:
+    plain = Layout(channels={})
+    lines = [f"variable = {_text(layout.variable)}"] if layout.variable is not None else []
+    if layout.skip:
+        lines.append(f"skip = {layout.skip}")
+    if layout.header != plain.header:
+        lines.append("header = false")
+    if layout.delimiter != plain.delimiter:
+        lines.append(f"delimiter = {_text(layout.delimiter)}")
+    if layout.decimal != plain.decimal:
+        lines.append(f"decimal = {_text(layout.decimal)}")
+    if layout.rows is not None:
+        lines.append(f"rows = [{layout.rows[0]}, {layout.rows[1]}]")
+    return ["[file]", *_comment(why.get("file")), *lines] if lines else []
+
+
+def _time(layout: Layout, why: Mapping[str, str]) -> list[str]:
+    lines = _comment(why.get("time"))
+    if layout.time is not None:
+        if len(layout.time.terms) != 1 or layout.time.sign != 1.0:
+            raise SettingsError("the time of a layout is one column without a sign; use its factor.")
+        term = layout.time.terms[0]
+        lines += [f"column = {_text(term.column)}", f"unit = {_text(layout.time.unit)}"]
+        lines += [f"factor = {term.factor!r}"] if term.factor != 1.0 else []
+    lines += _comment(why.get("sample_time"))
+    if layout.estimate:
+        lines.append('sample_time_s = "estimate"')
+    elif layout.sample_time is not None:
+        lines.append(f"sample_time_s = {layout.sample_time!r}")
+    lines += ["new_run_at_restart = true"] if layout.new_run_at_restart else []
+    lines += [f"duplicates = {_text(layout.duplicates)}"] if layout.duplicates is not None else []
+    lines += [f"run_column = {_text(layout.run)}"] if layout.run is not None else []
+    return ["[time]", *lines] if lines else []
+
+
+def _inline(source: Source) -> str:
+    if len(source.terms) != 1:
+        return "{ " + ", ".join(_sum(source)) + " }"
+    term = source.terms[0]
+    parts = [f"column = {_text(term.column)}", f"unit = {_text(source.unit)}"]
+    parts += [f"factor = {term.factor!r}"] if term.factor != 1.0 else []
+    parts += [f"sign = {_number(source.sign)}"] if source.sign != 1.0 else []
+    return "{ " + ", ".join(parts) + " }"
+
+
+def _sum(source: Source) -> list[str]:
+    terms = ", ".join(f"{{ column = {_text(t.column)}, factor = {t.factor!r} }}" for t in source.terms)
+    return [f"unit = {_text(source.unit)}", f"terms = [{terms}]"] + (
+        [f"sign = {_number(source.sign)}"] if source.sign != 1.0 else []
+    )
+
+
+def _number(value: float) -> str:
+    return str(int(value)) if value in (1.0, -1.0) else repr(value)
+
+
+def _text(value: str | int) -> str:
+    """Return a string as TOML writes it, or a whole number."""
+    if isinstance(value, int):
+        return str(value)
+    # JSON leaves DEL as it is, TOML does not.
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _comment(text: str | None) -> list[str]:
+    """Return comment lines; control characters, which a comment may not hold, become blanks."""
+    if not text:
+        return []
+    return ["# " + "".join(c if c.isprintable() else " " for c in line) for line in text.splitlines()]

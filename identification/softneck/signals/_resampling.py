@@ -1,0 +1,154 @@
+"""Logged samples at irregular times become equidistant ones; gaps split a run and are never bridged."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+from softneck.core import DataError, Vector
+
+from ._channels import is_held
+
+# A step of 1.5 usual ones: at least one sample is not there.
+_GAP = 1.5
+# Lags of 2 to 4 and a delay of as much again: a shorter piece gives a model not one row to learn from.
+SHORTEST = 10
+# An instant that is this close to a logged one, in sample times, is that one: rounding of sums of steps.
+_SAME = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Samples:
+    """Channels at logged times, run by run.
+
+    Attributes:
+        time: (time,) [s].
+        run: (time,) numbers of the runs.
+        channels: name -> (time,).
+    """
+
+    time: Vector
+    run: np.ndarray
+    channels: Mapping[str, Vector]
+
+    def rows(self, keep: np.ndarray) -> Samples:
+        """Return the rows that `keep` (time,) marks."""
+        return Samples(self.time[keep], self.run[keep], {name: c[keep] for name, c in self.channels.items()})
+
+    def runs(self) -> list[slice]:
+        """Return the rows of each run."""
+        edges = [0, *(np.flatnonzero(np.diff(self.run)) + 1).tolist(), self.time.size]
+        return [slice(start, stop) for start, stop in itertools.pairwise(edges)]
+
+
+def without_duplicates(samples: Samples, rule: str | None) -> tuple[Samples, tuple[str, ...]]:
+    """Return one row for each time stamp of a run, by the layout's rule `first` or `last`, and a note.
+
+    Raises:
+        DataError: a stamp stands twice and there is no rule.
+    """
+    same = (np.diff(samples.time) == 0) & (np.diff(samples.run) == 0)
+    if not same.any():
+        return samples, ()
+    row = int(np.argmax(same)) + 1
+    if rule is None:
+        raise DataError(
+            f"`time` stands still at row {row}: {samples.time[row]:g} s stands there twice ({same.sum()} such row(s)); "
+            'mend the log, or write `duplicates = "first"` (or "last") into [time] of the layout to keep one of each.'
+        )
+    keep = np.append(True, ~same) if rule == "first" else np.append(~same, True)
+    note = f"{same.sum()} row(s) left out: their time stamp stands twice, the first time at row {row}"
+    return samples.rows(keep), (note,)
+
+
+def split_at_gaps(samples: Samples) -> tuple[Samples, tuple[str, ...]]:
+    """Return the samples with a new run after each gap, and notes; pieces shorter than 10 samples are dropped.
+
+    Raises:
+        DataError: no piece is long enough.
+    """
+    step = np.diff(samples.time)
+    inside = np.diff(samples.run) == 0
+    if not (inside & (step > 0)).any():
+        return samples, ()
+    typical = float(np.median(step[inside & (step > 0)]))
+    gap = inside & (step > _GAP * typical)
+    if not gap.any():
+        return samples, ()
+    number = np.concatenate([[0], np.cumsum(gap | ~inside)])
+    size = np.bincount(number)
+    # Only pieces that a gap cut off are judged: a short experiment is the user's.
+    cut = np.zeros(size.size, dtype=bool)
+    cut[number[:-1][gap]] = True
+    cut[number[1:][gap]] = True
+    dropped = cut & (size < SHORTEST)
+    row = int(np.argmax(gap)) + 1
+    notes = [
+        f"{gap.sum()} gap(s) in the time column, the longest {step[gap].max():.4g} s, the first at row {row} "
+        f"(t = {samples.time[row]:g} s): each starts a new run"
+    ]
+    if dropped.any():
+        lost = size[dropped].sum()
+        notes.append(f"{dropped.sum()} piece(s) between gaps, {lost} rows, dropped: shorter than {SHORTEST} samples")
+    kept = Samples(samples.time, number, samples.channels).rows(~dropped[number])
+    if kept.time.size == 0:
+        raise DataError(
+            f"`time` has {gap.sum()} gaps (steps beyond {_GAP} x {typical:.4g} s) and no {SHORTEST} samples in a row "
+            "between them; is the unit of the time column right, and is it the clock of these samples?"
+        )
+    return Samples(kept.time, np.unique(kept.run, return_inverse=True)[1], kept.channels), tuple(notes)
+
+
+def mean_step(samples: Samples) -> float:
+    """Return the mean step inside the runs [s], to ten digits: jitter averages out."""
+    step = np.diff(samples.time)[np.diff(samples.run) == 0]
+    return float(f"{step.mean():.10g}")
+
+
+def resample(samples: Samples, sample_time: float) -> tuple[Samples, float]:
+    """Return the samples at multiples of `sample_time` [s] from each run's first, and the largest shift [s].
+
+    Measured channels follow a monotone cubic (PCHIP, Fritsch and Carlson 1980) through the samples that were not
+    missed; an instant next to a missed sample is missed. Set-points and flags keep the last value before an instant.
+    The shift is the distance from an instant to the nearest logged sample.
+    """
+    parts: list[Samples] = []
+    shift = 0.0
+    for rows in samples.runs():
+        t = samples.time[rows]
+        count = int(np.floor((t[-1] - t[0]) / sample_time + _SAME)) + 1
+        grid = t[0] + sample_time * np.arange(count)
+        before = np.clip(np.searchsorted(t, grid + _SAME * sample_time, side="right") - 1, 0, t.size - 1)
+        after = np.minimum(before + (np.abs(grid - t[before]) > _SAME * sample_time), t.size - 1)
+        shift = max(shift, float(np.minimum(np.abs(grid - t[before]), np.abs(t[after] - grid)).max()))
+        channels = {
+            name: c[rows][before] if is_held(name) else _measured(t, c[rows], grid, before, after)
+            for name, c in samples.channels.items()
+        }
+        parts.append(Samples(grid, np.full(count, samples.run[rows.start]), channels))
+    names = tuple(samples.channels)
+    joined = {name: np.concatenate([part.channels[name] for part in parts]) for name in names}
+    time, run = (np.concatenate([getattr(part, what) for part in parts]) for what in ("time", "run"))
+    return Samples(time, run, joined), shift
+
+
+def _measured(t: Vector, x: Vector, grid: Vector, before: np.ndarray, after: np.ndarray) -> Vector:
+    """Return x (time,) at `grid` (instants,) between its samples `before` and `after`."""
+    seen = np.isfinite(x)
+    missed = ~(seen[before] & seen[after])
+    values = x[before]
+    # Two points make a line; fewer leave nothing between samples.
+    if seen.sum() > 1:
+        try:
+            values = PchipInterpolator(t[seen], x[seen])(grid)
+        except ValueError as error:  # slopes between damaged numbers are not finite
+            largest = float(np.abs(x[seen]).max())
+            raise DataError(
+                f"a channel reaches {largest:.3g} within {np.ptp(t):.3g} s and cannot be resampled; is the log damaged?"
+            ) from error
+    values = np.where(before == after, x[before], values)
+    return np.where(missed, np.nan, values)

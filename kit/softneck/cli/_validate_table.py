@@ -1,0 +1,77 @@
+"""The terminal's table of `softneck validate`: one line for each model, recording and horizon, in 120 columns."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from softneck.identification import Validation
+
+from ._console import percent
+
+Head = list[str]
+Cells = list[list[str]]
+# What is left of 120 columns beside the numbers.
+_NAME = 18
+
+
+def fit_table(results: Sequence[Validation]) -> tuple[Head, Cells]:
+    """Return the fits [%] of pitch and roll beside what they must be compared with."""
+    head = ["model on data", "horizon", "persist.", "best linear", "model", "95 % interval", "rms deg", "worst"]
+    cells: Cells = []
+    for r in results:
+        name = _short(f"{Path(r.model).stem} on {Path(r.data).stem}")
+        for horizon, fits in r.fits.items():
+            cells.append(
+                [
+                    name,
+                    "free run" if horizon == "inf" else horizon,
+                    _pair(r.persistence.get(horizon, {}).values()),
+                    _pair(r.best_linear[horizon].values()),
+                    _pair(fits.values()),
+                    "  ".join(_interval(interval) for interval in r.intervals[horizon].values()),
+                    _pair(r.rmse_deg[horizon].values(), digits=2),
+                    _pair(r.worst_deg[horizon].values(), digits=1),
+                ]
+            )
+            name = ""
+    return head, cells
+
+
+def remarks(r: Validation) -> list[str]:
+    """Return the lines below the table on one model and recording."""
+    who = f"{Path(r.model).stem} on {Path(r.data).stem}"
+    lines = [f"{who}: {r.rows_scored} rows judged, {r.rows_left_out} left out as the model was trained on them"]
+    lost = [entry for entry in r.per_run if entry["diverged"] is not None]
+    lines += [f"{who}: the free run of run {e['run']} diverged at {e['diverged']:.2f} s" for e in lost]
+    if any(fit is not None for fit in r.noise_ceiling.values()):
+        lines.append(f"{who}: repeats allow a perfect model {_pair(r.noise_ceiling.values())} % (noise ceiling)")
+    p_values = "/".join("<0.001" if p < 1e-3 else f"{p:.3f}" for p in r.residual_tests.p_value)
+    lines.append(
+        f"{who}: one-step errors are {'' if r.white else 'not '}white (p {p_values}) and "
+        f"{'do not follow' if r.uncorrelated else 'follow'} the inputs (99 %)"
+    )
+    if r.coverage_pct is not None and r.mean_width_deg is not None and not lost:
+        lines.append(
+            f"{who}: free-run bounds hold {_pair(r.coverage_pct.values())} % of the samples, "
+            f"{_pair(r.mean_width_deg.values())} deg wide"
+        )
+    if r.novelty is not None:
+        p50, p90, p99, most = (f"{value:.1f}" for value in r.novelty.ratio.max(axis=0))
+        lines.append(
+            f"{who}: novelty {p50} (median), {p90} (90 %), {p99} (99 %), {most} (largest) times the training's spacing"
+        )
+    return lines
+
+
+def _pair(values: Iterable[float | None], *, digits: int = 1) -> str:
+    words = ["-" if value is None else percent(value) if digits == 1 else f"{value:.{digits}f}" for value in values]
+    return "/".join(words) if words else ""
+
+
+def _interval(interval: Sequence[float] | None) -> str:
+    return "-" if interval is None else f"{interval[0]:.1f}..{interval[1]:.1f}"
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= _NAME else name[: _NAME - 1] + "…"

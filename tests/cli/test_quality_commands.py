@@ -1,0 +1,65 @@
+"""`softneck info` tells a recording's quality, and `softneck record` keeps to limits."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from softneck.signals import read_recording, signal, write_recording
+
+from ..data import neck_recording
+from .conftest import Call
+
+
+def test_info_tells_the_quality_as_text_json_and_page(call: Call, tmp_path: Path) -> None:
+    recording = neck_recording(600)
+    pitch = recording.channels["pitch"].copy()
+    pitch[100:120] = np.nan
+    write_recording("r.csv", recording.with_channels(pitch=pitch))
+    text = call("info", "r.csv")
+    assert (text.code, text.err) == (0, "")
+    assert "rows: 600" in text.out
+    assert "  warning: pitch: misses 20 of 600 samples (3.3 %) in 1 stretch(es); the longest is 0.40 s at" in text.out
+    page = call("info", "r.csv", "--html", "q.html", "--json")
+    told = json.loads(page.out)
+    assert told["html"] == "q.html"
+    assert told["quality"]["severity"] == "warning"
+    assert told["quality"]["channels"]["pitch"]["missed"] == [{"start_row": 100, "rows": 20, "time_s": 2.0, "run": 0}]
+    assert "misses 20 of 600" in (tmp_path / "q.html").read_text()
+    assert "exists already" in call("info", "r.csv", "--html", "q.html").error
+    assert call("info", "r.csv", "--html", "q.html", "--force").code == 0
+
+
+def test_a_page_of_anything_but_a_recording_is_refused(call: Call, rls_file: Path, tmp_path: Path) -> None:
+    said = call("info", rls_file, "--html", "q.html")
+    assert said.code == 2
+    assert "`--html` shows the quality of a recording" in said.error
+    assert not (tmp_path / "q.html").exists()
+
+
+def test_record_keeps_to_limits_and_says_what_it_changed(call: Call) -> None:
+    bounds = ("--ramp", 1, "--max-position", 2, "--max-speed", 3, "--max-slack", 1)
+    said = call("record", "eq22", "-o", "r.csv", "--duration", 6, *bounds, "--json")
+    changes = json.loads(said.out)["changes"]
+    P = read_recording("r.csv").set_points
+    # Files hold 17 digits.
+    assert (P.max(), P.min()) == (2.0, -1.0)
+    assert np.abs(np.diff(P, axis=0)).max() <= 3 * 0.02 + 1e-12
+    assert not P[[0, -1]].any()
+    assert all(changes[name] > 0 for name in ("position_clipped_pct", "slack_clipped_pct", "rate_limited_pct"))
+    assert changes["ramped_pct"] > 30
+    assert "% clipped in slack" in call("record", "eq22", "-o", "s.csv", "--duration", 6, *bounds).out
+
+
+def test_record_plays_the_frozen_signal_by_default(call: Call) -> None:
+    said = call("record", "eq22", "-o", "r.csv", "--duration", 2)
+    assert said.out == "r.csv: 100 rows of eq22 at 20 ms\n"
+    np.testing.assert_array_equal(read_recording("r.csv").set_points, signal("eq22", duration=2.0).set_points)
+
+
+def test_a_wrong_limit_is_one_line(call: Call, tmp_path: Path) -> None:
+    said = call("record", "eq22", "-o", "r.csv", "--max-speed", 0)
+    assert (said.code, said.error) == (2, "softneck: `speed` must be positive [rad/s]; got 0.")
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,173 @@
+"""One block of every kind, the variables that the public face names for it, and inputs to run it with."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import cache
+
+import control
+import numpy as np
+
+from softneck.core import Block
+from softneck.design import PiSettings
+from softneck.estimation import KalmanSettings, LinearNeck
+from softneck.identification import (
+    GreyBox,
+    Network,
+    OutputError,
+    Play,
+    Residual,
+    Rls,
+    SetMembership,
+    Srivc,
+    Subspace,
+    combine,
+)
+from softneck.plant import NeckParameters, VirtualNeck
+from softneck.signals import Recording, redefine, signal
+
+TS = 0.02
+ROWS = 400
+MOTORS = [f"motor_setpoint_{j}" for j in (1, 2, 3)]
+_MODEL = ("pitch_start", "roll_start", "use_measurement", "noise_std", "noise_seed")
+
+
+@cache
+def recording() -> Recording:
+    """Eq. 22 through two slow poles with a ripple: something to identify."""
+    P = signal("eq22").set_points[: 2 * ROWS]
+    drive = redefine(P)
+    y = np.zeros((2 * ROWS, 2))
+    for k in range(2 * ROWS - 1):
+        y[k + 1] = 0.9 * y[k] + 0.01 * drive[k, :2] + 1e-3 * math.sin(k)
+    channels = {name: P[:, j] for j, name in enumerate(MOTORS)} | {"pitch": y[:, 0], "roll": y[:, 1]}
+    return Recording(np.arange(2 * ROWS) * TS, TS, channels)
+
+
+def _linear() -> LinearNeck:
+    pole = math.exp(-5.293 * TS)  # Eq. 31
+    tf = control.TransferFunction([0.09 * (1.0 - pole)], [1.0, -pole, 0.0, 0.0], TS)
+    return LinearNeck(pitch=tf, roll=tf)
+
+
+def _rls() -> Block:
+    return Rls().fit(recording()).block()
+
+
+def _miso() -> Block:
+    return Rls(structure="miso", nb=2, max_delay=0.1).fit(recording()).block()
+
+
+def _oe() -> Block:
+    return OutputError(max_delay=0.1).fit(recording()).block()
+
+
+def _srivc() -> Block:
+    return Srivc(order=2, resamples=0, max_delay=0.1).fit(recording()).block()
+
+
+def _subspace() -> Block:
+    return Subspace(delay=0.0).fit(recording()).block()
+
+
+def _nlsm() -> Block:
+    return SetMembership().fit(recording()).block()
+
+
+def _residual() -> Block:
+    return SetMembership(form="residual").fit(recording()).block()
+
+
+def _play() -> Block:
+    return Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording()).block()
+
+
+def _greybox() -> Block:
+    return GreyBox(evaluations=3, sensor_delay=2).fit(recording()).block()
+
+
+def _any() -> Block:
+    return Residual(base="rls").fit(recording()).block()
+
+
+def _ensemble() -> Block:
+    play = Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording())
+    return combine([play, Rls().fit(recording())]).block()
+
+
+def _nn() -> Block:
+    return Network(hidden=(5, 5), iterations=3).fit(recording()).block()
+
+
+def _neck() -> Block:
+    return VirtualNeck(NeckParameters.paper()).block(noise_seed=3)
+
+
+def _kalman() -> Block:
+    return KalmanSettings().design(_linear()).block()
+
+
+def _pi() -> Block:
+    return PiSettings().design(_linear()).block()
+
+
+# Kind -> its block, inputs, outputs and parameters that the public face names for it.
+KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...]]] = {
+    "rls": (_rls, MOTORS, ["pitch", "roll", "motor_position_1"], _MODEL),
+    "miso": (_miso, MOTORS, ["pitch", "roll", "motor_position_2"], _MODEL),
+    "oe": (_oe, MOTORS, ["pitch", "roll", "motor_position_1"], _MODEL),
+    "srivc": (_srivc, MOTORS, ["pitch", "roll", "motor_position_2"], _MODEL),
+    "subspace": (_subspace, MOTORS, ["pitch", "roll", "motor_position_3"], _MODEL),
+    "nlsm": (_nlsm, MOTORS, ["pitch", "roll", "pitch_lower", "pitch_upper", "roll_lower", "roll_upper"], _MODEL),
+    "residual": (_residual, MOTORS, ["pitch", "pitch_lower", "roll_upper", "motor_position_2"], _MODEL),
+    "play": (_play, MOTORS, ["pitch", "roll", "motor_position_3"], _MODEL),
+    "greybox": (_greybox, MOTORS, ["pitch", "roll", "motor_position_1"], _MODEL),
+    "any": (_any, MOTORS, ["pitch", "roll", "pitch_lower", "pitch_upper", "roll_lower", "roll_upper"], _MODEL),
+    "ensemble": (
+        _ensemble,
+        MOTORS,
+        ["pitch", "roll", "pitch_lower", "pitch_upper", "roll_lower", "roll_upper"],
+        _MODEL,
+    ),
+    "nn": (_nn, MOTORS, ["pitch", "roll", "motor_position_3"], _MODEL),
+    "neck": (
+        _neck,
+        [*MOTORS, "payload", "push_x", "push_y", "base_tilt_pitch", "base_tilt_roll"],
+        ["pitch", "pitch_measured", "roll_rate_measured", "measurement_valid", "tension_2", "compression"],
+        ("noise_seed",),
+    ),
+    "kalman": (
+        _kalman,
+        [*MOTORS, "pitch_measured", "roll_measured", "measurement_valid"],
+        ["pitch", "roll", "pitch_rate", "roll_rate", "innovation", "healthy"],
+        (),
+    ),
+    "pi": (
+        _pi,
+        ["pitch_reference", "roll_reference", "cocontraction_reference", "pitch", "roll", "healthy", "enabled"],
+        MOTORS,
+        (),
+    ),
+}
+
+
+@cache
+def block_of(kind: str) -> Block:
+    return KINDS[kind][0]()
+
+
+def inputs_of(block: Block, rows: int, *, missing: bool = True) -> np.ndarray:
+    """Return small random inputs (rows, n_in); Booleans mostly true, some measurements missing."""
+    rng = np.random.default_rng(11)
+    u = 0.2 * rng.standard_normal((rows, len(block.inputs)))
+    for i, port in enumerate(block.inputs):
+        if port.name.startswith("motor_setpoint"):
+            u[:, i] = 5.0 * u[:, i].cumsum() / math.sqrt(rows)
+        if port.boolean:
+            u[:, i] = rng.random(rows) > 0.05
+        elif port.missing and missing:
+            u[rng.random(rows) > 0.8, i] = np.nan
+        if port.minimum is not None and port.maximum is not None:
+            u[:, i] = np.clip(u[:, i], port.minimum, port.maximum)
+    return u

@@ -1,0 +1,79 @@
+"""Charts of residual tests, histograms and searches show the numbers that they were given."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from softneck.core import DataError
+from softneck.plots import cost_chart, cost_figure, histogram_chart, histogram_figure, residual_chart, residual_figure
+
+LAGS, CROSS_LAGS = np.arange(26), np.arange(-25, 26)
+
+
+def _tests() -> tuple[tuple, tuple]:
+    rng = np.random.default_rng(0)
+    own = 0.02 * rng.standard_normal((2, 26))
+    own[:, 0] = 1.0
+    own[0, 3] = 0.2
+    return (LAGS, own, np.full(2, 0.1)), (CROSS_LAGS, 0.02 * rng.standard_normal((2, 3, 51)), np.full((2, 3), 0.15))
+
+
+def test_bars_beyond_their_bound_stand_out_and_lag_zero_is_no_news() -> None:
+    own, cross = _tests()
+    chart = residual_chart(own, cross, "r")
+    assert len(chart.panels) == 8
+    within, outside = chart.panels[0].curves
+    assert 0.0 not in within.x
+    np.testing.assert_array_equal(np.flatnonzero(np.isfinite(outside.y)), [2])  # lag 3
+    np.testing.assert_array_equal(np.where(np.isfinite(within.y), within.y, outside.y), own[1][0, 1:])
+    assert {level.value for level in chart.panels[0].levels} == {0.0, 0.1, -0.1}
+    assert np.isnan(chart.panels[7].curves[1].y).all()
+    for panel in chart.panels:
+        # Bounds are seen even where no bar comes near them.
+        assert panel.y_range is not None
+        assert panel.y_range[1] > max(level.value for level in panel.levels)
+    assert len(residual_figure(own, cross, "r").axes) == 8
+
+
+def test_too_few_rows_for_a_test_still_make_a_chart() -> None:
+    own, cross = _tests()
+    nothing = residual_chart((own[0], own[1] * np.nan, own[2] * np.nan), (cross[0], cross[1], cross[2] * np.nan), "r")
+    assert len(nothing.panels[0].levels) == 1
+    with pytest.raises(DataError, match="residual tests need correlations"):
+        residual_chart((own[0][:3], own[1], own[2]), cross, "r")
+
+
+def test_a_histogram_is_a_density_beside_the_normal_curve_of_its_moments() -> None:
+    rng = np.random.default_rng(0)
+    errors = np.radians(rng.standard_normal((20_000, 2)) * [0.5, 2.0] + [0.1, 0.0])
+    errors[:25] = np.nan
+    chart = histogram_chart(errors, "h")
+    for panel in chart.panels:
+        bars, normal = panel.curves
+        width = np.diff(bars.x)[0]
+        assert bars.y.sum() * width == pytest.approx(1.0, abs=1e-12)
+        assert np.trapezoid(normal.y, normal.x) == pytest.approx(1.0, abs=1e-2)
+        # About 600 of 20,000 samples in the fullest bin are known to 4 %; 3 of these.
+        np.testing.assert_allclose(bars.y, np.interp(bars.x, normal.x, normal.y), atol=0.12 * normal.y.max())
+    assert len(histogram_figure(errors, "h").axes) == 2
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_equal_errors_make_a_histogram_and_none_do_not(value: float) -> None:
+    chart = histogram_chart(np.full((50, 2), value), "h")
+    assert np.isfinite(chart.panels[0].curves[0].y).all()
+    with pytest.raises(DataError, match="no error of pitch"):
+        histogram_chart(np.full((50, 2), np.nan), "h")
+
+
+def test_a_search_keeps_its_whole_cost_curve() -> None:
+    lags = np.arange(1.0, 6.0)
+    costs = {f"order {n}": 80.0 + n * lags for n in (1, 2)}
+    chart = cost_chart(lags, costs, ("lag [samples]", "free-run fit [%]"), "search", chosen=3.0)
+    (panel,) = chart.panels
+    assert [curve.label for curve in panel.curves] == list(costs)
+    for curve, cost in zip(panel.curves, costs.values(), strict=True):
+        np.testing.assert_array_equal(curve.y, cost)
+    assert [level.value for level in panel.levels] == [3.0]
+    assert len(cost_figure(lags, costs, ("lag [samples]", "free-run fit [%]"), "search").axes) == 1

@@ -1,0 +1,215 @@
+"""What the report says of inputs: equal to other ways of computing it, and right on the neck and on real logs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from softneck.core import SettingsError
+from softneck.plant import NeckParameters, VirtualNeck, record
+from softneck.signals import (
+    SET_POINTS,
+    Recording,
+    concatenate,
+    import_log,
+    motors_from,
+    quality,
+    read_layout,
+    redefine,
+    signal,
+)
+
+from ..data import LAYOUTS, neck_recording, recording_from
+
+TS = 0.02
+
+
+def from_inputs(inputs: np.ndarray) -> Recording:
+    """The tests' neck under theta_i, phi_i, delta_i (time, 3)."""
+    return recording_from(motors_from(inputs), noise=1e-3)
+
+
+def topics(recording: Recording, severity: str) -> set[str]:
+    return {finding.topic for finding in quality(recording).findings if finding.severity == severity}
+
+
+@pytest.mark.parametrize("preset", ["paper", "lab"])
+@pytest.mark.parametrize("name", ["eq22", "mixed", "aprbs", "multisine"])
+def test_a_clean_recording_of_the_virtual_neck_gives_no_warning(preset: str, name: str) -> None:
+    neck = VirtualNeck(NeckParameters.preset(preset))
+    assert topics(record(signal(name, duration=60.0, seed=2), neck, seed=3), "warning") == set()
+
+
+@pytest.mark.parametrize("name", ["steps", "sine", "rotation"])
+@pytest.mark.parametrize("noise", [True, False], ids=["noise", "no noise"])
+def test_the_papers_tests_have_no_faulty_channels(name: str, noise: bool) -> None:
+    recording = record(signal(name), VirtualNeck(NeckParameters.preset("paper")), noise=noise)
+    faults = {"dropouts", "frozen", "clipping", "outliers", "quantisation"}
+    assert not faults & (topics(recording, "warning") | topics(recording, "note"))
+
+
+def test_parseval_the_density_integrates_to_the_variance() -> None:
+    recording = recording_from(signal("multisine", duration=200.0).set_points)
+    found = quality(recording).spectrum
+    variance = redefine(recording.set_points).var(axis=0)
+    # Welch's windows weigh the samples of one record unevenly: 10 % at 9 segments.
+    np.testing.assert_allclose(found.density.sum(axis=0) * found.omega[1], variance, rtol=0.1)
+
+
+@given(omega=st.floats(0.6, 60.0))
+def test_a_sine_has_its_power_where_it_is(omega: float) -> None:
+    t = np.arange(3000) * TS
+    found = quality(from_inputs(2.0 * np.sin(omega * t)[:, None] * [1.0, 0.5, 0.1])).spectrum
+    line = found.omega[1]
+    # Hann's main lobe is two lines to either side; 1 % of the mean up to 4 rad/s lies within it and one side lobe.
+    if omega < 4.0 - 3 * line:
+        np.testing.assert_allclose(found.highest, omega, atol=4 * line)
+        assert found.below_bandwidth.min() > 0.999
+    elif omega > 4.0 + 3 * line:
+        assert found.below_bandwidth.max() < 0.001
+    # sqrt(2) for whole periods; a record that ends within one is off by a part of 1 / periods.
+    np.testing.assert_allclose(found.crest, np.sqrt(2), rtol=0.2)
+
+
+def test_slow_excitation_is_a_warning_and_its_frequency_is_named() -> None:
+    t = np.arange(6000) * TS
+    slow = np.column_stack([3 * np.sin(0.5 * t), 3 * np.sin(0.37 * t), np.sin(0.3 * t)])
+    said = [f for f in quality(from_inputs(slow)).findings if f.topic == "excitation"]
+    assert [(f.severity, f.channel) for f in said] == [("warning", "theta_i"), ("warning", "phi_i")]
+    assert "real power up to 0." in said[0].message
+
+
+def test_the_condition_is_that_of_the_paper_regressor_written_out() -> None:
+    recording = neck_recording(800, seed=4)
+    y, u, M = recording.channels["pitch"], recording.set_points, recording.motor_positions
+    k = np.arange(3, 800)
+    lags = [u[k - lag, j] for j in range(3) for lag in (2, 3)]
+    X = np.column_stack([y[k - 1], *lags, M[k - 3]])
+    R = np.corrcoef(X.T)
+    found = quality(recording).conditioning["pitch"]
+    # The correlation matrix squares the condition: 1e-16 * cond^2 (1e4) leaves 1e-10.
+    assert found.number == pytest.approx(np.sqrt(np.linalg.cond(R)), rel=1e-6)
+    assert found.columns[:3] == ("y(k-1)", "u1(k-2)", "u1(k-3)")
+    assert (len(found.columns), found.rows) == (10, 797)
+
+
+def test_motors_with_one_sum_make_the_regressor_singular() -> None:
+    t = np.arange(3000) * TS
+    inputs = np.column_stack([3 * np.sin(1.3 * t) + np.sin(3.7 * t), 3 * np.cos(1.9 * t) + np.sin(4.3 * t), 0 * t])
+    recording = from_inputs(inputs)
+    assert quality(recording).conditioning["pitch"].number == np.inf
+    assert "regressors" in topics(recording, "warning")
+    assert "co-contraction" in topics(recording, "note")
+
+
+def test_a_motor_that_never_moves_is_named() -> None:
+    P = signal("multisine", duration=40.0).set_points.copy()
+    P[:, 2] = 0.5
+    found = quality(recording_from(P, noise=1e-3))
+    assert found.conditioning["roll"].weakest == ("u3(k-2)", "u3(k-3)")
+    assert np.isnan(found.correlation[2]).all()
+    said = [f for f in found.findings if f.channel == SET_POINTS[2]]
+    assert [f.message for f in said if f.severity == "warning"] == ["never leaves 0.5 rad."]
+
+
+def test_the_correlation_is_numpys_and_two_motors_as_one_are_a_warning() -> None:
+    P = signal("aprbs", duration=60.0).set_points.copy()
+    np.testing.assert_allclose(quality(recording_from(P)).correlation, np.corrcoef(P.T), atol=1e-12)
+    P[:, 1] = -P[:, 0]
+    found = quality(recording_from(P))
+    assert found.correlation[0, 1] == pytest.approx(-1.0, abs=1e-12)
+    assert "correlation" in topics(recording_from(P), "warning")
+
+
+def test_each_behaviour_is_seen_when_it_happens_and_missed_when_not() -> None:
+    rest = np.zeros((200, 3))
+    for j in range(3):
+        alone = rest.copy()
+        alone[100:] = 3.0 * np.eye(3)[j]
+        found = quality(recording_from(alone)).region.behaviours
+        expected = {f"tendon {i + 1} alone": (2.0 if i == j else 0.0) for i in range(3)}
+        # 100 samples of 20 ms.
+        assert {name: found[name] for name in expected} == pytest.approx(expected)
+        assert found["co-contraction"] == 0.0
+    together = rest + 2.0
+    assert quality(recording_from(together)).region.behaviours["co-contraction"] == pytest.approx(4.0)
+    assert quality(recording_from(together)).region.behaviours["holding still"] == pytest.approx(4.0)
+
+
+def test_the_papers_signal_misses_what_the_paper_says_and_mixed_does_not() -> None:
+    neck = VirtualNeck(NeckParameters.preset("paper"))
+    missing = ("tendon 1 alone", "tendon 2 alone", "tendon 3 alone", "co-contraction", "holding still")
+    assert quality(record(signal("eq22"), neck)).region.never == missing
+    assert quality(record(signal("mixed"), neck)).region.never == ()
+
+
+def test_coverage_is_whole_where_the_motors_went_everywhere() -> None:
+    # A grid of motor positions a third of a cell apart reaches every cell of the hexagon.
+    axis = np.arange(-2.0, 2.01, 1 / 6)
+    P = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    region = quality(recording_from(P), motor_limit=2.0).region
+    assert region.tilt_coverage == 1.0
+    assert region.delta_coverage == 1.0
+    corner = quality(recording_from(np.zeros((50, 3))), motor_limit=2.0).region
+    assert 0.0 < corner.tilt_coverage < 0.1
+
+
+def test_runs_with_the_same_set_points_show_the_noise() -> None:
+    P = signal("aprbs", duration=30.0).set_points
+    pair = [recording_from(P, noise=2e-3, seed=seed) for seed in (1, 2)]
+    found = quality(concatenate([*pair, neck_recording(1500)])).repeats
+    assert [repeat.runs for repeat in found] == [(0, 1)]
+    # The standard deviation of 1,500 samples scatters by 1.8 %.
+    np.testing.assert_allclose(found[0].rms, 2e-3, rtol=0.08)
+
+
+def test_nothing_reaches_across_runs() -> None:
+    """Runs in another order have the same spectrum, condition, correlation and region."""
+    parts = [recording_from(signal("multisine", duration=30.0, seed=s).set_points, noise=1e-3) for s in (1, 2, 3)]
+    one, other = quality(concatenate(parts)), quality(concatenate(parts[::-1]))
+    # Sums in another order: rounding.
+    np.testing.assert_allclose(one.spectrum.density, other.spectrum.density, rtol=1e-9, atol=1e-15)
+    assert one.conditioning["roll"].number == pytest.approx(other.conditioning["roll"].number, rel=1e-9)
+    np.testing.assert_allclose(one.correlation, other.correlation, atol=1e-12)
+    assert one.region.behaviours == pytest.approx(other.region.behaviours)
+
+
+@given(
+    rows=st.integers(1, 40), runs=st.integers(1, 4),
+    scale=st.sampled_from([0.0, 1e-12, 1.0]), missing=st.floats(0.0, 1.0),
+)  # fmt: skip
+def test_any_recording_has_a_report(rows: int, runs: int, scale: float, missing: float) -> None:
+    rng = np.random.default_rng(rows)
+    y = scale * rng.uniform(-1, 1, (2, rows))
+    y[rng.uniform(size=y.shape) < missing] = np.nan
+    channels = dict(zip(SET_POINTS, scale * rng.standard_normal((3, rows)), strict=True))
+    recording = Recording(np.arange(rows) * TS, TS, {**channels, "pitch": y[0], "roll": y[1]},
+                          np.sort(rng.integers(0, runs, rows)))  # fmt: skip
+    found = quality(recording)
+    assert found.text()
+    assert found.severity in ("note", "warning")
+    assert json.dumps(found.as_dict(), default=lambda value: value.tolist())
+
+
+def test_a_wrong_limit_is_refused() -> None:
+    with pytest.raises(SettingsError, match=r"`motor_limit` must be positive \[rad\]; got -1"):
+        quality(neck_recording(200), motor_limit=-1.0)
+
+
+def test_what_the_real_recordings_are_told(shared_data: Path) -> None:
+    def report(path: str, layout: str) -> set[tuple[str, str]]:
+        recording = import_log(shared_data / path, read_layout(LAYOUTS / f"{layout}.toml")).recording
+        return {(f.severity, f.topic) for f in quality(recording).findings if f.severity != "ok"}
+
+    # The platform shakes at times, by up to 4 deg at 24.8 s: that is motion, and no sample of it is a spike.
+    steps = report("neck_openloop/spring_test_0gr.csv", "neck_openloop")
+    assert steps == {("note", topic) for topic in ("co-contraction", "regressors", "region")}
+    loop = report("neck_closedloop/frontier_test_000gr.csv", "neck_closedloop")
+    assert loop == {("note", topic) for topic in ("co-contraction", "regressors", "region", "correlation")}
+    arm = report("arm_multisine/arm_multisine_400s.csv", "arm_multisine")
+    assert {("warning", "excitation"), ("warning", "regressors"), ("note", "co-contraction")} <= arm
