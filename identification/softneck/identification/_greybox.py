@@ -24,7 +24,7 @@ _MOTOR_WEIGHT = 0.05
 # How much a number a spread away from its guess counts, as an error [rad] of one row: next to nothing.
 _PRIOR = 0.005
 # The start is unknown for so long [s], a held input is forgotten after so long.
-_SETTLED, _MEMORY = 1.0, 3.0
+_SETTLED, _MEMORY = 0.5, 3.0
 _DELAYS = (2, 1, 3, 4)
 _TYPICAL_DRIVE_DELAY = 0.08
 _THIN = 2

@@ -12,9 +12,11 @@ from softneck.signals import TENDON_ANGLES, Recording, redefinition_matrix
 from ._loaded_drive import FUNCTIONS, LoadedDrive, drive_start
 from ._scores import nrmse_fit
 
-# Rows of each run in which its unknown past still shows [s].
-_SETTLED = 1.0
+# Rows of each run in which its unknown past still shows [s]: those that `validate` does not score either.
+_SETTLED = 0.5
 HOLD_OUT = 0.2
+# From so many runs on, a run is held out as a whole.
+_MANY_RUNS = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +62,7 @@ class Data:
         measured: the same with what was logged, where it was [rad].
         outputs: (time, 2) of all runs behind each other [rad].
         settled: (time,) rows to learn from and to judge.
-        late: (time,) rows in the last fifth of a run.
+        groups: masks (time,) of rows to hold out in turn: the last fifth of each run; of many runs a third of them.
         sample_time: [s].
     """
 
@@ -68,7 +70,7 @@ class Data:
     measured: list[Matrix]
     outputs: Matrix
     settled: np.ndarray
-    late: np.ndarray
+    groups: list[np.ndarray]
     sample_time: float
 
     @classmethod
@@ -87,7 +89,7 @@ class Data:
             measured=[np.where(np.isfinite(there), there, m) for there, m in zip(logged, motors, strict=True)],
             outputs=outputs,
             settled=settled,
-            late=np.concatenate([np.arange(len(run)) >= (1.0 - HOLD_OUT) * len(run) for run in runs]),
+            groups=_groups([len(run) for run in runs]),
             sample_time=recording.sample_time,
         )
 
@@ -103,6 +105,13 @@ class Data:
             parts.append(np.column_stack([signals, np.ones(len(signals))]))  # -1 is the column of ones
         signals = np.concatenate(parts)
         return signals[:, table[:, 0]] * signals[:, table[:, 1]] * signals[:, table[:, 2]]
+
+
+def _groups(lengths: list[int]) -> list[np.ndarray]:
+    if len(lengths) >= _MANY_RUNS:
+        number = np.repeat(3 * np.arange(len(lengths)) // len(lengths), lengths)
+        return [number == group for group in range(3)]
+    return [np.concatenate([np.arange(n) >= (1.0 - HOLD_OUT) * n for n in lengths])]
 
 
 def ridge(X: Matrix, Y: Matrix, weight: float) -> Matrix:
@@ -122,14 +131,14 @@ def ridge(X: Matrix, Y: Matrix, weight: float) -> Matrix:
 def scores(data: Data, hold_out: Data | None, form: Form, weights: tuple[float, ...]) -> list[float]:
     """Return, for each ridge weight, the mean free-run fit [%] of both axes on rows that were not learnt from.
 
-    Without `hold_out` two parts of the data are held out in turn: the end of each run, and what is furthest from
-    all the rest, which tells how the form extrapolates.
+    Without `hold_out` parts of the data are held out in turn: the end of each run (of many runs a third of them,
+    experiments of their own), and what is furthest from all the rest, which tells how the form extrapolates.
     """
     X, good = data.terms(form), data.settled
     if hold_out is None:
         far = _far(X[:, 1:], good)
         folds = [(X[good & ~held], data.outputs[good & ~held], X[good & held], data.outputs[good & held])
-                 for held in (data.late, far) if (good & held).sum() > 50]  # fmt: skip
+                 for held in (*data.groups, far) if (good & held).sum() > 50]  # fmt: skip
     else:
         folds = [(X[good], data.outputs[good], hold_out.terms(form)[hold_out.settled],
                   hold_out.outputs[hold_out.settled])]  # fmt: skip
