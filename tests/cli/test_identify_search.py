@@ -80,7 +80,7 @@ def test_an_interrupted_search_keeps_what_it_has_and_says_130(
         (("--search", "na", "--hold-out", "REC2"), "--search takes KEY=V1,V2,...; got `na`"),
         (
             ("--search", "magic=1", "--hold-out", "REC2"),
-            "there is no setting `magic` to search; this kind has covariance_bound",
+            "there is no setting `magic` to search",
         ),
         (("--search", "na=x", "--hold-out", "REC2"), "`na` must be a whole number"),
         (("--search", "na=1", "--search", "na=2", "--hold-out", "REC2"), "--search names `na` twice"),
