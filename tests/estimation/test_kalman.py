@@ -138,7 +138,7 @@ def test_a_rejected_measurement_leaves_no_trace() -> None:
     with_outlier = run_block(observer, record.with_channels(pitch_measured=spoiled))
     without = run_block(observer, with_gaps(record, slice(200, 201)))
     np.testing.assert_array_equal(with_outlier[:, :4], without[:, :4])
-    assert with_outlier[200, 4] > observer.arrays[7][2]
+    assert with_outlier[200, 4] > observer.arrays[8][2]
 
 
 def test_a_lasting_change_is_accepted_by_force_after_ten_rejections() -> None:

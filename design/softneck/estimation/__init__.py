@@ -4,7 +4,7 @@ from ._axis import AxisPlant as AxisPlant
 from ._axis import HasTransferFunctions as HasTransferFunctions
 from ._axis import LinearNeck as LinearNeck
 from ._axis import axis_plant as axis_plant
-from ._kalman import Estimates as Estimates
+from ._offline import Estimates as Estimates
 from ._kalman import KalmanObserver as KalmanObserver
 from ._sensors import SENSORS as SENSORS
 from ._sensors import Sensor as Sensor
