@@ -135,7 +135,7 @@ class AxisPlant:
         Ad, Bd = part[:n, :n], part[:n, n]
         denominator = np.real(np.poly(Ad))
         # Markov parameters times the denominator give the numerator.
-        markov = [C @ np.linalg.matrix_power(Ad, i) @ Bd for i in range(n)]
+        markov = np.array([C @ np.linalg.matrix_power(Ad, i) @ Bd for i in range(n)])
         numerator = np.convolve(markov, denominator)[:n]
         return AxisPlant(numerator, denominator, self.delay * ratio, sample_time)
 

@@ -242,4 +242,6 @@ def _require_covariance(name: str, P: Matrix) -> None:
         raise SettingsError(f"the covariance `{name}` must be finite and symmetric.")
     least = float(np.linalg.eigvalsh(P).min())
     if least < -1e-9 * largest:
-        raise SettingsError(f"the covariance `{name}` must be positive semidefinite; its least eigenvalue is {least:.3g}.")
+        raise SettingsError(
+            f"the covariance `{name}` must be positive semidefinite; its least eigenvalue is {least:.3g}."
+        )

@@ -36,7 +36,7 @@ KALMAN_STILL = 0.1
 
 def kalman_line_length(c: np.ndarray) -> int:
     """Return how many past inputs each axis keeps."""
-    return int(math.ceil(max(c[KALMAN_LAG], c[KALMAN_LAG + 1]))) + 1
+    return math.ceil(max(c[KALMAN_LAG], c[KALMAN_LAG + 1])) + 1
 
 
 def kalman_clear(c: np.ndarray, state: np.ndarray) -> None:

@@ -94,7 +94,7 @@ def source_rows(observer: KalmanObserver, run: Recording) -> tuple[Matrix, np.nd
         # The set-points of t_k are commanded after the measurement of t_k: the filter knows those before.
         return run.set_points[np.maximum(np.arange(len(run)) - 1, 0)], np.zeros(len(run), dtype=bool)
     rates = np.column_stack([_rate(run, axis) for axis in _AXES])
-    lost = ~np.isfinite(rates).all(axis=1)
+    lost = np.asarray(~np.isfinite(rates).all(axis=1))
     known = np.maximum.accumulate(np.where(lost, -1, np.arange(len(run))))
     return np.where(known[:, None] < 0, 0.0, rates[known]), lost
 
@@ -132,9 +132,19 @@ def _over_runs(observer: KalmanObserver, recording: Recording, *, smooth: bool) 
     angle, rate, flags, aligned, covariance = stacked
     innovation, accepted, healthy, judged, log_det = flags.T.copy()
     return Estimates(
-        recording.time, *angle.T.copy(), *rate.T.copy(), innovation, accepted > 0.5, healthy > 0.5, judged > 0.5,
-        aligned, covariance, log_det,
-    )  # fmt: skip
+        time=recording.time,
+        pitch=angle[:, 0].copy(),
+        roll=angle[:, 1].copy(),
+        pitch_rate=rate[:, 0].copy(),
+        roll_rate=rate[:, 1].copy(),
+        innovation=innovation,
+        accepted=accepted > 0.5,
+        healthy=healthy > 0.5,
+        judged=judged > 0.5,
+        aligned=aligned,
+        covariance=covariance,
+        log_det=log_det,
+    )
 
 
 def _forward(observer: KalmanObserver, run: Recording) -> _Pass:
@@ -181,9 +191,7 @@ def _backward(observer: KalmanObserver, passed: _Pass) -> tuple[Matrix, np.ndarr
     return x, P
 
 
-def _told(
-    observer: KalmanObserver, passed: _Pass, x: Matrix, P: np.ndarray, *, smooth: bool
-) -> tuple[np.ndarray, ...]:
+def _told(observer: KalmanObserver, passed: _Pass, x: Matrix, P: np.ndarray, *, smooth: bool) -> tuple[np.ndarray, ...]:
     """Return angles and rates (time, 2) carried ahead by the sensor's delay, flags, aligned angles, covariances."""
     H, c = observer.arrays[2], observer.arrays[8]
     whole = int(c[KALMAN_LEAD])
@@ -218,7 +226,9 @@ def _input(observer: KalmanObserver, sources: Matrix, k: int, ahead: int = 0) ->
     u = np.empty(2)
     for axis, lag in enumerate(_lags(observer)):
         place = max(k - max(lag - ahead, 0.0), 0.0)
-        u[axis] = np.interp(place, np.arange(k + 1), sources[: k + 1, axis]) if place % 1.0 else sources[int(place), axis]
+        u[axis] = (
+            np.interp(place, np.arange(k + 1), sources[: k + 1, axis]) if place % 1.0 else sources[int(place), axis]
+        )
     return u
 
 

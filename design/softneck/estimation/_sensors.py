@@ -42,9 +42,7 @@ SENSORS: dict[str, Sensor] = {
             math.radians(0.05),
             "3DM-GX5-10, 50 Hz: 0.02 to 0.04 deg on plateaus of the recordings; rates: data sheet class",
         ),
-        Sensor(
-            "paper", math.radians(0.05), math.radians(0.1), "the virtual neck's inclinometer in the paper preset"
-        ),
+        Sensor("paper", math.radians(0.05), math.radians(0.1), "the virtual neck's inclinometer in the paper preset"),
     )
 }
 

@@ -48,5 +48,3 @@ def system(arrays: tuple[Matrix, ...], noise: tuple[float, float, float]) -> tup
     """Return F, H, Q and R of one sample."""
     measurement, first, second = noise
     return arrays[0], arrays[2], first**2 * arrays[3] + second**2 * arrays[4], measurement**2 * np.eye(2)
-
-
