@@ -51,9 +51,8 @@ def test_the_real_inclinometer_becomes_smoother_by_less_than_a_sample_of_lag(sha
             if np.ptp(raw) < np.radians(5.0):
                 continue  # the axis that the step left alone: nothing to time
             timed += 1
-            print(
-                f"{payload} g, {axis}: roughness {roughness(column) / roughness(raw):.2f}, lag {lag(raw, column):.2f}"
-            )
+            rough, late = roughness(column) / roughness(raw), lag(raw, column)
+            print(f"{payload} g, {axis}: roughness {rough:.2f} of raw, lag {late:.2f} samples")
             # Issue 10; found: 0.46 to 0.95 of the raw roughness (0.95 where the log jumps) and 0.05 to 0.15 samples.
             assert rough < 0.97
             assert late <= 0.5

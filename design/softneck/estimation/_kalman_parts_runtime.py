@@ -77,7 +77,9 @@ def kalman_frozen(c: np.ndarray, state: np.ndarray, noise: float) -> bool:
     return bool(c[KALMAN_FROZEN] > 0.0 and state[-7] >= c[KALMAN_FROZEN] - 1.0 and state[-8] > still * still)
 
 
-def kalman_push(arrays: tuple[np.ndarray, ...], state: np.ndarray, inputs: np.ndarray, u: np.ndarray) -> bool:
+def kalman_push(
+    arrays: tuple[np.ndarray, ...], state: np.ndarray, inputs: np.ndarray, length: int, u: np.ndarray
+) -> bool:
     """Put what the sources say now into the lines, fill `u` (2,) with what acts; return whether a gyro said nothing."""
     T, c = arrays[7], arrays[8]
     lost = False
@@ -94,7 +96,6 @@ def kalman_push(arrays: tuple[np.ndarray, ...], state: np.ndarray, inputs: np.nd
     else:
         u[0] = T[0, 0] * inputs[0] + T[0, 1] * inputs[1] + T[0, 2] * inputs[2]
         u[1] = T[1, 0] * inputs[0] + T[1, 1] * inputs[1] + T[1, 2] * inputs[2]
-    length = kalman_line_length(c)
     first = state.shape[0] - KALMAN_TAIL - 2 * length
     head = int(state[-1]) % length
     for axis in range(2):
@@ -118,10 +119,11 @@ def kalman_lagged(state: np.ndarray, first: int, length: int, head: int, lag: fl
     return float(value)
 
 
-def kalman_tell(arrays: tuple[np.ndarray, ...], state: np.ndarray, frozen: bool, outputs: np.ndarray) -> None:
+def kalman_tell(
+    arrays: tuple[np.ndarray, ...], state: np.ndarray, frozen: bool, length: int, outputs: np.ndarray
+) -> None:
     """Carry the estimate from the filter's time to now; fill all outputs but the innovation."""
     F, B, H, c = arrays[0], arrays[1], arrays[2], arrays[8]
-    length = kalman_line_length(c)
     first = state.shape[0] - KALMAN_TAIL - 2 * length
     head = int(state[-1]) % length
     whole = int(c[KALMAN_LEAD])

@@ -62,15 +62,16 @@ def step(
     """
     c = arrays[8]
     n = arrays[0].shape[0]
+    length = kalman_line_length(c)
     u = np.empty(2)
-    lost = kalman_push(arrays, state, inputs, u)
+    lost = kalman_push(arrays, state, inputs, length, u)
     usable = kalman_usable(c, state, inputs, parameters[0])
     forced = state[-2] >= c[KALMAN_REJECTIONS]
     P = state[n : n + n * n].reshape((n, n))
     kalman_predict(arrays, parameters, state[:n], P, u)
     if lost:
         P += c[KALMAN_GAP] * c[KALMAN_GAP] * arrays[3] / arrays[3].max()
-    if state[-1] < kalman_line_length(c):
+    if state[-1] < length:
         # Inputs from before the start are still on their way: the model has no say.
         P += arrays[5]
     elif forced:
@@ -79,7 +80,7 @@ def step(
     if usable:
         innovation, accepted = kalman_correct(arrays, parameters[0], state, P, inputs, forced)
     kalman_count(c, state, usable, accepted)
-    kalman_tell(arrays, state, kalman_frozen(c, state, parameters[0]), outputs)
+    kalman_tell(arrays, state, kalman_frozen(c, state, parameters[0]), length, outputs)
     outputs[4] = innovation
     state[-1] += 1.0
 
@@ -92,7 +93,9 @@ def kalman_predict(
     q1, q2 = parameters[1] * parameters[1], parameters[2] * parameters[2]
     x[:] = kalman_ahead(F, x, arrays[1], u)
     if not COMPILED:
-        P[:] = np.dot(np.dot(F, P), F.T) + (q1 * QM + q2 * QW)
+        np.dot(np.dot(F, P), F.T, P)
+        P += q1 * QM
+        P += q2 * QW
         return
     kalman_sandwich(F, P)
     for i in range(F.shape[0]):
@@ -113,10 +116,10 @@ def kalman_correct(
     n = H.shape[1]
     x = state[:n]
     e = inputs[3:5] - kalman_dot(H, x)
-    e0, e1 = e[0], e[1]
+    e0, e1, r = float(e[0]), float(e[1]), float(noise * noise)
     PH = kalman_columns(P, H)
     S = kalman_columns(H, PH.T)
-    s00, s01, s11 = S[0, 0] + noise * noise, 0.5 * (S[0, 1] + S[1, 0]), S[1, 1] + noise * noise
+    s00, s01, s11 = float(S[0, 0]) + r, 0.5 * float(S[0, 1] + S[1, 0]), float(S[1, 1]) + r
     determinant = s00 * s11 - s01 * s01
     innovation = (s11 * e0 * e0 - 2.0 * s01 * e0 * e1 + s00 * e1 * e1) / determinant
     state[-9] = math.log(determinant)
@@ -127,7 +130,7 @@ def kalman_correct(
     S[0, 1] = S[1, 0] = -s01 / determinant
     K = kalman_columns(PH, S)
     x += kalman_dot(K, e)
-    kalman_joseph(P, K, H, noise * noise)
+    kalman_joseph(P, K, H, r)
     return innovation, True
 
 
@@ -138,7 +141,8 @@ def kalman_joseph(P: np.ndarray, K: np.ndarray, H: np.ndarray, r: float) -> None
         J = np.dot(K, H)
         J *= -1.0
         J.ravel()[:: n + 1] += 1.0
-        P[:] = np.dot(np.dot(J, P), J.T) + r * np.dot(K, K.T)
+        np.dot(np.dot(J, P), J.T, P)
+        P += np.dot(r * K, K.T)
         return
     J = np.zeros((n, n))
     for i in range(n):

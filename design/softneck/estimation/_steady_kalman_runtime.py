@@ -52,12 +52,13 @@ def step(
     """
     F, B, H, c = arrays[0], arrays[1], arrays[2], arrays[8]
     n = F.shape[0]
+    length = kalman_line_length(c)
     u = np.empty(2)
-    kalman_push(arrays, state, inputs, u)
+    kalman_push(arrays, state, inputs, length, u)
     usable = kalman_usable(c, state, inputs, parameters[0])
     forced = state[-2] >= c[KALMAN_REJECTIONS]
     K, SI = arrays[9], arrays[10]
-    if state[-1] < kalman_line_length(c):
+    if state[-1] < length:
         K, SI = arrays[11], arrays[12]
     elif forced:
         K, SI = arrays[13], arrays[14]
@@ -72,6 +73,6 @@ def step(
             x += e0 * K[:, 0] + e1 * K[:, 1]
     state[:n] = x
     kalman_count(c, state, usable, accepted)
-    kalman_tell(arrays, state, kalman_frozen(c, state, parameters[0]), outputs)
+    kalman_tell(arrays, state, kalman_frozen(c, state, parameters[0]), length, outputs)
     outputs[4] = innovation
     state[-1] += 1.0
