@@ -1,11 +1,15 @@
 """Closed loops over FMUs and Python parts: FMUs as parts, loop files, results."""
 
 from softneck.loop import Loop as Loop
+from softneck.loop import LoopRun as LoopRun
+from softneck.loop import LoopState as LoopState
+from softneck.loop import LoopStep as LoopStep
 
 from ._fmu_part import FmuError as FmuError
 from ._fmu_part import FmuPart as FmuPart
 from ._free_run import drive_fmu as drive_fmu
 from ._free_run import simulate_fmu_free_run as simulate_fmu_free_run
+from ._isolated import IsolatedPart as IsolatedPart
 from ._loop_file import load_loop as load_loop
 from ._result import Result as Result
 from ._simulate import LoopSetup as LoopSetup

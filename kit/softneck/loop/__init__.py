@@ -1,8 +1,13 @@
 """The closed loop over anything that steps: wiring by name, order, metrics; arrays only, no FMI, no files."""
 
+from ._faults import FAULT_KINDS as FAULT_KINDS
+from ._faults import Fault as Fault
+from ._faults import MotorFault as MotorFault
+from ._faults import NeckFault as NeckFault
+from ._faults import SensorFault as SensorFault
+from ._faults import make_fault as make_fault
 from ._loop import ORDERS as ORDERS
 from ._loop import Loop as Loop
-from ._loop import run_loop as run_loop
 from ._metrics import SETTLING_BAND as SETTLING_BAND
 from ._metrics import check_limits as check_limits
 from ._metrics import metrics as metrics
@@ -16,3 +21,9 @@ from ._references import SineReference as SineReference
 from ._references import StepReference as StepReference
 from ._references import make_reference as make_reference
 from ._result import LoopResult as LoopResult
+from ._run import LoopRun as LoopRun
+from ._run import LoopStep as LoopStep
+from ._run import StepCallback as StepCallback
+from ._run import run_loop as run_loop
+from ._state import LoopState as LoopState
+from ._wiring import REFERENCE_PORTS as REFERENCE_PORTS
