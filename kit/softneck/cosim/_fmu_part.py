@@ -43,6 +43,7 @@ class FmuPart:
         inputs, outputs, parameters: ports, in the FMU's order; Booleans are 0.0 and 1.0.
         sample_time: [s].
         role: "plant", "observer", "controller" or "reference".
+        native_names: our name -> the FMU's, where the mapping renames.
         messages: the last lines of the FMU's log, as (status, text).
     """
 
@@ -72,6 +73,7 @@ class FmuPart:
         with unpacked(self.path) as folder:
             self._description = read_description(self.path, folder, names or {}, units)
             _check_platform(self._description, folder)
+        self.native_names = {ours: theirs for theirs, ours in (names or {}).items()}
         self.role = role or self._description.annotation.role
         if not self.role:
             raise SettingsError(f"{self.path}: say its role in the loop ({', '.join(_ROLES)}).")

@@ -18,6 +18,7 @@ from softneck.loop import (
     Part,
     RecordingReference,
     Reference,
+    ReferenceBlock,
     make_fault,
     make_reference,
 )
@@ -61,6 +62,35 @@ def load_loop(path: str | Path) -> LoopSetup:
         raise type(error)(f"{source}: {error}") from error
 
 
+def is_loop_file(path: Path) -> bool:
+    """Return whether `path` is a TOML file with a [reference]."""
+    if path.suffix != ".toml" or not path.is_file():
+        return False
+    try:
+        return "reference" in _read(path)
+    except FileFormatError:
+        return False
+
+
+def reference_of(path: str | Path) -> ReferenceBlock:
+    """Return the [reference] of a loop file as a block, of which `build_fmu` makes a reference FMU.
+
+    Its sample time is the file's `sample_time_s`, 20 ms if it states none; its other parts are not opened.
+
+    Raises:
+        SettingsError: the reference is an FMU already, or wrong.
+    """
+    source = Path(path)
+    table = _read(source)
+    try:
+        reference = _Reader(source).reference(table["reference"])
+        if hasattr(reference, "advance"):
+            raise SettingsError("[reference] is an FMU already.")
+        return ReferenceBlock(reference, sample_time=_number("sample_time_s", table.get("sample_time_s", 0.02)))  # pyright: ignore[reportArgumentType]
+    except SoftneckError as error:
+        raise type(error)(f"{source}: {error}") from error
+
+
 class _Reader:
     """Reads one loop file and remembers the hash of each file that it opens."""
 
@@ -78,7 +108,7 @@ class _Reader:
         parts = {name: self._part(name, part) for name, part in tables.items()}
         parts |= {name: self._other(name, part) for name, part in others.items()}
         tables |= others
-        reference = self._reference(table["reference"])
+        reference = self.reference(table["reference"])
         if isinstance(reference, FmuPart | IsolatedPart):
             parts["reference"], tables["reference"] = reference, table["reference"]
         # What the file calls a parameter of a part may be one of its inputs, held constant.
@@ -156,7 +186,8 @@ class _Reader:
             raise SettingsError(f"[{name}] python = `{path}` returned a {type(made).__name__}, not a Block or a Part.")
         return made
 
-    def _reference(self, table: Any) -> Reference | Part:
+    def reference(self, table: Any) -> Reference | Part:
+        """Return what the table [reference] describes."""
         if isinstance(table, dict) and "fmu" in table:
             return self._made("reference", table, ("fmu",), None, as_role="reference")
         if not isinstance(table, dict) or table.get("kind") not in _REFERENCES:

@@ -13,6 +13,7 @@ from ._metrics import check_limits as check_limits
 from ._metrics import metrics as metrics
 from ._part import BlockPart as BlockPart
 from ._part import Part as Part
+from ._reference_block import ReferenceBlock as ReferenceBlock
 from ._references import RampReference as RampReference
 from ._references import RecordingReference as RecordingReference
 from ._references import Reference as Reference
@@ -27,3 +28,5 @@ from ._run import StepCallback as StepCallback
 from ._run import run_loop as run_loop
 from ._state import LoopState as LoopState
 from ._wiring import REFERENCE_PORTS as REFERENCE_PORTS
+from ._wiring import Wiring as Wiring
+from ._wiring import wire as wire
