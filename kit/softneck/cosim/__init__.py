@@ -12,6 +12,7 @@ from ._free_run import simulate_fmu_free_run as simulate_fmu_free_run
 from ._isolated import IsolatedPart as IsolatedPart
 from ._loop_file import is_loop_file as is_loop_file
 from ._loop_file import load_loop as load_loop
+from ._loop_file import make_loop as make_loop
 from ._loop_file import reference_of as reference_of
 from ._result import Result as Result
 from ._simulate import LoopSetup as LoopSetup

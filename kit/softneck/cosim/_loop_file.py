@@ -91,12 +91,23 @@ def reference_of(path: str | Path) -> ReferenceBlock:
         raise type(error)(f"{source}: {error}") from error
 
 
+def make_loop(table: Mapping[str, Any], folder: str | Path = ".") -> LoopSetup:
+    """Return the loop that a table with the keys of a loop file describes; relative paths start at `folder`.
+
+    Raises:
+        SettingsError: unknown or missing keys, or values that do not fit; the line names the key.
+    """
+    return _Reader(Path(folder)).setup(table)
+
+
 class _Reader:
-    """Reads one loop file and remembers the hash of each file that it opens."""
+    """Reads one loop file, or a table like one, and remembers the hash of each file that it opens."""
 
     def __init__(self, source: Path) -> None:
-        self.folder = source.parent
-        self.files: dict[str, tuple[str, str]] = {"loop": (str(source), file_hash(source))}
+        self.folder = source if source.is_dir() else source.parent
+        self.files: dict[str, tuple[str, str]] = {}
+        if not source.is_dir():
+            self.files["loop"] = (str(source), file_hash(source))
 
     def setup(self, table: Mapping[str, Any]) -> LoopSetup:
         _refuse_unknown("the file", table, _TOP)
