@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from softneck.core import FileFormatError, SettingsError, load
+from softneck.cosim import is_loop_file, reference_of
 from softneck.fmu import Buildable, build_fmu, describe
 from softneck.plant import NeckParameters, VirtualNeck
 
@@ -28,7 +29,8 @@ def command(
 ) -> None:
     """Package FILE as an FMI 2.0 Co-Simulation FMU.
 
-    FILE is a model, observer or controller (.npz), a neck parameter file (.toml), or a neck preset (paper, lab).
+    FILE is a model, observer or controller (.npz), a neck parameter file (.toml), a neck preset (paper, lab), or a
+    loop file, of whose [reference] a reference FMU is made.
     """
     del backend, fmi  # one of each in this version; the options hold their place
     jobs, replace = _what(file, folder, output, force=force)
@@ -49,6 +51,8 @@ def open_buildable(source: str | Path) -> Buildable:
     """Return what `source` names: a file of ours, a neck file or a neck preset."""
     if Path(source).suffix == ".npz":
         return load(source)
+    if is_loop_file(Path(source)):
+        return reference_of(Path(source))
     return VirtualNeck(load_neck(str(source)))
 
 
