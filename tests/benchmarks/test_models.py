@@ -1,4 +1,4 @@
-"""Training of the kinds that run free, beside peers; run with `pytest tests/benchmarks/test_models.py --benchmark-only`.
+"""Kinds that run free, beside peers; run with `pytest tests/benchmarks/test_models.py --benchmark-only`.
 
 The same data for all: Eq. 22 on the virtual neck `paper`, 7,000 rows to identify; judged in free run from set-points
 alone on the paper's three tests. The peers get what they are fed in their own examples (lagged inputs and outputs) and
@@ -51,7 +51,7 @@ def lagged(u: np.ndarray, y: np.ndarray, lags: int) -> np.ndarray:
     return np.column_stack([both[lags - i : len(both) - i] for i in range(1, lags + 1)])
 
 
-def narx_free_run(predict, u: np.ndarray, y: np.ndarray, lags: int) -> np.ndarray:  # noqa: ANN001
+def narx_free_run(predict, u: np.ndarray, y: np.ndarray, lags: int) -> np.ndarray:
     out = y.copy()
     for k in range(25, len(u)):
         past = np.column_stack([out, u])[k - lags : k][::-1]
@@ -70,7 +70,7 @@ def test_scikit_learn_mlp_in_narx_form(benchmark: BenchmarkFixture) -> None:
     train = recordings()["train"]
     scale = train.outputs.std(axis=0)
 
-    def fit():  # noqa: ANN202
+    def fit():
         found = []
         head, tail = train.split(0.8)
         for lags in (2, 5):
