@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 from hypothesis import HealthCheck, settings
 
-from softneck.identification import Model, Network, Rls, SetMembership
+from softneck.identification import Model, Network, OutputError, Rls, SetMembership, Srivc, Subspace
 from softneck.signals import Recording
 
 from .browser import chromium_path, started
@@ -38,6 +38,10 @@ def models() -> dict[str, Model]:
     recording = short_neck()
     return {
         "rls": Rls(max_delay=0.12).fit(recording),
+        "mimo": Rls(structure="mimo", delay=0.06).fit(recording),
+        "oe": OutputError(delay=0.06, source="positions").fit(recording),
+        "srivc": Srivc(order=2, delay=0.06, resamples=0).fit(recording),
+        "subspace": Subspace(order=3, delay=0.06).fit(recording),
         "nlsm": SetMembership(epsilon=0.01, output_weight=10.0).fit(recording),
         "residual": SetMembership(form="residual").fit(recording),
         "nn": Network(hidden=(4, 3), iterations=8).fit(recording),

@@ -13,6 +13,7 @@ import pytest
 from scipy.io import savemat
 
 from softneck.core import read_archive, write_archive
+from softneck.signals import Recording, write_recording
 
 from ..data import LAYOUTS, changed, csv_lines, neck_recording
 from .conftest import Call, Said
@@ -64,6 +65,24 @@ def test_a_file_that_is_not_there_is_named(call: Call, tmp_path: Path, rls_file:
     refused(call(*arguments), "none.csv: no such file", tmp_path, set())
 
 
+def test_recordings_of_two_sample_times_are_named(call: Call, tmp_path: Path, rls_file: Path) -> None:
+    (tmp_path / "a.csv").write_text("\n".join(csv_lines(neck_recording(300), 300)))
+    slow = neck_recording(300)
+    write_recording("b.csv", Recording(2 * slow.time, 2 * slow.sample_time, slow.channels))
+    message = "b.csv: is at 40 ms and a.csv at 20 ms; recordings are used together at one sample time only"
+    left = {"a.csv", "b.csv"}
+    refused(call("identify", "rls", "a.csv", "b.csv", "-o", "m.npz", "--json"), message, tmp_path, left)
+    training = ("--training", "a.csv", "--training", "b.csv")
+    refused(call("validate", rls_file, "--data", "a.csv", *training), message, tmp_path, left)
+
+
+def test_a_model_under_another_ending_is_refused_before_any_work(call: Call, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("never read")
+    for name in ("m.csv", "m"):
+        said = call("identify", "rls", "a.csv", "-o", name, "--json")
+        refused(said, f"{name}: must end in `.npz`, by which softneck knows the file", tmp_path, {"a.csv"})
+
+
 def test_a_model_that_is_none(call: Call, tmp_path: Path, recording: Path) -> None:
     (tmp_path / "m.npz").write_bytes(b"PK\x03\x04 a zip that is none")
     said = call("validate", "m.npz", "--data", recording, "--json")
@@ -99,7 +118,7 @@ def test_a_folder_that_cannot_be_written(call: Call, tmp_path: Path, recording: 
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("speed=3", "there is no setting `speed`; this kind has delay, delay_by, forgetting, max_delay, na, nb"),
+        ("speed=3", "there is no setting `speed`; this kind has covariance_bound, dead_zone, delay"),
         ("na", "--set takes KEY=VALUE; got `na`"),
         ("na=0", "`na` must be a whole number between 1 and 100; got 0"),
         ("na=1.5", "`na` must be a whole number between 1 and 100; got 1.5"),
@@ -126,7 +145,7 @@ def test_a_wrong_setting_of_a_network(call: Call, tmp_path: Path, recording: Pat
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("identify", "magic", "REC", "-o", "m.npz"), "`magic` is no kind of model; use one of rls, nlsm, nn"),
+        (("identify", "magic", "REC", "-o", "m.npz"), "`magic` is no kind of model; use one of rls, oe"),
         (("identify", "pi", "REC", "-o", "m.npz"), "`pi` is no kind of model"),
         (("identify", "rls", "REC", "-o", "m.npz", "--train", "0"), "the part to train on must be in (0, 1]; got 0"),
         (("identify", "rls", "REC", "-o", "m.npz", "--train", "all"), "'all' is not a valid float"),
@@ -144,7 +163,7 @@ def test_a_wrong_setting_of_a_network(call: Call, tmp_path: Path, recording: Pat
         (("record", "song", "-o", "r.csv"), "`signal` must be one of eq22"),
         (("record", "steps", "-o", "r.csv", "--neck", "giraffe"), "`giraffe` is neither a neck preset"),
         (("record", "steps", "-o", "r.csv", "--payload", "-1"), "`--payload` must be between 0 and 1 [kg]"),
-        (("record", "steps", "-o", "r.csv", "--duration", "0"), "`duration` must be positive [s]"),
+        (("record", "steps", "-o", "r.csv", "--duration", "0"), "`duration` must be between 0.02 and 86400 [s]"),
         (("record", "eq22", "-o", "r.csv", "--duration", "0.001"), "r"),
         (("record", "steps", "-o", "r.xlsx", "--duration", "1"), "a recording is a `.csv` or a `.parquet` file"),
         (("design", "lqg", "MODEL", "-o", "c.npz"), "`lqg` is no kind of controller; use one of pi"),

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from softneck.identification import Novelty
 from softneck.signals import Recording, concatenate, write_recording
 
 from ..data import neck_recording
@@ -37,7 +39,8 @@ CASES: dict[str, tuple[Recording, tuple[str, ...], str]] = {
     "another sample time": (
         slower(WHOLE),
         (),
-        "the model was identified at 0.02 s and the recording is at 0.04 s; resample it or identify again",
+        "on bad.csv: the model was identified at 0.02 s and the recording is at 0.04 s; resample it "
+        "(`softneck.signals.resampled`) or identify again",
     ),
     "a horizon longer than the run": (
         WHOLE,
@@ -91,3 +94,19 @@ def test_missing_columns_are_named(call: Call, rls_file: Path) -> None:
     cut = [",".join(c for i, c in enumerate(line.split(",")) if i != column) for line in lines]
     Path("bad.csv").write_text("\n".join(cut))
     refused(call("validate", rls_file, "--data", "bad.csv", "--json"), "missing: roll")
+
+
+def test_what_too_few_rows_cannot_tell_is_not_told(call: Call, rls_file: Path) -> None:
+    write_recording("short.csv", WHOLE.rows(0, 70))  # 45 errors; a correlation at lag 25 needs more than 50
+    said = call("validate", rls_file, "--data", "short.csv", "--html", "page.html")
+    assert said.code == 0
+    assert "too few one-step errors to test whether they are white" in said.out
+    assert "nan" not in said.out
+    page = Path("page.html").read_text(encoding="utf-8")
+    assert "There are too few one-step errors to test whether they are white." in page
+
+
+def test_novelty_has_no_measure_where_training_rows_coincide() -> None:
+    steady = Novelty(distance=np.ones((2, 4)), spacing=np.array([[0.0, 1.0, 1.0, 1.0], [0.5, 0.5, 0.5, 0.5]]))
+    assert steady.larger == [2.0, 2.0, 2.0, 2.0]  # roll's alone
+    assert Novelty(np.ones((2, 4)), np.zeros((2, 4))).larger is None

@@ -12,7 +12,7 @@ import numpy as np
 from softneck.core import Block
 from softneck.design import PiSettings
 from softneck.estimation import KalmanSettings, LinearNeck
-from softneck.identification import Network, Rls, SetMembership
+from softneck.identification import Network, OutputError, Rls, SetMembership, Srivc, Subspace
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.signals import Recording, redefine, signal
 
@@ -44,6 +44,22 @@ def _rls() -> Block:
     return Rls().fit(recording()).block()
 
 
+def _miso() -> Block:
+    return Rls(structure="miso", nb=2, max_delay=0.1).fit(recording()).block()
+
+
+def _oe() -> Block:
+    return OutputError(max_delay=0.1).fit(recording()).block()
+
+
+def _srivc() -> Block:
+    return Srivc(order=2, resamples=0, max_delay=0.1).fit(recording()).block()
+
+
+def _subspace() -> Block:
+    return Subspace(delay=0.0).fit(recording()).block()
+
+
 def _nlsm() -> Block:
     return SetMembership().fit(recording()).block()
 
@@ -71,6 +87,10 @@ def _pi() -> Block:
 # Kind -> its block, inputs, outputs and parameters that the public face names for it.
 KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...]]] = {
     "rls": (_rls, MOTORS, ["pitch", "roll", "motor_position_1"], _MODEL),
+    "miso": (_miso, MOTORS, ["pitch", "roll", "motor_position_2"], _MODEL),
+    "oe": (_oe, MOTORS, ["pitch", "roll", "motor_position_1"], _MODEL),
+    "srivc": (_srivc, MOTORS, ["pitch", "roll", "motor_position_2"], _MODEL),
+    "subspace": (_subspace, MOTORS, ["pitch", "roll", "motor_position_3"], _MODEL),
     "nlsm": (_nlsm, MOTORS, ["pitch", "roll", "pitch_lower", "pitch_upper", "roll_lower", "roll_upper"], _MODEL),
     "residual": (_residual, MOTORS, ["pitch", "pitch_lower", "roll_upper", "motor_position_2"], _MODEL),
     "nn": (_nn, MOTORS, ["pitch", "roll", "motor_position_3"], _MODEL),

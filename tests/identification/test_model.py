@@ -15,7 +15,7 @@ from softneck.signals import Recording, concatenate
 from ..data import TS, neck_recording
 
 # By the name of the shared models: "residual" is the other form of kind "nlsm".
-KINDS = ("rls", "nlsm", "residual", "nn")
+KINDS = ("rls", "mimo", "oe", "srivc", "subspace", "nlsm", "residual", "nn")
 UNSEEN = neck_recording(120, seed=21)
 
 
@@ -40,7 +40,9 @@ def test_a_free_run_sees_no_measurement_after_its_warm_up(models: dict[str, Mode
     np.testing.assert_array_equal(model.simulate(UNSEEN.with_channels(**spoilt)), model.simulate(UNSEEN))
     # With motors="measured" the logged positions count throughout, for those kinds that look at them.
     given = model.simulate(UNSEEN.with_channels(**spoilt), motors="measured")
-    assert (np.abs(given[:, :2] - model.simulate(UNSEEN)[:, :2]).max() > 0) == (kind != "rls")
+    assert (np.abs(given[:, :2] - model.simulate(UNSEEN)[:, :2]).max() > 0) == (
+        kind not in ("rls", "mimo", "srivc", "subspace")
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -90,6 +92,10 @@ CRAFTED = [
     ("rls", "delay", lambda a: a + 1e6, "a dead time is no whole number"),
     ("rls", "drive", lambda a: a - 50.0, "a drive's delay"),
     ("rls", "redefinition", lambda a: a[:1], "`redefinition` has shape"),
+    ("mimo", "A", lambda a: a[:, :-1], "`A` has shape"),
+    ("oe", "source", lambda a: a + 1.0, "the source is no whole number"),
+    ("srivc", "delay", lambda a: a + 1e6, "a dead time is no whole number"),
+    ("subspace", "K", lambda a: a[:-1], "`K` has shape"),
     ("nlsm", "table", lambda a: a + 100.0, "a regressor's source"),
     ("nlsm", "points", lambda a: a[:, :, :5], "`points` has shape"),
     ("nlsm", "nodes", lambda a: a[:, :4], "`nodes` is not the tree over its points"),

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softneck.identification import WARM_UP, Model, SetMembership, validate
-from softneck.signals import Recording, concatenate
+from softneck.identification import WARM_UP, Model, SetMembership, outside_seen, validate
+from softneck.signals import SET_POINTS, Recording, concatenate
 
 from ..data import neck_recording
 from ._numbers import number
@@ -94,6 +94,7 @@ def test_bounds_are_those_of_set_membership_alone(models: dict[str, Model], kind
     result = validate(model, recording)
     if kind not in ("nlsm", "residual"):
         assert result.coverage_pct is None
+        assert result.outside_pct is None
         assert np.isnan(result.lower).all()
         return
     outputs = model.simulate(recording)
@@ -107,3 +108,23 @@ def test_bounds_are_those_of_set_membership_alone(models: dict[str, Model], kind
         assert result.mean_width_deg is not None
         assert result.coverage_pct[name] == pytest.approx(100 * inside.mean(), abs=1e-9)
         assert result.mean_width_deg[name] == pytest.approx(np.degrees((high - low)[WARM_UP:].mean()), rel=1e-12)
+        flagged = outside_seen(model, outputs)[WARM_UP:, axis]
+        assert result.outside_pct is not None
+        assert result.outside_pct[name] == pytest.approx(100 * flagged.mean(), abs=1e-9)
+
+
+def test_what_was_never_seen_is_told_as_a_share_of_the_rows(models: dict[str, Model]) -> None:
+    recording = neck_recording(300, seed=18, noise=1e-3)
+    wild = recording.with_channels(**{name: 3.0 * recording.channels[name] for name in SET_POINTS})
+    shares = [validate(models["residual"], r).as_dict()["outside_pct"] for r in (recording, wild)]
+    for axis in ("pitch", "roll"):
+        assert shares[0][axis] < shares[1][axis], shares  # three times the motion of training lies outside it
+    assert max(shares[1].values()) > 50.0
+
+
+def test_rows_where_nothing_was_measured_are_not_judged() -> None:
+    recording = neck_recording(200, seed=3, noise=1e-3)
+    gap = {name: np.where(np.arange(200) < 60, np.nan, recording.channels[name]) for name in ("pitch", "roll")}
+    result = validate(memoriser(neck_recording(200, seed=4)), recording.with_channels(**gap))
+    assert result.rows_scored == 200 - 60
+    assert result.as_dict()["per_run"][0]["rows_scored"] == 200 - 60

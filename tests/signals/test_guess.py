@@ -34,12 +34,12 @@ UNITS = {"rad": ["rad", "deg"], "s": ["s", "ms"], "rad/s": ["rad/s", "deg/s", "r
          "kg": ["kg", "g"], "1": ["1"]}  # fmt: skip
 
 columns = st.text(min_size=1, max_size=8) | st.integers(0, 30)
-finite = st.floats(allow_nan=False, allow_infinity=False)
+finite = st.floats(allow_nan=False, allow_infinity=False).filter(bool)
 
 
 def sources(quantity: str) -> st.SearchStrategy[Source]:
     terms = st.lists(st.builds(Term, columns, finite), max_size=3).map(tuple)
-    return st.builds(Source, terms, st.sampled_from(UNITS[quantity]), finite)
+    return st.builds(Source, terms, st.sampled_from(UNITS[quantity]), st.sampled_from([1.0, -1.0]))
 
 
 @st.composite

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softneck.core import DataError
-from softneck.signals import Imported, import_log, parse_layout
+from softneck.signals import Imported, Recording, concatenate, import_log, parse_layout, resampled
 
 LAYOUT = """
 [time]
@@ -159,3 +159,25 @@ def test_numbers_beyond_all_bounds_are_refused_without_a_warning(tmp_path: Path)
     layout = LAYOUT.replace("[channels]", '[channels]\nmotor_position_1 = { column = "s1", unit = "rad" }')
     with pytest.raises(DataError, match=r"a channel reaches 1\.5e\+308 within .* is the log damaged"):
         imported(tmp_path, time, layout, s1=step)
+
+
+def test_a_recording_goes_to_another_sample_time_and_its_runs_stay_apart() -> None:
+    time = 0.021 * np.arange(300)
+    step = np.floor(time)
+    run = Recording(
+        time,
+        0.021,
+        {**{f"motor_setpoint_{j}": step for j in (1, 2, 3)}, "pitch": truth(time), "roll": truth(time)},
+    )
+    both = concatenate([run, run.rows(0, 100)])
+    slower = resampled(both, 0.02)
+    assert slower.sample_time == 0.02
+    assert [len(part) for part in slower.runs()] == [314, 104]  # floor(0.021 (n - 1) / 0.02) + 1
+    for part in slower.runs():
+        # PCHIP, as above: h^2 max|x''| / 4 with h = 21 ms.
+        assert np.abs(part.outputs[:, 0] - truth(part.time)).max() < 0.3e-3
+        assert set(np.unique(part.set_points)) <= set(step)
+    same = resampled(run, run.sample_time)
+    np.testing.assert_array_equal(same.outputs, run.outputs)
+    with pytest.raises(DataError, match=r"a run of 100 rows at 0\.021 s has no two samples 5 s apart"):
+        resampled(both, 5.0)

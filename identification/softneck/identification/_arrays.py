@@ -13,6 +13,9 @@ from ._tree import tree_nodes
 # In the runtimes' order (see each kind's `_runtime` module).
 _ORDER = {
     "rls": ("history", "drive", "redefinition", "a", "b", "delay"),
+    "oe": ("history", "drive", "redefinition", "a", "b", "delay", "source"),
+    "srivc": ("history", "drive", "redefinition", "a", "b", "delay", "source"),
+    "subspace": ("history", "drive", "A", "B", "K", "delay"),
     "nlsm": (
         "history", "drive", "table", "scale", "points", "values", "bounds", "nodes",
         "redefinition", "a", "b", "delay",
@@ -25,9 +28,11 @@ _LONGEST_HISTORY = 60_000
 
 def check_arrays(kind: str, arrays: Mapping[str, Matrix]) -> None:
     """Raise FileFormatError unless the arrays are finite, in order, and of shapes that fit each other."""
-    if tuple(arrays) != _ORDER[kind]:
+    # `rls` over the motors and more than one pole are state spaces as well.
+    form = "subspace" if kind in ("rls", "oe", "srivc") and "A" in arrays else kind
+    if tuple(arrays) != _ORDER[form]:
         raise FileFormatError(
-            f"a model of kind {kind} has the arrays {', '.join(_ORDER[kind])}; got {', '.join(arrays)}."
+            f"a model of kind {kind} has the arrays {', '.join(_ORDER[form])}; got {', '.join(arrays)}."
         )
     for name, array in arrays.items():
         if array.dtype != np.float64 or not np.isfinite(array).all():
@@ -38,7 +43,7 @@ def check_arrays(kind: str, arrays: Mapping[str, Matrix]) -> None:
     if history != int(history) or not 1 <= history <= _LONGEST_HISTORY:
         raise FileFormatError(f"its history of {history:g} samples is no number from 1 to {_LONGEST_HISTORY}.")
     _within(arrays["drive"][:, 1], 0, history, "a drive's delay")
-    {"rls": _check_rls, "nlsm": _check_nlsm, "nn": _check_nn}[kind](arrays, history)
+    _CHECKS[form](arrays, history)
 
 
 def no_base() -> dict[str, Matrix]:
@@ -50,6 +55,21 @@ def no_base() -> dict[str, Matrix]:
 def _check_rls(arrays: Mapping[str, Matrix], history: float) -> None:
     _check_linear(arrays, history)
     _within(np.array([arrays["a"].shape[-1]]), 1, history, "the order")
+
+
+def _check_oe(arrays: Mapping[str, Matrix], history: float) -> None:
+    _check_rls(arrays, history)
+    _expect(arrays, "source", (1,))
+    _within(arrays["source"], 0, 1, "the source")
+
+
+def _check_state_space(arrays: Mapping[str, Matrix], history: float) -> None:
+    n = arrays["A"].shape[-1]
+    for name, shape in {"A": (n, n), "B": (n, 3), "K": (n, 2), "delay": (2,)}.items():
+        _expect(arrays, name, shape)
+    _within(np.array([n]), 2, 2 * history, "the order")
+    _within(arrays["delay"][:1], 0, history - 1, "a dead time")
+    _within(arrays["delay"][1:], 0, 1, "the source")
 
 
 def _check_linear(arrays: Mapping[str, Matrix], history: float) -> None:
@@ -103,3 +123,13 @@ def _expect(arrays: Mapping[str, Matrix], name: str, shape: tuple[int, ...]) -> 
 def _within(values: Matrix, low: float, high: float, what: str) -> None:
     if (values != np.round(values)).any() or not ((values >= low) & (values <= high)).all():
         raise FileFormatError(f"{what} is no whole number from {low:g} to {high:g}.")
+
+
+_CHECKS = {
+    "rls": _check_rls,
+    "oe": _check_oe,
+    "srivc": _check_oe,
+    "subspace": _check_state_space,
+    "nlsm": _check_nlsm,
+    "nn": _check_nn,
+}

@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from softneck.core import Progress, SettingsError, silent
+from softneck.core import DataError, Progress, SettingsError, silent
 from softneck.signals import Recording
 
 from ._baselines import Baselines
@@ -79,8 +79,11 @@ def compare(
     for model_name, model in named_models:
         for data_name, recording in named_data:
             progress(len(results) / (len(named_models) * len(named_data)), f"{model_name} on {data_name}")
-            parts = judged_parts(model, recording, rules, known[data_name])
-            results.append(judge(model, parts, rules, names=(model_name, data_name), training=training))
+            try:
+                parts = judged_parts(model, recording, rules, known[data_name])
+                results.append(judge(model, parts, rules, names=(model_name, data_name), training=training))
+            except DataError as error:
+                raise DataError(f"{model_name} on {data_name}: {error}") from error
     return Comparison(tuple(results))
 
 

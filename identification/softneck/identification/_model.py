@@ -60,7 +60,7 @@ class Model:
         return Block(
             kind=self.kind,
             role="plant",
-            runtime=KINDS[self.kind].runtime,
+            runtime=_linear.STATE_SPACE if "A" in self.arrays else KINDS[self.kind].runtime,
             sample_time=self.sample_time,
             arrays=tuple(self.arrays.values()),
             inputs=_ports.INPUTS,
@@ -150,19 +150,37 @@ class Model:
             parts.append(np.vstack([start.outputs, predicted[:-1]]))
         return np.concatenate(parts)
 
-    def tf(self, output: str, *, angle_unit: str = "rad") -> control.TransferFunction:
-        """Return the transfer function from the redefined input to `output`, with its dead time (linear kinds)."""
-        return _linear.transfer_function(self.kind, self.sample_time, self.arrays, output, angle_unit)
+    def tf(
+        self,
+        output: str,
+        *,
+        angle_unit: str = "rad",
+        input: str | None = None,
+        continuous: bool = False,
+        pade: int = 3,
+    ) -> control.TransferFunction:
+        """Return a transfer function to `output` (linear kinds); in discrete time its dead time is exact.
+
+        Args:
+            output: "pitch" or "roll".
+            angle_unit: of the output, "rad" or "deg".
+            input: "theta_i", "phi_i", "delta_i" or "motor_setpoint_1".., the others held; None takes the redefined
+                input of `output` (Eq. 9, 10).
+            continuous: return K/(s + p) and the like, the dead time as a Pade approximation.
+            pade: its order; 0 leaves the dead time out.
+        """
+        G = _linear.transfer_function(self, output, input, angle_unit)
+        return _linear.continuous_function(self, output, input, angle_unit, pade) if continuous else G
 
     def ss(self) -> control.StateSpace:
-        """Return the state space from (theta_i, phi_i) to (pitch, roll) [rad] (linear kinds)."""
-        return _linear.state_space(self.kind, self.sample_time, self.arrays)
+        """Return the state space to (pitch, roll) [rad] from (theta_i, phi_i), or from the motors where it has them."""
+        return _linear.state_space(self)
 
     def summary(self) -> str:
         """Return a few lines on what the model is, in degrees."""
         lines = [f"{self.kind}: {KINDS[self.kind].summary}", f"sample time {1e3 * self.sample_time:g} ms"]
         if self.kind in _linear.KINDS:
-            lines += [_linear.describe(self.sample_time, self.arrays, axis) for axis in (0, 1)]
+            lines += _linear.describe(self)
         lines += [f"{key}: {_short(value)}" for key, value in self.findings.items() if _is_plain(value)]
         lines.append(f"trained on {self.training_rows.size} rows")
         return "\n".join(lines)
@@ -202,7 +220,7 @@ class Model:
         if not np.isclose(recording.sample_time, self.sample_time, rtol=1e-3):
             raise DataError(
                 f"the model was identified at {self.sample_time:g} s and the recording is at "
-                f"{recording.sample_time:g} s; resample it or identify again."
+                f"{recording.sample_time:g} s; resample it (`softneck.signals.resampled`) or identify again."
             )
         if len(recording) < 2:
             raise DataError(f"a run needs at least 2 rows; got {len(recording)}.")

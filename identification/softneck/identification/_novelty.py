@@ -50,6 +50,12 @@ class Novelty:
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(self.spacing > 0.0, self.distance / self.spacing, np.nan)
 
+    @property
+    def larger(self) -> list[float] | None:
+        """The larger ratio of both axes at each quantile; None where the training rows coincide."""
+        ratio = self.ratio[np.isfinite(self.ratio).all(axis=1)]
+        return ratio.max(axis=0).tolist() if ratio.size else None
+
     def as_dict(self) -> dict[str, Any]:
         """Return axis -> {"distance", "spacing", "ratio"} -> quantile -> value, for JSON."""
         tables = {"distance": self.distance, "spacing": self.spacing, "ratio": self.ratio}

@@ -34,6 +34,11 @@ def usual_widths(data: Sequence[tuple[Matrix, Vector]], gamma: Vector, epsilon: 
     return {_FINDING: np.degrees(widths).tolist()}
 
 
+def knows_what_it_saw(model: Model) -> bool:
+    """Return whether `outside_seen` can judge by this model."""
+    return _FINDING in model.findings
+
+
 def outside_seen(model: Model, outputs: Matrix) -> np.ndarray:
     """Return (rows, 2) whether the bounds of pitch and of roll are wider than the training data's usually are.
 
@@ -44,7 +49,7 @@ def outside_seen(model: Model, outputs: Matrix) -> np.ndarray:
     Raises:
         SettingsError: a model without bounds, or one identified before this was learned.
     """
-    if _FINDING not in model.findings:
+    if not knows_what_it_saw(model):
         raise SettingsError("only a model of kind nlsm knows what it has seen; identify one (again).")
     if outputs.ndim != 2 or outputs.shape[1] != 9:
         raise DataError(f"`outputs` must be (rows, 9), as a model of kind nlsm returns; got {outputs.shape}.")

@@ -1,16 +1,16 @@
-"""Recursive least squares over the redefined inputs, one axis at a time, with dead time (section 4)."""
+"""Recursive least squares over the redefined inputs or the motors, with dead time (section 4)."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from scipy.signal import lfilter, lfiltic
 
 from softneck.core import (
     DataError,
     Matrix,
     Progress,
+    SettingsError,
     Vector,
     load_functions,
     require_between,
@@ -23,13 +23,20 @@ from softneck.signals import TENDON_ANGLES, Recording, concatenate, redefine, re
 
 from ._checks import check_training
 from ._drive import fit_drive
+from ._free_run import delay_samples, free_run_fit
+from ._lss import lss_arrays, varx_system
 from ._model import WARM_UP, Model
+from ._recursion import EXACT_START, Recursion, require_forgetting
+from ._regression import arx_rows, require_excitation
 from ._rows import row_hashes
 from ._scores import nrmse_fit
 
-_RECURSION = "softneck.identification._recursion_runtime"
-# F(0): the weight of the start theta = 0; at 1e8 its bias is below 1e-9 on a record of one minute.
-_START_COVARIANCE = 1e8
+_STANDARD, _UD = "softneck.identification._recursion_runtime", "softneck.identification._ud_runtime"
+# F(0) of the standard form; a weaker start would cost it more digits than the start's pull does.
+_STANDARD_START = 1e8
+STRUCTURES = ("siso", "miso", "mimo")
+_AXES = ("pitch", "roll")
+Curve = list[list[float]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,7 +48,13 @@ class Rls:
         delay: dead time [s]; None searches it.
         delay_by: the search's criterion on the training rows: "free_run" (simulation) or "one_step" (prediction).
         max_delay: end of the search [s].
-        forgetting: 1 for Eq. 29, below for a constant forgetting factor.
+        forgetting: lambda in (0, 1]; 1 for Eq. 29, below for a constant forgetting factor (CFF-RLS).
+        structure: "siso" over theta_i and phi_i, "miso" (each output from the three motors and its own past) or
+            "mimo" (from the three motors and both pasts).
+        form: "ud" (Bierman's factors) or "standard" (Eq. 29 as printed).
+        covariance_bound: on the trace of F where `forgetting` is below 1; 0 for none.
+        dead_zone: prediction errors up to this size [rad] change nothing.
+        stable: halve a step that would make a pole unstable (not for "mimo").
     """
 
     na: int = 1
@@ -50,6 +63,11 @@ class Rls:
     delay_by: str = "free_run"
     max_delay: float = 0.3
     forgetting: float = 1.0
+    structure: str = "siso"
+    form: str = "ud"
+    covariance_bound: float = 1e8
+    dead_zone: float = 0.0
+    stable: bool = False
 
     def __post_init__(self) -> None:
         # A hundred samples are 2 s: no neck remembers longer.
@@ -59,104 +77,182 @@ class Rls:
             require_between("delay", self.delay, 0.0, 2.0, "s")
         require_one_of("delay_by", self.delay_by, ("free_run", "one_step"))
         require_positive("max_delay", self.max_delay, "s")
-        require_between("forgetting", self.forgetting, 0.5, 1.0)
+        require_forgetting(self.forgetting)
+        require_one_of("structure", self.structure, STRUCTURES)
+        require_one_of("form", self.form, ("ud", "standard"))
+        require_between("covariance_bound", self.covariance_bound, 0.0, 1e15)
+        require_between("dead_zone", self.dead_zone, 0.0, np.pi, "rad")
+        if self.form == "standard" and (self.dead_zone > 0.0 or self.stable):
+            raise SettingsError("form `standard` is Eq. 28-30 alone; `dead_zone` and `stable` need form `ud`.")
+        if self.stable and self.structure == "mimo":
+            raise SettingsError("`stable` watches the poles of one output; use structure `siso` or `miso` with it.")
+
+    def recursion(self) -> Recursion:
+        """Return the recursion of one output, for use sample by sample."""
+        inputs = {"siso": 1, "miso": 3, "mimo": 3}[self.structure]
+        outputs = 2 if self.structure == "mimo" else 1
+        return Recursion(
+            parameters=outputs * self.na + inputs * self.nb,
+            forgetting=self.forgetting,
+            covariance_bound=self.covariance_bound if self.forgetting < 1.0 else 0.0,
+            dead_zone=self.dead_zone,
+            poles=self.na if self.stable else 0,
+            start_covariance=EXACT_START,
+        )
 
     def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
-        """Identify pitch from theta_i and roll from phi_i.
+        """Identify pitch from theta_i and roll from phi_i, or both from the motors.
 
         Args:
             recordings: one or several of one sample time; their runs are never joined.
             progress: called with the part done and a word on it.
 
         Raises:
-            DataError: too short, constant, or without two usable rows.
+            DataError: too short, constant, without two usable rows, or not enough excitation.
         """
         recording = concatenate(recordings if isinstance(recordings, list) else [recordings])
         check_training(recording)
-        drive = fit_drive(recording)
-        results = []
-        for axis in range(2):
-            progress(axis / 2, ("pitch", "roll")[axis])
-            results.append(self._fit_axis(recording, axis))
-        delays = np.array([float(d) for d, *_ in results])
-        history = int(max(self.na, delays.max() + self.nb, drive.delay.max()))
-        arrays = {
-            "history": np.array([float(history)]),
-            "drive": drive.array,
-            "redefinition": redefinition_matrix(TENDON_ANGLES),
-            "a": np.array([a for _, a, _, _ in results]),
-            "b": np.array([b for _, _, b, _ in results]),
-            "delay": delays,
-        }
-        curves = {name: curve for name, (_, _, _, curve) in zip(("pitch", "roll"), results, strict=True)}
+        fit = self._fit_siso if self.structure == "siso" else self._fit_motors
+        arrays, findings = fit(recording, progress)
         progress(1.0, "done")
         return Model(
             kind="rls",
             sample_time=recording.sample_time,
             arrays=arrays,
             settings=asdict(self),
-            findings={"delay_criterion": self.delay_by, "delay_curve": curves},
+            findings={"delay_criterion": self.delay_by, **findings},
             training_rows=row_hashes(recording),
         )
 
-    def _fit_axis(self, recording: Recording, axis: int) -> tuple[int, Vector, Vector, list[list[float]]]:
-        """Return delay [samples], a, b and the cost curve: rows of (delay [s], free-run fit [%], one-step rms)."""
-        Ts = recording.sample_time
-        delays = range(round(self.max_delay / Ts) + 1) if self.delay is None else [round(self.delay / Ts)]
-        runs = [(redefine(run.set_points)[:, axis], run.outputs[:, axis]) for run in recording.runs()]
-        best: tuple[float, int, Vector, Vector] | None = None
-        curve: list[list[float]] = []
-        for d in delays:
-            a, b, one_step = self._fit_delay(runs, d)
-            free = _free_run_fit(runs, a, b, d)
-            curve.append([d * Ts, free, one_step])
+    def _fit_siso(self, recording: Recording, progress: Progress) -> tuple[dict[str, Matrix], dict]:
+        drive = fit_drive(recording)
+        runs = [(run.outputs, redefine(run.set_points)) for run in recording.runs()]
+        a, b, delays, stds, numbers = [], [], [], [], []
+        curves: dict[str, Curve] = {}
+        for axis, name in enumerate(_AXES):
+            progress(axis / 2, name)
+            one = [(Y[:, [axis]], U[:, [axis]]) for Y, U in runs]
+            d, theta, std, curves[name], number = self._search(recording.sample_time, one, name)
+            a.append(theta[: self.na])
+            b.append(theta[self.na :])
+            delays.append(float(d))
+            stds.append(std.tolist())
+            numbers.append(number)
+        history = max(self.na, max(delays) + self.nb, drive.delay.max())
+        arrays = {
+            "history": np.array([float(int(history))]),
+            "drive": drive.array,
+            "redefinition": redefinition_matrix(TENDON_ANGLES),
+            "a": np.array(a),
+            "b": np.array(b),
+            "delay": np.array(delays),
+        }
+        return arrays, {"delay_curve": curves, "condition_number": numbers, "parameter_std": stds}
+
+    def _search(
+        self, sample_time: float, runs: list[tuple[Matrix, Matrix]], name: str
+    ) -> tuple[int, Vector, Vector, Curve, float]:
+        """Return delay [samples], theta, its std, the cost curve (delay [s], free-run fit [%], one-step rms), cond."""
+        best: tuple[float, int, Vector, Vector, float] | None = None
+        curve: Curve = []
+        for d in delay_samples(self.delay, self.max_delay, sample_time, runs):
+            theta, std, one_step, number = self._least_squares(runs, d, name)
+            free = free_run_fit(runs, theta[: self.na], theta[self.na :].reshape(-1, self.nb), d)
+            curve.append([d * sample_time, free, one_step])
             cost = -free if self.delay_by == "free_run" else one_step
             if best is None or cost < best[0]:
-                best = (cost, d, a, b)
+                best = (cost, d, theta, std, number)
         if best is None or not np.isfinite(best[0]):
             raise DataError(
-                f"no dead time gives a stable one-step model of {('pitch', 'roll')[axis]}; "
-                "record with more excitation or set `delay`."
+                f"no dead time gives a stable one-step model of {name}; record with more excitation or set `delay`."
             )
-        return best[1], best[2], best[3], curve
+        return best[1], best[2], best[3], curve, best[4]
 
-    def _fit_delay(self, runs: list[tuple[Vector, Vector]], d: int) -> tuple[Vector, Vector, float]:
-        Phi, y = _arx_regression(runs, self.na, self.nb, d)
-        theta = np.zeros(self.na + self.nb)
-        F = _START_COVARIANCE * np.eye(theta.size)
-        load_functions(_RECURSION).rls_recursion(Phi, y, theta, F, self.forgetting)
-        rms = float(np.sqrt(np.mean((y - Phi @ theta) ** 2)))
-        return theta[: self.na], theta[self.na :], rms
+    def _least_squares(
+        self, runs: list[tuple[Matrix, Matrix]], d: int, name: str
+    ) -> tuple[Vector, Vector, float, float]:
+        """Return theta, its standard deviation, the one-step rms and the condition number."""
+        Phi, Y = arx_rows(runs, self.na, self.nb, d)
+        y = np.ascontiguousarray(Y[:, 0])
+        number = require_excitation(name, Phi)
+        theta, F = self._recurse(Phi, y)
+        e = y - Phi @ theta
+        rms = float(np.sqrt(np.mean(e**2)))
+        free = max(y.size - theta.size, 1)
+        return theta, rms * np.sqrt(y.size / free * np.diag(F)), rms, number
+
+    def _recurse(self, Phi: Matrix, y: Vector) -> tuple[Vector, Matrix]:
+        n = Phi.shape[1]
+        if self.form == "standard":
+            theta, F = np.zeros(n), _STANDARD_START * np.eye(n)
+            load_functions(_STANDARD).rls_recursion(Phi, y, theta, F, self.forgetting)
+            return theta, F
+        recursion = self.recursion()
+        state = recursion.initial_state()
+        if self.forgetting < 1.0 or self.dead_zone > 0.0 or self.stable:
+            state, _ = recursion.run(state, Phi, y)
+        else:
+            load_functions(_UD).ud_recursion(Phi, y, state.theta, state.factor, state.scale, 1.0)
+        return state.theta, state.covariance
+
+    def _fit_motors(self, recording: Recording, progress: Progress) -> tuple[dict[str, Matrix], dict]:
+        """Fit both outputs over the three motors; "miso" takes a dead time each, "mimo" one for both."""
+        drive = fit_drive(recording).array
+        Ts = recording.sample_time
+        runs = [(run.outputs, run.set_points) for run in recording.runs()]
+        if self.structure == "miso":
+            found = []
+            for axis, name in enumerate(_AXES):
+                progress(axis / 2, name)
+                found.append(self._search(Ts, [(Y[:, [axis]], U) for Y, U in runs], name))
+            delays = [d for d, *_ in found]
+            arrays = self._motor_arrays([theta for _, theta, *_ in found], delays, drive)
+            curves = {name: curve for name, (*_, curve, _) in zip(_AXES, found, strict=True)}
+            return arrays, {"delay_curve": curves, "condition_number": [number for *_, number in found]}
+        best, curves = None, {name: [] for name in _AXES}
+        tried = delay_samples(self.delay, self.max_delay, Ts, runs)
+        for step, d in enumerate(tried):
+            progress(step / len(tried), f"{1e3 * d * Ts:.0f} ms")
+            both = [self._least_squares(_own_first(runs, axis), d, name) for axis, name in enumerate(_AXES)]
+            arrays = self._motor_arrays([theta for theta, *_ in both], [d, d], drive)
+            fits = _fits(Model(kind="rls", sample_time=Ts, arrays=arrays), recording)
+            for name, fit, (_, _, rms, _) in zip(_AXES, fits, both, strict=True):
+                curves[name].append([d * Ts, fit, rms])
+            cost = -sum(fits) if self.delay_by == "free_run" else sum(rms for _, _, rms, _ in both)
+            if best is None or cost < best[0]:
+                best = (cost, arrays, [number for *_, number in both])
+        if best is None or not np.isfinite(best[0]):
+            raise DataError("no dead time gives a stable model of both outputs; record more or set `delay`.")
+        return best[1], {"delay_curve": curves, "condition_number": best[2]}
+
+    def _motor_arrays(self, thetas: list[Vector], delays: list[int], drive: Matrix) -> dict[str, Matrix]:
+        return motor_arrays(self, thetas, delays, drive)
 
 
-def _arx_regression(runs: list[tuple[Vector, Vector]], na: int, nb: int, d: int) -> tuple[Matrix, Vector]:
-    """Return phi(t-1) of Eq. 26 (rows, na + nb), inputs shifted by the dead time, and y(t)."""
-    lag = max(na, nb + d)
-    parts, targets = [], []
-    for u, y in runs:
-        if u.size <= lag:
-            continue
-        columns = [-y[lag - i : y.size - i] for i in range(1, na + 1)]
-        columns += [u[lag - d - j : u.size - d - j] for j in range(1, nb + 1)]
-        parts.append(np.column_stack(columns))
-        targets.append(y[lag:])
-    if not parts:
-        raise DataError(f"every run is shorter than the {lag + 1} samples that this order and dead time need.")
-    Phi, target = np.concatenate(parts), np.concatenate(targets)
-    good = np.isfinite(Phi).all(axis=1) & np.isfinite(target)
-    return np.ascontiguousarray(Phi[good]), np.ascontiguousarray(target[good])
+def motor_arrays(settings: Rls, thetas: list[Vector], delays: list[int], drive: Matrix) -> dict[str, Matrix]:
+    """Return the runtime's arrays of parameters over the three motors, one vector for each output."""
+    na, nb, common = settings.na, settings.nb, min(delays)
+    p = max(na, nb + max(delays) - common)
+    A, B = np.zeros((p, 2, 2)), np.zeros((p, 2, 3))
+    for axis, (theta, d) in enumerate(zip(thetas, delays, strict=True)):
+        A[:na, axis, axis] = theta[:na]
+        rest = theta[na:]
+        if settings.structure == "mimo":
+            A[:na, axis, 1 - axis] = rest[:na]
+            rest = rest[na:]
+        late = d - common
+        B[late : late + nb, axis] = rest.reshape(3, nb).T
+    return lss_arrays(varx_system(A, B), delay=common, drive=drive, history=p + common)
 
 
-def _free_run_fit(runs: list[tuple[Vector, Vector]], a: Vector, b: Vector, d: int) -> float:
-    """Return the simulation fit [%] over all runs; -inf where the model is unstable."""
-    denominator = np.concatenate([[1.0], a])
-    if np.abs(np.roots(denominator)).max(initial=0.0) >= 1.0:
-        return -np.inf
-    numerator = np.concatenate([np.zeros(1 + d), b])
-    measured, simulated = [], []
-    for u, y in runs:
-        y0 = y[np.argmax(np.isfinite(y))]
-        zi = lfiltic(numerator, denominator, np.full(a.size, y0), np.full(numerator.size, u[0]))
-        measured.append(y[WARM_UP:])
-        simulated.append(lfilter(numerator, denominator, u, zi=zi)[0][WARM_UP:])
-    return nrmse_fit(np.concatenate(measured), np.concatenate(simulated))
+def _own_first(runs: list[tuple[Matrix, Matrix]], axis: int) -> list[tuple[Matrix, Matrix]]:
+    return [(Y[:, [axis, 1 - axis]], U) for Y, U in runs]
+
+
+def _fits(model: Model, recording: Recording) -> list[float]:
+    """Return the free-run fits [%] of both outputs; -inf where the model is unstable."""
+    if np.abs(np.linalg.eigvals(model.arrays["A"])).max() >= 1.0:
+        return [-np.inf, -np.inf]
+    simulated = model.simulate(recording)
+    starts = np.concatenate([np.arange(len(run)) for run in recording.runs()]) >= WARM_UP
+    return [nrmse_fit(recording.outputs[starts, axis], simulated[starts, axis]) for axis in range(2)]

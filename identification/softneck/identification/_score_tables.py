@@ -10,6 +10,8 @@ import numpy as np
 from softneck.core import Matrix, Vector
 
 from ._bootstrap import fit_intervals
+from ._model import Model
+from ._outside import knows_what_it_saw, outside_seen
 from ._scores import nrmse_fit, r_squared, rmse, worst_error
 from ._stretches import Rows, Stretch
 
@@ -103,6 +105,17 @@ def coverage_tables(
     width = np.where(there, upper - lower, 0.0).sum(axis=0) / count
     coverage = 100.0 * inside.sum(axis=0) / count
     return dict(zip(AXES, coverage.tolist(), strict=True)), dict(zip(AXES, np.degrees(width).tolist(), strict=True))
+
+
+def outside_table(model: Model, measured: Matrix, free: Matrix) -> dict[str, float] | None:
+    """Return how many measured samples [%] the bounds flag as outside what a set membership model has seen."""
+    lower, upper = free_run_bounds(free)
+    there = np.isfinite(measured) & np.isfinite(lower) & np.isfinite(upper)
+    if not there.any() or not knows_what_it_saw(model):
+        return None
+    flagged = outside_seen(model, free) & there
+    share = 100.0 * flagged.sum(axis=0) / np.maximum(there.sum(axis=0), 1)
+    return dict(zip(AXES, share.tolist(), strict=True))
 
 
 def _number(value: float) -> float | None:

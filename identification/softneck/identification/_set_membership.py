@@ -89,7 +89,7 @@ class SetMembership:
     output_weight: float | None = None
     epsilon: float | None = None
     motors: str | None = None
-    base: str = "rls"
+    base: str = "oe"
 
     def __post_init__(self) -> None:
         require_one_of("form", self.form, FORMS)

@@ -23,7 +23,8 @@ class Stretch:
 
     Attributes:
         recording: those rows alone.
-        scored: (time,) which of them are judged; never the first 25, nor a row that the model was trained on.
+        scored: (time,) which of them are judged; never the first 25, a row that the model was trained on, or one
+            where neither angle was measured.
         run: number of the run, as the recording counts.
     """
 
@@ -79,8 +80,10 @@ def unseen_stretches(recording: Recording, hashes: np.ndarray) -> tuple[list[Str
         for start, stop in _unseen(seen):
             mask = ~seen[start:stop]
             mask[:WARM_UP] = False
+            part = run.rows(start, stop)
+            mask &= np.isfinite(part.outputs).any(axis=1)
             if mask.any():
-                stretches.append(Stretch(run.rows(start, stop), mask, int(run.run[0])))
+                stretches.append(Stretch(part, mask, int(run.run[0])))
     if not stretches:
         raise DataError(f"nothing is left to judge: {_why(len(recording), left_out, longest)}")
     return stretches, left_out

@@ -18,7 +18,7 @@ from ._model import Model
 from ._novelty import Novelty, novelty
 from ._residual_tests import ResidualTests, residual_tests
 from ._score_tables import INFINITE as INFINITE
-from ._score_tables import coverage_tables, free_run_bounds, interval_tables, run_tables, score_tables
+from ._score_tables import coverage_tables, free_run_bounds, interval_tables, outside_table, run_tables, score_tables
 from ._stretches import Rows, Stretch, pooled, unseen_stretches
 
 _HORIZONS = (1, 5, 25, INFINITE)
@@ -50,6 +50,8 @@ class Validation:
         novelty: how far the judged rows lie from the training rows, where these are known.
         coverage_pct, mean_width_deg: of set membership in free run: axis -> measured samples within the bounds [%],
             and their mean distance [deg]; None for other kinds.
+        outside_pct: of set membership in free run: axis -> measured samples [%] at which the bounds are wider than
+            training's usually are (see `outside_seen`); None for other kinds.
         time, run: (time,) [s] and the number of the stretch, for plots: no line joins two of them.
         measured, free_run, one_step: (time, 2) [rad], NaN where nothing is scored.
         lower, upper: (time, 2) [rad] bounds of the free run, NaN where there are none.
@@ -75,6 +77,7 @@ class Validation:
     novelty: Novelty | None
     coverage_pct: dict[str, float] | None
     mean_width_deg: dict[str, float] | None
+    outside_pct: dict[str, float] | None
     time: Vector
     run: np.ndarray
     measured: Matrix
@@ -121,6 +124,7 @@ class Validation:
             "novelty": None if self.novelty is None else self.novelty.as_dict(),
             "coverage_pct": self.coverage_pct,
             "mean_width_deg": self.mean_width_deg,
+            "outside_pct": self.outside_pct,
             "per_run": self.per_run,
         }
 
@@ -252,6 +256,7 @@ def judge(
         novelty=novelty(model, parts.stretches, training),
         coverage_pct=coverage,
         mean_width_deg=width,
+        outside_pct=outside_table(model, rows.measured, free),
         time=rows.time,
         run=rows.stretch,
         measured=rows.measured,

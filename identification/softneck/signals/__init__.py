@@ -43,6 +43,7 @@ from ._redefinition import TENDON_ANGLES as TENDON_ANGLES
 from ._redefinition import motors_from as motors_from
 from ._redefinition import redefine as redefine
 from ._redefinition import redefinition_matrix as redefinition_matrix
+from ._resampling import resampled as resampled
 from ._sample_time import SampleTime as SampleTime
 from ._sample_time import estimate_sample_time as estimate_sample_time
 from ._scaling import Scaling as Scaling

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, Vector, require_one_of, require_positive
+from softneck.core import Matrix, SettingsError, Vector, require_between, require_one_of
 
 from ._redefinition import motors_from
 
@@ -20,6 +20,8 @@ _PHI_3, _PHI_5, _PHI_6, _PHI_7 = 0.32, 0.09, 0.29, 0.67
 # [s] of each signal when no other length is asked for; None: any length.
 _DURATIONS = {"eq22": 200.0, "steps": 26.0, "sine": 30.0, "rotation": 30.0, "aprbs": 140.0, "multisine": 140.0,
               "mixed": 140.0}  # fmt: skip
+# A day at 20 ms is 4 million samples and 1 GB as text.
+_LONGEST = 86_400.0
 # Fixed by definition: these tests have one length.
 _FIXED = ("steps", "sine", "rotation")
 
@@ -55,11 +57,11 @@ def signal(name: str, *, duration: float | None = None, seed: int = 0) -> Excita
         seed: of aprbs, multisine and mixed.
 
     Raises:
-        SettingsError: unknown name or a duration that is not positive.
+        SettingsError: unknown name, or a duration under a sample or beyond a day.
     """
     require_one_of("signal", name, signal_names())
     length = _DURATIONS[name] if duration is None else duration
-    require_positive("duration", length, "s")
+    require_between("duration", length, SAMPLE_TIME, _LONGEST, "s")
     if name in _FIXED and length > _DURATIONS[name]:
         raise SettingsError(f"`{name}` is {_DURATIONS[name]:g} s long by definition; got a duration of {length:g} s.")
     t = np.arange(round(length / SAMPLE_TIME)) * SAMPLE_TIME

@@ -143,9 +143,7 @@ def _layout(table: dict[str, Any]) -> Layout:
         channels={name: _channel_source(name, entry) for name, entry in table.get("channels", {}).items()},
         inclination=_source(tilt["inclination"], "rad", "[tilt] inclination") if tilt else None,
         orientation=_source(tilt["orientation"], "rad", "[tilt] orientation") if tilt else None,
-        time=_source({"unit": "s", **_only(time, "column", "unit", "factor")}, "s", "[time]")
-        if "column" in time
-        else None,
+        time=_time_source(time),
         sample_time=None if time.get("sample_time_s") == "estimate" else _positive(time.get("sample_time_s")),
         estimate=time.get("sample_time_s") == "estimate",
         new_run_at_restart=_flag(time, "new_run_at_restart", default=False),
@@ -185,14 +183,16 @@ def _source(entry: Any, quantity: str, where: str) -> Source:
         raise SettingsError(f"{where} names no unit.")
     if to_si(entry["unit"])[1] != quantity:
         raise SettingsError(f"{where} cannot be in `{entry['unit']}`; its SI unit is {quantity}.")
-    parsed = tuple(Term(term["column"], _finite(term.get("factor", 1.0), where)) for term in terms)
-    return Source(parsed, entry["unit"], _finite(entry.get("sign", 1.0), where))
+    parsed = tuple(Term(term["column"], _factor(term.get("factor", 1.0), where)) for term in terms)
+    if entry.get("sign", 1) not in (1, -1) or isinstance(entry.get("sign"), bool):
+        raise SettingsError(f"{where}: sign must be 1 or -1; got {entry['sign']!r}. Scale it by `factor`.")
+    return Source(parsed, entry["unit"], float(entry.get("sign", 1)))
 
 
-def _finite(value: Any, where: str) -> float:
+def _factor(value: Any, where: str) -> float:
     number = float(value)
-    if not math.isfinite(number):
-        raise SettingsError(f"{where}: a factor or sign must be a finite number; got {value}.")
+    if not math.isfinite(number) or number == 0.0:
+        raise SettingsError(f"{where}: a factor must be a finite number other than 0; got {value}.")
     return number
 
 

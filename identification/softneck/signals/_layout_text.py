@@ -82,19 +82,15 @@ def _inline(source: Source) -> str:
     term = source.terms[0]
     parts = [f"column = {_text(term.column)}", f"unit = {_text(source.unit)}"]
     parts += [f"factor = {term.factor!r}"] if term.factor != 1.0 else []
-    parts += [f"sign = {_number(source.sign)}"] if source.sign != 1.0 else []
+    parts += [f"sign = {source.sign:g}"] if source.sign != 1.0 else []
     return "{ " + ", ".join(parts) + " }"
 
 
 def _sum(source: Source) -> list[str]:
     terms = ", ".join(f"{{ column = {_text(t.column)}, factor = {t.factor!r} }}" for t in source.terms)
     return [f"unit = {_text(source.unit)}", f"terms = [{terms}]"] + (
-        [f"sign = {_number(source.sign)}"] if source.sign != 1.0 else []
+        [f"sign = {source.sign:g}"] if source.sign != 1.0 else []
     )
-
-
-def _number(value: float) -> str:
-    return str(int(value)) if value in (1.0, -1.0) else repr(value)
 
 
 def _text(value: str | int) -> str:

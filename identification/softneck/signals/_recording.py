@@ -215,7 +215,7 @@ def concatenate(recordings: list[Recording] | tuple[Recording, ...]) -> Recordin
         if not np.isclose(recording.sample_time, first.sample_time, rtol=1e-6):
             raise DataError(
                 f"recordings of different sample times cannot be used together: {first.sample_time:g} s and "
-                f"{recording.sample_time:g} s. Resample one of them."
+                f"{recording.sample_time:g} s. Work on each by itself, or bring one to the other's by `resampled`."
             )
         parts.extend(recording.runs())
     names = [name for name in first.channels if all(name in part.channels for part in parts)]

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from softneck.core import DataError, Vector
+from softneck.core import DataError, Vector, require_positive
 
 from ._channels import is_held
+from ._recording import Recording
 
 # A step of 1.5 usual ones: at least one sample is not there.
 _GAP = 1.5
@@ -107,6 +108,25 @@ def mean_step(samples: Samples) -> float:
     """Return the mean step inside the runs [s], to ten digits: jitter averages out."""
     step = np.diff(samples.time)[np.diff(samples.run) == 0]
     return float(f"{step.mean():.10g}")
+
+
+def resampled(recording: Recording, sample_time: float) -> Recording:
+    """Return a recording at another sample time [s], run by run, as an import makes uneven times even.
+
+    A model is of one sample time; this brings other recordings there. What a slower one cannot hold is not filtered
+    out before.
+
+    Raises:
+        DataError: a run is shorter than the new sample time.
+    """
+    require_positive("sample_time", sample_time, "s")
+    shortest = min(len(run) for run in recording.runs())
+    if (shortest - 1) * recording.sample_time < sample_time:
+        raise DataError(
+            f"a run of {shortest} rows at {recording.sample_time:g} s has no two samples {sample_time:g} s apart."
+        )
+    even, _ = resample(Samples(recording.time, recording.run, recording.channels), sample_time)
+    return Recording(even.time, sample_time, even.channels, even.run)
 
 
 def resample(samples: Samples, sample_time: float) -> tuple[Samples, float]:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
-from softneck.core import KINDS, find_kind, kinds_of, refuse_existing, resolve
-from softneck.identification import load_model
+from softneck.core import KINDS, find_kind, kinds_of, load, refuse_existing, resolve
 
 from ._console import print_json, progress
 from ._options import apply_settings, force_option, json_option, output_option, set_option, target
@@ -17,7 +17,8 @@ _KINDS = "\n".join(f"  {name:6} {KINDS[name].summary}" for name in kinds_of("con
 
 @click.command(
     "design",
-    help=f"Design a controller of KIND on an identified linear MODEL.\n\n\b\nKinds:\n{_KINDS}",
+    help="Design a controller of KIND on an identified linear MODEL, or on the nominal plant of a FAMILY."
+    f"\n\n\b\nKinds:\n{_KINDS}",
     epilog="Example: softneck design pi rls.npz -o pi.npz --set phase_margin_deg=60",
 )
 @click.argument("kind")
@@ -29,12 +30,18 @@ _KINDS = "\n".join(f"  {name:6} {KINDS[name].summary}" for name in kinds_of("con
 def command(kind: str, model: Path, output: Path | None, settings: tuple[str, ...], force: bool, as_json: bool) -> None:
     """Design a controller of KIND on an identified linear MODEL."""
     entry = find_kind(kind, "controller")
-    path, replace = target(output, f"controllers/{kind}.npz", force=force)
+    path, replace = target(output, f"controllers/{kind}.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
     with progress(f"design {kind}", quiet=as_json):
-        controller = apply_settings(resolve(entry.settings), settings).design(load_model(model))
+        controller = apply_settings(resolve(entry.settings), settings).design(_linear(model))
     controller.save(path, force=replace)
     if as_json:
         print_json({"controller": str(path), "kind": kind, "summary": controller.summary()})
         return
     click.echo(f"{path}\n{controller.summary()}")
+
+
+def _linear(path: Path) -> Any:
+    """Open a model or a family."""
+    thing = load(path)
+    return thing if hasattr(thing, "tf") else load(path, role="model")  # which says what it is

@@ -8,10 +8,11 @@ import click
 
 from softneck.core import KINDS, SettingsError, find_kind, kinds_of, refuse_existing, resolve
 from softneck.identification import INFINITE, Model, Search, Validation, validate
-from softneck.signals import Recording, concatenate, read_recording
+from softneck.signals import Recording
 
 from ._console import note, percent, print_json, progress
 from ._options import apply_settings, force_option, json_option, output_option, set_option, target
+from ._recordings import read_together
 from ._search import (
     SearchOptions,
     hold_out_option,
@@ -63,11 +64,11 @@ def command(
     options = SearchOptions(searches, hold_out, strategy, plot)
     if not 0.0 < train <= 1.0:
         raise SettingsError(f"--train: the part to train on must be in (0, 1]; got {train:g}.")
-    path, replace = target(output, f"models/{kind}.npz", force=force)
+    path, replace = target(output, f"models/{kind}.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
     if plot is not None:
         refuse_existing(plot, force=force)
-    whole = concatenate([read_recording(source) for source in recordings])
+    whole = read_together(recordings)
     # All of it to train on leaves nothing to hold out.
     head, tail = (whole, None) if train == 1.0 else whole.split(train)
     found = run_search(estimator, head, options, quiet=as_json)

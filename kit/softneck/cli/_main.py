@@ -23,6 +23,7 @@ _COMMANDS = {
     "identify": ("_identify", "Identify a model from recordings."),
     "validate": ("_validate", "Judge models on rows that they were not trained on."),
     "reproduce-paper": ("_reproduce_paper", "Run the paper on the virtual neck, ours beside its tables and figures."),
+    "family": ("_family", "Fit an uncertain linear plant over inclinations and payloads."),
     "fmu": ("_fmu", "Package models, observers, controllers or the virtual neck as FMUs."),
     "observer": ("_observer", "Build a Kalman filter over a linear model."),
     "design": ("_design", "Design a controller on a linear model."),

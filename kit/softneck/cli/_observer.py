@@ -25,7 +25,7 @@ def command(
 ) -> None:
     """Build a Kalman filter over the linear MODEL."""
     kind = find_kind("kalman", "observer")
-    path, replace = target(output, "observers/kalman.npz", force=force)
+    path, replace = target(output, "observers/kalman.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
     observer = apply_settings(resolve(kind.settings), settings, sensor=sensor).design(load_model(model))
     observer.save(path, force=replace)

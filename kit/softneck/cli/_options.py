@@ -32,8 +32,14 @@ def output_option(what: str, metavar: str, *, required: bool = False) -> Callabl
     )
 
 
-def target(output: Path | None, default: str, *, force: bool) -> tuple[Path, bool]:
-    """Return where to write and whether what stands there may be replaced: always under build/."""
+def target(output: Path | None, default: str, *, force: bool, ending: str | None = None) -> tuple[Path, bool]:
+    """Return where to write and whether what stands there may be replaced: always under build/.
+
+    Raises:
+        SettingsError: another ending than `ending`, by which files are known.
+    """
+    if output is not None and ending is not None and output.suffix.lower() != ending:
+        raise SettingsError(f"{output}: must end in `{ending}`, by which softneck knows the file.")
     return (output, force) if output is not None else (Path("build") / default, True)
 
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
-import numpy as np
 
-from softneck.core import DataError, SettingsError, refuse_existing
+from softneck.core import SettingsError, refuse_existing
 from softneck.identification import INFINITE, Rules, Validation, compare, load_model
 from softneck.plots import write_page
-from softneck.signals import Recording, concatenate, read_recording
+from softneck.signals import read_recording
 
 from ._console import print_json, print_table, progress
 from ._options import force_option, json_option
+from ._recordings import read_together
 from ._validate_table import fit_table, remarks
 
 _NOTE = (
@@ -63,9 +63,9 @@ def command(
     if html is not None:
         refuse_existing(html, force=force)
     loaded = {str(path): load_model(path) for path in models}
-    recordings = {str(path): _measured(path) for path in data}
+    recordings = {str(path): read_recording(path) for path in data}
     rules = Rules(horizons, motors, include_training)
-    known = concatenate([read_recording(path) for path in training]) if training else None
+    known = read_together(training) if training else None
     with progress("validate", quiet=as_json) as report:
         comparison = compare(loaded, recordings, rules=rules, training=known, progress=report)
     results = list(comparison.validations)
@@ -79,15 +79,6 @@ def command(
         for line in remarks(result):
             click.echo(line)
     click.echo(_NOTE)
-
-
-def _measured(path: Path) -> Recording:
-    """Read a recording whose outputs were both measured."""
-    recording = read_recording(path)
-    for axis, name in enumerate(("pitch", "roll")):
-        if not np.isfinite(recording.outputs[:, axis]).any():
-            raise DataError(f"{path}: `{name}` holds no measured sample; nothing can be judged by it.")
-    return recording
 
 
 def _horizons(text: str) -> tuple[int | str, ...]:

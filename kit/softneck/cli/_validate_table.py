@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from softneck.identification import Validation
 
 from ._console import percent
@@ -46,22 +48,31 @@ def remarks(r: Validation) -> list[str]:
     lines += [f"{who}: the free run of run {e['run']} diverged at {e['diverged']:.2f} s" for e in lost]
     if any(fit is not None for fit in r.noise_ceiling.values()):
         lines.append(f"{who}: repeats allow a perfect model {_pair(r.noise_ceiling.values())} % (noise ceiling)")
-    p_values = "/".join("<0.001" if p < 1e-3 else f"{p:.3f}" for p in r.residual_tests.p_value)
-    lines.append(
-        f"{who}: one-step errors are {'' if r.white else 'not '}white (p {p_values}) and "
-        f"{'do not follow' if r.uncorrelated else 'follow'} the inputs (99 %)"
-    )
+    lines.append(f"{who}: {_residuals(r)}")
     if r.coverage_pct is not None and r.mean_width_deg is not None and not lost:
         lines.append(
             f"{who}: free-run bounds hold {_pair(r.coverage_pct.values())} % of the samples, "
             f"{_pair(r.mean_width_deg.values())} deg wide"
         )
-    if r.novelty is not None:
-        p50, p90, p99, most = (f"{value:.1f}" for value in r.novelty.ratio.max(axis=0))
+    if r.outside_pct is not None and not lost:
+        lines.append(f"{who}: {_pair(r.outside_pct.values())} % of them lie outside what the model has seen")
+    if r.novelty is not None and r.novelty.larger is not None:
+        p50, p90, p99, most = (f"{value:.1f}" for value in r.novelty.larger)
         lines.append(
             f"{who}: novelty {p50} (median), {p90} (90 %), {p99} (99 %), {most} (largest) times the training's spacing"
         )
     return lines
+
+
+def _residuals(r: Validation) -> str:
+    p_value = r.residual_tests.p_value
+    if np.isnan(p_value).any():
+        return "too few one-step errors to test whether they are white"
+    p_values = "/".join("<0.001" if p < 1e-3 else f"{p:.3f}" for p in p_value)
+    return (
+        f"one-step errors are {'' if r.white else 'not '}white (p {p_values}) and "
+        f"{'do not follow' if r.uncorrelated else 'follow'} the inputs (99 %)"
+    )
 
 
 def _pair(values: Iterable[float | None], *, digits: int = 1) -> str:

@@ -17,10 +17,10 @@ class Kind:
 
     Attributes:
         name: what users type and what a file's header says.
-        role: "model", "observer" or "controller".
+        role: "model", "observer", "controller", "family" or "state".
         settings: dotted path of the settings class whose `fit` or `design` makes it.
         result: dotted path of the class that a file becomes, by its `from_archive`.
-        runtime: dotted name of the runtime module (see `core.bundle`).
+        runtime: dotted name of the runtime module (see `core.bundle`); "" for what no loop steps.
         summary: one line for `--help` and the docs.
     """
 
@@ -38,10 +38,22 @@ KINDS: dict[str, Kind] = {
     for kind in (
         Kind("rls", "model", "softneck.identification:Rls", _MODEL, "softneck.identification._rls_runtime",
              "recursive least squares over the redefined inputs, with dead time (Eq. 23-30)"),
+        Kind("oe", "model", "softneck.identification:OutputError", _MODEL, "softneck.identification._oe_runtime",
+             "output error: transfer functions with dead time that simulate best (Gauss-Newton)"),
+        Kind("srivc", "model", "softneck.identification:Srivc", _MODEL, "softneck.identification._oe_runtime",
+             "continuous-time K exp(-L s)/(s + p) by refined instrumental variables, with confidence intervals"),
+        Kind("subspace", "model", "softneck.identification:Subspace", _MODEL, "softneck.identification._lss_runtime",
+             "state space from the three motors to both angles (N4SID), without redefinition"),
         Kind("nlsm", "model", "softneck.identification:SetMembership", _MODEL, "softneck.identification._nlsm_runtime",
              "nonlinear set membership (Eq. 12-21, Algorithm 1)"),
         Kind("nn", "model", "softneck.identification:Network", _MODEL, "softneck.identification._nn_runtime",
              "NLARX neural network, two hidden layers of 25 (section 6.2)"),
+        Kind("rls_state", "state", "softneck.identification:Recursion", "softneck.identification:RecursionState",
+             "", "what a recursive least squares remembers"),
+        Kind("rls_online", "state", "softneck.identification:OnlineRls", "softneck.identification:OnlineState",
+             "", "what a neck identified sample by sample has learnt"),
+        Kind("family", "family", "softneck.identification:FamilySettings", "softneck.identification:Family", "",
+             "uncertain linear plant: nominal, box, samples and a weight over them"),
         Kind("kalman", "observer", "softneck.estimation:KalmanSettings", "softneck.estimation:KalmanObserver",
              "softneck.estimation._kalman_runtime",
              "Kalman filter over an identified linear model with a disturbance state"),

@@ -18,6 +18,9 @@ from ._figures import validation_figure as validation_figure
 from ._judgement_charts import cost_chart as cost_chart
 from ._judgement_charts import histogram_chart as histogram_chart
 from ._judgement_charts import residual_chart as residual_chart
+from ._linear_figures import convergence_figure as convergence_figure
+from ._linear_figures import cover_figure as cover_figure
+from ._linear_figures import local_map_figure as local_map_figure
 from ._matplotlib import chart_figure as chart_figure
 from ._neck3d import neck_view as neck_view
 from ._page import Section as Section

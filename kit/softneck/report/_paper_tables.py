@@ -21,9 +21,10 @@ _SAME = 1.0
 PAPER_HEAD = ["where", "model, axis", "what it is", "persistence", "paper", "ours", "other necks", "the difference"]
 PAPER_NOTE = (
     "Fit 100 (1 - |y - yhat| / |y - mean y|) in %. SM and NN of Tables 3 and 4 are one step ahead, RLS a free run; "
-    "section 7.4 is a free run with measured motors. `Other necks` is the span of the same estimator, trained anew, "
-    "over the other plants; `scaling` adds set membership with angles in degrees beside motors in radians in its norm, "
-    "as they are logged. A figure of the paper inside such a span needs no other cause; `unexplained`: none tried here."
+    "section 7.4 is a free run with measured motors. SM's norm has no weights and the units of the paper's logs, "
+    "motors in rad and angles in deg; `scaling` is SM with weights chosen for free run. `Other necks` is the span of "
+    "the same estimator, trained anew, over the other plants. A figure of the paper inside these needs no other cause; "
+    "`unexplained`: none tried here."
 )
 
 
@@ -124,7 +125,7 @@ def _entries(found: Reproduction) -> Iterator[Entry]:
                     paper=figure,
                     ours=_fit(found.judged, key, axis, configuration),
                     span=_span(found.others, key, axis, configuration),
-                    scaling=_fit(found.as_logged, key, axis, configuration) if key in found.as_logged else None,
+                    scaling=_fit(found.rescaled, key, axis, configuration) if key in found.rescaled else None,
                 )
 
 

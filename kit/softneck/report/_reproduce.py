@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from softneck.core import require_whole
-from softneck.identification import Model, SetMembership
+from softneck.identification import Model, Network, Rls, SetMembership
 from softneck.plant import NeckParameters
 
-from ._experiments import Experiments, Judged, Tell, identify, judge, record_experiments
+from ._experiments import Experiments, Judged, Tell, judge, record_experiments
 
-KINDS = ("nlsm", "nn", "rls")
-# The paper logs motors in radians and angles in degrees; taken as they are, an angle weighs 180/pi times a motor.
+# The paper's norm (Eq. 16) has no weights, and its logs have motors in radians and angles in degrees: taken as they
+# are, an angle weighs 180/pi times a motor.
 AS_LOGGED = 180.0 / np.pi
 _DURATION = 200.0
 _SPREAD_SEED = 0
@@ -53,7 +53,7 @@ class Reproduction:
         experiments: recordings on the `paper` preset.
         models: nlsm, nn and rls of those.
         judged: (model, data) -> scores on the `paper` preset.
-        as_logged: the same for set membership with angles in degrees beside motors in radians in its norm.
+        rescaled: the same for set membership with weights chosen for free run instead of the paper's units.
         others: name of another neck -> its scores.
         seconds: it all took.
     """
@@ -62,7 +62,7 @@ class Reproduction:
     experiments: Experiments
     models: Mapping[str, Model]
     judged: Verdicts
-    as_logged: Verdicts
+    rescaled: Verdicts
     others: Mapping[str, Verdicts]
     seconds: float
 
@@ -77,9 +77,7 @@ def reproduce(settings: ReproduceSettings, *, tell: Tell) -> Reproduction:
     begin = time.monotonic()
     experiments = record_experiments(NeckParameters.paper(), duration=settings.duration, tell=tell)
     models = _models(experiments, settings, tell)
-    variant = SetMembership(output_weight=AS_LOGGED).fit(
-        experiments.identification, progress=tell("identify nlsm, angles in degrees")
-    )
+    rescaled = SetMembership().fit(experiments.identification, progress=tell("identify nlsm, weights for free run"))
     others: dict[str, Verdicts] = {}
     for name, neck in _other_necks(settings.other_necks).items():
         recorded = record_experiments(neck, duration=settings.duration, tell=lambda text, n=name: tell(f"{n}: {text}"))
@@ -93,15 +91,20 @@ def reproduce(settings: ReproduceSettings, *, tell: Tell) -> Reproduction:
         experiments=experiments,
         models=models,
         judged=judge(models, experiments, tell=tell),
-        as_logged=judge({"nlsm": variant}, experiments, tell=tell),
+        rescaled=judge({"nlsm": rescaled}, experiments, tell=tell),
         others=others,
         seconds=time.monotonic() - begin,
     )
 
 
 def _models(experiments: Experiments, settings: ReproduceSettings, tell: Tell) -> dict[str, Model]:
-    found = identify(experiments.identification, iterations=settings.iterations, seed=settings.seed, tell=tell)
-    return {kind: found[kind] for kind in KINDS}
+    estimators = {
+        "nlsm": SetMembership(output_weight=AS_LOGGED),
+        "nn": Network(iterations=settings.iterations, seed=settings.seed),
+        "rls": Rls(),
+    }
+    data = experiments.identification
+    return {kind: estimator.fit(data, progress=tell(f"identify {kind}")) for kind, estimator in estimators.items()}
 
 
 def _other_necks(count: int) -> dict[str, NeckParameters]:

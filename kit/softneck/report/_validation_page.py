@@ -68,7 +68,8 @@ def _overview(results: Sequence[Validation]) -> Section:
 
 
 def _verdicts(r: Validation) -> list[str]:
-    words = ["holds" if verdict else "fails" for verdict in (r.white, r.uncorrelated)]
+    tested = not np.isnan(r.residual_tests.p_value).any()
+    words = ["-" if not tested else "holds" if verdict else "fails" for verdict in (r.white, r.uncorrelated)]
     return [*words, "no" if r.diverged is None else f"at {r.diverged:.2f} s"]
 
 
@@ -120,10 +121,12 @@ def _residuals(r: Validation) -> Chart:
 
 def _remarks(r: Validation) -> list[str]:
     p_values = "/".join(f"{p:.2g}" for p in r.residual_tests.p_value)
-    words = [
-        f"One step ahead the errors are {'white' if r.white else 'not white'} (portmanteau p {p_values}) and "
-        f"{'follow no set-point' if r.uncorrelated else 'follow the set-points'} (99 %)."
-    ]
+    words = ["There are too few one-step errors to test whether they are white."]
+    if not np.isnan(r.residual_tests.p_value).any():
+        words = [
+            f"One step ahead the errors are {'white' if r.white else 'not white'} (portmanteau p {p_values}) and "
+            f"{'follow no set-point' if r.uncorrelated else 'follow the set-points'} (99 %)."
+        ]
     if r.diverged is not None:
         words.append(f"The free run diverged at {r.diverged:.2f} s and is not drawn beyond half a turn.")
     if any(fit is not None for fit in r.noise_ceiling.values()):
@@ -134,8 +137,13 @@ def _remarks(r: Validation) -> list[str]:
             f"The bounds of the free run hold {_cell(r.coverage_pct, 1)} % of the samples and are "
             f"{_cell(r.mean_width_deg, 1)} deg wide in the mean."
         )
-    if r.novelty is not None:
-        p50, p90, p99, most = (f"{value:.1f}" for value in r.novelty.ratio.max(axis=0))
+    if r.outside_pct is not None:
+        words.append(
+            f"At {_cell(r.outside_pct, 1)} % of the samples the bounds are wider than 99 % of the training rows have "
+            "them: the model has never seen that."
+        )
+    if r.novelty is not None and r.novelty.larger is not None:
+        p50, p90, p99, most = (f"{value:.1f}" for value in r.novelty.larger)
         words.append(
             f"Novelty: the judged rows lie {p50} (median), {p90} (90 %), {p99} (99 %), {most} (largest) times as far "
             "from the training rows as these from each other."

@@ -1,0 +1,27 @@
+"""Several recordings on a command line."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from softneck.core import DataError
+from softneck.signals import Recording, concatenate, read_recording
+
+
+def read_together(paths: Sequence[Path]) -> Recording:
+    """Read recordings as runs of one.
+
+    Raises:
+        DataError: their sample times differ; the line names two that do.
+    """
+    recordings = [read_recording(path) for path in paths]
+    for path, recording in zip(paths, recordings, strict=True):
+        if not math.isclose(recording.sample_time, recordings[0].sample_time, rel_tol=1e-6):
+            raise DataError(
+                f"{path}: is at {1e3 * recording.sample_time:g} ms and {paths[0]} at "
+                f"{1e3 * recordings[0].sample_time:g} ms; recordings are used together at one sample time only. Take "
+                "each by itself, or bring one to the other's (Python: `softneck.signals.resampled`)."
+            )
+    return concatenate(recordings)

@@ -1,0 +1,85 @@
+"""The figures of linear models: convergence of a recursion, maps of local models, cover of an uncertain plant."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from softneck.core import Matrix, Vector
+
+from ._style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, label, new_figure
+
+_COLOURS = (BLUE, ORANGE, GREEN, RED, PURPLE, GREY)
+_QUANTITIES = ("static gain [deg/rad]", "pole [1/s]", "dead time [ms]")
+# Two-sided 95 %.
+_REACH = 1.96
+
+
+def convergence_figure(
+    time: Vector, parameters: Matrix, std: Matrix, names: Sequence[str], title: str, *, error: Vector | None = None
+) -> Figure:
+    """Draw parameters over time with 95 % bands, and the prediction error below where it is given.
+
+    Args:
+        time: (rows,) [s].
+        parameters: (rows, n).
+        std: (rows, n) standard deviations.
+        names: of the parameters.
+        title: of the figure.
+        error: (rows,) epsilon of Eq. 30 [rad].
+    """
+    n = parameters.shape[1]
+    figure, axes = new_figure(n + (error is not None), row_height=1.7)
+    for i, ax in enumerate(axes[:n]):
+        colour = _COLOURS[i % len(_COLOURS)]
+        ax.plot(time, parameters[:, i], color=colour, lw=1.0)
+        low, high = parameters[:, i] - _REACH * std[:, i], parameters[:, i] + _REACH * std[:, i]
+        ax.fill_between(time, low, high, color=colour, alpha=0.2, lw=0)
+        # Before anything is known the band is wider than any paper.
+        settled = parameters[len(time) // 10 :, i]
+        middle, span = 0.5 * (settled.min() + settled.max()), max(float(np.ptp(settled)), 1e-6)
+        ax.set_ylim(middle - 1.5 * span, middle + 1.5 * span)
+        label(ax, names[i], legend=False)
+    if error is not None:
+        axes[n].plot(time, np.degrees(error), color=GREY, lw=0.7)
+        label(axes[n], "error [deg]", legend=False)
+    axes[-1].set_xlabel("time [s]")
+    figure.suptitle(title)
+    return figure
+
+
+def local_map_figure(groups: Mapping[str, tuple[Vector, Matrix, Matrix]], title: str) -> Figure:
+    """Draw static gain, pole and dead time of local models against inclination, with 95 % bars.
+
+    Args:
+        groups: name -> inclination (n,) [rad], numbers (n, 3) and standard deviations (n, 3 or more) of static gain
+            [rad/rad], pole [1/s], dead time [s].
+        title: of the figure.
+    """
+    figure, axes = new_figure(3, row_height=2.1)
+    scale = np.array([np.degrees(1.0), 1.0, 1e3])
+    for (name, (inclination, numbers, std)), colour in zip(groups.items(), _COLOURS, strict=False):
+        for i, ax in enumerate(axes):
+            ax.errorbar(
+                np.degrees(inclination), scale[i] * numbers[:, i], yerr=_REACH * scale[i] * std[:, i],
+                fmt="o", ms=4, lw=0.8, capsize=2, color=colour, label=name,
+            )  # fmt: skip
+    for ax, name in zip(axes, _QUANTITIES, strict=True):
+        label(ax, name, legend=ax is axes[0])
+    axes[-1].set_xlabel("inclination [deg]")
+    figure.suptitle(title)
+    return figure
+
+
+def cover_figure(frequency: Vector, errors: Matrix, weight: Vector, title: str) -> Figure:
+    """Draw relative errors of all samples (n, m) under the weight (m,) over `frequency` (m,) [rad/s]."""
+    figure, (ax,) = new_figure(1, row_height=4.0)
+    for number, row in enumerate(errors):
+        ax.loglog(frequency, np.maximum(row, 1e-4), color=GREY, lw=0.6, label="samples" if number == 0 else None)
+    ax.loglog(frequency, weight, color=RED, lw=1.6, label="|W|")
+    label(ax, "|G/G0 - 1|")
+    ax.set_xlabel("frequency [rad/s]")
+    figure.suptitle(title)
+    return figure

@@ -1,0 +1,33 @@
+"""Figures of linear models: what was given is what is drawn."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from softneck.plots import convergence_figure, cover_figure, local_map_figure
+
+
+def test_a_convergence_has_an_axis_for_each_parameter_and_one_for_the_error() -> None:
+    t = np.arange(50) * 0.02
+    theta = np.column_stack([np.linspace(0, 1, 50), np.ones(50)])
+    figure = convergence_figure(t, theta, 0.1 * np.ones((50, 2)), ["a_1", "b_1"], "course", error=np.zeros(50))
+    assert [ax.get_ylabel() for ax in figure.axes] == ["a_1", "b_1", "error [deg]"]
+    np.testing.assert_array_equal(figure.axes[0].lines[0].get_ydata(), theta[:, 0])
+    assert len(figure.axes[0].collections) == 1  # the band
+
+
+def test_a_map_shows_degrees_and_milliseconds() -> None:
+    numbers = np.array([[0.1, 5.0, 0.08], [0.09, 6.0, 0.1]])
+    figure = local_map_figure({"0 g": (np.array([0.1, 0.3]), numbers, np.full((2, 4), 0.01))}, "pitch")
+    scale = (np.degrees(1.0), 1.0, 1e3)
+    for i, ax in enumerate(figure.axes):
+        x, y = np.asarray(ax.lines[0].get_xdata(), float), np.asarray(ax.lines[0].get_ydata(), float)
+        np.testing.assert_allclose(x, np.degrees([0.1, 0.3]))
+        np.testing.assert_allclose(y, scale[i] * numbers[:, i])
+
+
+def test_a_cover_draws_every_sample_under_the_weight() -> None:
+    w = np.geomspace(0.1, 100, 30)
+    figure = cover_figure(w, np.full((3, 30), 0.2), np.full(30, 0.5), "pitch")
+    assert len(figure.axes[0].lines) == 4
+    np.testing.assert_array_equal(figure.axes[0].lines[-1].get_ydata(), np.full(30, 0.5))
