@@ -76,7 +76,14 @@ def test_scikit_learn_mlp_in_narx_form(benchmark: BenchmarkFixture) -> None:
         for lags in (2, 5):
             net = make_pipeline(
                 StandardScaler(),
-                MLPRegressor((25, 25), activation="tanh", solver="lbfgs", alpha=1e-3, max_iter=400, random_state=0),
+                MLPRegressor(
+                    hidden_layer_sizes=(25, 25),
+                    activation="tanh",
+                    solver="lbfgs",
+                    alpha=1e-3,
+                    max_iter=400,
+                    random_state=0,
+                ),
             )
             with np.errstate(all="ignore"), pytest.warns():
                 net.fit(lagged(head.set_points, head.outputs / scale, lags), (head.outputs / scale)[lags:])
@@ -86,6 +93,7 @@ def test_scikit_learn_mlp_in_narx_form(benchmark: BenchmarkFixture) -> None:
         return max(found, key=lambda one: one[0])
 
     _, lags, net = benchmark.pedantic(fit, rounds=1)
+    free = np.zeros((0, 2))
     for name in ("validation", *TESTS):
         test = recordings()[name]
         free = narx_free_run(net.predict, test.set_points, test.outputs / scale, lags)

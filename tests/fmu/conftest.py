@@ -108,3 +108,9 @@ def lag_inputs() -> np.ndarray:
 def own_temporary_folder(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
     """Unpack FMUs where no test of another process does, so that leftovers can be counted."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path_factory.mktemp("unpacked")))
+
+
+@pytest.fixture(autouse=True)
+def plain_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave numba out, so that an FMU equals the plain text to the bit; `test_compiled.py` lets it in."""
+    monkeypatch.setenv("SOFTNECK_FMU_NUMBA", "0")

@@ -1,7 +1,7 @@
 """The one FMI 2.0 slave: every FMU carries this text behind the runtime of its kind (`_module.py`).
 
 It knows nothing of kinds: ports, sample time and arrays come from `resources/block.json` and
-`resources/arrays.npz`, the three functions of the runtime from the module it stands in. It must run
+`resources/arrays.npy`, the three functions of the runtime from the module it stands in. It must run
 where softneck is not: standard library, numpy and pythonfmu's base class only.
 
 Timing: sample n is at t_0 + n T_s. It is taken in the communication step that begins at or before it,
@@ -9,6 +9,7 @@ with the inputs held then. A plant's new outputs show when communication reaches
 everything else at once.
 """
 
+import contextvars
 import ctypes
 import json
 import math
@@ -23,6 +24,7 @@ import numpy as np
 from pythonfmu.fmi2slave import Fmi2Slave
 
 from softneck.fmu._runtime_names import initialise, state_size, step
+from softneck.fmu._slave_compiled import _FMU_SWITCH, _fmu_compiled_step, _fmu_print
 
 # Share of a sample time: hosts add up their time, and 1e6 steps of 2 ms are off by 1e-7 s at most.
 _FMU_SAME_TIME = 1e-4
@@ -50,10 +52,7 @@ def _fmu_guarded(method: Callable[..., Any]) -> Callable[..., Any]:
         try:
             return method(self, *arguments)
         except BaseException as error:
-            self.tell(_FMU_ERROR, f"{self.facts['name']}: {error}")
-            if not isinstance(error, ValueError):
-                _fmu_print(traceback.format_exc())
-            _fmu_keep_alive(self, type(self), self.queue)
+            self._fail(error)
             raise
 
     return call
@@ -66,9 +65,30 @@ def _fmu_keep_alive(*things: object) -> None:
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(thing))
 
 
-def _fmu_print(text: str) -> None:
-    if sys.stderr is not None:
-        print(text, file=sys.stderr, flush=True)
+def _fmu_arrays(path: Path, shapes: list[list[int]]) -> tuple[np.ndarray, ...]:
+    """Return the arrays that stand behind each other in one file."""
+    flat = np.load(path, allow_pickle=False).astype(np.float64, copy=False)
+    arrays, first = [], 0
+    for shape in shapes:
+        last = first + math.prod(shape)
+        arrays.append(flat[first:last].reshape(shape))
+        first = last
+    return tuple(arrays)
+
+
+def _fmu_quiet() -> Callable[..., Any]:
+    """Return a way to call plain numpy without its warnings, which are the host's to switch."""
+    if int(np.__version__.split(".")[0]) >= 2:
+        # numpy 2 keeps its error state in the context: entering one costs a tenth of `errstate`.
+        context = contextvars.copy_context()
+        context.run(np.seterr, all="ignore")
+        return context.run
+
+    def call(function: Callable[..., None], *arguments: Any) -> None:
+        with np.errstate(all="ignore"):
+            function(*arguments)
+
+    return call
 
 
 class SoftneckSlave(Fmi2Slave):
@@ -76,11 +96,9 @@ class SoftneckSlave(Fmi2Slave):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        folder = Path(kwargs["resources"])
-        self.search_path = kwargs["resources"]
-        self.facts = json.loads((folder / "block.json").read_text(encoding="utf-8"))
-        with np.load(folder / "arrays.npz", allow_pickle=False) as archive:
-            self.arrays = tuple(archive[f"array_{i}"] for i in range(len(archive.files)))
+        self.folder = kwargs["resources"]
+        self.facts = json.loads(Path(self.folder, "block.json").read_text(encoding="utf-8"))
+        self.arrays = _fmu_arrays(Path(self.folder, "arrays.npy"), self.facts["shapes"])
         self.modelName = self.facts["name"]
         self.queue: list[_FmuMessage] = []
         self.warned: set[str] = set()
@@ -95,6 +113,9 @@ class SoftneckSlave(Fmi2Slave):
         self.variables[:n_in][[port["missing"] for port in self.facts["inputs"]]] = np.nan
         self.pending = np.zeros(n_out)
         self.memory = np.zeros(state_size(self.arrays))
+        self.advance: Callable[..., None] | None = None
+        self.compiled = False
+        self.quietly = _fmu_quiet()
         self._view()
 
     def _view(self) -> None:
@@ -110,14 +131,20 @@ class SoftneckSlave(Fmi2Slave):
         self.queue.append(_FmuMessage(status, text))
         _fmu_print(text)
 
+    def _fail(self, error: BaseException) -> None:
+        self.tell(_FMU_ERROR, f"{self.facts['name']}: {error}")
+        if not isinstance(error, ValueError):
+            _fmu_print(traceback.format_exc())
+        _fmu_keep_alive(self, type(self), self.queue)
+
     # Life cycle
 
     @_fmu_guarded
     def setup_experiment(self, start_time: float, *_: Any) -> None:
         """Take the start time."""
         self.start, self.count = float(start_time), 0
-        if self.search_path in sys.path:  # the binary put it there to find this module, once for each instance
-            sys.path.remove(self.search_path)
+        if self.folder in sys.path:  # the binary put it there to find this module, once for each instance
+            sys.path.remove(self.folder)
 
     @_fmu_guarded
     def enter_initialization_mode(self) -> None:
@@ -132,29 +159,43 @@ class SoftneckSlave(Fmi2Slave):
     def _initialise(self) -> None:
         if self.stale:
             self.memory[:] = 0.0
-            with np.errstate(all="ignore"):
-                initialise(self.arrays, self.parameters, self.memory, self.pending)
+            self.quietly(initialise, self.arrays, self.parameters, self.memory, self.pending)
             self.outputs[:] = self.pending
+            if self.advance is None:
+                self._choose(always=False)
             self.stale = False
 
-    @_fmu_guarded
+    def _choose(self, *, always: bool) -> None:
+        """Take `step` from numba where that pays, or where it must be (`always`), else as it stands here."""
+        found = _fmu_compiled_step(self.facts, self.folder, always=always)
+        self.compiled, self.advance = found is not None, found or step
+        if found is not None:  # what numba takes its time for is done now, on copies
+            found(self.arrays, self.parameters, self.memory.copy(), np.zeros(self.n_in), self.pending.copy())
+
     def do_step(self, current_time: float, step_size: float) -> bool:
         """Take all samples in [current_time, current_time + step_size)."""
-        self._initialise()
-        end = current_time + step_size
-        slack = _FMU_SAME_TIME * self.sample_time
-        while self.start + self.count * self.sample_time < end - slack:
-            self._take_sample()
-        # A plant's next outputs belong to the next sample: they show when that is reached.
-        if self.plant and self.start + self.count * self.sample_time <= end + slack:
-            self.outputs[:] = self.pending
+        try:
+            if self.stale:
+                self._initialise()
+            end = current_time + step_size
+            slack = _FMU_SAME_TIME * self.sample_time
+            while self.start + self.count * self.sample_time < end - slack:
+                self._take_sample()
+            # A plant's next outputs belong to the next sample: they show when that is reached.
+            if self.plant and self.start + self.count * self.sample_time <= end + slack:
+                self.outputs[:] = self.pending
+        except BaseException as error:
+            self._fail(error)
+            raise
         return True  # False would be "discard", on which hosts cut the result off without a word
 
     def _take_sample(self) -> None:
         if self.plant:
             self.outputs[:] = self.pending
-        with np.errstate(all="ignore"):
-            step(self.arrays, self.parameters, self.memory, self.inputs, self.pending)
+        if self.compiled:
+            self.advance(self.arrays, self.parameters, self.memory, self.inputs, self.pending)  # type: ignore[misc]
+        else:
+            self.quietly(step, self.arrays, self.parameters, self.memory, self.inputs, self.pending)
         self.count += 1
         if not self.plant:
             self.outputs[:] = self.pending
@@ -231,7 +272,7 @@ class SoftneckSlave(Fmi2Slave):
     def _get_fmu_state(self) -> dict[str, Any]:
         self._initialise()
         vectors = {name: getattr(self, name).astype("<f8").tobytes() for name in _FMU_VECTORS}
-        counters = {"start": self.start, "count": self.count, "running": self.running}
+        counters = {"start": self.start, "count": self.count, "running": self.running, "compiled": self.compiled}
         return {"guid": self.facts["guid"], **counters, **vectors}
 
     @_fmu_guarded
@@ -243,6 +284,21 @@ class SoftneckSlave(Fmi2Slave):
             getattr(self, name)[:] = np.frombuffer(state[name], dtype="<f8")
         self.start, self.count, self.running = state["start"], state["count"], state["running"]
         self.stale = False
+        # Compiled and plain steps differ in the last digit, and a replay must not.
+        if self.advance is None or state["compiled"] != self.compiled:
+            self._resume(state["compiled"])
+
+    def _resume(self, compiled: bool) -> None:
+        if compiled:
+            self._choose(always=True)
+        else:
+            self.compiled, self.advance = False, step
+        if compiled and not self.compiled:
+            self.tell(
+                _FMU_WARNING,
+                f"{self.facts['name']}: this state was saved by compiled steps and goes on by plain ones, "
+                f"which differ in the last digit (numba is not here, or {_FMU_SWITCH} is 0).",
+            )
 
     @staticmethod
     def _fmu_state_to_bytes(state: dict[str, Any]) -> bytes:

@@ -14,7 +14,9 @@ from ._checks import require_finite as require_finite
 from ._checks import require_one_of as require_one_of
 from ._checks import require_positive as require_positive
 from ._checks import require_whole as require_whole
+from ._compile import COMPILE_OPTIONS as COMPILE_OPTIONS
 from ._compile import Runtime as Runtime
+from ._compile import compiled_name as compiled_name
 from ._compile import have_numba as have_numba
 from ._compile import load_functions as load_functions
 from ._compile import load_runtime as load_runtime

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import FunctionType, ModuleType
+from typing import Any
 
 import platformdirs
 
@@ -18,7 +19,7 @@ from ._bundle import bundle, content_name
 from ._files import atomic_write
 
 # No fast-math: compiled and plain Python must agree to rounding. No GIL: batches run on all cores.
-_OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
+COMPILE_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
 # One thread at a time loads: a cache alone lets two begin, and CPython 3.11's `ast` fails in two threads at once.
 _LOADING = threading.RLock()
 
@@ -75,6 +76,12 @@ def _functions(module: str, compiled: bool) -> ModuleType:
     return namespace
 
 
+def compiled_name(text: str) -> str:
+    """Return the name under which the bundle `text` and its compiled code are kept; FMUs keep theirs there too."""
+    # numba's cache does not look at its options: they belong to the name.
+    return content_name(f"{text}\n# {COMPILE_OPTIONS}")
+
+
 def have_numba() -> bool:
     """Return whether numba is installed, without importing it."""
     return importlib.util.find_spec("numba") is not None
@@ -89,13 +96,12 @@ def _compile(namespace: ModuleType) -> bool:
         vars(namespace)["COMPILED"] = 1  # see `_compiled_runtime`; numba takes it as a constant
     for name, value in list(vars(namespace).items()):
         if isinstance(value, FunctionType):
-            setattr(namespace, name, njit(**_OPTIONS)(value))
+            setattr(namespace, name, njit(**COMPILE_OPTIONS)(value))
     return True
 
 
 def _import_text(text: str, *, compiled: bool) -> ModuleType:
-    # numba's cache does not look at its options: they belong to the name.
-    name = content_name(f"{text}\n# {_OPTIONS}")
+    name = compiled_name(text)
     path = _cache_folder() / f"{name}.py"
     if not path.is_file() or path.read_text(encoding="utf-8") != text:
         with atomic_write(path, force=True) as temporary:

@@ -1,0 +1,102 @@
+"""The part of every FMU that takes its `step` from numba where the host has it (docs, how-to, FMUs).
+
+It writes the runtime's text to the folder, under the name and with the options, that softneck itself uses
+(`core._compile`): what either has compiled, the other finds. Standard library, numpy and numba only.
+"""
+
+import importlib.util
+import os
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+# In the environment of the host: "0" never, "1" always, else by the cost that the FMU states.
+_FMU_SWITCH = "SOFTNECK_FMU_NUMBA"
+# The line before and behind the runtime in the module's text.
+_FMU_BORDER = "# --- runtime ---\n"
+
+
+def _fmu_compiled_step(facts: dict[str, Any], folder: str, *, always: bool = False) -> Callable[..., None] | None:
+    """Return the compiled `step` of the FMU unpacked in `folder`, or None where plain Python shall run.
+
+    A light runtime is not worth numba's start of half a second; a middling one is where it is compiled already;
+    a heavy one is compiled here, once for all FMUs of its kind on this machine.
+    """
+    switch = os.environ.get(_FMU_SWITCH, "")
+    wanted = always or switch == "1"
+    if switch == "0" or not (wanted or facts["cost"] != "light") or not _fmu_have_numba():
+        return None
+    alias = facts["runtime"] + "_compiled"
+    here = sys.modules.get(alias)
+    if hasattr(getattr(here, "step", None), "py_func"):
+        return here.step  # type: ignore[union-attr]
+    cache = _fmu_cache_folder()
+    ready = any((cache / "__pycache__").glob(f"{facts['runtime']}.step-*.nbi"))
+    if not (ready or wanted or facts["cost"] == "heavy"):
+        return None
+    try:
+        if not ready:
+            _fmu_print(
+                f"{facts['name']}: compiling its runtime, once on this machine; {_FMU_SWITCH}=0 leaves that out."
+            )
+        return _fmu_compile(alias, _fmu_cached_text(facts, folder, cache), facts["options"])
+    except Exception as error:  # whatever is wrong with this numba or this disk, plain Python still runs
+        _fmu_print(f"{facts['name']}: runs without numba, which failed: {error}")
+        return None
+
+
+def _fmu_print(text: str) -> None:
+    if sys.stderr is not None:
+        print(text, file=sys.stderr, flush=True)
+
+
+def _fmu_have_numba() -> bool:
+    try:
+        return importlib.util.find_spec("numba") is not None
+    except (ImportError, ValueError):
+        return False
+
+
+def _fmu_cache_folder() -> Path:
+    """Return where softneck keeps compiled runtimes (the user's cache folder as platformdirs names it)."""
+    if sys.platform == "win32":
+        cache = Path(os.environ.get("LOCALAPPDATA") or Path.home(), "softneck", "Cache")
+    elif sys.platform == "darwin":
+        cache = Path.home() / "Library" / "Caches" / "softneck"
+    else:
+        cache = Path(os.environ.get("XDG_CACHE_HOME", "").strip() or Path.home() / ".cache", "softneck")
+    return cache / "runtime"
+
+
+def _fmu_cached_text(facts: dict[str, Any], folder: str, cache: Path) -> Path:
+    """Write the runtime's text into `cache` unless it is there, and return its path."""
+    text = Path(folder, facts["module"] + ".py").read_text(encoding="utf-8").split(_FMU_BORDER)[1]
+    path = cache / (facts["runtime"] + ".py")
+    if path.is_file() and path.read_text(encoding="utf-8") == text:
+        return path
+    cache.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=cache, suffix=".tmp")
+    os.close(handle)
+    Path(temporary).write_text(text, encoding="utf-8")
+    Path(temporary).replace(path)
+    return path
+
+
+def _fmu_compile(alias: str, path: Path, options: dict[str, Any]) -> Callable[..., None]:
+    from numba import njit
+
+    spec = importlib.util.spec_from_file_location(alias, path)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"cannot import {path}")
+    namespace = importlib.util.module_from_spec(spec)
+    sys.modules[alias] = namespace  # numba rebuilds cached functions by their module's name
+    spec.loader.exec_module(namespace)
+    names = vars(namespace)
+    if "COMPILED" in names:
+        names["COMPILED"] = 1
+    for name, value in list(names.items()):
+        if callable(value) and getattr(value, "__module__", None) == alias:
+            names[name] = njit(**options)(value)
+    return names["step"]

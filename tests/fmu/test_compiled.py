@@ -1,0 +1,158 @@
+"""Where the host has numba, an FMU steps by compiled code: the same numbers, the same states, and no surprises."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from softneck.core import _compile, have_numba
+from softneck.fmu import _build, _slave_compiled, build_fmu, unpacked
+
+from .every_kind import KINDS, TS, block_of, inputs_of
+
+pytestmark = pytest.mark.skipif(not have_numba(), reason="numba is not installed")
+
+
+def _run(fmu: Any, kind: str, first: int, last: int) -> np.ndarray:
+    block, u = block_of(kind), inputs_of(block_of(kind), 60)
+    names, outputs = [p.name for p in block.inputs], [p.name for p in block.outputs]
+    seen = []
+    for k in range(first, last):
+        fmu.set(**dict(zip(names, u[k], strict=True)))
+        fmu.fmu.doStep(k * TS, TS)
+        seen.append(fmu.get(*outputs))
+    return np.array(seen)
+
+
+def _state(fmu: Any) -> bytes:
+    return bytes(fmu.fmu.serializeFMUstate(fmu.fmu.getFMUstate()))
+
+
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_compiled_and_plain_steps_agree(
+    kind: str, tmp_path: Path, running: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = build_fmu(block_of(kind), tmp_path / f"{kind}.fmu")
+    with running(path) as plain, running(path) as compiled:
+        plain.begin()
+        monkeypatch.setenv("SOFTNECK_FMU_NUMBA", "1")
+        compiled.begin()
+        modes = [json.loads(_state(fmu))["compiled"] for fmu in (plain, compiled)]
+        assert modes == [False, True]
+        # tanh, exp and matrix products differ in the last digit; 60 stable steps do not add to 1e-12.
+        np.testing.assert_allclose(_run(compiled, kind, 0, 60), _run(plain, kind, 0, 60), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("saved", ["0", "1"])
+def test_a_state_goes_on_as_it_was_saved_to_the_bit(
+    saved: str, tmp_path: Path, running: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = build_fmu(block_of("nn"), tmp_path / "Nn.fmu")
+    with running(path) as one, running(path) as two:
+        monkeypatch.setenv("SOFTNECK_FMU_NUMBA", saved)
+        one.begin()
+        _run(one, "nn", 0, 20)
+        text = _state(one)
+        expected = _run(one, "nn", 20, 60)
+        # The other instance would run the other way by itself: by the switch, or because nothing says "always".
+        monkeypatch.setenv("SOFTNECK_FMU_NUMBA", "1" if saved == "0" else "")
+        two.begin()
+        two.fmu.setFMUstate(two.fmu.deSerializeFMUstate(text))
+        np.testing.assert_array_equal(_run(two, "nn", 20, 60), expected)
+
+
+def test_a_compiled_state_where_numba_is_switched_off_goes_on_with_a_warning(
+    tmp_path: Path, running: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = build_fmu(block_of("rls"), tmp_path / "Rls.fmu")
+    with running(path) as one, running(path) as two:
+        monkeypatch.setenv("SOFTNECK_FMU_NUMBA", "1")
+        one.begin()
+        text = _state(one)
+        monkeypatch.setenv("SOFTNECK_FMU_NUMBA", "0")
+        two.begin()
+        two.fmu.setFMUstate(two.fmu.deSerializeFMUstate(text))
+        _run(two, "rls", 0, 1)
+        assert "goes on by plain ones" in two.log[-1][1]
+
+
+def test_fmus_keep_compiled_code_where_softneck_does() -> None:
+    assert _slave_compiled._fmu_cache_folder() == _compile._cache_folder()
+
+
+@pytest.mark.parametrize(
+    ("kind", "cost"), [("rls", "light"), ("kalman", "light"), ("nn", "middling"), ("nlsm", "heavy"), ("neck", "heavy")]
+)
+def test_the_cost_decides_what_is_compiled(kind: str, cost: str) -> None:
+    from softneck.fmu._cost import plain_cost
+
+    # The paper's 7,000 points; the network's lines do not depend on its size.
+    block = _many_points() if kind == "nlsm" else block_of(kind)
+    assert plain_cost(block) == cost
+
+
+def _many_points() -> Any:
+    from dataclasses import replace
+
+    block = block_of("nlsm")
+    arrays = list(block.arrays)
+    arrays[4] = np.tile(arrays[4], (1, 1, 20))
+    return replace(block, arrays=tuple(arrays))
+
+
+_HOST = """
+import sys, fmpy
+from fmpy.fmi2 import FMU2Slave
+model = fmpy.read_model_description(sys.argv[1])
+fmu = FMU2Slave(guid=model.guid, unzipDirectory=sys.argv[1], modelIdentifier="Lag", instanceName="child")
+fmu.instantiate()
+fmu.setupExperiment(startTime=0.0)
+fmu.enterInitializationMode()
+fmu.exitInitializationMode()
+fmu.doStep(0.0, 0.02)
+print(b'"compiled": true' in bytes(fmu.serializeFMUstate(fmu.getFMUstate())), "softneck.core" in sys.modules)
+"""
+
+
+def _host(path: Path, cache: Path, before: str = "") -> tuple[str, str]:
+    environment = {k: v for k, v in os.environ.items() if k != "SOFTNECK_FMU_NUMBA"}
+    with unpacked(path) as folder:
+        child = subprocess.run(
+            [sys.executable, "-c", before + _HOST, str(folder)], capture_output=True, text=True, check=True,
+            timeout=120, env=environment | {"XDG_CACHE_HOME": str(cache)},
+        )  # fmt: skip
+    return child.stdout.strip(), child.stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the cache folder is moved by XDG_CACHE_HOME")
+def test_a_heavy_fmu_compiles_once_and_says_so_and_a_middling_one_waits_for_it(
+    toys: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths = {}
+    for cost in ("light", "middling", "heavy"):
+        monkeypatch.setattr(_build, "plain_cost", lambda _block, cost=cost: cost)
+        (tmp_path / cost).mkdir()
+        paths[cost] = build_fmu(toys.lag(), tmp_path / cost / "Lag.fmu")
+    cache = tmp_path / "cache"
+    assert _host(paths["middling"], cache) == ("False False", "")
+    assert not cache.exists()
+    assert _host(paths["heavy"], cache, "sys = __import__('sys'); sys.modules['numba'] = None") == ("False False", "")
+    out, told = _host(paths["heavy"], cache)
+    assert out == "True False"
+    assert "Lag: compiling its runtime, once on this machine; SOFTNECK_FMU_NUMBA=0 leaves that out." in told
+    assert _host(paths["heavy"], cache) == ("True False", "")
+    assert _host(paths["middling"], cache) == ("True False", "")
+    assert _host(paths["light"], cache) == ("False False", "")
+    # softneck would take up the same code: the same name, the same text.
+    text = next((cache / "softneck" / "runtime").glob("softneck_*.py"))
+    spec = importlib.util.spec_from_file_location("anything", text)
+    assert spec is not None
+    assert text.stem == _compile.compiled_name(text.read_text(encoding="utf-8"))
