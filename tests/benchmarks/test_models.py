@@ -1,4 +1,4 @@
-"""Training of the kinds that run free, beside peers; run with `pytest tests/benchmarks/test_models.py --benchmark-only`.
+"""Training of the kinds that run free, beside peers: `pytest tests/benchmarks/test_models.py --benchmark-only`.
 
 The same data for all: Eq. 22 on the virtual neck `paper`, 7,000 rows to identify; judged in free run from set-points
 alone on the paper's three tests. The peers get what they are fed in their own examples (lagged inputs and outputs) and
@@ -7,6 +7,7 @@ a choice of lags by free run on the last fifth of the training rows.
 
 from __future__ import annotations
 
+import warnings
 from functools import cache
 
 import numpy as np
@@ -51,7 +52,7 @@ def lagged(u: np.ndarray, y: np.ndarray, lags: int) -> np.ndarray:
     return np.column_stack([both[lags - i : len(both) - i] for i in range(1, lags + 1)])
 
 
-def narx_free_run(predict, u: np.ndarray, y: np.ndarray, lags: int) -> np.ndarray:  # noqa: ANN001
+def narx_free_run(predict, u: np.ndarray, y: np.ndarray, lags: int) -> np.ndarray:
     out = y.copy()
     for k in range(25, len(u)):
         past = np.column_stack([out, u])[k - lags : k][::-1]
@@ -70,15 +71,23 @@ def test_scikit_learn_mlp_in_narx_form(benchmark: BenchmarkFixture) -> None:
     train = recordings()["train"]
     scale = train.outputs.std(axis=0)
 
-    def fit():  # noqa: ANN202
+    def fit():
         found = []
         head, tail = train.split(0.8)
         for lags in (2, 5):
             net = make_pipeline(
                 StandardScaler(),
-                MLPRegressor((25, 25), activation="tanh", solver="lbfgs", alpha=1e-3, max_iter=400, random_state=0),
+                MLPRegressor(
+                    hidden_layer_sizes=(25, 25),
+                    activation="tanh",
+                    solver="lbfgs",
+                    alpha=1e-3,
+                    max_iter=400,
+                    random_state=0,
+                ),
             )
-            with np.errstate(all="ignore"), pytest.warns():
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # that 400 iterations were not enough, if so
                 net.fit(lagged(head.set_points, head.outputs / scale, lags), (head.outputs / scale)[lags:])
             free = narx_free_run(net.predict, tail.set_points, tail.outputs / scale, lags)
             score = min(nrmse_fit((tail.outputs / scale)[25:, i], free[25:, i]) for i in range(2))
