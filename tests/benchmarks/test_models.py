@@ -1,4 +1,4 @@
-"""Kinds that run free, beside peers; run with `pytest tests/benchmarks/test_models.py --benchmark-only`.
+"""Training of the kinds that run free, beside peers: `pytest tests/benchmarks/test_models.py --benchmark-only`.
 
 The same data for all: Eq. 22 on the virtual neck `paper`, 7,000 rows to identify; judged in free run from set-points
 alone on the paper's three tests. The peers get what they are fed in their own examples (lagged inputs and outputs) and
@@ -7,6 +7,7 @@ a choice of lags by free run on the last fifth of the training rows.
 
 from __future__ import annotations
 
+import warnings
 from functools import cache
 
 import numpy as np
@@ -85,7 +86,8 @@ def test_scikit_learn_mlp_in_narx_form(benchmark: BenchmarkFixture) -> None:
                     random_state=0,
                 ),
             )
-            with np.errstate(all="ignore"), pytest.warns():
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # that 400 iterations were not enough, if so
                 net.fit(lagged(head.set_points, head.outputs / scale, lags), (head.outputs / scale)[lags:])
             free = narx_free_run(net.predict, tail.set_points, tail.outputs / scale, lags)
             score = min(nrmse_fit((tail.outputs / scale)[25:, i], free[25:, i]) for i in range(2))
@@ -93,7 +95,6 @@ def test_scikit_learn_mlp_in_narx_form(benchmark: BenchmarkFixture) -> None:
         return max(found, key=lambda one: one[0])
 
     _, lags, net = benchmark.pedantic(fit, rounds=1)
-    free = np.zeros((0, 2))
     for name in ("validation", *TESTS):
         test = recordings()[name]
         free = narx_free_run(net.predict, test.set_points, test.outputs / scale, lags)

@@ -145,7 +145,7 @@ def test_a_wrong_setting_of_a_network(call: Call, tmp_path: Path, recording: Pat
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("identify", "magic", "REC", "-o", "m.npz"), "`magic` is no kind of model; use one of rls, oe"),
+        (("identify", "magic", "REC", "-o", "m.npz"), "`magic` is no kind of model; use one of rls, "),
         (("identify", "pi", "REC", "-o", "m.npz"), "`pi` is no kind of model"),
         (("identify", "rls", "REC", "-o", "m.npz", "--train", "0"), "the part to train on must be in (0, 1]; got 0"),
         (("identify", "rls", "REC", "-o", "m.npz", "--train", "all"), "'all' is not a valid float"),

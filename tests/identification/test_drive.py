@@ -42,7 +42,9 @@ def test_a_run_shorter_than_the_longest_delay_does_no_harm(rows: int) -> None:
 def test_the_models_free_run_moves_its_motors_by_the_drive_model(models: dict) -> None:
     P = signal("aprbs", duration=5.0, seed=11).set_points
     r = recording_from(P)
-    for model in models.values():
+    for kind, model in models.items():
+        if kind == "greybox":
+            continue  # its drives are part of its own equations
         motors = model.simulate(r, warm_up=0)[:, 2:5]
         # The drive of a model is identified from noise-free positions.
         np.testing.assert_allclose(motors, drive_positions(P), rtol=0, atol=1e-8)

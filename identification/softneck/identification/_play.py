@@ -30,7 +30,7 @@ _WIDTHS = ((), (0.3,), (0.1, 0.3, 0.6))
 _DEGREES = (1, 2, 3)
 _RIDGES = (1e-6, 1e-4, 1e-2)
 # Of forms whose fits on the hold-out differ by less than this [points], that with the fewest terms is taken.
-_ALIKE = 0.3
+_ALIKE = 0.1
 # A held input is forgotten after this [s]: the slowest filter by far is that of the load, some 1 1/s.
 _MEMORY = 15.0
 # f is kept within the range of the training outputs, widened by half of it to either side.
