@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from softneck.core import DataError
+from softneck.core import DataError, SettingsError
 from softneck.estimation import KalmanObserver, KalmanSettings, consistency, fit_noise
 from softneck.plots import chart_figure, consistency_chart, consistency_figure
 from softneck.signals import Recording
@@ -98,6 +98,17 @@ def test_the_likelihood_is_that_of_filterpy() -> None:
     ours = -0.5 * _Cost(observer, [record]).of(np.log10(TRUE))
     # Sums of 350 terms of about 10.
     assert ours == pytest.approx(expected / (400 - _SETTLE), rel=1e-9)
+
+
+def test_a_level_that_is_known_stays() -> None:
+    start = observer_of((TRUE[0], TRUE[1] / 5, TRUE[2] * 6))
+    found = fit_noise(start, drawn(seed=7), fixed=["measurement_noise_std"])
+    assert found.noise[0] == TRUE[0]
+    assert found.noise[1] == pytest.approx(TRUE[1], rel=0.3)
+    with pytest.raises(SettingsError, match="`bias_noise_std` is no noise level"):
+        fit_noise(start, drawn(rows=300), fixed=["bias_noise_std"])
+    with pytest.raises(SettingsError, match="no noise level is left"):
+        fit_noise(start, drawn(rows=300), fixed=start.noise_names)
 
 
 def test_outliers_do_not_move_the_noise() -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize
 
-from softneck.core import DataError, Matrix, Vector, load_functions
+from softneck.core import DataError, Matrix, SettingsError, Vector, load_functions
 from softneck.signals import Recording
 
 from ._kalman import KalmanObserver
@@ -51,16 +51,31 @@ class NoiseFit:
     at_bound: tuple[str, ...]
 
 
-def fit_noise(observer: KalmanObserver, recordings: Recording | Sequence[Recording]) -> NoiseFit:
+def fit_noise(
+    observer: KalmanObserver, recordings: Recording | Sequence[Recording], *, fixed: Sequence[str] = ()
+) -> NoiseFit:
     """Return the noise levels of greatest likelihood (Schweppe 1965; Anderson and Moore 1979, sec. 10.3).
 
     The cost is the sum of log det S_k + e_k' S_k^-1 e_k over the innovations, minimised over the logarithms of the
     three levels by the simplex of Nelder and Mead. Outliers are taken out beforehand (Hampel 1974), since a gate
     inside the search would reward a filter that refuses everything.
 
+    Where the model is wrong its error is not white, and the likeliest levels may leave the measurement no noise at all:
+    then hold that of the sensor.
+
+    Args:
+        observer: the filter, with the levels to start from.
+        recordings: of its sample time.
+        fixed: names of levels that stay as they are.
+
     Raises:
+        SettingsError: a name in `fixed` that is none of the levels', or all of them.
         DataError: another sample time, missing channels, or fewer than 200 measurements.
     """
+    unknown = sorted(set(fixed) - set(observer.noise_names))
+    if unknown or len(set(fixed)) == len(observer.noise_names):
+        what = f"`{unknown[0]}` is no noise level" if unknown else "no noise level is left to estimate"
+        raise SettingsError(f"{what}; this filter has {', '.join(observer.noise_names)}.")
     given = [recordings] if isinstance(recordings, Recording) else list(recordings)
     runs = [run for recording in given for run in recording.runs()]
     for run in runs:
@@ -72,15 +87,25 @@ def fit_noise(observer: KalmanObserver, recordings: Recording | Sequence[Recordi
             f"got {cost.rows}. Record longer."
         )
     start = np.log10(observer.noise)
-    bounds = [(level - _DECADES, level + _DECADES) for level in start]
-    found = minimize(cost.of, start, method="Nelder-Mead", bounds=bounds, options={"xatol": 1e-3, "fatol": 1e-5})
-    noise = tuple(float(10.0**level) for level in found.x)
+    free = np.array([name not in fixed for name in observer.noise_names])
+    bounds = [(level - _DECADES, level + _DECADES) for level in start[free]]
+
+    def of(levels: Vector) -> float:
+        whole = start.copy()
+        whole[free] = levels
+        return cost.of(whole)
+
+    found = minimize(of, start[free], method="Nelder-Mead", bounds=bounds, options={"xatol": 1e-3, "fatol": 1e-5})
+    noise = np.array(observer.noise)
+    noise[free] = 10.0**found.x
+    names = [name for name in observer.noise_names if name not in fixed]
     at_bound = tuple(
         name
-        for name, level, (low, high) in zip(observer.noise_names, found.x, bounds, strict=True)
+        for name, level, (low, high) in zip(names, found.x, bounds, strict=True)
+        # A hundredth of a decade: where the simplex stops.
         if min(level - low, high - level) < 0.01
     )
-    levels = (noise[0], noise[1], noise[2])
+    levels = (float(noise[0]), float(noise[1]), float(noise[2]))
     return NoiseFit(
         observer=observer.with_noise(levels, sensor="data"),
         names=observer.noise_names,

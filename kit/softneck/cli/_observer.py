@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     multiple=True,
     type=click.Path(path_type=Path),
     metavar="REC",
-    help="Estimate the noise levels from this recording (maximum likelihood); may be given several times.",
+    help="Estimate the noise levels from this recording (maximum likelihood); with --sensor all but that of the "
+    "measurement. May be given several times.",
 )
 @click.option("--gyro", is_flag=True, help="Driven by the gyro's rates, with their bias as a state (form=gyro).")
 @set_option
@@ -57,7 +58,7 @@ def command(
     told: dict[str, Any] = {}
     lines: list[str] = []
     if data:
-        fit, lines = _fitted(observer, data)
+        fit, lines = _fitted(observer, data, fixed=() if sensor is None else (observer.noise_names[0],))
         observer = fit.observer
         told = {"fit": {"rows": fit.rows, "outliers": fit.outliers, "log_likelihood": list(fit.log_likelihood),
                         "at_bound": list(fit.at_bound)}}  # fmt: skip
@@ -70,13 +71,13 @@ def command(
     click.echo("\n".join([str(path), observer.summary(), *lines]))
 
 
-def _fitted(observer: Any, data: tuple[Path, ...]) -> tuple[NoiseFit, list[str]]:
+def _fitted(observer: Any, data: tuple[Path, ...], *, fixed: tuple[str, ...]) -> tuple[NoiseFit, list[str]]:
     """Return the noise levels that the recordings support, and what to say about them."""
     # Imported here: `softneck --help` must not wait for scipy's optimisers.
     from softneck.estimation import consistency, fit_noise
 
     recordings = [read_recording(path) for path in data]
-    fit = fit_noise(observer, recordings)
+    fit = fit_noise(observer, recordings, fixed=fixed)
     before, after = fit.log_likelihood
     lines = [
         f"  noise from {fit.rows} measurements, {fit.outliers} outliers left out; "
