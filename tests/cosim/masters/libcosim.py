@@ -15,7 +15,7 @@ observer = CosimObserver.create_last_value()
 execution.add_observer(observer)
 places = []
 for part, name in task["signals"]:
-    slave = execution.slave_index_from_instance_name(part)
+    slave = int(execution.slave_index_from_instance_name(part) or 0)
     references = {variable.name.decode(): variable.reference for variable in execution.slave_variables(slave)}
     places.append((slave, references[name]))
 rows = [[np.nan] * len(places)]  # before its first step this observer has nothing
