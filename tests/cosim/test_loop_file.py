@@ -12,8 +12,11 @@ import pytest
 
 from softneck.core import FileFormatError, SettingsError, SoftneckError, file_hash
 from softneck.cosim import FmuPart, Loop, load_loop, simulate
-from softneck.loop import BlockPart, StepReference
+from softneck.fmu import build_fmu
+from softneck.loop import BlockPart, NeckFault, SensorFault, StepReference
 from softneck.signals import read_recording, write_recording
+
+from .conftest import LOOP
 
 
 def _python_loop(toys: Any, order: str = "sequential") -> Loop:
@@ -127,6 +130,53 @@ def test_parts_of_one_loop_may_be_mixed(loop_file: Path, toys: Any) -> None:
     np.testing.assert_array_equal(simulate(mixed)["roll"], simulate(_python_loop(toys))["roll"])
 
 
+def test_faults_of_the_file_are_those_of_the_loop(loop_file: Path, toys: Any) -> None:
+    loop_file.write_text(
+        loop_file.read_text()
+        + '[[fault]]\nkind = "sensor_bias"\naxis = "pitch"\nsize_deg = 1.0\nstart_s = 2.0\nduration_s = 0.5\n'
+        + '[[fault]]\nkind = "payload_step"\npayload_kg = 0.1\nstart_s = 3.0\n'
+    )
+    setup = load_loop(loop_file)
+    assert setup.loop.faults == (
+        SensorFault(kind="bias", axis="pitch", size=math.radians(1.0), start=2.0, duration=0.5),
+        NeckFault(values={"payload": 0.1}, start=3.0),
+    )
+    result = simulate(setup)
+    bias = result["pitch_measured"] - result["pitch"]
+    inside = (result.signals.time > 1.99) & (result.signals.time < 2.49)
+    # One rounding of the sum.
+    np.testing.assert_allclose(bias, np.where(inside, math.radians(1.0), 0.0), atol=1e-16)
+    np.testing.assert_allclose(result["payload"], 0.5 + 0.1 * (result.signals.time > 2.99), rtol=1e-15)
+
+
+def test_an_fmu_between_reference_and_controller(loop_file: Path, toys: Any) -> None:
+    """The toy gain makes a motor set-point of an angle; here its output is what the controller shall follow."""
+    build_fmu(toys.controller(gain=0.5), loop_file.parent / "Gain.fmu")
+    text = loop_file.read_text()
+    loop_file.write_text(
+        f'{text}\n[[part]]\nname = "filter"\nfmu = "Gain.fmu"\nnames = {{ motor_setpoint_1 = "wanted" }}\n'
+        'parameters = { gain = 0.25, pitch = 0.0 }\n[connections]\n"controller.pitch_reference" = "filter.wanted"\n'
+    )
+    result = simulate(load_loop(loop_file))
+    block = toys.controller(gain=0.5)
+    inputs = np.column_stack([result["pitch_reference"], np.zeros(200)])
+    _, expected = block.run(block.initial_state(gain=0.25), inputs)
+    # Of the same sample: nothing is delayed. Compiled and plain Python differ by rounding.
+    np.testing.assert_allclose(result["wanted"], expected[:, 0], rtol=1e-12, atol=1e-15)
+    assert set(result.certificate()["files"]) == {"loop", "plant", "controller", "filter"}
+
+
+def test_the_measured_angle_is_judged_on_request(loop_file: Path) -> None:
+    fault = '[[fault]]\nkind = "sensor_bias"\nsize_deg = 5.0\naxis = "roll"\n'
+    values = {}
+    for angle in ("true", "measured"):
+        loop_file.write_text(f'angle = "{angle}"\n{LOOP}{fault}')
+        result = simulate(load_loop(loop_file))
+        values[angle] = result.metrics["roll"]["rms_error_deg"]
+        assert result.certificate()["angle"] == angle
+    assert values["true"] != values["measured"]
+
+
 def _judge(path: Path) -> list[Any]:
     return simulate(load_loop(path)).limits
 
@@ -158,6 +208,20 @@ def _judge(path: Path) -> list[Any]:
             r"\[\[fault\]\] 1: `bias` is no kind of fault; use one of sensor_dropout",
         ),
         ("[limits]", "[bounds]", "`bounds` is no key of the file"),
+        ("[limits]", "[[fault]]\nkind = 'push'\ny_n = 1.0\n[limits]", "needs the plant's input `push_y`"),
+        ("[limits]", "[fault]\nkind = 'push'\n[limits]", r"`fault` must be a list of tables: \[\[fault\]\]"),
+        ("[limits]", "[[part]]\nfmu = 'Pi.fmu'\n[limits]", r"each \[\[part\]\] needs a `name`"),
+        (
+            "[limits]",
+            "[connections]\n'controller.pitch' = 'plant.yaw'\n[limits]",
+            "`plant.yaw`: there is no such output",
+        ),
+        ("[limits]", "[connections]\n'controller.pitch' = 1\n[limits]", r"\[connections\] must be a table of names"),
+        ('fmu = "Neck.fmu"', 'fmu = "Neck.fmu"\nisolated = 1', r"\[plant\] isolated must be true or false"),
+        ('fmu = "Neck.fmu"', 'fmu = "Neck.fmu"\nnames = { speed = "pitch" }', "has no variable speed"),
+        ('fmu = "Neck.fmu"', 'fmu = "Neck.fmu"\nnames = "pitch"', r"\[plant\] names must be a table of names"),
+        ('fmu = "Pi.fmu"', 'fmu = "Pi.fmu"\nsample_time_s = 0.03', "sample times do not divide: plant 0.02 s"),
+        ("sample_time_s = 0.02", 'angle = "felt"', "`angle` must be one of true, measured"),
     ],
 )
 def test_a_wrong_loop_file_is_refused_in_one_line(old: str, new: str, message: str, loop_file: Path) -> None:

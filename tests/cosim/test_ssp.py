@@ -15,7 +15,7 @@ from typing import Any
 import fmpy
 import numpy as np
 import pytest
-from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
+from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] - it has no stubs
 
 from softneck.core import OutputError, SettingsError
 from softneck.cosim import Loop, LoopSetup, load_loop, reference_of, simulate, write_ssp

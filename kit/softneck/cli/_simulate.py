@@ -6,10 +6,11 @@ import json
 from pathlib import Path
 
 import click
+from markupsafe import Markup
 
 from softneck.core import CheckFailedError, atomic_write, refuse_existing
 from softneck.cosim import Result, load_loop, simulate
-from softneck.plots import Section, Table, loop_chart, page, write_page
+from softneck.plots import Section, Table, loop_chart, neck_view, page, write_page
 from softneck.signals import recording_suffix, write_recording
 
 from ._console import print_json, print_table, progress
@@ -20,7 +21,7 @@ from ._options import force_option, json_option, output_option, target
 @click.argument("loop_file", metavar="LOOP.toml", type=click.Path(path_type=Path))
 @output_option("recording of the run", "REC")
 @click.option("--certificate", type=click.Path(path_type=Path), help="Write what held, with the hashes of all files.")
-@click.option("--html", type=click.Path(path_type=Path), help="Write a page with plots.")
+@click.option("--html", type=click.Path(path_type=Path), help="Write a page with plots, and beside it the neck in 3-D.")
 @force_option
 @json_option
 def command(
@@ -30,7 +31,8 @@ def command(
     path, replace = target(output, f"results/{loop_file.stem}.csv", force=force)
     recording_suffix(path)
     refuse_existing(path, force=replace)
-    for extra in (certificate, html):
+    view = html.with_name(f"{html.stem}_3d.html") if html is not None else None
+    for extra in (certificate, html, view):
         if extra is not None:
             refuse_existing(extra, force=force)
     with progress("simulate", quiet=as_json) as report:
@@ -39,8 +41,9 @@ def command(
     if certificate is not None:
         with atomic_write(certificate, force=force) as temporary:
             temporary.write_text(json.dumps(result.certificate(), indent=2) + "\n", encoding="utf-8")
-    if html is not None:
-        write_page(html, _page(loop_file.stem, result), force=force)
+    if html is not None and view is not None:
+        write_page(view, neck_view(result.recording(), title=f"Loop {loop_file.stem}"), force=force)
+        write_page(html, _page(loop_file.stem, result, view), force=force)
     if as_json:
         print_json(result.report())
     else:
@@ -72,8 +75,9 @@ def _limits(result: Result) -> tuple[list[str], list[list[str]]]:
     return ["metric", "limit", "value", "verdict"], rows
 
 
-def _page(name: str, result: Result) -> str:
+def _page(name: str, result: Result, view: Path) -> str:
     tables = [Table("Limits", *_limits(result)), Table("Metrics", *_metrics(result))]
     chart = loop_chart(result.signals.time, result.signals.signals, name)
-    words = f"Order {result.order}, {result.real_time_factor:.0f} times real time."
-    return page(f"Loop {name}", [Section("Result", text=[words], tables=tables, charts=[chart])])
+    words = f"Order {result.order}, metrics of the {result.angle} angle, {result.real_time_factor:.0f} times real time."
+    link = Markup('<a href="{}">The neck in 3-D</a>').format(view.name)
+    return page(f"Loop {name}", [Section("Result", text=[words, link], tables=tables, charts=[chart])])

@@ -96,8 +96,9 @@ class LoopRun:
         wiring = wire(self._parts, loop.constants, loop.connections)
         sequential = loop.order == "sequential"
         self._order = step_order(self._parts, wiring.taps) if sequential else ()
-        self._wiring, self._stages = place_faults(loop.faults, wiring, self._parts, self.step)
-        self._memories = tuple(acting.memory for acting in (*self._stages.sensors, *self._stages.plant))
+        self._wiring, stages = place_faults(loop.faults, wiring, self._parts, self.step)
+        self._stages = stages if loop.faults else None
+        self._memories = tuple(acting.memory for acting in (*stages.sensors, *stages.plant))
         self.row, self.rows = 0, max(1, round(loop.duration / self.step))
         self._late = tuple(name for name, part in self._parts.items() if late(part))
         self._bus, self._pending = self._wiring.start.copy(), {}
@@ -106,7 +107,6 @@ class LoopRun:
         self._columns = _columns(self._wiring)
         self._table = np.empty((self.rows, self._bus.size))
         self._reference = _reference_table(loop, self.step, self.rows)
-        self._zeros = {name: np.zeros(len(part.outputs)) for name, part in self._parts.items()}
 
     def __enter__(self) -> LoopRun:
         """Return the run itself."""
@@ -215,7 +215,8 @@ class LoopRun:
         for name in self._order:
             if k % self._ratios[name] == 0:
                 bus[self._wiring.spans[name]] = self._advance(name, time)
-        self._stages.actuate(bus, k)
+        if self._stages is not None:
+            self._stages.actuate(bus, k)
         self._table[k] = bus
         for name in self._late:
             if k % self._ratios[name] == 0:
@@ -224,7 +225,8 @@ class LoopRun:
     def _jacobi(self, k: int) -> None:
         """Set the inputs of all from what is on the bus at t_k, step all; the outputs are seen at t_k+1."""
         time, bus = self._arrive(k), self._bus
-        self._stages.actuate(bus, k)
+        if self._stages is not None:
+            self._stages.actuate(bus, k)
         self._table[k] = bus
         due = [name for name in self._parts if k % self._ratios[name] == 0]
         outputs = {name: self._advance(name, time) for name in due}
@@ -242,7 +244,8 @@ class LoopRun:
                 bus[spans[name]] = self._pending[name]
         if self._reference is not None:
             bus[spans["reference"]] = self._reference[k]
-        self._stages.sense(bus, k)
+        if self._stages is not None:
+            self._stages.sense(bus, k)
         return k * self.step
 
     def _advance(self, name: str, time: float) -> Vector:
@@ -250,8 +253,8 @@ class LoopRun:
         return self._checked(name, self._parts[name].advance(time, inputs), time)
 
     def _checked(self, name: str, outputs: Vector, time: float) -> Vector:
-        # Zero times anything finite is zero: one product tells whether a closer look is needed.
-        if outputs.dot(self._zeros[name]) == 0.0:
+        # One sum tells whether a closer look is needed; in Python, which warns of no inf - inf.
+        if math.isfinite(sum(outputs.tolist())):
             return outputs
         for port, value in zip(self._parts[name].outputs, outputs, strict=True):
             if not math.isfinite(value) and not (port.missing and math.isnan(value)):

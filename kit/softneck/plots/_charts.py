@@ -115,7 +115,10 @@ def loop_chart(time: Vector, signals: Mapping[str, Vector], title: str, *, capti
 
 
 def _angle_panel(time: Vector, signals: Mapping[str, Vector], axis: str) -> Panel:
-    looks_of = (("_measured", GREEN, 0.6), ("", BLUE, 1.4), ("_estimate", ORANGE, 0.9), ("_reference", BLACK, 1.0))
+    looks_of = (
+        ("_lower", GREY, 0.7), ("_upper", GREY, 0.7), ("_measured", GREEN, 0.6), ("", BLUE, 1.4),
+        ("_estimate", ORANGE, 0.9), ("_reference", BLACK, 1.0),
+    )  # fmt: skip
     curves = [
         Curve(time, np.degrees(signals[f"{axis}{end}"]), end.strip("_") or "true", colour, width=width)
         for end, colour, width in looks_of
