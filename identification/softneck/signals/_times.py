@@ -34,7 +34,8 @@ def check_times(time: Vector, sample_time: float, run: np.ndarray, *, tolerance:
         row = int(np.argmax(jump)) + 1
         raise DataError(
             f"`time` jumps by {step[row - 1]:.6g} s at row {row} (t = {time[row]:g} s) where the "
-            f"sample time is {sample_time:.6g} s; fill the gap, or split the record there by the `run` column."
+            f"sample time is {sample_time:.6g} s; fill the gap, split the record there by "
+            "the `run` column, or let `softneck import --guess` do it (it evens jitter out too)."
         )
 
 
