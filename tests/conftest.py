@@ -9,7 +9,19 @@ from typing import TYPE_CHECKING
 import pytest
 from hypothesis import HealthCheck, settings
 
-from softneck.identification import Model, Network, OutputError, Rls, SetMembership, Srivc, Subspace
+from softneck.identification import (
+    GreyBox,
+    Model,
+    Network,
+    OutputError,
+    Play,
+    Residual,
+    Rls,
+    SetMembership,
+    Srivc,
+    Subspace,
+    combine,
+)
 from softneck.signals import Recording
 
 from .browser import chromium_path, started
@@ -34,9 +46,9 @@ def neck() -> Recording:
 
 @pytest.fixture(scope="session")
 def models() -> dict[str, Model]:
-    """One small model of each kind, all trained on the same 500 rows."""
+    """One small model of each kind, all on the same 500 rows; "any" is kind `residual`, "residual" a form of `nlsm`."""
     recording = short_neck()
-    return {
+    made = {
         "rls": Rls(max_delay=0.12).fit(recording),
         "mimo": Rls(structure="mimo", delay=0.06).fit(recording),
         "oe": OutputError(delay=0.06, source="positions").fit(recording),
@@ -44,8 +56,12 @@ def models() -> dict[str, Model]:
         "subspace": Subspace(order=3, delay=0.06).fit(recording),
         "nlsm": SetMembership(epsilon=0.01, output_weight=10.0).fit(recording),
         "residual": SetMembership(form="residual").fit(recording),
+        "play": Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording),
         "nn": Network(hidden=(4, 3), iterations=8).fit(recording),
+        "greybox": GreyBox(evaluations=4, sensor_delay=2).fit(recording),
+        "any": Residual(base="rls", epsilon=0.004).fit(recording),
     }
+    return {**made, "ensemble": combine([made["play"], made["rls"], made["nn"]])}
 
 
 @pytest.fixture(scope="session")

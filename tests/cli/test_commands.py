@@ -152,6 +152,33 @@ def test_info_knows_recordings_models_and_certificates(call: Call, recording: Pa
     assert "rows: 600" in call("info", recording).out
 
 
+def test_info_says_what_the_columns_of_a_log_seem_to_be(call: Call, recording: Path) -> None:
+    rows = [line.split(",") for line in recording.read_text().splitlines()]
+    titles = [
+        cell.split(" [")[0].replace("motor_setpoint", "target").replace("motor_position", "enc") for cell in rows[0]
+    ]
+    Path("log.txt").write_text("\n".join(";".join(cells) for cells in [titles, *rows[1:]]))
+    facts = one_object(call("info", "log.txt", "--json"))
+    assert facts["type"] == "log"
+    assert any(line.startswith("motor_setpoint_1 from column 'target_1' [rad]: because") for line in facts["columns"])
+    assert facts["missing"] == "nothing that a recording needs"
+    assert call(*facts["import"].split()[1:]).code == 0  # what it says to do is what to do
+    assert "type: log" in call("info", "log.txt").out
+    said = call("info", "log.txt", "--html", "page.html")
+    assert said.code == 2
+    assert "log.txt: `--html` shows the quality of a recording" in said.error
+
+
+def test_info_of_a_recording_with_a_fault_says_the_fault(call: Call, recording: Path) -> None:
+    lines = recording.read_text().splitlines()
+    Path("gap.csv").write_text("\n".join([*lines[:50], *lines[80:]]))
+    said = call("info", "gap.csv")
+    assert said.code == 2
+    assert "gap.csv: `time` jumps" in said.error
+    Path("note.txt").write_text("a neck of soft material")
+    assert "note.txt: is no file of softneck by its ending, and no log either" in call("info", "note.txt").error
+
+
 def test_the_doctor_tells_of_every_dependency(call: Call) -> None:
     facts = one_object(call("doctor", "--json"))
     states = {check["name"]: check["state"] for check in facts["checks"]}

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Barrier
 
 import numpy as np
 import pytest
@@ -112,3 +114,16 @@ def test_a_cache_folder_that_cannot_be_written_is_no_hindrance(
     monkeypatch.setattr("platformdirs.user_cache_dir", lambda *_a, **_k: "/proc/nowhere")
     (runtime_folder / "other_a_runtime.py").write_text(STEP)
     assert load_runtime("other_a_runtime", compiled=False).state_size(()) == 1
+
+
+def test_threads_that_load_one_runtime_at_once_get_one(runtime_folder: Path) -> None:
+    for k in range(8):
+        (runtime_folder / f"shared_{k}_runtime.py").write_text(STEP)
+        together = Barrier(8)
+
+        def load(_: int, module: str = f"shared_{k}_runtime", together: Barrier = together) -> int:
+            together.wait()
+            return id(load_runtime(module, compiled=False))
+
+        with ThreadPoolExecutor(8) as pool:
+            assert len(set(pool.map(load, range(8)))) == 1

@@ -152,7 +152,11 @@ def _judge(path: Path) -> list[Any]:
         ('kind = "step"', 'kind = "recording"', r"`pitch_deg` is no key of \[reference\]"),
         ("pitch_deg = 15.0", "pitch = 15.0", "degrees"),
         ('"pitch.overshoot_pct"', '"pitch.beauty"', "limit on unknown metric `pitch.beauty`"),
-        ("[limits]", "[[fault]]\nkind = 'bias'\n[limits]", r"`\[\[fault\]\]` is not yet in this version"),
+        (
+            "[limits]",
+            "[[fault]]\nkind = 'bias'\n[limits]",
+            r"\[\[fault\]\] 1: `bias` is no kind of fault; use one of sensor_dropout",
+        ),
         ("[limits]", "[bounds]", "`bounds` is no key of the file"),
     ],
 )

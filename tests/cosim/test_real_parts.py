@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import subprocess
 import sys
 from pathlib import Path
@@ -13,14 +12,9 @@ import pytest
 
 from softneck.core import load
 from softneck.cosim import load_loop, simulate
-from softneck.design import PiSettings
-from softneck.estimation import KalmanSettings
-from softneck.fmu import build_fmu, unpacked
-from softneck.identification import Rls
+from softneck.fmu import unpacked
 from softneck.plant import NeckParameters, VirtualNeck
-from softneck.signals import Recording, redefine, signal
 
-TS = 0.02
 LOOP = """
 duration_s = 2.0
 [plant]
@@ -37,25 +31,6 @@ at_s = 0.4
 [limits]
 "pitch.rms_error_deg" = 6.0
 """
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Files and FMUs of an RLS model, its Kalman filter and PI controller, and the virtual neck's FMU."""
-    place = tmp_path_factory.mktemp("line")
-    P = signal("eq22").set_points[:800]
-    drive, y = redefine(P), np.zeros((800, 2))
-    for k in range(799):
-        y[k + 1] = 0.9 * y[k] + 0.01 * drive[k, :2] + 1e-3 * math.sin(k)
-    channels = {f"motor_setpoint_{j + 1}": P[:, j] for j in range(3)} | {"pitch": y[:, 0], "roll": y[:, 1]}
-    model = Rls().fit(Recording(np.arange(800) * TS, TS, channels))
-    model.save(place / "rls.npz")
-    KalmanSettings().design(model).save(place / "kalman.npz")
-    PiSettings().design(model).save(place / "pi.npz")
-    for name in ("rls", "kalman", "pi"):
-        build_fmu(load(place / f"{name}.npz").block(), place / f"{name}.fmu")
-    build_fmu(VirtualNeck(NeckParameters.paper()).block(), place / "VirtualNeck.fmu")
-    return place
 
 
 def _loop(folder: Path, plant: str, ending: str) -> Path:

@@ -4,57 +4,16 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import control
 import numpy as np
 import pytest
 
-from softneck.core import DataError, FileFormatError, SettingsError, load, load_runtime, read_archive, write_archive
-from softneck.estimation import SENSORS, KalmanObserver, KalmanSettings, LinearNeck, axis_plant
-from softneck.signals import Recording, redefine, signal
+from softneck.core import DataError, FileFormatError, SettingsError, load, read_archive, write_archive
+from softneck.estimation import SENSORS, KalmanSettings, LinearNeck, axis_plant
+from softneck.signals import Recording
 
-TS = 0.02
-POLE = math.exp(-5.293 * TS)
-
-
-def neck(*, pitch_delay: int = 4, roll_delay: int = 2, gain: float = 1.0) -> LinearNeck:
-    """The paper's pitch (Eq. 31, exp(-0.08 s) 27.69/(s + 5.293) deg/rad) and a faster-answering roll."""
-    b = gain * math.radians(27.69) / 5.293 * (1.0 - POLE)
-    first = control.TransferFunction([b], [1.0, -POLE, *([0.0] * pitch_delay)], TS)
-    second = control.TransferFunction([0.8 * b], [1.0, -POLE, *([0.0] * roll_delay)], TS)
-    return LinearNeck(pitch=first, roll=second)
-
-
-def recording(
-    *, noise_deg: float = 0.05, seed: int = 1, rows: int = 1500, model: LinearNeck | None = None
-) -> Recording:
-    """Eq. 22 through the linear neck, with white noise on the measured angles."""
-    P = signal("eq22").set_points[:rows]
-    u = redefine(P)
-    rng = np.random.default_rng(1)
-    time: Any = np.arange(rows) * TS
-    channels = {f"motor_setpoint_{j + 1}": P[:, j] for j in range(3)}
-    for i, axis in enumerate(("pitch", "roll")):
-        true = np.asarray(control.forced_response(neck().tf(axis), time, u[:, i]).outputs)  # pyright: ignore
-        channels[axis] = true
-        channels[f"{axis}_measured"] = true + math.radians(noise_deg) * rng.standard_normal(rows)
-    return Recording(time, TS, channels)
-
-
-def run_block(observer: KalmanObserver, record: Recording, *, compiled: bool = True) -> np.ndarray:
-    """The runtime over a recording, as a sequential loop calls it; outputs (time, 6)."""
-    block = observer.block()
-    state = block.initial_state()
-    z = np.column_stack([record.channels["pitch_measured"], record.channels["roll_measured"]])
-    P = record.set_points[np.maximum(np.arange(len(record)) - 1, 0)]
-    valid = np.isfinite(z).all(axis=1).astype(float)
-    U = np.column_stack([P, z, valid])
-    if compiled:
-        return block.run(state, U)[1]
-    Y = np.zeros((len(U), 6))
-    load_runtime(block.runtime, compiled=False).run_steps(block.arrays, state.parameters, state.values.copy(), U, Y)
-    return Y
+from .necks import TS, neck, recording, run_block
 
 
 def with_gaps(record: Recording, rows: slice) -> Recording:
@@ -138,7 +97,7 @@ def test_a_rejected_measurement_leaves_no_trace() -> None:
     with_outlier = run_block(observer, record.with_channels(pitch_measured=spoiled))
     without = run_block(observer, with_gaps(record, slice(200, 201)))
     np.testing.assert_array_equal(with_outlier[:, :4], without[:, :4])
-    assert with_outlier[200, 4] > observer.arrays[7][2]
+    assert with_outlier[200, 4] > observer.arrays[8][2]
 
 
 def test_a_lasting_change_is_accepted_by_force_after_ten_rejections() -> None:

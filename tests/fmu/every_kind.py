@@ -12,7 +12,18 @@ import numpy as np
 from softneck.core import Block
 from softneck.design import PiSettings
 from softneck.estimation import KalmanSettings, LinearNeck
-from softneck.identification import Network, OutputError, Rls, SetMembership, Srivc, Subspace
+from softneck.identification import (
+    GreyBox,
+    Network,
+    OutputError,
+    Play,
+    Residual,
+    Rls,
+    SetMembership,
+    Srivc,
+    Subspace,
+    combine,
+)
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.signals import Recording, redefine, signal
 
@@ -68,6 +79,23 @@ def _residual() -> Block:
     return SetMembership(form="residual").fit(recording()).block()
 
 
+def _play() -> Block:
+    return Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording()).block()
+
+
+def _greybox() -> Block:
+    return GreyBox(evaluations=3, sensor_delay=2).fit(recording()).block()
+
+
+def _any() -> Block:
+    return Residual(base="rls").fit(recording()).block()
+
+
+def _ensemble() -> Block:
+    play = Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording())
+    return combine([play, Rls().fit(recording())]).block()
+
+
 def _nn() -> Block:
     return Network(hidden=(5, 5), iterations=3).fit(recording()).block()
 
@@ -93,6 +121,15 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
     "subspace": (_subspace, MOTORS, ["pitch", "roll", "motor_position_3"], _MODEL),
     "nlsm": (_nlsm, MOTORS, ["pitch", "roll", "pitch_lower", "pitch_upper", "roll_lower", "roll_upper"], _MODEL),
     "residual": (_residual, MOTORS, ["pitch", "pitch_lower", "roll_upper", "motor_position_2"], _MODEL),
+    "play": (_play, MOTORS, ["pitch", "roll", "motor_position_3"], _MODEL),
+    "greybox": (_greybox, MOTORS, ["pitch", "roll", "motor_position_1"], _MODEL),
+    "any": (_any, MOTORS, ["pitch", "roll", "pitch_lower", "pitch_upper", "roll_lower", "roll_upper"], _MODEL),
+    "ensemble": (
+        _ensemble,
+        MOTORS,
+        ["pitch", "roll", "pitch_lower", "pitch_upper", "roll_lower", "roll_upper"],
+        _MODEL,
+    ),
     "nn": (_nn, MOTORS, ["pitch", "roll", "motor_position_3"], _MODEL),
     "neck": (
         _neck,

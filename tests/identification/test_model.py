@@ -15,7 +15,7 @@ from softneck.signals import Recording, concatenate
 from ..data import TS, neck_recording
 
 # By the name of the shared models: "residual" is the other form of kind "nlsm".
-KINDS = ("rls", "mimo", "oe", "srivc", "subspace", "nlsm", "residual", "nn")
+KINDS = ("rls", "nlsm", "residual", "play", "nn", "greybox", "any", "ensemble", "mimo", "oe", "srivc", "subspace")
 UNSEEN = neck_recording(120, seed=21)
 
 
@@ -103,6 +103,16 @@ CRAFTED = [
     ("residual", "delay", lambda a: a + 1e6, "a dead time"),
     ("residual", "a", lambda a: a[:1], "`a` has shape"),
     ("residual", "table", lambda a: np.where(a == [3, 1, 1], [3, 2, 1], a), "a regressor's output"),
+    ("play", "table", lambda a: a + 100.0, "a term's signal"),
+    ("play", "chain", lambda a: a + 0.5, "the order of the filters"),
+    ("play", "echo", lambda a: a[:1], "`echo` has shape"),
+    ("play", "memory", lambda a: a * 1e9, "its memory in samples"),
+    ("greybox", "neck", lambda a: a * 1e6, "drive_rate of .* is out of range"),
+    ("greybox", "sensor", lambda a: a + 0.5, "the sensor's dead time"),
+    ("any", "table", lambda a: a - 1.0, "a regressor's"),
+    ("any", "0.rls.delay", lambda a: a + 1e6, "a dead time"),
+    ("ensemble", "memory", lambda a: a * 1e9, "its memory in samples"),
+    ("ensemble", "2.nn.w3", lambda a: a * np.nan, "`w3` is not of finite floats"),
     ("nn", "W2", lambda a: a[:, :, :-1], "`W2` has shape"),
 ]
 

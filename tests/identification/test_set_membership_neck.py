@@ -76,8 +76,8 @@ def test_the_residual_form_from_mixed_excitation(tests: dict[str, Recording]) ->
     model = SetMembership(form="residual").fit(mixed)
     assert len(mixed) == 7000
     for name, recording in tests.items():
-        assert free_run(model, recording) >= 85.0, name  # the issue's; over five seeds 86.2 and more
-        assert coverage(recording, model.simulate(recording)) >= 0.97, name  # over five seeds 97.2 % and more
+        assert free_run(model, recording) >= 85.0, name  # the issue's; over five seeds 89.7 and more
+        assert coverage(recording, model.simulate(recording)) >= 0.97, name  # over five seeds all of them
         # An epsilon below what the base leaves unexplained let gamma and the width grow to 1,000 deg.
         assert np.degrees(np.mean(model.simulate(recording)[:, 6] - model.simulate(recording)[:, 5])) < 25.0, name
 
@@ -95,8 +95,8 @@ def test_on_the_real_arm_both_forms_beat_any_linear_model(arm: tuple[Recording, 
     y = test.outputs[WARM_UP:, 0]
     # The best of them is chosen on the test itself: more than a linear model can claim.
     linear = max(_laguerre_fit(train, test, pole, order) for pole in (0.9, 0.95) for order in (2, 8))
-    # Measured: 73.8 at most, also for output-error models of orders 1 to 4 and FIR of up to 8 s; here 93.3, 83.4.
-    for form, margin in (("paper_eq21", 15.0), ("residual", 5.0)):
+    # Measured: 73.8 at most, also for output-error models of orders 1 to 4 and FIR of up to 8 s; here 93.3, 92.6.
+    for form, margin in (("paper_eq21", 15.0), ("residual", 10.0)):
         fit = nrmse_fit(y, SetMembership(form=form).fit(train).simulate(test)[WARM_UP:, 0])
         assert fit >= linear + margin, form
 

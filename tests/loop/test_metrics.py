@@ -88,6 +88,42 @@ def test_motor_metrics() -> None:
     assert table["motors"]["effort"] == pytest.approx((0.01 + 0.09 + 0.09) * TS, rel=1e-12)
 
 
+def test_total_variation_time_beyond_the_limits_and_slack() -> None:
+    motor = np.array([0.0, 6.0, 6.5, 6.5, 5.0])
+    result = result_of(np.zeros(5), np.zeros(5), motor)
+    table = metrics(result)["motors"]
+    assert table["total_variation_rad"] == pytest.approx(8.0, rel=1e-12)
+    assert table["limit_violation_s"] == pytest.approx(2 * TS, rel=1e-12)
+    assert table["slack_s"] is None
+    signals = {**result.signals, "tension_1": np.full(5, 3.0), "tension_2": np.array([1.0, 0.0, 0.0, 2.0, 0.0])}
+    slack = metrics(LoopResult(result.time, signals, {}, TS))["motors"]["slack_s"]
+    assert slack == pytest.approx(3 * TS, rel=1e-12)
+
+
+def test_ise_and_itae_are_integrals_of_a_known_error() -> None:
+    n, late = 4000, 100
+    time = np.arange(n) * TS
+    reference = np.where(time >= late * TS - 1e-9, 0.2, 0.0)
+    pitch = np.where(reference > 0.0, 0.2 * (1.0 - np.exp(-(time - late * TS))), 0.0)
+    table = metrics(result_of(pitch, reference))["pitch"]
+    # Of 0.2 exp(-t): 0.2, 0.2^2 / 2 and 0.2; sums over samples of 20 ms miss the integrals by 1 % or 2 %.
+    assert table["iae"] == pytest.approx(0.2, rel=0.02)
+    assert table["ise"] == pytest.approx(0.02, rel=0.03)
+    assert table["itae"] == pytest.approx(0.2, rel=0.02)
+
+
+def test_measured_angles_are_judged_on_request_and_gaps_are_left_out() -> None:
+    result = result_of(np.zeros(400), np.zeros(400))
+    measured = np.full(400, np.radians(1.0))
+    measured[::3] = np.nan
+    both = LoopResult(result.time, {**result.signals, "pitch_measured": measured}, {}, TS)
+    assert metrics(both)["pitch"]["rms_error_deg"] == 0.0
+    assert metrics(both, angle="measured")["pitch"]["rms_error_deg"] == pytest.approx(1.0, rel=1e-12)
+    assert metrics(both, angle="measured")["roll"]["rms_error_deg"] == 0.0
+    with pytest.raises(SettingsError, match="`angle` must be one of true, measured"):
+        metrics(both, angle="felt")
+
+
 def test_limits_hold_or_not_by_name() -> None:
     values = {"pitch": {"overshoot_pct": 4.0, "settling_s": None}, "motors": {"max_rad": 3.0}}
     rows = check_limits(values, {"pitch.overshoot_pct": 5.0, "pitch.settling_s": 1.0, "motors.max_rad": 2.5})

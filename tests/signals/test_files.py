@@ -45,6 +45,15 @@ def recordings(draw: st.DrawFn) -> Recording:
     return Recording(time, Ts, channels, np.repeat(np.arange(len(runs)), runs))
 
 
+def test_a_delimiter_at_the_end_of_each_line_is_no_channel(tmp_path: Path) -> None:
+    lines = csv_lines(neck_recording(30), 30)
+    (tmp_path / "plain.csv").write_text("\n".join(lines))
+    (tmp_path / "ended.csv").write_text("\n".join(line + "," for line in lines))
+    plain, ended = read_recording(tmp_path / "plain.csv"), read_recording(tmp_path / "ended.csv")
+    assert ended.channels.keys() == plain.channels.keys()
+    np.testing.assert_array_equal(ended.outputs, plain.outputs)
+
+
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
 @given(recording=recordings())
 @settings(max_examples=25)

@@ -48,6 +48,7 @@ def layouts(draw: st.DrawFn) -> Layout:
     tilt = draw(st.booleans())
     estimate = draw(st.booleans())
     first = draw(st.integers(0, 99))
+    header = draw(st.booleans())
     clock = st.builds(Source, st.builds(Term, columns, finite).map(lambda term: (term,)), st.sampled_from(UNITS["s"]))
     return Layout(
         channels={name: draw(sources(si_unit(name))) for name in names},
@@ -60,10 +61,11 @@ def layouts(draw: st.DrawFn) -> Layout:
         duplicates=draw(st.sampled_from([None, "first", "last"])),
         run=draw(st.none() | columns),
         variable=draw(st.none() | st.text(max_size=5)),
-        header=draw(st.booleans()),
+        header=header,
         delimiter=draw(st.sampled_from([",", ";", "\t", "|", '"', "\\", "whitespace"])),
         decimal=draw(st.sampled_from([".", ","])),
         skip=draw(st.integers(0, 9)),
+        unit_row=header and draw(st.booleans()),
         rows=draw(st.none() | st.just((first, first + 5))),
     )
 
@@ -151,6 +153,25 @@ def test_remarks_before_the_table_are_left_out(tmp_path: Path, remarks: list[str
     assert (guess.layout.skip, guess.layout.header) == (len(remarks), header)
     assert parse_layout(guess.text) == guess.layout
     assert len(import_log(tmp_path / "log.csv", guess.layout).recording) == 1200
+
+
+@pytest.mark.parametrize("brackets", ["{}", "[{}]"])
+@pytest.mark.parametrize(("delimiter", "decimal"), [(",", "."), (";", ",")])
+def test_a_line_of_units_below_the_names_is_read(tmp_path: Path, brackets: str, delimiter: str, decimal: str) -> None:
+    columns = {f"target{name[1]}" if name[0] == "s" else name.replace("x", "encoder"): c for name, c in table().items()}
+    columns["t"] = 1000 * columns["t"]
+    names, *rows = pd.DataFrame(columns).to_csv(index=False, sep=delimiter, decimal=decimal).splitlines()
+    units = delimiter.join(brackets.format(unit) for unit in ["ms", *["deg"] * 8])
+    # Loggers end lines with a delimiter, Windows with CR LF, and its editors begin with a byte order mark.
+    text = "\r\n".join(line + delimiter for line in ["logger 3", names, units, *rows])
+    (tmp_path / "log.csv").write_bytes(b"\xef\xbb\xbf" + text.encode())
+    guess = guess_layout(tmp_path / "log.csv")
+    assert (guess.layout.skip, guess.layout.header, guess.layout.unit_row) == (1, True, True)
+    assert guess.layout.time == Source((Term("t"),), "ms")
+    assert parse_layout(guess.text) == guess.layout
+    same(import_log(tmp_path / "log.csv", guess.layout).recording)
+    assert any("because its title says so" in line or "says ms" in line for line in guess.lines)
+    assert any(line.startswith("ignored: column 'Unnamed: 9': because it is empty") for line in guess.lines)
 
 
 def test_the_set_points_are_those_that_the_positions_follow(tmp_path: Path) -> None:

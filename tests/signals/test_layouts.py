@@ -95,6 +95,8 @@ def test_a_gap_in_the_time_column_splits_the_run_under_any_sample_time(tmp_path:
             '"p", unit = "deg", sign = "x"',
             "pitch]: sign must be 1 or -1; got 'x'. Scale it by `factor`",
         ),
+        ("[time]", "[file]\nunit_row = 1\n[time]", "`unit_row` must be true or false; got 1"),
+        ("[time]", "[file]\nheader = false\nunit_row = true\n[time]", "unit_row is the line below the names"),
         ('"p", unit = "deg"', '"p", unit = "deg", sign = 0', "sign must be 1 or -1; got 0"),
         ('"p", unit = "deg"', '"p", unit = "deg", factor = 0', "a factor must be a finite number other than 0; got 0"),
         ('"p", unit = "deg"', '"p", unit = "deg", factor = "x"', "wrong type"),

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import control
 import numpy as np
+from scipy.linalg import fractional_matrix_power
 
 from softneck.core import DataError, Matrix, SettingsError, Vector
 
@@ -102,6 +104,40 @@ class AxisPlant:
         """Return the same plant with a dead time of at least `least` [s], in whole samples."""
         delay = max(self.delay, round(least / self.sample_time))
         return AxisPlant(self.numerator, self.denominator, delay, self.sample_time)
+
+    def resampled(self, sample_time: float) -> AxisPlant:
+        """Return the same plant, between whose samples the input is held, at a shorter `sample_time` [s].
+
+        The augmented matrix [A B; 0 I] to the power of the ratio (Van Loan 1978); at the old instants both agree.
+
+        Raises:
+            SettingsError: the new sample time does not divide the old one, or a pole has no real root.
+        """
+        ratio = round(self.sample_time / sample_time)
+        # 1e-6: sample times such as 0.02 / 2 are off by rounding only.
+        if ratio < 1 or not math.isclose(ratio * sample_time, self.sample_time, rel_tol=1e-6):
+            raise SettingsError(
+                f"`sample_time` {sample_time:g} s must divide that of the model, {self.sample_time:g} s, as "
+                f"{self.sample_time / 2:g} s does."
+            )
+        if ratio == 1:
+            return self
+        A, B, C = self.observable_form()
+        poles = np.linalg.eigvals(A)
+        if np.any((np.abs(poles.imag) < 1e-12) & (poles.real <= 1e-12)):
+            raise SettingsError(
+                f"the model has a pole at {poles.real.min():.3g}, which no plant has whose input is held: it cannot "
+                f"be taken to {sample_time:g} s. Identify it at that sample time."
+            )
+        whole = np.block([[A, B[:, None]], [np.zeros((1, A.shape[0])), np.ones((1, 1))]])
+        part = np.real(np.asarray(fractional_matrix_power(whole, 1.0 / ratio)))
+        n = A.shape[0]
+        Ad, Bd = part[:n, :n], part[:n, n]
+        denominator = np.real(np.poly(Ad))
+        # Markov parameters times the denominator give the numerator.
+        markov = np.array([C @ np.linalg.matrix_power(Ad, i) @ Bd for i in range(n)])
+        numerator = np.convolve(markov, denominator)[:n]
+        return AxisPlant(numerator, denominator, self.delay * ratio, sample_time)
 
     def tf(self, *, extra_delay: int = 0) -> control.TransferFunction:
         """Return it as a `control.TransferFunction` with `extra_delay` samples more."""

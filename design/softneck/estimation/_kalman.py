@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,36 +13,27 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.typing import ArrayLike
 
-from softneck.core import Block, DataError, FileFormatError, Matrix, Port, State, Vector, write_archive
+from softneck.core import Block, FileFormatError, Matrix, Port, SettingsError, State, Vector, write_archive
 from softneck.signals import Recording
 
+from ._forms import NOISES, STATES
+from ._kalman_parts_runtime import (
+    KALMAN_CONSTANTS,
+    KALMAN_DIVIDER,
+    KALMAN_FROZEN,
+    KALMAN_GATE,
+    KALMAN_LEAD,
+    KALMAN_REJECTIONS,
+    KALMAN_TIMEOUT,
+)
+from ._offline import Estimates, filter_recording, smooth_recording
+from ._steady import steady_gains, system
+
 _RUNTIME = "softneck.estimation._kalman_runtime"
-_ARRAYS = ("F", "B", "H", "model_noise", "disturbance_noise", "P0", "redefinition", "constants")
-_NOISE = ("measurement_noise_std", "model_noise_std", "disturbance_noise_std")
+_STEADY = "softneck.estimation._steady_kalman_runtime"
+_ARRAYS = ("F", "B", "H", "first_noise", "second_noise", "P0", "PF", "sources", "constants")
+_GAINS = ("gain", "inverse_spread", "start_gain", "start_inverse_spread", "forced_gain", "forced_inverse_spread")
 _MEASURED = ("pitch", "roll")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Estimates:
-    """What the filter made of a recording, row by row.
-
-    Attributes:
-        time: (time,) [s].
-        pitch, roll: (time,) estimates at the instant of the measurement [rad].
-        pitch_rate, roll_rate: (time,) [rad/s].
-        innovation: (time,) normalised innovation squared; 0 where nothing was measured.
-        accepted: (time,) bool, whether the measurement was taken in.
-        healthy: (time,) bool.
-    """
-
-    time: Vector
-    pitch: Vector
-    roll: Vector
-    pitch_rate: Vector
-    roll_rate: Vector
-    innovation: Vector
-    accepted: np.ndarray
-    healthy: np.ndarray
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -49,15 +41,17 @@ class KalmanObserver:
     """A designed Kalman filter; `KalmanSettings.design` makes it.
 
     Attributes:
+        form: "model", "gyro" or "kinematic".
         sample_time: [s].
-        arrays: F (n, n), B (n, 2), H (2, n), unit covariances of model and disturbance noise (n, n), P0 (n, n),
-            rows 1 and 2 of the redefinition (2, 3), constants (delays, gate, rejections, timeout, sample time).
-        noise: measurement, model and disturbance noise, standard deviations [rad].
-        sensor: name of the preset, "none" where the noise was given.
+        arrays: F (n, n), B (n, 2), H (2, n), unit covariances of the two process noises (n, n), P0 (n, n) at the
+            start, PF (n, n) of a forced acceptance, sources (2, 3 or 2) and constants; with steady gains six more.
+        noise: standard deviations, named and in the units of `noise_names`.
+        sensor: name of the preset, "none" where the noise was given, "data" where it was estimated.
         order: of the loop it is for.
         gate_level: chi-square level of the gate.
     """
 
+    form: str = "model"
     sample_time: float
     arrays: tuple[Matrix, ...]
     noise: tuple[float, float, float]
@@ -65,23 +59,61 @@ class KalmanObserver:
     order: str
     gate_level: float
 
+    def __post_init__(self) -> None:
+        for i, name in ((3, "first_noise"), (4, "second_noise"), (5, "P0"), (6, "PF")):
+            _require_covariance(name, self.arrays[i])
+
     @property
     def delays(self) -> tuple[int, int]:
-        """Samples that set-points need to act on pitch and roll, beyond the first."""
-        return int(self.arrays[7][0]), int(self.arrays[7][1])
+        """Samples that set-points need to act on pitch and roll, beyond the first; 0 where they do not act."""
+        return (int(self.arrays[8][0]), int(self.arrays[8][1])) if self.form == "model" else (0, 0)
+
+    @property
+    def noise_names(self) -> tuple[str, ...]:
+        """Names of the noise levels."""
+        return tuple(name for name, _ in NOISES[self.form])
+
+    @property
+    def is_steady(self) -> bool:
+        """Whether gains are constant."""
+        return len(self.arrays) > len(_ARRAYS)
+
+    @property
+    def lead(self) -> float:
+        """How far the estimate runs ahead of the measurement [s]: the sensor's delay."""
+        return float(self.arrays[8][KALMAN_LEAD]) * self.sample_time
+
+    def with_noise(self, noise: Sequence[float], *, sensor: str = "none") -> KalmanObserver:
+        """Return the same filter with other noise levels, steady gains made anew."""
+        levels = (float(noise[0]), float(noise[1]), float(noise[2]))
+        for (name, unit), value in zip(NOISES[self.form], levels, strict=True):
+            if not (math.isfinite(value) and value > 0.0):
+                raise SettingsError(f"`{name}` must be positive [{unit}]; got {value}.")
+        bare = dataclasses.replace(self, noise=levels, sensor=sensor, arrays=self.arrays[: len(_ARRAYS)])
+        return bare.steady() if self.is_steady else bare
+
+    def steady(self) -> KalmanObserver:
+        """Return the filter with the gains that it converges to while measurements come regularly."""
+        arrays = self.arrays[: len(_ARRAYS)]
+        return dataclasses.replace(self, arrays=(*arrays, *steady_gains(arrays, self.noise)))
 
     def block(self) -> Block:
         """Return the filter as a block of role "observer"."""
         u = tuple(Port(name=f"motor_setpoint_{j}", unit="rad", minimum=-6.0, maximum=6.0) for j in (1, 2, 3))
         y = tuple(Port(name=f"{a}_measured", unit="rad", description=f"measured {a}", missing=True) for a in _MEASURED)
         valid = Port(name="measurement_valid", description="whether the angles were measured", start=1.0, boolean=True)
+        rates = tuple(
+            Port(name=f"{a}_rate_measured", unit="rad/s", description=f"{a} rate of the gyro", missing=True)
+            for a in _MEASURED
+        )
+        levels = list(zip(NOISES[self.form], self.noise, strict=True))
         return Block(
             kind="kalman",
             role="observer",
-            runtime=_RUNTIME,
+            runtime=_STEADY if self.is_steady else _RUNTIME,
             sample_time=self.sample_time,
             arrays=self.arrays,
-            inputs=(*u, *y, valid),
+            inputs=(*u, *y, valid, *(rates if self.form == "gyro" else ())),
             outputs=(
                 *(Port(name=a, unit="rad", description=f"estimated {a}") for a in _MEASURED),
                 *(Port(name=f"{a}_rate", unit="rad/s", description=f"estimated rate of {a}") for a in _MEASURED),
@@ -89,12 +121,12 @@ class KalmanObserver:
                 Port(name="healthy", description="a measurement was accepted in time", boolean=True),
             ),
             parameters=tuple(
-                Port(
-                    name=name, unit="rad", start=value, minimum=1e-9, maximum=math.pi, description="standard deviation"
-                )
-                for name, value in zip(_NOISE, self.noise, strict=True)
+                # Levels of process noise are part of constant gains and cannot be changed there.
+                Port(name=name, unit=unit, start=value, minimum=1e-9, maximum=1e3 if unit != "rad" else math.pi,
+                     description="standard deviation")
+                for (name, unit), value in (levels[:1] if self.is_steady else levels)
             ),
-        )
+        )  # fmt: skip
 
     def initial_state(self, **parameters: float) -> State:
         """Return the state at the start; parameters are the noise levels by name."""
@@ -105,89 +137,64 @@ class KalmanObserver:
         return self.block().step(state, inputs)
 
     def filterpy(self) -> KalmanFilter:
-        """Return a configured `filterpy.kalman.KalmanFilter` (2 inputs: delayed theta_i, phi_i; 2 measurements).
+        """Return a configured `filterpy.kalman.KalmanFilter` (2 inputs, 2 measurements).
 
-        Give `predict(u)` the inputs that act, (2, 1), and `update(None)` where nothing was measured: a NaN in
-        `update` would stay in its state for good.
+        Give `predict(u)` the inputs that act, (2, 1): delayed theta_i and phi_i, or rates of the gyro; and
+        `update(None)` where nothing was measured: a NaN in `update` would stay in its state for good.
         """
-        F, B, H, QM, QW, P0 = self.arrays[:6]
-        measurement, model, disturbance = self.noise
+        F, _, Q, R = system(self.arrays, self.noise)
         kf: Any = KalmanFilter(dim_x=F.shape[0], dim_z=2, dim_u=2)
-        kf.F, kf.B, kf.H, kf.P = F.copy(), B.copy(), H.copy(), P0.copy()
-        kf.Q = model**2 * QM + disturbance**2 * QW
-        kf.R = measurement**2 * np.eye(2)
+        kf.F, kf.B, kf.H = F.copy(), self.arrays[1].copy(), self.arrays[2].copy()
+        kf.P, kf.Q, kf.R = self.arrays[5].copy(), Q, R
         return kf
 
     def estimate(self, recording: Recording) -> Estimates:
         """Run filterpy over a recording; each of its runs starts anew. Missing samples are predicted over.
 
         Raises:
-            DataError: another sample time.
+            DataError: another sample time, or no gyro rates where the form needs them.
         """
-        if not math.isclose(recording.sample_time, self.sample_time, rel_tol=1e-6):
-            raise DataError(
-                f"the recording has sample time {recording.sample_time:g} s, the observer {self.sample_time:g} s; "
-                "resample it or design the observer for it."
-            )
-        rows = np.concatenate([self._estimate_run(run) for run in recording.runs()])
-        pitch, roll, pitch_rate, roll_rate, innovation, accepted, healthy = rows.T.copy()
-        return Estimates(recording.time, pitch, roll, pitch_rate, roll_rate, innovation, accepted > 0.5, healthy > 0.5)
+        return filter_recording(self, recording)
 
-    def _estimate_run(self, run: Recording) -> Matrix:
-        F, B, H, P0, T, constants = (self.arrays[i] for i in (0, 1, 2, 5, 6, 7))
-        kf = self.filterpy()
-        inputs = run.set_points @ T.T
-        rows = np.zeros((len(run), 7))
-        misses, rejections = constants[4], 0
-        for k, z in enumerate(_measured(run)):
-            # At t_k the set-points of t_k-1 were held; those of t_k-1-delay act.
-            u = np.array([[inputs[max(0, k - 1 - (delay - self._late)), i]] for i, delay in enumerate(self.delays)])
-            kf.predict(u)
-            forced = rejections >= constants[3]
-            if forced or k <= max(self.delays) - self._late:
-                kf.P = kf.P + P0
-            nis, accepted = 0.0, False
-            if np.isfinite(z).all():
-                e = z[:, None] - H @ kf.x
-                nis = float((e.T @ np.linalg.solve(H @ kf.P @ H.T + kf.R, e))[0, 0])
-                accepted = forced or nis <= constants[2]
-                rejections = 0 if accepted else rejections + 1
-            kf.update(z[:, None] if accepted else None)
-            misses = 0 if accepted else misses + 1
-            angle = (H @ kf.x).ravel()
-            rate = ((H @ (F @ kf.x + B @ u)).ravel() - angle) / self.sample_time
-            rows[k] = [*angle, *rate, nis, accepted, misses < constants[4]]
-        return rows
+    def smooth(self, recording: Recording) -> Estimates:
+        """Return the best estimates from a whole run, what comes after each row included (Rauch, Tung, Striebel 1965).
 
-    @property
-    def _late(self) -> int:
-        """The sample that a Jacobi loop adds to the delays and a recording does not have."""
-        return int(self.order == "jacobi")
+        For offline use: no online filter knows what comes. Raises as `estimate`.
+        """
+        return smooth_recording(self, recording)
 
     def summary(self) -> str:
         """Return some lines for people."""
-        measurement, model, disturbance = (math.degrees(value) for value in self.noise)
-        n = self.arrays[0].shape[0]
-        d = self.delays
-        return "\n".join(
-            [
-                f"kalman observer, {self.sample_time * 1e3:g} ms, {self.order} order, sensor {self.sensor}",
-                f"  {n} states: model and disturbance of pitch and roll; set-points act after "
-                f"{d[0] + 1} and {d[1] + 1} samples",
-                f"  noise: measured {measurement:.3g} deg, model {model:.3g} deg, disturbance {disturbance:.3g} deg",
-                f"  gate: chi-square level {self.gate_level:g} (innovation <= {self.arrays[7][2]:.3g}); "
-                f"by force after {self.arrays[7][3]:g} rejections",
-                f"  healthy until {self.arrays[7][4] * self.sample_time * 1e3:g} ms without an accepted measurement",
-            ]
-        )
+        n, c, d = self.arrays[0].shape[0], self.arrays[8], self.delays
+        acts = f"; set-points act after {d[0] + 1} and {d[1] + 1} samples" if self.form == "model" else ""
+        levels = [
+            f"{name.removesuffix('_noise_std')} {math.degrees(value):.3g} {unit.replace('rad', 'deg')}"
+            for (name, unit), value in zip(NOISES[self.form], self.noise, strict=True)
+        ]
+        lines = [
+            f"kalman observer, {self.sample_time * 1e3:g} ms, {self.order} order, sensor {self.sensor}",
+            f"  {self.form} form, {'constant gains' if self.is_steady else 'gains from the covariance'}",
+            f"  {n} states: {STATES[self.form]}{acts}",
+            f"  noise: {', '.join(levels)}",
+            f"  gate: chi-square level {self.gate_level:g} (innovation <= {c[KALMAN_GATE]:.3g}); "
+            f"by force after {c[KALMAN_REJECTIONS]:g} rejections",
+            f"  healthy until {c[KALMAN_TIMEOUT] * self.sample_time * 1e3:g} ms without an accepted measurement"
+            + (f" or {c[KALMAN_FROZEN]:g} identical ones" if c[KALMAN_FROZEN] > 0 else ""),
+        ]
+        if c[KALMAN_DIVIDER] > 1 or self.lead > 0:
+            lines.append(
+                f"  measured every {c[KALMAN_DIVIDER] * self.sample_time * 1e3:g} ms, late by {self.lead * 1e3:g} ms"
+            )
+        return "\n".join(lines)
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write the observer to one `.npz` file."""
         block = self.block()
         header = {
             "kind": "kalman",
+            "form": self.form,
             "sample_time": self.sample_time,
-            "noise": dict(zip(_NOISE, self.noise, strict=True)),
+            "noise": dict(zip(self.noise_names, self.noise, strict=True)),
             "sensor": self.sensor,
             "order": self.order,
             "gate_level": self.gate_level,
@@ -195,28 +202,46 @@ class KalmanObserver:
             "outputs": [port.name for port in block.outputs],
             "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
         }
-        write_archive(path, header, dict(zip(_ARRAYS, self.arrays, strict=True)), force=force)
+        names = (*_ARRAYS, *(_GAINS if self.is_steady else ()))
+        write_archive(path, header, dict(zip(names, self.arrays, strict=True)), force=force)
 
     @classmethod
     def from_archive(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> KalmanObserver:
         """Return the observer that `save` wrote; `softneck.core.load` calls this."""
-        items = tuple(np.ascontiguousarray(arrays[name], dtype=np.float64) for name in _ARRAYS)
+        form = str(header["form"])
+        names = (*_ARRAYS, *(_GAINS if _GAINS[0] in arrays else ()))
+        items = tuple(np.ascontiguousarray(arrays[name], dtype=np.float64) for name in names)
         n = items[0].shape[0]
-        shapes = ((n, n), (n, 2), (2, n), (n, n), (n, n), (n, n), (2, 3), (6,))
-        if any(item.shape != shape or not np.isfinite(item).all() for item, shape in zip(items, shapes, strict=True)):
+        source = (2, 2) if form == "gyro" else (2, 3)
+        shapes = ((n, n), (n, 2), (2, n), *([(n, n)] * 4), source, (KALMAN_CONSTANTS,), *([(n, 2), (2, 2)] * 3))
+        if any(
+            item.shape != shape or not np.isfinite(item).all()
+            for item, shape in zip(items, shapes[: len(items)], strict=True)
+        ):
             raise FileFormatError("the observer's arrays have wrong shapes or are not finite; design it again.")
-        noise = header["noise"]
-        return cls(
-            sample_time=float(header["sample_time"]),
-            arrays=items,
-            noise=(float(noise[_NOISE[0]]), float(noise[_NOISE[1]]), float(noise[_NOISE[2]])),
-            sensor=str(header["sensor"]),
-            order=str(header["order"]),
-            gate_level=float(header["gate_level"]),
+        levels = [float(header["noise"][name]) for name, _ in NOISES[form]]
+        try:
+            return cls(
+                form=form,
+                sample_time=float(header["sample_time"]),
+                arrays=items,
+                noise=(levels[0], levels[1], levels[2]),
+                sensor=str(header["sensor"]),
+                order=str(header["order"]),
+                gate_level=float(header["gate_level"]),
+            )
+        except SettingsError as error:
+            raise FileFormatError(f"{error} Design the observer again.") from error
+
+
+def _require_covariance(name: str, P: Matrix) -> None:
+    """Raise SettingsError unless `P` is symmetric and no direction has a negative variance."""
+    largest = float(np.abs(P).max(initial=0.0))
+    # 1e-9 of the largest: what rounding leaves of a zero eigenvalue.
+    if not np.isfinite(P).all() or not np.allclose(P, P.T, rtol=0.0, atol=1e-9 * largest):
+        raise SettingsError(f"the covariance `{name}` must be finite and symmetric.")
+    least = float(np.linalg.eigvalsh(P).min())
+    if least < -1e-9 * largest:
+        raise SettingsError(
+            f"the covariance `{name}` must be positive semidefinite; its least eigenvalue is {least:.3g}."
         )
-
-
-def _measured(run: Recording) -> Matrix:
-    """Return the measured angles (time, 2): `pitch_measured` where a simulation logged it, else `pitch`."""
-    columns = [run.channels.get(f"{axis}_measured", run.channels[axis]) for axis in _MEASURED]
-    return np.column_stack(columns)

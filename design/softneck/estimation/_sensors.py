@@ -15,22 +15,34 @@ class Sensor:
     Attributes:
         name: what users type.
         noise_std: standard deviation of pitch and of roll at rest [rad].
-        source: where the number comes from.
+        gyro_noise_std: standard deviation of its rates from sample to sample [rad/s].
+        source: where the numbers come from.
     """
 
     name: str
     noise_std: float
+    gyro_noise_std: float
     source: str
 
 
 # Upper ends of what the recordings show on plateaus: a filter that trusts too little lags a little,
-# one that trusts too much rejects good samples.
+# one that trusts too much rejects good samples. Rates were not recorded: data sheet class.
 SENSORS: dict[str, Sensor] = {
     sensor.name: sensor
     for sensor in (
-        Sensor("mpu9250", math.radians(0.29), "Arduino with MPU-9250: 0.26 to 0.29 deg on plateaus of the recordings"),
-        Sensor("3dm-gx5-10", math.radians(0.04), "3DM-GX5-10, 50 Hz: 0.02 to 0.04 deg on plateaus of the recordings"),
-        Sensor("paper", math.radians(0.05), "the virtual neck's inclinometer in the paper preset"),
+        Sensor(
+            "mpu9250",
+            math.radians(0.29),
+            math.radians(0.1),
+            "Arduino with MPU-9250: 0.26 to 0.29 deg on plateaus of the recordings; rates: data sheet class",
+        ),
+        Sensor(
+            "3dm-gx5-10",
+            math.radians(0.04),
+            math.radians(0.05),
+            "3DM-GX5-10, 50 Hz: 0.02 to 0.04 deg on plateaus of the recordings; rates: data sheet class",
+        ),
+        Sensor("paper", math.radians(0.05), math.radians(0.1), "the virtual neck's inclinometer in the paper preset"),
     )
 }
 

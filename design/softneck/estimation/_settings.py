@@ -6,117 +6,191 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import block_diag, solve_discrete_lyapunov
 from scipy.stats import chi2
 
-from softneck.core import Matrix, SettingsError, require_between, require_one_of, require_positive
+from softneck.core import (
+    Matrix,
+    SettingsError,
+    Vector,
+    require_between,
+    require_one_of,
+    require_positive,
+    require_whole,
+)
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
 from ._axis import AXES, AxisPlant, HasTransferFunctions, axis_plant
+from ._forms import FORMS, NOISES, RATE_STD, Form, gyro_form, kinematic_form, model_form
 from ._kalman import KalmanObserver
 from ._sensors import find_sensor
+from ._steady import steady_gains
 
 ORDERS = ("sequential", "jacobi")
-# The neck reaches some 40 deg (paper, section 5): so far off may the first angle be.
-_START_STD = math.radians(40.0)
-# Set-points may stand anywhere in +-6 rad when a filter starts: a third of it as standard deviation.
-_START_INPUT = 2.0
+# Sample times and delays that are whole multiples but for the rounding of decimal fractions.
+_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KalmanSettings:
-    """Kalman filter over an identified linear model with an output disturbance on each axis.
+    """Kalman filter of pitch and roll in one of three forms.
 
-    The angle is what the model makes of the delayed set-points plus a disturbance that walks; the estimate is
-    of the angle at the instant of the measurement. Measurement noise is white, and so is what the model's angle
-    misses from one sample to the next.
+    "model": the angle is what an identified linear model makes of the delayed set-points plus a disturbance that
+    walks. "gyro": the angle rises by what the gyro says minus a bias that walks. "kinematic": angle and rate under
+    a white acceleration. Measurement noise is white.
 
     Attributes:
+        form: "model", "gyro" or "kinematic".
         sensor: preset of the measurement noise: "mpu9250", "3dm-gx5-10", "paper".
         measurement_noise_std: [rad]; None for that of the sensor.
-        model_noise_std: of the model's angle, added each sample [rad].
-        disturbance_noise_std: step of the disturbance's walk, each sample [rad].
+        model_noise_std: "model": of the model's angle, added each sample [rad].
+        disturbance_noise_std: "model": step of the disturbance's walk, each sample [rad].
+        acceleration_noise_std: "kinematic": of the acceleration [rad/s^2].
+        angle_noise_std: "kinematic": what else the angle does, each sample [rad].
+        gyro_noise_std: "gyro": of the rates, with what their alignment misses [rad/s]; None for thrice the sensor's.
+        bias_noise_std: "gyro": step of the bias's walk, each sample [rad/s].
+        sample_time: of the loop [s]; None for that of the model. Must divide the model's.
+        sensor_period: of the inclinometer [s], a multiple of the sample time; None: a new sample each time.
+        sensor_delay: how late measurements are [s]; the estimate is of the angle now. 0 estimates the angle at the
+            instant of the measurement.
+        gyro_delay: how late the gyro's rates are [s], at most the sensor's delay.
         gate_level: part of good measurements that the gate lets pass, chi-square with 2 degrees of freedom.
         max_rejections: after so many in a row the next measurement is taken in by force.
         healthy_timeout: [s] without an accepted measurement until `healthy` goes false.
+        frozen_samples: so many identical samples are a frozen sensor: not used, not healthy. 0: never.
+        steady: constant gains instead of a covariance: for small targets.
         order: of the loop it will run in; in "jacobi" the observer sees set-points one sample younger.
         tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
     """
 
+    form: str = "model"
     sensor: str = "paper"
     measurement_noise_std: float | None = None
     # The neck moves by up to 0.8 deg in 20 ms, and a fit to large moves is some 20 % off in small ones.
     model_noise_std: float = math.radians(0.15)
     disturbance_noise_std: float = math.radians(0.02)
+    # 40 deg/s within 0.15 s, as the neck's pole of 5 1/s allows.
+    acceleration_noise_std: float = 5.0
+    angle_noise_std: float = 1e-6
+    gyro_noise_std: float | None = None
+    # A bias that wanders by 0.2 deg/s in some 10 s.
+    bias_noise_std: float = math.radians(0.01)
+    sample_time: float | None = None
+    sensor_period: float | None = None
+    sensor_delay: float = 0.0
+    gyro_delay: float = 0.0
     gate_level: float = 0.9999
     max_rejections: int = 10
     healthy_timeout: float = 0.1
+    frozen_samples: int = 20
+    steady: bool = False
     order: str = "sequential"
     tendon_angles: tuple[float, float, float] = tuple(TENDON_ANGLES.tolist())
 
     def __post_init__(self) -> None:
+        require_one_of("form", self.form, FORMS)
         find_sensor(self.sensor)
-        if self.measurement_noise_std is not None:
-            _require_noise("measurement_noise_std", self.measurement_noise_std)
-        _require_noise("model_noise_std", self.model_noise_std)
-        _require_noise("disturbance_noise_std", self.disturbance_noise_std)
+        for names in NOISES.values():
+            for name, unit in names:
+                if getattr(self, name) is not None:
+                    _require_noise(name, getattr(self, name), unit)
+        for name in ("sample_time", "sensor_period"):
+            if getattr(self, name) is not None:
+                require_positive(name, getattr(self, name), "s")
+        require_between("sensor_delay", self.sensor_delay, 0.0, 1.0, "s")
+        require_between("gyro_delay", self.gyro_delay, 0.0, 1.0, "s")
+        if self.gyro_delay > self.sensor_delay:
+            raise SettingsError(
+                f"`gyro_delay` {self.gyro_delay:g} s must be at most `sensor_delay`, {self.sensor_delay:g} s: the "
+                "rates between two measurements must be known when the second comes."
+            )
         require_between("gate_level", self.gate_level, 0.5, 1.0 - 1e-12)
         require_between("max_rejections", self.max_rejections, 0, 1_000_000)
         require_positive("healthy_timeout", self.healthy_timeout, "s")
+        require_whole("frozen_samples", self.frozen_samples, 0, 1_000_000)
         require_one_of("order", self.order, ORDERS)
 
     @property
-    def noise_std(self) -> float:
-        """The measurement noise that holds [rad]."""
-        return find_sensor(self.sensor).noise_std if self.measurement_noise_std is None else self.measurement_noise_std
+    def noise(self) -> tuple[float, float, float]:
+        """The noise levels that hold, in the order of the form's."""
+        sensor = find_sensor(self.sensor)
+        preset = {"measurement_noise_std": sensor.noise_std, "gyro_noise_std": 3.0 * sensor.gyro_noise_std}
+        first, second, third = (
+            preset[name] if getattr(self, name) is None else float(getattr(self, name)) for name, _ in NOISES[self.form]
+        )
+        return first, second, third
 
     def design(self, model: HasTransferFunctions) -> KalmanObserver:
         """Return the filter for `model`, anything with `tf("pitch")` and `tf("roll")`.
 
         Raises:
-            SettingsError: a model that is not linear, discrete and stable, or axes of different sample times.
+            SettingsError: a model that is not linear, discrete and stable, axes of different sample times, or times
+                that do not divide.
         """
         plants = [axis_plant(model, axis) for axis in AXES]
         times = [plant.sample_time for plant in plants]
         if not math.isclose(*times, rel_tol=1e-9):
             raise SettingsError(f"pitch and roll have different sample times, {times[0]:g} s and {times[1]:g} s.")
-        axes = [_axis_matrices(plant) for plant in plants]
-        F, QM, QW, P0 = (_diagonal(*(axis[i] for axis in axes)) for i in (0, 3, 4, 5))
-        B, H = (_diagonal(*(axis[i] for axis in axes)) for i in (1, 2))
-        late = self.order == "jacobi"
-        timeout = math.ceil(self.healthy_timeout / times[0] - 1e-9)
-        gate = float(chi2.ppf(self.gate_level, df=len(AXES)))
-        constants = np.array([*(p.delay + late for p in plants), gate, self.max_rejections, timeout, times[0]])
-        T = redefinition_matrix(np.array(self.tendon_angles))[:2]
+        period = times[0] if self.sample_time is None else self.sample_time
+        plants = [plant.resampled(period) for plant in plants]
+        constants, sources = self._constants(plants, period), self._sources()
+        arrays = self._form(plants, period).arrays(sources, constants)
         return KalmanObserver(
-            sample_time=times[0],
-            arrays=(F, B, H, QM, QW, P0, T, constants),
-            noise=(self.noise_std, self.model_noise_std, self.disturbance_noise_std),
+            form=self.form,
+            sample_time=period,
+            arrays=(*arrays, *steady_gains(arrays, self.noise)) if self.steady else arrays,
+            noise=self.noise,
             sensor=self.sensor if self.measurement_noise_std is None else "none",
             order=self.order,
             gate_level=self.gate_level,
         )
 
+    def _form(self, plants: list[AxisPlant], period: float) -> Form:
+        if self.form == "model":
+            return model_form(plants)
+        return gyro_form(period) if self.form == "gyro" else kinematic_form(period)
 
-def _axis_matrices(plant: AxisPlant) -> tuple[Matrix, ...]:
-    """Return F, B, H, unit model noise, unit disturbance noise and P0 of one axis: model states, disturbance."""
-    A, b, c = plant.observable_form()
-    F = _diagonal(A, np.eye(1))
-    B = np.append(b, 0.0)[:, None]
-    H = np.append(c, 1.0)[None, :]
-    QM, QW = np.zeros_like(F), np.zeros_like(F)
-    QM[0, 0] = QW[-1, -1] = 1.0
-    # The model's spread under a white input, scaled to what set-points of _START_INPUT held for long do.
-    spread = np.asarray(solve_discrete_lyapunov(A, np.outer(b, b)))
-    spread *= (_START_INPUT * plant.static_gain) ** 2 / spread[0, 0]
-    return F, B, H, QM, QW, _diagonal(0.5 * (spread + spread.T), _START_STD**2 * np.eye(1))
+    def _sources(self) -> Matrix:
+        if self.form == "gyro":
+            return np.eye(2)
+        T = redefinition_matrix(np.array(self.tendon_angles))[:2]
+        return T if self.form == "model" else np.zeros_like(T)
+
+    def _constants(self, plants: list[AxisPlant], period: float) -> Vector:
+        """Return the constants in the places that `_kalman_parts_runtime` names."""
+        lags = [0.0, 0.0]
+        if self.form == "model":
+            lags = [plant.delay + float(self.order == "jacobi") for plant in plants]
+        if self.form == "gyro":
+            # Between two measurements acts the mean of the rates at both ends: half a sample ago.
+            lags = [0.5 + (self.sensor_delay - self.gyro_delay) / period] * 2
+        gate = float(chi2.ppf(self.gate_level, df=len(AXES)))
+        timeout = math.ceil(self.healthy_timeout / period - 1e-9)
+        lead = self.sensor_delay / period
+        lead = round(lead) if abs(lead - round(lead)) < _ROUNDING else lead
+        gap = RATE_STD * period
+        return np.array(
+            [*lags, gate, self.max_rejections, timeout, period, lead, self._divider(period), self.frozen_samples,
+             float(self.form == "gyro"), gap]
+        )  # fmt: skip
+
+    def _divider(self, period: float) -> int:
+        if self.sensor_period is None:
+            return 1
+        divider = round(self.sensor_period / period)
+        if divider < 1 or not math.isclose(divider * period, self.sensor_period, rel_tol=_ROUNDING):
+            raise SettingsError(
+                f"`sensor_period` {self.sensor_period:g} s must be a multiple of the sample time, {period:g} s, as "
+                f"{max(divider, 1) * period:g} s is."
+            )
+        if divider * period >= self.healthy_timeout:
+            raise SettingsError(
+                f"`healthy_timeout` {self.healthy_timeout:g} s must be longer than `sensor_period`, "
+                f"{self.sensor_period:g} s, or the filter is never healthy."
+            )
+        return divider
 
 
-def _diagonal(*blocks: Matrix) -> Matrix:
-    return np.asarray(block_diag(*blocks), dtype=np.float64)
-
-
-def _require_noise(name: str, value: float) -> None:
-    require_positive(name, value, "rad")
-    if value > math.pi:
+def _require_noise(name: str, value: float, unit: str) -> None:
+    require_positive(name, value, unit)
+    if unit == "rad" and value > math.pi:
         raise SettingsError(f"`{name}` is a standard deviation in rad; got {value:g}: degrees?")

@@ -1,11 +1,17 @@
 """Models of the neck from recordings, judged honestly."""
 
+from ._auto import Choice as Choice
+from ._auto import Tried as Tried
+from ._auto import choose as choose
+from ._auto import kinds_to_try as kinds_to_try
 from ._compare import Comparison as Comparison
 from ._compare import compare as compare
 from ._cone_set import ConeSet as ConeSet
 from ._cones import Cones as Cones
 from ._drive import DriveModel as DriveModel
 from ._drive import fit_drive as fit_drive
+from ._ensemble import Ensemble as Ensemble
+from ._ensemble import combine as combine
 from ._envelope import envelope_weight as envelope_weight
 from ._family import AxisFamily as AxisFamily
 from ._family import Family as Family
@@ -13,6 +19,7 @@ from ._family_fit import FamilySettings as FamilySettings
 from ._gamma import GammaCurve as GammaCurve
 from ._gamma import gamma_curve as gamma_curve
 from ._gamma import offending_pair as offending_pair
+from ._greybox import GreyBox as GreyBox
 from ._linear import continuous_parameters as continuous_parameters
 from ._lpv import Lpv as Lpv
 from ._model import WARM_UP as WARM_UP
@@ -26,10 +33,12 @@ from ._online import Tracked as Tracked
 from ._online_rls import OnlineRls as OnlineRls
 from ._online_rls import OnlineState as OnlineState
 from ._outside import outside_seen as outside_seen
+from ._play import Play as Play
 from ._recursion import Recursion as Recursion
 from ._recursion import RecursionHistory as RecursionHistory
 from ._recursion import RecursionState as RecursionState
 from ._regressors import PAPER_EQ21 as PAPER_EQ21
+from ._residual_any import Residual as Residual
 from ._residual_tests import ResidualTests as ResidualTests
 from ._rls import Rls as Rls
 from ._rows import row_hashes as row_hashes

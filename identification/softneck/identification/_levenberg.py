@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
@@ -11,6 +13,12 @@ from softneck.core import DataError, Matrix, Progress, Vector
 
 # Marquardt's factors: bold after success, careful after failure (Hagan and Menhaj 1994).
 _SHRINK, _GROW, _MAX_DAMPING = 0.2, 4.0, 1e10
+
+
+class Errors(Protocol):
+    """What `levenberg` minimises: errors (rows,) at w and, when asked for, derivatives (rows, w) of the model."""
+
+    def __call__(self, w: Vector, *, derivatives: bool) -> tuple[Vector, Matrix | None]: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,26 +89,63 @@ def train(
     Raises:
         DataError: the cost is not finite, so that the data cannot be learnt from.
     """
-    w, damping = start.vector(), 1e-2
-    output, J = jacobian(start, Z)
-    cost = _cost(target - output, w, decay)
+
+    def errors(w: Vector, *, derivatives: bool) -> tuple[Vector, Matrix | None]:
+        if not derivatives:
+            return target - start.like(w).output(Z), None
+        output, J = jacobian(start.like(w), Z)
+        return target - output, J
+
+    history: list[float] = []
+
+    def seen(_w: Vector, cost: float) -> bool:
+        progress(min(len(history) / iterations, 1.0), f"cost {cost:.4g}")
+        history.append(cost)
+        return True
+
+    w = levenberg(errors, start.vector(), iterations=iterations, decay=decay, seen=seen)
+    return start.like(w), history
+
+
+def levenberg(
+    errors: Errors, start: Vector, *, iterations: int, decay: float, seen: Callable[[Vector, float], bool]
+) -> Vector:
+    """Minimise `|errors(w)|^2 + decay |w|^2` over w by Levenberg and Marquardt; return the last w.
+
+    Args:
+        errors: returns the errors and, when asked for, the derivatives of what was subtracted in them.
+        start: the first w.
+        iterations: at most so many steps.
+        decay: weight of the squared parameters.
+        seen: called with w and its cost, first of all with the start; False ends the search.
+
+    Raises:
+        DataError: the first cost is not finite, so that the data cannot be learnt from.
+    """
+    w, damping = start, 1e-2
+    error, J = errors(w, derivatives=True)
+    cost = _cost(error, w, decay)
     if not np.isfinite(cost):
         raise DataError("the network's first error is not finite; look for wild values in the recording.")
-    history = [cost]
-    for iteration in range(iterations):
-        progress(iteration / iterations, f"cost {cost:.4g}")
-        A, g = J.T @ J, J.T @ (target - output) - decay * w
+    if not seen(w, cost):
+        return w
+    for _ in range(iterations):
+        if J is None:
+            raise ValueError("`errors` returned no derivatives")
+        A, g = J.T @ J, J.T @ error - decay * w
         trial, trial_cost = w, cost
-        while trial_cost >= cost and damping < _MAX_DAMPING:
+        # A cost that is not finite is no improvement either: the step is shortened until it is.
+        while not trial_cost < cost and damping < _MAX_DAMPING:
             trial = w + _solve(A, g, decay + damping)
-            trial_cost = _cost(target - start.like(trial).output(Z), trial, decay)
+            trial_cost = _cost(errors(trial, derivatives=False)[0], trial, decay)
             damping *= _SHRINK if trial_cost < cost else _GROW
-        if trial_cost >= cost:
+        if not trial_cost < cost:
             break
         w, cost, damping = trial, trial_cost, max(damping, 1e-9)
-        history.append(cost)
-        output, J = jacobian(start.like(w), Z)
-    return start.like(w), history
+        if not seen(w, cost):
+            break
+        error, J = errors(w, derivatives=True)
+    return w
 
 
 def _solve(A: Matrix, g: Vector, damping: float) -> Vector:

@@ -29,6 +29,7 @@ from softneck.signals import Recording
 
 from . import _linear, _ports
 from ._arrays import check_arrays
+from ._composed import memory_of, runtime_of, set_now
 
 # A free run starts from this many measured samples, for every kind; they are not scored.
 WARM_UP = 25
@@ -60,7 +61,7 @@ class Model:
         return Block(
             kind=self.kind,
             role="plant",
-            runtime=_linear.STATE_SPACE if "A" in self.arrays else KINDS[self.kind].runtime,
+            runtime=runtime_of(self.kind, self.arrays),
             sample_time=self.sample_time,
             arrays=tuple(self.arrays.values()),
             inputs=_ports.INPUTS,
@@ -84,14 +85,13 @@ class Model:
         logged = recording.motor_positions[0]
         m0 = np.where(np.isfinite(logged), logged, recording.set_points[0])
         start = block.initial_state(use_measurement=1.0, pitch_start=y0[0], roll_start=y0[1])
-        held = np.tile(np.concatenate([m0, y0, m0]), (int(self.arrays["history"][0]), 1))
+        held = np.tile(np.concatenate([m0, y0, m0]), (memory_of(self.arrays), 1))
         state, _ = block.run(start, held)
         outputs = start.outputs.copy()
         outputs[2:5] = m0
         # The last `step` moved the outputs of now; set them back to what the first row says.
         values = state.values.copy()
-        now = 8 * int(self.arrays["history"][0])
-        values[now : now + 5] = np.concatenate([m0, y0])
+        set_now(self.kind, self.arrays, values, m0, y0)
         return State(values, state.parameters, outputs)
 
     def step(self, state: State, inputs: ArrayLike, *, measured: ArrayLike | None = None) -> tuple[State, Vector]:

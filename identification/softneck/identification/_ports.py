@@ -30,7 +30,7 @@ INPUTS = (
     ),
 )
 _BOUNDS = tuple(
-    _angle(f"{angle}_{side}", f"{side.capitalize()} bound of {angle} by set membership (Eq. 19, 20)")
+    _angle(f"{angle}_{side}", f"{side.capitalize()} bound of {angle} by set membership (Eq. 19, 20) or of the ensemble")
     for angle in _ANGLES
     for side in ("lower", "upper")
 )
@@ -61,5 +61,5 @@ PARAMETERS = (
 
 
 def outputs(kind: str) -> tuple[Port, ...]:
-    """Return the outputs of a kind; set membership has bounds as well."""
-    return (*_OUTPUTS, *_BOUNDS) if kind == "nlsm" else _OUTPUTS
+    """Return the outputs of a kind; set membership and ensembles have bounds as well."""
+    return (*_OUTPUTS, *_BOUNDS) if kind in ("nlsm", "residual", "ensemble") else _OUTPUTS

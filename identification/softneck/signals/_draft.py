@@ -48,7 +48,12 @@ class Draft:
 
     def __post_init__(self) -> None:
         self.moving = shortened(self.sniffed.columns)
-        self.titles = {name: read_title(name) for name in self.sniffed.columns if isinstance(name, str)}
+        units = self.sniffed.units
+        self.titles = {
+            name: read_title(f"{name} [{units[name]}]" if name in units else name)
+            for name in self.sniffed.columns
+            if isinstance(name, str)
+        }
 
     def pick(self, channel: str, column: Column, why: str, *, sign: float = 1.0, sure: bool = True) -> None:
         """Take one column for a channel."""

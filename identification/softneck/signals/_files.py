@@ -80,6 +80,7 @@ class TextForm:
     delimiter: str = ","
     decimal: str = "."
     skip: int = 0
+    unit_row: bool = False
 
 
 def read_table(source: Path, suffix: str, form: TextForm) -> pd.DataFrame:
@@ -102,7 +103,7 @@ def read_table(source: Path, suffix: str, form: TextForm) -> pd.DataFrame:
                 header=0 if form.header else None,
                 sep=r"\s+" if form.delimiter == WHITESPACE else form.delimiter,
                 decimal=form.decimal,
-                skiprows=form.skip,
+                skiprows=[*range(form.skip), form.skip + 1] if form.unit_row else form.skip,
                 index_col=False,
                 skipinitialspace=True,
                 keep_default_na=False,
@@ -121,6 +122,8 @@ def _from_frame(frame: pd.DataFrame) -> Recording:
         if title.strip() == "run":
             run = integers(pd.Series(frame[title]))
             continue
+        if title.startswith("Unnamed: ") and pd.Series(frame[title]).isna().all():
+            continue  # a delimiter at the end of each line
         name, factor = parse_column(title)
         if name in channels:
             raise DataError(f"channel `{name}` stands in two columns; drop one.")

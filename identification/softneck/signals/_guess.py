@@ -168,7 +168,9 @@ def _left_out(draft: Draft) -> list[str]:
         if column in used:
             continue
         title = draft.titles.get(column)
-        if column in draft.passed_over:
+        if np.isnan(draft.sniffed.columns[column]).all():
+            reason = "it is empty"
+        elif column in draft.passed_over:
             reason = draft.passed_over[column]
         elif title is not None and title.role == "ignored":
             reason = title.why

@@ -53,6 +53,7 @@ class Layout:
         delimiter: between cells, one character or `whitespace`.
         decimal: the decimal mark, `.` or `,`.
         skip: lines before the table.
+        unit_row: whether the line below the names holds units; it is left out.
         rows: first and last row (not included) to take.
     """
 
@@ -70,12 +71,13 @@ class Layout:
     delimiter: str = ","
     decimal: str = "."
     skip: int = 0
+    unit_row: bool = False
     rows: tuple[int, int] | None = None
 
     @property
     def form(self) -> TextForm:
         """How a text is a table."""
-        return TextForm(self.header, self.delimiter, self.decimal, self.skip)
+        return TextForm(self.header, self.delimiter, self.decimal, self.skip, self.unit_row)
 
 
 def read_layout(path: str | Path) -> Layout:
@@ -123,7 +125,7 @@ def _layout(table: dict[str, Any]) -> Layout:
     _known_keys(table, {"file", "time", "channels", "tilt"}, "the layout")
     file, time = table.get("file", {}), table.get("time", {})
     tilt = table.get("tilt", {})
-    _known_keys(file, {"header", "delimiter", "decimal", "skip", "rows", "variable"}, "[file]")
+    _known_keys(file, {"header", "delimiter", "decimal", "skip", "unit_row", "rows", "variable"}, "[file]")
     _known_keys(
         time,
         {"column", "unit", "factor", "sample_time_s", "new_run_at_restart", "duplicates", "run_column"},
@@ -139,6 +141,8 @@ def _layout(table: dict[str, Any]) -> Layout:
         isinstance(rows, list) and [type(row) for row in rows] == [int, int] and 0 <= rows[0] < rows[1]
     ):
         raise SettingsError(f"[file] rows must be [first, last] with 0 <= first < last; got {rows}.")
+    if file.get("unit_row") is True and file.get("header") is False:
+        raise SettingsError("[file] unit_row is the line below the names; a file without `header` has none.")
     return Layout(
         channels={name: _channel_source(name, entry) for name, entry in table.get("channels", {}).items()},
         inclination=_source(tilt["inclination"], "rad", "[tilt] inclination") if tilt else None,
@@ -154,6 +158,7 @@ def _layout(table: dict[str, Any]) -> Layout:
         delimiter=_delimiter(file.get("delimiter", ",")),
         decimal=_choice(file, "decimal", (".", ","), ".") or ".",
         skip=_skip(file.get("skip", 0)),
+        unit_row=_flag(file, "unit_row", default=False),
         rows=(rows[0], rows[1]) if rows is not None else None,
     )
 

@@ -46,6 +46,8 @@ def _file(layout: Layout, why: Mapping[str, str]) -> list[str]:
     lines = [f"variable = {_text(layout.variable)}"] if layout.variable is not None else []
     if layout.skip:
         lines.append(f"skip = {layout.skip}")
+    if layout.unit_row:
+        lines.append("unit_row = true")
     if layout.header != plain.header:
         lines.append("header = false")
     if layout.delimiter != plain.delimiter:

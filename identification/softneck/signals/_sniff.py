@@ -34,12 +34,14 @@ class Sniffed:
         words: columns that hold no numbers.
         form: a layout without channels that says how to read the file.
         lines: why.
+        units: what the line of units says of each column, where there is such a line.
     """
 
     columns: dict[Column, Vector]
     words: tuple[Column, ...]
     form: Layout
     lines: tuple[str, ...]
+    units: dict[Column, str]
 
 
 def sniff(path: str | Path) -> Sniffed:
@@ -53,12 +55,13 @@ def sniff(path: str | Path) -> Sniffed:
     if not source.is_file():
         raise FileFormatError(f"{source}: no such file.")
     suffix = source.suffix.lower()
+    units: list[str] = []
     if suffix == ".mat":
         frame, form, lines = _mat(source)
     elif suffix == ".parquet":
         frame, form, lines = read_table(source, suffix, TextForm()), Layout(channels={}), ()
     else:
-        form, lines = _text_form(source)
+        form, lines, units = _text_form(source)
         frame = read_table(source, ".csv", form.form)
         if form.header:
             frame.columns = [str(name).strip() for name in frame.columns]
@@ -77,7 +80,8 @@ def sniff(path: str | Path) -> Sniffed:
             f"{source}: has {len(columns)} column(s) of numbers; a recording needs three set-points, pitch and roll. "
             "Is this a log? If so, write its delimiter into a layout and use --layout."
         )
-    return Sniffed(columns, tuple(words), form, lines)
+    named = {name: unit for name, unit in zip(frame.columns, units, strict=False) if unit}
+    return Sniffed(columns, tuple(words), form, lines, named)
 
 
 def _numbers(column: pd.Series) -> Vector | None:
@@ -108,7 +112,8 @@ def _mat(source: Path) -> tuple[pd.DataFrame, Layout, tuple[str, ...]]:
     return mat_table(source, arrays, name), Layout(channels={}, variable=name, header=False), (line,)
 
 
-def _text_form(source: Path) -> tuple[Layout, tuple[str, ...]]:
+def _text_form(source: Path) -> tuple[Layout, tuple[str, ...], list[str]]:
+    """Return how a text is a table, why, and the cells of its line of units."""
     with source.open("rb") as file:
         head = file.read(_HEAD_BYTES)
     raw = head.decode("utf-8-sig", errors="replace").splitlines()
@@ -127,9 +132,33 @@ def _text_form(source: Path) -> tuple[Layout, tuple[str, ...]]:
     header = any(cell and not _NUMBER.fullmatch(cell) for cell in first)
     why = f"file: cells are parted by {_NAMES[delimiter]}, because that cuts the lines into equally many"
     second = "the first line holds words: names" if header else "no header line, because the first line holds numbers"
-    form = Layout(channels={}, header=header, delimiter=delimiter, decimal="," if comma else ".", skip=skip)
+    units = _unit_row(raw[skip + 1 : skip + 3], delimiter) if header else []
+    form = Layout(
+        channels={},
+        header=header,
+        delimiter=delimiter,
+        decimal="," if comma else ".",
+        skip=skip,
+        unit_row=bool(units),
+    )
     before = (f"file: the first {skip} line(s) are no part of the table",) if skip else ()
-    return form, (why, *before, f"file: {second}", *(("file: decimal commas",) if comma else ()))
+    after = [
+        *(["file: the line below the names holds units"] if units else []),
+        *(["file: decimal commas"] if comma else []),
+    ]
+    return form, (why, *before, f"file: {second}", *after), units
+
+
+def _unit_row(lines: list[str], delimiter: str) -> list[str]:
+    """Return the cells of the line below the names, without brackets, if it holds no number and the next line does."""
+    if len(lines) < 2:
+        return []
+    cells = [cell.strip().strip("[]()").strip() for cell in _cells(lines[0], delimiter)]
+    below = [cell.strip().replace(",", ".") for cell in _cells(lines[1], delimiter)]
+    words = [cell for cell in cells if cell]
+    if not words or any(_NUMBER.fullmatch(cell.replace(",", ".")) for cell in words):
+        return []
+    return cells if sum(bool(_NUMBER.fullmatch(cell)) for cell in below) > len(below) / 2 else []
 
 
 def _cells(line: str, delimiter: str) -> list[str]:

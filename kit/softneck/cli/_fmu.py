@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from softneck.core import FileFormatError, SettingsError, load
+from softneck.cosim import is_loop_file, reference_of
 from softneck.fmu import Buildable, build_fmu, describe
 from softneck.identification import Model, Validation, validate
 from softneck.plant import NeckParameters, VirtualNeck
@@ -35,7 +36,8 @@ def command(
 ) -> None:  # fmt: skip
     """Package FILE as an FMI 2.0 Co-Simulation FMU.
 
-    FILE is a model, observer or controller (.npz), a neck parameter file (.toml), or a neck preset (paper, lab).
+    FILE is a model, observer or controller (.npz), a neck parameter file (.toml), a neck preset (paper, lab), or a
+    loop file, of whose [reference] a reference FMU is made.
     """
     del backend, fmi  # one of each in this version; the options hold their place
     jobs, replace = _what(file, folder, output, force=force)
@@ -64,6 +66,8 @@ def open_buildable(source: str | Path) -> Buildable:
         if not hasattr(thing, "block"):
             raise FileFormatError(f"{source}: is no model, observer or controller, so that no FMU can be made of it.")
         return thing
+    if is_loop_file(Path(source)):
+        return reference_of(Path(source))
     return VirtualNeck(load_neck(str(source)))
 
 

@@ -10,6 +10,7 @@ from softneck.core import KINDS, SettingsError, find_kind, kinds_of, refuse_exis
 from softneck.identification import INFINITE, Model, Search, Validation, validate
 from softneck.signals import Recording
 
+from ._auto import identify_auto
 from ._console import note, percent, print_json, progress
 from ._options import apply_settings, force_option, json_option, output_option, set_option, target
 from ._recordings import read_together
@@ -24,7 +25,8 @@ from ._search import (
     write_plot,
 )
 
-_KINDS = "\n".join(f"  {name:6} {KINDS[name].summary}" for name in kinds_of("model"))
+_KINDS = "\n".join(f"  {name:8} {KINDS[name].summary}" for name in kinds_of("model"))
+_KINDS += "\n  auto     tries them all and takes the best in free run"
 
 
 @click.command(
@@ -36,6 +38,7 @@ _KINDS = "\n".join(f"  {name:6} {KINDS[name].summary}" for name in kinds_of("mod
 @click.argument("recordings", nargs=-1, required=True, type=click.Path(path_type=Path))
 @output_option("model", "MODEL")
 @click.option("--train", default=0.7, show_default=True, help="Part of each run, from its start, to train on.")
+@click.option("--html", type=click.Path(path_type=Path), help="With KIND auto: write a page with the ranking.")
 @click.option("--seed", type=int, help="Seed of kinds that start at random.")
 @set_option
 @search_option
@@ -49,6 +52,7 @@ def command(
     recordings: tuple[Path, ...],
     output: Path | None,
     train: float,
+    html: Path | None,
     seed: int | None,
     settings: tuple[str, ...],
     searches: tuple[str, ...],
@@ -59,6 +63,15 @@ def command(
     as_json: bool,
 ) -> None:
     """Identify a model of KIND from one or more recordings."""
+    if kind == "auto":
+        if settings:
+            raise SettingsError("--set: `auto` takes no settings; name the kind that they are for.")
+        identify_auto(recordings, output, train=train, seed=seed, html=html, force=force, as_json=as_json)
+        return
+    if html is not None:
+        raise SettingsError(
+            f"--html goes with KIND auto; for `{kind}` use `softneck validate MODEL --data REC --html`."
+        )
     entry = find_kind(kind, "model")
     estimator = apply_settings(resolve(entry.settings), settings, seed=seed)
     options = SearchOptions(searches, hold_out, strategy, plot)

@@ -10,9 +10,9 @@ from typing import Any
 import click
 import fmpy
 
-from softneck.core import FileFormatError, SettingsError, file_hash, load, read_archive, refuse_existing
+from softneck.core import DataError, FileFormatError, SettingsError, file_hash, load, read_archive, refuse_existing
 from softneck.plant import NeckParameters, VirtualNeck
-from softneck.signals import quality, read_layout, read_recording
+from softneck.signals import Guess, Layout, guess_layout, quality, read_layout, read_recording
 
 from ._console import print_json, progress
 from ._options import force_option, json_option
@@ -28,9 +28,10 @@ _LARGE = 20_000_000
 @force_option
 @json_option
 def command(file: Path, html: Path | None, force: bool, as_json: bool) -> None:
-    """Say what FILE is: a recording, model, observer, controller, FMU, loop, layout, neck or certificate.
+    """Say what FILE is: a recording, model, observer, controller, FMU, loop, layout, neck, certificate or log.
 
-    Of a recording it tells the quality too: faults of its channels, and what its inputs can teach a model.
+    Of a recording it tells the quality too: faults of its channels, and what its inputs can teach a model. Of a log it
+    tells what `softneck import --guess` would take each column for.
     """
     if not file.is_file():
         raise FileFormatError(f"{file}: no such file.")
@@ -45,7 +46,8 @@ def command(file: Path, html: Path | None, force: bool, as_json: bool) -> None:
         print_json(facts if found is None else {**facts, "quality": found.as_dict()})
         return
     for key, value in facts.items():
-        text = "\n  ".join(str(value).splitlines()) if isinstance(value, str) else value
+        lines = value.splitlines() if isinstance(value, str) else value
+        text = "\n  ".join(lines) if isinstance(lines, list) else value
         click.echo(f"{key}: {text}")
     if found is not None:
         click.echo("\nquality:")
@@ -56,7 +58,10 @@ def command(file: Path, html: Path | None, force: bool, as_json: bool) -> None:
 def _describe(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dict[str, Any]:
     match file.suffix.lower():
         case ".csv" | ".parquet":
-            return _recording(file, html, force=force, quiet=quiet)
+            try:
+                return _recording(file, html, force=force, quiet=quiet)
+            except (DataError, FileFormatError) as error:
+                return _log(file, html, error)
         case ".npz":
             header, _ = read_archive(file)
             thing = load(file)
@@ -68,7 +73,7 @@ def _describe(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dic
         case ".json":
             return _certificate(file)
         case _:
-            raise FileFormatError(f"{file}: softneck has no files with the ending `{file.suffix}`.")
+            return _log(file, html, None)
 
 
 def _recording(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dict[str, Any]:
@@ -94,6 +99,36 @@ def _recording(file: Path, html: Path | None, *, force: bool, quiet: bool) -> di
         **({} if html is None else {"html": str(html)}),
         "quality": found,
     }
+
+
+def _log(file: Path, html: Path | None, error: DataError | FileFormatError | None) -> dict[str, Any]:
+    """Return what a foreign log seems to hold; `error` is why it is no recording, where it has a recording's ending.
+
+    Raises:
+        DataError, FileFormatError: it is a recording with a fault, or no log either.
+    """
+    try:
+        guess = guess_layout(file)
+    except (DataError, FileFormatError) as reason:
+        raise error or FileFormatError(
+            f"{file}: is no file of softneck by its ending, and no log either ({str(reason).removeprefix(f'{file}: ')})"
+        ) from reason
+    if error is not None and _is_titled(guess):
+        raise error
+    if html is not None:
+        raise SettingsError(f"{file}: `--html` shows the quality of a recording, and this is a log; import it first.")
+    return {
+        "type": "log",
+        "columns": list(guess.lines),
+        "missing": list(guess.missing) or "nothing that a recording needs",
+        "import": f"softneck import {file} --guess -o {file.stem}.recording.csv",
+    }
+
+
+def _is_titled(guess: Guess) -> bool:
+    """Whether a table has the form and the titles of a recording: a fault in it is for its user to mend."""
+    titled = [line for line in guess.lines if "titled as in a recording" in line]
+    return guess.layout.form == Layout(channels={}).form and len(titled) > 0
 
 
 def _fmu(file: Path) -> dict[str, Any]:

@@ -3,6 +3,10 @@
 A runtime module imports numpy, math and other runtime modules only. The bundle is those modules behind
 each other without the imports between them. numba compiles it, and an FMU carries it: what runs in the
 kit and what runs in the host is the same text, under a name that its content decides.
+
+A runtime may hold others: `outer(inner:11,other:13)` is module `outer` over member `inner`, which reads the first
+11 arrays behind those of `outer`, and `other`, which reads the next 13. Each member's names get a prefix, and the
+calls `member_*` of `_members_runtime` become calls of the members.
 """
 
 from __future__ import annotations
@@ -13,9 +17,11 @@ from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
+from ._composition import member_calls, prefixed
 from ._errors import SettingsError
 
 _LOOPS = "softneck.core._loops_runtime"
+_MEMBERS = "softneck.core._members_runtime"
 _ALLOWED = {"numpy", "math", "__future__"}
 
 
@@ -24,18 +30,23 @@ def bundle(runtime: str, *, loops: bool = True) -> str:
     """Return the source text of runtime module `runtime` with all it needs.
 
     Args:
-        runtime: dotted name.
+        runtime: dotted name, with members in brackets.
         loops: add the loops over `step`; false for a module of plain functions.
 
     Raises:
         SettingsError: a module imports what a runtime must not, or two define the same name.
     """
+    outer, members = _members(runtime)
     order: list[str] = []
-    _collect(runtime, order)
+    _collect(outer, order)
     names: dict[str, str] = {}
     parts = ["# A softneck runtime: generated, do not edit.", "import math", "", "import numpy as np", ""]
+    parts += [prefixed(bundle(member, loops=False), f"m{i}_") for i, (member, _) in enumerate(members)]
     for module in order:
-        parts.append(_stripped(module, names, skip=set()))
+        if module == _MEMBERS and members:
+            parts.append(member_calls([count for _, count in members], _own_arrays(outer)))
+        else:
+            parts.append(_stripped(module, names, skip=set()))
     if loops:
         parts.append(_stripped(_LOOPS, names, skip={"step"}))
     return "\n".join(parts)
@@ -44,6 +55,21 @@ def bundle(runtime: str, *, loops: bool = True) -> str:
 def content_name(text: str, prefix: str = "softneck") -> str:
     """Return a module name that the content of `text` decides."""
     return f"{prefix}_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
+
+
+def _members(runtime: str) -> tuple[str, list[tuple[str, int]]]:
+    """Return the outer module, and each member with the number of its arrays."""
+    outer, _, inner = runtime.partition("(")
+    pairs = [part.rpartition(":") for part in inner.rstrip(")").split(",")] if inner else []
+    return outer, [(name, int(count)) for name, _, count in pairs]
+
+
+def _own_arrays(outer: str) -> int:
+    """Return the number that a module with members says it reads before those of its members."""
+    for node in _tree(outer).body:
+        if _defined(node) == ["OWN_ARRAYS"] and isinstance(node, ast.Assign):
+            return int(ast.literal_eval(node.value))
+    raise SettingsError(f"runtime module {outer} takes no members: it does not say OWN_ARRAYS.")
 
 
 def _collect(module: str, order: list[str]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import sys
 import tempfile
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -19,6 +20,8 @@ from ._files import atomic_write
 
 # No fast-math: compiled and plain Python must agree to rounding. No GIL: batches run on all cores.
 COMPILE_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
+# One thread at a time loads: a cache alone lets two begin, and CPython 3.11's `ast` fails in two threads at once.
+_LOADING = threading.RLock()
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,12 +45,23 @@ class Runtime:
     compiled: bool
 
 
-@cache
 def load_runtime(module: str, *, compiled: bool = True) -> Runtime:
     """Return the functions of runtime module `module`; `compiled=False` gives plain Python.
 
     The bundle is written to the user's cache folder so that numba keeps the compiled code between runs.
     """
+    with _LOADING:
+        return _runtime(module, compiled)
+
+
+def load_functions(module: str, *, compiled: bool = True) -> ModuleType:
+    """Return a namespace with the functions of runtime module `module`, which has no `step` of its own."""
+    with _LOADING:
+        return _functions(module, compiled)
+
+
+@cache
+def _runtime(module: str, compiled: bool) -> Runtime:
     namespace = _import_text(bundle(module), compiled=compiled)
     done = compiled and _compile(namespace)
     names = ("state_size", "initialise", "step", "run_steps", "run_horizon")
@@ -55,8 +69,7 @@ def load_runtime(module: str, *, compiled: bool = True) -> Runtime:
 
 
 @cache
-def load_functions(module: str, *, compiled: bool = True) -> ModuleType:
-    """Return a namespace with the functions of runtime module `module`, which has no `step` of its own."""
+def _functions(module: str, compiled: bool) -> ModuleType:
     namespace = _import_text(bundle(module, loops=False), compiled=compiled)
     if compiled:
         _compile(namespace)

@@ -1,12 +1,20 @@
 """Closed loops over FMUs and Python parts: FMUs as parts, loop files, results."""
 
 from softneck.loop import Loop as Loop
+from softneck.loop import LoopRun as LoopRun
+from softneck.loop import LoopState as LoopState
+from softneck.loop import LoopStep as LoopStep
 
 from ._fmu_part import FmuError as FmuError
 from ._fmu_part import FmuPart as FmuPart
 from ._free_run import drive_fmu as drive_fmu
 from ._free_run import simulate_fmu_free_run as simulate_fmu_free_run
+from ._isolated import IsolatedPart as IsolatedPart
+from ._loop_file import is_loop_file as is_loop_file
 from ._loop_file import load_loop as load_loop
+from ._loop_file import make_loop as make_loop
+from ._loop_file import reference_of as reference_of
 from ._result import Result as Result
 from ._simulate import LoopSetup as LoopSetup
 from ._simulate import simulate as simulate
+from ._ssp import write_ssp as write_ssp

@@ -4,21 +4,13 @@ from __future__ import annotations
 
 import shutil
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import fmpy
 import numpy as np
-from fmpy import calloc, free
 from fmpy.fmi1 import FMICallException
-from fmpy.fmi2 import (
-    FMU2Slave,
-    fmi2CallbackAllocateMemoryTYPE,
-    fmi2CallbackFreeMemoryTYPE,
-    fmi2CallbackFunctions,
-    fmi2CallbackLoggerTYPE,
-)
 
 from softneck.core import (
     DataError,
@@ -31,10 +23,10 @@ from softneck.core import (
 )
 from softneck.fmu import unpack, unpacked
 
-from ._variables import Bank, Description, read_description
+from ._native import ERROR, FATAL, Bank, CallError, Native
+from ._variables import Description, read_description
 
 _ROLES = ("plant", "observer", "controller", "reference")
-_WARNING, _ERROR, _FATAL = 1, 3, 4
 # What pythonfmu's binary says of every Python exception; the reason stands in the line before.
 _NO_REASON = "Fatal py exception encountered"
 
@@ -44,13 +36,14 @@ class FmuError(SoftneckError):
 
 
 class FmuPart:
-    """An FMI 2.0 Co-Simulation FMU as a `softneck.loop.Part`.
+    """An FMI 2.0 or 3.0 Co-Simulation FMU as a `softneck.loop.Part`.
 
     Attributes:
         path: of the FMU.
         inputs, outputs, parameters: ports, in the FMU's order; Booleans are 0.0 and 1.0.
         sample_time: [s].
         role: "plant", "observer", "controller" or "reference".
+        native_names: our name -> the FMU's, where the mapping renames.
         messages: the last lines of the FMU's log, as (status, text).
     """
 
@@ -61,6 +54,7 @@ class FmuPart:
         role: str | None = None,
         sample_time: float | None = None,
         names: Mapping[str, str] | None = None,
+        units: Mapping[str, str] | None = None,
     ) -> None:
         """Read the FMU's description; it is unpacked and loaded at `start`.
 
@@ -69,15 +63,17 @@ class FmuPart:
             role: what it is in the loop; softneck's own FMUs know it themselves.
             sample_time: [s]; the step of the FMU's default experiment if not given.
             names: the FMU's variable name -> ours, for FMUs that use other names.
+            units: our name -> unit, for FMUs that state none or a wrong one.
 
         Raises:
-            FileFormatError: no FMI 2.0 Co-Simulation FMU for this platform.
+            FileFormatError: no FMI 2.0 or 3.0 Co-Simulation FMU for this platform.
             SettingsError: neither FMU nor caller say role or sample time.
         """
         self.path = Path(path)
         with unpacked(self.path) as folder:
-            self._description = read_description(self.path, folder, names or {})
+            self._description = read_description(self.path, folder, names or {}, units)
             _check_platform(self._description, folder)
+        self.native_names = {ours: theirs for theirs, ours in (names or {}).items()}
         self.role = role or self._description.annotation.role
         if not self.role:
             raise SettingsError(f"{self.path}: say its role in the loop ({', '.join(_ROLES)}).")
@@ -89,29 +85,29 @@ class FmuPart:
         self.messages: deque[tuple[int, str]] = deque(maxlen=100)
         self._inputs = self._bank(port.name for port in self.inputs)
         self._outputs = self._bank(port.name for port in self.outputs)
-        self._fmu: FMU2Slave | None = None
+        self._native: Native | None = None
         self._folder: Path | None = None
         self._broken = False
 
     def start(self, time: float, parameters: Mapping[str, float]) -> Vector:
         """Instantiate and initialise the FMU at `time` [s]; return its outputs (n_out,) there.
 
+        An instance that is still loaded is reset and used again, which costs less and leaks nothing.
+
         Raises:
             SettingsError: a parameter that the FMU does not have.
             FmuError: the FMU refused; the line says why.
         """
-        self.close()
-        self.messages.clear()
         bank, values = self._parameter_bank(parameters)
-        self._folder = unpack(self.path)
-        fmu = self._fmu = self._instance(self._folder)
-        self._do("it could not be instantiated", fmu.instantiate, False, _callbacks(self._log), True)
-        self._do("setup", fmu.setupExperiment, None, time, None)
-        self._do("parameters", bank.write, fmu, values)
-        self._do("inputs", self._inputs.write, fmu, np.array([port.start for port in self.inputs]))
-        self._do("initialisation", fmu.enterInitializationMode)
-        self._do("initialisation", fmu.exitInitializationMode)
-        return self._do("outputs", self._outputs.read, fmu)
+        self.messages.clear()
+        native = self._fresh()
+        self._do("setup", native.setup, time)
+        bank.bind(native)
+        self._do("parameters", bank.write, values)
+        self._do("inputs", self._inputs.write, np.array([port.start for port in self.inputs]))
+        self._do("initialisation", native.enter, time)
+        self._do("initialisation", native.exit)
+        return self._do("outputs", self._outputs.read)
 
     def advance(self, time: float, inputs: Vector) -> Vector:
         """Step one sample from `time` [s] with `inputs` (n_in,); return the outputs (n_out,) after it.
@@ -119,27 +115,44 @@ class FmuPart:
         Raises:
             FmuError: the FMU refused; the line says why.
         """
-        fmu = self._fmu
-        if fmu is None:
+        native = self._native
+        if native is None:
             raise FmuError(f"{self.path}: is not running; call `start` first.")
         try:
-            self._inputs.write(fmu, inputs)
-            fmu.fmi2DoStep(fmu.component, time, self.sample_time, 1)
-            return self._outputs.read(fmu)
-        except FMICallException as error:
+            self._inputs.write(inputs)
+            native.step(time, self.sample_time)
+            return self._outputs.read()
+        except CallError as error:
             raise self._refused(f"in the step from t = {time:g} s", error) from error
 
     def close(self) -> None:
         """Terminate the FMU, free it and remove what was unpacked."""
-        fmu, self._fmu = self._fmu, None
+        native, self._native = self._native, None
         folder, self._folder = self._folder, None
         broken, self._broken = self._broken, False
         try:
-            if fmu is not None and fmu.component is not None:
-                _release(fmu, broken=broken, ours=bool(self._description.annotation.role))
+            if native is not None:
+                native.release(broken=broken, ours=bool(self._description.annotation.role))
         finally:
             if folder is not None:
                 shutil.rmtree(folder, ignore_errors=True)
+
+    def get_state(self) -> bytes:
+        """Return the whole state of the FMU, serialised by itself.
+
+        Raises:
+            SettingsError: the FMU cannot serialise its state.
+        """
+        experiment: Any = self._description.model.coSimulation
+        if not (experiment.canGetAndSetFMUstate and experiment.canSerializeFMUstate) or self._native is None:
+            raise SettingsError(f"{self.path}: cannot save its state; its canSerializeFMUstate is false.")
+        return self._do("its state", self._native.get_state)
+
+    def set_state(self, state: bytes) -> None:
+        """Go on from a state that `get_state` returned, here or in another process."""
+        if self._native is None:
+            raise FmuError(f"{self.path}: is not running; call `start` first.")
+        self._do("its state", self._native.set_state, state)
 
     def __enter__(self) -> FmuPart:
         """Return the part itself."""
@@ -149,20 +162,27 @@ class FmuPart:
         """Close."""
         self.close()
 
-    def _instance(self, folder: Path) -> FMU2Slave:
-        model = self._description.model
+    def _fresh(self) -> Native:
+        """Return an instance before its initialisation."""
+        if self._native is not None and not self._broken:
+            try:
+                self._native.reset()
+                return self._native
+            except (FMICallException, CallError):
+                self._broken = True
+        self.close()
+        self._folder = unpack(self.path)
         try:
-            return FMU2Slave(
-                guid=model.guid,
-                unzipDirectory=str(folder),
-                modelIdentifier=self._description.identifier,
-                instanceName=self.path.stem,
-            )
+            self._native = Native(self._description, self._folder, lambda *line: self.messages.append(line))
         except Exception as error:  # fmpy raises nothing narrower
             raise FileFormatError(f"{self.path}: its binary cannot be loaded ({error}).") from error
+        self._do("it could not be instantiated", self._native.instantiate)
+        self._inputs.bind(self._native)
+        self._outputs.bind(self._native)
+        return self._native
 
-    def _bank(self, names: Any) -> Bank:
-        return Bank([self._description.variables[name] for name in names])
+    def _bank(self, names: Iterable[str]) -> Bank:
+        return Bank([self._description.variables[name] for name in names], self._description.version)
 
     def _parameter_bank(self, parameters: Mapping[str, float]) -> tuple[Bank, Vector]:
         known = [port.name for port in self.parameters]
@@ -175,53 +195,30 @@ class FmuPart:
     def _do(self, what: str, call: Callable[..., Any], *arguments: Any) -> Any:
         try:
             return call(*arguments)
-        except FMICallException as error:
+        except (FMICallException, CallError) as error:
             raise self._refused(f"at {what}", error) from error
         except Exception as error:
             # fmpy's own answer to a null instance
             self._broken = True
             raise FmuError(f"{self.path}: {what}: {self._reason() or error}") from error
 
-    def _refused(self, when: str, error: FMICallException) -> FmuError:
-        self._broken = self._broken or error.status >= _FATAL
+    def _refused(self, when: str, error: FMICallException | CallError) -> FmuError:
+        self._broken = self._broken or error.status >= FATAL
         return FmuError(f"{self.path}: {when}: {self._reason() or error}")
 
     def _reason(self) -> str:
-        lines = [text for status, text in self.messages if status >= _ERROR and not text.startswith(_NO_REASON)]
+        lines = [text for status, text in self.messages if status >= ERROR and not text.startswith(_NO_REASON)]
         return lines[-1] if lines else ""
-
-    def _log(self, _environment: Any, _instance: bytes, status: int, _category: bytes, message: bytes) -> None:
-        text = message.decode("utf-8", "replace").replace("%%", "%")
-        self.messages.append((status, " ".join(text.split())))
-
-
-def _callbacks(log: Callable[..., None]) -> fmi2CallbackFunctions:
-    # Without fmpy's logger proxy: that is one for the process, and an FMU's log would reach another part.
-    callbacks = fmi2CallbackFunctions()
-    callbacks.logger = fmi2CallbackLoggerTYPE(log)
-    callbacks.allocateMemory = fmi2CallbackAllocateMemoryTYPE(calloc)
-    callbacks.freeMemory = fmi2CallbackFreeMemoryTYPE(free)
-    return callbacks
-
-
-def _release(fmu: FMU2Slave, *, broken: bool, ours: bool) -> None:
-    if not broken:
-        try:
-            fmu.terminate()
-        except FMICallException as error:
-            broken = error.status >= _FATAL
-    # After "fatal" FMI allows no further call; our own slave stays sound and is freed.
-    if not broken or ours:
-        fmu.freeInstance()
 
 
 def _check_platform(description: Description, folder: Path) -> None:
     name = description.identifier
-    if (folder / "binaries" / fmpy.platform / f"{name}{fmpy.sharedLibraryExtension}").is_file():
+    wanted = fmpy.platform if description.version == 2 else fmpy.platform_tuple
+    if (folder / "binaries" / wanted / f"{name}{fmpy.sharedLibraryExtension}").is_file():
         return
     present = sorted(item.name for item in (folder / "binaries").glob("*")) or ["none"]
     raise FileFormatError(
-        f"{description.path}: has no binary for this platform ({fmpy.platform}); it has {', '.join(present)}."
+        f"{description.path}: has no binary for this platform ({wanted}); it has {', '.join(present)}."
     )
 
 

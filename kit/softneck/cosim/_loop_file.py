@@ -11,19 +11,36 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import Block, DataError, FileFormatError, SettingsError, SoftneckError, file_hash, load
-from softneck.loop import BlockPart, Loop, Part, RecordingReference, Reference, make_reference
+from softneck.loop import (
+    BlockPart,
+    Fault,
+    Loop,
+    Part,
+    RecordingReference,
+    Reference,
+    ReferenceBlock,
+    make_fault,
+    make_reference,
+)
 from softneck.signals import read_recording
 
 from ._fmu_part import FmuPart
+from ._isolated import IsolatedPart
 from ._simulate import LoopSetup
 
-_TOP = ("duration_s", "sample_time_s", "order", "plant", "observer", "controller", "reference", "limits", "fault")
+_TOP = (
+    "duration_s", "sample_time_s", "order", "plant", "observer", "controller", "reference", "part", "connections",
+    "fault", "limits", "angle",
+)  # fmt: skip
 # Table -> (the keys that say where the part comes from, the role of a file of ours).
 _SOURCES = {
     "plant": (("fmu", "model", "python"), "model"),
     "observer": (("fmu", "file", "python"), "observer"),
     "controller": (("fmu", "file", "python"), "controller"),
 }
+_OTHER_SOURCES = ("fmu", "file", "python")
+# What may stand beside `fmu`: how an FMU that nobody here wrote becomes a part, and where it runs.
+_FMU_KEYS = ("names", "units", "sample_time_s", "isolated", "timeout_s")
 _REFERENCES = ("step", "ramp", "sine", "rotation", "recording")
 _SAME_SAMPLE_TIME = 1e-6
 
@@ -45,45 +62,106 @@ def load_loop(path: str | Path) -> LoopSetup:
         raise type(error)(f"{source}: {error}") from error
 
 
+def is_loop_file(path: Path) -> bool:
+    """Return whether `path` is a TOML file with a [reference]."""
+    if path.suffix != ".toml" or not path.is_file():
+        return False
+    try:
+        return "reference" in _read(path)
+    except FileFormatError:
+        return False
+
+
+def reference_of(path: str | Path) -> ReferenceBlock:
+    """Return the [reference] of a loop file as a block, of which `build_fmu` makes a reference FMU.
+
+    Its sample time is the file's `sample_time_s`, 20 ms if it states none; its other parts are not opened.
+
+    Raises:
+        SettingsError: the reference is an FMU already, or wrong.
+    """
+    source = Path(path)
+    table = _read(source)
+    try:
+        reference = _Reader(source).reference(table["reference"])
+        if hasattr(reference, "advance"):
+            raise SettingsError("[reference] is an FMU already.")
+        return ReferenceBlock(reference, sample_time=_number("sample_time_s", table.get("sample_time_s", 0.02)))  # pyright: ignore[reportArgumentType]
+    except SoftneckError as error:
+        raise type(error)(f"{source}: {error}") from error
+
+
+def make_loop(table: Mapping[str, Any], folder: str | Path = ".") -> LoopSetup:
+    """Return the loop that a table with the keys of a loop file describes; relative paths start at `folder`.
+
+    Raises:
+        SettingsError: unknown or missing keys, or values that do not fit; the line names the key.
+    """
+    return _Reader(Path(folder)).setup(table)
+
+
 class _Reader:
-    """Reads one loop file and remembers the hash of each file that it opens."""
+    """Reads one loop file, or a table like one, and remembers the hash of each file that it opens."""
 
     def __init__(self, source: Path) -> None:
-        self.folder = source.parent
-        self.files: dict[str, tuple[str, str]] = {"loop": (str(source), file_hash(source))}
+        self.folder = source if source.is_dir() else source.parent
+        self.files: dict[str, tuple[str, str]] = {}
+        if not source.is_dir():
+            self.files["loop"] = (str(source), file_hash(source))
 
     def setup(self, table: Mapping[str, Any]) -> LoopSetup:
-        if "fault" in table:
-            raise SettingsError("`[[fault]]` is not yet in this version of softneck; remove it.")
         _refuse_unknown("the file", table, _TOP)
         for key in ("duration_s", "plant", "controller", "reference"):
             if key not in table:
                 raise SettingsError(f"`{key}` is missing.")
-        parts = {name: self._part(name, table[name]) for name in _SOURCES if name in table}
-        chosen = {name: _numbers(f"[{name}] parameters", table[name].get("parameters", {})) for name in parts}
-        # What the file calls a parameter of the plant may be one of its inputs, held constant.
-        ports = {port.name for port in parts["plant"].inputs}
-        constants = {name: value for name, value in chosen["plant"].items() if name in ports}
+        tables = {name: table[name] for name in _SOURCES if name in table}
+        others = _named_parts(table.get("part", []))
+        parts = {name: self._part(name, part) for name, part in tables.items()}
+        parts |= {name: self._other(name, part) for name, part in others.items()}
+        tables |= others
+        reference = self.reference(table["reference"])
+        if isinstance(reference, FmuPart | IsolatedPart):
+            parts["reference"], tables["reference"] = reference, table["reference"]
+        # What the file calls a parameter of a part may be one of its inputs, held constant.
+        constants, parameters = {}, {}
+        for name, part in parts.items():
+            chosen = _numbers(f"[{name}] parameters", tables[name].get("parameters", {}))
+            ports = {port.name for port in part.inputs}
+            constants[name] = {key: value for key, value in chosen.items() if key in ports}
+            parameters[name] = {key: value for key, value in chosen.items() if key not in ports}
         loop = Loop(
             plant=parts["plant"],
             observer=parts.get("observer"),
             controller=parts["controller"],
-            reference=self._reference(table["reference"]),
+            reference=reference,
             duration=_number("duration_s", table["duration_s"]),
             order=table.get("order", "sequential"),
-            plant_parameters={name: value for name, value in chosen["plant"].items() if name not in ports},
-            plant_inputs=constants,
-            observer_parameters=chosen.get("observer", {}),
-            controller_parameters=chosen["controller"],
+            plant_parameters=parameters.pop("plant"),
+            plant_inputs=constants.pop("plant"),
+            observer_parameters=parameters.pop("observer", {}),
+            controller_parameters=parameters.pop("controller"),
+            other_parameters=parameters,
+            other_inputs=constants,
+            others={name: parts[name] for name in others},
+            faults=_faults(table.get("fault", [])),
+            connections=_texts("[connections]", table.get("connections", {})),
         )
         _check_sample_time(loop, table.get("sample_time_s"))
-        return LoopSetup(loop=loop, limits=_numbers("[limits]", table.get("limits", {})), files=dict(self.files))
+        limits = _numbers("[limits]", table.get("limits", {}))
+        return LoopSetup(loop=loop, limits=limits, files=dict(self.files), angle=table.get("angle", "true"))
 
     def _part(self, name: str, table: Any) -> Part:
         keys, role = _SOURCES[name]
+        return self._made(name, table, keys, role, as_role=name)
+
+    def _other(self, name: str, table: Mapping[str, Any]) -> Part:
+        rest = {key: value for key, value in table.items() if key not in ("name", "role")}
+        return self._made(name, rest, _OTHER_SOURCES, None, as_role=str(table.get("role", "controller")))
+
+    def _made(self, name: str, table: Any, keys: tuple[str, ...], role: str | None, *, as_role: str) -> Part:
         if not isinstance(table, dict):
             raise SettingsError(f"`{name}` must be a table: [{name}].")
-        _refuse_unknown(f"[{name}]", table, (*keys, "parameters"))
+        _refuse_unknown(f"[{name}]", table, (*keys, "parameters", *(_FMU_KEYS if "fmu" in table else ())))
         given = [key for key in keys if key in table]
         if len(given) != 1:
             raise SettingsError(
@@ -96,7 +174,7 @@ class _Reader:
             return self._from_python(name, value)
         file = self._file(name, value)
         if key == "fmu":
-            return FmuPart(file, role=name)
+            return _fmu_part(file, f"[{name}]", table, as_role)
         return BlockPart(load(file, role=role).block())
 
     def _from_python(self, name: str, path: str) -> Part:
@@ -119,7 +197,10 @@ class _Reader:
             raise SettingsError(f"[{name}] python = `{path}` returned a {type(made).__name__}, not a Block or a Part.")
         return made
 
-    def _reference(self, table: Any) -> Reference:
+    def reference(self, table: Any) -> Reference | Part:
+        """Return what the table [reference] describes."""
+        if isinstance(table, dict) and "fmu" in table:
+            return self._made("reference", table, ("fmu",), None, as_role="reference")
         if not isinstance(table, dict) or table.get("kind") not in _REFERENCES:
             raise SettingsError(f"[reference] kind must be one of {', '.join(_REFERENCES)}.")
         values = {key: value for key, value in table.items() if key != "kind"}
@@ -142,6 +223,57 @@ class _Reader:
             raise FileFormatError(f"[{role}]: there is no file {path}.")
         self.files[role] = (str(path), file_hash(path))
         return path
+
+
+def _fmu_part(file: Path, where: str, table: Mapping[str, Any], role: str) -> Part:
+    isolated = table.get("isolated", False)
+    if not isinstance(isolated, bool):
+        raise SettingsError(f"{where} isolated must be true or false; got {isolated!r}.")
+    step = table.get("sample_time_s")
+    settings: dict[str, Any] = {
+        "role": role,
+        "names": _texts(f"{where} names", table.get("names", {})),
+        "units": _texts(f"{where} units", table.get("units", {})),
+        "sample_time": None if step is None else _number("sample_time_s", step),
+    }
+    if not isolated:
+        return FmuPart(file, **settings)
+    return IsolatedPart(file, **settings, timeout=_number("timeout_s", table.get("timeout_s", 10.0)))
+
+
+def _named_parts(tables: Any) -> dict[str, Mapping[str, Any]]:
+    named: dict[str, Mapping[str, Any]] = {}
+    for table in _tables("part", tables):
+        name = table.get("name")
+        if not isinstance(name, str):
+            raise SettingsError("each [[part]] needs a `name`.")
+        if name in named:
+            raise SettingsError(f"two [[part]] are named `{name}`.")
+        named[name] = table
+    return named
+
+
+def _faults(tables: Any) -> tuple[Fault, ...]:
+    faults = []
+    for number, table in enumerate(_tables("fault", tables), start=1):
+        values = {key: value for key, value in table.items() if key != "kind"}
+        try:
+            faults.append(make_fault(str(table.get("kind", "")), values))
+        except SettingsError as error:
+            raise SettingsError(f"[[fault]] {number}: {error}") from error
+    return tuple(faults)
+
+
+def _tables(key: str, tables: Any) -> list[Mapping[str, Any]]:
+    if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
+        raise SettingsError(f"`{key}` must be a list of tables: [[{key}]].")
+    return tables
+
+
+def _texts(where: str, table: Any) -> dict[str, str]:
+    if not isinstance(table, dict) or not all(isinstance(value, str) for value in table.values()):
+        raise SettingsError(f"{where} must be a table of names; got {table!r}.")
+    return dict(table)
 
 
 def _read(source: Path) -> dict[str, Any]:

@@ -24,6 +24,7 @@ class Result:
         wall_time: what the run took [s].
         files: what it was told to read: role -> (path, SHA-256).
         order: "sequential" or "jacobi".
+        angle: which angle the metrics judge, "true" or "measured".
     """
 
     signals: LoopResult
@@ -31,6 +32,7 @@ class Result:
     wall_time: float = 0.0
     files: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     order: str = "sequential"
+    angle: str = "true"
 
     def __getitem__(self, name: str) -> Vector:
         """Return one signal (N,) in SI."""
@@ -39,7 +41,7 @@ class Result:
     @property
     def metrics(self) -> dict[str, dict[str, float | None]]:
         """Rise, settling, overshoot and errors of each axis, and what the motors did."""
-        return metrics(self.signals)
+        return metrics(self.signals, angle=self.angle)
 
     @property
     def limits(self) -> list[dict[str, Any]]:
@@ -86,6 +88,7 @@ class Result:
             "limits": self.limits,
             "metrics": self.metrics,
             "order": self.order,
+            "angle": self.angle,
             "sample_time_s": self.signals.sample_time,
             "duration_s": len(self.signals.time) * self.signals.sample_time,
             "files": {role: {"path": path, "sha256": digest} for role, (path, digest) in self.files.items()},

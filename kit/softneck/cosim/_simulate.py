@@ -6,7 +6,8 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-from softneck.loop import Loop, run_loop
+from softneck.core import require_one_of
+from softneck.loop import Loop, LoopState, StepCallback, run_loop
 
 from ._result import Result
 
@@ -19,19 +20,36 @@ class LoopSetup:
         loop: the parts, the reference, the order.
         limits: metric -> upper limit, such as "pitch.overshoot_pct": 5.0.
         files: what was read for it: role -> (path, SHA-256).
+        angle: which angle the metrics judge: "true" (where the plant offers it) or "measured".
     """
 
     loop: Loop
     limits: Mapping[str, float] = field(default_factory=dict)
     files: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    angle: str = "true"
+
+    def __post_init__(self) -> None:
+        require_one_of("angle", self.angle, ("true", "measured"))
 
 
-def simulate(loop: Loop | LoopSetup, *, report: Callable[[float], None] | None = None) -> Result:
+def simulate(
+    loop: Loop | LoopSetup,
+    *,
+    report: Callable[[float], None] | None = None,
+    on_step: StepCallback | None = None,
+    pace: float | None = None,
+    resume: LoopState | None = None,
+    keep: bool = False,
+) -> Result:
     """Run a loop from t = 0 to its end.
 
     Args:
         loop: a plain loop, or one with limits as `load_loop` returns it.
         report: called now and then with the done fraction.
+        on_step: called after each row with a `LoopStep`; it stops the run by returning True.
+        pace: run at this multiple of real time; as fast as possible if not given.
+        resume: go on from this state instead of t = 0.
+        keep: leave the FMUs loaded, so that the next run of the same loop resets them; `loop.close()` ends it.
 
     Raises:
         SettingsError: parts that do not fit together.
@@ -40,6 +58,13 @@ def simulate(loop: Loop | LoopSetup, *, report: Callable[[float], None] | None =
     """
     setup = loop if isinstance(loop, LoopSetup) else LoopSetup(loop=loop)
     begin = time.perf_counter()
-    signals = run_loop(setup.loop, report)
+    signals = run_loop(setup.loop, report, on_step=on_step, pace=pace, resume=resume, keep=keep)
     wall = time.perf_counter() - begin
-    return Result(signals=signals, bounds=setup.limits, wall_time=wall, files=setup.files, order=setup.loop.order)
+    return Result(
+        signals=signals,
+        bounds=setup.limits,
+        wall_time=wall,
+        files=setup.files,
+        order=setup.loop.order,
+        angle=setup.angle,
+    )

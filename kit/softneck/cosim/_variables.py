@@ -5,24 +5,39 @@ from __future__ import annotations
 import ctypes
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import fmpy
 import numpy as np
-from fmpy.fmi2 import FMU2Slave
 from fmpy.model_description import ModelDescription, ScalarVariable
 
-from softneck.core import FileFormatError, Port, Vector
+from softneck.core import FileFormatError, Port
 
-# FMI type -> (C type, numpy type, name in fmi2Get... and fmi2Set...).
-_TYPES: dict[str, tuple[Any, Any, str]] = {
+# FMI type -> (C type, numpy type, name in fmi2Get... or fmi3Get...); FMI 2.0 above, FMI 3.0 below.
+TYPES: dict[str, tuple[Any, Any, str]] = {
     "Real": (ctypes.c_double, np.float64, "Real"),
     "Integer": (ctypes.c_int, np.int32, "Integer"),
     "Enumeration": (ctypes.c_int, np.int32, "Integer"),
     "Boolean": (ctypes.c_int, np.int32, "Boolean"),
 }
+_TYPES_3: dict[str, tuple[Any, Any, str]] = {
+    "Float64": (ctypes.c_double, np.float64, "Float64"),
+    "Float32": (ctypes.c_float, np.float32, "Float32"),
+    **{
+        f"{u.upper()}Int{bits}": (getattr(ctypes, f"c_{u}int{bits}"), f"{u}int{bits}", f"{u.upper()}Int{bits}")
+        for u in ("", "u")
+        for bits in (8, 16, 32, 64)
+    },
+    "Enumeration": (ctypes.c_int64, np.int64, "Int64"),
+    "Boolean": (ctypes.c_bool, np.bool_, "Boolean"),
+}
+
+
+def types_of(version: int) -> dict[str, tuple[Any, Any, str]]:
+    """Return FMI type -> (C type, numpy type, name in the C calls) of an FMI version."""
+    return TYPES if version == 2 else _TYPES_3
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,12 +63,16 @@ class Description:
         model: fmpy's own description.
         annotation: see `Annotation`.
         variables: our name -> variable, for all that can be numbers.
+        version: of FMI, 2 or 3.
+        units: our name -> unit, where the user knows better than the FMU.
     """
 
     path: Path
     model: ModelDescription
     annotation: Annotation
     variables: Mapping[str, ScalarVariable]
+    version: int = 2
+    units: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def identifier(self) -> str:
@@ -71,7 +90,7 @@ class Description:
         declared = variable.declaredType
         return Port(
             name=name,
-            unit=variable.unit or (declared.unit if declared is not None and declared.unit else "1"),
+            unit=self.units.get(name) or variable.unit or (declared.unit if declared is not None else "") or "1",
             description=variable.description or "",
             start=_number(variable.start, 0.0),
             minimum=_number(variable.min if variable.min is not None else getattr(declared, "min", None), None),
@@ -82,77 +101,45 @@ class Description:
         )
 
 
-def read_description(path: Path, folder: Path, names: Mapping[str, str]) -> Description:
+def read_description(
+    path: Path, folder: Path, names: Mapping[str, str], units: Mapping[str, str] | None = None
+) -> Description:
     """Read the description of the FMU `path`, unpacked in `folder`.
 
     Args:
         path: for messages.
         folder: where it is unpacked.
         names: the FMU's variable name -> ours, for FMUs that use others.
+        units: our name -> unit, for FMUs that state none or a wrong one.
 
     Raises:
-        FileFormatError: no valid FMI 2.0 Co-Simulation FMU, or it lacks a variable of `names`.
+        FileFormatError: no valid FMI 2.0 or 3.0 Co-Simulation FMU, or it lacks a variable of `names`.
     """
     try:
         model = fmpy.read_model_description(str(folder), validate=False)
     except Exception as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise FileFormatError(f"{path}: its modelDescription.xml cannot be read ({reason}).") from error
-    if model.fmiVersion != "2.0":
-        raise FileFormatError(f"{path}: is an FMI {model.fmiVersion} FMU; this softneck runs FMI 2.0.")
+    version = {"2": 2, "3": 3}.get(str(model.fmiVersion).partition(".")[0])
+    if version is None:
+        raise FileFormatError(f"{path}: is an FMI {model.fmiVersion} FMU; softneck runs FMI 2.0 and 3.0.")
     if model.coSimulation is None:
         raise FileFormatError(f"{path}: is for Model Exchange only; a Co-Simulation FMU is needed.")
     known = {variable.name for variable in model.modelVariables}
     absent = sorted(set(names) - known)
     if absent:
         raise FileFormatError(f"{path}: has no variable {', '.join(absent)}; it has {', '.join(sorted(known))}.")
-    variables = {names.get(v.name, v.name): v for v in model.modelVariables if v.type in _TYPES}
-    return Description(path, model, _annotation(folder), variables)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Group:
-    """Variables of one FMI type: where they stand in the vector and the buffers the C calls use."""
-
-    places: np.ndarray
-    references: Any
-    buffer: Any
-    view: np.ndarray
-    call: str
-
-
-class Bank:
-    """Some variables of an FMU, moved from and to a vector with one C call for each type."""
-
-    def __init__(self, variables: list[ScalarVariable]) -> None:
-        """Prepare the buffers for `variables`, in the vector's order."""
-        self.size = len(variables)
-        self._groups: list[_Group] = []
-        for kind in ("Real", "Integer", "Boolean"):
-            places = [i for i, v in enumerate(variables) if _TYPES[v.type][2] == kind]
-            if places:
-                c_type, dtype, call = _TYPES[kind]
-                references = (ctypes.c_uint * len(places))(*(variables[i].valueReference for i in places))
-                buffer = (c_type * len(places))()
-                view = np.frombuffer(buffer, dtype=dtype)
-                self._groups.append(_Group(np.array(places), references, buffer, view, call))
-
-    def write(self, fmu: FMU2Slave, values: Vector) -> None:
-        """Set all variables from `values` (size,)."""
-        for group in self._groups:
-            chosen = values[group.places]
-            group.view[:] = chosen != 0.0 if group.call == "Boolean" else chosen
-            call = getattr(fmu, f"fmi2Set{group.call}")
-            call(fmu.component, group.references, group.places.size, group.buffer)
-
-    def read(self, fmu: FMU2Slave) -> Vector:
-        """Return all variables (size,)."""
-        values = np.empty(self.size)
-        for group in self._groups:
-            call = getattr(fmu, f"fmi2Get{group.call}")
-            call(fmu.component, group.references, group.places.size, group.buffer)
-            values[group.places] = group.view
-        return values
+    numbers = [v for v in model.modelVariables if v.type in types_of(version) and not v.dimensions]
+    variables: dict[str, ScalarVariable] = {}
+    for variable in numbers:
+        name = names.get(variable.name, variable.name)
+        if name in variables:
+            raise FileFormatError(f"{path}: {variables[name].name} and {variable.name} are both named `{name}`.")
+        variables[name] = variable
+    for name in units or {}:
+        if name not in variables:
+            raise FileFormatError(f"{path}: a unit is given for `{name}`, which is no variable of it.")
+    return Description(path, model, _annotation(folder), variables, version, units or {})
 
 
 def _annotation(folder: Path) -> Annotation:

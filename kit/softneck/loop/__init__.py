@@ -1,13 +1,19 @@
 """The closed loop over anything that steps: wiring by name, order, metrics; arrays only, no FMI, no files."""
 
+from ._faults import FAULT_KINDS as FAULT_KINDS
+from ._faults import Fault as Fault
+from ._faults import MotorFault as MotorFault
+from ._faults import NeckFault as NeckFault
+from ._faults import SensorFault as SensorFault
+from ._faults import make_fault as make_fault
 from ._loop import ORDERS as ORDERS
 from ._loop import Loop as Loop
-from ._loop import run_loop as run_loop
 from ._metrics import SETTLING_BAND as SETTLING_BAND
 from ._metrics import check_limits as check_limits
 from ._metrics import metrics as metrics
 from ._part import BlockPart as BlockPart
 from ._part import Part as Part
+from ._reference_block import ReferenceBlock as ReferenceBlock
 from ._references import RampReference as RampReference
 from ._references import RecordingReference as RecordingReference
 from ._references import Reference as Reference
@@ -16,3 +22,11 @@ from ._references import SineReference as SineReference
 from ._references import StepReference as StepReference
 from ._references import make_reference as make_reference
 from ._result import LoopResult as LoopResult
+from ._run import LoopRun as LoopRun
+from ._run import LoopStep as LoopStep
+from ._run import StepCallback as StepCallback
+from ._run import run_loop as run_loop
+from ._state import LoopState as LoopState
+from ._wiring import REFERENCE_PORTS as REFERENCE_PORTS
+from ._wiring import Wiring as Wiring
+from ._wiring import wire as wire

@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from softneck.core import Block, Port, Vector, load_runtime
+from softneck.core import Block, DataError, Port, Vector, load_runtime
 
 
 class Part(Protocol):
@@ -71,3 +71,14 @@ class BlockPart:
 
     def close(self) -> None:
         """Do nothing: a block holds nothing but memory."""
+
+    def get_state(self) -> bytes:
+        """Return the state vector and the outputs, to the bit."""
+        return np.concatenate([self._state, self._outputs]).astype("<f8").tobytes()
+
+    def set_state(self, state: bytes) -> None:
+        """Go on from what `get_state` returned; raise DataError if it is of another block."""
+        values = np.frombuffer(state, dtype="<f8")
+        if values.size != self._state.size + self._outputs.size:
+            raise DataError(f"the state of the {self.role} has {values.size} values; this {self.block.kind} differs.")
+        self._state[:], self._outputs[:] = values[: self._state.size], values[self._state.size :]

@@ -34,6 +34,12 @@ class LoopResult:
         except KeyError:
             raise DataError(f"the result has no signal `{name}`; it has {', '.join(self.signals)}.") from None
 
-    def angle(self, axis: str) -> Vector:
-        """Return the true angle of `axis` ("pitch" or "roll"), or the measured one where the plant has no other."""
-        return self.signals[axis] if axis in self.signals else self[f"{axis}_measured"]
+    def angle(self, axis: str, which: str = "true") -> Vector:
+        """Return an angle (N,) of `axis` ("pitch" or "roll"); the other one where the plant does not offer `which`.
+
+        Args:
+            axis: "pitch" or "roll".
+            which: "true" or "measured".
+        """
+        names = (axis, f"{axis}_measured") if which == "true" else (f"{axis}_measured", axis)
+        return self.signals[names[0]] if names[0] in self.signals else self[names[1]]

@@ -8,6 +8,8 @@ from ._charts import delay_chart as delay_chart
 from ._charts import loop_chart as loop_chart
 from ._charts import recording_chart as recording_chart
 from ._charts import validation_chart as validation_chart
+from ._estimation_charts import consistency_chart as consistency_chart
+from ._estimation_charts import consistency_figure as consistency_figure
 from ._figures import cost_figure as cost_figure
 from ._figures import delay_figure as delay_figure
 from ._figures import histogram_figure as histogram_figure

@@ -1,0 +1,111 @@
+"""The three forms of the filter: what its states are, what drives them, which noises it has."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import block_diag, solve_discrete_lyapunov
+
+from softneck.core import Matrix, Vector
+
+from ._axis import AxisPlant
+
+FORMS = ("model", "kinematic", "gyro")
+# Name and unit of the noise levels (standard deviations): of the measurement, then of the two process noises.
+NOISES: dict[str, tuple[tuple[str, str], ...]] = {
+    "model": (("measurement_noise_std", "rad"), ("model_noise_std", "rad"), ("disturbance_noise_std", "rad")),
+    "kinematic": (
+        ("measurement_noise_std", "rad"),
+        ("acceleration_noise_std", "rad/s^2"),
+        ("angle_noise_std", "rad"),
+    ),
+    "gyro": (("measurement_noise_std", "rad"), ("gyro_noise_std", "rad/s"), ("bias_noise_std", "rad/s")),
+}
+STATES = {
+    "model": "model and disturbance of pitch and roll",
+    "kinematic": "angle and rate of pitch and roll",
+    "gyro": "angle and gyro bias of pitch and roll",
+}
+# The neck reaches some 40 deg (paper, section 5): so far off may the first angle be.
+_START_STD = math.radians(40.0)
+# Set-points may stand anywhere in +-6 rad when a filter starts: a third of it as standard deviation.
+_START_INPUT = 2.0
+# The neck moves by up to 0.8 deg in 20 ms: what its rate may be when nothing tells it [rad/s].
+RATE_STD = math.radians(40.0)
+# A gyro that was not zeroed is off by up to some deg/s (MPU-9250 data sheet: 5).
+_START_BIAS = math.radians(5.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Form:
+    """Matrices of both axes together, as the runtime takes them.
+
+    Attributes:
+        F: (n, n) state over one sample.
+        B: (n, 2) of the inputs.
+        H: (2, n) angles.
+        first_noise, second_noise: (n, n) unit covariances of the process noises.
+        start: (n, n) covariance when nothing is known.
+        forced: (n, n) added before a measurement is taken in by force.
+    """
+
+    F: Matrix
+    B: Matrix
+    H: Matrix
+    first_noise: Matrix
+    second_noise: Matrix
+    start: Matrix
+    forced: Matrix
+
+    def arrays(self, sources: Matrix, constants: Vector) -> tuple[Matrix, ...]:
+        """Return what the runtime reads."""
+        items = (self.F, self.B, self.H, self.first_noise, self.second_noise, self.start, self.forced)
+        return (*items, sources, constants)
+
+
+def model_form(plants: Sequence[AxisPlant]) -> Form:
+    """Return model states and an output disturbance that walks, on each axis."""
+    axes: list[tuple[Matrix, ...]] = []
+    for plant in plants:
+        A, b, c = plant.observable_form()
+        F = _diagonal(A, np.eye(1))
+        QM, QW = np.zeros_like(F), np.zeros_like(F)
+        QM[0, 0] = QW[-1, -1] = 1.0
+        # The model's spread under a white input, scaled to what set-points of _START_INPUT held for long do.
+        spread = np.asarray(solve_discrete_lyapunov(A, np.outer(b, b)))
+        spread *= (_START_INPUT * plant.static_gain) ** 2 / spread[0, 0]
+        P0 = _diagonal(0.5 * (spread + spread.T), _START_STD**2 * np.eye(1))
+        axes.append((F, np.append(b, 0.0)[:, None], np.append(c, 1.0)[None, :], QM, QW, P0, P0))
+    return _both(axes)
+
+
+def kinematic_form(sample_time: float) -> Form:
+    """Return angle and rate, driven by an acceleration constant over each sample (Bar-Shalom 2001, sec. 6.3.2)."""
+    T = sample_time
+    F = np.array([[1.0, T], [0.0, 1.0]])
+    g = np.array([0.5 * T * T, T])
+    P0 = np.diag([_START_STD**2, RATE_STD**2])
+    axis = (F, np.zeros((2, 1)), np.array([[1.0, 0.0]]), np.outer(g, g), np.diag([1.0, 0.0]), P0, P0)
+    return _both([axis, axis])
+
+
+def gyro_form(sample_time: float) -> Form:
+    """Return angle and gyro bias: the angle rises by what the gyro says minus its bias (Lefferts 1982)."""
+    T = sample_time
+    F = np.array([[1.0, -T], [0.0, 1.0]])
+    P0 = np.diag([_START_STD**2, _START_BIAS**2])
+    # A measurement taken in by force moves the angle; the bias is none the worse for it.
+    forced = np.diag([_START_STD**2, 0.0])
+    axis = (F, np.array([[T], [0.0]]), np.array([[1.0, 0.0]]), np.diag([T * T, 0.0]), np.diag([0.0, 1.0]), P0, forced)
+    return _both([axis, axis])
+
+
+def _both(axes: Sequence[tuple[Matrix, ...]]) -> Form:
+    return Form(*(_diagonal(*(axis[i] for axis in axes)) for i in range(7)))
+
+
+def _diagonal(*blocks: Matrix) -> Matrix:
+    return np.asarray(block_diag(*blocks), dtype=np.float64)

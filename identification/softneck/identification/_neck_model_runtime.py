@@ -1,0 +1,111 @@
+"""The equations of kind `greybox`: a bent link between three tendons, whose drives stall, seen by a slow sensor.
+
+Lengths of tendon are in radians of motor, tensions in radians of stretch, so that no stiffness appears twice.
+
+- drive: m_j lags its delayed set-point, and stops where its tension reaches `pull_limit`;
+- stretch: x_j = pretension + m_j - lever (e_j . b) - s, tension T_j = max(0, x_j): a tendon only pulls;
+- bend: b' = gain sum T_j e_j - stiffness (1 +- asymmetry) (b - rest) - stiffening |b|^2 b - friction z;
+- compression: s' = axial_rate (compliance (sum T_j - 3 pretension) - s);
+- hysteresis (Dahl): z' = b' - |b'| z / friction_angle, so |z| <= friction_angle;
+- tilt: pitch = atan2(sin|b| b_1/|b|, cos|b|), roll likewise, through a dead time and a first-order lag.
+
+Bend and compression are taken half implicitly (Rosenbrock, one stage), stable for any rates, and |b| is kept below
+1.2 rad: no input moves the output further.
+"""
+
+import math
+
+import numpy as np
+
+# Numbers of `neck`, in this order.
+NECK_DRIVE_RATE = 0
+NECK_PRETENSION = 1
+NECK_PULL_LIMIT = 2
+NECK_LEVER = 3
+NECK_GAIN = 4
+NECK_STIFFNESS = 5
+NECK_STIFFENING = 6
+NECK_ASYMMETRY = 7
+NECK_REST = 8  # two
+NECK_COMPLIANCE = 10
+NECK_AXIAL_RATE = 11
+NECK_FRICTION = 12
+NECK_FRICTION_ANGLE = 13
+NECK_TWIST = 14
+NECK_SENSOR_RATE = 15
+NECK_SIZE = 16
+# b (2), z (2), s, sensor (2); then the dead time's line of tilts.
+NECK_STATES = 7
+# A stalled drive gives way as the bend does: 4 ms at 20 ms follow that closely enough.
+_SUBSTEPS = 5
+_LARGEST_BEND = 1.2
+
+
+def neck_limit(neck: np.ndarray, x: np.ndarray, j: int) -> float:
+    """Return the motor position at which tendon j reaches the pull limit."""
+    angle = neck[NECK_TWIST] + 2.0943951023931953 * j
+    toward = math.cos(angle) * x[0] + math.sin(angle) * x[1]
+    return neck[NECK_PULL_LIMIT] - neck[NECK_PRETENSION] + neck[NECK_LEVER] * toward + x[4]
+
+
+def neck_advance(neck: np.ndarray, sample_time: float, targets: np.ndarray, m: np.ndarray, x: np.ndarray) -> None:
+    """Move the motors `m` (3,) towards `targets` (3,), and bend, hysteresis and compression in `x`, by one sample."""
+    dt = sample_time / _SUBSTEPS
+    keep = math.exp(-neck[NECK_DRIVE_RATE] * dt)
+    for _ in range(_SUBSTEPS):
+        for j in range(3):
+            m[j] = min(keep * m[j] + (1.0 - keep) * targets[j], neck_limit(neck, x, j))
+        pull0 = 0.0
+        pull1 = 0.0
+        total = 0.0
+        taut = 0
+        for j in range(3):
+            angle = neck[NECK_TWIST] + 2.0943951023931953 * j
+            c = math.cos(angle)
+            s = math.sin(angle)
+            stretch = neck[NECK_PRETENSION] + m[j] - neck[NECK_LEVER] * (c * x[0] + s * x[1]) - x[4]
+            if stretch > 0.0:
+                pull0 += stretch * c
+                pull1 += stretch * s
+                total += stretch
+                taut += 1
+        squared = x[0] * x[0] + x[1] * x[1]
+        loss = neck[NECK_STIFFENING] * squared
+        k0 = neck[NECK_STIFFNESS] * (1.0 + neck[NECK_ASYMMETRY])
+        k1 = neck[NECK_STIFFNESS] * (1.0 - neck[NECK_ASYMMETRY])
+        f0 = neck[NECK_GAIN] * pull0 - k0 * (x[0] - neck[NECK_REST]) - loss * x[0] - neck[NECK_FRICTION] * x[2]
+        f1 = neck[NECK_GAIN] * pull1 - k1 * (x[1] - neck[NECK_REST + 1]) - loss * x[1] - neck[NECK_FRICTION] * x[3]
+        rate = neck[NECK_STIFFNESS] + 3.0 * loss + 0.5 * taut * neck[NECK_GAIN] * neck[NECK_LEVER] + neck[NECK_FRICTION]
+        d0 = dt * f0 / (1.0 + dt * rate)
+        d1 = dt * f1 / (1.0 + dt * rate)
+        x[0] += d0
+        x[1] += d1
+        size = math.sqrt(x[0] * x[0] + x[1] * x[1])
+        if size > _LARGEST_BEND:
+            x[0] *= _LARGEST_BEND / size
+            x[1] *= _LARGEST_BEND / size
+        # Implicit in z: it cannot leave |z| <= friction_angle.
+        forget = 1.0 + math.sqrt(d0 * d0 + d1 * d1) / neck[NECK_FRICTION_ANGLE]
+        x[2] = (x[2] + d0) / forget
+        x[3] = (x[3] + d1) / forget
+        axial = neck[NECK_AXIAL_RATE]
+        rise = axial * (neck[NECK_COMPLIANCE] * (total - 3.0 * neck[NECK_PRETENSION]) - x[4])
+        x[4] += dt * rise / (1.0 + dt * axial * (1.0 + neck[NECK_COMPLIANCE] * taut))
+
+
+def neck_sense(neck: np.ndarray, sample_time: float, x: np.ndarray) -> None:
+    """Push the tilt of now into the dead time's line behind the states, and move the sensor on."""
+    size = math.sqrt(x[0] * x[0] + x[1] * x[1])
+    part = math.sin(size) / size if size > 1e-9 else 1.0
+    lines = (x.shape[0] - NECK_STATES) // 2
+    keep = math.exp(-neck[NECK_SENSOR_RATE] * sample_time)
+    for axis in range(2):
+        tilt = math.atan2(part * x[axis], math.cos(size))
+        first = NECK_STATES + axis * lines
+        seen = tilt
+        if lines > 0:
+            seen = x[first + lines - 1]
+            for i in range(lines - 1, 0, -1):
+                x[first + i] = x[first + i - 1]
+            x[first] = tilt
+        x[5 + axis] = keep * x[5 + axis] + (1.0 - keep) * seen

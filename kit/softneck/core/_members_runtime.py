@@ -1,0 +1,35 @@
+"""The members of a runtime that holds others; a bundle replaces these functions (see `_bundle`).
+
+The outer module defines OWN_ARRAYS, the number of arrays before those of its members.
+"""
+
+import numpy as np
+
+
+def member_count() -> int:
+    """Return the number of members."""
+    raise NotImplementedError
+
+
+def member_size(arrays: tuple[np.ndarray, ...], member: int) -> int:
+    """Return the length of a member's state."""
+    raise NotImplementedError
+
+
+def member_initialise(
+    arrays: tuple[np.ndarray, ...], member: int, parameters: np.ndarray, state: np.ndarray, outputs: np.ndarray
+) -> None:
+    """Fill a member's state and outputs at t_0."""
+    raise NotImplementedError
+
+
+def member_step(
+    arrays: tuple[np.ndarray, ...],
+    member: int,
+    parameters: np.ndarray,
+    state: np.ndarray,
+    inputs: np.ndarray,
+    outputs: np.ndarray,
+) -> None:
+    """Advance a member by one sample."""
+    raise NotImplementedError

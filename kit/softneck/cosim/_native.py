@@ -1,0 +1,226 @@
+"""The C calls of a Co-Simulation FMU, the same few for FMI 2.0 and FMI 3.0.
+
+fmpy loads and instantiates; the calls of every step go straight to the library with buffers made once.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from fmpy import calloc, free
+from fmpy.fmi2 import (
+    FMU2Slave,
+    fmi2CallbackAllocateMemoryTYPE,
+    fmi2CallbackFreeMemoryTYPE,
+    fmi2CallbackFunctions,
+    fmi2CallbackLoggerTYPE,
+)
+from fmpy.fmi3 import FMU3Slave
+from fmpy.model_description import ScalarVariable
+
+from softneck.core import Vector
+
+from ._variables import Description, types_of
+
+OK_OR_WARNING, ERROR, FATAL = 1, 3, 4
+_STATUS = ("OK", "a warning", "discard", "an error", "a fatal error", "pending")
+Log = Callable[[int, str], None]
+
+
+class CallError(RuntimeError):
+    """A C call returned a bad status; `_fmu_part` turns it into an `FmuError` with the FMU's own reason."""
+
+    def __init__(self, name: str, status: int) -> None:
+        """Name the call and its status."""
+        said = _STATUS[status] if 0 <= status < len(_STATUS) else f"status {status}"
+        super().__init__(f"{name} returned {said}")
+        self.status = status
+
+
+class Native:
+    """An instance of an FMU.
+
+    Attributes:
+        fmu: fmpy's object.
+        version: 2 or 3.
+    """
+
+    def __init__(self, description: Description, folder: Path, log: Log) -> None:
+        """Load the library that lies in `folder` and instantiate; raise what fmpy raises if that fails."""
+        self.version = description.version
+        common = {
+            "guid": description.model.guid,
+            "unzipDirectory": str(folder),
+            "modelIdentifier": description.identifier,
+            "instanceName": description.path.stem,
+        }
+        self.fmu: Any = FMU2Slave(**common) if self.version == 2 else FMU3Slave(**common)
+        self._log = log
+        self._step: Callable[..., int] | None = None
+        self._step_rest: tuple[Any, ...] = ()
+
+    def instantiate(self) -> None:
+        """Create the instance and prepare the call of a step."""
+        if self.version == 2:
+            # Without fmpy's logger proxy: that is one for the process, and an FMU's log would reach another part.
+            callbacks = fmi2CallbackFunctions()
+            callbacks.logger = fmi2CallbackLoggerTYPE(lambda _e, _i, status, _c, text: self._tell(status, text))
+            callbacks.allocateMemory = fmi2CallbackAllocateMemoryTYPE(calloc)
+            callbacks.freeMemory = fmi2CallbackFreeMemoryTYPE(free)
+            self.fmu.instantiate(False, callbacks, True)
+        else:
+            self.fmu.instantiate(loggingOn=True, logMessage=lambda _e, status, _c, text: self._tell(status, text))
+        self._step, self._step_rest = self._step_call()
+
+    def _tell(self, status: int, message: bytes) -> None:
+        self._log(status, " ".join((message or b"").decode("utf-8", "replace").replace("%%", "%").split()))
+
+    def _step_call(self) -> tuple[Callable[..., int], tuple[Any, ...]]:
+        if self.version == 2:
+            types = [ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_int]
+            return self.function("fmi2DoStep", types), (1,)
+        flags = [ctypes.c_bool() for _ in range(3)]
+        self._held = (*flags, ctypes.c_double())
+        types = [ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_bool] + [ctypes.c_void_p] * 4
+        return self.function("fmi3DoStep", types), (True, *(ctypes.addressof(item) for item in self._held))
+
+    def function(self, name: str, types: list[Any]) -> Callable[..., int]:
+        """Return the C function `name` of the library with those argument types."""
+        found = self.fmu.dll[name]
+        found.argtypes, found.restype = types, ctypes.c_int
+        return found
+
+    def enter(self, time: float) -> None:
+        """Set up the experiment at `time` [s] and enter initialisation."""
+        if self.version == 2:
+            self.fmu.enterInitializationMode()
+        else:
+            self.fmu.enterInitializationMode(startTime=time)
+
+    def setup(self, time: float) -> None:
+        """Tell FMI 2.0 the start time; FMI 3.0 hears it on entering initialisation."""
+        if self.version == 2:
+            self.fmu.setupExperiment(None, time, None)
+
+    def exit(self) -> None:
+        """Leave initialisation."""
+        self.fmu.exitInitializationMode()
+
+    def step(self, time: float, size: float) -> None:
+        """Step from `time` by `size` [s]; raise CallError on a bad status."""
+        status = self._step(self.fmu.component, time, size, *self._step_rest)  # pyright: ignore[reportOptionalCall]
+        if status > OK_OR_WARNING:
+            raise CallError(f"fmi{self.version}DoStep", status)
+
+    def reset(self) -> None:
+        """Return to the state after instantiation."""
+        self.fmu.reset()
+
+    def release(self, *, broken: bool, ours: bool) -> None:
+        """Terminate and free the instance as far as FMI allows."""
+        if self.fmu.component is None:
+            return
+        if not broken:
+            try:
+                self.fmu.terminate()
+            except Exception as error:  # a failing end is no reason to lose the run
+                broken = getattr(error, "status", 0) >= FATAL
+        # After "fatal" FMI allows no further call; our own slave stays sound and is freed.
+        if not broken or ours:
+            self.fmu.freeInstance()
+
+    def get_state(self) -> bytes:
+        """Return the serialised state."""
+        state = self._named("get")()
+        try:
+            return bytes(self._named("serialize")(state))
+        finally:
+            self._named("free")(state)
+
+    def set_state(self, data: bytes) -> None:
+        """Restore a serialised state."""
+        state = self._named("deSerialize")(data)
+        try:
+            self._named("set")(state)
+        finally:
+            self._named("free")(state)
+
+    def _named(self, verb: str) -> Callable[..., Any]:
+        # fmpy spells it `...FMUstate` for FMI 2.0 and `...FMUState` for FMI 3.0.
+        wanted = f"{verb}FMUState".lower()
+        return getattr(self.fmu, next(name for name in dir(self.fmu) if name.lower() == wanted))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Group:
+    """Variables of one FMI type: where they stand in the vector, and the buffers the C calls use."""
+
+    places: Any
+    references: Any
+    buffer: Any
+    view: np.ndarray
+    suffix: str
+    count: int
+    boolean: bool
+
+
+class Bank:
+    """Some variables of an FMU, moved from and to a vector with one C call for each type."""
+
+    def __init__(self, variables: list[ScalarVariable], version: int) -> None:
+        """Prepare the buffers for `variables`, in the vector's order."""
+        self.size, self.version = len(variables), version
+        self._groups: list[_Group] = []
+        types = types_of(version)
+        suffixes = [types[v.type][2] for v in variables]
+        for suffix in dict.fromkeys(suffixes):
+            places = [i for i, other in enumerate(suffixes) if other == suffix]
+            c_type, dtype, _ = next(entry for entry in types.values() if entry[2] == suffix)
+            references = (ctypes.c_uint * len(places))(*(variables[i].valueReference for i in places))
+            buffer = (c_type * len(places))()
+            even = places == list(range(places[0], places[0] + len(places)))
+            self._groups.append(
+                _Group(
+                    slice(places[0], places[-1] + 1) if even else np.array(places), references, buffer,
+                    np.frombuffer(buffer, dtype=dtype), suffix, len(places), suffix == "Boolean",
+                )
+            )  # fmt: skip
+        self._sets: list[tuple[_Group, Callable[..., int], tuple[Any, ...]]] = []
+        self._gets: list[tuple[_Group, Callable[..., int], tuple[Any, ...]]] = []
+
+    def bind(self, native: Native) -> None:
+        """Take the functions of a new instance."""
+        self._sets, self._gets = [], []
+        for group in self._groups:
+            sizes = [ctypes.c_size_t, ctypes.c_void_p] + [ctypes.c_size_t] * (self.version == 3)
+            types = [ctypes.c_void_p, ctypes.c_void_p, *sizes]
+            end = (group.count,) if self.version == 3 else ()
+            rest = (ctypes.addressof(group.references), group.count, ctypes.addressof(group.buffer), *end)
+            head = f"fmi{self.version}"
+            arguments = (native.fmu.component, *rest)
+            self._sets.append((group, native.function(f"{head}Set{group.suffix}", types), arguments))
+            self._gets.append((group, native.function(f"{head}Get{group.suffix}", types), arguments))
+
+    def write(self, values: Vector) -> None:
+        """Set all variables from `values` (size,); raise CallError on a bad status."""
+        for group, call, arguments in self._sets:
+            chosen = values[group.places]
+            group.view[:] = chosen != 0.0 if group.boolean else chosen
+            status = call(*arguments)
+            if status > OK_OR_WARNING:
+                raise CallError(f"fmi{self.version}Set{group.suffix}", status)
+
+    def read(self) -> Vector:
+        """Return all variables (size,); raise CallError on a bad status."""
+        values = np.empty(self.size)
+        for group, call, arguments in self._gets:
+            status = call(*arguments)
+            if status > OK_OR_WARNING:
+                raise CallError(f"fmi{self.version}Get{group.suffix}", status)
+            values[group.places] = group.view
+        return values

@@ -1,0 +1,49 @@
+"""softneck identify auto: table, JSON, page, the model it saves, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from softneck.core import load
+from softneck.identification import _auto
+from softneck.signals import write_recording
+
+from ..data import neck_recording
+from .conftest import Call
+
+
+@pytest.fixture(autouse=True)
+def few_kinds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two kinds are enough to rank, and quick."""
+    monkeypatch.setattr(_auto, "_SIMPLE_FIRST", ("rls", "play"))
+
+
+def test_auto_ranks_explains_and_saves(call: Call, recording: Path) -> None:
+    said = call("identify", "auto", recording, "-o", "best.npz", "--html", "why.html")
+    assert said.code == 0, said.err
+    assert "chosen" in said.out
+    assert "free run" in said.out
+    assert "last one is held out" in " ".join(said.err.split())
+    assert load("best.npz").kind in ("rls", "play")
+    assert "Which model" in Path("why.html").read_text()
+    assert call("identify", "auto", recording, "-o", "best.npz").code == 2
+
+
+def test_auto_prints_one_json_object_and_holds_out_the_last_of_several(call: Call, recording: Path) -> None:
+    write_recording(Path("other.csv"), neck_recording(300, seed=44))
+    said = call("identify", "auto", recording, "other.csv", "--json")
+    assert said.code == 0, said.err
+    facts = json.loads(said.out)
+    assert facts["model"] == "build/models/auto.npz"
+    assert facts["remarks"] == []
+    assert facts["chosen"] in [entry["kind"] for entry in facts["ranking"]]
+    assert facts["ranking"][0]["hold_out"]["rows_scored"] == 275
+
+
+def test_auto_refuses_settings_and_nothing_held_out(call: Call, recording: Path) -> None:
+    assert "`auto` takes no settings" in call("identify", "auto", recording, "--set", "na=1").error
+    assert "has to hold rows out" in call("identify", "auto", recording, "--train", "1").error
+    assert "--html goes with KIND auto" in call("identify", "rls", recording, "--html", "x.html").error

@@ -1,0 +1,192 @@
+"""An FMU that nobody here wrote, FMI 2 and 3: as a plant by a name mapping, isolated, crashing, hanging."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from softneck.core import DataError, FileFormatError, SettingsError
+from softneck.cosim import FmuError, FmuPart, IsolatedPart, Loop, LoopRun, LoopState, load_loop, simulate
+from softneck.loop import BlockPart, SensorFault, StepReference
+
+from ._foreign import NAMES, build_foreign
+
+TS = 0.02
+LOOP = """
+duration_s = 2.0
+[plant]
+fmu = "Foreign{version}.fmu"
+names = {{ u1 = "motor_setpoint_1", u2 = "motor_setpoint_2", u3 = "motor_setpoint_3", alpha = "pitch", beta = "roll" }}
+sample_time_s = 0.02
+parameters = {{ T = 0.3 }}
+isolated = {isolated}
+[controller]
+fmu = "Pi.fmu"
+[reference]
+kind = "step"
+pitch_deg = 5.0
+at_s = 0.1
+"""
+
+
+@pytest.fixture(scope="module")
+def foreign(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
+    folder = tmp_path_factory.mktemp("foreign")
+    return {version: build_foreign(folder, version) for version in (2, 3)}
+
+
+def plant(path: Path, kind: type = FmuPart, **more: Any) -> Any:
+    return kind(path, role="plant", sample_time=TS, names=NAMES, **more)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("kind", [FmuPart, IsolatedPart])
+def test_the_linear_plant_gives_its_known_answer(version: int, kind: type, foreign: dict[int, Path]) -> None:
+    part = plant(foreign[version], kind)
+    assert [(port.name, port.unit) for port in part.outputs] == [("pitch", "deg"), ("roll", "deg")]
+    part.start(0.0, {"T": 0.4, "k": 8.0})
+    seen = [part.advance(k * TS, np.array([1.0, 0.5, -0.5])) for k in range(50)]
+    part.close()
+    n = np.arange(1, 51)
+    rise = 1.0 - (1.0 - TS / 0.4) ** n
+    # Forward Euler of a first-order lag is a geometric series; 50 roundings.
+    np.testing.assert_allclose(np.array(seen), np.column_stack([8.0 * rise, 8.0 * rise]), rtol=1e-13)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_it_closes_a_loop_with_our_controller_and_its_degrees_are_converted(
+    version: int, foreign: dict[int, Path], fmus: Path, tmp_path: Path
+) -> None:
+    for path in (foreign[version], fmus / "Pi.fmu"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    results = []
+    for isolated in ("false", "true"):
+        file = tmp_path / "loop.toml"
+        file.write_text(LOOP.format(version=version, isolated=isolated))
+        results.append(simulate(load_loop(file)))
+    for name, values in results[0].signals.signals.items():
+        np.testing.assert_array_equal(results[1][name], values, err_msg=name)
+    result = results[0]
+    assert result.frame["pitch [deg]"].iloc[-1] == pytest.approx(5.0, abs=0.5)  # a PI loop: it arrives
+    u = result["motor_setpoint_1"] - 0.5 * (result["motor_setpoint_2"] + result["motor_setpoint_3"])
+    y = np.zeros(100)
+    for k in range(99):
+        y[k + 1] = y[k] + TS / 0.3 * (10.0 * u[k] - y[k])
+    np.testing.assert_allclose(result["pitch"], y, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("kind", [FmuPart, IsolatedPart])
+def test_faults_of_the_sensor_work_on_it(version: int, kind: type, foreign: dict[int, Path], toys: Any) -> None:
+    loop = Loop(
+        plant=plant(foreign[version], kind), controller=BlockPart(toys.pi()), reference=StepReference(pitch=0.1),
+        duration=1.0, faults=(SensorFault(kind="bias", axis="pitch", size=math.radians(2.0), start=0.5),),
+    )  # fmt: skip
+    result = simulate(loop)
+    bias = result["pitch_measured"] - result["pitch"]
+    np.testing.assert_allclose(bias, np.where(result.signals.time > 0.49, 2.0, 0.0), atol=1e-13)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_its_state_resumes_in_another_instance(
+    version: int, foreign: dict[int, Path], toys: Any, tmp_path: Path
+) -> None:
+    def loop(kind: type) -> Loop:
+        return Loop(
+            plant=plant(foreign[version], kind), controller=BlockPart(toys.pi()), reference=StepReference(pitch=0.1),
+            duration=1.0,
+        )  # fmt: skip
+
+    whole = simulate(loop(FmuPart))
+    with LoopRun(loop(FmuPart)) as run:
+        run.advance(20)
+        run.state().save(tmp_path / "state.npz")
+    resumed = simulate(loop(IsolatedPart), resume=LoopState.load(tmp_path / "state.npz"))
+    np.testing.assert_array_equal(resumed["pitch"], whole["pitch"])
+
+
+_RESUME = """
+import sys
+from softneck.cosim import LoopState, load_loop, simulate
+result = simulate(load_loop(sys.argv[1]), resume=LoopState.load(sys.argv[2]))
+print([value.hex() for value in result["pitch"].tolist()])
+"""
+
+
+def test_a_loop_over_our_fmus_resumes_in_another_process(loop_file: Path, tmp_path: Path) -> None:
+    setup = load_loop(loop_file)
+    whole = simulate(setup)
+    with LoopRun(setup.loop) as run:
+        run.advance(80)
+        run.state().save(tmp_path / "state.npz")
+    command = [sys.executable, "-c", _RESUME, str(loop_file), str(tmp_path / "state.npz")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == str([value.hex() for value in whole["pitch"].tolist()])
+
+
+@pytest.mark.parametrize(
+    ("mode", "message"),
+    [
+        (1.0, r"crashed in the step from t = 0\.2 s: its process was ended by SIGABRT"),
+        (2.0, r"hung in the step from t = 0\.2 s: no answer within 0\.5 s; its process was ended"),
+        (4.0, r"in the step from t = 0\.2 s: fmi.DoStep returned an error"),
+    ],
+    ids=["crash", "hang", "error"],
+)
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_bad_fmu_costs_one_run_only(
+    version: int, mode: float, message: str, foreign: dict[int, Path], toys: Any
+) -> None:
+    part = plant(foreign[version], IsolatedPart, timeout=0.5)
+    good = Loop(plant=part, controller=BlockPart(toys.pi()), reference=StepReference(pitch=0.1), duration=0.4)
+    bad = Loop(
+        plant=part, controller=BlockPart(toys.pi()), reference=StepReference(pitch=0.1), duration=0.4,
+        plant_parameters={"mode": mode},
+    )  # fmt: skip
+    with pytest.raises(FmuError, match=message) as caught:
+        simulate(bad)
+    assert "\n" not in str(caught.value)
+    assert np.isfinite(simulate(good)["pitch"]).all()
+    assert not list(Path(tempfile.gettempdir()).glob("softneck-child-*"))
+
+
+def test_nan_and_errors_of_an_fmu_name_it(foreign: dict[int, Path], toys: Any) -> None:
+    part = plant(foreign[2])
+    for mode, error, message in ((3, DataError, "output `pitch` of the plant became nan"), (4, FmuError, "DoStep")):
+        loop = Loop(
+            plant=part, controller=BlockPart(toys.pi()), reference=StepReference(pitch=0.1), duration=0.4,
+            plant_parameters={"mode": mode},
+        )  # fmt: skip
+        with pytest.raises(error, match=message):
+            simulate(loop)
+
+
+def test_an_instance_that_is_kept_is_reset_not_loaded_again(foreign: dict[int, Path], fmus: Path) -> None:
+    part = plant(foreign[2])
+    loop = Loop(plant=part, controller=FmuPart(fmus / "Pi.fmu"), reference=StepReference(pitch=0.1), duration=0.4)
+    first = simulate(loop, keep=True)
+    native = part._native
+    second = simulate(loop, keep=True)
+    assert part._native is native is not None
+    loop.close()
+    third = simulate(loop)
+    for other in (second, third):
+        np.testing.assert_array_equal(other["pitch"], first["pitch"])
+    assert part._native is None
+
+
+def test_units_may_be_given_and_wrong_mappings_are_refused(foreign: dict[int, Path]) -> None:
+    assert plant(foreign[2], units={"motor_setpoint_1": "deg"}).inputs[0].unit == "deg"
+    with pytest.raises(FileFormatError, match="a unit is given for `yaw`, which is no variable"):
+        plant(foreign[2], units={"yaw": "deg"})
+    with pytest.raises(FileFormatError, match="u1 and u2 are both named `a`"):
+        FmuPart(foreign[3], role="plant", sample_time=TS, names={"u1": "a", "u2": "a"})
+    with pytest.raises(SettingsError, match="says no step size"):
+        FmuPart(foreign[3], role="plant", names=NAMES)

@@ -1,0 +1,33 @@
+"""`softneck new`: a project whose test passes at once."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from softneck.cli._main import run
+
+from .test_plugin import run_pytest
+
+
+def test_the_new_project_s_test_passes_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "my neck"
+    assert run(["new", str(folder), "--json"]) == 0
+    files = json.loads(capsys.readouterr().out)["files"]
+    assert {"identify.py", "design.py", "loop.toml", "study.toml", "test_closed_loop.py"} <= set(files)
+    done = run_pytest(folder)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "2 passed" in done.stdout
+    assert run(["simulate", str(folder / "loop.toml"), "-o", str(tmp_path / "run.csv")]) == 0
+    assert run(["ssp", str(folder / "loop.toml"), "-o", str(tmp_path / "loop.ssp")]) == 0
+
+
+def test_what_stands_there_is_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "loop.toml").write_text("mine")
+    assert run(["new", str(tmp_path)]) == 2
+    assert "holds loop.toml already" in capsys.readouterr().err
+    assert (tmp_path / "loop.toml").read_text() == "mine"
+    assert [path.name for path in tmp_path.iterdir()] == ["loop.toml"]
+    assert run(["new", str(tmp_path), "--force"]) == 0
