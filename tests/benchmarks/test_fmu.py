@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+import shutil
+import subprocess
 import sys
+import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -75,11 +78,32 @@ def _trivial(folder: Path) -> Path:
         sys.modules.pop("softneck_trivial_slave", None)
 
 
-@pytest.fixture(scope="module", params=["trivial", *_KINDS])
+_LAG = """<?xml version="1.0" encoding="UTF-8"?>
+<fmiModelDescription fmiVersion="2.0" modelName="Lag" guid="lag"><CoSimulation modelIdentifier="Lag"/>
+<ModelVariables><ScalarVariable name="u" valueReference="0" causality="input"><Real start="0"/></ScalarVariable>
+<ScalarVariable name="y" valueReference="1" causality="output"><Real/></ScalarVariable></ModelVariables>
+<ModelStructure><Outputs><Unknown index="2"/></Outputs></ModelStructure></fmiModelDescription>
+"""
+
+
+def _in_c(folder: Path) -> Path:
+    compiler = shutil.which("cc")
+    if compiler is None or sys.platform != "linux":
+        pytest.skip("no C compiler here to compare with")
+    library = folder / "Lag.so"
+    source = Path(__file__).with_name("lag_fmu.c")
+    subprocess.run([compiler, "-O2", "-shared", "-fPIC", "-o", str(library), str(source)], check=True)
+    with zipfile.ZipFile(folder / "Lag.fmu", "w") as archive:
+        archive.writestr("modelDescription.xml", _LAG)
+        archive.write(library, "binaries/linux64/Lag.so")
+    return folder / "Lag.fmu"
+
+
+@pytest.fixture(scope="module", params=["trivial", "c", *_KINDS])
 def path(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("benchmark")
-    if request.param == "trivial":
-        return _trivial(folder)
+    if request.param in ("trivial", "c"):
+        return _trivial(folder) if request.param == "trivial" else _in_c(folder)
     return build_fmu(_KINDS[request.param](), folder / f"{request.param}.fmu")
 
 
@@ -103,13 +127,22 @@ def fmu(path: Path) -> Iterator[FMU2Slave]:
         fmu.freeInstance()
 
 
-def test_do_step(benchmark: BenchmarkFixture, fmu: FMU2Slave) -> None:
+def test_do_step(benchmark: BenchmarkFixture, path: Path, fmu: FMU2Slave) -> None:
+    """Time `doStep` alone, along the paper's validation signal: a set is searched where it holds data."""
+    variables = fmpy.read_model_description(str(path)).modelVariables
+    inputs = [v.valueReference for v in variables if v.causality == "input" and v.name.startswith("motor_setpoint")]
+    P = signal("eq22").set_points[7000:10_000]
     samples = iter(range(10**9))
+    if not inputs:  # the trivial one, the one in C and the controller
+        benchmark(lambda: fmu.doStep(next(samples) * TS, TS))
+        return
 
-    def step() -> None:
-        fmu.doStep(next(samples) * TS, TS)
+    def hold() -> tuple[tuple[float], dict[str, float]]:
+        k = next(samples)
+        fmu.setReal(inputs, P[k % len(P)].tolist())
+        return (k * TS,), {}
 
-    benchmark(step)
+    benchmark.pedantic(lambda time: fmu.doStep(time, TS), setup=hold, rounds=3000, warmup_rounds=50)
     # Not more samples than were asked for, and none was lost: the FMU's time is the last one it reached.
     assert fmu.getRealStatus(2) == pytest.approx(next(samples) * TS, rel=1e-12)
 

@@ -26,6 +26,7 @@ from softneck.core import Block, Port, SettingsError, atomic_write, refuse_exist
 from ._cost import plain_cost
 from ._description import Identity, described_block, generation_tool, model_description
 from ._documentation import HOST_NEEDS, documentation_page
+from ._icon import icon_png
 from ._info import FmuInfo
 from ._module import slave_module
 from ._pack import read_zip, write_zip
@@ -100,7 +101,9 @@ def _members(block: Block, info: FmuInfo, name: str) -> dict[str, bytes]:
     members["modelDescription.xml"] = model_description(block, info, Identity(name, guid, _date()))
     members["documentation/index.html"] = documentation_page(name, block, info).encode()
     members["documentation/host.txt"] = f"{HOST_NEEDS}\n".encode()
-    members["documentation/licenses/pythonfmu.txt"] = _pythonfmu_license()
+    members["documentation/licenses/license.txt"] = _license("softneck", info.license).encode()
+    members["documentation/licenses/pythonfmu.txt"] = _license("pythonfmu", "MIT").encode()
+    members["model.png"] = icon_png(block.kind, block.role)
     return members
 
 
@@ -177,9 +180,10 @@ def _date() -> str:
     return moment.strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-def _pythonfmu_license() -> bytes:
-    files = distribution("pythonfmu").files or []
-    for file in files:
+def _license(package: str, stated: str) -> str:
+    """Return what the licence is said to be, and the text of the package's own, which covers its code in the FMU."""
+    for file in distribution(package).files or []:
         if file.name == "LICENSE":
-            return file.read_binary()
-    return b"The binaries come from PythonFMU, MIT licence.\n"
+            text = file.read_text(encoding="utf-8")
+            return f"{stated}\n\nThe code of {package} in this FMU:\n\n{text}".lstrip()
+    return f"{stated}\n\nThe code of {package} in this FMU is under the licence that {package} states.\n".lstrip()

@@ -9,10 +9,15 @@ from softneck.core import Block, Port
 
 from ._info import FmuInfo
 from ._module import MINIMUM_PYTHON
+from ._response import response_figure
 
 HOST_NEEDS = (
     f"The host needs Python {'.'.join(map(str, MINIMUM_PYTHON))} or newer with numpy (nothing of softneck); "
     "a host that is no Python program finds it through LD_PRELOAD=libpython3.x.so and PYTHONPATH."
+)
+_NUMBA = (
+    "Where the host has numba too, a runtime that is slow in plain Python is compiled or taken from softneck's cache; "
+    "the environment variable SOFTNECK_FMU_NUMBA=0 leaves that out, =1 always does it."
 )
 _PATHS = (
     "pythonfmu's binary decodes only %20 in the path it is unpacked to: keep +, #, %, parentheses and "
@@ -24,6 +29,7 @@ _TIMING = {
 }
 _STYLE = (
     "body{font:15px/1.5 sans-serif;max-width:60em;margin:2em auto;padding:0 1em}"
+    "svg{width:100%;height:auto;background:#fff}figure{margin:1em 0}pre{overflow:auto}"
     "table{border-collapse:collapse}td,th{border:1px solid #bbb;padding:.2em .6em;text-align:left}"
 )
 
@@ -37,12 +43,14 @@ def documentation_page(name: str, block: Block, info: FmuInfo) -> str:
         f"<style>{_STYLE}</style></head><body>",
         f"<h1>{escape(name)}</h1><p>{title}</p>",
         info.documentation,
+        response_figure(block),
         "<h2>Variables</h2>",
         _table(block),
         f"<h2>Timing</h2><p>Internal sample time {block.sample_time:g} s; any communication step is legal.",
         f"{timing}</p>",
-        f"<h2>Host</h2><p>{escape(HOST_NEEDS)} {escape(_PATHS)}</p>",
-        f"<p>{escape(' · '.join(text for text in (info.author, info.copyright, info.license) if text))}</p>",
+        f"<h2>Host</h2><p>{escape(HOST_NEEDS)} {escape(_NUMBA)} {escape(_PATHS)}</p>",
+        '<p>Licences: <a href="licenses/">licenses/</a>. '
+        f"{escape(' · '.join(text for text in (info.author, info.copyright, info.license) if text))}</p>",
         "</body></html>\n",
     ]
     return "\n".join(parts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 
 import click
@@ -9,24 +10,30 @@ import click
 from softneck.core import FileFormatError, SettingsError, load
 from softneck.cosim import is_loop_file, reference_of
 from softneck.fmu import Buildable, build_fmu, describe
+from softneck.identification import Model, Validation, validate
 from softneck.plant import NeckParameters, VirtualNeck
 
 from ._console import print_json, progress
 from ._neck import load_neck
 from ._options import force_option, json_option, output_option, target
+from ._recordings import read_together
 
 
 @click.command("fmu", epilog="Example: softneck fmu build/demo/models/rls.npz -o Rls.fmu")
 @click.argument("file", required=False)
 @output_option("FMU", "X.fmu")
 @click.option("--all", "folder", type=click.Path(path_type=Path), help="Build one FMU of every file of ours in DIR.")
+@click.option(
+    "--data", multiple=True, type=click.Path(path_type=Path), help="A recording to score a model on, inside the FMU."
+)
 @click.option("--backend", type=click.Choice(["python"]), default="python", show_default=True, help="What runs inside.")
 @click.option("--fmi", type=click.Choice(["2"]), default="2", show_default=True, help="FMI version.")
 @force_option
 @json_option
 def command(
-    file: str | None, output: Path | None, folder: Path | None, backend: str, fmi: str, force: bool, as_json: bool
-) -> None:
+    file: str | None, output: Path | None, folder: Path | None, data: tuple[Path, ...],
+    backend: str, fmi: str, force: bool, as_json: bool,
+) -> None:  # fmt: skip
     """Package FILE as an FMI 2.0 Co-Simulation FMU.
 
     FILE is a model, observer or controller (.npz), a neck parameter file (.toml), a neck preset (paper, lab), or a
@@ -34,26 +41,46 @@ def command(
     """
     del backend, fmi  # one of each in this version; the options hold their place
     jobs, replace = _what(file, folder, output, force=force)
+    # All are read before any is written: one bad file stops the command with nothing done.
+    things = [(source, open_buildable(source), path) for source, path in jobs if folder is None or _can_be_fmu(source)]
+    built, left_out = [], [str(source) for source, _ in jobs if source not in {source for source, _, _ in things}]
     with progress("build FMU", quiet=as_json) as report:
-        for number, (source, path) in enumerate(jobs):
-            report(number / len(jobs), path.name)
-            thing = open_buildable(source)
-            build_fmu(thing.block(), path, info=describe(thing), force=replace)
-    built = [{"source": str(source), "fmu": str(path)} for source, path in jobs]
+        for number, (source, thing, path) in enumerate(things):
+            report(number / len(things), path.name)
+            judged = _judge(thing, source, data) if data else None
+            build_fmu(thing.block(), path, info=describe(thing, validation=judged), force=replace)
+            built.append({"source": str(source), "fmu": str(path)})
     if as_json:
-        print_json({"fmus": built})
+        print_json({"fmus": built, "left_out": left_out})
         return
     for entry in built:
         click.echo(f"{entry['fmu']}  from {entry['source']}")
+    for source in left_out:
+        click.echo(f"left out: {source}, which is no model, observer or controller")
 
 
 def open_buildable(source: str | Path) -> Buildable:
     """Return what `source` names: a file of ours, a neck file or a neck preset."""
     if Path(source).suffix == ".npz":
-        return load(source)
+        thing = load(source)
+        if not hasattr(thing, "block"):
+            raise FileFormatError(f"{source}: is no model, observer or controller, so that no FMU can be made of it.")
+        return thing
     if is_loop_file(Path(source)):
         return reference_of(Path(source))
     return VirtualNeck(load_neck(str(source)))
+
+
+def _can_be_fmu(source: str | Path) -> bool:
+    return Path(source).suffix != ".npz" or hasattr(load(source), "block")
+
+
+def _judge(thing: Buildable, source: str | Path, data: tuple[Path, ...]) -> Validation | None:
+    """Return the scores of a model on recordings as one, each run of its own; None for what is no model."""
+    if not isinstance(thing, Model):
+        return None
+    names = (Path(source).name, ", ".join(path.name for path in data))
+    return validate(thing, read_together(data), names=names)
 
 
 def _what(
@@ -74,17 +101,24 @@ def _jobs(folder: Path, out: Path) -> list[tuple[str | Path, Path]]:
     sources = sorted(path for path in folder.iterdir() if path.suffix == ".npz" or _is_neck(path))
     if not sources:
         raise FileFormatError(f"{folder}: holds no model, observer, controller or neck file.")
-    return [(path, out / f"{_stem(path.name)}.fmu") for path in sources]
+    jobs: dict[Path, Path] = {}
+    for path in sources:
+        fmu = out / f"{_stem(path.name)}.fmu"
+        if fmu in jobs:
+            raise SettingsError(f"{jobs[fmu]} and {path} would both become {fmu}; rename one of them.")
+        jobs[fmu] = path
+    return [(path, fmu) for fmu, path in jobs.items()]
 
 
 def _is_neck(path: Path) -> bool:
+    """Return whether a file means to be a neck's; what is wrong in it is said when it is read."""
     if path.suffix != ".toml":
         return False
     try:
-        NeckParameters.from_toml(path)
-    except SettingsError:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError):
         return False
-    return True
+    return not set(content).isdisjoint({"preset", *NeckParameters.names()})
 
 
 def _stem(file: str) -> str:

@@ -1,0 +1,66 @@
+"""`model.png`: a small picture by which diagrams tell a plant, an observer, a controller and a reference apart."""
+
+from __future__ import annotations
+
+import colorsys
+import itertools
+import math
+import struct
+import zlib
+
+import numpy as np
+
+from softneck.core import Matrix
+
+_SIZE = 96
+# Polylines in a unit square, y downwards; drawn with round ends. One picture a role, one colour a kind.
+_BEND = [(0.5 + 0.22 * (1 - math.cos(a)), 0.82 - 0.6 * math.sin(a) / math.sin(1.2)) for a in np.linspace(0, 1.2, 9)]
+_EYE = [(0.15 + 0.7 * s, 0.5 - 0.22 * math.sin(math.pi * s)) for s in np.linspace(0, 1, 13)]
+_STROKES: dict[str, list[list[tuple[float, float]]]] = {
+    "plant": [[(0.25, 0.82), (0.75, 0.82)], _BEND, [(0.5, 0.2), (0.8, 0.3)], [(0.3, 0.82), (0.42, 0.5), (0.48, 0.19)]],
+    "observer": [
+        _EYE,
+        [(x, 1.0 - y) for x, y in _EYE],
+        [(0.5, 0.45), (0.55, 0.5), (0.5, 0.55), (0.45, 0.5), (0.5, 0.45)],
+    ],
+    "controller": [
+        [(0.12, 0.4), (0.3, 0.4)],
+        [(0.3, 0.25), (0.7, 0.25), (0.7, 0.55), (0.3, 0.55), (0.3, 0.25)],
+        [(0.7, 0.4), (0.88, 0.4), (0.88, 0.78), (0.2, 0.78), (0.2, 0.5)],
+    ],
+    "reference": [[(0.15, 0.75), (0.45, 0.75), (0.45, 0.3), (0.85, 0.3)]],
+}  # fmt: skip
+
+
+def icon_png(kind: str, role: str) -> bytes:
+    """Return a PNG of 96 x 96 pixels."""
+    # The golden ratio spreads whatever numbers the letters of kinds add up to over the colours.
+    hue = (sum(kind.encode()) * 0.6180339887) % 1.0
+    colour = np.array(colorsys.hls_to_rgb(hue, 0.36, 0.6))
+    near = np.full((_SIZE, _SIZE), np.inf)
+    for stroke in _STROKES[role]:
+        for a, b in itertools.pairwise(stroke):
+            near = np.minimum(near, _distance(np.array(a), np.array(b)))
+    ink = np.clip((0.03 - near) * _SIZE + 0.5, 0.0, 1.0)[..., None]  # half a pixel of soft edge
+    pixels = np.round(255.0 * (ink + (1.0 - ink) * colour)).astype(np.uint8)  # white on the kind's colour
+    return _png(pixels)
+
+
+def _distance(a: Matrix, b: Matrix) -> Matrix:
+    """Return the distance of every pixel's middle from the stroke a-b."""
+    middle = (np.arange(_SIZE) + 0.5) / _SIZE
+    x, y = np.meshgrid(middle, middle)
+    along = b - a
+    share = np.clip(((x - a[0]) * along[0] + (y - a[1]) * along[1]) / float(along @ along), 0.0, 1.0)
+    return np.hypot(x - a[0] - share * along[0], y - a[1] - share * along[1])
+
+
+def _png(pixels: np.ndarray) -> bytes:
+    """Return (height, width, 3) bytes as a PNG (ISO/IEC 15948): header, one block of unfiltered rows, end."""
+    height, width, _ = pixels.shape
+    rows = b"".join(b"\0" + row.tobytes() for row in pixels)
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(rows, 9)), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks
+    )

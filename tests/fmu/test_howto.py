@@ -1,0 +1,70 @@
+"""The commands and scripts of the how-to pages work as they stand there."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softneck.fmu import build_fmu
+
+from .every_kind import block_of
+from .test_importers import need
+
+PAGES = Path(__file__).parents[2] / "docs" / "howto"
+
+
+def _parts(page: str, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", (PAGES / page).read_text(encoding="utf-8"), re.DOTALL)
+
+
+def _run(command: list[str], folder: Path) -> str:
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+    # An embedded Python may abort at the end of its process; what the script printed is there by then.
+    assert done.stdout or done.returncode == 0, done.stderr[-2000:]
+    assert "Traceback" not in done.stderr, done.stderr[-2000:]
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("howto")
+    build_fmu(block_of("rls"), place / "Neck.fmu")
+    return place
+
+
+def test_fmpy_s_commands_run(folder: Path) -> None:
+    commands = [line.removeprefix("$ ") for part in _parts("fmu_fmpy.md", "console") for line in part.splitlines()]
+    assert len(commands) == 3
+    for command in commands:
+        words = shlex.split(command)
+        assert words[0] == "python"
+        _run([sys.executable, *words[1:]], folder)
+    assert (folder / "neck.csv").read_text().startswith('"time"')
+
+
+@pytest.mark.parametrize(("page", "package"), [("fmu_fmpy.md", "fmpy"), ("fmu_libcosim.md", "libcosimpy")])
+def test_the_scripts_compute_the_same_pitch(page: str, package: str, folder: Path) -> None:
+    need(package)
+    (script,) = _parts(page, "python")
+    printed = _run([sys.executable, "-c", script], folder)
+    block = block_of("rls")
+    steps = 175 if page == "fmu_fmpy.md" else 200  # 2 rad for 3.5 s, and for 4 s
+    u = [[2.0, 0.0, 0.0, *[float("nan")] * 5]] * steps
+    _, y = block.run(block.initial_state(), np.array(u))
+    numbers = [line for line in printed.splitlines() if re.fullmatch(r"[\[\](), \d.e+-]+", line)]  # not the log
+    value = float(re.findall(r"-?\d+\.\d+(?:e-?\d+)?", numbers[-1])[0])
+    wanted = np.degrees(y[-1, 0]) if page == "fmu_fmpy.md" else y[-1, 0]
+    assert value == pytest.approx(wanted, rel=1e-9)  # printed in full
+
+
+@pytest.mark.parametrize("page", ["fmu_fmpy.md", "fmu_libcosim.md", "fmu_openmodelica.md", "fmu_simulink.md"])
+def test_every_page_says_what_was_run(page: str) -> None:
+    text = (PAGES / page).read_text(encoding="utf-8")
+    assert "**Run here**" in text or "**Not run here:**" in text
+    assert page.removesuffix(".md") in (PAGES.parent / "index.md").read_text(encoding="utf-8")
