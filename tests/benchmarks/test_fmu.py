@@ -22,7 +22,7 @@ from softneck.core import Block
 from softneck.design import PiSettings
 from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.fmu import build_fmu, unpacked
-from softneck.identification import Network, Rls, SetMembership
+from softneck.identification import Network, Play, Rls, SetMembership
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.signals import Recording, redefine, signal
 
@@ -60,6 +60,7 @@ def _linear() -> LinearNeck:
 _KINDS: dict[str, Callable[[], Block]] = {
     "rls": lambda: Rls().fit(_recording(1000)).block(),
     "nlsm": lambda: SetMembership().fit(_recording(7000)).block(),
+    "play": lambda: Play().fit(_recording(2000)).block(),
     "nn": lambda: Network(iterations=1).fit(_recording(2000)).block(),
     "kalman": lambda: KalmanSettings().design(_linear()).block(),
     "pi": lambda: PiSettings().design(_linear()).block(),

@@ -95,6 +95,7 @@ def test_scikit_learn_mlp_in_narx_form(benchmark: BenchmarkFixture) -> None:
         return max(found, key=lambda one: one[0])
 
     _, lags, net = benchmark.pedantic(fit, rounds=1)
+    free = np.zeros((0, 2))
     for name in ("validation", *TESTS):
         test = recordings()[name]
         free = narx_free_run(net.predict, test.set_points, test.outputs / scale, lags)

@@ -47,8 +47,10 @@ def test_compiled_and_plain_steps_agree(
         compiled.begin()
         modes = [json.loads(_state(fmu))["compiled"] for fmu in (plain, compiled)]
         assert modes == [False, True]
-        # tanh, exp and matrix products differ in the last digit; 60 stable steps do not add to 1e-12.
-        np.testing.assert_allclose(_run(compiled, kind, 0, 60), _run(plain, kind, 0, 60), rtol=1e-12, atol=1e-12)
+        # tanh, exp and matrix products differ in the last digit; 60 stable steps do not add to 1e-12. A Kalman
+        # filter's innovation, 1e4 on these random measurements, is a small difference over a smaller variance.
+        rtol = 1e-10 if kind == "kalman" else 1e-12
+        np.testing.assert_allclose(_run(compiled, kind, 0, 60), _run(plain, kind, 0, 60), rtol=rtol, atol=1e-12)
 
 
 @pytest.mark.parametrize("saved", ["0", "1"])

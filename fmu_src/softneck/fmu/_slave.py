@@ -105,7 +105,7 @@ class SoftneckSlave(Fmi2Slave):
         self.ports = self.facts["inputs"] + self.facts["outputs"] + self.facts["parameters"]
         n_in, n_out = len(self.facts["inputs"]), len(self.facts["outputs"])
         self.n_in, self.n_known = n_in, n_in + n_out
-        self.plant = self.facts["role"] == "plant"
+        self.plant = self.facts["role"] in ("plant", "reference")
         self.sample_time = self.facts["sample_time"]
         self.start, self.count, self.running, self.stale = 0.0, 0, False, True
         self.variables = np.array([port["start"] for port in self.ports], dtype=np.float64)
