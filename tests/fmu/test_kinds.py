@@ -61,14 +61,9 @@ def test_the_fmu_equals_theblock_of(kind: str, path: Path, running: Any) -> None
         seen = _run(fmu, block, u)
     np.testing.assert_array_equal(seen, plain)  # the same text on the same numbers
     # numba's and numpy's tanh and matrix products differ in the last digit; 60 stable steps do not add to 1e-12.
-<<<<<<< HEAD
     # A Kalman filter's first covariances are 40 deg squared less almost all of it: 1e-16 of 0.5 in 1e-6.
     digits = 1e-10 if kind.startswith("kalman") else 1e-12
     np.testing.assert_allclose(seen, compiled, rtol=digits, atol=1e-12)
-=======
-    # A Kalman filter's innovation, 1e4 on these random measurements, is a small difference over a smaller variance.
-    np.testing.assert_allclose(seen, compiled, rtol=1e-10 if kind == "kalman" else 1e-12, atol=1e-12)
->>>>>>> wip_fmu
 
 
 def test_the_whole_state_replays_to_the_bit(kind: str, path: Path, running: Any) -> None:
