@@ -14,6 +14,7 @@ from softneck.core import (
     Matrix,
     Progress,
     SettingsError,
+    load_functions,
     require_positive,
     require_whole,
     silent,
@@ -25,7 +26,7 @@ from ._echo import fit_correction
 from ._levenberg import Layers, random_layers
 from ._loaded_drive import LoadedDrive, drive_start, fit_loaded_drive
 from ._model import Model
-from ._nn_training import AxisData, Best, axis_data, train_axis
+from ._nn_training import FUNCTIONS, AxisData, Best, axis_data, train_axis
 from ._play import SAME_EXCITATION
 from ._regressors import PAPER_EQ21, regression
 from ._rows import row_hashes
@@ -142,6 +143,8 @@ class Network:
         told = [(0.0, "pitch"), (0.0, "roll")]
         stop = threading.Event()
         interrupted = False
+        # Before the threads start: Python 3.11 cannot parse two texts at once.
+        load_functions(FUNCTIONS)
         # One thread each: matrices this small gain nothing from more.
         with threadpool_limits(limits=1), ThreadPoolExecutor(2) as pool:
             jobs = [pool.submit(self._axis, train, judge, drive, axis, told, stop) for axis in range(2)]

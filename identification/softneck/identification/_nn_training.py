@@ -14,7 +14,7 @@ from ._levenberg import Layers, jacobian, levenberg, random_layers
 from ._regressors import PAPER_EQ21
 from ._scores import nrmse_fit
 
-_FUNCTIONS = "softneck.identification._nn_fit_runtime"
+FUNCTIONS = "softneck.identification._nn_fit_runtime"
 # Every third row: at 20 ms neighbours say the same, and the time is that of the rows.
 THIN = 3
 # Windows of free run [s]: from a few steps over the neck's time constant to many of them.
@@ -80,7 +80,7 @@ class AxisData:
         starts[self.first & ~np.isfinite(starts)] = 0.0
         free = np.empty(y.size)
         call = (layers.vector(), layers.b1.size, layers.b2.size, self.simulated, starts, self.shift, self.gain, free)
-        load_functions(_FUNCTIONS).nn_free(*call)
+        load_functions(FUNCTIONS).nn_free(*call)
         return nrmse_fit(np.where(known, y, np.nan), np.nan_to_num(one)), nrmse_fit(y, free)
 
 
@@ -222,7 +222,7 @@ def _windows(
     start: Layers, data: AxisData, rows: np.ndarray, decay: float, length: int, iterations: int, best: Best
 ) -> Layers:
     """Minimise the errors of free runs over windows, and of one step beside them so that neither is given up."""
-    functions = load_functions(_FUNCTIONS)
+    functions = load_functions(FUNCTIONS)
     starts, h1, h2 = data.starts(length), start.b1.size, start.b2.size
     there = np.isfinite(data.target[::THIN])
     free = np.empty(data.target.size)
