@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError, SettingsError, State
-from softneck.estimation import KalmanSettings, UkfObserver, ukf
+from softneck.design import PiSettings
+from softneck.estimation import KalmanSettings, UkfObserver, UkfPart, ukf
 from softneck.identification import Model, Network, Play, Rls
+from softneck.loop import BlockPart, Loop, StepReference, run_loop
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import Recording, signal
 
@@ -124,6 +126,31 @@ def test_both_orders_of_a_loop_give_the_same_estimates(play: Model, test_run: Re
     part = test_run.rows(0, 80)
     sequential, jacobi = (ukf(play, KalmanSettings(order=order), memory=2) for order in ("sequential", "jacobi"))
     np.testing.assert_array_equal(sequential.estimate(part).innovation, jacobi.estimate(part).innovation)
+
+
+def test_it_closes_the_loop_over_dropouts_and_its_part_resumes(play: Model, training: Recording) -> None:
+    part = UkfPart(ukf(play, memory=8))
+    result = run_loop(
+        Loop(
+            plant=BlockPart(VirtualNeck(replace(NeckParameters.paper(), dropout_rate=0.5, dropout_time=0.1)).block()),
+            controller=BlockPart(PiSettings().design(Rls().fit([training])).block()),
+            observer=part,
+            reference=StepReference(pitch=np.radians(15.0), at=1.0),
+            duration=8.0,
+        )
+    )
+    # Integral action takes the mean to 15 deg; noise of 0.05 deg and creep of the neck remain.
+    assert np.degrees(np.mean(result["pitch"][result.time > 6.0])) == pytest.approx(15.0, abs=0.5)
+    assert np.isfinite(result["pitch_estimate"]).all()
+    row = np.array([0.5, 0.2, 0.1, 0.2, 0.1, 1.0])
+    saved = part.get_state()
+    once = part.advance(8.0, row)
+    part.set_state(saved)
+    np.testing.assert_array_equal(part.advance(8.0, row), once)
+    with pytest.raises(DataError, match="the state has 1 values"):
+        part.set_state(bytes(8))
+    with pytest.raises(SettingsError, match="no parameter of an unscented filter"):
+        part.start(0.0, {"measurement_noise_std": 1e-3})
 
 
 def _angles(observer: UkfObserver, recording: Recording) -> np.ndarray:

@@ -19,3 +19,4 @@ from ._settings import ORDERS as ORDERS
 from ._settings import KalmanSettings as KalmanSettings
 from ._ukf import UkfObserver as UkfObserver
 from ._ukf import ukf as ukf
+from ._ukf_part import UkfPart as UkfPart
