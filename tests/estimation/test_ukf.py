@@ -12,7 +12,7 @@ import pytest
 
 from softneck.core import DataError, SettingsError, State
 from softneck.design import PiSettings
-from softneck.estimation import KalmanSettings, UkfObserver, UkfPart, ukf
+from softneck.estimation import KalmanSettings, UkfObserver, UkfPart, consistency, ukf
 from softneck.identification import Model, Network, Play, Rls
 from softneck.loop import BlockPart, Loop, StepReference, run_loop
 from softneck.plant import NeckParameters, VirtualNeck, record
@@ -63,6 +63,21 @@ def test_over_a_linear_model_it_is_the_linear_filter(
     np.testing.assert_allclose(told.innovation[late], linear.innovation[late], rtol=0, atol=1e-4)
     np.testing.assert_array_equal(told.accepted, linear.accepted)
     np.testing.assert_array_equal(told.healthy, linear.healthy)
+
+
+def test_its_nis_and_nees_are_those_of_the_linear_filter(training: Recording) -> None:
+    model, part = Rls().fit([training]), training.rows(0, 600)
+    noise = math.radians(0.05) * np.random.default_rng(2).standard_normal((2, 600))
+    measured = {f"{a}_measured": part.channels[a] + e for a, e in zip(("pitch", "roll"), noise, strict=True)}
+    part = part.with_channels(**measured)
+    settings = replace(DISTURBED, sensor_delay=0.02)
+    ours, theirs = (consistency(o, part, settle=300) for o in (ukf(model, settings), settings.design(model)))
+    assert ours.nees is not None
+    assert theirs.nees is not None
+    # Both filters have forgotten their starts to 1e-9 rad, of some 1e-3 rad that an innovation of 1 stands for.
+    assert ours.nis.mean == pytest.approx(theirs.nis.mean, rel=1e-5)
+    assert ours.nees.mean == pytest.approx(theirs.nees.mean, rel=1e-5)
+    assert "over rls, 20 ms" in ukf(model, settings).summary()
 
 
 def test_a_first_order_model_needs_one_angle_and_gains_nothing_from_more(training: Recording) -> None:

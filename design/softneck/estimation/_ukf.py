@@ -60,6 +60,22 @@ class UkfObserver:
         """Of the model and of the loop [s]."""
         return self.model.sample_time
 
+    @property
+    def lead(self) -> float:
+        """How far the estimate runs ahead of the measurement [s]: the sensor's delay."""
+        return self._lead * self.sample_time
+
+    def summary(self) -> str:
+        """Return some lines for people."""
+        levels = zip(("measurement", "model", "disturbance"), self.settings.noise, strict=True)
+        return "\n".join(
+            (
+                f"unscented Kalman observer over {self.model.kind}, {self.sample_time * 1e3:g} ms",
+                f"  {2 * self.memory + 2} states: {self.memory} angles and a disturbance of pitch and roll",
+                f"  noise: {', '.join(f'{name} {math.degrees(value):.3g} deg' for name, value in levels)}",
+            )
+        )
+
     def block(self) -> NoReturn:
         """Raise SettingsError: there is no runtime, hence no FMU."""
         raise SettingsError(
