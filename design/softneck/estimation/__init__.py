@@ -17,3 +17,6 @@ from ._sensors import Sensor as Sensor
 from ._sensors import find_sensor as find_sensor
 from ._settings import ORDERS as ORDERS
 from ._settings import KalmanSettings as KalmanSettings
+from ._ukf import UkfObserver as UkfObserver
+from ._ukf import ukf as ukf
+from ._ukf_part import UkfPart as UkfPart

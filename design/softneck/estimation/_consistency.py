@@ -12,6 +12,7 @@ from softneck.signals import Recording
 
 from ._kalman import KalmanObserver
 from ._offline import Estimates
+from ._ukf import UkfObserver
 
 _DEGREES = 2
 # Samples averaged for a curve that shows where a filter is too sure: half a second at 100 Hz.
@@ -79,7 +80,7 @@ class Consistency:
 
 
 def consistency(
-    observer: KalmanObserver, recording: Recording, *, level: float = 0.95, settle: int = 50
+    observer: KalmanObserver | UkfObserver, recording: Recording, *, level: float = 0.95, settle: int = 50
 ) -> Consistency:
     """Return NIS, and NEES where the recording knows the true angles beside the measured ones.
 
@@ -113,7 +114,7 @@ def consistency(
 
 
 def _nees(
-    observer: KalmanObserver, recording: Recording, estimates: Estimates, counts: np.ndarray, level: float
+    observer: KalmanObserver | UkfObserver, recording: Recording, estimates: Estimates, counts: np.ndarray, level: float
 ) -> Squares | None:
     if not all(f"{axis}_measured" in recording.channels for axis in ("pitch", "roll")):
         return None

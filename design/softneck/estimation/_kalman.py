@@ -99,13 +99,7 @@ class KalmanObserver:
 
     def block(self) -> Block:
         """Return the filter as a block of role "observer"."""
-        u = tuple(Port(name=f"motor_setpoint_{j}", unit="rad", minimum=-6.0, maximum=6.0) for j in (1, 2, 3))
-        y = tuple(Port(name=f"{a}_measured", unit="rad", description=f"measured {a}", missing=True) for a in _MEASURED)
-        valid = Port(name="measurement_valid", description="whether the angles were measured", start=1.0, boolean=True)
-        rates = tuple(
-            Port(name=f"{a}_rate_measured", unit="rad/s", description=f"{a} rate of the gyro", missing=True)
-            for a in _MEASURED
-        )
+        inputs, outputs = observer_ports(self.form)
         levels = list(zip(NOISES[self.form], self.noise, strict=True))
         return Block(
             kind="kalman",
@@ -113,13 +107,8 @@ class KalmanObserver:
             runtime=_STEADY if self.is_steady else _RUNTIME,
             sample_time=self.sample_time,
             arrays=self.arrays,
-            inputs=(*u, *y, valid, *(rates if self.form == "gyro" else ())),
-            outputs=(
-                *(Port(name=a, unit="rad", description=f"estimated {a}") for a in _MEASURED),
-                *(Port(name=f"{a}_rate", unit="rad/s", description=f"estimated rate of {a}") for a in _MEASURED),
-                Port(name="innovation", description="normalised innovation squared; 0 when nothing was measured"),
-                Port(name="healthy", description="a measurement was accepted in time", boolean=True),
-            ),
+            inputs=inputs,
+            outputs=outputs,
             parameters=tuple(
                 # Levels of process noise are part of constant gains and cannot be changed there.
                 Port(name=name, unit=unit, start=value, minimum=1e-9, maximum=1e3 if unit != "rad" else math.pi,
@@ -232,6 +221,24 @@ class KalmanObserver:
             )
         except SettingsError as error:
             raise FileFormatError(f"{error} Design the observer again.") from error
+
+
+def observer_ports(form: str) -> tuple[tuple[Port, ...], tuple[Port, ...]]:
+    """Return the inputs and outputs of a filter of one form."""
+    u = tuple(Port(name=f"motor_setpoint_{j}", unit="rad", minimum=-6.0, maximum=6.0) for j in (1, 2, 3))
+    y = tuple(Port(name=f"{a}_measured", unit="rad", description=f"measured {a}", missing=True) for a in _MEASURED)
+    valid = Port(name="measurement_valid", description="whether the angles were measured", start=1.0, boolean=True)
+    rates = tuple(
+        Port(name=f"{a}_rate_measured", unit="rad/s", description=f"{a} rate of the gyro", missing=True)
+        for a in _MEASURED
+    )
+    outputs = (
+        *(Port(name=a, unit="rad", description=f"estimated {a}") for a in _MEASURED),
+        *(Port(name=f"{a}_rate", unit="rad/s", description=f"estimated rate of {a}") for a in _MEASURED),
+        Port(name="innovation", description="normalised innovation squared; 0 when nothing was measured"),
+        Port(name="healthy", description="a measurement was accepted in time", boolean=True),
+    )
+    return (*u, *y, valid, *(rates if form == "gyro" else ())), outputs
 
 
 def _require_covariance(name: str, P: Matrix) -> None:

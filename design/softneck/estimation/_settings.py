@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -132,7 +133,7 @@ class KalmanSettings:
             raise SettingsError(f"pitch and roll have different sample times, {times[0]:g} s and {times[1]:g} s.")
         period = times[0] if self.sample_time is None else self.sample_time
         plants = [plant.resampled(period) for plant in plants]
-        constants, sources = self._constants(plants, period), self._sources()
+        constants, sources = self.constants([plant.delay for plant in plants], period), self._sources()
         arrays = self._form(plants, period).arrays(sources, constants)
         return KalmanObserver(
             form=self.form,
@@ -155,11 +156,16 @@ class KalmanSettings:
         T = redefinition_matrix(np.array(self.tendon_angles))[:2]
         return T if self.form == "model" else np.zeros_like(T)
 
-    def _constants(self, plants: list[AxisPlant], period: float) -> Vector:
-        """Return the constants in the places that `_kalman_parts_runtime` names."""
+    def constants(self, delays: Sequence[int], period: float) -> Vector:
+        """Return the constants in the places that `_kalman_parts_runtime` names.
+
+        Args:
+            delays: samples that set-points need to act on pitch and on roll, beyond the first.
+            period: the filter's sample time [s].
+        """
         lags = [0.0, 0.0]
         if self.form == "model":
-            lags = [plant.delay + float(self.order == "jacobi") for plant in plants]
+            lags = [delay + float(self.order == "jacobi") for delay in delays]
         if self.form == "gyro":
             # Between two measurements acts the mean of the rates at both ends: half a sample ago.
             lags = [0.5 + (self.sensor_delay - self.gyro_delay) / period] * 2
