@@ -71,8 +71,10 @@ def test_import_validate_and_report(
     seconds, busy = time.perf_counter() - started, time.process_time() - busy
     assert '"best_linear"' in capsys.readouterr().out
     benchmark.extra_info |= {"s": round(seconds, 1), "s of processor": round(busy, 1)}
-    # The issue's figure, on 2 cores that do nothing else; the processors' own time is beside it in the report.
+    # The issue's figure, on 2 cores that do nothing else.
     assert seconds < 20.0
+    # The time of all cores together: a machine that others use shows no other. It lies within noise of its bound.
+    assert busy < 20.0
 
 
 @pytest.mark.benchmark(group="bootstrap")

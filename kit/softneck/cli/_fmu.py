@@ -66,6 +66,11 @@ def open_buildable(source: str | Path) -> Buildable:
         if not hasattr(thing, "block"):
             raise FileFormatError(f"{source}: is no model, observer or controller, so that no FMU can be made of it.")
         return thing
+    if Path(source).suffix not in ("", ".toml"):
+        raise FileFormatError(
+            f"{source}: no FMU can be made of a `{Path(source).suffix}` file; give a model, controller or observer "
+            "(.npz), a neck or loop file (.toml), or a preset (paper, lab)."
+        )
     if is_loop_file(Path(source)):
         return reference_of(Path(source))
     return VirtualNeck(load_neck(str(source)))
