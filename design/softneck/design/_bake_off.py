@@ -143,14 +143,23 @@ def run_bake_off(
         raise DataError("the bake-off needs at least one plant.")
     runs = [_run(factory(), plant, asked) for plant in chosen]
     angles, inputs = (np.array(part) for part in zip(*runs, strict=True))
-    before, after = angles[:, : asked.load_row], angles[:, asked.load_row :]
+    return judge(angles, inputs, asked, len(chosen) // 2 if plants is None else 0)
+
+
+def judge(angles: Matrix, inputs: Matrix, test: BakeOff, nominal: int) -> BakeOffResult:
+    """Return the figures of runs, `angles` and `inputs` (plants, time)."""
+    before, after = angles[:, : test.load_row], angles[:, test.load_row :]
+    # 1e-12: the border itself belongs to the band, whatever rounding says.
+    outside = np.abs(before - test.reference) > (0.05 + 1e-12) * test.reference
+    last = before.shape[1] - np.argmax(outside[:, ::-1], axis=1)
+    settled = np.where(outside[:, -1], math.inf, last * test.sample_time)
     return BakeOffResult(
-        settling=np.array([_settling(row, asked) for row in before]),
-        overshoot=100.0 * np.maximum(before.max(axis=1) / asked.reference - 1.0, 0.0),
-        load_rms=np.degrees(np.sqrt(np.mean((after - asked.reference) ** 2, axis=1))),
+        settling=np.where(outside.any(axis=1), settled, 0.0),
+        overshoot=100.0 * np.maximum(before.max(axis=1) / test.reference - 1.0, 0.0),
+        load_rms=np.degrees(np.sqrt(np.mean((after - test.reference) ** 2, axis=1))),
         angles=angles,
         inputs=inputs,
-        nominal=len(chosen) // 2 if plants is None else 0,
+        nominal=nominal,
     )
 
 
@@ -216,11 +225,3 @@ def _run(step: Step, plant: AxisPlant, test: BakeOff) -> tuple[Vector, Vector]:
             x = A @ x + B * line.popleft()
             y = float(x[0])
     return angles, inputs
-
-
-def _settling(angle: Vector, test: BakeOff) -> float:
-    # 1e-12: the border itself belongs to the band, whatever rounding says.
-    outside = np.flatnonzero(np.abs(angle - test.reference) > (0.05 + 1e-12) * test.reference)
-    if outside.size == 0:
-        return 0.0
-    return float(outside[-1] + 1) * test.sample_time if outside[-1] + 1 < angle.size else math.inf
