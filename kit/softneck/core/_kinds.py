@@ -70,6 +70,12 @@ KINDS: dict[str, Kind] = {
         Kind("pi", "controller", "softneck.design:PiSettings", "softneck.design:LinearController",
              "softneck.design._linear_controller_runtime",
              "PI with reference filter, anti-windup and tendon allocation"),
+        Kind("hinf", "controller", "softneck.design:HinfSettings", "softneck.design:LinearController",
+             "softneck.design._linear_controller_runtime",
+             "H-infinity mixed sensitivity on the exact-delay plant, verified on every sample"),
+        Kind("ncf", "controller", "softneck.design:NcfSettings", "softneck.design:LinearController",
+             "softneck.design._linear_controller_runtime",
+             "loop shaping with normalised coprime factors (Glover, McFarlane)"),
     )
 }  # fmt: skip
 
