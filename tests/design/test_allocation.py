@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -130,8 +131,9 @@ def test_tendons_have_no_number(tilt: tuple[float, float], common: float, positi
     np.testing.assert_allclose(np.roll(first, 1), turned, atol=1e-11)
 
 
-def pi(**settings: float) -> LinearController:
-    return PiSettings(lead_limit=0.8, reference_time=0.12, **settings).design(neck())
+def pi(*, least_position: float = -6.0, least_cocontraction: float = -6.0) -> LinearController:
+    rule = {"least_position": least_position, "least_cocontraction": least_cocontraction}
+    return replace(PiSettings(lead_limit=0.8, reference_time=0.12).design(neck()), **rule)
 
 
 def test_a_least_cocontraction_keeps_tendons_taut_under_a_payload_that_slackens_them() -> None:
@@ -177,4 +179,4 @@ def test_files_of_before_the_rule_are_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["least_position", "least_cocontraction"])
 def test_a_rule_that_leaves_no_room_is_refused(name: str) -> None:
     with pytest.raises(SettingsError, match=rf"`{name}` must be below `position_limit`, 2 rad"):
-        PiSettings(position_limit=2.0, **{name: 2.5})
+        replace(PiSettings(position_limit=2.0), **{name: 2.5})

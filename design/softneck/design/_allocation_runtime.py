@@ -37,12 +37,11 @@ def allocate_tendons(
     is first raised so far that no motor is below it. `least` must be below `position`.
     """
     tilt = np.empty(3)
-    common = wanted[2]
+    # All of the last column are positive where the tendons surround the link.
+    most = position / np.max(inverse[:, 2])
+    common = min(max(wanted[2], -most), most)
     for j in range(3):
         tilt[j] = inverse[j, 0] * wanted[0] + inverse[j, 1] * wanted[1]
-    for j in range(3):
-        # All of the last column are positive where the tendons surround the link.
-        common = min(max(common, -position / inverse[j, 2]), position / inverse[j, 2])
     taut = least > -position
     if taut:
         for j in range(3):
@@ -65,6 +64,9 @@ def allocate_tendons(
     if taut:
         for j in range(3):
             common = max(common, (least - scale * tilt[j]) / inverse[j, 2])
+    if scale == 0.0:
+        # Unequal tendons that cannot all be at `least` together.
+        common = min(common, most)
     for j in range(3):
         target[j] = min(max(inverse[j, 2] * common + scale * tilt[j], -position), position)
 
