@@ -15,6 +15,15 @@ from ._hinf import HinfSettings as HinfSettings
 from ._margins import Margins as Margins
 from ._margins import loop_margins as loop_margins
 from ._ncf import NcfSettings as NcfSettings
+from ._neck_table import FIGURES as FIGURES
+from ._neck_table import NECK_HEAD as NECK_HEAD
+from ._neck_table import NeckCase as NeckCase
+from ._neck_table import NeckRow as NeckRow
+from ._neck_table import NeckSteps as NeckSteps
+from ._neck_table import neck_row as neck_row
+from ._neck_table import neck_step as neck_step
+from ._neck_table import neck_table as neck_table
+from ._neck_table import table_cells as table_cells
 from ._pi import PiSettings as PiSettings
 from ._reduction import Reduced as Reduced
 from ._reduction import reduce_controller as reduce_controller
