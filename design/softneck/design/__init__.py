@@ -2,6 +2,14 @@
 
 from ._assembly import AxisController as AxisController
 from ._assembly import pi_axis as pi_axis
+from ._bake_off import BakeOff as BakeOff
+from ._bake_off import BakeOffResult as BakeOffResult
+from ._bake_off import bake_off_neck as bake_off_neck
+from ._bake_off import bake_off_plant as bake_off_plant
+from ._bake_off import bake_off_plants as bake_off_plants
+from ._bake_off import bake_off_samples as bake_off_samples
+from ._bake_off import block_stepper as block_stepper
+from ._bake_off import run_bake_off as run_bake_off
 from ._controller import LinearController as LinearController
 from ._margins import Margins as Margins
 from ._margins import loop_margins as loop_margins
