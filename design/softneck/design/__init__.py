@@ -13,4 +13,13 @@ from ._bake_off import run_bake_off as run_bake_off
 from ._controller import LinearController as LinearController
 from ._margins import Margins as Margins
 from ._margins import loop_margins as loop_margins
+from ._neck_table import FIGURES as FIGURES
+from ._neck_table import NECK_HEAD as NECK_HEAD
+from ._neck_table import NeckCase as NeckCase
+from ._neck_table import NeckRow as NeckRow
+from ._neck_table import NeckSteps as NeckSteps
+from ._neck_table import neck_row as neck_row
+from ._neck_table import neck_step as neck_step
+from ._neck_table import neck_table as neck_table
+from ._neck_table import table_cells as table_cells
 from ._pi import PiSettings as PiSettings
