@@ -1,0 +1,127 @@
+"""From problem and tuning to the arrays that `_mpc_runtime` reads."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_discrete_are
+
+from softneck.core import Matrix, Vector
+
+from ._disturbance import MeasuredDisturbance
+from ._prediction import Matrices, Problem, disturbance_pole, padded, rest_states
+
+NAMES = (
+    "constants", "model_A", "model_B", "observer", "rest", "delays", "disturbances", "filters", "T", "starts", "K",
+    "A", "G", "E", "kinds", "AH", "H", "F", "scale",
+)  # fmt: skip
+# Radians: a motor resolves 1.3e-4 rad, a soft limit is judged at 1e-6.
+_TOLERANCE = 1e-10
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tuning:
+    """What the observer and the reference filters do.
+
+    Attributes:
+        trust: of the output-disturbance observer in what is measured, see `observer_gains`.
+        reference_time: time constant of the reference filters [s].
+        preview: samples that the reference is known ahead.
+        budget: iterations that the solver may take.
+        coast: samples without measurement until the motors are held.
+        disturbances: that are measured.
+    """
+
+    trust: float
+    reference_time: float
+    preview: int = 0
+    budget: int = 100
+    coast: int = 25
+    disturbances: tuple[MeasuredDisturbance, ...] = ()
+
+
+def assemble(problem: Problem, found: Matrices, tuning: Tuning) -> tuple[Matrix, ...]:
+    """Return the arrays in the order of `NAMES`."""
+    p, n = problem, problem.order
+    plants = [scenario.axis(i) for scenario in p.scenarios for i in range(2)]
+    Ts = plants[0].sample_time
+    AH = np.linalg.solve(found.H, found.A.T).T
+    angle_at = 3.0
+    constants = np.array([
+        Ts, p.rows, len(p.scenarios), n, p.dead_time, len(p.starts), p.slacks, tuning.preview,
+        min(round(tuning.reference_time / Ts), tuning.preview), len(tuning.disturbances), tuning.budget, _TOLERANCE,
+        tuning.coast, angle_at, angle_at + float(p.angles),
+    ])  # fmt: skip
+    keep = math.exp(-Ts / tuning.reference_time) if tuning.reference_time > 0.0 else 0.0
+    disturbances = np.zeros((max(1, len(tuning.disturbances)), 3))
+    for row, item in zip(disturbances, tuning.disturbances, strict=False):
+        row[:] = item.pitch, item.roll, math.exp(-Ts / item.time) if item.time > 0.0 else 0.0
+    return (
+        constants,
+        np.vstack([padded(plant, n)[0] for plant in plants]),
+        np.array([padded(plant, n)[1] for plant in plants]),
+        observer_gains(np.array([disturbance_pole(plant) for plant in plants]), tuning.trust),
+        np.array([rest_states(plant, n) for plant in plants]),
+        np.array([float(plant.delay) for plant in plants]),
+        disturbances,
+        np.full(3, keep),
+        p.T,
+        np.array(p.starts, dtype=np.float64),
+        -np.linalg.solve(found.H, found.F),
+        found.A,
+        found.A @ AH.T,
+        found.E,
+        found.kinds,
+        AH,
+        found.H,
+        found.F,
+        np.array([max(1.0, float(np.abs(found.H).max()))]),
+    )
+
+
+def observer_gains(poles: Vector, trust: float) -> Matrix:
+    """Return (plants, 3): gains on level and rate of the output disturbance, and the pole of its rate.
+
+    Of a steady Kalman filter whose measurement noise is one and whose noise on the rate is `trust`: the model's own
+    states are not corrected, so that one number says how much of what is measured is believed.
+
+    Args:
+        poles: (plants,) of the rates.
+        trust: > 0.
+    """
+    rows = []
+    C = np.array([[1.0, 0.0]])
+    for a in poles:
+        A = np.array([[1.0, 1.0], [0.0, a]])
+        P = solve_discrete_are(A.T, C.T, np.diag([0.0, trust**2]), np.eye(1))
+        gain = P @ C.T / (1.0 + P[0, 0])
+        rows.append([gain[0, 0], gain[1, 0], a])
+    return np.array(rows)
+
+
+def observer_bandwidth(gains: Vector, sample_time: float) -> float:
+    """Return how fast the slower pole of the observer's error is [rad/s], from a row of `observer_gains`."""
+    A = np.array([[1.0, 1.0], [0.0, gains[2]]])
+    error = A @ (np.eye(2) - np.outer(gains[:2], [1.0, 0.0]))
+    slowest = float(np.abs(np.linalg.eigvals(error)).max())
+    return -math.log(max(slowest, 1e-6)) / sample_time
+
+
+def with_gains(arrays: tuple[Matrix, ...], trust: float) -> tuple[Matrix, ...]:
+    """Return the arrays with another trust of the observer in what is measured."""
+    items = list(arrays)
+    items[3] = observer_gains(items[3][:, 2], trust)
+    return tuple(items)
+
+
+def with_filter(arrays: tuple[Matrix, ...], reference_time: float) -> tuple[Matrix, ...]:
+    """Return the arrays with other reference filters."""
+    items = list(arrays)
+    Ts = float(items[0][0])
+    keep = math.exp(-Ts / reference_time) if reference_time > 0.0 else 0.0
+    constants: Vector = items[0].copy()
+    constants[8] = min(round(reference_time / Ts), constants[7])
+    items[0], items[7] = constants, np.full(3, keep)
+    return tuple(items)

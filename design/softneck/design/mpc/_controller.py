@@ -1,0 +1,181 @@
+"""The linear predictive controller, in loops, FMUs and files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import control
+import numpy as np
+from numpy.typing import ArrayLike
+
+from softneck.core import Block, FileFormatError, Matrix, Port, State, Vector, write_archive
+
+from .._controller import LinearController
+from . import _mpc_runtime as rt
+from ._arrays import NAMES
+from ._disturbance import MeasuredDisturbance
+from ._lti import lti
+
+_RUNTIME = "softneck.design.mpc._mpc_runtime"
+STATUS = {0.0: "not started", rt.MPC_OPTIMAL: "optimal", rt.MPC_SOFT: "softened", rt.MPC_PLAN: "previous plan",
+          rt.MPC_HOLDING: "holding"}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class MpcController:
+    """A linear predictive controller of pitch and roll; `MpcSettings.design` makes it.
+
+    Attributes:
+        sample_time: [s].
+        arrays: what the runtime reads, by `_arrays.NAMES`.
+        position_limit, slew_limit, lead_limit: of each motor [rad], [rad/s], [rad].
+        angle_limit: soft, of pitch and roll [rad], or None.
+        minimum_tautness: soft, of each tendon [rad], or None.
+        disturbances: that are measured.
+        order: of the loop it is for.
+        design: JSON values: the settings and what was found.
+    """
+
+    sample_time: float
+    arrays: tuple[Matrix, ...]
+    position_limit: float
+    slew_limit: float
+    lead_limit: float
+    angle_limit: float | None
+    minimum_tautness: float | None
+    disturbances: tuple[MeasuredDisturbance, ...]
+    order: str
+    design: Mapping[str, Any]
+
+    kind = "mpc"
+
+    def block(self) -> Block:
+        """Return the controller as a block of role "controller"."""
+        plain = LinearController(
+            kind="mpc", sample_time=self.sample_time, arrays=(), position_limit=self.position_limit,
+            slew_limit=self.slew_limit, lead_limit=self.lead_limit, order=self.order, design={},
+        ).block()  # fmt: skip
+        ahead = tuple(
+            Port(name=f"{axis}_reference_ahead", unit="rad", minimum=-rt.MPC_REFERENCE_LIMIT,
+                 maximum=rt.MPC_REFERENCE_LIMIT, description=f"wanted {axis} {self.preview:g} s from now")
+            for axis in ("pitch", "roll")
+        ) if self.preview > 0.0 else ()  # fmt: skip
+        measured = tuple(
+            Port(name=item.name, unit=item.unit, description="measured disturbance") for item in self.disturbances
+        )
+        soft: tuple[Port, ...] = ()
+        if self.angle_limit is not None:
+            soft += (Port(name="angle_limit", unit="rad", start=self.angle_limit, minimum=0.01, maximum=0.8),)
+        if self.minimum_tautness is not None:
+            soft += (Port(name="minimum_tautness", unit="rad", start=self.minimum_tautness, minimum=-12.0, maximum=6.0),)
+        return Block(
+            kind="mpc",
+            role="controller",
+            runtime=_RUNTIME,
+            sample_time=self.sample_time,
+            arrays=self.arrays,
+            inputs=(*plain.inputs, *ahead, *measured),
+            outputs=plain.outputs,
+            parameters=(*plain.parameters, *soft),
+        )
+
+    @property
+    def preview(self) -> float:
+        """How far ahead the reference is known [s]."""
+        return float(self.arrays[0][rt.MPC_AHEAD]) * self.sample_time
+
+    def initial_state(self, **parameters: float) -> State:
+        """Return the state at the start; parameters are the limits by name."""
+        return self.block().initial_state(**parameters)
+
+    def step(self, state: State, inputs: ArrayLike) -> tuple[State, Vector]:
+        """Return the next state and the set-points valid now; inputs and outputs as in `block()`."""
+        return self.block().step(state, inputs)
+
+    def ss(self) -> control.StateSpace:
+        """Return it without limits, from (pitch_reference, roll_reference, pitch, roll) to (theta_i, phi_i)."""
+        return lti(self.arrays)
+
+    def to_lti(self) -> control.StateSpace:
+        """Return `ss()`: the controller while no limit is active."""
+        return self.ss()
+
+    def review(self) -> list[str]:
+        """Return what is wrong or doubtful with this set-up, one line each; empty if nothing is."""
+        from ._review import review
+
+        return review(self)
+
+    def summary(self) -> str:
+        """Return some lines for people."""
+        q, d = self.arrays[0], self.design
+        settings = d.get("settings", {})
+        lines = [
+            f"mpc controller, {self.sample_time * 1e3:g} ms, {self.order} order, {d.get('extra_delay', 0)} samples of "
+            "delay added to the plant for it",
+            f"  {self.arrays[16].shape[0]} unknowns ({int(q[rt.MPC_MOVES])} moves of 3 motors, {int(q[rt.MPC_SLACKS])} "
+            f"slacks), {self.arrays[14].shape[0]} rows, horizon {settings.get('horizon')} samples behind the dead time, "
+            f"{int(q[rt.MPC_SCENARIOS])} scenario(s)",
+            f"  limits: |P| <= {self.position_limit:g} rad, slew {self.slew_limit:g} rad/s, lead {self.lead_limit:g} rad"
+            + ("" if self.angle_limit is None else f", |angle| <= {np.degrees(self.angle_limit):.3g} deg (soft)")
+            + ("" if self.minimum_tautness is None else f", tautness >= {self.minimum_tautness:g} rad (soft)"),
+            f"  observer {d.get('observer_bandwidth_rad_s', 0.0):.3g} rad/s, reference filter "
+            f"{d.get('reference_time_s', 0.0):.3g} s; Ms "
+            + " and ".join(f"{value:.3g}" for value in d.get("sensitivity", []))
+            + " (as identified, small moves)",
+        ]
+        if d.get("worst_sensitivity") is not None:
+            lines.append(f"  Ms at most {d['worst_sensitivity']:.3g} over samples of the family")
+        return "\n".join(lines + [f"  review: {line}" for line in self.review()])
+
+    def save(self, path: str | Path, *, force: bool = False) -> None:
+        """Write the controller to one `.npz` file."""
+        block = self.block()
+        header = {
+            "kind": "mpc",
+            "sample_time": self.sample_time,
+            **{name: getattr(self, name) for name in _LIMITS},
+            "disturbances": [asdict(item) for item in self.disturbances],
+            "order": self.order,
+            "design": dict(self.design),
+            "inputs": [port.name for port in block.inputs],
+            "outputs": [port.name for port in block.outputs],
+            "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
+        }
+        write_archive(path, header, dict(zip(NAMES, self.arrays, strict=True)), force=force)
+
+    @classmethod
+    def from_archive(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> MpcController:
+        """Return the controller that `save` wrote; `softneck.core.load` calls this."""
+        items = tuple(np.ascontiguousarray(arrays[name], dtype=np.float64) for name in NAMES)
+        _check_shapes(items)
+        return cls(
+            sample_time=float(header["sample_time"]),
+            arrays=items,
+            **{name: None if header[name] is None else float(header[name]) for name in _LIMITS},  # type: ignore[arg-type]
+            disturbances=tuple(MeasuredDisturbance(**item) for item in header["disturbances"]),
+            order=str(header["order"]),
+            design=dict(header["design"]),
+        )
+
+
+_LIMITS = ("position_limit", "slew_limit", "lead_limit", "angle_limit", "minimum_tautness")
+
+
+def _check_shapes(items: tuple[Matrix, ...]) -> None:
+    q = items[0]
+    if q.shape != (15,) or not np.isfinite(q).all():
+        raise FileFormatError("the controller's constants are damaged; design it again.")
+    S, n, L = int(q[rt.MPC_SCENARIOS]), int(q[rt.MPC_ORDER]), int(q[rt.MPC_ROWS])
+    b = int(q[rt.MPC_MOVES])
+    nz, m, p = 3 * b + int(q[rt.MPC_SLACKS]), items[14].shape[0], 2 * S * (n + 2) + 2 * L + 5
+    disturbances = max(1, int(q[rt.MPC_DISTURBANCES]))
+    shapes = (
+        (15,), (2 * S * n, n), (2 * S, n), (2 * S, 3), (2 * S, n), (2 * S,), (disturbances, 3), (3,), (3, 3), (b,),
+        (nz, p), (m, nz), (m, m), (m, p), (m, 2), (m, nz), (nz, nz), (nz, p), (1,),
+    )  # fmt: skip
+    if any(item.shape != shape or not np.isfinite(item).all() for item, shape in zip(items, shapes, strict=True)):
+        raise FileFormatError("the controller's arrays have wrong shapes or are not finite; design it again.")

@@ -1,0 +1,280 @@
+"""The linear controller's problem, written once in CasADi; its QP's matrices come out of that expression."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.linalg import solve_discrete_are
+
+from softneck.core import Matrix, SettingsError, Vector
+from softneck.estimation import AxisPlant
+
+from . import _mpc_runtime as rt
+
+# Rounding of a Cholesky factor; beyond it H has no inverse worth the name.
+_LARGEST_CONDITION = 1e12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scenario:
+    """What the neck may be: a plant for each axis and how much this counts in the cost."""
+
+    pitch: AxisPlant
+    roll: AxisPlant
+    weight: float
+
+    def axis(self, i: int) -> AxisPlant:
+        """Return pitch (0) or roll (1)."""
+        return (self.pitch, self.roll)[i]
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Problem:
+    """What is asked of the controller, in numbers.
+
+    Attributes:
+        scenarios: the first is the nominal one.
+        horizon: N, samples after each axis' dead time.
+        starts: samples at which the motors may move.
+        T: (3, 3) of Eq. 9-11.
+        output_weight: (2,) on angle errors [1/rad^2].
+        move_weight: on moves of the motors [1/rad^2].
+        cocontraction_weight: on co-contraction's error [1/rad^2].
+        slack_weight: on violations of soft limits [1/rad^2].
+        angles: whether angles are limited.
+        tautness: (3, 2) how much an angle loosens each tendon [rad/rad]; None for no limit.
+    """
+
+    scenarios: tuple[Scenario, ...]
+    horizon: int
+    starts: tuple[int, ...]
+    T: Matrix
+    output_weight: Vector
+    move_weight: float
+    cocontraction_weight: float
+    slack_weight: float
+    angles: bool = False
+    tautness: Matrix | None = None
+
+    @property
+    def order(self) -> int:
+        """n, states of an axis."""
+        return max(s.axis(i).order for s in self.scenarios for i in range(2))
+
+    @property
+    def dead_time(self) -> int:
+        """D, the longest dead time in samples."""
+        return max(s.axis(i).delay for s in self.scenarios for i in range(2))
+
+    @property
+    def rows(self) -> int:
+        """L, samples of which the reference is needed."""
+        return self.horizon + self.dead_time
+
+    @property
+    def slacks(self) -> int:
+        """Number of slack variables."""
+        return int(self.angles) + int(self.tautness is not None)
+
+    @property
+    def variables(self) -> int:
+        """Moves and slacks."""
+        return 3 * len(self.starts) + self.slacks
+
+    @property
+    def parameters(self) -> int:
+        """Length of theta, see `_mpc_runtime`."""
+        return 2 * len(self.scenarios) * (self.order + 2) + 2 * self.rows + 5
+
+    @property
+    def checked(self) -> tuple[int, ...]:
+        """Samples after the dead time at which soft limits are looked at: at the end of each move's hold."""
+        return (*self.starts[1:], self.horizon)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Matrices:
+    """`min 1/2 z'Hz + (F theta)'z` subject to `lower <= A z + E theta <= upper`, bounds by kind of row.
+
+    Attributes:
+        H: (nz, nz).
+        F: (nz, n_theta).
+        A: (m, nz).
+        E: (m, n_theta).
+        kinds: (m, 2) kind of each row, and the motor or axis that it is of.
+    """
+
+    H: Matrix
+    F: Matrix
+    A: Matrix
+    E: Matrix
+    kinds: Matrix
+
+
+def padded(plant: AxisPlant, n: int) -> tuple[Matrix, Vector]:
+    """Return A (n, n) and B (n,) of the observable form, with states that nothing reaches behind its own."""
+    A, B, _ = plant.observable_form()
+    whole, column = np.zeros((n, n)), np.zeros(n)
+    whole[: plant.order, : plant.order], column[: plant.order] = A, B
+    return whole, column
+
+
+def rest_states(plant: AxisPlant, n: int) -> Vector:
+    """Return (n,) the states at rest under an input of one."""
+    A, B = padded(plant, n)
+    return np.linalg.solve(np.eye(n) - A, B)
+
+
+def disturbance_pole(plant: AxisPlant) -> float:
+    """Return a of the output disturbance: the plant's slowest pole, by its size."""
+    # Below 0.1 a rate would be gone within a sample, and the observer has to divide by it.
+    return float(np.clip(np.abs(np.roots(plant.denominator)).max(initial=0.0), 0.1, 0.995))
+
+
+def expression(problem: Problem) -> dict[str, Any]:
+    """Return the problem as CasADi expressions: z, theta, cost, rows, and the kinds of rows."""
+    import casadi as ca
+
+    p = problem
+    S, n, L, N = len(p.scenarios), p.order, p.rows, p.horizon
+    z, theta = ca.SX.sym("z", p.variables), ca.SX.sym("theta", p.parameters)
+    at = 2 * S * n
+    offset = [(theta[at + 2 * i], theta[at + 2 * i + 1]) for i in range(2 * S)]
+    at += 4 * S
+    wanted = [theta[at + axis * L : at + (axis + 1) * L] for axis in range(2)]
+    at += 2 * L
+    held, common = theta[at : at + 3], theta[at + 3]
+    moves = [z[3 * b : 3 * b + 3] for b in range(len(p.starts))]
+    slack = [z[3 * len(p.starts) + i] for i in range(p.slacks)]
+
+    motors, positions, now = [], [], held
+    for i in range(N):
+        if i in p.starts:
+            now = now + moves[p.starts.index(i)]
+            positions.append(now)
+        motors.append(now)
+    inputs = [ca.mtimes(ca.DM(p.T), motor) for motor in motors]
+
+    cost = sum((p.move_weight * ca.sumsqr(move) for move in moves), ca.SX(0))
+    angles: list[list[list[Any]]] = []
+    for s, scenario in enumerate(p.scenarios):
+        ends, paths = [], []
+        for axis in range(2):
+            plant = scenario.axis(axis)
+            A, B = padded(plant, n)
+            level, rate = offset[2 * s + axis]
+            a = disturbance_pole(plant)
+            x = theta[(2 * s + axis) * n : (2 * s + axis + 1) * n]
+            path = []
+            for i, v in enumerate(inputs):
+                x = ca.mtimes(ca.DM(A), x) + ca.DM(B) * v[axis]
+                path.append(x[0] + level + rate * (1.0 - a ** (plant.delay + 1 + i)) / (1.0 - a))
+            errors = [path[i] - wanted[axis][plant.delay + i] for i in range(N - 1)]
+            cost += scenario.weight * p.output_weight[axis] * sum(e**2 for e in errors)
+            paths.append(path)
+            goal = wanted[axis][plant.delay + N - 1] - level - rate / (1.0 - a)
+            ends.append((x, plant, goal / plant.static_gain))
+        cost += scenario.weight * _terminal(p, scenario, ends, motors[-1], common)
+        angles.append(paths)
+    cost += p.cocontraction_weight * sum((v[2] - common) ** 2 for v in inputs[:-1])
+    cost += p.slack_weight * sum((value**2 + 0.1 * value for value in slack), ca.SX(0))
+
+    rows, kinds = _hard_rows(moves, positions, slack)
+    _soft_rows(p, angles, motors, slack, rows, kinds)
+    return {"z": z, "theta": theta, "cost": cost, "rows": ca.vertcat(*rows), "kinds": np.array(kinds)}
+
+
+def _hard_rows(moves: list[Any], positions: list[Any], slack: list[Any]) -> tuple[list[Any], list[tuple[float, float]]]:
+    """Return slew rows, position rows and the slacks' own."""
+    rows: list[Any] = []
+    kinds: list[tuple[float, float]] = []
+    for kind, group in ((rt.MPC_ROW_MOVE, moves), (rt.MPC_ROW_POSITION, positions)):
+        for value in group:
+            rows += [value[j] for j in range(3)]
+            kinds += [(kind, float(j)) for j in range(3)]
+    rows += slack
+    kinds += [(rt.MPC_ROW_SLACK, float(i)) for i in range(len(slack))]
+    return rows, kinds
+
+
+def _soft_rows(
+    p: Problem, angles: list[list[list[Any]]], motors: list[Any], slack: list[Any], rows: list[Any],
+    kinds: list[tuple[float, float]],
+) -> None:  # fmt: skip
+    """Append limits of angles in all scenarios, and of tautness in the nominal one."""
+    if p.angles:
+        for paths in angles:
+            for axis in range(2):
+                for i in p.checked:
+                    rows += [paths[axis][i - 1] - slack[0], paths[axis][i - 1] + slack[0]]
+                    kinds += [(rt.MPC_ROW_ANGLE_HIGH, float(axis)), (rt.MPC_ROW_ANGLE_LOW, float(axis))]
+    if p.tautness is not None:
+        for i in p.checked:
+            for j in range(3):
+                loosened = sum(p.tautness[j, axis] * angles[0][axis][i - 1] for axis in range(2))
+                rows.append(motors[i - 1][j] - loosened + slack[-1])
+                kinds.append((rt.MPC_ROW_TAUT, float(j)))
+
+
+def _terminal(p: Problem, scenario: Scenario, ends: list[Any], motors: Any, common: Any) -> Any:
+    """Return the cost to go after the horizon, of an LQR without limits (Riccati), around where it comes to rest."""
+    import casadi as ca
+
+    P = terminal_matrix(p, scenario)
+    n = p.order
+    goal = ca.mtimes(ca.DM(np.linalg.inv(p.T)), ca.vertcat(ends[0][2], ends[1][2], common))
+    parts = [x - ca.DM(rest_states(plant, n)) * v for x, plant, v in ends]
+    error = ca.vertcat(*parts, motors - goal)
+    return ca.bilin(ca.DM(P), error, error)
+
+
+def terminal_matrix(p: Problem, scenario: Scenario) -> Matrix:
+    """Return P (2n + 3, 2n + 3) of the Riccati equation for states of both axes and motors, moves as inputs."""
+    n = p.order
+    A, B = np.eye(2 * n + 3), np.zeros((2 * n + 3, 3))
+    Q = np.zeros_like(A)
+    for axis in range(2):
+        a, b = padded(scenario.axis(axis), n)
+        place = slice(axis * n, (axis + 1) * n)
+        A[place, place], A[place, 2 * n :] = a, np.outer(b, p.T[axis])
+        B[place] = np.outer(b, p.T[axis])
+        Q[axis * n, axis * n] = p.output_weight[axis]
+    B[2 * n :] = np.eye(3)
+    # Of the scenarios' weights, which sum to one, each carries its part of co-contraction and moves.
+    Q[2 * n :, 2 * n :] = p.cocontraction_weight * np.outer(p.T[2], p.T[2])
+    try:
+        return solve_discrete_are(A, B, Q, p.move_weight * np.eye(3))
+    except np.linalg.LinAlgError as error:
+        raise SettingsError(f"the terminal cost has no solution ({error}); check weights and model.") from error
+
+
+def matrices(problem: Problem) -> Matrices:
+    """Return the QP's matrices out of the expression.
+
+    Raises:
+        SettingsError: the cost is not strictly convex.
+    """
+    import casadi as ca
+
+    e = expression(problem)
+    H, gradient = ca.hessian(e["cost"], e["z"])
+    zero = ca.SX.zeros(problem.variables)
+    f = ca.substitute(gradient, e["z"], zero)
+    out = ca.Function(
+        "matrices", [],
+        [H, ca.jacobian(f, e["theta"]), ca.jacobian(e["rows"], e["z"]), ca.jacobian(e["rows"], e["theta"]),
+         ca.substitute(f, e["theta"], ca.SX.zeros(problem.parameters))],
+    )()  # fmt: skip
+    H, F, A, E, constant = (np.array(out[f"o{i}"].full()) for i in range(5))
+    # The last entry of theta is one.
+    F[:, -1] += constant[:, 0]
+    H = 0.5 * (H + H.T)
+    values = np.linalg.eigvalsh(H)
+    if values[0] <= 0.0 or values[-1] > _LARGEST_CONDITION * values[0]:
+        raise SettingsError(
+            f"the cost is not strictly convex (eigenvalues {values[0]:.3g} to {values[-1]:.3g}); all weights must be "
+            "positive and not further apart."
+        )
+    return Matrices(H, F, A, E, e["kinds"])

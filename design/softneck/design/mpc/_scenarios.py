@@ -1,0 +1,56 @@
+"""Samples of an uncertain plant as scenarios of the prediction."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from softneck.core import SettingsError
+from softneck.estimation import AxisPlant, LinearNeck, axis_plant
+
+from ._prediction import Scenario
+from ._tuning import Pair
+
+# The nominal plant counts as much as all other scenarios together.
+_NOMINAL_WEIGHT = 0.5
+# That many samples of a family judge robustness; they are spread evenly over all.
+_JUDGES = 12
+
+
+def sample_pairs(model: Any, least_delay: float) -> list[Pair]:
+    """Return samples of a family, pitch with roll by the order of their static gains; none for a single model."""
+    if not hasattr(model, "samples"):
+        return []
+    axes = []
+    for axis in ("pitch", "roll"):
+        plants = [_plant(tf, axis).delayed(least_delay) for tf in model.samples(axis)]
+        axes.append(sorted(plants, key=lambda plant: plant.static_gain))
+    count = min(_JUDGES, *(len(plants) for plants in axes))
+    picks = [np.linspace(0, len(plants) - 1, count).round().astype(int) for plants in axes]
+    return [(axes[0][i], axes[1][j]) for i, j in zip(*picks, strict=True)]
+
+
+def chosen_scenarios(model: Any, nominal: Pair, count: int, least_delay: float, extra_delay: int) -> list[Scenario]:
+    """Return the nominal plant and `count` samples, from the lowest to the highest gain.
+
+    Raises:
+        SettingsError: scenarios of a model that has no samples.
+    """
+    if count == 0:
+        return [Scenario(*nominal, 1.0)]
+    pairs = sample_pairs(model, least_delay)
+    if not pairs:
+        raise SettingsError("scenarios are samples of a family; give a FAMILY (`softneck family`), or `scenarios=0`.")
+    picks = np.unique(np.linspace(0, len(pairs) - 1, min(count, len(pairs))).round().astype(int))
+    weight = (1.0 - _NOMINAL_WEIGHT) / picks.size
+    others = []
+    for pair in (pairs[i] for i in picks):
+        first, second = (replace(plant, delay=plant.delay + extra_delay) for plant in pair)
+        others.append(Scenario(first, second, weight))
+    return [Scenario(*nominal, _NOMINAL_WEIGHT), *others]
+
+
+def _plant(tf: Any, axis: str) -> AxisPlant:
+    return axis_plant(LinearNeck(pitch=tf, roll=tf), axis)

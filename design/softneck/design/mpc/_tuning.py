@@ -1,0 +1,173 @@
+"""From bandwidth and robustness to weights, observer and reference filter."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.linalg import block_diag, solve_discrete_are
+
+from softneck.core import Matrix, SettingsError, Vector
+from softneck.estimation import AxisPlant
+
+from ._arrays import with_filter, with_gains
+from ._lti import system
+
+Pair = tuple[AxisPlant, AxisPlant]
+
+# Decades of the move weight that are searched, relative to errors of the input.
+_WEIGHTS = (-6.0, 6.0)
+# Trust of the observers that are tried.
+_LEAST, _MOST = 1e-4, 1e3
+_HALVINGS = 18
+# A step response is judged over this long [s].
+_HORIZON = 4.0
+_SLOWEST_FILTER = 2.0
+
+
+def move_weight(plant: AxisPlant, bandwidth: float) -> float:
+    """Return the weight on moves of an axis' input with which the slowest pole of its LQR is as fast as `bandwidth`.
+
+    The error is weighted by one over the squared static gain, so that both count in rad of the input.
+    """
+    low, high = _WEIGHTS
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        if _slowest(plant, 10.0**middle) > math.exp(-bandwidth * plant.sample_time):
+            high = middle
+        else:
+            low = middle
+    return float(10.0**low)
+
+
+def _slowest(plant: AxisPlant, weight: float) -> float:
+    """Return the spectral radius of the loop of (states, held input) under the LQR."""
+    A0, B0, C0 = plant.observable_form()
+    n = plant.order
+    A, B = np.eye(n + 1), np.zeros((n + 1, 1))
+    A[:n, :n], A[:n, n], B[:n, 0], B[n, 0] = A0, B0, B0, 1.0
+    Q = np.zeros((n + 1, n + 1))
+    Q[:n, :n] = np.outer(C0, C0) / plant.static_gain**2
+    R = np.array([[weight]])
+    P = solve_discrete_are(A, B, Q, R)
+    K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+    return float(np.abs(np.linalg.eigvals(A - B @ K)).max())
+
+
+def sensitivity(
+    parts: tuple[Matrix, Matrix, Matrix, Matrix], plants: Pair, extra_delay: int, frequency: Vector
+) -> float:
+    """Return Ms: the largest singular value of (I - G C)^-1 at the angles, over `frequency` [rad/s]."""
+    A, B, C, D = parts
+    z = np.exp(1j * frequency * plants[0].sample_time)
+    values, V = np.linalg.eig(A)
+    if np.linalg.cond(V) < 1e8:
+        left, right = C @ V, np.linalg.solve(V, B[:, 2:].astype(complex))
+        K = np.einsum("on,kn,ni->koi", left, 1.0 / (z[:, None] - values), right) + D[:, 2:]
+    else:
+        eye = np.eye(A.shape[0])
+        K = np.array([C @ np.linalg.solve(point * eye - A, B[:, 2:]) + D[:, 2:] for point in z])
+    G = np.array([plant.response(frequency, extra_delay=extra_delay) for plant in plants]).T
+    S = np.linalg.inv(np.eye(2) - G[:, :, None] * K)
+    return float(np.linalg.norm(S, ord=2, axis=(1, 2)).max())
+
+
+def closed(parts: tuple[Matrix, Matrix, Matrix, Matrix], plants: Pair, extra_delay: int) -> tuple[Matrix, Matrix, Matrix]:
+    """Return A, B (from both references) and C (to both angles) of the loop with its dead time in full."""
+    A, B, C, D = parts
+    sides = [_realised(plant, plant.delay + extra_delay) for plant in plants]
+    Ap, Bp, Cp = (np.asarray(block_diag(*items)) for items in zip(*sides, strict=True))
+    top = np.hstack([Ap + Bp @ D[:, 2:] @ Cp, Bp @ C])
+    bottom = np.hstack([B[:, 2:] @ Cp, A])
+    return (
+        np.vstack([top, bottom]),
+        np.vstack([Bp @ D[:, :2], B[:, :2]]),
+        np.hstack([Cp, np.zeros((2, A.shape[0]))]),
+    )
+
+
+def _realised(plant: AxisPlant, delay: int) -> tuple[Matrix, Matrix, Matrix]:
+    """Return A, B (n + delay, 1), C (1, n + delay) of a plant behind a chain of samples."""
+    A0, B0, C0 = plant.observable_form()
+    n = plant.order
+    A, B = np.zeros((n + delay, n + delay)), np.zeros((n + delay, 1))
+    A[:n, :n] = A0
+    if delay == 0:
+        B[:n, 0] = B0
+    else:
+        A[:n, n + delay - 1] = B0
+        A[n + 1 :, n : n + delay - 1] = np.eye(delay - 1)
+        B[n, 0] = 1.0
+    return A, B, np.concatenate([C0, np.zeros(delay)])[None, :]
+
+
+def radius(parts: tuple[Matrix, Matrix, Matrix, Matrix], plants: Pair, extra_delay: int) -> float:
+    """Return the spectral radius of the loop."""
+    return float(np.abs(np.linalg.eigvals(closed(parts, plants, extra_delay)[0])).max())
+
+
+def observer_trust(
+    arrays: tuple[Matrix, ...], families: list[tuple[Pair, float]], extra_delay: int, frequency: Vector
+) -> float:
+    """Return the trust of the fastest observer whose loop keeps every plant's bound on Ms.
+
+    Args:
+        arrays: of the controller.
+        families: plants, each with its bound.
+        extra_delay: samples added to their delay.
+        frequency: at which Ms is looked at [rad/s].
+
+    Raises:
+        SettingsError: not even the slowest does.
+    """
+
+    def keeps(trust: float) -> bool:
+        parts = system(with_gains(arrays, trust))
+        return all(
+            sensitivity(parts, pair, extra_delay, frequency) <= bound and radius(parts, pair, extra_delay) < 1.0
+            for pair, bound in families
+        )
+
+    low, high = math.log(_LEAST), math.log(_MOST)
+    if keeps(_MOST):
+        return _MOST
+    if not keeps(_LEAST):
+        raise SettingsError("no observer keeps the asked robustness; ask for less `bandwidth` or more `max_sensitivity`.")
+    for _ in range(_HALVINGS // 2 + 2):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if keeps(math.exp(middle)) else (low, middle)
+    return math.exp(low)
+
+
+def reference_time(
+    arrays: tuple[Matrix, ...], families: list[Pair], extra_delay: int, *, overshoot: float
+) -> float:
+    """Return the least time constant [s] of the reference filter with which no plant overshoots by more than this part.
+
+    Raises:
+        SettingsError: none does that is fast enough.
+    """
+    Ts = families[0][0].sample_time
+    low, high = 0, round(_SLOWEST_FILTER / Ts)
+
+    def keeps(samples: int) -> bool:
+        parts = system(with_filter(arrays, samples * Ts))
+        return all(_peak(parts, pair, extra_delay) <= 1.0 + overshoot for pair in families)
+
+    if not keeps(high):
+        raise SettingsError("no reference filter keeps the overshoot; ask for less `max_sensitivity` or `bandwidth`.")
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if keeps(middle) else (middle, high)
+    return 0.0 if keeps(low) else high * Ts
+
+
+def _peak(parts: tuple[Matrix, Matrix, Matrix, Matrix], pair: Pair, extra_delay: int) -> float:
+    """Return the largest angle after unit steps of both references, without limits."""
+    A, B, C = closed(parts, pair, extra_delay)
+    u, x, peak = np.ones(2), np.zeros(A.shape[0]), 0.0
+    drive = B @ u
+    for _ in range(math.ceil(_HORIZON / pair[0].sample_time)):
+        x = A @ x + drive
+        peak = max(peak, float((C @ x).max()))
+    return peak
