@@ -19,6 +19,7 @@ from ._compile import Runtime as Runtime
 from ._compile import compiled_name as compiled_name
 from ._compile import have_numba as have_numba
 from ._compile import load_functions as load_functions
+from ._compile import load_linked as load_linked
 from ._compile import load_runtime as load_runtime
 from ._errors import CheckFailedError as CheckFailedError
 from ._errors import DataError as DataError
