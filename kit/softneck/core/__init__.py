@@ -8,6 +8,13 @@ from ._block import Port as Port
 from ._block import State as State
 from ._bundle import bundle as bundle
 from ._bundle import content_name as content_name
+from ._certificate import CERTIFICATE_ENDING as CERTIFICATE_ENDING
+from ._certificate import Certificate as Certificate
+from ._certificate import certificate_contents as certificate_contents
+from ._certificate import certificate_path as certificate_path
+from ._certificate import check_certificate as check_certificate
+from ._certificate import read_certificate as read_certificate
+from ._certificate import write_certificate as write_certificate
 from ._checks import finite_vector as finite_vector
 from ._checks import require_between as require_between
 from ._checks import require_finite as require_finite
@@ -19,6 +26,7 @@ from ._compile import Runtime as Runtime
 from ._compile import compiled_name as compiled_name
 from ._compile import have_numba as have_numba
 from ._compile import load_functions as load_functions
+from ._compile import load_linked as load_linked
 from ._compile import load_runtime as load_runtime
 from ._errors import CheckFailedError as CheckFailedError
 from ._errors import DataError as DataError

@@ -26,12 +26,13 @@ _ALLOWED = {"numpy", "math", "__future__"}
 
 
 @cache
-def bundle(runtime: str, *, loops: bool = True) -> str:
+def bundle(runtime: str, *, loops: bool = True, skip: tuple[str, ...] = ()) -> str:
     """Return the source text of runtime module `runtime` with all it needs.
 
     Args:
         runtime: dotted name, with members in brackets.
         loops: add the loops over `step`; false for a module of plain functions.
+        skip: functions to leave out, which the caller writes otherwise.
 
     Raises:
         SettingsError: a module imports what a runtime must not, or two define the same name.
@@ -46,7 +47,7 @@ def bundle(runtime: str, *, loops: bool = True) -> str:
         if module == _MEMBERS and members:
             parts.append(member_calls([count for _, count in members], _own_arrays(outer)))
         else:
-            parts.append(_stripped(module, names, skip=set()))
+            parts.append(_stripped(module, names, skip=set(skip)))
     if loops:
         parts.append(_stripped(_LOOPS, names, skip={"step"}))
     return "\n".join(parts)

@@ -6,7 +6,7 @@ import importlib.util
 import sys
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -73,6 +73,32 @@ def _functions(module: str, compiled: bool) -> ModuleType:
     namespace = _import_text(bundle(module, loops=False), compiled=compiled)
     if compiled:
         _compile(namespace)
+    return namespace
+
+
+def load_linked(module: str, runtimes: Sequence[str]) -> ModuleType:
+    """Return the functions of runtime module `module`, whose `part_step(part, ...)` calls the step of `runtimes[part]`.
+
+    The steps are those that `load_runtime` compiled: they are linked, not compiled again, and give the same bits.
+    """
+    with _LOADING:
+        return _linked(module, tuple(runtimes))
+
+
+@cache
+def _linked(module: str, runtimes: tuple[str, ...]) -> ModuleType:
+    arguments = "parameters, state, inputs, outputs"
+    lines = ["from softneck.core import load_runtime"]
+    for i, runtime in enumerate(runtimes):
+        # Its content's name is part of this text: another runtime makes another module, and another cache.
+        lines.append(f'linked_{i} = load_runtime("{runtime}").step  # {compiled_name(bundle(runtime))}')
+    lines += ["del load_runtime", "", "", f"def part_step(part, arrays, {arguments}):"]
+    for i in range(len(runtimes)):
+        # Constant indices: a compiler knows the type of each part's arrays then.
+        lines += [f"    if part == {i}:", f"        linked_{i}(arrays[{i}], {arguments})"]
+    text = bundle(module, loops=False, skip=("part_step",)) + "\n".join(lines) + "\n"
+    namespace = _import_text(text, compiled=True)
+    _compile(namespace)
     return namespace
 
 

@@ -15,6 +15,12 @@ from ._loop_file import load_loop as load_loop
 from ._loop_file import make_loop as make_loop
 from ._loop_file import reference_of as reference_of
 from ._result import Result as Result
+from ._run_study import study as study
 from ._simulate import LoopSetup as LoopSetup
 from ._simulate import simulate as simulate
 from ._ssp import write_ssp as write_ssp
+from ._store import read_runs as read_runs
+from ._study import Study as Study
+from ._study import load_study as load_study
+from ._study import make_study as make_study
+from ._vary import Vary as Vary

@@ -44,6 +44,7 @@ class FmuPart:
         sample_time: [s].
         role: "plant", "observer", "controller" or "reference".
         native_names: our name -> the FMU's, where the mapping renames.
+        units: our name -> unit, as the caller gave them.
         messages: the last lines of the FMU's log, as (status, text).
     """
 
@@ -74,6 +75,7 @@ class FmuPart:
             self._description = read_description(self.path, folder, names or {}, units)
             _check_platform(self._description, folder)
         self.native_names = {ours: theirs for theirs, ours in (names or {}).items()}
+        self.units = dict(units or {})
         self.role = role or self._description.annotation.role
         if not self.role:
             raise SettingsError(f"{self.path}: say its role in the loop ({', '.join(_ROLES)}).")

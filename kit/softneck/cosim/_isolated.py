@@ -40,7 +40,7 @@ class IsolatedPart:
     """An FMU as a part like `FmuPart`, run by a child process that is kept until `close`.
 
     Attributes:
-        path, inputs, outputs, parameters, sample_time, role, native_names: as of `FmuPart`.
+        path, inputs, outputs, parameters, sample_time, role, native_names, units: as of `FmuPart`.
         timeout: longest wait for one step [s].
     """
 
@@ -59,7 +59,7 @@ class IsolatedPart:
         described = FmuPart(path, role=role, sample_time=sample_time, names=names, units=units)
         self.path, self.role, self.sample_time = described.path, described.role, described.sample_time
         self.inputs, self.outputs, self.parameters = described.inputs, described.outputs, described.parameters
-        self.native_names, self.timeout = described.native_names, timeout
+        self.native_names, self.units, self.timeout = described.native_names, described.units, timeout
         self._settings = {
             "path": str(self.path), "role": self.role, "sample_time": self.sample_time,
             "names": dict(names or {}), "units": dict(units or {}),

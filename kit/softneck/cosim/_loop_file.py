@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -22,6 +22,7 @@ from softneck.loop import (
     make_fault,
     make_reference,
 )
+from softneck.plant import NeckParameters, VirtualNeck
 from softneck.signals import read_recording
 
 from ._fmu_part import FmuPart
@@ -30,19 +31,23 @@ from ._simulate import LoopSetup
 
 _TOP = (
     "duration_s", "sample_time_s", "order", "plant", "observer", "controller", "reference", "part", "connections",
-    "fault", "limits", "angle",
+    "fault", "limits", "angle", "folder",
 )  # fmt: skip
 # Table -> (the keys that say where the part comes from, the role of a file of ours).
 _SOURCES = {
-    "plant": (("fmu", "model", "python"), "model"),
+    "plant": (("fmu", "model", "neck", "python"), "model"),
     "observer": (("fmu", "file", "python"), "observer"),
     "controller": (("fmu", "file", "python"), "controller"),
 }
 _OTHER_SOURCES = ("fmu", "file", "python")
+# A table from Python may hold the part itself.
+OBJECT = "object"
 # What may stand beside `fmu`: how an FMU that nobody here wrote becomes a part, and where it runs.
 _FMU_KEYS = ("names", "units", "sample_time_s", "isolated", "timeout_s")
 _REFERENCES = ("step", "ramp", "sine", "rotation", "recording")
 _SAME_SAMPLE_TIME = 1e-6
+# What `neck` may be beside a file of parameters.
+PRESETS = ("paper", "lab")
 
 
 def load_loop(path: str | Path) -> LoopSetup:
@@ -53,7 +58,7 @@ def load_loop(path: str | Path) -> LoopSetup:
         SettingsError: unknown or missing keys, or values that do not fit; the line names the key.
     """
     source = Path(path)
-    table = _read(source)
+    table = read_toml(source)
     try:
         return _Reader(source).setup(table)
     except SoftneckError as error:
@@ -67,7 +72,7 @@ def is_loop_file(path: Path) -> bool:
     if path.suffix != ".toml" or not path.is_file():
         return False
     try:
-        return "reference" in _read(path)
+        return "reference" in read_toml(path)
     except FileFormatError:
         return False
 
@@ -81,7 +86,7 @@ def reference_of(path: str | Path) -> ReferenceBlock:
         SettingsError: the reference is an FMU already, or wrong.
     """
     source = Path(path)
-    table = _read(source)
+    table = read_toml(source)
     try:
         reference = _Reader(source).reference(table["reference"])
         if hasattr(reference, "advance"):
@@ -91,20 +96,28 @@ def reference_of(path: str | Path) -> ReferenceBlock:
         raise type(error)(f"{source}: {error}") from error
 
 
-def make_loop(table: Mapping[str, Any], folder: str | Path = ".") -> LoopSetup:
+def make_loop(
+    table: Mapping[str, Any], folder: str | Path = ".", *, opened: dict[Any, Any] | None = None
+) -> LoopSetup:
     """Return the loop that a table with the keys of a loop file describes; relative paths start at `folder`.
+
+    From Python, plant, observer, controller and reference may also be the things themselves: a part, a block, what
+    has a `block()` such as a model or `VirtualNeck`, the path of an FMU or a file, a reference. `opened` remembers
+    files and FMUs for the next loop of the same.
 
     Raises:
         SettingsError: unknown or missing keys, or values that do not fit; the line names the key.
     """
-    return _Reader(Path(folder)).setup(table)
+    return _Reader(Path(folder), opened).setup(normal_table(table))
 
 
 class _Reader:
     """Reads one loop file, or a table like one, and remembers the hash of each file that it opens."""
 
-    def __init__(self, source: Path) -> None:
+    def __init__(self, source: Path, opened: dict[Any, Any] | None = None) -> None:
         self.folder = source if source.is_dir() else source.parent
+        self._opened = opened
+        self._step = 0.02
         self.files: dict[str, tuple[str, str]] = {}
         if not source.is_dir():
             self.files["loop"] = (str(source), file_hash(source))
@@ -114,6 +127,9 @@ class _Reader:
         for key in ("duration_s", "plant", "controller", "reference"):
             if key not in table:
                 raise SettingsError(f"`{key}` is missing.")
+        if "folder" in table:
+            self.folder = self.folder / str(table["folder"])
+        self._step = _number("sample_time_s", table.get("sample_time_s", 0.02))
         tables = {name: table[name] for name in _SOURCES if name in table}
         others = _named_parts(table.get("part", []))
         parts = {name: self._part(name, part) for name, part in tables.items()}
@@ -161,21 +177,39 @@ class _Reader:
     def _made(self, name: str, table: Any, keys: tuple[str, ...], role: str | None, *, as_role: str) -> Part:
         if not isinstance(table, dict):
             raise SettingsError(f"`{name}` must be a table: [{name}].")
-        _refuse_unknown(f"[{name}]", table, (*keys, "parameters", *(_FMU_KEYS if "fmu" in table else ())))
-        given = [key for key in keys if key in table]
+        extra = (OBJECT,) if OBJECT in table else _FMU_KEYS if "fmu" in table else ()
+        _refuse_unknown(f"[{name}]", table, (*keys, "parameters", *extra))
+        given = [key for key in (*keys, OBJECT) if key in table]
         if len(given) != 1:
             raise SettingsError(
                 f"[{name}] needs exactly one of {', '.join(keys)}; it has {', '.join(given) or 'none'}."
             )
         key, value = given[0], table[given[0]]
+        if key == OBJECT:
+            return _part_of(name, value)
         if not isinstance(value, str):
             raise SettingsError(f"[{name}] {key} must be a text; got {value!r}.")
         if key == "python":
             return self._from_python(name, value)
+        if key == "neck" and value in PRESETS:
+            return BlockPart(VirtualNeck(NeckParameters.preset(value)).block(sample_time=self._step))
         file = self._file(name, value)
+        if key == "neck":
+            return BlockPart(VirtualNeck(NeckParameters.from_toml(file)).block(sample_time=self._step))
+        settings = sorted((k, repr(v)) for k, v in table.items() if k != "parameters")
         if key == "fmu":
-            return _fmu_part(file, f"[{name}]", table, as_role)
-        return BlockPart(load(file, role=role).block())
+            return self._open((name, file, *settings), lambda: _fmu_part(file, f"[{name}]", table, as_role))
+        return BlockPart(self._open((role, file), lambda: load(file, role=role).block()))
+
+    def _open(self, key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
+        """Return what `make` opens, remembered if this reader shares what it opens; a changed file is opened again."""
+        if self._opened is None:
+            return make()
+        stat = key[1].stat()
+        full = (*key, stat.st_mtime_ns, stat.st_size)
+        if full not in self._opened:
+            self._opened[full] = make()
+        return self._opened[full]
 
     def _from_python(self, name: str, path: str) -> Part:
         """Call `package.module:factory`; modules beside the loop file are found too."""
@@ -190,15 +224,13 @@ class _Reader:
             ) from error
         if module.__file__:
             self.files[name] = (module.__file__, file_hash(module.__file__))
-        made = made.block() if hasattr(made, "block") and not hasattr(made, "advance") else made
-        if isinstance(made, Block):
-            return BlockPart(made)
-        if not all(hasattr(made, item) for item in ("inputs", "outputs", "sample_time", "start", "advance", "close")):
-            raise SettingsError(f"[{name}] python = `{path}` returned a {type(made).__name__}, not a Block or a Part.")
-        return made
+        return _part_of(name, made, f" python = `{path}` returned")
 
     def reference(self, table: Any) -> Reference | Part:
         """Return what the table [reference] describes."""
+        if isinstance(table, dict) and OBJECT in table:
+            made = table[OBJECT]
+            return made if callable(made) else _part_of("reference", made)
         if isinstance(table, dict) and "fmu" in table:
             return self._made("reference", table, ("fmu",), None, as_role="reference")
         if not isinstance(table, dict) or table.get("kind") not in _REFERENCES:
@@ -221,8 +253,40 @@ class _Reader:
         path = self.folder / name
         if not path.is_file():
             raise FileFormatError(f"[{role}]: there is no file {path}.")
-        self.files[role] = (str(path), file_hash(path))
+        self.files[role] = (str(path), self._open(("hash", path), lambda: file_hash(path)))
         return path
+
+
+def normal_table(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a loop's table in which every part is a table, as in a loop file."""
+    made = dict(table)
+    for name in ("plant", "observer", "controller", "reference"):
+        value = made.get(name)
+        if value is None or isinstance(value, Mapping):
+            continue
+        if isinstance(value, str | Path) and name != "reference":
+            made[name] = {_source_key(name, str(value)): str(value)}
+        else:
+            made[name] = {OBJECT: value}
+    return {key: value for key, value in made.items() if value is not None}
+
+
+def _source_key(part: str, text: str) -> str:
+    if text.endswith(".fmu"):
+        return "fmu"
+    if part == "plant":
+        return "neck" if text in PRESETS or text.endswith(".toml") else "model"
+    return "file"
+
+
+def _part_of(name: str, made: Any, said: str = " is") -> Part:
+    """Return a part out of a part, a block, or what has a block."""
+    made = made.block() if hasattr(made, "block") and not hasattr(made, "advance") else made
+    if isinstance(made, Block):
+        return BlockPart(made)
+    if not all(hasattr(made, item) for item in ("inputs", "outputs", "sample_time", "start", "advance", "close")):
+        raise SettingsError(f"[{name}]{said} a {type(made).__name__}, not a Block or a Part.")
+    return made
 
 
 def _fmu_part(file: Path, where: str, table: Mapping[str, Any], role: str) -> Part:
@@ -276,7 +340,8 @@ def _texts(where: str, table: Any) -> dict[str, str]:
     return dict(table)
 
 
-def _read(source: Path) -> dict[str, Any]:
+def read_toml(source: Path) -> dict[str, Any]:
+    """Return the content of a TOML file; raise FileFormatError if there is none."""
     if not source.is_file():
         raise FileFormatError(f"{source}: no such file.")
     try:

@@ -40,6 +40,7 @@ def simulate(
     pace: float | None = None,
     resume: LoopState | None = None,
     keep: bool = False,
+    compiled: bool = False,
 ) -> Result:
     """Run a loop from t = 0 to its end.
 
@@ -50,6 +51,8 @@ def simulate(
         pace: run at this multiple of real time; as fast as possible if not given.
         resume: go on from this state instead of t = 0.
         keep: leave the FMUs loaded, so that the next run of the same loop resets them; `loop.close()` ends it.
+        compiled: run loops whose parts are all blocks (files of ours, the virtual neck, no FMUs) as one compiled
+            function: the same bits, sooner after a second of compiling, which is kept.
 
     Raises:
         SettingsError: parts that do not fit together.
@@ -58,7 +61,7 @@ def simulate(
     """
     setup = loop if isinstance(loop, LoopSetup) else LoopSetup(loop=loop)
     begin = time.perf_counter()
-    signals = run_loop(setup.loop, report, on_step=on_step, pace=pace, resume=resume, keep=keep)
+    signals = run_loop(setup.loop, report, on_step=on_step, pace=pace, resume=resume, keep=keep, compiled=compiled)
     wall = time.perf_counter() - begin
     return Result(
         signals=signals,

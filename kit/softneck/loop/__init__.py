@@ -5,9 +5,12 @@ from ._faults import Fault as Fault
 from ._faults import MotorFault as MotorFault
 from ._faults import NeckFault as NeckFault
 from ._faults import SensorFault as SensorFault
+from ._faults import fault_field as fault_field
+from ._faults import fault_keys as fault_keys
 from ._faults import make_fault as make_fault
 from ._loop import ORDERS as ORDERS
 from ._loop import Loop as Loop
+from ._metrics import METRICS as METRICS
 from ._metrics import SETTLING_BAND as SETTLING_BAND
 from ._metrics import check_limits as check_limits
 from ._metrics import metrics as metrics
@@ -21,6 +24,8 @@ from ._references import RotationReference as RotationReference
 from ._references import SineReference as SineReference
 from ._references import StepReference as StepReference
 from ._references import make_reference as make_reference
+from ._references import reference_field as reference_field
+from ._references import reference_keys as reference_keys
 from ._result import LoopResult as LoopResult
 from ._run import LoopRun as LoopRun
 from ._run import LoopStep as LoopStep

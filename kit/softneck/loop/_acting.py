@@ -24,6 +24,9 @@ class Acting:
 
     Attributes:
         memory: what it remembers between steps, for `LoopState`.
+        what: it does: the fault's kind, "add" for a disturbance.
+        slots, flags: positions of its signals, and of those of validity.
+        first, last: rows of its window.
     """
 
     def __init__(self, fault: Fault, slots: list[int], flags: list[int], scale: Vector, step: float) -> None:
@@ -36,76 +39,80 @@ class Acting:
             scale: (n,) SI to the unit of each signal.
             step: of the loop [s].
         """
-        self.fault, self._slots, self._flags = fault, np.array(slots, dtype=np.intp), np.array(flags, dtype=np.intp)
-        self._first = math.ceil(fault.start / step - _SAME_TIME)
+        self.fault, self.slots, self.flags = fault, np.array(slots, dtype=np.intp), np.array(flags, dtype=np.intp)
+        self.first = math.ceil(fault.start / step - _SAME_TIME)
         end = fault.start + fault.duration
-        self._last = math.ceil(end / step - _SAME_TIME) if math.isfinite(end) else 2**62
+        self.last = math.ceil(end / step - _SAME_TIME) if math.isfinite(end) else 2**62
         self._scale, self._step = scale, step
-        kind = "add" if isinstance(fault, NeckFault) else fault.kind
-        self._act = getattr(self, f"_{kind}")
+        self.what = "add" if isinstance(fault, NeckFault) else fault.kind
+        self._act = getattr(self, f"_{self.what}")
         self._lag = _lag(fault, step)
         self.memory = np.zeros(((self._lag or 1), len(slots)))
         # The two tails of a normal variable: a share of the samples, of either sign.
-        self._far = NormalDist().inv_cdf(1.0 - 0.5 * getattr(fault, "share", 0.0)) if kind == "outlier" else 0.0
+        self._far = NormalDist().inv_cdf(1.0 - 0.5 * getattr(fault, "share", 0.0)) if self.what == "outlier" else 0.0
 
     def apply(self, bus: Vector, k: int) -> None:
         """Change the bus at row `k` if the fault is on; remember what it needs in any case."""
-        self._act(bus, k, self._first <= k < self._last)
+        self._act(bus, k, self.first <= k < self.last)
 
     def _dropout(self, bus: Vector, k: int, on: bool) -> None:  # noqa: ARG002
         if on:
-            bus[self._slots] = np.nan
-            bus[self._flags] = 0.0
+            bus[self.slots] = np.nan
+            bus[self.flags] = 0.0
 
     def _freeze(self, bus: Vector, k: int, on: bool) -> None:
         # At the very first row there is nothing before: that row's own value stays.
         if on and k > 0:
-            bus[self._slots] = self.memory[0]
+            bus[self.slots] = self.memory[0]
         else:
-            self.memory[0] = bus[self._slots]
+            self.memory[0] = bus[self.slots]
 
     _stuck = _freeze
 
-    def _bias(self, bus: Vector, k: int, on: bool) -> None:  # noqa: ARG002
+    def _bias(self, bus: Vector, k: int, on: bool) -> None:
         if on:
-            bus[self._slots] += self._scale * getattr(self.fault, "size")  # noqa: B009 - sensors and motors have one
+            bus[self.slots] += self.amount(k)
 
-    _offset = _bias
+    _offset = _noise = _outlier = _add = _bias
 
     def _delay(self, bus: Vector, k: int, on: bool) -> None:
-        now = bus[self._slots]
+        now = bus[self.slots]
         if k == 0:
             self.memory[:] = now
         old = self.memory[k % self._lag].copy()
         self.memory[k % self._lag] = now
         if on:
-            bus[self._slots] = old
-
-    def _noise(self, bus: Vector, k: int, on: bool) -> None:
-        if on and isinstance(self.fault, SensorFault):
-            bus[self._slots] += self._scale * self.fault.std * self._draws(k)
-
-    def _outlier(self, bus: Vector, k: int, on: bool) -> None:
-        if on and isinstance(self.fault, SensorFault):
-            draw = self._draws(k)
-            hit = np.abs(draw) > self._far
-            bus[self._slots] += np.where(hit, self._scale * self.fault.size * np.sign(draw), 0.0)
+            bus[self.slots] = old
 
     def _slow(self, bus: Vector, k: int, on: bool) -> None:
-        wanted = bus[self._slots]
-        if on and k > 0 and isinstance(self.fault, MotorFault):
-            most = self._scale * self.fault.rate * self._step
-            wanted = self.memory[0] + np.clip(wanted - self.memory[0], -most, most)
-            bus[self._slots] = wanted
+        wanted = bus[self.slots]
+        if on and k > 0:
+            wanted = self.memory[0] + np.clip(wanted - self.memory[0], -self.most, self.most)
+            bus[self.slots] = wanted
         self.memory[0] = wanted
 
-    def _add(self, bus: Vector, k: int, on: bool) -> None:  # noqa: ARG002
-        if on and isinstance(self.fault, NeckFault):
-            bus[self._slots] += self._scale * np.array(list(self.fault.values.values()))
+    def amount(self, k: int) -> Vector:
+        """Return what is added at row `k` (n,): bias, offset and disturbance, noise, outliers; zero for the others."""
+        fault = self.fault
+        if isinstance(fault, NeckFault):
+            return self._scale * np.array(list(fault.values.values()))
+        if fault.kind in ("bias", "offset"):
+            return self._scale * fault.size
+        if fault.kind == "noise" and isinstance(fault, SensorFault):
+            return self._scale * fault.std * self._draws(k)
+        if fault.kind == "outlier":
+            draw = self._draws(k)
+            return np.where(np.abs(draw) > self._far, self._scale * fault.size * np.sign(draw), 0.0)
+        return np.zeros(self.slots.size)
+
+    @property
+    def most(self) -> Vector:
+        """How far a slow motor gets in one step (n,)."""
+        return self._scale * getattr(self.fault, "rate", 0.0) * self._step
 
     def _draws(self, k: int) -> Vector:
         """Return the normal draws (n,) of row `k`: a function of seed and row, so that nothing must be remembered."""
-        return np.random.default_rng([getattr(self.fault, "seed"), k]).standard_normal(self._slots.size)  # noqa: B009
+        return np.random.default_rng([getattr(self.fault, "seed"), k]).standard_normal(self.slots.size)  # noqa: B009
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -167,6 +167,33 @@ def make_fault(kind: str, values: Mapping[str, object]) -> Fault:
         raise SettingsError(f"{kind}: {error}") from error
 
 
+def fault_field(kind: str, key: str) -> str | None:
+    """Return what a key of a loop file such as `size_deg` sets in a fault of `kind`, None if it sets nothing."""
+    name = _split(key)[0]
+    return name if kind in _FILE and name in (*_FILE[kind][2], "start", "duration") else None
+
+
+def fault_keys(fault: Fault) -> dict[str, object]:
+    """Return the keys of a loop file that describe `fault`, all in SI."""
+    prefix = ""
+    if isinstance(fault, NeckFault):
+        kind = next((k for k, (made, p, known) in _FILE.items() if made is NeckFault and _covers(p, known, fault)), "")
+        prefix = _FILE[kind][1] if kind else ""
+        values: dict[str, object] = {name.removeprefix(prefix): value for name, value in fault.values.items()}
+    else:
+        kind = next(k for k, (made, what, _) in _FILE.items() if isinstance(fault, made) and what == fault.kind)
+        values = {name: getattr(fault, name) for name in _FILE[kind][2]}
+    if not kind:
+        raise SettingsError(f"the {with_kind(fault)} is of no kind that a loop file has; make it of several.")
+    values = {name: list(value) if isinstance(value, tuple) else value for name, value in values.items() if value != ()}
+    times = {"start": fault.start, "duration": fault.duration}
+    return {"kind": kind, **values, **{name: time for name, time in times.items() if math.isfinite(time)}}
+
+
+def _covers(prefix: str, known: tuple[str, ...], fault: NeckFault) -> bool:
+    return all(name.startswith(prefix) and name.removeprefix(prefix) in known for name in fault.values)
+
+
 def with_kind(fault: Fault) -> str:
     """Return what a message calls a fault."""
     if isinstance(fault, NeckFault):

@@ -22,6 +22,11 @@ _RISE = (0.1, 0.9)
 # The steady state is judged on the last quarter of what follows the step.
 _STEADY_PART = 0.25
 
+_AXIS = ("rise_s", "settling_s", "overshoot_pct", "rms_error_deg", "iae", "ise", "itae", "steady_rms_deg")
+_MOTORS = ("max_rad", "max_rate_rad_s", "effort", "total_variation_rad", "limit_violation_s", "slack_s")
+# All metrics, named as in [limits].
+METRICS = (*(f"{axis}.{name}" for axis in ("pitch", "roll") for name in _AXIS), *(f"motors.{name}" for name in _MOTORS))
+
 Metrics = dict[str, dict[str, float | None]]
 
 

@@ -72,6 +72,11 @@ class BlockPart:
     def close(self) -> None:
         """Do nothing: a block holds nothing but memory."""
 
+    @property
+    def memory(self) -> tuple[Vector, Vector, Vector]:
+        """Parameters, state and outputs, as the runtime changes them in place."""
+        return self._parameters, self._state, self._outputs
+
     def get_state(self) -> bytes:
         """Return the state vector and the outputs, to the bit."""
         return np.concatenate([self._state, self._outputs]).astype("<f8").tobytes()

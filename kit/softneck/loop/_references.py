@@ -185,6 +185,11 @@ _KINDS: dict[str, _Setting] = {
     "rotation": RotationReference,
 }
 
+_ENDINGS = {
+    "pitch": "_rad", "roll": "_rad", "inclination": "_rad", "cocontraction": "_rad", "frequency": "_hz", "at": "_s",
+    "rise": "_s",
+}  # fmt: skip
+
 
 def make_reference(kind: str, values: Mapping[str, float]) -> Reference:
     """Return a reference from the keys of a loop file, which end in their unit: `pitch_deg`, `at_s`.
@@ -206,6 +211,22 @@ def make_reference(kind: str, values: Mapping[str, float]) -> Reference:
             raise SettingsError(f"`{key}` must be a number; got {value!r}.")
         chosen[name] = factor * value
     return setting(**chosen)
+
+
+def reference_field(kind: str, key: str) -> str | None:
+    """Return the field that a key of a loop file such as `pitch_deg` sets in a reference of `kind`, if there is one."""
+    setting = _KINDS.get(kind)
+    name = _split(key)[0]
+    return name if setting is not None and name in {item.name for item in fields(setting)} else None
+
+
+def reference_keys(reference: Reference) -> dict[str, float | str] | None:
+    """Return the keys of a loop file that describe `reference`; None for one that is no step, ramp, sine or rotation."""
+    for kind, setting in _KINDS.items():
+        if isinstance(reference, setting):
+            named = {f"{item.name}{_ENDINGS[item.name]}": getattr(reference, item.name) for item in fields(setting)}
+            return {"kind": kind, **named}
+    return None
 
 
 def _split(key: str) -> tuple[str, float]:

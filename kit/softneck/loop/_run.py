@@ -14,8 +14,9 @@ from softneck.core import DataError, Matrix, SettingsError, Vector
 from ._acting import place_faults
 from ._loop import Loop
 from ._order import late, step_order
-from ._part import Part
+from ._part import BlockPart, Part
 from ._result import LoopResult
+from ._rows import CompiledRows, can_compile
 from ._state import LoopState, Saved
 from ._wiring import REFERENCE_PORTS, Named, Wiring, wire
 
@@ -52,6 +53,7 @@ def run_loop(
     pace: float | None = None,
     resume: LoopState | None = None,
     keep: bool = False,
+    compiled: bool = False,
 ) -> LoopResult:
     """Run `loop` from t = 0 and return its signals, one row for each sample of the fastest part.
 
@@ -62,12 +64,14 @@ def run_loop(
         pace: run at this multiple of real time; as fast as possible if not given.
         resume: go on from here instead of t = 0.
         keep: leave the parts loaded for the next run; `loop.close()` releases them.
+        compiled: run all rows as one compiled function where all parts are blocks and nobody watches the steps: the
+            same bits, much sooner once it is compiled; other loops run as always.
 
     Raises:
         SettingsError: sample times that do not divide, inputs without a source, algebraic loops.
         DataError: a part returned NaN or infinity; the message names part, variable and time.
     """
-    run = LoopRun(loop)
+    run = LoopRun(loop, compiled=compiled)
     try:
         if resume is not None:
             run.restore(resume)
@@ -89,8 +93,11 @@ class LoopRun:
         step: base step [s], the shortest sample time.
     """
 
-    def __init__(self, loop: Loop) -> None:
-        """Wire `loop`; the parts start with the first `advance` or `restore`."""
+    def __init__(self, loop: Loop, *, compiled: bool = False) -> None:
+        """Wire `loop`; the parts start with the first `advance` or `restore`.
+
+        `compiled` takes compiled rows where all parts are blocks.
+        """
         self.loop, self._parts = loop, loop.parts
         self.step, self._ratios = _schedule(self._parts)
         wiring = wire(self._parts, loop.constants, loop.connections)
@@ -107,6 +114,8 @@ class LoopRun:
         self._columns = _columns(self._wiring)
         self._table = np.empty((self.rows, self._bus.size))
         self._reference = _reference_table(loop, self.step, self.rows)
+        self._compiled: CompiledRows | None = None
+        self._compile = compiled and can_compile(self._parts)
 
     def __enter__(self) -> LoopRun:
         """Return the run itself."""
@@ -139,6 +148,9 @@ class LoopRun:
         stride = max(1, self.rows // 100)
         if pace is not None and not pace > 0.0:
             raise SettingsError(f"`pace` must be positive (1 is real time); got {pace}.")
+        if self._compile and on_step is None and pace is None:
+            self._advance_compiled(stop, stride, report)
+            return self.row == self.rows
         begin, first = clock.perf_counter(), self.row
         cycle = self._cycle
         for k in range(self.row, stop):
@@ -153,6 +165,30 @@ class LoopRun:
                 self.rows = self.row
                 break
         return self.row == self.rows
+
+    def _advance_compiled(self, stop: int, stride: int, report: Callable[[float], None] | None) -> None:
+        rows = self._compiled = self._compiled or self._compiled_rows()
+        while self.row < stop:
+            end = stop if report is None else min(stop, (self.row // stride + 1) * stride)
+            self.row, problem, part = rows.run(self.row, end, self._pending, self._bus, self._table)
+            if problem:
+                self._explain(rows.names[part], self.row * self.step)
+            if report is not None:
+                report(self.row / self.rows)
+
+    def _compiled_rows(self) -> CompiledRows:
+        blocks = {name: part for name, part in self._parts.items() if isinstance(part, BlockPart)}
+        return CompiledRows(
+            blocks, self._wiring, sequential=self.loop.order == "sequential", order=self._order, late=self._late,
+            ratios=self._ratios, reference=self._reference, stages=self._stages, rows=self.rows,
+        )  # fmt: skip
+
+    def _explain(self, name: str, time: float) -> None:
+        """Raise what the Python rows would raise of part `name`, whose inputs or outputs the compiled ones refused."""
+        self._wiring.taps[name].read(self._bus, time)
+        part = self._parts[name]
+        if isinstance(part, BlockPart):
+            self._checked(name, part.memory[2], time)
 
     def result(self) -> LoopResult:
         """Return the signals of all rows so far."""

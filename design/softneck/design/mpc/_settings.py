@@ -25,7 +25,7 @@ from ._arrays import Tuning, assemble, observer_bandwidth, with_filter, with_gai
 from ._controller import MpcController
 from ._disturbance import MeasuredDisturbance
 from ._lti import system
-from ._prediction import Problem, Scenario, matrices
+from ._prediction import Problem, matrices
 from ._scenarios import chosen_scenarios, sample_pairs
 from ._tuning import Pair, move_weight, observer_trust, radius, reference_time, sensitivity
 

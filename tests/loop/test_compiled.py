@@ -1,0 +1,145 @@
+"""The compiled rows are the Python rows: the same bits, whatever the loop."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import control
+import pytest
+
+from softneck.core import Block, DataError
+from softneck.design import PiSettings
+from softneck.estimation import KalmanSettings, LinearNeck
+from softneck.loop import (
+    FAULT_KINDS,
+    BlockPart,
+    Loop,
+    LoopRun,
+    ReferenceBlock,
+    RotationReference,
+    SensorFault,
+    StepReference,
+    make_fault,
+    run_loop,
+)
+from softneck.plant import NeckParameters, VirtualNeck
+
+_KEYS: dict[str, dict[str, Any]] = {
+    "sensor_bias": {"size_deg": 2.0}, "sensor_outlier": {"size_deg": 5.0, "share": 0.2, "seed": 3},
+    "sensor_delay": {"delay_s": 0.06}, "measurement_noise": {"std_deg": 0.5, "seed": 1}, "motor_stuck": {"motor": 2},
+    "motor_slow": {"motor": 0, "rate_rad_s": 0.7}, "motor_offset": {"size_rad": 0.3},
+    "payload_step": {"payload_kg": 0.3},
+    "push": {"x_n": 1.0, "y_n": -0.5}, "base_tilt": {"pitch_deg": 3.0},
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def parts() -> dict[str, Block]:
+    """The virtual neck, a Kalman filter and a PI controller, all at 20 ms."""
+    pole = math.exp(-5.293 * 0.02)  # Eq. 31
+    tf = control.TransferFunction([0.09 * (1.0 - pole)], [1.0, -pole, 0.0, 0.0], 0.02)
+    model = LinearNeck(pitch=tf, roll=tf)
+    return {
+        "plant": VirtualNeck(NeckParameters.lab().replace(dropout_rate=1.0)).block(noise_seed=3),
+        "observer": KalmanSettings(sensor="paper").design(model).block(),
+        "controller": PiSettings().design(model).block(),
+    }
+
+
+@pytest.fixture
+def loop(parts: dict[str, Block]) -> Callable[..., Loop]:
+    """Make the loop of these parts, with what a test changes."""
+
+    def made(**changes: Any) -> Loop:
+        settings: dict[str, Any] = {name: BlockPart(block) for name, block in parts.items()}
+        settings |= {"reference": StepReference(pitch=0.2, roll=-0.1, at=0.3), "duration": 2.0} | changes
+        return Loop(**settings)
+
+    return made
+
+
+def _same(first: Any, second: Any) -> None:
+    assert list(first.signals) == list(second.signals)
+    for name, values in first.signals.items():
+        # Not one bit: the same compiled steps, linked.
+        assert values.tobytes() == second.signals[name].tobytes(), name
+
+
+@pytest.mark.parametrize("order", ["sequential", "jacobi"])
+@pytest.mark.parametrize("kind", ["none", *FAULT_KINDS])
+def test_every_fault_and_order(kind: str, order: str, loop: Callable[..., Loop]) -> None:
+    window = {"start_s": 0.5, "duration_s": 0.6}
+    faults = () if kind == "none" else (make_fault(kind, {**window, **_KEYS.get(kind, {})}),)
+    case = loop(order=order, faults=faults)
+    _same(run_loop(case), run_loop(case, compiled=True))
+
+
+def test_all_faults_at_once(loop: Callable[..., Loop]) -> None:
+    faults = tuple(make_fault(kind, {"start_s": 0.1 * i, **_KEYS.get(kind, {})}) for i, kind in enumerate(FAULT_KINDS))
+    case = loop(faults=faults, plant_inputs={"payload": 0.2}, plant_parameters={"bending_stiffness": 0.9})
+    _same(run_loop(case), run_loop(case, compiled=True))
+
+
+def test_parts_of_other_rates_and_a_reference_that_is_a_part(loop: Callable[..., Loop]) -> None:
+    neck = BlockPart(VirtualNeck(NeckParameters.paper()).block(sample_time=0.005))
+    wanted = BlockPart(ReferenceBlock(RotationReference(inclination=0.2), sample_time=0.01).block())
+    for case in (
+        loop(plant=neck),
+        loop(plant=neck, reference=wanted),
+        loop(plant=neck, reference=wanted, order="jacobi"),
+    ):
+        _same(run_loop(case), run_loop(case, compiled=True))
+
+
+def test_a_state_goes_from_one_to_the_other(loop: Callable[..., Loop]) -> None:
+    fault = make_fault("sensor_delay", {"delay_s": 0.06, "start_s": 0.5})
+    case = loop(faults=(fault, make_fault("measurement_noise", _KEYS["measurement_noise"])))
+    whole = run_loop(case)
+    for first, second in ((True, False), (False, True), (True, True)):
+        with LoopRun(case, compiled=first) as run:
+            run.advance(37)
+            state = run.state()
+        with LoopRun(case, compiled=second) as run:
+            run.restore(state)
+            run.advance()
+            _same(whole, run.result())
+
+
+def test_progress_is_reported(loop: Callable[..., Loop]) -> None:
+    plain: list[float] = []
+    compiled: list[float] = []
+    run_loop(loop(), plain.append)
+    run_loop(loop(), compiled.append, compiled=True)
+    assert compiled == plain
+
+
+def test_what_is_missing_is_named_as_ever(loop: Callable[..., Loop]) -> None:
+    """A dropout without an observer: the line is the master's."""
+    case = loop(observer=None, faults=(SensorFault(kind="dropout", start=0.4),))
+    with pytest.raises(DataError, match=r"input `pitch` of the controller is nan at t = 0.4 s") as plain:
+        run_loop(case)
+    with pytest.raises(DataError, match="put an observer between") as compiled:
+        run_loop(case, compiled=True)
+    assert str(plain.value) == str(compiled.value)
+
+
+def test_what_is_no_number_is_named_as_ever(loop: Callable[..., Loop], toy_blocks: Callable) -> None:
+    """A gain beyond all bounds blows up within the run."""
+    neck, pi = toy_blocks()
+    wild = pi.with_starts(gain=1e300)
+    case = loop(plant=BlockPart(neck), controller=BlockPart(wild), observer=None)
+    errors = []
+    for compiled in (False, True):
+        with pytest.raises(DataError, match=r"became (nan|inf|-inf) in the step") as caught:
+            run_loop(case, compiled=compiled)
+        errors.append(str(caught.value))
+    assert errors[0] == errors[1]
+
+
+def test_watched_loops_run_in_python(loop: Callable[..., Loop]) -> None:
+    seen: list[int] = []
+    result = run_loop(loop(), compiled=True, on_step=lambda row: seen.append(row.index) or row.index == 9)
+    assert seen == list(range(10))
+    assert result.time.size == 10
