@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import click
 from markupsafe import Markup
 
-from softneck.core import CheckFailedError, atomic_write, refuse_existing
+from softneck.core import CheckFailedError, refuse_existing, write_certificate
 from softneck.cosim import Result, load_loop, simulate
 from softneck.plots import Section, Table, loop_chart, neck_view, page, write_page
 from softneck.signals import recording_suffix, write_recording
@@ -39,8 +38,7 @@ def command(
         result = simulate(load_loop(loop_file), report=lambda done: report(done, loop_file.name))
     write_recording(path, result.recording(), force=replace)
     if certificate is not None:
-        with atomic_write(certificate, force=force) as temporary:
-            temporary.write_text(json.dumps(result.certificate(), indent=2) + "\n", encoding="utf-8")
+        write_certificate(certificate, result.certificate(), force=force)
     if html is not None and view is not None:
         write_page(view, neck_view(result.recording(), title=f"Loop {loop_file.stem}"), force=force)
         write_page(html, _page(loop_file.stem, result, view), force=force)

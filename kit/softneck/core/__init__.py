@@ -8,6 +8,13 @@ from ._block import Port as Port
 from ._block import State as State
 from ._bundle import bundle as bundle
 from ._bundle import content_name as content_name
+from ._certificate import CERTIFICATE_ENDING as CERTIFICATE_ENDING
+from ._certificate import Certificate as Certificate
+from ._certificate import certificate_contents as certificate_contents
+from ._certificate import certificate_path as certificate_path
+from ._certificate import check_certificate as check_certificate
+from ._certificate import read_certificate as read_certificate
+from ._certificate import write_certificate as write_certificate
 from ._checks import finite_vector as finite_vector
 from ._checks import require_between as require_between
 from ._checks import require_finite as require_finite

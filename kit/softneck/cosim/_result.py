@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from typing import Any
 
 import pandas as pd
 
-from softneck.core import DataError, Vector, to_si
+from softneck.core import DataError, Vector, certificate_contents, to_si
 from softneck.loop import LoopResult, check_limits, metrics
 from softneck.signals import Recording, file_unit, known_channels
 
@@ -81,18 +80,15 @@ class Result:
 
     def certificate(self) -> dict[str, Any]:
         """Return what held, with the hash of every file that was read."""
-        return {
-            "certificate": "simulate",
-            "softneck": version("softneck"),
-            "holds": self.holds,
+        more = {
             "limits": self.limits,
             "metrics": self.metrics,
             "order": self.order,
             "angle": self.angle,
             "sample_time_s": self.signals.sample_time,
             "duration_s": len(self.signals.time) * self.signals.sample_time,
-            "files": {role: {"path": path, "sha256": digest} for role, (path, digest) in self.files.items()},
         }
+        return certificate_contents("simulate", holds=self.holds, files=self.files, more=more)
 
 
 def _shown(name: str, unit: str) -> tuple[str, float]:
