@@ -1,5 +1,30 @@
-"""The drives of the neck: conversions between SI and the internal units of Technosoft iPOS drives."""
+"""The drives of the neck: CANopen master, safety, pre-flight, zeroing, runs, and simulated drives to try it on."""
 
+from ._deploy import Deployed as Deployed
+from ._deploy import Sensor as Sensor
+from ._deploy import neck_of as neck_of
+from ._deploy import prepare as prepare
+from ._deploy import require_certificate as require_certificate
+from ._deploy import run_on_bus as run_on_bus
+from ._deploy import run_simulated as run_simulated
+from ._file import DriveEntry as DriveEntry
+from ._file import DrivesFile as DrivesFile
+from ._file import default_drives as default_drives
+from ._file import load_drives as load_drives
+from ._file import make_drives as make_drives
+from ._link import BusError as BusError
+from ._link import CanLink as CanLink
+from ._link import Link as Link
+from ._link import VirtualLink as VirtualLink
+from ._link import open_bus as open_bus
+from ._pilot import LoopPilot as LoopPilot
+from ._preflight import OVERRIDES as OVERRIDES
+from ._preflight import Report as Report
+from ._preflight import preflight as preflight
+from ._preflight import scan as scan
+from ._result import DrivesResult as DrivesResult
+from ._sdo import SdoError as SdoError
+from ._sdo import load_eds as load_eds
 from ._units import DriveScale as DriveScale
 from ._units import acceleration_to_internal as acceleration_to_internal
 from ._units import counts_to_position as counts_to_position
@@ -9,3 +34,10 @@ from ._units import internal_to_current as internal_to_current
 from ._units import internal_to_speed as internal_to_speed
 from ._units import position_to_counts as position_to_counts
 from ._units import speed_to_internal as speed_to_internal
+from ._virtual import VirtualRun as VirtualRun
+from ._virtual import recorded as recorded
+from ._virtual import simulated_neck as simulated_neck
+from ._zero import Zeroed as Zeroed
+from ._zero import reset as reset
+from ._zero import stop as stop
+from ._zero import zero as zero

@@ -1,0 +1,173 @@
+"""Which objects of a drive a run needs and what is written to them, per profile."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from canopen.objectdictionary import ObjectDictionary
+
+from softneck.core import FileFormatError
+
+from ._file import DriveEntry, DrivesFile
+from ._sdo import is_integer
+from ._units import acceleration_to_internal, current_to_internal, position_to_counts
+
+# Home offset [counts] that `softneck drives zero` sets: no drive has it after a reset, so it proves the zero.
+HOMED_MARK = 1
+CSP = 8
+# Speeds of the profile ds402: counts per second.
+_PLAIN = "ds402"
+
+# (index, subindex) -> bytes, of what a run reads or writes.
+SIZES: dict[tuple[int, int], int] = {
+    (0x1000, 0): 4, (0x1018, 1): 4, (0x1018, 2): 4, (0x1018, 3): 4, (0x1018, 4): 4, (0x100C, 0): 2, (0x100D, 0): 1,
+    (0x1017, 0): 2, (0x6007, 0): 2, (0x6040, 0): 2, (0x6041, 0): 2, (0x605A, 0): 2, (0x605E, 0): 2, (0x6060, 0): 1,
+    (0x6061, 0): 1, (0x6064, 0): 4, (0x6065, 0): 4, (0x6066, 0): 2, (0x606C, 0): 4, (0x607A, 0): 4, (0x607C, 0): 4,
+    (0x607D, 1): 4, (0x607D, 2): 4, (0x6083, 0): 4, (0x6085, 0): 4, (0x6093, 1): 4, (0x6093, 2): 4, (0x6094, 1): 4,
+    (0x6094, 2): 4, (0x6097, 1): 4, (0x6097, 2): 4, (0x6098, 0): 1, (0x60C2, 1): 1, (0x60C2, 2): 1, (0x60FF, 0): 4,
+    (0x6502, 0): 4, (0x1400, 1): 4, (0x1400, 2): 1, (0x1600, 0): 1, (0x1600, 1): 4, (0x1600, 2): 4, (0x1800, 1): 4,
+    (0x1800, 2): 1, (0x1A00, 0): 1, (0x1A00, 1): 4, (0x1A00, 2): 4, (0x1A00, 3): 4,
+}  # fmt: skip
+_PROFILE_SIZES = {
+    "ipos2015": {(0x207E, 0): 2, (0x207F, 0): 2},
+    "ds402": {(0x1016, 1): 4, (0x6073, 0): 2, (0x6078, 0): 2},
+}
+_CURRENT = {"ipos2015": 0x207E, "ds402": 0x6078}
+# Rated current of the motor, to which 6073h and 6078h are relative (maxon 118739) [A].
+RATED_CURRENT = 0.060
+
+
+@dataclass(frozen=True, slots=True)
+class Write:
+    """One object to write and read back.
+
+    Attributes:
+        index, subindex: where.
+        value: what.
+        topic: row of the report it belongs to.
+    """
+
+    index: int
+    subindex: int
+    value: int
+    topic: str
+
+
+def require_eds(dictionary: ObjectDictionary, profile: str, name: str) -> None:
+    """Raise FileFormatError unless the EDS has what a run needs, in the right sizes."""
+    for (index, subindex), size in {**SIZES, **_PROFILE_SIZES[profile]}.items():
+        integer, found = is_integer(dictionary, index, subindex)
+        place = f"{index:04X}h:{subindex}"
+        if not integer:
+            raise FileFormatError(f"{name}: the EDS does not fit profile {profile}: it has no number at {place}.")
+        if found != size:
+            raise FileFormatError(
+                f"{name}: the EDS does not fit profile {profile}: {place} has {found} bytes there and {size} here."
+            )
+
+
+def speed_units(speed: float, entry: DriveEntry, profile: str) -> int:
+    """Return a speed [rad/s] in the drive's units."""
+    from ._units import speed_to_internal
+
+    if profile == _PLAIN:
+        return round(speed * entry.scale.counts_per_radian)
+    return speed_to_internal(speed, entry.scale)
+
+
+def speed_of_units(units: int, entry: DriveEntry, profile: str) -> float:
+    """Return a speed [rad/s] of the drive's units."""
+    from ._units import internal_to_speed
+
+    return units / entry.scale.counts_per_radian if profile == _PLAIN else internal_to_speed(units, entry.scale)
+
+
+def current_write(current: float, entry: DriveEntry, profile: str, topic: str) -> Write:
+    """Return the write that limits the motor's current [A]."""
+    if profile == _PLAIN:
+        return Write(0x6073, 0, round(1000.0 * current / RATED_CURRENT), topic)
+    return Write(0x207F, 0, abs(current_to_internal(current, entry.scale)), topic)
+
+
+def _acceleration(value: float, entry: DriveEntry, profile: str) -> int:
+    if profile == _PLAIN:
+        return abs(round(value * entry.scale.counts_per_radian))
+    return abs(acceleration_to_internal(value, entry.scale))
+
+
+def option_writes() -> list[Write]:
+    """What a drive does when connection, master or itself fails: latch Fault after a quick-stop ramp."""
+    return [
+        Write(0x6007, 0, 1, "options"),
+        Write(0x605E, 0, 2, "options"),
+        Write(0x605A, 0, 2, "options"),
+    ]
+
+
+def limit_writes(file: DrivesFile, entry: DriveEntry) -> list[Write]:
+    """Position limits, quick stop, following error, current."""
+    edges = [position_to_counts(sign * file.limits.position, entry.scale) + HOMED_MARK for sign in (-1.0, 1.0)]
+    window = abs(position_to_counts(file.following, entry.scale))
+    return [
+        Write(0x607D, 1, min(edges), "limits"),
+        Write(0x607D, 2, max(edges), "limits"),
+        Write(0x6083, 0, _acceleration(file.quick_stop, entry, file.profile), "limits"),
+        Write(0x6085, 0, _acceleration(file.quick_stop, entry, file.profile), "limits"),
+        Write(0x6065, 0, window, "limits"),
+        Write(0x6066, 0, round(1000.0 * file.following_time), "limits"),
+        current_write(entry.current_limit, entry, file.profile, "limits"),
+    ]
+
+
+def guarding_writes(file: DrivesFile, kind: str, master: int) -> list[Write]:
+    """Life guarding, or heartbeat both ways."""
+    if kind == "life":
+        period = max(1, round(1000.0 * file.guarding.time / 5.0))
+        return [Write(0x1017, 0, 0, "guarding"), Write(0x100C, 0, period, "guarding"), Write(0x100D, 0, 5, "guarding")]
+    milliseconds = round(1000.0 * file.guarding.time)
+    return [
+        Write(0x100C, 0, 0, "guarding"),
+        Write(0x100D, 0, 0, "guarding"),
+        Write(0x1017, 0, max(10, milliseconds // 2), "guarding"),
+        Write(0x1016, 1, (master << 16) | milliseconds, "guarding"),
+    ]
+
+
+def disarm_writes(kind: str) -> list[Write]:
+    """The end of guarding, so that a drive that is left alone does not fault."""
+    if kind == "life":
+        return [Write(0x100C, 0, 0, "guarding"), Write(0x100D, 0, 0, "guarding")]
+    return [Write(0x1016, 1, 0, "guarding"), Write(0x1017, 0, 0, "guarding")]
+
+
+def pdo_writes(entry: DriveEntry, profile: str) -> list[Write]:
+    """RPDO 1: control word, target; TPDO 1: status word, position, current; both with each SYNC."""
+    node, topic = entry.node, "mapping"
+    current = _CURRENT[profile] << 16 | 0x0010
+    disabled = 0x80000000
+    writes = [
+        Write(0x1400, 1, disabled | 0x200 + node, topic),
+        Write(0x1600, 0, 0, topic),
+        Write(0x1600, 1, 0x60400010, topic),
+        Write(0x1600, 2, 0x607A0020, topic),
+        Write(0x1600, 0, 2, topic),
+        Write(0x1400, 2, 1, topic),
+        Write(0x1400, 1, 0x200 + node, topic),
+        Write(0x1800, 1, disabled | 0x180 + node, topic),
+        Write(0x1A00, 0, 0, topic),
+        Write(0x1A00, 1, 0x60410010, topic),
+        Write(0x1A00, 2, 0x60640020, topic),
+        Write(0x1A00, 3, current, topic),
+        Write(0x1A00, 0, 3, topic),
+        Write(0x1800, 2, 1, topic),
+        Write(0x1800, 1, 0x180 + node, topic),
+    ]
+    return writes
+
+
+def mode_writes(file: DrivesFile) -> list[Write]:
+    """Cyclic synchronous position with the bus period as interpolation period."""
+    exponent, period = -3, file.cycle * 1e3
+    if abs(period - round(period)) > 1e-6:
+        exponent, period = -4, file.cycle * 1e4
+    return [Write(0x60C2, 1, round(period), "modes"), Write(0x60C2, 2, exponent, "modes"), Write(0x6060, 0, CSP, "modes")]

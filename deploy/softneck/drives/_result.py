@@ -1,0 +1,140 @@
+"""What a run on drives leaves: its signals as `softneck simulate` names them, and what happened."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from softneck.core import CheckFailedError, Vector
+from softneck.loop import LoopResult, metrics
+from softneck.signals import Recording, known_channels
+
+from ._pilot import LoopPilot
+from .master import Event, Master, Phase
+
+_TRUTH = ("pitch", "roll", "tension_1", "tension_2", "tension_3", "compression")
+
+
+class RunLog:
+    """Collects one row for each sample while the controller runs."""
+
+    def __init__(self, pilot: LoopPilot) -> None:
+        """Prepare the columns."""
+        self._pilot = pilot
+        places = {}
+        for name in ("pitch_reference", "roll_reference", "cocontraction_reference"):
+            places[name] = pilot.slot("reference", name)
+        for j in (1, 2, 3):
+            places[f"motor_setpoint_{j}"] = pilot.slot("controller", f"motor_setpoint_{j}")
+        for name in ("pitch", "roll"):
+            places[f"{name}_estimate"] = pilot.slot("observer", name)
+        places["healthy"] = pilot.slot("observer", "healthy")
+        self._places = {name: place for name, place in places.items() if place is not None}
+        self._rows: list[list[float]] = []
+        self._index = -1
+
+    def take(self, master: Master, index: int, truth: Mapping[str, float] | None) -> None:
+        """Add the row of sample `index`, once."""
+        if index <= self._index or master.supervisor.phase is not Phase.RUNNING:
+            return
+        self._index = index
+        signals = self._pilot.signals
+        row = [float(signals[place]) for place in self._places.values()]
+        tilt = master.tilt
+        row += [*master.positions, *master.tensions]
+        row += [tilt.pitch, tilt.roll] if tilt is not None else [np.nan, np.nan]
+        if truth is not None:
+            row += [truth[name] for name in _TRUTH]
+        self._rows.append(row)
+
+    def result(self, sample_time: float, *, truth: bool) -> LoopResult:
+        """Return all rows."""
+        names = [*self._places, *(f"motor_position_{j}" for j in (1, 2, 3))]
+        names += [f"tension_estimate_{j}" for j in (1, 2, 3)] + ["pitch_measured", "roll_measured"]
+        names += list(_TRUTH) if truth else []
+        table = np.array(self._rows) if self._rows else np.zeros((0, len(names)))
+        units = {name: "N" if "tension" in name else "1" if name == "healthy" else "rad" for name in names}
+        units |= {"compression": "m"}
+        signals: dict[str, Vector] = {name: table[:, i].copy() for i, name in enumerate(names)}
+        return LoopResult(np.arange(len(table)) * sample_time, signals, units, sample_time)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DrivesResult:
+    """One run on drives.
+
+    Attributes:
+        signals: one row for each sample of the controller while it ran.
+        phase: in which the run ended: "done" or "stopped".
+        fault: what ended it early, None if nothing did.
+        counts: how often each event happened.
+        events: the last of them.
+        rehome: whether a drive lost its zero.
+        cycles: of the bus.
+        cycle: bus period [s].
+        wall_time: [s].
+        longest_step: of the master, controller included [s].
+        simulated: whether the drives were.
+    """
+
+    signals: LoopResult
+    phase: str
+    fault: Event | None
+    counts: Mapping[str, int]
+    events: tuple[Event, ...]
+    rehome: bool
+    cycles: int
+    cycle: float
+    wall_time: float
+    simulated: bool
+    longest_step: float = 0.0
+    notes: tuple[str, ...] = field(default=())
+
+    @property
+    def completed(self) -> bool:
+        """Whether the loop ran to its end and nothing stopped it."""
+        return self.fault is None and self.phase == "done"
+
+    @property
+    def real_time_factor(self) -> float:
+        """Time on the bus over the time it took."""
+        return self.cycles * self.cycle / max(self.wall_time, 1e-9)
+
+    def require(self) -> None:
+        """Raise CheckFailedError if something ended the run early."""
+        if self.fault is None:
+            return
+        after = " Run `softneck drives zero` before the next run." if self.rehome else ""
+        raise CheckFailedError(
+            f"stopped at t = {self.fault.time:.3f} s: {self.fault}. The drives are off; look for the cause, then "
+            f"`softneck drives reset`.{after}"
+        )
+
+    def recording(self) -> Recording:
+        """Return the run as a recording: as measured, with true angles where simulated drives know them."""
+        known = set(known_channels())
+        channels = {name: values for name, values in self.signals.signals.items() if name in known}
+        for axis in ("pitch", "roll"):
+            channels.setdefault(axis, self.signals[f"{axis}_measured"])
+        return Recording(self.signals.time, self.signals.sample_time, channels)
+
+    def table(self) -> dict[str, Any]:
+        """Return the JSON of `softneck drives run`."""
+        return {
+            "completed": self.completed,
+            "phase": self.phase,
+            "fault": None if self.fault is None else {"time_s": self.fault.time, "event": self.fault.name,
+                                                      "node": self.fault.node, "text": str(self.fault)},
+            "rehome": self.rehome,
+            "events": dict(self.counts),
+            "simulated": self.simulated,
+            "cycles": self.cycles,
+            "cycle_s": self.cycle,
+            "real_time_factor": self.real_time_factor,
+            "longest_step_s": self.longest_step,
+            "metrics": metrics(self.signals) if len(self.signals.time) > 1 else None,
+            "notes": list(self.notes),
+        }  # fmt: skip

@@ -1,0 +1,35 @@
+"""The master without I/O: frames and time in, frames out."""
+
+from ._cia402 import DriveState as DriveState
+from ._cia402 import Goal as Goal
+from ._cia402 import control_word as control_word
+from ._cia402 import state_of as state_of
+from ._events import RULES as RULES
+from ._events import Event as Event
+from ._events import Reaction as Reaction
+from ._events import Rule as Rule
+from ._fieldbus import BusSettings as BusSettings
+from ._fieldbus import DriveView as DriveView
+from ._fieldbus import Fieldbus as Fieldbus
+from ._frame import BUS_OFF as BUS_OFF
+from ._frame import Frame as Frame
+from ._gate import Gate as Gate
+from ._gate import Tilt as Tilt
+from ._limiter import Limiter as Limiter
+from ._master import Master as Master
+from ._master import Measured as Measured
+from ._master import Pilot as Pilot
+from ._nmt import AFTER as AFTER
+from ._nmt import Command as Command
+from ._nmt import NodeState as NodeState
+from ._nmt import nmt_frame as nmt_frame
+from ._nmt import node_state as node_state
+from ._settings import LimitSettings as LimitSettings
+from ._settings import MasterSettings as MasterSettings
+from ._settings import RampSettings as RampSettings
+from ._settings import SensorSettings as SensorSettings
+from ._settings import WatchSettings as WatchSettings
+from ._supervisor import NEXT as NEXT
+from ._supervisor import Phase as Phase
+from ._supervisor import Signal as Signal
+from ._supervisor import Supervisor as Supervisor

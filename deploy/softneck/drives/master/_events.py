@@ -1,0 +1,99 @@
+"""What may go wrong, as a table: for each event who reacts, how, and until when at the latest.
+
+The table is the requirement list of the project's fault table; the tests name each row.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Reaction(StrEnum):
+    """What the master does."""
+
+    COUNT = "count"
+    HOLD = "hold"
+    RETREAT = "retreat"
+    STOP = "stop"
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """One row.
+
+    Attributes:
+        reaction: what happens.
+        cycles: deadline in cycles; 0 where `seconds` counts.
+        seconds: deadline [s].
+        text: for people.
+        rehome: the drives' zero is lost: `softneck drives zero` is due.
+    """
+
+    reaction: Reaction
+    cycles: int
+    seconds: float
+    text: str
+    rehome: bool = False
+
+
+_R = Reaction
+RULES: dict[str, Rule] = {
+    "setpoint_missing": Rule(_R.HOLD, 2, 0.0, "no new set-point: the last one holds"),
+    "setpoint_lost": Rule(_R.STOP, 5, 0.0, "no set-point for 5 cycles"),
+    "bus_off": Rule(_R.STOP, 1, 0.0, "the adapter is bus-off or gone"),
+    "bus_silent": Rule(_R.STOP, 3, 0.0, "no drive answered for 3 cycles: cable?"),
+    "emergency": Rule(_R.STOP, 2, 0.0, "a drive sent an emergency"),
+    "drive_fault": Rule(_R.STOP, 2, 0.0, "a drive is in Fault"),
+    "drive_left": Rule(_R.STOP, 2, 0.0, "a drive left Operation Enabled by itself"),
+    "node_left": Rule(_R.STOP, 0, 0.3, "a drive is no longer operational (NMT)"),
+    "tpdo_missing": Rule(_R.STOP, 5, 0.0, "a drive's position did not come for 5 cycles"),
+    "heartbeat_missing": Rule(_R.STOP, 0, 0.3, "a drive's heartbeat or guarding answer did not come"),
+    "boot_up": Rule(_R.STOP, 2, 0.0, "a drive booted: its encoder's zero is lost", rehome=True),
+    "second_master": Rule(_R.STOP, 1, 0.0, "another master is on the bus"),
+    "sensor_lost": Rule(_R.RETREAT, 0, 0.1, "the inclinometer dropped out"),
+    "sensor_frozen": Rule(_R.RETREAT, 0, 0.1, "the inclinometer is frozen"),
+    "sensor_bad": Rule(_R.STOP, 1, 0.0, "three samples of the inclinometer in a row were no angles"),
+    "sample_discarded": Rule(_R.COUNT, 1, 0.0, "a sample of the inclinometer was discarded"),
+    "controller_failed": Rule(_R.STOP, 1, 0.0, "controller or observer failed"),
+    "clamped": Rule(_R.COUNT, 1, 0.0, "a set-point was beyond a limit and clamped"),
+    "clamp_persistent": Rule(_R.STOP, 0, 1.0, "set-points stayed beyond a limit"),
+    "drive_limit": Rule(_R.COUNT, 1, 0.0, "a drive is at its own position limit (607Dh)"),
+    "following": Rule(_R.STOP, 0, 0.2, "a motor does not follow its set-point"),
+    "diverged": Rule(_R.STOP, 0, 0.2, "the measured tilt is not what the motors' positions give"),
+    "tension": Rule(_R.STOP, 0, 0.2, "a tendon is pulled too hard"),
+    "stalled": Rule(_R.STOP, 1, 0.0, "the control loop stood still for 5 cycles or more"),
+    "late_cycle": Rule(_R.COUNT, 1, 0.0, "a cycle came late"),
+    "clock": Rule(_R.STOP, 1, 0.0, "the clock went backwards"),
+    "enable_timeout": Rule(_R.STOP, 0, 2.0, "a drive did not reach Operation Enabled"),
+    "ramp_timeout": Rule(_R.STOP, 0, 60.0, "a ramp did not end"),
+    "operator": Rule(_R.STOP, 1, 0.0, "stopped by the operator"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that happened.
+
+    Attributes:
+        time: [s] of the master's clock.
+        name: key of `RULES`.
+        node: of the drive, 0 for none.
+        detail: for people.
+    """
+
+    time: float
+    name: str
+    node: int = 0
+    detail: str = ""
+
+    @property
+    def rule(self) -> Rule:
+        """Its row of the table."""
+        return RULES[self.name]
+
+    def __str__(self) -> str:
+        """One line for people."""
+        where = f" (node {self.node})" if self.node else ""
+        more = f": {self.detail}" if self.detail else ""
+        return f"{self.rule.text}{where}{more}"

@@ -1,0 +1,206 @@
+"""The cyclic traffic with the drives, without I/O: frames in become axis states and events, targets become frames."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from softneck.core import require_between, require_whole
+
+from ._cia402 import DriveState, Goal, control_word, state_of
+from ._events import Event
+from ._frame import Frame
+from ._nmt import Command, NodeState, nmt_frame, node_state
+
+_TPDO = struct.Struct("<Hih")
+_RPDO = struct.Struct("<Hi")
+_EMERGENCY = struct.Struct("<HB")
+SYNC = Frame(0x080)
+# Not faults: a drive at its own software limit decelerates and says so (FF06h, FF07h).
+_LIMIT_CODES = (0xFF06, 0xFF07)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BusSettings:
+    """The cyclic traffic.
+
+    Attributes:
+        nodes: node numbers of motors 1 to 3.
+        cycle: [s].
+        guarding: "life" (guarding by RTR) or "heartbeat".
+        guard_cycles: cycles between two guarding requests, or two heartbeats of ours.
+        master: our node number, for the heartbeat.
+        silent_cycles: without any drive's answer until the bus counts as dead.
+        missing_cycles: without a drive's TPDO until it counts as lost.
+        answer_time: without its guarding answer or heartbeat [s], the same.
+        stalled_cycles: between two steps until the loop counts as stalled.
+        off: names of guards that are switched off; for the tests that prove each one to be needed.
+    """
+
+    nodes: tuple[int, int, int] = (1, 2, 3)
+    cycle: float = 0.01
+    guarding: str = "life"
+    guard_cycles: int = 2
+    master: int = 127
+    silent_cycles: int = 3
+    missing_cycles: int = 5
+    answer_time: float = 0.25
+    stalled_cycles: int = 5
+    off: frozenset[str] = frozenset()
+
+    def __post_init__(self) -> None:
+        require_between("cycle", self.cycle, 0.005, 0.05, "s")
+        for node in self.nodes:
+            require_whole("node", node, 1, 126)
+
+
+class DriveView:
+    """What the master knows of one drive.
+
+    Attributes:
+        node: its number.
+        word, state: last status word and the state in it.
+        counts, current: last position and current in the drive's units.
+        fresh: whether a TPDO came since the last step.
+        silent: cycles without a TPDO.
+        answered: when guarding or heartbeat last came [s]; None before the first.
+        nmt: state that it said there.
+        emergencies: (time, code, register) of all so far, the last 20.
+    """
+
+    __slots__ = (
+        "answered", "counts", "current", "emergencies", "fresh", "heard", "nmt", "node", "silent", "state", "toggle",
+        "word",
+    )  # fmt: skip
+
+    def __init__(self, node: int) -> None:
+        """Know nothing yet."""
+        self.node = node
+        self.word, self.state = 0, DriveState.UNKNOWN
+        self.counts = self.current = 0
+        self.fresh, self.heard, self.silent = False, False, 0
+        self.answered: float | None = None
+        self.nmt, self.toggle = NodeState.UNKNOWN, -1
+        self.emergencies: list[tuple[float, int, int]] = []
+
+
+class Fieldbus:
+    """Reads and writes the cyclic frames of three drives.
+
+    Attributes:
+        settings: as given.
+        drives: the views.
+        malformed: frames that were none of CANopen's, so far.
+    """
+
+    def __init__(self, settings: BusSettings) -> None:
+        """Prepare the look-up of identifiers."""
+        self.settings = settings
+        self.drives = tuple(DriveView(node) for node in settings.nodes)
+        self.malformed = 0
+        self._cycle = 0
+        self._handlers = {}
+        foreign = {0x000, 0x080, 0x100, 0x700 + settings.master}
+        for view in self.drives:
+            self._handlers[0x180 + view.node] = (self._tpdo, view)
+            self._handlers[0x080 + view.node] = (self._emergency, view)
+            self._handlers[0x700 + view.node] = (self._error_control, view)
+            foreign |= {base + view.node for base in (0x200, 0x300, 0x400, 0x500, 0x600)}
+        self._foreign = frozenset(foreign)
+        self._guards = tuple(Frame(0x700 + node, b"\0", remote=True) for node in settings.nodes)
+        self._beat = Frame(0x700 + settings.master, bytes([NodeState.OPERATIONAL]))
+
+    def receive(self, now: float, frames: Sequence[Frame]) -> list[Event]:
+        """Take in all frames since the last step; return what happened."""
+        events: list[Event] = []
+        for view in self.drives:
+            view.fresh = False
+        for frame in frames:
+            identifier, data, remote, error = frame
+            if error:
+                if data == b"off":
+                    events.append(Event(now, "bus_off"))
+                continue
+            handler = self._handlers.get(identifier)
+            if handler is not None and not remote:
+                handler[0](now, handler[1], data, events)
+            elif identifier in self._foreign or (remote and handler is not None):
+                kind = "request" if remote else "frame"
+                events.append(Event(now, "second_master", 0, f"{kind} {identifier:03X}h, not sent by us"))
+        self._watch(now, events)
+        return events
+
+    def _tpdo(self, now: float, view: DriveView, data: bytes, events: list[Event]) -> None:
+        del now, events
+        if len(data) != 8:
+            self.malformed += 1
+            return
+        view.word, view.counts, view.current = _TPDO.unpack(data)
+        view.state = state_of(view.word)
+        view.fresh = view.heard = True
+
+    def _emergency(self, now: float, view: DriveView, data: bytes, events: list[Event]) -> None:
+        if len(data) < 3:
+            self.malformed += 1
+            return
+        code, register = _EMERGENCY.unpack_from(data)
+        view.emergencies = [*view.emergencies[-19:], (now, code, register)]
+        if code in _LIMIT_CODES:
+            events.append(Event(now, "drive_limit", view.node, f"{code:04X}h"))
+        elif code:
+            events.append(Event(now, "emergency", view.node, f"code {code:04X}h, register {register:02X}h"))
+
+    def _error_control(self, now: float, view: DriveView, data: bytes, events: list[Event]) -> None:
+        if len(data) != 1:
+            self.malformed += 1
+            return
+        state = node_state(data[0])
+        if state is NodeState.BOOT_UP:
+            events.append(Event(now, "boot_up", view.node))
+            view.nmt = NodeState.PRE_OPERATIONAL
+            return
+        if self.settings.guarding == "life":
+            toggle = data[0] >> 7
+            # An answer with the old toggle bit is an old answer (CiA 301, 7.2.8.2.2.2): it counts as none. The next
+            # one is compared with it, so that a lost answer costs one more and not all.
+            stale, view.toggle = toggle == view.toggle, toggle
+            if stale:
+                return
+        view.answered, view.nmt = now, state
+        if state is not NodeState.OPERATIONAL:
+            events.append(Event(now, "node_left", view.node, f"it says {state.name}"))
+
+    def _watch(self, now: float, events: list[Event]) -> None:
+        s = self.settings
+        dead = True
+        for view in self.drives:
+            if view.fresh:
+                view.silent = 0
+                dead = False
+            else:
+                view.silent += 1
+                dead = dead and view.silent >= s.silent_cycles
+            if view.silent == s.missing_cycles or (view.silent > s.missing_cycles and view.silent % 100 == 0):
+                events.append(Event(now, "tpdo_missing", view.node))
+            if view.answered is not None and now - view.answered > s.answer_time:
+                events.append(Event(now, "heartbeat_missing", view.node))
+                view.answered = now
+        if dead and self._cycle and all(view.heard for view in self.drives):
+            events.append(Event(now, "bus_silent"))
+
+    def send(self, goals: Sequence[Goal], targets: Sequence[int]) -> list[Frame]:
+        """Return the frames of this cycle: set-points, SYNC, and guarding when it is due."""
+        frames = []
+        for view, goal, target in zip(self.drives, goals, targets, strict=True):
+            word = control_word(view.state, goal)
+            frames.append(Frame(0x200 + view.node, _RPDO.pack(word, target)))
+        frames.append(SYNC)
+        if self._cycle % self.settings.guard_cycles == 0:
+            frames.extend(self._guards if self.settings.guarding == "life" else (self._beat,))
+        self._cycle += 1
+        return frames
+
+    def start(self) -> list[Frame]:
+        """Return the frames that start the nodes."""
+        return [nmt_frame(Command.START, view.node) for view in self.drives]

@@ -1,0 +1,82 @@
+"""What of the inclinometer's samples may be believed."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from ._events import Event
+from ._settings import SensorSettings
+
+
+class Tilt(NamedTuple):
+    """One sample of the inclinometer as it came.
+
+    Attributes:
+        pitch, roll: [rad].
+        pitch_rate, roll_rate: [rad/s]; NaN without a gyro.
+        valid: False while the sensor itself says that it has nothing.
+    """
+
+    pitch: float
+    roll: float
+    pitch_rate: float = math.nan
+    roll_rate: float = math.nan
+    valid: bool = True
+
+
+class Gate:
+    """Passes samples on, counts what is wrong with them, and says when the sensor is lost.
+
+    Attributes:
+        last: last believed sample.
+    """
+
+    def __init__(self, settings: SensorSettings) -> None:
+        """Believe nothing yet."""
+        self._settings = settings
+        self.last: Tilt | None = None
+        self._raw: tuple[float, float] | None = None
+        self._same = self._bad = 0
+        self._good_at: float | None = None
+        self._first: float | None = None
+
+    def step(self, now: float, sample: Tilt | None, events: list[Event]) -> bool:
+        """Take the sample that is due, None if none came; return whether it is believed."""
+        s = self._settings
+        if self._first is None:
+            self._first = now
+        good = sample is not None and sample.valid
+        if sample is not None and sample.valid:
+            reason = self._reason(now, sample)
+            self._same = self._same + 1 if (sample.pitch, sample.roll) == self._raw else 1
+            self._raw = (sample.pitch, sample.roll)
+            if reason:
+                good = False
+                self._bad += 1
+                events.append(Event(now, "sample_discarded", 0, reason))
+                if self._bad >= s.bad_samples:
+                    events.append(Event(now, "sensor_bad", 0, reason))
+            else:
+                self._bad = 0
+                self.last, self._good_at = sample, now
+            if self._same >= s.frozen_samples:
+                events.append(Event(now, "sensor_frozen", 0, f"{self._same} identical samples"))
+                good = False
+        since = now - (self._first if self._good_at is None else self._good_at)
+        if not good and since >= s.dropout - 1e-9:
+            events.append(Event(now, "sensor_lost", 0, f"no valid sample for {since * 1e3:.0f} ms"))
+        return good
+
+    def _reason(self, now: float, sample: Tilt) -> str:
+        """Return why `sample` is none, "" if it may be one."""
+        s = self._settings
+        if not (math.isfinite(sample.pitch) and math.isfinite(sample.roll)):
+            return "not finite"
+        if abs(sample.pitch) > s.angle or abs(sample.roll) > s.angle:
+            return "beyond what the neck can bend"
+        if self.last is not None and self._good_at is not None:
+            most = s.rate * (now - self._good_at) + s.margin
+            if abs(sample.pitch - self.last.pitch) > most or abs(sample.roll - self.last.roll) > most:
+                return "an outlier"
+        return ""

@@ -1,0 +1,71 @@
+"""Set-points within position, speed, acceleration, and within what the tendons bear."""
+
+from __future__ import annotations
+
+import math
+
+from ._settings import LimitSettings
+
+# Differences below this are rounding [rad].
+_SAME = 1e-9
+# Pulling is refused from this part of the tension limit on.
+_NEAR = 0.8
+
+
+class Limiter:
+    """The set-point of one motor on its way to what is wanted.
+
+    Attributes:
+        value: set-point [rad].
+        speed: of the set-point [rad/s].
+        clamped: whether the last step was limited, and by what ("" if not).
+    """
+
+    __slots__ = ("_cycle", "_limits", "_slack_at", "clamped", "speed", "value")
+
+    def __init__(self, limits: LimitSettings, cycle: float) -> None:
+        """Begin at zero, at rest."""
+        self._limits, self._cycle = limits, cycle
+        self.value = self.speed = 0.0
+        self.clamped = ""
+        self._slack_at: float | None = None
+
+    def reset(self, value: float) -> None:
+        """Stand still at `value` [rad]."""
+        self.value, self.speed, self.clamped, self._slack_at = value, 0.0, "", None
+
+    def step(self, wanted: float, tension: float) -> float:
+        """Return the set-point of this cycle [rad] on the way to `wanted`; `tension` [N] is estimated."""
+        limits, T = self._limits, self._cycle
+        low, high = -limits.position, limits.position
+        why = ""
+        goal = wanted
+        if not low <= goal <= high:
+            goal, why = min(max(goal, low), high), "position"
+        if tension > _NEAR * limits.tension and goal > self.value:
+            goal, why = self.value, "tension"
+        if tension >= limits.slack:
+            self._slack_at = None
+        else:
+            if self._slack_at is None:
+                self._slack_at = self.value
+            floor = self._slack_at - limits.slack_unwind
+            if goal < floor:
+                goal, why = floor, "slack"
+        way = goal - self.value
+        speed = way / T
+        # Not faster than allowed, nor than what still stops at the goal.
+        most = min(limits.speed, math.sqrt(2.0 * limits.acceleration * abs(way)) + 0.5 * limits.acceleration * T)
+        if abs(speed) > most:
+            if abs(speed) > limits.speed * (1.0 + _SAME):
+                why = why or "speed"
+            speed = math.copysign(most, speed)
+        change = limits.acceleration * T
+        if abs(speed - self.speed) > change:
+            # Coming to rest at the goal may need no more than it has: only what asks for more is told.
+            why = why or "acceleration"
+            speed = self.speed + math.copysign(change, speed - self.speed)
+        self.speed = speed
+        self.value = min(max(self.value + T * speed, low), high)
+        self.clamped = why if abs(self.value - wanted) > _SAME else ""
+        return self.value

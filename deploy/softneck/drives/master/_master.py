@@ -1,0 +1,406 @@
+"""The master: `step(now, frames_in)` returns the frames to send. No clock, no bus, no thread: time is an argument."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from ._cia402 import DriveState, Goal
+from ._events import Event, Reaction
+from ._fieldbus import Fieldbus
+from ._frame import Frame
+from ._gate import Gate, Tilt
+from ._limiter import Limiter
+from ._settings import MasterSettings
+from ._supervisor import ACTIVE, FINAL, GOALS, Phase, Signal, Supervisor
+from ._watches import Patience, Watches
+
+Triple = tuple[float, float, float]
+# Cycles without a set-point until the run stops (fault table: hold at once, stop at 5).
+_LOST = 5
+# Drives get this long for their stop ramp before they lose their voltage [s].
+_STOP_TIME = 1.0
+_MOST_EVENTS = 1000
+_NEVER = -math.inf
+_MOVED = frozenset({Phase.RAMP_IN, Phase.RUNNING, Phase.RAMP_OUT, Phase.RETREAT})
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """What the pilot gets at a sample.
+
+    Attributes:
+        index: of the sample, from 0 where the phase `running` begins.
+        tilt: last believed sample.
+        fresh: whether it is of now.
+        positions: of the motors [rad].
+    """
+
+    index: int
+    tilt: Tilt
+    fresh: bool
+    positions: Triple
+
+
+class Pilot(Protocol):
+    """Observer and controller: what turns measurements into set-points."""
+
+    def start(self) -> None:
+        """Begin anew."""
+        ...
+
+    def step(self, measured: Measured) -> Triple | None:
+        """Return the set-points [rad]; None if there are none in time."""
+        ...
+
+    def finished(self, index: int) -> bool:
+        """Return whether the run ends before sample `index`."""
+        ...
+
+
+class Master:
+    """Three drives and one neck, from enabling to switched off, and every fault between.
+
+    Attributes:
+        settings: as given.
+        bus: the drives as they report themselves.
+        supervisor: the phase, and what ended the run.
+        positions, tensions: of the motors [rad] and tendons [N], as measured and estimated.
+        setpoints: as sent [rad].
+        wanted: what the pilot asked for last [rad].
+        counts: event name -> how often.
+        events: the last 1000.
+        cycle: number of steps so far.
+    """
+
+    def __init__(self, settings: MasterSettings, pilot: Pilot) -> None:
+        """Be idle; `start` begins the run."""
+        self.settings, self._pilot = settings, pilot
+        self.bus = Fieldbus(settings.bus)
+        self.supervisor = Supervisor(settings.bus.off)
+        self._gate = Gate(settings.sensor)
+        self._watches = Watches(settings.watch, settings.limits)
+        self._limiters = tuple(Limiter(settings.limits, settings.bus.cycle) for _ in range(3))
+        self._clamped = Patience(settings.limits.persistent)
+        self.positions: Triple = (0.0, 0.0, 0.0)
+        self.tensions: Triple = (0.0, 0.0, 0.0)
+        self.setpoints: Triple = (0.0, 0.0, 0.0)
+        self.wanted: Triple = (0.0, 0.0, 0.0)
+        self._from: Triple = (0.0, 0.0, 0.0)
+        self.counts: Counter[str] = Counter()
+        self.events: deque[Event] = deque(maxlen=_MOST_EVENTS)
+        self.cycle = 0
+        self._now: float | None = None
+        self._missing = 0
+        self._index = -1
+        self._part, self._arrived_at = 0, _NEVER
+        self._enabling, self._enabling_since = 0, _NEVER
+        self._hold_at: Triple | None = None
+        self._asked: list[Signal] = []
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run is over and the drives are off."""
+        return self.supervisor.phase in FINAL
+
+    def start(self) -> None:
+        """Ask for the run to begin with the next step."""
+        self._asked.append(Signal.START)
+
+    def finish(self) -> None:
+        """Ask for the ramp out."""
+        self._asked.append(Signal.FINISH)
+
+    def stop(self, reason: str = "") -> None:
+        """Ask for an immediate stop of all drives."""
+        self._told(Event(self._now or 0.0, "operator", 0, reason))
+
+    def step(self, now: float, frames: Sequence[Frame], tilt: Tilt | None = None) -> list[Frame]:
+        """Return the frames to send at `now` [s, monotonic].
+
+        Args:
+            now: of this cycle.
+            frames: all that came since the last one; not our own.
+            tilt: the inclinometer's sample if one is due and came; due are the steps with `sample_due`.
+        """
+        events = self._timing(now)
+        events += self.bus.receive(now, frames)
+        self._measure()
+        due = self.sample_due
+        fresh = self._gate.step(now, tilt, events) if due else False
+        self._judge(now, events)
+        if self._asked:
+            for signal in self._asked:
+                self.supervisor.signal(now, signal)
+            self._asked.clear()
+        events = []
+        self._watch(now, due, fresh, events)
+        self._act(now, due, fresh, events)
+        self._judge(now, events)
+        frames_out = self.bus.send(self._goals(), self._targets())
+        self.cycle += 1
+        return frames_out
+
+    @property
+    def index(self) -> int:
+        """Number of the pilot's last sample; -1 before the first."""
+        return self._index
+
+    @property
+    def ran(self) -> bool:
+        """Whether the pilot was asked in the last step and answered."""
+        return self._index >= 0 and self._part == 1 and self.supervisor.phase is Phase.RUNNING
+
+    @property
+    def tilt(self) -> Tilt | None:
+        """The last believed sample of the inclinometer."""
+        return self._gate.last
+
+    @property
+    def sample_due(self) -> bool:
+        """Whether the next step is one at which observer and controller run."""
+        return self.cycle % self.settings.sample_cycles == 0
+
+    # -- what came in -------------------------------------------------------------------------------------------
+
+    def _timing(self, now: float) -> list[Event]:
+        before, self._now = self._now, now
+        if before is None:
+            for view in self.bus.drives:
+                view.answered = now
+            return []
+        gap = (now - before) / self.settings.bus.cycle
+        if gap <= 0.0:
+            return [Event(now, "clock", 0, f"{before:.6f} s, then {now:.6f} s")]
+        if gap >= self.settings.bus.stalled_cycles:
+            return [Event(now, "stalled", 0, f"{gap * self.settings.bus.cycle * 1e3:.0f} ms")]
+        return [Event(now, "late_cycle")] if gap > 1.5 else []
+
+    def _measure(self) -> None:
+        s, d = self.settings, self.bus.drives
+        k, zero, n = s.counts_per_radian, s.zero_counts, s.newton_per_unit
+        self.positions = (
+            (d[0].counts - zero) / k[0],
+            (d[1].counts - zero) / k[1],
+            (d[2].counts - zero) / k[2],
+        )
+        self.tensions = (d[0].current * n[0], d[1].current * n[1], d[2].current * n[2])
+
+    def _judge(self, now: float, events: list[Event]) -> None:
+        if not events:
+            return
+        supervisor, active = self.supervisor, self.supervisor.phase in ACTIVE
+        # While nothing has power only what could move or mislead counts.
+        for event in supervisor.react(now, events if active else [e for e in events if e.name in _IDLE_TOO]):
+            self._told(event, judged=True)
+
+    def _told(self, event: Event, *, judged: bool = False) -> None:
+        if not judged:
+            self.supervisor.react(event.time, [event])
+        self.counts[event.name] += 1
+        # What is only counted is kept once: it must not push out what stopped the run.
+        if event.rule.reaction is not Reaction.COUNT or self.counts[event.name] == 1:
+            self.events.append(event)
+
+    # -- what is wrong ------------------------------------------------------------------------------------------
+
+    def _watch(self, now: float, due: bool, fresh: bool, events: list[Event]) -> None:
+        phase = self.supervisor.phase
+        if phase not in ACTIVE:
+            return
+        for i, view in enumerate(self.bus.drives):
+            if view.state in (DriveState.FAULT, DriveState.REACTION):
+                events.append(Event(now, "drive_fault", view.node, f"status {view.word:04X}h"))
+            elif view.state is not DriveState.ENABLED and (
+                phase in _MOVED or (phase is Phase.ENABLING and i < self._enabling)
+            ):
+                events.append(Event(now, "drive_left", view.node, f"it is {view.state.name}"))
+        if phase in _MOVED:
+            self._watches.motors(now, self.setpoints, self.positions, self.settings.bus.nodes, self.tensions, events)
+            if due:
+                last = self._gate.last
+                measured = (last.pitch, last.roll) if fresh and last else None
+                step = self.settings.sample_cycles * self.settings.bus.cycle
+                self._watches.tilt(now, step, self.positions, measured, events)
+        if events:
+            self._judge(now, events)
+            events.clear()
+
+    # -- what to do ---------------------------------------------------------------------------------------------
+
+    def _act(self, now: float, due: bool, fresh: bool, events: list[Event]) -> None:
+        phase = self.supervisor.phase
+        if phase is Phase.RUNNING:
+            self._run(now, due, fresh, events)
+        elif phase is Phase.ENABLING:
+            self._enable(now, events)
+        elif phase in (Phase.RAMP_IN, Phase.RAMP_OUT):
+            self._ramp(now, events)
+        elif phase is Phase.RETREAT:
+            self._retreat(now, events)
+        elif phase in (Phase.DISABLING, Phase.STOPPING):
+            self._switch_off(now)
+        if self.supervisor.phase not in _MOVED:
+            self._track()
+
+    def _enable(self, now: float, events: list[Event]) -> None:
+        """One drive at a time; its set-point is where it is until it is enabled."""
+        if self._enabling_since == _NEVER:
+            self._enabling_since = now
+        view = self.bus.drives[self._enabling]
+        if view.state is DriveState.ENABLED and view.fresh:
+            self._enabling += 1
+            self._enabling_since = now
+            if self._enabling == 3:
+                self._enabling = 2
+                if self._gate.last is not None:
+                    self._change(now, Signal.ENABLED)
+        elif now - self._enabling_since > self.settings.ramps.enable_timeout:
+            events.append(Event(now, "enable_timeout", view.node, f"it is {view.state.name}"))
+
+    def _ramp(self, now: float, events: list[Event]) -> None:
+        """Straight to rest, where P is zero, and a while there."""
+        ramps = self.settings.ramps
+        step = ramps.speed * self.settings.bus.cycle
+        wanted = [value - min(max(value, -step), step) for value in self.setpoints]
+        self._limit(now, wanted, events, count=False)
+        there = all(
+            abs(value) < 1e-6 and abs(position) < ramps.tolerance
+            for value, position in zip(self.setpoints, self.positions, strict=True)
+        )
+        if not there:
+            self._arrived_at = _NEVER
+            if now - self.supervisor.since > ramps.timeout:
+                events.append(Event(now, "ramp_timeout", 0, "the motors do not reach their rest"))
+            return
+        if self._arrived_at == _NEVER:
+            self._arrived_at = now
+        # The run begins at a sample, so that its first row is one.
+        last = (self.cycle + 1) % self.settings.sample_cycles == 0
+        if now - self._arrived_at >= ramps.settle - 1e-9 and last:
+            self._change(now, Signal.ARRIVED)
+            if self.supervisor.phase is Phase.RUNNING:
+                self._begin()
+
+    def _begin(self) -> None:
+        self._index = -1
+        self._missing = 0
+        self.wanted = self._from = self.setpoints
+        if self._gate.last is not None:
+            self._watches.align(self._gate.last.pitch, self._gate.last.roll, self.positions)
+        try:
+            self._pilot.start()
+        except Exception as error:  # noqa: BLE001 - whatever a controller raises must stop the drives
+            self._failed(self._now or 0.0, error)
+
+    def _run(self, now: float, due: bool, fresh: bool, events: list[Event]) -> None:
+        cycles = self.settings.sample_cycles
+        if due:
+            self._index += 1
+            self._part = 0
+            self._consult(now, fresh, events)
+            if self.supervisor.phase is not Phase.RUNNING:
+                return
+        if self._missing:
+            self._missing += 0 if due else 1
+            name = "setpoint_lost" if self._missing >= _LOST else "setpoint_missing"
+            events.append(Event(now, name))
+        self._part += 1
+        share = min(self._part / cycles, 1.0)
+        a, b = self._from, self.wanted
+        wanted = [a[i] + share * (b[i] - a[i]) for i in range(3)]
+        self._limit(now, wanted, events, count=True)
+
+    def _consult(self, now: float, fresh: bool, events: list[Event]) -> None:
+        """Ask the pilot; whatever goes wrong in it stops the drives in this cycle."""
+        tilt = self._gate.last
+        if tilt is None:
+            return
+        try:
+            if self._pilot.finished(self._index):
+                self._change(now, Signal.FINISH)
+                self._arrived_at = _NEVER
+                self._ramp(now, events)
+                return
+            answer = self._pilot.step(Measured(self._index, tilt, fresh, self.positions))
+            if answer is None:
+                self._missing += 1
+                self._from = self.wanted
+                return
+            a, b, c = answer
+            if not (math.isfinite(a) and math.isfinite(b) and math.isfinite(c)):
+                raise ValueError(f"set-points {a:g}, {b:g}, {c:g} are not finite")
+        except Exception as error:  # noqa: BLE001 - whatever a controller raises must stop the drives
+            self._failed(now, error)
+            return
+        self._missing = 0
+        self._from, self.wanted = self.wanted, (a, b, c)
+
+    def _failed(self, now: float, error: Exception) -> None:
+        self._judge(now, [Event(now, "controller_failed", 0, f"{type(error).__name__}: {error}")])
+
+    def _limit(self, now: float, wanted: Sequence[float], events: list[Event], *, count: bool) -> None:
+        values, why = [], ""
+        for limiter, value, tension in zip(self._limiters, wanted, self.tensions, strict=True):
+            values.append(limiter.step(value, tension))
+            why = why or limiter.clamped
+        self.setpoints = (values[0], values[1], values[2])
+        if not count:
+            return
+        if why:
+            events.append(Event(now, "clamped", 0, why))
+        if self._clamped.over(now, bool(why)):
+            events.append(Event(now, "clamp_persistent", 0, why))
+
+    def _retreat(self, now: float, events: list[Event]) -> None:
+        """Without a sensor: to rest, or stand where the set-points can stop."""
+        if self.settings.sensor.on_loss == "rest":
+            self._ramp(now, events)
+            return
+        if self._hold_at is None:
+            self._hold_at = self.setpoints
+        self._limit(now, self._hold_at, events, count=False)
+        if now - self.supervisor.since >= self.settings.sensor.hold:
+            self._change(now, Signal.ARRIVED)
+
+    def _switch_off(self, now: float) -> None:
+        powered = any(
+            view.state in (DriveState.ENABLED, DriveState.QUICK_STOP, DriveState.REACTION) and not view.silent > 5
+            for view in self.bus.drives
+        )
+        if not powered or now - self.supervisor.since > _STOP_TIME:
+            self._change(now, Signal.OFF)
+
+    def _change(self, now: float, signal: Signal) -> None:
+        if self.supervisor.signal(now, signal):
+            self._arrived_at = _NEVER
+
+    def _track(self) -> None:
+        """Without power a set-point is where its motor is; one that is enabled already holds."""
+        values = []
+        for view, limiter, position in zip(self.bus.drives, self._limiters, self.positions, strict=True):
+            if view.state is not DriveState.ENABLED:
+                limiter.reset(position)
+            values.append(limiter.value)
+        self.setpoints = (values[0], values[1], values[2])
+
+    # -- what goes out ------------------------------------------------------------------------------------------
+
+    def _goals(self) -> tuple[Goal, Goal, Goal]:
+        goal = GOALS[self.supervisor.phase]
+        if self.supervisor.phase is not Phase.ENABLING:
+            return goal, goal, goal
+        one, two, three = (goal if i <= self._enabling else Goal.OFF for i in range(3))
+        return one, two, three
+
+    def _targets(self) -> tuple[int, int, int]:
+        s = self.settings
+        k, zero, p = s.counts_per_radian, s.zero_counts, self.setpoints
+        return round(p[0] * k[0]) + zero, round(p[1] * k[1]) + zero, round(p[2] * k[2]) + zero
+
+
+# Told also while no drive has power: what says that somebody else drives, or that a zero is lost.
+_IDLE_TOO = frozenset({"second_master", "bus_off", "boot_up", "operator", "emergency"})

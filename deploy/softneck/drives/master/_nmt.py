@@ -1,0 +1,50 @@
+"""Network management (CiA 301, 7.3.2): node states, commands, and the frames that carry them."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from ._frame import Frame
+
+
+class NodeState(IntEnum):
+    """NMT states as heartbeat and guarding code them."""
+
+    BOOT_UP = 0x00
+    STOPPED = 0x04
+    OPERATIONAL = 0x05
+    PRE_OPERATIONAL = 0x7F
+    UNKNOWN = 0xFF
+
+
+class Command(IntEnum):
+    """NMT commands."""
+
+    START = 0x01
+    STOP = 0x02
+    PRE_OPERATIONAL = 0x80
+    RESET_NODE = 0x81
+    RESET_COMMUNICATION = 0x82
+
+
+# What a command leads to.
+AFTER = {
+    Command.START: NodeState.OPERATIONAL,
+    Command.STOP: NodeState.STOPPED,
+    Command.PRE_OPERATIONAL: NodeState.PRE_OPERATIONAL,
+    Command.RESET_NODE: NodeState.PRE_OPERATIONAL,
+    Command.RESET_COMMUNICATION: NodeState.PRE_OPERATIONAL,
+}
+
+
+def nmt_frame(command: Command, node: int) -> Frame:
+    """Return the frame that commands `node` (0: all)."""
+    return Frame(0x000, bytes([command, node]))
+
+
+def node_state(code: int) -> NodeState:
+    """Return the state that a heartbeat or guarding byte says, without its toggle bit."""
+    try:
+        return NodeState(code & 0x7F)
+    except ValueError:
+        return NodeState.UNKNOWN

@@ -1,0 +1,155 @@
+"""Settings of the master: limits, sensor, watches, ramps. `drives.toml` fills them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from softneck.core import require_between, require_one_of, require_whole
+
+from ._fieldbus import BusSettings
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LimitSettings:
+    """What set-points may be; beyond it they are clamped and counted.
+
+    Attributes:
+        position: |P| of each motor [rad].
+        speed: [rad/s].
+        acceleration: [rad/s^2].
+        persistent: a clamp for longer than this stops [s].
+        tension: of a tendon, as estimated from the motor's current [N]; nearer than a fifth it may not be pulled
+            further, above it for 150 ms stops.
+        slack: a tendon below this hangs [N].
+        slack_unwind: how far a hanging tendon may still be let out [rad].
+    """
+
+    position: float = 6.0
+    speed: float = 15.6
+    acceleration: float = 1000.0
+    persistent: float = 0.5
+    tension: float = 12.0
+    slack: float = 0.2
+    slack_unwind: float = 3.0
+
+    def __post_init__(self) -> None:
+        require_between("position", self.position, 0.01, 100.0, "rad")
+        require_between("speed", self.speed, 0.01, 100.0, "rad/s")
+        require_between("acceleration", self.acceleration, 0.1, 1e5, "rad/s^2")
+        require_between("persistent", self.persistent, 0.02, 1.0, "s")
+        require_between("tension", self.tension, 0.1, 200.0, "N")
+        require_between("slack", self.slack, 0.0, 50.0, "N")
+        require_between("slack_unwind", self.slack_unwind, 0.0, 20.0, "rad")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorSettings:
+    """The inclinometer's gate.
+
+    Attributes:
+        dropout: without a valid sample for this long the sensor counts as lost [s].
+        frozen_samples: identical raw samples in a row until it counts as frozen.
+        bad_samples: samples in a row that are no angles until it stops.
+        angle: |pitch|, |roll| beyond this are no angles of this neck [rad].
+        rate: faster changes are outliers [rad/s].
+        margin: change that is always allowed: noise [rad].
+        on_loss: "rest" or "hold": where to ramp when the sensor is lost.
+        hold: how long "hold" holds before the drives are switched off [s].
+    """
+
+    dropout: float = 0.08
+    frozen_samples: int = 20
+    bad_samples: int = 3
+    angle: float = 1.2
+    rate: float = 8.0
+    margin: float = math.radians(3.0)
+    on_loss: str = "rest"
+    hold: float = 5.0
+
+    def __post_init__(self) -> None:
+        require_between("dropout", self.dropout, 0.01, 0.09, "s")
+        require_whole("frozen_samples", self.frozen_samples, 2, 20)
+        require_whole("bad_samples", self.bad_samples, 1, 3)
+        require_between("angle", self.angle, 0.1, 1.6, "rad")
+        require_between("rate", self.rate, 0.1, 100.0, "rad/s")
+        require_between("margin", self.margin, 0.0, 0.5, "rad")
+        require_one_of("on_loss", self.on_loss, ("rest", "hold"))
+        require_between("hold", self.hold, 0.0, 600.0, "s")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WatchSettings:
+    """Model against measurement; both watches stop after 150 ms beyond their tolerance.
+
+    Attributes:
+        following: motor against set-point [rad].
+        tilt: measured angle against the one that the motors' positions give [rad].
+        gain: static tilt for one radian of theta_i or phi_i (Eq. 31: 0.483/5.293).
+        pole: of that first-order model [1/s] (Eq. 31).
+        tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
+    """
+
+    following: float = 1.5
+    tilt: float = math.radians(12.0)
+    gain: float = 0.483 / 5.293
+    pole: float = 5.293
+    tendon_angles: tuple[float, float, float] = (0.0, 2.0 * math.pi / 3.0, 4.0 * math.pi / 3.0)
+
+    def __post_init__(self) -> None:
+        require_between("following", self.following, 0.01, 20.0, "rad")
+        require_between("tilt", self.tilt, 0.01, 1.6, "rad")
+        require_between("gain", self.gain, 0.001, 2.0, "rad/rad")
+        require_between("pole", self.pole, 0.1, 100.0, "1/s")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RampSettings:
+    """How a run begins and ends.
+
+    Attributes:
+        speed: of ramps [rad/s].
+        settle: time at the end of a ramp before what follows [s].
+        tolerance: of the motors to their rest there [rad].
+        enable_timeout: for each drive [s].
+        timeout: for a ramp [s].
+    """
+
+    speed: float = 1.0
+    settle: float = 1.0
+    tolerance: float = 0.05
+    enable_timeout: float = 1.0
+    timeout: float = 30.0
+
+    def __post_init__(self) -> None:
+        require_between("speed", self.speed, 0.01, 10.0, "rad/s")
+        require_between("settle", self.settle, 0.0, 60.0, "s")
+        require_between("tolerance", self.tolerance, 1e-3, 1.0, "rad")
+        require_between("enable_timeout", self.enable_timeout, 0.1, 2.0, "s")
+        require_between("timeout", self.timeout, 1.0, 60.0, "s")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MasterSettings:
+    """All of it.
+
+    Attributes:
+        counts_per_radian: of each winch, with sign.
+        zero_counts: counts at the zero of P (1: the mark of a homed drive, see `softneck drives zero`).
+        newton_per_unit: tension for one unit of each drive's current, with sign.
+        sample_cycles: bus cycles for one sample of the controller.
+        bus, limits, sensor, watch, ramps: as their classes say.
+    """
+
+    counts_per_radian: tuple[float, float, float]
+    newton_per_unit: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    zero_counts: int = 1
+    sample_cycles: int = 2
+    bus: BusSettings = field(default_factory=BusSettings)
+    limits: LimitSettings = field(default_factory=LimitSettings)
+    sensor: SensorSettings = field(default_factory=SensorSettings)
+    watch: WatchSettings = field(default_factory=WatchSettings)
+    ramps: RampSettings = field(default_factory=RampSettings)
+
+    def __post_init__(self) -> None:
+        require_whole("sample_cycles", self.sample_cycles, 1, 20)

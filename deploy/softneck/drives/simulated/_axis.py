@@ -1,0 +1,339 @@
+"""The drive behind the bus: objects, power states, modes, faults, and their effect on the motion row."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections import deque
+
+from softneck.core import Vector
+
+from . import _power as power
+from ._profiles import Item, Profile
+from ._sdo import NO_OBJECT, NO_SUBINDEX, READ_ONLY, WRONG_LENGTH, WRONG_VALUE
+from ._servo_runtime import (
+    SERVO_ACCELERATION,
+    SERVO_ACTUAL_SPEED,
+    SERVO_AT_LIMIT,
+    SERVO_CURRENT,
+    SERVO_CURRENT_LIMIT,
+    SERVO_DECELERATION,
+    SERVO_DEMAND,
+    SERVO_DEMAND_SPEED,
+    SERVO_HIGH,
+    SERVO_LEFT,
+    SERVO_LOW,
+    SERVO_MODE,
+    SERVO_POSITION,
+    SERVO_POWER,
+    SERVO_SLOPE,
+    SERVO_SPEED,
+    SERVO_TARGET,
+    SERVO_TARGET_SPEED,
+    SERVO_TIMEOUT,
+    SERVO_TRIPPED,
+    SERVO_WINDOW,
+    SERVO_ZERO,
+)
+
+MODES = (1, 3, 6, 8)
+# Current in internal units: A x 65520 / (2 I_peak).
+_CURRENT_RANGE = 65520.0
+# A stop ramp is over when the demand stands [counts/s].
+_STANDS = 1.0
+_FOLLOWING_ERROR, _ENABLE_INPUT, _GUARDING = 0x8611, 0x5441, 0x8130
+_LIMIT_CODES = {1.0: 0xFF06, -1.0: 0xFF07}
+
+
+class Axis:
+    """One drive's objects and power stage; the node around it speaks CAN.
+
+    Attributes:
+        values: (index, subindex) -> value of every object.
+        state: of the power state machine.
+        emergencies: codes not yet sent, with error register.
+        fault: code of the fault that holds, 0 if none.
+        homed: whether the encoder's zero was set since the last reset.
+        enable_input: the hardware input; without it the drive faults.
+    """
+
+    def __init__(self, node: int, profile: Profile, motion: Vector, *, peak_current: float, slow_loop: float) -> None:
+        """Make a drive with number `node` that acts on its row `motion` of the servo runtime."""
+        self.node, self.profile, self.motion = node, profile, motion
+        self.peak_current, self.slow_loop = peak_current, slow_loop
+        self.enable_input = True
+        self.tick = 1e-3
+        self.values: dict[tuple[int, int], int] = {}
+        self.emergencies: deque[tuple[int, int]] = deque()
+        self.setters = {(0x6040, 0): self._control, (0x607A, 0): self._set_target, (0x60FF, 0): self._set_speed}
+        self.getters = {
+            (0x6041, 0): self.status_word,
+            (0x6064, 0): lambda: int(motion[SERVO_POSITION]),
+            (0x606C, 0): lambda: round(motion[SERVO_ACTUAL_SPEED] * self._units_per_count),
+            (0x6061, 0): self._shown_mode,
+            (0x207E, 0): lambda: round(motion[SERVO_CURRENT] * _CURRENT_RANGE / (2.0 * self.peak_current)),
+            (0x6078, 0): lambda: round(1000.0 * motion[SERVO_CURRENT] / max(profile.rated_current, 1e-9)),
+            (0x603F, 0): lambda: self.fault,
+            (0x1001, 0): lambda: 1 if self.fault else 0,
+        }
+        self.reset()
+
+    # -- life cycle ---------------------------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Power-on or node reset: start values everywhere; the encoder's zero is lost."""
+        self.values = {key: item.start for key, item in self.profile.items.items()}
+        for key in ((0x1018, 4), (0x1018, 2)):
+            self.values[key] = 1000 + self.node if key[1] == 4 else 27014101
+        for n in range(4):
+            for base in (0x1400, 0x1800):
+                self.values[(base + n, 1)] += self.node
+        if self.profile.rated_current:
+            self.values[(0x6075, 0)] = round(1000.0 * self.profile.rated_current)
+        self._default_limits()
+        self.state, self.fault, self.homed = power.SWITCH_ON_DISABLED, 0, False
+        self._word = self._stop_then = 0
+        self._attained = self._acknowledged = False
+        self._limit_told = self._target = 0
+        m = self.motion
+        m[SERVO_POWER] = m[SERVO_TRIPPED] = m[SERVO_LEFT] = 0.0
+        m[SERVO_ZERO] -= m[SERVO_POSITION]
+        m[SERVO_POSITION] = 0.0
+        self._configure()
+
+    def _default_limits(self) -> None:
+        key = (0x207F, 0)
+        if key in self.values:
+            self.values[key] = 32760  # the peak current: whoever does not set it has no limit
+
+    @property
+    def _units_per_count(self) -> float:
+        return self.profile.units_per_count or 65536.0 * self.slow_loop
+
+    # -- objects ------------------------------------------------------------------------------------------------
+
+    def read(self, index: int, subindex: int) -> bytes | int:
+        """Return an object's bytes, or an SDO abort code."""
+        item = self.profile.items.get((index, subindex))
+        if item is None:
+            return NO_SUBINDEX if any(key[0] == index for key in self.profile.items) else NO_OBJECT
+        if not item.size:
+            return item.text.encode("ascii")
+        getter = self.getters.get((index, subindex))
+        value = getter() if getter else self.values[(index, subindex)]
+        return (int(value) & ((1 << 8 * item.size) - 1)).to_bytes(item.size, "little")
+
+    def write(self, index: int, subindex: int, data: bytes) -> int:
+        """Store an object's bytes; return 0 or an SDO abort code."""
+        item = self.profile.items.get((index, subindex))
+        if item is None:
+            return NO_SUBINDEX if any(key[0] == index for key in self.profile.items) else NO_OBJECT
+        if not item.writable:
+            return READ_ONLY
+        if len(data) != item.size:
+            return WRONG_LENGTH
+        return self.store((index, subindex), int.from_bytes(data, "little", signed=item.signed), item)
+
+    def store(self, key: tuple[int, int], value: int, item: Item) -> int:
+        """Store a value that fits `item`; return 0 or an SDO abort code."""
+        del item
+        if not self._allowed(key, value):
+            return WRONG_VALUE
+        self.values[key] = value
+        setter = self.setters.get(key)
+        if setter is not None:
+            setter(value)
+        else:
+            self._configure()
+        return 0
+
+    def _allowed(self, key: tuple[int, int], value: int) -> bool:
+        allowed = {
+            (0x6060, 0): MODES,
+            (0x605A, 0): (0, 1, 2, 5, 6),
+            (0x605E, 0): (-1, 0, 2),
+            (0x6007, 0): (0, 1, 2, 3),
+            (0x6098, 0): (0, 35, 37),
+        }.get(key)
+        return allowed is None or value in allowed
+
+    def _configure(self) -> None:
+        """Carry what the objects say into the motion row."""
+        v, m = self.values, self.motion
+        unit, square = self._units_per_count, self._units_per_count * (1.0 if self._plain else self.slow_loop)
+        m[SERVO_SPEED] = v[(0x6081, 0)] / unit
+        m[SERVO_ACCELERATION] = v[(0x6083, 0)] / square or math.inf
+        m[SERVO_DECELERATION] = v[(0x6085, 0)] / square or math.inf
+        m[SERVO_LOW], m[SERVO_HIGH] = v[(0x607D, 1)], v[(0x607D, 2)]
+        m[SERVO_WINDOW], m[SERVO_TIMEOUT] = v[(0x6065, 0)], v[(0x6066, 0)] / 1000.0
+        if (0x207F, 0) in v:
+            m[SERVO_CURRENT_LIMIT] = v[(0x207F, 0)] * 2.0 * self.peak_current / _CURRENT_RANGE
+        else:
+            m[SERVO_CURRENT_LIMIT] = v[(0x6073, 0)] * v[(0x6075, 0)] / 1e6
+        if self.state == power.ENABLED and m[SERVO_MODE] != v[(0x6060, 0)]:
+            self._take_mode()
+
+    @property
+    def _plain(self) -> bool:
+        return self.profile.units_per_count is not None
+
+    # -- power states -------------------------------------------------------------------------------------------
+
+    def status_word(self) -> int:
+        """Return 6041h."""
+        m, mode = self.motion, self.values[(0x6060, 0)]
+        word = self.state | 0x0200 | 0x0010
+        if self.state != power.QUICK_STOP:
+            word |= 0x0020 if self.state & 0x04 else 0
+        if m[SERVO_AT_LIMIT] != 0.0:
+            word |= 0x0800
+        if mode == 6:
+            return word | (0x1400 if self._attained else 0)
+        if mode == 1 and m[SERVO_DEMAND] == m[SERVO_TARGET]:
+            word |= 0x0400
+        if (mode == 8 and self.state == power.ENABLED) or (mode == 1 and self._acknowledged):
+            word |= 0x1000
+        return word | (0x2000 if m[SERVO_TRIPPED] else 0)
+
+    def _shown_mode(self) -> int:
+        mode = self.values[(0x6060, 0)]
+        return 0 if mode == 8 and self.profile.late_mode_display and self.state != power.ENABLED else mode
+
+    def _control(self, word: int) -> None:
+        before, self._word = self._word, word
+        if self.state == power.FAULT:
+            if word & 0x80 and not before & 0x80 and self.enable_input:
+                self.fault = 0
+                self.motion[SERVO_TRIPPED] = 0.0
+                self.emergencies.append((0x0000, 0))
+                self.state = power.SWITCH_ON_DISABLED
+            return
+        if self.state == power.REACTION:
+            return
+        self._enter(power.next_state(self.state, word))
+        if self.state == power.ENABLED:
+            self._mode_bits(word, before)
+
+    def _mode_bits(self, word: int, before: int) -> None:
+        """What bits 4 to 6 start: a move in mode 1, homing in mode 6."""
+        mode, m = self.values[(0x6060, 0)], self.motion
+        rising = word & 0x10 and not before & 0x10
+        self._acknowledged = bool(word & 0x10)
+        if mode == 1 and rising:
+            m[SERVO_TARGET] = self._target + (m[SERVO_DEMAND] if word & 0x40 else 0.0)
+        if mode == 6 and rising and self.values[(0x6098, 0)] in (35, 37):
+            shift = self.values[(0x607C, 0)] - m[SERVO_POSITION]
+            for column in (SERVO_ZERO, SERVO_POSITION, SERVO_DEMAND, SERVO_TARGET):
+                m[column] += shift
+            self._attained = self.homed = True
+
+    def _enter(self, state: int) -> None:
+        if state == self.state:
+            return
+        before, self.state = self.state, state
+        if state == power.QUICK_STOP:
+            option = self.values[(0x605A, 0)]
+            if option == 0:
+                self._enter(power.SWITCH_ON_DISABLED)
+            else:
+                self._stop(power.SWITCH_ON_DISABLED if option in (1, 2) else 0)
+        elif state == power.ENABLED:
+            if not self.enable_input:
+                self.trip(_ENABLE_INPUT)
+                return
+            if before != power.QUICK_STOP:
+                self.motion[SERVO_DEMAND] = self.motion[SERVO_POSITION]
+                self.motion[SERVO_DEMAND_SPEED] = 0.0
+            self.motion[SERVO_POWER] = 1.0
+            self._attained = False
+            self._take_mode()
+        elif state != power.REACTION:
+            self.motion[SERVO_POWER] = 0.0
+
+    def _take_mode(self) -> None:
+        m, mode = self.motion, self.values[(0x6060, 0)]
+        m[SERVO_MODE] = mode if mode in (1, 3, 8) else 0
+        m[SERVO_LEFT] = 0.0
+        if mode == 1:
+            m[SERVO_TARGET] = m[SERVO_DEMAND]
+
+    def _stop(self, then: int) -> None:
+        """Ramp down, then go to state `then`; 0 stays in Quick Stop Active."""
+        self.motion[SERVO_MODE] = 0.0
+        self._stop_then = then
+
+    def trip(self, code: int) -> None:
+        """A fault: tell it once, react as 605Eh says, latch."""
+        if self.state in (power.FAULT, power.REACTION):
+            return
+        self.fault = code
+        self.emergencies.append((code, 1))
+        if self.motion[SERVO_POWER] > 0.5 and self.values[(0x605E, 0)] == 2:
+            self._enter(power.REACTION)
+            self._stop(power.FAULT)
+        else:
+            self._enter(power.FAULT)
+
+    def connection_lost(self) -> None:
+        """Guarding or heartbeat failed: tell it, and do what 6007h says."""
+        option = self.values[(0x6007, 0)]
+        if option == 1:
+            self.trip(_GUARDING)
+            return
+        self.emergencies.append((_GUARDING, 0x10))
+        if option == 2:
+            self._enter(power.next_state(self.state, 0x00))
+        elif option == 3 and self.state == power.ENABLED:
+            self._enter(power.QUICK_STOP)
+
+    def watch(self) -> None:
+        """To be called after each stretch of motion: limits, following error, inputs, the end of stop ramps."""
+        m = self.motion
+        if m[SERVO_POWER] < 0.5:
+            return
+        if m[SERVO_TRIPPED] and self.state not in (power.FAULT, power.REACTION):
+            self.trip(_FOLLOWING_ERROR)
+        if not self.enable_input:
+            self.trip(_ENABLE_INPUT)
+        at = m[SERVO_AT_LIMIT]
+        if at != self._limit_told:
+            self._limit_told = at
+            if at:
+                self.emergencies.append((_LIMIT_CODES[at], 0))
+        if m[SERVO_MODE] == 0.0 and self._stop_then and abs(m[SERVO_DEMAND_SPEED]) < _STANDS:
+            then, self._stop_then = self._stop_then, 0
+            self._enter(then)
+
+    # -- set-points ---------------------------------------------------------------------------------------------
+
+    def _set_target(self, counts: int) -> None:
+        self._target = counts
+
+    def _set_speed(self, units: int) -> None:
+        self.motion[SERVO_TARGET_SPEED] = units / self._units_per_count
+
+    def synchronise(self) -> None:
+        """SYNC came: in the cyclic mode go to the target within one interpolation period (60C2h)."""
+        m = self.motion
+        if m[SERVO_MODE] != 8.0 or m[SERVO_POWER] < 0.5:
+            return
+        period = self.values[(0x60C2, 1)] * 10.0 ** self.values[(0x60C2, 2)]
+        ticks = max(1.0, float(round(period / self.tick)))
+        m[SERVO_TARGET] = self._target
+        m[SERVO_SLOPE] = (self._target - m[SERVO_DEMAND]) / ticks
+        m[SERVO_LEFT] = ticks
+
+
+def fields_of(items: dict[tuple[int, int], Item], mapping: list[int]) -> tuple[struct.Struct, list[tuple[int, int]]] | None:
+    """Return how the mapping entries (index, subindex, bits) pack into a PDO; None if one does not fit."""
+    letters = {(1, False): "B", (1, True): "b", (2, False): "H", (2, True): "h", (4, False): "I", (4, True): "i"}
+    code, keys = "<", []
+    for entry in mapping:
+        key, bits = (entry >> 16, (entry >> 8) & 0xFF), entry & 0xFF
+        item = items.get(key)
+        if item is None or not item.size or bits != 8 * item.size:
+            return None
+        code += letters[item.size, item.signed]
+        keys.append(key)
+    packed = struct.Struct(code)
+    return (packed, keys) if packed.size <= 8 else None

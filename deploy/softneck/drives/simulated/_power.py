@@ -1,0 +1,50 @@
+"""The power state machine of a drive (CiA 402-2) as tables: what a control word asks for and where it leads."""
+
+from __future__ import annotations
+
+# States by their status word under the mask 6Fh.
+NOT_READY = 0x00
+SWITCH_ON_DISABLED = 0x40
+READY = 0x21
+SWITCHED_ON = 0x23
+ENABLED = 0x27
+QUICK_STOP = 0x07
+REACTION = 0x0F
+FAULT = 0x08
+
+# What a control word asks for: (mask, value, request), first match wins; bit 7 is looked at for its rising edge.
+_REQUESTS = (
+    (0x02, 0x00, "disable voltage"),
+    (0x06, 0x02, "quick stop"),
+    (0x07, 0x06, "shutdown"),
+    (0x0F, 0x07, "switch on"),
+    (0x0F, 0x0F, "enable"),
+)
+_TRANSITIONS = {
+    (SWITCH_ON_DISABLED, "shutdown"): READY,
+    (READY, "disable voltage"): SWITCH_ON_DISABLED,
+    (READY, "quick stop"): SWITCH_ON_DISABLED,
+    (READY, "switch on"): SWITCHED_ON,
+    # Through Switched On at once (CiA 402-2, transition 3 followed by 4).
+    (READY, "enable"): ENABLED,
+    (SWITCHED_ON, "disable voltage"): SWITCH_ON_DISABLED,
+    (SWITCHED_ON, "quick stop"): SWITCH_ON_DISABLED,
+    (SWITCHED_ON, "shutdown"): READY,
+    (SWITCHED_ON, "enable"): ENABLED,
+    (ENABLED, "disable voltage"): SWITCH_ON_DISABLED,
+    (ENABLED, "shutdown"): READY,
+    (ENABLED, "switch on"): SWITCHED_ON,
+    (ENABLED, "quick stop"): QUICK_STOP,
+    (QUICK_STOP, "disable voltage"): SWITCH_ON_DISABLED,
+    (QUICK_STOP, "enable"): ENABLED,
+}
+
+
+def request(word: int) -> str:
+    """Return what control word `word` asks for."""
+    return next((name for mask, value, name in _REQUESTS if word & mask == value), "")
+
+
+def next_state(state: int, word: int) -> int:
+    """Return the state after control word `word`; the same one if it asks for nothing new."""
+    return _TRANSITIONS.get((state, request(word)), state)
