@@ -11,11 +11,17 @@ from ._bake_off import bake_off_samples as bake_off_samples
 from ._bake_off import block_stepper as block_stepper
 from ._bake_off import run_bake_off as run_bake_off
 from ._controller import LinearController as LinearController
+from ._fopi import FopiSettings as FopiSettings
+from ._fractional import FractionalPid as FractionalPid
+from ._fractional import fopi as fopi
 from ._hinf import HinfSettings as HinfSettings
+from ._lqg import LqgSettings as LqgSettings
 from ._margins import Margins as Margins
 from ._margins import loop_margins as loop_margins
 from ._ncf import NcfSettings as NcfSettings
 from ._pi import PiSettings as PiSettings
+from ._pid import PidGains as PidGains
+from ._pid import PidSettings as PidSettings
 from ._reduction import Reduced as Reduced
 from ._reduction import reduce_controller as reduce_controller
 from ._synthesis import Synthesis as Synthesis

@@ -76,6 +76,15 @@ KINDS: dict[str, Kind] = {
         Kind("ncf", "controller", "softneck.design:NcfSettings", "softneck.design:LinearController",
              "softneck.design._linear_controller_runtime",
              "loop shaping with normalised coprime factors (Glover, McFarlane)"),
+        Kind("pid", "controller", "softneck.design:PidSettings", "softneck.design:LinearController",
+             "softneck.design._linear_controller_runtime",
+             "PID tuned on the worst sample of the plant, or by placed poles"),
+        Kind("fopi", "controller", "softneck.design:FopiSettings", "softneck.design:LinearController",
+             "softneck.design._linear_controller_runtime",
+             "fractional-order PI or PID, iso-damped"),
+        Kind("lqg", "controller", "softneck.design:LqgSettings", "softneck.design:LinearController",
+             "softneck.design._linear_controller_runtime",
+             "LQG whose filter estimates a load on the input: its integral action"),
     )
 }  # fmt: skip
 
