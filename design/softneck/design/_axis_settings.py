@@ -109,7 +109,7 @@ class AxisSettings(ABC):
         axes = {name: self._prepared(uncertain.axis(name)) for name in AXES}
         made: dict[str, tuple[AxisController, float, dict[str, Any]]] = {}
         for name, axis in axes.items():
-            if name == "roll" and _same(axis, axes["pitch"]):
+            if name == "roll" and axis.same_as(axes["pitch"]):
                 made["roll"] = made["pitch"]
                 continue
             try:
@@ -272,11 +272,3 @@ def slowest_time(plant: AxisPlant) -> float:
 def margins_json(margins: Margins) -> dict[str, float | None]:
     """Return margins as JSON values; None stands for infinity."""
     return {name: value if math.isfinite(value) else None for name, value in asdict(margins).items()}
-
-
-def _same(one: UncertainAxis, other: UncertainAxis) -> bool:
-    """Return whether both axes are the same plants, so that one synthesis does for both."""
-    return len(one.samples) == len(other.samples) and all(
-        a.delay == b.delay and np.array_equal(a.numerator, b.numerator) and np.array_equal(a.denominator, b.denominator)
-        for a, b in zip((one.nominal, *one.samples), (other.nominal, *other.samples), strict=True)
-    )

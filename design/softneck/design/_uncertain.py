@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import control
+import numpy as np
 
 from softneck.core import DataError, SettingsError, SoftneckError, require_one_of
 from softneck.estimation import AXES, AxisPlant, LinearNeck, axis_plant
@@ -31,6 +32,16 @@ class UncertainAxis:
     def sample_time(self) -> float:
         """[s]."""
         return self.nominal.sample_time
+
+    def same_as(self, other: UncertainAxis) -> bool:
+        """Return whether both are the same plants, so that one synthesis does for both."""
+        mine, its = (self.nominal, *self.samples), (other.nominal, *other.samples)
+        return len(mine) == len(its) and all(
+            a.delay == b.delay
+            and np.array_equal(a.numerator, b.numerator)
+            and np.array_equal(a.denominator, b.denominator)
+            for a, b in zip(mine, its, strict=True)
+        )
 
     def prepared(self, least_delay: float, small_move_pole: float) -> UncertainAxis:
         """Return it with a nominal dead time of at least `least_delay` [s], and the form of small moves as a sample.
