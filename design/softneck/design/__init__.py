@@ -1,5 +1,6 @@
 """Design: controllers for the neck out of identified linear models, with limits and tendon allocation."""
 
+from ._adaptive import AdaptiveSettings as AdaptiveSettings
 from ._assembly import AxisController as AxisController
 from ._assembly import pi_axis as pi_axis
 from ._controller import LinearController as LinearController
@@ -15,3 +16,6 @@ from ._neck_table import neck_step as neck_step
 from ._neck_table import neck_table as neck_table
 from ._neck_table import table_cells as table_cells
 from ._pi import PiSettings as PiSettings
+from ._scheduled import ScheduledSettings as ScheduledSettings
+from ._varying import Limits as Limits
+from ._varying import VaryingController as VaryingController

@@ -70,6 +70,12 @@ KINDS: dict[str, Kind] = {
         Kind("pi", "controller", "softneck.design:PiSettings", "softneck.design:LinearController",
              "softneck.design._linear_controller_runtime",
              "PI with reference filter, anti-windup and tendon allocation"),
+        Kind("scheduled", "controller", "softneck.design:ScheduledSettings", "softneck.design:VaryingController",
+             "softneck.design._scheduled_runtime",
+             "robust PI at every inclination of a family, gains interpolated without bumps"),
+        Kind("adaptive", "controller", "softneck.design:AdaptiveSettings", "softneck.design:VaryingController",
+             "softneck.design._adaptive_runtime",
+             "recursive least squares as the neck moves, gains redesigned in every sample, with safeguards"),
     )
 }  # fmt: skip
 
