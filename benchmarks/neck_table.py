@@ -28,7 +28,7 @@ ON_MODEL: set[str] = set()
 TAUT: dict[str, Any] = {"least_cocontraction": 0.6}
 QUICK: dict[str, Any] = {**TAUT, "lead_limit": 0.8, "reference_time": 0.12}
 # Settings other than the defaults, by kind.
-SETTINGS: dict[str, dict[str, Any]] = {"pi": QUICK, "scheduled": TAUT, "adaptive": TAUT}
+SETTINGS: dict[str, dict[str, Any]] = {"pi": QUICK, "scheduled": TAUT, "adaptive": {**TAUT, "lead_limit": 1.0}}
 
 
 def main() -> None:

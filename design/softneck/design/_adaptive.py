@@ -30,6 +30,7 @@ class AdaptiveSettings:
         least_delay: the dead time is taken as at least this [s].
         small_move_pole: the nominal plant is taken as at least as fast as this [1/s]; 0: as identified.
         forgetting: lambda of the recursion, for the samples it takes in.
+        start_covariance: diagonal of F(0); small trusts the identified plant, so that a first step is not one of learning.
         covariance_bound: on the trace of F.
         dead_zone: errors of the band-passed angle up to this [rad] teach nothing.
         excitation: band-passed input [rad], rms over the last second, below which nothing is learnt.
@@ -52,7 +53,9 @@ class AdaptiveSettings:
     small_move_pole: float = 5.293
     # 4 s of motion.
     forgetting: float = 0.995
-    covariance_bound: float = 1e3
+    # One step of 15 deg teaches about as much.
+    start_covariance: float = 0.5
+    covariance_bound: float = 100.0
     # The filtered noise of the 3DM inclinometer.
     dead_zone: float = math.radians(0.02)
     excitation: float = 0.05
@@ -79,6 +82,7 @@ class AdaptiveSettings:
         require_between("least_delay", self.least_delay, 0.0, 1.0, "s")
         require_between("small_move_pole", self.small_move_pole, 0.0, 1000.0, "1/s")
         require_between("forgetting", self.forgetting, 0.9, 1.0)
+        require_between("start_covariance", self.start_covariance, 1e-9, 1e12)
         require_between("covariance_bound", self.covariance_bound, 1e-6, 1e12)
         require_between("dead_zone", self.dead_zone, 0.0, 0.1, "rad")
         require_between("excitation", self.excitation, 0.0, 10.0, "rad")
@@ -216,7 +220,7 @@ class AdaptiveSettings:
             self.forgetting, self.covariance_bound, self.dead_zone,
             max(-float(plant.denominator[1]) for plant in plants) ** (1.0 / (2.0 * self.pole_range)), self.excitation,
             math.exp(-self.band * Ts), self.distrust, min(self.gain_rate * Ts, 0.5), Ts / self.leak_time,
-            0.5 * self.covariance_bound,
+            min(self.start_covariance, 0.5 * self.covariance_bound),
         ]  # fmt: skip
         return dict(zip(names, (*common[:4], *common[12:16]), strict=True)) | {
             "nominal": np.array([[-plant.denominator[1], plant.numerator[0]] for plant in plants]),
