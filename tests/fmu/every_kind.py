@@ -10,7 +10,7 @@ import control
 import numpy as np
 
 from softneck.core import Block
-from softneck.design import PiSettings
+from softneck.design import FopiSettings, HinfSettings, LqgSettings, NcfSettings, PidSettings, PiSettings
 from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.identification import (
     GreyBox,
@@ -120,6 +120,28 @@ def _pi() -> Block:
     return PiSettings().design(_linear()).block()
 
 
+def _hinf() -> Block:
+    return HinfSettings(bandwidth=4.0, gain_spread=0.0).design(_linear()).block()
+
+
+def _ncf() -> Block:
+    return NcfSettings(crossover=6.0, gain_spread=0.0).design(_linear()).block()
+
+
+def _pid() -> Block:
+    return PidSettings(tuning="placement", frequency=12.0, gain_spread=0.0).design(_linear()).block()
+
+
+def _fopi() -> Block:
+    return FopiSettings(crossover=4.0, gain_spread=0.0).design(_linear()).block()
+
+
+def _lqg() -> Block:
+    return LqgSettings(load_rate=20.0, gain_spread=0.0).design(_linear()).block()
+
+
+_REFERENCES = ["pitch_reference", "roll_reference", "cocontraction_reference", "pitch", "roll", "healthy", "enabled"]
+
 # Kind -> its block, inputs, outputs and parameters that the public face names for it.
 KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...]]] = {
     "rls": (_rls, MOTORS, ["pitch", "roll", "motor_position_1"], _MODEL),
@@ -165,10 +187,15 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
     ),
     "pi": (
         _pi,
-        ["pitch_reference", "roll_reference", "cocontraction_reference", "pitch", "roll", "healthy", "enabled"],
+        _REFERENCES,
         MOTORS,
         (),
     ),
+    "hinf": (_hinf, _REFERENCES, MOTORS, ("slew_limit",)),
+    "ncf": (_ncf, _REFERENCES, MOTORS, ("slew_limit",)),
+    "pid": (_pid, _REFERENCES, MOTORS, ("slew_limit",)),
+    "fopi": (_fopi, _REFERENCES, MOTORS, ("slew_limit",)),
+    "lqg": (_lqg, _REFERENCES, MOTORS, ("slew_limit",)),
 }
 
 

@@ -30,7 +30,7 @@ class AdaptiveSettings:
         least_delay: the dead time is taken as at least this [s].
         small_move_pole: the nominal plant is taken as at least as fast as this [1/s]; 0: as identified.
         forgetting: lambda of the recursion, for the samples it takes in.
-        start_covariance: diagonal of F(0); small trusts the identified plant, so that a first step is not one of learning.
+        start_covariance: diagonal of F(0); small trusts the identified plant, so that no first step is one of learning.
         covariance_bound: on the trace of F.
         dead_zone: errors of the band-passed angle up to this [rad] teach nothing.
         excitation: band-passed input [rad], rms over the last second, below which nothing is learnt.

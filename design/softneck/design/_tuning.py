@@ -83,7 +83,7 @@ def reference_time(plants: Plants, extra_delay: int, gains: Gains, *, gain_sprea
     """
     sample_time = plants[0].sample_time
     rows = math.ceil(_HORIZON / sample_time)
-    scales = (1.0 - gain_spread, 1.0, 1.0 + gain_spread)
+    scales = (1.0 - gain_spread, 1.0, 1.0 + gain_spread) if gain_spread > 0.0 else (1.0,)
     steps = [_step_response(plant, extra_delay, gains, rows, scale) for plant in plants for scale in scales]
     for samples in range(1 + math.ceil(_SLOWEST_FILTER / sample_time)):
         a = math.exp(-1.0 / samples) if samples else 0.0

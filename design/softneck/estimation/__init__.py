@@ -1,5 +1,6 @@
 """Estimation: the inclinometer's Kalman filter over set-points, gyro rates or nothing else."""
 
+from ._axis import AXES as AXES
 from ._axis import AxisPlant as AxisPlant
 from ._axis import HasTransferFunctions as HasTransferFunctions
 from ._axis import LinearNeck as LinearNeck

@@ -76,6 +76,21 @@ KINDS: dict[str, Kind] = {
         Kind("adaptive", "controller", "softneck.design:AdaptiveSettings", "softneck.design:VaryingController",
              "softneck.design._adaptive_runtime",
              "recursive least squares as the neck moves, gains redesigned in every sample, with safeguards"),
+        Kind("hinf", "controller", "softneck.design:HinfSettings", "softneck.design:LinearController",
+             "softneck.design._linear_controller_runtime",
+             "H-infinity mixed sensitivity on the exact-delay plant, verified on every sample"),
+        Kind("ncf", "controller", "softneck.design:NcfSettings", "softneck.design:LinearController",
+             "softneck.design._linear_controller_runtime",
+             "loop shaping with normalised coprime factors (Glover, McFarlane)"),
+        Kind("pid", "controller", "softneck.design:PidSettings", "softneck.design:LinearController",
+             "softneck.design._linear_controller_runtime",
+             "PID tuned on the worst sample of the plant, or by placed poles"),
+        Kind("fopi", "controller", "softneck.design:FopiSettings", "softneck.design:LinearController",
+             "softneck.design._linear_controller_runtime",
+             "fractional-order PI or PID, iso-damped"),
+        Kind("lqg", "controller", "softneck.design:LqgSettings", "softneck.design:LinearController",
+             "softneck.design._linear_controller_runtime",
+             "LQG whose filter estimates a load on the input: its integral action"),
     )
 }  # fmt: skip
 

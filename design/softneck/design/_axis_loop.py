@@ -1,0 +1,119 @@
+"""One axis of a controller around one plant: stable or not, margins, worst case over the samples."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import control
+import numpy as np
+from scipy.linalg import solve_discrete_are
+
+from softneck.core import Matrix, SettingsError, Vector
+from softneck.estimation import AxisPlant
+
+from ._assembly import AxisController
+from ._margins import Margins, frequencies
+
+# Samples are judged on a coarser grid than margins: 4 % apart, a peak of |S| changes by less than 2e-3 between two.
+_COARSE = 4
+# Besides the reference, the state is disturbed by this part of it everywhere: it keeps the conditioning's poles
+# off the border where a zero of the controller lies on it.
+_SPREAD = 1e-3
+# Hanus' gain is taken where it forgets within a second or so.
+_FORGETS = 0.98
+
+
+def error_feedback(K: Any) -> AxisController:
+    """Return the axis of `v = K (r - y)` for a discrete scalar K."""
+    A, B, C, D = (np.asarray(part, dtype=np.float64) for part in (K.A, K.B, K.C, K.D))
+    d = float(D[0, 0])
+    return AxisController(A=A, Br=B, By=-B, C=C, Dr=d, Dy=-d, L=conditioning_gain(A, B, C, d))
+
+
+def conditioning_gain(A: Matrix, B: Matrix, C: Matrix, D: float) -> Matrix:
+    """Return L (n, 1) for `x+ = A x + B r + L (v_limited - v)`, v = C x + D r.
+
+    Hanus' B/D where D is not zero and the conditioned state forgets quickly (Hanus et al. 1987, Automatica 23:729).
+    Otherwise the gain of the innovations form of v: the Kalman predictor of a state driven by r as by noise, which
+    is B/D with its unstable zeros mirrored (Anderson and Moore 1979, sec. 9.3), and exists for D = 0.
+    """
+    if abs(D) > 1e-9:
+        L = B / D
+        if float(np.abs(np.linalg.eigvals(A - L @ C)).max(initial=0.0)) <= _FORGETS:
+            return L
+    n = A.shape[0]
+    # In units of what a reference does, so that the spread is relative.
+    size = max(float(np.linalg.norm(B)), 1e-12)
+    Q = B @ B.T + (_SPREAD * size) ** 2 * np.eye(n)
+    v = max(abs(D), 1e-3 * float(np.abs(C @ B).max(initial=0.0)), 1e-9)
+    R, S = np.array([[v * v * (1.0 + _SPREAD)]]), B * D
+    try:
+        P = solve_discrete_are(A.T, C.T, Q, R, s=S)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise SettingsError(
+            "no conditioning keeps the controller stable at its limits: a mode that is not stable does not show in "
+            "its output. Ask for less, or reduce it (`controller_order`)."
+        ) from error
+    return np.asarray((A @ P @ C.T + S) / (C @ P @ C.T + R))
+
+
+def feedback_response(axis: AxisController, z: np.ndarray) -> np.ndarray:
+    """Return K(z) (m,) of `v = -K y`."""
+    n = axis.A.shape[0]
+    stacked = z[:, None, None] * np.eye(n) - axis.A
+    x = np.linalg.solve(stacked, np.broadcast_to(axis.By, (z.size, n, 1)).astype(complex))
+    return -(np.einsum("in,knj->k", axis.C, x) + axis.Dy)
+
+
+def closed_radius(axis: AxisController, plant: AxisPlant, extra_delay: int) -> float:
+    """Return the spectral radius of the loop with its exact delay; below 1 is stable."""
+    A, B, C = delayed_form(plant, extra_delay)
+    n = A.shape[0]
+    whole = np.block([[A + axis.Dy * np.outer(B, C), np.outer(B, axis.C[0])], [axis.By @ C[None, :], axis.A]])
+    return float(np.abs(np.linalg.eigvals(whole)).max(initial=0.0)) if n else 0.0
+
+
+def delayed_form(plant: AxisPlant, extra_delay: int = 0) -> tuple[Matrix, Vector, Vector]:
+    """Return A, B, C of the plant with its delay as states: the inputs that are on their way, oldest first."""
+    A, B, C = plant.observable_form()
+    n, d = A.shape[0], plant.delay + extra_delay
+    if d == 0:
+        return A, B, C
+    whole, entry = np.zeros((n + d, n + d)), np.zeros(n + d)
+    whole[:n, :n], whole[:n, n] = A, B
+    whole[n : n + d - 1, n + 1 : n + d] = np.eye(d - 1)
+    entry[-1] = 1.0
+    return whole, entry, np.concatenate([C, np.zeros(d)])
+
+
+def axis_margins(axis: AxisController, plant: AxisPlant, extra_delay: int) -> Margins:
+    """Return the margins of the loop with its exact delay, verified to be stable.
+
+    Raises:
+        SettingsError: the closed loop is not stable.
+    """
+    radius = closed_radius(axis, plant, extra_delay)
+    if radius >= 1.0:
+        raise SettingsError(f"the closed loop is not stable (spectral radius {radius:.4f}); ask for less.")
+    w = frequencies(plant.sample_time)
+    loop = feedback_response(axis, np.exp(1j * w * plant.sample_time)) * plant.response(w, extra_delay=extra_delay)
+    data = (np.abs(loop), np.degrees(np.unwrap(np.angle(loop))), w)
+    gain, phase, _, _, crossover, _ = (float(value) for value in control.stability_margins(data))
+    angle = math.radians(phase)
+    delay = angle / crossover if math.isfinite(angle) and crossover > 0 else math.inf
+    return Margins(gain, angle, float(np.max(1.0 / np.abs(1.0 + loop))), crossover, delay)
+
+
+def sensitivities(axis: AxisController, plants: Sequence[AxisPlant], extra_delay: int) -> Vector:
+    """Return Ms of every plant (plants,); the loops are taken to be stable."""
+    w = frequencies(plants[0].sample_time)[::_COARSE]
+    K = feedback_response(axis, np.exp(1j * w * plants[0].sample_time))
+    loops = np.array([K * plant.response(w, extra_delay=extra_delay) for plant in plants])
+    return np.max(1.0 / np.abs(1.0 + loops), axis=1)
+
+
+def unstable_samples(axis: AxisController, plants: Sequence[AxisPlant], extra_delay: int) -> list[int]:
+    """Return the indices of the plants around which the loop is not stable."""
+    return [i for i, plant in enumerate(plants) if closed_radius(axis, plant, extra_delay) >= 1.0]

@@ -1,0 +1,288 @@
+"""Names of the field on `control` systems: `mixsyn`, `hinfsyn`, `ncfsyn`, `loopsyn`."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import control
+import numpy as np
+from scipy.linalg import solve_continuous_are
+
+from softneck.core import Matrix, SettingsError, require_between, require_one_of
+
+from ._bilinear import to_continuous, to_discrete
+from ._riccati import least_gamma, partition, solve_at
+from ._weights import weight_image
+
+METHODS = ("auto", "slycot", "riccati")
+# The optimal controller has a pole near infinity (3e9 rad/s); a little above gamma it is an ordinary one.
+_ABOVE = 1.05
+# |T_zw| found on a grid may exceed gamma by rounding of the synthesis, not more.
+_SLACK = 1e-3
+# A weight below this at infinity counts as strictly proper.
+_LEAST_DIRECT = 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Synthesis:
+    """A controller and what it was found to do.
+
+    Attributes:
+        controller: K for negative feedback, `u = K (r - y)`, with the plant's dt and names.
+        gamma: the least possible norm (`mixsyn`, `hinfsyn`), or 1/e_max (`ncfsyn`).
+        achieved: the norm with this controller, on a grid of frequencies.
+        method: "slycot" or "riccati".
+    """
+
+    controller: control.StateSpace
+    gamma: float
+    achieved: float
+    method: str
+
+    @property
+    def margin(self) -> float:
+        """1/achieved: for `ncfsyn` the stability margin against coprime factor uncertainty."""
+        return 1.0 / self.achieved
+
+
+def have_slycot() -> bool:
+    """Return whether the extra `[slycot]` is installed, without importing it."""
+    return importlib.util.find_spec("slycot") is not None
+
+
+def mixsyn(
+    G: Any,
+    W1: Any = None,
+    W2: Any = None,
+    W3: Any = None,
+    *,
+    method: str = "auto",
+    above: float = _ABOVE,
+) -> Synthesis:
+    """Return the controller that keeps `|W1 S; W2 K S; W3 T|` small (Skogestad and Postlethwaite 2005, sec. 9.3.6).
+
+    Args:
+        G: scalar plant; a discrete one, dead time as poles at zero, is taken exactly through the bilinear map.
+        W1, W2, W3: None, numbers or stable scalar systems, continuous or of the plant's dt. Continuous weights of
+            a discrete plant act at `2/Ts tan(w Ts/2)`.
+        method: "slycot" (the routine behind python-control's `mixsyn`), "riccati" (ours), or what is there.
+        above: the controller is built at this factor above the least gamma.
+
+    Raises:
+        SettingsError: no weight, one that cannot be solved for, another dt, or no controller.
+    """
+    dt = _dt_of(G)
+    weights = [weight_image(W, dt, name) for name, W in (("W1", W1), ("W2", W2), ("W3", W3))]
+    if all(W is None for W in weights):
+        raise SettingsError("`mixsyn` needs at least one weight.")
+    if not any(W is not None and abs(float(np.asarray(W.D)[0, 0])) > _LEAST_DIRECT for W in weights[1:]):
+        raise SettingsError(
+            "the control effort is not weighted at high frequencies (D12 has not full rank), where the search for a "
+            "controller hangs: give W2 a gain there, a number for example, or a W3 with as many zeros as poles."
+        )
+    found = hinfsyn(_augmented(to_continuous(G), weights), 1, 1, method=method, above=above)
+    K = to_discrete(found.controller, dt) if dt else found.controller
+    return Synthesis(controller=_named(K, G, dt), gamma=found.gamma, achieved=found.achieved, method=found.method)
+
+
+def hinfsyn(P: Any, nmeas: int, ncon: int, *, method: str = "auto", above: float = _ABOVE) -> Synthesis:
+    """Return the H-infinity controller of the generalised plant P, built at `above` times the least gamma.
+
+    Both methods refuse what makes the search hang (D12 or D21 of less than full rank), and what comes out is
+    verified: a stable loop and its norm. A discrete P gives a controller of its dt.
+
+    Raises:
+        SettingsError: as said, or no controller exists.
+    """
+    require_one_of("method", method, METHODS)
+    require_between("above", above, 1.001, 100.0)
+    dt = _dt_of(P)
+    image: Any = to_continuous(P)
+    A, B, C, D = (np.asarray(part, dtype=np.float64) for part in (image.A, image.B, image.C, image.D))
+    plant = partition(A, B, C, D, nmeas=nmeas, ncon=ncon)
+    chosen = ("slycot" if have_slycot() else "riccati") if method == "auto" else method
+    if chosen == "slycot":
+        gamma, K = _by_slycot(image, nmeas, ncon, above)
+    else:
+        gamma = least_gamma(plant)
+        parts = solve_at(plant, above * gamma)
+        if parts is None:
+            raise SettingsError(f"no controller at {above:g} times gamma {gamma:.4g}; scale the weights.")
+        K = control.StateSpace(*parts, 0)
+    closed: Any = image.lft(K)
+    return Synthesis(
+        controller=to_discrete(K, dt) if dt else K,
+        gamma=gamma,
+        achieved=_verified(closed, above * gamma),
+        method=chosen,
+    )
+
+
+def ncfsyn(G: Any, W: Any = None, *, above: float = _ABOVE) -> Synthesis:
+    """Return the loop-shaping controller of Glover and McFarlane: `K = W Ks`, robust about the shaped plant G W.
+
+    Against coprime factor uncertainty, at `above` times the least gamma = 1/e_max (McFarlane and Glover 1992, IEEE
+    TAC 37:759; Zhou, Doyle and Glover 1996, sec. 18.3).
+
+    Args:
+        G: scalar plant, continuous or discrete.
+        W: the shape; integrators are welcome. Continuous, or of the plant's dt.
+        above: factor above the least gamma.
+    """
+    found, weight = ncf_parts(G, W, above=above)
+    dt = _dt_of(G)
+    K: Any = weight * found.controller
+    return Synthesis(
+        controller=_named(to_discrete(K, dt) if dt else K, G, dt),
+        gamma=found.gamma,
+        achieved=found.achieved,
+        method="riccati",
+    )
+
+
+def ncf_parts(G: Any, W: Any, *, above: float = _ABOVE) -> tuple[Synthesis, Any]:
+    """Return the continuous images of Ks, for negative feedback, and of W."""
+    require_between("above", above, 1.001, 100.0)
+    dt = _dt_of(G)
+    weight: Any = control.StateSpace([], [], [], [[1.0]], 0) if W is None else control.ss(W)
+    if weight.dt not in (0, None) and not math.isclose(float(weight.dt), dt, rel_tol=1e-9):
+        raise SettingsError(f"W has dt = {weight.dt:g} s, the plant dt = {dt:g} s; they must agree.")
+    weight = to_continuous(weight)
+    image: Any = to_continuous(G)
+    shaped: Any = image * weight
+    A, B, C, D = (np.asarray(part, dtype=np.float64) for part in (shaped.A, shaped.B, shaped.C, shaped.D))
+    S, R = np.eye(B.shape[1]) + D.T @ D, np.eye(C.shape[0]) + D @ D.T
+    try:
+        # X of the control, Z of the filter equation; the cross terms come from D.
+        X = solve_continuous_are(A, B, C.T @ C, S, s=C.T @ D)
+        Z = solve_continuous_are(A.T, C.T, B @ B.T, R, s=B @ D.T)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise SettingsError(
+            "the shaped plant has no stabilising controller: W cancels a pole of the plant that is not stable, or "
+            "a mode of either is hidden. Give another W."
+        ) from error
+    gamma = math.sqrt(1.0 + float(np.abs(np.linalg.eigvals(X @ Z)).max(initial=0.0)))
+    n, g2 = A.shape[0], (above * gamma) ** 2
+    F = -np.linalg.solve(S, D.T @ C + B.T @ X)
+    Q = (1.0 - g2) * np.eye(n) + X @ Z
+    H = g2 * np.linalg.solve(Q.T, Z @ C.T)
+    # Theirs is for positive feedback.
+    Ks = control.StateSpace(A + B @ F + H @ (C + D @ F), H, -B.T @ X, D.T, 0)
+    return Synthesis(controller=Ks, gamma=gamma, achieved=_coprime(shaped, Ks), method="riccati"), weight
+
+
+def loopsyn(G: Any, Gd: Any, *, above: float = _ABOVE) -> Synthesis:
+    """Return the controller whose loop G K follows `Gd` to within gamma, above and below (Glover and McFarlane).
+
+    W = Gd/G needs the plant's inverse: its stable, minimum-phase part is inverted, its delay is left alone.
+
+    Raises:
+        SettingsError: a plant with zeros outside the stability border; shape with `ncfsyn` there.
+    """
+    dt = _dt_of(G)
+    zeros: Any = np.asarray(control.zeros(G))
+    outside = zeros[np.abs(zeros) >= 1.0] if dt else zeros[zeros.real >= 0.0]
+    if outside.size:
+        raise SettingsError(
+            f"the plant has a zero at {_number(outside[0])} outside the stability border, whose inverse is not stable; "
+            "use `ncfsyn` with a weight of your own."
+        )
+    tf: Any = control.ss2tf(G) if isinstance(G, control.StateSpace) else G
+    num, den = (np.trim_zeros(np.asarray(part[0][0]), "f") for part in (tf.num, tf.den))
+    if dt:
+        den = np.trim_zeros(den, "b")
+        inverse = control.TransferFunction(den, np.concatenate([num, np.zeros(den.size - num.size)]), dt)
+    else:
+        fast = 1e3 * max(1.0, float(np.abs(np.roots(den)).max(initial=1.0)))
+        lag = np.poly(np.full(den.size - num.size, -fast)) * fast ** (num.size - den.size)
+        inverse = control.TransferFunction(den, np.convolve(num, lag))
+    target: Any = to_discrete(to_continuous(Gd), dt) if dt and control.isctime(Gd) else Gd
+    return ncfsyn(G, control.minreal(control.ss2tf(control.ss(target)) * inverse, verbose=False), above=above)
+
+
+def _augmented(G: Any, weights: list[Any]) -> control.StateSpace:
+    """Return P from (r, u) to (W1 e, W2 u, W3 y, e) with e = r - G u (python-control's `augw`, which warns)."""
+    one = control.StateSpace([], [], [], [[1.0]], 0)
+    blocks = [(W, part) for W, part in zip(weights, ("e", "u", "y"), strict=True) if W is not None]
+    A, B, C, D = (np.asarray(part, dtype=np.float64) for part in (G.A, G.B, G.C, G.D))
+    rows = {
+        "e": (-C, np.hstack([np.ones((1, 1)), -D])),
+        "u": (np.zeros_like(C), np.array([[0.0, 1.0]])),
+        "y": (C, np.hstack([np.zeros((1, 1)), D])),
+    }
+    states, inputs = A, np.hstack([np.zeros_like(B), B])
+    outputs, direct = [], []
+    for W, part in [*blocks, (one, "e")]:
+        before = states.shape[0]
+        row, gain = rows[part]
+        row = np.hstack([row, np.zeros((1, before - row.shape[1]))])
+        Aw, Bw, Cw, Dw = (np.asarray(item, dtype=np.float64) for item in (W.A, W.B, W.C, W.D))
+        states = np.block([[states, np.zeros((before, Aw.shape[0]))], [Bw @ row, Aw]])
+        inputs = np.vstack([inputs, Bw @ gain])
+        outputs.append(np.hstack([Dw @ row, Cw]))
+        direct.append(Dw @ gain)
+    wide = [np.hstack([row, np.zeros((1, states.shape[0] - row.shape[1]))]) for row in outputs]
+    return control.StateSpace(states, inputs, np.vstack(wide), np.vstack(direct), 0)
+
+
+def _by_slycot(P: Any, nmeas: int, ncon: int, above: float) -> tuple[float, control.StateSpace]:
+    try:
+        from slycot import sb10ad
+        from slycot.exceptions import SlycotError
+    except ImportError as error:
+        raise SettingsError(
+            "`method` slycot needs the extra: pip install softneck[slycot]; `riccati` does without."
+        ) from error
+    sizes = (P.nstates, P.ninputs, P.noutputs, ncon, nmeas)
+    try:
+        gamma = float(sb10ad(*sizes, 1e6, P.A, P.B, P.C, P.D, job=1, gtol=1e-5)[0])
+        K = sb10ad(*sizes, above * gamma, P.A, P.B, P.C, P.D, job=4)[1:5]
+    except SlycotError as error:
+        raise SettingsError(f"slycot found no controller ({error}); scale the weights, or use `riccati`.") from error
+    return gamma, control.StateSpace(*K, 0)
+
+
+def _verified(closed: Any, bound: float) -> float:
+    """Return the norm of the closed loop on a grid; raise where it is not stable or beyond `bound`."""
+    largest = float(np.max(np.linalg.eigvals(np.asarray(closed.A)).real, initial=-np.inf))
+    if largest >= 0.0:
+        raise SettingsError(
+            f"what came out is not stable (a pole at {largest:.3g} rad/s): the problem is near singular. Weigh the "
+            "control effort more (W2), or build further `above` gamma."
+        )
+    response = np.moveaxis(np.asarray(closed(1j * np.geomspace(1e-4, 1e5, 400), squeeze=False)), -1, 0)
+    size = float(np.linalg.norm(response, 2, axis=(1, 2)).max())
+    if size > (1.0 + _SLACK) * bound:
+        raise SettingsError(f"what came out has a norm of {size:.4g}, beyond {bound:.4g}: scale the weights.")
+    return size
+
+
+def _coprime(G: Any, K: Any) -> float:
+    """Return `|[K; 1] (1 + G K)^-1 [1, G]|` on a grid, which 1/margin is; raise if the loop is not stable."""
+    closed: Any = control.feedback(G * K, 1)
+    if float(np.max(np.linalg.eigvals(np.asarray(closed.A)).real, initial=-np.inf)) >= 0.0:
+        raise SettingsError("what came out is not stable: shape a slower loop, or build further `above` gamma.")
+    s = 1j * np.geomspace(1e-4, 1e5, 400)
+    g, k = np.asarray(G(s)), np.asarray(K(s))
+    return float(np.max(np.sqrt((1.0 + np.abs(g) ** 2) * (1.0 + np.abs(k) ** 2)) / np.abs(1.0 + g * k)))
+
+
+def _dt_of(system: Any) -> float:
+    if not isinstance(system, control.StateSpace | control.TransferFunction):
+        raise SettingsError(f"a control.StateSpace or TransferFunction is needed; got {type(system).__name__}.")
+    if system.dt is None or system.dt is True:
+        raise SettingsError("the system must say its sample time: give it dt = 0 (continuous) or dt in seconds.")
+    return float(system.dt)
+
+
+def _number(value: complex) -> str:
+    return f"{value.real:.4g}" if abs(value.imag) < 1e-9 else f"{value.real:.4g}{value.imag:+.4g}j"
+
+
+def _named(K: Any, G: Any, dt: float) -> control.StateSpace:
+    """Return K, from the plant's outputs to its inputs by name."""
+    parts: list[Matrix] = [np.asarray(part) for part in (K.A, K.B, K.C, K.D)]
+    return control.StateSpace(*parts, dt, inputs=list(G.output_labels), outputs=list(G.input_labels))

@@ -1,0 +1,173 @@
+"""Synthesis against slycot, against theorems, and against what makes it hang or lie."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import control
+import numpy as np
+import pytest
+
+from softneck.core import SettingsError
+from softneck.design import bake_off_plant, hinfsyn, loopsyn, makeweight, mixsyn, ncfsyn
+
+TS = 0.02
+PLANT = bake_off_plant()
+# In units of its static gain, so that weights are plain numbers.
+DISCRETE: Any = PLANT.tf() / PLANT.static_gain
+LAG = control.TransferFunction([1.0], [1.0 / 5.293, 1.0])
+CONTINUOUS: Any = control.ss(LAG * control.TransferFunction(*control.pade(0.08, 3)))
+W1 = makeweight(1e4, 3.0, 0.6)
+
+
+def norm_of_mixed(G: Any, K: Any, weights: list[Any], points: int = 2000) -> float:
+    """The largest |W1 S; W2 K S; W3 T| on a grid, from the frequency responses alone."""
+    if G.dt:
+        w = np.geomspace(1e-3, 0.9999 * np.pi / G.dt, points)
+        at, at_weights = np.exp(1j * w * G.dt), 2j / G.dt * np.tan(0.5 * w * G.dt)
+    else:
+        at = at_weights = 1j * np.geomspace(1e-3, 1e4, points)
+    g, k = np.asarray(G(at)), np.asarray(K(at))
+    parts = [1.0 / (1.0 + g * k), k / (1.0 + g * k), g * k / (1.0 + g * k)]
+    sizes = [
+        np.abs(part * (W(at_weights) if hasattr(W, "dt") else W)) ** 2
+        for W, part in zip(weights, parts, strict=True)
+        if W is not None
+    ]
+    return float(np.sqrt(np.max(np.sum(sizes, axis=0))))
+
+
+@pytest.mark.parametrize("plant", [DISCRETE, CONTINUOUS], ids=["exact_delay", "pade"])
+@pytest.mark.parametrize("W3", [None, makeweight(0.3, 20.0, 5.0)], ids=["two", "three"])
+def test_our_riccati_synthesis_equals_slycot(plant: Any, W3: Any) -> None:
+    pytest.importorskip("slycot")
+    ours = mixsyn(plant, W1, 0.2, W3, method="riccati")
+    theirs = mixsyn(plant, W1, 0.2, W3, method="slycot")
+    # Both searches end within 1e-4 of the least gamma.
+    assert ours.gamma == pytest.approx(theirs.gamma, rel=3e-4)
+    z = np.exp(1j * np.geomspace(1e-2, 100.0, 50) * TS) if plant.dt else 1j * np.geomspace(1e-2, 100.0, 50)
+    # The central controllers at gammas 3e-4 apart.
+    np.testing.assert_allclose(ours.controller(z), theirs.controller(z), rtol=2e-2)
+
+
+@pytest.mark.parametrize("method", ["riccati", "slycot"])
+@pytest.mark.parametrize("plant", [DISCRETE, CONTINUOUS], ids=["exact_delay", "pade"])
+def test_the_norm_is_what_it_says(plant: Any, method: str) -> None:
+    if method == "slycot":
+        pytest.importorskip("slycot")
+    found = mixsyn(plant, W1, 0.2, method=method)
+    size = norm_of_mixed(plant, found.controller, [W1, 0.2, None])
+    # Built 5 % above gamma; two grids see the peak to 1e-3.
+    assert found.gamma <= size * 1.001
+    assert size <= 1.05 * found.gamma * 1.001
+    assert size == pytest.approx(found.achieved, rel=1e-3)
+
+
+def test_no_pi_does_better_than_gamma() -> None:
+    """gamma is a bound below for every controller: PI controllers stay above it."""
+    gamma = mixsyn(DISCRETE, W1, 0.2, method="riccati").gamma
+    for gain in (0.3, 0.6, 0.9):
+        for time in (0.1, 0.19, 0.4):
+            pi: Any = control.TransferFunction([gain, gain * (TS / time - 1.0)], [1.0, -1.0], TS)
+            assert norm_of_mixed(DISCRETE, pi, [W1, 0.2, None]) >= gamma
+
+
+def test_a_known_optimum() -> None:
+    """min over K of |K S|: any stable plant has 0; an unstable 1/(s - 1) needs |K S| >= 2 (Glover 1986)."""
+    G = control.ss(control.TransferFunction([1.0], [1.0, -1.0]))
+    found = mixsyn(G, makeweight(1e-4, (1.0, 1e-5), 1e-6), 1.0, method="riccati")
+    # W1 of 1e-4 at most adds at most its square.
+    assert found.gamma == pytest.approx(2.0, rel=1e-3)
+
+
+def test_dt_and_names_are_kept() -> None:
+    G = control.TransferFunction(DISCRETE.num, DISCRETE.den, TS, inputs=["theta_i"], outputs=["pitch"])
+    for K in (
+        mixsyn(G, W1, 0.2).controller,
+        ncfsyn(G, control.TransferFunction([4.0, 20.0], [5.0, 0.0])).controller,
+        loopsyn(G, control.TransferFunction([4.0], [1.0, 0.0])).controller,
+    ):
+        assert K.dt == TS
+        assert K.input_labels == ["pitch"]
+        assert K.output_labels == ["theta_i"]
+
+
+@pytest.mark.parametrize("plant", [DISCRETE, CONTINUOUS], ids=["exact_delay", "pade"])
+def test_ncf_reaches_the_margin_of_the_hankel_norm(plant: Any) -> None:
+    """e_max = sqrt(1 - |[N M]|_H^2) (Glover and McFarlane 1989, Theorem 4.2), N M of python-control's Gramians."""
+    from scipy.linalg import solve_continuous_are, solve_continuous_lyapunov
+
+    from softneck.design._bilinear import to_continuous
+
+    W = control.TransferFunction([4.0, 21.0], [5.0, 0.0])
+    found = ncfsyn(plant, W)
+    G: Any = to_continuous(plant) * control.ss(W)
+    A, B, C, D = (np.asarray(part) for part in (G.A, G.B, G.C, G.D))
+    R = np.eye(1) + D @ D.T
+    Z = solve_continuous_are(A.T, C.T, B @ B.T, R, s=B @ D.T)
+    H = -(Z @ C.T + B @ D.T) @ np.linalg.inv(R)
+    r = 1.0 / np.sqrt(R[0, 0])
+    Bnm, Ac = np.hstack([B + H @ D, H]), A + H @ C
+    P = solve_continuous_lyapunov(Ac, -Bnm @ Bnm.T)
+    Q = solve_continuous_lyapunov(Ac.T, -(r * C).T @ (r * C))
+    hankel = np.sqrt(np.abs(np.linalg.eigvals(P @ Q)).max())
+    # Two Riccati and two Lyapunov equations of order 9.
+    assert 1.0 / found.gamma == pytest.approx(np.sqrt(1.0 - hankel**2), rel=1e-6)
+    assert found.margin >= 1.0 / (1.05 * found.gamma) * (1.0 - 1e-9)
+
+
+def test_loopsyn_follows_its_target() -> None:
+    target = control.TransferFunction([3.0], [1.0, 0.0])
+    K: Any = loopsyn(DISCRETE, target).controller
+    w = np.array([0.1, 0.3, 1.0])
+    z = np.exp(1j * w * TS)
+    ratio = np.abs(np.asarray(DISCRETE(z)) * np.asarray(K(z))) / np.abs(target(1j * w))
+    # Within gamma (1.8 here) above and below at low frequencies.
+    assert np.all(ratio > 0.5)
+    assert np.all(ratio < 2.0)
+
+
+def test_what_hangs_or_lies_is_refused_in_words() -> None:
+    integrator = control.TransferFunction([1.0], [1.0, 0.0])
+    slow = makeweight(0.1, 20.0, 3.0)
+    strictly_proper = control.TransferFunction([1.0], [1.0, 1.0])
+    for method in ("riccati", "slycot"):
+        with pytest.raises(SettingsError, match="D12 has not full rank"):
+            mixsyn(DISCRETE, W1, method=method)
+        with pytest.raises(SettingsError, match="D12 has not full rank"):
+            mixsyn(DISCRETE, W1, strictly_proper, method=method)
+        with pytest.raises(SettingsError, match="D12 has not full rank"):
+            mixsyn(CONTINUOUS, W1, None, slow, method=method)  # G itself falls off
+    with pytest.raises(SettingsError, match="W1 has an integrator"):
+        mixsyn(DISCRETE, integrator, 0.2)
+    with pytest.raises(SettingsError, match="W2 is not stable"):
+        mixsyn(DISCRETE, W1, control.TransferFunction([1.0, 0.0], [1.0, -1.0]))
+    with pytest.raises(SettingsError, match="W3 has more zeros than poles"):
+        mixsyn(DISCRETE, W1, 0.2, control.TransferFunction([1.0, 1.0], [1.0]))
+    with pytest.raises(SettingsError, match=r"W1 has dt = 0.01 s, the plant dt = 0.02 s"):
+        mixsyn(DISCRETE, makeweight(1e3, 3.0, 0.5, dt=0.01), 0.2)
+    with pytest.raises(SettingsError, match="at least one weight"):
+        mixsyn(DISCRETE)
+    with pytest.raises(SettingsError, match="must say its sample time"):
+        mixsyn(control.TransferFunction([1.0], [1.0, 0.5], True), W1, 0.2)
+    with pytest.raises(SettingsError, match="TransferFunction is needed"):
+        mixsyn(3.0, W1, 0.2)
+    with pytest.raises(SettingsError, match="W has dt"):
+        ncfsyn(DISCRETE, control.TransferFunction([1.0], [1.0, -1.0], 0.01))
+    with pytest.raises(SettingsError, match=r"zero at 1\.2 outside"):
+        loopsyn(control.TransferFunction([1.0, -1.2], [1.0, -0.5, 0.0], TS), integrator)
+
+
+def test_a_measurement_without_input_of_its_own_is_refused() -> None:
+    P = control.StateSpace(-np.eye(2), np.eye(2), np.eye(2), [[0.0, 1.0], [0.0, 0.0]], 0)
+    with pytest.raises(SettingsError, match="D21 has not full rank"):
+        hinfsyn(P, 1, 1)
+
+
+def test_a_mode_that_no_input_reaches_is_no_solution() -> None:
+    A = np.diag([1.0, -1.0])
+    B = np.array([[0.0, 0.0], [1.0, 1.0]])
+    C = np.array([[1.0, 1.0], [0.0, 0.0], [1.0, 1.0]])
+    P = control.StateSpace(A, B, C, [[0.0, 0.0], [0.0, 1.0], [1.0, 0.0]], 0)
+    with pytest.raises(SettingsError, match="no controller exists"):
+        hinfsyn(P, 1, 1, method="riccati")
