@@ -1,5 +1,6 @@
 """Design: controllers for the neck out of identified linear models, with limits and tendon allocation."""
 
+from ._adaptive import AdaptiveSettings as AdaptiveSettings
 from ._assembly import AxisController as AxisController
 from ._assembly import pi_axis as pi_axis
 from ._bake_off import BakeOff as BakeOff
@@ -19,11 +20,21 @@ from ._lqg import LqgSettings as LqgSettings
 from ._margins import Margins as Margins
 from ._margins import loop_margins as loop_margins
 from ._ncf import NcfSettings as NcfSettings
+from ._neck_table import FIGURES as FIGURES
+from ._neck_table import NECK_HEAD as NECK_HEAD
+from ._neck_table import NeckCase as NeckCase
+from ._neck_table import NeckRow as NeckRow
+from ._neck_table import NeckSteps as NeckSteps
+from ._neck_table import neck_row as neck_row
+from ._neck_table import neck_step as neck_step
+from ._neck_table import neck_table as neck_table
+from ._neck_table import table_cells as table_cells
 from ._pi import PiSettings as PiSettings
 from ._pid import PidGains as PidGains
 from ._pid import PidSettings as PidSettings
 from ._reduction import Reduced as Reduced
 from ._reduction import reduce_controller as reduce_controller
+from ._scheduled import ScheduledSettings as ScheduledSettings
 from ._synthesis import Synthesis as Synthesis
 from ._synthesis import hinfsyn as hinfsyn
 from ._synthesis import loopsyn as loopsyn
@@ -32,5 +43,7 @@ from ._synthesis import ncfsyn as ncfsyn
 from ._uncertain import UncertainAxis as UncertainAxis
 from ._uncertain import UncertainPlant as UncertainPlant
 from ._uncertain import uncertain_plant as uncertain_plant
+from ._varying import Limits as Limits
+from ._varying import VaryingController as VaryingController
 from ._weights import makeweight as makeweight
 from ._weights import ucover as ucover

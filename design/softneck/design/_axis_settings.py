@@ -19,6 +19,7 @@ from ._axis_loop import axis_margins, sensitivities, unstable_samples
 from ._bake_off import BakeOff
 from ._controller import LinearController
 from ._margins import Margins
+from ._ports import require_taut
 from ._reduction import reduce_axis
 from ._sweep import Sweep, make_sweep
 from ._uncertain import UncertainAxis, uncertain_plant
@@ -58,6 +59,9 @@ class AxisSettings(ABC):
         position_limit: of each motor [rad].
         slew_limit: of each motor [rad/s].
         lead_limit: how far a set-point may be from its measured motor [rad].
+        least_position: no motor is let out below this [rad]; co-contraction is raised instead. -6 for no such rule.
+        least_cocontraction: the co-contraction reference is at least this [rad]; keeps tendons taut under a payload.
+            -6 for no such rule.
         order: of the loop; "jacobi" adds one sample for the controller and one for the observer.
         observer: whether the loop will have an observer.
         tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
@@ -76,6 +80,8 @@ class AxisSettings(ABC):
     position_limit: float = 6.0
     slew_limit: float = 12.5
     lead_limit: float = 0.4
+    least_position: float = -6.0
+    least_cocontraction: float = -6.0
     order: str = "sequential"
     observer: bool = True
     tendon_angles: tuple[float, float, float] = tuple(TENDON_ANGLES.tolist())
@@ -92,6 +98,7 @@ class AxisSettings(ABC):
         require_between("position_limit", self.position_limit, 0.01, 6.0, "rad")
         require_positive("slew_limit", self.slew_limit, "rad/s")
         require_between("lead_limit", self.lead_limit, 0.01, 12.0, "rad")
+        require_taut(self.least_position, self.least_cocontraction, self.position_limit)
         require_one_of("order", self.order, ORDERS)
 
     @property
@@ -129,6 +136,8 @@ class AxisSettings(ABC):
             position_limit=self.position_limit,
             slew_limit=self.slew_limit,
             lead_limit=self.lead_limit,
+            least_position=self.least_position,
+            least_cocontraction=self.least_cocontraction,
             order=self.order,
             design={
                 "settings": asdict(self),

@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.io import savemat
 
-from softneck.core import Block, FileFormatError, Matrix, Port, State, Vector, atomic_write, write_archive
+from softneck.core import Block, FileFormatError, Matrix, State, Vector, atomic_write, write_archive
+
+from ._ports import MAX_MOTOR, controller_inputs, controller_outputs, limit_ports, require_taut, taut_lines
 
 _RUNTIME = "softneck.design._linear_controller_runtime"
 _ARRAYS = (
@@ -34,10 +36,6 @@ _ARRAYS = (
     "T_inverse",
     "constants",
 )
-# The neck's inclination stays below 0.7 rad; motors within 6 rad (paper, section 5).
-_MAX_REFERENCE = 0.8
-_MAX_MOTOR = 6.0
-_MAX_SLEW = 1000.0
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -47,10 +45,13 @@ class LinearController:
     Attributes:
         kind: name in the table of kinds.
         sample_time: [s].
-        arrays: what the runtime reads, see `_linear_controller_runtime`.
+        arrays: what the runtime reads, see `_linear_parts_runtime`.
         position_limit: of each motor [rad].
         slew_limit: of each motor [rad/s].
         lead_limit: how far a set-point may be from its motor [rad].
+        least_position: no motor is let out below this [rad], co-contraction is raised instead; tendons stay taut.
+            -6 for no such rule.
+        least_cocontraction: the co-contraction reference is at least this [rad of delta_i]; -6 for no such rule.
         order: of the loop it is for.
         design: JSON values: the settings, gains and margins by axis, for `summary` and the header.
     """
@@ -63,6 +64,11 @@ class LinearController:
     lead_limit: float
     order: str
     design: Mapping[str, Any]
+    least_position: float = -MAX_MOTOR
+    least_cocontraction: float = -MAX_MOTOR
+
+    def __post_init__(self) -> None:
+        require_taut(self.least_position, self.least_cocontraction, self.position_limit)
 
     def block(self) -> Block:
         """Return the controller as a block of role "controller"."""
@@ -72,12 +78,10 @@ class LinearController:
             runtime=_RUNTIME,
             sample_time=self.sample_time,
             arrays=self.arrays,
-            inputs=_inputs(),
-            outputs=tuple(_motor(f"motor_setpoint_{j}", "set-point of motor") for j in (1, 2, 3)),
-            parameters=(
-                Port(name="position_limit", unit="rad", start=self.position_limit, minimum=0.01, maximum=_MAX_MOTOR),
-                Port(name="slew_limit", unit="rad/s", start=self.slew_limit, minimum=0.01, maximum=_MAX_SLEW),
-                Port(name="lead_limit", unit="rad", start=self.lead_limit, minimum=0.01, maximum=2.0 * _MAX_MOTOR),
+            inputs=controller_inputs(),
+            outputs=controller_outputs(),
+            parameters=limit_ports(
+                (self.position_limit, self.slew_limit, self.lead_limit, self.least_position, self.least_cocontraction)
             ),
         )
 
@@ -125,6 +129,7 @@ class LinearController:
             f"  limits: |P| <= {self.position_limit:g} rad, slew {self.slew_limit:g} rad/s "
             f"({self.slew_limit * self.sample_time:g} rad per sample), "
             f"lead {self.lead_limit:g} rad before the motors",
+            *taut_lines(self.least_position, self.least_cocontraction),
         ]
         for axis in ("pitch", "roll"):
             item = self.design.get(axis, {})
@@ -144,6 +149,8 @@ class LinearController:
             "position_limit": self.position_limit,
             "slew_limit": self.slew_limit,
             "lead_limit": self.lead_limit,
+            "least_position": self.least_position,
+            "least_cocontraction": self.least_cocontraction,
             "order": self.order,
             "design": dict(self.design),
             "inputs": [port.name for port in block.inputs],
@@ -172,29 +179,10 @@ class LinearController:
             lead_limit=float(header["lead_limit"]),
             order=str(header["order"]),
             design=dict(header["design"]),
+            # Files of the first version do not know the rule.
+            least_position=float(header.get("least_position", -MAX_MOTOR)),
+            least_cocontraction=float(header.get("least_cocontraction", -MAX_MOTOR)),
         )
-
-
-def _inputs() -> tuple[Port, ...]:
-    references = tuple(
-        Port(name=f"{axis}_reference", unit="rad", minimum=-_MAX_REFERENCE, maximum=_MAX_REFERENCE,
-             description=f"wanted {axis}") for axis in ("pitch", "roll")
-    )  # fmt: skip
-    cocontraction = Port(
-        name="cocontraction_reference", unit="rad", minimum=-_MAX_MOTOR, maximum=_MAX_MOTOR,
-        description="wanted delta_i (Eq. 11)",
-    )  # fmt: skip
-    angles = tuple(Port(name=axis, unit="rad", description=f"{axis} of the neck") for axis in ("pitch", "roll"))
-    motors = tuple(_motor(f"motor_position_{j}", "measured position of motor") for j in (1, 2, 3))
-    flags = (
-        Port(name="healthy", description="the angles can be trusted", start=1.0, boolean=True),
-        Port(name="enabled", description="may move the motors", start=1.0, boolean=True),
-    )
-    return (*references, cocontraction, *angles, *motors, *flags)
-
-
-def _motor(name: str, what: str) -> Port:
-    return Port(name=name, unit="rad", description=f"{what} {name[-1]}", minimum=-_MAX_MOTOR, maximum=_MAX_MOTOR)
 
 
 def _margins(values: Mapping[str, float | None]) -> str:

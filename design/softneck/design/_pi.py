@@ -16,6 +16,7 @@ from ._axis_settings import margins_json
 from ._controller import LinearController
 from ._margins import loop_margins
 from ._pid import place_pid
+from ._ports import require_taut
 from ._tuning import Gains, Plants, open_loop, reference_time, tune_pi
 from ._uncertain import UncertainAxis, uncertain_plant
 
@@ -50,6 +51,9 @@ class PiSettings:
         slew_limit: of each motor [rad/s]; the default is 0.25 rad in 20 ms.
         lead_limit: how far a set-point may be from its measured motor [rad]; keeps the integral from winding up
             while a drive at its current limit falls behind.
+        least_position: no motor is let out below this [rad]; co-contraction is raised instead. -6 for no such rule.
+        least_cocontraction: the co-contraction reference is at least this [rad]; keeps tendons taut under a payload.
+            -6 for no such rule.
         order: of the loop; "jacobi" adds one sample for the controller and one for the observer.
         observer: whether the loop will have an observer.
         tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
@@ -70,6 +74,8 @@ class PiSettings:
     position_limit: float = 6.0
     slew_limit: float = 12.5
     lead_limit: float = 0.4
+    least_position: float = -6.0
+    least_cocontraction: float = -6.0
     order: str = "sequential"
     observer: bool = True
     tendon_angles: tuple[float, float, float] = tuple(TENDON_ANGLES.tolist())
@@ -89,6 +95,7 @@ class PiSettings:
         require_between("position_limit", self.position_limit, 0.01, 6.0, "rad")
         require_positive("slew_limit", self.slew_limit, "rad/s")
         require_between("lead_limit", self.lead_limit, 0.01, 12.0, "rad")
+        require_taut(self.least_position, self.least_cocontraction, self.position_limit)
         require_one_of("order", self.order, ORDERS)
 
     @property
@@ -131,6 +138,8 @@ class PiSettings:
             position_limit=self.position_limit,
             slew_limit=self.slew_limit,
             lead_limit=self.lead_limit,
+            least_position=self.least_position,
+            least_cocontraction=self.least_cocontraction,
             order=self.order,
             design={"settings": asdict(self), "extra_delay": self.extra_delay, **found},
         )
