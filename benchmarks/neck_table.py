@@ -22,9 +22,13 @@ from softneck.plant import VirtualNeck, record
 from softneck.signals import Recording, signal
 
 # What a kind is designed on, where its own default is not the family over the payloads.
-ON_MODEL = {"pi"}
+ON_MODEL: set[str] = set()
+# What the defaults leave to the user: the co-contraction that keeps tendons taut under 1 kg, how far set-points may run
+# ahead of the motors, and how much of a step the reference filter holds back.
+TAUT: dict[str, Any] = {"least_cocontraction": 0.6}
+QUICK: dict[str, Any] = {**TAUT, "lead_limit": 0.8, "reference_time": 0.12}
 # Settings other than the defaults, by kind.
-SETTINGS: dict[str, dict[str, Any]] = {}
+SETTINGS: dict[str, dict[str, Any]] = {"pi": QUICK, "scheduled": TAUT, "adaptive": {**TAUT, "lead_limit": 1.0}}
 
 
 def main() -> None:

@@ -10,7 +10,15 @@ import control
 import numpy as np
 
 from softneck.core import Block
-from softneck.design import HinfSettings, NcfSettings, PiSettings
+from softneck.design import (
+    CustomSettings,
+    FopiSettings,
+    HinfSettings,
+    LqgSettings,
+    NcfSettings,
+    PidSettings,
+    PiSettings,
+)
 from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.identification import (
     GreyBox,
@@ -128,6 +136,23 @@ def _ncf() -> Block:
     return NcfSettings(crossover=6.0, gain_spread=0.0).design(_linear()).block()
 
 
+def _pid() -> Block:
+    return PidSettings(tuning="placement", frequency=12.0, gain_spread=0.0).design(_linear()).block()
+
+
+def _fopi() -> Block:
+    return FopiSettings(crossover=4.0, gain_spread=0.0).design(_linear()).block()
+
+
+def _lqg() -> Block:
+    return LqgSettings(load_rate=20.0, gain_spread=0.0).design(_linear()).block()
+
+
+def _custom() -> Block:
+    K = control.TransferFunction([4.0, -3.5], [1.0, -1.0], TS)
+    return CustomSettings(controller=K, gain_spread=0.0).design(_linear()).block()
+
+
 _REFERENCES = ["pitch_reference", "roll_reference", "cocontraction_reference", "pitch", "roll", "healthy", "enabled"]
 
 # Kind -> its block, inputs, outputs and parameters that the public face names for it.
@@ -181,6 +206,10 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
     ),
     "hinf": (_hinf, _REFERENCES, MOTORS, ("slew_limit",)),
     "ncf": (_ncf, _REFERENCES, MOTORS, ("slew_limit",)),
+    "pid": (_pid, _REFERENCES, MOTORS, ("slew_limit",)),
+    "fopi": (_fopi, _REFERENCES, MOTORS, ("slew_limit",)),
+    "lqg": (_lqg, _REFERENCES, MOTORS, ("slew_limit",)),
+    "custom": (_custom, _REFERENCES, MOTORS, ("slew_limit",)),
 }
 
 

@@ -21,8 +21,8 @@ from ._preflight import Report, preflight
 from ._result import DrivesResult, RunLog
 from ._sdo import Objects, SdoError, load_eds
 from ._virtual import VirtualRun, simulated_neck
-from .master import Master, MasterSettings, Tilt, nmt_frame
 from .master import Command as NmtCommand
+from .master import Master, MasterSettings, Tilt, nmt_frame
 
 # Before the first cycle on a bus each drive is given this time to become operational [s].
 _START_TIME = 0.1

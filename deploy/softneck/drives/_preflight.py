@@ -6,8 +6,6 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from canopen.objectdictionary import ObjectDictionary
-
 from softneck.core import CheckFailedError, SoftneckError
 
 from ._file import DriveEntry, DrivesFile

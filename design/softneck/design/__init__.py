@@ -1,5 +1,6 @@
 """Design: controllers for the neck out of identified linear models, with limits and tendon allocation."""
 
+from ._adaptive import AdaptiveSettings as AdaptiveSettings
 from ._assembly import AxisController as AxisController
 from ._assembly import pi_axis as pi_axis
 from ._bake_off import BakeOff as BakeOff
@@ -11,7 +12,12 @@ from ._bake_off import bake_off_samples as bake_off_samples
 from ._bake_off import block_stepper as block_stepper
 from ._bake_off import run_bake_off as run_bake_off
 from ._controller import LinearController as LinearController
+from ._custom import CustomSettings as CustomSettings
+from ._fopi import FopiSettings as FopiSettings
+from ._fractional import FractionalPid as FractionalPid
+from ._fractional import fopi as fopi
 from ._hinf import HinfSettings as HinfSettings
+from ._lqg import LqgSettings as LqgSettings
 from ._margins import Margins as Margins
 from ._margins import loop_margins as loop_margins
 from ._ncf import NcfSettings as NcfSettings
@@ -25,8 +31,11 @@ from ._neck_table import neck_step as neck_step
 from ._neck_table import neck_table as neck_table
 from ._neck_table import table_cells as table_cells
 from ._pi import PiSettings as PiSettings
+from ._pid import PidGains as PidGains
+from ._pid import PidSettings as PidSettings
 from ._reduction import Reduced as Reduced
 from ._reduction import reduce_controller as reduce_controller
+from ._scheduled import ScheduledSettings as ScheduledSettings
 from ._synthesis import Synthesis as Synthesis
 from ._synthesis import hinfsyn as hinfsyn
 from ._synthesis import loopsyn as loopsyn
@@ -35,5 +44,7 @@ from ._synthesis import ncfsyn as ncfsyn
 from ._uncertain import UncertainAxis as UncertainAxis
 from ._uncertain import UncertainPlant as UncertainPlant
 from ._uncertain import uncertain_plant as uncertain_plant
+from ._varying import Limits as Limits
+from ._varying import VaryingController as VaryingController
 from ._weights import makeweight as makeweight
 from ._weights import ucover as ucover

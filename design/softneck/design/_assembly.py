@@ -70,7 +70,7 @@ def assemble(
     sample_time: float,
     tendon_angles: tuple[float, float, float],
 ) -> tuple[Matrix, ...]:
-    """Return the arrays that `_linear_controller_runtime` reads.
+    """Return the arrays that `_linear_parts_runtime` reads.
 
     Args:
         axes: controllers of pitch and roll.

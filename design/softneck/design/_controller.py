@@ -45,7 +45,7 @@ class LinearController:
     Attributes:
         kind: name in the table of kinds.
         sample_time: [s].
-        arrays: what the runtime reads, see `_linear_controller_runtime`.
+        arrays: what the runtime reads, see `_linear_parts_runtime`.
         position_limit: of each motor [rad].
         slew_limit: of each motor [rad/s].
         lead_limit: how far a set-point may be from its motor [rad].

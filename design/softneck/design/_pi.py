@@ -7,14 +7,20 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from softneck.core import SettingsError, require_between, require_one_of, require_positive
-from softneck.estimation import ORDERS, AxisPlant, HasTransferFunctions, axis_plant
+from softneck.estimation import AXES, ORDERS, HasTransferFunctions
 from softneck.signals import TENDON_ANGLES
 
 from ._assembly import assemble, pi_axis
+from ._axis_loop import sensitivities, unstable_samples
+from ._axis_settings import margins_json
 from ._controller import LinearController
-from ._margins import Margins, loop_margins
+from ._margins import loop_margins
+from ._pid import place_pid
 from ._ports import require_taut
 from ._tuning import Gains, Plants, open_loop, reference_time, tune_pi
+from ._uncertain import UncertainAxis, uncertain_plant
+
+TUNINGS = ("nominal", "samples", "placement")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,6 +32,11 @@ class PiSettings:
     leaves, a reference filter takes away.
 
     Attributes:
+        tuning: "nominal": on the identified plant and on its faster form; "samples": on every sample of the plant as
+            well; "placement": the gains that put two poles of the nominal loop where they are wanted, exact for the
+            delay. The loop is verified on every sample whatever is chosen.
+        frequency: of the placed poles [rad/s].
+        damping: of the placed poles.
         max_sensitivity: bound on Ms, on the identified plant and on its faster form.
         phase_margin: least phase margin [rad], on both.
         least_delay: the dead time is taken as at least this [s]; a fit of free runs hides it in the pole.
@@ -48,6 +59,9 @@ class PiSettings:
         tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
     """
 
+    tuning: str = "nominal"
+    frequency: float = 5.0
+    damping: float = 0.9
     max_sensitivity: float = 1.5
     phase_margin: float = math.radians(60.0)
     # The paper's own dead time and pole (Eq. 31: 0.08 s, 5.293 1/s).
@@ -67,6 +81,9 @@ class PiSettings:
     tendon_angles: tuple[float, float, float] = tuple(TENDON_ANGLES.tolist())
 
     def __post_init__(self) -> None:
+        require_one_of("tuning", self.tuning, TUNINGS)
+        require_positive("frequency", self.frequency, "rad/s")
+        require_between("damping", self.damping, 0.1, 1.0)
         require_between("max_sensitivity", self.max_sensitivity, 1.05, 4.0)
         require_between("phase_margin", self.phase_margin, 0.1, 1.5, "rad")
         require_between("least_delay", self.least_delay, 0.0, 1.0, "s")
@@ -92,25 +109,30 @@ class PiSettings:
         Raises:
             SettingsError: a model that is not linear, discrete and stable, or no gains that keep the robustness.
         """
-        plants = [axis_plant(model, axis) for axis in ("pitch", "roll")]
-        times = [plant.sample_time for plant in plants]
-        if not math.isclose(*times, rel_tol=1e-9):
-            raise SettingsError(f"pitch and roll have different sample times, {times[0]:g} s and {times[1]:g} s.")
+        uncertain = uncertain_plant(model)
+        sample_time = uncertain.sample_time
+        plants = [uncertain.axis(axis).prepared(self.least_delay, self.small_move_pole) for axis in AXES]
         families = [self._family(plant) for plant in plants]
-        tuned = [tune_pi(f, self.extra_delay, self.max_sensitivity, self.phase_margin) for f in families]
-        filters = [self._filter(family, gains) for family, gains in zip(families, tuned, strict=True)]
+        # Axes that are the same plants are tuned once.
+        each = range(1 if plants[0].same_as(plants[1]) else 2)
+        tuned = [self._tuned(families[i]) for i in each]
+        filters = [self._filter(families[i], tuned[i]) for i in each]
+        tuned, filters = [tuned[0], tuned[-1]], [filters[0], filters[-1]]
         found = {
-            axis: _findings(family, self.extra_delay, gains, time)
-            for axis, family, gains, time in zip(("pitch", "roll"), families, tuned, filters, strict=True)
+            axis: _findings(plant, len(self._small(plant)), self.extra_delay, gains, time)
+            for axis, plant, gains, time in zip(AXES, plants, tuned, filters, strict=True)
         }
-        first, second = (pi_axis(gains.gain, gains.integral_time, times[0]) for gains in tuned)
+        for axis in AXES if self.tuning == "samples" else ():
+            if found[axis]["samples_unstable"]:
+                raise SettingsError(f"{axis}: not every sample is stable; lower `max_sensitivity`.")
+        first, second = (pi_axis(gains.gain, gains.integral_time, sample_time) for gains in tuned)
         return LinearController(
             kind="pi",
-            sample_time=times[0],
+            sample_time=sample_time,
             arrays=assemble(
                 (first, second),
                 reference_times=(filters[0], filters[1], max(filters)),
-                sample_time=times[0],
+                sample_time=sample_time,
                 tendon_angles=self.tendon_angles,
             ),
             position_limit=self.position_limit,
@@ -122,27 +144,49 @@ class PiSettings:
             design={"settings": asdict(self), "extra_delay": self.extra_delay, **found},
         )
 
-    def _family(self, plant: AxisPlant) -> Plants:
-        """Return what the axis may be: as identified, and faster; both with at least the least delay."""
-        late = plant.delayed(self.least_delay)
-        faster = late.faster(self.small_move_pole) if self.small_move_pole > 0.0 else late
-        return (late,) if faster is late else (late, faster)
+    def _family(self, plant: UncertainAxis) -> Plants:
+        """Return what the gains must hold on."""
+        return plant.samples if self.tuning == "samples" else self._small(plant)
+
+    def _small(self, plant: UncertainAxis) -> Plants:
+        """Return the plant as identified, and faster where it is slow; the samples of its own come after those."""
+        faster = plant.nominal.faster(self.small_move_pole) if self.small_move_pole > 0.0 else plant.nominal
+        return plant.samples[: 1 if faster is plant.nominal else 2]
+
+    def _tuned(self, family: Plants) -> Gains:
+        if self.tuning != "placement":
+            return tune_pi(family, self.extra_delay, self.max_sensitivity, self.phase_margin)
+        pair = self.frequency * complex(-self.damping, math.sqrt(1.0 - min(self.damping, 1.0 - 1e-9) ** 2))
+        K, Ki, _ = place_pid(family[0], self.extra_delay, pair, 0.0, 0.0)
+        if K * family[0].static_gain <= 0.0 or Ki / K <= 0.0:
+            raise SettingsError(
+                f"poles at {self.frequency:.3g} rad/s with damping {self.damping:.2g} need gains of both signs "
+                f"(K {K:.3g}, K/Ti {Ki:.3g}); choose another `frequency` or `damping`."
+            )
+        return Gains(K, K / Ki)
 
     def _filter(self, family: Plants, gains: Gains) -> float:
         if self.reference_time is not None:
             return self.reference_time
-        return reference_time(
-            family, self.extra_delay, gains, gain_spread=self.gain_spread, overshoot=self.overshoot_pct / 100.0
-        )
+        # Samples say themselves how the gain spreads.
+        spread = 0.0 if self.tuning == "samples" and len(family) > 2 else self.gain_spread
+        return reference_time(family, self.extra_delay, gains, gain_spread=spread, overshoot=self.overshoot_pct / 100.0)
 
 
-def _findings(family: Plants, extra_delay: int, gains: Gains, filter_time: float) -> dict[str, Any]:
+def _findings(plant: UncertainAxis, small: int, extra_delay: int, gains: Gains, filter_time: float) -> dict[str, Any]:
     """Return gains and margins of one axis as JSON values; None stands for infinity."""
-    margins = [_json(loop_margins(open_loop(plant, extra_delay, gains))) for plant in family]
+    family = plant.samples[:small]
+    margins = [margins_json(loop_margins(open_loop(item, extra_delay, gains))) for item in family]
+    axis = pi_axis(gains.gain, gains.integral_time, plant.sample_time)
+    lost = unstable_samples(axis, plant.samples, extra_delay)
     named = {"K": gains.gain, "Ti_s": gains.integral_time, "reference_time_s": filter_time}
     dead_time = (family[0].delay + extra_delay) * family[0].sample_time
-    return {"gains": named, "dead_time_s": dead_time, "margins": margins[0], "margins_small_moves": margins[-1]}
-
-
-def _json(margins: Margins) -> dict[str, float | None]:
-    return {name: value if math.isfinite(value) else None for name, value in asdict(margins).items()}
+    return {
+        "gains": named,
+        "dead_time_s": dead_time,
+        "margins": margins[0],
+        "margins_small_moves": margins[-1],
+        "samples": len(plant.samples),
+        "samples_unstable": len(lost),
+        "worst_sensitivity": None if lost else float(sensitivities(axis, plant.samples, extra_delay).max()),
+    }

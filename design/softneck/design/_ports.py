@@ -7,7 +7,7 @@ from softneck.core import Port, SettingsError, require_between
 # The neck's inclination stays below 0.7 rad; motors within 6 rad (paper, section 5).
 MAX_REFERENCE = 0.8
 MAX_MOTOR = 6.0
-_MAX_SLEW = 1000.0
+MAX_SLEW = 1000.0
 
 
 def limit_ports(starts: tuple[float, float, float, float, float]) -> tuple[Port, ...]:
@@ -19,7 +19,7 @@ def limit_ports(starts: tuple[float, float, float, float, float]) -> tuple[Port,
     position, slew, lead, least, common = starts
     return (
         Port(name="position_limit", unit="rad", start=position, minimum=0.01, maximum=MAX_MOTOR),
-        Port(name="slew_limit", unit="rad/s", start=slew, minimum=0.01, maximum=_MAX_SLEW),
+        Port(name="slew_limit", unit="rad/s", start=slew, minimum=0.01, maximum=MAX_SLEW),
         Port(name="lead_limit", unit="rad", start=lead, minimum=0.01, maximum=2.0 * MAX_MOTOR),
         Port(name="least_position", unit="rad", start=least, minimum=-MAX_MOTOR, maximum=MAX_MOTOR,
              description="no motor below this, co-contraction is raised instead"),

@@ -9,6 +9,7 @@ import numpy as np
 from softneck.plant._geometry_runtime import bend_functions, lean_angles
 from softneck.plant._inclinometer_runtime import inclinometer_store
 from softneck.plant._index_runtime import NECK_SENSOR_LAG
+from softneck.plant._mechanics_runtime import neck_constants, neck_load
 from softneck.plant._neck_runtime import (
     NECK_QUEUE,
     neck_measure,
@@ -16,7 +17,6 @@ from softneck.plant._neck_runtime import (
     neck_read,
     neck_runge_kutta,
 )
-from softneck.plant._mechanics_runtime import neck_constants, neck_load
 
 # No drive has so much torque [N m]: what limits it is the drive's business.
 WINCH_NO_LIMIT = 1e3

@@ -293,7 +293,7 @@ class Master:
             self._watches.align(self._gate.last.pitch, self._gate.last.roll, self.positions)
         try:
             self._pilot.start()
-        except Exception as error:  # noqa: BLE001 - whatever a controller raises must stop the drives
+        except Exception as error:
             self._failed(self._now or 0.0, error)
 
     def _run(self, now: float, due: bool, fresh: bool, events: list[Event]) -> None:
@@ -333,7 +333,7 @@ class Master:
             a, b, c = answer
             if not (math.isfinite(a) and math.isfinite(b) and math.isfinite(c)):
                 raise ValueError(f"set-points {a:g}, {b:g}, {c:g} are not finite")
-        except Exception as error:  # noqa: BLE001 - whatever a controller raises must stop the drives
+        except Exception as error:
             self._failed(now, error)
             return
         self._missing = 0
