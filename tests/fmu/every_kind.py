@@ -10,7 +10,15 @@ import control
 import numpy as np
 
 from softneck.core import Block
-from softneck.design import FopiSettings, HinfSettings, LqgSettings, NcfSettings, PidSettings, PiSettings
+from softneck.design import (
+    CustomSettings,
+    FopiSettings,
+    HinfSettings,
+    LqgSettings,
+    NcfSettings,
+    PidSettings,
+    PiSettings,
+)
 from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.identification import (
     GreyBox,
@@ -140,6 +148,11 @@ def _lqg() -> Block:
     return LqgSettings(load_rate=20.0, gain_spread=0.0).design(_linear()).block()
 
 
+def _custom() -> Block:
+    K = control.TransferFunction([4.0, -3.5], [1.0, -1.0], TS)
+    return CustomSettings(controller=K, gain_spread=0.0).design(_linear()).block()
+
+
 _REFERENCES = ["pitch_reference", "roll_reference", "cocontraction_reference", "pitch", "roll", "healthy", "enabled"]
 
 # Kind -> its block, inputs, outputs and parameters that the public face names for it.
@@ -196,6 +209,7 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
     "pid": (_pid, _REFERENCES, MOTORS, ("slew_limit",)),
     "fopi": (_fopi, _REFERENCES, MOTORS, ("slew_limit",)),
     "lqg": (_lqg, _REFERENCES, MOTORS, ("slew_limit",)),
+    "custom": (_custom, _REFERENCES, MOTORS, ("slew_limit",)),
 }
 
 

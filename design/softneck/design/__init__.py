@@ -12,6 +12,7 @@ from ._bake_off import bake_off_samples as bake_off_samples
 from ._bake_off import block_stepper as block_stepper
 from ._bake_off import run_bake_off as run_bake_off
 from ._controller import LinearController as LinearController
+from ._custom import CustomSettings as CustomSettings
 from ._fopi import FopiSettings as FopiSettings
 from ._fractional import FractionalPid as FractionalPid
 from ._fractional import fopi as fopi

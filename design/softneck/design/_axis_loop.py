@@ -23,6 +23,8 @@ _COARSE = 4
 _SPREAD = 1e-3
 # Hanus' gain is taken where it forgets within a second or so.
 _FORGETS = 0.98
+# Noise ascribed to the output, in units of what the reference does to it at once (squared).
+_NOISES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 
 
 def error_feedback(K: Any) -> AxisController:
@@ -57,6 +59,28 @@ def conditioning_gain(A: Matrix, B: Matrix, C: Matrix, D: float) -> Matrix:
             "its output. Ask for less, or reduce it (`controller_order`)."
         ) from error
     return np.asarray((A @ P @ C.T + S) / (C @ P @ C.T + R))
+
+
+def conditioning_candidates(axis: AxisController) -> list[Matrix]:
+    """Return gains L that may do better than Hanus' under slew limits: predictors that trust the limited output more.
+
+    The smaller the noise ascribed to the output, the faster the state follows what the motors could do.
+    """
+    n = axis.A.shape[0]
+    size = max(float(np.linalg.norm(axis.Br)), 1e-12)
+    Q = axis.Br @ axis.Br.T + (_SPREAD * size) ** 2 * np.eye(n)
+    v = max(abs(axis.Dr), 1e-3 * float(np.abs(axis.C @ axis.Br).max(initial=0.0)), 1e-9)
+    found = []
+    for noise in _NOISES:
+        R = np.array([[noise * v * v]])
+        try:
+            P = solve_discrete_are(axis.A.T, axis.C.T, Q, R)
+        except (np.linalg.LinAlgError, ValueError):
+            continue
+        L = np.asarray(axis.A @ P @ axis.C.T / (axis.C @ P @ axis.C.T + R))
+        if np.isfinite(L).all() and float(np.abs(np.linalg.eigvals(axis.A - L @ axis.C)).max(initial=0.0)) < _FORGETS:
+            found.append(L)
+    return found
 
 
 def feedback_response(axis: AxisController, z: np.ndarray) -> np.ndarray:

@@ -5,17 +5,17 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
-from softneck.core import SettingsError, require_between, require_one_of, require_positive, require_whole
+from softneck.core import Matrix, SettingsError, require_between, require_one_of, require_positive, require_whole
 from softneck.estimation import AXES, ORDERS, AxisPlant
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
 from ._assembly import AxisController, assemble
-from ._axis_loop import axis_margins, sensitivities, unstable_samples
+from ._axis_loop import axis_margins, conditioning_candidates, sensitivities, unstable_samples
 from ._bake_off import BakeOff
 from ._controller import LinearController
 from ._margins import Margins
@@ -26,6 +26,9 @@ from ._uncertain import UncertainAxis, uncertain_plant
 
 # A reference filter slower than this [samples] would be no answer to overshoot.
 _SLOWEST = 100
+CONDITIONINGS = ("hanus", "tuned")
+# Another conditioning than Hanus' must overshoot less by this [%].
+_WORTH_IT = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,6 +59,9 @@ class AxisSettings(ABC):
         least_delay: the nominal dead time is taken as at least this [s]; a fit of free runs hides it in the pole.
         small_move_pole: the nominal plant with its slowest pole as fast as this [1/s] is a sample as well; 0 for not.
         controller_order: states that balanced reduction leaves to the axis' controller; 0 for all.
+        conditioning: "hanus" (what a limit took away is taken from the reference), or "tuned": of that and of
+            predictors that follow the limited output faster, the one that overshoots least on the worst sample in a
+            step of 20 deg and in one with half the slew.
         position_limit: of each motor [rad].
         slew_limit: of each motor [rad/s].
         lead_limit: how far a set-point may be from its measured motor [rad].
@@ -77,6 +83,7 @@ class AxisSettings(ABC):
     least_delay: float = 0.08
     small_move_pole: float = 5.293
     controller_order: int = 0
+    conditioning: str = "tuned"
     position_limit: float = 6.0
     slew_limit: float = 12.5
     lead_limit: float = 0.4
@@ -95,6 +102,7 @@ class AxisSettings(ABC):
         require_between("least_delay", self.least_delay, 0.0, 1.0, "s")
         require_between("small_move_pole", self.small_move_pole, 0.0, 1000.0, "1/s")
         require_whole("controller_order", self.controller_order, 0, 100)
+        require_one_of("conditioning", self.conditioning, CONDITIONINGS)
         require_between("position_limit", self.position_limit, 0.01, 6.0, "rad")
         require_positive("slew_limit", self.slew_limit, "rad/s")
         require_between("lead_limit", self.lead_limit, 0.01, 12.0, "rad")
@@ -116,11 +124,11 @@ class AxisSettings(ABC):
         axes = {name: self._prepared(uncertain.axis(name)) for name in AXES}
         made: dict[str, tuple[AxisController, float, dict[str, Any]]] = {}
         for name, axis in axes.items():
-            if name == "roll" and _same(axis, axes["pitch"]):
+            if name == "roll" and self._shared() and axis.same_as(axes["pitch"]):
                 made["roll"] = made["pitch"]
                 continue
             try:
-                made[name] = self._made(axis)
+                made[name] = self._made(axis, name)
             except SettingsError as error:
                 raise SettingsError(f"{name}: {error}") from error
         times = [made[name][1] for name in AXES]
@@ -140,15 +148,23 @@ class AxisSettings(ABC):
             least_cocontraction=self.least_cocontraction,
             order=self.order,
             design={
-                "settings": asdict(self),
+                "settings": self._stored(),
                 "extra_delay": self.extra_delay,
                 **{name: item[2] for name, item in made.items()},
             },
         )
 
     @abstractmethod
-    def _synthesise(self, axis: UncertainAxis) -> Found:
-        """Return the controller of one axis."""
+    def _synthesise(self, axis: UncertainAxis, name: str) -> Found:
+        """Return the controller of one axis, "pitch" or "roll"."""
+
+    def _shared(self) -> bool:
+        """Return whether equal axes get the same controller."""
+        return True
+
+    def _stored(self) -> dict[str, Any]:
+        """Return the settings as JSON values."""
+        return asdict(self)
 
     def _prepared(self, axis: UncertainAxis) -> UncertainAxis:
         """Return the axis as it is designed for."""
@@ -159,14 +175,16 @@ class AxisSettings(ABC):
         more = tuple(scaled(plant, scale) for plant in taken.samples for scale in scales)
         return UncertainAxis(taken.nominal, (*taken.samples, *more))
 
-    def _made(self, axis: UncertainAxis) -> tuple[AxisController, float, dict[str, Any]]:
-        found = self._synthesise(axis)
+    def _made(self, axis: UncertainAxis, name: str) -> tuple[AxisController, float, dict[str, Any]]:
+        found = self._synthesise(axis, name)
         controller, reduction = found.controller, {}
         if 0 < self.controller_order < controller.A.shape[0]:
             controller, reduction = reduce_axis(controller, axis.nominal, self.extra_delay, self.controller_order)
         margins = axis_margins(controller, axis.nominal, self.extra_delay)
         self._hold(controller, axis)
         time = self._reference_time(controller, axis) if self.reference_time is None else self.reference_time
+        if self.conditioning == "tuned":
+            controller = self._conditioned(controller, time, axis)
         worst = float(sensitivities(controller, axis.samples, self.extra_delay).max())
         findings = {
             "gains": {**found.gains, "reference_time_s": time},
@@ -208,6 +226,25 @@ class AxisSettings(ABC):
             middle = (low + high) // 2
             low, high = (low, middle) if keeps(middle) else (middle, high)
         return high * axis.sample_time
+
+    def _conditioned(self, controller: AxisController, time: float, axis: UncertainAxis) -> AxisController:
+        """Return the controller with the conditioning that overshoots least where limits matter."""
+        usual = self._sweep(axis)
+        large = replace(usual, test=replace(usual.test, reference=2.0 * usual.test.reference))
+        slow = replace(usual, test=replace(usual.test, slew_limit=0.5 * usual.test.slew_limit))
+
+        def worst(L: Matrix) -> float:
+            with np.errstate(over="ignore", invalid="ignore"):
+                peaks = [float(sweep.run(controller, time, L).overshoot.max()) for sweep in (large, slow)]
+            return max(peaks) if np.isfinite(peaks).all() else math.inf
+
+        best, least = controller.conditioning(), worst(controller.conditioning()) - _WORTH_IT
+        for L in conditioning_candidates(controller):
+            found = worst(L)
+            # What is asked for within the limits must not suffer.
+            if found < least and usual.run(controller, time, L).overshoot.max() <= self.overshoot_pct:
+                best, least = L, found
+        return replace(controller, L=best)
 
     def _sweep(self, axis: UncertainAxis) -> Sweep:
         """Return the samples ready for steps within the limits of the motors."""
@@ -281,11 +318,3 @@ def slowest_time(plant: AxisPlant) -> float:
 def margins_json(margins: Margins) -> dict[str, float | None]:
     """Return margins as JSON values; None stands for infinity."""
     return {name: value if math.isfinite(value) else None for name, value in asdict(margins).items()}
-
-
-def _same(one: UncertainAxis, other: UncertainAxis) -> bool:
-    """Return whether both axes are the same plants, so that one synthesis does for both."""
-    return len(one.samples) == len(other.samples) and all(
-        a.delay == b.delay and np.array_equal(a.numerator, b.numerator) and np.array_equal(a.denominator, b.denominator)
-        for a, b in zip((one.nominal, *one.samples), (other.nominal, *other.samples), strict=True)
-    )

@@ -47,7 +47,7 @@ class FopiSettings(AxisSettings):
         require_between("derivative_order", self.derivative_order, 0.05, 1.0)
         require_whole("sections", self.sections, 1, 25)
 
-    def _synthesise(self, axis: UncertainAxis) -> Found:
+    def _synthesise(self, axis: UncertainAxis, name: str) -> Found:  # noqa: ARG002
         if self.crossover is not None:
             return self._built(axis, self.crossover)
         lag = slowest_time(axis.nominal) + axis.nominal.delay * axis.sample_time

@@ -52,7 +52,7 @@ class HinfSettings(AxisSettings):
         require_between("control_weight", self.control_weight, 1e-3, 100.0)
         require_one_of("method", self.method, METHODS)
 
-    def _synthesise(self, axis: UncertainAxis) -> Found:
+    def _synthesise(self, axis: UncertainAxis, name: str) -> Found:  # noqa: ARG002
         W3 = self._uncertainty(axis)
         if self.bandwidth is not None:
             return self._built(axis, self.bandwidth, W3)

@@ -44,7 +44,7 @@ class LqgSettings(AxisSettings):
         require_between("control_weight", self.control_weight, 1e-4, 1e4)
         require_between("input_noise", self.input_noise, 0.0, 1e4)
 
-    def _synthesise(self, axis: UncertainAxis) -> Found:
+    def _synthesise(self, axis: UncertainAxis, name: str) -> Found:  # noqa: ARG002
         if self.load_rate is not None:
             return self._built(axis, self.load_rate)
         lag = slowest_time(axis.nominal) + axis.nominal.delay * axis.sample_time

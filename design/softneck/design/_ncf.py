@@ -46,7 +46,7 @@ class NcfSettings(AxisSettings):
             if value is not None:
                 require_positive(name, value, unit)
 
-    def _synthesise(self, axis: UncertainAxis) -> Found:
+    def _synthesise(self, axis: UncertainAxis, name: str) -> Found:  # noqa: ARG002
         if self.crossover is not None:
             return self._built(axis, self.crossover)
         lag = slowest_time(axis.nominal) + axis.nominal.delay * axis.sample_time

@@ -113,8 +113,11 @@ class PiSettings:
         sample_time = uncertain.sample_time
         plants = [uncertain.axis(axis).prepared(self.least_delay, self.small_move_pole) for axis in AXES]
         families = [self._family(plant) for plant in plants]
-        tuned = [self._tuned(family) for family in families]
-        filters = [self._filter(family, gains) for family, gains in zip(families, tuned, strict=True)]
+        # Axes that are the same plants are tuned once.
+        each = range(1 if plants[0].same_as(plants[1]) else 2)
+        tuned = [self._tuned(families[i]) for i in each]
+        filters = [self._filter(families[i], tuned[i]) for i in each]
+        tuned, filters = [tuned[0], tuned[-1]], [filters[0], filters[-1]]
         found = {
             axis: _findings(plant, len(self._small(plant)), self.extra_delay, gains, time)
             for axis, plant, gains, time in zip(AXES, plants, tuned, filters, strict=True)

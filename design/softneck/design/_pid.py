@@ -111,7 +111,7 @@ class PidSettings(AxisSettings):
         require_between("damping", self.damping, 0.1, 1.0)
         require_between("third_pole", self.third_pole, 0.0, 20.0)
 
-    def _synthesise(self, axis: UncertainAxis) -> Found:
+    def _synthesise(self, axis: UncertainAxis, name: str) -> Found:  # noqa: ARG002
         dt = axis.sample_time
         gains = self._placed(axis.nominal, dt) if self.tuning == "placement" else self._tuned(axis, dt)
         named = {

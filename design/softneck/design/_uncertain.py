@@ -8,10 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import control
+import numpy as np
 
 from softneck.core import DataError, SettingsError, SoftneckError, require_one_of
 from softneck.estimation import AXES, AxisPlant, LinearNeck, axis_plant
 
+# Coefficients below this part of the largest are rounding of a characteristic polynomial.
+_ROUNDING = 1e-11
 _INPUTS = {"pitch": "theta_i", "roll": "phi_i"}
 
 
@@ -31,6 +34,16 @@ class UncertainAxis:
     def sample_time(self) -> float:
         """[s]."""
         return self.nominal.sample_time
+
+    def same_as(self, other: UncertainAxis) -> bool:
+        """Return whether both are the same plants, so that one synthesis does for both."""
+        mine, its = (self.nominal, *self.samples), (other.nominal, *other.samples)
+        return len(mine) == len(its) and all(
+            a.delay == b.delay
+            and np.array_equal(a.numerator, b.numerator)
+            and np.array_equal(a.denominator, b.denominator)
+            for a, b in zip(mine, its, strict=True)
+        )
 
     def prepared(self, least_delay: float, small_move_pole: float) -> UncertainAxis:
         """Return it with a nominal dead time of at least `least_delay` [s], and the form of small moves as a sample.
@@ -148,12 +161,21 @@ def _joined(axes: Mapping[str, list[AxisPlant]]) -> UncertainPlant:
 
 
 def _plant(system: Any, axis: str, what: str) -> AxisPlant:
-    tf: Any = control.ss2tf(system) if isinstance(system, control.StateSpace) else system
+    tf: Any = _polynomials(system) if isinstance(system, control.StateSpace) else system
     neck = LinearNeck(pitch=tf, roll=tf)
     try:
         return axis_plant(neck, axis)
     except SoftneckError as error:
         raise type(error)(f"{what}: {error}") from error
+
+
+def _polynomials(system: Any) -> control.TransferFunction:
+    """Return the transfer function of a state space, what rounding left of its dead time taken away."""
+    found: Any = control.ss2tf(system)
+    num, den = (np.asarray(part[0][0]) for part in (found.num, found.den))
+    for part in (num, den):
+        part[np.abs(part) < _ROUNDING * np.abs(part).max(initial=0.0)] = 0.0
+    return control.TransferFunction(num, den, system.dt)
 
 
 def _scalar(system: Any, axis: str) -> Any:
@@ -164,13 +186,11 @@ def _scalar(system: Any, axis: str) -> Any:
         )
     if system.ninputs != 1 or system.noutputs != 1:
         raise SettingsError(f"{axis} must have one input and one output; got {system.ninputs} and {system.noutputs}.")
-    for kind, label, wanted in (
-        ("input", system.input_labels[0], _INPUTS[axis]),
-        ("output", system.output_labels[0], axis),
-    ):
-        if not _default(label) and label in (*_INPUTS, *_INPUTS.values()) and label != wanted:
+    names = ((system.input_labels[0], _INPUTS[axis]), (system.output_labels[0], axis))
+    for label, wanted in names:
+        if label in (*_INPUTS, *_INPUTS.values()) and label != wanted:
             raise SettingsError(
-                f"the {kind} of {axis} is named {label}; it must be {wanted}. Rename it or swap the axes."
+                f"a signal of {axis} is named {label}; it must be {wanted}. Rename it or swap the axes."
             )
     return system
 

@@ -91,6 +91,9 @@ KINDS: dict[str, Kind] = {
         Kind("lqg", "controller", "softneck.design:LqgSettings", "softneck.design:LinearController",
              "softneck.design._linear_controller_runtime",
              "LQG whose filter estimates a load on the input: its integral action"),
+        Kind("custom", "controller", "softneck.design:CustomSettings", "softneck.design:LinearController",
+             "softneck.design._linear_controller_runtime",
+             "a system of your own from python-control (in Python: CustomSettings(controller=K))"),
     )
 }  # fmt: skip
 
