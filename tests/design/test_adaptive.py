@@ -1,4 +1,4 @@
-"""Indirect adaptive control: it learns what is true, its safeguards hold; without learning it is a linear controller."""
+"""Indirect adaptive control: it learns what is true, its safeguards hold, and unlearnt it is a linear controller."""
 
 from __future__ import annotations
 
@@ -100,9 +100,7 @@ def test_no_step_overshoots_while_it_learns() -> None:
 
 def test_what_it_learns_is_what_the_kit_s_recursion_learns() -> None:
     """The regression written out with plain filters, run through `softneck.identification.Recursion`."""
-    settings = AdaptiveSettings(
-        lead_limit=12.0, excitation=0.0, distrust=100.0, pole_range=3.0, start_covariance=1.0
-    )
+    settings = AdaptiveSettings(lead_limit=12.0, excitation=0.0, distrust=100.0, pole_range=3.0, start_covariance=1.0)
     part = BlockPart(settings.design(neck()).block())
     result = squares(part, gain=1.2, noise_deg=0.05, duration=6.0)
     y = result["pitch_measured"] if "pitch_measured" in result.signals else result["pitch"]
@@ -302,3 +300,8 @@ def test_a_plant_of_two_poles_is_refused_with_the_remedy() -> None:
     axis = control.TransferFunction([0.01], [1.0, -1.7, 0.72], TS)
     with pytest.raises(SettingsError, match="takes a plant of one pole and a dead time; this one is of order 2"):
         AdaptiveSettings().design(LinearNeck(pitch=axis, roll=axis))
+
+
+def test_several_models_are_refused() -> None:
+    with pytest.raises(SettingsError, match="one model or a family; got 2 models"):
+        AdaptiveSettings().design([neck(), neck()])  # pyright: ignore[reportArgumentType]
