@@ -27,8 +27,17 @@ ON_MODEL: set[str] = set()
 # ahead of the motors, and how much of a step the reference filter holds back.
 TAUT: dict[str, Any] = {"least_cocontraction": 0.6}
 QUICK: dict[str, Any] = {**TAUT, "lead_limit": 0.8, "reference_time": 0.12}
-# Settings other than the defaults, by kind.
-SETTINGS: dict[str, dict[str, Any]] = {"pi": QUICK, "scheduled": TAUT, "adaptive": {**TAUT, "lead_limit": 1.0}}
+# Settings other than the defaults, by kind; a kind that is not named gets its defaults.
+SETTINGS: dict[str, dict[str, Any]] = {
+    "pi": QUICK,
+    "scheduled": TAUT,
+    "adaptive": {**TAUT, "lead_limit": 1.0},
+    "hinf": {**TAUT, "lead_limit": 1.0, "reference_time": 0.04},
+    "ncf": {**TAUT, "lead_limit": 0.8, "reference_time": 0.06},
+    "pid": {**TAUT, "lead_limit": 0.8, "reference_time": 0.25},
+    "fopi": {**TAUT, "lead_limit": 0.8, "reference_time": 0.14},
+    "lqg": {**TAUT, "lead_limit": 0.8, "reference_time": 0.16},
+}
 
 
 def main() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from softneck.core import Block
 from softneck.design import (
+    AdaptiveSettings,
     CustomSettings,
     FopiSettings,
     HinfSettings,
@@ -18,6 +19,7 @@ from softneck.design import (
     NcfSettings,
     PidSettings,
     PiSettings,
+    ScheduledSettings,
 )
 from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.identification import (
@@ -128,6 +130,14 @@ def _pi() -> Block:
     return PiSettings().design(_linear()).block()
 
 
+def _scheduled() -> Block:
+    return ScheduledSettings(inclinations=(0.05, 0.3)).design([_linear(), _linear()]).block()
+
+
+def _adaptive() -> Block:
+    return AdaptiveSettings().design(_linear()).block()
+
+
 def _hinf() -> Block:
     return HinfSettings(bandwidth=4.0, gain_spread=0.0).design(_linear()).block()
 
@@ -204,6 +214,8 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
         MOTORS,
         (),
     ),
+    "scheduled": (_scheduled, _REFERENCES, MOTORS, ("lead_limit", "least_position", "least_cocontraction")),
+    "adaptive": (_adaptive, _REFERENCES, MOTORS, ("lead_limit", "least_cocontraction", "adapt")),
     "hinf": (_hinf, _REFERENCES, MOTORS, ("slew_limit",)),
     "ncf": (_ncf, _REFERENCES, MOTORS, ("slew_limit",)),
     "pid": (_pid, _REFERENCES, MOTORS, ("slew_limit",)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -117,6 +118,10 @@ class AdaptiveSettings:
         Raises:
             SettingsError: another model, or a box that the nominal gains do not stand.
         """
+        if isinstance(model, Sequence):
+            raise SettingsError(
+                f"adaptive control starts from one model or a family; got {len(model)} models. Name one."
+            )
         plants = [self._plant(model, axis) for axis in AXES]
         Ts = plants[0].sample_time
         if not math.isclose(Ts, plants[1].sample_time, rel_tol=1e-9):

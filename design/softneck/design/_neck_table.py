@@ -129,7 +129,11 @@ NECK_HEAD = ("controller", "overshoot [%]", "rise [s]", "steady rms [deg]", "all
 
 
 def neck_table(
-    controllers: Mapping[str, HasBlock | Part], observer: HasBlock | Part | None, steps: NeckSteps | None = None
+    controllers: Mapping[str, HasBlock | Part],
+    observer: HasBlock | Part | None,
+    steps: NeckSteps | None = None,
+    *,
+    parameters: Mapping[str, float] | None = None,
 ) -> list[NeckRow]:
     """Return a row for each controller; one that fails gets the reason instead of figures.
 
@@ -137,22 +141,42 @@ def neck_table(
         controllers: by name, each with `block()` or a part of a loop.
         observer: between the inclinometer and the controllers; None for none.
         steps: what they are judged on.
+        parameters: of all controllers, such as `lead_limit`.
     """
     steps = NeckSteps() if steps is None else steps
-    return [neck_row(name, controller, observer, steps) for name, controller in controllers.items()]
+    return [
+        neck_row(name, controller, observer, steps, parameters=parameters) for name, controller in controllers.items()
+    ]
 
 
-def neck_row(name: str, controller: HasBlock | Part, observer: HasBlock | Part | None, steps: NeckSteps) -> NeckRow:
+def neck_row(
+    name: str,
+    controller: HasBlock | Part,
+    observer: HasBlock | Part | None,
+    steps: NeckSteps,
+    *,
+    parameters: Mapping[str, float] | None = None,
+) -> NeckRow:
     """Return the row of one controller."""
     try:
-        cases = tuple(_case(controller, observer, steps, i) for i in range(len(steps.cases())))
+        cases = tuple(
+            _case(neck_step(controller, observer, steps, i, parameters=parameters), steps.cases()[i])
+            for i in range(len(steps.cases()))
+        )
     except SoftneckError as error:
         return NeckRow(name=name, skipped=str(error))
     return NeckRow(name=name, cases=cases)
 
 
-def neck_step(controller: HasBlock | Part, observer: HasBlock | Part | None, steps: NeckSteps, case: int) -> LoopResult:
-    """Return the signals of run number `case` of `steps.cases()`."""
+def neck_step(
+    controller: HasBlock | Part,
+    observer: HasBlock | Part | None,
+    steps: NeckSteps,
+    case: int,
+    *,
+    parameters: Mapping[str, float] | None = None,
+) -> LoopResult:
+    """Return the signals of run number `case` of `steps.cases()`; `parameters` are the controller's."""
     orientation, payload = steps.cases()[case]
     plant = VirtualNeck(steps.parameters()).block(noise_seed=steps.seed + case)
     # cos(90 deg) is 6e-17: an axis that does not step must not count as one that does.
@@ -168,6 +192,7 @@ def neck_step(controller: HasBlock | Part, observer: HasBlock | Part | None, ste
             duration=steps.duration,
             order=steps.order,
             plant_inputs={"payload": payload},
+            controller_parameters=parameters or {},
         )
     )
 
@@ -187,9 +212,8 @@ def table_cells(rows: Sequence[NeckRow]) -> list[tuple[str, ...]]:
     return cells
 
 
-def _case(controller: HasBlock | Part, observer: HasBlock | Part | None, steps: NeckSteps, case: int) -> NeckCase:
-    result = neck_step(controller, observer, steps, case)
-    found, (orientation, payload) = metrics(result), steps.cases()[case]
+def _case(result: LoopResult, case: tuple[float, float]) -> NeckCase:
+    found, (orientation, payload) = metrics(result), case
     stepped = [axis for axis in _AXES if found[axis]["overshoot_pct"] is not None]
     values: dict[str, Any] = {
         name: max(_known(found[axis][key]) for axis in (_AXES if name == "steady" else stepped))

@@ -1,0 +1,62 @@
+"""softneck design scheduled and adaptive: files in, file out, FMU, and one clear line where it cannot be."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from softneck.core import load
+from softneck.fmu import build_fmu, describe
+from softneck.identification import Rls
+
+from ..data import neck_recording
+from .conftest import Call
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    for i, name in enumerate(("low", "high")):
+        Rls(max_delay=0.12).fit(neck_recording(600, seed=i + 1)).save(tmp_path / f"{name}.npz")
+    return tmp_path
+
+
+def test_two_models_make_a_schedule(call: Call, files: Path) -> None:
+    said = call(
+        "design", "scheduled", "low.npz", "high.npz", "-o", "s.npz", "--set", "inclinations=[0.0, 0.35]", "--json"
+    )
+    assert said.code == 0, said.err
+    assert json.loads(said.out)["kind"] == "scheduled"
+    made = load(files / "s.npz", role="controller")
+    assert made.design["inclinations_deg"] == [0.0, pytest.approx(math.degrees(0.35))]
+    assert "scheduled" in call("info", "s.npz").out
+
+
+def test_one_model_makes_an_adaptive_controller_and_its_fmu(call: Call, files: Path) -> None:
+    said = call("design", "adaptive", "low.npz", "-o", "a.npz", "--set", "dead_zone_deg=0.05")
+    assert said.code == 0, said.err
+    assert "starts from" in said.out
+    made = load(files / "a.npz")
+    assert made.design["settings"]["dead_zone"] == pytest.approx(math.radians(0.05))
+    path = build_fmu(made.block(), files / "A.fmu", info=describe(made))
+    assert path is None or Path(files / "A.fmu").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("scheduled", "low.npz"), "at least two models with one of `inclinations` each"),
+        (("scheduled", "low.npz", "high.npz"), "got 2 model(s) and 0 inclination(s)"),
+        (("adaptive", "low.npz", "high.npz"), "one model or a family; got 2 models"),
+        (("adaptive", "low.npz", "--set", "forgetting=2"), "`forgetting` must be between 0.9 and 1"),
+        (("adaptive", "low.npz", "--set", "least_position=7"), "`least_position` must be between -6 and 6 [rad]"),
+    ],
+)
+def test_what_cannot_be_designed_is_one_line(call: Call, files: Path, arguments: tuple[str, ...], message: str) -> None:
+    said = call("design", *arguments, "-o", "c.npz", "--json")
+    assert said.code == 2
+    assert message in said.err
+    assert len(said.err.strip().splitlines()) == 1
+    assert not (files / "c.npz").exists()
