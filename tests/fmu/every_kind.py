@@ -10,7 +10,7 @@ import control
 import numpy as np
 
 from softneck.core import Block
-from softneck.design import PiSettings
+from softneck.design import MpcSettings, PiSettings
 from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.identification import (
     GreyBox,
@@ -120,6 +120,10 @@ def _pi() -> Block:
     return PiSettings().design(_linear()).block()
 
 
+def _mpc() -> Block:
+    return MpcSettings(bandwidth=6.0, moves=5, angle_limit=0.5).design(_linear()).block()
+
+
 # Kind -> its block, inputs, outputs and parameters that the public face names for it.
 KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...]]] = {
     "rls": (_rls, MOTORS, ["pitch", "roll", "motor_position_1"], _MODEL),
@@ -162,6 +166,12 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
         [*MOTORS, "pitch_measured", "roll_measured", "measurement_valid"],
         ["pitch", "roll", "pitch_rate", "roll_rate", "innovation", "healthy"],
         ("measurement_noise_std",),
+    ),
+    "mpc": (
+        _mpc,
+        ["pitch_reference", "roll_reference", "cocontraction_reference", "pitch", "roll", "healthy", "enabled"],
+        MOTORS,
+        ("position_limit", "slew_limit", "lead_limit", "angle_limit"),
     ),
     "pi": (
         _pi,

@@ -23,3 +23,6 @@ from ._neck_table import neck_step as neck_step
 from ._neck_table import neck_table as neck_table
 from ._neck_table import table_cells as table_cells
 from ._pi import PiSettings as PiSettings
+from .mpc import MeasuredDisturbance as MeasuredDisturbance
+from .mpc import MpcController as MpcController
+from .mpc import MpcSettings as MpcSettings

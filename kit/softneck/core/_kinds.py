@@ -70,6 +70,9 @@ KINDS: dict[str, Kind] = {
         Kind("pi", "controller", "softneck.design:PiSettings", "softneck.design:LinearController",
              "softneck.design._linear_controller_runtime",
              "PI with reference filter, anti-windup and tendon allocation"),
+        Kind("mpc", "controller", "softneck.design:MpcSettings", "softneck.design:MpcController",
+             "softneck.design.mpc._mpc_runtime",
+             "linear predictive control: limits, preview and co-contraction in one QP for each sample"),
     )
 }  # fmt: skip
 

@@ -48,7 +48,7 @@ def assemble(problem: Problem, found: Matrices, tuning: Tuning) -> tuple[Matrix,
     plants = [scenario.axis(i) for scenario in p.scenarios for i in range(2)]
     Ts = plants[0].sample_time
     AH = np.linalg.solve(found.H, found.A.T).T
-    angle_at = 3.0
+    angle_at = 4.0
     constants = np.array([
         Ts, p.rows, len(p.scenarios), n, p.dead_time, len(p.starts), p.slacks, tuning.preview,
         min(round(tuning.reference_time / Ts), tuning.preview), len(tuning.disturbances), tuning.budget, _TOLERANCE,

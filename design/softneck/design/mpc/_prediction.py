@@ -157,7 +157,8 @@ def expression(problem: Problem) -> dict[str, Any]:
         motors.append(now)
     inputs = [ca.mtimes(ca.DM(p.T), motor) for motor in motors]
 
-    cost = sum((p.move_weight * ca.sumsqr(move) for move in moves), ca.SX(0))
+    asked = _asked_moves(p, wanted)
+    cost = sum((p.move_weight * ca.sumsqr(move - own) for move, own in zip(moves, asked, strict=True)), ca.SX(0))
     angles: list[list[list[Any]]] = []
     for s, scenario in enumerate(p.scenarios):
         ends, paths = [], []
@@ -184,6 +185,31 @@ def expression(problem: Problem) -> dict[str, Any]:
     rows, kinds = _hard_rows(moves, positions, slack)
     _soft_rows(p, angles, motors, slack, rows, kinds)
     return {"z": z, "theta": theta, "cost": cost, "rows": ca.vertcat(*rows), "kinds": np.array(kinds)}
+
+
+def _asked_moves(p: Problem, wanted: list[Any]) -> list[Any]:
+    """Return the moves (3,) at each start that the reference itself asks for, at rest: only others cost.
+
+    Without them a reference that keeps moving would be followed late and too low, in a trade against its moves.
+    """
+    import casadi as ca
+
+    inverse = ca.DM(np.linalg.inv(p.T))
+    ends = (*p.starts[1:], p.horizon)
+    middles = [-0.5, *(0.5 * (start + end) for start, end in zip(p.starts, ends, strict=True))]
+    levels = []
+    for axis in range(2):
+        plant = p.scenarios[0].axis(axis)
+        places = np.clip(plant.delay + np.array(middles), 0.0, p.rows - 1.0)
+        low = np.floor(places).astype(int)
+        high = np.minimum(low + 1, p.rows - 1)
+        part = places - low
+        row = [(1.0 - f) * wanted[axis][i] + f * wanted[axis][j] for i, j, f in zip(low, high, part, strict=True)]
+        levels.append([value / plant.static_gain for value in row])
+    return [
+        ca.mtimes(inverse, ca.vertcat(*(level[b + 1] - level[b] for level in levels), 0.0))
+        for b in range(len(p.starts))
+    ]
 
 
 def _hard_rows(moves: list[Any], positions: list[Any], slack: list[Any]) -> tuple[list[Any], list[tuple[float, float]]]:
