@@ -25,4 +25,8 @@ from ._neck_table import table_cells as table_cells
 from ._pi import PiSettings as PiSettings
 from .mpc import MeasuredDisturbance as MeasuredDisturbance
 from .mpc import MpcController as MpcController
+from .mpc import MpcInfo as MpcInfo
+from .mpc import MpcProgram as MpcProgram
 from .mpc import MpcSettings as MpcSettings
+from .mpc import NmpcController as NmpcController
+from .mpc import NmpcSettings as NmpcSettings

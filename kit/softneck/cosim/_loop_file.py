@@ -175,7 +175,9 @@ class _Reader:
         file = self._file(name, value)
         if key == "fmu":
             return _fmu_part(file, f"[{name}]", table, as_role)
-        return BlockPart(load(file, role=role).block())
+        thing = load(file, role=role)
+        # A controller over CasADi is a part, not a block.
+        return thing.part() if getattr(thing, "kind", "") == "nmpc" else BlockPart(thing.block())
 
     def _from_python(self, name: str, path: str) -> Part:
         """Call `package.module:factory`; modules beside the loop file are found too."""

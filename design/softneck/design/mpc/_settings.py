@@ -80,6 +80,8 @@ class MpcSettings:
         tautness_lever: motor angle that one radian of neck takes up [rad/rad].
         cocontraction_weight: on the error of co-contraction, against that of the tilt's inputs, squared.
         slack_weight: on violations of soft limits, against errors of the angles, squared.
+        disturbance_time: time constant of the output disturbance's rate [s]; None for the plant's own, as a load at its
+            input makes it. A longer one follows what keeps changing, such as a payload carried round, and is less robust.
         budget: iterations of the solver for each sample; beyond them the previous plan goes on.
         least_delay: the dead time is taken as at least this [s]; a fit of free runs hides it in the pole.
         small_move_pole: the design must hold as well where the slowest pole is as fast as this [1/s]; 0 for the
@@ -111,6 +113,7 @@ class MpcSettings:
     tautness_lever: float = 6.93
     cocontraction_weight: float = 1.0
     slack_weight: float = 1e3
+    disturbance_time: float | None = None
     budget: int = 100
     # The paper's own dead time and pole (Eq. 31: 0.08 s, 5.293 1/s).
     least_delay: float = 0.08
@@ -133,6 +136,8 @@ class MpcSettings:
         require_whole("scenarios", self.scenarios, 0, 8)
         require_between("preview", self.preview, 0.0, 4.0, "s")
         self._check_limits()
+        if self.disturbance_time is not None:
+            require_between("disturbance_time", self.disturbance_time, 0.02, 20.0, "s")
         for name in ("cocontraction_weight", "slack_weight"):
             require_positive(name, getattr(self, name))
         require_whole("budget", self.budget, 1, 10_000)
@@ -164,14 +169,7 @@ class MpcSettings:
     @property
     def starts(self) -> tuple[int, ...]:
         """Samples of the horizon at which the motors move."""
-        places = np.interp(np.linspace(0.0, 9.0, self.moves), np.arange(10), np.array(_SPACING) * self.horizon / 30.0)
-        starts = [0]
-        for place in places[1:]:
-            starts.append(max(starts[-1] + 1, round(float(place))))
-        # Squeezed together at the end where there are as many moves as samples.
-        for i in range(self.moves):
-            starts[-1 - i] = min(starts[-1 - i], self.horizon - 1 - i)
-        return tuple(starts)
+        return spaced_starts(self.horizon, self.moves)
 
     def design(self, model: HasTransferFunctions) -> MpcController:
         """Return the controller for `model`, anything with `tf("pitch")` and `tf("roll")`, or for a `Family`.
@@ -246,6 +244,7 @@ class MpcSettings:
             slack_weight=self.slack_weight * float(weights.max()),
             angles=self.angle_limit is not None,
             tautness=None if self.minimum_tautness is None else lever,
+            disturbance_time=self.disturbance_time,
         )
 
     def _families(self, nominal: Pair) -> list[Pair]:
@@ -301,6 +300,18 @@ class MpcSettings:
             "starts": list(self.starts),
         }  # fmt: skip
         return arrays, found
+
+
+def spaced_starts(horizon: int, moves: int) -> tuple[int, ...]:
+    """Return samples at which the motors move: dense at first, sparse later."""
+    places = np.interp(np.linspace(0.0, 9.0, moves), np.arange(10), np.array(_SPACING) * horizon / 30.0)
+    starts = [0]
+    for place in places[1:]:
+        starts.append(max(starts[-1] + 1, round(float(place))))
+    # Squeezed together at the end where there are as many moves as samples.
+    for i in range(moves):
+        starts[-1 - i] = min(starts[-1 - i], horizon - 1 - i)
+    return tuple(starts)
 
 
 def scaled(pair: Pair, factor: float) -> Pair:
