@@ -16,6 +16,7 @@ from softneck.design import (
     FopiSettings,
     HinfSettings,
     LqgSettings,
+    MpcSettings,
     NcfSettings,
     PidSettings,
     PiSettings,
@@ -165,6 +166,10 @@ def _custom() -> Block:
 
 _REFERENCES = ["pitch_reference", "roll_reference", "cocontraction_reference", "pitch", "roll", "healthy", "enabled"]
 
+def _mpc() -> Block:
+    return MpcSettings(bandwidth=6.0, moves=5, angle_limit=0.5).design(_linear()).block()
+
+
 # Kind -> its block, inputs, outputs and parameters that the public face names for it.
 KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...]]] = {
     "rls": (_rls, MOTORS, ["pitch", "roll", "motor_position_1"], _MODEL),
@@ -207,6 +212,12 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
         [*MOTORS, "pitch_measured", "roll_measured", "measurement_valid"],
         ["pitch", "roll", "pitch_rate", "roll_rate", "innovation", "healthy"],
         ("measurement_noise_std",),
+    ),
+    "mpc": (
+        _mpc,
+        ["pitch_reference", "roll_reference", "cocontraction_reference", "pitch", "roll", "healthy", "enabled"],
+        MOTORS,
+        ("position_limit", "slew_limit", "lead_limit", "angle_limit"),
     ),
     "pi": (
         _pi,

@@ -48,3 +48,10 @@ from ._varying import Limits as Limits
 from ._varying import VaryingController as VaryingController
 from ._weights import makeweight as makeweight
 from ._weights import ucover as ucover
+from .mpc import MeasuredDisturbance as MeasuredDisturbance
+from .mpc import MpcController as MpcController
+from .mpc import MpcInfo as MpcInfo
+from .mpc import MpcProgram as MpcProgram
+from .mpc import MpcSettings as MpcSettings
+from .mpc import NmpcController as NmpcController
+from .mpc import NmpcSettings as NmpcSettings

@@ -94,6 +94,11 @@ KINDS: dict[str, Kind] = {
         Kind("custom", "controller", "softneck.design:CustomSettings", "softneck.design:LinearController",
              "softneck.design._linear_controller_runtime",
              "a system of your own from python-control (in Python: CustomSettings(controller=K))"),
+        Kind("mpc", "controller", "softneck.design:MpcSettings", "softneck.design:MpcController",
+             "softneck.design.mpc._mpc_runtime",
+             "linear predictive control: limits, preview and co-contraction in one QP for each sample"),
+        Kind("nmpc", "controller", "softneck.design:NmpcSettings", "softneck.design:NmpcController", "",
+             "nonlinear predictive control over nn, play, greybox or nss: one Gauss-Newton step for each sample"),
     )
 }  # fmt: skip
 

@@ -210,6 +210,10 @@ class _Reader:
         if full not in self._opened:
             self._opened[full] = make()
         return self._opened[full]
+            return _fmu_part(file, f"[{name}]", table, as_role)
+        thing = load(file, role=role)
+        # A controller over CasADi is a part, not a block.
+        return thing.part() if getattr(thing, "kind", "") == "nmpc" else BlockPart(thing.block())
 
     def _from_python(self, name: str, path: str) -> Part:
         """Call `package.module:factory`; modules beside the loop file are found too."""

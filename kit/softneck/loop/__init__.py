@@ -1,5 +1,6 @@
 """The closed loop over anything that steps: wiring by name, order, metrics; arrays only, no FMI, no files."""
 
+from ._ahead import AheadReference as AheadReference
 from ._faults import FAULT_KINDS as FAULT_KINDS
 from ._faults import Fault as Fault
 from ._faults import MotorFault as MotorFault

@@ -48,7 +48,7 @@ def assemble(problem: Problem, found: Matrices, tuning: Tuning) -> tuple[Matrix,
     plants = [scenario.axis(i) for scenario in p.scenarios for i in range(2)]
     Ts = plants[0].sample_time
     AH = np.linalg.solve(found.H, found.A.T).T
-    angle_at = 3.0
+    angle_at = 4.0
     constants = np.array([
         Ts, p.rows, len(p.scenarios), n, p.dead_time, len(p.starts), p.slacks, tuning.preview,
         min(round(tuning.reference_time / Ts), tuning.preview), len(tuning.disturbances), tuning.budget, _TOLERANCE,
@@ -62,7 +62,7 @@ def assemble(problem: Problem, found: Matrices, tuning: Tuning) -> tuple[Matrix,
         constants,
         np.vstack([padded(plant, n)[0] for plant in plants]),
         np.array([padded(plant, n)[1] for plant in plants]),
-        observer_gains(np.array([disturbance_pole(plant) for plant in plants]), tuning.trust),
+        observer_gains(np.array([disturbance_pole(plant, p.disturbance_time) for plant in plants]), tuning.trust),
         np.array([rest_states(plant, n) for plant in plants]),
         np.array([float(plant.delay) for plant in plants]),
         disturbances,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import control
 import numpy as np
@@ -13,15 +13,17 @@ from numpy.typing import ArrayLike
 
 from softneck.core import Block, FileFormatError, Matrix, Port, State, Vector, write_archive
 
-from .._controller import LinearController
+from .._ports import MAX_MOTOR, controller_inputs, controller_outputs, limit_ports
 from . import _mpc_runtime as rt
 from ._arrays import NAMES
 from ._disturbance import MeasuredDisturbance
 from ._lti import lti
+from ._program import MpcInfo, MpcProgram, explain
+
+if TYPE_CHECKING:
+    from ._part import MpcPart
 
 _RUNTIME = "softneck.design.mpc._mpc_runtime"
-STATUS = {0.0: "not started", rt.MPC_OPTIMAL: "optimal", rt.MPC_SOFT: "softened", rt.MPC_PLAN: "previous plan",
-          rt.MPC_HOLDING: "holding"}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -31,7 +33,7 @@ class MpcController:
     Attributes:
         sample_time: [s].
         arrays: what the runtime reads, by `_arrays.NAMES`.
-        position_limit, slew_limit, lead_limit: of each motor [rad], [rad/s], [rad].
+        position_limit, slew_limit, lead_limit, least_position: of each motor [rad], [rad/s], [rad], [rad].
         angle_limit: soft, of pitch and roll [rad], or None.
         minimum_tautness: soft, of each tendon [rad], or None.
         disturbances: that are measured.
@@ -44,6 +46,7 @@ class MpcController:
     position_limit: float
     slew_limit: float
     lead_limit: float
+    least_position: float
     angle_limit: float | None
     minimum_tautness: float | None
     disturbances: tuple[MeasuredDisturbance, ...]
@@ -54,10 +57,6 @@ class MpcController:
 
     def block(self) -> Block:
         """Return the controller as a block of role "controller"."""
-        plain = LinearController(
-            kind="mpc", sample_time=self.sample_time, arrays=(), position_limit=self.position_limit,
-            slew_limit=self.slew_limit, lead_limit=self.lead_limit, order=self.order, design={},
-        ).block()  # fmt: skip
         ahead = tuple(
             Port(name=f"{axis}_reference_ahead", unit="rad", minimum=-rt.MPC_REFERENCE_LIMIT,
                  maximum=rt.MPC_REFERENCE_LIMIT, description=f"wanted {axis} {self.preview:g} s from now")
@@ -66,20 +65,25 @@ class MpcController:
         measured = tuple(
             Port(name=item.name, unit=item.unit, description="measured disturbance") for item in self.disturbances
         )
+        limits = limit_ports((self.position_limit, self.slew_limit, self.lead_limit, self.least_position, -MAX_MOTOR))[
+            :4
+        ]
         soft: tuple[Port, ...] = ()
         if self.angle_limit is not None:
             soft += (Port(name="angle_limit", unit="rad", start=self.angle_limit, minimum=0.01, maximum=0.8),)
         if self.minimum_tautness is not None:
-            soft += (Port(name="minimum_tautness", unit="rad", start=self.minimum_tautness, minimum=-12.0, maximum=6.0),)
+            soft += (
+                Port(name="minimum_tautness", unit="rad", start=self.minimum_tautness, minimum=-12.0, maximum=6.0),
+            )
         return Block(
             kind="mpc",
             role="controller",
             runtime=_RUNTIME,
             sample_time=self.sample_time,
             arrays=self.arrays,
-            inputs=(*plain.inputs, *ahead, *measured),
-            outputs=plain.outputs,
-            parameters=(*plain.parameters, *soft),
+            inputs=(*controller_inputs(), *ahead, *measured),
+            outputs=controller_outputs(),
+            parameters=(*limits, *soft),
         )
 
     @property
@@ -103,6 +107,24 @@ class MpcController:
         """Return `ss()`: the controller while no limit is active."""
         return self.ss()
 
+    def info(self, state: State) -> MpcInfo:
+        """Return what the sample that led to `state` decided: prediction, active limits, iterations."""
+        return explain(self.arrays, state.values)
+
+    def program(self) -> MpcProgram:
+        """Return the QP outside of the block: as CasADi functions, solved by daqp."""
+        return MpcProgram(self.arrays)
+
+    def part(self, *, solver: str = "own") -> MpcPart:
+        """Return the controller as a part of a loop that tells `info` after each sample.
+
+        Args:
+            solver: "own" for that of the block, "daqp" for daqp.
+        """
+        from ._part import MpcPart
+
+        return MpcPart(self, solver=solver)
+
     def review(self) -> list[str]:
         """Return what is wrong or doubtful with this set-up, one line each; empty if nothing is."""
         from ._review import review
@@ -117,12 +139,14 @@ class MpcController:
             f"mpc controller, {self.sample_time * 1e3:g} ms, {self.order} order, {d.get('extra_delay', 0)} samples of "
             "delay added to the plant for it",
             f"  {self.arrays[16].shape[0]} unknowns ({int(q[rt.MPC_MOVES])} moves of 3 motors, {int(q[rt.MPC_SLACKS])} "
-            f"slacks), {self.arrays[14].shape[0]} rows, horizon {settings.get('horizon')} samples behind the dead time, "
+            f"slacks), {self.arrays[14].shape[0]} rows, horizon {settings.get('horizon')} samples after the dead time, "
             f"{int(q[rt.MPC_SCENARIOS])} scenario(s)",
-            f"  limits: |P| <= {self.position_limit:g} rad, slew {self.slew_limit:g} rad/s, lead {self.lead_limit:g} rad"
+            f"  limits: |P| <= {self.position_limit:g} rad, slew {self.slew_limit:g} rad/s, "
+            f"lead {self.lead_limit:g} rad"
             + ("" if self.angle_limit is None else f", |angle| <= {np.degrees(self.angle_limit):.3g} deg (soft)")
             + ("" if self.minimum_tautness is None else f", tautness >= {self.minimum_tautness:g} rad (soft)"),
-            f"  observer {d.get('observer_bandwidth_rad_s', 0.0):.3g} rad/s, reference filter "
+            f"  bandwidth {d.get('bandwidth_rad_s', 0.0):.3g} rad/s, "
+            f"observer {d.get('observer_bandwidth_rad_s', 0.0):.3g} rad/s, reference filter "
             f"{d.get('reference_time_s', 0.0):.3g} s; Ms "
             + " and ".join(f"{value:.3g}" for value in d.get("sensitivity", []))
             + " (as identified, small moves)",
@@ -162,7 +186,7 @@ class MpcController:
         )
 
 
-_LIMITS = ("position_limit", "slew_limit", "lead_limit", "angle_limit", "minimum_tautness")
+_LIMITS = ("position_limit", "slew_limit", "lead_limit", "least_position", "angle_limit", "minimum_tautness")
 
 
 def _check_shapes(items: tuple[Matrix, ...]) -> None:

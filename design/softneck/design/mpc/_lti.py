@@ -35,7 +35,7 @@ def system(arrays: tuple[Matrix, ...]) -> tuple[Matrix, Matrix, Matrix, Matrix]:
     head = rt.MPC_COUNTERS
     # Held set-points, filtered references, then models, disturbances, past inputs and references to come.
     kept = np.concatenate([np.arange(head, head + 6), np.arange(places[1], places[5])])
-    parameters = np.array([_FREE, _FREE, _FREE, _FREE, -_FREE])
+    parameters = np.array([_FREE, _FREE, _FREE, -_FREE, _FREE, -_FREE])
     ahead = 2 if arrays[0][rt.MPC_AHEAD] > 0 else 0
     ports = 10 + ahead + int(arrays[0][rt.MPC_DISTURBANCES])
 

@@ -109,9 +109,19 @@ def step(
     inputs: pitch, roll and co-contraction reference, pitch, roll, motor_position_1..3, healthy, enabled; with preview
     pitch_reference_ahead, roll_reference_ahead; then measured disturbances.
     outputs: motor_setpoint_1..3.
-    parameters: position limit [rad], slew limit [rad/s], lead limit [rad]; where set, angle limit and least tautness
-    [rad].
+    parameters: position limit [rad], slew limit [rad/s], lead limit [rad], least position [rad]; where set,
+    angle limit and least tautness [rad].
     """
+    if mpc_begin(arrays, state, inputs):
+        mpc_decide(arrays, parameters, state, inputs)
+    else:
+        state[MPC_STATUS] = MPC_HOLDING
+    mpc_predict(arrays, state)
+    outputs[:] = state[MPC_COUNTERS : MPC_COUNTERS + 3]
+
+
+def mpc_begin(arrays: tuple[np.ndarray, ...], state: np.ndarray, inputs: np.ndarray) -> bool:
+    """Take in what is known now; return whether the motors may move."""
     held = state[MPC_COUNTERS : MPC_COUNTERS + 3]
     if state[MPC_STARTED] == 0.0:
         for j in range(3):
@@ -127,11 +137,7 @@ def step(
     state[MPC_STARTED] = 1.0
     if active:
         mpc_filter(arrays, state)
-        mpc_decide(arrays, parameters, state, inputs)
-    else:
-        state[MPC_STATUS] = MPC_HOLDING
-    mpc_predict(arrays, state)
-    outputs[:] = held
+    return active
 
 
 def mpc_plausible(angle: float) -> bool:
@@ -183,7 +189,7 @@ def mpc_align(arrays: tuple[np.ndarray, ...], state: np.ndarray, inputs: np.ndar
     """Start as if the neck had always stood where it is under the held set-points: no bump."""
     q = arrays[0]
     S, n, D = int(q[MPC_SCENARIOS]), int(q[MPC_ORDER]), int(q[MPC_PAST])
-    _, first, o, past, _, plan, active, end = mpc_places(arrays)
+    _, first, o, past, _, plan, _, end = mpc_places(arrays)
     held = state[MPC_COUNTERS : MPC_COUNTERS + 3]
     v = np.dot(arrays[8], held)
     for s in range(S):
@@ -285,10 +291,10 @@ def mpc_bounds(
                 low = min(max(low, motors[i] - parameters[2] - held[i]), high)
                 high = max(min(high, motors[i] + parameters[2] - held[i]), low)
         elif kinds[i] == MPC_ROW_POSITION:
-            # Motors that start beyond a limit are not asked to jump back; they may only come back.
+            # A motor beyond a limit comes back as fast as its first move may: that can always be done.
             j = int(motor[i])
-            low = min(-parameters[0], held[j]) - free[i]
-            high = max(parameters[0], held[j]) - free[i]
+            low = min(max(-parameters[0], parameters[3]), held[j] + upper[j]) - free[i]
+            high = max(parameters[0], held[j] + lower[j]) - free[i]
         elif kinds[i] == MPC_ROW_SLACK:
             low = 0.0
         elif kinds[i] == MPC_ROW_ANGLE_HIGH:
@@ -305,7 +311,7 @@ def mpc_decide(arrays: tuple[np.ndarray, ...], parameters: np.ndarray, state: np
     """Solve the QP, check its answer and move `held` by its first moves, or by those of the plan before."""
     q = arrays[0]
     held = state[MPC_COUNTERS : MPC_COUNTERS + 3]
-    _, _, _, _, _, first, active, end = mpc_places(arrays)
+    _, _, _, _, _, _, active, end = mpc_places(arrays)
     theta = np.empty(arrays[10].shape[1])
     mpc_parameter(arrays, state, theta)
     m = arrays[14].shape[0]
@@ -316,24 +322,33 @@ def mpc_decide(arrays: tuple[np.ndarray, ...], parameters: np.ndarray, state: np
     sign = state[active:end].copy()
     budget, tolerance = int(q[MPC_BUDGET]), q[MPC_TOLERANCE]
     iterations = qp_solve(arrays[12], c, lower, upper, sign, lam, budget, tolerance, z0.shape[0])
-    answered = iterations >= 0
-    state[MPC_ITERATIONS] = iterations if answered else q[MPC_BUDGET]
+    state[MPC_ITERATIONS] = iterations if iterations >= 0 else budget
+    z = z0 - np.dot(lam, arrays[15])
+    mpc_take(arrays, state, theta, z, lam, lower, upper, iterations >= 0)
+    mpc_move(arrays, state, lower, upper, parameters[0])
+
+
+def mpc_take(
+    arrays: tuple[np.ndarray, ...], state: np.ndarray, theta: np.ndarray, z: np.ndarray, lam: np.ndarray,
+    lower: np.ndarray, upper: np.ndarray, answered: bool,
+) -> None:  # fmt: skip
+    """Make an answer the plan if it keeps the KKT conditions; else the previous plan goes on."""
+    _, _, _, _, _, first, active, end = mpc_places(arrays)
     if answered:
-        z = z0 - np.dot(lam, arrays[15])
         state[MPC_RESIDUAL] = mpc_residual(arrays, theta, z, lam, lower, upper)
         # 100 times the solver's own bound: beyond it the answer is none.
-        answered = state[MPC_RESIDUAL] <= 100.0 * tolerance
-        if answered:
-            state[first:active] = z
-            state[active:end] = sign
-            state[MPC_AGE] = 0.0
-            mpc_judge(arrays, state, z)
-    if not answered:
+        answered = state[MPC_RESIDUAL] <= 100.0 * arrays[0][MPC_TOLERANCE]
+    if answered:
+        state[first:active] = z
+        for i in range(end - active):
+            state[active + i] = 1.0 if lam[i] > 0.0 else (-1.0 if lam[i] < 0.0 else 0.0)
+        state[MPC_AGE] = 0.0
+        mpc_judge(arrays, state, z)
+    else:
         state[active:end] = 0.0
         state[MPC_AGE] += 1.0
         state[MPC_STATUS] = MPC_PLAN
         state[MPC_SHIFTED] += 1.0
-    mpc_move(arrays, state, lower, upper, parameters[0])
 
 
 def mpc_judge(arrays: tuple[np.ndarray, ...], state: np.ndarray, z: np.ndarray) -> None:

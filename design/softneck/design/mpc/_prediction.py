@@ -45,6 +45,7 @@ class Problem:
         slack_weight: on violations of soft limits [1/rad^2].
         angles: whether angles are limited.
         tautness: (3, 2) how much an angle loosens each tendon [rad/rad]; None for no limit.
+        disturbance_time: of the output disturbance's rate [s]; None for the plant's own.
     """
 
     scenarios: tuple[Scenario, ...]
@@ -57,6 +58,7 @@ class Problem:
     slack_weight: float
     angles: bool = False
     tautness: Matrix | None = None
+    disturbance_time: float | None = None
 
     @property
     def order(self) -> int:
@@ -127,8 +129,10 @@ def rest_states(plant: AxisPlant, n: int) -> Vector:
     return np.linalg.solve(np.eye(n) - A, B)
 
 
-def disturbance_pole(plant: AxisPlant) -> float:
-    """Return a of the output disturbance: the plant's slowest pole, by its size."""
+def disturbance_pole(plant: AxisPlant, time: float | None = None) -> float:
+    """Return a of the output disturbance: the plant's slowest pole, by its size, or that of a time constant [s]."""
+    if time is not None:
+        return float(np.clip(np.exp(-plant.sample_time / time), 0.1, 0.999))
     # Below 0.1 a rate would be gone within a sample, and the observer has to divide by it.
     return float(np.clip(np.abs(np.roots(plant.denominator)).max(initial=0.0), 0.1, 0.995))
 
@@ -157,7 +161,8 @@ def expression(problem: Problem) -> dict[str, Any]:
         motors.append(now)
     inputs = [ca.mtimes(ca.DM(p.T), motor) for motor in motors]
 
-    cost = sum((p.move_weight * ca.sumsqr(move) for move in moves), ca.SX(0))
+    asked = _asked_moves(p, wanted)
+    cost = sum((p.move_weight * ca.sumsqr(move - own) for move, own in zip(moves, asked, strict=True)), ca.SX(0))
     angles: list[list[list[Any]]] = []
     for s, scenario in enumerate(p.scenarios):
         ends, paths = [], []
@@ -165,7 +170,7 @@ def expression(problem: Problem) -> dict[str, Any]:
             plant = scenario.axis(axis)
             A, B = padded(plant, n)
             level, rate = offset[2 * s + axis]
-            a = disturbance_pole(plant)
+            a = disturbance_pole(plant, p.disturbance_time)
             x = theta[(2 * s + axis) * n : (2 * s + axis + 1) * n]
             path = []
             for i, v in enumerate(inputs):
@@ -174,7 +179,9 @@ def expression(problem: Problem) -> dict[str, Any]:
             errors = [path[i] - wanted[axis][plant.delay + i] for i in range(N - 1)]
             cost += scenario.weight * p.output_weight[axis] * sum(e**2 for e in errors)
             paths.append(path)
-            goal = wanted[axis][plant.delay + N - 1] - level - rate / (1.0 - a)
+            # With the plant's own pole all but 1e-2 of it is there; a slower one is extrapolated no further.
+            drift = rate * (1.0 - a ** (plant.delay + N)) / (1.0 - a)
+            goal = wanted[axis][plant.delay + N - 1] - level - drift
             ends.append((x, plant, goal / plant.static_gain))
         cost += scenario.weight * _terminal(p, scenario, ends, motors[-1], common)
         angles.append(paths)
@@ -184,6 +191,31 @@ def expression(problem: Problem) -> dict[str, Any]:
     rows, kinds = _hard_rows(moves, positions, slack)
     _soft_rows(p, angles, motors, slack, rows, kinds)
     return {"z": z, "theta": theta, "cost": cost, "rows": ca.vertcat(*rows), "kinds": np.array(kinds)}
+
+
+def _asked_moves(p: Problem, wanted: list[Any]) -> list[Any]:
+    """Return the moves (3,) at each start that the reference itself asks for, at rest: only others cost.
+
+    Without them a reference that keeps moving would be followed late and too low, in a trade against its moves.
+    """
+    import casadi as ca
+
+    inverse = ca.DM(np.linalg.inv(p.T))
+    ends = (*p.starts[1:], p.horizon)
+    middles = [-0.5, *(0.5 * (start + end) for start, end in zip(p.starts, ends, strict=True))]
+    levels = []
+    for axis in range(2):
+        plant = p.scenarios[0].axis(axis)
+        places = np.clip(plant.delay + np.array(middles), 0.0, p.rows - 1.0)
+        low = np.floor(places).astype(int)
+        high = np.minimum(low + 1, p.rows - 1)
+        part = places - low
+        row = [(1.0 - f) * wanted[axis][i] + f * wanted[axis][j] for i, j, f in zip(low, high, part, strict=True)]
+        levels.append([value / plant.static_gain for value in row])
+    return [
+        ca.mtimes(inverse, ca.vertcat(*(level[b + 1] - level[b] for level in levels), 0.0))
+        for b in range(len(p.starts))
+    ]
 
 
 def _hard_rows(moves: list[Any], positions: list[Any], slack: list[Any]) -> tuple[list[Any], list[tuple[float, float]]]:

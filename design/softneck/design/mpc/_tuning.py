@@ -18,7 +18,7 @@ Pair = tuple[AxisPlant, AxisPlant]
 # Decades of the move weight that are searched, relative to errors of the input.
 _WEIGHTS = (-6.0, 6.0)
 # Trust of the observers that are tried.
-_LEAST, _MOST = 1e-4, 1e3
+_LEAST, FULL_TRUST = 1e-4, 1e3
 _HALVINGS = 18
 # A step response is judged over this long [s].
 _HORIZON = 4.0
@@ -72,7 +72,9 @@ def sensitivity(
     return float(np.linalg.norm(S, ord=2, axis=(1, 2)).max())
 
 
-def closed(parts: tuple[Matrix, Matrix, Matrix, Matrix], plants: Pair, extra_delay: int) -> tuple[Matrix, Matrix, Matrix]:
+def closed(
+    parts: tuple[Matrix, Matrix, Matrix, Matrix], plants: Pair, extra_delay: int
+) -> tuple[Matrix, Matrix, Matrix]:
     """Return A, B (from both references) and C (to both angles) of the loop with its dead time in full."""
     A, B, C, D = parts
     sides = [_realised(plant, plant.delay + extra_delay) for plant in plants]
@@ -106,6 +108,17 @@ def radius(parts: tuple[Matrix, Matrix, Matrix, Matrix], plants: Pair, extra_del
     return float(np.abs(np.linalg.eigvals(closed(parts, plants, extra_delay)[0])).max())
 
 
+def keeps_bounds(
+    arrays: tuple[Matrix, ...], families: list[tuple[Pair, float]], extra_delay: int, frequency: Vector
+) -> bool:
+    """Return whether the loop with every plant is stable and keeps the plant's bound on Ms."""
+    parts = system(arrays)
+    return all(
+        sensitivity(parts, pair, extra_delay, frequency) <= bound and radius(parts, pair, extra_delay) < 1.0
+        for pair, bound in families
+    )
+
+
 def observer_trust(
     arrays: tuple[Matrix, ...], families: list[tuple[Pair, float]], extra_delay: int, frequency: Vector
 ) -> float:
@@ -122,26 +135,22 @@ def observer_trust(
     """
 
     def keeps(trust: float) -> bool:
-        parts = system(with_gains(arrays, trust))
-        return all(
-            sensitivity(parts, pair, extra_delay, frequency) <= bound and radius(parts, pair, extra_delay) < 1.0
-            for pair, bound in families
-        )
+        return keeps_bounds(with_gains(arrays, trust), families, extra_delay, frequency)
 
-    low, high = math.log(_LEAST), math.log(_MOST)
-    if keeps(_MOST):
-        return _MOST
+    low, high = math.log(_LEAST), math.log(FULL_TRUST)
+    if keeps(FULL_TRUST):
+        return FULL_TRUST
     if not keeps(_LEAST):
-        raise SettingsError("no observer keeps the asked robustness; ask for less `bandwidth` or more `max_sensitivity`.")
+        raise SettingsError(
+            "no observer keeps the asked robustness; ask for less `bandwidth` or more `max_sensitivity`."
+        )
     for _ in range(_HALVINGS // 2 + 2):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if keeps(math.exp(middle)) else (low, middle)
     return math.exp(low)
 
 
-def reference_time(
-    arrays: tuple[Matrix, ...], families: list[Pair], extra_delay: int, *, overshoot: float
-) -> float:
+def reference_time(arrays: tuple[Matrix, ...], families: list[Pair], extra_delay: int, *, overshoot: float) -> float:
     """Return the least time constant [s] of the reference filter with which no plant overshoots by more than this part.
 
     Raises:

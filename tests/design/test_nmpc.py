@@ -1,0 +1,215 @@
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from softneck.core import DataError, SettingsError, load
+from softneck.design import NmpcController, NmpcSettings
+from softneck.design.mpc._gauss_newton import cost_function
+from softneck.design.mpc._horizon_estimate import disturbance_ahead, estimate_gains
+from softneck.design.mpc._model_steps import step_function
+from softneck.estimation import LinearNeck
+from softneck.identification import GreyBox, Model, Network, Play, Rls
+from softneck.plant import NeckParameters, VirtualNeck, record
+from softneck.signals import Recording, signal
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    return record(signal("eq22"), VirtualNeck(NeckParameters.paper()), seed=1).rows(0, 2000)
+
+
+@pytest.fixture(scope="module")
+def network(recording: Recording) -> Model:
+    return Network(hidden=(6, 6), iterations=30).fit(recording)
+
+
+@pytest.fixture(scope="module")
+def models(recording: Recording, network: Model) -> dict[str, Model]:
+    return {
+        "nn": network,
+        "play": Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording),
+        "greybox": GreyBox(evaluations=3, sensor_delay=2).fit(recording),
+    }
+
+
+@pytest.fixture(scope="module")
+def controller(network: Model) -> NmpcController:
+    return NmpcSettings(horizon=12, moves=4, lead_limit=12.0).design(network)
+
+
+def closed_loop(
+    controller: NmpcController, plant: Model, rows: int, pitch: float, *, load_at: int = 10**9, load: float = 0.0
+) -> tuple[np.ndarray, list[str]]:
+    """Return pitch and roll (rows, 2), the plant's free run plus a load on the angles, and what each sample said."""
+    block, state = plant.block(), controller.initial_state()
+    x, angles, said = block.initial_state(use_measurement=0.0), [], []
+    motors, y = np.zeros(3), block.initial_state().outputs[:2]
+    for k in range(rows):
+        seen = y + (load if k >= load_at else 0.0)
+        state, motors = controller.step(state, [pitch, 0.0, 0.0, *seen, *motors, 1.0, 1.0])
+        said.append(controller.info(state).status)
+        x, out = block.step(x, [*motors, *[math.nan] * 5])
+        y = out[:2]
+        angles.append(y + (load if k + 1 >= load_at else 0.0))
+    return np.array(angles), said
+
+
+@pytest.mark.parametrize("kind", ["nn", "play", "greybox"])
+def test_the_expression_of_a_model_is_its_runtime(kind: str, models: dict[str, Model]) -> None:
+    model = models[kind]
+    f, block = step_function(model), model.block()
+    state = block.initial_state(pitch_start=0.1, use_measurement=0.0)
+    x, u = state.values.copy(), np.zeros(3)
+    rng = np.random.default_rng(0)
+    for _ in range(150):
+        u = np.clip(u + rng.normal(0.0, 0.4, 3), -6.0, 6.0)
+        state, y = block.step(state, [*u, *[math.nan] * 5])
+        ahead, angles = f(x, u)
+        x = np.array(ahead)[:, 0]
+        # Rounding, and in the grey box roots of 1e-24 where the runtime has a case of its own.
+        np.testing.assert_allclose(np.array(angles)[:, 0], y[:2], atol=1e-10)
+        np.testing.assert_allclose(x, state.values, atol=1e-10)
+
+
+@pytest.mark.parametrize("kind", ["nn", "play"])
+def test_converged_it_is_what_ipopt_finds(kind: str, models: dict[str, Model]) -> None:
+    settings = NmpcSettings(horizon=12, moves=4, converged=True, slew_limit=4.0, lead_limit=12.0)
+    controller = settings.design(models[kind])
+    solver, p = controller.solver, controller.problem()
+    state, motors = controller.initial_state(), np.zeros(3)
+    for k in range(30):
+        state, motors = controller.step(state, [0.3 if k < 15 else -0.2, 0.1, 0.2, 0.05, 0.0, *state.outputs, 1.0, 1.0])
+    # The last sample's problem is still in the buffers: its parameters, and its solution as the point it stands at.
+    found, x, held, target, asked, common = (item.copy() for item in solver._evaluated.inputs)
+    z = ca.MX.sym("z", p.variables)
+    cost = cost_function(p)(z, x, held, target, asked, common)[0]
+    sums = ca.mtimes(ca.DM(solver._A[: solver.nz, : solver.nz]), z)
+    oracle = ca.nlpsol("oracle", "ipopt", {"x": z, "f": cost, "g": sums}, {
+        "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-10}, "print_time": False,
+    })  # fmt: skip
+    n = solver._n
+    low, high = solver._lower, solver._upper
+    best = oracle(x0=np.zeros(solver.nz), lbx=low[: solver.nz], ubx=high[: solver.nz], lbg=low[n:], ubg=high[n:])
+    # The issue's bound; ipopt itself stops its barrier at 1e-10 of the scaled problem.
+    np.testing.assert_allclose(found, np.array(best["x"])[:, 0], atol=1e-5)
+    assert np.abs(motors).max() > 0.1
+
+
+def test_one_iteration_a_sample_ends_where_all_do(network: Model) -> None:
+    ends = []
+    for converged in (False, True):
+        settings = NmpcSettings(horizon=12, moves=4, converged=converged, lead_limit=12.0)
+        ends.append(closed_loop(settings.design(network), network, 60, 0.15)[0])
+    # Near rest the problem changes less than it is linear: 0.1 deg in the transient, nothing at its end.
+    assert np.abs(ends[0] - ends[1]).max() < 2e-3
+    np.testing.assert_allclose(ends[0][-1], ends[1][-1], atol=1e-4)
+
+
+def test_it_reaches_the_reference_and_rejects_a_load(controller: NmpcController, network: Model) -> None:
+    angles, said = closed_loop(controller, network, 220, 0.15, load_at=100, load=0.03)
+    np.testing.assert_allclose(angles[95], [0.15, 0.0], atol=2e-3)
+    np.testing.assert_allclose(angles[-1], [0.15, 0.0], atol=2e-3)
+    assert set(said) == {"optimal"}
+
+
+def test_limits_are_kept(network: Model) -> None:
+    controller = NmpcSettings(horizon=12, moves=4, angle_limit=0.12, position_limit=1.5, slew_limit=5.0).design(network)
+    state, before = controller.initial_state(), np.zeros(3)
+    block = network.block()
+    x, y, highest = block.initial_state(use_measurement=0.0), np.zeros(2), 0.0
+    for _ in range(80):
+        state, motors = controller.step(state, [0.5, -0.5, 0.0, *y, *before, 1.0, 1.0])
+        assert np.abs(motors).max() <= 1.5
+        assert np.abs(motors - before).max() <= 0.1 + 1e-12
+        before = motors
+        x, out = block.step(x, [*motors, *[math.nan] * 5])
+        y = out[:2]
+        highest = max(highest, float(np.abs(y).max()))
+    # Soft, and checked at the ends of the holds: a little of what a move makes between two of them.
+    assert highest < 0.12 + 0.01
+
+
+def test_a_constant_disturbance_is_found_and_carried_on() -> None:
+    a, level, rate = 0.9, 0.05, -0.004
+    path = [level]
+    rates = [rate]
+    for _ in range(20):
+        path.append(path[-1] + rates[-1])
+        rates.append(a * rates[-1])
+    found = estimate_gains(a, 8) @ np.array(path[12:4:-1])
+    np.testing.assert_allclose(found, [path[12], rates[12]], atol=1e-12)  # rounding of 8 sums
+    np.testing.assert_allclose(disturbance_ahead(a, 8) @ found, path[13:21], atol=1e-12)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, 57.0])
+def test_a_bad_measurement_never_reaches_the_solver(controller: NmpcController, bad: float) -> None:
+    part = controller.part()
+    motors = part.start(0.0, {})
+    for k in range(60):
+        y = [bad, 0.0] if k >= 20 else [0.0, 0.0]
+        motors = part.advance(0.0, np.array([0.1, 0.0, 0.0, *y, *motors, 1.0, 1.0]))
+        assert np.isfinite(part._values).all()
+        assert part.info.status == ("holding" if k >= 45 else "optimal")
+    with pytest.raises(DataError, match="finite inputs"):
+        controller.step(controller.initial_state(), [0.1, 0.0, 0.0, bad if bad != 57.0 else math.nan, *[0.0] * 6])
+
+
+def test_its_state_is_whole(controller: NmpcController) -> None:
+    one, two = controller.part(), controller.part()
+    rng = np.random.default_rng(3)
+    rows = 0.1 * rng.standard_normal((30, 10))
+    rows[:, 8:] = 1.0
+    one.start(0.0, {})
+    for u in rows[:15]:
+        one.advance(0.0, u)
+    two.start(0.0, {})
+    two.set_state(one.get_state())
+    for u in rows[15:]:
+        np.testing.assert_array_equal(one.advance(0.0, u), two.advance(0.0, u))
+    with pytest.raises(DataError, match="the state has"):
+        two.set_state(b"12345678")
+
+
+def test_disabled_it_holds_and_takes_over_without_a_bump(controller: NmpcController) -> None:
+    state, motors = controller.initial_state(), np.array([0.8, -0.2, -0.2])
+    out = motors
+    for _ in range(5):
+        state, out = controller.step(state, [0.3, 0.0, 0.0, 0.05, 0.0, *motors, 1.0, 0.0])
+        np.testing.assert_array_equal(out, motors)
+    before = out
+    filtered = state.values[controller.solver._at["filtered"]]
+    state, out = controller.step(state, [*filtered, 0.05, 0.0, *motors, 1.0, 1.0])
+    # Asked for what is there: 1e-3 rad is what a model that was not quite at rest moves on by.
+    np.testing.assert_allclose(out, before, atol=1e-3)
+
+
+def test_saved_and_loaded_it_is_the_same(controller: NmpcController, tmp_path: Path) -> None:
+    controller.save(tmp_path / "nmpc.npz")
+    again = load(tmp_path / "nmpc.npz", role="controller")
+    assert isinstance(again, NmpcController)
+    assert again.summary() == controller.summary()
+    u = [0.1, 0.0, 0.0, 0.01, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0]
+    one, two = controller.step(controller.initial_state(), u), again.step(again.initial_state(), u)
+    np.testing.assert_array_equal(one[1], two[1])
+
+
+def test_what_it_cannot_use_is_refused(recording: Recording, controller: NmpcController) -> None:
+    with pytest.raises(SettingsError, match=r"is over nn, play, greybox, nss; got rls"):
+        NmpcSettings().design(Rls().fit(recording))
+    with pytest.raises(SettingsError, match="got LinearNeck"):
+        NmpcSettings().design(LinearNeck(pitch=None, roll=None))  # type: ignore[arg-type]
+    with pytest.raises(SettingsError, match="`horizon` must be"):
+        NmpcSettings(horizon=0)
+    with pytest.raises(SettingsError, match="`slack_weight` must be positive"):
+        NmpcSettings(slack_weight=-1.0)
+    with pytest.raises(SettingsError, match="for `order=sequential`"):
+        NmpcSettings(order="jacobi")
+    with pytest.raises(SettingsError, match="there is no FMU of it"):
+        controller.block()
+    with pytest.raises(SettingsError, match="is no parameter of nmpc"):
+        controller.initial_state(colour=1.0)
