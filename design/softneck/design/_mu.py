@@ -199,9 +199,11 @@ def _descend(problem: _Problem, start: Matrix, sharpness: Vector, free: Vector) 
         rho = np.where(update, 1.0 / np.where(update, sy, 1.0), 0.0)
         left = np.eye(p) - rho[:, None, None] * np.einsum("mi,mj->mij", s, y)
         B[active] = left @ B[active] @ np.swapaxes(left, 1, 2) + rho[:, None, None] * np.einsum("mi,mj->mij", s, s)
+        # Along a straight slope there is no curvature to learn from: go further.
+        B[active[~update]] *= 4.0
         theta[active], f[active], gradient[active] = new_t, new_f, new_g
         # A gain below a tenth of what smoothing loses is none.
-        active = active[fa - new_f > 1e-2 / sharpness[active] * 1e-2]
+        active = active[(fa - new_f > 1e-4 / sharpness[active]) & (new_f > 0.0)]
         if active.size == 0:
             break
     return theta

@@ -130,5 +130,6 @@ def check_blocks(controller: Block, observer: Block | None) -> None:
     """Raise SettingsError where an observer has another sample time than the controller."""
     if observer is not None and not math.isclose(observer.sample_time, controller.sample_time, rel_tol=1e-9):
         raise SettingsError(
-            f"the observer has a sample time of {observer.sample_time:g} s, the controller {controller.sample_time:g} s."
+            f"the observer has a sample time of {observer.sample_time:g} s, the controller one of "
+            f"{controller.sample_time:g} s."
         )

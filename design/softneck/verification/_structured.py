@@ -24,8 +24,9 @@ from ._plants import UncertainNeck, make_plants
 
 # Dead times and poles of a box that its weight is taken over.
 _DELAYS, _POLES = 15, 5
-# What lies between those is covered by this part more.
-_ROOM = 1.01
+# What lies between those is covered by this part more; and a complex change of this size is always allowed for, since
+# purely real uncertainty may have peaks that no grid meets.
+_ROOM, _LEAST = 1.01, 0.01
 _FREQUENCIES, _PERFORMANCE_FREQUENCIES = 90, 24
 # The box is grown up to this many times to find what makes the loop unstable.
 _LARGEST_SCALE = 4.0
@@ -130,10 +131,9 @@ def interconnection(
 
 
 def _uncertain(neck: UncertainNeck, axis: int, start: int) -> list[int]:
-    """Return which of gain, pole and dead time of an axis are uncertain; all where none is, at no width."""
+    """Return which of gain and pole of an axis are uncertain, and its dead time, which always is a little."""
     widths = neck.axes[axis].widths
-    rows = [start + k for k in range(3) if widths[k] > 0.0]
-    return rows or [start]
+    return [start + k for k in range(3) if widths[k] > 0.0 or k == 2]
 
 
 def _axis(box: Any, w: Vector, Ts: float, extra: int) -> tuple[np.ndarray, ...]:
@@ -168,13 +168,11 @@ def _delay_factor(p: float, L: float, z: np.ndarray, Ts: float) -> np.ndarray:
 
 
 def _delay_weight(box: Any, middle: float, z: np.ndarray, Ts: float) -> Vector:
-    if box.widths[2] == 0.0:
-        return np.zeros(z.size)
     base = _delay_factor(middle, box.middle[2], z, Ts)
     delays = np.linspace(box.low[2], box.high[2], _DELAYS)
     poles = np.unique(np.linspace(box.low[1], box.high[1], _POLES))
     changes = [np.abs(_delay_factor(p, L, z, Ts) / base - 1.0) for p, L in itertools.product(poles, delays)]
-    return _ROOM * np.max(changes, axis=0)
+    return np.maximum(_ROOM * np.max(changes, axis=0), _LEAST)
 
 
 def _worst_sensitivity(neck: UncertainNeck, law: LinearLaw, w: Vector, axes: Sequence[int], extra: int) -> list[float]:
