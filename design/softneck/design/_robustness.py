@@ -23,7 +23,7 @@ from ._mu import Array, Blocks, Structure, mu_lower, mu_upper
 _POINTS = 400
 # Candidates for the highest peak that are refined, each to this part of its frequency.
 _PEAKS, _ACCURACY = 3, 1e-7
-# The complex part that purely real uncertainty gets in `robstab`: its peaks are then this wide, its bound that much higher.
+# The complex part that purely real uncertainty gets in `robstab`: its peaks are that wide, its bound that much higher.
 _SOFT = 0.02
 
 

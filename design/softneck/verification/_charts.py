@@ -20,6 +20,7 @@ RED, PURPLE = "#D55E00", "#CC79A7"
 # Responses that an envelope is taken over; more would not be seen.
 _MOST = 240
 _FREQUENCY = "frequency [rad/s]"
+_CAPTION = f"Band: an even choice of up to {_MOST} plants; black: nominal; red: the plant with the least disk margin."
 # Disk margins are shown in five colours between these.
 _LEVELS = ((0.0, RED), (0.3, ORANGE), (0.5, PURPLE), (0.7, BLUE), (0.9, GREEN))
 
@@ -43,7 +44,7 @@ def frequency_charts(part: LinearEvidence, w: Vector) -> list[Chart]:
         charts.append(
             Chart(
                 f"Gang of four: {axis}", panels, _FREQUENCY, columns=2, row_height=2.6,
-                caption="Band: all plants tried; black: nominal; red: the plant with the least disk margin.",
+                caption=_CAPTION,
             )
         )  # fmt: skip
     return charts
@@ -75,7 +76,7 @@ def _bode(part: LinearEvidence, rows: np.ndarray, S: np.ndarray, w: Vector) -> C
         )
     return Chart(
         "Bode envelopes of the open loops", panels, _FREQUENCY, columns=2, row_height=2.6,
-        caption="Band: all plants tried; black: nominal; red: the plant with the least disk margin.",
+        caption=_CAPTION,
     )  # fmt: skip
 
 
@@ -117,11 +118,13 @@ def margin_map(part: LinearEvidence) -> Chart:
     return Chart("Margin map", panels, columns=2, linked=False, row_height=3.0)
 
 
-def mu_chart(part: LinearEvidence) -> Chart:
-    """Return the structured singular value over frequency with its bounds."""
+def mu_charts(part: LinearEvidence) -> list[Chart]:
+    """Return the structured singular value over frequency with its bounds; nothing where the middle is not stable."""
     panels = []
     for rows in part.structured:
         for row in rows:
+            if not np.isfinite(row.upper).all():
+                continue
             found = row.lower > 0.0
             curves = [
                 Curve(row.frequency, row.upper, "upper bound", BLUE, width=1.4),
@@ -132,7 +135,11 @@ def mu_chart(part: LinearEvidence) -> Chart:
                 levels.append(Level(row.sampled, "sampled plants in a scaled box", GREEN))
             top = max(1.1, 1.1 * float(row.upper.max()))
             panels.append(Panel(curves, f"mu, {row.axes}", levels=levels, log_x=True, y_range=(0.0, top)))
-    return Chart("Structured singular value for stability of the box", panels, _FREQUENCY, row_height=2.4)
+    return (
+        [Chart("Structured singular value for stability of the box", panels, _FREQUENCY, row_height=2.4)]
+        if panels
+        else []
+    )
 
 
 def delay_sensitivity(part: LinearEvidence, sample_time: float) -> Chart:

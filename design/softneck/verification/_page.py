@@ -14,7 +14,7 @@ from ._charts import (
     frequency_charts,
     gap_chart,
     margin_map,
-    mu_chart,
+    mu_charts,
     neck_chart,
     step_chart,
 )
@@ -38,12 +38,12 @@ def verdict_table(found: Verification) -> Table:
 
 
 def number(value: Any) -> str:
-    """Return a value for a table: `-` where there is none, `never` where a level is never reached."""
+    """Return a value for a table: `-` where there is none."""
     if value is None:
         return "-"
     if not isinstance(value, int | float | np.floating):
         return str(value)
-    return "never" if math.isinf(value) else f"{value:.4g}"
+    return f"{value:.4g}"
 
 
 def _word(verdict: Verdict) -> str:
@@ -125,7 +125,7 @@ def _linear_sections(found: Verification, part: LinearEvidence) -> list[Section]
             tables=[_margin_table(part)], charts=[*frequency_charts(part, evidence.frequency), margin_map(part)],
         ),
         Section(
-            f"Structured singular value{title}", tables=[Table("Bounds", head, mu, text=2)], charts=[mu_chart(part)]
+            f"Structured singular value{title}", tables=[Table("Bounds", head, mu, text=2)], charts=mu_charts(part)
         ),
         Section(
             f"Delay and gaps{title}", tables=[_delay_table(part, Ts)],

@@ -77,15 +77,30 @@ def structured(
     results = []
     for axes in [(0, 1)] if whole else [(0,), (1,)]:
         M, blocks = interconnection(neck, law, w, axes, extra)
+        sampled, scale = _sampled(neck, law, axes, extra, drawn)
+        name = "both" if whole else ("pitch", "roll")[axes[0]]
+        if not _middle_is_stable(neck, law, axes, extra):
+            # The bound grows the box from a stable middle; without one there is nothing to grow.
+            never = np.full(w.size, math.inf)
+            results.append(StructuredResult(name, w, never, never, math.inf, scale, math.inf))
+            continue
         upper, lower = _bounds(M, blocks)
         sensitivity = math.nan
         if performance:
             at = np.geomspace(0.3, math.pi / Ts, _PERFORMANCE_FREQUENCIES)
             sensitivity = max(_worst_sensitivity(neck, law, at, axes, extra))
-        sampled, scale = _sampled(neck, law, axes, extra, drawn)
-        name = "both" if whole else ("pitch", "roll")[axes[0]]
         results.append(StructuredResult(name, w, upper, lower, sampled, scale, sensitivity))
     return results
+
+
+def _middle_is_stable(neck: UncertainNeck, law: LinearLaw, axes: Sequence[int], extra: int) -> bool:
+    """Return whether the loop around which the box is modelled is stable; an axis that is not judged is nominal."""
+    numbers = np.stack([box.nominal for box in neck.axes])
+    for i in axes:
+        box, Ts = neck.axes[i], neck.sample_time
+        alpha = 1.0 - 0.5 * np.exp(-np.array([box.low[1], box.high[1]]) * Ts).sum()
+        numbers[i] = [box.middle[0], -math.log1p(-alpha) / Ts, box.middle[2]]
+    return bool(radii(make_plants(neck, numbers[None], [""]).later(extra), law)[0] < 1.0)
 
 
 def _bounds(M: np.ndarray, blocks: list[tuple[int, int]]) -> tuple[Vector, Vector]:
