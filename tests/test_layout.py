@@ -19,7 +19,7 @@ PACKAGES = [path for path in FILES if path.name == "__init__.py"]
 # Lowest first; those of one line must not import each other.
 LAYERS = (
     ("core",), ("signals",), ("loop", "plots"), ("plant", "identification"), ("estimation",), ("design",), ("fmu",),
-    ("cosim",), ("testing",), ("drives",), ("report",), ("cli",),
+    ("cosim",), ("verification",), ("testing",), ("drives",), ("report",), ("cli",),
 )  # fmt: skip
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 

@@ -20,6 +20,11 @@ from ._hinf import HinfSettings as HinfSettings
 from ._lqg import LqgSettings as LqgSettings
 from ._margins import Margins as Margins
 from ._margins import loop_margins as loop_margins
+from ._mu import Mu as Mu
+from ._mu import Structure as Structure
+from ._mu import mu_bounds as mu_bounds
+from ._mu import mu_lower as mu_lower
+from ._mu import mu_upper as mu_upper
 from ._ncf import NcfSettings as NcfSettings
 from ._neck_table import FIGURES as FIGURES
 from ._neck_table import NECK_HEAD as NECK_HEAD
@@ -35,6 +40,14 @@ from ._pid import PidGains as PidGains
 from ._pid import PidSettings as PidSettings
 from ._reduction import Reduced as Reduced
 from ._reduction import reduce_controller as reduce_controller
+from ._robustness import DiskMargin as DiskMargin
+from ._robustness import RobustStability as RobustStability
+from ._robustness import WorstCaseGain as WorstCaseGain
+from ._robustness import diskmargin as diskmargin
+from ._robustness import robstab as robstab
+from ._robustness import wcgain as wcgain
+from ._robustness import worst_gains as worst_gains
+from ._robustness_gap import nugap as nugap
 from ._scheduled import ScheduledSettings as ScheduledSettings
 from ._synthesis import Synthesis as Synthesis
 from ._synthesis import hinfsyn as hinfsyn

@@ -27,6 +27,7 @@ _COMMANDS = {
     "fmu": ("_fmu", "Package models, observers, controllers or the virtual neck as FMUs."),
     "observer": ("_observer", "Build a Kalman filter over a linear model."),
     "design": ("_design", "Design a controller on a linear model."),
+    "verify": ("_verify", "Prove a controller on what it claims, or fail loudly."),
     "simulate": ("_simulate", "Close the loop that a TOML file describes and judge it."),
     "ssp": ("_ssp", "Write a loop as an SSP file for other simulators."),
     "new": ("_new", "Begin a project whose closed-loop test passes at once."),

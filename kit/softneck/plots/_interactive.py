@@ -147,7 +147,9 @@ def _plot(panel: Panel, chart: Chart, number: int) -> Plot:
         axis.update(axis_label_text_font=_FONT, axis_label_text_font_style="normal", axis_label_text_font_size="12px")
         axis.update(major_label_text_font=_FONT, major_label_text_font_size="11px", minor_tick_line_color=None)
     if chart.linked and not x_label:
-        plot.xaxis.major_label_text_font_size = "0px"  # the panel below has the same axis
+        # The panel below has the same axis. Powers of ten cannot be drawn at no size (Bokeh stops with a NaN box).
+        plot.xaxis.major_label_text_font_size = "1px" if panel.log_x else "0px"
+        plot.xaxis.major_label_text_alpha = 0.0
     if panel.title:
         plot.title = Title(text=panel.title, text_font=_FONT, text_font_size="12px")
     return plot

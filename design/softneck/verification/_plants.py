@@ -1,0 +1,298 @@
+"""What the neck may be: a box of static gain, pole and dead time for each axis, and plants drawn from it.
+
+An axis is `K p exp(-L s)/(s + p)` behind a zero-order hold, sampled exactly for every dead time L, also between
+samples, times dynamics that are certain (of a model of higher order, all but its slowest pole).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy.stats import qmc
+
+from softneck.core import Matrix, SettingsError, Vector
+from softneck.estimation import AxisPlant, axis_plant
+
+AXES = ("pitch", "roll")
+QUANTITIES = ("static gain", "pole", "dead time")
+# A pole that is none: so fast [1/s] that a sample is over before it shows.
+_NO_POLE = 1e4
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class AxisBox:
+    """What one axis may be; numbers are static gain [rad/rad], pole [1/s], dead time [s].
+
+    Attributes:
+        nominal: (3,).
+        low, high: (3,).
+        samples: (n, 3) plants that were identified; none for a model.
+        std: (n, 3) their standard deviations; None where nobody knows.
+        rest: numerator and denominator (r + 1,) each, highest power first, of dynamics that are certain.
+    """
+
+    nominal: Vector
+    low: Vector
+    high: Vector
+    samples: Matrix
+    std: Matrix | None = None
+    rest: tuple[Vector, Vector] = field(default_factory=lambda: (np.ones(1), np.ones(1)))
+
+    @property
+    def widths(self) -> Vector:
+        """Half the width of the box (3,), 0 where it is certain."""
+        return 0.5 * (self.high - self.low)
+
+    @property
+    def middle(self) -> Vector:
+        """(3,) of the box."""
+        return 0.5 * (self.high + self.low)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class UncertainNeck:
+    """One source of plants.
+
+    Attributes:
+        name: of its file.
+        sample_time: [s].
+        axes: pitch and roll.
+        cross: (2,) phi_i into pitch as a part of theta_i's gain, and theta_i into roll as a part of phi_i's.
+        kind: "family" or "model".
+    """
+
+    name: str
+    sample_time: float
+    axes: tuple[AxisBox, AxisBox]
+    cross: Vector
+    kind: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plants:
+    """Plants, one a row.
+
+    Attributes:
+        sample_time: [s].
+        numbers: (n, 2, 3) static gain, pole, dead time of pitch and roll.
+        cross: (n, 2).
+        names: of each.
+        source: (n,) number of the neck that each comes from.
+        numerator, denominator: (n, 2, q) highest power first, monic; the numerator's first is 0.
+        delay: (n, 2) samples besides.
+    """
+
+    sample_time: float
+    numbers: np.ndarray
+    cross: Matrix
+    names: tuple[str, ...]
+    source: np.ndarray
+    numerator: np.ndarray
+    denominator: np.ndarray
+    delay: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def take(self, rows: Any) -> Plants:
+        """Return some of them: rows as indices."""
+        rows = np.atleast_1d(np.asarray(rows, dtype=int))
+        names = tuple(self.names[int(row)] for row in rows)
+        return Plants(
+            self.sample_time, self.numbers[rows], self.cross[rows], names, self.source[rows], self.numerator[rows],
+            self.denominator[rows], self.delay[rows],
+        )  # fmt: skip
+
+    def later(self, samples: int) -> Plants:
+        """Return the same with `samples` of delay more on both axes, as a loop's order adds."""
+        return Plants(
+            self.sample_time, self.numbers, self.cross, self.names, self.source, self.numerator, self.denominator,
+            self.delay + samples,
+        )  # fmt: skip
+
+    def response(self, frequency: Vector) -> np.ndarray:
+        """Return the exact complex response (n, 2, m) of both axes at `frequency` [rad/s], without cross gains."""
+        z = np.exp(1j * frequency * self.sample_time)
+        powers = z[None, :] ** np.arange(self.numerator.shape[2] - 1, -1, -1)[:, None]
+        return (self.numerator @ powers) / (self.denominator @ powers) * z ** -self.delay[:, :, None].astype(float)
+
+
+def neck_of_family(family: Any, name: str) -> UncertainNeck:
+    """Return a `Family` as a source of plants, the samples that it uses with their standard deviations.
+
+    Raises:
+        SettingsError: it has no samples.
+    """
+    boxes = []
+    for axis in AXES:
+        found = family.axes[axis]
+        used = found.used > 0.5
+        if not used.any():
+            raise SettingsError(f"{name}: the family has no samples of {axis}; fit it on longer recordings.")
+        low, high = found.box
+        boxes.append(
+            AxisBox(
+                nominal=found.nominal.copy(), low=np.minimum(low, found.nominal), high=np.maximum(high, found.nominal),
+                samples=found.samples[used], std=found.std[used][:, :3],
+            )
+        )  # fmt: skip
+    own = [family.axes[axis].nominal[0] for axis in AXES]
+    cross = np.nan_to_num(np.array([family.cross[0, 1] / own[0], family.cross[1, 0] / own[1]]))
+    return UncertainNeck(
+        name=name, sample_time=family.sample_time, axes=(boxes[0], boxes[1]), cross=cross, kind="family"
+    )
+
+
+def neck_of_model(model: Any, name: str, spread: Mapping[str, float]) -> UncertainNeck:
+    """Return a linear model as a source of plants within +-`gain` and +-`pole` (relative) and +-`delay` [s] of it.
+
+    Raises:
+        SettingsError: a model that is not linear, discrete and stable.
+    """
+    plants = []
+    for axis in AXES:
+        try:
+            plants.append(axis_plant(model, axis))
+        except SettingsError as error:
+            raise SettingsError(f"{name}: {error}") from error
+    if not math.isclose(plants[0].sample_time, plants[1].sample_time, rel_tol=1e-9):
+        raise SettingsError(f"{name}: pitch and roll have different sample times.")
+    first, second = (_axis_of(plant, spread) for plant in plants)
+    cross = np.array([_cross_gain(model, axis, plant) for axis, plant in zip(AXES, plants, strict=True)])
+    return UncertainNeck(name=name, sample_time=plants[0].sample_time, axes=(first, second), cross=cross, kind="model")
+
+
+def _axis_of(plant: AxisPlant, spread: Mapping[str, float]) -> AxisBox:
+    poles = np.roots(plant.denominator)
+    slowest = complex(poles[int(np.argmax(np.abs(poles)))]) if poles.size else 0j
+    gain, Ts = plant.static_gain, plant.sample_time
+    dead = plant.delay * Ts
+    if abs(slowest.imag) > 1e-9 or slowest.real <= 1e-6:
+        # No slowest real pole to be uncertain about: one that does not show, and all else is certain.
+        nominal = np.array([gain, _NO_POLE, dead])
+        rest = (np.append(plant.numerator, 0.0) / gain, plant.denominator)
+        pole_spread = 0.0
+    else:
+        a = slowest.real
+        others = np.atleast_1d(np.real(np.poly(np.delete(poles, int(np.argmax(np.abs(poles)))))))
+        nominal = np.array([gain, -math.log(a) / Ts, dead])
+        # The first-order part has one sample of its own, (1 - a)/(z - a); the rest is B over all other poles.
+        rest = (plant.numerator / (gain * (1.0 - a)), others)
+        pole_spread = spread["pole"]
+    half = np.array([abs(gain) * spread["gain"], nominal[1] * pole_spread, spread["delay"]])
+    low, high = nominal - half, nominal + half
+    low[2] = max(low[2], 0.0)
+    return AxisBox(nominal=nominal, low=low, high=high, samples=np.zeros((0, 3)), rest=rest)
+
+
+def _cross_gain(model: Any, axis: str, plant: AxisPlant) -> float:
+    other = {"pitch": "phi_i", "roll": "theta_i"}[axis]
+    try:
+        value = float(np.real(model.tf(axis, input=other).dcgain()))
+    except (SettingsError, TypeError, ValueError):
+        return 0.0  # a model of two single axes
+    return value / plant.static_gain if math.isfinite(value) else 0.0
+
+
+def make_plants(neck: UncertainNeck, numbers: np.ndarray, names: list[str], *, source: int = 0) -> Plants:
+    """Return plants of `neck` with `numbers` (n, 2, 3), sampled exactly."""
+    Ts = neck.sample_time
+    parts = [_sampled(numbers[:, i], box.rest, Ts) for i, box in enumerate(neck.axes)]
+    q = max(part[0].shape[1] for part in parts)
+    padded = [[np.pad(p, ((0, 0), (0, q - p.shape[1]))) for p in part[:2]] for part in parts]
+    # Zeros behind both polynomials of an axis are poles and zeros at 0 that cancel.
+    numerator, denominator = (np.stack([padded[0][k], padded[1][k]], axis=1) for k in (0, 1))
+    delay = np.stack([part[2] for part in parts], axis=1)
+    n = numbers.shape[0]
+    return Plants(
+        Ts, numbers, np.tile(neck.cross, (n, 1)), tuple(names), np.full(n, source), numerator, denominator, delay
+    )
+
+
+def _sampled(numbers: Matrix, rest: tuple[Vector, Vector], Ts: float) -> tuple[Matrix, Matrix, np.ndarray]:
+    """Return numerator and denominator (n, q) and delay (n,) of one axis: y+ = a y + b0 u(k-d) + b1 u(k-d-1)."""
+    K, p, L = numbers.T
+    # 1e-9: dead times such as 0.08 / 0.02 are whole but for rounding.
+    d = np.floor(L / Ts + 1e-9)
+    part = np.clip(L / Ts - d, 0.0, 1.0)
+    a = np.exp(-p * Ts)
+    late = np.exp(-p * Ts * (1.0 - part))
+    first = np.stack([K * (1.0 - late), K * (late - a)], axis=1)
+    own = np.stack([np.ones_like(a), -a], axis=1)
+    above = _products(first, rest[0])
+    below = _products(own, np.append(rest[1], 0.0))
+    above = np.pad(above, ((0, 0), (below.shape[1] - above.shape[1], 0)))
+    return above, below, d.astype(int)
+
+
+def _products(rows: Matrix, polynomial: Vector) -> Matrix:
+    return np.stack([np.convolve(row, polynomial) for row in rows])
+
+
+def nominal_plants(necks: list[UncertainNeck]) -> list[Plants]:
+    """Return the nominal plant of each neck."""
+    return [
+        make_plants(neck, np.stack([box.nominal for box in neck.axes])[None], [f"{neck.name}: nominal"], source=i)
+        for i, neck in enumerate(necks)
+    ]
+
+
+def all_plants(necks: list[UncertainNeck], count: int, seed: int) -> Plants:
+    """Return nominals, corners, identified samples and, up to `count` in all, plants from inside the boxes.
+
+    Corners of pitch stand beside the same of roll, and beside the opposite ones. Inside, a Latin hypercube.
+    """
+    share = max(1, count // len(necks))
+    return join([_of_neck(neck, share, seed + i, i) for i, neck in enumerate(necks)])
+
+
+def _of_neck(neck: UncertainNeck, count: int, seed: int, source: int) -> Plants:
+    numbers: list[np.ndarray] = [np.stack([box.nominal for box in neck.axes])]
+    names = [f"{neck.name}: nominal"]
+    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    for first, opposite in itertools.product(range(8), (False, True)):
+        chosen = (signs[first], signs[7 - first] if opposite else signs[first])
+        numbers.append(np.stack([_corner(box, s) for box, s in zip(neck.axes, chosen, strict=True)]))
+        texts = ["".join("+" if value > 0 else "-" for value in s) for s in chosen]
+        names.append(f"{neck.name}: corner {texts[0]} of pitch, {texts[1]} of roll")
+    sizes = [box.samples.shape[0] for box in neck.axes]
+    for k in range(max(sizes)):
+        rows = [k % size for size in sizes]
+        numbers.append(np.stack([box.samples[row] for box, row in zip(neck.axes, rows, strict=True)]))
+        names.append(f"{neck.name}: sample {rows[0]} of pitch, {rows[1]} of roll")
+    inside = max(0, count - len(numbers))
+    if inside:
+        drawn = qmc.LatinHypercube(d=6, rng=np.random.default_rng(seed)).random(inside).reshape(inside, 2, 3)
+        low, high = (np.stack([getattr(box, end) for box in neck.axes]) for end in ("low", "high"))
+        numbers += list(low + drawn * (high - low))
+        names += [f"{neck.name}: inside {k}" for k in range(inside)]
+    return make_plants(neck, np.array(numbers), names, source=source)
+
+
+def _corner(box: AxisBox, signs: Vector) -> Vector:
+    return np.where(signs > 0.0, box.high, box.low)
+
+
+def join(parts: list[Plants]) -> Plants:
+    """Return all rows of several."""
+    q = max(part.numerator.shape[2] for part in parts)
+
+    def stacked(name: str) -> np.ndarray:
+        rows = [getattr(part, name) for part in parts]
+        return np.concatenate([np.pad(row, ((0, 0), (0, 0), (0, q - row.shape[2]))) for row in rows])
+
+    return Plants(
+        parts[0].sample_time,
+        np.concatenate([part.numbers for part in parts]),
+        np.concatenate([part.cross for part in parts]),
+        tuple(itertools.chain.from_iterable(part.names for part in parts)),
+        np.concatenate([part.source for part in parts]),
+        stacked("numerator"),
+        stacked("denominator"),
+        np.concatenate([part.delay for part in parts]),
+    )

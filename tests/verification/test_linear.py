@@ -1,0 +1,222 @@
+"""Plants, stability and margins of many loops at once equal what python-control says of each alone."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import control
+import numpy as np
+import pytest
+
+from softneck.design import diskmargin, mu_bounds, nugap
+from softneck.verification._gaps import gaps
+from softneck.verification._linear import LinearLaw, diagonal_mu, judged, margins, radii
+from softneck.verification._plants import (
+    AxisBox,
+    Plants,
+    UncertainNeck,
+    all_plants,
+    make_plants,
+    neck_of_family,
+    neck_of_model,
+    nominal_plants,
+)
+from softneck.verification._search import search
+from softneck.verification._structured import structured
+
+from .necks import PAPER, TS, controller_of, family, linear_neck, pi
+
+SPREAD = {"gain": 0.2, "pole": 0.2, "delay": 0.02}
+W = judged(TS)
+
+
+def _transfer(plants: Plants, row: int, axis: int) -> control.TransferFunction:
+    below = np.append(plants.denominator[row, axis], np.zeros(plants.delay[row, axis]))
+    return control.TransferFunction(plants.numerator[row, axis], below, TS)
+
+
+def test_plants_of_a_family_are_sampled_as_the_family_samples_them() -> None:
+    found = family()
+    plants = all_plants([neck_of_family(found, "f")], 1, 0)
+    rows = [k for k, name in enumerate(plants.names) if "sample" in name]
+    G = plants.take(rows).response(W)
+    for i, axis in enumerate(("pitch", "roll")):
+        expected = [np.asarray(item(np.exp(1j * W * TS))) for item in found.samples(axis)]
+        # Rounding of coefficients only.
+        np.testing.assert_allclose(G[:, i], expected, rtol=1e-9)
+
+
+def test_the_nominal_plant_of_a_model_is_the_model() -> None:
+    model = linear_neck()
+    a, b = 0.9, 0.6
+    second = control.TransferFunction([0.002, 0.001], np.concatenate([np.convolve([1, -a], [1, -b]), [0, 0, 0]]), TS)
+    ringing = control.TransferFunction([0.002, 0.001], [1.0, -1.6, 0.73, 0.0, 0.0], TS)
+    for tf in (model.pitch, second, ringing):
+        neck = neck_of_model(type(model)(pitch=tf, roll=tf), "m", SPREAD)
+        G = nominal_plants([neck])[0].response(W)[0, 0]
+        # 1e-6: of a ringing model the pole that does not show is at exp(-200).
+        np.testing.assert_allclose(G, np.asarray(tf(np.exp(1j * W * TS))), rtol=1e-6)
+
+
+@pytest.mark.parametrize("cross", [0.0, 0.3])
+def test_radii_are_those_of_the_closed_loops_poles(cross: float) -> None:
+    plants = all_plants([neck_of_family(family(cross=cross, spread=0.5), "f")], 40, 1).later(2)
+    controller = pi()
+    found = radii(plants, LinearLaw.of(controller.ss()))
+    K: Any = controller.ss()
+    for row in range(0, len(plants), 7):
+        first, second = (control.ss(_transfer(plants, row, i)) for i in (0, 1))
+        mixed = np.array([[1.0, plants.cross[row, 0]], [plants.cross[row, 1], 1.0]])
+        P: Any = control.append(first, second) * control.StateSpace([], [], [], mixed, TS)
+        Ky = control.StateSpace(K.A, K.B[:, 2:], K.C, K.D[:, 2:], TS)
+        closed: Any = control.feedback(P, Ky, sign=1)
+        # Poles at zero of multiplicity m are found to eps^(1/m) only; the largest ones are simple.
+        assert found[row] == pytest.approx(np.abs(closed.poles()).max(), rel=1e-6)
+
+
+def test_margins_are_those_of_python_control() -> None:
+    pytest.importorskip("slycot")
+    plants = all_plants([neck_of_model(linear_neck(), "m", SPREAD)], 30, 0)
+    law = LinearLaw.of(pi().ss())
+    found = margins(plants, law, np.geomspace(0.02, math.pi / TS, 1500))
+    z = np.exp(1j * W * TS)
+    Ky: Any = control.minreal(
+        control.StateSpace(law.A, law.By[:, [0]], -law.C[[0]], -law.Dy[[0]][:, [0]], TS), verbose=False
+    )
+    for row in range(0, len(plants), 5):
+        L: Any = control.ss(_transfer(plants, row, 0)) * Ky
+        gain, phase, _, _, crossover, _ = (float(item) for item in control.stability_margins(L))
+        # Straight lines on a grid 0.6 % wide.
+        assert found["pitch.gain_margin"][row] == pytest.approx(gain, rel=2e-3)
+        assert found["pitch.phase_margin_deg"][row] == pytest.approx(phase, rel=2e-3)
+        assert found["pitch.delay_margin_ms"][row] == pytest.approx(1e3 * math.radians(phase) / crossover, rel=2e-3)
+        S: Any = control.feedback(1, L)
+        infinity: Any = "inf"
+        norm = float(control.system_norm(S, p=infinity, print_warning=False))
+        assert found["pitch.sensitivity"][row] == pytest.approx(norm, rel=2e-3)
+        assert found["pitch.disk_margin"][row] == pytest.approx(diskmargin(L).margin, rel=2e-3)
+    assert np.isfinite(np.asarray(Ky(z))).all()
+
+
+def test_two_complex_scalars_have_a_closed_form() -> None:
+    M = np.random.default_rng(0).standard_normal((50, 2, 2, 2)) @ [1.0, 1.0j]
+    # The descent ends at log(2)/3000 of the bound.
+    np.testing.assert_allclose(diagonal_mu(M), mu_bounds(M, [(1, 0), (1, 0)]).upper, rtol=1e-3)
+
+
+def test_the_margin_of_both_channels_is_that_of_the_system_of_two() -> None:
+    plants = nominal_plants([neck_of_family(family(cross=0.3), "f")])[0]
+    controller: Any = pi().ss()
+    law = LinearLaw.of(controller)
+    mixed = np.array([[1.0, plants.cross[0, 0]], [plants.cross[0, 1], 1.0]])
+    P: Any = control.append(*(control.ss(_transfer(plants, 0, i)) for i in (0, 1)))
+    P = P * control.StateSpace([], [], [], mixed, TS)
+    K = control.StateSpace(law.A, law.By, -law.C, -law.Dy, TS)
+    least = min(diskmargin(P * K).margin, diskmargin(K * P).margin)
+    # A grid of 2.5 % on a flat peak.
+    assert margins(plants, law, W)["mimo.disk_margin"][0] == pytest.approx(least, rel=5e-3)
+
+
+def test_the_gap_of_each_plant_is_the_nu_gap() -> None:
+    plants = all_plants([neck_of_model(linear_neck(), "m", SPREAD)], 1, 0)
+    law = LinearLaw.of(pi().ss())
+    found = gaps(plants.take(0), plants, law, W)[0]
+    P0, C = plants.take(0).response(W)[0, 0], -law.feedback(W)[:, 0, 0]
+    k = float(np.abs(C[np.flatnonzero(np.abs(P0 * C) >= 1.0)[-1]]))
+    for row in (1, 5, 9):
+        expected = nugap(k * _transfer(plants, 0, 0), k * _transfer(plants, row, 0))
+        # A grid of 2.5 % on a flat peak.
+        assert found.gap[row] == pytest.approx(expected, rel=5e-3)
+
+
+def _hidden() -> tuple[UncertainNeck, LinearLaw]:
+    """A resonance of gain 2 and a dead time that turns it once around: unstable only in the middle.
+
+    At both ends of the box the resonance is in phase with -180 deg + 180 deg; half a period later it is at -180.
+    """
+    frequency, damping = 2.0 * math.pi / 0.08, 0.995
+    pole = damping * np.exp(1j * frequency * TS)
+    below = np.real(np.poly([pole, np.conj(pole)]))
+    shape = control.TransferFunction([1.0, -1.0], below, TS)
+    z = np.exp(1j * frequency * TS)
+    a = math.exp(-PAPER[1] * TS)
+    G = PAPER[0] * (1.0 - a) / (z - a)
+    at: complex = complex(np.asarray(shape(z))) * G
+    # Such a sign and dead time that the resonance is harmless at the ends.
+    sign = 1.5 / abs(at)
+    turned = -np.angle(at) % (2.0 * math.pi)
+    start = (2.0 * math.pi - turned) / frequency
+    low = np.array([PAPER[0], PAPER[1], start])
+    box = AxisBox(
+        nominal=low, low=low, high=low + np.array([0.0, 0.0, 0.08]), samples=np.zeros((0, 3)),
+    )  # fmt: skip
+    neck = UncertainNeck(name="hidden", sample_time=TS, axes=(box, box), cross=np.zeros(2), kind="model")
+    law = LinearLaw.of(controller_of(sign * np.array([1.0, -1.0]), below))
+    return neck, law
+
+
+def test_a_loop_that_is_stable_at_all_corners_but_not_inside_is_caught_by_the_search() -> None:
+    neck, law = _hidden()
+    corners = all_plants([neck], 1, 0)
+    assert radii(corners, law).max() < 1.0
+    found = search([neck], law, W, extra=0, generations=15, seed=0)
+    assert found.radius > 1.0
+    assert radii(found.plants, law).max() > 1.0
+
+
+def test_where_the_search_finds_an_unstable_plant_the_bound_proves_nothing() -> None:
+    neck, law = _hidden()
+    drawn = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 2, 3))
+    for row in structured(neck, law, extra=0, drawn=drawn, performance=False):
+        assert row.mu > 1.0
+
+
+def test_bounds_enclose_what_was_sampled() -> None:
+    """The box of a neck with a PI: sampled instability, lower and upper bound stand in this order."""
+    neck = neck_of_model(linear_neck(), "m", {"gain": 0.4, "pole": 0.4, "delay": 0.02})
+    law = LinearLaw.of(pi().ss())
+    drawn = np.random.default_rng(0).uniform(-1.0, 1.0, (100, 2, 3))
+    drawn[:50] = np.sign(drawn[:50])
+    peak = margins(all_plants([neck], 60, 0), law, W)["pitch.sensitivity"].max()
+    row = structured(neck, law, extra=0, drawn=drawn, performance=True)[0]
+    assert 0.0 < row.sampled <= row.mu
+    assert 0.0 < row.lower.max() <= row.mu < 1.0
+    assert row.worst_sensitivity >= peak
+
+
+def test_mu_of_gain_alone_is_that_of_the_gain_margin() -> None:
+    """With gain +-r alone the loop is unstable from 1 + k r = gain margin on: mu = r/(margin - 1)."""
+    r = 0.3
+    neck = neck_of_model(linear_neck(), "m", {"gain": r, "pole": 0.0, "delay": 0.0})
+    law = LinearLaw.of(pi().ss())
+    margin = float(margins(nominal_plants([neck])[0], law, W)["pitch.gain_margin"][0])
+    row = structured(neck, law, extra=0, drawn=np.ones((1, 2, 3)), performance=False)[0]
+    # The 1 % of complex dead time that is always there widens the peak, and costs as much here.
+    assert r / (margin - 1.0) <= row.mu <= 1.2 * r / (margin - 1.0)
+
+
+def test_wrong_delay_is_seen() -> None:
+    """Designed without dead time, judged on the paper's 80 ms: not stable."""
+    neck = neck_of_model(linear_neck(), "m", SPREAD)
+    assert radii(nominal_plants([neck])[0], LinearLaw.of(pi(delay=0).ss())).max() > 1.0
+
+
+def test_more_delay_by_the_order_is_more_delay_of_the_plant() -> None:
+    neck = neck_of_model(linear_neck(delay=4), "m", SPREAD)
+    other = neck_of_model(linear_neck(delay=6), "m", SPREAD)
+    law = LinearLaw.of(pi().ss())
+    one, two = margins(nominal_plants([neck])[0].later(2), law, W), margins(nominal_plants([other])[0], law, W)
+    for name in one:
+        np.testing.assert_allclose(one[name], two[name], rtol=1e-9)  # rounding
+
+
+def test_numbers_make_plants_between_samples() -> None:
+    """A dead time of 3.5 samples lies between those of 3 and 4 in phase."""
+    neck = neck_of_model(linear_neck(), "m", SPREAD)
+    numbers = np.tile(PAPER, (3, 2, 1))
+    numbers[:, :, 2] = np.array([0.06, 0.07, 0.08])[:, None]
+    G = make_plants(neck, numbers, [""] * 3).response(np.array([1.0]))[:, 0, 0]
+    # Between samples the held input makes 3 % of difference; over the whole sample none.
+    np.testing.assert_allclose(np.diff(np.angle(G)), -0.01, rtol=0.03)
+    assert np.angle(G[2] / G[0]) == pytest.approx(-0.02, rel=1e-9)
