@@ -9,6 +9,7 @@ import numpy as np
 from softneck.plant._geometry_runtime import bend_functions, lean_angles
 from softneck.plant._inclinometer_runtime import inclinometer_store
 from softneck.plant._index_runtime import NECK_SENSOR_LAG
+from softneck.plant._mechanics_runtime import neck_constants, neck_load
 from softneck.plant._neck_runtime import (
     NECK_QUEUE,
     neck_measure,
@@ -16,7 +17,6 @@ from softneck.plant._neck_runtime import (
     neck_read,
     neck_runge_kutta,
 )
-from softneck.plant._mechanics_runtime import neck_constants, neck_load
 
 # No drive has so much torque [N m]: what limits it is the drive's business.
 WINCH_NO_LIMIT = 1e3
@@ -75,8 +75,6 @@ def winch_sense(
     lean = lean_angles((x[0], x[1], x[3], x[4]), bend_functions(x[0] * x[0] + x[1] * x[1]), load[2])
     lag = float(parameters[NECK_SENSOR_LAG])
     history = state[NECK_QUEUE + 3 * int(arrays[0][0, 2]) :]
-    inclinometer_store(
-        history, (x[17], x[18], (lean[0] - x[17]) / lag, (lean[1] - x[18]) / lag, lean[2], lean[3])
-    )
+    inclinometer_store(history, (x[17], x[18], (lean[0] - x[17]) / lag, (lean[1] - x[18]) / lag, lean[2], lean[3]))
     neck_measure(arrays[0][0], parameters, state)
     neck_outputs(parameters, state, c, load, outputs)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Protocol
 
 from ._cia402 import DriveState, Goal
 from ._events import Event, Reaction
@@ -14,11 +12,11 @@ from ._fieldbus import Fieldbus
 from ._frame import Frame
 from ._gate import Gate, Tilt
 from ._limiter import Limiter
+from ._measured import Measured, Pilot, Triple
 from ._settings import MasterSettings
 from ._supervisor import ACTIVE, FINAL, GOALS, Phase, Signal, Supervisor
 from ._watches import Patience, Watches
 
-Triple = tuple[float, float, float]
 # Cycles without a set-point until the run stops (fault table: hold at once, stop at 5).
 _LOST = 5
 # Drives get this long for their stop ramp before they lose their voltage [s].
@@ -26,39 +24,6 @@ _STOP_TIME = 1.0
 _MOST_EVENTS = 1000
 _NEVER = -math.inf
 _MOVED = frozenset({Phase.RAMP_IN, Phase.RUNNING, Phase.RAMP_OUT, Phase.RETREAT})
-
-
-@dataclass(frozen=True, slots=True)
-class Measured:
-    """What the pilot gets at a sample.
-
-    Attributes:
-        index: of the sample, from 0 where the phase `running` begins.
-        tilt: last believed sample.
-        fresh: whether it is of now.
-        positions: of the motors [rad].
-    """
-
-    index: int
-    tilt: Tilt
-    fresh: bool
-    positions: Triple
-
-
-class Pilot(Protocol):
-    """Observer and controller: what turns measurements into set-points."""
-
-    def start(self) -> None:
-        """Begin anew."""
-        ...
-
-    def step(self, measured: Measured) -> Triple | None:
-        """Return the set-points [rad]; None if there are none in time."""
-        ...
-
-    def finished(self, index: int) -> bool:
-        """Return whether the run ends before sample `index`."""
-        ...
 
 
 class Master:
@@ -293,7 +258,7 @@ class Master:
             self._watches.align(self._gate.last.pitch, self._gate.last.roll, self.positions)
         try:
             self._pilot.start()
-        except Exception as error:  # noqa: BLE001 - whatever a controller raises must stop the drives
+        except Exception as error:
             self._failed(self._now or 0.0, error)
 
     def _run(self, now: float, due: bool, fresh: bool, events: list[Event]) -> None:
@@ -333,7 +298,7 @@ class Master:
             a, b, c = answer
             if not (math.isfinite(a) and math.isfinite(b) and math.isfinite(c)):
                 raise ValueError(f"set-points {a:g}, {b:g}, {c:g} are not finite")
-        except Exception as error:  # noqa: BLE001 - whatever a controller raises must stop the drives
+        except Exception as error:
             self._failed(now, error)
             return
         self._missing = 0
