@@ -20,7 +20,8 @@ from ._console import print_json, print_table, progress
 from ._options import json_option
 
 _NEEDED = ("numpy", "scipy", "control", "casadi", "filterpy", "fmpy", "pythonfmu", "numba", "pandas", "pyarrow", "h5py",
-           "matplotlib", "click", "rich", "jinja2", "platformdirs", "threadpoolctl", "python-can", "canopen")  # fmt: skip
+           "matplotlib", "click", "rich", "jinja2", "platformdirs", "threadpoolctl", "python-can",
+           "canopen")  # fmt: skip
 _EXTRAS = {"slycot": "H-infinity by SLICOT"}
 
 
