@@ -1,10 +1,10 @@
 """The drives of the neck: CANopen master, safety, pre-flight, zeroing, runs, and simulated drives to try it on."""
 
+from ._certified import require_certified as require_certified
 from ._deploy import Deployed as Deployed
 from ._deploy import Sensor as Sensor
 from ._deploy import neck_of as neck_of
 from ._deploy import prepare as prepare
-from ._deploy import require_certificate as require_certificate
 from ._deploy import run_on_bus as run_on_bus
 from ._deploy import run_simulated as run_simulated
 from ._file import DriveEntry as DriveEntry
@@ -25,6 +25,7 @@ from ._preflight import scan as scan
 from ._result import DrivesResult as DrivesResult
 from ._sdo import SdoError as SdoError
 from ._sdo import load_eds as load_eds
+from ._sensor import CanInclinometer as CanInclinometer
 from ._units import DriveScale as DriveScale
 from ._units import acceleration_to_internal as acceleration_to_internal
 from ._units import counts_to_position as counts_to_position

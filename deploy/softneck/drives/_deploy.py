@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
-from softneck.core import CheckFailedError, SettingsError, SoftneckError, load
+from softneck.core import SettingsError, SoftneckError, load
 from softneck.cosim import FmuPart, LoopSetup
 from softneck.loop import BlockPart, Loop, Part
 from softneck.plant import NeckParameters
@@ -22,7 +22,7 @@ from ._result import DrivesResult, RunLog
 from ._sdo import Objects, SdoError, load_eds
 from ._virtual import VirtualRun, simulated_neck
 from .master import Command as NmtCommand
-from .master import Master, MasterSettings, Tilt, nmt_frame
+from .master import Frame, Master, MasterSettings, Tilt, nmt_frame
 
 # Before the first cycle on a bus each drive is given this time to become operational [s].
 _START_TIME = 0.1
@@ -32,7 +32,11 @@ _NECK = "virtual_neck"
 class Sensor(Protocol):
     """An inclinometer on hardware."""
 
-    def read(self, now: float) -> Tilt | None:
+    def take(self, frames: Sequence[Frame]) -> None:
+        """Look at frames of a cycle in which no sample is due; a sensor that is not on the bus ignores them."""
+        ...
+
+    def read(self, now: float, frames: Sequence[Frame]) -> Tilt | None:
         """Return the newest sample, None if none came since the last call."""
         ...
 
@@ -226,7 +230,11 @@ def _cycle(
         now = link.now
         # All that is there, so that one late TPDO does not leave a lag for ever.
         frames = link.receive(0.0)
-        tilt = sensor.read(now) if master.sample_due else None
+        tilt = None
+        if master.sample_due:
+            tilt = sensor.read(now, frames)
+        else:
+            sensor.take(frames)
         if stopped is not None and stopped():
             master.stop("asked to")
         out = master.step(now, frames, tilt)
@@ -295,15 +303,3 @@ def _result(
         longest_step=longest,
         notes=tuple(notes),
     )
-
-
-def require_certificate(checked: Callable[[], object] | None, override: Collection[str]) -> None:
-    """Raise CheckFailedError without a certificate that holds, unless `certificate` is overridden by name."""
-    if "certificate" in override:
-        return
-    if checked is None:
-        raise CheckFailedError(
-            "no certificate: run `softneck verify` or `softneck simulate --certificate`, and give what it wrote with "
-            "--certificate; or let it pass by name with --override certificate."
-        )
-    checked()

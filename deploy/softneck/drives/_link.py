@@ -197,7 +197,9 @@ def open_bus(text: str, *, bit_rate: int = 1_000_000) -> Iterator[CanLink]:
     try:
         bus = can.Bus(interface=interface, channel=channel, receive_own_messages=False, **options)
     except (can.CanError, OSError, ValueError, TypeError, ImportError, NotImplementedError) as error:
-        raise BusError(f"bus {text} cannot be opened: {' '.join(str(error).split()) or type(error).__name__}") from error
+        raise BusError(
+            f"bus {text} cannot be opened: {' '.join(str(error).split()) or type(error).__name__}"
+        ) from error
     link = CanLink(bus, text, echoes=interface == "udp_multicast")
     try:
         yield link

@@ -15,6 +15,8 @@ from ._units import acceleration_to_internal, current_to_internal, position_to_c
 # Home offset [counts] that `softneck drives zero` sets: no drive has it after a reset, so it proves the zero.
 HOMED_MARK = 1
 CSP = 8
+# Our own node number, for heartbeats.
+MASTER_NODE = 127
 # Speeds of the profile ds402: counts per second.
 _PLAIN = "ds402"
 
@@ -145,7 +147,7 @@ def pdo_writes(entry: DriveEntry, profile: str) -> list[Write]:
     node, topic = entry.node, "mapping"
     current = _CURRENT[profile] << 16 | 0x0010
     disabled = 0x80000000
-    writes = [
+    return [
         Write(0x1400, 1, disabled | 0x200 + node, topic),
         Write(0x1600, 0, 0, topic),
         Write(0x1600, 1, 0x60400010, topic),
@@ -162,7 +164,6 @@ def pdo_writes(entry: DriveEntry, profile: str) -> list[Write]:
         Write(0x1800, 2, 1, topic),
         Write(0x1800, 1, 0x180 + node, topic),
     ]
-    return writes
 
 
 def mode_writes(file: DrivesFile) -> list[Write]:
@@ -170,4 +171,8 @@ def mode_writes(file: DrivesFile) -> list[Write]:
     exponent, period = -3, file.cycle * 1e3
     if abs(period - round(period)) > 1e-6:
         exponent, period = -4, file.cycle * 1e4
-    return [Write(0x60C2, 1, round(period), "modes"), Write(0x60C2, 2, exponent, "modes"), Write(0x6060, 0, CSP, "modes")]
+    return [
+        Write(0x60C2, 1, round(period), "modes"),
+        Write(0x60C2, 2, exponent, "modes"),
+        Write(0x6060, 0, CSP, "modes"),
+    ]

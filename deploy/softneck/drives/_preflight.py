@@ -13,6 +13,7 @@ from ._link import Link
 from ._objects import (
     CSP,
     HOMED_MARK,
+    MASTER_NODE,
     Write,
     guarding_writes,
     limit_writes,
@@ -28,7 +29,6 @@ from .master import Command, DriveState, Frame, nmt_frame, state_of
 LISTEN = 1.0
 # All nodes answer within this time [s] after the last request.
 _SCAN_TIME = 0.2
-_MASTER_NODE = 127
 # What a row may be overridden by; a missing drive or a second master never.
 OVERRIDES = ("certificate", "identity", "firmware", "modes", "homed")
 _DRIVE = 0x192  # device profile in 1000h
@@ -118,7 +118,7 @@ def foreign_master(frames: Sequence[Frame]) -> str:
             return f"an SDO request to node {frame.identifier - 0x600}"
         if frame.remote and 0x700 < frame.identifier < 0x780:
             return f"a guarding request to node {frame.identifier - 0x700}"
-        if frame.identifier == 0x700 + _MASTER_NODE:
+        if frame.identifier == 0x700 + MASTER_NODE:
             return "a master's heartbeat"
     return ""
 
@@ -201,6 +201,10 @@ def preflight(link: Link, file: DrivesFile, *, override: Collection[str] = (), h
         objects = Objects(link, entry.node, dictionary)
         try:
             kind = _check_drive(objects, file, entry, guarding, rows)
+            if homed:
+                found = objects.read(0x607C)
+                advice = "Run `softneck drives zero`: a drive loses its zero with every reset."
+                rows.add(entry.node, "homed", "yes" if found == HOMED_MARK else "no", found == HOMED_MARK, advice)
         except SdoError as error:
             if error.aborted:
                 rows.add(entry.node, "objects", str(error), False, "Is this a drive of the profile in the drives file?")
@@ -208,10 +212,6 @@ def preflight(link: Link, file: DrivesFile, *, override: Collection[str] = (), h
                 rows.add(entry.node, "present", "no answer", False, "Is it on, is its node number and bit rate right?")
             continue
         guarding = guarding if guarding != "auto" else kind
-        if homed:
-            found = objects.read(0x607C)
-            advice = "Run `softneck drives zero`: a drive loses its zero with every reset."
-            rows.add(entry.node, "homed", "yes" if found == HOMED_MARK else "no", found == HOMED_MARK, advice)
     return Report(tuple(rows.rows), guarding, tuple(override))
 
 
@@ -235,7 +235,7 @@ def _check_drive(objects: Objects, file: DrivesFile, entry: DriveEntry, guarding
         ("modes", mode_writes(file)),
         ("options", option_writes()),
         ("limits", limit_writes(file, entry)),
-        ("guarding", guarding_writes(file, guarding, _MASTER_NODE)),
+        ("guarding", guarding_writes(file, guarding, MASTER_NODE)),
         ("mapping", pdo_writes(entry, file.profile)),
     ):
         _apply(objects, topic, writes, rows)

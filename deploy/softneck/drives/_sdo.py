@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import canopen
-from canopen.objectdictionary import ObjectDictionary
+from canopen.objectdictionary import ObjectDictionary, ODVariable
 from canopen.objectdictionary.datatypes import INTEGER_TYPES
-from canopen.sdo import SdoAbortedError, SdoClient, SdoCommunicationError
+from canopen.sdo.client import SdoClient
+from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from softneck.core import FileFormatError, SoftneckError
 
@@ -41,7 +42,9 @@ def load_eds(profile: str, path: Path | None = None) -> ObjectDictionary:
     try:
         dictionary = canopen.import_od(str(source))
     except Exception as error:  # canopen raises what its parser meets: KeyError, ValueError, configparser's
-        raise FileFormatError(f"{source}: is no EDS ({type(error).__name__}: {' '.join(str(error).split())}).") from error
+        raise FileFormatError(
+            f"{source}: is no EDS ({type(error).__name__}: {' '.join(str(error).split())})."
+        ) from error
     if not isinstance(dictionary, ObjectDictionary) or not len(dictionary):
         raise FileFormatError(f"{source}: has no objects; is it an EDS?")
     return dictionary
@@ -95,7 +98,9 @@ class Objects:
             asked = "" if value is None else f" the value {value} for"
             raise SdoError(f"node {self.node} refuses{asked} object {place} ({error}).", aborted=True) from error
         except SdoCommunicationError as error:
-            raise SdoError(f"node {self.node} does not answer (object {place}); is it on, is its number right?") from error
+            raise SdoError(
+                f"node {self.node} does not answer (object {place}); is it on, is its number right?"
+            ) from error
         except KeyError as error:
             raise SdoError(f"the EDS has no object {place}; it does not fit the drive's profile.") from error
 
@@ -126,7 +131,7 @@ class _Network:
 
 
 def _plain(dictionary: ObjectDictionary, index: int) -> bool:
-    return isinstance(dictionary[index], canopen.objectdictionary.ODVariable)
+    return isinstance(dictionary[index], ODVariable)
 
 
 def is_integer(dictionary: ObjectDictionary, index: int, subindex: int) -> tuple[bool, int]:

@@ -48,6 +48,7 @@ class VirtualRun:
         host_stopped: the host process hangs or is gone: its master is not stepped.
         watch: called after each step.
         cycles: number of steps so far.
+        newest: the inclinometer's sample that the master did not read yet.
     """
 
     link: VirtualLink
@@ -55,20 +56,22 @@ class VirtualRun:
     host_stopped: bool = False
     watch: Callable[[VirtualRun], None] | None = None
     cycles: int = 0
+    newest: Tilt | None = None
 
     def step(self) -> None:
         """One cycle: sensor, master, frames, and the time until the next."""
         link, master = self.link, self.master
         now = link.now
-        tilt = None
         if self.cycles % master.settings.sample_cycles == 0:
             sample = link.neck.sample(now)
-            tilt = Tilt(sample.pitch, sample.roll, sample.pitch_rate, sample.roll_rate, sample.valid)
+            self.newest = Tilt(sample.pitch, sample.roll, sample.pitch_rate, sample.roll_rate, sample.valid)
         if self.host_stopped:
             link.send(())
         else:
-            out = master.step(now, link.drain(), tilt)
-            link.send(out)
+            tilt = None
+            if master.sample_due:
+                tilt, self.newest = self.newest, None
+            link.send(master.step(now, link.drain(), tilt))
         if self.watch is not None:
             self.watch(self)
         link.pass_time()

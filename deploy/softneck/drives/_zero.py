@@ -13,7 +13,16 @@ from softneck.core import CheckFailedError, SoftneckError
 
 from ._file import DriveEntry, DrivesFile
 from ._link import Link
-from ._objects import HOMED_MARK, Write, current_write, option_writes, speed_of_units, speed_units
+from ._objects import (
+    HOMED_MARK,
+    MASTER_NODE,
+    Write,
+    current_write,
+    disarm_writes,
+    option_writes,
+    speed_of_units,
+    speed_units,
+)
 from ._sdo import Objects, SdoError, load_eds
 from ._units import counts_to_position
 from .master import DriveState, Frame, Tilt, state_of
@@ -101,7 +110,9 @@ class _Motor:
             self.word(word)
             while self.state() is not state:
                 if self.link.now > until:
-                    raise CheckFailedError(f"node {self.entry.node}: does not get to {state.name}; it is in {self.state().name}.")
+                    raise CheckFailedError(
+                        f"node {self.entry.node}: does not get to {state.name}; it is in {self.state().name}."
+                    )
                 wait(self.link, _LOOK)
 
 
@@ -112,20 +123,21 @@ def wait(link: Link, seconds: float) -> None:
         link.receive(until - link.now)
 
 
-def zero(link: Link, file: DrivesFile, look: Look, *, guard: Callable[[], None] | None = None) -> Zeroed:
+def zero(link: Link, file: DrivesFile, look: Look, *, guarding: str) -> Zeroed:
     """Tension the tendons of motors 1 to 3, set the encoders' zero there, verify, and switch the drives off.
 
     Args:
         link: to the bus; the drives are configured and their nodes operational or pre-operational.
         file: with the settings.
         look: returns the inclinometer's newest sample.
-        guard: called between looks: feeds the drives' guarding.
+        guarding: "life" or "heartbeat", as the pre-flight set it up; it is fed from here while tendons are pulled.
 
     Raises:
         CheckFailedError: a tendon does not get tight in time, the neck is not upright, or the slow loop is another.
     """
     dictionary = load_eds(file.profile, file.eds)
     motors = [_Motor(link, entry, file, dictionary) for entry in file.drives]
+    guard = _feeder(link, file, guarding)
     try:
         for motor in motors:
             motor.prepare()
@@ -138,12 +150,12 @@ def zero(link: Link, file: DrivesFile, look: Look, *, guard: Callable[[], None] 
         for motor in motors:
             _set_zero(link, motor)
     finally:
-        _off(motors)
+        _off(motors, guarding)
     pulled = tuple(motor.pulled for motor in motors)
     return Zeroed(file.nodes, pulled, tilt.pitch, tilt.roll)
 
 
-def _tension(link: Link, motor: _Motor, guard: Callable[[], None] | None) -> None:
+def _tension(link: Link, motor: _Motor, guard: Callable[[], None]) -> None:
     zero, node = motor.file.zero, motor.entry.node
     motor.objects.write(0x60FF, 0, speed_units(zero.speed, motor.entry, motor.file.profile))
     begin = link.now
@@ -168,7 +180,9 @@ def _tension(link: Link, motor: _Motor, guard: Callable[[], None] | None) -> Non
                 "is it attached, does the winch turn the right way (`reversed`)?"
             )
         if motor.state() is not DriveState.ENABLED:
-            raise CheckFailedError(f"node {node}: left Operation Enabled while it pulled; it is in {motor.state().name}.")
+            raise CheckFailedError(
+                f"node {node}: left Operation Enabled while it pulled; it is in {motor.state().name}."
+            )
     motor.pulled = position - motor.start
     middle = sorted(ratios)[len(ratios) // 2] if len(ratios) >= 3 else 1.0
     if abs(middle - 1.0) > _SLOW_LOOP_TOLERANCE:
@@ -207,22 +221,36 @@ def _set_zero(link: Link, motor: _Motor) -> None:
         raise CheckFailedError(f"node {motor.entry.node}: homing did not end (status {word:04X}h, position {counts}).")
 
 
-def _off(motors: list[_Motor]) -> None:
-    """Switch all off; one that does not answer must not keep the others on."""
+def _feeder(link: Link, file: DrivesFile, guarding: str) -> Callable[[], None]:
+    """Return what tells the drives that we live: guarding requests, or our heartbeat."""
+    if guarding == "life":
+        frames = [Frame(0x700 + node, b"\0", remote=True) for node in file.nodes]
+    else:
+        frames = [Frame(0x700 + MASTER_NODE, b"\x05")]
+    return lambda: link.send(frames)
+
+
+def _off(motors: list[_Motor], guarding: str) -> None:
+    """Switch all off and end their guarding; one that does not answer must not keep the others on."""
     for motor in motors:
         try:
             motor.word(0x06)
             motor.word(0x00)
         except SoftneckError:
             continue
+    for motor in motors:
+        try:
+            for write in disarm_writes(guarding):
+                motor.objects.write(write.index, write.subindex, write.value)
+        except SoftneckError:
+            continue
 
 
-def _rest(link: Link, seconds: float, guard: Callable[[], None] | None) -> None:
+def _rest(link: Link, seconds: float, guard: Callable[[], None]) -> None:
     """Wait, feeding the drives' guarding from here: a master that hangs stops feeding."""
     until = link.now + seconds
     while link.now < until - 1e-9:
-        if guard is not None:
-            guard()
+        guard()
         wait(link, min(_LOOK, until - link.now))
 
 

@@ -75,8 +75,6 @@ def winch_sense(
     lean = lean_angles((x[0], x[1], x[3], x[4]), bend_functions(x[0] * x[0] + x[1] * x[1]), load[2])
     lag = float(parameters[NECK_SENSOR_LAG])
     history = state[NECK_QUEUE + 3 * int(arrays[0][0, 2]) :]
-    inclinometer_store(
-        history, (x[17], x[18], (lean[0] - x[17]) / lag, (lean[1] - x[18]) / lag, lean[2], lean[3])
-    )
+    inclinometer_store(history, (x[17], x[18], (lean[0] - x[17]) / lag, (lean[1] - x[18]) / lag, lean[2], lean[3]))
     neck_measure(arrays[0][0], parameters, state)
     neck_outputs(parameters, state, c, load, outputs)

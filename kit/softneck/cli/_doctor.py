@@ -20,8 +20,9 @@ from ._console import print_json, print_table, progress
 from ._options import json_option
 
 _NEEDED = ("numpy", "scipy", "control", "casadi", "filterpy", "fmpy", "pythonfmu", "numba", "pandas", "pyarrow", "h5py",
-           "matplotlib", "click", "rich", "jinja2", "platformdirs", "threadpoolctl")  # fmt: skip
-_EXTRAS = {"slycot": "H-infinity by SLICOT", "can": "CAN buses by python-can", "canopen": "SDO and EDS"}
+           "matplotlib", "click", "rich", "jinja2", "platformdirs", "threadpoolctl", "python-can",
+           "canopen")  # fmt: skip
+_EXTRAS = {"slycot": "H-infinity by SLICOT"}
 
 
 @click.command("doctor", epilog="Example: softneck doctor --json")

@@ -30,6 +30,7 @@ _COMMANDS = {
     "verify": ("_verify", "Prove a controller on what it claims, or fail loudly."),
     "simulate": ("_simulate", "Close the loop that a TOML file describes and judge it."),
     "ssp": ("_ssp", "Write a loop as an SSP file for other simulators."),
+    "drives": ("_drives", "Run controllers on CANopen drives, or on simulated ones."),
     "new": ("_new", "Begin a project whose closed-loop test passes at once."),
 }
 _INTERRUPTED, _BAD_INPUT, _OUR_FAULT = 130, 2, 3

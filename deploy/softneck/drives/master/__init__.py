@@ -17,8 +17,8 @@ from ._gate import Gate as Gate
 from ._gate import Tilt as Tilt
 from ._limiter import Limiter as Limiter
 from ._master import Master as Master
-from ._master import Measured as Measured
-from ._master import Pilot as Pilot
+from ._measured import Measured as Measured
+from ._measured import Pilot as Pilot
 from ._nmt import AFTER as AFTER
 from ._nmt import Command as Command
 from ._nmt import NodeState as NodeState

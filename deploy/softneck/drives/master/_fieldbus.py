@@ -189,14 +189,14 @@ class Fieldbus:
         if dead and self._cycle and all(view.heard for view in self.drives):
             events.append(Event(now, "bus_silent"))
 
-    def send(self, goals: Sequence[Goal], targets: Sequence[int]) -> list[Frame]:
-        """Return the frames of this cycle: set-points, SYNC, and guarding when it is due."""
+    def send(self, goals: Sequence[Goal], targets: Sequence[int], *, guard: bool = True) -> list[Frame]:
+        """Return the frames of this cycle: set-points, SYNC, and guarding when it is due and `guard`."""
         frames = []
         for view, goal, target in zip(self.drives, goals, targets, strict=True):
             word = control_word(view.state, goal)
             frames.append(Frame(0x200 + view.node, _RPDO.pack(word, target)))
         frames.append(SYNC)
-        if self._cycle % self.settings.guard_cycles == 0:
+        if guard and self._cycle % self.settings.guard_cycles == 0:
             frames.extend(self._guards if self.settings.guarding == "life" else (self._beat,))
         self._cycle += 1
         return frames

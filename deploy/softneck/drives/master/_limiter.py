@@ -54,13 +54,14 @@ class Limiter:
                 goal, why = floor, "slack"
         way = goal - self.value
         speed = way / T
-        # Not faster than allowed, nor than what still stops at the goal.
-        most = min(limits.speed, math.sqrt(2.0 * limits.acceleration * abs(way)) + 0.5 * limits.acceleration * T)
+        # Not faster than allowed, nor than what still stops at the goal: v^2 / (2 a) + v T / 2 = way, in steps of T.
+        a = limits.acceleration
+        most = min(limits.speed, a * (math.sqrt(0.25 * T * T + 2.0 * abs(way) / a) - 0.5 * T))
         if abs(speed) > most:
             if abs(speed) > limits.speed * (1.0 + _SAME):
                 why = why or "speed"
             speed = math.copysign(most, speed)
-        change = limits.acceleration * T
+        change = a * T
         if abs(speed - self.speed) > change:
             # Coming to rest at the goal may need no more than it has: only what asks for more is told.
             why = why or "acceleration"

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Protocol
 
 from ._cia402 import DriveState, Goal
 from ._events import Event, Reaction
@@ -14,51 +12,21 @@ from ._fieldbus import Fieldbus
 from ._frame import Frame
 from ._gate import Gate, Tilt
 from ._limiter import Limiter
+from ._measured import Measured, Pilot, Triple
 from ._settings import MasterSettings
 from ._supervisor import ACTIVE, FINAL, GOALS, Phase, Signal, Supervisor
-from ._watches import Patience, Watches
+from ._watches import Leaky, Watches
 
-Triple = tuple[float, float, float]
 # Cycles without a set-point until the run stops (fault table: hold at once, stop at 5).
 _LOST = 5
 # Drives get this long for their stop ramp before they lose their voltage [s].
 _STOP_TIME = 1.0
+# A drive that has not stopped this long after it was told to gets no more sign of life [s].
+_OBEY_TIME = 0.25
+_POWERED = (DriveState.ENABLED, DriveState.QUICK_STOP, DriveState.REACTION)
 _MOST_EVENTS = 1000
 _NEVER = -math.inf
 _MOVED = frozenset({Phase.RAMP_IN, Phase.RUNNING, Phase.RAMP_OUT, Phase.RETREAT})
-
-
-@dataclass(frozen=True, slots=True)
-class Measured:
-    """What the pilot gets at a sample.
-
-    Attributes:
-        index: of the sample, from 0 where the phase `running` begins.
-        tilt: last believed sample.
-        fresh: whether it is of now.
-        positions: of the motors [rad].
-    """
-
-    index: int
-    tilt: Tilt
-    fresh: bool
-    positions: Triple
-
-
-class Pilot(Protocol):
-    """Observer and controller: what turns measurements into set-points."""
-
-    def start(self) -> None:
-        """Begin anew."""
-        ...
-
-    def step(self, measured: Measured) -> Triple | None:
-        """Return the set-points [rad]; None if there are none in time."""
-        ...
-
-    def finished(self, index: int) -> bool:
-        """Return whether the run ends before sample `index`."""
-        ...
 
 
 class Master:
@@ -84,7 +52,7 @@ class Master:
         self._gate = Gate(settings.sensor)
         self._watches = Watches(settings.watch, settings.limits)
         self._limiters = tuple(Limiter(settings.limits, settings.bus.cycle) for _ in range(3))
-        self._clamped = Patience(settings.limits.persistent)
+        self._clamped = Leaky(settings.limits.persistent, settings.bus.cycle)
         self.positions: Triple = (0.0, 0.0, 0.0)
         self.tensions: Triple = (0.0, 0.0, 0.0)
         self.setpoints: Triple = (0.0, 0.0, 0.0)
@@ -140,7 +108,7 @@ class Master:
         self._watch(now, due, fresh, events)
         self._act(now, due, fresh, events)
         self._judge(now, events)
-        frames_out = self.bus.send(self._goals(), self._targets())
+        frames_out = self.bus.send(self._goals(), self._targets(), guard=not self._starved(now))
         self.cycle += 1
         return frames_out
 
@@ -352,7 +320,7 @@ class Master:
             return
         if why:
             events.append(Event(now, "clamped", 0, why))
-        if self._clamped.over(now, bool(why)):
+        if self._clamped.over(bool(why)):
             events.append(Event(now, "clamp_persistent", 0, why))
 
     def _retreat(self, now: float, events: list[Event]) -> None:
@@ -367,12 +335,18 @@ class Master:
             self._change(now, Signal.ARRIVED)
 
     def _switch_off(self, now: float) -> None:
-        powered = any(
-            view.state in (DriveState.ENABLED, DriveState.QUICK_STOP, DriveState.REACTION) and not view.silent > 5
-            for view in self.bus.drives
-        )
+        powered = any(view.state in _POWERED and not view.silent > 5 for view in self.bus.drives)
         if not powered or now - self.supervisor.since > _STOP_TIME:
             self._change(now, Signal.OFF)
+
+    def _starved(self, now: float) -> bool:
+        """Whether guarding ends because a drive does not stop: one that hears no PDO still notices our silence."""
+        phase = self.supervisor.phase
+        if phase is Phase.STOPPING:
+            return now - self.supervisor.since > _OBEY_TIME
+        if phase is not Phase.STOPPED:
+            return False
+        return any(view.heard and (view.silent or view.state in _POWERED) for view in self.bus.drives)
 
     def _change(self, now: float, signal: Signal) -> None:
         if self.supervisor.signal(now, signal):

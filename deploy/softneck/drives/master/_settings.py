@@ -18,7 +18,7 @@ class LimitSettings:
         position: |P| of each motor [rad].
         speed: [rad/s].
         acceleration: [rad/s^2].
-        persistent: a clamp for longer than this stops [s].
+        persistent: clamped for longer than this stops [s]; time without a clamp takes a tenth of itself off.
         tension: of a tendon, as estimated from the motor's current [N]; nearer than a fifth it may not be pulled
             further, above it for 150 ms stops.
         slack: a tendon below this hangs [N].
@@ -28,7 +28,7 @@ class LimitSettings:
     position: float = 6.0
     speed: float = 15.6
     acceleration: float = 1000.0
-    persistent: float = 0.5
+    persistent: float = 0.3
     tension: float = 12.0
     slack: float = 0.2
     slack_unwind: float = 3.0

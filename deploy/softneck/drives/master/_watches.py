@@ -33,6 +33,22 @@ class Patience:
         return now - self._since >= self._limit - 1e-9
 
 
+class Leaky:
+    """Adds up the time in which something holds and forgets it ten times as slowly."""
+
+    __slots__ = ("_cycle", "_level", "_limit")
+
+    def __init__(self, limit: float, cycle: float) -> None:
+        """Be full at `limit` [s]; asked each `cycle` [s]."""
+        self._limit, self._cycle, self._level = limit, cycle, 0.0
+
+    def over(self, beyond: bool) -> bool:
+        """Return whether it is full."""
+        step = self._cycle if beyond else -0.1 * self._cycle
+        self._level = max(0.0, self._level + step)
+        return self._level >= self._limit - 1e-9
+
+
 class Watches:
     """All three, over one run.
 

@@ -7,3 +7,4 @@ from ._neck import SimulatedSettings as SimulatedSettings
 from ._neck import TiltSample as TiltSample
 from ._node import SimulatedDrive as SimulatedDrive
 from ._profiles import PROFILES as PROFILES
+from ._server import serve as serve

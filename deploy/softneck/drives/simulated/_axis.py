@@ -324,7 +324,9 @@ class Axis:
         m[SERVO_LEFT] = ticks
 
 
-def fields_of(items: dict[tuple[int, int], Item], mapping: list[int]) -> tuple[struct.Struct, list[tuple[int, int]]] | None:
+def fields_of(
+    items: dict[tuple[int, int], Item], mapping: list[int]
+) -> tuple[struct.Struct, list[tuple[int, int]]] | None:
     """Return how the mapping entries (index, subindex, bits) pack into a PDO; None if one does not fit."""
     letters = {(1, False): "B", (1, True): "b", (2, False): "H", (2, True): "h", (4, False): "I", (4, True): "i"}
     code, keys = "<", []

@@ -67,8 +67,8 @@ class SimulatedSettings:
 
     nodes: tuple[int, int, int] = (1, 2, 3)
     profile: str = "ipos2015"
-    gear: tuple[float, float, float] = (1539.0 / 65.0,) * 3
-    counts_per_turn: tuple[float, float, float] = (2048.0,) * 3
+    gear: tuple[float, float, float] = (1539.0 / 65.0, 1539.0 / 65.0, 1539.0 / 65.0)
+    counts_per_turn: tuple[float, float, float] = (2048.0, 2048.0, 2048.0)
     reversed: tuple[bool, bool, bool] = (False, False, False)
     peak_current: tuple[float, float, float] = (10.0, 10.0, 10.0)
     slow_loop: tuple[float, float, float] = (1e-3, 1e-3, 1e-3)
@@ -108,7 +108,8 @@ class SimulatedNeck:
         self._h = settings.cycle / self._ticks
         self._samples = 0
         self.sensor = "works"
-        self._last = TiltSample(0.0, *(float(v) for v in self.outputs[2:6]), True)
+        pitch, roll, pitch_rate, roll_rate = (float(value) for value in self.outputs[2:6])
+        self._last = TiltSample(0.0, pitch, roll, pitch_rate, roll_rate, True)
         lag = parameters.drive_latency - 0.5 * settings.hold
         for row in range(3):
             size = settings.gear[row] * settings.counts_per_turn[row] / (2.0 * math.pi)
@@ -159,9 +160,7 @@ class SimulatedNeck:
 
     def move(self) -> None:
         """Let one cycle of time pass for drives and neck."""
-        self._functions.servo_ticks(
-            self._arrays, self._q, self._x, self.disturbance, self.motion, self._ring, self._ticks, self._h
-        )
+        self._functions.servo_ticks(self._q, self._x, self.disturbance, self.motion, self._ring, self._ticks, self._h)
 
     def sample(self, now: float) -> TiltSample:
         """Take one sample of the inclinometer; to be called each `sample_time`."""

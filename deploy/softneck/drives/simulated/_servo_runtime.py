@@ -49,7 +49,6 @@ SERVO_SIZE = 28
 
 
 def servo_ticks(
-    arrays: tuple[np.ndarray, ...],
     parameters: np.ndarray,
     state: np.ndarray,
     disturbance: np.ndarray,

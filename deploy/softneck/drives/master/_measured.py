@@ -1,0 +1,43 @@
+"""What the master asks of observer and controller: a measurement goes in, set-points come out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from ._gate import Tilt
+
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """What the pilot gets at a sample.
+
+    Attributes:
+        index: of the sample, from 0 where the phase `running` begins.
+        tilt: last believed sample.
+        fresh: whether it is of now.
+        positions: of the motors [rad].
+    """
+
+    index: int
+    tilt: Tilt
+    fresh: bool
+    positions: Triple
+
+
+class Pilot(Protocol):
+    """Observer and controller: what turns measurements into set-points."""
+
+    def start(self) -> None:
+        """Begin anew."""
+        ...
+
+    def step(self, measured: Measured) -> Triple | None:
+        """Return the set-points [rad]; None if there are none in time."""
+        ...
+
+    def finished(self, index: int) -> bool:
+        """Return whether the run ends before sample `index`."""
+        ...
