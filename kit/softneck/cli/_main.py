@@ -28,6 +28,7 @@ _COMMANDS = {
     "observer": ("_observer", "Build a Kalman filter over a linear model."),
     "design": ("_design", "Design a controller on a linear model."),
     "simulate": ("_simulate", "Close the loop that a TOML file describes and judge it."),
+    "study": ("_study", "Run a loop many times over what varies: ranking, Pareto front, worst cases."),
     "ssp": ("_ssp", "Write a loop as an SSP file for other simulators."),
     "new": ("_new", "Begin a project whose closed-loop test passes at once."),
 }

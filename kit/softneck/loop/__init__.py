@@ -10,8 +10,8 @@ from ._faults import fault_keys as fault_keys
 from ._faults import make_fault as make_fault
 from ._loop import ORDERS as ORDERS
 from ._loop import Loop as Loop
-from ._metrics import SETTLING_BAND as SETTLING_BAND
 from ._metrics import METRICS as METRICS
+from ._metrics import SETTLING_BAND as SETTLING_BAND
 from ._metrics import check_limits as check_limits
 from ._metrics import metrics as metrics
 from ._part import BlockPart as BlockPart
