@@ -65,7 +65,7 @@ def check_key(table: Mapping[str, Any], key: str, names: Mapping[str, set[str] |
             return
         raise SettingsError(f"the loop has no key `{key}`; it has {', '.join((*_PLAIN, *_PARTS))} and keys below them.")
     if head in ("fault", "part"):
-        entry, place, rest = _entry(table, key)
+        entry, _, rest = _entry(table, key)
         if head == "fault":
             _check_field(key, rest, fault_field(str(entry.get("kind")), rest), f"a {entry.get('kind')}")
             return

@@ -67,7 +67,7 @@ def distribution_chart(values: Mapping[str, Mapping[str, Vector]], title: str, *
             panels.append(_shares(metric, known, legend=not panels))
     if not panels:
         raise DataError("no run has a metric to show.")
-    return Chart(title, panels, columns=min(2, len(panels)), linked=False, caption=caption)
+    return Chart(title, panels, linked=False, caption=caption, row_height=2.0)
 
 
 def influence_chart(
@@ -93,7 +93,7 @@ def influence_chart(
                 curves.append(Curve(np.asarray(x, float)[known], y[known], name, colour, "points", _POINT))
         curves = curves or [Curve(np.zeros(0), np.zeros(0), "", GREY, "points")]
         panels.append(Panel(curves, label, x_label=key, legend=not panels))
-    return Chart(title, panels, columns=min(2, len(panels)), linked=False, caption=caption)
+    return Chart(title, panels, linked=False, caption=caption, row_height=2.0)
 
 
 def pareto_figure(

@@ -12,6 +12,9 @@ from ._paper_page import paper_page as paper_page
 from ._paper_tables import PAPER_HEAD as PAPER_HEAD
 from ._paper_tables import PAPER_NOTE as PAPER_NOTE
 from ._paper_tables import paper_entries as paper_entries
+from ._project import Project as Project
+from ._project import read_project as read_project
+from ._project_page import project_page as project_page
 from ._reproduce import ReproduceSettings as ReproduceSettings
 from ._reproduce import Reproduction as Reproduction
 from ._reproduce import reproduce as reproduce
