@@ -192,7 +192,7 @@ def _judge(path: Path) -> list[Any]:
         ("sample_time_s = 0.02", 'order = "random"', "`order` must be one of sequential, jacobi"),
         ('fmu = "Neck.fmu"', 'fmu = "absent.fmu"', r"\[plant\]: there is no file"),
         ('fmu = "Neck.fmu"', "fmu = 3", r"\[plant\] fmu must be a text"),
-        ('fmu = "Neck.fmu"', "", "needs exactly one of fmu, model, python; it has none"),
+        ('fmu = "Neck.fmu"', "", "needs exactly one of fmu, model, neck, python; it has none"),
         ('fmu = "Neck.fmu"', 'fmu = "Neck.fmu"\nmodel = "a.npz"', "it has fmu, model"),
         ('fmu = "Neck.fmu"', 'model = "Neck.fmu"', "is no softneck file"),
         ('fmu = "Neck.fmu"', 'fmu = "Neck.fmu"\nspeed = 1', r"`speed` is no key of \[plant\]"),

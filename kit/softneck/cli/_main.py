@@ -29,8 +29,10 @@ _COMMANDS = {
     "design": ("_design", "Design a controller on a linear model."),
     "verify": ("_verify", "Prove a controller on what it claims, or fail loudly."),
     "simulate": ("_simulate", "Close the loop that a TOML file describes and judge it."),
+    "study": ("_study", "Run a loop many times over what varies: ranking, Pareto front, worst cases."),
     "ssp": ("_ssp", "Write a loop as an SSP file for other simulators."),
     "drives": ("_drives", "Run controllers on CANopen drives, or on simulated ones."),
+    "report": ("_report", "Write one page on a whole project: data, models, certificates, loops, studies."),
     "new": ("_new", "Begin a project whose closed-loop test passes at once."),
 }
 _INTERRUPTED, _BAD_INPUT, _OUR_FAULT = 130, 2, 3

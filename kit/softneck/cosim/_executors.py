@@ -31,8 +31,8 @@ class Crew(Protocol):
         """Give out some work."""
         ...
 
-    def renew(self) -> None:
-        """Take new workers after one broke and took its pool along."""
+    def renew(self, *, alone: bool) -> None:
+        """Take new workers after one broke and took its pool along; a single one if `alone`."""
         ...
 
 
@@ -47,7 +47,7 @@ class Here:
         future.set_result(function(*arguments))
         return future
 
-    def renew(self) -> None:
+    def renew(self, *, alone: bool) -> None:
         """Do nothing."""
 
 
@@ -58,27 +58,27 @@ class Processes:
         """Start `size` workers."""
         self.size = size
         self._folder = tempfile.mkdtemp(prefix="softneck-study-")
-        self._pool = self._start()
+        self._pool = self._start(size)
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future:
         """Give work to a worker."""
         return self._pool.submit(function, *arguments)
 
-    def renew(self) -> None:
+    def renew(self, *, alone: bool) -> None:
         """Start new workers; those that are left of the old ones end."""
         self._pool.shutdown(wait=True, kill_workers=True)
-        self._pool = self._start()
+        self._pool = self._start(1 if alone else self.size)
 
     def close(self, *, kill: bool = False) -> None:
         """End the workers, at once with `kill`."""
         self._pool.shutdown(wait=True, kill_workers=kill)
         shutil.rmtree(self._folder, ignore_errors=True)
 
-    def _start(self) -> Any:
+    def _start(self, size: int) -> Any:
         from loky import ProcessPoolExecutor
 
         return ProcessPoolExecutor(
-            self.size, timeout=None, initializer=_begin_worker, initargs=(self._folder,), env=_ENVIRONMENT
+            size, timeout=None, initializer=_begin_worker, initargs=(self._folder,), env=_ENVIRONMENT
         )
 
 
@@ -108,7 +108,7 @@ class Cluster:
         """Give work to the cluster; it runs it again elsewhere if a worker dies."""
         return self._pool.submit(function, *arguments)
 
-    def renew(self) -> None:
+    def renew(self, *, alone: bool) -> None:
         """Do nothing: the scheduler replaces its workers."""
 
     def close(self) -> None:

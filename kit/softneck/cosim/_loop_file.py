@@ -96,9 +96,7 @@ def reference_of(path: str | Path) -> ReferenceBlock:
         raise type(error)(f"{source}: {error}") from error
 
 
-def make_loop(
-    table: Mapping[str, Any], folder: str | Path = ".", *, opened: dict[Any, Any] | None = None
-) -> LoopSetup:
+def make_loop(table: Mapping[str, Any], folder: str | Path = ".", *, opened: dict[Any, Any] | None = None) -> LoopSetup:
     """Return the loop that a table with the keys of a loop file describes; relative paths start at `folder`.
 
     From Python, plant, observer, controller and reference may also be the things themselves: a part, a block, what
@@ -233,7 +231,7 @@ class _Reader:
     def reference(self, table: Any) -> Reference | Part:
         """Return what the table [reference] describes."""
         if isinstance(table, dict) and OBJECT in table:
-            made = table[OBJECT]
+            made: Any = table[OBJECT]
             return made if callable(made) else _part_of("reference", made)
         if isinstance(table, dict) and "fmu" in table:
             return self._made("reference", table, ("fmu",), None, as_role="reference")

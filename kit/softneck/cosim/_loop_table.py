@@ -65,9 +65,9 @@ def check_key(table: Mapping[str, Any], key: str, names: Mapping[str, set[str] |
             return
         raise SettingsError(f"the loop has no key `{key}`; it has {', '.join((*_PLAIN, *_PARTS))} and keys below them.")
     if head in ("fault", "part"):
-        entry, place, rest = _entry(table, key)
+        entry, _, rest = _entry(table, key)
         if head == "fault":
-            _check_field(key, rest, fault_field(str(entry.get("kind")), rest), f"the {entry.get('kind')} of fault.{place}")
+            _check_field(key, rest, fault_field(str(entry.get("kind")), rest), f"a {entry.get('kind')}")
             return
         head = str(entry["name"])
     elif head == "reference":
@@ -103,7 +103,9 @@ def _check_part_key(key: str, part: str, rest: str, names: Mapping[str, set[str]
     if group != "parameters" or not name:
         raise SettingsError(f"the loop has no key `{key}`; what a part takes is written {part}.parameters.NAME.")
     if known is not None and name not in known:
-        raise SettingsError(f"the loop has no key `{key}`: the {part} has {', '.join(sorted(known)) or 'no parameters'}.")
+        raise SettingsError(
+            f"the loop has no key `{key}`: the {part} has {', '.join(sorted(known)) or 'no parameters'}."
+        )
 
 
 def _check_field(key: str, rest: str, field: str | None, where: str) -> None:

@@ -104,7 +104,7 @@ class _Work:
         self._deaths: dict[int, int] = {}
         self._out: dict[Future, list[int]] = {}
         self._seconds, self._ended, self._failed = 0.0, 0, 0
-        self._digest = study.digest
+        self._digest, self._alone = study.digest, False
 
     def run(self) -> None:
         """Give out and take in until all runs are written down."""
@@ -121,8 +121,11 @@ class _Work:
             if not self._out:
                 self._submit([self._suspects.popleft()])
             return
+        if self._alone and not self._out and self._left:
+            self._alone = False
+            self._crew.renew(alone=False)
         # Two chunks for each worker: one runs while the other waits.
-        while self._left and len(self._out) < 2 * self._crew.size:
+        while self._left and not self._alone and len(self._out) < 2 * self._crew.size:
             self._submit([self._left.popleft() for _ in range(self._chunk())])
 
     def _chunk(self) -> int:
@@ -157,7 +160,9 @@ class _Work:
             if len(runs) > 1:
                 self._suspects.extend(runs)
             else:
-                self._write([failed_row(self._study.points[runs[0]], f"its worker failed: {type(error).__name__}: {error}")])
+                self._write(
+                    [failed_row(self._study.points[runs[0]], f"its worker failed: {type(error).__name__}: {error}")]
+                )
 
     def _died(self, runs: list[int]) -> None:
         """Try the runs of a worker that died again, each alone; give up on one that was alone already."""
@@ -178,7 +183,8 @@ class _Work:
                 self._write(future.result(timeout=60.0))
             except Exception:  # went down with the pool
                 self._suspects.extend(runs)
-        self._crew.renew()
+        self._alone = True
+        self._crew.renew(alone=True)
 
     def _write(self, rows: list[Row]) -> None:
         self._store.add(rows)

@@ -97,11 +97,14 @@ class Study:
 
     def description(self) -> dict[str, Any]:
         """Return what the study is, as JSON values, with the hash of every file that it names."""
-        files = sorted({text for text in _texts([self.loop, [v.values for v in self.vary.values()]])})
+        files = sorted(set(_texts([self.loop, [v.values for v in self.vary.values()]])))
         hashes = {name: file_hash(self.folder / name) for name in files if (self.folder / name).is_file()}
         return {
             "loop": _plain(self.loop),
-            "vary": {key: {"kind": v.kind, "values": _plain(v.values), "labels": list(v.labels)} for key, v in self.vary.items()},
+            "vary": {
+                key: {"kind": v.kind, "values": _plain(v.values), "labels": list(v.labels)}
+                for key, v in self.vary.items()
+            },
             "runs": len(self.points),
             "seed": self.seed,
             "sampling": self.sampling,
@@ -127,7 +130,7 @@ def make_study(
 ) -> Study:
     """Return a study of `loop`: a loop file, its table, or a loop; `vary` is as [vary] in a study file.
 
-    Without `objectives` they are the error and the moves of the motors, of roll where the reference is one of roll alone.
+    Without `objectives` they are the error of the axis that the reference is about, and the moves of the motors.
 
     Raises:
         SettingsError: an empty or contradictory range, or no such metric.
@@ -188,7 +191,9 @@ def _opened(loop: Source) -> tuple[Mapping[str, Any], Path]:
 
 def _objectives(table: Mapping[str, Any], limits: Mapping[str, float]) -> tuple[str, ...]:
     reference = table.get("reference", {})
-    stated = {key.partition("_")[0] for key, value in reference.items() if value and key.startswith(("pitch_", "roll_"))}
+    stated = {
+        key.partition("_")[0] for key, value in reference.items() if value and key.startswith(("pitch_", "roll_"))
+    }
     limited = {name.partition(".")[0] for name in limits} & {"pitch", "roll"}
     axis = "roll" if "roll" in (stated or limited) and "pitch" not in (stated or limited) else "pitch"
     return (f"{axis}.rms_error_deg", "motors.total_variation_rad")

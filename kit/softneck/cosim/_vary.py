@@ -162,7 +162,9 @@ def _number_of_runs(runs: int | None, grid: int, *, random: bool) -> int:
     if not random and runs != grid:
         raise SettingsError(f"the grid has {grid} points and nothing is random, but `runs` is {runs}; leave it out.")
     if runs < grid:
-        raise SettingsError(f"the grid has {grid} points; `runs` is {runs}: make it at least that, or the grid smaller.")
+        raise SettingsError(
+            f"the grid has {grid} points; `runs` is {runs}: make it at least that, or the grid smaller."
+        )
     return runs
 
 
@@ -171,7 +173,9 @@ def _quantiles(samples: int, keys: int, seed: int, sampling: str) -> Matrix:
     rng = np.random.default_rng(seed)
     if keys == 0:
         return np.zeros((samples, 0))
-    drawn = qmc.LatinHypercube(keys, rng=rng).random(samples) if sampling == SAMPLINGS[0] else rng.random((samples, keys))
+    drawn = (
+        qmc.LatinHypercube(keys, rng=rng).random(samples) if sampling == SAMPLINGS[0] else rng.random((samples, keys))
+    )
     return np.clip(drawn, 1e-12, 1.0 - 1e-12)
 
 
@@ -217,7 +221,9 @@ def _range(key: str, kind: str, values: Any) -> Vary:
         if not high > 0.0:
             raise SettingsError(f"[vary] `{key}`: the standard deviation must be positive; got {high:g}.")
     elif not low < high:
-        raise SettingsError(f"[vary] `{key}`: the {kind} range from {low:g} to {high:g} is empty; the lower bound first.")
+        raise SettingsError(
+            f"[vary] `{key}`: the {kind} range from {low:g} to {high:g} is empty; the lower bound first."
+        )
     elif kind == "log_uniform" and low <= 0.0:
         raise SettingsError(f"[vary] `{key}`: log_uniform needs positive bounds; got {low:g}.")
     return Vary(kind, (low, high))

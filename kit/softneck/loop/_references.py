@@ -221,7 +221,7 @@ def reference_field(kind: str, key: str) -> str | None:
 
 
 def reference_keys(reference: Reference) -> dict[str, float | str] | None:
-    """Return the keys of a loop file that describe `reference`; None for one that is no step, ramp, sine or rotation."""
+    """Return the keys of a loop file that describe `reference`; None if it is no step, ramp, sine or rotation."""
     for kind, setting in _KINDS.items():
         if isinstance(reference, setting):
             named = {f"{item.name}{_ENDINGS[item.name]}": getattr(reference, item.name) for item in fields(setting)}

@@ -37,6 +37,13 @@ from ._quality_figures import region_figure as region_figure
 from ._quality_figures import spectrum_figure as spectrum_figure
 from ._quality_page import quality_page as quality_page
 from ._search_figures import search_figure as search_figure
+from ._study_charts import correlations as correlations
+from ._study_charts import distribution_chart as distribution_chart
+from ._study_charts import distribution_figure as distribution_figure
+from ._study_charts import influence_chart as influence_chart
+from ._study_charts import influence_figure as influence_figure
+from ._study_charts import pareto_chart as pareto_chart
+from ._study_charts import pareto_figure as pareto_figure
 from ._style import BLUE as BLUE
 from ._style import GREEN as GREEN
 from ._style import GREY as GREY

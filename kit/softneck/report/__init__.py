@@ -12,9 +12,17 @@ from ._paper_page import paper_page as paper_page
 from ._paper_tables import PAPER_HEAD as PAPER_HEAD
 from ._paper_tables import PAPER_NOTE as PAPER_NOTE
 from ._paper_tables import paper_entries as paper_entries
+from ._project import Project as Project
+from ._project import read_project as read_project
+from ._project_page import project_page as project_page
 from ._reproduce import ReproduceSettings as ReproduceSettings
 from ._reproduce import Reproduction as Reproduction
 from ._reproduce import reproduce as reproduce
+from ._study_page import failures as failures
+from ._study_page import study_head as study_head
+from ._study_page import study_page as study_page
+from ._study_page import study_rows as study_rows
+from ._study_page import study_sections as study_sections
 from ._tables import FIT_HEAD as FIT_HEAD
 from ._tables import FIT_NOTE as FIT_NOTE
 from ._tables import fit_rows as fit_rows

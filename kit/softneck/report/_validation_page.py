@@ -83,8 +83,8 @@ def _comparisons(results: Sequence[Validation]) -> list[Section]:
     for group in groups.values():
         if len(group) > 1:
             data = Path(group[0].data).stem
-            runs = {Path(r.model).stem: _drawable(r.free_run) for r in group}
-            runs = runs if len(runs) == len(group) else {r.model: _drawable(r.free_run) for r in group}
+            runs = {Path(r.model).stem: drawable(r.free_run) for r in group}
+            runs = runs if len(runs) == len(group) else {r.model: drawable(r.free_run) for r in group}
             chart = validation_chart(
                 group[0].time, group[0].measured, runs, "Free runs", run=group[0].run, caption=_ERROR
             )
@@ -93,9 +93,9 @@ def _comparisons(results: Sequence[Validation]) -> list[Section]:
 
 
 def _section(r: Validation) -> Section:
-    predictions = {"one step": _drawable(r.one_step)}
+    predictions = {"one step": drawable(r.one_step)}
     if INFINITE in r.fits:
-        predictions["free run"] = _drawable(r.free_run)
+        predictions["free run"] = drawable(r.free_run)
     bounds = _bounds_of(r)
     caption = _ERROR + (" The band holds the model's bounds of its free run." if bounds else "")
     curves = validation_chart(
@@ -180,7 +180,7 @@ def _name(r: Validation) -> str:
     return f"{Path(r.model).stem} on {Path(r.data).stem}"
 
 
-def _drawable(values: Matrix) -> Matrix:
+def drawable(values: Matrix) -> Matrix:
     with np.errstate(invalid="ignore"):
         return np.where(np.abs(values) < _DRAWN, values, np.nan)
 
@@ -188,4 +188,4 @@ def _drawable(values: Matrix) -> Matrix:
 def _bounds_of(r: Validation) -> tuple[Matrix, Matrix] | None:
     if not np.isfinite(r.lower).any():
         return None
-    return _drawable(r.lower), _drawable(r.upper)
+    return drawable(r.lower), drawable(r.upper)

@@ -1,0 +1,121 @@
+"""What a study draws: laws of its points, and ranges that are none."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from softneck.core import SettingsError
+from softneck.cosim._vary import Points, flattened, make_vary
+
+
+def points(vary: dict[str, Any], runs: int | None = None, seed: int = 0, sampling: str = "latin_hypercube") -> Points:
+    return Points({key: make_vary(key, given) for key, given in vary.items()}, runs, seed, sampling)
+
+
+def test_grids_alone_give_each_combination_once() -> None:
+    found = points({"a": [1, 2, 3], "b": {"grid": ["x", "y"]}})
+    assert [tuple(found[run].values.values()) for run in range(len(found))] == [
+        (1, "x"), (1, "y"), (2, "x"), (2, "y"), (3, "x"), (3, "y")
+    ]  # fmt: skip
+
+
+def test_all_points_of_the_grid_see_the_same_samples() -> None:
+    """Controllers are compared on equal plants: differences between them are theirs."""
+    found = points({"c": ["p", "q", "r"], "k": {"uniform": [0.0, 1.0]}, "s": {"seed": True}}, runs=30)
+    for sample in range(10):
+        runs = [found[3 * sample + i] for i in range(3)]
+        assert [run.values["c"] for run in runs] == ["p", "q", "r"]
+        assert len({(run.values["k"], run.values["s"], run.seed, run.sample) for run in runs}) == 1
+
+
+@given(runs=st.integers(1, 60), seed=st.integers(0, 10**6))
+def test_a_latin_hypercube_has_one_run_in_each_layer_of_each_key(runs: int, seed: int) -> None:
+    found = points({"a": {"uniform": [-1.0, 3.0]}, "b": {"log_uniform": [1e-3, 10.0]}}, runs, seed)
+    values = np.array([list(found[run].values.values()) for run in range(runs)])
+    quantiles = np.column_stack([(values[:, 0] + 1.0) / 4.0, np.log(values[:, 1] / 1e-3) / np.log(1e4)])
+    # A layer is 1/60 wide at least; 1e-9 keeps rounding from moving a draw over its edge.
+    layers = np.floor(quantiles * runs + 1e-9 * (0.5 - quantiles)).astype(int)
+    assert (np.sort(layers, axis=0) == np.arange(runs)[:, None]).all()
+
+
+def test_choices_are_balanced_in_a_latin_hypercube() -> None:
+    found = points({"a": {"choices": ["p", "q", "r", "s"]}}, runs=40)
+    names, counts = np.unique([found[run].values["a"] for run in range(40)], return_counts=True)
+    assert dict(zip(names, counts, strict=True)) == dict.fromkeys("pqrs", 10)
+
+
+def test_normal_draws_have_their_mean_and_deviation() -> None:
+    found = points({"a": {"normal": [2.0, 0.5]}}, runs=2_000)
+    values = np.array([found[run].values["a"] for run in range(2_000)])
+    # Stratified: the mean is off by far less than 0.5 / sqrt(2000) = 0.011.
+    assert values.mean() == pytest.approx(2.0, abs=2e-3)
+    assert values.std() == pytest.approx(0.5, rel=0.01)
+
+
+def test_more_monte_carlo_runs_begin_with_the_fewer() -> None:
+    few, many = (points({"a": {"uniform": [0, 1]}}, runs, 3, "monte_carlo") for runs in (5, 50))
+    assert [few[i].values for i in range(5)] == [many[i].values for i in range(5)]
+    assert [few[i].seed for i in range(5)] == [many[i].seed for i in range(5)]
+
+
+def test_another_seed_draws_others() -> None:
+    first, second = (points({"a": {"uniform": [0, 1]}}, 5, seed)[0] for seed in (0, 1))
+    assert first.values != second.values
+    assert first.seed != second.seed
+
+
+def test_labels_of_choices() -> None:
+    named = make_vary("c", {"grid": {"fast": 1, "slow": object()}})
+    assert named.labels == ("fast", "slow")
+    assert make_vary("c", {"choices": [{"file": "pi.npz"}, "x"]}).labels == ("pi.npz", "x")
+
+
+def test_nested_and_quoted_keys_are_the_same() -> None:
+    nested = {"plant": {"parameters": {"payload": {"uniform": [0, 1]}}}, "duration_s": [1.0, 2.0]}
+    assert dict(flattened(nested)) == {"plant.parameters.payload": {"uniform": [0, 1]}, "duration_s": [1.0, 2.0]}
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"uniform": [1.0, 1.0]}, "range from 1 to 1 is empty"),
+        ({"uniform": [2.0, 1.0]}, "the lower bound first"),
+        ({"uniform": [1.0]}, "takes two numbers"),
+        ({"uniform": [0.0, float("nan")]}, "takes two numbers"),
+        ({"log_uniform": [0.0, 1.0]}, "positive bounds"),
+        ({"normal": [0.0, 0.0]}, "standard deviation must be positive"),
+        ({"grid": []}, "the grid is empty"),
+        ({"choices": []}, "the choices is empty"),
+        ({"grid": [1, 2, 1]}, "a value twice"),
+        ({"grid": [1], "uniform": [0, 1]}, "exactly one of"),
+        ({"triangle": [0, 1]}, "exactly one of"),
+        (5.0, "exactly one of"),
+        ({"seed": 5}, "seed = true"),
+    ],
+)
+def test_ranges_that_are_none(given: Any, message: str) -> None:
+    with pytest.raises(SettingsError, match=message) as caught:
+        make_vary("plant.parameters.payload", given)
+    assert "plant.parameters.payload" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("vary", "runs", "message"),
+    [
+        ({}, 10, "varies nothing"),
+        ({"a": [1, 2]}, 0, "at least 1"),
+        ({"a": {"uniform": [0, 1]}}, None, "`runs` is missing"),
+        ({"a": {"uniform": [0, 1]}}, -3, "at least 1"),
+        ({"a": {"uniform": [0, 1]}}, 2.5, "whole number"),
+        ({"a": [1, 2]}, 3, "2 points and nothing is random"),
+        ({"a": [1, 2, 3], "b": {"uniform": [0, 1]}}, 2, "3 points; `runs` is 2"),
+    ],
+)
+def test_numbers_of_runs_that_cannot_be(vary: dict[str, Any], runs: Any, message: str) -> None:
+    with pytest.raises(SettingsError, match=message):
+        points(vary, runs)
