@@ -50,6 +50,7 @@ from ._search import search as search
 from ._set_membership import SetMembership as SetMembership
 from ._set_membership import noise_level as noise_level
 from ._srivc import Srivc as Srivc
+from ._state_space_network import NeuralStateSpace as NeuralStateSpace
 from ._subspace import Subspace as Subspace
 from ._trials import Trial as Trial
 from ._validation import INFINITE as INFINITE
