@@ -1,9 +1,11 @@
 """Models of the neck from recordings, judged honestly."""
 
+from ._auto import REFITTED as REFITTED
 from ._auto import Choice as Choice
 from ._auto import Tried as Tried
 from ._auto import choose as choose
 from ._auto import kinds_to_try as kinds_to_try
+from ._auto import refit as refit
 from ._compare import Comparison as Comparison
 from ._compare import compare as compare
 from ._cone_set import ConeSet as ConeSet
