@@ -43,6 +43,14 @@ def test_auto_prints_one_json_object_and_holds_out_the_last_of_several(call: Cal
     assert facts["ranking"][0]["hold_out"]["rows_scored"] == 275
 
 
+def test_auto_trains_the_chosen_kind_on_all_rows_and_says_so(call: Call, recording: Path) -> None:
+    said = call("identify", "auto", recording, "--refit", "-o", "all.npz")
+    assert said.code == 0, said.err
+    assert "after the choice" in " ".join(said.err.split())
+    assert load("all.npz").findings["refit"]["hold_out_fit_before"] > 0.0
+    assert "--refit goes with KIND auto" in call("identify", "rls", recording, "--refit").error
+
+
 def test_auto_refuses_settings_and_nothing_held_out(call: Call, recording: Path) -> None:
     assert "`auto` takes no settings" in call("identify", "auto", recording, "--set", "na=1").error
     assert "has to hold rows out" in call("identify", "auto", recording, "--train", "1").error

@@ -26,6 +26,7 @@ from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.identification import (
     GreyBox,
     Network,
+    NeuralStateSpace,
     OutputError,
     Play,
     Residual,
@@ -92,6 +93,10 @@ def _residual() -> Block:
 
 def _play() -> Block:
     return Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording()).block()
+
+
+def _nss() -> Block:
+    return NeuralStateSpace(neurons=3, starts=1, iterations=3).fit(recording()).block()
 
 
 def _greybox() -> Block:
@@ -188,6 +193,7 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
         ["pitch", "roll", "pitch_lower", "pitch_upper", "roll_lower", "roll_upper"],
         _MODEL,
     ),
+    "nss": (_nss, MOTORS, ["pitch", "roll", "motor_position_3"], _MODEL),
     "nn": (_nn, MOTORS, ["pitch", "roll", "motor_position_3"], _MODEL),
     "neck": (
         _neck,

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from softneck.core import DataError, SettingsError
-from softneck.identification import Choice, choose, kinds_to_try
+from softneck.identification import REFITTED, Choice, Play, choose, kinds_to_try, refit
 from softneck.identification._auto import ALIKE
 
 from ..data import neck_recording
@@ -40,6 +42,19 @@ def test_the_residual_is_on_the_best_and_the_ensemble_of_the_others(choice: Choi
     best = max((one for one in choice.ranking if one.kind in ("rls", "play")), key=lambda one: one.fit)
     assert models["residual"].settings["base"] == best.kind
     assert sorted(models["ensemble"].settings["members"]) == ["play", "rls"]
+
+
+@pytest.mark.parametrize("kinds", [("play",), ("rls", "residual"), ("rls", "play", "ensemble")])
+def test_a_refit_is_the_chosen_kind_on_all_rows_and_keeps_the_scores_of_before(kinds: tuple[str, ...]) -> None:
+    found = choose(TRAIN, OTHER, kinds=kinds, other_excitation=True)
+    last = next(one for one in found.ranking if one.kind == kinds[-1])
+    again = refit(replace(found, chosen=last), [TRAIN, OTHER])
+    assert again.kind == kinds[-1]
+    assert again.training_rows.size == len(TRAIN) + len(OTHER)
+    assert again.findings["refit"] == {"hold_out_fit_before": last.fit, "remark": REFITTED}
+    alone = Play().fit([TRAIN, OTHER])
+    if kinds == ("play",):
+        assert all(again.arrays[name].tobytes() == alone.arrays[name].tobytes() for name in alone.arrays)
 
 
 def test_rows_held_out_were_never_trained_on(choice: Choice) -> None:

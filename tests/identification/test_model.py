@@ -15,7 +15,21 @@ from softneck.signals import Recording, concatenate
 from ..data import TS, neck_recording
 
 # By the name of the shared models: "residual" is the other form of kind "nlsm".
-KINDS = ("rls", "nlsm", "residual", "play", "nn", "greybox", "any", "ensemble", "mimo", "oe", "srivc", "subspace")
+KINDS = (
+    "rls",
+    "nlsm",
+    "residual",
+    "play",
+    "nss",
+    "nn",
+    "greybox",
+    "any",
+    "ensemble",
+    "mimo",
+    "oe",
+    "srivc",
+    "subspace",
+)
 UNSEEN = neck_recording(120, seed=21)
 
 
@@ -107,6 +121,9 @@ CRAFTED = [
     ("play", "chain", lambda a: a + 0.5, "the order of the filters"),
     ("play", "echo", lambda a: a[:1], "`echo` has shape"),
     ("play", "memory", lambda a: a * 1e9, "its memory in samples"),
+    ("nss", "A", lambda a: a + np.eye(len(a)), "its linear part is not stable"),
+    ("nss", "delay", lambda a: a + 1e6, "a dead time"),
+    ("nss", "D", lambda a: a[:-1], "`D` has shape"),
     ("greybox", "neck", lambda a: a * 1e6, "drive_rate of .* is out of range"),
     ("greybox", "sensor", lambda a: a + 0.5, "the sensor's dead time"),
     ("any", "table", lambda a: a - 1.0, "a regressor's"),

@@ -1,9 +1,11 @@
 """Models of the neck from recordings, judged honestly."""
 
+from ._auto import REFITTED as REFITTED
 from ._auto import Choice as Choice
 from ._auto import Tried as Tried
 from ._auto import choose as choose
 from ._auto import kinds_to_try as kinds_to_try
+from ._auto import refit as refit
 from ._compare import Comparison as Comparison
 from ._compare import compare as compare
 from ._cone_set import ConeSet as ConeSet
@@ -50,6 +52,7 @@ from ._search import search as search
 from ._set_membership import SetMembership as SetMembership
 from ._set_membership import noise_level as noise_level
 from ._srivc import Srivc as Srivc
+from ._state_space_network import NeuralStateSpace as NeuralStateSpace
 from ._subspace import Subspace as Subspace
 from ._trials import Trial as Trial
 from ._validation import INFINITE as INFINITE

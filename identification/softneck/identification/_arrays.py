@@ -28,6 +28,10 @@ _ORDER = {
     "play": (
         "history", "drive", "load", "redefinition", "widths", "chain", "table", "weights", "range", "echo", "memory",
     ),
+    "nss": (
+        "history", "drive", "load", "redefinition", "widths", "delay", "A", "B", "E", "F", "G", "h", "D", "C", "c",
+        "range", "echo", "memory",
+    ),
     "nn": (
         "history", "drive", "table", "W1", "b1", "W2", "b2", "w3", "b3", "input_scale", "output_scale", "load",
         "correction",
@@ -167,6 +171,22 @@ def _check_play(arrays: Mapping[str, Matrix], history: float) -> None:
     _within(np.array([p]), 1, history, "the length of the echo")
 
 
+def _check_nss(arrays: Mapping[str, Matrix], history: float) -> None:
+    widths, n, q, p = (arrays[name].shape[-1] for name in ("widths", "A", "h", "echo"))
+    inputs = 3 * (1 + widths)
+    shapes = {
+        "load": (4,), "redefinition": (3, 3), "widths": (widths,), "delay": (1,), "A": (n, n), "B": (n, inputs),
+        "E": (n, q), "F": (q, n), "G": (q, inputs), "h": (q,), "D": (q, q), "C": (2, n), "c": (2,), "range": (2, 2),
+        "echo": (2, p),
+    }  # fmt: skip
+    for name, shape in shapes.items():
+        _expect(arrays, name, shape)
+    _within(arrays["delay"], 0, history - 1, "a dead time")
+    _within(np.array([p]), 1, history, "the length of the echo")
+    if np.abs(np.linalg.eigvals(arrays["A"])).max(initial=0.0) >= 1.0:
+        raise FileFormatError("its linear part is not stable, so that a free run could diverge.")
+
+
 def _check_greybox(arrays: Mapping[str, Matrix], history: float) -> None:
     p = arrays["echo"].shape[-1]
     for name, shape in {"neck": (len(NUMBERS),), "sensor": (2,), "echo": (2, p)}.items():
@@ -206,6 +226,7 @@ _CHECKS = {
     "rls": _check_rls,
     "play": _check_play,
     "greybox": _check_greybox,
+    "nss": _check_nss,
     "oe": _check_oe,
     "srivc": _check_oe,
     "subspace": _check_state_space,

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from softneck.core import KINDS, DataError, Progress, SettingsError, SoftneckError, resolve, silent
-from softneck.signals import Recording
+from softneck.signals import Recording, concatenate
 
 from ._ensemble import combine
 from ._model import Model
@@ -24,6 +24,7 @@ ALIKE = 0.5
 # Below this [%] no kind has understood the recording.
 _POOR = 70.0
 _MOST_MEMBERS = 3
+REFITTED = "trained on all rows after the choice; its scores are those of the model before, which had not seen them all"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,12 +62,14 @@ class Choice:
         chosen: the one to take.
         why: sentences for people.
         remarks: what to be wary of.
+        seed: of kinds that start at random.
     """
 
     ranking: tuple[Tried, ...]
     chosen: Tried
     why: str
     remarks: tuple[str, ...]
+    seed: int = 0
 
 
 def kinds_to_try() -> tuple[str, ...]:
@@ -115,7 +118,30 @@ def choose(
     alike = [one for one in ranking if one.fit > best.fit - ALIKE]
     chosen = min(alike, key=lambda one: _SIMPLE_FIRST.index(one.kind))
     progress(1.0, f"chosen: {chosen.kind}")
-    return Choice(ranking, chosen, _why(best, chosen, alike), _remarks(ranking, other_excitation))
+    return Choice(ranking, chosen, _why(best, chosen, alike), _remarks(ranking, other_excitation), seed)
+
+
+def refit(choice: Choice, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
+    """Identify the chosen kind again, with what it is made of, from all recordings there are.
+
+    Nothing is left to judge this model by: `findings["refit"]` says so, and holds the fits of the model that was
+    chosen, which had not seen the rows held out.
+
+    Raises:
+        DataError: the chosen kind could not be identified.
+    """
+    chosen, whole = choice.chosen, concatenate(recordings if isinstance(recordings, list) else [recordings])
+    if chosen.model is None:
+        raise DataError(f"{chosen.kind} was not identified, so that there is nothing to identify again.")
+    settings = chosen.model.settings
+    parts = {"residual": [settings.get("base")], "ensemble": list(settings.get("members", ()))}.get(chosen.kind, [])
+    models: list[Model] = []
+    for number, kind in enumerate([*parts, chosen.kind]):
+        progress(number / (len(parts) + 1), f"{kind} on all rows")
+        models.append(_model(str(kind), whole, models, choice.seed))
+    said = {"hold_out_fit_before": chosen.fit, "remark": REFITTED}
+    progress(1.0, "done")
+    return replace(models[-1], findings={**models[-1].findings, "refit": said})
 
 
 def _try(kind: str, train: Recording, hold_out: Recording, before: list[Tried], seed: int) -> Tried:

@@ -53,7 +53,7 @@ def members(arrays: Mapping[str, Matrix]) -> list[tuple[str, dict[str, Matrix]]]
 def runtime_of(kind: str, arrays: Mapping[str, Matrix]) -> str:
     """Return the name of the runtime, with those of the members (see `softneck.core.bundle`)."""
     if kind not in COMPOSED:
-        return STATE_SPACE if "A" in arrays else KINDS[kind].runtime
+        return STATE_SPACE if "A" in arrays and kind != "nss" else KINDS[kind].runtime
     inner = ",".join(f"{runtime_of(member, part)}:{len(part)}" for member, part in members(arrays))
     return f"{KINDS[kind].runtime}({inner})"
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from softneck.core import SettingsError, refuse_existing
-from softneck.identification import INFINITE, Choice, Tried, choose
+from softneck.identification import INFINITE, REFITTED, Choice, Tried, choose, refit
 from softneck.plots import Section, Table, page, validation_figure, write_page
 from softneck.signals import Recording, concatenate, read_recording
 
@@ -22,6 +22,7 @@ def identify_auto(
     output: Path | None,
     *,
     train: float,
+    refit_all: bool,
     seed: int | None,
     html: Path | None,
     force: bool,
@@ -32,21 +33,25 @@ def identify_auto(
     refuse_existing(path, force=replace)
     if html is not None:
         refuse_existing(html, force=force)
-    head, tail, other = _split([read_recording(source) for source in recordings], train)
+    parts = [read_recording(source) for source in recordings]
+    head, tail, other = _split(parts, train)
     with progress("identify auto", quiet=as_json) as report:
         choice = choose(head, tail, other_excitation=other, seed=seed or 0, progress=report)
     model = choice.chosen.model
     if model is None:
         raise SettingsError("the chosen kind has no model.")
+    if refit_all:
+        with progress(f"identify {choice.chosen.kind} on all rows", quiet=as_json) as report:
+            model = refit(choice, parts, progress=report)
     model.save(path, force=replace)
     if html is not None:
         write_page(html, _page(choice), force=force)
     if as_json:
-        print_json(_facts(choice, path))
+        print_json({**_facts(choice, path), "refit": refit_all})
         return
     print_table("Fit [%] on the rows held out, pitch/roll", _HEAD, _rows(choice))
     click.echo(f"{choice.why}\n{path}\n{model.summary()}")
-    for remark in choice.remarks:
+    for remark in [*choice.remarks, *([REFITTED] if refit_all else [])]:
         note(remark)
 
 

@@ -39,6 +39,7 @@ _KINDS += "\n  auto     tries them all and takes the best in free run"
 @output_option("model", "MODEL")
 @click.option("--train", default=0.7, show_default=True, help="Part of each run, from its start, to train on.")
 @click.option("--html", type=click.Path(path_type=Path), help="With KIND auto: write a page with the ranking.")
+@click.option("--refit", is_flag=True, help="With KIND auto: train the chosen kind again, on all rows; judged before.")
 @click.option("--seed", type=int, help="Seed of kinds that start at random.")
 @set_option
 @search_option
@@ -53,6 +54,7 @@ def command(
     output: Path | None,
     train: float,
     html: Path | None,
+    refit: bool,
     seed: int | None,
     settings: tuple[str, ...],
     searches: tuple[str, ...],
@@ -66,12 +68,16 @@ def command(
     if kind == "auto":
         if settings:
             raise SettingsError("--set: `auto` takes no settings; name the kind that they are for.")
-        identify_auto(recordings, output, train=train, seed=seed, html=html, force=force, as_json=as_json)
+        identify_auto(
+            recordings, output, train=train, refit_all=refit, seed=seed, html=html, force=force, as_json=as_json
+        )
         return
     if html is not None:
         raise SettingsError(
             f"--html goes with KIND auto; for `{kind}` use `softneck validate MODEL --data REC --html`."
         )
+    if refit:
+        raise SettingsError(f"--refit goes with KIND auto; `{kind}` is trained on the part that --train says.")
     entry = find_kind(kind, "model")
     estimator = apply_settings(resolve(entry.settings), settings, seed=seed)
     options = SearchOptions(searches, hold_out, strategy, plot)

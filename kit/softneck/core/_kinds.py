@@ -50,6 +50,8 @@ KINDS: dict[str, Kind] = {
              "NLARX neural network, two hidden layers of 25 (section 6.2)"),
         Kind("play", "model", "softneck.identification:Play", _MODEL, "softneck.identification._play_runtime",
              "play operators and low-pass filters, ridge on their polynomial; no feedback, strong in free run"),
+        Kind("nss", "model", "softneck.identification:NeuralStateSpace", _MODEL, "softneck.identification._nss_runtime",
+             "neural state space over play operators, contracting; trained over its whole free run"),
         Kind("greybox", "model", "softneck.identification:GreyBox", _MODEL, "softneck.identification._greybox_runtime",
              "equations of a tendon-driven neck, their 16 numbers fitted by the error of its free run"),
         Kind("residual", "model", "softneck.identification:Residual", _MODEL,
