@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check docs benchmark clean
+.PHONY: demo test check docs benchmark native wheel clean
 
 demo: $(VENV)/.installed
 	$(BIN)/softneck demo --out build/demo
@@ -24,6 +24,14 @@ docs: $(VENV)/.documented
 benchmark: $(VENV)/.tested
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-only
 
+# The library of compiled FMUs for all five platforms, cross-compiled by zig into fmu_src/softneck/fmu/native/binaries.
+native: $(VENV)/.crossed
+	$(BIN)/python -m softneck.fmu.native
+
+# Exporting from this wheel needs no compiler.
+wheel: native
+	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir build/dist .
+
 clean:
 	rm -rf $(VENV) docs/_build .pytest_cache .ruff_cache
 
@@ -38,6 +46,10 @@ $(VENV)/.installed: pyproject.toml
 
 $(VENV)/.tested: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --group test --group importers
+	@touch $@
+
+$(VENV)/.crossed: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --group native
 	@touch $@
 
 $(VENV)/.linted: $(VENV)/.tested

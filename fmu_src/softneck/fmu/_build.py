@@ -52,16 +52,17 @@ def build_fmu(block: Block, path: str | Path, *, info: FmuInfo | None = None, fo
         OutputError: the file exists or cannot be written.
     """
     target = Path(path)
-    name = _model_name(target)
+    name = model_name(target)
     refuse_existing(target, force=force)
-    _check(block)
+    check_block(block)
     members = _members(described_block(block), info or FmuInfo(), name)
     with atomic_write(target, force=force) as temporary:
         write_zip(temporary, members)
     return target
 
 
-def _model_name(path: Path) -> str:
+def model_name(path: Path) -> str:
+    """Return the model name that an FMU file's name gives."""
     name = path.stem
     if path.suffix != ".fmu":
         raise SettingsError(f"{path}: an FMU's file name must end in `.fmu`.")
@@ -73,7 +74,8 @@ def _model_name(path: Path) -> str:
     return name
 
 
-def _check(block: Block) -> None:
+def check_block(block: Block) -> None:
+    """Refuse a block that no FMU can be made of."""
     if block.role not in _ROLES:
         raise SettingsError(f"{block.kind}: role `{block.role}` must be one of {', '.join(_ROLES)}.")
     for port in (*block.inputs, *block.outputs, *block.parameters):
@@ -98,11 +100,11 @@ def _members(block: Block, info: FmuInfo, name: str) -> dict[str, bytes]:
     missing = [folder for folder in _BINARIES if not any(member.startswith(folder) for member in members)]
     if missing:
         raise SettingsError(f"the installed pythonfmu lacks {', '.join(missing)}; install pythonfmu 0.6.9 or newer.")
-    members["modelDescription.xml"] = model_description(block, info, Identity(name, guid, _date()))
+    members["modelDescription.xml"] = model_description(block, info, Identity(name, guid, generation_date()))
     members["documentation/index.html"] = documentation_page(name, block, info).encode()
     members["documentation/host.txt"] = f"{HOST_NEEDS}\n".encode()
-    members["documentation/licenses/license.txt"] = _license("softneck", info.license).encode()
-    members["documentation/licenses/pythonfmu.txt"] = _license("pythonfmu", "MIT").encode()
+    members["documentation/licenses/license.txt"] = license_text("softneck", info.license).encode()
+    members["documentation/licenses/pythonfmu.txt"] = license_text("pythonfmu", "MIT").encode()
     members["model.png"] = icon_png(block.kind, block.role)
     return members
 
@@ -174,13 +176,14 @@ def _imports_restored() -> Iterator[None]:
             sys.path_importer_cache.pop(entry, None)
 
 
-def _date() -> str:
+def generation_date() -> str:
+    """Return SOURCE_DATE_EPOCH, or the first moment that a zip archive can carry: equal blocks, equal bytes."""
     seconds = os.environ.get("SOURCE_DATE_EPOCH", "")
     moment = datetime.fromtimestamp(int(seconds), UTC) if seconds.isdigit() else datetime(1980, 1, 1, tzinfo=UTC)
     return moment.strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-def _license(package: str, stated: str) -> str:
+def license_text(package: str, stated: str) -> str:
     """Return what the licence is said to be, and the text of the package's own, which covers its code in the FMU."""
     for file in distribution(package).files or []:
         if file.name == "LICENSE":

@@ -30,11 +30,19 @@ _NONE = ("", "1")
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Name, GUID and generation date of one FMU."""
+    """Name, GUID and generation date of one FMU, and what runs in it.
+
+    Attributes:
+        name, guid, date: as FMI means them.
+        tool: what built it; None for pythonfmu.
+        sources: files that a compiler takes to rebuild it; none where Python runs in it.
+    """
 
     name: str
     guid: str
     date: str
+    tool: str | None = None
+    sources: tuple[str, ...] = ()
 
 
 def described_block(block: Block) -> Block:
@@ -53,10 +61,10 @@ def model_description(block: Block, info: FmuInfo, identity: Identity) -> bytes:
     Raises:
         SettingsError: two ports of one name.
     """
-    _check_names(block)
+    check_names(block)
     root = Element("fmiModelDescription", _head(block, info, identity))
-    _co_simulation(root, identity.name)
-    _unit_definitions(root, block)
+    _co_simulation(root, identity)
+    add_unit_definitions(root, block)
     categories = SubElement(root, "LogCategories")
     for name, text in (("logStatusWarning", "Warnings"), ("logStatusError", "Errors"), ("logAll", "Everything")):
         SubElement(categories, "Category", name=name, description=text)
@@ -76,14 +84,28 @@ def _with_reference_range(port: Port) -> Port:
     return replace(port, minimum=-REFERENCE_LIMIT, maximum=REFERENCE_LIMIT)
 
 
-def _check_names(block: Block) -> None:
-    names = [port.name for port in (*block.inputs, *block.outputs, *block.parameters)]
+def check_names(block: Block, reserved: str = "") -> None:
+    """Refuse two variables of one name; `reserved` is one that is taken already."""
+    names = [port.name for port in (*block.inputs, *block.outputs, *block.parameters)] + [reserved] * bool(reserved)
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise SettingsError(f"{block.kind}: an FMU variable needs one name of its own; twice: {', '.join(twice)}.")
 
 
 def _head(block: Block, info: FmuInfo, identity: Identity) -> dict[str, str]:
+    return {
+        "fmiVersion": "2.0",
+        "modelName": identity.name,
+        "guid": identity.guid,
+        "generationTool": identity.tool or generation_tool(),
+        "generationDateAndTime": identity.date,
+        "variableNamingConvention": "structured",
+        "numberOfEventIndicators": "0",
+    } | head_texts(block, info)
+
+
+def head_texts(block: Block, info: FmuInfo) -> dict[str, str]:
+    """Return the attributes that say what the FMU is, without the empty ones."""
     texts = {
         "description": info.description or f"{block.kind} ({block.role}), sample time {block.sample_time:g} s",
         "author": info.author,
@@ -91,29 +113,27 @@ def _head(block: Block, info: FmuInfo, identity: Identity) -> dict[str, str]:
         "copyright": info.copyright,
         "license": info.license,
     }
-    return {
-        "fmiVersion": "2.0",
-        "modelName": identity.name,
-        "guid": identity.guid,
-        "generationTool": generation_tool(),
-        "generationDateAndTime": identity.date,
-        "variableNamingConvention": "structured",
-        "numberOfEventIndicators": "0",
-    } | {name: text for name, text in texts.items() if text}
+    return {name: text for name, text in texts.items() if text}
 
 
-def _co_simulation(root: Element, name: str) -> None:
+def _co_simulation(root: Element, identity: Identity) -> None:
     yes = (
-        "needsExecutionTool",  # the Python of the host
         "canHandleVariableCommunicationStepSize",
         "canNotUseMemoryManagementFunctions",
         "canGetAndSetFMUstate",
         "canSerializeFMUstate",
     )
-    SubElement(root, "CoSimulation", {"modelIdentifier": name} | dict.fromkeys(yes, "true"))
+    python = {} if identity.sources else {"needsExecutionTool": "true"}  # the Python of the host
+    attributes = {"modelIdentifier": identity.name} | python | dict.fromkeys(yes, "true")
+    element = SubElement(root, "CoSimulation", attributes)
+    if identity.sources:
+        files = SubElement(element, "SourceFiles")
+        for name in identity.sources:
+            SubElement(files, "File", name=name)
 
 
-def _unit_definitions(root: Element, block: Block) -> None:
+def add_unit_definitions(root: Element, block: Block) -> None:
+    """Add the units that the variables use; FMI 2 and 3 write them alike."""
     used = sorted({port.unit for port in (*block.inputs, *block.outputs, *block.parameters) if _has_unit(port)})
     if not used:
         return
@@ -153,11 +173,11 @@ def _variable(table: Element, port: Port, causality: str, reference: int) -> Non
     if port.description:
         head["description"] = port.description
     variable = SubElement(table, "ScalarVariable", head)
-    start = {} if causality == "output" else {"start": _start(port)}
+    start = {} if causality == "output" else {"start": start_attribute(port)}
     if port.boolean:
         SubElement(variable, "Boolean", start)
     else:
-        SubElement(variable, "Real", _unit(port) | _range(port) | start)
+        SubElement(variable, "Real", unit_attributes(port) | range_attributes(port) | start)
 
 
 def _structure(root: Element, block: Block) -> None:
@@ -178,19 +198,22 @@ def _has_unit(port: Port) -> bool:
     return port.unit not in _NONE and not port.boolean
 
 
-def _unit(port: Port) -> dict[str, str]:
+def unit_attributes(port: Port) -> dict[str, str]:
+    """Return unit and display unit."""
     if not _has_unit(port):
         return {}
     display = _UNITS.get(port.unit, ({}, None))[1]
     return {"unit": port.unit} | ({"displayUnit": display[0]} if display else {})
 
 
-def _range(port: Port) -> dict[str, str]:
+def range_attributes(port: Port) -> dict[str, str]:
+    """Return min, max and nominal."""
     values = {"min": port.minimum, "max": port.maximum, "nominal": port.nominal}
     return {name: repr(float(value)) for name, value in values.items() if value is not None and math.isfinite(value)}
 
 
-def _start(port: Port) -> str:
+def start_attribute(port: Port) -> str:
+    """Return the start value as XML writes it."""
     if port.boolean:
         return "true" if port.start else "false"
     return "NaN" if math.isnan(port.start) else repr(float(port.start))

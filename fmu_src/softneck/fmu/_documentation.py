@@ -34,8 +34,8 @@ _STYLE = (
 )
 
 
-def documentation_page(name: str, block: Block, info: FmuInfo) -> str:
-    """Return the page as one HTML text without any outside resource."""
+def documentation_page(name: str, block: Block, info: FmuInfo, host: str = "") -> str:
+    """Return the page as one HTML text without any outside resource; `host` says what the host needs, "" for Python."""
     title = escape(info.description or f"{block.kind} ({block.role})")
     timing = _TIMING["plant" if block.role == "plant" else "other"]
     parts = [
@@ -48,7 +48,7 @@ def documentation_page(name: str, block: Block, info: FmuInfo) -> str:
         _table(block),
         f"<h2>Timing</h2><p>Internal sample time {block.sample_time:g} s; any communication step is legal.",
         f"{timing}</p>",
-        f"<h2>Host</h2><p>{escape(HOST_NEEDS)} {escape(_NUMBA)} {escape(_PATHS)}</p>",
+        f"<h2>Host</h2><p>{escape(host or f'{HOST_NEEDS} {_NUMBA} {_PATHS}')}</p>",
         '<p>Licences: <a href="licenses/">licenses/</a>. '
         f"{escape(' · '.join(text for text in (info.author, info.copyright, info.license) if text))}</p>",
         "</body></html>\n",

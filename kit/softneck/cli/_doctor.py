@@ -32,7 +32,7 @@ def command(compile_now: bool, as_json: bool) -> None:
     """Say what of this machine works: packages, compilers, FMU platforms, CAN, extras."""
     if compile_now:
         _compile(quiet=as_json)
-    checks = [_python(), *_packages(), _compiler(), _fmu_platform(), _can(), *_extras()]
+    checks = [_python(), *_packages(), _compiler(), _fmu_platform(), _compiled_fmus(), _can(), *_extras()]
     bad = [check for check in checks if check["state"] == "missing"]
     if as_json:
         print_json({"checks": checks, "healthy": not bad})
@@ -84,6 +84,20 @@ def _fmu_platform() -> dict[str, str]:
     if FmuBuilder.has_binary():
         return _check("pythonfmu binary", "ok", f"{platform.system()} {platform.machine()}")
     return _check("pythonfmu binary", "missing", "pythonfmu ships linux64 and win64 only; FMUs will not run here")
+
+
+def _compiled_fmus() -> dict[str, str]:
+    from softneck.core import FileFormatError
+    from softneck.fmu.native import PLATFORMS, platforms_built
+
+    try:
+        built, how = platforms_built()
+    except FileFormatError as error:
+        return _check("compiled FMUs", "missing", str(error))
+    if not built:
+        return _check("compiled FMUs", "optional", how)
+    state = "ok" if len(built) == len(PLATFORMS) else "optional"
+    return _check("compiled FMUs", state, f"{', '.join(built)} ({how})")
 
 
 def _can() -> dict[str, str]:

@@ -10,6 +10,7 @@ import click
 from softneck.core import FileFormatError, SettingsError, load
 from softneck.cosim import is_loop_file, reference_of
 from softneck.fmu import Buildable, build_fmu, describe
+from softneck.fmu.native import PLATFORMS, build_compiled_fmu
 from softneck.identification import Model, Validation, validate
 from softneck.plant import NeckParameters, VirtualNeck
 
@@ -26,20 +27,29 @@ from ._recordings import read_together
 @click.option(
     "--data", multiple=True, type=click.Path(path_type=Path), help="A recording to score a model on, inside the FMU."
 )
-@click.option("--backend", type=click.Choice(["python"]), default="python", show_default=True, help="What runs inside.")
-@click.option("--fmi", type=click.Choice(["2"]), default="2", show_default=True, help="FMI version.")
+@click.option(
+    "--backend", type=click.Choice(["python", "compiled"]), default="python", show_default=True,
+    help="What runs inside: Python and numpy of the host, or a C library that needs neither.",
+)
+@click.option("--fmi", type=click.Choice(["2", "3"]), default="2", show_default=True, help="FMI version; 3: compiled.")
+@click.option(
+    "--platform", "platforms", multiple=True, metavar="NAME",
+    help=f"Of a compiled FMU, only for these: {', '.join(PLATFORMS)}.  [default: all that are built]",
+)
 @force_option
 @json_option
 def command(
     file: str | None, output: Path | None, folder: Path | None, data: tuple[Path, ...],
-    backend: str, fmi: str, force: bool, as_json: bool,
+    backend: str, fmi: str, platforms: tuple[str, ...], force: bool, as_json: bool,
 ) -> None:  # fmt: skip
-    """Package FILE as an FMI 2.0 Co-Simulation FMU.
+    """Package FILE as a Co-Simulation FMU of FMI 2.0 or 3.0.
 
     FILE is a model, observer or controller (.npz), a neck parameter file (.toml), a neck preset (paper, lab), or a
     loop file, of whose [reference] a reference FMU is made.
     """
-    del backend, fmi  # one of each in this version; the options hold their place
+    if backend == "python" and (fmi != "2" or platforms):
+        raise SettingsError("--fmi 3 and --platform are of compiled FMUs; add `--backend compiled`.")
+    origin = ""
     jobs, replace = _what(file, folder, output, force=force)
     # All are read before any is written: one bad file stops the command with nothing done.
     things = [(source, open_buildable(source), path) for source, path in jobs if folder is None or _can_be_fmu(source)]
@@ -48,13 +58,21 @@ def command(
         for number, (source, thing, path) in enumerate(things):
             report(number / len(things), path.name)
             judged = _judge(thing, source, data) if data else None
-            build_fmu(thing.block(), path, info=describe(thing, validation=judged), force=replace)
+            block, info = thing.block(), describe(thing, validation=judged)
+            if backend == "compiled":
+                origin = build_compiled_fmu(
+                    block, path, info=info, force=replace, fmi=int(fmi), platforms=platforms
+                )
+            else:
+                build_fmu(block, path, info=info, force=replace)
             built.append({"source": str(source), "fmu": str(path)})
     if as_json:
-        print_json({"fmus": built, "left_out": left_out})
+        print_json({"fmus": built, "left_out": left_out} | ({"libraries": origin} if origin else {}))
         return
     for entry in built:
         click.echo(f"{entry['fmu']}  from {entry['source']}")
+    if origin:
+        click.echo(f"libraries: {origin}")
     for source in left_out:
         click.echo(f"left out: {source}, which is no model, observer or controller")
 

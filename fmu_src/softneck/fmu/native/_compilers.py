@@ -1,0 +1,77 @@
+"""C compilers: the one of this machine, and zig, which compiles for all platforms."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+from importlib.util import find_spec
+from pathlib import Path
+
+from softneck.core import SettingsError
+
+from ._platforms import Platform
+from ._sources import FLAGS, MAIN, Sources
+
+_MINUTES = 10
+
+
+def local_compiler() -> list[str] | None:
+    """Return the command of this machine's C compiler ($CC, cc, gcc or clang), or None."""
+    stated = shlex.split(os.environ.get("CC", ""))
+    for command in [stated] if stated else [["cc"], ["gcc"], ["clang"]]:
+        if shutil.which(command[0]) is not None:
+            return command
+    return None
+
+
+def have_zig() -> bool:
+    """Return whether the package `ziglang` is here."""
+    return find_spec("ziglang") is not None
+
+
+def compile_here(sources: Sources, compiler: list[str]) -> bytes:
+    """Return the library of this machine, made by its own compiler."""
+    suffix = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
+    extra = [] if sys.platform == "win32" else ["-fPIC"]
+    strip = [] if sys.platform == "darwin" else ["-s", "-Wl,--gc-sections"]
+    return _compiled(sources, [*compiler, *FLAGS, *extra, *strip], suffix)
+
+
+def compile_for(sources: Sources, platform: Platform) -> bytes:
+    """Return the library of any platform, made by zig.
+
+    Raises:
+        SettingsError: zig is not here, or refused the sources.
+    """
+    if not have_zig():
+        raise SettingsError("zig is not here; install it with `pip install ziglang`.")
+    extra = [] if platform.system == "win32" else ["-fPIC"]
+    gather = [] if platform.system == "darwin" else ["-Wl,--gc-sections"]
+    command = [sys.executable, "-m", "ziglang", "cc", "-target", platform.target, *FLAGS, *extra, "-s", *gather]
+    return _compiled(sources, command, platform.suffix)
+
+
+def _compiled(sources: Sources, command: list[str], suffix: str) -> bytes:
+    with tempfile.TemporaryDirectory(prefix="softneck-native-") as name:
+        folder = Path(name)
+        for file, text in sources.files.items():
+            (folder / file).write_text(text, encoding="utf-8")
+        library = folder / f"softneck{suffix}"
+        full = [*command, "-shared", "-o", library.name, MAIN]
+        # A library that names the temporary folder would have other bytes each time.
+        full += [] if suffix == ".dll" else ["-lm"]
+        environment = os.environ | {"SOURCE_DATE_EPOCH": "315532800"}
+        try:
+            done = subprocess.run(
+                full, cwd=folder, env=environment, capture_output=True, text=True, timeout=60 * _MINUTES, check=False
+            )
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise SettingsError(f"`{command[0]}` could not compile the FMU library: {error}.") from error
+        if done.returncode != 0 or not library.is_file():
+            first = next((line for line in done.stderr.splitlines() if "error" in line), done.stderr.strip()[:200])
+            raise SettingsError(f"`{shlex.join(command[:4])} ...` could not compile the FMU library: {first}")
+        return library.read_bytes()

@@ -1,0 +1,376 @@
+"""Expressions to C.
+
+Every result is one term of C or stands in brackets. Python evaluates from left to right and C in no order: whatever
+an operand has to write as statements of its own comes after the operands before it are kept in variables.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable
+from typing import Any
+
+from ._calls import method, numpy_call, plain_call
+from ._scope import Scope
+from ._types import (
+    BOOL,
+    FLOAT,
+    INT,
+    MATRIX,
+    VECTOR,
+    Arrays,
+    Bundle,
+    Scalar,
+    Type,
+    Value,
+    View,
+    unified,
+    uniform,
+)
+
+_ARITHMETIC = {ast.Add: "add", ast.Sub: "sub", ast.Mult: "mul", ast.Div: "div"}
+_SIGNS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
+_COMPARISONS = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
+_BITS = {ast.BitXor: "^", ast.BitAnd: "&", ast.BitOr: "|"}
+_CONSTANTS = {"pi": "SN_PI", "inf": "HUGE_VAL", "nan": "sn_from_bits(0x7ff8000000000000u)", "e": "2.718281828459045"}
+# A product of whole numbers up to this factor cannot leave int64: `sn_int` lets none beyond 2^53 in.
+_SMALL_FACTOR = 512
+_LARGEST_POWER = 16
+
+
+class Expressions:
+    """Turns expressions of one function into C; `own` translates calls of the runtime's own functions."""
+
+    def __init__(self, scope: Scope, constants: dict[str, ast.expr], own: Callable[..., Value | None]) -> None:
+        self.scope, self.constants, self._own = scope, constants, own
+
+    def value(self, node: ast.expr) -> Value:
+        """Return the C of an expression; statements that it needs are written before."""
+        handler: Callable[[Any], Value] | None = getattr(self, f"_{type(node).__name__.lower()}", None)
+        if handler is None:
+            raise self.scope.fail(node, "no C is known for this.")
+        return handler(node)
+
+    def ordered(self, nodes: list[ast.expr]) -> list[Value]:
+        """Return several, evaluated from left to right."""
+        values: list[Value] = []
+        for node in nodes:
+            before = len(self.scope.lines)
+            value = self.value(node)
+            if len(self.scope.lines) > before and values:
+                written = self.scope.taken_back(before)
+                values = [v if self._fixed(v) else self.scope.kept(v) for v in values]
+                self.scope.lines += written
+            values.append(value)
+        return values
+
+    def _fixed(self, value: Value) -> bool:
+        """Return whether later statements of the same expression cannot change a value."""
+        return value.known is not None or value.code.isidentifier()
+
+    def scalar(self, node: ast.expr, kind: Scalar) -> str:
+        """Return C of a number of one kind."""
+        value = self.value(node)
+        if not isinstance(value.type, Scalar) or (kind == INT and value.type == FLOAT):
+            raise self.scope.fail(node, f"a number ({kind.name}) is needed here.")
+        return self.scope.cast(value, kind)
+
+    # Terms
+
+    def _constant(self, node: ast.Constant) -> Value:
+        if isinstance(node.value, bool):
+            return Value("1" if node.value else "0", BOOL, node.value)
+        if isinstance(node.value, int):
+            return Value(f"{node.value}LL" if abs(node.value) > 2**31 - 1 else str(node.value), INT, node.value)
+        if isinstance(node.value, float):
+            return Value(repr(node.value), FLOAT, node.value)
+        raise self.scope.fail(node, "only numbers are known.")
+
+    def _name(self, node: ast.Name) -> Value:
+        kind = self.scope.variables.get(node.id)
+        if kind is not None:
+            return Value(f"v_{node.id}", kind)
+        if node.id in self.constants:
+            return self.value(self.constants[node.id])
+        raise self.scope.fail(node, "this name is not known, or not on every way here.")
+
+    def _attribute(self, node: ast.Attribute) -> Value:
+        if isinstance(node.value, ast.Name) and node.value.id in ("np", "math") and node.attr in _CONSTANTS:
+            return Value(_CONSTANTS[node.attr], FLOAT)
+        base = self.value(node.value)
+        if node.attr == "size" and isinstance(base.type, View):
+            return Value("(" + " * ".join(base.code + _length(base.type, i) for i in range(base.type.rank)) + ")", INT)
+        if node.attr == "T" and base.type in (VECTOR, MATRIX):
+            return base if base.type == VECTOR else Value(f"sn_turned({base.code})", MATRIX)
+        raise self.scope.fail(node, "this attribute is not known.")
+
+    def _tuple(self, node: ast.Tuple) -> Value:
+        values = self.ordered(node.elts)
+        kind = Bundle(tuple(value.type for value in values))
+        return Value(self.scope.bundled([value.code for value in values], kind), kind)
+
+    # Operators
+
+    def _unaryop(self, node: ast.UnaryOp) -> Value:
+        value = self.value(node.operand)
+        if isinstance(node.op, ast.Not):
+            known = None if value.known is None else not value.known
+            return Value(f"(!{self.truth(value, node)})", BOOL, known)
+        if isinstance(node.op, ast.USub) and value.type == VECTOR:
+            return self.room(f"sn_negative_v(w, {value.code})", VECTOR)
+        if not isinstance(value.type, Scalar) or isinstance(node.op, ast.Invert):
+            raise self.scope.fail(node, "this operator is not known here.")
+        kind = INT if value.type == BOOL else value.type
+        if isinstance(node.op, ast.UAdd):
+            return value
+        return Value(f"(-{value.code})", kind, None if value.known is None else -value.known)
+
+    def _binop(self, node: ast.BinOp) -> Value:
+        if isinstance(node.op, ast.Pow):
+            return self._power(node)
+        left, right = self.ordered([node.left, node.right])
+        return self.binary(node, left, right)
+
+    def binary(self, node: ast.AST, left: Value, right: Value) -> Value:
+        """Return `left op right`; `node` holds the operator."""
+        op: Any = type(node.op)  # type: ignore[attr-defined]
+        if op is ast.MatMult:
+            return numpy_call(self, node, "dot", [left, right])
+        if isinstance(left.type, View) or isinstance(right.type, View):
+            if op not in _ARITHMETIC:
+                raise self.scope.fail(node, "this operator is not known between arrays.")
+            return self.elementwise(node, f"sn_{_ARITHMETIC[op]}", left, right)
+        if not (isinstance(left.type, Scalar) and isinstance(right.type, Scalar)):
+            raise self.scope.fail(node, f"no arithmetic with {left.type} and {right.type}.")
+        if op in _BITS and left.type == right.type == INT:
+            return Value(f"({left.code} {_BITS[op]} {right.code})", INT)
+        whole = FLOAT not in (left.type, right.type) and op is not ast.Div
+        kind = INT if whole else FLOAT
+        a, b = self.scope.cast(left, kind), self.scope.cast(right, kind)
+        if op in (ast.Mod, ast.FloorDiv):
+            return self._modulo(node, kind, a, b)
+        if op not in _SIGNS:
+            raise self.scope.fail(node, "this operator is not known.")
+        if whole and op is ast.Mult and not any(_small(v) for v in (left, right)):
+            return Value(f"sn_times(w, {a}, {b})", INT)
+        known = _fold(op, left, right) if whole else None
+        return Value(f"({a} {_SIGNS[op]} {b})", kind, known)
+
+    def _modulo(self, node: ast.AST, kind: Scalar, a: str, b: str) -> Value:
+        if isinstance(node.op, ast.Mod):  # type: ignore[attr-defined]
+            return Value(f"sn_modulo(w, {a}, {b})" if kind == INT else f"sn_fmod({a}, {b})", kind)
+        if kind == INT:
+            return Value(f"sn_floor_divide(w, {a}, {b})", INT)
+        raise self.scope.fail(node, "`//` is known between whole numbers only.")
+
+    def elementwise(self, node: ast.AST, name: str, left: Value, right: Value) -> Value:
+        """Return an operation on each entry of arrays of one shape, or of an array and a number."""
+        letters = ""
+        for value in (left, right):
+            if value.type not in (VECTOR, MATRIX) and not isinstance(value.type, Scalar):
+                raise self.scope.fail(node, f"no arithmetic with {value.type}.")
+            letters += {VECTOR: "v", MATRIX: "m"}.get(value.type, "s")  # type: ignore[arg-type]
+        if letters in ("vm", "mv"):
+            raise self.scope.fail(node, "a vector and a matrix of one shape there are not.")
+        a, b = (self.scope.cast(v, FLOAT) if isinstance(v.type, Scalar) else v.code for v in (left, right))
+        return self.room(f"{name}_{letters}(w, {a}, {b})", MATRIX if "m" in letters else VECTOR)
+
+    def _power(self, node: ast.BinOp) -> Value:
+        base, exponent = self.ordered([node.left, node.right])
+        n = exponent.known
+        if not isinstance(base.type, Scalar) or n is None:
+            raise self.scope.fail(node, "powers are known of numbers, with a constant exponent.")
+        if n == 0.5:
+            return Value(f"sqrt({self.scope.cast(base, FLOAT)})", FLOAT)
+        if int(n) != n or abs(n) > _LARGEST_POWER or (base.type == INT and n < 0):
+            raise self.scope.fail(node, "powers are known for whole exponents up to 16, and 0.5.")
+        if base.type == FLOAT or exponent.type == FLOAT:
+            return Value(f"sn_power_whole({self.scope.cast(base, FLOAT)}, {int(n)})", FLOAT)
+        raise self.scope.fail(node, "powers of whole numbers are not known.")
+
+    # Truth
+
+    def truth(self, value: Value, node: ast.AST) -> str:
+        """Return C that is true where Python takes `value` for true."""
+        if value.type == BOOL:
+            return value.code
+        if not isinstance(value.type, Scalar):
+            raise self.scope.fail(node, "only numbers and Booleans are true or false.")
+        return f"({value.code} != 0)"
+
+    def _compare(self, node: ast.Compare) -> Value:
+        values = self.ordered([node.left, *node.comparators])
+        values = [values[0], *(self.scope.kept(v) for v in values[1:-1]), values[-1]]
+        parts = []
+        for op, left, right in zip(node.ops, values, values[1:], strict=False):
+            if type(op) not in _COMPARISONS or not all(isinstance(v.type, Scalar) for v in (left, right)):
+                raise self.scope.fail(node, "numbers are compared by < <= > >= == != only.")
+            kind = FLOAT if FLOAT in (left.type, right.type) else INT
+            parts.append(f"({self.scope.cast(left, kind)} {_COMPARISONS[type(op)]} {self.scope.cast(right, kind)})")
+        return Value(parts[0] if len(parts) == 1 else "(" + " && ".join(parts) + ")", BOOL)
+
+    def _boolop(self, node: ast.BoolOp) -> Value:
+        sign = "&&" if isinstance(node.op, ast.And) else "||"
+        result = self._booleans(node, node.values[0])
+        for part in node.values[1:]:
+            with self.scope.captured() as lines:
+                value = self._booleans(node, part)
+            if not lines:
+                result = Value(f"({result.code} {sign} {value.code})", BOOL)
+                continue
+            name = self.scope.temporary(BOOL)
+            self.scope.emit(f"{name} = {result.code};")
+            self.scope.emit(f"if ({'' if sign == '&&' else '!'}{name}) {{")
+            self.scope.lines += [*lines, f"{name} = {value.code};", "}"]
+            result = Value(name, BOOL)
+        return result
+
+    def _booleans(self, node: ast.BoolOp, part: ast.expr) -> Value:
+        value = self.value(part)
+        if value.type != BOOL:
+            raise self.scope.fail(node, "`and` and `or` are known between Booleans only.")
+        return value
+
+    def _ifexp(self, node: ast.IfExp) -> Value:
+        test = self.truth(self.value(node.test), node)
+        with self.scope.captured() as yes_lines:
+            yes = self.value(node.body)
+        with self.scope.captured() as no_lines:
+            no = self.value(node.orelse)
+        kind = unified(yes.type, no.type, self.scope.function)
+        if not yes_lines and not no_lines and isinstance(kind, Scalar):
+            return Value(f"({test} ? {self.scope.cast(yes, kind)} : {self.scope.cast(no, kind)})", kind)
+        name = self.scope.temporary(kind)
+        self.scope.emit(f"if ({test}) {{")
+        self.scope.lines += yes_lines
+        self.scope.emit(f"{name} = {self.scope.cast(yes, kind)};")
+        self.scope.emit("} else {")
+        self.scope.lines += no_lines
+        self.scope.emit(f"{name} = {self.scope.cast(no, kind)};")
+        self.scope.emit("}")
+        return Value(name, kind)
+
+    # Entries and parts
+
+    def _subscript(self, node: ast.Subscript) -> Value:
+        if isinstance(node.value, ast.Attribute) and node.value.attr == "shape":
+            return self._shape(node, node.value)
+        base = self.value(node.value)
+        if isinstance(base.type, Arrays):
+            index = self.value(node.slice).known
+            if not isinstance(index, int) or not 0 <= index < len(base.type.ranks):
+                raise self.scope.fail(node, f"a constant below {len(base.type.ranks)} is needed here.")
+            rank = base.type.ranks[index]
+            return Value(f"sn_array{rank}({base.code}, {index})", View(rank))
+        if isinstance(base.type, Bundle):
+            return self._entry(node, base, base.type)
+        if isinstance(base.type, View):
+            return self.part(node, base, base.type)
+        raise self.scope.fail(node, "this has no entries.")
+
+    def _shape(self, node: ast.Subscript, attribute: ast.Attribute) -> Value:
+        base, index = self.value(attribute.value), self.value(node.slice).known
+        if not isinstance(base.type, View) or not isinstance(index, int) or not 0 <= index < base.type.rank:
+            raise self.scope.fail(node, "this dimension is not there.")
+        return Value(f"{base.code}{_length(base.type, index)}", INT)
+
+    def _entry(self, node: ast.Subscript, base: Value, kind: Bundle) -> Value:
+        index = self.value(node.slice)
+        if isinstance(index.known, int) and -len(kind.items) <= index.known < len(kind.items):
+            i = index.known % len(kind.items)
+            return Value(base.code + self.scope.types.field(kind, i), kind.items[i])
+        if index.type != INT or not uniform(kind) or index.known is not None:
+            raise self.scope.fail(node, "this entry of a tuple is not known.")
+        held = self.scope.kept(base)
+        place = self.scope.kept(index)
+        self.scope.emit(
+            f"if ((uint64_t){place.code} >= {len(kind.items)}u) {{ sn_fault(w, SN_INDEX); {place.code} = 0; }}"
+        )
+        return Value(f"{held.code}.f[{place.code}]", kind.items[0])
+
+    def part(self, node: ast.Subscript, base: Value, kind: View) -> Value:
+        """Return an entry, a row or a stretch of an array."""
+        places = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
+        if len(places) > kind.rank:
+            raise self.scope.fail(node, f"the array has {kind.rank} dimensions.")
+        if not any(isinstance(place, ast.Slice) for place in places):
+            return self._at(base, kind, places)
+        if len(places) == 1 and isinstance(places[0], ast.Slice) and not kind.whole and kind.rank < 3:
+            return self._stretch(node, base, kind, places[0])
+        if len(places) == 2 and kind == MATRIX:
+            first, second = places
+            if isinstance(first, ast.Slice) and not isinstance(second, ast.Slice):
+                column = Value(f"sn_column2(w, {base.code}, {self.place(second, base, kind, 1)})", VECTOR)
+                return column if _all(first) else self._stretch(node, self.scope.kept(column), VECTOR, first)
+            if isinstance(second, ast.Slice) and not isinstance(first, ast.Slice):
+                row = Value(f"sn_row2(w, {base.code}, {self.place(first, base, kind, 0)})", VECTOR)
+                return row if _all(second) else self._stretch(node, self.scope.kept(row), VECTOR, second)
+        raise self.scope.fail(node, "this part of an array is not known.")
+
+    def _at(self, base: Value, kind: View, places: list[ast.expr]) -> Value:
+        if kind.whole:
+            return Value(f"(*sn_at_i(w, {base.code}, {self.place(places[0], base, kind, 0)}))", INT)
+        if len(places) == kind.rank:
+            indices = ", ".join(self.place(place, base, kind, i) for i, place in enumerate(places))
+            return Value(f"(*sn_at{kind.rank}(w, {base.code}, {indices}))", FLOAT)
+        code, rank = base.code, kind.rank
+        for i, place in enumerate(places):
+            code, rank = f"sn_row{rank}(w, {code}, {self.place(place, base, kind, i)})", rank - 1
+        return Value(code, View(rank))
+
+    def place(self, node: ast.expr, base: Value, kind: View, dimension: int) -> str:
+        """Return C of an index; a negative constant counts from the end."""
+        index = self.value(node)
+        if index.type != INT:
+            raise self.scope.fail(node, "an index must be a whole number.")
+        if index.known is not None and index.known < 0:
+            return f"({base.code}{_length(kind, dimension)} - {-index.known})"
+        return index.code
+
+    def _stretch(self, node: ast.AST, base: Value, kind: View, cut: ast.Slice) -> Value:
+        if cut.step is not None:
+            raise self.scope.fail(node, "a slice with a step is not known.")
+        if _all(cut):
+            return base
+        if not base.code.isidentifier():
+            base = self.scope.kept(base)
+        low = "0" if cut.lower is None else self.place(cut.lower, base, kind, 0)
+        high = f"{base.code}{_length(kind, 0)}" if cut.upper is None else self.place(cut.upper, base, kind, 0)
+        return Value(f"sn_cut{'2' if kind.rank == 2 else ''}(w, {base.code}, {low}, {high})", kind)
+
+    # Calls
+
+    def _call(self, node: ast.Call) -> Value:
+        function = node.func
+        if isinstance(function, ast.Attribute):
+            if isinstance(function.value, ast.Name) and function.value.id in ("np", "math"):
+                return numpy_call(self, node, function.attr, self.ordered(node.args))
+            return method(self, node, function.attr, self.value(function.value))
+        if not isinstance(function, ast.Name):
+            raise self.scope.fail(node, "this call is not known.")
+        result = self._own(node, self)
+        return plain_call(self, node, function.id) if result is None else result
+
+    def room(self, code: str, kind: Type) -> Value:
+        """Return a new array in a variable of its own: made once, in its turn."""
+        self.scope.allocates = True
+        return self.scope.kept(Value(code, kind))
+
+
+def _length(kind: View, dimension: int) -> str:
+    return ".n" if kind.rank == 1 else f".n{dimension}"
+
+
+def _all(cut: ast.Slice) -> bool:
+    return cut.lower is None and cut.upper is None and cut.step is None
+
+
+def _small(value: Value) -> bool:
+    return value.known is not None and abs(value.known) <= _SMALL_FACTOR
+
+
+def _fold(op: Any, left: Value, right: Value) -> int | None:
+    if left.known is None or right.known is None:
+        return None
+    a, b = int(left.known), int(right.known)
+    return {ast.Add: a + b, ast.Sub: a - b, ast.Mult: a * b}.get(op)

@@ -1,0 +1,28 @@
+"""The runtimes that the library holds, and the rank of each of their arrays.
+
+The types of a runtime's arrays decide all other types in it. A runtime that is not here, or that the translator does
+not know how to write in C, cannot be in a compiled FMU; `refused` says why.
+"""
+
+from __future__ import annotations
+
+# One digit for each array.
+_RANKS = {
+    "softneck.identification._rls_runtime": "122221",
+    "softneck.identification._oe_runtime": "1222211",
+    "softneck.identification._lss_runtime": "122221",
+    "softneck.identification._nlsm_runtime": "122132232221",
+    "softneck.identification._nn_runtime": "1223232213212",
+    "softneck.identification._play_runtime": "12121122221",
+    "softneck.identification._greybox_runtime": "121121",
+    # Those of its members come behind.
+    "softneck.identification._residual_any_runtime": "11213223",
+    "softneck.identification._ensemble_runtime": "11",
+    "softneck.plant._neck_runtime": "2",
+    "softneck.estimation._kalman_runtime": "222222221",
+    "softneck.estimation._steady_kalman_runtime": "222222221222222",
+    "softneck.design._linear_controller_runtime": "2222222222222221",
+    "softneck.loop._reference_runtime": "12",
+}
+
+RANKS: dict[str, tuple[int, ...]] = {name: tuple(map(int, ranks)) for name, ranks in _RANKS.items()}

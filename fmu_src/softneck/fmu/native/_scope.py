@@ -1,0 +1,100 @@
+"""One function on its way to C: its variables, and the lines written so far."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from ._types import BOOL, FLOAT, INT, Bundle, CTypes, Scalar, TranslationError, Type, Value, unified
+
+
+class Scope:
+    """What a function translator writes into.
+
+    Attributes:
+        lines: of C.
+        variables: name -> type, widened from pass to pass.
+        allocates: whether the function takes room in the workspace.
+    """
+
+    def __init__(self, function: str, types: CTypes, variables: dict[str, Type]) -> None:
+        self.function, self.types, self.variables = function, types, variables
+        self.lines: list[str] = []
+        self.temporaries: list[tuple[str, Type]] = []
+        self.allocates = False
+        self.widened = False
+
+    def emit(self, line: str) -> None:
+        """Write one line."""
+        self.lines.append(line)
+
+    def fail(self, node: ast.AST, text: str) -> TranslationError:
+        """Return the error that says which part of the function cannot be translated."""
+        shown = ast.unparse(node) if isinstance(node, ast.expr | ast.stmt) else type(node).__name__
+        return TranslationError(f"{self.function}: `{shown.splitlines()[0][:80]}`: {text}")
+
+    def bind(self, name: str, kind: Type) -> Type:
+        """Give a variable a type that holds `kind` beside what it held before, and return that."""
+        before = self.variables.get(name)
+        after = kind if before is None else unified(before, kind, f"{self.function}: `{name}`")
+        if after != before:
+            self.variables[name] = after
+            self.widened = True
+        return after
+
+    def temporary(self, kind: Type) -> str:
+        """Return the name of a new C variable."""
+        name = f"t{len(self.temporaries)}"
+        self.temporaries.append((name, kind))
+        return name
+
+    def kept(self, value: Value) -> Value:
+        """Return `value` in a variable of its own, evaluated here."""
+        if value.known is not None:
+            return value
+        name = self.temporary(value.type)
+        self.emit(f"{name} = {value.code};")
+        return Value(name, value.type)
+
+    @contextmanager
+    def captured(self) -> Iterator[list[str]]:
+        """Collect lines apart from those written so far."""
+        outside, self.lines = self.lines, []
+        try:
+            yield self.lines
+        finally:
+            self.lines = outside
+
+    def taken_back(self, before: int) -> list[str]:
+        """Take back the lines written since there were `before` of them, and return them."""
+        written = self.lines[before:]
+        del self.lines[before:]
+        return written
+
+    def cast(self, value: Value, kind: Type) -> str:
+        """Return C that turns `value` into `kind`, which holds it."""
+        if value.type == kind:
+            return value.code
+        if isinstance(value.type, Scalar) and isinstance(kind, Scalar):
+            if kind == FLOAT and value.known is not None:
+                return repr(float(value.known))
+            if kind == FLOAT:
+                return f"((double)({value.code}))"
+            if kind == INT and value.type == BOOL:
+                return f"((int64_t)({value.code}))"
+        if isinstance(value.type, Bundle) and isinstance(kind, Bundle):
+            held = self.kept(value)
+            items = [
+                self.cast(Value(held.code + self.types.field(value.type, i), item), kind.items[i])
+                for i, item in enumerate(value.type.items)
+            ]
+            return self.bundled(items, kind)
+        raise TranslationError(f"{self.function}: {value.type} cannot become {kind}.")
+
+    def bundled(self, items: list[str], kind: Bundle) -> str:
+        """Return C of a tuple, in a variable of its own."""
+        name = self.temporary(kind)
+        for i, item in enumerate(items):
+            self.emit(f"{name}{self.types.field(kind, i)} = {item};")
+        return name

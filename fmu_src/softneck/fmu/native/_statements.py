@@ -1,0 +1,248 @@
+"""Statements to C."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable
+from typing import Any
+
+from ._expressions import Expressions
+from ._scope import Scope
+from ._types import FLOAT, INT, MATRIX, NONE, VECTOR, Bundle, Scalar, Type, Value, View, unified
+
+
+class Statements:
+    """Writes the statements of one function into its scope.
+
+    Attributes:
+        result: type of what it returns, widened from pass to pass; None before the first `return`.
+    """
+
+    def __init__(self, function: ast.FunctionDef, scope: Scope, expressions: Expressions, result: Type | None) -> None:
+        self.scope, self.ex, self.result = scope, expressions, result
+        self._function = function
+
+    def block(self, statements: list[ast.stmt]) -> None:
+        """Write statements one after the other."""
+        for node in statements:
+            handler: Callable[[Any], None] | None = getattr(self, f"_{type(node).__name__.lower()}", None)
+            if handler is None:
+                raise self.scope.fail(node, "no C is known for this statement.")
+            handler(node)
+
+    # Simple ones
+
+    def _expr(self, node: ast.Expr) -> None:
+        if not isinstance(node.value, ast.Constant):  # a docstring
+            value = self.ex.value(node.value)
+            if value.code and not value.code.isidentifier():
+                self.scope.emit(f"(void){value.code};" if value.type != NONE else f"{value.code};")
+
+    def _pass(self, node: ast.Pass) -> None:
+        del node
+
+    def _break(self, node: ast.Break) -> None:
+        del node
+        self.scope.emit("break;")
+
+    def _continue(self, node: ast.Continue) -> None:
+        del node
+        self.scope.emit("continue;")
+
+    def _raise(self, node: ast.Raise) -> None:
+        del node
+        self.scope.emit(f'sn_fault(w, "{self.scope.function}: refuses this model");')
+
+    def _return(self, node: ast.Return) -> None:
+        constant = isinstance(node.value, ast.Constant) and node.value.value is None
+        if node.value is None or constant:
+            self._returned(NONE, node)
+            self.scope.emit("goto leave;")
+            return
+        value = self.ex.value(node.value)
+        kind = self._returned(value.type, node)
+        if kind != NONE:
+            self.scope.emit(f"result = {self.scope.cast(value, kind)};")
+        self.scope.emit("goto leave;")
+
+    def _returned(self, kind: Type, node: ast.AST) -> Type:
+        before = self.result
+        if before is not None and NONE in (kind, before) and kind != before:
+            raise self.scope.fail(node, "either every `return` gives something or none.")
+        self.result = kind if before is None else unified(before, kind, self.scope.function)
+        self.scope.widened |= before is not None and self.result != before
+        return self.result
+
+    # Assignment
+
+    def _assign(self, node: ast.Assign) -> None:
+        if len(node.targets) == 1 and isinstance(node.targets[0], ast.Tuple) and isinstance(node.value, ast.Tuple):
+            # All right sides before any left one; no tuple is made.
+            values = self.ex.ordered(node.value.elts)
+            if len(values) == len(node.targets[0].elts):
+                held = values if len(values) == 1 else [self._own_copy(value) for value in values]
+                for target, value in zip(node.targets[0].elts, held, strict=True):
+                    self.assign(target, value)
+                return
+        value = self.ex.value(node.value)
+        if len(node.targets) > 1:
+            value = self.scope.kept(value)
+        for target in node.targets:
+            self.assign(target, value)
+
+    def _own_copy(self, value: Value) -> Value:
+        return value if value.known is not None else self.scope.kept(value)
+
+    def _annassign(self, node: ast.AnnAssign) -> None:
+        if node.value is not None:
+            self.assign(node.target, self.ex.value(node.value))
+
+    def assign(self, target: ast.expr, value: Value) -> None:
+        """Write `target = value`."""
+        if value.type == NONE:
+            raise self.scope.fail(target, "there is no value to keep.")
+        if isinstance(target, ast.Name):
+            if target.id != "_":
+                kind = self.scope.bind(target.id, value.type)
+                self.scope.emit(f"v_{target.id} = {self.scope.cast(value, kind)};")
+        elif isinstance(target, ast.Tuple):
+            if not isinstance(value.type, Bundle) or len(value.type.items) != len(target.elts):
+                raise self.scope.fail(target, "the tuple has another length.")
+            held = self.scope.kept(value)
+            for i, (part, kind) in enumerate(zip(target.elts, value.type.items, strict=True)):
+                self.assign(part, Value(held.code + self.scope.types.field(value.type, i), kind))
+        elif isinstance(target, ast.Subscript):
+            self._store(target, value)
+        else:
+            raise self.scope.fail(target, "nothing can be assigned to this.")
+
+    def _store(self, target: ast.Subscript, value: Value) -> None:
+        # Python takes the value before it looks for the place.
+        before = len(self.scope.lines)
+        place = self.ex.value(target)
+        if len(self.scope.lines) > before and value.known is None:
+            written = self.scope.taken_back(before)
+            value = self.scope.kept(value)
+            self.scope.lines += written
+        self.put(target, place, value)
+
+    def put(self, node: ast.AST, place: Value, value: Value) -> None:
+        """Write `value` to an entry or into a part of an array."""
+        if isinstance(place.type, Scalar):
+            if place.type == INT and value.type == FLOAT:
+                raise self.scope.fail(node, "a float does not go into whole numbers.")
+            self.scope.emit(f"{place.code} = {self.scope.cast(value, place.type)};")
+        elif place.type in (VECTOR, MATRIX) and isinstance(value.type, Scalar):
+            rank = 1 if place.type == VECTOR else 2
+            self.scope.emit(f"sn_fill{rank}({place.code}, {self.scope.cast(value, FLOAT)});")
+        elif place.type in (VECTOR, MATRIX) and value.type == place.type:
+            self.scope.emit(f"sn_set{1 if place.type == VECTOR else 2}(w, {place.code}, {value.code});")
+        else:
+            raise self.scope.fail(node, f"{value.type} does not go into {place.type}.")
+
+    def _augassign(self, node: ast.AugAssign) -> None:
+        place = self.ex.value(node.target)
+        if isinstance(place.type, View):
+            self._in_place(node, place)
+        elif isinstance(node.target, ast.Subscript):
+            # Python reads the entry before it works out what to add.
+            old = self.scope.kept(place)
+            self.put(node, place, self.ex.binary(node, old, self.ex.value(node.value)))
+        else:
+            self.assign(node.target, self.ex.binary(node, place, self.ex.value(node.value)))
+
+    def _in_place(self, node: ast.AugAssign, place: Value) -> None:
+        names: dict[type, str] = {ast.Add: "add", ast.Sub: "sub", ast.Mult: "mul", ast.Div: "div"}
+        name = names.get(type(node.op))
+        if name is None or place.type not in (VECTOR, MATRIX):
+            raise self.scope.fail(node, "this is not known in place.")
+        value = self.ex.value(node.value)
+        number = isinstance(value.type, Scalar)
+        if not number and value.type != place.type:
+            raise self.scope.fail(node, f"{value.type} does not go into {place.type}.")
+        letters = {(VECTOR, False): "iv", (VECTOR, True): "is", (MATRIX, False): "im", (MATRIX, True): "ims"}
+        code = self.scope.cast(value, FLOAT) if number else value.code
+        self.scope.emit(f"sn_{name}_{letters[(place.type, number)]}(w, {place.code}, {code});")
+
+    # Control
+
+    def _if(self, node: ast.If) -> None:
+        test = self.ex.value(node.test)
+        if test.known is not None:  # what is left out need not be known in C
+            self.block(node.body if test.known else node.orelse)
+            return
+        self.scope.emit(f"if ({self.ex.truth(test, node)}) {{")
+        self.block(node.body)
+        if node.orelse:
+            self.scope.emit("} else {")
+            self.block(node.orelse)
+        self.scope.emit("}")
+
+    def _while(self, node: ast.While) -> None:
+        if node.orelse:
+            raise self.scope.fail(node, "`else` of a loop is not known.")
+
+        def head() -> None:
+            test = self.ex.value(node.test)
+            if test.known is None:
+                self.scope.emit(f"if (!{self.ex.truth(test, node)}) break;")
+            elif not test.known:
+                self.scope.emit("break;")
+            self.scope.emit("if (SN_RARE(w->fault != NULL) || !sn_rounds(w, 1)) break;")
+
+        self._rounds(node, "for (;;) {", head)
+
+    def _for(self, node: ast.For) -> None:
+        call, target = node.iter, node.target
+        plain = isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "range"
+        if not plain or node.orelse or not isinstance(target, ast.Name) or not isinstance(call, ast.Call):
+            raise self.scope.fail(node, "`for NAME in range(...)` is the only loop known.")
+        borders = self.ex.ordered(call.args)
+        step = borders[2].known if len(borders) == 3 else 1
+        if any(border.type != INT for border in borders) or not isinstance(step, int) or step == 0:
+            raise self.scope.fail(node, "`range` takes whole numbers, its step a constant.")
+        first = borders[0] if len(borders) > 1 else Value("0", INT, 0)
+        last = borders[1] if len(borders) > 1 else borders[0]
+        counter, end = self.scope.temporary(INT), self.scope.temporary(INT)
+        self.scope.emit(f"{counter} = {first.code}; {end} = {last.code};")
+        ahead, sign = (f"{end} - {counter}", "<") if step > 0 else (f"{counter} - {end}", ">")
+        if first.known is None or last.known is None:
+            self.scope.emit(f"if (!sn_rounds(w, {ahead})) {end} = {counter};")
+
+        def head() -> None:
+            if target.id != "_":
+                kind = self.scope.bind(target.id, INT)
+                self.scope.emit(f"v_{target.id} = {self.scope.cast(Value(counter, INT), kind)};")
+
+        self._rounds(node, f"for (; {counter} {sign} {end}; {counter} += {step}) {{", head)
+
+    def _rounds(self, node: ast.For | ast.While, opening: str, head: Callable[[], None]) -> None:
+        """Write a loop; what a round takes of the workspace the next one gets back, unless a name carries it on."""
+        before, self.scope.allocates = self.scope.allocates, False
+        with self.scope.captured() as lines:
+            head()
+            self.block(node.body)
+        if self.scope.allocates and not self._carries(node):
+            mark = self.scope.temporary(INT)
+            self.scope.emit(f"{mark} = (int64_t)w->top;")
+            lines = [f"w->top = (size_t){mark};", *lines]
+        self.scope.allocates |= before
+        self.scope.lines += [opening, *lines, "}"]
+
+    def _carries(self, node: ast.For | ast.While) -> bool:
+        """Return whether an array bound in the loop may be read in a later round or behind it: not told apart."""
+        bound = {
+            name.id for part in ast.walk(node) if isinstance(part, ast.Assign | ast.AnnAssign)
+            for target in ([part.target] if isinstance(part, ast.AnnAssign) else part.targets)
+            for name in ast.walk(target) if isinstance(name, ast.Name) and isinstance(name.ctx, ast.Store)
+        }  # fmt: skip
+        arrays = {name for name in bound if holds_view(self.scope.variables.get(name))}
+        inside = {id(part) for part in ast.walk(node)}
+        names = (part for part in ast.walk(self._function) if isinstance(part, ast.Name) and id(part) not in inside)
+        return bool(arrays & {name.id for name in names})
+
+
+def holds_view(kind: Type | None) -> bool:
+    if isinstance(kind, Bundle):
+        return any(holds_view(item) for item in kind.items)
+    return isinstance(kind, View)

@@ -1,0 +1,329 @@
+/* What the translated runtimes stand on: views of arrays whose every access is checked, a workspace instead of
+ * malloc, and a budget of loop rounds, so that no model file makes a step read elsewhere, allocate or hang. */
+#ifndef SN_BASE_H
+#define SN_BASE_H
+
+#include <float.h>
+#include <math.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#ifdef __GNUC__
+#define SN_COLD __attribute__((noinline, cold))
+#define SN_RARE(x) __builtin_expect(!!(x), 0)
+#else
+#define SN_COLD
+#define SN_RARE(x) (x)
+#endif
+
+/* Rounds of loops that one call may take: seconds, where an honest step takes microseconds. */
+#ifndef SN_FUEL
+#define SN_FUEL 1000000000LL
+#endif
+/* Largest whole number that a double carries exactly; beyond it `int` of Python would be a long one. */
+#define SN_WHOLE 9007199254740992.0
+
+typedef struct { double *p; int64_t n, s; } sn_v1;             /* (n,), stride in elements */
+typedef struct { double *p; int64_t n0, n1, s0, s1; } sn_v2;   /* (n0, n1) */
+typedef struct { double *p; int64_t n0, n1, n2, s0, s1, s2; } sn_v3;
+typedef struct { int64_t *p; int64_t n, s; } sn_i1;
+
+struct sn_kind;
+typedef struct { double *p; int64_t n[3]; int32_t rank; } sn_array;
+typedef struct sn_node {
+    const struct sn_kind *kind;
+    sn_array *arrays;
+    struct sn_node *members;
+    int32_t array_count, member_count;
+} sn_node;
+
+typedef struct {
+    unsigned char *base;
+    size_t size, top, peak;
+    int64_t fuel;
+    const char *fault; /* why the step is worth nothing, NULL while it is */
+    double trash;      /* what a refused access reads and writes */
+    int64_t trash_i;
+} sn_work;
+
+typedef struct sn_kind {
+    const char *name;
+    const signed char *ranks;
+    int32_t array_count, has_members;
+    int64_t (*state_size)(sn_work *, const sn_node *);
+    void (*initialise)(sn_work *, const sn_node *, sn_v1, sn_v1, sn_v1);
+    void (*step)(sn_work *, const sn_node *, sn_v1, sn_v1, sn_v1, sn_v1);
+} sn_kind;
+
+SN_COLD static void sn_fault(sn_work *w, const char *why)
+{
+    if (w->fault == NULL)
+        w->fault = why;
+}
+
+static const char SN_INDEX[] = "an index is outside of its array: model file and kind do not fit together";
+static const char SN_SHAPE[] = "shapes do not fit: model file and kind do not fit together";
+static const char SN_HANGS[] = "a loop does not end: model file and kind do not fit together";
+static const char SN_FULL[] = "the workspace is too small: model file and kind do not fit together";
+static const char SN_NUMBER[] = "a number is too large or not whole where one is counted with";
+
+/* Workspace: a stack that a function leaves as it found it. */
+static void *sn_room(sn_work *w, int64_t count, size_t each)
+{
+    size_t bytes;
+    void *room;
+    if (count < 0 || (uint64_t)count > w->size / each) {
+        sn_fault(w, SN_FULL);
+        return NULL;
+    }
+    bytes = ((size_t)count * each + 15u) & ~(size_t)15u;
+    if (bytes > w->size - w->top) {
+        sn_fault(w, SN_FULL);
+        return NULL;
+    }
+    room = w->base + w->top;
+    w->top += bytes;
+    if (w->top > w->peak)
+        w->peak = w->top;
+    return room;
+}
+
+static sn_v1 sn_new1(sn_work *w, int64_t n)
+{
+    sn_v1 v = {(double *)sn_room(w, n, sizeof(double)), n, 1};
+    if (v.p == NULL) {
+        v.p = &w->trash;
+        v.n = 0;
+    }
+    return v;
+}
+
+static sn_v1 sn_zeros1(sn_work *w, int64_t n)
+{
+    sn_v1 v = sn_new1(w, n);
+    memset(v.p, 0, (size_t)v.n * sizeof(double));
+    return v;
+}
+
+static sn_v2 sn_zeros2(sn_work *w, int64_t n0, int64_t n1)
+{
+    sn_v2 m = {&w->trash, 0, 0, 0, 1};
+    sn_v1 v;
+    if (n0 < 0 || n1 < 0 || (n1 > 0 && n0 > (int64_t)(w->size / sizeof(double)) / n1)) {
+        sn_fault(w, SN_FULL);
+        return m;
+    }
+    v = sn_zeros1(w, n0 * n1);
+    if (v.n == n0 * n1) {
+        m.p = v.p;
+        m.n0 = n0;
+        m.n1 = n1;
+        m.s0 = n1;
+    }
+    return m;
+}
+
+static sn_i1 sn_zeros_i(sn_work *w, int64_t n)
+{
+    sn_i1 v = {(int64_t *)sn_room(w, n, sizeof(int64_t)), n, 1};
+    if (v.p == NULL) {
+        v.p = &w->trash_i;
+        v.n = 0;
+    }
+    memset(v.p, 0, (size_t)v.n * sizeof(int64_t));
+    return v;
+}
+
+/* Entries. */
+static inline double *sn_at1(sn_work *w, sn_v1 v, int64_t i)
+{
+    if (SN_RARE((uint64_t)i >= (uint64_t)v.n)) {
+        sn_fault(w, SN_INDEX);
+        return &w->trash;
+    }
+    return v.p + i * v.s;
+}
+
+static inline int64_t *sn_at_i(sn_work *w, sn_i1 v, int64_t i)
+{
+    if (SN_RARE((uint64_t)i >= (uint64_t)v.n)) {
+        sn_fault(w, SN_INDEX);
+        return &w->trash_i;
+    }
+    return v.p + i * v.s;
+}
+
+static inline double *sn_at2(sn_work *w, sn_v2 m, int64_t i, int64_t j)
+{
+    if (SN_RARE((uint64_t)i >= (uint64_t)m.n0 || (uint64_t)j >= (uint64_t)m.n1)) {
+        sn_fault(w, SN_INDEX);
+        return &w->trash;
+    }
+    return m.p + i * m.s0 + j * m.s1;
+}
+
+static inline double *sn_at3(sn_work *w, sn_v3 c, int64_t i, int64_t j, int64_t k)
+{
+    if (SN_RARE((uint64_t)i >= (uint64_t)c.n0 || (uint64_t)j >= (uint64_t)c.n1 || (uint64_t)k >= (uint64_t)c.n2)) {
+        sn_fault(w, SN_INDEX);
+        return &w->trash;
+    }
+    return c.p + i * c.s0 + j * c.s1 + k * c.s2;
+}
+
+/* Parts. */
+static inline sn_v1 sn_row2(sn_work *w, sn_v2 m, int64_t i)
+{
+    sn_v1 v = {m.p, m.n1, m.s1};
+    if (SN_RARE((uint64_t)i >= (uint64_t)m.n0)) {
+        sn_fault(w, SN_INDEX);
+        v.n = 0;
+        return v;
+    }
+    v.p += i * m.s0;
+    return v;
+}
+
+static inline sn_v1 sn_column2(sn_work *w, sn_v2 m, int64_t j)
+{
+    sn_v2 t = {m.p, m.n1, m.n0, m.s1, m.s0};
+    return sn_row2(w, t, j);
+}
+
+static inline sn_v2 sn_row3(sn_work *w, sn_v3 c, int64_t i)
+{
+    sn_v2 m = {c.p, c.n1, c.n2, c.s1, c.s2};
+    if (SN_RARE((uint64_t)i >= (uint64_t)c.n0)) {
+        sn_fault(w, SN_INDEX);
+        m.n0 = m.n1 = 0;
+        return m;
+    }
+    m.p += i * c.s0;
+    return m;
+}
+
+static inline sn_v2 sn_turned(sn_v2 m)
+{
+    sn_v2 t = {m.p, m.n1, m.n0, m.s1, m.s0};
+    return t;
+}
+
+/* v[a:b] as Python cuts it; a negative border of a variable is refused: none of ours means one. */
+static inline sn_v1 sn_cut(sn_work *w, sn_v1 v, int64_t a, int64_t b)
+{
+    sn_v1 r = {v.p, 0, v.s};
+    if (SN_RARE(a < 0 || b < 0)) {
+        sn_fault(w, SN_INDEX);
+        return r;
+    }
+    if (b > v.n)
+        b = v.n;
+    if (a < b) {
+        r.p += a * v.s;
+        r.n = b - a;
+    }
+    return r;
+}
+
+static inline sn_v2 sn_cut2(sn_work *w, sn_v2 m, int64_t a, int64_t b)
+{
+    sn_v2 r = {m.p, 0, m.n1, m.s0, m.s1};
+    if (SN_RARE(a < 0 || b < 0)) {
+        sn_fault(w, SN_INDEX);
+        return r;
+    }
+    if (b > m.n0)
+        b = m.n0;
+    if (a < b) {
+        r.p += a * m.s0;
+        r.n0 = b - a;
+    }
+    return r;
+}
+
+static inline sn_v1 sn_array1(const sn_node *node, int i)
+{
+    const sn_array *a = node->arrays + i;
+    sn_v1 v = {a->p, a->n[0], 1};
+    return v;
+}
+
+static inline sn_v2 sn_array2(const sn_node *node, int i)
+{
+    const sn_array *a = node->arrays + i;
+    sn_v2 v = {a->p, a->n[0], a->n[1], a->n[1], 1};
+    return v;
+}
+
+static inline sn_v3 sn_array3(const sn_node *node, int i)
+{
+    const sn_array *a = node->arrays + i;
+    sn_v3 v = {a->p, a->n[0], a->n[1], a->n[2], a->n[1] * a->n[2], a->n[2], 1};
+    return v;
+}
+
+/* Loops. */
+static inline int64_t sn_rounds(sn_work *w, int64_t rounds)
+{
+    if (SN_RARE(rounds > w->fuel)) {
+        sn_fault(w, SN_HANGS);
+        return 0;
+    }
+    if (rounds > 0)
+        w->fuel -= rounds;
+    return rounds;
+}
+
+/* Whole numbers, as Python counts. */
+static inline int64_t sn_int(sn_work *w, double x)
+{
+    if (SN_RARE(!(x > -SN_WHOLE && x < SN_WHOLE))) {
+        sn_fault(w, SN_NUMBER);
+        return 0;
+    }
+    return (int64_t)x;
+}
+
+static inline int64_t sn_times(sn_work *w, int64_t a, int64_t b)
+{
+    /* Exact in int64 while both stay below 2^31; what an honest model counts does. */
+    if (SN_RARE(a < -2147483647 || a > 2147483647 || b < -2147483647 || b > 2147483647)) {
+        sn_fault(w, SN_NUMBER);
+        return 0;
+    }
+    return a * b;
+}
+
+static inline int64_t sn_floor_divide(sn_work *w, int64_t a, int64_t b)
+{
+    int64_t q;
+    if (SN_RARE(b == 0 || b == -1)) {
+        if (b == 0)
+            sn_fault(w, SN_NUMBER);
+        return b == 0 || a == INT64_MIN ? 0 : -a;
+    }
+    q = a / b;
+    return a % b != 0 && (a < 0) != (b < 0) ? q - 1 : q;
+}
+
+static inline int64_t sn_modulo(sn_work *w, int64_t a, int64_t b)
+{
+    int64_t r;
+    if (SN_RARE(b == 0 || b == -1)) {
+        if (b == 0)
+            sn_fault(w, SN_NUMBER);
+        return 0;
+    }
+    r = a % b;
+    return r != 0 && (r < 0) != (b < 0) ? r + b : r;
+}
+
+static inline int64_t sn_min_i(int64_t a, int64_t b) { return b < a ? b : a; }
+static inline int64_t sn_max_i(int64_t a, int64_t b) { return b > a ? b : a; }
+static inline int64_t sn_abs_i(int64_t a) { return a < 0 ? -a : a; }
+static inline double sn_min(double a, double b) { return b < a ? b : a; }
+static inline double sn_max(double a, double b) { return b > a ? b : a; }
+
+#endif

@@ -1,0 +1,413 @@
+/* One instance of a model, apart from the version of FMI that it is called by. Value references count inputs, outputs,
+ * parameters. Sample n is at t_0 + n T_s; it is taken in the communication step that begins at or before it, with the
+ * inputs held then. A plant's new outputs show when communication reaches sample n + 1, those of all else at once. */
+#ifndef SN_INSTANCE_H
+#define SN_INSTANCE_H
+
+#include "sn_model.h"
+
+enum { SN_WARN = 1, SN_FAIL = 3 };
+
+/* Share of a sample time: hosts add up their time, and 1e6 steps of 2 ms are off by 1e-7 s at most. */
+#define SN_SAME_TIME 1e-4
+#define SN_MOST_SAMPLES 1e9
+
+typedef struct {
+    sn_model model;
+    sn_work work;
+    sn_v1 values, inputs, outputs, parameters, pending, state;
+    unsigned char *warned;
+    double start, time;
+    int64_t count;
+    int running, stale, stepping;
+    char *instance_name;
+    /* Of the version of FMI. */
+    void (*tell)(void *self, int status, const char *text);
+    void *environment;
+    void *logger;
+} sn_instance;
+
+typedef struct {
+    double start, time;
+    int64_t count, running;
+    double values[];
+} sn_snapshot;
+
+static void sn_say(sn_instance *s, int status, const char *format, ...)
+{
+    char text[SN_TEXT + 100];
+    va_list list;
+    int used = snprintf(text, sizeof text, "%.100s: ", s->model.name != NULL ? s->model.name : "softneck");
+    va_start(list, format);
+    vsnprintf(text + used, sizeof text - (size_t)used, format, list);
+    va_end(list);
+    if (s->tell != NULL)
+        s->tell(s, status, text);
+}
+
+static void sn_free_instance(sn_instance *s)
+{
+    if (s == NULL)
+        return;
+    sn_free_model(&s->model);
+    free(s->work.base);
+    free(s->values.p);
+    free(s->warned);
+    free(s->instance_name);
+    free(s);
+}
+
+static void sn_ready(sn_work *w)
+{
+    w->top = 0;
+    w->fuel = SN_FUEL;
+    w->fault = NULL;
+}
+
+/* Room for what a step keeps for a while: many times what any kind takes. */
+static size_t sn_room_needed(const sn_node *node)
+{
+    size_t bytes = 0;
+    for (int32_t i = 0; i < node->array_count; i++)
+        for (int k = 0; k < node->arrays[i].rank; k++) {
+            size_t n = (size_t)node->arrays[i].n[k];
+            bytes += n <= 512 ? 32u * n * n + 512u * n : n <= 8192 ? 512u * n : 0u;
+        }
+    for (int32_t i = 0; i < node->member_count; i++)
+        bytes += sn_room_needed(&node->members[i]);
+    return bytes;
+}
+
+static int sn_make_room(sn_instance *s)
+{
+    const sn_model *m = &s->model;
+    size_t ports = (size_t)m->n_in + m->n_out + m->n_par, i;
+    int64_t states;
+    double *p;
+    s->work.size = 262144u + sn_room_needed(&m->root) + 64u * ports;
+    s->work.base = (unsigned char *)malloc(s->work.size);
+    if (s->work.base == NULL)
+        return 0;
+    sn_ready(&s->work);
+    states = m->root.kind->state_size(&s->work, &m->root);
+    if (s->work.fault != NULL || states < 0 || states > SN_MOST_STATES) {
+        sn_say(s, SN_FAIL, "%s", s->work.fault != NULL ? s->work.fault : "the model has too many states");
+        return 0;
+    }
+    p = (double *)calloc(ports + m->n_out + (size_t)states + 1u, sizeof(double));
+    s->warned = (unsigned char *)calloc(m->n_in + 1u, 1);
+    if (p == NULL || s->warned == NULL) {
+        free(p);
+        return 0;
+    }
+    s->values = (sn_v1){p, (int64_t)ports, 1};
+    s->inputs = (sn_v1){p, m->n_in, 1};
+    s->outputs = (sn_v1){p + m->n_in, m->n_out, 1};
+    s->parameters = (sn_v1){p + m->n_in + m->n_out, m->n_par, 1};
+    s->pending = (sn_v1){p + ports, m->n_out, 1};
+    s->state = (sn_v1){p + ports + m->n_out, states, 1};
+    for (i = 0; i < ports; i++) /* what nobody connects or sets was not measured */
+        p[i] = i < m->n_in && (m->ports[i].flags & SN_MISSING) ? sn_from_bits(0x7ff8000000000000u) : m->ports[i].start;
+    return 1;
+}
+
+/* As it was when it was made. */
+static void sn_restart(sn_instance *s)
+{
+    const sn_model *m = &s->model;
+    for (int64_t i = 0; i < s->values.n; i++)
+        s->values.p[i] = i < m->n_in && (m->ports[i].flags & SN_MISSING) ? sn_from_bits(0x7ff8000000000000u)
+                                                                        : m->ports[i].start;
+    memset(s->pending.p, 0, (size_t)(s->pending.n + s->state.n) * sizeof(double));
+    memset(s->warned, 0, m->n_in);
+    s->start = s->time = 0.0;
+    s->count = 0;
+    s->running = 0;
+    s->stale = 1;
+}
+
+static int sn_failed(sn_instance *s)
+{
+    if (s->work.fault == NULL)
+        return 0;
+    sn_say(s, SN_FAIL, "%s.", s->work.fault);
+    return 1;
+}
+
+static int sn_check_outputs(sn_instance *s)
+{
+    double sum = 0.0;
+    for (int64_t i = 0; i < s->pending.n; i++)
+        sum += s->pending.p[i];
+    if (sn_finite(sum))
+        return 1;
+    for (int64_t i = 0; i < s->pending.n; i++) {
+        double x = s->pending.p[i];
+        const sn_port *port = &s->model.ports[s->model.n_in + i];
+        if (sn_infinite(x) || (sn_nan(x) && !(port->flags & SN_MISSING))) {
+            sn_say(s, SN_FAIL, "output %.80s became %f at t = %.6g s: the model has diverged.", port->name, x,
+                   s->start + (double)s->count * s->model.sample_time);
+            return 0;
+        }
+    }
+    return 1;
+}
+
+static int sn_initialise(sn_instance *s)
+{
+    const sn_node *root = &s->model.root;
+    if (!s->stale)
+        return 1;
+    memset(s->state.p, 0, (size_t)s->state.n * sizeof(double));
+    sn_ready(&s->work);
+    root->kind->initialise(&s->work, root, s->parameters, s->state, s->pending);
+    if (sn_failed(s) || !sn_check_outputs(s))
+        return 0;
+    memcpy(s->outputs.p, s->pending.p, (size_t)s->pending.n * sizeof(double));
+    s->stale = 0;
+    return 1;
+}
+
+static int sn_begin(sn_instance *s, double start)
+{
+    if (!sn_finite(start)) {
+        sn_say(s, SN_FAIL, "the start time is %f; it must be finite.", start);
+        return 0;
+    }
+    s->start = s->time = start;
+    s->count = 0;
+    return 1;
+}
+
+/* From here on parameters are fixed. */
+static int sn_run(sn_instance *s)
+{
+    if (!sn_initialise(s))
+        return 0;
+    s->running = 1;
+    return 1;
+}
+
+static int sn_take_sample(sn_instance *s)
+{
+    const sn_node *root = &s->model.root;
+    size_t bytes = (size_t)s->pending.n * sizeof(double);
+    if (s->model.plant)
+        memcpy(s->outputs.p, s->pending.p, bytes);
+    sn_ready(&s->work);
+    root->kind->step(&s->work, root, s->parameters, s->state, s->inputs, s->pending);
+    if (sn_failed(s))
+        return 0;
+    s->count++;
+    if (!s->model.plant)
+        memcpy(s->outputs.p, s->pending.p, bytes);
+    return sn_check_outputs(s);
+}
+
+static int sn_do_step(sn_instance *s, double time, double size)
+{
+    double period = s->model.sample_time, slack = SN_SAME_TIME * period, end = time + size;
+    if (!s->running) {
+        sn_say(s, SN_FAIL, "a step before the initialisation has ended.");
+        return 0;
+    }
+    if (!sn_finite(end) || size < 0.0 || (end - s->start) / period - (double)s->count > SN_MOST_SAMPLES) {
+        sn_say(s, SN_FAIL, "a step from %g s over %g s cannot be taken.", time, size);
+        return 0;
+    }
+    if (!sn_initialise(s))
+        return 0;
+    while (s->start + (double)s->count * period < end - slack)
+        if (!sn_take_sample(s))
+            return 0;
+    /* A plant's next outputs belong to the next sample: they show when that is reached. */
+    if (s->model.plant && s->start + (double)s->count * period <= end + slack)
+        memcpy(s->outputs.p, s->pending.p, (size_t)s->pending.n * sizeof(double));
+    s->time = end;
+    return 1;
+}
+
+static void sn_warn_outside(sn_instance *s, uint32_t i, double value)
+{
+    const sn_port *port = &s->model.ports[i];
+    size_t n = strlen(port->name);
+    int angle = n > 10 && strcmp(port->name + n - 10, "_reference") == 0 && strcmp(port->unit, "rad") == 0;
+    if (s->warned[i])
+        return;
+    s->warned[i] = 1;
+    sn_say(s, SN_WARN, "%.80s = %g is outside %g to %g %.20s.%s", port->name, value, port->low, port->high, port->unit,
+           angle ? " Is it in degrees?" : "");
+}
+
+static int sn_set(sn_instance *s, uint32_t i, double value)
+{
+    const sn_port *port;
+    double slack = 1e-9 * (1.0 + fabs(value)); /* a limit that a controller works out may miss by rounding */
+    uint32_t known = s->model.n_in + s->model.n_out;
+    int outside;
+    if (i >= known + s->model.n_par) {
+        sn_say(s, SN_FAIL, "there is no variable %u.", (unsigned)i);
+        return 0;
+    }
+    port = &s->model.ports[i];
+    if (!sn_finite(value) && !((port->flags & SN_MISSING) && sn_nan(value))) {
+        sn_say(s, SN_FAIL, "%.80s was set to %f; it must be finite.", port->name, value);
+        return 0;
+    }
+    outside = (value < port->low - slack || value > port->high + slack);
+    if (i < s->model.n_in) {
+        if (outside)
+            sn_warn_outside(s, i, value);
+    } else if (i < known) {
+        sn_say(s, SN_FAIL, "%.80s is an output and cannot be set.", port->name);
+        return 0;
+    } else if (s->running) {
+        sn_say(s, SN_FAIL, "%.80s is fixed; set it before the initialisation ends.", port->name);
+        return 0;
+    } else if (outside) {
+        sn_say(s, SN_FAIL, "%.80s must be between %g and %g [%.20s]; it was set to %g.", port->name, port->low,
+               port->high, port->unit, value);
+        return 0;
+    } else {
+        s->stale = 1;
+    }
+    s->values.p[i] = value;
+    return 1;
+}
+
+static int sn_get(sn_instance *s, uint32_t i, double *value)
+{
+    if ((int64_t)i >= s->values.n) {
+        sn_say(s, SN_FAIL, "there is no variable %u.", (unsigned)i);
+        return 0;
+    }
+    if (!sn_initialise(s))
+        return 0;
+    *value = s->values.p[i];
+    /* An input that was never set shows its start value: hosts expect a number. */
+    if (i < s->model.n_in && sn_nan(*value))
+        *value = s->model.ports[i].start;
+    return 1;
+}
+
+/* The whole state, to the bit: values, pending outputs and state vector stand behind each other. */
+static size_t sn_snapshot_bytes(const sn_instance *s)
+{
+    return (size_t)(s->values.n + s->pending.n + s->state.n) * sizeof(double);
+}
+
+static sn_snapshot *sn_take_snapshot(sn_instance *s, sn_snapshot *into)
+{
+    if (!sn_initialise(s))
+        return NULL;
+    if (into == NULL)
+        into = (sn_snapshot *)malloc(sizeof *into + sn_snapshot_bytes(s));
+    if (into == NULL) {
+        sn_say(s, SN_FAIL, "no memory for a state.");
+        return NULL;
+    }
+    into->start = s->start;
+    into->time = s->time;
+    into->count = s->count;
+    into->running = s->running;
+    memcpy(into->values, s->values.p, sn_snapshot_bytes(s));
+    return into;
+}
+
+static void sn_go_back(sn_instance *s, const sn_snapshot *from)
+{
+    s->start = from->start;
+    s->time = from->time;
+    s->count = from->count;
+    s->running = (int)from->running;
+    memcpy(s->values.p, from->values, sn_snapshot_bytes(s));
+    s->stale = 0;
+}
+
+/* Serialised: magic, size, CRC-32, GUID (40), the snapshot. */
+#define SN_SERIAL_HEAD 64
+
+static size_t sn_serial_bytes(const sn_instance *s) { return SN_SERIAL_HEAD + sizeof(sn_snapshot) + sn_snapshot_bytes(s); }
+
+static void sn_serialise(const sn_instance *s, const sn_snapshot *from, unsigned char *to)
+{
+    uint64_t size = sn_serial_bytes(s);
+    size_t named = strlen(s->model.guid);
+    uint32_t crc;
+    memset(to, 0, SN_SERIAL_HEAD);
+    memcpy(to, "SNSTATE1", 8);
+    memcpy(to + 8, &size, 8);
+    memcpy(to + 24, s->model.guid, named < 39 ? named : 39);
+    memcpy(to + SN_SERIAL_HEAD, from, (size_t)size - SN_SERIAL_HEAD);
+    crc = sn_crc32(to + 24, (size_t)size - 24);
+    memcpy(to + 16, &crc, 4);
+}
+
+static sn_snapshot *sn_deserialise(sn_instance *s, const unsigned char *from, size_t size)
+{
+    sn_snapshot *made;
+    uint64_t stated = 0;
+    uint32_t crc = 0;
+    char guid[40] = "";
+    size_t named = strlen(s->model.guid);
+    memcpy(guid, s->model.guid, named < 39 ? named : 39);
+    if (size == sn_serial_bytes(s)) {
+        memcpy(&stated, from + 8, 8);
+        memcpy(&crc, from + 16, 4);
+    }
+    if (stated != size || size == 0 || memcmp(from, "SNSTATE1", 8) != 0 || memcmp(from + 24, guid, 40) != 0
+        || crc != sn_crc32(from + 24, size - 24)) {
+        sn_say(s, SN_FAIL, "the FMU state comes from another FMU or is damaged.");
+        return NULL;
+    }
+    made = (sn_snapshot *)malloc(size - SN_SERIAL_HEAD);
+    if (made == NULL) {
+        sn_say(s, SN_FAIL, "no memory for a state.");
+        return NULL;
+    }
+    memcpy(made, from + SN_SERIAL_HEAD, size - SN_SERIAL_HEAD);
+    made->running = made->running != 0;
+    if (!sn_finite(made->start) || !sn_finite(made->time) || made->count < 0 || made->count > INT64_MAX / 2) {
+        free(made);
+        sn_say(s, SN_FAIL, "the FMU state is damaged.");
+        return NULL;
+    }
+    return made;
+}
+
+/* Make an instance from resources/model.bin; `resources` is a path. NULL where that fails; the reason was told. */
+static sn_instance *sn_instantiate(const char *resources, const char *guid, const char *name,
+                                   void (*tell)(void *, int, const char *), void *environment, void *logger)
+{
+    char error[SN_TEXT], path[4096];
+    sn_instance *s = (sn_instance *)calloc(1, sizeof *s);
+    size_t n = name != NULL ? strlen(name) : 0;
+    int fits;
+    if (s == NULL)
+        return NULL;
+    s->tell = tell;
+    s->environment = environment;
+    s->logger = logger;
+    s->instance_name = (char *)calloc(n + 1, 1);
+    if (s->instance_name != NULL && n > 0)
+        memcpy(s->instance_name, name, n);
+    fits = snprintf(path, sizeof path, "%s/model.bin", resources != NULL ? resources : ".") < (int)sizeof path;
+    if (s->instance_name == NULL || !fits) {
+        sn_say(s, SN_FAIL, "the path of the resources is too long.");
+    } else if (!sn_load_model(&s->model, path, error)) {
+        s->model.name = NULL;
+        sn_say(s, SN_FAIL, "%s", error);
+    } else if (guid == NULL || strcmp(guid, s->model.guid) != 0) {
+        sn_say(s, SN_FAIL, "the host's GUID %.60s is not that of the model, %.60s.", guid != NULL ? guid : "(none)",
+               s->model.guid);
+    } else if (sn_make_room(s)) {
+        sn_restart(s);
+        return s;
+    } else {
+        sn_say(s, SN_FAIL, "no memory, or no model of this kind.");
+    }
+    sn_free_instance(s);
+    return NULL;
+}
+
+#endif
