@@ -169,11 +169,11 @@ def _custom() -> Block:
     return CustomSettings(controller=K, gain_spread=0.0).design(_linear()).block()
 
 
-_REFERENCES = ["pitch_reference", "roll_reference", "cocontraction_reference", "pitch", "roll", "healthy", "enabled"]
-
 def _mpc() -> Block:
     return MpcSettings(bandwidth=6.0, moves=5, angle_limit=0.5).design(_linear()).block()
 
+
+_REFERENCES = ["pitch_reference", "roll_reference", "cocontraction_reference", "pitch", "roll", "healthy", "enabled"]
 
 # Kind -> its block, inputs, outputs and parameters that the public face names for it.
 KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...]]] = {

@@ -197,7 +197,9 @@ class _Reader:
         settings = sorted((k, repr(v)) for k, v in table.items() if k != "parameters")
         if key == "fmu":
             return self._open((name, file, *settings), lambda: _fmu_part(file, f"[{name}]", table, as_role))
-        return BlockPart(self._open((role, file), lambda: load(file, role=role).block()))
+        thing = self._open((role, file), lambda: load(file, role=role))
+        # A controller over CasADi is a part, not a block.
+        return thing.part() if getattr(thing, "kind", "") == "nmpc" else BlockPart(thing.block())
 
     def _open(self, key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
         """Return what `make` opens, remembered if this reader shares what it opens; a changed file is opened again."""
@@ -208,10 +210,6 @@ class _Reader:
         if full not in self._opened:
             self._opened[full] = make()
         return self._opened[full]
-            return _fmu_part(file, f"[{name}]", table, as_role)
-        thing = load(file, role=role)
-        # A controller over CasADi is a part, not a block.
-        return thing.part() if getattr(thing, "kind", "") == "nmpc" else BlockPart(thing.block())
 
     def _from_python(self, name: str, path: str) -> Part:
         """Call `package.module:factory`; modules beside the loop file are found too."""
