@@ -112,9 +112,8 @@ def with_bound(settings: Any, bound: float) -> Any:
 
 def heading() -> None:
     """Print the columns."""
-    print(
-        f"{'controller':20} {'5 % settling':>12} {'worst overshoot':>16} {'worst load rms':>15}  all three   processor   Ms nominal / worst"
-    )
+    columns = f"{'controller':20} {'5 % settling':>12} {'worst overshoot':>16} {'worst load rms':>15}"
+    print(f"{columns}  all three   processor   Ms nominal / worst")
 
 
 def line(name: str, result: BakeOffResult, note: str) -> None:
