@@ -132,10 +132,15 @@ def axis_margins(axis: AxisController, plant: AxisPlant, extra_delay: int) -> Ma
 
 def sensitivities(axis: AxisController, plants: Sequence[AxisPlant], extra_delay: int) -> Vector:
     """Return Ms of every plant (plants,); the loops are taken to be stable."""
-    w = frequencies(plants[0].sample_time)[::_COARSE]
+    w = coarse(plants[0].sample_time)
     K = feedback_response(axis, np.exp(1j * w * plants[0].sample_time))
     loops = np.array([K * plant.response(w, extra_delay=extra_delay) for plant in plants])
     return np.max(1.0 / np.abs(1.0 + loops), axis=1)
+
+
+def coarse(sample_time: float) -> Vector:
+    """Return frequencies [rad/s] for many samples, 4 % apart, the Nyquist frequency among them."""
+    return frequencies(sample_time)[::-_COARSE][::-1]
 
 
 def unstable_samples(axis: AxisController, plants: Sequence[AxisPlant], extra_delay: int) -> list[int]:

@@ -135,6 +135,7 @@ class LinearController:
             item = self.design.get(axis, {})
             gains = ", ".join(f"{name} {value:.4g}" for name, value in item.get("gains", {}).items())
             lines.append(f"  {axis}: {gains}; designed for a dead time of {1e3 * item.get('dead_time_s', 0.0):g} ms")
+            lines += _findings(item)
             for title, key in (("as identified", "margins"), ("small moves", "margins_small_moves")):
                 if key in item:
                     lines.append(f"    {title}: {_margins(item[key])}")
@@ -183,6 +184,25 @@ class LinearController:
             least_position=float(header.get("least_position", -MAX_MOTOR)),
             least_cocontraction=float(header.get("least_cocontraction", -MAX_MOTOR)),
         )
+
+
+def _findings(item: Mapping[str, Any]) -> list[str]:
+    """Return a line on the samples that a design was verified on, and one on its reduction."""
+    lines = []
+    if item.get("samples", 1) > 1:
+        worst, lost = item.get("worst_sensitivity"), item.get("samples_unstable", 0)
+        held = f"stable on all {item['samples']} samples" if not lost else f"NOT stable on {lost} of {item['samples']}"
+        lines.append(f"    {held}" + (f", worst Ms {worst:.3g}" if worst is not None else ""))
+    if "gamma" in item:
+        lines.append(f"    gamma {item['gamma']:.4g}")
+    if "reduction" in item:
+        loss = item["reduction"]
+        lines.append(
+            f"    reduced to {item['states']} of {loss['states_before']} states: error at most "
+            f"{loss['error_bound']:.3g} at any frequency, Ms {loss['sensitivity_before']:.4g} before, "
+            f"{loss['sensitivity_after']:.4g} after"
+        )
+    return lines
 
 
 def _margins(values: Mapping[str, float | None]) -> str:

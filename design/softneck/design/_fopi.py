@@ -36,7 +36,7 @@ class FopiSettings(AxisSettings):
     phase_margin: float = math.radians(70.0)
     derivative: float = 0.0
     derivative_order: float = 0.8
-    sections: int = 9
+    sections: int = 13
 
     def __post_init__(self) -> None:
         AxisSettings.__post_init__(self)

@@ -17,9 +17,10 @@ from softneck.core import Matrix, SettingsError, Vector, require_between, requir
 _ORDERS = np.linspace(0.05, 1.95, 96)
 # Relative step of the slopes of phases: the error of a central difference is its square.
 _STEP = 1e-4
-# The band of the approximation: two decades to both sides of the crossover, 9 poles and zeros.
-_DECADES = 2.0
-_SECTIONS = 9
+# The band of the approximation: three decades to both sides of the crossover, 13 poles and zeros; from a tenth to
+# five times the crossover the error stays below 0.5 %.
+_DECADES = 3.0
+_SECTIONS = 13
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,8 +51,8 @@ class FractionalPid:
     def controller(self, dt: float, *, sections: int = _SECTIONS) -> control.StateSpace:
         """Return it in discrete time: s^-lambda is s^-1 times Oustaloup's s^(1 - lambda), with an exact integrator.
 
-        Every pole and zero is mapped by `exp(s dt)`, and the gain is exact at the crossover (Oustaloup et al. 2000,
-        IEEE TCAS-I 47:25).
+        The poles and zeros of the integral are mapped bilinearly, which costs no phase, those of a derivative as
+        exp(s dt); gains are exact at the crossover (Oustaloup et al. 2000, IEEE TCAS-I 47:25).
         """
         require_positive("dt", dt, "s")
         require_whole("sections", sections, 1, 25)
@@ -148,8 +149,11 @@ def _term(
     """Return poles, residues (n,) and the direct gain of s^order, over s if `integrator`, in z."""
     low, span = crossover * 10.0**-_DECADES, 100.0**_DECADES
     k = np.arange(sections)
-    zeros = np.exp(-dt * low * span ** ((k + 0.5 - 0.5 * order) / sections))
-    poles = np.exp(-dt * low * span ** ((k + 0.5 + 0.5 * order) / sections))
+    corners = [low * span ** ((k + 0.5 + side * order) / sections) for side in (-0.5, 0.5)]
+    # Bilinear, a derivative would have its largest gain where noise is, and ring: there corners map as exp(-a dt).
+    zeros, poles = (
+        (2.0 - dt * corner) / (2.0 + dt * corner) if integrator else np.exp(-dt * corner) for corner in corners
+    )
     if abs(order) < 1e-9:
         zeros, poles = np.zeros(0), np.zeros(0)
     if integrator:

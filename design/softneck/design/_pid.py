@@ -14,17 +14,14 @@ from softneck.core import SettingsError, Vector, require_between, require_one_of
 from softneck.estimation import AxisPlant
 
 from ._assembly import AxisController
-from ._axis_loop import closed_radius, conditioning_gain
+from ._axis_loop import closed_radius, coarse, conditioning_gain
 from ._axis_settings import AxisSettings, Found, slowest_time
-from ._margins import frequencies
 from ._sweep import Sweep
 from ._uncertain import UncertainAxis
 
 TUNINGS = ("samples", "placement")
 # While gains are searched the reference is filtered this slowly [s]: only the load is judged.
 _WHILE_SEARCHING = 0.3
-# Every fourth frequency, 4 % apart: see `_axis_loop`.
-_COARSE = 4
 _STARTS = (1.0, 2.0)
 # Nelder-Mead ends where neither the gains nor the load's rms move by more than 0.2 %.
 _OPTIONS = {"xatol": 2e-3, "fatol": 1e-3, "maxfev": 220}
@@ -185,7 +182,7 @@ class _Judge:
     @classmethod
     def of(cls, settings: PidSettings, axis: UncertainAxis) -> _Judge:
         dt = axis.sample_time
-        w = frequencies(dt)[::_COARSE]
+        w = coarse(dt)
         loops = np.array([plant.response(w, extra_delay=settings.extra_delay) for plant in axis.samples])
         return cls(settings, settings._sweep(axis), np.exp(1j * w * dt), loops, dt, axis.nominal.static_gain)
 

@@ -12,6 +12,7 @@ from scipy.signal import lfilter
 from softneck.core import Matrix, SettingsError, Vector
 from softneck.estimation import AxisPlant
 
+from ._axis_loop import coarse
 from ._margins import frequencies
 
 # Loop gains that are tried, in units of the plant's static gain, 5 % apart and refined to 0.1 % at the border.
@@ -23,7 +24,6 @@ _TIMES = np.geomspace(0.2, 3.0, 40)
 _HORIZON = 4.0
 # Up to so many plants are judged on the fine grid and all at once; more of them 4 % apart, the deciding ones alone.
 _FEW = 3
-_COARSE = 4
 # A reference filter slower than this [s] would be no answer to overshoot.
 _SLOWEST_FILTER = 2.0
 
@@ -53,7 +53,7 @@ def tune_pi(plants: Plants, extra_delay: int, max_sensitivity: float, phase_marg
         SettingsError: none do.
     """
     plant = plants[0]
-    w = frequencies(plant.sample_time)[:: 1 if len(plants) <= _FEW else _COARSE]
+    w = frequencies(plant.sample_time) if len(plants) <= _FEW else coarse(plant.sample_time)
     z = np.exp(1j * w * plant.sample_time)
     # (plants, frequencies)
     G = np.array([item.response(w, extra_delay=extra_delay) for item in plants]) / plant.static_gain
