@@ -166,7 +166,7 @@ def test_a_wrong_setting_of_a_network(call: Call, tmp_path: Path, recording: Pat
         (("record", "steps", "-o", "r.csv", "--duration", "0"), "`duration` must be between 0.02 and 86400 [s]"),
         (("record", "eq22", "-o", "r.csv", "--duration", "0.001"), "r"),
         (("record", "steps", "-o", "r.xlsx", "--duration", "1"), "a recording is a `.csv` or a `.parquet` file"),
-        (("design", "lqg", "MODEL", "-o", "c.npz"), "`lqg` is no kind of controller; use one of pi"),
+        (("design", "lqr", "MODEL", "-o", "c.npz"), "`lqr` is no kind of controller; use one of pi"),
         (("design", "pi", "MODEL", "-o", "c.npz", "--set", "luck=1"), "there is no setting `luck`"),
         (("observer", "MODEL", "-o", "o.npz", "--sensor", "nose"), "nose"),
         (("simulate", "none.toml"), "none.toml: no such file"),

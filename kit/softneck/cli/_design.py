@@ -12,7 +12,7 @@ from softneck.core import KINDS, SettingsError, find_kind, kinds_of, load, refus
 from ._console import print_json, progress
 from ._options import apply_settings, force_option, json_option, output_option, set_option, target
 
-_KINDS = "\n".join(f"  {name:6} {KINDS[name].summary}" for name in kinds_of("controller"))
+_KINDS = "\n".join(f"  {name:9} {KINDS[name].summary}" for name in kinds_of("controller"))
 
 
 @click.command(
