@@ -30,3 +30,9 @@ def test_the_pictures_of_set_membership_are_those_of_the_docs(tmp_path: Path, mo
     names = {path.name for path in tmp_path.glob("*.svg")}
     assert len(names) == 4
     assert names == {path.name for path in (ROOT / "docs" / "_static").glob("set_membership_*.svg")}
+
+
+def test_the_picture_of_limits_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["mpc_limits.py", str(tmp_path)])
+    runpy.run_path(str(ROOT / "examples" / "mpc_limits.py"), run_name="__main__")
+    assert (tmp_path / "mpc_limits.png").is_file()
