@@ -12,6 +12,7 @@ from typing import Any
 
 from softneck.core import Block, DataError, FileFormatError, SettingsError, SoftneckError, file_hash, load
 from softneck.loop import (
+    AheadReference,
     BlockPart,
     Fault,
     Loop,
@@ -89,6 +90,8 @@ def reference_of(path: str | Path) -> ReferenceBlock:
     table = read_toml(source)
     try:
         reference = _Reader(source).reference(table["reference"])
+        if isinstance(reference, AheadReference):
+            reference = reference.reference
         if hasattr(reference, "advance"):
             raise SettingsError("[reference] is an FMU already.")
         return ReferenceBlock(reference, sample_time=_number("sample_time_s", table.get("sample_time_s", 0.02)))  # pyright: ignore[reportArgumentType]
@@ -133,7 +136,7 @@ class _Reader:
         parts = {name: self._part(name, part) for name, part in tables.items()}
         parts |= {name: self._other(name, part) for name, part in others.items()}
         tables |= others
-        reference = self.reference(table["reference"])
+        reference = self.reference(table["reference"], parts["controller"].sample_time)
         if isinstance(reference, FmuPart | IsolatedPart):
             parts["reference"], tables["reference"] = reference, table["reference"]
         # What the file calls a parameter of a part may be one of its inputs, held constant.
@@ -231,6 +234,14 @@ class _Reader:
         if isinstance(table, dict) and OBJECT in table:
             made: Any = table[OBJECT]
             return made if callable(made) else _part_of("reference", made)
+    def reference(self, table: Any, sample_time: float = 0.02) -> Reference | Part:
+        """Return what the table [reference] describes; with `ahead_s` a part that tells it so long before."""
+        if isinstance(table, dict) and "ahead_s" in table:
+            rest = {key: value for key, value in table.items() if key != "ahead_s"}
+            made = self.reference(rest)
+            if hasattr(made, "advance"):
+                raise SettingsError("[reference] ahead_s: an FMU cannot be asked what it will say; leave it out.")
+            return AheadReference(made, _number("[reference] ahead_s", table["ahead_s"]), sample_time=sample_time)  # pyright: ignore[reportArgumentType]
         if isinstance(table, dict) and "fmu" in table:
             return self._made("reference", table, ("fmu",), None, as_role="reference")
         if not isinstance(table, dict) or table.get("kind") not in _REFERENCES:

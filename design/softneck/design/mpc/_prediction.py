@@ -46,6 +46,7 @@ class Problem:
         angles: whether angles are limited.
         tautness: (3, 2) how much an angle loosens each tendon [rad/rad]; None for no limit.
         disturbance_time: of the output disturbance's rate [s]; None for the plant's own.
+        guard: samples after the dead time from which on limits of angles are looked at.
     """
 
     scenarios: tuple[Scenario, ...]
@@ -59,6 +60,7 @@ class Problem:
     angles: bool = False
     tautness: Matrix | None = None
     disturbance_time: float | None = None
+    guard: int = 1
 
     @property
     def order(self) -> int:
@@ -91,9 +93,17 @@ class Problem:
         return 2 * len(self.scenarios) * (self.order + 2) + 2 * self.rows + 5
 
     @property
-    def checked(self) -> tuple[int, ...]:
-        """Samples after the dead time at which soft limits are looked at: at the end of each move's hold."""
+    def ends(self) -> tuple[int, ...]:
+        """Ends of the moves' holds."""
         return (*self.starts[1:], self.horizon)
+
+    @property
+    def checked(self) -> tuple[int, ...]:
+        """Samples after the dead time at which limits of angles are looked at: `ends` from `guard` on.
+
+        Looked at sooner, a limit would ask for a loop that is as fast as the samples, and the neck would swing on it.
+        """
+        return tuple(end for end in self.ends if end >= min(self.guard, self.horizon))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -243,7 +253,7 @@ def _soft_rows(
                     rows += [paths[axis][i - 1] - slack[0], paths[axis][i - 1] + slack[0]]
                     kinds += [(rt.MPC_ROW_ANGLE_HIGH, float(axis)), (rt.MPC_ROW_ANGLE_LOW, float(axis))]
     if p.tautness is not None:
-        for i in p.checked:
+        for i in p.ends:
             for j in range(3):
                 loosened = sum(p.tautness[j, axis] * angles[0][axis][i - 1] for axis in range(2))
                 rows.append(motors[i - 1][j] - loosened + slack[-1])

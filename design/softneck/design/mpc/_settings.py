@@ -82,6 +82,7 @@ class MpcSettings:
         slack_weight: on violations of soft limits, against errors of the angles, squared.
         disturbance_time: time constant of the output disturbance's rate [s]; None for the plant's own, as a load at its
             input makes it. A longer one follows what keeps changing, such as a payload carried round, less robustly.
+            input makes it. A longer one follows what keeps changing and is less robust.
         budget: iterations of the solver for each sample; beyond them the previous plan goes on.
         least_delay: the dead time is taken as at least this [s]; a fit of free runs hides it in the pole.
         small_move_pole: the design must hold as well where the slowest pole is as fast as this [1/s]; 0 for the
@@ -245,6 +246,7 @@ class MpcSettings:
             angles=self.angle_limit is not None,
             tautness=None if self.minimum_tautness is None else lever,
             disturbance_time=self.disturbance_time,
+            guard=guard_samples(bandwidth, nominal[0].sample_time),
         )
 
     def _families(self, nominal: Pair) -> list[Pair]:
@@ -300,6 +302,11 @@ class MpcSettings:
             "starts": list(self.starts),
         }  # fmt: skip
         return arrays, found
+
+
+def guard_samples(bandwidth: float, sample_time: float) -> int:
+    """Return after how many samples soft limits are looked at: the time constant of the loop."""
+    return max(1, round(1.0 / (bandwidth * sample_time)))
 
 
 def spaced_starts(horizon: int, moves: int) -> tuple[int, ...]:
