@@ -10,6 +10,7 @@ from ._mu import Structure as Structure
 from ._mu import mu_bounds as mu_bounds
 from ._mu import mu_lower as mu_lower
 from ._mu import mu_upper as mu_upper
+from ._mu import two_scalars as two_scalars
 from ._pi import PiSettings as PiSettings
 from ._robustness import DiskMargin as DiskMargin
 from ._robustness import RobustStability as RobustStability
