@@ -95,7 +95,7 @@ def test_a_real_uncertainty_is_less_than_a_complex_one() -> None:
 
 def test_worst_gain_of_an_uncertain_gain() -> None:
     """(1 + delta/2)/(s + 1) has gain 1.5 at most."""
-    G = control.ss(control.TransferFunction([1.0], [1.0, 1.0]))
+    G: Any = control.ss(control.TransferFunction([1.0], [1.0, 1.0]))
     M = control.StateSpace(G.A, G.B @ [[0.5, 1.0]], np.vstack([np.zeros((1, 1)), G.C]), [[0.0, 1.0], [0.0, 0.0]])
     found = wcgain(M, [(-1, 0)])
     # The bound is found by halves to 1 %.

@@ -9,9 +9,9 @@ import control
 import numpy as np
 import pytest
 
-from softneck.design import diskmargin, mu_bounds, nugap
+from softneck.design import diskmargin, mu_bounds, nugap, two_scalars
 from softneck.verification._gaps import gaps
-from softneck.verification._linear import LinearLaw, diagonal_mu, judged, margins, radii
+from softneck.verification._linear import LinearLaw, judged, margins, radii
 from softneck.verification._plants import (
     AxisBox,
     Plants,
@@ -69,7 +69,7 @@ def test_radii_are_those_of_the_closed_loops_poles(cross: float) -> None:
         first, second = (control.ss(_transfer(plants, row, i)) for i in (0, 1))
         mixed = np.array([[1.0, plants.cross[row, 0]], [plants.cross[row, 1], 1.0]])
         P: Any = control.append(first, second) * control.StateSpace([], [], [], mixed, TS)
-        Ky = control.StateSpace(K.A, K.B[:, 2:], K.C, K.D[:, 2:], TS)
+        Ky: Any = control.StateSpace(K.A, K.B[:, 2:], K.C, K.D[:, 2:], TS)
         closed: Any = control.feedback(P, Ky, sign=1)
         # Poles at zero of multiplicity m are found to eps^(1/m) only; the largest ones are simple.
         assert found[row] == pytest.approx(np.abs(closed.poles()).max(), rel=1e-6)
@@ -102,7 +102,7 @@ def test_margins_are_those_of_python_control() -> None:
 def test_two_complex_scalars_have_a_closed_form() -> None:
     M = np.random.default_rng(0).standard_normal((50, 2, 2, 2)) @ [1.0, 1.0j]
     # The descent ends at log(2)/3000 of the bound.
-    np.testing.assert_allclose(diagonal_mu(M), mu_bounds(M, [(1, 0), (1, 0)]).upper, rtol=1e-3)
+    np.testing.assert_allclose(two_scalars(M), mu_bounds(M, [(1, 0), (1, 0)]).upper, rtol=1e-3)
 
 
 def test_the_margin_of_both_channels_is_that_of_the_system_of_two() -> None:

@@ -25,6 +25,7 @@ from ._mu import Structure as Structure
 from ._mu import mu_bounds as mu_bounds
 from ._mu import mu_lower as mu_lower
 from ._mu import mu_upper as mu_upper
+from ._mu import two_scalars as two_scalars
 from ._ncf import NcfSettings as NcfSettings
 from ._neck_table import FIGURES as FIGURES
 from ._neck_table import NECK_HEAD as NECK_HEAD

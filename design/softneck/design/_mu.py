@@ -304,6 +304,10 @@ def _power(M: Array, structure: Structure, *, iterations: int = _POWER_ITERATION
     """Return max rho(Q M) found over unitary-like Q of the structure, complex blocks only."""
     m, rows = M.shape[:2]
     out_of, into = structure.out_of, structure.into
+    if structure.real.size == 1:
+        return np.linalg.norm(M, 2, axis=(1, 2))
+    if structure.real.size == 2 and M.shape[1:] == (2, 2):
+        return two_scalars(M)
     _, _, Vh = np.linalg.svd(M)
     b = np.conj(Vh[:, 0])
     w = b.copy()
@@ -318,6 +322,18 @@ def _power(M: Array, structure: Structure, *, iterations: int = _POWER_ITERATION
     same = into @ out_of.T
     Q = unit_w[:, :, None] * np.conj(unit_a)[:, None, :] * same
     return np.abs(np.linalg.eigvals(Q @ M)).max(axis=1)
+
+
+def two_scalars(M: Array) -> Array:
+    """Return the structured singular value (...) of 2 x 2 matrices for two complex scalars, exactly.
+
+    With d M d^-1 the determinant stays, and the Frobenius norm is least where both off-diagonal sizes agree; so is
+    the larger singular value, for their squares sum to the one and multiply to the other. Tight for two blocks.
+    """
+    off = np.abs(M[..., 0, 1] * M[..., 1, 0])
+    total = np.abs(M[..., 0, 0]) ** 2 + np.abs(M[..., 1, 1]) ** 2 + 2.0 * off
+    det = np.abs(M[..., 0, 0] * M[..., 1, 1] - M[..., 0, 1] * M[..., 1, 0])
+    return 0.5 * (np.sqrt(total + 2.0 * det) + np.sqrt(np.maximum(total - 2.0 * det, 0.0)))
 
 
 def _norms(v: Array, blocks: Array) -> Array:

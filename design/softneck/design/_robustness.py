@@ -119,7 +119,7 @@ def disk(alpha: float, frequency: float, skew: float) -> DiskMargin:
 
 
 def robstab(M: Any, blocks: Blocks, *, frequency: Vector | None = None, seed: int = 0) -> RobustStability:
-    """Return how much of the uncertainty `w = Delta z`, |Delta| <= 1, the system `z = M w` stands.
+    """Return how much of the uncertainty `w = Delta z`, `|Delta| <= 1`, the system `z = M w` stands.
 
     Where all blocks are real, each gets a complex part of 2 %: real ones alone may have peaks that no grid meets.
 
@@ -148,7 +148,7 @@ def robstab(M: Any, blocks: Blocks, *, frequency: Vector | None = None, seed: in
 
 
 def wcgain(M: Any, blocks: Blocks, *, frequency: Vector | None = None, seed: int = 0) -> WorstCaseGain:
-    """Return bounds of the largest gain from the last inputs to the last outputs over all |Delta| <= 1.
+    """Return bounds of the largest gain from the last inputs to the last outputs over all `|Delta| <= 1`.
 
     The upper bound is the least gamma with `mu [M11 M12; M21/gamma M22/gamma] <= 1` at every frequency (skewed mu,
     Smith and Fan 1991); the lower one is of perturbations that were tried.

@@ -10,6 +10,7 @@ import control
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector
+from softneck.design import two_scalars
 
 from ._plants import Plants
 
@@ -184,21 +185,9 @@ def _margins(plants: Plants, law: LinearLaw, w: Vector) -> dict[str, Vector]:
         for name, values in classical(1.0 / own - 1.0, w).items():
             found[f"{axis}.{name}"] = values
     at_input = inverse(eye - law.feedback(w) @ P)
-    sizes = [diagonal_mu(M - 0.5 * eye).max(axis=1) for M in (S, at_input)]
+    sizes = [two_scalars(M - 0.5 * eye).max(axis=1) for M in (S, at_input)]
     found["mimo.disk_margin"] = 1.0 / np.maximum(*sizes)
     return found
-
-
-def diagonal_mu(M: np.ndarray) -> np.ndarray:
-    """Return the structured singular value (...) of 2 x 2 matrices for two complex scalars, exactly.
-
-    With d M d^-1 the determinant stays, and the Frobenius norm is least where both off-diagonal sizes agree; so is
-    the larger singular value, for their squares sum to the one and multiply to the other. Tight for two blocks.
-    """
-    off = np.abs(M[..., 0, 1] * M[..., 1, 0])
-    total = np.abs(M[..., 0, 0]) ** 2 + np.abs(M[..., 1, 1]) ** 2 + 2.0 * off
-    det = np.abs(M[..., 0, 0] * M[..., 1, 1] - M[..., 0, 1] * M[..., 1, 0])
-    return 0.5 * (np.sqrt(total + 2.0 * det) + np.sqrt(np.maximum(total - 2.0 * det, 0.0)))
 
 
 def classical(L: np.ndarray, w: Vector) -> dict[str, Vector]:

@@ -97,6 +97,12 @@ def _loop(
         duration=STEP_AT + float(table["duration_s"]),
         order=order,
         plant_inputs={"payload": payload},
+        # Nobody knows the step before it comes: a predictive controller sees the reference of now as that of later.
+        connections={
+            f"controller.{port.name}": f"reference.{port.name.removesuffix('_ahead')}"
+            for port in controller.inputs
+            if port.name.endswith("_reference_ahead")
+        },
     )
 
 

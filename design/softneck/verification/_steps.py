@@ -122,6 +122,9 @@ def _run(plants: Plants, block: Block, signals: Matrix, workers: int) -> tuple[n
     outputs = [port.name for port in block.outputs]
     outputs_at = np.array([*(outputs.index(f"motor_setpoint_{j}") for j in (1, 2, 3)), len(outputs)])
     start = np.array([port.start for port in block.inputs])
+    for axis, name in enumerate(("pitch", "roll")):
+        if f"{name}_reference_ahead" in names:  # of a predictive one; the step is there from the start
+            start[names.index(f"{name}_reference_ahead")] = signals[0, axis]
     n, rows = len(plants), signals.shape[0]
     angles, motors = np.empty((n, rows, 2)), np.empty((n, rows, 3))
 
