@@ -129,8 +129,8 @@ def test_an_eds_that_does_not_fit(tmp_path: Path, change: Callable[[str], str], 
 # -- what is on the bus -----------------------------------------------------------------------------------------------
 
 
-def _row(link: VirtualLink, file: DrivesFile, name: str, **options: bool) -> str:
-    report = preflight(link, file, **options)
+def _row(link: VirtualLink, file: DrivesFile, name: str) -> str:
+    report = preflight(link, file)
     assert not report.holds
     bad = [row for row in report.rows if not row.holds]
     assert bad[0].name == name
