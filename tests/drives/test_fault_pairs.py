@@ -29,7 +29,7 @@ def _bus_off(bench: Bench) -> None:
 
 
 # What breaks, one line per row of the fault table; each ends the run within `LATEST`.
-FAULTS: dict[str, Callable[[Bench], None]] = {
+FAULTS: dict[str, Callable[[Bench], object]] = {
     "lost set-points": lambda b: setattr(b.pilot, "act", lambda _: None),
     "bus-off": _bus_off,
     "cable": lambda b: setattr(b.link, "cut", True),

@@ -47,6 +47,7 @@ class VirtualLink:
         tap: called with (time, from_master, frame) for each frame that is on the wire.
         lose: returns whether a frame is lost: (from_master, frame).
         inject: frames of somebody else, delivered to both sides with the next exchange.
+        sampling: whether passing time makes the inclinometer sample; else whoever steps the link does.
     """
 
     def __init__(self, neck: SimulatedNeck) -> None:
@@ -59,6 +60,8 @@ class VirtualLink:
         self.tap: Callable[[float, bool, Frame], None] | None = None
         self.lose: Callable[[bool, Frame], bool] | None = None
         self.inject: list[Frame] = []
+        self.sampling = True
+        self._samples = max(1, round(neck.settings.sample_time / self.cycle))
 
     @property
     def now(self) -> float:
@@ -83,6 +86,8 @@ class VirtualLink:
         """Let one cycle pass: drives, neck, and what the drives say by themselves."""
         self.neck.move()
         self._step += 1
+        if self.sampling and self._step % self._samples == 0:
+            self.neck.sample(self.now)
 
     def receive(self, timeout: float) -> list[Frame]:
         """Return what is there; else let time pass until something comes or `timeout` [s] is over."""

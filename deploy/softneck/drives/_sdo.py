@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +102,8 @@ class Objects:
             raise SdoError(
                 f"node {self.node} does not answer (object {place}); is it on, is its number right?"
             ) from error
+        except (struct.error, ValueError, IndexError) as error:
+            raise SdoError(f"node {self.node} sends what is no answer (object {place}: {error}).") from error
         except KeyError as error:
             raise SdoError(f"the EDS has no object {place}; it does not fit the drive's profile.") from error
 

@@ -61,6 +61,7 @@ class VirtualRun:
     def step(self) -> None:
         """One cycle: sensor, master, frames, and the time until the next."""
         link, master = self.link, self.master
+        link.sampling = False
         now = link.now
         if self.cycles % master.settings.sample_cycles == 0:
             sample = link.neck.sample(now)

@@ -184,7 +184,7 @@ def _look(link: CanLink | VirtualLink, file: DrivesFile) -> Callable[[], Tilt | 
     if isinstance(link, VirtualLink):
 
         def sample() -> Tilt:
-            taken = link.neck.sample(link.now)
+            taken = link.neck.newest
             return Tilt(taken.pitch, taken.roll, taken.pitch_rate, taken.roll_rate, taken.valid)
 
         return sample

@@ -241,7 +241,11 @@ class Master:
         )
         if not there:
             self._arrived_at = _NEVER
-            if now - self.supervisor.since > ramps.timeout:
+            most = ramps.timeout
+            if self.supervisor.phase is Phase.RETREAT:
+                # Without a sensor no longer than the way from the farthest set-point takes.
+                most = min(most, self.settings.limits.position / ramps.speed + ramps.settle + 1.0)
+            if now - self.supervisor.since > most:
                 events.append(Event(now, "ramp_timeout", 0, "the motors do not reach their rest"))
             return
         if self._arrived_at == _NEVER:

@@ -116,6 +116,7 @@ class SimulatedNeck:
             self.motion[row, SERVO_SCALE] = -size if settings.reversed[row] else size
             self.motion[row, SERVO_LAG] = max(0, round(lag / self._h))
             self.motion[row, SERVO_PLACE] = 0
+        self._newest = self._last
         self.drives = tuple(self._drive(row) for row in range(3))
 
     def _drive(self, row: int) -> SimulatedDrive:
@@ -164,6 +165,10 @@ class SimulatedNeck:
 
     def sample(self, now: float) -> TiltSample:
         """Take one sample of the inclinometer; to be called each `sample_time`."""
+        self._newest = self._sampled(now)
+        return self._newest
+
+    def _sampled(self, now: float) -> TiltSample:
         if self._samples:
             self._functions.winch_sense(self._arrays, self._q, self._x, self.disturbance, self.outputs)
         self._samples += 1
@@ -178,6 +183,11 @@ class SimulatedNeck:
             return TiltSample(now, math.nan, math.nan, math.nan, math.nan, False)
         self._last = TiltSample(now, float(y[2]) + jump, float(y[3]), float(y[4]), float(y[5]), True)
         return self._last
+
+    @property
+    def newest(self) -> TiltSample:
+        """The last sample that was taken."""
+        return self._newest
 
     def truth(self) -> Mapping[str, float]:
         """Return the neck's outputs at the last sample by name: true angles, tensions, compression."""

@@ -1,0 +1,249 @@
+"""Bad input: one clear line each, before anything moves."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from softneck.core import FileFormatError, SettingsError, SoftneckError
+from softneck.drives import DrivesFile, SdoError, VirtualLink, default_drives, load_drives, preflight, simulated_neck
+from softneck.drives._link import open_bus
+from softneck.drives._objects import SIZES, require_eds
+from softneck.drives._sdo import Objects, load_eds
+from softneck.drives.master import Frame
+from softneck.drives.simulated import PROFILES
+from softneck.plant import NeckParameters
+
+from ..data import ROOT
+
+IPOS = load_eds("ipos2015")
+EXAMPLE = ROOT / "examples" / "drives" / "drives.toml"
+
+
+def link_to(file: DrivesFile) -> VirtualLink:
+    return VirtualLink(simulated_neck(file, NeckParameters.paper(), sample_time=0.02, homed=True))
+
+
+def written(tmp_path: Path, change: Callable[[str], str]) -> Path:
+    path = tmp_path / "drives.toml"
+    path.write_text(change(EXAMPLE.read_text(encoding="utf-8")), encoding="utf-8")
+    return path
+
+
+# -- the drives file --------------------------------------------------------------------------------------------------
+
+
+def test_the_example_states_the_defaults() -> None:
+    file = load_drives(EXAMPLE)
+    assert file.sensor_kind == "can"
+    plain = default_drives()
+    for name in ("cycle", "guarding", "limits", "zero", "ramps", "neck", "quick_stop", "following"):
+        assert getattr(file, name) == getattr(plain, name), name
+    assert [drive.node for drive in file.drives] == [1, 2, 3]
+    # Angles stand there in rounded degrees, the gear and Eq. 31 with as many digits as one reads.
+    assert file.sensor.angle == pytest.approx(plain.sensor.angle, rel=1e-3)
+    assert file.watch.gain == pytest.approx(plain.watch.gain, rel=1e-3)
+    assert file.drives[0].scale.gear == pytest.approx(plain.drives[0].scale.gear, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("period_s", "periode_s", r"`periode_s` is no key of \[bus\]; it takes period_s, bit_rate"),
+        ("[limits]", "[limit]", "`limit` is no key of the file"),
+        ("node = 2", "node = 1", "three drives need three node numbers; got 1, 1, 3"),
+        ("node = 2", "node = 200", r"\[\[drive\]\] 2: `node` must be a whole number between 1 and 126"),
+        ("node = 3\npeak_current_A = 10.0", "node = 3", r"\[\[drive\]\] 3: `peak_current_A` is missing"),
+        ("current_limit_A = 0.0299", "current_limit_A = 29.9", "beyond the drive's peak current 10 A"),
+        ("current_limit_A = 0.0299", "current_limit_A = 0.00001", "less than one unit"),
+        ("position_rad = 6.0", 'position_rad = "6"', r"\[limits\] position_rad must be a number"),
+        ("time_s = 0.1 ", "time_s = 0.5 ", r"\[guarding\]: `time_s` must be between 0.02 and 0.1 \[s\]"),
+        ("reversed = false", "reversed = 1", r"\[\[drive\]\] 1 reversed must be true or false"),
+        ('profile = "ipos2015"', 'profile = "epos"', "`profile` must be one of ipos2015, ds402"),
+        ("dropout_s = 0.08", "dropout_s = 0.3", r"`dropout` must be between 0\.01 and 0\.09"),
+        ("[bus]", "[bus", "is no TOML"),
+    ],
+)
+def test_a_drives_file_with_a_typo(tmp_path: Path, old: str, new: str, message: str) -> None:
+    path = written(tmp_path, lambda text: text.replace(old, new))
+    with pytest.raises((SettingsError, FileFormatError), match=message) as error:
+        load_drives(path)
+    assert str(error.value).startswith(str(path))
+
+
+def test_two_drives_are_not_enough(tmp_path: Path) -> None:
+    path = written(tmp_path, lambda text: text.replace("[[drive]]                       # motor 3\n", "").replace(
+        "node = 3\npeak_current_A = 10.0\n", ""))  # fmt: skip
+    with pytest.raises(SettingsError, match=r"three \[\[drive\]\] tables are needed.*there are 2"):
+        load_drives(path)
+
+
+# -- EDS --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("profile", list(PROFILES))
+def test_our_eds_is_what_the_simulated_drives_have(profile: str) -> None:
+    dictionary = load_eds(profile)
+    require_eds(dictionary, profile, profile)
+    for (index, subindex), item in PROFILES[profile]().items.items():
+        variable = dictionary.get_variable(index, subindex)
+        assert variable is not None, f"{index:04X}h:{subindex}"
+        if item.size:
+            assert (len(variable) // 8, variable.writable) == (item.size, item.writable), f"{index:04X}h:{subindex}"
+    assert set(SIZES) <= set(PROFILES[profile]().items)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda text: text.replace("[607A]", "[607F]").replace("=0x607A", "=0x607F"), "it has no number at 607Ah:0"),
+        (lambda text: text.replace("ParameterName=Target position\nObjectType=0x7\nDataType=0x0004",
+                                   "ParameterName=Target position\nObjectType=0x7\nDataType=0x0003"),
+         "607Ah:0 has 2 bytes there and 4 here"),
+        (lambda _: "no eds at all", "is no EDS"),
+        (lambda _: "", "is no EDS|has no objects"),
+    ],
+    ids=["object missing", "another size", "no EDS", "empty"],
+)  # fmt: skip
+def test_an_eds_that_does_not_fit(tmp_path: Path, change: Callable[[str], str], message: str) -> None:
+    ours = ROOT / "deploy" / "softneck" / "drives" / "eds" / "ipos2015.eds"
+    path = tmp_path / "mine.eds"
+    path.write_text(change(ours.read_text(encoding="utf-8")), encoding="utf-8")
+    file = default_drives(eds=path)
+    link = link_to(file)
+    sent: list[Frame] = []
+    link.tap = lambda _now, from_master, frame: sent.append(frame) if from_master else None
+    logging.getLogger("canopen").setLevel(logging.CRITICAL)
+    with pytest.raises(FileFormatError, match=message):
+        preflight(link, file)
+    assert sent == []
+
+
+# -- what is on the bus -----------------------------------------------------------------------------------------------
+
+
+def _row(link: VirtualLink, file: DrivesFile, name: str) -> str:
+    report = preflight(link, file)
+    assert not report.holds
+    bad = [row for row in report.rows if not row.holds]
+    assert bad[0].name == name
+    # Nothing moved: no drive ever had power.
+    assert all(drive.axis.state == 0x40 or drive.axis.state == 0x08 for drive in link.neck.drives)
+    return f"{bad[0].found} | {bad[0].advice}"
+
+
+def test_a_node_that_is_missing() -> None:
+    file = default_drives()
+    link = link_to(file)
+    link.neck.drives[1].alive = False
+    assert _row(link, file, "present").startswith("no answer | Is it on")
+
+
+def test_a_node_with_another_identity(tmp_path: Path) -> None:
+    file = load_drives(written(tmp_path, lambda text: text.replace("# serial = 1001", "serial = 4711")))
+    assert "serial 1001 instead of 4711" in _row(link_to(file), file, "identity")
+    assert preflight(link_to(file), file, override=["identity"]).holds
+
+
+def test_another_firmware(tmp_path: Path) -> None:
+    file = load_drives(written(tmp_path, lambda text: text.replace('# firmware = "F514I"', 'firmware = "F515K"')))
+    assert "F514I" in _row(link_to(file), file, "firmware")
+
+
+def test_a_drive_in_another_factor_group() -> None:
+    file = default_drives()
+    link = link_to(file)
+    link.neck.drives[2].axis.values[(0x6093, 1)] = 1000
+    assert "6093h is 1000/1 | Set the factor group to 1/1" in _row(link, file, "factor group")
+
+
+def test_limits_beyond_the_drives() -> None:
+    file = default_drives()
+    link = link_to(file)
+    axis = link.neck.drives[0].axis
+    keep = axis._allowed
+    axis._allowed = lambda key, value: keep(key, value) and not (key == (0x6085, 0) and value > 1000)
+    text = _row(link, file, "limits")
+    assert "node 1 refuses the value" in text
+    assert "beyond what the drive takes" in text
+
+
+def test_a_value_that_does_not_stay() -> None:
+    file = default_drives()
+    link = link_to(file)
+    axis = link.neck.drives[1].axis
+    axis.getters[(0x6007, 0)] = lambda: 0
+    assert "6007h:0 reads 0 after 1 was written" in _row(link, file, "options")
+
+
+def test_a_drive_in_fault() -> None:
+    file = default_drives()
+    link = link_to(file)
+    link.neck.drives[0].axis.trip(0x2310)
+    assert "softneck drives reset" in _row(link, file, "state")
+
+
+def test_a_second_master_within_a_second() -> None:
+    file = default_drives()
+    link = link_to(file)
+    link.inject.append(Frame(0x080))
+    assert "a SYNC" in _row(link, file, "second master")
+    assert link.now <= 1.0
+    link.inject.append(Frame(0x203, b"\x0f\0\0\0\0\0"))
+    assert "set-points to node 3" in _row(link, file, "second master")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("can0", "--bus takes INTERFACE:CHANNEL"),
+        ("nothing:can0", "python-can has no interface `nothing`"),
+        ("socketcan:can_that_is_not", "bus socketcan:can_that_is_not cannot be opened"),
+    ],
+)
+def test_a_bus_that_cannot_be_opened(text: str, message: str) -> None:
+    with pytest.raises(SoftneckError, match=message), open_bus(text):
+        pass
+
+
+# -- SDO --------------------------------------------------------------------------------------------------------------
+
+
+class Liar:
+    """A link whose node answers whatever it likes."""
+
+    def __init__(self, answers: list[bytes]) -> None:
+        self.answers, self.now = answers, 0.0
+
+    def send(self, frames: object) -> None:
+        del frames
+
+    def receive(self, timeout: float) -> list[Frame]:
+        self.now += max(timeout, 1e-3)
+        return [Frame(0x581, self.answers.pop(0))] if timeout and self.answers else []
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    answers=st.lists(st.binary(min_size=0, max_size=8) | st.binary(min_size=8, max_size=8), max_size=6),
+    index=st.sampled_from([0x1000, 0x1008, 0x6064, 0x607D]),
+)
+def test_any_answer_is_a_value_or_one_clear_error(answers: list[bytes], index: int) -> None:
+    objects = Objects(Liar(answers), 1, IPOS)
+    with contextlib.suppress(SdoError):
+        if index == 0x1008:
+            objects.read_text(index)
+        else:
+            objects.read(index, 1 if index == 0x607D else 0)
+
+
+def test_a_value_is_what_the_node_sent() -> None:
+    answer = struct.pack("<BHBi", 0x43, 0x6064, 0, -12345)
+    assert Objects(Liar([answer]), 1, load_eds("ipos2015")).read(0x6064) == -12345
