@@ -57,7 +57,8 @@ def command(line: str, place: Path) -> Path:
     if words[0] == "cd":
         return place / words[1]
     programs = {
-        "softneck": ["-c", "from softneck.cli import main; main()"], "python": [], "pytest": ["-m", "pytest", "-p", "no:cacheprovider"],
+        "softneck": ["-c", "from softneck.cli import main; main()"], "python": [],
+        "pytest": ["-m", "pytest", "-p", "no:cacheprovider"],
     }  # fmt: skip
     run = [sys.executable, *programs[words[0]], *words[1:]]
     done = subprocess.run(run, cwd=place, capture_output=True, text=True, env={**os.environ, "MPLBACKEND": "Agg"})
