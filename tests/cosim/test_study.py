@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 import threading
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from softneck.core import OutputError, SettingsError, load
+from softneck.core import FileFormatError, OutputError, SettingsError, load
 from softneck.cosim import (
     load_loop,
     load_study,
@@ -319,3 +320,24 @@ def test_ranking_puts_limits_before_objectives() -> None:
     assert worst_runs(runs, ["m"], 2)["run"].tolist() == [3, 0]
     with pytest.raises(SettingsError, match="no column of the runs"):
         rank(runs, ["n"])
+
+
+def test_the_virtual_neck_needs_no_fmu(folder: Path, tmp_path: Path) -> None:
+    """`neck` names a preset or a neck file, at the loop's sample time."""
+    (tmp_path / "stiff.toml").write_text("bending_stiffness = 0.9\n")
+    text = 'duration_s = 0.5\nsample_time_s = 0.02\nfolder = "{folder}"\n[plant]\nneck = "{neck}"\n'
+    text += (
+        '[observer]\nfile = "kalman.npz"\n[controller]\nfile = "pi.npz"\n[reference]\nkind = "step"\npitch_deg = 5.0\n'
+    )
+    found = {}
+    for neck in ("paper", str(tmp_path / "stiff.toml")):
+        (tmp_path / "loop.toml").write_text(text.format(folder=folder, neck=neck))
+        found[neck] = simulate(load_loop(tmp_path / "loop.toml"))["pitch"]
+    (tmp_path / "loop.toml").write_text(text.format(folder=folder, neck="paper"))
+    setup = load_loop(tmp_path / "loop.toml")
+    stiff = dataclasses.replace(setup.loop, plant_parameters={"bending_stiffness": 0.9})
+    np.testing.assert_array_equal(simulate(stiff)["pitch"], found[str(tmp_path / "stiff.toml")])
+    assert np.abs(found["paper"] - found[str(tmp_path / "stiff.toml")]).max() > 1e-3
+    (tmp_path / "loop.toml").write_text(text.format(folder=folder, neck="rubber"))
+    with pytest.raises(FileFormatError, match=r"\[plant\]: there is no file .*rubber"):
+        load_loop(tmp_path / "loop.toml")

@@ -228,7 +228,8 @@ class _Reader:
         """Return what the table [reference] describes."""
         if isinstance(table, dict) and OBJECT in table:
             made: Any = table[OBJECT]
-            return made if callable(made) else _part_of("reference", made)
+            part: Any = made if callable(made) else _part_of("reference", made)
+            return part
         if isinstance(table, dict) and "fmu" in table:
             return self._made("reference", table, ("fmu",), None, as_role="reference")
         if not isinstance(table, dict) or table.get("kind") not in _REFERENCES:
