@@ -76,6 +76,12 @@ def test_a_study_s_table_names_what_varied(call: Call, project: Path) -> None:
     assert call("study", "study.toml", "-o", "out", "--workers", "0", "--force").code == 0
 
 
+def test_info_knows_a_study(call: Call, project: Path) -> None:
+    facts = json.loads(call("info", "study.toml", "--json").out)
+    assert (facts["type"], facts["runs"]) == ("study", 12)
+    assert facts["varies"] == "plant.parameters.pole, controller.parameters.gain, order"
+
+
 def test_a_study_of_failures_alone_fails(call: Call, project: Path) -> None:
     (project / "study.toml").write_text('loop = "loop.toml"\n[vary]\n"plant.parameters.fails" = [1.0, 2.0]\n')
     said = call("study", "study.toml", "-o", "out", "--workers", "0", "--json")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+import tempfile
 import threading
 from pathlib import Path
 from typing import Any
@@ -341,3 +342,24 @@ def test_the_virtual_neck_needs_no_fmu(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "loop.toml").write_text(text.format(folder=folder, neck="rubber"))
     with pytest.raises(FileFormatError, match=r"\[plant\]: there is no file .*rubber"):
         load_loop(tmp_path / "loop.toml")
+
+
+def test_parts_vary_by_their_files(folder: Path) -> None:
+    """Plants and controllers on a grid: an identified model, the virtual neck, an FMU of it; each run is its loop."""
+    loop = {"duration_s": 0.5, "plant": "rls.npz", "observer": "kalman.npz", "controller": "pi.npz",
+            "reference": {"kind": "step", "pitch_deg": 5.0}}  # fmt: skip
+    vary = {
+        "plant": ["rls.npz", "paper", "VirtualNeck.fmu"],
+        "controller.file": ["pi.npz"],
+        "reference.roll_deg": [0.0, 2.0],
+    }
+    made = make_study(loop, vary=vary, folder=folder)
+    runs: Any = study(made, workers=0)
+    assert runs["error"].tolist() == [""] * 6
+    assert runs["plant"].tolist() == ["rls.npz"] * 2 + ["paper"] * 2 + ["VirtualNeck.fmu"] * 2
+    assert not list(Path(tempfile.gettempdir()).glob("softneck-*/**/*.so"))  # no FMU is left unpacked
+    for run in range(6):
+        # FMUs were reset between runs, and came out as new ones do.
+        assert runs.loc[run, "pitch.iae"] == simulate(made.setup(run)).metrics["pitch"]["iae"], run
+    with pytest.raises(FileFormatError, match="there is no file"):
+        study(make_study(loop, vary={"controller.file": ["pi.npz", "none.npz"]}, folder=folder), workers=0)
