@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
+import tempfile
 import threading
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from softneck.core import OutputError, SettingsError, load
+from softneck.core import FileFormatError, OutputError, SettingsError, load
 from softneck.cosim import (
     load_loop,
     load_study,
@@ -319,3 +321,45 @@ def test_ranking_puts_limits_before_objectives() -> None:
     assert worst_runs(runs, ["m"], 2)["run"].tolist() == [3, 0]
     with pytest.raises(SettingsError, match="no column of the runs"):
         rank(runs, ["n"])
+
+
+def test_the_virtual_neck_needs_no_fmu(folder: Path, tmp_path: Path) -> None:
+    """`neck` names a preset or a neck file, at the loop's sample time."""
+    (tmp_path / "stiff.toml").write_text("bending_stiffness = 0.9\n")
+    text = 'duration_s = 0.5\nsample_time_s = 0.02\nfolder = "{folder}"\n[plant]\nneck = "{neck}"\n'
+    text += (
+        '[observer]\nfile = "kalman.npz"\n[controller]\nfile = "pi.npz"\n[reference]\nkind = "step"\npitch_deg = 5.0\n'
+    )
+    found = {}
+    for neck in ("paper", str(tmp_path / "stiff.toml")):
+        (tmp_path / "loop.toml").write_text(text.format(folder=folder, neck=neck))
+        found[neck] = simulate(load_loop(tmp_path / "loop.toml"))["pitch"]
+    (tmp_path / "loop.toml").write_text(text.format(folder=folder, neck="paper"))
+    setup = load_loop(tmp_path / "loop.toml")
+    stiff = dataclasses.replace(setup.loop, plant_parameters={"bending_stiffness": 0.9})
+    np.testing.assert_array_equal(simulate(stiff)["pitch"], found[str(tmp_path / "stiff.toml")])
+    assert np.abs(found["paper"] - found[str(tmp_path / "stiff.toml")]).max() > 1e-3
+    (tmp_path / "loop.toml").write_text(text.format(folder=folder, neck="rubber"))
+    with pytest.raises(FileFormatError, match=r"\[plant\]: there is no file .*rubber"):
+        load_loop(tmp_path / "loop.toml")
+
+
+def test_parts_vary_by_their_files(folder: Path) -> None:
+    """Plants and controllers on a grid: an identified model, the virtual neck, an FMU of it; each run is its loop."""
+    loop = {"duration_s": 0.5, "plant": "rls.npz", "observer": "kalman.npz", "controller": "pi.npz",
+            "reference": {"kind": "step", "pitch_deg": 5.0}}  # fmt: skip
+    vary = {
+        "plant": ["rls.npz", "paper", "VirtualNeck.fmu"],
+        "controller.file": ["pi.npz"],
+        "reference.roll_deg": [0.0, 2.0],
+    }
+    made = make_study(loop, vary=vary, folder=folder)
+    runs: Any = study(made, workers=0)
+    assert runs["error"].tolist() == [""] * 6
+    assert runs["plant"].tolist() == ["rls.npz"] * 2 + ["paper"] * 2 + ["VirtualNeck.fmu"] * 2
+    assert not list(Path(tempfile.gettempdir()).glob("softneck-*/**/*.so"))  # no FMU is left unpacked
+    for run in range(6):
+        # FMUs were reset between runs, and came out as new ones do.
+        assert runs.loc[run, "pitch.iae"] == simulate(made.setup(run)).metrics["pitch"]["iae"], run
+    with pytest.raises(FileFormatError, match="there is no file"):
+        study(make_study(loop, vary={"controller.file": ["pi.npz", "none.npz"]}, folder=folder), workers=0)

@@ -11,6 +11,7 @@ import click
 import fmpy
 
 from softneck.core import DataError, FileFormatError, SettingsError, file_hash, load, read_archive, refuse_existing
+from softneck.cosim import load_study
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.signals import Guess, Layout, guess_layout, quality, read_layout, read_recording
 
@@ -28,7 +29,7 @@ _LARGE = 20_000_000
 @force_option
 @json_option
 def command(file: Path, html: Path | None, force: bool, as_json: bool) -> None:
-    """Say what FILE is: a recording, model, observer, controller, FMU, loop, layout, neck, certificate or log.
+    """Say what FILE is: a recording, model, observer, controller, FMU, loop, layout, neck, study, certificate or log.
 
     Of a recording it tells the quality too: faults of its channels, and what its inputs can teach a model. Of a log it
     tells what `softneck import --guess` would take each column for.
@@ -153,13 +154,16 @@ def _fmu(file: Path) -> dict[str, Any]:
 
 
 def _toml(file: Path) -> dict[str, Any]:
-    """Say what a TOML file is: a loop names a plant, a layout names channels, all else must be a neck."""
+    """Say what a TOML file is: a loop names a plant, a study what varies, a layout channels; else it must be a neck."""
     try:
         table = tomllib.loads(file.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise FileFormatError(f"{file}: is no TOML file ({error}).") from error
     if "plant" in table:
         return {"type": "loop", "parts": ", ".join(name for name in table if isinstance(table[name], dict))}
+    if "vary" in table:
+        study = load_study(file)
+        return {"type": "study", "runs": len(study.points), "varies": ", ".join(study.vary)}
     if "channels" in table:
         layout = read_layout(file)
         tilt = ["pitch, roll (from the tilt)"] if layout.inclination else []

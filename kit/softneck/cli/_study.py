@@ -44,7 +44,7 @@ def command(
     \b
     DIR gets  runs.parquet   a row for each run: what varied, seed, metrics, limits, error
               report.html    ranking, Pareto front, distributions, influences
-              worst/*.toml   the worst runs as loop files for softneck simulate
+              worst/         the worst runs as loop files for softneck simulate
     Ctrl-C or a crash loses no finished run: --resume goes on.
     """
     study = load_study(study_file)

@@ -102,7 +102,8 @@ class Cluster:
                 f"no Dask scheduler answers at {address} ({type(error).__name__}); start one with `dask scheduler`."
             ) from error
         self._pool: Executor = self._client.get_executor(pure=False)
-        self.size = max(1, len(self._client.scheduler_info(n_workers=-1)["workers"]))
+        workers = self._client.scheduler_info(n_workers=-1)["workers"].values()
+        self.size = max(1, sum(int(worker["nthreads"]) for worker in workers))
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future:
         """Give work to the cluster; it runs it again elsewhere if a worker dies."""

@@ -242,6 +242,8 @@ class _Reader:
             if hasattr(made, "advance"):
                 raise SettingsError("[reference] ahead_s: an FMU cannot be asked what it will say; leave it out.")
             return AheadReference(made, _number("[reference] ahead_s", table["ahead_s"]), sample_time=sample_time)  # pyright: ignore[reportArgumentType]
+            part: Any = made if callable(made) else _part_of("reference", made)
+            return part
         if isinstance(table, dict) and "fmu" in table:
             return self._made("reference", table, ("fmu",), None, as_role="reference")
         if not isinstance(table, dict) or table.get("kind") not in _REFERENCES:

@@ -11,12 +11,12 @@ from typing import Any
 
 import pandas as pd
 
-from softneck.core import OutputError, Progress, silent
+from softneck.core import OutputError, Progress, SettingsError, silent
 
 from ._executors import Crew, check_sendable, crew
 from ._store import Store
 from ._study import Source, Study, make_study
-from ._study_run import Chunk, Row, failed_row, run_chunk
+from ._study_run import Chunk, Row, failed_row, release, run_chunk
 
 # So much work at a time [s]: a kill loses no more than this, and giving out costs little of it.
 _CHUNK_S = 0.5
@@ -67,7 +67,7 @@ def study(
         loop, vary=vary or {}, runs=runs, seed=seed, sampling=sampling, objectives=objectives
     )  # fmt: skip
     if isinstance(loop, Study) and (vary, runs, objectives) != (None, None, None):
-        raise OutputError("a Study has its own vary, runs and objectives; make another one with `make_study`.")
+        raise SettingsError("a Study has its own vary, runs and objectives; make another one with `make_study`.")
     if output is not None:
         return run_study(made, Path(output), workers=workers, dask=dask, resume=resume, force=force, report=report)
     with tempfile.TemporaryDirectory(prefix="softneck-study-") as folder:
@@ -90,7 +90,10 @@ def run_study(
         check_sendable((dict(study.loop), [item.values for item in study.vary.values()]))
     with crew(workers, dask) as members:
         store = Store(study, folder, resume=resume, force=force)
-        _Work(study, store, members, report).run()
+        try:
+            _Work(study, store, members, report).run()
+        finally:
+            release(study.digest)
     return store.finish()
 
 

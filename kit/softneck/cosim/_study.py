@@ -155,7 +155,9 @@ def load_study(path: str | Path) -> Study:
     source = Path(path)
     table = read_toml(source)
     try:
-        return _from_table(source, table)
+        made = _from_table(source, table)
+        len(made.points)  # numbers of runs that cannot be are the file's fault too
+        return made
     except SoftneckError as error:
         raise (error if str(error).startswith(str(source)) else type(error)(f"{source}: {error}")) from error
 

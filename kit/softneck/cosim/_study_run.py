@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -58,6 +59,15 @@ def run_point(chunk: Chunk, point: Point) -> Row:
     return row
 
 
+def release(digest: str) -> None:
+    """Close what this thread has opened for a study; worker processes end with all that they hold."""
+    opened = _opened(digest, threading.get_ident())
+    for part in opened.values():
+        if hasattr(part, "advance"):
+            part.close()
+    opened.clear()
+
+
 def failed_row(point: Point, error: str) -> Row:
     """Return the row of a run that no process could finish."""
     row: Row = {"run": point.run, "sample": point.sample, "seed": point.seed, **point.labels}
@@ -65,7 +75,7 @@ def failed_row(point: Point, error: str) -> Row:
 
 
 def _judged(chunk: Chunk, point: Point) -> Row:
-    opened = _opened(chunk.digest)
+    opened = _opened(chunk.digest, threading.get_ident())
     setup = make_loop(with_values(chunk.loop, point.values), chunk.folder, opened=opened)
     try:
         result = simulate(setup, compiled=True, keep=True)
@@ -80,8 +90,8 @@ def _judged(chunk: Chunk, point: Point) -> Row:
     return {**values, "holds": result.holds if setup.limits else None}
 
 
-@lru_cache(maxsize=2)
-def _opened(digest: str) -> dict[Any, Any]:
-    """Return what this process has opened for a study."""
-    del digest
+@lru_cache(maxsize=64)
+def _opened(digest: str, thread: int) -> dict[Any, Any]:
+    """Return what this thread has opened for a study: a Dask worker may have several, and an FMU serves one."""
+    del digest, thread
     return {}

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, SettingsError, Vector
+from softneck.core import DataError, Matrix, Port, SettingsError, Vector, to_si
 
 from ._acting import place_faults
 from ._loop import Loop
@@ -195,7 +195,7 @@ class LoopRun:
         signals, units = {}, {}
         by_slot = {item.slot: item for item in self._wiring.named}
         for name, slot in self._columns.items():
-            signals[name], units[name] = self._table[: self.row, slot].copy(), by_slot[slot].port.unit
+            signals[name], units[name] = _in_si(self._table[: self.row, slot], by_slot[slot].port)
         return LoopResult(np.arange(self.row) * self.step, signals, units, self.step)
 
     def state(self) -> LoopState:
@@ -334,6 +334,15 @@ def _columns(wiring: Wiring) -> dict[str, int]:
         name = _signal_name(item, columns, faulty)
         columns[name] = item.slot
     return columns
+
+
+def _in_si(values: Vector, port: Port) -> tuple[Vector, str]:
+    """Return a signal (N,) in SI with its unit; one of a unit that nobody knows stays as it is."""
+    try:
+        factor, unit = to_si(port.unit or "1")
+    except DataError:
+        return values.copy(), port.unit
+    return (values.copy(), port.unit) if factor == 1.0 else (values * factor, unit)
 
 
 def _signal_name(item: Named, taken: Mapping[str, int], faulty: set[str]) -> str:

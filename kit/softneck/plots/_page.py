@@ -33,6 +33,7 @@ _TEMPLATE = """<!doctype html>
 * { box-sizing: border-box; }
 body { font: 16px/1.55 system-ui, sans-serif; color: var(--ink); background: var(--paper); margin: 0 auto;
   max-width: 66rem; padding: 1rem; }
+h1, h2, h3, p, nav a { overflow-wrap: anywhere; }
 h1 { font-size: 1.7rem; line-height: 1.2; } h2 { margin-top: 2.4rem; border-bottom: 1px solid var(--line); }
 nav { display: flex; flex-wrap: wrap; gap: .2rem 1rem; } a { color: inherit; }
 .scroll { overflow-x: auto; }
