@@ -92,6 +92,26 @@ def test_the_echo_finds_an_autoregression_and_is_always_stable() -> None:
     np.testing.assert_array_equal(fit_echo([np.zeros(100)], 3), np.zeros(3))
 
 
+def test_an_echo_for_larger_errors_follows_them_more_closely_and_is_as_stable() -> None:
+    rng = np.random.default_rng(8)
+    smooth = np.zeros(20_000)
+    for k in range(2, smooth.size):
+        smooth[k] = 1.8 * smooth[k - 1] - 0.81 * smooth[k - 2] + 0.05 * rng.standard_normal()
+    noise = rng.standard_normal(smooth.size)
+    plain, bold = (fit_echo([smooth + noise], 8, beyond=factor) for factor in (1.0, 3.0))
+
+    def left(c: np.ndarray, size: float) -> float:
+        e = size * smooth + noise
+        return float(np.mean((e[8:] - sum(c[i] * e[7 - i : e.size - 1 - i] for i in range(8))) ** 2))
+
+    # Each is the better one where its errors are.
+    assert left(plain, 1.0) < left(bold, 1.0)
+    assert left(bold, 3.0) < left(plain, 3.0)
+    # It is the echo that larger errors would have given, but for the noise's estimate from three lags.
+    assert left(bold, 3.0) < 1.05 * left(fit_echo([3.0 * smooth + noise], 8), 3.0)
+    assert np.abs(np.roots(np.concatenate([[1.0], -bold]))).max() < 1.0
+
+
 def test_ridge_without_weight_is_least_squares_and_a_heavy_one_is_the_mean() -> None:
     rng = np.random.default_rng(2)
     X = np.column_stack([np.ones(200), rng.standard_normal((200, 4)) + 3.0])

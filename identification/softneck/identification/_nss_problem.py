@@ -125,9 +125,12 @@ class Records:
         return replace(self, settled=self.settled & rows)
 
     def fit(self, Y: Matrix) -> float:
-        """Return the mean fit [%] of both axes of free runs `Y` (time, 2)."""
+        """Return the mean fit [%] of both axes of free runs `Y` (time, 2); one worse than the mean's counts 0.
+
+        An axis that drifts, which no input explains, does not decide what the other one becomes.
+        """
         y = self.outputs[self.settled]
-        return float(np.mean([nrmse_fit(y[:, axis], Y[self.settled, axis]) for axis in range(2)]))
+        return float(np.mean([max(nrmse_fit(y[:, axis], Y[self.settled, axis]), 0.0) for axis in range(2)]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

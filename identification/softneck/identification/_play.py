@@ -17,7 +17,7 @@ from softneck.core import (
 from softneck.signals import TENDON_ANGLES, Recording, concatenate, redefinition_matrix
 
 from ._checks import check_training
-from ._echo import fit_echo
+from ._echo import BEYOND, fit_echo
 from ._loaded_drive import LoadedDrive, fit_loaded_drive
 from ._model import Model
 from ._play_terms import Data, Form, ridge, scores
@@ -166,7 +166,7 @@ def _arrays(data: Data, drive: LoadedDrive, form: Form, weight: float, order: in
     errors[~good] = np.nan
     edges = np.cumsum([len(motors) for motors in data.motors])[:-1]
     parts: list[Matrix] = np.split(errors, edges)
-    echo = np.array([fit_echo([part[:, axis] for part in parts], order) for axis in range(2)])
+    echo = np.array([fit_echo([part[:, axis] for part in parts], order, beyond=BEYOND) for axis in range(2)])
     history = int(max(order, drive.drive[:, 1].max(), 1))
     return {
         "history": np.array([float(history)]),

@@ -15,7 +15,7 @@ from softneck.signals import TENDON_ANGLES, Recording, concatenate, redefinition
 
 from ._checks import check_training
 from ._contraction import Contraction
-from ._echo import fit_echo
+from ._echo import BEYOND, fit_echo
 from ._loaded_drive import LoadedDrive, fit_loaded_drive
 from ._model import Model
 from ._nss_problem import FUNCTIONS, Records, Shape, free_run
@@ -255,7 +255,7 @@ def _arrays(
     free = np.clip(scales.middle + scales.outputs * Y, limits[:, 0], limits[:, 1])
     errors = np.where(records.settled[:, None], scales.middle + scales.outputs * records.outputs - free, np.nan)
     runs = np.split(errors, np.flatnonzero(records.first)[1:])
-    echo = np.array([fit_echo([run[:, axis] for run in runs], order) for axis in range(2)])
+    echo = np.array([fit_echo([run[:, axis] for run in runs], order, beyond=BEYOND) for axis in range(2)])
     return {
         "history": np.array([float(max(order, drive.drive[:, 1].max(), delay + 1))]),
         "drive": drive.drive,

@@ -1,0 +1,74 @@
+# pyright: reportMissingImports=false
+"""jax-sysid (Bemporad 2024): neural state space, Adam, then L-BFGS-B, started from its own linear model.
+
+Number of states and penalty are chosen by free run on the last fifth of the rows.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_thunk_runtime=false")
+
+import jax.numpy as jnp
+import numpy as np
+from exchange import HOLD_OUT, WARM_UP, FreeRun, answer, fit
+from jax_sysid.models import LinearModel, Model
+
+STATES, PENALTIES = (4, 6), (1e-5, 1e-4)
+NEURONS = 10
+ADAM, LBFGS = 300, 1200
+
+
+def trained(u: np.ndarray, y: np.ndarray, states: int, penalty: float, seed: int) -> Model:
+    """Return a model of scaled data: `x+ = A x + B u + E tanh(F x + G u + h)`, `y = C x + c`."""
+    linear = LinearModel(states, 2, 3, feedthrough=False)
+    linear.loss(rho_x0=1e-4, rho_th=1e-5)
+    linear.optimization(adam_epochs=0, lbfgs_epochs=500, iprint=-1)
+    linear.fit(y, u)
+    A, B, C = (np.asarray(part) for part in linear.params[:3])
+
+    def state(x, u, p):
+        return p[0] @ x + p[1] @ u + p[2] @ jnp.tanh(p[3] @ x + p[4] @ u + p[5])
+
+    def output(x, _u, p):
+        return p[6] @ x + p[7]
+
+    rng = np.random.default_rng(seed)
+    model = Model(states, 2, 3, state_fcn=state, output_fcn=output)
+    model.init(params=[
+        A, B, 0.01 * rng.standard_normal((states, NEURONS)), 0.3 * rng.standard_normal((NEURONS, states)),
+        0.3 * rng.standard_normal((NEURONS, 3)), 0.3 * rng.standard_normal(NEURONS), C, np.zeros(2),
+    ])  # fmt: skip
+    model.loss(rho_x0=1e-4, rho_th=penalty)
+    model.optimization(adam_eta=1e-3, adam_epochs=ADAM, lbfgs_epochs=LBFGS, memory=20, iprint=-1)
+    model.fit(y, u)
+    return model
+
+
+def free_run(model: Model, u: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the free run (time, 2); its start is found from the given rows by jax-sysid's smoother."""
+    x0 = model.learn_x0(u[:WARM_UP], y[:WARM_UP], RTS_epochs=10, verbosity=False)
+    return np.asarray(model.predict(np.asarray(x0), u)[0])
+
+
+def train(u: np.ndarray, y: np.ndarray, seed: int) -> tuple[FreeRun, str]:
+    """Choose by free run on the last fifth, then train on all rows."""
+    spread, middle, size = u.std(axis=0), y.mean(axis=0), y.std(axis=0)
+    v, z, cut = u / spread, (y - middle) / size, round((1.0 - HOLD_OUT) * len(u))
+    tried = []
+    for states in STATES:
+        for penalty in PENALTIES:
+            free = free_run(trained(v[:cut], z[:cut], states, penalty, seed), v[cut:], z[cut:])
+            tried.append((fit(z[cut:], np.nan_to_num(free, nan=1e3)), states, penalty))
+    _, states, penalty = max(tried)
+    model = trained(v, z, states, penalty, seed)
+
+    def run(u: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return middle + size * free_run(model, u / spread, (y - middle) / size)
+
+    return run, f"{states} states, {NEURONS} neurons, penalty {penalty:g}"
+
+
+if __name__ == "__main__":
+    answer(train, "jax-sysid", "jax", "numpy")
