@@ -28,12 +28,18 @@ from ._recordings import read_together
     "--data", multiple=True, type=click.Path(path_type=Path), help="A recording to score a model on, inside the FMU."
 )
 @click.option(
-    "--backend", type=click.Choice(["python", "compiled"]), default="python", show_default=True,
+    "--backend",
+    type=click.Choice(["python", "compiled"]),
+    default="python",
+    show_default=True,
     help="What runs inside: Python and numpy of the host, or a C library that needs neither.",
 )
 @click.option("--fmi", type=click.Choice(["2", "3"]), default="2", show_default=True, help="FMI version; 3: compiled.")
 @click.option(
-    "--platform", "platforms", multiple=True, metavar="NAME",
+    "--platform",
+    "platforms",
+    multiple=True,
+    metavar="NAME",
     help=f"Of a compiled FMU, only for these: {', '.join(PLATFORMS)}.  [default: all that are built]",
 )
 @force_option
@@ -60,9 +66,7 @@ def command(
             judged = _judge(thing, source, data) if data else None
             block, info = thing.block(), describe(thing, validation=judged)
             if backend == "compiled":
-                origin = build_compiled_fmu(
-                    block, path, info=info, force=replace, fmi=int(fmi), platforms=platforms
-                )
+                origin = build_compiled_fmu(block, path, info=info, force=replace, fmi=int(fmi), platforms=platforms)
             else:
                 build_fmu(block, path, info=info, force=replace)
             built.append({"source": str(source), "fmu": str(path)})
