@@ -58,7 +58,7 @@ def _mended(data: bytes) -> bytes:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d: b"", "ends too early"),
+        (lambda _: b"", "ends too early"),
         (lambda d: b"PK" + d[2:], "is no model file"),
         (lambda d: d[:8] + b"\x09" + d[9:], "has format 9; this library reads 1"),
         (lambda d: d[:-8], "and should have"),
@@ -192,7 +192,7 @@ def test_hostile_files_and_states_break_nothing_under_the_sanitizers(tmp_path: P
 
 def test_a_kind_that_is_not_in_the_library_is_named(tmp_path: Path) -> None:
     block = dataclasses.replace(block_of("rls"), runtime="softneck.core._random_runtime")
-    with pytest.raises(SettingsError, match="`softneck.core._random_runtime` cannot be in a compiled FMU"):
+    with pytest.raises(SettingsError, match=r"`softneck.core._random_runtime` cannot be in a compiled FMU"):
         build_compiled_fmu(block, tmp_path / "X.fmu")
     flat = dataclasses.replace(block_of("rls"), arrays=tuple(array.ravel() for array in block_of("rls").arrays))
     with pytest.raises(SettingsError, match="has arrays of ranks"):
