@@ -10,6 +10,7 @@ from pathlib import Path
 
 from softneck.core import OutputError, Port, SettingsError, atomic_write, refuse_existing
 from softneck.fmu import FmuInfo, build_fmu
+from softneck.fmu.native import build_compiled_fmu
 from softneck.loop import BlockPart, Loop, Part, ReferenceBlock, Wiring, wire
 
 from ._fmu_part import FmuPart
@@ -21,7 +22,7 @@ from ._ssp_description import Component, Link, system_description
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 
-def write_ssp(loop: Loop | LoopSetup, path: str | Path, *, force: bool = False) -> Path:
+def write_ssp(loop: Loop | LoopSetup, path: str | Path, *, force: bool = False, compiled: bool = False) -> Path:
     """Write `loop` as an SSP 1.0 archive and return its path.
 
     Parts that are no FMUs become some; so does the reference. A master that sets all inputs first and then steps all
@@ -31,6 +32,7 @@ def write_ssp(loop: Loop | LoopSetup, path: str | Path, *, force: bool = False) 
         loop: a loop or what `load_loop` returned.
         path: `NAME.ssp`.
         force: replace an existing file.
+        compiled: what is made here needs no Python; FMUs that the loop names stay what they are.
 
     Raises:
         SettingsError: faults, or a part that can be no FMU; the line names it.
@@ -49,7 +51,7 @@ def write_ssp(loop: Loop | LoopSetup, path: str | Path, *, force: bool = False) 
         plain = replace(plain, reference=BlockPart(block))
     wiring = wire(plain.parts, plain.constants, plain.connections)
     with tempfile.TemporaryDirectory(prefix="softneck-ssp-") as folder:
-        sources = {name: _fmu_of(name, part, Path(folder)) for name, part in plain.parts.items()}
+        sources = {name: _fmu_of(name, part, Path(folder), compiled) for name, part in plain.parts.items()}
         parts = [_component(name, part, sources[name], plain, wiring) for name, part in plain.parts.items()]
         text = system_description(target.stem, parts, _links(plain, wiring), step=step, duration=plain.duration)
         members = {"SystemStructure.ssd": text}
@@ -58,7 +60,7 @@ def write_ssp(loop: Loop | LoopSetup, path: str | Path, *, force: bool = False) 
     return target
 
 
-def _fmu_of(name: str, part: Part, folder: Path) -> Path:
+def _fmu_of(name: str, part: Part, folder: Path, compiled: bool) -> Path:
     """Return an FMU of `part`, in `folder` if it must be made or renamed."""
     if isinstance(part, FmuPart | IsolatedPart):
         renamed = folder / f"{name}_{part.path.name}"
@@ -68,7 +70,11 @@ def _fmu_of(name: str, part: Part, folder: Path) -> Path:
         raise SettingsError(
             f"the {name} is a {type(part).__name__}, of which no FMU can be built; give an FMU or a file."
         )
-    return build_fmu(part.block, folder / f"{name}.fmu", info=FmuInfo(description=f"{part.block.kind} of a loop"))
+    target, info = folder / f"{name}.fmu", FmuInfo(description=f"{part.block.kind} of a loop")
+    if compiled:
+        build_compiled_fmu(part.block, target, info=info)
+        return target
+    return build_fmu(part.block, target, info=info)
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,9 +12,11 @@
 
 #ifdef __GNUC__
 #define SN_COLD __attribute__((noinline, cold))
+#define SN_APART __attribute__((noinline)) /* called so often that copies of it would be most of the library */
 #define SN_RARE(x) __builtin_expect(!!(x), 0)
 #else
 #define SN_COLD
+#define SN_APART
 #define SN_RARE(x) (x)
 #endif
 
@@ -46,6 +48,7 @@ typedef struct {
     const char *fault; /* why the step is worth nothing, NULL while it is */
     double trash;      /* what a refused access reads and writes */
     int64_t trash_i;
+    int wide; /* this processor takes four numbers at a time */
 } sn_work;
 
 typedef struct sn_kind {
@@ -68,6 +71,19 @@ static const char SN_SHAPE[] = "shapes do not fit: model file and kind do not fi
 static const char SN_HANGS[] = "a loop does not end: model file and kind do not fit together";
 static const char SN_FULL[] = "the workspace is too small: model file and kind do not fit together";
 static const char SN_NUMBER[] = "a number is too large or not whole where one is counted with";
+
+/* What an access beyond an array gets, out of the way of those within. */
+SN_COLD static double *sn_outside(sn_work *w)
+{
+    sn_fault(w, SN_INDEX);
+    return &w->trash;
+}
+
+SN_COLD static int64_t sn_no_number(sn_work *w)
+{
+    sn_fault(w, SN_NUMBER);
+    return 0;
+}
 
 /* Workspace: a stack that a function leaves as it found it. */
 static void *sn_room(sn_work *w, int64_t count, size_t each)
@@ -139,10 +155,8 @@ static sn_i1 sn_zeros_i(sn_work *w, int64_t n)
 /* Entries. */
 static inline double *sn_at1(sn_work *w, sn_v1 v, int64_t i)
 {
-    if (SN_RARE((uint64_t)i >= (uint64_t)v.n)) {
-        sn_fault(w, SN_INDEX);
-        return &w->trash;
-    }
+    if (SN_RARE((uint64_t)i >= (uint64_t)v.n))
+        return sn_outside(w);
     return v.p + i * v.s;
 }
 
@@ -157,24 +171,20 @@ static inline int64_t *sn_at_i(sn_work *w, sn_i1 v, int64_t i)
 
 static inline double *sn_at2(sn_work *w, sn_v2 m, int64_t i, int64_t j)
 {
-    if (SN_RARE((uint64_t)i >= (uint64_t)m.n0 || (uint64_t)j >= (uint64_t)m.n1)) {
-        sn_fault(w, SN_INDEX);
-        return &w->trash;
-    }
+    if (SN_RARE((uint64_t)i >= (uint64_t)m.n0 || (uint64_t)j >= (uint64_t)m.n1))
+        return sn_outside(w);
     return m.p + i * m.s0 + j * m.s1;
 }
 
 static inline double *sn_at3(sn_work *w, sn_v3 c, int64_t i, int64_t j, int64_t k)
 {
-    if (SN_RARE((uint64_t)i >= (uint64_t)c.n0 || (uint64_t)j >= (uint64_t)c.n1 || (uint64_t)k >= (uint64_t)c.n2)) {
-        sn_fault(w, SN_INDEX);
-        return &w->trash;
-    }
+    if (SN_RARE((uint64_t)i >= (uint64_t)c.n0 || (uint64_t)j >= (uint64_t)c.n1 || (uint64_t)k >= (uint64_t)c.n2))
+        return sn_outside(w);
     return c.p + i * c.s0 + j * c.s1 + k * c.s2;
 }
 
 /* Parts. */
-static inline sn_v1 sn_row2(sn_work *w, sn_v2 m, int64_t i)
+SN_APART static sn_v1 sn_row2(sn_work *w, sn_v2 m, int64_t i)
 {
     sn_v1 v = {m.p, m.n1, m.s1};
     if (SN_RARE((uint64_t)i >= (uint64_t)m.n0)) {
@@ -186,13 +196,13 @@ static inline sn_v1 sn_row2(sn_work *w, sn_v2 m, int64_t i)
     return v;
 }
 
-static inline sn_v1 sn_column2(sn_work *w, sn_v2 m, int64_t j)
+SN_APART static sn_v1 sn_column2(sn_work *w, sn_v2 m, int64_t j)
 {
     sn_v2 t = {m.p, m.n1, m.n0, m.s1, m.s0};
     return sn_row2(w, t, j);
 }
 
-static inline sn_v2 sn_row3(sn_work *w, sn_v3 c, int64_t i)
+SN_APART static sn_v2 sn_row3(sn_work *w, sn_v3 c, int64_t i)
 {
     sn_v2 m = {c.p, c.n1, c.n2, c.s1, c.s2};
     if (SN_RARE((uint64_t)i >= (uint64_t)c.n0)) {
@@ -211,7 +221,7 @@ static inline sn_v2 sn_turned(sn_v2 m)
 }
 
 /* v[a:b] as Python cuts it; a negative border of a variable is refused: none of ours means one. */
-static inline sn_v1 sn_cut(sn_work *w, sn_v1 v, int64_t a, int64_t b)
+SN_APART static sn_v1 sn_cut(sn_work *w, sn_v1 v, int64_t a, int64_t b)
 {
     sn_v1 r = {v.p, 0, v.s};
     if (SN_RARE(a < 0 || b < 0)) {
@@ -227,7 +237,7 @@ static inline sn_v1 sn_cut(sn_work *w, sn_v1 v, int64_t a, int64_t b)
     return r;
 }
 
-static inline sn_v2 sn_cut2(sn_work *w, sn_v2 m, int64_t a, int64_t b)
+SN_APART static sn_v2 sn_cut2(sn_work *w, sn_v2 m, int64_t a, int64_t b)
 {
     sn_v2 r = {m.p, 0, m.n1, m.s0, m.s1};
     if (SN_RARE(a < 0 || b < 0)) {
@@ -279,24 +289,20 @@ static inline int64_t sn_rounds(sn_work *w, int64_t rounds)
 /* Whole numbers, as Python counts. */
 static inline int64_t sn_int(sn_work *w, double x)
 {
-    if (SN_RARE(!(x > -SN_WHOLE && x < SN_WHOLE))) {
-        sn_fault(w, SN_NUMBER);
-        return 0;
-    }
+    if (SN_RARE(!(x > -SN_WHOLE && x < SN_WHOLE)))
+        return sn_no_number(w);
     return (int64_t)x;
 }
 
 static inline int64_t sn_times(sn_work *w, int64_t a, int64_t b)
 {
     /* Exact in int64 while both stay below 2^31; what an honest model counts does. */
-    if (SN_RARE(a < -2147483647 || a > 2147483647 || b < -2147483647 || b > 2147483647)) {
-        sn_fault(w, SN_NUMBER);
-        return 0;
-    }
+    if (SN_RARE(a < -2147483647 || a > 2147483647 || b < -2147483647 || b > 2147483647))
+        return sn_no_number(w);
     return a * b;
 }
 
-static inline int64_t sn_floor_divide(sn_work *w, int64_t a, int64_t b)
+SN_APART static int64_t sn_floor_divide(sn_work *w, int64_t a, int64_t b)
 {
     int64_t q;
     if (SN_RARE(b == 0 || b == -1)) {
@@ -308,7 +314,7 @@ static inline int64_t sn_floor_divide(sn_work *w, int64_t a, int64_t b)
     return a % b != 0 && (a < 0) != (b < 0) ? q - 1 : q;
 }
 
-static inline int64_t sn_modulo(sn_work *w, int64_t a, int64_t b)
+SN_APART static int64_t sn_modulo(sn_work *w, int64_t a, int64_t b)
 {
     int64_t r;
     if (SN_RARE(b == 0 || b == -1)) {

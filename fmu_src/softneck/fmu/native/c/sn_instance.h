@@ -88,6 +88,7 @@ static int sn_make_room(sn_instance *s)
     s->work.base = (unsigned char *)malloc(s->work.size);
     if (s->work.base == NULL)
         return 0;
+    s->work.wide = sn_has_wide();
     sn_ready(&s->work);
     states = m->root.kind->state_size(&s->work, &m->root);
     if (s->work.fault != NULL || states < 0 || states > SN_MOST_STATES) {

@@ -38,14 +38,26 @@ static inline int sn_finite(double x) { return x - x == 0.0; }
 static inline int sn_nan(double x) { return x != x; }
 static inline int sn_infinite(double x) { return x == x && x - x != 0.0; }
 
+/* 1 / n!, nearest doubles. */
+#define SN_E3 0x1.5555555555555p-3
+#define SN_E4 0x1.5555555555555p-5
+#define SN_E5 0x1.1111111111111p-7
+#define SN_E6 0x1.6c16c16c16c17p-10
+#define SN_E7 0x1.a01a01a01a01ap-13
+#define SN_E8 0x1.a01a01a01a01ap-16
+#define SN_E9 0x1.71de3a556c734p-19
+#define SN_E10 0x1.27e4fb7789f5cp-22
+#define SN_E11 0x1.ae64567f544e4p-26
+#define SN_E12 0x1.1eed8eff8d898p-29
+#define SN_E13 0x1.6124613a86d09p-33
+#define SN_E14 0x1.93974a8c07c9dp-37
+
 /* exp(r) - 1 for |r| <= ln(2)/2. */
 static inline double sn_expm1_small(double r)
 {
     double s = r * r;
-    double even = 0.5 + s * (0x1.5555555555555p-5 + s * (0x1.6c16c16c16c17p-10 + s * (0x1.a01a01a01a01ap-16
-        + s * (0x1.27e4fb7789f5cp-22 + s * (0x1.1eed8eff8d898p-29 + s * 1.1470745597729725e-11)))));
-    double odd = 0x1.5555555555555p-3 + s * (0x1.1111111111111p-7 + s * (0x1.a01a01a01a01ap-13
-        + s * (0x1.71de3a556c734p-19 + s * (0x1.ae64567f544e4p-26 + s * 1.6059043836821613e-10))));
+    double even = 0.5 + s * (SN_E4 + s * (SN_E6 + s * (SN_E8 + s * (SN_E10 + s * (SN_E12 + s * SN_E14)))));
+    double odd = SN_E3 + s * (SN_E5 + s * (SN_E7 + s * (SN_E9 + s * (SN_E11 + s * SN_E13))));
     return r + s * (even + r * odd);
 }
 
@@ -178,12 +190,6 @@ static inline double sn_tanh(double x)
     double y = e / (e + 2.0);
     y = sn_from_bits(sn_to_bits(y) | (sn_to_bits(x) & 0x8000000000000000u));
     return x == x ? y : x;
-}
-
-static void sn_tanh_all(double *restrict y, const double *restrict x, int64_t n)
-{
-    for (int64_t i = 0; i < n; i++)
-        y[i] = sn_tanh(x[i]);
 }
 
 /* atan of |t| <= 1/16 beyond its first term. */

@@ -2,7 +2,7 @@
 #ifndef SN_VECTOR_H
 #define SN_VECTOR_H
 
-#include "sn_math.h"
+#include "sn_wide.h"
 
 #define SN_ADD(a, b) ((a) + (b))
 #define SN_SUB(a, b) ((a) - (b))
@@ -119,7 +119,7 @@ static sn_v1 sn_tanh_v(sn_work *w, sn_v1 a)
 {
     sn_v1 r = sn_new1(w, a.n);
     if (a.s == 1)
-        sn_tanh_all(r.p, a.p, r.n);
+        sn_tanh_all(w, r.p, a.p, r.n);
     else
         for (int64_t i = 0; i < r.n; i++)
             r.p[i] = sn_tanh(a.p[i * a.s]);
@@ -230,6 +230,12 @@ static double sn_dot(sn_work *w, sn_v1 a, sn_v1 b)
 static sn_v1 sn_dot_mv(sn_work *w, sn_v2 A, sn_v1 x)
 {
     sn_v1 r = sn_new1(w, sn_same(w, A.n1, x.n) ? A.n0 : 0);
+#ifdef SN_LANES
+    if (A.s1 == 1 && x.s == 1) {
+        sn_rows(w, r.p, A.p, x.p, r.n, A.s0, x.n);
+        return r;
+    }
+#endif
     for (int64_t i = 0; i < r.n; i++) {
         sn_v1 row = {A.p + i * A.s0, A.n1, A.s1};
         r.p[i] = sn_dot(w, row, x);
