@@ -61,9 +61,6 @@ def command(line: str, place: Path) -> Path:
         "python": [],
         "pytest": ["-m", "pytest", "-p", "no:cacheprovider"],
     }
-        "softneck": ["-c", "from softneck.cli import main; main()"], "python": [],
-        "pytest": ["-m", "pytest", "-p", "no:cacheprovider"],
-    }  # fmt: skip
     run = [sys.executable, *programs[words[0]], *words[1:]]
     done = subprocess.run(run, cwd=place, capture_output=True, text=True, env={**os.environ, "MPLBACKEND": "Agg"})
     assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"

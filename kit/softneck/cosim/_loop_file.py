@@ -229,11 +229,6 @@ class _Reader:
             self.files[name] = (module.__file__, file_hash(module.__file__))
         return _part_of(name, made, f" python = `{path}` returned")
 
-    def reference(self, table: Any) -> Reference | Part:
-        """Return what the table [reference] describes."""
-        if isinstance(table, dict) and OBJECT in table:
-            made: Any = table[OBJECT]
-            return made if callable(made) else _part_of("reference", made)
     def reference(self, table: Any, sample_time: float = 0.02) -> Reference | Part:
         """Return what the table [reference] describes; with `ahead_s` a part that tells it so long before."""
         if isinstance(table, dict) and "ahead_s" in table:
@@ -242,8 +237,9 @@ class _Reader:
             if hasattr(made, "advance"):
                 raise SettingsError("[reference] ahead_s: an FMU cannot be asked what it will say; leave it out.")
             return AheadReference(made, _number("[reference] ahead_s", table["ahead_s"]), sample_time=sample_time)  # pyright: ignore[reportArgumentType]
-            part: Any = made if callable(made) else _part_of("reference", made)
-            return part
+        if isinstance(table, dict) and OBJECT in table:
+            given: Any = table[OBJECT]
+            return given if callable(given) else _part_of("reference", given)
         if isinstance(table, dict) and "fmu" in table:
             return self._made("reference", table, ("fmu",), None, as_role="reference")
         if not isinstance(table, dict) or table.get("kind") not in _REFERENCES:

@@ -82,7 +82,6 @@ class MpcSettings:
         slack_weight: on violations of soft limits, against errors of the angles, squared.
         disturbance_time: time constant of the output disturbance's rate [s]; None for the plant's own, as a load at its
             input makes it. A longer one follows what keeps changing, such as a payload carried round, less robustly.
-            input makes it. A longer one follows what keeps changing and is less robust.
         budget: iterations of the solver for each sample; beyond them the previous plan goes on.
         least_delay: the dead time is taken as at least this [s]; a fit of free runs hides it in the pole.
         small_move_pole: the design must hold as well where the slowest pole is as fast as this [1/s]; 0 for the
