@@ -31,7 +31,7 @@ class BakeOff:
 
     Attributes:
         reference: the step at t = 0 [rad].
-        position_limit: of |u| [rad].
+        position_limit: of `|u|` [rad].
         slew_limit: of u, per sample [rad].
         load: added to the plant's input [rad].
         load_at: from when on [s].

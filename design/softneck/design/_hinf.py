@@ -24,13 +24,13 @@ _AT_REST = 1e4
 class HinfSettings(AxisSettings):
     """H-infinity mixed sensitivity `|W1 S; W2 K S; W3 T|` on the exact-delay plant, at 1.05 gamma.
 
-    W1 asks for |S| below frequency/bandwidth and `peak`; W2 is a gain on the effort in units of the plant's static
-    gain; W3, if `cover`, the smallest weight over the samples: |W3 T| < 1 then proves them stable. The slow pole of
+    W1 asks for `|S|` below frequency/bandwidth and `peak`; W2 is a gain on the effort in units of the plant's static
+    gain; W3, if `cover`, the smallest weight over the samples: `|W3 T| < 1` then proves them stable. The slow pole of
     the controller becomes a true integrator.
 
     Attributes:
         bandwidth: where W1 falls to 1 [rad/s]; None for the largest whose loops keep `max_sensitivity` on all samples.
-        peak: what W1 allows |S| far up.
+        peak: what W1 allows `|S|` far up.
         control_weight: W2, dimensionless.
         cover: whether the samples' weight enters as W3.
         method: "slycot", "riccati" or "auto".
