@@ -20,7 +20,7 @@ from softneck.design import (
     block_stepper,
     run_bake_off,
 )
-from softneck.design.mpc import _mpc_runtime as rt
+from softneck.design.mpc import _mpc_state_runtime as rt
 from softneck.estimation import LinearNeck
 from softneck.loop import AheadReference, BlockPart, Loop, RotationReference, run_loop
 

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from softneck.core import Block, FileFormatError, Matrix, Port, State, Vector, write_archive
 
 from .._ports import MAX_MOTOR, controller_inputs, controller_outputs, limit_ports
-from . import _mpc_runtime as rt
+from . import _mpc_state_runtime as rt
 from ._arrays import NAMES
 from ._disturbance import MeasuredDisturbance
 from ._lti import lti

@@ -7,7 +7,7 @@ import numpy as np
 
 from softneck.core import Matrix, Vector, load_runtime
 
-from . import _mpc_runtime as rt
+from . import _mpc_state_runtime as rt
 
 # Far beyond anything: no limit acts.
 _FREE = 1e12

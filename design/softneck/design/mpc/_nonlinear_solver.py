@@ -10,7 +10,7 @@ import numpy as np
 
 from softneck.core import Matrix, Vector, load_runtime
 
-from . import _mpc_runtime as rt
+from . import _mpc_state_runtime as rt
 from ._gauss_newton import Evaluated, compiled, qp_function
 from ._horizon_estimate import disturbance_ahead, estimate_gains
 

@@ -13,7 +13,7 @@ import numpy as np
 from softneck.core import Vector, load_functions, require_one_of
 from softneck.loop import BlockPart
 
-from . import _mpc_runtime as rt
+from . import _mpc_state_runtime as rt
 from ._program import MpcInfo, MpcProgram, explain
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from scipy.linalg import solve_discrete_are
 from softneck.core import Matrix, SettingsError, Vector
 from softneck.estimation import AxisPlant
 
-from . import _mpc_runtime as rt
+from . import _mpc_state_runtime as rt
 
 # Rounding of a Cholesky factor; beyond it H has no inverse worth the name.
 _LARGEST_CONDITION = 1e12

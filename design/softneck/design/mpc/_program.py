@@ -9,7 +9,7 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, load_functions
 
-from . import _mpc_runtime as rt
+from . import _mpc_state_runtime as rt
 from ._arrays import NAMES
 
 # daqp's own default is 1e-6; the block's solver ends at 1e-10.

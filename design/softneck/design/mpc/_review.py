@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from . import _mpc_runtime as rt
+from . import _mpc_state_runtime as rt
 
 if TYPE_CHECKING:
     from ._controller import MpcController
