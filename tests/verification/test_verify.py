@@ -97,6 +97,7 @@ def test_the_order_adds_its_samples_and_says_so() -> None:
     assert one - two == pytest.approx(1e3 * TS, rel=0.05)
 
 
+@pytest.mark.slow
 def test_intervals_come_from_the_familys_own_uncertainty() -> None:
     widths = []
     for std in (0.01, 0.02):
@@ -162,6 +163,7 @@ def test_what_cannot_be_computed_is_said_and_not_passed_off() -> None:
     assert [v.requirement.metric for v in strict.failed] == ["axes.sensitivity"]
 
 
+@pytest.mark.slow
 def test_frozen_points_are_each_judged() -> None:
     found = verify(_Frozen(pi()), linear_neck(), make_requirements(QUICK))
     plain = verify(pi(), linear_neck(), make_requirements(QUICK))
