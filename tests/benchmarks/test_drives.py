@@ -12,7 +12,7 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from softneck.drives.master import Phase, Tilt
 
-from ..drives.bench import T, Bench
+from ..drives.bench import Bench, T
 
 CYCLES = 2_000
 
