@@ -93,7 +93,7 @@ class Bench:
         self.link.send([nmt_frame(Command.START, 0)])
         self.link.drain()
         self.run = VirtualRun(self.link, self.master)
-        self.jobs: list[tuple[float, Callable[[Bench], None]]] = []
+        self.jobs: list[tuple[float, Callable[[Bench], object]]] = []
         self.stopped_at: float | None = None
         self.drive_stopped_at: list[float | None] = [None, None, None]
         self._enabled_once = [False, False, False]
@@ -114,7 +114,7 @@ class Bench:
     def states(self) -> list[int]:
         return [drive.axis.state for drive in self.neck.drives]
 
-    def at(self, time: float, job: Callable[[Bench], None]) -> None:
+    def at(self, time: float, job: Callable[[Bench], object]) -> None:
         """Do `job` before the cycle at `time` [s]."""
         self.jobs.append((time, job))
 

@@ -95,7 +95,7 @@ def test_pairs(names: tuple[str, str], times: tuple[float, float]) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=3000, deadline=None)
+@settings(max_examples=2000, deadline=None)
 @given(names=PAIRS, times=TIMES, seed=st.integers(0, 1000))
 def test_thousands_of_pairs(names: tuple[str, str], times: tuple[float, float], seed: int) -> None:
     safe(play(names, times, seed))
@@ -166,4 +166,4 @@ def test_abuse() -> None:
 
 @pytest.mark.slow
 def test_much_abuse() -> None:
-    run_state_machine_as_test(Abuse, settings=settings(max_examples=1000, stateful_step_count=25, deadline=None))
+    run_state_machine_as_test(Abuse, settings=settings(max_examples=500, stateful_step_count=25, deadline=None))

@@ -188,6 +188,7 @@ def run_on_bus(
         CheckFailedError: the pre-flight failed; nothing moved.
     """
     pilot = LoopPilot(deployed.loop)
+    pilot.warm()
     checked = preflight(link, file, override=override, homed=True)
     checked.require()
     master = _master(pilot, file, checked, None)

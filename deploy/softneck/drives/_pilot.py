@@ -10,7 +10,7 @@ from softneck.core import SettingsError, Vector
 from softneck.loop import Loop, wire
 from softneck.loop._order import step_order
 
-from .master import Measured
+from .master import Measured, Tilt
 
 _ANGLES = ("pitch", "roll", "pitch_rate", "roll_rate")
 
@@ -65,6 +65,11 @@ class LoopPilot:
                 if name == "reference":
                     self._next_reference = outputs
         self._started = True
+
+    def warm(self) -> None:
+        """Step all parts once with the neck at rest: what compiles or loads at its first call does so before a run."""
+        self.start()
+        self.step(Measured(0, Tilt(0.0, 0.0), True, (0.0, 0.0, 0.0)))
 
     def step(self, measured: Measured) -> tuple[float, float, float] | None:
         """Step observer and controller with what was measured now."""
