@@ -17,7 +17,7 @@ from jax_sysid.models import LinearModel, Model
 
 STATES, PENALTIES = (4, 6), (1e-5, 1e-4)
 NEURONS = 10
-ADAM, LBFGS = 300, 1200
+ADAM, LBFGS = 200, 600
 
 
 def trained(u: np.ndarray, y: np.ndarray, states: int, penalty: float, seed: int) -> Model:
@@ -28,11 +28,14 @@ def trained(u: np.ndarray, y: np.ndarray, states: int, penalty: float, seed: int
     linear.fit(y, u)
     A, B, C = (np.asarray(part) for part in linear.params[:3])
 
-    def state(x, u, p):
-        return p[0] @ x + p[1] @ u + p[2] @ jnp.tanh(p[3] @ x + p[4] @ u + p[5])
+    # jax-sysid calls them by these names.
+    def state(x, u, params):
+        A, B, E, F, G, h = params[:6]
+        return A @ x + B @ u + E @ jnp.tanh(F @ x + G @ u + h)
 
-    def output(x, _u, p):
-        return p[6] @ x + p[7]
+    def output(x, u, params):
+        del u
+        return params[6] @ x + params[7]
 
     rng = np.random.default_rng(seed)
     model = Model(states, 2, 3, state_fcn=state, output_fcn=output)
