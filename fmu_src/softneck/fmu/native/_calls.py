@@ -118,6 +118,18 @@ def _dot(ex: Expressions, node: ast.AST, values: list[Value]) -> Value:
     raise ex.scope.fail(node, "products are known of vectors and matrices.")
 
 
+def array_of(ex: Expressions, node: ast.Call) -> Value:
+    """Return `np.array([a, b, ...])` of numbers."""
+    items = node.args[0].elts if len(node.args) == 1 and isinstance(node.args[0], ast.List | ast.Tuple) else []
+    values = ex.ordered(items)
+    if not items or node.keywords or not all(isinstance(value.type, Scalar) for value in values):
+        raise ex.scope.fail(node, "`np.array` is known of a list of numbers.")
+    made = ex.room(f"sn_zeros1(w, {len(values)})", VECTOR)
+    for i, value in enumerate(values):
+        ex.scope.emit(f"*sn_at1(w, {made.code}, {i}) = {ex.scope.cast(value, FLOAT)};")
+    return made
+
+
 def method(ex: Expressions, node: ast.Call, name: str, base: Value) -> Value:
     """Return the C of `base.NAME(...)`."""
     if node.keywords or not isinstance(base.type, View) or base.type.whole:

@@ -10,7 +10,7 @@ import ast
 from collections.abc import Callable
 from typing import Any
 
-from ._calls import method, numpy_call, plain_call
+from ._calls import array_of, method, numpy_call, plain_call
 from ._scope import Scope
 from ._types import (
     BOOL,
@@ -344,6 +344,8 @@ class Expressions:
         function = node.func
         if isinstance(function, ast.Attribute):
             if isinstance(function.value, ast.Name) and function.value.id in ("np", "math"):
+                if function.attr == "array":
+                    return array_of(self, node)
                 return numpy_call(self, node, function.attr, self.ordered(node.args))
             return method(self, node, function.attr, self.value(function.value))
         if not isinstance(function, ast.Name):

@@ -14,6 +14,7 @@ _RANKS = {
     "softneck.identification._nlsm_runtime": "122132232221",
     "softneck.identification._nn_runtime": "1223232213212",
     "softneck.identification._play_runtime": "12121122221",
+    "softneck.identification._nss_runtime": "121211222221221221",
     "softneck.identification._greybox_runtime": "121121",
     # Those of its members come behind.
     "softneck.identification._residual_any_runtime": "11213223",
@@ -22,6 +23,9 @@ _RANKS = {
     "softneck.estimation._kalman_runtime": "222222221",
     "softneck.estimation._steady_kalman_runtime": "222222221222222",
     "softneck.design._linear_controller_runtime": "2222222222222221",
+    "softneck.design._scheduled_runtime": "222222222222222111",
+    "softneck.design._adaptive_runtime": "2222222122111",
+    "softneck.design.mpc._mpc_runtime": "1222212121222222221",
     "softneck.loop._reference_runtime": "12",
 }
 

@@ -94,11 +94,7 @@ class _Runtime:
         tree = ast.parse(bundle(module, loops=False))
         self.unit = unit
         self.definitions = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
-        self.constants = {
-            target.id: node.value
-            for node in tree.body if isinstance(node, ast.Assign)
-            for target in node.targets if isinstance(target, ast.Name)
-        }  # fmt: skip
+        self.constants = _constants(tree)
         # C is compiled: loops over branches beat whole arrays.
         self.constants |= {"COMPILED": ast.Constant(True)} if "COMPILED" in self.constants else {}
         self.has_members = "member_step" in self.definitions
@@ -186,6 +182,19 @@ class _Runtime:
             return Value("", NONE)
         ex.scope.allocates |= holds_view(value.type)
         return ex.scope.kept(value)
+
+
+def _constants(tree: ast.Module) -> dict[str, ast.expr]:
+    """Return the constants of a runtime: `A = 1`, and `A, B = 1, 2`."""
+    found: dict[str, ast.expr] = {}
+    for node in tree.body:
+        for target in node.targets if isinstance(node, ast.Assign) else []:
+            if isinstance(target, ast.Name):
+                found[target.id] = node.value
+            elif isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple):
+                names = [part.id if isinstance(part, ast.Name) else "" for part in target.elts]
+                found.update(zip(names, node.value.elts, strict=False))
+    return found
 
 
 def indented(lines: list[str]) -> str:
