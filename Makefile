@@ -3,13 +3,17 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check docs benchmark native wheel clean
+.PHONY: demo test slow check docs benchmark native wheel clean
 
 demo: $(VENV)/.installed
 	$(BIN)/softneck demo --out build/demo
 
 test: $(VENV)/.tested
-	$(BIN)/python -m pytest -q -n 2
+	$(BIN)/python -m pytest -q -n 2 -m "not slow"
+
+# What takes long: CI runs it too.
+slow: $(VENV)/.tested
+	$(BIN)/python -m pytest -q -n 2 -m slow
 
 check: $(VENV)/.linted
 	$(BIN)/ruff check .

@@ -37,6 +37,7 @@ def test_core_per_cycle(benchmark: BenchmarkFixture) -> None:
 
     benchmark(steps)
     assert master.supervisor.phase is Phase.RUNNING
+    assert benchmark.stats is not None
     assert benchmark.stats["median"] / CYCLES < 200e-6
 
 
@@ -47,4 +48,5 @@ def test_virtual_time(benchmark: BenchmarkFixture) -> None:
     bench.link.tap = None
     benchmark(lambda: bench.pass_time(CYCLES * T))
     assert bench.phase is Phase.RUNNING
+    assert benchmark.stats is not None
     assert CYCLES * T / benchmark.stats["median"] > 50.0

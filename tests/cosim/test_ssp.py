@@ -121,7 +121,8 @@ def test_units_that_differ_are_converted_on_the_way(fmus: Path, toys: Any, tmp_p
     assert factors == {"pitch": pytest.approx(np.pi / 180), "roll": pytest.approx(np.pi / 180)}
     theirs = run_in("libcosim", path, [("plant", "alpha"), ("controller", "motor_setpoint_1")], 50, tmp_path)
     ours = simulate(setup)
-    np.testing.assert_allclose(theirs[1:, 0], ours["pitch"][1:], rtol=0, atol=1e-12)
+    # The foreign plant speaks degrees; our results are in SI.
+    np.testing.assert_allclose(np.radians(theirs[1:, 0]), ours["pitch"][1:], rtol=0, atol=1e-12)
     np.testing.assert_allclose(theirs[1:, 1], ours["motor_setpoint_1"][1:], rtol=0, atol=1e-12)
 
 

@@ -1,7 +1,8 @@
+"""Predictive control: optimal, within its limits, without offset or bumps."""
+
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import casadi as ca
 import control
@@ -10,32 +11,17 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from softneck.core import DataError, FileFormatError, SettingsError, load, load_functions, load_runtime
+from softneck.core import DataError, load_functions, load_runtime
 from softneck.design import (
     MeasuredDisturbance,
     MpcController,
     MpcSettings,
     bake_off_neck,
-    bake_off_samples,
-    block_stepper,
-    run_bake_off,
 )
 from softneck.design.mpc import _mpc_state_runtime as rt
-from softneck.estimation import LinearNeck
 from softneck.loop import AheadReference, BlockPart, Loop, RotationReference, run_loop
 
-TS = 0.02
-GAIN = math.radians(27.691) / 5.293
-POLE = math.exp(-5.293 * TS)
-# The block's solver ends at 1e-10 rad; a loop adds up to 1e3 of its roundings.
-SOLVED = 1e-7
-
-
-class Samples(LinearNeck):
-    """A neck with samples, as a family has them."""
-
-    def samples(self, output: str) -> list[control.TransferFunction]:
-        return bake_off_samples()[output]
+from .mpc_neck import GAIN, POLE, SOLVED, TS, Neck
 
 
 @pytest.fixture(scope="module")
@@ -47,32 +33,6 @@ def plain() -> MpcController:
 def soft() -> MpcController:
     settings = MpcSettings(bandwidth=8.0, angle_limit=0.3, minimum_tautness=-0.25, lead_limit=12.0)
     return settings.design(bake_off_neck())
-
-
-class Neck:
-    """Two first-order axes with dead time behind motors that follow at once."""
-
-    def __init__(self, controller: MpcController, *, gain: float = 1.0, load: float = 0.0, **parameters: float) -> None:
-        self.controller, self.gain, self.load = controller, gain, load
-        self.block = controller.block()
-        self.state = self.block.initial_state(**parameters)
-        self.y, self.motors, self.line = np.zeros(2), np.zeros(3), [np.zeros(2)] * 5
-        self.inputs = np.array([port.start for port in self.block.inputs])
-
-    def step(self, pitch: float, roll: float = 0.0, **others: float) -> np.ndarray:
-        names = [port.name for port in self.block.inputs]
-        self.inputs[:2], self.inputs[3:5], self.inputs[5:8] = (pitch, roll), self.y, self.motors
-        for name, value in others.items():
-            self.inputs[names.index(name)] = value
-        # As a loop does it: a block does not look at what comes.
-        values, out = self.state.values.copy(), np.zeros(3)
-        load_runtime(self.block.runtime).step(self.block.arrays, self.state.parameters, values, self.inputs, out)
-        self.state = type(self.state)(values, self.state.parameters, out)
-        v = (self.controller.arrays[8] @ out)[:2] + self.load
-        self.line = [*self.line[1:], v]
-        self.y = POLE * self.y + (1.0 - POLE) * self.gain * GAIN * self.line[0]
-        self.motors = out
-        return out
 
 
 def thetas(controller: MpcController, count: int, size: float = 0.15) -> np.ndarray:
@@ -382,108 +342,3 @@ def test_its_state_is_whole(plain: MpcController) -> None:
     two.set_state(one.get_state())
     for u in rows[20:]:
         np.testing.assert_array_equal(one.advance(0.0, u), two.advance(0.0, u))
-
-
-def test_equal_scenarios_are_one() -> None:
-    class Same(LinearNeck):
-        def samples(self, output: str) -> list[control.TransferFunction]:
-            return [self.tf(output)] * 3
-
-    nominal = bake_off_neck()
-    same = Same(pitch=nominal.pitch, roll=nominal.roll)
-    settings = {"bandwidth": 8.0, "angle_limit": 0.3}
-    one = MpcSettings(**settings).design(nominal)  # type: ignore[arg-type]
-    three = MpcSettings(**settings, scenarios=2).design(same)  # type: ignore[arg-type]
-    assert three.arrays[0][rt.MPC_SCENARIOS] == 3
-    necks = [Neck(one), Neck(three)]
-    for k in range(60):
-        outs = [neck.step(0.4 if k < 30 else -0.1) for neck in necks]
-        np.testing.assert_allclose(outs[1], outs[0], atol=SOLVED)
-
-
-def test_scenarios_keep_the_limit_on_all_their_plants() -> None:
-    nominal = bake_off_neck()
-    family = Samples(pitch=nominal.pitch, roll=nominal.roll)
-    settings = {"bandwidth": 4.0, "angle_limit": 0.2, "worst_sensitivity": 9.0, "lead_limit": 12.0}
-    highest = []
-    for scenarios in (0, 3):
-        controller = MpcSettings(**settings, scenarios=scenarios).design(family)  # type: ignore[arg-type]
-        neck, peak = Neck(controller, gain=1.4), 0.0
-        for _ in range(150):
-            neck.step(0.2)
-            peak = max(peak, float(neck.y[0]))
-        highest.append(peak)
-    assert highest[1] < highest[0]
-
-
-def test_saved_and_loaded_it_is_the_same(soft: MpcController, tmp_path: Path) -> None:
-    soft.save(tmp_path / "mpc.npz")
-    again = load(tmp_path / "mpc.npz", role="controller")
-    assert isinstance(again, MpcController)
-    assert again.summary() == soft.summary()
-    for mine, its in zip(soft.arrays, again.arrays, strict=True):
-        np.testing.assert_array_equal(mine, its)
-    assert [port.name for port in again.block().parameters] == [port.name for port in soft.block().parameters]
-    header = {"angle_limit": None, "minimum_tautness": None}
-    arrays = {f"a{i}": item for i, item in enumerate(soft.arrays)}
-    with pytest.raises((KeyError, FileFormatError)):
-        MpcController.from_archive(header, arrays)
-
-
-def test_the_tuning_keeps_what_it_was_asked() -> None:
-    asked = MpcSettings(max_sensitivity=1.4).design(bake_off_neck())
-    assert max(asked.design["sensitivity"]) <= 1.4
-    looser = MpcSettings(max_sensitivity=1.8).design(bake_off_neck())
-    assert looser.design["bandwidth_rad_s"] > asked.design["bandwidth_rad_s"]
-    slow = MpcSettings(reference_time=None, overshoot_pct=1.0, bandwidth=8.0).design(bake_off_neck())
-    assert 0.0 <= slow.design["reference_time_s"] < 1.0
-
-
-@pytest.mark.slow
-def test_the_bake_off_is_won() -> None:
-    # The issue's figures; the plants are the facts' 75, the prediction is for their longest dead time.
-    settings = MpcSettings(bandwidth=8.5, max_sensitivity=2.2, reference_time=0.31, least_delay=0.1, lead_limit=12.0)
-    row = run_bake_off(block_stepper(settings.design(bake_off_neck()).block())).row
-    assert row["worst_overshoot_pct"] <= 2.0
-    assert row["nominal_settling_s"] <= 0.95
-
-
-@pytest.mark.parametrize(
-    ("settings", "match"),
-    [
-        ({"horizon": 0}, "`horizon` must be"),
-        ({"moves": 31}, "`moves` must be"),
-        ({"cocontraction_weight": -1.0}, "`cocontraction_weight` must be positive"),
-        ({"slack_weight": 0.0}, "`slack_weight` must be positive"),
-        ({"minimum_tautness": 6.5}, "contradict each other"),
-        ({"position_limit": math.nan}, "`position_limit`"),
-        ({"max_sensitivity": 1.01}, "`max_sensitivity`"),
-        ({"order": "parallel"}, "`order`"),
-    ],
-)
-def test_bad_settings_are_refused(settings: dict[str, float], match: str) -> None:
-    with pytest.raises(SettingsError, match=match):
-        MpcSettings(**settings)  # type: ignore[arg-type]
-
-
-def test_models_it_cannot_use_are_refused() -> None:
-    good = control.TransferFunction([0.01], [1.0, -0.9], TS)
-    with pytest.raises(SettingsError, match="different sample times"):
-        MpcSettings().design(LinearNeck(pitch=good, roll=control.TransferFunction([0.01], [1.0, -0.9], 0.01)))
-    with pytest.raises(SettingsError, match="not stable"):
-        MpcSettings().design(LinearNeck(pitch=good, roll=control.TransferFunction([0.01], [1.0, -1.1], TS)))
-    with pytest.raises(SettingsError, match="a linear model is needed"):
-        MpcSettings().design(object())  # type: ignore[arg-type]
-    with pytest.raises(SettingsError, match="scenarios are samples of a family"):
-        MpcSettings(scenarios=2, bandwidth=8.0).design(bake_off_neck())
-
-
-def test_review_tells_what_is_doubtful() -> None:
-    assert MpcSettings(bandwidth=8.0).design(bake_off_neck()).review() == []
-    short = MpcSettings(bandwidth=8.0, horizon=4, moves=2, lead_limit=0.1, angle_limit=0.8, position_limit=2.0).design(
-        bake_off_neck()
-    )
-    text = "\n".join(short.review())
-    assert "not longer than the dead time" in text
-    assert "slew limit is never reached" in text
-    assert "beyond what the motors reach" in text

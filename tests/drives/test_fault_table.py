@@ -7,7 +7,8 @@ import pytest
 from softneck.drives.master import RULES, Phase, Reaction
 
 from .bench import Bench
-from .fault_table import SCENARIOS, Scenario, short_dropout
+from .fault_table import Scenario, short_dropout
+from .scenarios import SCENARIOS
 
 
 def bench_for(scenario: Scenario, *, without: bool = False) -> Bench:

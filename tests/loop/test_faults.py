@@ -182,7 +182,7 @@ def test_sizes_are_si_whatever_the_plant_measures_in() -> None:
         lambda _, u: [10.0, 20.0, *map(float, u[:3])],
     )
     result = run(SensorFault(kind="bias", size=math.radians(2.0)), plant=in_degrees)
-    np.testing.assert_allclose(result["pitch_measured"], result["pitch"] + 2.0, rtol=1e-14)
+    np.testing.assert_allclose(result["pitch_measured"], result["pitch"] + math.radians(2.0), rtol=1e-14)
 
 
 def test_faults_on_one_signal_act_in_their_order() -> None:

@@ -239,7 +239,8 @@ class _Reader:
             return AheadReference(made, _number("[reference] ahead_s", table["ahead_s"]), sample_time=sample_time)  # pyright: ignore[reportArgumentType]
         if isinstance(table, dict) and OBJECT in table:
             given: Any = table[OBJECT]
-            return given if callable(given) else _part_of("reference", given)
+            part: Any = given if callable(given) else _part_of("reference", given)
+            return part
         if isinstance(table, dict) and "fmu" in table:
             return self._made("reference", table, ("fmu",), None, as_role="reference")
         if not isinstance(table, dict) or table.get("kind") not in _REFERENCES:
