@@ -21,7 +21,7 @@
 
 typedef struct { void *logger, *allocate, *release, *finished, *environment; } callbacks;
 
-static void tell(void *e, const char *name, int status, const char *category, const char *text, ...)
+static void report(void *e, const char *name, int status, const char *category, const char *text, ...)
 {
     (void)e, (void)name, (void)status, (void)category;
     fprintf(stderr, "%s\n", text);
@@ -30,7 +30,7 @@ static void tell(void *e, const char *name, int status, const char *category, co
 int main(int argc, char **argv)
 {
     void *library, *fmu;
-    callbacks calls = {(void *)tell, NULL, NULL, NULL, NULL};
+    callbacks calls = {(void *)report, NULL, NULL, NULL, NULL};
     if (argc < 8 || (library = LOAD(argv[1])) == NULL) {
         fprintf(stderr, "cannot load the library\n");
         return 2;
