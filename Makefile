@@ -4,6 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 
 .PHONY: demo test slow check docs benchmark native wheel clean
+.PHONY: demo test check docs benchmark native wheel nightly clean
 
 demo: $(VENV)/.installed
 	$(BIN)/softneck demo --out build/demo
@@ -31,6 +32,11 @@ benchmark: $(VENV)/.tested
 # The library of compiled FMUs for all five platforms, cross-compiled by zig into fmu_src/softneck/fmu/native/binaries.
 native: $(VENV)/.crossed
 	$(BIN)/python -m softneck.fmu.native
+
+# The library on other platforms, bit for bit, and many wrong bytes. Debian: wine64, qemu-user, libc6-arm64-cross.
+nightly: $(VENV)/.tested native
+	SOFTNECK_NIGHTLY=1 $(BIN)/python -m pytest -q -n 0 tests/fmu/test_native_platforms.py
+	SOFTNECK_FUZZ_ROUNDS=3000 $(BIN)/python -m pytest -q -n 0 tests/fmu/test_native_errors.py -k sanitizers
 
 # Exporting from this wheel needs no compiler.
 wheel: native

