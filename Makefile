@@ -3,8 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test slow check docs benchmark native wheel clean
-.PHONY: demo test check docs benchmark native wheel nightly clean
+.PHONY: demo test slow check docs benchmark native wheel nightly clean
 
 demo: $(VENV)/.installed
 	$(BIN)/softneck demo --out build/demo

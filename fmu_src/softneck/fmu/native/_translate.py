@@ -188,7 +188,9 @@ def _constants(tree: ast.Module) -> dict[str, ast.expr]:
     """Return the constants of a runtime: `A = 1`, and `A, B = 1, 2`."""
     found: dict[str, ast.expr] = {}
     for node in tree.body:
-        for target in node.targets if isinstance(node, ast.Assign) else []:
+        if not isinstance(node, ast.Assign):
+            continue
+        for target in node.targets:
             if isinstance(target, ast.Name):
                 found[target.id] = node.value
             elif isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple):
