@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
@@ -56,6 +56,7 @@ def test_without_limits_it_is_the_inverse_of_eq_9_to_11(
 
 
 @given(tilt=TILT, common=COMMON, angles=ANGLES, position=POSITION, part=st.floats(-1.0, 0.9))
+@example(tilt=(0.0, 0.0), common=0.0, angles=(0.0, 1.6953125, 4.0), position=1.0, part=0.75)
 def test_within_the_limits_tilt_keeps_its_direction(
     tilt: tuple[float, float], common: float, angles: tuple[float, float, float], position: float, part: float
 ) -> None:

@@ -47,8 +47,8 @@ ROTATION = 'kind = "rotation"\ninclination_deg = 12.0\nfrequency_hz = 0.2'
         # A smooth motion agrees to 0.02 deg: servo loops sampled at 1 ms, encoders, the ramp between set-points.
         pytest.param("rotation", ROTATION, 0.02, id="rotation"),
         # While the drives run at their limits the controller's lead limit sees positions that are one bus cycle old:
-        # 10 ms at 60 deg/s are 0.6 deg.
-        pytest.param("step", STEP, 0.6, id="step"),
+        # 10 ms at the slew limit of 12.5 rad/s are 0.125 rad of each motor, 0.25 rad of theta_i, at 5.2 deg/rad.
+        pytest.param("step", STEP, 1.3, id="step"),
     ],
 )
 def test_a_run_on_simulated_drives_equals_the_co_simulation(

@@ -124,7 +124,7 @@ state = fmu.getFMUstate()
 print(b'"compiled": true' in bytes(fmu.serializeFMUstate(state)), "softneck.core" in sys.modules)
 fmu.freeFMUstate(state)
 fmu.terminate()
-fmu.freeInstance()  # FMI asks for it; CI once saw a child that did not, end by SIGABRT
+fmu.freeInstance()
 """
 
 

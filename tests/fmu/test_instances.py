@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softneck.fmu import build_fmu
+from softneck.fmu import build_fmu, unpacked
 
 TS = 0.02
 
@@ -95,3 +95,28 @@ def test_fmpy_s_own_simulation_runs_them(kind: str, toys: Any, tmp_path: Path) -
     result = fmpy.simulate_fmu(str(path), stop_time=1.0, start_values=starts)
     assert len(result) == 51
     assert np.isfinite(np.array(result.tolist(), dtype=float)).all()
+
+
+_ENDING = """
+import atexit, sys
+import fmpy
+from fmpy.fmi2 import FMU2Slave
+seen = []
+register = atexit.register
+atexit.register = lambda function, *rest: (seen.append(getattr(function, "__name__", "")), register(function, *rest))[1]
+guid = fmpy.read_model_description(sys.argv[1]).guid
+for name in ("one", "two"):
+    fmu = FMU2Slave(guid=guid, unzipDirectory=sys.argv[1], modelIdentifier="Lag", instanceName=name)
+    fmu.instantiate()
+    fmu.freeInstance()
+print(seen.count("finalizePythonInterpreter"))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only the binary for Linux ends twice")
+def test_the_binary_is_let_go_before_python_ends(lag_fmu: Path) -> None:
+    """Else a finaliser of pythonfmu's binary writes to memory that was freed, and some hosts end by SIGABRT."""
+    with unpacked(lag_fmu) as folder:
+        command = [sys.executable, "-c", _ENDING, str(folder)]
+        child = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert (child.returncode, child.stdout.strip()) == (0, "1"), child.stderr

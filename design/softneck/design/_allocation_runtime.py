@@ -34,12 +34,14 @@ def allocate_tendons(
     """Fill `target` (3,) with the motors of `wanted`, none above `position` nor below `least` or -`position`.
 
     Co-contraction comes before tilt, which is scaled as a whole. Where `least` is above -`position`, co-contraction
-    is first raised so far that no motor is below it. `least` must be below `position`.
+    is first raised so far that no motor is below it. `least` must be below `position`; unequal tendons that
+    cannot all keep it at rest keep as much of it as they can.
     """
     tilt = np.empty(3)
     # All of the last column are positive where the tendons surround the link.
     most = position / np.max(inverse[:, 2])
     common = min(max(wanted[2], -most), most)
+    least = min(least, most * np.min(inverse[:, 2]))
     for j in range(3):
         tilt[j] = inverse[j, 0] * wanted[0] + inverse[j, 1] * wanted[1]
     taut = least > -position
@@ -64,9 +66,6 @@ def allocate_tendons(
     if taut:
         for j in range(3):
             common = max(common, (least - scale * tilt[j]) / inverse[j, 2])
-    if scale == 0.0:
-        # Unequal tendons that cannot all be at `least` together.
-        common = min(common, most)
     for j in range(3):
         target[j] = min(max(inverse[j, 2] * common + scale * tilt[j], -position), position)
 

@@ -41,7 +41,7 @@ from {name} import SoftneckSlave
 
 ctypes.pythonapi.Py_IncRef(ctypes.py_object(globals()))
 """
-_SLAVE = ("_slave_compiled.py", "_slave.py")
+_SLAVE = ("_slave_compiled.py", "_slave_exit.py", "_slave.py")
 
 
 @dataclass(frozen=True, slots=True)

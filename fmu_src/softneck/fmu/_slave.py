@@ -25,6 +25,7 @@ from pythonfmu.fmi2slave import Fmi2Slave
 
 from softneck.fmu._runtime_names import initialise, state_size, step
 from softneck.fmu._slave_compiled import _FMU_SWITCH, _fmu_compiled_step, _fmu_print
+from softneck.fmu._slave_exit import _fmu_release_at_exit
 
 # Share of a sample time: hosts add up their time, and 1e6 steps of 2 ms are off by 1e-7 s at most.
 _FMU_SAME_TIME = 1e-4
@@ -97,6 +98,7 @@ class SoftneckSlave(Fmi2Slave):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.folder = kwargs["resources"]
+        _fmu_release_at_exit(self.folder)
         self.facts = json.loads(Path(self.folder, "block.json").read_text(encoding="utf-8"))
         self.arrays = _fmu_arrays(Path(self.folder, "arrays.npy"), self.facts["shapes"])
         self.modelName = self.facts["name"]

@@ -101,7 +101,10 @@ _override_option = click.option(
 _neck_option = click.option("--neck", metavar="paper|lab|NECK.toml", help="The virtual neck of --simulated.")
 
 
-@click.group("drives")
+@click.group(
+    "drives",
+    epilog="Example: softneck drives check --simulated. Every command takes --json, and --help tells its options.",
+)
 def command() -> None:
     """CANopen drives (CiA 301/402): scan, check, zero, run, stop, reset; on a bus or simulated.
 
