@@ -88,6 +88,7 @@ def test_a_first_order_model_needs_one_angle_and_gains_nothing_from_more(trainin
     np.testing.assert_allclose(_angles(one, part), _angles(three, part), rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_over_nonlinear_models_it_bridges_what_is_missing() -> None:
     """20 % dropouts and blackouts of 0.6 s on the virtual neck, as `examples/nonlinear_filter.py` prints them."""
     script: dict[str, Any] = runpy.run_path(str(ROOT / "examples" / "nonlinear_filter.py"))

@@ -149,6 +149,7 @@ def test_windows_and_their_uncertainty_widen_the_plant(recordings: list[Recordin
         assert wide.covered(name) <= 1.0 + 1e-9
 
 
+@pytest.mark.slow
 def test_gains_across_the_axes_are_told() -> None:
     P = signal("mixed", duration=60.0, seed=3).set_points.copy()
     P[:15] = 0.0

@@ -90,6 +90,7 @@ def arm(shared_data: Path) -> tuple[Recording, Recording]:
     return whole.rows(0, 13_000), whole.rows(13_000, 20_000)
 
 
+@pytest.mark.slow
 def test_on_the_real_arm_both_forms_beat_any_linear_model(arm: tuple[Recording, Recording]) -> None:
     train, test = arm
     y = test.outputs[WARM_UP:, 0]

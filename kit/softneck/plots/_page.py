@@ -40,7 +40,7 @@ nav { display: flex; flex-wrap: wrap; gap: .2rem 1rem; } a { color: inherit; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .9rem; margin: .6rem 0; }
 th, td { padding: .25rem .7rem; border-bottom: 1px solid var(--line); text-align: right; white-space: nowrap; }
 th { white-space: normal; vertical-align: bottom; }
-th.text, td.text { text-align: left; }
+th.text, td.text { text-align: left; } td.text ~ td.text { white-space: normal; min-width: 16rem; }
 caption { text-align: left; font-weight: 600; padding: .3rem 0; }
 td.holds { color: var(--good); font-weight: 600; } td.fails { color: var(--bad); font-weight: 600; }
 figure { margin: 1rem 0; } figure img { width: 100%; background: #fff; border-radius: 4px; display: block; }
