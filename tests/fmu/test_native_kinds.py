@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import zipfile
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -155,16 +156,18 @@ def test_instances_in_threads_do_not_disturb_each_other(tmp_path: Path, running:
     block, u = block_of("any"), inputs_of(block_of("any"), 200)
     results: list[np.ndarray] = []
 
-    def one() -> None:
-        with running(tmp_path / "Any.fmu") as fmu:
-            fmu.begin()
-            results.append(_run(fmu, block, u))
+    def one(fmu: Any) -> None:
+        fmu.begin()
+        results.append(_run(fmu, block, u))
 
-    threads = [threading.Thread(target=one) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ExitStack() as stack:
+        # Loading is for one thread: fmpy changes the directory of the process meanwhile.
+        fmus = [stack.enter_context(running(tmp_path / "Any.fmu")) for _ in range(4)]
+        threads = [threading.Thread(target=one, args=(fmu,)) for fmu in fmus]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
     assert len(results) == 4
     for seen in results[1:]:
         np.testing.assert_array_equal(seen, results[0])
