@@ -6,6 +6,7 @@ fmpy loads and instantiates; the calls of every step go straight to the library 
 from __future__ import annotations
 
 import ctypes
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,8 @@ from ._variables import Description, types_of
 OK_OR_WARNING, ERROR, FATAL = 1, 3, 4
 _STATUS = ("OK", "a warning", "discard", "an error", "a fatal error", "pending")
 Log = Callable[[int, str], None]
+# fmpy changes the directory of the process while it loads a library: two threads would leave it in the wrong one.
+_LOADING = threading.Lock()
 
 
 class CallError(RuntimeError):
@@ -59,7 +62,8 @@ class Native:
             "modelIdentifier": description.identifier,
             "instanceName": description.path.stem,
         }
-        self.fmu: Any = FMU2Slave(**common) if self.version == 2 else FMU3Slave(**common)
+        with _LOADING:
+            self.fmu: Any = FMU2Slave(**common) if self.version == 2 else FMU3Slave(**common)
         self._log = log
         self._step: Callable[..., int] | None = None
         self._step_rest: tuple[Any, ...] = ()
