@@ -64,7 +64,13 @@ def mpc(part: str) -> Any:
     return settings.design(neck_table.family())
 
 
-CONTROLLERS: dict[str, Callable[[str], Any]] = {"pi": pi, "mpc": mpc}
+def mpc_tight(part: str) -> Any:
+    """Return the same with limits that hold on samples of the family, tightened by what trials still passed."""
+    settings = MpcSettings(**SOFT, scenarios=3, tightening=True) if part != "rotation" else MpcSettings(**FOLLOWING)
+    return settings.design(neck_table.family())
+
+
+CONTROLLERS: dict[str, Callable[[str], Any]] = {"pi": pi, "mpc": mpc, "mpc_tight": mpc_tight}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
