@@ -249,6 +249,10 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
 }
 
 
+# Kinds that also run as C; nonlinear predictive control is not translated.
+NATIVE = [kind for kind in KINDS if kind != "nmpc"]
+
+
 @cache
 def block_of(kind: str) -> Block:
     return KINDS[kind][0]()
