@@ -67,8 +67,9 @@ def mpc(part: str) -> Any:
 
 def nmpc(part: str) -> Any:
     """Return nonlinear predictive control over a network of the neck without payload; it knows no tautness."""
-    following = {"preview": 0.6, "bandwidth": 12.0, "reference_time": 0.05}
-    settings = NmpcSettings(**(following if part == "rotation" else {"angle_limit": LIMIT}))
+    following: dict[str, Any] = {"preview": 0.6, "bandwidth": 12.0, "reference_time": 0.05}
+    asked: dict[str, Any] = following if part == "rotation" else {"angle_limit": LIMIT}
+    settings = NmpcSettings(**asked)
     return settings.design(Network().fit(neck_table.recordings()[0]))
 
 

@@ -266,5 +266,11 @@ def test_what_it_cannot_use_is_refused(recording: Recording, controller: NmpcCon
         NmpcSettings(slack_weight=-1.0)
     with pytest.raises(SettingsError, match="for `order=sequential`"):
         NmpcSettings(order="jacobi")
+    with pytest.raises(SettingsError, match="`cocontraction_weight` must be positive"):
+        NmpcSettings(cocontraction_weight=-1.0)
+    with pytest.raises(SettingsError, match="`horizon` must be"):
+        NmpcSettings(horizon=10.5)  # type: ignore[arg-type]
+    with pytest.raises(DataError, match="nmpc takes 10 finite inputs"):
+        controller.step(controller.initial_state(), [0.1] * 7)
     with pytest.raises(SettingsError, match="is no parameter of nmpc"):
         controller.initial_state(colour=1.0)

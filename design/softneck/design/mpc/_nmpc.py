@@ -135,7 +135,7 @@ class NmpcSettings:
 class NmpcController:
     """A nonlinear predictive controller of pitch and roll; `NmpcSettings.design` makes it.
 
-    It is a Python object with `step`, and a part of loops (`part`); CasADi and daqp are needed where it runs.
+    `block` is for FMUs and loop files and needs numpy alone; `step` and `part` solve the same with CasADi and daqp.
 
     Attributes:
         settings: what was asked.
