@@ -30,7 +30,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from softneck.core import Matrix, Vector
-from softneck.design import MpcSettings, NeckSteps, PiSettings
+from softneck.design import MpcSettings, NeckSteps, NmpcSettings, PiSettings
+from softneck.identification import Network
 from softneck.loop import AheadReference, BlockPart, Loop, LoopResult, RecordingReference, run_loop
 from softneck.plant import VirtualNeck, record
 from softneck.signals import TENDON_ANGLES, redefinition_matrix, signal
@@ -71,6 +72,15 @@ def mpc_tight(part: str) -> Any:
 
 
 CONTROLLERS: dict[str, Callable[[str], Any]] = {"pi": pi, "mpc": mpc, "mpc_tight": mpc_tight}
+def nmpc(part: str) -> Any:
+    """Return nonlinear predictive control over a network of the neck without payload; it knows no tautness."""
+    following: dict[str, Any] = {"preview": 0.6, "bandwidth": 12.0, "reference_time": 0.05}
+    asked: dict[str, Any] = following if part == "rotation" else {"angle_limit": LIMIT}
+    settings = NmpcSettings(**asked)
+    return settings.design(Network().fit(neck_table.recordings()[0]))
+
+
+CONTROLLERS: dict[str, Callable[[str], Any]] = {"pi": pi, "mpc": mpc, "nmpc": nmpc}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
