@@ -1,4 +1,4 @@
-/* The two loops of a network, four numbers at a time: AVX2 where the processor has it, else what it has. Every lane does
+/* The loops that take most of the time, four numbers at a time: AVX2 where the processor has it, else what it has. Every lane does
  * what the scalar code does, and the order of all sums is written down, so that the bits are the same either way. */
 #ifndef SN_WIDE_H
 #define SN_WIDE_H
@@ -67,14 +67,42 @@ typedef int64_t sn_l4 __attribute__((vector_size(32)));
         }                                                                                                           \
     }
 
+/* `tree_cones`: four points at a time, each point's sum in the order of its sides. The last four overlap those before:
+ * what is worked out twice comes out equal. */
+#define SN_CONES(name, attribute)                                                                                   \
+    attribute static void name(double *restrict y, const double *restrict p, int64_t gap, int64_t count,             \
+                               const double *restrict x, int64_t n, double gamma)                                   \
+    {                                                                                                               \
+        for (int64_t k = 0; k < count; k += 8) {                                                                    \
+            int64_t one = k < count - 4 ? k : count - 4, two = k + 4 < count - 4 ? k + 4 : count - 4;               \
+            sn_d4 s = {0.0, 0.0, 0.0, 0.0}, t = s, a, b;                                                            \
+            for (int64_t i = 0; i < n; i++) {                                                                       \
+                memcpy(&a, p + i * gap + one, sizeof a);                                                            \
+                memcpy(&b, p + i * gap + two, sizeof b);                                                            \
+                a -= x[i];                                                                                          \
+                b -= x[i];                                                                                          \
+                s += a * a;                                                                                         \
+                t += b * b;                                                                                         \
+            }                                                                                                       \
+            for (int j = 0; j < 4; j++)                                                                             \
+                s[j] = sqrt(s[j]), t[j] = sqrt(t[j]);                                                               \
+            s *= gamma;                                                                                             \
+            t *= gamma;                                                                                             \
+            memcpy(y + one, &s, sizeof s);                                                                          \
+            memcpy(y + two, &t, sizeof t);                                                                          \
+        }                                                                                                           \
+    }
+
 SN_TANH_ALL(sn_tanh_all_plain, )
 SN_ROWS(sn_rows_plain, )
+SN_CONES(sn_cones_plain, )
 
 #if defined(__x86_64__)
 #include <cpuid.h>
 #define SN_AVX2 __attribute__((target("avx2")))
 SN_TANH_ALL(sn_tanh_all_wide, SN_AVX2)
 SN_ROWS(sn_rows_wide, SN_AVX2)
+SN_CONES(sn_cones_wide, SN_AVX2)
 
 /* Whether processor and operating system have AVX2. */
 static int sn_has_wide(void)
@@ -88,6 +116,7 @@ static int sn_has_wide(void)
 #else
 #define sn_tanh_all_wide sn_tanh_all_plain
 #define sn_rows_wide sn_rows_plain
+#define sn_cones_wide sn_cones_plain
 static int sn_has_wide(void) { return 0; }
 #endif
 
@@ -106,8 +135,39 @@ static void sn_rows(const sn_work *w, double *y, const double *A, const double *
     else
         sn_rows_plain(y, A, x, rows, gap, n);
 }
+
+typedef double sn_d2 __attribute__((vector_size(16)));
+typedef int64_t sn_l2 __attribute__((vector_size(16)));
+
+/* `tree_children`: both children side by side, each sum in the order of the sides; a gap below zero counts nothing. */
+static void sn_two_boxes(const double *a, const double *b, const double *x, int64_t n, double *result)
+{
+    sn_d2 sum = {0.0, 0.0};
+    for (int64_t i = 0; i < n; i++) {
+        sn_d2 low = {a[2 * i], b[2 * i]}, high = {a[2 * i + 1], b[2 * i + 1]}, below = low - x[i], above = x[i] - high;
+        sn_l2 first = below > above;
+        sn_d2 gap = (sn_d2)((first & (sn_l2)below) | (~first & (sn_l2)above));
+        gap = (sn_d2)((gap > 0.0) & (sn_l2)gap);
+        sum += gap * gap;
+    }
+    result[0] = sqrt(sum[0]);
+    result[1] = sqrt(sum[1]);
+}
 #else
 static int sn_has_wide(void) { return 0; }
+
+static void sn_two_boxes(const double *a, const double *b, const double *x, int64_t n, double *result)
+{
+    double left = 0.0, right = 0.0, gap;
+    for (int64_t i = 0; i < n; i++) {
+        gap = sn_max(a[2 * i] - x[i], x[i] - a[2 * i + 1]);
+        left += gap > 0.0 ? gap * gap : 0.0;
+        gap = sn_max(b[2 * i] - x[i], x[i] - b[2 * i + 1]);
+        right += gap > 0.0 ? gap * gap : 0.0;
+    }
+    result[0] = sqrt(left);
+    result[1] = sqrt(right);
+}
 
 static void sn_tanh_all(const sn_work *w, double *y, const double *x, int64_t n)
 {
@@ -116,5 +176,45 @@ static void sn_tanh_all(const sn_work *w, double *y, const double *x, int64_t n)
         y[i] = sn_tanh(x[i]);
 }
 #endif
+
+/* What the runtimes' functions of these names do, with their checks made once for all entries; see `_translate.py`. */
+static void sn_tree_children(sn_work *w, sn_v2 nodes, int64_t node, sn_v1 x, double *result)
+{
+    result[0] = result[1] = 0.0;
+    if (SN_RARE(node < 0 || node > nodes.n0 / 2 || 2 * node + 1 >= nodes.n0 || x.n > nodes.n1 / 2 || nodes.s1 != 1
+                || x.s != 1)) {
+        sn_fault(w, SN_INDEX);
+        return;
+    }
+    sn_two_boxes(nodes.p + 2 * node * nodes.s0, nodes.p + (2 * node + 1) * nodes.s0, x.p, x.n, result);
+}
+
+static void sn_tree_cones(sn_work *w, sn_v2 points, int64_t first, int64_t count, double gamma, sn_v1 x, sn_v1 cones)
+{
+    if (SN_RARE(first < 0 || count < 0 || first > points.n1 || count > points.n1 - first || count > cones.n
+                || x.n > points.n0 || points.s1 != 1 || x.s != 1 || cones.s != 1)) {
+        sn_fault(w, SN_INDEX);
+        return;
+    }
+    if (count == 0 || !sn_rounds(w, count))
+        return;
+#ifdef SN_LANES
+    if (count >= 4) {
+        if (w->wide)
+            sn_cones_wide(cones.p, points.p + first, points.s0, count, x.p, x.n, gamma);
+        else
+            sn_cones_plain(cones.p, points.p + first, points.s0, count, x.p, x.n, gamma);
+        return;
+    }
+#endif
+    for (int64_t k = 0; k < count; k++) {
+        double sum = 0.0;
+        for (int64_t i = 0; i < x.n; i++) {
+            double gap = points.p[i * points.s0 + first + k] - x.p[i];
+            sum += gap * gap;
+        }
+        cones.p[k] = gamma * sqrt(sum);
+    }
+}
 
 #endif
