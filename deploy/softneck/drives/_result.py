@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -36,10 +36,10 @@ class RunLog:
         self._rows: list[list[float]] = []
         self._index = -1
 
-    def take(self, master: Master, index: int, truth: Mapping[str, float] | None) -> None:
-        """Add the row of sample `index`, once."""
+    def take(self, master: Master, index: int, truth: Mapping[str, float] | None) -> dict[str, float] | None:
+        """Add the row of sample `index`, once, and return it by name."""
         if index <= self._index or master.supervisor.phase is not Phase.RUNNING:
-            return
+            return None
         self._index = index
         signals = self._pilot.signals
         row = [float(signals[place]) for place in self._places.values()]
@@ -49,17 +49,34 @@ class RunLog:
         if truth is not None:
             row += [truth[name] for name in _TRUTH]
         self._rows.append(row)
+        return dict(zip(self._names(truth is not None), row, strict=True))
+
+    def _names(self, truth: bool) -> list[str]:
+        names = [*self._places, *(f"motor_position_{j}" for j in (1, 2, 3))]
+        names += [f"tension_estimate_{j}" for j in (1, 2, 3)] + ["pitch_measured", "roll_measured"]
+        return names + (list(_TRUTH) if truth else [])
 
     def result(self, sample_time: float, *, truth: bool) -> LoopResult:
         """Return all rows."""
-        names = [*self._places, *(f"motor_position_{j}" for j in (1, 2, 3))]
-        names += [f"tension_estimate_{j}" for j in (1, 2, 3)] + ["pitch_measured", "roll_measured"]
-        names += list(_TRUTH) if truth else []
+        names = self._names(truth)
         table = np.array(self._rows) if self._rows else np.zeros((0, len(names)))
-        units = {name: "N" if "tension" in name else "1" if name == "healthy" else "rad" for name in names}
-        units |= {"compression": "m"}
         signals: dict[str, Vector] = {name: table[:, i].copy() for i, name in enumerate(names)}
-        return LoopResult(np.arange(len(table)) * sample_time, signals, units, sample_time)
+        return LoopResult(np.arange(len(table)) * sample_time, signals, signal_units(names), sample_time)
+
+
+def signal_units(names: Iterable[str]) -> dict[str, str]:
+    """Return the unit of each signal of a run."""
+    units = {name: "N" if "tension" in name else "1" if name == "healthy" else "rad" for name in names}
+    return units | ({"compression": "m"} if "compression" in units else {})
+
+
+def recording_of(signals: LoopResult) -> Recording:
+    """Return a run as a recording: as measured, with true angles where simulated drives know them."""
+    known = set(known_channels())
+    channels = {name: values for name, values in signals.signals.items() if name in known}
+    for axis in ("pitch", "roll"):
+        channels.setdefault(axis, signals[f"{axis}_measured"])
+    return Recording(signals.time, signals.sample_time, channels)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,11 +132,7 @@ class DrivesResult:
 
     def recording(self) -> Recording:
         """Return the run as a recording: as measured, with true angles where simulated drives know them."""
-        known = set(known_channels())
-        channels = {name: values for name, values in self.signals.signals.items() if name in known}
-        for axis in ("pitch", "roll"):
-            channels.setdefault(axis, self.signals[f"{axis}_measured"])
-        return Recording(self.signals.time, self.signals.sample_time, channels)
+        return recording_of(self.signals)
 
     def table(self) -> dict[str, Any]:
         """Return the JSON of `softneck drives run`."""
