@@ -13,6 +13,7 @@ from softneck.loop import LoopResult, metrics
 from softneck.signals import Recording, known_channels
 
 from ._pilot import LoopPilot
+from ._times import CycleTimes
 from .master import Event, Master, Phase
 
 _TRUTH = ("pitch", "roll", "tension_1", "tension_2", "tension_3", "compression")
@@ -93,8 +94,8 @@ class DrivesResult:
         cycles: of the bus.
         cycle: bus period [s].
         wall_time: [s].
-        longest_step: of the master, controller included [s].
         simulated: whether the drives were.
+        times: of the cycles, in real time.
     """
 
     signals: LoopResult
@@ -107,7 +108,7 @@ class DrivesResult:
     cycle: float
     wall_time: float
     simulated: bool
-    longest_step: float = 0.0
+    times: CycleTimes
     notes: tuple[str, ...] = field(default=())
 
     @property
@@ -147,7 +148,8 @@ class DrivesResult:
             "cycles": self.cycles,
             "cycle_s": self.cycle,
             "real_time_factor": self.real_time_factor,
-            "longest_step_s": self.longest_step,
+            "longest_step_s": self.times.longest_step,
+            "times": None if self.simulated else self.times.table(),
             "metrics": metrics(self.signals) if len(self.signals.time) > 1 else None,
             "notes": list(self.notes),
         }  # fmt: skip
