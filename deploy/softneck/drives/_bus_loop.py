@@ -7,17 +7,20 @@ On simulated drives it runs in virtual time, on a bus at the pace of the monoton
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from pathlib import Path
 from typing import Protocol
 
 from softneck.core import SettingsError, SoftneckError
 
+from ._cycle import LoggedPilot
 from ._file import DrivesFile
 from ._link import CanLink, VirtualLink
 from ._objects import disarm_writes
 from ._preflight import preflight
+from ._run_log import RunLogger, run_facts
 from ._sdo import Objects, SdoError, load_eds
 from ._times import CycleTimes
 from ._virtual import VirtualRun, Watch
@@ -64,6 +67,8 @@ class Session:
             On a bus they run in the control loop: what takes long belongs to another thread or process.
         operator: asked each cycle what somebody at the keyboard wants.
         settings: changes the master's settings, for tests.
+        log: where frames and cycles are written; whoever opened it closes it.
+        files: role -> path of what acts in the run, for the log.
     """
 
     file: DrivesFile
@@ -74,6 +79,8 @@ class Session:
     watches: tuple[Watch, ...] = ()
     operator: Operator | None = None
     settings: Callable[[MasterSettings], MasterSettings] | None = None
+    log: RunLogger | None = None
+    files: Mapping[str, str | Path] = field(default_factory=dict)
 
     @property
     def simulated(self) -> bool:
@@ -113,10 +120,18 @@ def run_session(
     """
     file, link = session.file, session.link
     file.master_settings(sample_time)
+    log = session.log
+    if log is not None:
+        link.tap = log.frame
     checked = preflight(link, file, override=session.override, homed=True)
     checked.require()
     settings = file.master_settings(sample_time, guarding=checked.guarding)
-    master = Master(settings if session.settings is None else session.settings(settings), pilot)
+    settings = settings if session.settings is None else session.settings(settings)
+    if log is not None:
+        log.describe(run_facts(settings, session.files, simulated=session.simulated))
+        pilot = LoggedPilot(pilot)
+        session = replace(session, watches=(*session.watches, log.watch(pilot)))
+    master = Master(settings, pilot)
     link.send([nmt_frame(NmtCommand.START, node) for node in file.nodes])
     if begin is not None:
         begin(master)

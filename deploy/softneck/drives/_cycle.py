@@ -136,7 +136,7 @@ def decode_cycle(table: dict[str, Any]) -> Cycle:
 
 
 def frame_text(frame: Frame) -> str:
-    """Return `201#0f00a1b2c3d4`; after `#` stand R for a remote request, X for what is about the bus and not from it."""
+    """Return `201#0f00a1b2c3d4`; after `#` stand R for a remote request, X for what is about the bus, not from it."""
     kind = ("R" if frame.remote else "") + ("X" if frame.error else "")
     return f"{frame.identifier:03X}#{kind}{frame.data.hex()}"
 

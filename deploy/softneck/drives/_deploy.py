@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from ._file import DrivesFile
 from ._link import CanLink, VirtualLink
 from ._pilot import LoopPilot
 from ._result import DrivesResult, RunLog
+from ._run_log import RunLogger
 from ._virtual import Watch, simulated_neck
 from .master import Frame, Master, MasterSettings, Tilt
 
@@ -84,6 +85,8 @@ def run_simulated(
     operator: Operator | None = None,
     hook: Callable[[VirtualLink], None] | None = None,
     settings: Callable[[MasterSettings], MasterSettings] | None = None,
+    log: RunLogger | None = None,
+    files: Mapping[str, str | Path] | None = None,
 ) -> DrivesResult:
     """Run the whole loop on simulated drives, in virtual time.
 
@@ -98,6 +101,8 @@ def run_simulated(
         operator: asked each cycle what the operator wants.
         hook: called after each bus cycle, to let things go wrong.
         settings: changes the master's settings, for tests.
+        log: where frames and cycles are written.
+        files: role -> path of what acts, for the log; `replay` looks for "loop" and "controller".
 
     Raises:
         CheckFailedError: the pre-flight failed.
@@ -116,8 +121,9 @@ def run_simulated(
     if hook is not None:
         more.append(lambda _now, _in, _out, _tilt, _master: hook(link))
     session = Session(
-        file=file, link=link, override=override, pace=pace, watches=tuple(more), operator=operator, settings=settings
-    )
+        file=file, link=link, override=override, pace=pace, watches=tuple(more), operator=operator, settings=settings,
+        log=log, files=files or {},
+    )  # fmt: skip
     return _run(deployed, pilot, session, report)
 
 
@@ -131,6 +137,8 @@ def run_on_bus(
     report: Callable[[float], None] | None = None,
     watches: Sequence[Watch] = (),
     operator: Operator | None = None,
+    log: RunLogger | None = None,
+    files: Mapping[str, str | Path] | None = None,
 ) -> DrivesResult:
     """Run the loop on the drives behind `link`, at the pace of the monotonic clock.
 
@@ -143,6 +151,8 @@ def run_on_bus(
         report: called now and then with the done fraction.
         watches: called after each bus cycle, see `Session`.
         operator: asked each cycle what the operator wants.
+        log: where frames and cycles are written.
+        files: role -> path of what acts, for the log; `replay` looks for "loop" and "controller".
 
     Raises:
         CheckFailedError: the pre-flight failed; nothing moved.
@@ -150,7 +160,8 @@ def run_on_bus(
     pilot = LoopPilot(deployed.loop)
     pilot.warm()
     session = Session(
-        file=file, link=link, sensor=sensor, override=override, watches=tuple(watches), operator=operator
+        file=file, link=link, sensor=sensor, override=override, watches=tuple(watches), operator=operator,
+        log=log, files=files or {},
     )  # fmt: skip
     return _run(deployed, pilot, session, report)
 
@@ -165,7 +176,9 @@ def _run(
     def watch(_now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Tilt | None, master: Master) -> None:
         if not master.ran:
             return
-        log.take(master, master.index, None if neck is None else neck.truth())
+        row = log.take(master, master.index, None if neck is None else neck.truth())
+        if session.log is not None:
+            session.log.signals(row)
         if report is not None and master.index % 50 == 0:
             report(min(1.0, master.index / rows))
 

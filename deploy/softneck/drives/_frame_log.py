@@ -92,6 +92,9 @@ class _Kept(io.BufferedIOBase):
     def writable(self) -> bool:
         return True
 
+    def seekable(self) -> bool:
+        return True
+
 
 class FrameLog:
     """Frames of a `.log` or `.blf` file.

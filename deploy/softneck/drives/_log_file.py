@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,12 +24,16 @@ from .master import BusSettings, LimitSettings, MasterSettings, RampSettings, Se
 # No record of ours comes near; a damaged length must not reserve the memory of the machine.
 _LARGEST = 1 << 26
 _PARTS: dict[str, type] = {
-    "bus": BusSettings, "limits": LimitSettings, "sensor": SensorSettings, "watch": WatchSettings, "ramps": RampSettings,
-}  # fmt: skip
+    "bus": BusSettings,
+    "limits": LimitSettings,
+    "sensor": SensorSettings,
+    "watch": WatchSettings,
+    "ramps": RampSettings,
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RunLog:
+class LoggedRun:
     """The log of one run.
 
     Attributes:
@@ -63,9 +68,7 @@ class RunLog:
     def signals(self) -> LoopResult:
         """Return the rows as the result of the run had them."""
         names = list(dict.fromkeys(name for row in self.rows for name in row))
-        signals: dict[str, Vector] = {
-            name: np.array([row.get(name, math.nan) for row in self.rows]) for name in names
-        }
+        signals: dict[str, Vector] = {name: np.array([row.get(name, math.nan) for row in self.rows]) for name in names}
         step = self.sample_time
         return LoopResult(np.arange(len(self.rows)) * step, signals, signal_units(names), step)
 
@@ -86,13 +89,12 @@ class RunLog:
         return recording_of(self.signals())
 
 
-def read_run_log(path: str | Path) -> RunLog:
+def read_run_log(path: str | Path) -> LoggedRun:
     """Read a `.mcap` log of `softneck drives`; one that is cut is read up to the cut.
 
     Raises:
         FileFormatError: no such file, no MCAP, or none of ours.
     """
-    from mcap.exceptions import McapError
     from mcap.records import Channel, Message, Metadata
     from mcap.stream_reader import StreamReader
 
@@ -123,15 +125,13 @@ def read_run_log(path: str | Path) -> RunLog:
         raise FileFormatError(f"{source}: cannot be read ({error.strerror}).") from error
     except FileFormatError:
         raise
-    # What damaged bytes make of mcap's reader and its compressors has no common base class.
-    except (McapError, EOFError, ValueError, KeyError, TypeError, IndexError, RuntimeError, ArithmeticError, MemoryError,
-            _zstd_error()) as error:  # fmt: skip
+    except _damage() as error:
         if facts is None:
             raise FileFormatError(f"{source}: is no log of `softneck drives` ({_word(error)}).") from error
         cut = f"ends in the middle ({_word(error)})"
     if facts is None:
         raise FileFormatError(f"{source}: is MCAP, but no log of `softneck drives`: it has no `{METADATA}`.")
-    return RunLog(source, facts, tuple(cycles), tuple(rows), tuple(events), cut)
+    return LoggedRun(source, facts, tuple(cycles), tuple(rows), tuple(events), cut)
 
 
 def _facts(source: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
@@ -150,17 +150,22 @@ def _tuples(table: Mapping[str, Any]) -> dict[str, Any]:
     return {key: frozenset(value) if key == "off" else value for key, value in values.items()}
 
 
-def _zstd_error() -> type[Exception]:
+def _damage() -> tuple[type[Exception], ...]:
+    """Return what damaged bytes make of mcap's reader and its decompressor: it has no common base class."""
     import zstandard
+    from mcap.exceptions import McapError
 
-    return zstandard.ZstdError
+    return (
+        McapError, zstandard.ZstdError, EOFError, ValueError, KeyError, TypeError, IndexError, RuntimeError,
+        ArithmeticError, MemoryError, struct.error,
+    )  # fmt: skip
 
 
 def _word(error: BaseException) -> str:
     return " ".join(str(error).split())[:120] or type(error).__name__
 
 
-def changed_files(log: RunLog) -> list[str]:
+def changed_files(log: LoggedRun) -> list[str]:
     """Return a line for each file of the run that is gone or is not what it was."""
     lines = []
     for role, entry in log.facts.get("files", {}).items():

@@ -9,7 +9,7 @@ from typing import Any
 from softneck.core import CheckFailedError, DataError
 
 from ._cycle import Answer, Cycle, LoggedPilot, Triple, cycle_of
-from ._log_file import RunLog
+from ._log_file import LoggedRun
 from ._meaning import meaning
 from .master import Master, Measured, Pilot
 
@@ -112,7 +112,7 @@ class _Astray(Exception):
     """The replayed core asks for what the logged one did not."""
 
 
-def replay(log: RunLog, pilot: Pilot | None = None, notes: Iterable[str] = ()) -> Replay:
+def replay(log: LoggedRun, pilot: Pilot | None = None, notes: Iterable[str] = ()) -> Replay:
     """Feed the log's frames, samples, requests and times to a new master and compare all that it sends.
 
     Args:

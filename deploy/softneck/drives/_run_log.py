@@ -8,16 +8,16 @@ import math
 import queue
 import threading
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 from softneck.core import OutputError, SettingsError, file_hash, refuse_existing
 
-from ._cycle import Cycle, encode_cycle
+from ._cycle import Cycle, LoggedPilot, cycle_of, encode_cycle
 from ._frame_log import FRAME_LOGS, BlfSink, CandumpSink
-from .master import Event, Frame, MasterSettings
+from .master import Event, Frame, Master, MasterSettings, Tilt
 
 RUN_LOG = ".mcap"
 LOG_VERSION = 1
@@ -86,9 +86,7 @@ def run_facts(
         "settings": dataclasses.asdict(settings)
         | {"bus": dataclasses.asdict(settings.bus) | {"off": sorted(settings.bus.off)}},
         "simulated": simulated,
-        "files": {
-            role: {"path": str(Path(path).resolve()), "sha256": file_hash(path)} for role, path in files.items()
-        },
+        "files": {role: {"path": str(Path(path).resolve()), "sha256": file_hash(path)} for role, path in files.items()},
         **more,
     }
 
@@ -126,6 +124,8 @@ class RunLogger:
         self.lost, self.problem = 0, ""
         self._wait, self._epoch = wait, epoch
         self._frames: list[tuple[float, bool, Frame]] = []
+        self._row: Mapping[str, float] | None = None
+        self._seen: Event | None = None
         self._queue: queue.Queue[_Entry | Mapping[str, Any] | None] = queue.Queue(_WAITING)
         self._streams: list[BinaryIO] = []
         self._sinks: list[Any] = []
@@ -152,11 +152,39 @@ class RunLogger:
         if len(self._frames) >= 256:
             self._put(_Entry(self._swap()))
 
-    def cycle(
-        self, cycle: Cycle, *, signals: Mapping[str, float] | None = None, events: Collection[Event] = ()
-    ) -> None:
-        """Take one step of the master, with the row of its sample and what happened in it."""
-        self._put(_Entry(self._swap(), cycle, signals, tuple(events), cycle.time))
+    def signals(self, row: Mapping[str, float] | None) -> None:
+        """Take the row of a sample of the controller; it is written with the cycle."""
+        self._row = row
+
+    def watch(self, pilot: LoggedPilot) -> Callable[..., None]:
+        """Return what is to be called after each step of a master that asks `pilot`."""
+
+        def watch(
+            now: float, received: Sequence[Frame], sent: Sequence[Frame], tilt: Tilt | None, master: Master
+        ) -> None:
+            row, self._row = self._row, None
+            cycle = cycle_of(master, pilot, now, received, tilt, sent)
+            self._put(_Entry(self._swap(), cycle, row, self._news(master), now))
+
+        return watch
+
+    def _news(self, master: Master) -> tuple[Event, ...]:
+        news = []
+        for event in reversed(master.events):
+            if event is self._seen:
+                break
+            news.append(event)
+        if news:
+            self._seen = news[0]
+        return tuple(reversed(news))
+
+    def __enter__(self) -> RunLogger:
+        """Be a context."""
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Close, whatever happened: a log of what went wrong is worth most."""
+        self.close()
 
     def close(self) -> None:
         """Write what is left and give the files their names.

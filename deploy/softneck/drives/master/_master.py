@@ -90,11 +90,13 @@ class Master:
 
     def leave(self, reason: str = "") -> None:
         """Ask for the ramp to rest and the end from wherever the run is; before anything moved, for a stop."""
+        self.requests.append(("leave", reason))
+        now = self._now or 0.0
         if self.supervisor.phase in (Phase.RAMP_IN, Phase.RUNNING):
-            self.finish()
-            self._told(Event(self._now or 0.0, "left", 0, reason))
+            self._asked.append(Signal.FINISH)
+            self._told(Event(now, "left", 0, reason))
         elif self.supervisor.phase in (Phase.IDLE, Phase.ENABLING):
-            self.stop(reason)
+            self._told(Event(now, "operator", 0, reason))
 
     def stop(self, reason: str = "") -> None:
         """Ask for an immediate stop of all drives."""
