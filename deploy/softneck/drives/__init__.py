@@ -42,6 +42,10 @@ from ._run_log import run_facts as run_facts
 from ._sdo import SdoError as SdoError
 from ._sdo import load_eds as load_eds
 from ._sensor import CanInclinometer as CanInclinometer
+from ._serial import SensorError as SensorError
+from ._serial import SerialInclinometer as SerialInclinometer
+from ._serial import TiltLines as TiltLines
+from ._serial import tilt_of_line as tilt_of_line
 from ._times import CycleTimes as CycleTimes
 from ._units import DriveScale as DriveScale
 from ._units import acceleration_to_internal as acceleration_to_internal

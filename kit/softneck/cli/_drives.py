@@ -38,6 +38,8 @@ from softneck.drives.master import Tilt
 from softneck.signals import recording_suffix, write_recording
 
 from ._console import note, print_json, print_table, progress
+from ._drives_log import acting_files, log_option, opened_log
+from ._drives_replay import replay_command
 from ._neck import load_neck
 from ._options import force_option, json_option, output_option, target
 
@@ -106,7 +108,7 @@ _neck_option = click.option("--neck", metavar="paper|lab|NECK.toml", help="The v
     epilog="Example: softneck drives check --simulated. Every command takes --json, and --help tells its options.",
 )
 def command() -> None:
-    """CANopen drives (CiA 301/402): scan, check, zero, run, stop, reset; on a bus or simulated.
+    """CANopen drives (CiA 301/402): scan, check, zero, run, replay, stop, reset; on a bus or simulated.
 
     What these commands do was shown on simulated drives only; no hardware was at hand.
     """
@@ -213,13 +215,14 @@ def _require_can_sensor(file: DrivesFile) -> None:
 @_override_option
 @_neck_option
 @click.option("--pace", type=float, help="With --simulated: this multiple of real time instead of as fast as possible.")
+@log_option
 @output_option("recording of the run", "REC")
 @force_option
 @json_option
 def run_command(
     controller: Path, loop_file: Path, certificates: tuple[Path, ...], drives_file: Path | None, bus: str | None,
     simulated: bool, arm: bool, overrides: tuple[str, ...], neck: str | None, pace: float | None,
-    output: Path | None, force: bool, as_json: bool,
+    logs: tuple[Path, ...], output: Path | None, force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Run CONTROLLER in the loop of LOOP.toml on the drives: enable, ramp in, control, ramp out, switch off.
 
@@ -236,18 +239,23 @@ def run_command(
     deployed = prepare(setup, controller)
     for text in deployed.notes:
         note(text)
-    with progress("drives", quiet=as_json) as tell:
+    files = acting_files(setup, loop_file, controller, drives_file)
+    with progress("drives", quiet=as_json) as tell, opened_log(logs, chosen.simulated, force=force) as log:
         report = lambda done: tell(done, controller.name)  # noqa: E731
         if chosen.simulated:
             virtual = load_neck(neck) if neck else None
-            result = run_simulated(deployed, chosen.file, neck=virtual, override=names, pace=pace, report=report)
+            result = run_simulated(
+                deployed, chosen.file, neck=virtual, override=names, pace=pace, report=report, log=log, files=files
+            )
         else:
             _require_can_sensor(chosen.file)
             with _link(chosen, moves=True) as link:
                 sensor = CanInclinometer(chosen.file.sensor_node)
                 if isinstance(link, VirtualLink):
                     raise SettingsError("drives on a bus are asked.")
-                result = run_on_bus(deployed, chosen.file, link, sensor, override=names, report=report)
+                result = run_on_bus(
+                    deployed, chosen.file, link, sensor, override=names, report=report, log=log, files=files
+                )
     if len(result.signals.time) > 1:
         write_recording(path, result.recording(), force=replace)
     _print_run(path, result, as_json=as_json)
@@ -290,3 +298,6 @@ def _states(states: dict[int, str], what: str, *, as_json: bool) -> None:
         print_json({what: [{"node": node, "state": state} for node, state in states.items()]})
     else:
         print_table(what, ["node", "state"], [[str(node), state] for node, state in states.items()])
+
+
+command.add_command(replay_command)
