@@ -46,6 +46,9 @@ from ._serial import SensorError as SensorError
 from ._serial import SerialInclinometer as SerialInclinometer
 from ._serial import TiltLines as TiltLines
 from ._serial import tilt_of_line as tilt_of_line
+from ._sources import ReplaySensor as ReplaySensor
+from ._sources import SensorSource as SensorSource
+from ._sources import open_sensor as open_sensor
 from ._times import CycleTimes as CycleTimes
 from ._units import DriveScale as DriveScale
 from ._units import acceleration_to_internal as acceleration_to_internal

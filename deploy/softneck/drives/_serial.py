@@ -1,9 +1,9 @@
 """The lab's inclinometer on a serial port: an Arduino that sends a line `i12.34,o120.00` for each sample.
 
 i is the inclination, o the orientation of the tilt vector, both in degrees with two decimals, as `Serial.print` writes
-a float; a line ends in "\\n". One firmware sends by itself, another one line for each "i" that it gets. After its start,
-which opening the port causes, it measures its offsets for some seconds and sends "123". Source: the lab's public
-sketches, HUMASoft/ArduinoSensors_Archived; read, not copied.
+a float. One firmware sends by itself, another one line for each "i" that it gets. After its start, which opening the
+port causes, it measures its offsets for some seconds and sends "123". Source: the lab's public sketches,
+HUMASoft/ArduinoSensors_Archived; read, not copied.
 """
 
 from __future__ import annotations
