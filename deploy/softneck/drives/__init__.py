@@ -19,6 +19,8 @@ from ._file import load_drives as load_drives
 from ._file import make_drives as make_drives
 from ._jog import Jogged as Jogged
 from ._jog import jog as jog
+from ._keyboard import Keyboard as Keyboard
+from ._link import HARMLESS as HARMLESS
 from ._link import BusError as BusError
 from ._link import CanLink as CanLink
 from ._link import Link as Link
