@@ -19,6 +19,10 @@ from ._file import default_drives as default_drives
 from ._file import load_drives as load_drives
 from ._file import make_drives as make_drives
 from ._frame_log import FrameLog as FrameLog
+from ._jog import Jogged as Jogged
+from ._jog import jog as jog
+from ._keyboard import Keyboard as Keyboard
+from ._link import HARMLESS as HARMLESS
 from ._link import BusError as BusError
 from ._link import CanLink as CanLink
 from ._link import Link as Link
@@ -33,6 +37,9 @@ from ._preflight import OVERRIDES as OVERRIDES
 from ._preflight import Report as Report
 from ._preflight import preflight as preflight
 from ._preflight import scan as scan
+from ._record import Recorded as Recorded
+from ._record import drive_limits as drive_limits
+from ._record import record_signal as record_signal
 from ._replay import Difference as Difference
 from ._replay import Replay as Replay
 from ._replay import replay as replay
