@@ -42,6 +42,8 @@ class Master:
         counts: event name -> how often.
         events: the last 1000.
         cycle: number of steps so far.
+        requests: (what, why) that came from outside since the last step: start, finish, stop.
+        taken: those that the last step took in.
     """
 
     def __init__(self, settings: MasterSettings, pilot: Pilot) -> None:
@@ -68,6 +70,8 @@ class Master:
         self._enabling, self._enabling_since = 0, _NEVER
         self._hold_at: Triple | None = None
         self._asked: list[Signal] = []
+        self.requests: list[tuple[str, str]] = []
+        self.taken: tuple[tuple[str, str], ...] = ()
 
     @property
     def finished(self) -> bool:
@@ -76,14 +80,27 @@ class Master:
 
     def start(self) -> None:
         """Ask for the run to begin with the next step."""
+        self.requests.append(("start", ""))
         self._asked.append(Signal.START)
 
     def finish(self) -> None:
         """Ask for the ramp out."""
+        self.requests.append(("finish", ""))
         self._asked.append(Signal.FINISH)
+
+    def leave(self, reason: str = "") -> None:
+        """Ask for the ramp to rest and the end from wherever the run is; before anything moved, for a stop."""
+        self.requests.append(("leave", reason))
+        now = self._now or 0.0
+        if self.supervisor.phase in (Phase.RAMP_IN, Phase.RUNNING):
+            self._asked.append(Signal.FINISH)
+            self._told(Event(now, "left", 0, reason))
+        elif self.supervisor.phase in (Phase.IDLE, Phase.ENABLING):
+            self._told(Event(now, "operator", 0, reason))
 
     def stop(self, reason: str = "") -> None:
         """Ask for an immediate stop of all drives."""
+        self.requests.append(("stop", reason))
         self._told(Event(self._now or 0.0, "operator", 0, reason))
 
     def step(self, now: float, frames: Sequence[Frame], tilt: Tilt | None = None) -> list[Frame]:
@@ -94,6 +111,8 @@ class Master:
             frames: all that came since the last one; not our own.
             tilt: the inclinometer's sample if one is due and came; due are the steps with `sample_due`.
         """
+        self.taken = tuple(self.requests)
+        self.requests.clear()
         events = self._timing(now)
         events += self.bus.receive(now, frames)
         self._measure()
