@@ -17,6 +17,7 @@ from ._link import CanLink as CanLink
 from ._link import Link as Link
 from ._link import VirtualLink as VirtualLink
 from ._link import open_bus as open_bus
+from ._notify import Notifier as Notifier
 from ._pilot import LoopPilot as LoopPilot
 from ._preflight import OVERRIDES as OVERRIDES
 from ._preflight import Report as Report
@@ -26,6 +27,8 @@ from ._result import DrivesResult as DrivesResult
 from ._sdo import SdoError as SdoError
 from ._sdo import load_eds as load_eds
 from ._sensor import CanInclinometer as CanInclinometer
+from ._timing import CycleTimes as CycleTimes
+from ._timing import steady as steady
 from ._units import DriveScale as DriveScale
 from ._units import acceleration_to_internal as acceleration_to_internal
 from ._units import counts_to_position as counts_to_position

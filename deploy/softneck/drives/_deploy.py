@@ -15,14 +15,16 @@ from softneck.plant import NeckParameters
 
 from ._file import DrivesFile
 from ._link import CanLink, VirtualLink
+from ._notify import Notifier
 from ._objects import disarm_writes
 from ._pilot import LoopPilot
 from ._preflight import Report, preflight
 from ._result import DrivesResult, RunLog
 from ._sdo import Objects, SdoError, load_eds
+from ._timing import CycleClock, on_termination, steady
 from ._virtual import VirtualRun, simulated_neck
 from .master import Command as NmtCommand
-from .master import Frame, Master, MasterSettings, Tilt, nmt_frame
+from .master import Frame, Master, MasterSettings, Phase, Tilt, nmt_frame
 
 # Before the first cycle on a bus each drive is given this time to become operational [s].
 _START_TIME = 0.1
@@ -172,8 +174,12 @@ def run_on_bus(
     override: Collection[str] = (),
     report: Callable[[float], None] | None = None,
     stopped: Callable[[], bool] | None = None,
+    realtime: bool = False,
 ) -> DrivesResult:
     """Run the loop on the drives behind `link`, at the pace of the monotonic clock.
+
+    SIGTERM ends it early: by a ramp to rest while the controller runs, else at once. A service manager is told
+    (sd_notify) when the pre-flight holds, in which phase the run is, and from each cycle that the loop is alive.
 
     Args:
         deployed: the loop.
@@ -183,10 +189,26 @@ def run_on_bus(
         override: names of pre-flight checks that may fail.
         report: called now and then with the done fraction.
         stopped: asked each cycle whether the operator wants to stop.
+        realtime: run before all ordinary processes (SCHED_FIFO), with memory locked.
 
     Raises:
         CheckFailedError: the pre-flight failed; nothing moved.
+        SettingsError: `realtime` is not permitted; nothing was sent.
     """
+    with Notifier() as notifier, steady(realtime=realtime):
+        return _run_on_bus(deployed, file, link, sensor, override, report, stopped, notifier)
+
+
+def _run_on_bus(
+    deployed: Deployed,
+    file: DrivesFile,
+    link: CanLink,
+    sensor: Sensor,
+    override: Collection[str],
+    report: Callable[[float], None] | None,
+    stopped: Callable[[], bool] | None,
+    notifier: Notifier,
+) -> DrivesResult:
     pilot = LoopPilot(deployed.loop)
     pilot.warm()
     checked = preflight(link, file, override=override, homed=True)
@@ -197,10 +219,13 @@ def run_on_bus(
     link.receive(0.0)
     log = RunLog(pilot)
     rows = max(1, round(deployed.loop.duration / pilot.sample_time))
+    clock, ending = CycleClock(master.settings.bus.cycle), _Ending()
     begin = time.perf_counter()
+    notifier.ready()
     master.start()
     try:
-        longest = _cycle(link, master, sensor, log, stopped, report, rows)
+        with on_termination(ending.ask):
+            longest = _cycle(link, master, sensor, log, stopped, report, rows, clock, notifier, ending)
     except BaseException:
         # Whatever happens here must not leave a drive on: this loop is what feeds them.
         _emergency_stop(link, file)
@@ -209,7 +234,31 @@ def run_on_bus(
         pilot.close()
     _disarm(link, file, checked.guarding)
     wall = time.perf_counter() - begin
-    return _result(master, log, pilot, wall, simulated=False, notes=deployed.notes, longest=longest)
+    result = _result(master, log, pilot, wall, simulated=False, notes=deployed.notes, longest=longest)
+    return replace(result, timing=clock.result(), terminated=ending.asked > 0)
+
+
+@dataclass(slots=True)
+class _Ending:
+    """SIGTERM came: to rest and off while the controller runs, else off at once; the same for a second one."""
+
+    asked: int = 0
+    done: int = 0
+
+    def ask(self) -> None:
+        """Only mark it: a signal comes in the middle of whatever the master does."""
+        self.asked += 1
+
+    def act(self, master: Master) -> None:
+        """Tell the master, between two of its steps."""
+        if self.done == self.asked:
+            return
+        first, self.done = self.done == 0, self.asked
+        phase = master.supervisor.phase
+        if phase is Phase.RUNNING and first and self.asked == 1:
+            master.finish()
+        elif phase in (Phase.IDLE, Phase.ENABLING, Phase.RAMP_IN, Phase.RUNNING, Phase.RAMP_OUT):
+            master.stop("SIGTERM")
 
 
 def _cycle(
@@ -220,6 +269,9 @@ def _cycle(
     stopped: Callable[[], bool] | None,
     report: Callable[[float], None] | None,
     rows: int,
+    clock: CycleClock,
+    notifier: Notifier,
+    ending: _Ending,
 ) -> float:
     """Step the master at its period until it is done; return its longest step [s]."""
     period = master.settings.bus.cycle
@@ -238,9 +290,12 @@ def _cycle(
             sensor.take(frames)
         if stopped is not None and stopped():
             master.stop("asked to")
+        ending.act(master)
         out = master.step(now, frames, tilt)
         link.send(out)
         longest = max(longest, link.now - now)
+        clock.took(now)
+        notifier.cycle(now, master)
         if master.ran:
             log.take(master, master.index, None)
             if report is not None and master.index % 50 == 0:

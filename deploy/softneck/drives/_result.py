@@ -13,6 +13,7 @@ from softneck.loop import LoopResult, metrics
 from softneck.signals import Recording, known_channels
 
 from ._pilot import LoopPilot
+from ._timing import CycleTimes
 from .master import Event, Master, Phase
 
 _TRUTH = ("pitch", "roll", "tension_1", "tension_2", "tension_3", "compression")
@@ -78,6 +79,8 @@ class DrivesResult:
         wall_time: [s].
         longest_step: of the master, controller included [s].
         simulated: whether the drives were.
+        timing: of the cycles on a bus; None in virtual time.
+        terminated: whether SIGTERM asked for the end.
     """
 
     signals: LoopResult
@@ -92,11 +95,13 @@ class DrivesResult:
     simulated: bool
     longest_step: float = 0.0
     notes: tuple[str, ...] = field(default=())
+    timing: CycleTimes | None = None
+    terminated: bool = False
 
     @property
     def completed(self) -> bool:
         """Whether the loop ran to its end and nothing stopped it."""
-        return self.fault is None and self.phase == "done"
+        return self.fault is None and self.phase == "done" and not self.terminated
 
     @property
     def real_time_factor(self) -> float:
@@ -135,6 +140,8 @@ class DrivesResult:
             "cycle_s": self.cycle,
             "real_time_factor": self.real_time_factor,
             "longest_step_s": self.longest_step,
+            "timing": None if self.timing is None else self.timing.table(),
+            "terminated": self.terminated,
             "metrics": metrics(self.signals) if len(self.signals.time) > 1 else None,
             "notes": list(self.notes),
         }  # fmt: skip

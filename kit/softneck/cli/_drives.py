@@ -42,6 +42,8 @@ from ._neck import load_neck
 from ._options import force_option, json_option, output_option, target
 
 _SAMPLE_TIME = 0.02
+# As a shell says it of a process that SIGTERM ended: 128 + 15.
+_TERMINATED = 143
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,17 +215,19 @@ def _require_can_sensor(file: DrivesFile) -> None:
 @_override_option
 @_neck_option
 @click.option("--pace", type=float, help="With --simulated: this multiple of real time instead of as fast as possible.")
+@click.option("--realtime", is_flag=True, help="On a bus: before all ordinary processes (SCHED_FIFO), memory locked.")
 @output_option("recording of the run", "REC")
 @force_option
 @json_option
 def run_command(
     controller: Path, loop_file: Path, certificates: tuple[Path, ...], drives_file: Path | None, bus: str | None,
-    simulated: bool, arm: bool, overrides: tuple[str, ...], neck: str | None, pace: float | None,
+    simulated: bool, arm: bool, overrides: tuple[str, ...], neck: str | None, pace: float | None, realtime: bool,
     output: Path | None, force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Run CONTROLLER in the loop of LOOP.toml on the drives: enable, ramp in, control, ramp out, switch off.
 
-    Refused unless certificates cover controller, observer and loop file and hold. Exit code 1 if anything stopped it.
+    Refused unless certificates cover controller, observer and loop file and hold. Exit code 1 if anything stopped it,
+    143 if SIGTERM ended it (to rest, then off).
     """
     path, replace = target(output, f"results/drives_{loop_file.stem}.csv", force=force)
     recording_suffix(path)
@@ -247,10 +251,14 @@ def run_command(
                 sensor = CanInclinometer(chosen.file.sensor_node)
                 if isinstance(link, VirtualLink):
                     raise SettingsError("drives on a bus are asked.")
-                result = run_on_bus(deployed, chosen.file, link, sensor, override=names, report=report)
+                result = run_on_bus(deployed, chosen.file, link, sensor, override=names, report=report,
+                                    realtime=realtime)  # fmt: skip
     if len(result.signals.time) > 1:
         write_recording(path, result.recording(), force=replace)
     _print_run(path, result, as_json=as_json)
+    if result.terminated:
+        note("ended by SIGTERM; the drives are off.")
+        click.get_current_context().exit(_TERMINATED)
     result.require()
 
 
@@ -261,6 +269,15 @@ def _print_run(path: Path, result: DrivesResult, *, as_json: bool) -> None:
         return
     rows = [["phase", result.phase], ["bus cycles", str(result.cycles)]]
     rows += [[name, str(count)] for name, count in result.counts.items()]
+    if result.timing is not None:
+        times = result.timing
+        rows.append(
+            [
+                "cycle, median / p99 / longest",
+                f"{times.median * 1e3:.2f} / {times.p99 * 1e3:.2f} / {times.longest * 1e3:.2f} ms",
+            ]
+        )
+        rows.append(["missed cycles", f"{times.missed} ({100.0 * times.missed_share:.2f} %)"])
     rows.append(["real-time factor", f"{result.real_time_factor:.1f}"])
     print_table(str(path), ["what", "value"], rows)
 
