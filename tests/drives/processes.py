@@ -1,8 +1,8 @@
 """Drives, inclinometer and host as processes of their own on a real bus: `python tests/drives/processes.py [CASE...]`.
 
-Prints one JSON line for each case. Without --bus it moves into a network namespace with nothing but a loopback of its own
-and uses UDP multicast there. What happened is judged from the drives' side: their process reports each change of a power
-state with its monotonic time, which all processes of a machine share.
+Prints one JSON line for each case. Without --bus it moves into a network namespace with nothing but a loopback of its
+own and uses UDP multicast there. What happened is judged from the drives' side: their process reports each change of a
+power state with its monotonic time, which all processes of a machine share.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ from typing import Any
 
 UDP = "udp_multicast:239.74.163.2"
 INSIDE = "SOFTNECK_OWN_NETWORK"
-NAMESPACE = ("unshare", "--net") if os.name == "posix" and os.geteuid() == 0 else ("unshare", "--net", "--map-root-user")
+NAMESPACE = (
+    ("unshare", "--net") if os.name == "posix" and os.geteuid() == 0 else ("unshare", "--net", "--map-root-user")
+)
 OFF, FAULT = "DISABLED", "FAULT"
 SLEEP = 0.01
 
@@ -134,12 +136,16 @@ class World:
     def run(self, loop: str) -> subprocess.Popen:
         """Start `softneck drives run`."""
         code = "from softneck.cli import main; main()"
-        out = self.folder / f"run_{time.monotonic_ns()}.csv"
-        return self._spawn("-c", code, "drives", "run", str(self.folder / "pi.npz"), "--loop", f"{self.folder}/{loop}.toml",
-                           "--drives", str(self.folder / "drives.toml"), "--bus", self.bus, "--arm", "--json", "--override",
-                           "certificate", "-o", str(out), *self.extra, stdout=subprocess.PIPE, stderr=subprocess.PIPE)  # fmt: skip
+        files = {"--loop": f"{loop}.toml", "--drives": "drives.toml", "-o": f"run_{time.monotonic_ns()}.csv"}
+        words = ["drives", "run", str(self.folder / "pi.npz"), "--bus", self.bus, "--arm", "--json"]
+        words += ["--override", "certificate", *self.extra]
+        for option, name in files.items():
+            words += [option, str(self.folder / name)]
+        return self._spawn("-c", code, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
-    def _spawn(self, *arguments: str, stdout: int = subprocess.DEVNULL, stderr: int = subprocess.DEVNULL) -> subprocess.Popen:
+    def _spawn(
+        self, *arguments: str, stdout: int = subprocess.DEVNULL, stderr: int = subprocess.DEVNULL
+    ) -> subprocess.Popen:
         child = subprocess.Popen([sys.executable, *arguments], stdin=subprocess.DEVNULL, stdout=stdout, stderr=stderr)
         self.children.append(child)
         return child
@@ -248,11 +254,19 @@ def hung(world: World) -> dict[str, Any]:
 def second_master(world: World) -> dict[str, Any]:
     """Another `softneck drives run` is refused, and the first one goes on."""
     since = time.monotonic()
-    code, _, line = world.ended(world.run("short"))
+    code, _, line = world.ended(world.run("short"), seconds=60.0)
     went_on = world.all("ENABLED")
     world.host.terminate()
     first, result, _ = world.ended()
-    return {"reaction_s": None, "exit": first, "event": (result["fault"] or {}).get("text"), "second_exit": code, "line": line, "went_on": went_on, **rest(world, since)}
+    return {
+        "reaction_s": None,
+        "exit": first,
+        "event": (result["fault"] or {}).get("text"),
+        "second_exit": code,
+        "line": line,
+        "went_on": went_on,
+        **rest(world, since),
+    }
 
 
 def intruder(world: World) -> dict[str, Any]:
@@ -302,14 +316,22 @@ def terminated(world: World) -> dict[str, Any]:
     since = time.monotonic()
     world.host.terminate()
     code, result, _ = world.ended()
-    return {"reaction_s": None, "exit": code, "phase": result["phase"], "fed": "WATCHDOG=1" in world.told,
-            "ready": "READY=1" in world.told, "stopping": world.told[-1:] == ["STOPPING=1"], **rest(world, since)}  # fmt: skip
+    told = {"ready": "READY=1" in world.told, "fed": "WATCHDOG=1" in world.told}
+    stopping = world.told[-1:] == ["STOPPING=1"]
+    return {
+        "reaction_s": None,
+        "exit": code,
+        "phase": result["phase"],
+        **told,
+        "stopping": stopping,
+        **rest(world, since),
+    }
 
 
 def undisturbed(world: World) -> dict[str, Any]:
     """Nothing happens: the cycles."""
     code, result, _ = world.ended(seconds=120.0)
-    return {"reaction_s": None, "exit": code, "timing": result["timing"], **rest(world, math.inf)}
+    return {"reaction_s": None, "exit": code, "times": result["times"], **rest(world, math.inf)}
 
 
 CASES: dict[str, tuple[Callable[[World], dict[str, Any]], dict[str, Any]]] = {

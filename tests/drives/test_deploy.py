@@ -20,7 +20,6 @@ from softneck.drives import (
     DriveEntry,
     DriveScale,
     VirtualLink,
-    VirtualRun,
     default_drives,
     preflight,
     prepare,
@@ -91,10 +90,10 @@ def test_a_bus_period_must_divide_the_sample_time(project: Project) -> None:
 
 
 def test_a_fault_ends_the_run_and_its_log_is_kept(project: Project) -> None:
-    def breaks(run: VirtualRun) -> None:
+    def breaks(link: VirtualLink) -> None:
         # Pre-flight and enabling take 1.2 s, the ramp back from where the tendons unwound to 5.7 s.
-        if run.link.now > 8.5:
-            run.link.neck.sensor = "freezes"
+        if link.now > 8.5:
+            link.neck.sensor = "freezes"
 
     result = run_simulated(prepare(load_loop(project.loop)), default_drives(), hook=breaks)
     assert result.fault is not None

@@ -1,8 +1,13 @@
 """The drives of the neck: CANopen master, safety, pre-flight, zeroing, runs, and simulated drives to try it on."""
 
+from ._ask import Ask as Ask
+from ._ask import Operator as Operator
+from ._bus_loop import Ended as Ended
+from ._bus_loop import Sensor as Sensor
+from ._bus_loop import Session as Session
+from ._bus_loop import run_session as run_session
 from ._certified import require_certified as require_certified
 from ._deploy import Deployed as Deployed
-from ._deploy import Sensor as Sensor
 from ._deploy import neck_of as neck_of
 from ._deploy import prepare as prepare
 from ._deploy import run_on_bus as run_on_bus
@@ -27,8 +32,7 @@ from ._result import DrivesResult as DrivesResult
 from ._sdo import SdoError as SdoError
 from ._sdo import load_eds as load_eds
 from ._sensor import CanInclinometer as CanInclinometer
-from ._timing import CycleTimes as CycleTimes
-from ._timing import steady as steady
+from ._times import CycleTimes as CycleTimes
 from ._units import DriveScale as DriveScale
 from ._units import acceleration_to_internal as acceleration_to_internal
 from ._units import counts_to_position as counts_to_position
@@ -39,6 +43,7 @@ from ._units import internal_to_speed as internal_to_speed
 from ._units import position_to_counts as position_to_counts
 from ._units import speed_to_internal as speed_to_internal
 from ._virtual import VirtualRun as VirtualRun
+from ._virtual import Watch as Watch
 from ._virtual import recorded as recorded
 from ._virtual import simulated_neck as simulated_neck
 from ._zero import Zeroed as Zeroed

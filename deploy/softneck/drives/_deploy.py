@@ -2,45 +2,22 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
 
-from softneck.core import SettingsError, SoftneckError, load
+from softneck.core import SettingsError, load
 from softneck.cosim import FmuPart, LoopSetup
 from softneck.loop import BlockPart, Loop, Part
 from softneck.plant import NeckParameters
 
+from ._bus_loop import Operator, Sensor, Session, run_session
 from ._file import DrivesFile
 from ._link import CanLink, VirtualLink
-from ._notify import Notifier
-from ._objects import disarm_writes
 from ._pilot import LoopPilot
-from ._preflight import Report, preflight
 from ._result import DrivesResult, RunLog
-from ._sdo import Objects, SdoError, load_eds
-from ._timing import CycleClock, on_termination, steady
-from ._virtual import VirtualRun, simulated_neck
-from .master import Command as NmtCommand
-from .master import Frame, Master, MasterSettings, Phase, Tilt, nmt_frame
-
-# Before the first cycle on a bus each drive is given this time to become operational [s].
-_START_TIME = 0.1
-_NECK = "virtual_neck"
-
-
-class Sensor(Protocol):
-    """An inclinometer on hardware."""
-
-    def take(self, frames: Sequence[Frame]) -> None:
-        """Look at frames of a cycle in which no sample is due; a sensor that is not on the bus ignores them."""
-        ...
-
-    def read(self, now: float, frames: Sequence[Frame]) -> Tilt | None:
-        """Return the newest sample, None if none came since the last call."""
-        ...
+from ._virtual import Watch, simulated_neck
+from .master import Frame, Master, MasterSettings, Tilt
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,7 +80,9 @@ def run_simulated(
     override: Collection[str] = (),
     pace: float | None = None,
     report: Callable[[float], None] | None = None,
-    hook: Callable[[VirtualRun], None] | None = None,
+    watches: Sequence[Watch] = (),
+    operator: Operator | None = None,
+    hook: Callable[[VirtualLink], None] | None = None,
     settings: Callable[[MasterSettings], MasterSettings] | None = None,
 ) -> DrivesResult:
     """Run the whole loop on simulated drives, in virtual time.
@@ -115,6 +94,8 @@ def run_simulated(
         override: names of pre-flight checks that may fail.
         pace: at this multiple of real time; as fast as possible if not given.
         report: called now and then with the done fraction.
+        watches: called after each bus cycle, see `Session`.
+        operator: asked each cycle what the operator wants.
         hook: called after each bus cycle, to let things go wrong.
         settings: changes the master's settings, for tests.
 
@@ -131,38 +112,13 @@ def run_simulated(
     disturbances = {name: value for name, value in loop.plant_inputs.items() if not name.startswith("motor_")}
     virtual.set(**disturbances)
     link = VirtualLink(virtual)
-    checked = preflight(link, file, override=override, homed=True)
-    checked.require()
-    master = _master(pilot, file, checked, settings)
-    link.send([nmt_frame(NmtCommand.START, node) for node in file.nodes])
-    link.receive(_START_TIME)
-    log = RunLog(pilot)
-    run = VirtualRun(link, master)
-    rows = max(1, round(loop.duration / pilot.sample_time))
-    begin, first = time.perf_counter(), link.now
-
-    def watch(state: VirtualRun) -> None:
-        index = master.index
-        if master.ran:
-            log.take(master, index, virtual.truth())
-            if report is not None and index % 50 == 0:
-                report(min(1.0, index / rows))
-        if hook is not None:
-            hook(state)
-        if pace is not None:
-            rest = begin + (link.now - first + link.cycle) / pace - time.perf_counter()
-            if rest > 0.0:
-                time.sleep(rest)
-
-    run.watch = watch
-    master.start()
-    try:
-        run.run(loop.duration)
-    finally:
-        pilot.close()
-    _disarm(link, file, checked.guarding)
-    wall = time.perf_counter() - begin
-    return _result(master, log, pilot, wall, simulated=True, notes=deployed.notes)
+    more = [*watches]
+    if hook is not None:
+        more.append(lambda _now, _in, _out, _tilt, _master: hook(link))
+    session = Session(
+        file=file, link=link, override=override, pace=pace, watches=tuple(more), operator=operator, settings=settings
+    )
+    return _run(deployed, pilot, session, report)
 
 
 def run_on_bus(
@@ -173,13 +129,11 @@ def run_on_bus(
     *,
     override: Collection[str] = (),
     report: Callable[[float], None] | None = None,
-    stopped: Callable[[], bool] | None = None,
+    watches: Sequence[Watch] = (),
+    operator: Operator | None = None,
     realtime: bool = False,
 ) -> DrivesResult:
     """Run the loop on the drives behind `link`, at the pace of the monotonic clock.
-
-    SIGTERM ends it early: by a ramp to rest while the controller runs, else at once. A service manager is told
-    (sd_notify) when the pre-flight holds, in which phase the run is, and from each cycle that the loop is alive.
 
     Args:
         deployed: the loop.
@@ -188,165 +142,49 @@ def run_on_bus(
         sensor: the inclinometer.
         override: names of pre-flight checks that may fail.
         report: called now and then with the done fraction.
-        stopped: asked each cycle whether the operator wants to stop.
-        realtime: run before all ordinary processes (SCHED_FIFO), with memory locked.
+        watches: called after each bus cycle, see `Session`.
+        operator: asked each cycle what the operator wants.
+        realtime: see `Session`.
 
     Raises:
         CheckFailedError: the pre-flight failed; nothing moved.
         SettingsError: `realtime` is not permitted; nothing was sent.
     """
-    with Notifier() as notifier, steady(realtime=realtime):
-        return _run_on_bus(deployed, file, link, sensor, override, report, stopped, notifier)
-
-
-def _run_on_bus(
-    deployed: Deployed,
-    file: DrivesFile,
-    link: CanLink,
-    sensor: Sensor,
-    override: Collection[str],
-    report: Callable[[float], None] | None,
-    stopped: Callable[[], bool] | None,
-    notifier: Notifier,
-) -> DrivesResult:
     pilot = LoopPilot(deployed.loop)
     pilot.warm()
-    checked = preflight(link, file, override=override, homed=True)
-    checked.require()
-    master = _master(pilot, file, checked, None)
-    link.send([nmt_frame(NmtCommand.START, node) for node in file.nodes])
-    time.sleep(_START_TIME)
-    link.receive(0.0)
+    session = Session(
+        file=file, link=link, sensor=sensor, override=override, watches=tuple(watches), operator=operator,
+        realtime=realtime,
+    )  # fmt: skip
+    return _run(deployed, pilot, session, report)
+
+
+def _run(
+    deployed: Deployed, pilot: LoopPilot, session: Session, report: Callable[[float], None] | None
+) -> DrivesResult:
     log = RunLog(pilot)
     rows = max(1, round(deployed.loop.duration / pilot.sample_time))
-    clock, ending = CycleClock(master.settings.bus.cycle), _Ending()
-    begin = time.perf_counter()
-    notifier.ready()
-    master.start()
+    neck = session.link.neck if isinstance(session.link, VirtualLink) else None
+
+    def watch(_now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Tilt | None, master: Master) -> None:
+        if not master.ran:
+            return
+        log.take(master, master.index, None if neck is None else neck.truth())
+        if report is not None and master.index % 50 == 0:
+            report(min(1.0, master.index / rows))
+
     try:
-        with on_termination(ending.ask):
-            longest = _cycle(link, master, sensor, log, stopped, report, rows, clock, notifier, ending)
-    except BaseException:
-        # Whatever happens here must not leave a drive on: this loop is what feeds them.
-        _emergency_stop(link, file)
-        raise
+        ended = run_session(
+            replace(session, watches=(watch, *session.watches)),
+            pilot,
+            sample_time=pilot.sample_time,
+            most=deployed.loop.duration,
+        )
     finally:
         pilot.close()
-    _disarm(link, file, checked.guarding)
-    wall = time.perf_counter() - begin
-    result = _result(master, log, pilot, wall, simulated=False, notes=deployed.notes, longest=longest)
-    return replace(result, timing=clock.result(), terminated=ending.asked > 0)
-
-
-@dataclass(slots=True)
-class _Ending:
-    """SIGTERM came: to rest and off while the controller runs, else off at once; the same for a second one."""
-
-    asked: int = 0
-    done: int = 0
-
-    def ask(self) -> None:
-        """Only mark it: a signal comes in the middle of whatever the master does."""
-        self.asked += 1
-
-    def act(self, master: Master) -> None:
-        """Tell the master, between two of its steps."""
-        if self.done == self.asked:
-            return
-        first, self.done = self.done == 0, self.asked
-        phase = master.supervisor.phase
-        if phase is Phase.RUNNING and first and self.asked == 1:
-            master.finish()
-        elif phase in (Phase.IDLE, Phase.ENABLING, Phase.RAMP_IN, Phase.RUNNING, Phase.RAMP_OUT):
-            master.stop("SIGTERM")
-
-
-def _cycle(
-    link: CanLink,
-    master: Master,
-    sensor: Sensor,
-    log: RunLog,
-    stopped: Callable[[], bool] | None,
-    report: Callable[[float], None] | None,
-    rows: int,
-    clock: CycleClock,
-    notifier: Notifier,
-    ending: _Ending,
-) -> float:
-    """Step the master at its period until it is done; return its longest step [s]."""
-    period = master.settings.bus.cycle
-    due, longest = link.now, 0.0
-    while not master.finished:
-        rest = due - link.now
-        if rest > 0.0:
-            time.sleep(rest)
-        now = link.now
-        # All that is there, so that one late TPDO does not leave a lag for ever.
-        frames = link.receive(0.0)
-        tilt = None
-        if master.sample_due:
-            tilt = sensor.read(now, frames)
-        else:
-            sensor.take(frames)
-        if stopped is not None and stopped():
-            master.stop("asked to")
-        ending.act(master)
-        out = master.step(now, frames, tilt)
-        link.send(out)
-        longest = max(longest, link.now - now)
-        clock.took(now)
-        notifier.cycle(now, master)
-        if master.ran:
-            log.take(master, master.index, None)
-            if report is not None and master.index % 50 == 0:
-                report(min(1.0, master.index / rows))
-        due = max(due + period, now + 0.5 * period) if link.now - due > period else due + period
-    return longest
-
-
-def _master(
-    pilot: LoopPilot,
-    file: DrivesFile,
-    checked: Report,
-    change: Callable[[MasterSettings], MasterSettings] | None,
-) -> Master:
-    settings = file.master_settings(pilot.sample_time, guarding=checked.guarding)
-    return Master(settings if change is None else change(settings), pilot)
-
-
-def _disarm(link: CanLink | VirtualLink, file: DrivesFile, guarding: str) -> None:
-    """End the guarding of drives that are off; one that does not answer keeps it, and faults: so be it."""
-    dictionary = load_eds(file.profile, file.eds)
-    for node in file.nodes:
-        objects = Objects(link, node, dictionary)
-        try:
-            for write in disarm_writes(guarding):
-                objects.write(write.index, write.subindex, write.value)
-        except (SdoError, SoftneckError):
-            continue
-
-
-def _emergency_stop(link: CanLink, file: DrivesFile) -> None:
-    from ._zero import stop
-
-    try:
-        stop(link, file)
-    except SoftneckError:
-        return
-
-
-def _result(
-    master: Master,
-    log: RunLog,
-    pilot: LoopPilot,
-    wall: float,
-    *,
-    simulated: bool,
-    notes: Sequence[str],
-    longest: float = 0.0,
-) -> DrivesResult:
+    master = ended.master
     return DrivesResult(
-        signals=log.result(pilot.sample_time, truth=simulated),
+        signals=log.result(pilot.sample_time, truth=session.simulated),
         phase=str(master.supervisor.phase),
         fault=master.supervisor.fault,
         counts=dict(master.counts),
@@ -354,8 +192,9 @@ def _result(
         rehome=master.supervisor.rehome,
         cycles=master.cycle,
         cycle=master.settings.bus.cycle,
-        wall_time=wall,
-        simulated=simulated,
-        longest_step=longest,
-        notes=tuple(notes),
+        wall_time=ended.wall_time,
+        simulated=session.simulated,
+        times=ended.times,
+        notes=deployed.notes,
+        terminated=ended.terminated,
     )

@@ -13,7 +13,7 @@ from softneck.loop import LoopResult, metrics
 from softneck.signals import Recording, known_channels
 
 from ._pilot import LoopPilot
-from ._timing import CycleTimes
+from ._times import CycleTimes
 from .master import Event, Master, Phase
 
 _TRUTH = ("pitch", "roll", "tension_1", "tension_2", "tension_3", "compression")
@@ -77,9 +77,8 @@ class DrivesResult:
         cycles: of the bus.
         cycle: bus period [s].
         wall_time: [s].
-        longest_step: of the master, controller included [s].
         simulated: whether the drives were.
-        timing: of the cycles on a bus; None in virtual time.
+        times: of the cycles, in real time.
         terminated: whether SIGTERM asked for the end.
     """
 
@@ -93,9 +92,8 @@ class DrivesResult:
     cycle: float
     wall_time: float
     simulated: bool
-    longest_step: float = 0.0
+    times: CycleTimes
     notes: tuple[str, ...] = field(default=())
-    timing: CycleTimes | None = None
     terminated: bool = False
 
     @property
@@ -139,8 +137,8 @@ class DrivesResult:
             "cycles": self.cycles,
             "cycle_s": self.cycle,
             "real_time_factor": self.real_time_factor,
-            "longest_step_s": self.longest_step,
-            "timing": None if self.timing is None else self.timing.table(),
+            "longest_step_s": self.times.longest_step,
+            "times": None if self.simulated else self.times.table(),
             "terminated": self.terminated,
             "metrics": metrics(self.signals) if len(self.signals.time) > 1 else None,
             "notes": list(self.notes),

@@ -1,4 +1,4 @@
-"""Time on a bus: what its cycles took, and what a process can do so that they come in time."""
+"""What a process does so that its cycles come in time, and what it does when it is asked to end."""
 
 from __future__ import annotations
 
@@ -8,76 +8,16 @@ import gc
 import os
 import signal
 import threading
-from array import array
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import Any
-
-import numpy as np
+from collections.abc import Iterator
 
 from softneck.core import SettingsError
+
+from ._ask import Ask
 
 # Of 1 to 99: above ordinary work and below the kernel's own threads for interrupts, which have 50.
 _PRIORITY = 40
 # linux/mman.h: MCL_CURRENT, MCL_FUTURE.
 _LOCK_ALL = 1 | 2
-
-
-@dataclass(frozen=True, slots=True)
-class CycleTimes:
-    """Times between the beginnings of two steps of the master.
-
-    Attributes:
-        period: as set [s].
-        count: number of cycles.
-        median, p99, longest: [s].
-        late: cycles longer than 1.5 periods.
-        missed: periods in which no step began: a cycle of n periods misses n - 1.
-    """
-
-    period: float
-    count: int
-    median: float
-    p99: float
-    longest: float
-    late: int
-    missed: int
-
-    @property
-    def missed_share(self) -> float:
-        """Missed periods over all periods."""
-        return self.missed / max(1, self.count + self.missed)
-
-    def table(self) -> dict[str, Any]:
-        """Return the JSON of it."""
-        return {
-            "period_s": self.period, "count": self.count, "median_s": self.median, "p99_s": self.p99,
-            "longest_s": self.longest, "late": self.late, "missed": self.missed, "missed_share": self.missed_share,
-        }  # fmt: skip
-
-
-class CycleClock:
-    """Collects when steps began."""
-
-    def __init__(self, period: float) -> None:
-        """Begin with none."""
-        self._period, self._begins = period, array("d")
-
-    def took(self, now: float) -> None:
-        """Take the beginning of a step."""
-        self._begins.append(now)
-
-    def result(self) -> CycleTimes | None:
-        """Return what was seen; None of fewer than two steps."""
-        if len(self._begins) < 2:
-            return None
-        gaps = np.diff(np.array(self._begins))
-        median, p99 = np.percentile(gaps, [50.0, 99.0])
-        missed = np.maximum(np.round(gaps / self._period) - 1.0, 0.0).sum()
-        late = int((gaps > 1.5 * self._period).sum())
-        return CycleTimes(
-            self._period, len(gaps), float(median), float(p99), float(gaps.max()), late, int(missed)
-        )  # fmt: skip
 
 
 @contextlib.contextmanager
@@ -132,14 +72,32 @@ def _in_line_again() -> None:
     ctypes.CDLL(None).munlockall()
 
 
-@contextlib.contextmanager
-def on_termination(act: Callable[[], None]) -> Iterator[None]:
-    """Let SIGTERM call `act` instead of ending the process at once; only in the main thread."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, lambda *_: act())
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+class Ending:
+    """Marks that SIGTERM came, for the loop to look at between two steps: to rest, and at once if it comes again."""
+
+    def __init__(self) -> None:
+        """Begin without."""
+        self.asked = self._done = 0
+
+    def ask(self) -> Ask | None:
+        """Return what is to be done now, once for each signal."""
+        if self._done == self.asked:
+            return None
+        self._done = self.asked
+        return Ask.LEAVE if self.asked == 1 else Ask.STOP
+
+    @contextlib.contextmanager
+    def watched(self) -> Iterator[None]:
+        """Take SIGTERM instead of ending at once; a signal reaches the main thread only."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+
+        def mark(*_: object) -> None:
+            self.asked += 1
+
+        before = signal.signal(signal.SIGTERM, mark)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGTERM, before)

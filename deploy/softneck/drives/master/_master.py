@@ -82,6 +82,14 @@ class Master:
         """Ask for the ramp out."""
         self._asked.append(Signal.FINISH)
 
+    def leave(self, reason: str = "") -> None:
+        """Ask for the ramp to rest and the end from wherever the run is; before anything moved, for a stop."""
+        if self.supervisor.phase in (Phase.RAMP_IN, Phase.RUNNING):
+            self.finish()
+            self._told(Event(self._now or 0.0, "left", 0, reason))
+        elif self.supervisor.phase in (Phase.IDLE, Phase.ENABLING):
+            self.stop(reason)
+
     def stop(self, reason: str = "") -> None:
         """Ask for an immediate stop of all drives."""
         self._told(Event(self._now or 0.0, "operator", 0, reason))
