@@ -105,6 +105,8 @@ class World:
     period: float = 0.01
     patience: float = 1.0
     extra: tuple[str, ...] = ()
+    realtime: bool = False
+    drives_bus: str = ""
     changes: list[dict[str, Any]] = field(default_factory=list)
     told: list[str] = field(default_factory=list)
     children: list[subprocess.Popen] = field(default_factory=list)
@@ -113,9 +115,10 @@ class World:
         """Start all three and wait until the controller runs."""
         path = self.folder / "inclinometer.socket"
         module = "softneck.drives.simulated"
-        self.sensor = self._spawn("-m", f"{module}.inclinometer", self.bus, str(path))
+        self.sensor = self._spawn("-m", f"{module}.inclinometer", self.drives_bus or self.bus, str(path))
         self.wait(path.exists, "the inclinometer", 60.0)
-        self.drives = self._spawn("-m", module, self.bus, "--homed", "--report", "--cycle", str(self.period),
+        self.drives = self._spawn("-m", module, self.drives_bus or self.bus, "--homed", "--report",
+                                  "--cycle", str(self.period),
                                   "--sensor-socket", str(path), stdout=subprocess.PIPE)  # fmt: skip
         threading.Thread(target=self._read, daemon=True).start()
         self.wait(lambda: len(self.changes) >= 3, "the drives", 60.0)
@@ -138,7 +141,7 @@ class World:
         code = "from softneck.cli import main; main()"
         files = {"--loop": f"{loop}.toml", "--drives": "drives.toml", "-o": f"run_{time.monotonic_ns()}.csv"}
         words = ["drives", "run", str(self.folder / "pi.npz"), "--bus", self.bus, "--arm", "--json"]
-        words += ["--override", "certificate", *self.extra]
+        words += ["--override", "certificate", *self.extra, *(["--realtime"] if self.realtime else [])]
         for option, name in files.items():
             words += [option, str(self.folder / name)]
         return self._spawn("-c", code, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
@@ -146,7 +149,10 @@ class World:
     def _spawn(
         self, *arguments: str, stdout: int = subprocess.DEVNULL, stderr: int = subprocess.DEVNULL
     ) -> subprocess.Popen:
-        child = subprocess.Popen([sys.executable, *arguments], stdin=subprocess.DEVNULL, stdout=stdout, stderr=stderr)
+        # The simulated drives stand for hardware, which no other process holds up.
+        first = ["chrt", "-f", "41"] if self.realtime and arguments[0] == "-m" else []
+        command = [*first, sys.executable, *arguments]
+        child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=stdout, stderr=stderr)
         self.children.append(child)
         return child
 
@@ -364,6 +370,12 @@ def play(name: str, world: World) -> dict[str, Any]:
     return {"case": name, "exact": exact, **found}
 
 
+def too_busy(found: dict[str, Any]) -> bool:
+    """Whether the machine could not run the loop: the host said that it stood still, though nobody stopped it."""
+    stalled = found.get("event") == "stalled" and found["case"] != "paused"
+    return not found["exact"] and (stalled or "stood still" in json.dumps(found))
+
+
 def bring_up(link: str) -> None:
     """Set a link up; multicast over the loopback needs a route."""
     subprocess.run(["ip", "link", "set", link, "up"], check=True)
@@ -378,11 +390,14 @@ def main() -> None:
     parser.add_argument("cases", nargs="*", metavar="CASE", help=f"of {', '.join(CASES)}")
     parser.add_argument("--repeat", type=int, default=1)
     parser.add_argument("--bus", default=UDP)
+    parser.add_argument("--drives-bus", default="", help="where the drives are, if that interface is another one")
     parser.add_argument("--link", default="lo")
     parser.add_argument("--duration", type=float, default=3.0)
     parser.add_argument("--period", type=float, default=0.01)
     parser.add_argument("--guarding", type=float, default=0.1)
     parser.add_argument("--patience", type=float, default=1.0)
+    parser.add_argument("--realtime", action="store_true", help="host and drives before all ordinary processes")
+    parser.add_argument("--attempts", type=int, default=1, help="where the machine was too busy for the loop")
     parser.add_argument("--extra", action="append", default=[], help="further option of `softneck drives run`")
     chosen = parser.parse_args()
     if chosen.bus == UDP and INSIDE not in os.environ:
@@ -395,8 +410,13 @@ def main() -> None:
         write_project(folder, duration=chosen.duration, period=chosen.period, guarding=chosen.guarding)
         for case in chosen.cases or CASES:
             for _ in range(chosen.repeat):
-                world = World(folder, chosen.bus, chosen.link, chosen.period, chosen.patience, tuple(chosen.extra))
-                print(json.dumps(play(case, world)), flush=True)
+                for attempt in range(chosen.attempts):
+                    world = World(folder, chosen.bus, chosen.link, chosen.period, chosen.patience, tuple(chosen.extra))
+                    world.realtime, world.drives_bus = chosen.realtime, chosen.drives_bus
+                    found = play(case, world)
+                    if not too_busy(found) or attempt == chosen.attempts - 1:
+                        break
+                print(json.dumps(found), flush=True)
 
 
 if __name__ == "__main__":
