@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test slow check docs benchmark native wheel nightly clean
+.PHONY: demo test slow check docs benchmark native wheel nightly nightly-can clean
 
 demo: $(VENV)/.installed
 	$(BIN)/softneck demo --out build/demo
@@ -33,9 +33,13 @@ native: $(VENV)/.crossed
 	$(BIN)/python -m softneck.fmu.native
 
 # The library on other platforms, bit for bit, and many wrong bytes. Debian: wine64, qemu-user, libc6-arm64-cross.
-nightly: $(VENV)/.tested native
+nightly: $(VENV)/.tested native nightly-can
 	SOFTNECK_NIGHTLY=1 $(BIN)/python -m pytest -q -n 0 tests/fmu/test_native_platforms.py
 	SOFTNECK_FUZZ_ROUNDS=3000 $(BIN)/python -m pytest -q -n 0 tests/fmu/test_native_errors.py -k sanitizers
+
+# The drives over real SocketCAN in QEMU. Debian: qemu-system-x86 busybox-static kmod cpio iproute2.
+nightly-can: $(VENV)/.tested
+	$(BIN)/python tests/nightly/socketcan.py
 
 # Exporting from this wheel needs no compiler.
 wheel: native
