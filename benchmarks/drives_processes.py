@@ -1,7 +1,7 @@
 """Print how real processes fail on UDP multicast: `python benchmarks/drives_processes.py [--repeat 50] [CASE...]`.
 
-For each case of `tests/drives/processes.py`: how many end states were exact, the reaction's median and longest time, and
-of undisturbed runs the cycles. It takes about 8 s a case and repetition. Other work on the machine shows in all of it.
+For each case of `tests/drives/processes.py`: how many end states were exact, the reaction's median and longest time,
+and of undisturbed runs the cycles. It takes about 8 s a case and repetition. Other work on the machine shows.
 """
 
 from __future__ import annotations

@@ -126,6 +126,7 @@ class World:
         address = self.folder / "notify.socket"
         self.notify.bind(str(address))
         threading.Thread(target=self._listen, args=(self.notify,), daemon=True).start()
+        os.environ["SOFTNECK_ARM"] = f"MOVE {self.bus.partition(':')[2]}"
         os.environ.update(NOTIFY_SOCKET=str(address), WATCHDOG_USEC="400000")
         try:
             self.host = self.run(loop)

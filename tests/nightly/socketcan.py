@@ -2,7 +2,8 @@
 
 Boots Debian's own kernel (its package is unpacked into build/nightly, never installed) in QEMU, with the host's files
 read only by 9p, and plays `tests/drives/processes.py` there: over vcan0, and over two emulated SJA1000 controllers
-(kvaser_pci) at 1 Mbit/s on one emulated bus. Needs qemu-system-x86, busybox-static, kmod, cpio, iproute2, apt-get and dpkg-deb.
+(kvaser_pci) at 1 Mbit/s on one emulated bus. Needs qemu-system-x86, busybox-static, kmod, cpio, iproute2, apt-get,
+dpkg-deb.
 Without KVM the machine is emulated and slow: period and patience are relaxed then, and the output says so.
 """
 
@@ -148,8 +149,8 @@ def main() -> None:
         processor = ["-accel", "kvm", "-cpu", "max,-arch-capabilities"] if fast else ["-accel", "tcg", "-cpu", "max"]
         controller = ["-device", "kvaser_pci,canbus=canbus0"]
         command = [
-            "qemu-system-x86_64", *processor, "-smp", "2", "-m", "3072", "-nodefaults", "-display", "none", "-no-reboot",
-            "-serial", "stdio", "-kernel", str(image), "-initrd", str(archive),
+            "qemu-system-x86_64", *processor, "-smp", "2", "-m", "3072", "-nodefaults", "-display", "none",
+            "-no-reboot", "-serial", "stdio", "-kernel", str(image), "-initrd", str(archive),
             "-append", "console=ttyS0 quiet panic=-1 tsc=reliable mitigations=off",
             "-virtfs", "local,path=/,mount_tag=root,security_model=none,readonly=on,multidevs=remap",
             "-object", "can-bus,id=canbus0", *controller, *controller,

@@ -17,6 +17,10 @@ from ._file import DrivesFile as DrivesFile
 from ._file import default_drives as default_drives
 from ._file import load_drives as load_drives
 from ._file import make_drives as make_drives
+from ._jog import Jogged as Jogged
+from ._jog import jog as jog
+from ._keyboard import Keyboard as Keyboard
+from ._link import HARMLESS as HARMLESS
 from ._link import BusError as BusError
 from ._link import CanLink as CanLink
 from ._link import Link as Link
@@ -28,6 +32,9 @@ from ._preflight import OVERRIDES as OVERRIDES
 from ._preflight import Report as Report
 from ._preflight import preflight as preflight
 from ._preflight import scan as scan
+from ._record import Recorded as Recorded
+from ._record import drive_limits as drive_limits
+from ._record import record_signal as record_signal
 from ._result import DrivesResult as DrivesResult
 from ._sdo import SdoError as SdoError
 from ._sdo import load_eds as load_eds

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 from softneck.core import SettingsError, SoftneckError
 
@@ -19,12 +19,13 @@ from ._link import CanLink, VirtualLink
 from ._notify import Notifier
 from ._objects import disarm_writes
 from ._preflight import preflight
+from ._result import fault_table, require_unstopped
 from ._sdo import Objects, SdoError, load_eds
 from ._times import CycleTimes
 from ._timing import Ending, steady
 from ._virtual import VirtualRun, Watch
+from .master import ACTIVE, Frame, Master, MasterSettings, Pilot, Tilt, nmt_frame
 from .master import Command as NmtCommand
-from .master import Frame, Master, MasterSettings, Pilot, Tilt, nmt_frame
 
 # Before the first cycle on a bus each drive is given this time to become operational [s].
 _START_TIME = 0.1
@@ -84,12 +85,38 @@ class Ended:
         times: of the cycles, in real time.
         wall_time: [s].
         terminated: whether SIGTERM asked for the end.
+        tensions: estimated when the drives last had power [N].
     """
 
     master: Master
     times: CycleTimes
     wall_time: float
     terminated: bool = False
+    tensions: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def require(self) -> None:
+        """Raise CheckFailedError if something stopped the drives."""
+        supervisor = self.master.supervisor
+        require_unstopped(supervisor.fault, rehome=supervisor.rehome)
+
+    @property
+    def left(self) -> bool:
+        """Whether the operator ended it, at once or by the ramp out."""
+        counts = self.master.counts
+        return counts["left"] + counts["operator"] > 0
+
+    def table(self) -> dict[str, Any]:
+        """Return what JSON holds of it."""
+        master = self.master
+        return {
+            "phase": str(master.supervisor.phase),
+            "fault": fault_table(master.supervisor.fault),
+            "rehome": master.supervisor.rehome,
+            "events": dict(master.counts),
+            "cycles": master.cycle,
+            "cycle_s": master.settings.bus.cycle,
+            "real_time_factor": master.cycle * master.settings.bus.cycle / max(self.wall_time, 1e-9),
+        }
 
 
 def run_session(
@@ -135,6 +162,13 @@ def _run_session(
     if begin is not None:
         begin(master)
     times, ending = CycleTimes(file.cycle), Ending()
+    tensions = [(0.0, 0.0, 0.0)]
+
+    def remember(_now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Tilt | None, master: Master) -> None:
+        if master.supervisor.phase in ACTIVE:
+            tensions[0] = master.tensions
+
+    session = replace(session, watches=(remember, *session.watches))
     started = time.perf_counter()
     master.start()
     if isinstance(link, VirtualLink):
@@ -147,7 +181,7 @@ def _run_session(
         with ending.watched():
             _in_real_time(session, link, master, times, notifier, ending)
     disarm(link, file, checked.guarding)
-    return Ended(master, times, time.perf_counter() - started, ending.asked > 0)
+    return Ended(master, times, time.perf_counter() - started, ending.asked > 0, tensions[0])
 
 
 def _in_virtual_time(

@@ -63,6 +63,26 @@ class RunLog:
         return LoopResult(np.arange(len(table)) * sample_time, signals, units, sample_time)
 
 
+def require_unstopped(fault: Event | None, *, rehome: bool = False) -> None:
+    """Raise CheckFailedError if `fault` ended a run early."""
+    if fault is None:
+        return
+    after = " Run `softneck drives zero` before the next run." if rehome else ""
+    if fault.name == "operator":
+        raise CheckFailedError(f"stopped at t = {fault.time:.3f} s by the operator. The drives are off.{after}")
+    raise CheckFailedError(
+        f"stopped at t = {fault.time:.3f} s: {fault}. The drives are off; look for the cause, then "
+        f"`softneck drives reset`.{after}"
+    )
+
+
+def fault_table(fault: Event | None) -> dict[str, Any] | None:
+    """Return what JSON holds of what ended a run early."""
+    if fault is None:
+        return None
+    return {"time_s": fault.time, "event": fault.name, "node": fault.node, "text": str(fault)}
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class DrivesResult:
     """One run on drives.
@@ -108,13 +128,7 @@ class DrivesResult:
 
     def require(self) -> None:
         """Raise CheckFailedError if something ended the run early."""
-        if self.fault is None:
-            return
-        after = " Run `softneck drives zero` before the next run." if self.rehome else ""
-        raise CheckFailedError(
-            f"stopped at t = {self.fault.time:.3f} s: {self.fault}. The drives are off; look for the cause, then "
-            f"`softneck drives reset`.{after}"
-        )
+        require_unstopped(self.fault, rehome=self.rehome)
 
     def recording(self) -> Recording:
         """Return the run as a recording: as measured, with true angles where simulated drives know them."""
@@ -129,8 +143,7 @@ class DrivesResult:
         return {
             "completed": self.completed,
             "phase": self.phase,
-            "fault": None if self.fault is None else {"time_s": self.fault.time, "event": self.fault.name,
-                                                      "node": self.fault.node, "text": str(self.fault)},
+            "fault": fault_table(self.fault),
             "rehome": self.rehome,
             "events": dict(self.counts),
             "simulated": self.simulated,
