@@ -72,6 +72,8 @@ def mpc_tight(part: str) -> Any:
 
 
 CONTROLLERS: dict[str, Callable[[str], Any]] = {"pi": pi, "mpc": mpc, "mpc_tight": mpc_tight}
+
+
 def nmpc(part: str) -> Any:
     """Return nonlinear predictive control over a network of the neck without payload; it knows no tautness."""
     following: dict[str, Any] = {"preview": 0.6, "bandwidth": 12.0, "reference_time": 0.05}

@@ -1,8 +1,8 @@
 """The drives of the neck: CANopen master, safety, pre-flight, zeroing, runs, and simulated drives to try it on."""
 
-from ._bus_loop import Ask as Ask
+from ._ask import Ask as Ask
+from ._ask import Operator as Operator
 from ._bus_loop import Ended as Ended
-from ._bus_loop import Operator as Operator
 from ._bus_loop import Sensor as Sensor
 from ._bus_loop import Session as Session
 from ._bus_loop import run_session as run_session
@@ -32,6 +32,7 @@ from ._log_file import LoggedRun as LoggedRun
 from ._log_file import changed_files as changed_files
 from ._log_file import read_run_log as read_run_log
 from ._meaning import meaning as meaning
+from ._notify import Notifier as Notifier
 from ._pilot import LoopPilot as LoopPilot
 from ._preflight import OVERRIDES as OVERRIDES
 from ._preflight import Report as Report

@@ -9,37 +9,29 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 from pathlib import Path
 from typing import Any, Protocol
 
 from softneck.core import SettingsError, SoftneckError
 
+from ._ask import Ask, Operator
 from ._cycle import LoggedPilot
 from ._file import DrivesFile
 from ._link import CanLink, VirtualLink
+from ._notify import Notifier
 from ._objects import disarm_writes
 from ._preflight import preflight
 from ._result import fault_table, require_unstopped
 from ._run_log import RunLogger, run_facts
 from ._sdo import Objects, SdoError, load_eds
 from ._times import CycleTimes
+from ._timing import Ending, steady
 from ._virtual import VirtualRun, Watch
 from .master import ACTIVE, Frame, Master, MasterSettings, Pilot, Tilt, nmt_frame
 from .master import Command as NmtCommand
 
 # Before the first cycle on a bus each drive is given this time to become operational [s].
 _START_TIME = 0.1
-
-
-class Ask(StrEnum):
-    """What an operator wants of a run."""
-
-    LEAVE = "leave"
-    STOP = "stop"
-
-
-Operator = Callable[[], Ask | None]
 
 
 class Sensor(Protocol):
@@ -70,6 +62,7 @@ class Session:
         settings: changes the master's settings, for tests.
         log: where frames and cycles are written; whoever opened it closes it.
         files: role -> path of what acts in the run, for the log.
+        realtime: on a bus, run before all ordinary processes (SCHED_FIFO), with memory locked.
     """
 
     file: DrivesFile
@@ -82,6 +75,7 @@ class Session:
     settings: Callable[[MasterSettings], MasterSettings] | None = None
     log: RunLogger | None = None
     files: Mapping[str, str | Path] = field(default_factory=dict)
+    realtime: bool = False
 
     @property
     def simulated(self) -> bool:
@@ -97,12 +91,14 @@ class Ended:
         master: as it ended.
         times: of the cycles, in real time.
         wall_time: [s].
+        terminated: whether SIGTERM asked for the end.
         tensions: estimated when the drives last had power [N].
     """
 
     master: Master
     times: CycleTimes
     wall_time: float
+    terminated: bool = False
     tensions: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def require(self) -> None:
@@ -135,6 +131,9 @@ def run_session(
 ) -> Ended:
     """Check the drives, enable them, ramp in, let `pilot` lead, ramp out, switch off.
 
+    On a bus SIGTERM ends it by the ramp to rest, a second one at once. A service manager is told (sd_notify) when the
+    pre-flight holds, in which phase the run is, and from each cycle that the loop is alive.
+
     Args:
         session: on what.
         pilot: gives set-points each `sample_time`.
@@ -144,7 +143,22 @@ def run_session(
 
     Raises:
         CheckFailedError: the pre-flight failed; nothing moved.
+        SettingsError: real time is asked for and not permitted; nothing was sent.
     """
+    if session.simulated:
+        return _run_session(session, pilot, sample_time, most, begin, Notifier({}))
+    with steady(realtime=session.realtime), Notifier() as notifier:
+        return _run_session(session, pilot, sample_time, most, begin, notifier)
+
+
+def _run_session(
+    session: Session,
+    pilot: Pilot,
+    sample_time: float,
+    most: float,
+    begin: Callable[[Master], None] | None,
+    notifier: Notifier,
+) -> Ended:
     file, link = session.file, session.link
     file.master_settings(sample_time)
     log = session.log
@@ -162,7 +176,7 @@ def run_session(
     link.send([nmt_frame(NmtCommand.START, node) for node in file.nodes])
     if begin is not None:
         begin(master)
-    times = CycleTimes(file.cycle)
+    times, ending = CycleTimes(file.cycle), Ending()
     tensions = [(0.0, 0.0, 0.0)]
 
     def remember(_now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Tilt | None, master: Master) -> None:
@@ -178,9 +192,11 @@ def run_session(
     else:
         time.sleep(_START_TIME)
         link.receive(0.0)
-        _in_real_time(session, link, master, times)
+        notifier.ready()
+        with ending.watched():
+            _in_real_time(session, link, master, times, notifier, ending)
     disarm(link, file, checked.guarding)
-    return Ended(master, times, time.perf_counter() - started, tensions[0])
+    return Ended(master, times, time.perf_counter() - started, ending.asked > 0, tensions[0])
 
 
 def _in_virtual_time(
@@ -202,7 +218,9 @@ def _in_virtual_time(
     run.run(most)
 
 
-def _in_real_time(session: Session, link: CanLink, master: Master, times: CycleTimes) -> None:
+def _in_real_time(
+    session: Session, link: CanLink, master: Master, times: CycleTimes, notifier: Notifier, ending: Ending
+) -> None:
     """Step the master at its period until it is done."""
     sensor, operator = session.sensor, session.operator
     if sensor is None:
@@ -224,9 +242,11 @@ def _in_real_time(session: Session, link: CanLink, master: Master, times: CycleT
                 sensor.take(frames)
             if operator is not None:
                 _ask(master, operator())
+            _ask(master, ending.ask())
             out = master.step(now, frames, tilt)
             link.send(out)
             times.take(now, link.now - now)
+            notifier.cycle(now, master)
             for watch in session.watches:
                 watch(now, frames, out, tilt, master)
             due = max(due + period, now + 0.5 * period) if link.now - due > period else due + period

@@ -139,6 +139,7 @@ def run_on_bus(
     operator: Operator | None = None,
     log: RunLogger | None = None,
     files: Mapping[str, str | Path] | None = None,
+    realtime: bool = False,
 ) -> DrivesResult:
     """Run the loop on the drives behind `link`, at the pace of the monotonic clock.
 
@@ -153,15 +154,18 @@ def run_on_bus(
         operator: asked each cycle what the operator wants.
         log: where frames and cycles are written.
         files: role -> path of what acts, for the log; `replay` looks for "loop" and "controller".
+        realtime: see `Session`.
 
     Raises:
         CheckFailedError: the pre-flight failed; nothing moved.
+        SettingsError: `realtime` is not permitted; nothing was sent.
     """
     pilot = LoopPilot(deployed.loop)
     pilot.warm()
     session = Session(
         file=file, link=link, sensor=sensor, override=override, watches=tuple(watches), operator=operator,
         log=log, files=files or {},
+        realtime=realtime,
     )  # fmt: skip
     return _run(deployed, pilot, session, report)
 
@@ -205,4 +209,5 @@ def _run(
         simulated=session.simulated,
         times=ended.times,
         notes=deployed.notes,
+        terminated=ended.terminated,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -209,6 +210,8 @@ def open_bus(text: str, *, bit_rate: int = 1_000_000) -> Iterator[CanLink]:
         raise SettingsError(f"--bus takes INTERFACE:CHANNEL, such as socketcan:can0; got `{text}`.")
     if interface not in can.interfaces.BACKENDS:
         raise SettingsError(f"--bus {text}: python-can has no interface `{interface}`; try socketcan:can0.")
+    # What python-can has to say of a bus that fails is in the exception; without a handler it would print it as well.
+    logging.getLogger("can").addHandler(logging.NullHandler())
     options: dict[str, Any] = {} if interface in ("socketcan", *HARMLESS) else {"bitrate": bit_rate}
     try:
         bus = can.Bus(interface=interface, channel=channel, receive_own_messages=False, **options)

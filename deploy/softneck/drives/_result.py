@@ -116,6 +116,7 @@ class DrivesResult:
         wall_time: [s].
         simulated: whether the drives were.
         times: of the cycles, in real time.
+        terminated: whether SIGTERM asked for the end.
     """
 
     signals: LoopResult
@@ -130,11 +131,12 @@ class DrivesResult:
     simulated: bool
     times: CycleTimes
     notes: tuple[str, ...] = field(default=())
+    terminated: bool = False
 
     @property
     def completed(self) -> bool:
         """Whether the loop ran to its end and nothing stopped it."""
-        return self.fault is None and self.phase == "done"
+        return self.fault is None and self.phase == "done" and not self.terminated
 
     @property
     def real_time_factor(self) -> float:
@@ -163,6 +165,7 @@ class DrivesResult:
             "real_time_factor": self.real_time_factor,
             "longest_step_s": self.times.longest_step,
             "times": None if self.simulated else self.times.table(),
+            "terminated": self.terminated,
             "metrics": metrics(self.signals) if len(self.signals.time) > 1 else None,
             "notes": list(self.notes),
         }  # fmt: skip

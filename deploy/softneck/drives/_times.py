@@ -13,13 +13,14 @@ class CycleTimes:
     Attributes:
         count: periods so far.
         late: those beyond one and a half cycles.
+        missed: cycles in which no step began: a period of n cycles misses n - 1.
         longest_period, longest_step: [s].
     """
 
     def __init__(self, cycle: float) -> None:
         """Begin with nothing; `cycle` is the period that is wanted [s]."""
         self.cycle = cycle
-        self.count = self.late = 0
+        self.count = self.late = self.missed = 0
         self.longest_period = self.longest_step = 0.0
         self._bins = [0] * _BINS
         self._last: float | None = None
@@ -31,6 +32,7 @@ class CycleTimes:
             period = now - self._last
             self.longest_period = max(self.longest_period, period)
             self.late += period > 1.5 * self.cycle
+            self.missed += max(0, round(period / self.cycle) - 1)
             self.count += 1
             self._bins[min(_BINS - 1, max(0, int(period / _BIN)))] += 1
         self._last = now
@@ -49,6 +51,8 @@ class CycleTimes:
         return {
             "cycles": self.count,
             "late": self.late,
+            "missed": self.missed,
+            "missed_share": self.missed / max(1, self.count + self.missed),
             "p50_s": self.quantile(0.5),
             "p99_s": self.quantile(0.99),
             "longest_s": self.longest_period,

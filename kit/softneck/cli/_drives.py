@@ -45,6 +45,9 @@ from ._drives_target import (
 from ._neck import load_neck
 from ._options import force_option, json_option, output_option, target
 
+# As a shell says it of a process that SIGTERM ended: 128 + 15.
+_TERMINATED = 143
+
 
 @click.group(
     "drives",
@@ -148,17 +151,19 @@ def zero_command(
 @neck_option
 @click.option("--pace", type=float, help="With --simulated: this multiple of real time instead of as fast as possible.")
 @log_option
+@click.option("--realtime", is_flag=True, help="On a bus: before all ordinary processes (SCHED_FIFO), memory locked.")
 @output_option("recording of the run", "REC")
 @force_option
 @json_option
 def run_command(
     controller: Path, loop_file: Path, certificates: tuple[Path, ...], drives_file: Path | None, bus: str | None,
-    simulated: bool, arm: bool, overrides: tuple[str, ...], neck: str | None, pace: float | None,
+    simulated: bool, arm: bool, overrides: tuple[str, ...], neck: str | None, pace: float | None, realtime: bool,
     logs: tuple[Path, ...], output: Path | None, force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Run CONTROLLER in the loop of LOOP.toml on the drives: enable, ramp in, control, ramp out, switch off.
 
-    Refused unless certificates cover controller, observer and loop file and hold. Exit code 1 if anything stopped it.
+    Refused unless certificates cover controller, observer and loop file and hold. Exit code 1 if anything stopped it,
+    143 if SIGTERM ended it (to rest, then off).
     """
     path, replace = target(output, f"results/drives_{loop_file.stem}.csv", force=force)
     recording_suffix(path)
@@ -188,14 +193,25 @@ def run_command(
                     raise SettingsError("drives on a bus are asked.")
                 with Keyboard() as keyboard:
                     result = run_on_bus(
-                        deployed, chosen.file, link, sensor, override=names, report=report, operator=keyboard,
-                        log=log, files=files,
-                    )  # fmt: skip
+                        deployed,
+                        chosen.file,
+                        link,
+                        sensor,
+                        override=names,
+                        report=report,
+                        operator=keyboard,
+                        realtime=realtime,
+                        log=log,
+                        files=files,
+                    )
     if len(result.signals.time) > 1:
         write_recording(path, result.recording(), force=replace)
     _print_run(path, result, as_json=as_json)
     if keyboard.interrupted:
         raise KeyboardInterrupt
+    if result.terminated:
+        note("ended by SIGTERM; the drives are off.")
+        click.get_current_context().exit(_TERMINATED)
     result.require()
 
 
@@ -206,6 +222,11 @@ def _print_run(path: Path, result: DrivesResult, *, as_json: bool) -> None:
         return
     rows = [["phase", result.phase], ["bus cycles", str(result.cycles)]]
     rows += [[name, str(count)] for name, count in result.counts.items()]
+    if not result.simulated:
+        times = result.times
+        figures = (times.quantile(0.5), times.quantile(0.99), times.longest_period)
+        rows.append(["cycle: median, p99, longest", ", ".join(f"{1e3 * value:.2f}" for value in figures) + " ms"])
+        rows.append(["missed cycles", f"{times.missed} of {times.count + times.missed}"])
     rows.append(["real-time factor", f"{result.real_time_factor:.1f}"])
     print_table(str(path), ["what", "value"], rows)
 
