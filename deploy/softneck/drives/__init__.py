@@ -26,6 +26,9 @@ from ._result import DrivesResult as DrivesResult
 from ._sdo import SdoError as SdoError
 from ._sdo import load_eds as load_eds
 from ._sensor import CanInclinometer as CanInclinometer
+from ._snapshot import DriveSnapshot as DriveSnapshot
+from ._snapshot import Snapshot as Snapshot
+from ._snapshot import Snapshots as Snapshots
 from ._units import DriveScale as DriveScale
 from ._units import acceleration_to_internal as acceleration_to_internal
 from ._units import counts_to_position as counts_to_position

@@ -103,6 +103,7 @@ def run_simulated(
     report: Callable[[float], None] | None = None,
     hook: Callable[[VirtualRun], None] | None = None,
     settings: Callable[[MasterSettings], MasterSettings] | None = None,
+    watch: Callable[[Master, float], None] | None = None,
 ) -> DrivesResult:
     """Run the whole loop on simulated drives, in virtual time.
 
@@ -115,6 +116,7 @@ def run_simulated(
         report: called now and then with the done fraction.
         hook: called after each bus cycle, to let things go wrong.
         settings: changes the master's settings, for tests.
+        watch: called after each bus cycle with the master and the cycle's time; it looks and changes nothing.
 
     Raises:
         CheckFailedError: the pre-flight failed.
@@ -139,7 +141,7 @@ def run_simulated(
     rows = max(1, round(loop.duration / pilot.sample_time))
     begin, first = time.perf_counter(), link.now
 
-    def watch(state: VirtualRun) -> None:
+    def after(state: VirtualRun) -> None:
         index = master.index
         if master.ran:
             log.take(master, index, virtual.truth())
@@ -147,12 +149,14 @@ def run_simulated(
                 report(min(1.0, index / rows))
         if hook is not None:
             hook(state)
+        if watch is not None:
+            watch(master, link.now)
         if pace is not None:
             rest = begin + (link.now - first + link.cycle) / pace - time.perf_counter()
             if rest > 0.0:
                 time.sleep(rest)
 
-    run.watch = watch
+    run.watch = after
     master.start()
     try:
         run.run(loop.duration)
@@ -172,6 +176,7 @@ def run_on_bus(
     override: Collection[str] = (),
     report: Callable[[float], None] | None = None,
     stopped: Callable[[], bool] | None = None,
+    watch: Callable[[Master, float], None] | None = None,
 ) -> DrivesResult:
     """Run the loop on the drives behind `link`, at the pace of the monotonic clock.
 
@@ -183,6 +188,8 @@ def run_on_bus(
         override: names of pre-flight checks that may fail.
         report: called now and then with the done fraction.
         stopped: asked each cycle whether the operator wants to stop.
+        watch: called after each bus cycle, its frames sent, with the master and the cycle's time; it looks and
+            changes nothing.
 
     Raises:
         CheckFailedError: the pre-flight failed; nothing moved.
@@ -200,7 +207,7 @@ def run_on_bus(
     begin = time.perf_counter()
     master.start()
     try:
-        longest = _cycle(link, master, sensor, log, stopped, report, rows)
+        longest = _cycle(link, master, sensor, log, stopped, report, watch, rows)
     except BaseException:
         # Whatever happens here must not leave a drive on: this loop is what feeds them.
         _emergency_stop(link, file)
@@ -219,6 +226,7 @@ def _cycle(
     log: RunLog,
     stopped: Callable[[], bool] | None,
     report: Callable[[float], None] | None,
+    watch: Callable[[Master, float], None] | None,
     rows: int,
 ) -> float:
     """Step the master at its period until it is done; return its longest step [s]."""
@@ -245,6 +253,8 @@ def _cycle(
             log.take(master, master.index, None)
             if report is not None and master.index % 50 == 0:
                 report(min(1.0, master.index / rows))
+        if watch is not None:
+            watch(master, now)
         due = max(due + period, now + 0.5 * period) if link.now - due > period else due + period
     return longest
 

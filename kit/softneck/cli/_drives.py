@@ -38,6 +38,7 @@ from softneck.drives.master import Tilt
 from softneck.signals import recording_suffix, write_recording
 
 from ._console import note, print_json, print_table, progress
+from ._drives_view import live_view
 from ._neck import load_neck
 from ._options import force_option, json_option, output_option, target
 
@@ -224,6 +225,7 @@ def run_command(
     """Run CONTROLLER in the loop of LOOP.toml on the drives: enable, ramp in, control, ramp out, switch off.
 
     Refused unless certificates cover controller, observer and loop file and hold. Exit code 1 if anything stopped it.
+    On a terminal (stderr) a live view shows the run, on a bus and with --pace; not with --json.
     """
     path, replace = target(output, f"results/drives_{loop_file.stem}.csv", force=force)
     recording_suffix(path)
@@ -236,18 +238,25 @@ def run_command(
     deployed = prepare(setup, controller)
     for text in deployed.notes:
         note(text)
-    with progress("drives", quiet=as_json) as tell:
+    live = not as_json and (not chosen.simulated or pace is not None)
+    with (
+        live_view(controller.name, deployed.loop.duration, wanted=live) as watch,
+        # Two things that draw in place would draw over each other; the view tells the time as well.
+        progress("drives", quiet=as_json or watch is not None) as tell,
+    ):
         report = lambda done: tell(done, controller.name)  # noqa: E731
         if chosen.simulated:
             virtual = load_neck(neck) if neck else None
-            result = run_simulated(deployed, chosen.file, neck=virtual, override=names, pace=pace, report=report)
+            result = run_simulated(
+                deployed, chosen.file, neck=virtual, override=names, pace=pace, report=report, watch=watch
+            )
         else:
             _require_can_sensor(chosen.file)
             with _link(chosen, moves=True) as link:
                 sensor = CanInclinometer(chosen.file.sensor_node)
                 if isinstance(link, VirtualLink):
                     raise SettingsError("drives on a bus are asked.")
-                result = run_on_bus(deployed, chosen.file, link, sensor, override=names, report=report)
+                result = run_on_bus(deployed, chosen.file, link, sensor, override=names, report=report, watch=watch)
     if len(result.signals.time) > 1:
         write_recording(path, result.recording(), force=replace)
     _print_run(path, result, as_json=as_json)
