@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 
 from softneck.cli._drives_view import LiveView, live_view, render
-from softneck.drives import DriveSnapshot, Snapshot, default_drives
+from softneck.drives import DriveSnapshot, Snapshot
 from softneck.drives.master import DriveState, Event, NodeState, Phase
 
 DEG = math.pi / 180.0
@@ -36,7 +36,9 @@ def _snapshot() -> Snapshot:
         events=(Event(102.0, "late_cycle"),),
         counts={"late_cycle": 4, "clamped": 17},
         fault=None,
-        settings=default_drives().master_settings(0.02, guarding="life"),
+        period=0.01,
+        sample_time=0.02,
+        tension_limit=12.0,
     )
 
 
@@ -54,6 +56,9 @@ def test_everything_is_on_the_screen() -> None:
     assert "pi.npz" in lines[0]
     # Sample 75 of 0.02 s; begun at 100 s of the clock.
     assert "running loop 1.50 of 4.0 s since start 3.50 s bus cycle 350" in lines
+    # The units are there: rich would take [deg] in a string for markup.
+    assert "angle [deg] reference measured estimate error" in lines
+    assert "motor set-point [rad] position [rad] lag [rad] tension [N] of limit" in lines
     assert "pitch 15.00 14.25 14.50 0.75" in lines
     assert "roll -3.00 -2.50 -2.75 -0.50" in lines
     # A bar of 20: half of the limit of 12 N, a tenth, and 19 of 20.

@@ -63,6 +63,7 @@ def test_a_watched_run_sends_the_same_frames_and_shows_each_cycle(project: Proje
     assert math.degrees(last[-1].references[0]) == np.degrees(log["pitch_reference"][-1])
     assert last[-1].run_time == log.time[-1]
     assert seen[-1].phase is Phase.DONE
+    assert math.isnan(seen[-1].references[0])
     assert dict(seen[-1].counts) == dict(result.counts)
     assert seen[-1].events == result.events[-5:]
 

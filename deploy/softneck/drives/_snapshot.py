@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ._pilot import LoopPilot
-from .master import DriveState, Event, Master, MasterSettings, NodeState, Phase
+from .master import DriveState, Event, Master, NodeState, Phase
 
 Triple = tuple[float, float, float]
 # So many of the last events are copied.
@@ -56,16 +56,18 @@ class Snapshot:
         cycle: its number.
         phase: of the run.
         index: of the controller's sample, -1 before the first.
-        references: of pitch, roll and co-contraction [rad]; NaN until the controller runs.
+        references: of pitch, roll and co-contraction [rad]; NaN while the controller does not run.
         angles: pitch and roll of the last believed sample of the inclinometer [rad]; NaN before the first.
-        estimates: pitch and roll as the observer has them [rad]; NaN until it runs, or if there is none.
+        estimates: pitch and roll as the observer has them [rad]; NaN while it does not run, or if there is none.
         setpoints, positions: of the motors, as sent and as measured [rad].
         tensions: of the tendons, from the current that the drives report (TPDO) over the motor's constant [N].
         drives: all three.
         events: the last five.
         counts: event name -> how often so far.
         fault: what ended the run, None if nothing did.
-        settings: of the master: its limits and its period.
+        period: of the bus [s].
+        sample_time: of the controller [s].
+        tension_limit: beyond which a run stops [N].
     """
 
     time: float
@@ -82,12 +84,14 @@ class Snapshot:
     events: tuple[Event, ...]
     counts: Mapping[str, int]
     fault: Event | None
-    settings: MasterSettings
+    period: float
+    sample_time: float
+    tension_limit: float
 
     @property
     def run_time(self) -> float:
         """Time since the controller's first sample [s]; 0 before it."""
-        return max(0, self.index) * self.settings.sample_cycles * self.settings.bus.cycle
+        return max(0, self.index) * self.sample_time
 
 
 class Snapshots:
@@ -100,7 +104,7 @@ class Snapshots:
 
     def take(self, master: Master, now: float) -> Snapshot:
         """Return what there is to see after the step at `now` [s]."""
-        supervisor, events, tilt = master.supervisor, master.events, master.tilt
+        supervisor, events, tilt, settings = master.supervisor, master.events, master.tilt, master.settings
         pitch_reference, roll_reference, common, pitch, roll = self._signals(master)
         # A deque is indexed in constant time at its ends only; copying all of it would take longer with each event.
         newest = tuple([events[i] for i in range(-min(_EVENTS, len(events)), 0)])
@@ -127,12 +131,15 @@ class Snapshots:
             events=newest,
             counts=dict(master.counts),
             fault=supervisor.fault,
-            settings=master.settings,
+            period=settings.bus.cycle,
+            sample_time=settings.sample_cycles * settings.bus.cycle,
+            tension_limit=settings.limits.tension,
         )  # fmt: skip
 
     def _signals(self, master: Master) -> tuple[float, float, float, float, float]:
         pilot = master.pilot
-        if not isinstance(pilot, LoopPilot) or master.index < 0:
+        # Beyond the run they would be the last ones, and say something that nobody asks for any more.
+        if not isinstance(pilot, LoopPilot) or master.index < 0 or master.supervisor.phase is not Phase.RUNNING:
             return (*_NONE, math.nan, math.nan)
         if pilot is not self._pilot:
             self._pilot = pilot

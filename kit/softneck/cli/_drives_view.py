@@ -96,7 +96,7 @@ class LiveView:
         """Return what is to be drawn now."""
         newest = self._newest
         if newest is None:
-            return Panel("waiting for the first bus cycle ...", title=self._title or None, title_align="left")
+            return Panel("waiting for the first bus cycle ...", title=_title(self._title), title_align="left")
         cycles = self._gaps[: min(self._shown, _CYCLES)].copy()
         return render(newest, cycles, begin=self._begin, title=self._title, duration=self._duration)
 
@@ -119,7 +119,7 @@ def render(
     ]  # fmt: skip
     parts += ["", *_events(snapshot, begin)]
     style = "red" if snapshot.fault is not None else "none"
-    return Panel(Group(*parts), title=title or None, title_align="left", border_style=style)
+    return Panel(Group(*parts), title=_title(title), title_align="left", border_style=style)
 
 
 def _head(snapshot: Snapshot, begin: float, duration: float | None) -> Text:
@@ -146,7 +146,7 @@ def _angles(snapshot: Snapshot) -> Table:
 def _motors(snapshot: Snapshot) -> Table:
     table = _table("motor", "set-point [rad]", "position [rad]", "lag [rad]", "tension [N]", "of limit")
     table.columns[5].justify = "left"
-    most = snapshot.settings.limits.tension
+    most = snapshot.tension_limit
     for j, (setpoint, position, tension) in enumerate(
         zip(snapshot.setpoints, snapshot.positions, snapshot.tensions, strict=True)
     ):
@@ -184,15 +184,15 @@ def _bar(value: float, most: float) -> Text:
 
 
 def _timing(snapshot: Snapshot, cycles: Vector) -> Text:
-    due = snapshot.settings.bus.cycle
-    text = Text("cycle time [ms]  ", style="bold")
+    due = snapshot.period
+    text = Text.assemble(("cycle time [ms]  ", "bold"))
     if len(cycles):
         middle, high = (1e3 * float(value) for value in np.percentile(cycles, (50, 99)))
-        text.append(f"p50 {middle:.2f}   p99 {high:.2f}   max {1e3 * float(cycles.max()):.2f}", style="none")
+        text.append(f"p50 {middle:.2f}   p99 {high:.2f}   max {1e3 * float(cycles.max()):.2f}")
     else:
-        text.append("-", style="none")
+        text.append("-")
     late = snapshot.counts.get("late_cycle", 0)
-    text.append(f"   (of {len(cycles)} cycles, due {1e3 * due:g})   ", style="none")
+    text.append(f"   (of {len(cycles)} cycles, due {1e3 * due:g})   ")
     text.append(f"late cycles {late}", style="yellow" if late else "none")
     return text
 
@@ -206,15 +206,20 @@ def _events(snapshot: Snapshot, begin: float) -> list[Text]:
     if not snapshot.events:
         lines.append(Text("  none", style="dim"))
     counted = "   ".join(f"{name} {count}" for name, count in sorted(snapshot.counts.items()))
-    lines += [Text(""), Text("counts  ", style="bold") + Text(counted or "none", style="none")]
+    lines += [Text(""), Text.assemble(("counts  ", "bold"), counted or "none")]
     return lines
 
 
 def _table(*names: str) -> Table:
     table = Table(box=None, pad_edge=False, padding=(0, 2), header_style="bold")
     for i, name in enumerate(names):
-        table.add_column(name, justify="left" if i == 0 else "right", no_wrap=True)
+        # As text: rich takes [rad] in a string for markup.
+        table.add_column(Text(name), justify="left" if i == 0 else "right", no_wrap=True)
     return table
+
+
+def _title(title: str) -> Text | None:
+    return Text(title) if title else None
 
 
 def _number(value: float, form: str) -> str:
