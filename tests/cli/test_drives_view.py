@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import itertools
 import math
+import os
 import sys
+import threading
 from dataclasses import replace
 
-import numpy as np
 import pytest
-from rich.console import Console
+from rich.console import Console, RenderableType
 
-from softneck.cli._drives_view import LiveView, live_view, render
+from softneck.cli._drives_screen import CycleTimes, from_line, render, to_line
+from softneck.cli._drives_view import LiveView, live_view
 from softneck.drives import DriveSnapshot, Snapshot
 from softneck.drives.master import DriveState, Event, NodeState, Phase
 
@@ -42,16 +45,18 @@ def _snapshot() -> Snapshot:
     )
 
 
-def _text(snapshot: Snapshot, cycles: np.ndarray | None = None) -> str:
-    console = Console(record=True, width=100, file=io.StringIO())
-    cycles = np.zeros(0) if cycles is None else cycles
-    console.print(render(snapshot, cycles, begin=100.0, title="pi.npz", duration=4.0))
+def _text(snapshot: Snapshot, times: CycleTimes | None = None) -> str:
+    return _drawn(render(snapshot, times or CycleTimes(), begin=100.0, title="pi.npz", duration=4.0))
+
+
+def _drawn(what: RenderableType, width: int = 100) -> str:
+    console = Console(record=True, width=width, file=io.StringIO())
+    console.print(what)
     return console.export_text()
 
 
 def test_everything_is_on_the_screen() -> None:
-    # 99 cycles of 10 ms and two of 14 ms: percentiles by hand.
-    text = _text(_snapshot(), np.array([0.010] * 99 + [0.014] * 2))
+    text = _text(_snapshot(), CycleTimes(0.010, 0.0125, 0.014, 101))
     lines = [" ".join(line.strip("│ ").split()) for line in text.splitlines()]
     assert "pi.npz" in lines[0]
     # Sample 75 of 0.02 s; begun at 100 s of the clock.
@@ -67,7 +72,7 @@ def test_everything_is_on_the_screen() -> None:
         assert f"{start} {'█' * filled}{'·' * (20 - filled)}" in lines
     for node in (1, 2, 3):
         assert f"node {node} enabled operational 1237h 0 -" in lines
-    assert "cycle time [ms] p50 10.00 p99 14.00 max 14.00 (of 101 cycles, due 10) late cycles 4" in lines
+    assert "cycle time [ms] p50 10.00 p99 12.50 max 14.00 (of 101 cycles, due 10) late cycles 4" in lines
     assert "2.00 s late_cycle a cycle came late" in lines
     assert "counts clamped 17 late_cycle 4" in lines
     assert any("tension: from the drives' current" in line for line in lines)
@@ -90,26 +95,63 @@ def test_a_fault_is_named_and_what_is_not_known_is_a_dash() -> None:
 
 @pytest.mark.parametrize("width", [40, 80, 200])
 def test_no_width_breaks_it(width: int) -> None:
-    console = Console(record=True, width=width, file=io.StringIO())
-    console.print(render(_snapshot(), np.full(3, 0.01)))
-    assert all(len(line) <= width for line in console.export_text().splitlines())
+    assert all(len(line) <= width for line in _drawn(render(_snapshot(), CycleTimes()), width).splitlines())
 
 
-def test_the_view_shows_the_newest_and_counts_each_cycle() -> None:
-    ticks = itertools.count()
-    console = Console(record=True, width=100, file=io.StringIO())
-    view = LiveView(console, title="pi.npz", clock=lambda: 0.01 * next(ticks))
-    before = sys.getswitchinterval()
-    with view:
-        # More cycles than are kept: the last 1000 count.
-        for k in range(1500):
+def test_what_is_drawn_elsewhere_is_the_same() -> None:
+    fault = Event(103.4, "emergency", 2, "code 2310h")
+    times = CycleTimes(0.010, 0.0125, 0.014, 101)
+    stopped = replace(_snapshot(), phase=Phase.STOPPED, fault=fault, estimates=(math.nan, math.nan))
+    for snapshot in (_snapshot(), stopped):
+        line = to_line(snapshot, times, begin=100.0, title="pi [1].npz", duration=None)
+        assert line.count(b"\n") == 1
+        here = render(snapshot, times, begin=100.0, title="pi [1].npz", duration=None)
+        assert _drawn(from_line(line)) == _drawn(here)
+        assert "pi [1].npz" in _drawn(here)
+
+
+def test_the_newest_snapshot_and_the_last_thousand_cycles_count() -> None:
+    # 600 cycles of 20 ms, then 990 of 10 ms and ten of 14 ms: percentiles of the last 1000 by hand.
+    gaps = [0.02] * 600 + [0.01] * 989 + [0.014] * 11
+    ticks = iter([0.0, *itertools.accumulate(gaps)])
+    view = LiveView(title="pi.npz", clock=lambda: next(ticks))
+    assert view.line() is None
+    for k in range(1601):
+        view.show(replace(_snapshot(), cycle=k))
+    line = view.line()
+    assert line is not None
+    text = _drawn(from_line(line))
+    assert "bus cycle 1600" in text
+    assert "p50 10.00   p99 14.00   max 14.00   (of 1000 cycles" in text
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")
+def test_the_last_picture_is_on_the_terminal_and_a_dead_screen_does_no_harm() -> None:
+    here, there = os.openpty()
+    drawn: list[bytes] = []
+
+    def read() -> None:
+        # Reading ends with an error when nobody has the other side open any more.
+        with contextlib.suppress(OSError):
+            while chunk := os.read(here, 65536):
+                drawn.append(chunk)
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    with LiveView(title="pi.npz", terminal=there) as view:
+        for k in range(8):
             view.show(replace(_snapshot(), cycle=k))
-        assert sys.getswitchinterval() < before
-    assert sys.getswitchinterval() == before
-    console.print(view.render())
-    text = console.export_text()
-    assert "bus cycle 1499" in text
-    assert "p50 10.00   p99 10.00   max 10.00   (of 1000 cycles" in text
+    with LiveView(title="pi.npz", terminal=there) as view:
+        assert view._screen is not None
+        view._screen.kill()
+        view._screen.wait()
+        view.show(_snapshot())
+    os.close(there)
+    reader.join(10.0)
+    os.close(here)
+    text = b"".join(drawn).decode()
+    assert "bus cycle 7" in text
+    assert "Traceback" not in text
 
 
 def test_without_a_terminal_or_a_wish_nothing_is_drawn(capsys: pytest.CaptureFixture[str]) -> None:
