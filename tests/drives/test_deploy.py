@@ -205,7 +205,12 @@ def test_a_run_over_a_bus_of_python_can(project: Project) -> None:
             link = CanLink(ours, "virtual:softneck")
             # The threads share one interpreter: a stall of 50 ms is this machine's, not the master's.
             begin = time.monotonic()
-            result = run_on_bus(prepare(setup, project.controller), file, link, CanInclinometer(10))
+            watched: list[int] = []
+            result = run_on_bus(
+                prepare(setup, project.controller), file, link, CanInclinometer(10),
+                watches=(lambda *seen: watched.append(seen[-1].cycle),),
+            )  # fmt: skip
+            assert watched == list(range(1, result.cycles + 1))
             took = time.monotonic() - begin
         finally:
             ended.set()

@@ -54,6 +54,9 @@ from ._serial import SensorError as SensorError
 from ._serial import SerialInclinometer as SerialInclinometer
 from ._serial import TiltLines as TiltLines
 from ._serial import tilt_of_line as tilt_of_line
+from ._snapshot import DriveSnapshot as DriveSnapshot
+from ._snapshot import Snapshot as Snapshot
+from ._snapshot import Snapshots as Snapshots
 from ._sources import ReplaySensor as ReplaySensor
 from ._sources import SensorSource as SensorSource
 from ._sources import open_sensor as open_sensor

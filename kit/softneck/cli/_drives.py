@@ -42,6 +42,7 @@ from ._drives_target import (
     sensor_of,
     target_of,
 )
+from ._drives_view import live_view
 from ._neck import load_neck
 from ._options import force_option, json_option, output_option, target
 
@@ -164,6 +165,7 @@ def run_command(
 
     Refused unless certificates cover controller, observer and loop file and hold. Exit code 1 if anything stopped it,
     143 if SIGTERM ended it (to rest, then off).
+    On a terminal (stderr) a live view shows the run, on a bus and with --pace; not with --json.
     """
     path, replace = target(output, f"results/drives_{loop_file.stem}.csv", force=force)
     recording_suffix(path)
@@ -177,14 +179,20 @@ def run_command(
     for text in deployed.notes:
         note(text)
     files = acting_files(setup, loop_file, controller, drives_file)
-    with progress("drives", quiet=as_json) as tell, opened_log(logs, chosen.simulated, force=force) as log:
+    live = not as_json and (not chosen.simulated or pace is not None)
+    with (
+        opened_log(logs, chosen.simulated, force=force) as log,
+        live_view(controller.name, deployed.loop.duration, wanted=live) as watches,
+        # Two things that draw in place would draw over each other; the view tells the time as well.
+        progress("drives", quiet=as_json or bool(watches)) as tell,
+    ):
         report = lambda done: tell(done, controller.name)  # noqa: E731
         if chosen.simulated:
             virtual = load_neck(neck) if neck else None
             with Keyboard() as keyboard:
                 result = run_simulated(
                     deployed, chosen.file, neck=virtual, override=names, pace=pace, report=report, operator=keyboard,
-                    log=log, files=files,
+                    watches=watches, log=log, files=files,
                 )  # fmt: skip
         else:
             sensor = sensor_of(chosen.file)
@@ -200,6 +208,7 @@ def run_command(
                         override=names,
                         report=report,
                         operator=keyboard,
+                        watches=watches,
                         realtime=realtime,
                         log=log,
                         files=files,

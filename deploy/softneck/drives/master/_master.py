@@ -132,6 +132,11 @@ class Master:
         return frames_out
 
     @property
+    def pilot(self) -> Pilot:
+        """What is asked for set-points."""
+        return self._pilot
+
+    @property
     def index(self) -> int:
         """Number of the pilot's last sample; -1 before the first."""
         return self._index
