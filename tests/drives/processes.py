@@ -31,40 +31,8 @@ NAMESPACE = (
 OFF, FAULT = "DISABLED", "FAULT"
 SLEEP = 0.01
 
-LOOP = """duration_s = {duration}
-sample_time_s = 0.02
-[plant]
-neck = "paper"
-[observer]
-{observer}
-[controller]
-file = "pi.npz"
-[reference]
-kind = "rotation"
-inclination_deg = 8.0
-frequency_hz = 0.3
-"""
-HANGS = """import pathlib
-import time
-
-from softneck.core import load
-from softneck.loop import BlockPart
-
-HERE = pathlib.Path(__file__).parent
-
-
-class Hangs(BlockPart):
-    def advance(self, time_s, inputs):
-        if time_s > 0.5:
-            (HERE / "hung").write_text(str(time.monotonic()))
-            while True:
-                time.sleep(1.0)
-        return super().advance(time_s, inputs)
-
-
-def make():
-    return Hangs(load(HERE / "kalman.npz", role="observer").block())
-"""
+LOOP = (Path(__file__).parent / "processes_loop.toml").read_text()
+HANGS = (Path(__file__).parent / "hanging_observer.py").read_text()
 DRIVES = """profile = "ipos2015"
 bus.period_s = {period}
 ramp = {{ settle_s = 0.1, speed_rad_s = 3.0, tolerance_rad = 0.2 }}
@@ -411,6 +379,7 @@ def main() -> None:
         write_project(folder, duration=chosen.duration, period=chosen.period, guarding=chosen.guarding)
         for case in chosen.cases or CASES:
             for _ in range(chosen.repeat):
+                found: dict[str, Any] = {}
                 for attempt in range(chosen.attempts):
                     world = World(folder, chosen.bus, chosen.link, chosen.period, chosen.patience, tuple(chosen.extra))
                     world.realtime, world.drives_bus = chosen.realtime, chosen.drives_bus

@@ -73,7 +73,8 @@ def logged_bench(path: Path, name: str | None = None, *paths: Path) -> Bench:
         bench.run.watches = (log.watch(pilot),)
 
         def both(now: float, from_master: bool, frame: Frame) -> None:
-            tap(now, from_master, frame)
+            if tap is not None:
+                tap(now, from_master, frame)
             log.frame(now, from_master, frame)
 
         bench.link.tap = both

@@ -12,7 +12,7 @@ from softneck.drives import (
     DrivesResult,
     Snapshot,
     Snapshots,
-    VirtualRun,
+    VirtualLink,
     default_drives,
     prepare,
     recorded,
@@ -30,9 +30,9 @@ def _run(project: Project, *, watched: bool) -> tuple[DrivesResult, list[tuple[f
     seen: list[Snapshot] = []
     taker = Snapshots()
 
-    def record(run: VirtualRun) -> None:
+    def record(link: VirtualLink) -> None:
         if not frames:
-            frames.append(recorded(run.link))
+            frames.append(recorded(link))
 
     def watch(now: float, _in: object, _out: object, _tilt: object, master: Master) -> None:
         seen.append(taker.take(master, now))
