@@ -37,7 +37,8 @@ nightly: $(VENV)/.tested native
 	SOFTNECK_NIGHTLY=1 $(BIN)/python -m pytest -q -n 0 tests/fmu/test_native_platforms.py
 	SOFTNECK_FUZZ_ROUNDS=3000 $(BIN)/python -m pytest -q -n 0 tests/fmu/test_native_errors.py -k sanitizers
 
-# The drives over real SocketCAN in QEMU; its guest has not come up yet, so `nightly` leaves it out. Debian: qemu-system-x86 busybox-static kmod cpio iproute2.
+# The drives over real SocketCAN in QEMU; its guest has not come up yet, so `nightly` leaves it out.
+# Debian: qemu-system-x86 busybox-static kmod cpio iproute2.
 nightly-can: $(VENV)/.tested
 	$(BIN)/python tests/nightly/socketcan.py
 

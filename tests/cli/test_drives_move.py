@@ -7,7 +7,9 @@ import json
 import pytest
 
 from softneck.cli._arm import require_armed, words
+from softneck.cli._drives_target import sensor_of
 from softneck.core import SettingsError
+from softneck.drives import load_drives
 from softneck.signals import read_recording
 
 from ..data import ROOT
@@ -71,3 +73,12 @@ def test_a_service_says_the_same_words(monkeypatch: pytest.MonkeyPatch, capsys: 
         require_armed("socketcan:can0", arm=False)
     require_armed("socketcan:can0", arm=True)
     assert "nobody was asked" in capsys.readouterr().err
+
+
+def test_a_recording_is_no_sensor_for_real_drives(tmp_path):
+    (tmp_path / "drives.toml").write_text(
+        EXAMPLE.read_text().replace('kind = "can" ', 'kind = "replay"\nfile = "run.csv" ', 1)
+    )
+    file = load_drives(tmp_path / "drives.toml")
+    with pytest.raises(SettingsError, match="for simulated drives; on socketcan:can0"):
+        sensor_of(file, "socketcan:can0")

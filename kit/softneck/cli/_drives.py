@@ -195,7 +195,7 @@ def run_command(
                     watches=watches, log=log, files=files,
                 )  # fmt: skip
         else:
-            sensor = sensor_of(chosen.file)
+            sensor = sensor_of(chosen.file, str(chosen.bus))
             with open_link(chosen, moves=True) as link:
                 if isinstance(link, VirtualLink):
                     raise SettingsError("drives on a bus are asked.")

@@ -41,7 +41,7 @@ _pace_option = click.option("--pace", type=float, help="With --simulated: this m
 def _session(
     chosen: Target, link: CanLink | VirtualLink, keyboard: Keyboard, overrides: tuple[str, ...], pace: float | None
 ) -> Session:
-    sensor = None if isinstance(link, VirtualLink) else sensor_of(chosen.file)
+    sensor = None if isinstance(link, VirtualLink) else sensor_of(chosen.file, str(chosen.bus))
     return Session(
         file=chosen.file, link=link, sensor=sensor, override=checked_names(overrides), pace=pace, operator=keyboard
     )

@@ -12,6 +12,7 @@ import click
 
 from softneck.core import SettingsError
 from softneck.drives import (
+    HARMLESS,
     OVERRIDES,
     CanLink,
     DrivesFile,
@@ -104,7 +105,7 @@ def look_of(link: CanLink | VirtualLink, file: DrivesFile) -> Callable[[], Tilt 
             return Tilt(taken.pitch, taken.roll, taken.pitch_rate, taken.roll_rate, taken.valid)
 
         return sample
-    sensor = sensor_of(file)
+    sensor = sensor_of(file, link.name)
 
     def look() -> Tilt | None:
         until = link.now + _LOOK
@@ -117,12 +118,17 @@ def look_of(link: CanLink | VirtualLink, file: DrivesFile) -> Callable[[], Tilt 
     return look
 
 
-def sensor_of(file: DrivesFile) -> Any:
+def sensor_of(file: DrivesFile, bus: str) -> Any:
     """Return the inclinometer that the drives file names, open until the command ends.
 
     Raises:
+        SettingsError: a recording as sensor where the drives may be real.
         SoftneckError: see `open_sensor`; nothing was sent to the drives yet.
     """
+    if file.sensor_kind == "replay" and bus.partition(":")[0] not in HARMLESS:
+        raise SettingsError(
+            f'[sensor] kind "replay" is for simulated drives; on {bus} the loop would not see the neck it moves.'
+        )
     return click.get_current_context().with_resource(
         open_sensor(file.sensor_kind, file.sensor_node, file.sensor_source)
     )
