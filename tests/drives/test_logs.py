@@ -69,7 +69,7 @@ def logged_bench(path: Path, name: str | None = None, *paths: Path) -> Bench:
     with RunLogger([path, *paths], wait=True) as log:
         log.describe(run_facts(master.settings, {}, simulated=True))
         pilot = LoggedPilot(bench.pilot)
-        master._pilot = pilot
+        master.pilot = pilot
         bench.run.watches = (log.watch(pilot),)
 
         def both(now: float, from_master: bool, frame: Frame) -> None:
@@ -266,7 +266,7 @@ folder = Path(sys.argv[1])
 log = RunLogger([folder / "run.mcap", folder / "run.blf", folder / "run.log"])
 log.describe(run_facts(bench.master.settings, {}, simulated=True))
 pilot = LoggedPilot(bench.pilot)
-bench.master._pilot = pilot
+bench.master.pilot = pilot
 bench.run.watches = (log.watch(pilot),)
 bench.link.tap = log.frame
 bench.master.start()

@@ -48,7 +48,7 @@ class Master:
 
     def __init__(self, settings: MasterSettings, pilot: Pilot) -> None:
         """Be idle; `start` begins the run."""
-        self.settings, self._pilot = settings, pilot
+        self.settings, self.pilot = settings, pilot
         self.bus = Fieldbus(settings.bus)
         self.supervisor = Supervisor(settings.bus.off)
         self._gate = Gate(settings.sensor)
@@ -132,11 +132,6 @@ class Master:
         return frames_out
 
     @property
-    def pilot(self) -> Pilot:
-        """What is asked for set-points."""
-        return self._pilot
-
-    @property
     def index(self) -> int:
         """Number of the pilot's last sample; -1 before the first."""
         return self._index
@@ -174,11 +169,7 @@ class Master:
     def _measure(self) -> None:
         s, d = self.settings, self.bus.drives
         k, zero, n = s.counts_per_radian, s.zero_counts, s.newton_per_unit
-        self.positions = (
-            (d[0].counts - zero) / k[0],
-            (d[1].counts - zero) / k[1],
-            (d[2].counts - zero) / k[2],
-        )
+        self.positions = ((d[0].counts - zero) / k[0], (d[1].counts - zero) / k[1], (d[2].counts - zero) / k[2])
         self.tensions = (d[0].current * n[0], d[1].current * n[1], d[2].current * n[2])
 
     def _judge(self, now: float, events: list[Event]) -> None:
@@ -288,7 +279,7 @@ class Master:
         if self._gate.last is not None:
             self._watches.align(self._gate.last.pitch, self._gate.last.roll, self.positions)
         try:
-            self._pilot.start()
+            self.pilot.start()
         except Exception as error:
             self._failed(self._now or 0.0, error)
 
@@ -316,12 +307,12 @@ class Master:
         if tilt is None:
             return
         try:
-            if self._pilot.finished(self._index):
+            if self.pilot.finished(self._index):
                 self._change(now, Signal.FINISH)
                 self._arrived_at = _NEVER
                 self._ramp(now, events)
                 return
-            answer = self._pilot.step(Measured(self._index, tilt, fresh, self.positions))
+            answer = self.pilot.step(Measured(self._index, tilt, fresh, self.positions))
             if answer is None:
                 self._missing += 1
                 self._from = self.wanted
