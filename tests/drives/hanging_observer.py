@@ -1,7 +1,7 @@
 """An observer that never returns after half a second; `processes.py` copies it into its project."""
 
 import pathlib
-import time
+from time import monotonic, sleep
 
 from softneck.core import load
 from softneck.loop import BlockPart
@@ -10,12 +10,12 @@ HERE = pathlib.Path(__file__).parent
 
 
 class Hangs(BlockPart):
-    def advance(self, time_s, inputs):
-        if time_s > 0.5:
-            (HERE / "hung").write_text(str(time.monotonic()))
+    def advance(self, time, inputs):
+        if time > 0.5:
+            (HERE / "hung").write_text(str(monotonic()))
             while True:
-                time.sleep(1.0)
-        return super().advance(time_s, inputs)
+                sleep(1.0)
+        return super().advance(time, inputs)
 
 
 def make():
