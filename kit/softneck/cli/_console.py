@@ -12,6 +12,7 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
+from rich.text import Text
 
 from softneck.core import Progress as ProgressCallback
 from softneck.core import silent
@@ -22,15 +23,24 @@ def print_json(value: Any) -> None:
     click.echo(json.dumps(_plain(value), indent=2, sort_keys=False, allow_nan=False))
 
 
+# A pipe or a log has no width: no table is cut there.
+_NO_EDGE = 1_000_000
+
+
 def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table on stdout, the first column to the left and the others to the right."""
-    table = Table(title=title, title_justify="left", header_style="bold", pad_edge=False)
+    """Print a table on stdout, the first column to the left and the others to the right.
+
+    All of it is printed as it is: rich would take `[rad]` in a string for markup, `:key:` for a picture.
+    """
+    table = Table(header_style="bold", pad_edge=False)
     for index, name in enumerate(head):
-        table.add_column(name, justify="left" if index == 0 else "right", no_wrap=True)
+        table.add_column(Text(name), justify="left" if index == 0 else "right", no_wrap=True)
     for row in rows:
-        table.add_row(*row)
-    # A pipe or a log has no width: never cut a table there.
-    Console(width=None if sys.stdout.isatty() else 200).print(table)
+        table.add_row(*(Text(cell) for cell in row))
+    console = Console(width=None if sys.stdout.isatty() else _NO_EDGE)
+    # A line of its own: as the table's title a path would be folded to the table's width.
+    console.print(Text(title, style="table.title"), soft_wrap=True)
+    console.print(table)
 
 
 def note(message: str) -> None:
@@ -49,7 +59,8 @@ def progress(what: str, *, quiet: bool = False) -> Iterator[ProgressCallback]:
         note(f"{what} ...")
         yield silent
         return
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    # No markup: a description names files, and `run[1].csv` is one.
+    columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(what, total=1.0)
         yield lambda done, word: bar.update(task, completed=done, description=f"{what}: {word}")

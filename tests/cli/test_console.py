@@ -1,0 +1,64 @@
+"""What people read on the console: every character of a table, whatever it means to the library that draws it."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from rich.console import Console
+
+import softneck.cli._console as console_module
+from softneck.cli._console import note, print_table, progress
+
+# What a terminal shows in a place of its own: no controls, and no marks that join the letter before them.
+SHOWN = st.text(st.characters(categories=("L", "N", "P", "S")), min_size=1, max_size=12)
+
+
+def _printed(title: str, head: list[str], rows: list[list[str]]) -> str:
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        print_table(title, head, rows)
+    return out.getvalue()
+
+
+@given(title=SHOWN, name=SHOWN, cells=st.lists(SHOWN, min_size=1, max_size=3))
+@example(title="Pulled [rad]", name="[bold]", cells=["run[1].csv", "[/]", ":warning:", "\\[deg]"])
+def test_a_table_shows_every_character_of_title_heading_and_cells(title: str, name: str, cells: list[str]) -> None:
+    first, *table = _printed(title, ["what", name], [[cell, cell] for cell in cells]).splitlines()
+    assert first == title
+    assert name in table[1]
+    for line, cell in zip(table[3:], cells, strict=False):
+        assert line.count(cell) >= 2
+
+
+@pytest.mark.parametrize("unit", ["rad", "deg", "N", "s", "kg m^2", "rad/s", "%", "-", "1/s", "/", "bold", "red"])
+def test_units_in_brackets_survive_in_every_place(unit: str) -> None:
+    text = f"pulled [{unit}]"
+    assert _printed(text, [text, text], [[text, text]]).count(text) == 5
+
+
+def test_a_table_in_a_pipe_is_neither_cut_nor_folded() -> None:
+    path = "/a/" + "long/" * 80 + "name of a file.csv"
+    printed = _printed(path, ["file", "fit [%]"], [[path, "80.0"]])
+    assert printed.count(path) == 2
+
+
+@pytest.mark.parametrize("text", ["run[1].csv", "[/]", "[rad]"])
+def test_progress_shows_names_of_files_as_they_are(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = io.StringIO()
+    monkeypatch.setattr(
+        console_module, "Console", lambda stderr: Console(file=drawn, force_terminal=True, width=120, stderr=stderr)
+    )
+    with progress(text) as tell:
+        tell(0.5, text)
+    # Without the sequences that move the cursor and colour.
+    assert f"{text}: {text}" in re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", drawn.getvalue())
+
+
+@pytest.mark.parametrize("text", ["run[1].csv", "[/]", "no channel pitch [deg]"])
+def test_remarks_are_printed_as_they_are(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    note(text)
+    assert capsys.readouterr().err == f"{text}\n"
