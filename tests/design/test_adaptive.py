@@ -137,8 +137,7 @@ def linear(settings: AdaptiveSettings) -> LinearController:
         (axis, axis), reference_times=(time, time, time), sample_time=TS, tendon_angles=settings.tendon_angles
     )
     return LinearController(
-        kind="pi", sample_time=TS, order="sequential", design={}, arrays=arrays, position_limit=6.0, slew_limit=12.5,
-        lead_limit=settings.lead_limit,
+        kind="pi", sample_time=TS, order="sequential", design={}, arrays=arrays, limits=settings.limits()
     )  # fmt: skip
 
 

@@ -133,8 +133,9 @@ def test_tendons_have_no_number(tilt: tuple[float, float], common: float, positi
 
 
 def pi(*, least_position: float = -6.0, least_cocontraction: float = -6.0) -> LinearController:
-    rule = {"least_position": least_position, "least_cocontraction": least_cocontraction}
-    return replace(PiSettings(lead_limit=0.8, reference_time=0.12).design(neck()), **rule)
+    return PiSettings(
+        lead_limit=0.8, reference_time=0.12, least_position=least_position, least_cocontraction=least_cocontraction
+    ).design(neck())
 
 
 def test_a_least_cocontraction_keeps_tendons_taut_under_a_payload_that_slackens_them() -> None:
@@ -174,7 +175,7 @@ def test_files_of_before_the_rule_are_read(tmp_path: Path) -> None:
     header, arrays = read_archive(tmp_path / "c.npz")
     old = {key: value for key, value in header.items() if not key.startswith(("format", "least"))}
     write_archive(tmp_path / "old.npz", old, arrays)
-    assert load(tmp_path / "old.npz").least_position == -6.0
+    assert load(tmp_path / "old.npz").limits.least_position == -6.0
 
 
 @pytest.mark.parametrize("name", ["least_position", "least_cocontraction"])

@@ -202,7 +202,7 @@ def test_a_saved_controller_is_the_same(tmp_path: Path) -> None:
     again = load(tmp_path / "c.npz", role="controller")
     assert isinstance(again, LinearController)
     assert again.summary() == controller.summary()
-    assert (again.position_limit, again.slew_limit, again.order) == (4.0, 12.5, "jacobi")
+    assert (again.limits.position_limit, again.limits.slew_limit, again.order) == (4.0, 12.5, "jacobi")
     U = np.random.default_rng(0).standard_normal((20, 10))
     first, second = (c.block().run(c.initial_state(), U)[1] for c in (controller, again))
     np.testing.assert_array_equal(first, second)
@@ -249,7 +249,7 @@ def test_the_summary_names_margins_and_order() -> None:
         ({"position_limit": 7.0}, "`position_limit` must be between 0.01 and 6"),
         ({"lead_limit": 0.0}, "`lead_limit` must be between"),
         ({"least_delay": -0.1}, "`least_delay` must be between"),
-        ({"slew_limit": 0.0}, "`slew_limit` must be positive"),
+        ({"slew_limit": 0.0}, "`slew_limit` must be between 0.01 and 1000"),
         ({"reference_time": -1.0}, "`reference_time` must be between"),
         ({"order": "other"}, "`order` must be one of"),
         ({"tendon_angles": (0.0, 0.1, 0.1)}, "span the plane"),

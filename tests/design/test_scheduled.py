@@ -56,7 +56,7 @@ def test_equal_operating_points_make_the_linear_controller() -> None:
     first = controller.design["gains"][0]
     axes = [following_axis(Gains(**gains), axis_plant(neck(), "pitch"), 4, 3.0) for gains in first]
     linear = LinearController(
-        kind="pi", sample_time=TS, order="sequential", design={}, position_limit=6.0, slew_limit=12.5, lead_limit=0.8,
+        kind="pi", sample_time=TS, order="sequential", design={}, limits=ScheduledSettings().limits(),
         arrays=assemble(
             (axes[0], axes[1]), reference_times=(0.06, 0.06, 0.06), sample_time=TS,
             tendon_angles=ScheduledSettings().tendon_angles,

@@ -17,6 +17,7 @@ from ._fopi import FopiSettings as FopiSettings
 from ._fractional import FractionalPid as FractionalPid
 from ._fractional import fopi as fopi
 from ._hinf import HinfSettings as HinfSettings
+from ._limits import Limits as Limits
 from ._lqg import LqgSettings as LqgSettings
 from ._margins import Margins as Margins
 from ._margins import loop_margins as loop_margins
@@ -58,7 +59,6 @@ from ._synthesis import ncfsyn as ncfsyn
 from ._uncertain import UncertainAxis as UncertainAxis
 from ._uncertain import UncertainPlant as UncertainPlant
 from ._uncertain import uncertain_plant as uncertain_plant
-from ._varying import Limits as Limits
 from ._varying import VaryingController as VaryingController
 from ._weights import makeweight as makeweight
 from ._weights import ucover as ucover

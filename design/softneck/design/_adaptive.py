@@ -8,28 +8,27 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from softneck.core import Matrix, Port, SettingsError, Vector, require_between, require_one_of
-from softneck.estimation import ORDERS, AxisPlant, HasTransferFunctions, axis_plant
-from softneck.signals import TENDON_ANGLES
+from softneck.core import Matrix, Port, SettingsError, Vector, require_between
+from softneck.estimation import AxisPlant, HasTransferFunctions, axis_plant
 
 from ._assembly import assemble, pi_axis
+from ._loop_settings import LoopSettings
 from ._margins import frequencies
 from ._operating_points import AXES
-from ._varying import RUNTIMES, Limits, VaryingController
+from ._varying import RUNTIMES, VaryingController
 
 # Sizes of the loop kappa z^-d / (z - 1) that are tried, 1 % apart.
 _SIZES = np.geomspace(1e-3, 1.0, 695)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AdaptiveSettings:
+class AdaptiveSettings(LoopSettings):
     """Online recursive least squares and a redesign in every sample, with what keeps it safe.
 
     Attributes:
         max_sensitivity: bound on Ms of the loop that every redesign makes, with its delay in full.
         phase_margin: least phase margin [rad] of it.
-        least_delay: the dead time is taken as at least this [s].
-        small_move_pole: the nominal plant is taken as at least as fast as this [1/s]; 0: as identified.
+        small_move_pole: the nominal plant itself is taken as at least as fast as this [1/s]; 0: as identified.
         forgetting: lambda of the recursion, for the samples it takes in.
         start_covariance: diagonal of F(0); small trusts the identified plant, so that no first step is one of learning.
         covariance_bound: on the trace of F.
@@ -42,16 +41,10 @@ class AdaptiveSettings:
         gain_rate: change of lag and gain in use [1/s].
         reference_time: time constant of the reference filter [s].
         leak_time: over which the integral gives up what is beyond a limit [s].
-        position_limit, slew_limit, lead_limit, least_position, least_cocontraction: see `Limits`.
-        order: of the loop; "jacobi" adds one sample for the controller and one for the observer.
-        observer: whether the loop will have an observer.
-        tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
     """
 
     max_sensitivity: float = 1.5
     phase_margin: float = math.radians(60.0)
-    least_delay: float = 0.08
-    small_move_pole: float = 5.293
     # 4 s of motion.
     forgetting: float = 0.995
     # One step of 15 deg teaches about as much.
@@ -68,20 +61,12 @@ class AdaptiveSettings:
     gain_rate: float = 1.0
     reference_time: float = 0.06
     leak_time: float = 3.0
-    position_limit: float = 6.0
-    slew_limit: float = 12.5
     lead_limit: float = 0.8
-    least_position: float = -6.0
-    least_cocontraction: float = -6.0
-    order: str = "sequential"
-    observer: bool = True
-    tendon_angles: tuple[float, float, float] = tuple(TENDON_ANGLES.tolist())
 
     def __post_init__(self) -> None:
+        LoopSettings.__post_init__(self)
         require_between("max_sensitivity", self.max_sensitivity, 1.05, 4.0)
         require_between("phase_margin", self.phase_margin, 0.1, 1.5, "rad")
-        require_between("least_delay", self.least_delay, 0.0, 1.0, "s")
-        require_between("small_move_pole", self.small_move_pole, 0.0, 1000.0, "1/s")
         require_between("forgetting", self.forgetting, 0.9, 1.0)
         require_between("start_covariance", self.start_covariance, 1e-9, 1e12)
         require_between("covariance_bound", self.covariance_bound, 1e-6, 1e12)
@@ -94,23 +79,6 @@ class AdaptiveSettings:
         require_between("gain_rate", self.gain_rate, 0.0, 10.0, "1/s")
         require_between("reference_time", self.reference_time, 0.0, 60.0, "s")
         require_between("leak_time", self.leak_time, 0.1, 60.0, "s")
-        require_one_of("order", self.order, ORDERS)
-        self.limits()
-
-    def limits(self) -> Limits:
-        """Return the limits of the set-points."""
-        return Limits(
-            position_limit=self.position_limit,
-            slew_limit=self.slew_limit,
-            lead_limit=self.lead_limit,
-            least_position=self.least_position,
-            least_cocontraction=self.least_cocontraction,
-        )
-
-    @property
-    def extra_delay(self) -> int:
-        """Samples that the loop's order adds to the plant's delay."""
-        return 0 if self.order == "sequential" else 1 + int(self.observer)
 
     def design(self, model: HasTransferFunctions) -> VaryingController:
         """Return the controller that starts from `model`, of one pole and a dead time in each axis.

@@ -10,16 +10,16 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, require_between, require_one_of, require_positive, require_whole
-from softneck.estimation import AXES, ORDERS, AxisPlant
-from softneck.signals import TENDON_ANGLES, redefinition_matrix
+from softneck.core import Matrix, SettingsError, require_between, require_one_of, require_whole
+from softneck.estimation import AXES, AxisPlant
+from softneck.signals import redefinition_matrix
 
 from ._assembly import AxisController, assemble
 from ._axis_loop import axis_margins, conditioning_candidates, sensitivities, unstable_samples
 from ._bake_off import BakeOff
 from ._controller import LinearController
+from ._loop_settings import LoopSettings
 from ._margins import Margins
-from ._ports import require_taut
 from ._reduction import reduce_axis
 from ._sweep import Sweep, make_sweep
 from ._uncertain import UncertainAxis, uncertain_plant
@@ -47,7 +47,7 @@ class Found:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AxisSettings(ABC):
+class AxisSettings(LoopSettings, ABC):
     """Settings that all kinds of linear controller share; a kind adds its own and one synthesis.
 
     Attributes:
@@ -56,21 +56,10 @@ class AxisSettings(ABC):
             by more than `overshoot_pct`, from half the plant's lag on.
         overshoot_pct: of a step of 10 deg, within the limits.
         gain_spread: relative; a plant without samples of its own is taken at both ends of it as well.
-        least_delay: the nominal dead time is taken as at least this [s]; a fit of free runs hides it in the pole.
-        small_move_pole: the nominal plant with its slowest pole as fast as this [1/s] is a sample as well; 0 for not.
         controller_order: states that balanced reduction leaves to the axis' controller; 0 for all.
         conditioning: "hanus" (what a limit took away is taken from the reference), or "tuned": of that and of
             predictors that follow the limited output faster, the one that overshoots least on the worst sample in a
             step of 20 deg and in one with half the slew.
-        position_limit: of each motor [rad].
-        slew_limit: of each motor [rad/s].
-        lead_limit: how far a set-point may be from its measured motor [rad].
-        least_position: no motor is let out below this [rad]; co-contraction is raised instead. -6 for no such rule.
-        least_cocontraction: the co-contraction reference is at least this [rad]; keeps tendons taut under a payload.
-            -6 for no such rule.
-        order: of the loop; "jacobi" adds one sample for the controller and one for the observer.
-        observer: whether the loop will have an observer.
-        tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
     """
 
     KIND: ClassVar[str]
@@ -79,40 +68,18 @@ class AxisSettings(ABC):
     reference_time: float | None = None
     overshoot_pct: float = 4.0
     gain_spread: float = 0.2
-    # The paper's own dead time and pole (Eq. 31: 0.08 s, 5.293 1/s).
-    least_delay: float = 0.08
-    small_move_pole: float = 5.293
     controller_order: int = 0
     conditioning: str = "tuned"
-    position_limit: float = 6.0
-    slew_limit: float = 12.5
-    lead_limit: float = 0.4
-    least_position: float = -6.0
-    least_cocontraction: float = -6.0
-    order: str = "sequential"
-    observer: bool = True
-    tendon_angles: tuple[float, float, float] = tuple(TENDON_ANGLES.tolist())
 
     def __post_init__(self) -> None:
+        LoopSettings.__post_init__(self)
         require_between("max_sensitivity", self.max_sensitivity, 1.05, 10.0)
         if self.reference_time is not None:
             require_between("reference_time", self.reference_time, 0.0, 60.0, "s")
         require_between("overshoot_pct", self.overshoot_pct, 0.1, 100.0, "%")
         require_between("gain_spread", self.gain_spread, 0.0, 0.9)
-        require_between("least_delay", self.least_delay, 0.0, 1.0, "s")
-        require_between("small_move_pole", self.small_move_pole, 0.0, 1000.0, "1/s")
         require_whole("controller_order", self.controller_order, 0, 100)
         require_one_of("conditioning", self.conditioning, CONDITIONINGS)
-        require_between("position_limit", self.position_limit, 0.01, 6.0, "rad")
-        require_positive("slew_limit", self.slew_limit, "rad/s")
-        require_between("lead_limit", self.lead_limit, 0.01, 12.0, "rad")
-        require_taut(self.least_position, self.least_cocontraction, self.position_limit)
-        require_one_of("order", self.order, ORDERS)
-
-    @property
-    def extra_delay(self) -> int:
-        """Samples that the loop's order adds to the plant's delay."""
-        return 0 if self.order == "sequential" else 1 + int(self.observer)
 
     def design(self, plant: Any) -> LinearController:
         """Return the controller for `plant`, whatever `uncertain_plant` takes; verified on every sample.
@@ -141,11 +108,7 @@ class AxisSettings(ABC):
                 sample_time=uncertain.sample_time,
                 tendon_angles=self.tendon_angles,
             ),
-            position_limit=self.position_limit,
-            slew_limit=self.slew_limit,
-            lead_limit=self.lead_limit,
-            least_position=self.least_position,
-            least_cocontraction=self.least_cocontraction,
+            limits=self.limits(),
             order=self.order,
             design={
                 "settings": self._stored(),

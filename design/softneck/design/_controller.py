@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,8 @@ from scipy.io import savemat
 
 from softneck.core import Block, FileFormatError, Matrix, State, Vector, atomic_write, write_archive
 
-from ._ports import MAX_MOTOR, controller_inputs, controller_outputs, limit_ports, require_taut, taut_lines
+from ._limits import Limits
+from ._ports import controller_inputs, controller_outputs
 
 _RUNTIME = "softneck.design._linear_controller_runtime"
 _ARRAYS = (
@@ -46,12 +47,7 @@ class LinearController:
         kind: name in the table of kinds.
         sample_time: [s].
         arrays: what the runtime reads, see `_linear_parts_runtime`.
-        position_limit: of each motor [rad].
-        slew_limit: of each motor [rad/s].
-        lead_limit: how far a set-point may be from its motor [rad].
-        least_position: no motor is let out below this [rad], co-contraction is raised instead; tendons stay taut.
-            -6 for no such rule.
-        least_cocontraction: the co-contraction reference is at least this [rad of delta_i]; -6 for no such rule.
+        limits: of the set-points.
         order: of the loop it is for.
         design: JSON values: the settings, gains and margins by axis, for `summary` and the header.
     """
@@ -59,16 +55,9 @@ class LinearController:
     kind: str
     sample_time: float
     arrays: tuple[Matrix, ...]
-    position_limit: float
-    slew_limit: float
-    lead_limit: float
+    limits: Limits
     order: str
     design: Mapping[str, Any]
-    least_position: float = -MAX_MOTOR
-    least_cocontraction: float = -MAX_MOTOR
-
-    def __post_init__(self) -> None:
-        require_taut(self.least_position, self.least_cocontraction, self.position_limit)
 
     def block(self) -> Block:
         """Return the controller as a block of role "controller"."""
@@ -80,9 +69,7 @@ class LinearController:
             arrays=self.arrays,
             inputs=controller_inputs(),
             outputs=controller_outputs(),
-            parameters=limit_ports(
-                (self.position_limit, self.slew_limit, self.lead_limit, self.least_position, self.least_cocontraction)
-            ),
+            parameters=self.limits.ports(),
         )
 
     def initial_state(self, **parameters: float) -> State:
@@ -126,10 +113,7 @@ class LinearController:
         lines = [
             f"{self.kind} controller, {self.sample_time * 1e3:g} ms, {self.order} order, "
             f"{self.design.get('extra_delay', 0)} samples of delay added to the plant for it",
-            f"  limits: |P| <= {self.position_limit:g} rad, slew {self.slew_limit:g} rad/s "
-            f"({self.slew_limit * self.sample_time:g} rad per sample), "
-            f"lead {self.lead_limit:g} rad before the motors",
-            *taut_lines(self.least_position, self.least_cocontraction),
+            *self.limits.lines(self.sample_time),
         ]
         for axis in ("pitch", "roll"):
             item = self.design.get(axis, {})
@@ -147,11 +131,7 @@ class LinearController:
         header = {
             "kind": self.kind,
             "sample_time": self.sample_time,
-            "position_limit": self.position_limit,
-            "slew_limit": self.slew_limit,
-            "lead_limit": self.lead_limit,
-            "least_position": self.least_position,
-            "least_cocontraction": self.least_cocontraction,
+            **asdict(self.limits),
             "order": self.order,
             "design": dict(self.design),
             "inputs": [port.name for port in block.inputs],
@@ -175,14 +155,10 @@ class LinearController:
             kind=str(header["kind"]),
             sample_time=float(header["sample_time"]),
             arrays=items,
-            position_limit=float(header["position_limit"]),
-            slew_limit=float(header["slew_limit"]),
-            lead_limit=float(header["lead_limit"]),
+            # Files of the first version do not know the rules for taut tendons.
+            limits=Limits(**{item.name: float(header[item.name]) for item in fields(Limits) if item.name in header}),
             order=str(header["order"]),
             design=dict(header["design"]),
-            # Files of the first version do not know the rule.
-            least_position=float(header.get("least_position", -MAX_MOTOR)),
-            least_cocontraction=float(header.get("least_cocontraction", -MAX_MOTOR)),
         )
 
 

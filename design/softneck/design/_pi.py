@@ -7,16 +7,15 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from softneck.core import SettingsError, require_between, require_one_of, require_positive
-from softneck.estimation import AXES, ORDERS, HasTransferFunctions
-from softneck.signals import TENDON_ANGLES
+from softneck.estimation import AXES, HasTransferFunctions
 
 from ._assembly import assemble, pi_axis
 from ._axis_loop import sensitivities, unstable_samples
 from ._axis_settings import margins_json
 from ._controller import LinearController
+from ._loop_settings import LoopSettings
 from ._margins import loop_margins
 from ._pid import place_pid
-from ._ports import require_taut
 from ._tuning import Gains, Plants, open_loop, reference_time, tune_pi
 from ._uncertain import UncertainAxis, uncertain_plant
 
@@ -24,7 +23,7 @@ TUNINGS = ("nominal", "samples", "placement")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PiSettings:
+class PiSettings(LoopSettings):
     """PI on the exact-delay discrete plant, `v = K (e + 1/Ti int e)`, tuned for robustness.
 
     Among all K, Ti whose loop keeps the sensitivity and the phase margin, that with the largest K/Ti is taken:
@@ -39,24 +38,10 @@ class PiSettings:
         damping: of the placed poles.
         max_sensitivity: bound on Ms, on the identified plant and on its faster form.
         phase_margin: least phase margin [rad], on both.
-        least_delay: the dead time is taken as at least this [s]; a fit of free runs hides it in the pole.
-        small_move_pole: the design must hold as well where the slowest pole is as fast as this [1/s] at the same
-            static gain; 0 for the identified plant alone. Fits to large moves come out slower than small moves
-            are, for there the drives run at their current limit.
         reference_time: time constant of the reference filter [s]; None for the least with which no plant within
             `gain_spread` overshoots by more than `overshoot_pct`.
         overshoot_pct: of a step, without limits.
         gain_spread: relative spread of the plant's gain that the filter allows for.
-        position_limit: of each motor [rad].
-        slew_limit: of each motor [rad/s]; the default is 0.25 rad in 20 ms.
-        lead_limit: how far a set-point may be from its measured motor [rad]; keeps the integral from winding up
-            while a drive at its current limit falls behind.
-        least_position: no motor is let out below this [rad]; co-contraction is raised instead. -6 for no such rule.
-        least_cocontraction: the co-contraction reference is at least this [rad]; keeps tendons taut under a payload.
-            -6 for no such rule.
-        order: of the loop; "jacobi" adds one sample for the controller and one for the observer.
-        observer: whether the loop will have an observer.
-        tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
     """
 
     tuning: str = "nominal"
@@ -64,44 +49,22 @@ class PiSettings:
     damping: float = 0.9
     max_sensitivity: float = 1.5
     phase_margin: float = math.radians(60.0)
-    # The paper's own dead time and pole (Eq. 31: 0.08 s, 5.293 1/s).
-    least_delay: float = 0.08
-    small_move_pole: float = 5.293
     # About the time constant of the paper's neck, 1/5.293 s: what is asked faster only runs into limits.
     reference_time: float | None = 0.2
     overshoot_pct: float = 2.0
     gain_spread: float = 0.2
-    position_limit: float = 6.0
-    slew_limit: float = 12.5
-    lead_limit: float = 0.4
-    least_position: float = -6.0
-    least_cocontraction: float = -6.0
-    order: str = "sequential"
-    observer: bool = True
-    tendon_angles: tuple[float, float, float] = tuple(TENDON_ANGLES.tolist())
 
     def __post_init__(self) -> None:
+        LoopSettings.__post_init__(self)
         require_one_of("tuning", self.tuning, TUNINGS)
         require_positive("frequency", self.frequency, "rad/s")
         require_between("damping", self.damping, 0.1, 1.0)
         require_between("max_sensitivity", self.max_sensitivity, 1.05, 4.0)
         require_between("phase_margin", self.phase_margin, 0.1, 1.5, "rad")
-        require_between("least_delay", self.least_delay, 0.0, 1.0, "s")
-        require_between("small_move_pole", self.small_move_pole, 0.0, 1000.0, "1/s")
         if self.reference_time is not None:
             require_between("reference_time", self.reference_time, 0.0, 60.0, "s")
         require_between("overshoot_pct", self.overshoot_pct, 0.1, 100.0, "%")
         require_between("gain_spread", self.gain_spread, 0.0, 0.9)
-        require_between("position_limit", self.position_limit, 0.01, 6.0, "rad")
-        require_positive("slew_limit", self.slew_limit, "rad/s")
-        require_between("lead_limit", self.lead_limit, 0.01, 12.0, "rad")
-        require_taut(self.least_position, self.least_cocontraction, self.position_limit)
-        require_one_of("order", self.order, ORDERS)
-
-    @property
-    def extra_delay(self) -> int:
-        """Samples that the loop's order adds to the plant's delay."""
-        return 0 if self.order == "sequential" else 1 + int(self.observer)
 
     def design(self, model: HasTransferFunctions) -> LinearController:
         """Return the controller for `model`, anything with `tf("pitch")` and `tf("roll")`.
@@ -135,11 +98,7 @@ class PiSettings:
                 sample_time=sample_time,
                 tendon_angles=self.tendon_angles,
             ),
-            position_limit=self.position_limit,
-            slew_limit=self.slew_limit,
-            lead_limit=self.lead_limit,
-            least_position=self.least_position,
-            least_cocontraction=self.least_cocontraction,
+            limits=self.limits(),
             order=self.order,
             design={"settings": asdict(self), "extra_delay": self.extra_delay, **found},
         )

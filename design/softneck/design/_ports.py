@@ -1,8 +1,8 @@
-"""The ports that all controllers share, and the limits behind them."""
+"""The ports that all controllers share."""
 
 from __future__ import annotations
 
-from softneck.core import Port, SettingsError, require_between
+from softneck.core import Port
 
 # The neck's inclination stays below 0.7 rad; motors within 6 rad (paper, section 5).
 MAX_REFERENCE = 0.8
@@ -26,27 +26,6 @@ def limit_ports(starts: tuple[float, float, float, float, float]) -> tuple[Port,
         Port(name="least_cocontraction", unit="rad", start=common, minimum=-MAX_MOTOR, maximum=MAX_MOTOR,
              description="lower bound of the co-contraction reference"),
     )  # fmt: skip
-
-
-def require_taut(least_position: float, least_cocontraction: float, position_limit: float) -> None:
-    """Raise SettingsError unless the rule for taut tendons leaves the motors room below their limit."""
-    for name, value in (("least_position", least_position), ("least_cocontraction", least_cocontraction)):
-        require_between(name, value, -MAX_MOTOR, MAX_MOTOR, "rad")
-        if value >= position_limit:
-            raise SettingsError(
-                f"`{name}` must be below `position_limit`, {position_limit:g} rad, or no room to tilt is left; "
-                f"got {value:g}."
-            )
-
-
-def taut_lines(least_position: float, least_cocontraction: float) -> list[str]:
-    """Return a line on the rule for taut tendons, none where there is no rule."""
-    parts = []
-    if least_position > -MAX_MOTOR:
-        parts.append(f"no motor below {least_position:g} rad")
-    if least_cocontraction > -MAX_MOTOR:
-        parts.append(f"co-contraction at least {least_cocontraction:g} rad")
-    return [f"  tendons kept taut: {', '.join(parts)}"] if parts else []
 
 
 def controller_outputs() -> tuple[Port, ...]:

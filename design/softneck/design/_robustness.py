@@ -269,7 +269,7 @@ def highest(function: Callable[[Vector], Vector], w: Vector, *, refine: bool = T
         return where, value
     inner = np.flatnonzero((values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:])) + 1
     for k in inner[np.argsort(values[inner])[::-1][:_PEAKS]]:
-        found = minimize_scalar(
+        found: Any = minimize_scalar(
             lambda x: -float(function(np.array([math.exp(x)]))[0]),
             bounds=(math.log(w[k - 1]), math.log(w[k + 1])), method="bounded", options={"xatol": _ACCURACY},
         )  # fmt: skip

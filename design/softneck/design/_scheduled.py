@@ -8,17 +8,17 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, require_between, require_one_of
-from softneck.estimation import ORDERS, AxisPlant, HasTransferFunctions
+from softneck.core import Matrix, SettingsError, require_between
+from softneck.estimation import AxisPlant, HasTransferFunctions
 from softneck.identification import Family
-from softneck.signals import TENDON_ANGLES
 
 from ._assembly import assemble
 from ._following import following_axis
+from ._loop_settings import LoopSettings
 from ._margins import frequencies
 from ._operating_points import AXES, OperatingPoint, family_points, model_points
 from ._tuning import Gains, tune_pi
-from ._varying import RUNTIMES, Limits, VaryingController
+from ._varying import RUNTIMES, VaryingController
 
 # The arrays of `assemble`, in its order, and those that follow the inclination.
 _NAMES = (
@@ -30,70 +30,37 @@ _BETWEEN = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ScheduledSettings:
+class ScheduledSettings(LoopSettings):
     """PI at every operating point of a family, gains linear over the inclination between them.
 
     Attributes:
         max_sensitivity: bound on Ms at every operating point, on every plant there.
         phase_margin: least phase margin [rad] there.
-        least_delay: dead times are taken as at least this [s]; a fit of free runs hides it in the pole.
-        small_move_pole: each point must hold as well where its slowest pole is as fast as this [1/s]; 0: as it is.
         inclinations: [rad] of several models given by themselves, one each; empty for a family, which knows its own.
         schedule_time: time constant of the lag through which the inclination is seen [s].
         reference_time: time constant of the reference filter [s].
         leak_time: over which the integral gives up what is beyond a limit [s].
-        position_limit, slew_limit, lead_limit, least_position, least_cocontraction: see `Limits`.
-        order: of the loop; "jacobi" adds one sample for the controller and one for the observer.
-        observer: whether the loop will have an observer.
-        tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
     """
 
     max_sensitivity: float = 1.5
     phase_margin: float = math.radians(60.0)
-    least_delay: float = 0.08
-    small_move_pole: float = 5.293
     inclinations: tuple[float, ...] | list[float] = ()
     # As slow as the loop's own time constant.
     schedule_time: float = 0.3
     # The model that is followed is the filter; this one only keeps the slew limit out of a step.
     reference_time: float = 0.06
     leak_time: float = 3.0
-    position_limit: float = 6.0
-    slew_limit: float = 12.5
     lead_limit: float = 0.8
-    least_position: float = -6.0
-    least_cocontraction: float = -6.0
-    order: str = "sequential"
-    observer: bool = True
-    tendon_angles: tuple[float, float, float] = tuple(TENDON_ANGLES.tolist())
 
     def __post_init__(self) -> None:
+        LoopSettings.__post_init__(self)
         require_between("max_sensitivity", self.max_sensitivity, 1.05, 4.0)
         require_between("phase_margin", self.phase_margin, 0.1, 1.5, "rad")
-        require_between("least_delay", self.least_delay, 0.0, 1.0, "s")
-        require_between("small_move_pole", self.small_move_pole, 0.0, 1000.0, "1/s")
         require_between("schedule_time", self.schedule_time, 0.0, 60.0, "s")
         require_between("reference_time", self.reference_time, 0.0, 60.0, "s")
         require_between("leak_time", self.leak_time, 0.1, 60.0, "s")
-        require_one_of("order", self.order, ORDERS)
         for inclination in self.inclinations:
             require_between("inclinations", inclination, 0.0, 1.5, "rad")
-        self.limits()
-
-    def limits(self) -> Limits:
-        """Return the limits of the set-points."""
-        return Limits(
-            position_limit=self.position_limit,
-            slew_limit=self.slew_limit,
-            lead_limit=self.lead_limit,
-            least_position=self.least_position,
-            least_cocontraction=self.least_cocontraction,
-        )
-
-    @property
-    def extra_delay(self) -> int:
-        """Samples that the loop's order adds to the plant's delay."""
-        return 0 if self.order == "sequential" else 1 + int(self.observer)
 
     def design(self, plant: Family | Sequence[HasTransferFunctions]) -> VaryingController:
         """Return the controller for a family, or for several linear models at `inclinations`.

@@ -10,48 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import Block, FileFormatError, Matrix, Port, State, Vector, require_between, write_archive
+from softneck.core import Block, FileFormatError, Matrix, Port, State, Vector, write_archive
 
-from ._ports import MAX_MOTOR, MAX_SLEW, controller_inputs, controller_outputs, limit_ports, require_taut, taut_lines
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Limits:
-    """What set-points may do; the runtime shares each limit among the motors.
-
-    Attributes:
-        position_limit: of each motor [rad].
-        slew_limit: of each motor [rad/s]; the default is 0.25 rad in 20 ms.
-        lead_limit: how far a set-point may be from its motor [rad].
-        least_position: no motor is let out below this [rad], co-contraction is raised instead; -6 for no such rule.
-        least_cocontraction: the co-contraction reference is at least this [rad]; -6 for no such rule.
-    """
-
-    position_limit: float = MAX_MOTOR
-    slew_limit: float = 12.5
-    lead_limit: float = 0.8
-    least_position: float = -MAX_MOTOR
-    least_cocontraction: float = -MAX_MOTOR
-
-    def __post_init__(self) -> None:
-        require_between("position_limit", self.position_limit, 0.01, MAX_MOTOR, "rad")
-        require_between("slew_limit", self.slew_limit, 0.01, MAX_SLEW, "rad/s")
-        require_between("lead_limit", self.lead_limit, 0.01, 2.0 * MAX_MOTOR, "rad")
-        require_taut(self.least_position, self.least_cocontraction, self.position_limit)
-
-    def ports(self) -> tuple[Port, ...]:
-        """Return them as parameters of a block."""
-        return limit_ports(
-            (self.position_limit, self.slew_limit, self.lead_limit, self.least_position, self.least_cocontraction)
-        )
-
-    def lines(self, sample_time: float) -> list[str]:
-        """Return some lines for people."""
-        return [
-            f"  limits: |P| <= {self.position_limit:g} rad, slew {self.slew_limit:g} rad/s "
-            f"({self.slew_limit * sample_time:g} rad per sample), lead {self.lead_limit:g} rad before the motors",
-            *taut_lines(self.least_position, self.least_cocontraction),
-        ]
+from ._limits import Limits
+from ._ports import controller_inputs, controller_outputs
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

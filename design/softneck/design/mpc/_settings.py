@@ -20,8 +20,9 @@ from softneck.core import (
 from softneck.estimation import ORDERS, HasTransferFunctions, axis_plant
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
+from .._limits import require_taut
 from .._margins import frequencies
-from .._ports import MAX_MOTOR, require_taut
+from .._ports import MAX_MOTOR
 from ._arrays import Tuning, assemble, observer_bandwidth, with_filter, with_gains
 from ._controller import MpcController
 from ._disturbance import MeasuredDisturbance
