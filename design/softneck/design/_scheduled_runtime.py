@@ -17,22 +17,12 @@ import math
 import numpy as np
 
 from softneck.design._linear_parts_runtime import linear_align, linear_control
+from softneck.design._rest_runtime import initialise as initialise
 
 
 def state_size(arrays: tuple[np.ndarray, ...]) -> int:
     """Return the length of the state vector."""
     return arrays[0].shape[0] + arrays[4].shape[1] + 5
-
-
-def initialise(
-    arrays: tuple[np.ndarray, ...],  # noqa: ARG001
-    parameters: np.ndarray,  # noqa: ARG001
-    state: np.ndarray,
-    outputs: np.ndarray,
-) -> None:
-    """Start with motors at rest; the first step takes over where they really are."""
-    state[:] = 0.0
-    outputs[:] = 0.0
 
 
 def step(

@@ -7,6 +7,7 @@ the equations' output; that is bounded (see there) and the echo dies out, so no 
 
 import numpy as np
 
+from softneck.identification._feedforward_runtime import echo_added, echo_rest
 from softneck.identification._histories_runtime import narx_advance, narx_observe, narx_rest, narx_size
 from softneck.identification._neck_model_runtime import NECK_STATES, neck_advance, neck_sense
 
@@ -19,16 +20,13 @@ def state_size(arrays: tuple[np.ndarray, ...]) -> int:
 def initialise(arrays: tuple[np.ndarray, ...], parameters: np.ndarray, state: np.ndarray, outputs: np.ndarray) -> None:
     """Rest: motors at zero, the neck settled; what the start is above that is remembered as measured."""
     narx_rest(arrays, parameters, state, outputs)
-    h = int(arrays[0][0])
     x = state[narx_size(arrays) :]
     m = np.zeros(3)
     for _ in range(int(arrays[5][0])):
         neck_advance(arrays[2], arrays[3][1], np.zeros(3), m, x)
         neck_sense(arrays[2], arrays[3][1], x)
     for axis in range(2):
-        state[8 * h + 11 + axis] = x[5 + axis]
-        for j in range(h):
-            state[6 * h + 2 * j + axis] -= x[5 + axis]
+        echo_rest(arrays, state, axis, x[5 + axis])
 
 
 def step(
@@ -51,11 +49,7 @@ def step(
     neck_sense(arrays[2], arrays[3][1], x)
     angles = np.empty(2)
     for axis in range(2):
-        echo = 0.0
-        for i in range(arrays[4].shape[1]):
-            echo += arrays[4][axis, i] * state[6 * h + 2 * i + axis]
-        angles[axis] = x[5 + axis] + echo
-        state[now + 11 + axis] = x[5 + axis]
+        angles[axis] = echo_added(arrays, arrays[4], state, axis, x[5 + axis])
     narx_advance(arrays, parameters, state, angles[0], angles[1], outputs)
     for j in range(3):
         state[now + j] = m[j]

@@ -8,7 +8,8 @@ fed back; the echo dies out where nothing is measured.
 
 import numpy as np
 
-from softneck.identification._bank_runtime import drive_advance, drive_limit, load_advance
+from softneck.identification._bank_runtime import load_advance
+from softneck.identification._feedforward_runtime import echo_added, echo_rest, stalling_drives
 from softneck.identification._histories_runtime import narx_advance, narx_observe, narx_rest, narx_size
 from softneck.identification._nss_map_runtime import nss_inputs, nss_next
 
@@ -29,7 +30,6 @@ def nss_output(arrays: tuple[np.ndarray, ...], x: np.ndarray, axis: int) -> floa
 def initialise(arrays: tuple[np.ndarray, ...], parameters: np.ndarray, state: np.ndarray, outputs: np.ndarray) -> None:
     """Rest: motors at zero, the neck settled; what the start is above that is remembered as measured."""
     narx_rest(arrays, parameters, state, outputs)
-    h = int(arrays[0][0])
     first = narx_size(arrays) + 3 + 3 * arrays[4].shape[0]
     x = state[first:]
     v = np.zeros(arrays[7].shape[1])
@@ -39,10 +39,7 @@ def initialise(arrays: tuple[np.ndarray, ...], parameters: np.ndarray, state: np
         nss_next(arrays[6], arrays[7], arrays[8], arrays[9], arrays[10], arrays[11], arrays[12], x, v, t, ahead)
         x[:] = ahead
     for axis in range(2):
-        f = nss_output(arrays, x, axis)
-        state[8 * h + 11 + axis] = f
-        for j in range(h):
-            state[6 * h + 2 * j + axis] -= f
+        echo_rest(arrays, state, axis, nss_output(arrays, x, axis))
 
 
 def step(
@@ -55,13 +52,11 @@ def step(
     """Advance by one sample."""
     narx_observe(arrays, parameters, state, inputs)
     h = int(arrays[0][0])
-    now = 8 * h
     own = narx_size(arrays)
     q = state[own : own + 3]
     plays = state[own + 3 : own + 3 + 3 * arrays[4].shape[0]]
     x = state[own + 3 + 3 * arrays[4].shape[0] :]
-    m = state[3 * h : 3 * h + 3]
-    load_advance(arrays[2], m, q)
+    load_advance(arrays[2], state[3 * h : 3 * h + 3], q)
     v = np.empty(arrays[7].shape[1])
     late = 3 * h + 3 * int(arrays[5][0])
     nss_inputs(arrays[3], arrays[4], state[late : late + 3], plays, v)
@@ -71,16 +66,6 @@ def step(
     x[:] = ahead
     angles = np.empty(2)
     for axis in range(2):
-        f = nss_output(arrays, x, axis)
-        echo = 0.0
-        for i in range(arrays[16].shape[1]):
-            echo += arrays[16][axis, i] * state[6 * h + 2 * i + axis]
-        angles[axis] = f + echo
-        state[now + 11 + axis] = f
+        angles[axis] = echo_added(arrays, arrays[16], state, axis, nss_output(arrays, x, axis))
     narx_advance(arrays, parameters, state, angles[0], angles[1], outputs)
-    for j in range(3):
-        d = int(arrays[1][j, 1])
-        if d > 0:
-            limit = drive_limit(arrays[2], q, j)
-            state[now + j] = drive_advance(arrays[1][j, 0], state[3 * (d - 1) + j], m[j], limit)
-            outputs[2 + j] = state[now + j]
+    stalling_drives(arrays, arrays[2], q, state, outputs)

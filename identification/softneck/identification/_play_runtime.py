@@ -9,7 +9,8 @@ dies out when nothing is measured. So no free run can diverge.
 
 import numpy as np
 
-from softneck.identification._bank_runtime import bank_advance, drive_advance, drive_limit, load_advance, monomial
+from softneck.identification._bank_runtime import bank_advance, load_advance, monomial
+from softneck.identification._feedforward_runtime import echo_added, echo_rest, stalling_drives
 from softneck.identification._histories_runtime import narx_advance, narx_observe, narx_rest, narx_size
 
 
@@ -30,12 +31,9 @@ def play_output(arrays: tuple[np.ndarray, ...], bank: np.ndarray, axis: int) -> 
 def initialise(arrays: tuple[np.ndarray, ...], parameters: np.ndarray, state: np.ndarray, outputs: np.ndarray) -> None:
     """Rest: motors at zero, the output at its start value; what that is above f is remembered as measured."""
     narx_rest(arrays, parameters, state, outputs)
-    h = int(arrays[0][0])
+    bank = state[narx_size(arrays) + 3 + 3 * arrays[4].shape[0] :]
     for axis in range(2):
-        f = play_output(arrays, state[narx_size(arrays) + 3 + 3 * arrays[4].shape[0] :], axis)
-        state[8 * h + 11 + axis] = f
-        for j in range(h):
-            state[6 * h + 2 * j + axis] -= f
+        echo_rest(arrays, state, axis, play_output(arrays, bank, axis))
 
 
 def step(
@@ -48,7 +46,6 @@ def step(
     """Advance by one sample."""
     narx_observe(arrays, parameters, state, inputs)
     h = int(arrays[0][0])
-    now = 8 * h
     q = state[narx_size(arrays) : narx_size(arrays) + 3]
     plays = state[narx_size(arrays) + 3 : narx_size(arrays) + 3 + 3 * arrays[4].shape[0]]
     bank = state[narx_size(arrays) + 3 + 3 * arrays[4].shape[0] :]
@@ -57,16 +54,6 @@ def step(
     bank_advance(arrays[3], arrays[4], arrays[5], m, plays, bank)
     angles = np.empty(2)
     for axis in range(2):
-        f = play_output(arrays, bank, axis)
-        echo = 0.0
-        for i in range(arrays[9].shape[1]):
-            echo += arrays[9][axis, i] * state[6 * h + 2 * i + axis]
-        angles[axis] = f + echo
-        state[now + 11 + axis] = f
+        angles[axis] = echo_added(arrays, arrays[9], state, axis, play_output(arrays, bank, axis))
     narx_advance(arrays, parameters, state, angles[0], angles[1], outputs)
-    for j in range(3):
-        d = int(arrays[1][j, 1])
-        if d > 0:
-            limit = drive_limit(arrays[2], q, j)
-            state[now + j] = drive_advance(arrays[1][j, 0], state[3 * (d - 1) + j], m[j], limit)
-            outputs[2 + j] = state[now + j]
+    stalling_drives(arrays, arrays[2], q, state, outputs)

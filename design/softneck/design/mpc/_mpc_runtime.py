@@ -17,6 +17,7 @@ import math
 
 import numpy as np
 
+from softneck.design._rest_runtime import initialise as initialise
 from softneck.design.mpc._dual_runtime import qp_solve
 from softneck.design.mpc._mpc_state_runtime import (
     MPC_AGE,
@@ -55,17 +56,6 @@ from softneck.design.mpc._mpc_state_runtime import (
 def state_size(arrays: tuple[np.ndarray, ...]) -> int:
     """Return the length of the state vector."""
     return mpc_places(arrays)[7]
-
-
-def initialise(
-    arrays: tuple[np.ndarray, ...],  # noqa: ARG001
-    parameters: np.ndarray,  # noqa: ARG001
-    state: np.ndarray,
-    outputs: np.ndarray,
-) -> None:
-    """Start with motors at rest; the first step takes over where they really are."""
-    state[:] = 0.0
-    outputs[:] = 0.0
 
 
 def step(

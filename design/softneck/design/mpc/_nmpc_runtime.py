@@ -12,6 +12,7 @@ import math
 import numpy as np
 
 from softneck.core._members_runtime import member_initialise, member_size, member_step, member_tangent
+from softneck.design._rest_runtime import initialise as initialise
 from softneck.design.mpc._dual_runtime import qp_backward, qp_solve
 from softneck.design.mpc._nmpc_state_runtime import (
     NMPC_ANGLE_LIMIT,
@@ -58,17 +59,6 @@ _LARGEST_RESIDUAL = 1e-7
 def state_size(arrays: tuple[np.ndarray, ...]) -> int:
     """Return the length of the state vector."""
     return nmpc_places(arrays, member_size(arrays, 0))[6]
-
-
-def initialise(
-    arrays: tuple[np.ndarray, ...],  # noqa: ARG001
-    parameters: np.ndarray,  # noqa: ARG001
-    state: np.ndarray,
-    outputs: np.ndarray,
-) -> None:
-    """Start with motors at rest; the first step takes over where they really are."""
-    state[:] = 0.0
-    outputs[:] = 0.0
 
 
 def step(
