@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from softneck.core import KINDS, DataError, Progress, SettingsError, SoftneckError, resolve, silent
-from softneck.signals import Recording, concatenate
+from softneck.signals import Recording
 
 from ._ensemble import combine
+from ._fitting import one_recording
 from ._model import Model
 from ._residual_any import Residual
 from ._validation import INFINITE, Validation, validate
@@ -130,7 +131,7 @@ def refit(choice: Choice, recordings: Recording | list[Recording], *, progress: 
     Raises:
         DataError: the chosen kind could not be identified.
     """
-    chosen, whole = choice.chosen, concatenate(recordings if isinstance(recordings, list) else [recordings])
+    chosen, whole = choice.chosen, one_recording(recordings)
     if chosen.model is None:
         raise DataError(f"{chosen.kind} was not identified, so that there is nothing to identify again.")
     settings = chosen.model.settings

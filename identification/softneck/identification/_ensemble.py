@@ -8,9 +8,10 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from softneck.core import KINDS, Progress, SettingsError, find_kind, require_whole, resolve, silent
-from softneck.signals import Recording, concatenate
+from softneck.signals import Recording
 
 from ._composed import COMPOSED, memory_of, prefixed_arrays
+from ._fitting import one_recording
 from ._model import Model
 from ._rows import row_hashes
 
@@ -43,7 +44,7 @@ class Ensemble:
         Raises:
             DataError: what any member raises.
         """
-        recording = concatenate(recordings if isinstance(recordings, list) else [recordings])
+        recording = one_recording(recordings)
         models = []
         for number, kind in enumerate(self.members):
             part = _part(progress, number, len(self.members), kind)

@@ -9,10 +9,10 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
 from softneck.core import DataError, Matrix, Progress, Vector, load_functions, require_whole, silent
-from softneck.signals import Recording, concatenate
+from softneck.signals import Recording
 
-from ._checks import check_training
 from ._echo import fit_echo
+from ._fitting import training_recording
 from ._greybox_numbers import NUMBERS, decode
 from ._loaded_drive import drive_start, fit_loaded_drive
 from ._model import Model
@@ -61,8 +61,7 @@ class GreyBox:
         Raises:
             DataError: too short or constant.
         """
-        recording = concatenate(recordings if isinstance(recordings, list) else [recordings])
-        check_training(recording)
+        recording = training_recording(recordings)
         problem = _Problem.of(recording)
         delays = _DELAYS if self.sensor_delay is None else (self.sensor_delay,)
         best: tuple[float, int, Vector] | None = None

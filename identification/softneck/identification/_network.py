@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -19,17 +19,15 @@ from softneck.core import (
     require_whole,
     silent,
 )
-from softneck.signals import Recording, concatenate
+from softneck.signals import Recording
 
-from ._checks import check_training
 from ._echo import fit_correction
+from ._fitting import SAME_EXCITATION, fitted_model, training_recording
 from ._levenberg import Layers, random_layers
 from ._loaded_drive import LoadedDrive, drive_start, fit_loaded_drive
 from ._model import Model
 from ._nn_training import FUNCTIONS, AxisData, Best, axis_data, train_axis
-from ._play import SAME_EXCITATION
 from ._regressors import PAPER_EQ21, regression
-from ._rows import row_hashes
 
 # Of the starts: from hardly any to one that smooths; the hold-out decides between them.
 _DECAYS = (0.03, 0.1, 0.01)
@@ -93,8 +91,7 @@ class Network:
         Raises:
             DataError: too short, constant, or fewer rows than weights.
         """
-        recording = concatenate(recordings if isinstance(recordings, list) else [recordings])
-        check_training(recording)
+        recording = training_recording(recordings)
         self._check_rows(recording)
         drive = fit_loaded_drive(recording)
         train, judge = recording, hold_out
@@ -119,14 +116,7 @@ class Network:
         if interrupted:
             findings["interrupted"] = INTERRUPTED
         progress(1.0, "done")
-        return Model(
-            kind="nn",
-            sample_time=recording.sample_time,
-            arrays=arrays,
-            settings=asdict(self),
-            findings=findings,
-            training_rows=row_hashes(recording),
-        )
+        return fitted_model("nn", self, recording, arrays=arrays, findings=findings)
 
     def _check_rows(self, recording: Recording) -> None:
         rows = min(regression(recording, PAPER_EQ21, axis)[1].size for axis in range(2))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,16 +18,15 @@ from softneck.core import (
     require_whole,
     silent,
 )
-from softneck.signals import TENDON_ANGLES, Recording, concatenate, redefine, redefinition_matrix
+from softneck.signals import TENDON_ANGLES, Recording, redefine, redefinition_matrix
 
-from ._checks import check_training
 from ._drive import fit_drive
+from ._fitting import fitted_model, training_recording
 from ._free_run import delay_samples, free_run_fit
 from ._lss import axes_system, lss_arrays
 from ._model import Model
 from ._oe_fit import OutputErrorFit, default_starts, fit_output_error, largest_radius, pole_radius
 from ._regression import arx_rows, require_excitation
-from ._rows import row_hashes
 
 AXES = ("pitch", "roll")
 SOURCES = ("set_points", "positions")
@@ -68,8 +67,7 @@ class OutputError:
         Raises:
             DataError: too short, constant, not enough excitation, or no stable model.
         """
-        recording = concatenate(recordings if isinstance(recordings, list) else [recordings])
-        check_training(recording)
+        recording = training_recording(recordings)
         inputs = axis_runs(recording, self.source)
         found, delays, curves, beside = [], [], {}, {}
         for axis, name in enumerate(AXES):
@@ -81,11 +79,11 @@ class OutputError:
         arrays, functions = axis_arrays(
             recording, [fit.f for fit in found], [fit.b for fit in found], delays, self.source
         )
-        return Model(
-            kind="oe",
-            sample_time=recording.sample_time,
+        return fitted_model(
+            "oe",
+            self,
+            recording,
             arrays=arrays,
-            settings=asdict(self),
             findings={
                 **functions,
                 "delay_criterion": "output_error",
@@ -94,7 +92,6 @@ class OutputError:
                 "least_squares_beside": beside,
                 **_warnings(inputs, found),
             },
-            training_rows=row_hashes(recording),
         )
 
     def _fit_axis(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,14 +14,13 @@ from softneck.core import (
     require_whole,
     silent,
 )
-from softneck.signals import TENDON_ANGLES, Recording, concatenate, redefinition_matrix
+from softneck.signals import TENDON_ANGLES, Recording, redefinition_matrix
 
-from ._checks import check_training
 from ._echo import BEYOND, fit_echo
+from ._fitting import SAME_EXCITATION, fitted_model, training_recording
 from ._loaded_drive import LoadedDrive, fit_loaded_drive
 from ._model import Model
 from ._play_terms import Data, Form, ridge, scores
-from ._rows import row_hashes
 
 # What the hold-out chooses from: filters about as fast as the neck's 5 1/s and three times that; plays up to a
 # tenth of the motors' 6 rad.
@@ -35,7 +34,6 @@ _ALIKE = 0.1
 _MEMORY = 15.0
 # f is kept within the range of the training outputs, widened by half of it to either side.
 _BEYOND = 0.5
-SAME_EXCITATION = "chosen on rows of the excitation it was trained on; a hold-out of another one chooses better"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,8 +92,7 @@ class Play:
         Raises:
             DataError: too short, constant, or fewer rows than terms.
         """
-        recording = concatenate(recordings if isinstance(recordings, list) else [recordings])
-        check_training(recording)
+        recording = training_recording(recordings)
         progress(0.0, "drives")
         drive = fit_loaded_drive(recording)
         data = Data.of(recording, drive)
@@ -115,14 +112,7 @@ class Play:
         if hold_out is None and tried > 1:
             findings["remark"] = SAME_EXCITATION
         progress(1.0, "done")
-        return Model(
-            kind="play",
-            sample_time=recording.sample_time,
-            arrays=arrays,
-            settings=asdict(self),
-            findings=findings,
-            training_rows=row_hashes(recording),
-        )
+        return fitted_model("play", self, recording, arrays=arrays, findings=findings)
 
     def _choose(self, data: Data, extra: Data | None, progress: Progress) -> tuple[Form, float, float, int]:
         """Return form and ridge of the best free run on the hold-out, its fit [%], and how many were tried."""

@@ -17,11 +17,11 @@ from softneck.core import (
     require_whole,
     silent,
 )
-from softneck.signals import Recording, concatenate
+from softneck.signals import Recording
 
-from ._checks import check_training
 from ._composed import COMPOSED, memory_of, prefixed_arrays
 from ._ensemble import seeded
+from ._fitting import training_recording
 from ._model import WARM_UP, Model
 from ._regressors import lag_table
 from ._residual import residual_lags, residual_rows
@@ -72,8 +72,7 @@ class Residual:
         Raises:
             DataError: what the base raises, or `epsilon` so small that no function fits the residual.
         """
-        recording = concatenate(recordings if isinstance(recordings, list) else [recordings])
-        check_training(recording)
+        recording = training_recording(recordings)
         base = seeded(self.base, self.seed).fit(recording, progress=lambda done, what: progress(0.9 * done, what))
         progress(0.9, "set membership on what it leaves over")
         model = self.on(base, recording)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,16 +19,15 @@ from softneck.core import (
     require_whole,
     silent,
 )
-from softneck.signals import TENDON_ANGLES, Recording, concatenate, redefine, redefinition_matrix
+from softneck.signals import TENDON_ANGLES, Recording, redefine, redefinition_matrix
 
-from ._checks import check_training
 from ._drive import fit_drive
+from ._fitting import fitted_model, training_recording
 from ._free_run import delay_samples, free_run_fit
 from ._lss import lss_arrays, varx_system
 from ._model import WARM_UP, Model
 from ._recursion import EXACT_START, Recursion, require_forgetting
 from ._regression import arx_rows, require_excitation
-from ._rows import row_hashes
 from ._scores import nrmse_fit
 
 _STANDARD, _UD = "softneck.identification._recursion_runtime", "softneck.identification._ud_runtime"
@@ -110,18 +109,12 @@ class Rls:
         Raises:
             DataError: too short, constant, without two usable rows, or not enough excitation.
         """
-        recording = concatenate(recordings if isinstance(recordings, list) else [recordings])
-        check_training(recording)
+        recording = training_recording(recordings)
         fit = self._fit_siso if self.structure == "siso" else self._fit_motors
         arrays, findings = fit(recording, progress)
         progress(1.0, "done")
-        return Model(
-            kind="rls",
-            sample_time=recording.sample_time,
-            arrays=arrays,
-            settings=asdict(self),
-            findings={"delay_criterion": self.delay_by, **findings},
-            training_rows=row_hashes(recording),
+        return fitted_model(
+            "rls", self, recording, arrays=arrays, findings={"delay_criterion": self.delay_by, **findings}
         )
 
     def _fit_siso(self, recording: Recording, progress: Progress) -> tuple[dict[str, Matrix], dict]:

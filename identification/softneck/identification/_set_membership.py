@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,16 +20,15 @@ from softneck.core import (
     resolve,
     silent,
 )
-from softneck.signals import Recording, concatenate
+from softneck.signals import Recording
 
-from ._checks import check_training
 from ._drive import DriveModel, fit_drive
+from ._fitting import fitted_model, training_recording
 from ._model import WARM_UP, Model
 from ._offending import require_feasible
 from ._outside import usual_widths
 from ._regressors import lag_table
 from ._residual import residual_lags
-from ._rows import row_hashes
 from ._scaling import RULES, HoldOut, Tried, grouped_scale, ruled_scale
 from ._set_ground import Ground, gammas, scaled
 
@@ -118,8 +117,7 @@ class SetMembership:
             DataError: too short, constant, or `epsilon` so small that no function fits the data.
             SettingsError: a `scale` of another length than the regressor.
         """
-        recording = concatenate(recordings if isinstance(recordings, list) else [recordings])
-        check_training(recording)
+        recording = training_recording(recordings)
         noise = np.array([noise_level(recording, axis) for axis in range(2)])
         drive = fit_drive(recording)
         ground = self._ground(recording, drive)
@@ -134,14 +132,7 @@ class SetMembership:
         findings = {"form": self.form, "noise_deg": np.degrees(noise).tolist(), **_findings(chosen, tried, scale)}
         findings |= {"gamma": gamma.tolist(), "points": int(arrays["values"].shape[1])}
         findings |= usual_widths(sets, gamma, chosen.epsilon)
-        return Model(
-            kind="nlsm",
-            sample_time=recording.sample_time,
-            arrays=arrays,
-            settings=asdict(self),
-            findings=findings,
-            training_rows=row_hashes(recording),
-        )
+        return fitted_model("nlsm", self, recording, arrays=arrays, findings=findings)
 
     def _ground(self, recording: Recording, drive: DriveModel) -> Ground:
         """Return the set's ground; the base of form `residual` is identified on `recording`."""

@@ -17,15 +17,14 @@ from softneck.core import (
     require_whole,
     silent,
 )
-from softneck.signals import Recording, concatenate
+from softneck.signals import Recording
 
-from ._checks import check_training
+from ._fitting import fitted_model, training_recording
 from ._free_run import delay_samples
 from ._intervals import Intervals, bootstrap
 from ._model import Model
 from ._oe import AXES, SOURCES, axis_arrays, axis_runs
 from ._regression import arx_rows, require_excitation
-from ._rows import row_hashes
 from ._srivc_fit import Runs, Search, SrivcFit, with_delay
 
 # Poles [1/s] to start from: the neck's 5, and a third and three times that.
@@ -81,8 +80,7 @@ class Srivc:
         Raises:
             DataError: too short, constant, not enough excitation, or no stable model.
         """
-        recording = concatenate(recordings if isinstance(recordings, list) else [recordings])
-        check_training(recording)
+        recording = training_recording(recordings)
         generator = np.random.default_rng(self.seed)
         sampled, continuous, curves, intervals = [], {}, {}, {}
         for axis, (name, runs) in enumerate(zip(AXES, axis_runs(recording, self.source), strict=True)):
@@ -98,11 +96,11 @@ class Srivc:
         a, b, d = ([entry[i] for entry in sampled] for i in range(3))
         arrays, functions = axis_arrays(recording, a, b, [float(samples) for samples in d], self.source)
         said = {"intervals": intervals, "level": self.level, "caution": _CAUTION} if intervals else {}
-        return Model(
-            kind="srivc",
-            sample_time=recording.sample_time,
+        return fitted_model(
+            "srivc",
+            self,
+            recording,
             arrays=arrays,
-            settings=asdict(self),
             findings={
                 **functions,
                 "continuous": continuous,
@@ -110,7 +108,6 @@ class Srivc:
                 "delay_curve": curves,
                 **said,
             },
-            training_rows=row_hashes(recording),
         )
 
     def fit_axis(self, runs: Runs, sample_time: float, name: str) -> tuple[SrivcFit, list[list[float]]]:

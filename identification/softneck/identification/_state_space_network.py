@@ -4,25 +4,23 @@ from __future__ import annotations
 
 import threading
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from softneck.core import DataError, Matrix, Progress, load_functions, require_positive, require_whole, silent
-from softneck.signals import TENDON_ANGLES, Recording, concatenate, redefinition_matrix
+from softneck.signals import TENDON_ANGLES, Recording, redefinition_matrix
 
-from ._checks import check_training
 from ._contraction import Contraction
 from ._echo import BEYOND, fit_echo
+from ._fitting import SAME_EXCITATION, fitted_model, training_recording
 from ._loaded_drive import LoadedDrive, fit_loaded_drive
 from ._model import Model
 from ._nss_problem import FUNCTIONS, Records, Shape, free_run
 from ._nss_start import largest_rate, linear_start, whitened
 from ._nss_training import BestMap, Training, random_start, train_start
-from ._play import SAME_EXCITATION
-from ._rows import row_hashes
 
 # Steps of each start over windows of 1 sample, 0.2, 1 and 5 s; the whole free run takes what `iterations` says.
 _WINDOW_STEPS = (3, 3, 5, 5)
@@ -92,8 +90,7 @@ class NeuralStateSpace:
         Raises:
             DataError: too short, constant, or fewer rows than weights.
         """
-        recording = concatenate(recordings if isinstance(recordings, list) else [recordings])
-        check_training(recording)
+        recording = training_recording(recordings)
         progress(0.0, "drives and linear model")
         drive = fit_loaded_drive(recording)
         with threadpool_limits(limits=1):
@@ -113,14 +110,7 @@ class NeuralStateSpace:
         if hold_out is None:
             findings["remark"] = SAME_EXCITATION
         progress(1.0, "done")
-        return Model(
-            kind="nss",
-            sample_time=recording.sample_time,
-            arrays=arrays,
-            settings=asdict(self),
-            findings=findings,
-            training_rows=row_hashes(recording),
-        )
+        return fitted_model("nss", self, recording, arrays=arrays, findings=findings)
 
     def _check_rows(self, records: Records, shape: Shape) -> None:
         rows = int(records.settled.sum())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,16 +17,15 @@ from softneck.core import (
     require_whole,
     silent,
 )
-from softneck.signals import Recording, concatenate
+from softneck.signals import Recording
 
-from ._checks import check_training
 from ._drive import fit_drive
+from ._fitting import fitted_model, training_recording
 from ._free_run import delay_samples
 from ._lss import lss_arrays
 from ._model import Model
 from ._oe import AXES, SOURCES
 from ._regression import condition
-from ._rows import row_hashes
 from ._subspace_fit import SubspaceFit, fit_subspace
 
 # Motors that repeat each other to one part in a million: no method tells their effects apart.
@@ -68,8 +67,7 @@ class Subspace:
         Raises:
             DataError: too short, constant, or motors that repeat each other.
         """
-        recording = concatenate(recordings if isinstance(recordings, list) else [recordings])
-        check_training(recording)
+        recording = training_recording(recordings)
         if self.source == "positions" and not recording.has_motor_positions:
             raise DataError("no motor positions were logged; use `source=set_points`.")
         motors = recording.motor_positions if self.source == "positions" else recording.set_points
@@ -83,20 +81,19 @@ class Subspace:
         fit, d = best
         drive = fit_drive(recording)
         progress(1.0, "done")
-        return Model(
-            kind="subspace",
-            sample_time=recording.sample_time,
+        return fitted_model(
+            "subspace",
+            self,
+            recording,
             arrays=lss_arrays(
                 (fit.A, fit.B, fit.C, fit.K), delay=d, drive=drive.array, source=int(self.source == "positions")
             ),
-            settings=asdict(self),
             findings={
                 "delay_criterion": "output_error",
                 "delay_curve": curves,
                 "singular_values": fit.singular_values.tolist(),
                 "condition_number": number,
             },
-            training_rows=row_hashes(recording),
         )
 
     def _search(self, recording: Recording, progress: Progress) -> tuple[tuple[SubspaceFit, int], dict[str, Any]]:

@@ -1,0 +1,54 @@
+"""What every estimator begins and ends with: one recording to train on, and a model that knows its rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from softneck.core import Matrix
+from softneck.signals import Recording, concatenate
+
+from ._checks import check_training
+from ._model import Model
+from ._rows import row_hashes
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+SAME_EXCITATION = "chosen on rows of the excitation it was trained on; a hold-out of another one chooses better"
+
+
+def one_recording(recordings: Recording | list[Recording]) -> Recording:
+    """Return all runs as one recording; they are never joined."""
+    return concatenate(recordings if isinstance(recordings, list) else [recordings])
+
+
+def training_recording(recordings: Recording | list[Recording]) -> Recording:
+    """Return all runs as one recording to identify from.
+
+    Raises:
+        DataError: too short, without excitation, or with an output that never moves.
+    """
+    recording = one_recording(recordings)
+    check_training(recording)
+    return recording
+
+
+def fitted_model(
+    kind: str,
+    settings: DataclassInstance,
+    recording: Recording,
+    *,
+    arrays: Mapping[str, Matrix],
+    findings: Mapping[str, Any],
+) -> Model:
+    """Return what `settings` made of `recording`."""
+    return Model(
+        kind=kind,
+        sample_time=recording.sample_time,
+        arrays=arrays,
+        settings=asdict(settings),
+        findings=findings,
+        training_rows=row_hashes(recording),
+    )
