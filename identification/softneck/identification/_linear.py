@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import control
 import numpy as np
-from scipy.linalg import expm, logm
+from scipy.linalg import logm
 
 from softneck.core import Matrix, SettingsError, Vector, require_one_of, require_whole
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
@@ -148,15 +148,6 @@ def continuous_parameters(
         return None
     p = -np.log(-a[0]) / sample_time
     return float(b[0] * p / (1.0 + a[0])), float(p), float(arrays["delay"][axis] * sample_time)
-
-
-def zero_order_hold(A: Matrix, B: Matrix, sample_time: float) -> tuple[Matrix, Matrix]:
-    """Return the sampled A (n, n) and B (n, nu) of a continuous system whose input is held."""
-    n, m = B.shape
-    joint = np.zeros((n + m, n + m))
-    joint[:n, :n], joint[:n, n:] = A, B
-    E = np.asarray(expm(joint * sample_time))
-    return E[:n, :n], E[:n, n:]
 
 
 def _continuous(model: Linear, output: str, name: str) -> tuple[Vector, Vector, float]:

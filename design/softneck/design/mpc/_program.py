@@ -65,7 +65,7 @@ class MpcProgram:
         self.H, self.F, self.A = (arrays[_FIELDS[name]] for name in ("H", "F", "A"))
         m = self.A.shape[0]
         self._functions = load_functions("softneck.design.mpc._mpc_runtime")
-        self._simple = self._bounded()
+        self._rest, self._order = self._rows()
         self._model: Any = daqp.Model()
         wide = np.full(m, 1e30)
         flag, _ = self._model.setup(
@@ -76,8 +76,8 @@ class MpcProgram:
         limit = int(arrays[0][rt.MPC_BUDGET]) if budget is None else budget
         self._model.settings = {"primal_tol": _TOLERANCE, "dual_tol": _TOLERANCE, "iter_limit": max(limit, 1)}
 
-    def _bounded(self) -> bool:
-        """Note in which order daqp sees the rows: those on a single variable first, as bounds."""
+    def _rows(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rows without the bounds, and the order in which daqp sees all: those on one variable first."""
         nz, m = self.A.shape[1], self.A.shape[0]
         eye = np.eye(nz)
         place = {tuple(row): i for i, row in reversed(list(enumerate(self.A.tolist())))}
@@ -85,9 +85,8 @@ class MpcProgram:
         simple = all(i is not None for i in found)
         first = [i for i in found if i is not None] if simple else []
         taken = set(first)
-        self._rest = np.array([i for i in range(m) if i not in taken], dtype=np.int64)
-        self._order = np.concatenate([np.array(first, dtype=np.int64), self._rest])
-        return simple
+        rest = np.array([i for i in range(m) if i not in taken], dtype=np.int64)
+        return rest, np.concatenate([np.array(first, dtype=np.int64), rest])
 
     def bounds(self, theta: Vector, parameters: Vector, motors: Vector) -> tuple[Vector, Vector]:
         """Return the bounds (m,) of all rows under those limits, motors (3,) being where they are [rad]."""
