@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -19,10 +20,12 @@ from softneck.core import silent
 from ._console import print_json, print_table, progress
 from ._options import json_option
 
-_NEEDED = ("numpy", "scipy", "control", "casadi", "filterpy", "fmpy", "pythonfmu", "numba", "pandas", "pyarrow", "h5py",
-           "matplotlib", "click", "rich", "jinja2", "platformdirs", "threadpoolctl", "python-can",
-           "canopen")  # fmt: skip
-_EXTRAS = {"slycot": "H-infinity by SLICOT"}
+# Extra -> the module it brings, and what for.
+_EXTRAS = {
+    "slycot": ("slycot", "H-infinity by SLICOT"),
+    "sklearn": ("sklearn", "set membership as a scikit-learn regressor"),
+    "dask": ("distributed", "studies on a cluster"),
+}
 
 
 @click.command("doctor", epilog="Example: softneck doctor --json")
@@ -59,9 +62,15 @@ def _python() -> dict[str, str]:
     return _check("python", "ok", f"{platform.python_version()} on {platform.system()} {platform.machine()}")
 
 
+def _needed() -> list[str]:
+    """Return the names of all packages that the installed softneck asks for."""
+    asked = [line for line in metadata.requires("softneck") or [] if "extra ==" not in line]
+    return [re.split(r"[^\w.-]", line, maxsplit=1)[0] for line in asked]
+
+
 def _packages() -> list[dict[str, str]]:
     found = []
-    for name in _NEEDED:
+    for name in _needed():
         try:
             found.append(_check(name, "ok", metadata.version(name)))
         except metadata.PackageNotFoundError:
@@ -75,7 +84,7 @@ def _compiler() -> dict[str, str]:
         return _check("C compiler", "ok", compiler)
     if importlib.util.find_spec("ziglang"):
         return _check("C compiler", "ok", "ziglang wheel")
-    return _check("C compiler", "absent", "not needed yet; compiled FMUs will come prebuilt")
+    return _check("C compiler", "absent", "not needed: a wheel brings compiled FMUs along")
 
 
 def _fmu_platform() -> dict[str, str]:
@@ -111,8 +120,8 @@ def _can() -> dict[str, str]:
 
 def _extras() -> list[dict[str, str]]:
     checks = [
-        _check(f"extra {name}", "ok" if importlib.util.find_spec(name) else "absent", what)
-        for name, what in _EXTRAS.items()
+        _check(f"extra {name}", "ok" if importlib.util.find_spec(module) else "absent", what)
+        for name, (module, what) in _EXTRAS.items()
     ]
     jit = "off by NUMBA_DISABLE_JIT" if os.environ.get("NUMBA_DISABLE_JIT", "0") != "0" else "on"
     return [*checks, _check("compiled runtimes", "ok" if jit == "on" else "absent", f"numba {jit}")]
