@@ -12,6 +12,7 @@ from ._deploy import neck_of as neck_of
 from ._deploy import prepare as prepare
 from ._deploy import run_on_bus as run_on_bus
 from ._deploy import run_simulated as run_simulated
+from ._experiment import Experiment as Experiment
 from ._file import DriveEntry as DriveEntry
 from ._file import DrivesFile as DrivesFile
 from ._file import default_drives as default_drives
@@ -20,6 +21,7 @@ from ._file import make_drives as make_drives
 from ._frame_log import FrameLog as FrameLog
 from ._jog import Jogged as Jogged
 from ._jog import jog as jog
+from ._jog import jog_pilot as jog_pilot
 from ._keyboard import Keyboard as Keyboard
 from ._link import HARMLESS as HARMLESS
 from ._link import BusError as BusError
@@ -46,6 +48,7 @@ from ._replay import Replay as Replay
 from ._replay import replay as replay
 from ._result import DrivesResult as DrivesResult
 from ._run_log import RunLogger as RunLogger
+from ._run_log import require_log_paths as require_log_paths
 from ._run_log import run_facts as run_facts
 from ._sdo import SdoError as SdoError
 from ._sdo import load_eds as load_eds

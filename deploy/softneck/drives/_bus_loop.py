@@ -51,6 +51,7 @@ class Session:
         settings: changes the master's settings, for tests.
         log: where frames and cycles are written; whoever opened it closes it.
         files: role -> path of what acts in the run, for the log.
+        facts: what else the log says about the run; `replay` computes an experiment or a jog again from it.
         realtime: on a bus, run before all ordinary processes (SCHED_FIFO), with memory locked.
     """
 
@@ -64,6 +65,7 @@ class Session:
     settings: Callable[[MasterSettings], MasterSettings] | None = None
     log: RunLogger | None = None
     files: Mapping[str, str | Path] = field(default_factory=dict)
+    facts: Mapping[str, Any] = field(default_factory=dict)
     realtime: bool = False
 
     @property
@@ -158,7 +160,7 @@ def _run_session(
     settings = file.master_settings(sample_time, guarding=checked.guarding)
     settings = settings if session.settings is None else session.settings(settings)
     if log is not None:
-        log.describe(run_facts(settings, session.files, simulated=session.simulated))
+        log.describe(run_facts(settings, session.files, simulated=session.simulated, **session.facts))
         pilot = LoggedPilot(pilot)
         session = replace(session, watches=(*session.watches, log.watch(pilot)))
     master = Master(settings, pilot)

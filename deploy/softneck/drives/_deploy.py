@@ -178,10 +178,10 @@ def _run(
     rows = max(1, round(deployed.loop.duration / pilot.sample_time))
     neck = session.link.neck if isinstance(session.link, VirtualLink) else None
 
-    def watch(_now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Tilt | None, master: Master) -> None:
+    def watch(now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Tilt | None, master: Master) -> None:
+        row = log.take(now, master, None if neck is None else neck.truth())
         if not master.ran:
             return
-        row = log.take(master, master.index, None if neck is None else neck.truth())
         if session.log is not None:
             session.log.signals(row)
         if report is not None and master.index % 50 == 0:
@@ -211,4 +211,5 @@ def _run(
         times=ended.times,
         notes=deployed.notes,
         terminated=ended.terminated,
+        speeds=log.speeds(),
     )

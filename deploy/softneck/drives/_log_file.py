@@ -17,7 +17,9 @@ from softneck.loop import LoopResult
 from softneck.signals import Recording
 
 from ._cycle import Cycle, decode_cycle
+from ._motion import motion_at
 from ._result import recording_of, signal_units
+from ._rows import experiment_channels, experiment_recording, experiment_table
 from ._run_log import LOG_VERSION, METADATA
 from .master import BusSettings, LimitSettings, MasterSettings, RampSettings, SensorSettings, WatchSettings
 
@@ -41,6 +43,7 @@ class LoggedRun:
         facts: what `run_facts` said.
         cycles: steps of the master, in their order.
         rows: one for each sample of the controller while it ran: signal -> value in SI.
+        row_cycles: in which step of `cycles` each row was logged.
         events: (time [s], name, text).
         cut: why reading ended early, "" if the log is complete.
     """
@@ -51,6 +54,7 @@ class LoggedRun:
     rows: tuple[Mapping[str, float], ...]
     events: tuple[tuple[float, str, str], ...]
     cut: str = ""
+    row_cycles: tuple[int, ...] = ()
 
     def settings(self) -> MasterSettings:
         """Return the settings of the run's master.
@@ -79,14 +83,27 @@ class LoggedRun:
         return settings.sample_cycles * settings.bus.cycle
 
     def recording(self) -> Recording:
-        """Return the run as a recording, the same as `softneck drives run -o` writes.
+        """Return the run as a recording, the same as `softneck drives run -o` or `record -o` writes.
 
         Raises:
             DataError: the controller did not run.
         """
         if len(self.rows) < 2:
             raise DataError(f"{self.path}: the controller did not run, so that there is nothing to identify from.")
-        return recording_of(self.signals())
+        times = np.array([cycle.time for cycle in self.cycles])
+        positions = np.array([cycle.positions for cycle in self.cycles]).reshape(-1, 3)
+        if "run" not in self.rows[0]:
+            return recording_of(self.signals(), motion_at(times, positions, self.row_cycles)[1])
+        # A row of an experiment is logged when its set-points were sent to their end.
+        late = self.settings().sample_cycles - 1
+        columns = experiment_channels(
+            experiment_table(self.rows), *motion_at(times, positions, [cycle - late for cycle in self.row_cycles])
+        )
+        run = np.array([row["run"] for row in self.rows])
+        recording = experiment_recording(columns, run, self.sample_time)
+        if recording is None:
+            raise DataError(f"{self.path}: holds no angles, so that there is nothing to identify from.")
+        return recording
 
 
 def read_run_log(path: str | Path) -> LoggedRun:
@@ -103,6 +120,7 @@ def read_run_log(path: str | Path) -> LoggedRun:
     topics: dict[int, str] = {}
     cycles: list[Cycle] = []
     rows: list[Mapping[str, float]] = []
+    at: list[int] = []
     events: list[tuple[float, str, str]] = []
     cut = ""
     try:
@@ -118,6 +136,7 @@ def read_run_log(path: str | Path) -> LoggedRun:
                         cycles.append(decode_cycle(table))
                     elif topic == "/signals":
                         rows.append(table)
+                        at.append(len(cycles) - 1)
                     elif topic == "/events":
                         moment = cycles[-1].time if cycles else 0.0
                         events.append((moment, str(table.get("name")), str(table.get("message"))))
@@ -131,7 +150,7 @@ def read_run_log(path: str | Path) -> LoggedRun:
         cut = f"ends in the middle ({_word(error)})"
     if facts is None:
         raise FileFormatError(f"{source}: is MCAP, but no log of `softneck drives`: it has no `{METADATA}`.")
-    return LoggedRun(source, facts, tuple(cycles), tuple(rows), tuple(events), cut)
+    return LoggedRun(source, facts, tuple(cycles), tuple(rows), tuple(events), cut, tuple(at))
 
 
 def _facts(source: Path, metadata: Mapping[str, str]) -> dict[str, Any]:

@@ -77,6 +77,20 @@ def partial(path: Path) -> Path:
     return path.with_name(f"{path.stem}.part{path.suffix}")
 
 
+def require_log_paths(paths: Sequence[Path], *, force: bool = False) -> None:
+    """Raise where `RunLogger` would not write to `paths`.
+
+    Raises:
+        SettingsError: an ending that is none of a log.
+        OutputError: a file exists.
+    """
+    for path in paths:
+        if path.suffix.lower() not in (RUN_LOG, *FRAME_LOGS):
+            raise SettingsError(f"{path}: a log ends in {log_endings()}; `.mcap` holds all, the others frames.")
+        for taken in (path, partial(path)):
+            refuse_existing(taken, force=force)
+
+
 def run_facts(
     settings: MasterSettings, files: Mapping[str, str | Path], *, simulated: bool, **more: Any
 ) -> dict[str, Any]:
@@ -99,6 +113,7 @@ class RunLogger:
     Attributes:
         lost: cycles that were dropped because the disk did not keep up.
         problem: why writing ended, "" if it did not.
+        described: whether a run began: before that a log holds nothing to replay.
     """
 
     def __init__(self, paths: Sequence[Path], *, force: bool = False, wait: bool = False, epoch: float = 0.0) -> None:
@@ -116,12 +131,8 @@ class RunLogger:
             OutputError: a file exists or cannot be written.
         """
         self.paths = tuple(paths)
-        for path in self.paths:
-            if path.suffix.lower() not in (RUN_LOG, *FRAME_LOGS):
-                raise SettingsError(f"{path}: a log ends in {log_endings()}; `.mcap` holds all, the others frames.")
-            for taken in (path, partial(path)):
-                refuse_existing(taken, force=force)
-        self.lost, self.problem = 0, ""
+        require_log_paths(self.paths, force=force)
+        self.lost, self.problem, self.described = 0, "", False
         self._wait, self._epoch = wait, epoch
         self._frames: list[tuple[float, bool, Frame]] = []
         self._row: Mapping[str, float] | None = None
@@ -144,6 +155,7 @@ class RunLogger:
 
     def describe(self, facts: Mapping[str, Any]) -> None:
         """Say what the run is; before the first cycle."""
+        self.described = True
         self._put(dict(facts))
 
     def frame(self, now: float, from_master: bool, frame: Frame) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,6 @@ from softneck.drives import (
     DrivesResult,
     Keyboard,
     Report,
-    VirtualLink,
     default_drives,
     preflight,
     prepare,
@@ -28,15 +28,17 @@ from softneck.drives import (
 from softneck.signals import recording_suffix, write_recording
 
 from ._console import note, print_json, print_table, progress
-from ._drives_log import acting_files, log_option, opened_log
+from ._drives_log import acting_files, log_options, opened_log, require_logs
 from ._drives_move import jog_command, record_command
 from ._drives_replay import replay_command
 from ._drives_target import (
     Target,
     checked_names,
     drives_options,
+    leave_if_asked,
     look_of,
     neck_option,
+    open_drives,
     open_link,
     override_option,
     sensor_of,
@@ -45,9 +47,6 @@ from ._drives_target import (
 from ._drives_view import live_view
 from ._neck import load_neck
 from ._options import force_option, json_option, output_option, target
-
-# As a shell says it of a process that SIGTERM ended: 128 + 15.
-_TERMINATED = 143
 
 
 @click.group(
@@ -115,14 +114,26 @@ def _show(report: Report, *, as_json: bool) -> None:
 @drives_options
 @override_option
 @neck_option
+@log_options
+@force_option
 @json_option
 def zero_command(
     drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, overrides: tuple[str, ...],
-    neck: str | None, as_json: bool,
+    neck: str | None, logs: tuple[Path, ...], no_log: bool, force: bool, as_json: bool,
 ) -> None:  # fmt: skip
-    """Tension each tendon gently, set the encoders' zero there, and verify with the inclinometer."""
+    """Tension each tendon gently, set the encoders' zero there, and verify with the inclinometer.
+
+    Its log holds frames: .blf or .log.
+    """
     chosen = target_of(drives_file, bus, simulated, arm)
-    with open_link(chosen, moves=True, neck=neck or "paper") as link:
+    if any(path.suffix.lower() == ".mcap" for path in logs):
+        raise SettingsError("zero has no cycles to replay; its --log ends in .blf or .log.")
+    require_logs(logs, no_log=no_log, force=force)
+    with (
+        open_link(chosen, moves=True, neck=neck or "paper") as link,
+        opened_log(chosen, "zero", logs, no_log=no_log, force=force, ending=".blf") as log,
+    ):
+        link.tap = None if log is None else log.frame
         look = look_of(link, chosen.file)
         report = preflight(link, chosen.file, override=checked_names(overrides))
         report.require()
@@ -130,9 +141,9 @@ def zero_command(
             try:
                 zeroed = zero(link, chosen.file, look, guarding=report.guarding, operator=keyboard)
             except CheckFailedError as error:
-                if keyboard.interrupted:
+                if keyboard.interrupted or keyboard.terminated:
                     note(str(error))
-                    raise KeyboardInterrupt from error
+                leave_if_asked(keyboard)
                 raise
     if as_json:
         print_json(zeroed.table())
@@ -151,7 +162,7 @@ def zero_command(
 @override_option
 @neck_option
 @click.option("--pace", type=float, help="With --simulated: this multiple of real time instead of as fast as possible.")
-@log_option
+@log_options
 @click.option("--realtime", is_flag=True, help="On a bus: before all ordinary processes (SCHED_FIFO), memory locked.")
 @output_option("recording of the run", "REC")
 @force_option
@@ -159,7 +170,7 @@ def zero_command(
 def run_command(
     controller: Path, loop_file: Path, certificates: tuple[Path, ...], drives_file: Path | None, bus: str | None,
     simulated: bool, arm: bool, overrides: tuple[str, ...], neck: str | None, pace: float | None, realtime: bool,
-    logs: tuple[Path, ...], output: Path | None, force: bool, as_json: bool,
+    logs: tuple[Path, ...], no_log: bool, output: Path | None, force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Run CONTROLLER in the loop of LOOP.toml on the drives: enable, ramp in, control, ramp out, switch off.
 
@@ -170,6 +181,7 @@ def run_command(
     path, replace = target(output, f"results/drives_{loop_file.stem}.csv", force=force)
     recording_suffix(path)
     refuse_existing(path, force=replace)
+    require_logs(logs, no_log=no_log, force=force)
     chosen, names = target_of(drives_file, bus, simulated, arm), checked_names(overrides)
     setup = load_loop(loop_file)
     if not controller.is_file():
@@ -180,48 +192,33 @@ def run_command(
         note(text)
     files = acting_files(setup, loop_file, controller, drives_file)
     live = not as_json and (not chosen.simulated or pace is not None)
-    with (
-        opened_log(logs, chosen.simulated, force=force) as log,
-        live_view(controller.name, deployed.loop.duration, wanted=live) as watches,
-        # Two things that draw in place would draw over each other; the view tells the time as well.
-        progress("drives", quiet=as_json or bool(watches)) as tell,
-    ):
-        report = lambda done: tell(done, controller.name)  # noqa: E731
-        if chosen.simulated:
-            virtual = load_neck(neck) if neck else None
-            with Keyboard() as keyboard:
+    sensor: Any = None if chosen.simulated else sensor_of(chosen.file, str(chosen.bus))
+    with contextlib.ExitStack() as stack:
+        link = None if chosen.simulated else stack.enter_context(open_drives(chosen))
+        log = stack.enter_context(opened_log(chosen, "run", logs, no_log=no_log, force=force))
+        with (
+            live_view(controller.name, deployed.loop.duration, wanted=live) as watches,
+            # Two things that draw in place would draw over each other; the view tells the time as well.
+            progress("drives", quiet=as_json or bool(watches)) as tell,
+            Keyboard() as keyboard,
+        ):
+            report = lambda done: tell(done, controller.name)  # noqa: E731
+            if link is None:
                 result = run_simulated(
-                    deployed, chosen.file, neck=virtual, override=names, pace=pace, report=report, operator=keyboard,
-                    watches=watches, log=log, files=files,
+                    deployed, chosen.file, neck=load_neck(neck) if neck else None, override=names, pace=pace,
+                    report=report, operator=keyboard, watches=watches, log=log, files=files,
                 )  # fmt: skip
-        else:
-            sensor = sensor_of(chosen.file, str(chosen.bus))
-            with open_link(chosen, moves=True) as link:
-                if isinstance(link, VirtualLink):
-                    raise SettingsError("drives on a bus are asked.")
-                with Keyboard() as keyboard:
-                    result = run_on_bus(
-                        deployed,
-                        chosen.file,
-                        link,
-                        sensor,
-                        override=names,
-                        report=report,
-                        operator=keyboard,
-                        watches=watches,
-                        realtime=realtime,
-                        log=log,
-                        files=files,
-                    )
-    if len(result.signals.time) > 1:
-        write_recording(path, result.recording(), force=replace)
-    _print_run(path, result, as_json=as_json)
-    if keyboard.interrupted:
-        raise KeyboardInterrupt
-    if result.terminated:
-        note("ended by SIGTERM; the drives are off.")
-        click.get_current_context().exit(_TERMINATED)
-    result.require()
+            else:
+                result = run_on_bus(
+                    deployed, chosen.file, link, sensor, override=names, report=report, operator=keyboard,
+                    watches=watches, realtime=realtime, log=log, files=files,
+                )  # fmt: skip
+        # Before the log is closed: a full disk must not cost the recording and the result as well.
+        if len(result.signals.time) > 1:
+            write_recording(path, result.recording(), force=replace)
+        _print_run(path, result, as_json=as_json)
+        leave_if_asked(keyboard, terminated=result.terminated)
+        result.require()
 
 
 def _print_run(path: Path, result: DrivesResult, *, as_json: bool) -> None:

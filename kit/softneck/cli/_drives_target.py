@@ -16,6 +16,7 @@ from softneck.drives import (
     OVERRIDES,
     CanLink,
     DrivesFile,
+    Keyboard,
     VirtualLink,
     default_drives,
     load_drives,
@@ -26,6 +27,7 @@ from softneck.drives import (
 from softneck.drives.master import Tilt
 
 from ._arm import require_armed
+from ._console import note
 from ._neck import load_neck
 
 SAMPLE_TIME = 0.02
@@ -78,6 +80,28 @@ def open_link(
     if moves:
         require_armed(str(chosen.bus), arm=chosen.arm)
     with open_bus(str(chosen.bus), bit_rate=chosen.file.bit_rate) as link:
+        yield link
+
+
+# As a shell says it of a process that SIGTERM ended: 128 + 15.
+_TERMINATED = 143
+
+
+def leave_if_asked(keyboard: Keyboard, *, terminated: bool = False) -> None:
+    """End the command as somebody at the keyboard, or SIGTERM, asked; after its results are out."""
+    if keyboard.interrupted:
+        raise KeyboardInterrupt
+    if terminated or keyboard.terminated:
+        note("ended by SIGTERM; the drives are off.")
+        click.get_current_context().exit(_TERMINATED)
+
+
+@contextlib.contextmanager
+def open_drives(chosen: Target) -> Iterator[CanLink]:
+    """Yield the bus to drives that are to move."""
+    with open_link(chosen, moves=True) as link:
+        if isinstance(link, VirtualLink):
+            raise SettingsError("drives on a bus are asked.")
         yield link
 
 
