@@ -1,4 +1,4 @@
-"""An inclinometer of the user's own: `package.module:factory`, kept from hurting the control loop as far as that goes."""
+"""An inclinometer of the user's own, `package.module:factory`, kept from hurting the control loop where possible."""
 
 from __future__ import annotations
 

@@ -179,4 +179,3 @@ class SerialInclinometer:
                 # A full buffer is no end: the sensor is late, which the gate notices.
                 if not type(error).__name__.endswith("TimeoutException"):
                     self.problem = reason(error)
-
