@@ -3,7 +3,6 @@
 from ._ask import Ask as Ask
 from ._ask import Operator as Operator
 from ._bus_loop import Ended as Ended
-from ._bus_loop import Sensor as Sensor
 from ._bus_loop import Session as Session
 from ._bus_loop import run_session as run_session
 from ._certified import require_certified as require_certified
@@ -13,6 +12,7 @@ from ._deploy import neck_of as neck_of
 from ._deploy import prepare as prepare
 from ._deploy import run_on_bus as run_on_bus
 from ._deploy import run_simulated as run_simulated
+from ._experiment import Experiment as Experiment
 from ._file import DriveEntry as DriveEntry
 from ._file import DrivesFile as DrivesFile
 from ._file import default_drives as default_drives
@@ -21,6 +21,7 @@ from ._file import make_drives as make_drives
 from ._frame_log import FrameLog as FrameLog
 from ._jog import Jogged as Jogged
 from ._jog import jog as jog
+from ._jog import jog_pilot as jog_pilot
 from ._keyboard import Keyboard as Keyboard
 from ._link import HARMLESS as HARMLESS
 from ._link import BusError as BusError
@@ -38,6 +39,7 @@ from ._preflight import OVERRIDES as OVERRIDES
 from ._preflight import Report as Report
 from ._preflight import preflight as preflight
 from ._preflight import scan as scan
+from ._python_sensor import PythonInclinometer as PythonInclinometer
 from ._record import Recorded as Recorded
 from ._record import drive_limits as drive_limits
 from ._record import record_signal as record_signal
@@ -46,10 +48,12 @@ from ._replay import Replay as Replay
 from ._replay import replay as replay
 from ._result import DrivesResult as DrivesResult
 from ._run_log import RunLogger as RunLogger
+from ._run_log import require_log_paths as require_log_paths
 from ._run_log import run_facts as run_facts
 from ._sdo import SdoError as SdoError
 from ._sdo import load_eds as load_eds
 from ._sensor import CanInclinometer as CanInclinometer
+from ._sensor import Sensor as Sensor
 from ._serial import SensorError as SensorError
 from ._serial import SerialInclinometer as SerialInclinometer
 from ._serial import TiltLines as TiltLines
@@ -75,6 +79,8 @@ from ._virtual import Watch as Watch
 from ._virtual import recorded as recorded
 from ._virtual import simulated_neck as simulated_neck
 from ._zero import Zeroed as Zeroed
+from ._zero import require_reset as require_reset
+from ._zero import require_stopped as require_stopped
 from ._zero import reset as reset
 from ._zero import stop as stop
 from ._zero import zero as zero

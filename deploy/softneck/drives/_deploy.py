@@ -11,12 +11,13 @@ from softneck.cosim import FmuPart, LoopSetup
 from softneck.loop import BlockPart, Loop, Part
 from softneck.plant import NeckParameters
 
-from ._bus_loop import Operator, Sensor, Session, run_session
+from ._bus_loop import Operator, Session, run_session
 from ._file import DrivesFile
 from ._link import CanLink, VirtualLink
 from ._pilot import LoopPilot
 from ._result import DrivesResult, RunLog
 from ._run_log import RunLogger
+from ._sensor import Sensor
 from ._virtual import Watch, simulated_neck
 from .master import Frame, Master, MasterSettings, Tilt
 
@@ -177,10 +178,10 @@ def _run(
     rows = max(1, round(deployed.loop.duration / pilot.sample_time))
     neck = session.link.neck if isinstance(session.link, VirtualLink) else None
 
-    def watch(_now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Tilt | None, master: Master) -> None:
+    def watch(now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Tilt | None, master: Master) -> None:
+        row = log.take(now, master, None if neck is None else neck.truth())
         if not master.ran:
             return
-        row = log.take(master, master.index, None if neck is None else neck.truth())
         if session.log is not None:
             session.log.signals(row)
         if report is not None and master.index % 50 == 0:
@@ -210,4 +211,5 @@ def _run(
         times=ended.times,
         notes=deployed.notes,
         terminated=ended.terminated,
+        speeds=log.speeds(),
     )

@@ -131,17 +131,16 @@ def jog(
             f"--amplitude {amplitude:g} moves at up to {fastest:.2g} rad/s; the drives file allows {limits.speed:g}."
         )
     path, stands = _path(amplitude)
-    set_points = np.zeros((len(path), 3))
-    set_points[:, motor - 1] = path
-    log = SignalLog(len(path))
+    log = SignalLog(len(path), session=session)
 
     def tell(*cycle: Any) -> None:
         master = cycle[4]
         if report is not None and master.ran and master.index % 25 == 0:
             report(master.index / len(path))
 
-    session = replace(session, watches=(log, tell, *session.watches))
-    ended = run_session(session, SignalPilot(set_points), sample_time=SAMPLE_TIME, most=len(path) * SAMPLE_TIME)
+    facts = {**session.facts, "jog": {"motor": motor, "amplitude": amplitude}}
+    session = replace(session, watches=(log, tell, *session.watches), facts=facts)
+    ended = run_session(session, jog_pilot(motor, amplitude), sample_time=SAMPLE_TIME, most=len(path) * SAMPLE_TIME)
     expected = amplitude * session.file.watch.gain * cmath.exp(1j * tendon_angles[motor - 1])
     node = session.file.nodes[motor - 1]
     if log.rows < len(path):
@@ -160,6 +159,14 @@ def jog(
         advice = f"The motor itself turned by {turned:.2f} of {2.0 * amplitude:g} rad: is it blocked? {advice}"
     return Jogged(motor, node, amplitude, (expected.real, expected.imag), (seen.real, seen.imag), noise, turned,
                   verdict, advice, ended)  # fmt: skip
+
+
+def jog_pilot(motor: int, amplitude: float) -> SignalPilot:
+    """Return what moves one motor up and down by `amplitude` [rad]."""
+    path, _ = _path(amplitude)
+    set_points = np.zeros((len(path), 3))
+    set_points[:, motor - 1] = path
+    return SignalPilot(set_points)
 
 
 def _stopped(ended: Ended, motor: int) -> tuple[str, str]:

@@ -15,7 +15,8 @@ from ._bus_loop import Ask
 
 _INTERRUPT = b"\x03"
 # The terminal is closed, a service is ended: as Ctrl-C. Ctrl-Z would hang the loop that feeds the drives: it stops.
-_LEAVE = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
+_LEAVE = ("SIGINT", "SIGHUP", "SIGBREAK")
+_END = ("SIGTERM",)
 _STOP = ("SIGTSTP",)
 
 
@@ -26,12 +27,13 @@ class Keyboard:
     thread, and not where they were ignored before (`nohup`).
 
     Attributes:
-        interrupted: whether Ctrl-C was pressed, or a signal came.
+        interrupted: whether Ctrl-C or Ctrl-Z was pressed, or the terminal was closed.
+        terminated: whether SIGTERM came.
     """
 
     def __init__(self) -> None:
         """Listen to nothing yet."""
-        self.interrupted = False
+        self.interrupted = self.terminated = False
         self._asks: list[Ask] = []
         self._read: Callable[[], bytes] = lambda: b""
         self._stack = contextlib.ExitStack()
@@ -61,8 +63,11 @@ class Keyboard:
         return Ask.STOP if Ask.STOP in asks else asks[0]
 
     def _interrupt(self) -> None:
-        self._asks.append(Ask.STOP if self.interrupted else Ask.LEAVE)
+        self._leave()
         self.interrupted = True
+
+    def _leave(self) -> None:
+        self._asks.append(Ask.STOP if self.interrupted or self.terminated else Ask.LEAVE)
 
     def _take_signals(self, stack: contextlib.ExitStack) -> None:
         if threading.current_thread() is not threading.main_thread():
@@ -71,11 +76,15 @@ class Keyboard:
         def leave(_number: int, _frame: FrameType | None) -> None:
             self._interrupt()
 
+        def end(_number: int, _frame: FrameType | None) -> None:
+            self._leave()
+            self.terminated = True
+
         def halt(_number: int, _frame: FrameType | None) -> None:
             self.interrupted = True
             self._asks.append(Ask.STOP)
 
-        for names, handler in ((_LEAVE, leave), (_STOP, halt)):
+        for names, handler in ((_LEAVE, leave), (_END, end), (_STOP, halt)):
             for name in names:
                 number = getattr(signal, name, None)
                 if number is None or signal.getsignal(number) is signal.SIG_IGN:

@@ -17,7 +17,9 @@ from softneck.loop import LoopResult
 from softneck.signals import Recording
 
 from ._cycle import Cycle, decode_cycle
+from ._motion import motion_at
 from ._result import recording_of, signal_units
+from ._rows import experiment_channels, experiment_recording, experiment_table
 from ._run_log import LOG_VERSION, METADATA
 from .master import BusSettings, LimitSettings, MasterSettings, RampSettings, SensorSettings, WatchSettings
 
@@ -41,6 +43,7 @@ class LoggedRun:
         facts: what `run_facts` said.
         cycles: steps of the master, in their order.
         rows: one for each sample of the controller while it ran: signal -> value in SI.
+        row_cycles: in which step of `cycles` each row was logged.
         events: (time [s], name, text).
         cut: why reading ended early, "" if the log is complete.
     """
@@ -51,6 +54,7 @@ class LoggedRun:
     rows: tuple[Mapping[str, float], ...]
     events: tuple[tuple[float, str, str], ...]
     cut: str = ""
+    row_cycles: tuple[int, ...] = ()
 
     def settings(self) -> MasterSettings:
         """Return the settings of the run's master.
@@ -62,7 +66,7 @@ class LoggedRun:
             table = dict(self.facts["settings"])
             parts = {name: kind(**_tuples(table.pop(name))) for name, kind in _PARTS.items()}
             return MasterSettings(**_tuples(table), **parts)
-        except (KeyError, TypeError, ValueError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise FileFormatError(f"{self.path}: its settings do not fit this softneck ({error}).") from error
 
     def signals(self) -> LoopResult:
@@ -79,14 +83,27 @@ class LoggedRun:
         return settings.sample_cycles * settings.bus.cycle
 
     def recording(self) -> Recording:
-        """Return the run as a recording, the same as `softneck drives run -o` writes.
+        """Return the run as a recording, the same as `softneck drives run -o` or `record -o` writes.
 
         Raises:
             DataError: the controller did not run.
         """
         if len(self.rows) < 2:
             raise DataError(f"{self.path}: the controller did not run, so that there is nothing to identify from.")
-        return recording_of(self.signals())
+        times = np.array([cycle.time for cycle in self.cycles])
+        positions = np.array([cycle.positions for cycle in self.cycles]).reshape(-1, 3)
+        if "run" not in self.rows[0]:
+            return recording_of(self.signals(), motion_at(times, positions, self.row_cycles)[1])
+        # A row of an experiment is logged when its set-points were sent to their end.
+        late = self.settings().sample_cycles - 1
+        columns = experiment_channels(
+            experiment_table(self.rows), *motion_at(times, positions, [cycle - late for cycle in self.row_cycles])
+        )
+        run = np.array([row["run"] for row in self.rows])
+        recording = experiment_recording(columns, run, self.sample_time)
+        if recording is None:
+            raise DataError(f"{self.path}: holds no angles, so that there is nothing to identify from.")
+        return recording
 
 
 def read_run_log(path: str | Path) -> LoggedRun:
@@ -103,6 +120,7 @@ def read_run_log(path: str | Path) -> LoggedRun:
     topics: dict[int, str] = {}
     cycles: list[Cycle] = []
     rows: list[Mapping[str, float]] = []
+    at: list[int] = []
     events: list[tuple[float, str, str]] = []
     cut = ""
     try:
@@ -113,13 +131,14 @@ def read_run_log(path: str | Path) -> LoggedRun:
                 elif isinstance(record, Channel):
                     topics[record.id] = record.topic
                 elif isinstance(record, Message):
-                    topic, table = topics.get(record.channel_id), json.loads(record.data)
+                    topic = topics.get(record.channel_id)
                     if topic == "/cycle":
-                        cycles.append(decode_cycle(table))
+                        cycles.append(decode_cycle(_table(record.data)))
                     elif topic == "/signals":
-                        rows.append(table)
+                        rows.append({name: float(value) for name, value in _table(record.data).items()})
+                        at.append(len(cycles) - 1)
                     elif topic == "/events":
-                        moment = cycles[-1].time if cycles else 0.0
+                        table, moment = _table(record.data), cycles[-1].time if cycles else 0.0
                         events.append((moment, str(table.get("name")), str(table.get("message"))))
     except OSError as error:
         raise FileFormatError(f"{source}: cannot be read ({error.strerror}).") from error
@@ -131,7 +150,7 @@ def read_run_log(path: str | Path) -> LoggedRun:
         cut = f"ends in the middle ({_word(error)})"
     if facts is None:
         raise FileFormatError(f"{source}: is MCAP, but no log of `softneck drives`: it has no `{METADATA}`.")
-    return LoggedRun(source, facts, tuple(cycles), tuple(rows), tuple(events), cut)
+    return LoggedRun(source, facts, tuple(cycles), tuple(rows), tuple(events), cut, tuple(at))
 
 
 def _facts(source: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
@@ -140,9 +159,17 @@ def _facts(source: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
             f"{source}: has log version {metadata.get('version')}; this softneck reads {LOG_VERSION}."
         )
     facts = json.loads(metadata["facts"])
-    if not isinstance(facts, dict) or not isinstance(facts.get("files", {}), dict):
+    files = facts.get("files", {}) if isinstance(facts, dict) else None
+    if not isinstance(files, dict) or not all(isinstance(entry, dict) for entry in files.values()):
         raise FileFormatError(f"{source}: its metadata are damaged.")
     return facts
+
+
+def _table(data: bytes) -> dict[str, Any]:
+    table = json.loads(data)
+    if not isinstance(table, dict):
+        raise ValueError("a message that is no table")  # noqa: TRY004  (bad content, told with all other damage)
+    return table
 
 
 def _tuples(table: Mapping[str, Any]) -> dict[str, Any]:

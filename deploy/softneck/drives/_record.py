@@ -14,6 +14,7 @@ from softneck.signals import SET_POINTS, Excitation, Limits, Recording
 
 from ._bus_loop import Ended, Session, run_session
 from ._file import DrivesFile
+from ._rows import experiment_recording
 from ._signal import SignalLog, SignalPilot
 from .master import Frame, Master, Tilt
 
@@ -104,8 +105,8 @@ def record_signal(
     sample_time = excitations[0].sample_time
     for excitation in excitations:
         _require_playable(excitation, session.file, sample_time)
-    set_points, run = _joined(excitations, sample_time)
-    log = SignalLog(len(run))
+    set_points, run = joined(excitations, sample_time)
+    log = SignalLog(len(run), run=run, session=session)
 
     def tell(_now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Tilt | None, master: Master) -> None:
         if report is not None and master.ran and master.index % 50 == 0:
@@ -113,21 +114,11 @@ def record_signal(
 
     session = replace(session, watches=(log, tell, *session.watches))
     ended = run_session(session, SignalPilot(set_points), sample_time=sample_time, most=len(run) * sample_time)
-    recording = _recording(log, run, sample_time)
+    recording = experiment_recording(log.columns(), run[: log.rows], sample_time)
     return Recorded(recording, int(np.count_nonzero(run)), ended)
 
 
-def _recording(log: SignalLog, run: Vector, sample_time: float) -> Recording | None:
-    kept = np.flatnonzero(run[: log.rows])
-    if kept.size < 2:
-        return None
-    channels = {name: values[kept] for name, values in log.columns().items()}
-    if not all(np.isfinite(channels[name]).any() for name in ("pitch", "roll")):
-        return None
-    return Recording(kept * sample_time, sample_time, channels, run[kept].astype(np.int64))
-
-
-def _joined(excitations: Sequence[Excitation], sample_time: float) -> tuple[np.ndarray, Vector]:
+def joined(excitations: Sequence[Excitation], sample_time: float) -> tuple[np.ndarray, Vector]:
     """Return all set-points (rows, 3) with pauses at rest between, and the number of the run, 0 in pauses."""
     parts, runs = [], []
     pause = round(_PAUSE / sample_time)

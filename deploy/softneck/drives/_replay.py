@@ -134,10 +134,7 @@ def replay(log: LoggedRun, pilot: Pilot | None = None, notes: Iterable[str] = ()
     for number, cycle in enumerate(log.cycles):
         recalled.answers = list(cycle.answers)
         for what, why in cycle.taken:
-            if what == "stop":
-                master.stop(why)
-            else:
-                (master.start if what == "start" else master.finish)()
+            _ask_again(master, what, why)
         sent = master.step(cycle.time, cycle.received, cycle.tilt)
         again = cycle_of(master, listened, cycle.time, cycle.received, cycle.tilt, sent)
         frames += len(sent)
@@ -152,6 +149,15 @@ def replay(log: LoggedRun, pilot: Pilot | None = None, notes: Iterable[str] = ()
     return Replay(
         done, frames, answers, str(master.supervisor.phase), "" if fault is None else str(fault), found, tuple(told)
     )
+
+
+def _ask_again(master: Master, what: str, why: str) -> None:
+    if what == "stop":
+        master.stop(why)
+    elif what == "leave":
+        master.leave(why)
+    else:
+        (master.start if what == "start" else master.finish)()
 
 
 def _first(logged: Cycle, again: Cycle) -> tuple[str, str, str] | None:

@@ -8,14 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import CheckFailedError, Vector
+from softneck.core import CheckFailedError, Matrix, Vector
 from softneck.loop import LoopResult, metrics
 from softneck.signals import Recording, known_channels
 
+from ._motion import Motion, speed_channels
 from ._pilot import LoopPilot
 from ._times import CycleTimes
-from .master import Event, Master, Phase
+from .master import Event, Master
 
+_MEASURED = ("pitch_measured", "roll_measured")
+_RATES = ("pitch_rate_measured", "roll_rate_measured")
 _TRUTH = ("pitch", "roll", "tension_1", "tension_2", "tension_3", "compression")
 
 
@@ -36,17 +39,20 @@ class RunLog:
         self._places = {name: place for name, place in places.items() if place is not None}
         self._rows: list[list[float]] = []
         self._index = -1
+        self._motion, self._cycles = Motion(), list[int]()
 
-    def take(self, master: Master, index: int, truth: Mapping[str, float] | None) -> dict[str, float] | None:
-        """Add the row of sample `index`, once, and return it by name."""
-        if index <= self._index or master.supervisor.phase is not Phase.RUNNING:
+    def take(self, now: float, master: Master, truth: Mapping[str, float] | None) -> dict[str, float] | None:
+        """Take the cycle at `now` [s]; add the row of its sample, once, and return it by name."""
+        self._motion.take(now, master.positions)
+        if not master.ran or master.index <= self._index:
             return None
-        self._index = index
+        self._index = master.index
+        self._cycles.append(len(self._motion) - 1)
         signals = self._pilot.signals
         row = [float(signals[place]) for place in self._places.values()]
         tilt = master.tilt
         row += [*master.positions, *master.tensions]
-        row += [tilt.pitch, tilt.roll] if tilt is not None else [np.nan, np.nan]
+        row += [tilt.pitch, tilt.roll, tilt.pitch_rate, tilt.roll_rate] if tilt is not None else [np.nan] * 4
         if truth is not None:
             row += [truth[name] for name in _TRUTH]
         self._rows.append(row)
@@ -54,8 +60,12 @@ class RunLog:
 
     def _names(self, truth: bool) -> list[str]:
         names = [*self._places, *(f"motor_position_{j}" for j in (1, 2, 3))]
-        names += [f"tension_estimate_{j}" for j in (1, 2, 3)] + ["pitch_measured", "roll_measured"]
+        names += [f"tension_estimate_{j}" for j in (1, 2, 3)] + [*_MEASURED, *_RATES]
         return names + (list(_TRUTH) if truth else [])
+
+    def speeds(self) -> Matrix:
+        """Return the motors' speeds at all rows, (rows, 3) [rad/s]."""
+        return self._motion.at(self._cycles)[1]
 
     def result(self, sample_time: float, *, truth: bool) -> LoopResult:
         """Return all rows."""
@@ -71,12 +81,24 @@ def signal_units(names: Iterable[str]) -> dict[str, str]:
     return units | ({"compression": "m"} if "compression" in units else {})
 
 
-def recording_of(signals: LoopResult) -> Recording:
-    """Return a run as a recording: as measured, with true angles where simulated drives know them."""
+def recording_of(signals: LoopResult, speeds: Matrix) -> Recording:
+    """Return a run as a recording: as measured, with true angles and tensions where simulated drives know them.
+
+    Args:
+        signals: of the run.
+        speeds: of the motors at its samples, (time, 3) [rad/s].
+    """
     known = set(known_channels())
     channels = {name: values for name, values in signals.signals.items() if name in known}
     for axis in ("pitch", "roll"):
         channels.setdefault(axis, signals[f"{axis}_measured"])
+    for j in (1, 2, 3):
+        channels.setdefault(f"tension_{j}", signals[f"tension_estimate_{j}"])
+    for rate in _RATES:
+        if not np.isfinite(channels.get(rate, np.nan)).any():
+            channels.pop(rate, None)
+    if np.isfinite(speeds).any():
+        channels |= speed_channels(speeds)
     return Recording(signals.time, signals.sample_time, channels)
 
 
@@ -117,6 +139,7 @@ class DrivesResult:
         simulated: whether the drives were.
         times: of the cycles, in real time.
         terminated: whether SIGTERM asked for the end.
+        speeds: of the motors at the rows of `signals`, (rows, 3) [rad/s].
     """
 
     signals: LoopResult
@@ -132,6 +155,7 @@ class DrivesResult:
     times: CycleTimes
     notes: tuple[str, ...] = field(default=())
     terminated: bool = False
+    speeds: Matrix = field(default_factory=lambda: np.zeros((0, 3)))
 
     @property
     def completed(self) -> bool:
@@ -149,7 +173,7 @@ class DrivesResult:
 
     def recording(self) -> Recording:
         """Return the run as a recording: as measured, with true angles where simulated drives know them."""
-        return recording_of(self.signals)
+        return recording_of(self.signals, self.speeds)
 
     def table(self) -> dict[str, Any]:
         """Return the JSON of `softneck drives run`."""

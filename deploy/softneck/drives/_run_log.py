@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -77,6 +78,20 @@ def partial(path: Path) -> Path:
     return path.with_name(f"{path.stem}.part{path.suffix}")
 
 
+def require_log_paths(paths: Sequence[Path], *, force: bool = False) -> None:
+    """Raise where `RunLogger` would not write to `paths`.
+
+    Raises:
+        SettingsError: an ending that is none of a log.
+        OutputError: a file exists.
+    """
+    for path in paths:
+        if path.suffix.lower() not in (RUN_LOG, *FRAME_LOGS):
+            raise SettingsError(f"{path}: a log ends in {log_endings()}; `.mcap` holds all, the others frames.")
+        for taken in (path, partial(path)):
+            refuse_existing(taken, force=force)
+
+
 def run_facts(
     settings: MasterSettings, files: Mapping[str, str | Path], *, simulated: bool, **more: Any
 ) -> dict[str, Any]:
@@ -99,6 +114,7 @@ class RunLogger:
     Attributes:
         lost: cycles that were dropped because the disk did not keep up.
         problem: why writing ended, "" if it did not.
+        described: whether a run began: before that a log holds nothing to replay.
     """
 
     def __init__(self, paths: Sequence[Path], *, force: bool = False, wait: bool = False, epoch: float = 0.0) -> None:
@@ -116,12 +132,8 @@ class RunLogger:
             OutputError: a file exists or cannot be written.
         """
         self.paths = tuple(paths)
-        for path in self.paths:
-            if path.suffix.lower() not in (RUN_LOG, *FRAME_LOGS):
-                raise SettingsError(f"{path}: a log ends in {log_endings()}; `.mcap` holds all, the others frames.")
-            for taken in (path, partial(path)):
-                refuse_existing(taken, force=force)
-        self.lost, self.problem = 0, ""
+        require_log_paths(self.paths, force=force)
+        self.lost, self.problem, self.described = 0, "", False
         self._wait, self._epoch = wait, epoch
         self._frames: list[tuple[float, bool, Frame]] = []
         self._row: Mapping[str, float] | None = None
@@ -144,6 +156,7 @@ class RunLogger:
 
     def describe(self, facts: Mapping[str, Any]) -> None:
         """Say what the run is; before the first cycle."""
+        self.described = True
         self._put(dict(facts))
 
     def frame(self, now: float, from_master: bool, frame: Frame) -> None:
@@ -199,7 +212,8 @@ class RunLogger:
         self._thread.join()
         self._close_streams()
         if self.problem:
-            raise OutputError(f"{partial(self.paths[0])}: the log is not complete: {self.problem}.")
+            names = ", ".join(str(partial(path)) for path in self.paths)
+            raise OutputError(f"{names}: the log is not complete: {self.problem}. The run went on without it.")
         for path in self.paths:
             partial(path).replace(path)
         if self.lost:
@@ -220,7 +234,13 @@ class RunLogger:
 
     def _close_streams(self) -> None:
         for stream in self._streams:
-            stream.close()
+            try:
+                stream.close()
+            except OSError as error:
+                # What was kept back for a full disk does not fit now either; closing it again gives it up.
+                self.problem = self.problem or error.strerror or str(error)
+                with contextlib.suppress(OSError):
+                    stream.close()
         self._streams.clear()
 
     def _write(self) -> None:

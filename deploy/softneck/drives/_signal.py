@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from softneck.core import Matrix, Vector
 
+from ._link import VirtualLink
+from ._motion import Motion
+from ._rows import COLUMNS, experiment_channels
 from .master import Frame, Master, Measured, Phase, Tilt
 
-_COLUMNS = 10
+if TYPE_CHECKING:
+    from ._bus_loop import Session
 
 
 class SignalPilot:
@@ -40,9 +45,15 @@ class SignalLog:
     pilot unless a limit clamped them. An angle that did not come or was not believed is NaN.
     """
 
-    def __init__(self, rows: int) -> None:
-        """Make room for `rows`."""
-        self._table = np.full((rows, _COLUMNS), np.nan)
+    def __init__(self, rows: int, *, run: Vector | None = None, session: Session | None = None) -> None:
+        """Make room for `rows`; with a `session` each row goes into its log too, with its number in `run`."""
+        self._table = np.full((rows, len(COLUMNS)), np.nan)
+        self._first: list[int] = []
+        self._motion = Motion()
+        self._run = run
+        self._log = None if session is None else session.log
+        link = None if session is None else session.link
+        self._truth = link.neck.truth if isinstance(link, VirtualLink) else None
         self._cycles = 0
         self._complete = False
         self.index = -1
@@ -51,18 +62,29 @@ class SignalLog:
         self, now: float, frames_in: Sequence[Frame], frames_out: Sequence[Frame], tilt: Tilt | None, master: Master
     ) -> None:
         """Take what this cycle measured and sent."""
-        del now, frames_in, frames_out
+        del frames_in, frames_out
+        self._motion.take(now, master.positions)
         if master.supervisor.phase is not Phase.RUNNING or master.index >= len(self._table):
             return
         if master.index != self.index:
             self.index, self._cycles = master.index, 0
-            row = self._table[self.index]
-            row[3:6] = master.positions
-            if tilt is not None and master.tilt is tilt:
-                row[6:] = tilt.pitch, tilt.roll, tilt.pitch_rate, tilt.roll_rate
+            self._first.append(len(self._motion) - 1)
+            self._measure(self._table[self.index], tilt, master)
         self._cycles += 1
-        self._complete = self._cycles >= master.settings.sample_cycles
+        self._complete = self._cycles == master.settings.sample_cycles
         self._table[self.index, :3] = master.setpoints
+        if self._complete and self._log is not None:
+            row = dict(zip(COLUMNS, self._table[self.index].tolist(), strict=True))
+            self._log.signals({**row, "run": 1.0 if self._run is None else float(self._run[self.index])})
+
+    def _measure(self, row: Vector, tilt: Tilt | None, master: Master) -> None:
+        if tilt is not None and master.tilt is tilt:
+            row[3:7] = tilt.pitch, tilt.roll, tilt.pitch_rate, tilt.roll_rate
+        if self._truth is None:
+            row[7:10] = master.tensions
+        else:
+            truth = self._truth()
+            row[7:] = [truth[name] for name in COLUMNS[7:]]
 
     @property
     def rows(self) -> int:
@@ -70,15 +92,8 @@ class SignalLog:
         return self.index + 1 if self._complete or self.index < 0 else self.index
 
     def columns(self) -> dict[str, Vector]:
-        """Return the channels of a recording; rates only where they were measured."""
-        table = self._table[: self.rows]
-        names = [f"motor_setpoint_{j}" for j in (1, 2, 3)] + [f"motor_position_{j}" for j in (1, 2, 3)]
-        names += ["pitch", "roll", "pitch_rate", "roll_rate"]
-        columns = {name: table[:, i].copy() for i, name in enumerate(names)}
-        for name in ("pitch_rate", "roll_rate"):
-            if not np.isfinite(columns[name]).any():
-                del columns[name]
-        return columns
+        """Return the channels of a recording; those only that were measured."""
+        return experiment_channels(self._table[: self.rows], *self._motion.at(self._first[: self.rows]))
 
 
 def raised_cosine(rows: int) -> Vector:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,12 @@ from softneck.drives import (
     DrivesResult,
     Keyboard,
     Report,
-    VirtualLink,
     default_drives,
     preflight,
     prepare,
     require_certified,
+    require_reset,
+    require_stopped,
     reset,
     run_on_bus,
     run_simulated,
@@ -28,26 +30,26 @@ from softneck.drives import (
 from softneck.signals import recording_suffix, write_recording
 
 from ._console import note, print_json, print_table, progress
-from ._drives_log import acting_files, log_option, opened_log
+from ._drives_log import acting_files, log_options, opened_log, require_logs
 from ._drives_move import jog_command, record_command
 from ._drives_replay import replay_command
 from ._drives_target import (
     Target,
     checked_names,
     drives_options,
+    leave_if_asked,
     look_of,
     neck_option,
+    open_drives,
     open_link,
     override_option,
     sensor_of,
+    sensor_or_reason,
     target_of,
 )
 from ._drives_view import live_view
 from ._neck import load_neck
 from ._options import force_option, json_option, output_option, target
-
-# As a shell says it of a process that SIGTERM ended: 128 + 15.
-_TERMINATED = 143
 
 
 @click.group(
@@ -67,7 +69,7 @@ def command() -> None:
 @drives_options
 @json_option
 def scan_command(drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, as_json: bool) -> None:
-    """List the nodes on the bus; sends reads only."""
+    """List the nodes on the bus; sends reads only. Exit code 1 if none answers."""
     if bus is not None and drives_file is None:
         chosen = Target(default_drives(), bus, False, arm)
     else:
@@ -76,10 +78,15 @@ def scan_command(drives_file: Path | None, bus: str | None, simulated: bool, arm
         found = scan(link)
     if as_json:
         print_json({"nodes": found})
-        return
-    rows = [[str(item["node"]), str(item["name"] or "-"), str(item["firmware"] or "-"), str(item["serial"] or "-"),
-             str(item["state"] or "-")] for item in found]  # fmt: skip
-    print_table(f"{len(found)} node(s)", ["node", "name", "firmware", "serial", "state"], rows)
+    else:
+        rows = [[str(item["node"]), str(item["name"] or "-"), str(item["firmware"] or "-"), str(item["serial"] or "-"),
+                 str(item["state"] or "-")] for item in found]  # fmt: skip
+        print_table(f"{len(found)} node(s)", ["node", "name", "firmware", "serial", "state"], rows)
+    if not found:
+        raise CheckFailedError(
+            f"{bus or 'the bus'}: no node answers. Are the drives on, is the bit rate theirs, is the line terminated "
+            "(60 ohm between CAN_H and CAN_L)?"
+        )
 
 
 @command.command("check", epilog="Example: softneck drives check --simulated")
@@ -94,8 +101,10 @@ def check_command(
     Writes the configuration, moves nothing. Exit code 1 if a check does not hold.
     """
     chosen = target_of(drives_file, bus, simulated, arm)
+    names = checked_names(overrides)
     with open_link(chosen, moves=False, homed=True) as link:
-        report = preflight(link, chosen.file, override=checked_names(overrides))
+        sensor = None if chosen.simulated else sensor_or_reason(chosen.file, str(chosen.bus))
+        report = preflight(link, chosen.file, override=names, sensor=sensor)
     _show(report, as_json=as_json)
     report.require()
 
@@ -115,14 +124,26 @@ def _show(report: Report, *, as_json: bool) -> None:
 @drives_options
 @override_option
 @neck_option
+@log_options
+@force_option
 @json_option
 def zero_command(
     drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, overrides: tuple[str, ...],
-    neck: str | None, as_json: bool,
+    neck: str | None, logs: tuple[Path, ...], no_log: bool, force: bool, as_json: bool,
 ) -> None:  # fmt: skip
-    """Tension each tendon gently, set the encoders' zero there, and verify with the inclinometer."""
+    """Tension each tendon gently, set the encoders' zero there, and verify with the inclinometer.
+
+    Its log holds frames: .blf or .log.
+    """
     chosen = target_of(drives_file, bus, simulated, arm)
-    with open_link(chosen, moves=True, neck=neck or "paper") as link:
+    if any(path.suffix.lower() == ".mcap" for path in logs):
+        raise SettingsError("zero has no cycles to replay; its --log ends in .blf or .log.")
+    require_logs(logs, no_log=no_log, force=force)
+    with (
+        open_link(chosen, moves=True, neck=neck or "paper") as link,
+        opened_log(chosen, "zero", logs, no_log=no_log, force=force, ending=".blf") as log,
+    ):
+        link.tap = None if log is None else log.frame
         look = look_of(link, chosen.file)
         report = preflight(link, chosen.file, override=checked_names(overrides))
         report.require()
@@ -130,9 +151,9 @@ def zero_command(
             try:
                 zeroed = zero(link, chosen.file, look, guarding=report.guarding, operator=keyboard)
             except CheckFailedError as error:
-                if keyboard.interrupted:
+                if keyboard.interrupted or keyboard.terminated:
                     note(str(error))
-                    raise KeyboardInterrupt from error
+                leave_if_asked(keyboard)
                 raise
     if as_json:
         print_json(zeroed.table())
@@ -151,7 +172,7 @@ def zero_command(
 @override_option
 @neck_option
 @click.option("--pace", type=float, help="With --simulated: this multiple of real time instead of as fast as possible.")
-@log_option
+@log_options
 @click.option("--realtime", is_flag=True, help="On a bus: before all ordinary processes (SCHED_FIFO), memory locked.")
 @output_option("recording of the run", "REC")
 @force_option
@@ -159,7 +180,7 @@ def zero_command(
 def run_command(
     controller: Path, loop_file: Path, certificates: tuple[Path, ...], drives_file: Path | None, bus: str | None,
     simulated: bool, arm: bool, overrides: tuple[str, ...], neck: str | None, pace: float | None, realtime: bool,
-    logs: tuple[Path, ...], output: Path | None, force: bool, as_json: bool,
+    logs: tuple[Path, ...], no_log: bool, output: Path | None, force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Run CONTROLLER in the loop of LOOP.toml on the drives: enable, ramp in, control, ramp out, switch off.
 
@@ -170,6 +191,7 @@ def run_command(
     path, replace = target(output, f"results/drives_{loop_file.stem}.csv", force=force)
     recording_suffix(path)
     refuse_existing(path, force=replace)
+    require_logs(logs, no_log=no_log, force=force)
     chosen, names = target_of(drives_file, bus, simulated, arm), checked_names(overrides)
     setup = load_loop(loop_file)
     if not controller.is_file():
@@ -180,48 +202,33 @@ def run_command(
         note(text)
     files = acting_files(setup, loop_file, controller, drives_file)
     live = not as_json and (not chosen.simulated or pace is not None)
-    with (
-        opened_log(logs, chosen.simulated, force=force) as log,
-        live_view(controller.name, deployed.loop.duration, wanted=live) as watches,
-        # Two things that draw in place would draw over each other; the view tells the time as well.
-        progress("drives", quiet=as_json or bool(watches)) as tell,
-    ):
-        report = lambda done: tell(done, controller.name)  # noqa: E731
-        if chosen.simulated:
-            virtual = load_neck(neck) if neck else None
-            with Keyboard() as keyboard:
+    sensor: Any = None if chosen.simulated else sensor_of(chosen.file, str(chosen.bus))
+    with contextlib.ExitStack() as stack:
+        link = None if chosen.simulated else stack.enter_context(open_drives(chosen))
+        log = stack.enter_context(opened_log(chosen, "run", logs, no_log=no_log, force=force))
+        with (
+            live_view(controller.name, deployed.loop.duration, wanted=live) as watches,
+            # Two things that draw in place would draw over each other; the view tells the time as well.
+            progress("drives", quiet=as_json or bool(watches)) as tell,
+            Keyboard() as keyboard,
+        ):
+            report = lambda done: tell(done, controller.name)  # noqa: E731
+            if link is None:
                 result = run_simulated(
-                    deployed, chosen.file, neck=virtual, override=names, pace=pace, report=report, operator=keyboard,
-                    watches=watches, log=log, files=files,
+                    deployed, chosen.file, neck=load_neck(neck) if neck else None, override=names, pace=pace,
+                    report=report, operator=keyboard, watches=watches, log=log, files=files,
                 )  # fmt: skip
-        else:
-            sensor = sensor_of(chosen.file, str(chosen.bus))
-            with open_link(chosen, moves=True) as link:
-                if isinstance(link, VirtualLink):
-                    raise SettingsError("drives on a bus are asked.")
-                with Keyboard() as keyboard:
-                    result = run_on_bus(
-                        deployed,
-                        chosen.file,
-                        link,
-                        sensor,
-                        override=names,
-                        report=report,
-                        operator=keyboard,
-                        watches=watches,
-                        realtime=realtime,
-                        log=log,
-                        files=files,
-                    )
-    if len(result.signals.time) > 1:
-        write_recording(path, result.recording(), force=replace)
-    _print_run(path, result, as_json=as_json)
-    if keyboard.interrupted:
-        raise KeyboardInterrupt
-    if result.terminated:
-        note("ended by SIGTERM; the drives are off.")
-        click.get_current_context().exit(_TERMINATED)
-    result.require()
+            else:
+                result = run_on_bus(
+                    deployed, chosen.file, link, sensor, override=names, report=report, operator=keyboard,
+                    watches=watches, realtime=realtime, log=log, files=files,
+                )  # fmt: skip
+        # Before the log is closed: a full disk must not cost the recording and the result as well.
+        if len(result.signals.time) > 1:
+            write_recording(path, result.recording(), force=replace)
+        _print_run(path, result, as_json=as_json)
+        leave_if_asked(keyboard, terminated=result.terminated)
+        result.require()
 
 
 def _print_run(path: Path, result: DrivesResult, *, as_json: bool) -> None:
@@ -244,20 +251,24 @@ def _print_run(path: Path, result: DrivesResult, *, as_json: bool) -> None:
 @drives_options
 @json_option
 def stop_command(drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, as_json: bool) -> None:
-    """Quick stop, then no voltage, for every drive; always allowed."""
+    """Quick stop, then no voltage, for every drive; always allowed. Exit code 1 if one may still have power."""
     chosen = target_of(drives_file, bus, simulated, arm)
     with open_link(chosen, moves=False) as link:
-        _states(stop(link, chosen.file), "stopped", as_json=as_json)
+        states = stop(link, chosen.file)
+    _states(states, "stopped", as_json=as_json)
+    require_stopped(states)
 
 
 @command.command("reset")
 @drives_options
 @json_option
 def reset_command(drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, as_json: bool) -> None:
-    """Acknowledge latched faults; nothing else ever does, and nothing moves by it."""
+    """Acknowledge latched faults; nothing else ever does, and nothing moves by it. Exit code 1 if a fault stays."""
     chosen = target_of(drives_file, bus, simulated, arm)
     with open_link(chosen, moves=False) as link:
-        _states(reset(link, chosen.file), "reset", as_json=as_json)
+        states = reset(link, chosen.file)
+    _states(states, "reset", as_json=as_json)
+    require_reset(states)
 
 
 def _states(states: dict[int, str], what: str, *, as_json: bool) -> None:

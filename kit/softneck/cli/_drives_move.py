@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,22 +12,26 @@ import click
 from softneck.core import SettingsError, refuse_existing, require_between
 from softneck.drives import (
     CanLink,
+    Experiment,
     Jogged,
     Keyboard,
     Recorded,
+    RunLogger,
     Session,
     VirtualLink,
     drive_limits,
     jog,
     record_signal,
 )
-from softneck.signals import prepare, recording_suffix, signal, signal_names, write_recording
+from softneck.signals import recording_suffix, signal_names, write_recording
 
 from ._console import note, print_json, print_table, progress
+from ._drives_log import drives_of, log_options, opened_log, require_logs
 from ._drives_target import (
     Target,
     checked_names,
     drives_options,
+    leave_if_asked,
     neck_option,
     open_link,
     override_option,
@@ -39,12 +45,14 @@ _pace_option = click.option("--pace", type=float, help="With --simulated: this m
 
 
 def _session(
-    chosen: Target, link: CanLink | VirtualLink, keyboard: Keyboard, overrides: tuple[str, ...], pace: float | None
-) -> Session:
+    chosen: Target, link: CanLink | VirtualLink, keyboard: Keyboard, overrides: tuple[str, ...], pace: float | None,
+    log: RunLogger | None, files: Mapping[str, str | Path],
+) -> Session:  # fmt: skip
     sensor = None if isinstance(link, VirtualLink) else sensor_of(chosen.file, str(chosen.bus))
     return Session(
-        file=chosen.file, link=link, sensor=sensor, override=checked_names(overrides), pace=pace, operator=keyboard
-    )
+        file=chosen.file, link=link, sensor=sensor, override=checked_names(overrides), pace=pace, operator=keyboard,
+        log=log, files=files,
+    )  # fmt: skip
 
 
 def _checked(chosen: Target, pace: float | None) -> None:
@@ -61,36 +69,39 @@ def _checked(chosen: Target, pace: float | None) -> None:
 @override_option
 @neck_option
 @_pace_option
+@log_options
+@force_option
 @json_option
 def jog_command(
     motor: int, amplitude: float, drives_file: Path | None, bus: str | None, simulated: bool, arm: bool,
-    overrides: tuple[str, ...], neck: str | None, pace: float | None, as_json: bool,
+    overrides: tuple[str, ...], neck: str | None, pace: float | None, logs: tuple[Path, ...], no_log: bool, force: bool,
+    as_json: bool,
 ) -> None:  # fmt: skip
     """Pull the tendon of motor N a little, let it out as much, and look where the neck goes.
 
     Says whether a positive move tilts the neck the way that the neck's tendon angle says; the drives must be zeroed.
     Exit code 1 if it does not: nodes swapped, a sign reversed, a tendon that hangs.
     """
+    require_logs(logs, no_log=no_log, force=force)
     chosen = target_of(drives_file, bus, simulated, arm)
     _checked(chosen, pace)
     parameters = load_neck(neck or "paper")
     angles = (parameters.tendon_angle_1, parameters.tendon_angle_2, parameters.tendon_angle_3)
     with (
         open_link(chosen, moves=True, homed=True, neck=neck or "paper") as link,
-        progress("jog", quiet=as_json) as tell,
-        Keyboard() as keyboard,
+        opened_log(chosen, "jog", logs, no_log=no_log, force=force) as log,
     ):
-        found = jog(
-            motor,
-            _session(chosen, link, keyboard, overrides, pace),
-            tendon_angles=angles,
-            amplitude=amplitude,
-            report=lambda done: tell(done, f"motor {motor}"),
-        )
-    _print_jog(found, as_json=as_json)
-    if keyboard.interrupted:
-        raise KeyboardInterrupt
-    found.require()
+        with progress("jog", quiet=as_json) as tell, Keyboard() as keyboard:
+            found = jog(
+                motor,
+                _session(chosen, link, keyboard, overrides, pace, log, drives_of(drives_file)),
+                tendon_angles=angles,
+                amplitude=amplitude,
+                report=lambda done: tell(done, f"motor {motor}"),
+            )
+        _print_jog(found, as_json=as_json)
+        leave_if_asked(keyboard, terminated=found.ended.terminated)
+        found.require()
 
 
 def _print_jog(found: Jogged, *, as_json: bool) -> None:
@@ -128,44 +139,46 @@ def _print_jog(found: Jogged, *, as_json: bool) -> None:
 @override_option
 @neck_option
 @_pace_option
+@log_options
 @force_option
 @json_option
 def record_command(
     signal_name: str, output: Path, duration: float | None, runs: int, seed: int, ramp: float,
     max_position: float | None, max_speed: float | None, max_slack: float | None, payload: float,
     drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, overrides: tuple[str, ...],
-    neck: str | None, pace: float | None, force: bool, as_json: bool,
+    neck: str | None, pace: float | None, logs: tuple[Path, ...], no_log: bool, force: bool,
+    as_json: bool,
 ) -> None:  # fmt: skip
     """Record SIGNAL on the drives."""
     recording_suffix(output)
     refuse_existing(output, force=force)
+    require_logs(logs, no_log=no_log, force=force)
     require_between("--payload", payload, 0.0, 1.0, "kg")
     chosen = target_of(drives_file, bus, simulated, arm)
     _checked(chosen, pace)
     limits = drive_limits(chosen.file, position=max_position, speed=max_speed, slack=max_slack)
-    prepared = [
-        prepare(signal(signal_name, duration=duration, seed=seed + number), limits, ramp_s=ramp)
-        for number in range(runs)
-    ]
+    experiment = Experiment(signal=signal_name, limits=limits, duration=duration, seed=seed, runs=runs, ramp=ramp)
+    prepared = experiment.prepared()
     with (
         open_link(chosen, moves=True, homed=True, neck=neck or "paper", seed=seed) as link,
-        progress("record", quiet=as_json) as tell,
-        Keyboard() as keyboard,
+        opened_log(chosen, "record", logs, no_log=no_log, force=force) as log,
     ):
         if isinstance(link, VirtualLink):
             link.neck.set(payload=payload)
-        recorded = record_signal(
-            [excitation for excitation, _ in prepared],
-            _session(chosen, link, keyboard, overrides, pace),
-            report=lambda done: tell(done, signal_name),
-        )
-    if recorded.recording is not None:
-        write_recording(output, recorded.recording, force=force)
-    facts: dict[str, Any] = {"signal": signal_name, "runs": runs, "changes": prepared[0][1].as_dict()}
-    _print_record(output, recorded, facts, str(prepared[0][1]), as_json=as_json)
-    if keyboard.interrupted:
-        raise KeyboardInterrupt
-    recorded.require()
+        with progress("record", quiet=as_json) as tell, Keyboard() as keyboard:
+            session = _session(chosen, link, keyboard, overrides, pace, log, drives_of(drives_file))
+            recorded = record_signal(
+                [excitation for excitation, _ in prepared],
+                replace(session, facts={"record": experiment.facts()}),
+                report=lambda done: tell(done, signal_name),
+            )
+        # Before the log is closed: a full disk must not cost the recording as well.
+        if recorded.recording is not None:
+            write_recording(output, recorded.recording, force=force)
+        facts: dict[str, Any] = {"signal": signal_name, "runs": runs, "changes": prepared[0][1].as_dict()}
+        _print_record(output, recorded, facts, str(prepared[0][1]), as_json=as_json)
+        leave_if_asked(keyboard, terminated=recorded.ended.terminated)
+        recorded.require()
 
 
 def _print_record(

@@ -6,9 +6,19 @@ from pathlib import Path
 
 import click
 
-from softneck.core import SettingsError
+from softneck.core import FileFormatError, SettingsError, SoftneckError
 from softneck.cosim import load_loop
-from softneck.drives import LoggedRun, LoopPilot, changed_files, prepare, read_run_log, replay
+from softneck.drives import (
+    Experiment,
+    LoggedRun,
+    LoopPilot,
+    changed_files,
+    jog_pilot,
+    prepare,
+    read_run_log,
+    replay,
+)
+from softneck.drives.master import Pilot
 
 from ._console import note, print_json, print_table
 from ._options import json_option
@@ -24,8 +34,8 @@ from ._options import json_option
 def replay_command(log: Path, loop_file: Path | None, controller: Path | None, core_only: bool, as_json: bool) -> None:
     """Feed what a run saw to the same core and controller again, and compare every frame out, bit for bit.
 
-    LOG is the .mcap of `softneck drives run --log`; one that is cut is replayed up to the cut, and says so. Exit code 0
-    if all is equal, 1 with the first difference if not. Nothing is sent to any bus.
+    LOG is the .mcap of `run`, `jog` or `record` with --log; one that is cut is replayed up to the cut, and says so.
+    Exit code 0 if all is equal, 1 with the first difference if not. Nothing is sent to any bus.
     """
     if log.suffix.lower() in (".log", ".blf"):
         raise SettingsError(f"{log}: holds frames only; replay needs the `.mcap` of the run.")
@@ -48,8 +58,18 @@ def replay_command(log: Path, loop_file: Path | None, controller: Path | None, c
     result.require()
 
 
-def _pilot(run: LoggedRun, loop_file: Path | None, controller: Path | None) -> LoopPilot | None:
-    """Return the run's controller and observer, None where the log names no loop or its files are gone."""
+def _pilot(run: LoggedRun, loop_file: Path | None, controller: Path | None) -> Pilot | None:
+    """Return what led the run: controller and observer, a jog or an experiment.
+
+    None where the log names none, or the files of the loop are gone.
+    """
+    try:
+        if "jog" in run.facts:
+            return jog_pilot(**run.facts["jog"])
+        if "record" in run.facts:
+            return Experiment.of(run.facts["record"]).pilot()
+    except (SoftneckError, TypeError) as error:
+        raise FileFormatError(f"{run.path}: what it played does not fit this softneck ({error}).") from error
     files = {role: Path(str(entry.get("path"))) for role, entry in run.facts.get("files", {}).items()}
     loop = loop_file or files.get("loop")
     chosen = controller or files.get("controller")

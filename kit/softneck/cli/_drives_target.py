@@ -10,12 +10,14 @@ from typing import Any
 
 import click
 
-from softneck.core import SettingsError
+from softneck.core import SettingsError, SoftneckError
 from softneck.drives import (
     HARMLESS,
     OVERRIDES,
     CanLink,
     DrivesFile,
+    Keyboard,
+    Sensor,
     VirtualLink,
     default_drives,
     load_drives,
@@ -23,9 +25,10 @@ from softneck.drives import (
     open_sensor,
     simulated_neck,
 )
-from softneck.drives.master import Tilt
+from softneck.drives.master import Frame, Tilt
 
 from ._arm import require_armed
+from ._console import note
 from ._neck import load_neck
 
 SAMPLE_TIME = 0.02
@@ -81,6 +84,28 @@ def open_link(
         yield link
 
 
+# As a shell says it of a process that SIGTERM ended: 128 + 15.
+_TERMINATED = 143
+
+
+def leave_if_asked(keyboard: Keyboard, *, terminated: bool = False) -> None:
+    """End the command as somebody at the keyboard, or SIGTERM, asked; after its results are out."""
+    if keyboard.interrupted:
+        raise KeyboardInterrupt
+    if terminated or keyboard.terminated:
+        note("ended by SIGTERM; the drives are off.")
+        click.get_current_context().exit(_TERMINATED)
+
+
+@contextlib.contextmanager
+def open_drives(chosen: Target) -> Iterator[CanLink]:
+    """Yield the bus to drives that are to move."""
+    with open_link(chosen, moves=True) as link:
+        if isinstance(link, VirtualLink):
+            raise SettingsError("drives on a bus are asked.")
+        yield link
+
+
 def checked_names(names: Sequence[str]) -> tuple[str, ...]:
     """Return `names` if each may be overridden."""
     for name in names:
@@ -129,6 +154,38 @@ def sensor_of(file: DrivesFile, bus: str) -> Any:
         raise SettingsError(
             f'[sensor] kind "replay" is for simulated drives; on {bus} the loop would not see the neck it moves.'
         )
-    return click.get_current_context().with_resource(
-        open_sensor(file.sensor_kind, file.sensor_node, file.sensor_source)
-    )
+    return click.get_current_context().with_resource(_told(file))
+
+
+@contextlib.contextmanager
+def _told(file: DrivesFile) -> Iterator[Any]:
+    """Yield the inclinometer; say at the end what happened to it, which no drive and no watch can know."""
+    with open_sensor(file.sensor_kind, file.sensor_node, file.sensor_source) as sensor:
+        try:
+            yield sensor
+        finally:
+            problem = getattr(sensor, "problem", "")
+            if problem:
+                note(f"inclinometer {sensor.name}: {problem}")
+
+
+class _NoSensor:
+    """In the place of an inclinometer that cannot be opened, for a check that goes on and reports it."""
+
+    def __init__(self, problem: str) -> None:
+        self.problem = problem
+
+    def take(self, frames: Sequence[Frame]) -> None:
+        del frames
+
+    def read(self, now: float, frames: Sequence[Frame]) -> Tilt | None:
+        del now, frames
+        return None
+
+
+def sensor_or_reason(file: DrivesFile, bus: str) -> Sensor:
+    """Return the inclinometer, or something silent that knows why there is none."""
+    try:
+        return sensor_of(file, bus)
+    except SoftneckError as error:
+        return _NoSensor(str(error))
