@@ -220,7 +220,7 @@ class Liar:
     """A link whose node answers whatever it likes."""
 
     def __init__(self, answers: list[bytes]) -> None:
-        self.answers, self.now = answers, 0.0
+        self.answers, self.now, self.problem = answers, 0.0, ""
 
     def send(self, frames: object) -> None:
         del frames

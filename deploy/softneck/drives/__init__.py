@@ -3,7 +3,6 @@
 from ._ask import Ask as Ask
 from ._ask import Operator as Operator
 from ._bus_loop import Ended as Ended
-from ._bus_loop import Sensor as Sensor
 from ._bus_loop import Session as Session
 from ._bus_loop import run_session as run_session
 from ._certified import require_certified as require_certified
@@ -41,6 +40,7 @@ from ._preflight import OVERRIDES as OVERRIDES
 from ._preflight import Report as Report
 from ._preflight import preflight as preflight
 from ._preflight import scan as scan
+from ._python_sensor import PythonInclinometer as PythonInclinometer
 from ._record import Recorded as Recorded
 from ._record import drive_limits as drive_limits
 from ._record import record_signal as record_signal
@@ -54,6 +54,7 @@ from ._run_log import run_facts as run_facts
 from ._sdo import SdoError as SdoError
 from ._sdo import load_eds as load_eds
 from ._sensor import CanInclinometer as CanInclinometer
+from ._sensor import Sensor as Sensor
 from ._serial import SensorError as SensorError
 from ._serial import SerialInclinometer as SerialInclinometer
 from ._serial import TiltLines as TiltLines
@@ -79,6 +80,8 @@ from ._virtual import Watch as Watch
 from ._virtual import recorded as recorded
 from ._virtual import simulated_neck as simulated_neck
 from ._zero import Zeroed as Zeroed
+from ._zero import require_reset as require_reset
+from ._zero import require_stopped as require_stopped
 from ._zero import reset as reset
 from ._zero import stop as stop
 from ._zero import zero as zero

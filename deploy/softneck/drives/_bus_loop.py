@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from softneck.core import SettingsError, SoftneckError
 
@@ -24,6 +24,7 @@ from ._preflight import preflight
 from ._result import fault_table, require_unstopped
 from ._run_log import RunLogger, run_facts
 from ._sdo import Objects, SdoError, load_eds
+from ._sensor import Sensor
 from ._times import CycleTimes
 from ._timing import Ending, steady
 from ._virtual import VirtualRun, Watch
@@ -32,18 +33,6 @@ from .master import Command as NmtCommand
 
 # Before the first cycle on a bus each drive is given this time to become operational [s].
 _START_TIME = 0.1
-
-
-class Sensor(Protocol):
-    """An inclinometer on hardware."""
-
-    def take(self, frames: Sequence[Frame]) -> None:
-        """Look at frames of a cycle in which no sample is due; a sensor that is not on the bus ignores them."""
-        ...
-
-    def read(self, now: float, frames: Sequence[Frame]) -> Tilt | None:
-        """Return the newest sample, None if none came since the last call."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -166,7 +155,7 @@ def _run_session(
     log = session.log
     if log is not None:
         link.tap = log.frame
-    checked = preflight(link, file, override=session.override, homed=True)
+    checked = preflight(link, file, override=session.override, homed=True, sensor=session.sensor)
     checked.require()
     settings = file.master_settings(sample_time, guarding=checked.guarding)
     settings = settings if session.settings is None else session.settings(settings)

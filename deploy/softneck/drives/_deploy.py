@@ -11,12 +11,13 @@ from softneck.cosim import FmuPart, LoopSetup
 from softneck.loop import BlockPart, Loop, Part
 from softneck.plant import NeckParameters
 
-from ._bus_loop import Operator, Sensor, Session, run_session
+from ._bus_loop import Operator, Session, run_session
 from ._file import DrivesFile
 from ._link import CanLink, VirtualLink
 from ._pilot import LoopPilot
 from ._result import DrivesResult, RunLog
 from ._run_log import RunLogger
+from ._sensor import Sensor
 from ._virtual import Watch, simulated_neck
 from .master import Frame, Master, MasterSettings, Tilt
 

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 from softneck.core import SettingsError, SoftneckError
 
+from ._why import reason
 from .master import BUS_OFF, Frame
 from .simulated import CanFrame, SimulatedNeck
 
@@ -23,7 +24,13 @@ class BusError(SoftneckError):
 
 
 class Link(Protocol):
-    """Sends and receives frames; its clock is monotonic."""
+    """Sends and receives frames; its clock is monotonic.
+
+    Attributes:
+        problem: why frames no longer pass, "" while they do.
+    """
+
+    problem: str
 
     @property
     def now(self) -> float:
@@ -58,6 +65,7 @@ class VirtualLink:
         self._step = 0
         self._inbox: deque[Frame] = deque()
         self.cut = False
+        self.problem = ""
         self.tap: Callable[[float, bool, Frame], None] | None = None
         self.lose: Callable[[bool, Frame], bool] | None = None
         self.inject: list[Frame] = []
@@ -118,13 +126,14 @@ class CanLink:
 
     Attributes:
         tap: called with (time, from_master, frame) for each frame that was sent or came.
+        problem: what the bus last refused a frame with, "" if it never did.
     """
 
     def __init__(self, bus: Any, name: str, *, echoes: bool = False) -> None:
         """Use the open `bus`; `echoes` tells that it hands back what we sent, as UDP multicast does."""
         self._bus, self.name = bus, name
         self._sent: deque[tuple[int, bytes, bool]] | None = deque(maxlen=4096) if echoes else None
-        self._broken = False
+        self.problem = ""
         self.tap: Callable[[float, bool, Frame], None] | None = None
 
     @property
@@ -146,8 +155,8 @@ class CanLink:
             )
             try:
                 self._bus.send(message, timeout=0.0)
-            except (can.CanError, OSError):
-                self._broken = True
+            except (can.CanError, OSError) as error:
+                self.problem = reason(error)
                 return
             if self.tap is not None:
                 self.tap(self.now, True, frame)
@@ -159,17 +168,18 @@ class CanLink:
         import can
 
         frames: list[Frame] = []
-        if self._broken:
+        if self.problem:
             frames.append(BUS_OFF)
         try:
-            message = self._bus.recv(timeout)
+            # Between asking for the time and here a deadline may pass; a negative wait is an error to some interfaces.
+            message = self._bus.recv(max(0.0, timeout))
             while message is not None:
                 frame = self._frame(message)
                 if frame is not None:
                     frames.append(frame)
                 message = self._bus.recv(0.0)
-        except (can.CanError, OSError):
-            self._broken = True
+        except (can.CanError, OSError) as error:
+            self.problem = reason(error)
             frames.append(BUS_OFF)
         if self.tap is not None and frames:
             now = self.now
@@ -215,10 +225,8 @@ def open_bus(text: str, *, bit_rate: int = 1_000_000) -> Iterator[CanLink]:
     options: dict[str, Any] = {} if interface in ("socketcan", *HARMLESS) else {"bitrate": bit_rate}
     try:
         bus = can.Bus(interface=interface, channel=channel, receive_own_messages=False, **options)
-    except (can.CanError, OSError, ValueError, TypeError, ImportError, NotImplementedError) as error:
-        raise BusError(
-            f"bus {text} cannot be opened: {' '.join(str(error).split()) or type(error).__name__}"
-        ) from error
+    except Exception as error:  # vendors' drivers that are missing raise what comes: NameError, AttributeError, ...
+        raise BusError(f"bus {text} cannot be opened: {reason(error)} Nothing was sent.") from error
     link = CanLink(bus, text, echoes=interface == "udp_multicast")
     try:
         yield link

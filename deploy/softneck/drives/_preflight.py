@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 from softneck.core import CheckFailedError, SoftneckError
 
 from ._file import DriveEntry, DrivesFile
-from ._link import Link
+from ._link import BusError, Link
 from ._objects import (
     CSP,
     HOMED_MARK,
@@ -23,6 +24,7 @@ from ._objects import (
     require_eds,
 )
 from ._sdo import Objects, SdoError, load_eds
+from ._sensor import LOOK, Sensor, look_at
 from .master import Command, DriveState, Frame, nmt_frame, state_of
 
 # Another master shows within this time [s]: heartbeats and SYNCs come faster.
@@ -142,11 +144,18 @@ def listen(link: Link, nodes: Collection[int], seconds: float = LISTEN) -> str:
     return ""
 
 
+def require_bus(link: Link) -> None:
+    """Raise BusError if the bus refused a frame: whoever sends nothing hears nothing, which is no drive's fault."""
+    if link.problem:
+        raise BusError(f"the bus takes no frames: {link.problem} Nothing was moved.")
+
+
 def scan(link: Link) -> list[dict[str, Any]]:
     """Ask every node number for its device type; return what answers, with identity where it tells."""
     link.receive(0.0)
     for node in range(1, 127):
         link.send([Frame(0x600 + node, bytes([0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0]))])
+    require_bus(link)
     answers: dict[int, int] = {}
     until = link.now + _SCAN_TIME
     while link.now < until:
@@ -176,7 +185,9 @@ def _or_none(read: Any) -> Any:
         return None
 
 
-def preflight(link: Link, file: DrivesFile, *, override: Collection[str] = (), homed: bool = False) -> Report:
+def preflight(
+    link: Link, file: DrivesFile, *, override: Collection[str] = (), homed: bool = False, sensor: Sensor | None = None
+) -> Report:
     """Check all drives and write their configuration, each value read back; nothing moves.
 
     Args:
@@ -184,9 +195,11 @@ def preflight(link: Link, file: DrivesFile, *, override: Collection[str] = (), h
         file: what the drives should be.
         override: names of rows that may fail.
         homed: whether the drives' zero is needed.
+        sensor: the inclinometer, which must give a sample.
 
     Raises:
         FileFormatError: an EDS that does not fit.
+        BusError: the bus takes no frames.
     """
     dictionary = load_eds(file.profile, file.eds)
     require_eds(dictionary, file.profile, str(file.eds or f"{file.profile}.eds"))
@@ -196,6 +209,7 @@ def preflight(link: Link, file: DrivesFile, *, override: Collection[str] = (), h
     if other:
         return Report(tuple(rows.rows), "none")
     link.send([nmt_frame(Command.PRE_OPERATIONAL, node) for node in file.nodes])
+    require_bus(link)
     guarding = file.guarding.kind
     for entry in file.drives:
         objects = Objects(link, entry.node, dictionary)
@@ -212,7 +226,26 @@ def preflight(link: Link, file: DrivesFile, *, override: Collection[str] = (), h
                 rows.add(entry.node, "present", "no answer", False, "Is it on, is its node number and bit rate right?")
             continue
         guarding = guarding if guarding != "auto" else kind
+    if sensor is not None:
+        _check_sensor(link, file, sensor, rows)
     return Report(tuple(rows.rows), guarding, tuple(override))
+
+
+def _check_sensor(link: Link, file: DrivesFile, sensor: Sensor, rows: _Rows) -> None:
+    """Look for one sample that may be an angle of the neck; a drive must not get power without."""
+    on_bus = file.sensor_kind == "can"
+    if on_bus:
+        # After power-up a CANopen node says nothing by itself before it is started (CiA 301, 7.3.2).
+        link.send([nmt_frame(Command.START, file.sensor_node)])
+    tilt = look_at(sensor, link, LOOK)
+    node, holds, found = file.sensor_node if on_bus else 0, False, f"no sample within {LOOK:g} s"
+    advice = "Is it on, is `node` of [sensor] right?" if on_bus else "Is it plugged in and does it send?"
+    if tilt is not None:
+        angles = [math.degrees(angle) for angle in (tilt.pitch, tilt.roll)]
+        holds = tilt.valid and all(abs(angle) <= math.degrees(file.sensor.angle) for angle in angles)
+        found = f"pitch {angles[0]:.2f}, roll {angles[1]:.2f} deg"
+        advice = "That is no angle of the neck: is it mounted upright, is it the right sensor?"
+    rows.add(node, "inclinometer", found, holds, getattr(sensor, "problem", "") or advice)
 
 
 def _check_drive(objects: Objects, file: DrivesFile, entry: DriveEntry, guarding: str, rows: _Rows) -> str:

@@ -1,10 +1,11 @@
-"""An inclinometer on the CAN bus: slopes in a TPDO of its own, as CiA 410 devices send them."""
+"""What an inclinometer is, and one on the CAN bus: slopes in a TPDO of its own, as CiA 410 devices send them."""
 
 from __future__ import annotations
 
 import math
 import struct
 from collections.abc import Sequence
+from typing import Protocol
 
 from ._link import Link
 from .master import Frame, Tilt
@@ -14,6 +15,31 @@ _SLOPES = struct.Struct("<ii")
 _RESOLUTION = math.radians(0.001)
 # What the sensor sends where it has nothing: the most negative number.
 _NOTHING = -(2**31)
+# Within this time any inclinometer that sends has sent [s]: 10 samples at 20 Hz.
+LOOK = 0.5
+_PIECE = 0.02
+
+
+class Sensor(Protocol):
+    """An inclinometer on hardware; one that can say why it ended has an attribute `problem` as well."""
+
+    def take(self, frames: Sequence[Frame]) -> None:
+        """Look at frames of a cycle in which no sample is due; a sensor that is not on the bus ignores them."""
+        ...
+
+    def read(self, now: float, frames: Sequence[Frame]) -> Tilt | None:
+        """Return the newest sample, None if none came since the last call."""
+        ...
+
+
+def look_at(sensor: Sensor, link: Link, timeout: float) -> Tilt | None:
+    """Return the first sample of `sensor` that comes within `timeout` [s], None if none does."""
+    until = link.now + timeout
+    while link.now < until:
+        tilt = sensor.read(link.now, link.receive(_PIECE))
+        if tilt is not None:
+            return tilt
+    return None
 
 
 class CanInclinometer:
@@ -38,12 +64,3 @@ class CanInclinometer:
                 pitch, roll = _SLOPES.unpack(frame.data)
                 valid = _NOTHING not in (pitch, roll)
                 self._newest = Tilt(pitch * _RESOLUTION, roll * _RESOLUTION, valid=valid)
-
-    def look(self, link: Link, timeout: float = 0.5) -> Tilt | None:
-        """Wait for a sample on `link`, for at most `timeout` [s]."""
-        until = link.now + timeout
-        while link.now < until:
-            tilt = self.read(link.now, link.receive(until - link.now))
-            if tilt is not None:
-                return tilt
-        return None

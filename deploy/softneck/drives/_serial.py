@@ -18,6 +18,7 @@ from typing import Any
 from softneck.core import SoftneckError
 from softneck.signals import pitch_roll
 
+from ._why import reason
 from .master import Frame, Tilt
 
 # Two decimals or more: a number that was torn within its decimals is none.
@@ -113,7 +114,7 @@ class SerialInclinometer:
         try:
             self._port: Any = serial.Serial(port, baud, timeout=0.0, write_timeout=0.0, exclusive=True)
         except (OSError, ValueError) as error:
-            raise SensorError(f"inclinometer {port}: cannot be opened: {_reason(error)}") from error
+            raise SensorError(f"inclinometer {port}: cannot be opened: {reason(error)} Nothing moved.") from error
         try:
             self._begin(baud, start)
         except BaseException:
@@ -163,7 +164,7 @@ class SerialInclinometer:
         try:
             data = self._port.read(4096)
         except (OSError, TypeError) as error:
-            self.problem = _reason(error)
+            self.problem = reason(error)
             return
         if data:
             samples = self.lines.feed(data)
@@ -177,9 +178,4 @@ class SerialInclinometer:
             except OSError as error:
                 # A full buffer is no end: the sensor is late, which the gate notices.
                 if not type(error).__name__.endswith("TimeoutException"):
-                    self.problem = _reason(error)
-
-
-def _reason(error: BaseException) -> str:
-    text = " ".join(str(error).split())
-    return f"{text}. Is it plugged in, and may you use it (group dialout)?" if isinstance(error, OSError) else text
+                    self.problem = reason(error)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import math
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,12 +13,12 @@ from softneck.core import SettingsError, Vector, require_between, require_whole
 from softneck.signals import read_recording
 
 from ._log_file import read_run_log
+from ._python_sensor import make_python_sensor
 from ._sensor import CanInclinometer
-from ._serial import SensorError, SerialInclinometer
+from ._serial import SerialInclinometer
 from .master import Frame, Tilt
 
 SENSORS = ("simulated", "can", "serial", "replay", "python")
-_METHODS = ("take", "read")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,28 +135,6 @@ def _opened(kind: str, node: int, source: SensorSource) -> Any:
             recording = read_run_log(path).recording() if log else read_recording(path)
             return ReplaySensor(recording.time, recording.channels["pitch"], recording.channels["roll"])
         case "python":
-            return _made(source)
+            return make_python_sensor(source.python, source.options, source.folder)
         case _:
             raise SettingsError(f'[sensor] kind is "{kind}"; on a bus it must be one of {", ".join(SENSORS[1:])}.')
-
-
-def _made(source: SensorSource) -> Any:
-    module, _, name = source.python.partition(":")
-    folder = str(source.folder.resolve())
-    sys.path.insert(0, folder)
-    try:
-        factory = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise SettingsError(
-            f"[sensor] python = `{source.python}` cannot be found ({error}); write package.module:factory."
-        ) from error
-    finally:
-        sys.path.remove(folder)
-    try:
-        sensor = factory(dict(source.options))
-    except Exception as error:
-        raise SensorError(f"inclinometer `{source.python}`: {type(error).__name__}: {error}") from error
-    missing = [method for method in _METHODS if not callable(getattr(sensor, method, None))]
-    if missing:
-        raise SettingsError(f"[sensor] python = `{source.python}` returned a sensor without `{missing[0]}`.")
-    return sensor

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +24,7 @@ from ._objects import (
     speed_of_units,
     speed_units,
 )
+from ._preflight import require_bus
 from ._sdo import Objects, SdoError, load_eds
 from ._units import counts_to_position
 from .master import DriveState, Frame, Tilt, state_of
@@ -263,12 +264,17 @@ def _rest(link: Link, seconds: float, guard: Callable[[], None]) -> None:
 
 
 def stop(link: Link, file: DrivesFile) -> dict[int, str]:
-    """Quick stop, then no voltage, for every drive that answers; return node -> state after it."""
+    """Quick stop, then no voltage, for every drive that answers; return node -> state after it.
+
+    Raises:
+        BusError: the bus takes no frames: nobody was stopped.
+    """
     dictionary = load_eds(file.profile, file.eds)
     drives = {entry.node: Objects(link, entry.node, dictionary) for entry in file.drives}
     # At once and to all, without waiting for answers; then with answers.
     for word in (0x02, 0x02):
         link.send([Frame(0x600 + node, bytes([0x2B, 0x40, 0x60, 0, word, 0, 0, 0])) for node in drives])
+    require_bus(link)
     wait(link, 0.5)
     states = {}
     for node, objects in drives.items():
@@ -281,7 +287,11 @@ def stop(link: Link, file: DrivesFile) -> dict[int, str]:
 
 
 def reset(link: Link, file: DrivesFile) -> dict[int, str]:
-    """Acknowledge latched faults, the only place where that happens; return node -> state after it."""
+    """Acknowledge latched faults, the only place where that happens; return node -> state after it.
+
+    Raises:
+        BusError: the bus takes no frames.
+    """
     dictionary = load_eds(file.profile, file.eds)
     states = {}
     for entry in file.drives:
@@ -293,4 +303,25 @@ def reset(link: Link, file: DrivesFile) -> dict[int, str]:
             states[entry.node] = state_of(objects.read(0x6041)).name
         except SdoError:
             states[entry.node] = "no answer"
+        require_bus(link)
     return states
+
+
+# Where the motor surely has no current. A drive in REACTION or QUICK_STOP still brakes.
+_OFF = (DriveState.NOT_READY, DriveState.DISABLED, DriveState.READY, DriveState.SWITCHED_ON, DriveState.FAULT)
+
+
+def require_stopped(states: Mapping[int, str]) -> None:
+    """Raise CheckFailedError if a drive that `stop` spoke to may still have power."""
+    powered = [f"node {node}: {state}" for node, state in states.items() if state not in {one.name for one in _OFF}]
+    if powered:
+        raise CheckFailedError(f"{', '.join(powered)}: not stopped for sure. Press the hardware stop (Enable input).")
+
+
+def require_reset(states: Mapping[int, str]) -> None:
+    """Raise CheckFailedError if a drive is still in Fault, or did not answer `reset`."""
+    left = [f"node {node}: {state}" for node, state in states.items() if state in ("no answer", DriveState.FAULT.name)]
+    if left:
+        raise CheckFailedError(
+            f"{', '.join(left)} after the reset. Is the hardware stop released, is the drive on, is its number right?"
+        )

@@ -19,6 +19,8 @@ from softneck.drives import (
     preflight,
     prepare,
     require_certified,
+    require_reset,
+    require_stopped,
     reset,
     run_on_bus,
     run_simulated,
@@ -43,6 +45,7 @@ from ._drives_target import (
     open_link,
     override_option,
     sensor_of,
+    sensor_or_reason,
     target_of,
 )
 from ._drives_view import live_view
@@ -67,7 +70,7 @@ def command() -> None:
 @drives_options
 @json_option
 def scan_command(drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, as_json: bool) -> None:
-    """List the nodes on the bus; sends reads only."""
+    """List the nodes on the bus; sends reads only. Exit code 1 if none answers."""
     if bus is not None and drives_file is None:
         chosen = Target(default_drives(), bus, False, arm)
     else:
@@ -76,10 +79,15 @@ def scan_command(drives_file: Path | None, bus: str | None, simulated: bool, arm
         found = scan(link)
     if as_json:
         print_json({"nodes": found})
-        return
-    rows = [[str(item["node"]), str(item["name"] or "-"), str(item["firmware"] or "-"), str(item["serial"] or "-"),
-             str(item["state"] or "-")] for item in found]  # fmt: skip
-    print_table(f"{len(found)} node(s)", ["node", "name", "firmware", "serial", "state"], rows)
+    else:
+        rows = [[str(item["node"]), str(item["name"] or "-"), str(item["firmware"] or "-"), str(item["serial"] or "-"),
+                 str(item["state"] or "-")] for item in found]  # fmt: skip
+        print_table(f"{len(found)} node(s)", ["node", "name", "firmware", "serial", "state"], rows)
+    if not found:
+        raise CheckFailedError(
+            f"{bus or 'the bus'}: no node answers. Are the drives on, is the bit rate theirs, is the line terminated "
+            "(60 ohm between CAN_H and CAN_L)?"
+        )
 
 
 @command.command("check", epilog="Example: softneck drives check --simulated")
@@ -94,8 +102,10 @@ def check_command(
     Writes the configuration, moves nothing. Exit code 1 if a check does not hold.
     """
     chosen = target_of(drives_file, bus, simulated, arm)
+    names = checked_names(overrides)
     with open_link(chosen, moves=False, homed=True) as link:
-        report = preflight(link, chosen.file, override=checked_names(overrides))
+        sensor = None if chosen.simulated else sensor_or_reason(chosen.file, str(chosen.bus))
+        report = preflight(link, chosen.file, override=names, sensor=sensor)
     _show(report, as_json=as_json)
     report.require()
 
@@ -245,20 +255,24 @@ def _print_run(path: Path, result: DrivesResult, *, as_json: bool) -> None:
 @drives_options
 @json_option
 def stop_command(drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, as_json: bool) -> None:
-    """Quick stop, then no voltage, for every drive; always allowed."""
+    """Quick stop, then no voltage, for every drive; always allowed. Exit code 1 if one may still have power."""
     chosen = target_of(drives_file, bus, simulated, arm)
     with open_link(chosen, moves=False) as link:
-        _states(stop(link, chosen.file), "stopped", as_json=as_json)
+        states = stop(link, chosen.file)
+    _states(states, "stopped", as_json=as_json)
+    require_stopped(states)
 
 
 @command.command("reset")
 @drives_options
 @json_option
 def reset_command(drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, as_json: bool) -> None:
-    """Acknowledge latched faults; nothing else ever does, and nothing moves by it."""
+    """Acknowledge latched faults; nothing else ever does, and nothing moves by it. Exit code 1 if a fault stays."""
     chosen = target_of(drives_file, bus, simulated, arm)
     with open_link(chosen, moves=False) as link:
-        _states(reset(link, chosen.file), "reset", as_json=as_json)
+        states = reset(link, chosen.file)
+    _states(states, "reset", as_json=as_json)
+    require_reset(states)
 
 
 def _states(states: dict[int, str], what: str, *, as_json: bool) -> None:

@@ -10,13 +10,14 @@ from typing import Any
 
 import click
 
-from softneck.core import SettingsError
+from softneck.core import SettingsError, SoftneckError
 from softneck.drives import (
     HARMLESS,
     OVERRIDES,
     CanLink,
     DrivesFile,
     Keyboard,
+    Sensor,
     VirtualLink,
     default_drives,
     load_drives,
@@ -25,7 +26,7 @@ from softneck.drives import (
     open_sensor,
     simulated_neck,
 )
-from softneck.drives.master import Tilt
+from softneck.drives.master import Frame, Tilt
 from softneck.plant import NeckParameters
 
 from ._arm import require_armed
@@ -161,6 +162,38 @@ def sensor_of(file: DrivesFile, bus: str) -> Any:
         raise SettingsError(
             f'[sensor] kind "replay" is for simulated drives; on {bus} the loop would not see the neck it moves.'
         )
-    return click.get_current_context().with_resource(
-        open_sensor(file.sensor_kind, file.sensor_node, file.sensor_source)
-    )
+    return click.get_current_context().with_resource(_told(file))
+
+
+@contextlib.contextmanager
+def _told(file: DrivesFile) -> Iterator[Any]:
+    """Yield the inclinometer; say at the end what happened to it, which no drive and no watch can know."""
+    with open_sensor(file.sensor_kind, file.sensor_node, file.sensor_source) as sensor:
+        try:
+            yield sensor
+        finally:
+            problem = getattr(sensor, "problem", "")
+            if problem:
+                note(f"inclinometer {sensor.name}: {problem}")
+
+
+class _NoSensor:
+    """In the place of an inclinometer that cannot be opened, for a check that goes on and reports it."""
+
+    def __init__(self, problem: str) -> None:
+        self.problem = problem
+
+    def take(self, frames: Sequence[Frame]) -> None:
+        del frames
+
+    def read(self, now: float, frames: Sequence[Frame]) -> Tilt | None:
+        del now, frames
+        return None
+
+
+def sensor_or_reason(file: DrivesFile, bus: str) -> Sensor:
+    """Return the inclinometer, or something silent that knows why there is none."""
+    try:
+        return sensor_of(file, bus)
+    except SoftneckError as error:
+        return _NoSensor(str(error))
