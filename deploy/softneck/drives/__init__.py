@@ -33,6 +33,7 @@ from ._log_file import LoggedRun as LoggedRun
 from ._log_file import changed_files as changed_files
 from ._log_file import read_run_log as read_run_log
 from ._meaning import meaning as meaning
+from ._neck_file import neck_drives as neck_drives
 from ._notify import Notifier as Notifier
 from ._pilot import LoopPilot as LoopPilot
 from ._preflight import OVERRIDES as OVERRIDES
