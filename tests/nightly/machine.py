@@ -127,6 +127,11 @@ def layer(packages: Sequence[str]) -> str:
     if not folder.exists():
         for package in packages:
             unpacked(package, folder)
+        # The host's /lib is a link into /usr, which a folder of the layer would hide.
+        for name in ("bin", "sbin", "lib"):
+            if (folder / name).is_dir():
+                shutil.copytree(folder / name, folder / "usr" / name, symlinks=True, dirs_exist_ok=True)
+                shutil.rmtree(folder / name)
     return f"/lower{folder}:"
 
 
