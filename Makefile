@@ -37,10 +37,16 @@ nightly: $(VENV)/.tested native
 	SOFTNECK_NIGHTLY=1 $(BIN)/python -m pytest -q -n 0 tests/fmu/test_native_platforms.py
 	SOFTNECK_FUZZ_ROUNDS=3000 $(BIN)/python -m pytest -q -n 0 tests/fmu/test_native_errors.py -k sanitizers
 
-# The drives over real SocketCAN in QEMU; its guest has not come up yet, so `nightly` leaves it out.
-# Debian: qemu-system-x86 busybox-static kmod cpio iproute2.
+# In QEMU, with Debian's kernel: the drives over real SocketCAN, and the service under a real systemd.
+# Debian: qemu-system-x86 busybox-static kmod cpio iproute2. Minutes with KVM; an hour or two without.
+nightly: nightly-can nightly-systemd
+
 nightly-can: $(VENV)/.tested
 	$(BIN)/python tests/nightly/socketcan.py
+
+.PHONY: nightly-systemd
+nightly-systemd: $(VENV)/.tested
+	$(BIN)/python tests/nightly/systemd_unit.py
 
 # Exporting from this wheel needs no compiler.
 wheel: native

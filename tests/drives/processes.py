@@ -11,6 +11,7 @@ import argparse
 import json
 import math
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -23,12 +24,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+try:
+    from .forked import Forked
+except ImportError:  # run as a script
+    from forked import Forked  # type: ignore[no-redef]
+
 UDP = "udp_multicast:239.74.163.2"
 INSIDE = "SOFTNECK_OWN_NETWORK"
 NAMESPACE = (
     ("unshare", "--net") if os.name == "posix" and os.geteuid() == 0 else ("unshare", "--net", "--map-root-user")
 )
 OFF, FAULT = "DISABLED", "FAULT"
+ARM = "SOFTNECK_ARM"
+# linux/can/error.h
+CAN_ERR_BUSOFF = 0x40
 SLEEP = 0.01
 
 LOOP = (Path(__file__).parent / "processes_loop.toml").read_text()
@@ -75,9 +84,10 @@ class World:
     extra: tuple[str, ...] = ()
     realtime: bool = False
     drives_bus: str = ""
+    forking: bool = False
     changes: list[dict[str, Any]] = field(default_factory=list)
     told: list[str] = field(default_factory=list)
-    children: list[subprocess.Popen] = field(default_factory=list)
+    children: list[Any] = field(default_factory=list)
 
     def start(self, loop: str = "loop") -> None:
         """Start all three and wait until the controller runs."""
@@ -94,7 +104,7 @@ class World:
         address = self.folder / "notify.socket"
         self.notify.bind(str(address))
         threading.Thread(target=self._listen, args=(self.notify,), daemon=True).start()
-        os.environ["SOFTNECK_ARM"] = f"MOVE {self.bus.partition(':')[2]}"
+        os.environ[ARM] = f"MOVE {self.bus.partition(':')[2]}"
         os.environ.update(NOTIFY_SOCKET=str(address), WATCHDOG_USEC="400000")
         try:
             self.host = self.run(loop)
@@ -105,19 +115,20 @@ class World:
         if self.host.poll() is not None:
             raise RuntimeError(f"the host ended: {self.host.communicate()}")
 
-    def run(self, loop: str) -> subprocess.Popen:
+    def run(self, loop: str, *, arm: bool = True) -> Any:
         """Start `softneck drives run`."""
         code = "from softneck.cli import main; main()"
         files = {"--loop": f"{loop}.toml", "--drives": "drives.toml", "-o": f"run_{time.monotonic_ns()}.csv"}
-        words = ["drives", "run", str(self.folder / "pi.npz"), "--bus", self.bus, "--arm", "--json"]
+        words = ["drives", "run", str(self.folder / "pi.npz"), "--bus", self.bus, "--json", *(["--arm"] if arm else [])]
         words += ["--override", "certificate", *self.extra, *(["--realtime"] if self.realtime else [])]
         for option, name in files.items():
             words += [option, str(self.folder / name)]
         return self._spawn("-c", code, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
-    def _spawn(
-        self, *arguments: str, stdout: int = subprocess.DEVNULL, stderr: int = subprocess.DEVNULL
-    ) -> subprocess.Popen:
+    def _spawn(self, *arguments: str, stdout: int = subprocess.DEVNULL, stderr: int = subprocess.DEVNULL) -> Any:
+        if self.forking:
+            self.children.append(Forked(arguments, first=self.realtime and arguments[0] == "-m"))
+            return self.children[-1]
         # The simulated drives stand for hardware, which no other process holds up.
         first = ["chrt", "-f", "41"] if self.realtime and arguments[0] == "-m" else []
         command = [*first, sys.executable, *arguments]
@@ -165,7 +176,7 @@ class World:
                 raise RuntimeError(f"waited {seconds * self.patience:g} s for {what}")
             time.sleep(SLEEP)
 
-    def ended(self, child: subprocess.Popen | None = None, seconds: float = 20.0) -> tuple[int, dict[str, Any], str]:
+    def ended(self, child: Any = None, seconds: float = 20.0) -> tuple[int, dict[str, Any], str]:
         """Wait for a host; return exit code, JSON, last line on stderr."""
         child = child or self.host
         out, error = child.communicate(timeout=seconds * self.patience)
@@ -244,6 +255,20 @@ def second_master(world: World) -> dict[str, Any]:
     }
 
 
+def unarmed(world: World) -> dict[str, Any]:
+    """Without --arm, without the words, with another bus' words: refused; the running master sees no frame of them."""
+    words = os.environ.pop(ARM)
+    refused = [world.ended(world.run("short", arm=False), seconds=60.0)]
+    refused.append(world.ended(world.run("short"), seconds=60.0))
+    os.environ[ARM] = f"{words}0"
+    refused.append(world.ended(world.run("short"), seconds=60.0))
+    went_on = world.all("ENABLED")
+    world.host.terminate()
+    code, _, _ = world.ended()
+    return {"reaction_s": None, "exit": code, "refused": [found[0] for found in refused],
+            "lines": [found[2] for found in refused], "went_on": went_on, **rest(world, math.inf)}  # fmt: skip
+
+
 def intruder(world: World) -> dict[str, Any]:
     """A master that does not listen first sends SYNC messages."""
     import can
@@ -264,6 +289,18 @@ def cable(world: World) -> dict[str, Any]:
     code, result, _ = world.ended()
     bring_up(world.link)
     time.sleep(0.5)
+    return {"reaction_s": world.left(since), "exit": code, "event": result["fault"]["event"], **rest(world, since)}
+
+
+def bus_off(world: World) -> dict[str, Any]:
+    """The adapter says that it is bus-off, by SocketCAN's error frame, as an adapter's driver does."""
+    import can
+
+    interface, _, channel = world.bus.partition(":")
+    with can.Bus(interface=interface, channel=channel) as bus:
+        since = time.monotonic()
+        bus.send(can.Message(arbitration_id=CAN_ERR_BUSOFF, is_error_frame=True, is_extended_id=False, dlc=8))
+        code, result, _ = world.ended()
     return {"reaction_s": world.left(since), "exit": code, "event": result["fault"]["event"], **rest(world, since)}
 
 
@@ -322,11 +359,17 @@ CASES: dict[str, tuple[Callable[[World], dict[str, Any]], dict[str, Any]]] = {
                                 "states": [OFF] * 3}),
     "undisturbed": (undisturbed, {"exit": 0, "states": [OFF] * 3}),
 }  # fmt: skip
+# Only SocketCAN has error frames, and only a bus with a wire behind it wants the words typed.
+SOCKETCAN_CASES = {
+    **CASES,
+    "bus_off": (bus_off, {"exit": 1, "event": "bus_off"}),
+    "unarmed": (unarmed, {"exit": 143, "refused": [2, 2, 2], "went_on": True, "states": [OFF] * 3}),
+}
 
 
 def play(name: str, world: World) -> dict[str, Any]:
     """Run one case; `exact` tells whether all ended as it must."""
-    act, expected = CASES[name]
+    act, expected = SOCKETCAN_CASES[name]
     try:
         world.start({"hung": "hangs", "undisturbed": "short"}.get(name, "loop"))
         time.sleep(0.2)
@@ -356,7 +399,7 @@ def bring_up(link: str) -> None:
 def main() -> None:
     """Play the cases, each `--repeat` times."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("cases", nargs="*", metavar="CASE", help=f"of {', '.join(CASES)}")
+    parser.add_argument("cases", nargs="*", metavar="CASE", help=f"of {', '.join(SOCKETCAN_CASES)}")
     parser.add_argument("--repeat", type=int, default=1)
     parser.add_argument("--bus", default=UDP)
     parser.add_argument("--drives-bus", default="", help="where the drives are, if that interface is another one")
@@ -367,6 +410,8 @@ def main() -> None:
     parser.add_argument("--patience", type=float, default=1.0)
     parser.add_argument("--realtime", action="store_true", help="host and drives before all ordinary processes")
     parser.add_argument("--attempts", type=int, default=1, help="where the machine was too busy for the loop")
+    parser.add_argument("--project", type=Path, help="what write_project wrote, instead of writing it")
+    parser.add_argument("--fork", action="store_true", help="import once and fork: for slow machines")
     parser.add_argument("--extra", action="append", default=[], help="further option of `softneck drives run`")
     chosen = parser.parse_args()
     if chosen.bus == UDP and INSIDE not in os.environ:
@@ -376,13 +421,17 @@ def main() -> None:
         bring_up("lo")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        write_project(folder, duration=chosen.duration, period=chosen.period, guarding=chosen.guarding)
+        if chosen.project:
+            shutil.copytree(chosen.project, folder, dirs_exist_ok=True)
+        else:
+            write_project(folder, duration=chosen.duration, period=chosen.period, guarding=chosen.guarding)
         for case in chosen.cases or CASES:
             for _ in range(chosen.repeat):
                 found: dict[str, Any] = {}
                 for attempt in range(chosen.attempts):
                     world = World(folder, chosen.bus, chosen.link, chosen.period, chosen.patience, tuple(chosen.extra))
                     world.realtime, world.drives_bus = chosen.realtime, chosen.drives_bus
+                    world.forking = chosen.fork
                     found = play(case, world)
                     if not too_busy(found) or attempt == chosen.attempts - 1:
                         break
