@@ -18,7 +18,7 @@ def write_zip(path: Path, members: Mapping[str, bytes]) -> None:
             entry.compress_type = zipfile.ZIP_DEFLATED
             entry.create_system = 3  # Unix on every machine
             entry.external_attr = 0o644 << 16
-            archive.writestr(entry, members[name])
+            archive.writestr(entry, members[name], compresslevel=9)
 
 
 def read_zip(path: Path) -> dict[str, bytes]:
