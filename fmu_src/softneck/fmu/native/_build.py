@@ -35,8 +35,8 @@ _REBUILD = """Rebuild the library of this FMU for any platform with a C99 compil
     cc {flags} -fPIC -shared -o {name}.so {main} -lm
 
 and put it into binaries/ under the folder of your platform. `sn_kinds.h` was generated from the runtimes of softneck
-{version} and holds what this model needs; all other files are written by hand. No fused multiply-add (-ffp-contract=off), no fast-math: all platforms
-give the same bits.
+{version} and holds what this model needs; all other files are written by hand. No fused multiply-add
+(-ffp-contract=off), no fast-math: all platforms give the same bits.
 """
 
 

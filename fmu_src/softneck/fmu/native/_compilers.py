@@ -52,7 +52,7 @@ def compile_for(sources: Sources, platform: Platform) -> bytes:
     extra = [] if platform.system == "win32" else ["-fPIC"]
     gather = [] if platform.system == "darwin" else ["-Wl,--gc-sections"]
     gather += ["-Wl,--hash-style=gnu"] if platform.system == "linux" else []
-    # clang's -Os is two thirds of its -O2, and as fast. aarch64's outliner makes stubs that deflate worse than the code.
+    # clang's -Os is two thirds of its -O2, and as fast. Code that aarch64's outliner has shortened deflates worse.
     small = ["-Os", "-fno-sanitize=undefined", "-w", "-s", "-mllvm", "-enable-machine-outliner=never"]
     small += ["-mllvm", "-inline-threshold=0", "-mllvm", "-inlinehint-threshold=60"]
     # Nothing is thrown through C. Windows asks for the tables, and zig's own parts there need them.
