@@ -137,3 +137,13 @@ def test_review_tells_what_is_doubtful() -> None:
     assert "not longer than the dead time" in text
     assert "slew limit is never reached" in text
     assert "beyond what the motors reach" in text
+
+
+@pytest.mark.parametrize(
+    "limits", [{"minimum_tautness": -0.2}, {"angle_limit": 0.3}, {"angle_limit": 0.3, "minimum_tautness": -0.2}]
+)
+def test_limits_that_are_not_active_change_no_gain(limits: dict[str, float], plain: MpcController) -> None:
+    limited = MpcSettings(bandwidth=8.0, **limits).design(bake_off_neck())  # type: ignore[arg-type]
+    z = np.exp(1j * TS * np.geomspace(0.1, 100.0, 20))
+    # Slacks add rows to H that moves do not see: rounding of its inverse, 1e-16 times a condition below 1e8, is left.
+    np.testing.assert_allclose(limited.to_lti()(z), plain.to_lti()(z), rtol=1e-7, atol=1e-7)

@@ -7,13 +7,13 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from softneck.core import DataError, SettingsError, load
+from softneck.core import DataError, SettingsError, load, load_runtime
 from softneck.design import NmpcController, NmpcSettings
 from softneck.design.mpc._gauss_newton import cost_function
 from softneck.design.mpc._horizon_estimate import disturbance_ahead, estimate_gains
-from softneck.design.mpc._model_steps import step_function
+from softneck.design.mpc._model_steps import NONLINEAR_KINDS, step_function
 from softneck.estimation import LinearNeck
-from softneck.identification import GreyBox, Model, Network, Play, Rls
+from softneck.identification import GreyBox, Model, Network, NeuralStateSpace, Play, Rls
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import Recording, signal
 
@@ -34,6 +34,7 @@ def models(recording: Recording, network: Model) -> dict[str, Model]:
         "nn": network,
         "play": Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording),
         "greybox": GreyBox(evaluations=3, sensor_delay=2).fit(recording),
+        "nss": NeuralStateSpace(neurons=3, starts=1, iterations=3).fit(recording),
     }
 
 
@@ -59,7 +60,7 @@ def closed_loop(
     return np.array(angles), said
 
 
-@pytest.mark.parametrize("kind", ["nn", "play", "greybox"])
+@pytest.mark.parametrize("kind", NONLINEAR_KINDS)
 def test_the_expression_of_a_model_is_its_runtime(kind: str, models: dict[str, Model]) -> None:
     model = models[kind]
     f, block = step_function(model), model.block()
@@ -98,6 +99,62 @@ def test_converged_it_is_what_ipopt_finds(kind: str, models: dict[str, Model]) -
     # The bound; ipopt itself stops its barrier at 1e-10 of the scaled problem.
     np.testing.assert_allclose(found, np.array(best["x"])[:, 0], atol=1e-5)
     assert np.abs(motors).max() > 0.1
+
+
+# What FMUs and loop files run has derivatives and a solver of its own: an independent method for the same numbers.
+@pytest.mark.parametrize("kind", NONLINEAR_KINDS)
+@pytest.mark.parametrize("others", [{}, {"angle_limit": 0.1, "preview": 0.2}, {"converged": True}], ids=str)
+def test_the_block_is_what_casadi_and_daqp_compute(
+    kind: str, others: dict[str, float], models: dict[str, Model]
+) -> None:
+    controller = NmpcSettings(horizon=12, moves=4, slew_limit=6.0, **others).design(models[kind])  # type: ignore[arg-type]
+    block, plant = controller.block(), models[kind].block()
+    state, own = controller.initial_state(), block.initial_state()
+    x, y, motors = plant.initial_state(use_measurement=0.0), np.zeros(2), np.zeros(3)
+    rng, statuses = np.random.default_rng(0), set()
+    for k in range(80):
+        asked = [0.3, -0.1, 0.3] if k < 40 else [-0.3, 0.2, 0.0]
+        u = [*asked, *(y + 0.002 * rng.standard_normal(2)), *motors, 1.0, float(not 60 <= k < 64)]
+        u += asked[:2] if "preview" in others else []
+        state, motors = controller.step(state, u)
+        own, out = block.step(own, u)
+        statuses.add(state.values[2])
+        if k == 0 and kind == "greybox":
+            # Its friction has a corner where nothing moves; there rounding decides which side a derivative is of.
+            np.testing.assert_allclose(out, motors, atol=1e-3)
+            own.values[: state.values.size] = state.values
+            continue
+        # Both solve to 1e-10; a loop of 80 samples passes a difference on.
+        np.testing.assert_allclose(out, motors, atol=1e-7)
+        np.testing.assert_allclose(own.values[7 : state.values.size], state.values[7:], atol=1e-6)
+        np.testing.assert_array_equal(own.values[[2, 3, 4, 5]], state.values[[2, 3, 4, 5]])
+        x, seen = plant.step(x, [*motors, *[math.nan] * 5])
+        y = seen[:2]
+    assert statuses == ({1.0, 2.0, 4.0} if "angle_limit" in others and kind != "greybox" else statuses)
+
+
+def test_the_block_that_numba_has_not_compiled_is_the_same(network: Model) -> None:
+    block = NmpcSettings(horizon=6, moves=2, angle_limit=0.1).design(network).block()
+    plain = load_runtime(block.runtime, compiled=False)
+    state = block.initial_state()
+    values, out = state.values.copy(), np.zeros(3)
+    for _ in range(3):
+        u = np.array([0.2, 0.1, 0.0, 0.0, 0.0, *out, 1.0, 1.0])
+        plain.step(block.arrays, state.parameters, values, u, out)
+        state, motors = block.step(state, u)
+        # numpy's own products and tanh differ from compiled ones in their last bits.
+        np.testing.assert_allclose(out, motors, atol=1e-9)
+
+
+def test_a_bad_measurement_never_reaches_the_block_either(network: Model) -> None:
+    block = NmpcSettings(horizon=6, moves=2).design(network).block()
+    step, state = load_runtime(block.runtime).step, block.initial_state()
+    values, out = state.values.copy(), np.zeros(3)
+    for k in range(60):
+        y = math.nan if k >= 20 else 0.0
+        step(block.arrays, state.parameters, values, np.array([0.1, 0.0, 0.0, y, 0.0, *out, 1.0, 1.0]), out)
+        assert np.isfinite(values).all()
+        assert values[2] == (4.0 if k >= 45 else 1.0)
 
 
 def test_one_iteration_a_sample_ends_where_all_do(network: Model) -> None:
@@ -209,7 +266,11 @@ def test_what_it_cannot_use_is_refused(recording: Recording, controller: NmpcCon
         NmpcSettings(slack_weight=-1.0)
     with pytest.raises(SettingsError, match="for `order=sequential`"):
         NmpcSettings(order="jacobi")
-    with pytest.raises(SettingsError, match="there is no FMU of it"):
-        controller.block()
+    with pytest.raises(SettingsError, match="`cocontraction_weight` must be positive"):
+        NmpcSettings(cocontraction_weight=-1.0)
+    with pytest.raises(SettingsError, match="`horizon` must be"):
+        NmpcSettings(horizon=10.5)  # type: ignore[arg-type]
+    with pytest.raises(DataError, match="nmpc takes 10 finite inputs"):
+        controller.step(controller.initial_state(), [0.1] * 7)
     with pytest.raises(SettingsError, match="is no parameter of nmpc"):
         controller.initial_state(colour=1.0)

@@ -20,7 +20,6 @@ from softneck.drives import (
     DriveEntry,
     DriveScale,
     VirtualLink,
-    VirtualRun,
     default_drives,
     preflight,
     prepare,
@@ -91,10 +90,10 @@ def test_a_bus_period_must_divide_the_sample_time(project: Project) -> None:
 
 
 def test_a_fault_ends_the_run_and_its_log_is_kept(project: Project) -> None:
-    def breaks(run: VirtualRun) -> None:
+    def breaks(link: VirtualLink) -> None:
         # Pre-flight and enabling take 1.2 s, the ramp back from where the tendons unwound to 5.7 s.
-        if run.link.now > 8.5:
-            run.link.neck.sensor = "freezes"
+        if link.now > 8.5:
+            link.neck.sensor = "freezes"
 
     result = run_simulated(prepare(load_loop(project.loop)), default_drives(), hook=breaks)
     assert result.fault is not None
@@ -206,7 +205,12 @@ def test_a_run_over_a_bus_of_python_can(project: Project) -> None:
             link = CanLink(ours, "virtual:softneck")
             # The threads share one interpreter: a stall of 50 ms is this machine's, not the master's.
             begin = time.monotonic()
-            result = run_on_bus(prepare(setup, project.controller), file, link, CanInclinometer(10))
+            watched: list[int] = []
+            result = run_on_bus(
+                prepare(setup, project.controller), file, link, CanInclinometer(10),
+                watches=(lambda *seen: watched.append(seen[-1].cycle),),
+            )  # fmt: skip
+            assert watched == list(range(1, result.cycles + 1))
             took = time.monotonic() - begin
         finally:
             ended.set()

@@ -18,6 +18,7 @@ from softneck.design import (
     LqgSettings,
     MpcSettings,
     NcfSettings,
+    NmpcSettings,
     PidSettings,
     PiSettings,
     ScheduledSettings,
@@ -173,6 +174,11 @@ def _mpc() -> Block:
     return MpcSettings(bandwidth=6.0, moves=5, angle_limit=0.5).design(_linear()).block()
 
 
+def _nmpc() -> Block:
+    model = Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording())
+    return NmpcSettings(horizon=8, moves=3, angle_limit=0.5).design(model).block()
+
+
 _REFERENCES = ["pitch_reference", "roll_reference", "cocontraction_reference", "pitch", "roll", "healthy", "enabled"]
 
 # Kind -> its block, inputs, outputs and parameters that the public face names for it.
@@ -225,6 +231,7 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
         MOTORS,
         ("position_limit", "slew_limit", "lead_limit", "angle_limit"),
     ),
+    "nmpc": (_nmpc, _REFERENCES, MOTORS, ("position_limit", "slew_limit", "lead_limit", "least_position")),
     "pi": (
         _pi,
         _REFERENCES,
@@ -240,6 +247,10 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
     "lqg": (_lqg, _REFERENCES, MOTORS, ("slew_limit",)),
     "custom": (_custom, _REFERENCES, MOTORS, ("slew_limit",)),
 }
+
+
+# Kinds that also run as C; nonlinear predictive control is not translated.
+NATIVE = [kind for kind in KINDS if kind != "nmpc"]
 
 
 @cache

@@ -27,7 +27,7 @@ from softneck.fmu.native import _library, build_compiled_fmu, c_sources
 from softneck.fmu.native._model_file import model_bytes
 from softneck.fmu.native._sources import Sources
 
-from .every_kind import KINDS, block_of
+from .every_kind import NATIVE, block_of
 
 pytestmark = pytest.mark.skipif(
     shutil.which("cc") is None and not os.environ.get("CI"), reason="no C compiler here, and no library is built"
@@ -176,7 +176,7 @@ def test_hostile_files_and_states_break_nothing_under_the_sanitizers(tmp_path: P
     built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert built.returncode == 0, built.stderr[-2000:]
     files = []
-    for kind in KINDS:
+    for kind in NATIVE:
         files.append(tmp_path / f"{kind}.bin")
         files[-1].write_bytes(model_bytes(block_of(kind), kind, "00000000-0000-0000-0000-000000000000"))
     done = subprocess.run(
@@ -184,7 +184,7 @@ def test_hostile_files_and_states_break_nothing_under_the_sanitizers(tmp_path: P
         timeout=3000,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-3000:]
-    assert f"{len(KINDS)} files" in done.stdout
+    assert f"{len(NATIVE)} files" in done.stdout
 
 
 # Making one

@@ -23,7 +23,7 @@ from softneck.core import Block
 from softneck.fmu import build_fmu, unpacked
 from softneck.fmu.native import build_compiled_fmu
 
-from .every_kind import KINDS, TS, block_of, inputs_of
+from .every_kind import NATIVE, TS, block_of, inputs_of
 
 ROWS = 400
 pytestmark = pytest.mark.skipif(
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-@pytest.fixture(scope="module", params=list(KINDS))
+@pytest.fixture(scope="module", params=NATIVE)
 def kind(request: pytest.FixtureRequest) -> str:
     return request.param
 

@@ -16,7 +16,7 @@ from softneck.fmu.native import PLATFORMS, c_sources
 from softneck.fmu.native._compilers import compile_for, have_zig
 from softneck.fmu.native._model_file import model_bytes
 
-from .every_kind import KINDS, TS, block_of, inputs_of
+from .every_kind import NATIVE, TS, block_of, inputs_of
 
 ROWS = 200
 GUID = "00000000-0000-0000-0000-000000000000"
@@ -80,7 +80,7 @@ def _outputs(machine: tuple[str, Path], block: Block, u: np.ndarray, resources: 
 _SEEN: dict[str, np.ndarray] = {}
 
 
-@pytest.mark.parametrize("kind", list(KINDS))
+@pytest.mark.parametrize("kind", NATIVE)
 def test_all_platforms_give_the_same_bits(kind: str, machine: tuple[str, Path], tmp_path: Path) -> None:
     block = block_of(kind)
     u = inputs_of(block, ROWS)

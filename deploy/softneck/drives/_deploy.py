@@ -2,43 +2,23 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
 
-from softneck.core import SettingsError, SoftneckError, load
+from softneck.core import SettingsError, load
 from softneck.cosim import FmuPart, LoopSetup
 from softneck.loop import BlockPart, Loop, Part
 from softneck.plant import NeckParameters
 
+from ._bus_loop import Operator, Sensor, Session, run_session
 from ._file import DrivesFile
 from ._link import CanLink, VirtualLink
-from ._objects import disarm_writes
 from ._pilot import LoopPilot
-from ._preflight import Report, preflight
 from ._result import DrivesResult, RunLog
-from ._sdo import Objects, SdoError, load_eds
-from ._virtual import VirtualRun, simulated_neck
-from .master import Command as NmtCommand
-from .master import Frame, Master, MasterSettings, Tilt, nmt_frame
-
-# Before the first cycle on a bus each drive is given this time to become operational [s].
-_START_TIME = 0.1
-_NECK = "virtual_neck"
-
-
-class Sensor(Protocol):
-    """An inclinometer on hardware."""
-
-    def take(self, frames: Sequence[Frame]) -> None:
-        """Look at frames of a cycle in which no sample is due; a sensor that is not on the bus ignores them."""
-        ...
-
-    def read(self, now: float, frames: Sequence[Frame]) -> Tilt | None:
-        """Return the newest sample, None if none came since the last call."""
-        ...
+from ._run_log import RunLogger
+from ._virtual import Watch, simulated_neck
+from .master import Frame, Master, MasterSettings, Tilt
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,8 +81,12 @@ def run_simulated(
     override: Collection[str] = (),
     pace: float | None = None,
     report: Callable[[float], None] | None = None,
-    hook: Callable[[VirtualRun], None] | None = None,
+    watches: Sequence[Watch] = (),
+    operator: Operator | None = None,
+    hook: Callable[[VirtualLink], None] | None = None,
     settings: Callable[[MasterSettings], MasterSettings] | None = None,
+    log: RunLogger | None = None,
+    files: Mapping[str, str | Path] | None = None,
 ) -> DrivesResult:
     """Run the whole loop on simulated drives, in virtual time.
 
@@ -113,8 +97,12 @@ def run_simulated(
         override: names of pre-flight checks that may fail.
         pace: at this multiple of real time; as fast as possible if not given.
         report: called now and then with the done fraction.
+        watches: called after each bus cycle, see `Session`.
+        operator: asked each cycle what the operator wants.
         hook: called after each bus cycle, to let things go wrong.
         settings: changes the master's settings, for tests.
+        log: where frames and cycles are written.
+        files: role -> path of what acts, for the log; `replay` looks for "loop" and "controller".
 
     Raises:
         CheckFailedError: the pre-flight failed.
@@ -129,38 +117,14 @@ def run_simulated(
     disturbances = {name: value for name, value in loop.plant_inputs.items() if not name.startswith("motor_")}
     virtual.set(**disturbances)
     link = VirtualLink(virtual)
-    checked = preflight(link, file, override=override, homed=True)
-    checked.require()
-    master = _master(pilot, file, checked, settings)
-    link.send([nmt_frame(NmtCommand.START, node) for node in file.nodes])
-    link.receive(_START_TIME)
-    log = RunLog(pilot)
-    run = VirtualRun(link, master)
-    rows = max(1, round(loop.duration / pilot.sample_time))
-    begin, first = time.perf_counter(), link.now
-
-    def watch(state: VirtualRun) -> None:
-        index = master.index
-        if master.ran:
-            log.take(master, index, virtual.truth())
-            if report is not None and index % 50 == 0:
-                report(min(1.0, index / rows))
-        if hook is not None:
-            hook(state)
-        if pace is not None:
-            rest = begin + (link.now - first + link.cycle) / pace - time.perf_counter()
-            if rest > 0.0:
-                time.sleep(rest)
-
-    run.watch = watch
-    master.start()
-    try:
-        run.run(loop.duration)
-    finally:
-        pilot.close()
-    _disarm(link, file, checked.guarding)
-    wall = time.perf_counter() - begin
-    return _result(master, log, pilot, wall, simulated=True, notes=deployed.notes)
+    more = [*watches]
+    if hook is not None:
+        more.append(lambda _now, _in, _out, _tilt, _master: hook(link))
+    session = Session(
+        file=file, link=link, override=override, pace=pace, watches=tuple(more), operator=operator, settings=settings,
+        log=log, files=files or {},
+    )  # fmt: skip
+    return _run(deployed, pilot, session, report)
 
 
 def run_on_bus(
@@ -171,7 +135,11 @@ def run_on_bus(
     *,
     override: Collection[str] = (),
     report: Callable[[float], None] | None = None,
-    stopped: Callable[[], bool] | None = None,
+    watches: Sequence[Watch] = (),
+    operator: Operator | None = None,
+    log: RunLogger | None = None,
+    files: Mapping[str, str | Path] | None = None,
+    realtime: bool = False,
 ) -> DrivesResult:
     """Run the loop on the drives behind `link`, at the pace of the monotonic clock.
 
@@ -182,116 +150,54 @@ def run_on_bus(
         sensor: the inclinometer.
         override: names of pre-flight checks that may fail.
         report: called now and then with the done fraction.
-        stopped: asked each cycle whether the operator wants to stop.
+        watches: called after each bus cycle, see `Session`.
+        operator: asked each cycle what the operator wants.
+        log: where frames and cycles are written.
+        files: role -> path of what acts, for the log; `replay` looks for "loop" and "controller".
+        realtime: see `Session`.
 
     Raises:
         CheckFailedError: the pre-flight failed; nothing moved.
+        SettingsError: `realtime` is not permitted; nothing was sent.
     """
     pilot = LoopPilot(deployed.loop)
     pilot.warm()
-    checked = preflight(link, file, override=override, homed=True)
-    checked.require()
-    master = _master(pilot, file, checked, None)
-    link.send([nmt_frame(NmtCommand.START, node) for node in file.nodes])
-    time.sleep(_START_TIME)
-    link.receive(0.0)
+    session = Session(
+        file=file, link=link, sensor=sensor, override=override, watches=tuple(watches), operator=operator,
+        log=log, files=files or {},
+        realtime=realtime,
+    )  # fmt: skip
+    return _run(deployed, pilot, session, report)
+
+
+def _run(
+    deployed: Deployed, pilot: LoopPilot, session: Session, report: Callable[[float], None] | None
+) -> DrivesResult:
     log = RunLog(pilot)
     rows = max(1, round(deployed.loop.duration / pilot.sample_time))
-    begin = time.perf_counter()
-    master.start()
+    neck = session.link.neck if isinstance(session.link, VirtualLink) else None
+
+    def watch(_now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Tilt | None, master: Master) -> None:
+        if not master.ran:
+            return
+        row = log.take(master, master.index, None if neck is None else neck.truth())
+        if session.log is not None:
+            session.log.signals(row)
+        if report is not None and master.index % 50 == 0:
+            report(min(1.0, master.index / rows))
+
     try:
-        longest = _cycle(link, master, sensor, log, stopped, report, rows)
-    except BaseException:
-        # Whatever happens here must not leave a drive on: this loop is what feeds them.
-        _emergency_stop(link, file)
-        raise
+        ended = run_session(
+            replace(session, watches=(watch, *session.watches)),
+            pilot,
+            sample_time=pilot.sample_time,
+            most=deployed.loop.duration,
+        )
     finally:
         pilot.close()
-    _disarm(link, file, checked.guarding)
-    wall = time.perf_counter() - begin
-    return _result(master, log, pilot, wall, simulated=False, notes=deployed.notes, longest=longest)
-
-
-def _cycle(
-    link: CanLink,
-    master: Master,
-    sensor: Sensor,
-    log: RunLog,
-    stopped: Callable[[], bool] | None,
-    report: Callable[[float], None] | None,
-    rows: int,
-) -> float:
-    """Step the master at its period until it is done; return its longest step [s]."""
-    period = master.settings.bus.cycle
-    due, longest = link.now, 0.0
-    while not master.finished:
-        rest = due - link.now
-        if rest > 0.0:
-            time.sleep(rest)
-        now = link.now
-        # All that is there, so that one late TPDO does not leave a lag for ever.
-        frames = link.receive(0.0)
-        tilt = None
-        if master.sample_due:
-            tilt = sensor.read(now, frames)
-        else:
-            sensor.take(frames)
-        if stopped is not None and stopped():
-            master.stop("asked to")
-        out = master.step(now, frames, tilt)
-        link.send(out)
-        longest = max(longest, link.now - now)
-        if master.ran:
-            log.take(master, master.index, None)
-            if report is not None and master.index % 50 == 0:
-                report(min(1.0, master.index / rows))
-        due = max(due + period, now + 0.5 * period) if link.now - due > period else due + period
-    return longest
-
-
-def _master(
-    pilot: LoopPilot,
-    file: DrivesFile,
-    checked: Report,
-    change: Callable[[MasterSettings], MasterSettings] | None,
-) -> Master:
-    settings = file.master_settings(pilot.sample_time, guarding=checked.guarding)
-    return Master(settings if change is None else change(settings), pilot)
-
-
-def _disarm(link: CanLink | VirtualLink, file: DrivesFile, guarding: str) -> None:
-    """End the guarding of drives that are off; one that does not answer keeps it, and faults: so be it."""
-    dictionary = load_eds(file.profile, file.eds)
-    for node in file.nodes:
-        objects = Objects(link, node, dictionary)
-        try:
-            for write in disarm_writes(guarding):
-                objects.write(write.index, write.subindex, write.value)
-        except (SdoError, SoftneckError):
-            continue
-
-
-def _emergency_stop(link: CanLink, file: DrivesFile) -> None:
-    from ._zero import stop
-
-    try:
-        stop(link, file)
-    except SoftneckError:
-        return
-
-
-def _result(
-    master: Master,
-    log: RunLog,
-    pilot: LoopPilot,
-    wall: float,
-    *,
-    simulated: bool,
-    notes: Sequence[str],
-    longest: float = 0.0,
-) -> DrivesResult:
+    master = ended.master
     return DrivesResult(
-        signals=log.result(pilot.sample_time, truth=simulated),
+        signals=log.result(pilot.sample_time, truth=session.simulated),
         phase=str(master.supervisor.phase),
         fault=master.supervisor.fault,
         counts=dict(master.counts),
@@ -299,8 +205,9 @@ def _result(
         rehome=master.supervisor.rehome,
         cycles=master.cycle,
         cycle=master.settings.bus.cycle,
-        wall_time=wall,
-        simulated=simulated,
-        longest_step=longest,
-        notes=tuple(notes),
+        wall_time=ended.wall_time,
+        simulated=session.simulated,
+        times=ended.times,
+        notes=deployed.notes,
+        terminated=ended.terminated,
     )

@@ -20,11 +20,11 @@ from softneck.core import (
     require_whole,
 )
 
+from ._sources import SENSORS, SOURCE_KEYS, SensorSource, make_source
 from ._units import DriveScale, current_to_internal, internal_to_current
 from .master import BusSettings, LimitSettings, MasterSettings, RampSettings, SensorSettings, WatchSettings
 
 PROFILES = ("ipos2015", "ds402")
-SENSORS = ("simulated", "can")
 # Time in which a drive must notice that the master is gone [s] (fault table: 110 ms with its own slow loop).
 _LONGEST_LIFE = 0.1
 
@@ -141,7 +141,8 @@ class DrivesFile:
         cycle: bus period [s].
         bit_rate: [bit/s].
         guarding, zero, neck, limits, sensor, watch, ramps: the tables of those names.
-        sensor_kind, sensor_node: "simulated", or "can" for a CiA 410 inclinometer at that node.
+        sensor_kind, sensor_node: "simulated", or "can" for a CiA 410 inclinometer at that node; others need
+            `sensor_source`.
         quick_stop: deceleration of a quick stop (6085h) [rad/s^2].
         following: window (6065h) [rad]; following_time: its time-out (6066h) [s].
     """
@@ -160,6 +161,7 @@ class DrivesFile:
     ramps: RampSettings = field(default_factory=RampSettings)
     sensor_kind: str = "simulated"
     sensor_node: int = 10
+    sensor_source: SensorSource = field(default_factory=SensorSource)
     quick_stop: float = 200.0
     following: float = 2.0
     following_time: float = 0.2
@@ -312,6 +314,8 @@ def make_drives(table: Mapping[str, Any], folder: Path = Path()) -> DrivesFile:
         content = dict(_table(name, table[name]))
         if name == "sensor":
             values |= {f"sensor_{key}": content.pop(key) for key in ("kind", "node") if key in content}
+            kind, own = values.get("sensor_kind", "simulated"), [key for key in content if key in SOURCE_KEYS]
+            values["sensor_source"] = make_source(kind, {key: content.pop(key) for key in own}, folder)
         values[_FIELDS.get(name, name)] = _made(f"[{name}]", setting, name, content)
     values |= _values("[bus]", "bus", _table("bus", table.get("bus", {})))
     values |= _values("[stop]", "quick", _table("stop", table.get("stop", {})))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -113,13 +114,18 @@ class VirtualLink:
 
 
 class CanLink:
-    """A bus of python-can; frames of our own that come back are dropped."""
+    """A bus of python-can; frames of our own that come back are dropped.
+
+    Attributes:
+        tap: called with (time, from_master, frame) for each frame that was sent or came.
+    """
 
     def __init__(self, bus: Any, name: str, *, echoes: bool = False) -> None:
         """Use the open `bus`; `echoes` tells that it hands back what we sent, as UDP multicast does."""
         self._bus, self.name = bus, name
         self._sent: deque[tuple[int, bytes, bool]] | None = deque(maxlen=4096) if echoes else None
         self._broken = False
+        self.tap: Callable[[float, bool, Frame], None] | None = None
 
     @property
     def now(self) -> float:
@@ -143,6 +149,8 @@ class CanLink:
             except (can.CanError, OSError):
                 self._broken = True
                 return
+            if self.tap is not None:
+                self.tap(self.now, True, frame)
             if self._sent is not None:
                 self._sent.append((frame.identifier, b"" if frame.remote else frame.data, frame.remote))
 
@@ -163,6 +171,10 @@ class CanLink:
         except (can.CanError, OSError):
             self._broken = True
             frames.append(BUS_OFF)
+        if self.tap is not None and frames:
+            now = self.now
+            for frame in frames:
+                self.tap(now, False, frame)
         return frames
 
     def close(self) -> None:
@@ -198,6 +210,8 @@ def open_bus(text: str, *, bit_rate: int = 1_000_000) -> Iterator[CanLink]:
         raise SettingsError(f"--bus takes INTERFACE:CHANNEL, such as socketcan:can0; got `{text}`.")
     if interface not in can.interfaces.BACKENDS:
         raise SettingsError(f"--bus {text}: python-can has no interface `{interface}`; try socketcan:can0.")
+    # What python-can has to say of a bus that fails is in the exception; without a handler it would print it as well.
+    logging.getLogger("can").addHandler(logging.NullHandler())
     options: dict[str, Any] = {} if interface in ("socketcan", *HARMLESS) else {"bitrate": bit_rate}
     try:
         bus = can.Bus(interface=interface, channel=channel, receive_own_messages=False, **options)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,6 +13,7 @@ from softneck.loop import LoopResult, metrics
 from softneck.signals import Recording, known_channels
 
 from ._pilot import LoopPilot
+from ._times import CycleTimes
 from .master import Event, Master, Phase
 
 _TRUTH = ("pitch", "roll", "tension_1", "tension_2", "tension_3", "compression")
@@ -36,10 +37,10 @@ class RunLog:
         self._rows: list[list[float]] = []
         self._index = -1
 
-    def take(self, master: Master, index: int, truth: Mapping[str, float] | None) -> None:
-        """Add the row of sample `index`, once."""
+    def take(self, master: Master, index: int, truth: Mapping[str, float] | None) -> dict[str, float] | None:
+        """Add the row of sample `index`, once, and return it by name."""
         if index <= self._index or master.supervisor.phase is not Phase.RUNNING:
-            return
+            return None
         self._index = index
         signals = self._pilot.signals
         row = [float(signals[place]) for place in self._places.values()]
@@ -49,17 +50,54 @@ class RunLog:
         if truth is not None:
             row += [truth[name] for name in _TRUTH]
         self._rows.append(row)
+        return dict(zip(self._names(truth is not None), row, strict=True))
+
+    def _names(self, truth: bool) -> list[str]:
+        names = [*self._places, *(f"motor_position_{j}" for j in (1, 2, 3))]
+        names += [f"tension_estimate_{j}" for j in (1, 2, 3)] + ["pitch_measured", "roll_measured"]
+        return names + (list(_TRUTH) if truth else [])
 
     def result(self, sample_time: float, *, truth: bool) -> LoopResult:
         """Return all rows."""
-        names = [*self._places, *(f"motor_position_{j}" for j in (1, 2, 3))]
-        names += [f"tension_estimate_{j}" for j in (1, 2, 3)] + ["pitch_measured", "roll_measured"]
-        names += list(_TRUTH) if truth else []
+        names = self._names(truth)
         table = np.array(self._rows) if self._rows else np.zeros((0, len(names)))
-        units = {name: "N" if "tension" in name else "1" if name == "healthy" else "rad" for name in names}
-        units |= {"compression": "m"}
         signals: dict[str, Vector] = {name: table[:, i].copy() for i, name in enumerate(names)}
-        return LoopResult(np.arange(len(table)) * sample_time, signals, units, sample_time)
+        return LoopResult(np.arange(len(table)) * sample_time, signals, signal_units(names), sample_time)
+
+
+def signal_units(names: Iterable[str]) -> dict[str, str]:
+    """Return the unit of each signal of a run."""
+    units = {name: "N" if "tension" in name else "1" if name == "healthy" else "rad" for name in names}
+    return units | ({"compression": "m"} if "compression" in units else {})
+
+
+def recording_of(signals: LoopResult) -> Recording:
+    """Return a run as a recording: as measured, with true angles where simulated drives know them."""
+    known = set(known_channels())
+    channels = {name: values for name, values in signals.signals.items() if name in known}
+    for axis in ("pitch", "roll"):
+        channels.setdefault(axis, signals[f"{axis}_measured"])
+    return Recording(signals.time, signals.sample_time, channels)
+
+
+def require_unstopped(fault: Event | None, *, rehome: bool = False) -> None:
+    """Raise CheckFailedError if `fault` ended a run early."""
+    if fault is None:
+        return
+    after = " Run `softneck drives zero` before the next run." if rehome else ""
+    if fault.name == "operator":
+        raise CheckFailedError(f"stopped at t = {fault.time:.3f} s by the operator. The drives are off.{after}")
+    raise CheckFailedError(
+        f"stopped at t = {fault.time:.3f} s: {fault}. The drives are off; look for the cause, then "
+        f"`softneck drives reset`.{after}"
+    )
+
+
+def fault_table(fault: Event | None) -> dict[str, Any] | None:
+    """Return what JSON holds of what ended a run early."""
+    if fault is None:
+        return None
+    return {"time_s": fault.time, "event": fault.name, "node": fault.node, "text": str(fault)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,8 +114,9 @@ class DrivesResult:
         cycles: of the bus.
         cycle: bus period [s].
         wall_time: [s].
-        longest_step: of the master, controller included [s].
         simulated: whether the drives were.
+        times: of the cycles, in real time.
+        terminated: whether SIGTERM asked for the end.
     """
 
     signals: LoopResult
@@ -90,13 +129,14 @@ class DrivesResult:
     cycle: float
     wall_time: float
     simulated: bool
-    longest_step: float = 0.0
+    times: CycleTimes
     notes: tuple[str, ...] = field(default=())
+    terminated: bool = False
 
     @property
     def completed(self) -> bool:
         """Whether the loop ran to its end and nothing stopped it."""
-        return self.fault is None and self.phase == "done"
+        return self.fault is None and self.phase == "done" and not self.terminated
 
     @property
     def real_time_factor(self) -> float:
@@ -105,36 +145,27 @@ class DrivesResult:
 
     def require(self) -> None:
         """Raise CheckFailedError if something ended the run early."""
-        if self.fault is None:
-            return
-        after = " Run `softneck drives zero` before the next run." if self.rehome else ""
-        raise CheckFailedError(
-            f"stopped at t = {self.fault.time:.3f} s: {self.fault}. The drives are off; look for the cause, then "
-            f"`softneck drives reset`.{after}"
-        )
+        require_unstopped(self.fault, rehome=self.rehome)
 
     def recording(self) -> Recording:
         """Return the run as a recording: as measured, with true angles where simulated drives know them."""
-        known = set(known_channels())
-        channels = {name: values for name, values in self.signals.signals.items() if name in known}
-        for axis in ("pitch", "roll"):
-            channels.setdefault(axis, self.signals[f"{axis}_measured"])
-        return Recording(self.signals.time, self.signals.sample_time, channels)
+        return recording_of(self.signals)
 
     def table(self) -> dict[str, Any]:
         """Return the JSON of `softneck drives run`."""
         return {
             "completed": self.completed,
             "phase": self.phase,
-            "fault": None if self.fault is None else {"time_s": self.fault.time, "event": self.fault.name,
-                                                      "node": self.fault.node, "text": str(self.fault)},
+            "fault": fault_table(self.fault),
             "rehome": self.rehome,
             "events": dict(self.counts),
             "simulated": self.simulated,
             "cycles": self.cycles,
             "cycle_s": self.cycle,
             "real_time_factor": self.real_time_factor,
-            "longest_step_s": self.longest_step,
+            "longest_step_s": self.times.longest_step,
+            "times": None if self.simulated else self.times.table(),
+            "terminated": self.terminated,
             "metrics": metrics(self.signals) if len(self.signals.time) > 1 else None,
             "notes": list(self.notes),
         }  # fmt: skip

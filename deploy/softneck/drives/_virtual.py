@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from softneck.plant import NeckParameters
@@ -14,6 +14,9 @@ from .simulated import SimulatedNeck, SimulatedSettings
 
 # A run is over at the latest this long after its loop, whatever happens [s].
 _PATIENCE = 120.0
+
+# Called after each cycle: (now, frames in, frames out, sample of the inclinometer or None, master).
+Watch = Callable[[float, Sequence[Frame], Sequence[Frame], Tilt | None, Master], None]
 
 
 def simulated_neck(
@@ -47,6 +50,7 @@ class VirtualRun:
         master: what runs them.
         host_stopped: the host process hangs or is gone: its master is not stepped.
         watch: called after each step.
+        watches: called after each step of the master with what it got and sent.
         cycles: number of steps so far.
         newest: the inclinometer's sample that the master did not read yet.
     """
@@ -57,6 +61,7 @@ class VirtualRun:
     watch: Callable[[VirtualRun], None] | None = None
     cycles: int = 0
     newest: Tilt | None = None
+    watches: tuple[Watch, ...] = ()
 
     def step(self) -> None:
         """One cycle: sensor, master, frames, and the time until the next."""
@@ -72,7 +77,11 @@ class VirtualRun:
             tilt = None
             if master.sample_due:
                 tilt, self.newest = self.newest, None
-            link.send(master.step(now, link.drain(), tilt))
+            frames = link.drain()
+            out = master.step(now, frames, tilt)
+            link.send(out)
+            for watch in self.watches:
+                watch(now, frames, out, tilt, master)
         if self.watch is not None:
             self.watch(self)
         link.pass_time()

@@ -11,6 +11,7 @@ from canopen.objectdictionary import ObjectDictionary
 
 from softneck.core import CheckFailedError, SoftneckError
 
+from ._bus_loop import Operator
 from ._file import DriveEntry, DrivesFile
 from ._link import Link
 from ._objects import (
@@ -123,7 +124,7 @@ def wait(link: Link, seconds: float) -> None:
         link.receive(until - link.now)
 
 
-def zero(link: Link, file: DrivesFile, look: Look, *, guarding: str) -> Zeroed:
+def zero(link: Link, file: DrivesFile, look: Look, *, guarding: str, operator: Operator | None = None) -> Zeroed:
     """Tension the tendons of motors 1 to 3, set the encoders' zero there, verify, and switch the drives off.
 
     Args:
@@ -131,13 +132,14 @@ def zero(link: Link, file: DrivesFile, look: Look, *, guarding: str) -> Zeroed:
         file: with the settings.
         look: returns the inclinometer's newest sample.
         guarding: "life" or "heartbeat", as the pre-flight set it up; it is fed from here while tendons are pulled.
+        operator: asked every 20 ms; whatever is asked for switches the drives off.
 
     Raises:
         CheckFailedError: a tendon does not get tight in time, the neck is not upright, or the slow loop is another.
     """
     dictionary = load_eds(file.profile, file.eds)
     motors = [_Motor(link, entry, file, dictionary) for entry in file.drives]
-    guard = _feeder(link, file, guarding)
+    guard = _feeder(link, file, guarding, operator)
     try:
         for motor in motors:
             motor.prepare()
@@ -221,13 +223,19 @@ def _set_zero(link: Link, motor: _Motor) -> None:
         raise CheckFailedError(f"node {motor.entry.node}: homing did not end (status {word:04X}h, position {counts}).")
 
 
-def _feeder(link: Link, file: DrivesFile, guarding: str) -> Callable[[], None]:
+def _feeder(link: Link, file: DrivesFile, guarding: str, operator: Operator | None) -> Callable[[], None]:
     """Return what tells the drives that we live: guarding requests, or our heartbeat."""
     if guarding == "life":
         frames = [Frame(0x700 + node, b"\0", remote=True) for node in file.nodes]
     else:
         frames = [Frame(0x700 + MASTER_NODE, b"\x05")]
-    return lambda: link.send(frames)
+
+    def feed() -> None:
+        if operator is not None and operator() is not None:
+            raise CheckFailedError("stopped by the operator. The drives are off; zero them again.")
+        link.send(frames)
+
+    return feed
 
 
 def _off(motors: list[_Motor], guarding: str) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import asdict
 from html import escape
 from typing import Any, Protocol
 
@@ -65,7 +67,8 @@ def describe(
     block = thing.block()
     summary = thing.summary()
     parts = [f"<h2>{_HEADINGS[block.role]}</h2><pre>{escape(summary)}</pre>"]
-    settings: dict[str, Any] = dict(getattr(thing, "settings", {}) or {})
+    asked: Any = getattr(thing, "settings", None) or {}
+    settings: dict[str, Any] = dict(asked) if isinstance(asked, Mapping) else asdict(asked)
     if settings:
         rows = "".join(f"<tr><td>{escape(str(k))}</td><td>{escape(str(v))}</td></tr>" for k, v in settings.items())
         parts.append(f"<h2>Settings</h2><table>{rows}</table>")

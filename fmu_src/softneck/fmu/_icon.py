@@ -34,8 +34,8 @@ _STROKES: dict[str, list[list[tuple[float, float]]]] = {
 
 def icon_png(kind: str, role: str) -> bytes:
     """Return a PNG of 96 x 96 pixels."""
-    # The golden ratio spreads whatever numbers the letters of kinds add up to over the colours.
-    hue = (sum(kind.encode()) * 0.6180339887) % 1.0
+    # The golden ratio spreads whatever numbers kinds come to over the colours; letters alone add up alike in some.
+    hue = (sum(place * letter for place, letter in enumerate(kind.encode(), 1)) * 0.6180339887) % 1.0
     colour = np.array(colorsys.hls_to_rgb(hue, 0.36, 0.6))
     near = np.full((_SIZE, _SIZE), np.inf)
     for stroke in _STROKES[role]:

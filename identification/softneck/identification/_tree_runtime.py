@@ -40,6 +40,22 @@ def tree_children(nodes: np.ndarray, node: int, x: np.ndarray) -> tuple[float, f
     return math.sqrt(left), math.sqrt(right)
 
 
+def tree_cones(points: np.ndarray, first: int, count: int, gamma: float, x: np.ndarray, cones: np.ndarray) -> None:
+    """Fill `cones` with gamma times the distance of x (n,) from `count` points from column `first` on, side by side.
+
+    The sum of each point goes over its sides in their order, as a box's does: see above.
+    """
+    for k in range(count):
+        cones[k] = 0.0
+    for i in range(x.shape[0]):
+        value = x[i]
+        for k in range(count):
+            gap = points[i, first + k] - value
+            cones[k] += gap * gap
+    for k in range(count):
+        cones[k] = gamma * math.sqrt(cones[k])
+
+
 def tree_tighten(
     tree: tuple[np.ndarray, np.ndarray, np.ndarray],
     place: tuple[int, int],
@@ -63,32 +79,29 @@ def tree_tighten(
     low, high = bounds
     ages, start, stop = hidden
     rows = values.shape[0]
-    n = x.shape[0]
     leaves = nodes.shape[0] // 2
     # Left for later: one node a level at most, and 2^64 nodes are more than any memory holds.
     waiting = np.empty(64, dtype=np.int64)
-    cones = np.empty(64)
+    later = np.empty(64)
+    cones = np.empty(rows // leaves + 1)
     waiting[0] = node
-    cones[0] = 0.0 if node == 1 else gamma * tree_distance(nodes, node, x)
+    later[0] = 0.0 if node == 1 else gamma * tree_distance(nodes, node, x)
     top = 1
     while top > 0:
         top -= 1
         node = waiting[top]
-        cone = cones[top]
+        cone = later[top]
         while nodes[node, column] + cone < high or nodes[node, column + 1] - cone > low:
             if node >= leaves:
-                for k in range((node - leaves) * rows // leaves, (node + 1 - leaves) * rows // leaves):
-                    if start < stop and start <= ages[k] < stop:
+                first = (node - leaves) * rows // leaves
+                count = (node + 1 - leaves) * rows // leaves - first
+                tree_cones(points, first, count, gamma, x, cones)
+                for k in range(count):
+                    if start < stop and start <= ages[first + k] < stop:
                         continue
-                    squared = 0.0
-                    for i in range(n):
-                        gap = points[i, k] - x[i]
-                        squared += gap * gap
-                    cone = gamma * math.sqrt(squared)
-                    if values[k] + cone < high:
-                        high = values[k] + cone
-                    if values[k] - cone > low:
-                        low = values[k] - cone
+                    value = values[first + k]
+                    high = min(high, value + cones[k])
+                    low = max(low, value - cones[k])
                 break
             left, right = tree_children(nodes, node, x)
             # The nearer child now, the other one later, if ever.
@@ -96,15 +109,15 @@ def tree_tighten(
                 node = 2 * node
                 other = node + 1
                 cone = gamma * left
-                later = gamma * right
+                far = gamma * right
             else:
                 other = 2 * node
                 node = other + 1
                 cone = gamma * right
-                later = gamma * left
-            if nodes[other, column] + later < high or nodes[other, column + 1] - later > low:
+                far = gamma * left
+            if nodes[other, column] + far < high or nodes[other, column + 1] - far > low:
                 waiting[top] = other
-                cones[top] = later
+                later[top] = far
                 top += 1
     return low, high
 

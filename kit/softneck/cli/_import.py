@@ -27,7 +27,15 @@ from ._options import force_option, json_option, output_option, target
 @force_option
 @json_option
 def command(log: Path, layout_file: Path | None, guess: bool, output: Path | None, force: bool, as_json: bool) -> None:
-    """Turn any logger's table LOG into a recording, by a layout file or by a guess at one."""
+    """Turn any logger's table LOG into a recording, by a layout file or by a guess at one.
+
+    The .mcap log of `softneck drives run --log` needs neither.
+    """
+    if log.suffix.lower() == ".mcap":
+        _run_log(log, output, force=force, as_json=as_json, layout=guess or layout_file is not None)
+        return
+    if log.suffix.lower() == ".blf":
+        raise SettingsError(f"{log}: holds CAN frames only; import the `.mcap` log of the same run.")
     if guess == (layout_file is not None):
         what = "both were given" if guess else "neither was given"
         raise SettingsError(f"import needs either --layout LAYOUT.toml or --guess; {what}.")
@@ -41,6 +49,22 @@ def command(log: Path, layout_file: Path | None, guess: bool, output: Path | Non
         imported = import_log(log, read_layout(layout_file))
     write_recording(path, imported.recording, force=replace)
     _tell(path, imported, facts, as_json)
+
+
+def _run_log(log: Path, output: Path | None, *, force: bool, as_json: bool, layout: bool) -> None:
+    """Import the log of a run on drives."""
+    from softneck.drives import read_run_log  # the drives take a while to import
+
+    if layout:
+        raise SettingsError(f"{log}: is a log of ours, whose columns are known; leave --layout and --guess out.")
+    path, replace = target(output, f"recordings/{log.stem}.csv", force=force)
+    recording_suffix(path)
+    refuse_existing(path, force=replace)
+    run = read_run_log(log)
+    recording = run.recording()
+    notes = (f"{log}: {run.cut}: imported up to the cut",) if run.cut else ()
+    write_recording(path, recording, force=replace)
+    _tell(path, Imported(recording, notes), {}, as_json)
 
 
 def _by_guess(log: Path, path: Path, replace: bool) -> tuple[Imported, dict[str, Any]]:

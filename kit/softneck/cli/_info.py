@@ -16,6 +16,7 @@ from softneck.plant import NeckParameters, VirtualNeck
 from softneck.signals import Guess, Layout, guess_layout, quality, read_layout, read_recording
 
 from ._console import print_json, progress
+from ._info_log import describe_log, is_candump
 from ._options import force_option, json_option
 
 _RECORDINGS = (".csv", ".parquet")
@@ -29,7 +30,8 @@ _LARGE = 20_000_000
 @force_option
 @json_option
 def command(file: Path, html: Path | None, force: bool, as_json: bool) -> None:
-    """Say what FILE is: a recording, model, observer, controller, FMU, loop, layout, neck, study, certificate or log.
+    """Say what FILE is: a recording, model, observer, controller, FMU, loop, layout, neck, study, certificate or log
+    (tables, and those of `softneck drives run --log`).
 
     Of a recording it tells the quality too: faults of its channels, and what its inputs can teach a model. Of a log it
     tells what `softneck import --guess` would take each column for.
@@ -73,6 +75,10 @@ def _describe(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dic
             return _toml(file)
         case ".json":
             return _certificate(file)
+        case ".mcap" | ".blf":
+            return describe_log(file)
+        case ".log" if is_candump(file):
+            return describe_log(file)
         case _:
             return _log(file, html, None)
 

@@ -45,7 +45,8 @@ def bundle(runtime: str, *, loops: bool = True, skip: tuple[str, ...] = ()) -> s
     parts += [prefixed(bundle(member, loops=False), f"m{i}_") for i, (member, _) in enumerate(members)]
     for module in order:
         if module == _MEMBERS and members:
-            parts.append(member_calls([count for _, count in members], _own_arrays(outer)))
+            tangents = all(_has_tangent(member) for member, _ in members)
+            parts.append(member_calls([count for _, count in members], _own_arrays(outer), tangents=tangents))
         else:
             parts.append(_stripped(module, names, skip=set(skip)))
     if loops:
@@ -71,6 +72,11 @@ def _own_arrays(outer: str) -> int:
         if _defined(node) == ["OWN_ARRAYS"] and isinstance(node, ast.Assign):
             return int(ast.literal_eval(node.value))
     raise SettingsError(f"runtime module {outer} takes no members: it does not say OWN_ARRAYS.")
+
+
+def _has_tangent(member: str) -> bool:
+    """Return whether the module of a member says how its outputs answer to planned inputs."""
+    return any(_defined(node) == ["tangent"] for node in _tree(member.partition("(")[0]).body)
 
 
 def _collect(module: str, order: list[str]) -> None:

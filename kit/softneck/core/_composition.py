@@ -11,6 +11,8 @@ _CALLS = {
     "member_initialise": (", parameters, state, outputs", "initialise", False),
     "member_step": (", parameters, state, inputs, outputs", "step", False),
 }
+# Of members that have derivatives.
+_TANGENT = {"member_tangent": (", k, before, state, line, rows, slopes", "tangent", False)}
 
 
 def prefixed(text: str, prefix: str) -> str:
@@ -25,10 +27,16 @@ def prefixed(text: str, prefix: str) -> str:
     return ast.unparse(_Prefix(names - _SHARED, prefix).visit(tree)) + "\n\n"
 
 
-def member_calls(counts: list[int], own: int) -> str:
-    """Return the functions of `_members_runtime` for members that read so many arrays, behind `own` others."""
+def member_calls(counts: list[int], own: int, *, tangents: bool = False) -> str:
+    """Return the functions of `_members_runtime` for members that read so many arrays, behind `own` others.
+
+    Args:
+        counts: arrays of each member.
+        own: arrays before them.
+        tangents: the members have a function `tangent`.
+    """
     lines = ["", "def member_count():", f"    return {len(counts)}", ""]
-    for call, (arguments, name, returns) in _CALLS.items():
+    for call, (arguments, name, returns) in (_CALLS | (_TANGENT if tangents else {})).items():
         lines += ["", f"def {call}(arrays, member{arguments}):"]
         start = own
         for member, count in enumerate(counts):

@@ -99,7 +99,8 @@ KINDS: dict[str, Kind] = {
         Kind("mpc", "controller", "softneck.design:MpcSettings", "softneck.design:MpcController",
              "softneck.design.mpc._mpc_runtime",
              "linear predictive control: limits, preview and co-contraction in one QP for each sample"),
-        Kind("nmpc", "controller", "softneck.design:NmpcSettings", "softneck.design:NmpcController", "",
+        Kind("nmpc", "controller", "softneck.design:NmpcSettings", "softneck.design:NmpcController",
+             "softneck.design.mpc._nmpc_runtime",
              "nonlinear predictive control over nn, play, greybox or nss: one Gauss-Newton step for each sample"),
     )
 }  # fmt: skip

@@ -33,3 +33,17 @@ def member_step(
 ) -> None:
     """Advance a member by one sample."""
     raise NotImplementedError
+
+
+def member_tangent(
+    arrays: tuple[np.ndarray, ...],
+    member: int,
+    k: int,
+    before: np.ndarray,
+    state: np.ndarray,
+    line: np.ndarray,
+    rows: np.ndarray,
+    slopes: np.ndarray,
+) -> None:
+    """Move a member's derivatives on by one sample; only of members that have a function `tangent`."""
+    raise NotImplementedError

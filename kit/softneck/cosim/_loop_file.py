@@ -201,8 +201,7 @@ class _Reader:
         if key == "fmu":
             return self._open((name, file, *settings), lambda: _fmu_part(file, f"[{name}]", table, as_role))
         thing = self._open((role, file), lambda: load(file, role=role))
-        # A controller over CasADi is a part, not a block.
-        return thing.part() if getattr(thing, "kind", "") == "nmpc" else BlockPart(thing.block())
+        return BlockPart(thing.block())
 
     def _open(self, key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
         """Return what `make` opens, remembered if this reader shares what it opens; a changed file is opened again."""

@@ -29,6 +29,7 @@ from ._settings import MasterSettings as MasterSettings
 from ._settings import RampSettings as RampSettings
 from ._settings import SensorSettings as SensorSettings
 from ._settings import WatchSettings as WatchSettings
+from ._supervisor import ACTIVE as ACTIVE
 from ._supervisor import NEXT as NEXT
 from ._supervisor import Phase as Phase
 from ._supervisor import Signal as Signal

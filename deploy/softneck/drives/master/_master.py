@@ -42,11 +42,13 @@ class Master:
         counts: event name -> how often.
         events: the last 1000.
         cycle: number of steps so far.
+        requests: (what, why) that came from outside since the last step: start, finish, stop.
+        taken: those that the last step took in.
     """
 
     def __init__(self, settings: MasterSettings, pilot: Pilot) -> None:
         """Be idle; `start` begins the run."""
-        self.settings, self._pilot = settings, pilot
+        self.settings, self.pilot = settings, pilot
         self.bus = Fieldbus(settings.bus)
         self.supervisor = Supervisor(settings.bus.off)
         self._gate = Gate(settings.sensor)
@@ -68,6 +70,8 @@ class Master:
         self._enabling, self._enabling_since = 0, _NEVER
         self._hold_at: Triple | None = None
         self._asked: list[Signal] = []
+        self.requests: list[tuple[str, str]] = []
+        self.taken: tuple[tuple[str, str], ...] = ()
 
     @property
     def finished(self) -> bool:
@@ -76,14 +80,27 @@ class Master:
 
     def start(self) -> None:
         """Ask for the run to begin with the next step."""
+        self.requests.append(("start", ""))
         self._asked.append(Signal.START)
 
     def finish(self) -> None:
         """Ask for the ramp out."""
+        self.requests.append(("finish", ""))
         self._asked.append(Signal.FINISH)
+
+    def leave(self, reason: str = "") -> None:
+        """Ask for the ramp to rest and the end from wherever the run is; before anything moved, for a stop."""
+        self.requests.append(("leave", reason))
+        now = self._now or 0.0
+        if self.supervisor.phase in (Phase.RAMP_IN, Phase.RUNNING):
+            self._asked.append(Signal.FINISH)
+            self._told(Event(now, "left", 0, reason))
+        elif self.supervisor.phase in (Phase.IDLE, Phase.ENABLING):
+            self._told(Event(now, "operator", 0, reason))
 
     def stop(self, reason: str = "") -> None:
         """Ask for an immediate stop of all drives."""
+        self.requests.append(("stop", reason))
         self._told(Event(self._now or 0.0, "operator", 0, reason))
 
     def step(self, now: float, frames: Sequence[Frame], tilt: Tilt | None = None) -> list[Frame]:
@@ -94,6 +111,8 @@ class Master:
             frames: all that came since the last one; not our own.
             tilt: the inclinometer's sample if one is due and came; due are the steps with `sample_due`.
         """
+        self.taken = tuple(self.requests)
+        self.requests.clear()
         events = self._timing(now)
         events += self.bus.receive(now, frames)
         self._measure()
@@ -150,11 +169,7 @@ class Master:
     def _measure(self) -> None:
         s, d = self.settings, self.bus.drives
         k, zero, n = s.counts_per_radian, s.zero_counts, s.newton_per_unit
-        self.positions = (
-            (d[0].counts - zero) / k[0],
-            (d[1].counts - zero) / k[1],
-            (d[2].counts - zero) / k[2],
-        )
+        self.positions = ((d[0].counts - zero) / k[0], (d[1].counts - zero) / k[1], (d[2].counts - zero) / k[2])
         self.tensions = (d[0].current * n[0], d[1].current * n[1], d[2].current * n[2])
 
     def _judge(self, now: float, events: list[Event]) -> None:
@@ -264,7 +279,7 @@ class Master:
         if self._gate.last is not None:
             self._watches.align(self._gate.last.pitch, self._gate.last.roll, self.positions)
         try:
-            self._pilot.start()
+            self.pilot.start()
         except Exception as error:
             self._failed(self._now or 0.0, error)
 
@@ -292,12 +307,12 @@ class Master:
         if tilt is None:
             return
         try:
-            if self._pilot.finished(self._index):
+            if self.pilot.finished(self._index):
                 self._change(now, Signal.FINISH)
                 self._arrived_at = _NEVER
                 self._ramp(now, events)
                 return
-            answer = self._pilot.step(Measured(self._index, tilt, fresh, self.positions))
+            answer = self.pilot.step(Measured(self._index, tilt, fresh, self.positions))
             if answer is None:
                 self._missing += 1
                 self._from = self.wanted

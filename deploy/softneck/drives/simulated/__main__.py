@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
+import json
+import socket
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
 import click
 
 from softneck.plant import NeckParameters
 
+from ._frame import CanFrame
 from ._neck import SimulatedNeck, SimulatedSettings
 from ._profiles import PROFILES
-from ._server import serve
+from ._server import STATES, serve
 
 
 @click.command()
@@ -17,16 +26,50 @@ from ._server import serve
 @click.option("--profile", type=click.Choice(list(PROFILES)), default="ipos2015", show_default=True)
 @click.option("--homed", is_flag=True, help="As if `softneck drives zero` had been run.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Of the inclinometer's noise.")
-def main(bus: str, neck: str, profile: str, homed: bool, seed: int) -> None:
+@click.option("--report", is_flag=True, help="Print one JSON line for each change of a drive's power state.")
+@click.option("--cycle", type=float, default=0.01, show_default=True, help="Bus period the drives expect [s].")
+@click.option("--sensor-socket", type=click.Path(path_type=Path),
+              help="The inclinometer is softneck.drives.simulated.inclinometer and listens there.")  # fmt: skip
+def main(
+    bus: str, neck: str, profile: str, homed: bool, seed: int, report: bool, cycle: float, sensor_socket: Path | None
+) -> None:
     """Simulate three drives (nodes 1 to 3), the neck and an inclinometer (node 10) on a bus, until Ctrl-C."""
     import can
 
     interface, _, channel = bus.partition(":")
-    settings = SimulatedSettings(profile=profile, homed=homed, seed=seed)
+    settings = SimulatedSettings(profile=profile, homed=homed, seed=seed, cycle=cycle)
     virtual = SimulatedNeck(NeckParameters.preset(neck), settings)
-    with can.Bus(interface=interface, channel=channel) as opened:
+    # All that compiles at its first call does so before the drives answer.
+    virtual.move()
+    virtual.sample(0.0)
+    gc.freeze()
+    with can.Bus(interface=interface, channel=channel) as opened, _forwarded(sensor_socket) as sensor:
         click.echo(f"three {profile} drives on {bus}; Ctrl-C ends them", err=True)
-        serve(opened, virtual)
+        serve(opened, virtual, sensor=sensor, report=_print if report else None)
+
+
+def _print(now: float, neck: SimulatedNeck, row: int) -> None:
+    axis = neck.drives[row].axis
+    line = {"time_s": now, "node": axis.node, "state": STATES[axis.state], "fault": f"{axis.fault:04X}h",
+            "counts": axis.getters[(0x6064, 0)]()}  # fmt: skip
+    sys.stdout.write(json.dumps(line) + "\n")
+    sys.stdout.flush()
+
+
+@contextlib.contextmanager
+def _forwarded(path: Path | None) -> Iterator[Callable[[CanFrame], None] | None]:
+    """Yield what hands frames to the process behind socket `path`; one that does not read them loses them."""
+    if path is None:
+        yield None
+        return
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as out:
+        out.setblocking(False)
+
+        def hand_over(frame: CanFrame) -> None:
+            with contextlib.suppress(OSError):
+                out.sendto(frame.identifier.to_bytes(2, "little") + frame.data, str(path))
+
+        yield hand_over
 
 
 if __name__ == "__main__":

@@ -9,24 +9,53 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from . import _power as power
 from ._frame import CanFrame
 from ._neck import SimulatedNeck
 
 _SLOPES = struct.Struct("<ii")
 _NOTHING = -(2**31)
 _RESOLUTION = math.radians(0.001)
+STATES = {
+    power.NOT_READY: "NOT_READY", power.SWITCH_ON_DISABLED: "DISABLED", power.READY: "READY",
+    power.SWITCHED_ON: "SWITCHED_ON", power.ENABLED: "ENABLED", power.QUICK_STOP: "QUICK_STOP",
+    power.REACTION: "REACTION", power.FAULT: "FAULT",
+}  # fmt: skip
 
 
-def serve(bus: Any, neck: SimulatedNeck, *, sensor_node: int = 10, stopped: Callable[[], bool] | None = None) -> None:
+def serve(
+    bus: Any,
+    neck: SimulatedNeck,
+    *,
+    sensor_node: int = 10,
+    stopped: Callable[[], bool] | None = None,
+    sensor: Callable[[CanFrame], None] | None = None,
+    report: Callable[[float, SimulatedNeck, int], None] | None = None,
+) -> None:
     """Answer frames on `bus` and let the neck move, until `stopped` returns True.
 
-    The inclinometer sends its slopes as node `sensor_node` in a TPDO of its own (CiA 410, 0.001 deg).
+    Args:
+        bus: an open bus of python-can.
+        neck: what hangs on it.
+        sensor_node: node of the inclinometer, which sends its slopes in a TPDO of its own (CiA 410, 0.001 deg).
+        stopped: asked in each cycle.
+        sensor: takes the inclinometer's frames instead of `bus`: it is then a process of its own.
+        report: called with (monotonic time, neck, row) whenever the drive in that row changes its power state.
     """
     import can
 
     cycle, sample_time = neck.settings.cycle, neck.settings.sample_time
     begin = time.monotonic()
     moved = sampled = 0
+    states = [-1] * len(neck.drives)
+
+    def tell() -> None:
+        for row, drive in enumerate(neck.drives):
+            if drive.axis.state != states[row]:
+                states[row] = drive.axis.state
+                if report is not None:
+                    report(time.monotonic(), neck, row)
+
     while stopped is None or not stopped():
         now = time.monotonic() - begin
         while moved * cycle <= now:
@@ -34,17 +63,25 @@ def serve(bus: Any, neck: SimulatedNeck, *, sensor_node: int = 10, stopped: Call
             moved += 1
             if moved * cycle >= sampled * sample_time:
                 sampled += 1
-                _send(bus, [_slopes(neck, now, sensor_node)])
+                slopes = _slopes(neck, now, sensor_node)
+                if sensor is None:
+                    _send(bus, [slopes])
+                else:
+                    sensor(slopes)
             _send(bus, neck.run((), moved * cycle))
+            tell()
         rest = max(0.0, moved * cycle - (time.monotonic() - begin))
         try:
             message = bus.recv(rest)
         except (can.CanError, OSError):
+            # A bus that is down answers at once: no reason to spin.
+            time.sleep(min(rest, 1e-3))
             continue
         if message is not None and not message.is_error_frame and not message.is_extended_id:
             data = b"" if message.is_remote_frame else bytes(message.data)
             frame = CanFrame(message.arbitration_id, data, message.is_remote_frame)
             _send(bus, neck.run([frame], time.monotonic() - begin))
+            tell()
 
 
 def _slopes(neck: SimulatedNeck, now: float, node: int) -> CanFrame:

@@ -52,7 +52,7 @@ def assemble(problem: Problem, found: Matrices, tuning: Tuning) -> tuple[Matrix,
     constants = np.array([
         Ts, p.rows, len(p.scenarios), n, p.dead_time, len(p.starts), p.slacks, tuning.preview,
         min(round(tuning.reference_time / Ts), tuning.preview), len(tuning.disturbances), tuning.budget, _TOLERANCE,
-        tuning.coast, angle_at, angle_at + float(p.angles),
+        tuning.coast, angle_at, angle_at + float(p.angles), 0.0, 0.0,
     ])  # fmt: skip
     keep = math.exp(-Ts / tuning.reference_time) if tuning.reference_time > 0.0 else 0.0
     disturbances = np.zeros((max(1, len(tuning.disturbances)), 3))
@@ -113,6 +113,15 @@ def with_gains(arrays: tuple[Matrix, ...], trust: float) -> tuple[Matrix, ...]:
     """Return the arrays with another trust of the observer in what is measured."""
     items = list(arrays)
     items[3] = observer_gains(items[3][:, 2], trust)
+    return tuple(items)
+
+
+def with_back_off(arrays: tuple[Matrix, ...], angle: float, tautness: float) -> tuple[Matrix, ...]:
+    """Return the arrays with soft limits that are tighter by so much [rad]."""
+    items = list(arrays)
+    constants: Vector = items[0].copy()
+    constants[15:17] = angle, tautness
+    items[0] = constants
     return tuple(items)
 
 

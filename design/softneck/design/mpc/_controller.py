@@ -191,14 +191,14 @@ _LIMITS = ("position_limit", "slew_limit", "lead_limit", "least_position", "angl
 
 def _check_shapes(items: tuple[Matrix, ...]) -> None:
     q = items[0]
-    if q.shape != (15,) or not np.isfinite(q).all():
+    if q.shape != (17,) or not np.isfinite(q).all():
         raise FileFormatError("the controller's constants are damaged; design it again.")
     S, n, L = int(q[rt.MPC_SCENARIOS]), int(q[rt.MPC_ORDER]), int(q[rt.MPC_ROWS])
     b = int(q[rt.MPC_MOVES])
     nz, m, p = 3 * b + int(q[rt.MPC_SLACKS]), items[14].shape[0], 2 * S * (n + 2) + 2 * L + 5
     disturbances = max(1, int(q[rt.MPC_DISTURBANCES]))
     shapes = (
-        (15,), (2 * S * n, n), (2 * S, n), (2 * S, 3), (2 * S, n), (2 * S,), (disturbances, 3), (3,), (3, 3), (b,),
+        (17,), (2 * S * n, n), (2 * S, n), (2 * S, 3), (2 * S, n), (2 * S,), (disturbances, 3), (3,), (3, 3), (b,),
         (nz, p), (m, nz), (m, m), (m, p), (m, 2), (m, nz), (nz, nz), (nz, p), (1,),
     )  # fmt: skip
     if any(item.shape != shape or not np.isfinite(item).all() for item, shape in zip(items, shapes, strict=True)):

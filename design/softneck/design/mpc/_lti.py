@@ -35,7 +35,9 @@ def system(arrays: tuple[Matrix, ...]) -> tuple[Matrix, Matrix, Matrix, Matrix]:
     head = rt.MPC_COUNTERS
     # Held set-points, filtered references, then models, disturbances, past inputs and references to come.
     kept = np.concatenate([np.arange(head, head + 6), np.arange(places[1], places[5])])
-    parameters = np.array([_FREE, _FREE, _FREE, -_FREE, _FREE, -_FREE])
+    # Tautness is the fifth where angles have no limit, else the sixth.
+    soft = [_FREE] * (int(arrays[0][rt.MPC_TAUT_AT]) - int(arrays[0][rt.MPC_ANGLE_AT]))
+    parameters = np.array([_FREE, _FREE, _FREE, -_FREE, *soft, -_FREE])
     ahead = 2 if arrays[0][rt.MPC_AHEAD] > 0 else 0
     ports = 10 + ahead + int(arrays[0][rt.MPC_DISTURBANCES])
 

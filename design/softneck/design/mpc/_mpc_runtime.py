@@ -21,6 +21,7 @@ from softneck.design.mpc._dual_runtime import qp_solve
 from softneck.design.mpc._mpc_state_runtime import (
     MPC_AGE,
     MPC_ANGLE_AT,
+    MPC_ANGLE_BACK,
     MPC_BUDGET,
     MPC_COUNTERS,
     MPC_HOLDING,
@@ -41,6 +42,7 @@ from softneck.design.mpc._mpc_state_runtime import (
     MPC_SOFTENED,
     MPC_STATUS,
     MPC_TAUT_AT,
+    MPC_TAUT_BACK,
     MPC_TOLERANCE,
     MPC_TS,
     mpc_begin,
@@ -112,11 +114,11 @@ def mpc_bounds(
         elif kinds[i] == MPC_ROW_SLACK:
             low = 0.0
         elif kinds[i] == MPC_ROW_ANGLE_HIGH:
-            high = parameters[int(arrays[0][MPC_ANGLE_AT])] - free[i]
+            high = parameters[int(arrays[0][MPC_ANGLE_AT])] - arrays[0][MPC_ANGLE_BACK] - free[i]
         elif kinds[i] == MPC_ROW_ANGLE_LOW:
-            low = -parameters[int(arrays[0][MPC_ANGLE_AT])] - free[i]
+            low = arrays[0][MPC_ANGLE_BACK] - parameters[int(arrays[0][MPC_ANGLE_AT])] - free[i]
         else:
-            low = parameters[int(arrays[0][MPC_TAUT_AT])] - free[i]
+            low = parameters[int(arrays[0][MPC_TAUT_AT])] + arrays[0][MPC_TAUT_BACK] - free[i]
         lower[i] = low
         upper[i] = high
 

@@ -45,6 +45,8 @@ MPC_TOLERANCE = 11
 MPC_COAST = 12
 MPC_ANGLE_AT = 13  # places of two parameters; those whose limit is not set are not there
 MPC_TAUT_AT = 14
+MPC_ANGLE_BACK = 15  # how much soft limits are tightened
+MPC_TAUT_BACK = 16
 
 # Kinds of rows.
 MPC_ROW_MOVE = 0.0

@@ -7,12 +7,13 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import (
+    Block,
     DataError,
     Port,
     SettingsError,
@@ -134,7 +135,7 @@ class NmpcSettings:
 class NmpcController:
     """A nonlinear predictive controller of pitch and roll; `NmpcSettings.design` makes it.
 
-    It is a Python object with `step`, and a part of loops (`part`); CasADi and daqp are needed where it runs.
+    `block` is for FMUs and loop files and needs numpy alone; `step` and `part` solve the same with CasADi and daqp.
 
     Attributes:
         settings: what was asked.
@@ -242,11 +243,20 @@ class NmpcController:
 
         return NmpcPart(self)
 
-    def block(self) -> NoReturn:
-        """Raise SettingsError: there is no runtime, hence no FMU."""
-        raise SettingsError(
-            "a nonlinear predictive controller is a Python object with `step` and `part()`, not a block: it needs "
-            "CasADi and daqp where it runs, so there is no FMU of it. `softneck design mpc` makes one with an FMU."
+    def block(self) -> Block:
+        """Return the controller as a block of role "controller", for FMUs: numpy alone, no CasADi and no daqp."""
+        from ._nmpc_arrays import controller_arrays
+
+        runtime = f"softneck.design.mpc._tangent_{self.model.kind}_runtime:{len(self.model.arrays)}"
+        return Block(
+            kind="nmpc",
+            role="controller",
+            runtime=f"softneck.design.mpc._nmpc_runtime({runtime})",
+            sample_time=self.sample_time,
+            arrays=(*controller_arrays(self), *self.model.block().arrays),
+            inputs=self.inputs,
+            outputs=self.outputs,
+            parameters=self.parameters,
         )
 
     def summary(self) -> str:

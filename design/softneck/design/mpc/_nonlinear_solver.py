@@ -12,15 +12,13 @@ from softneck.core import Matrix, Vector, load_runtime
 
 from . import _mpc_state_runtime as rt
 from ._gauss_newton import Evaluated, compiled, qp_function
-from ._horizon_estimate import disturbance_ahead, estimate_gains
+from ._nmpc_prepared import COAST, SETTLE, Preparation
 
 if TYPE_CHECKING:
     from ._nmpc import NmpcController
 
 # Places in the head of the state.
 _STARTED, _ITERATIONS, _STATUS, _SHIFTED, _SOFTENED, _MISSED, _RESIDUAL, _HEAD = range(8)
-_COAST = 25
-_SETTLE = 200
 _MOST_ITERATIONS = 50
 _CONVERGED = 1e-10
 # Of the KKT conditions; daqp is asked for 1e-10.
@@ -54,55 +52,26 @@ class NonlinearSolver:
     def __init__(self, controller: NmpcController) -> None:
         """Compile the problem of `controller`."""
         c, s = controller, controller.settings
-        p = self.problem = c.problem()
+        self.prepared = Preparation(c)
+        p = self.problem = self.prepared.problem
         self.settings, self.Ts = s, c.sample_time
         self._block = c.model.block()
         self._model_step = load_runtime(self._block.runtime).step
         start = self._block.initial_state(use_measurement=0.0, noise_std=0.0)
         self._rest, self._free = start.values, start.parameters
         self.nx, self.nz = start.values.size, p.variables
-        self.ahead = round(s.preview / self.Ts)
         self._evaluated = Evaluated(compiled(qp_function(p)))
-        plants = c.plants()
-        pole = max(float(-plant.denominator[1]) for plant in plants)
-        if s.disturbance_time is not None:
-            pole = math.exp(-self.Ts / s.disturbance_time)
-        self._gains = estimate_gains(pole, s.window)
-        self._future = disturbance_ahead(pole, p.horizon)
-        self._gain = np.array([plant.static_gain for plant in plants])
-        self._references(max(plant.delay for plant in plants))
         self._rows()
         self._places()
         self._model: Any = None
 
     def _places(self) -> None:
         """Where the parts of the state begin."""
-        sizes = [_HEAD, 3, 3, 3, 2 * self.ahead, self.nx, 2, 2 * self.settings.window, self.nz]
+        sizes = [_HEAD, 3, 3, 3, 2 * self.prepared.ahead, self.nx, 2, 2 * self.settings.window, self.nz]
         ends = np.cumsum(sizes)
         names = ("head", "held", "filtered", "seen", "ahead", "x", "y", "missed", "plan")
         self._at = {name: slice(int(end - n), int(end)) for name, end, n in zip(names, ends, sizes, strict=True)}
         self.size = int(ends[-1])
-
-    def _references(self, delay: int) -> None:
-        """Prepare the filter over the horizon, and the moves that a moving reference asks for itself."""
-        s, p = self.settings, self.problem
-        self._keep = math.exp(-self.Ts / s.reference_time) if s.reference_time > 0.0 else 0.0
-        self._lead = min(round(s.reference_time / self.Ts), self.ahead)
-        L = p.horizon + delay + 1
-        i = np.arange(1, L + 1)
-        self._decay = self._keep**i
-        lag = i[:, None] - i[None, :]
-        self._filter = np.where(lag >= 0, (1.0 - self._keep) * self._keep ** np.maximum(lag, 0), 0.0)
-        self._asked_at = np.minimum(i + self._lead, max(self.ahead, 1)) - 1
-        ends = (*p.starts[1:], p.horizon)
-        middles = np.array([-0.5, *(0.5 * (a + b) for a, b in zip(p.starts, ends, strict=True))]) + delay
-        places = np.clip(middles, 0.0, L - 1.0)
-        low = np.minimum(np.floor(places).astype(int), L - 2)
-        weights = np.zeros((places.size, L))
-        weights[np.arange(places.size), low] += 1.0 - (places - low)
-        weights[np.arange(places.size), low + 1] += places - low
-        self._slopes = np.diff(weights, axis=0)
-        self._inverse = np.linalg.inv(p.T)[:, :2]
 
     def _rows(self) -> None:
         """Prepare the QP's rows: moves and slack as bounds, positions, and limits of the angles."""
@@ -147,7 +116,7 @@ class NonlinearSolver:
         self._listen(v, u, first)
         measured = rt.mpc_plausible(u[3]) and rt.mpc_plausible(u[4])
         head[_MISSED] = 0.0 if measured else head[_MISSED] + 1.0
-        active = u[8] > 0.5 and u[9] > 0.5 and head[_MISSED] <= _COAST
+        active = u[8] > 0.5 and u[9] > 0.5 and head[_MISSED] <= COAST
         if first:
             self._settle(v)
         missed = v["missed"].reshape(-1, 2)
@@ -174,7 +143,7 @@ class NonlinearSolver:
         seen = v["seen"]
         limit = np.array([rt.MPC_REFERENCE_LIMIT, rt.MPC_REFERENCE_LIMIT, rt.MPC_MOTOR_LIMIT])
         seen[:] = np.where(np.isfinite(u[:3]), np.clip(u[:3], -limit, limit), seen)
-        if self.ahead:
+        if self.prepared.ahead:
             line = v["ahead"].reshape(2, -1)
             if first:
                 line[:] = seen[:2, None]
@@ -184,7 +153,7 @@ class NonlinearSolver:
 
     def _settle(self, v: dict[str, Vector]) -> None:
         """Bring the model to where it had been, had it stood under the held set-points for ever."""
-        rows = np.full((_SETTLE, 8), np.nan)
+        rows = np.full((SETTLE, 8), np.nan)
         rows[:, :3] = v["held"]
         start = self._block.initial_state(use_measurement=0.0, noise_std=0.0)
         state, _ = self._block.run(start, rows)
@@ -194,22 +163,22 @@ class NonlinearSolver:
         """Return the filtered references of the samples to come (L, 2), and the moves that they ask for (nz,)."""
         filtered, seen = v["filtered"], v["seen"]
         now = seen.copy()
-        if self.ahead and self._lead:
-            now[:2] = v["ahead"].reshape(2, -1)[:, self._lead - 1]
-        filtered[:] = self._keep * filtered + (1.0 - self._keep) * now
-        if self.ahead:
-            wanted = v["ahead"].reshape(2, -1).T[self._asked_at]
+        if self.prepared.ahead and self.prepared.lead:
+            now[:2] = v["ahead"].reshape(2, -1)[:, self.prepared.lead - 1]
+        filtered[:] = self.prepared.keep * filtered + (1.0 - self.prepared.keep) * now
+        if self.prepared.ahead:
+            wanted = v["ahead"].reshape(2, -1).T[self.prepared.asked_at]
         else:
-            wanted = np.broadcast_to(seen[:2], (self._decay.size, 2))
-        path = self._decay[:, None] * filtered[:2] + self._filter @ wanted
-        moves = (self._slopes @ (path / self._gain)) @ self._inverse.T
+            wanted = np.broadcast_to(seen[:2], (self.prepared.decay.size, 2))
+        path = self.prepared.decay[:, None] * filtered[:2] + self.prepared.filter @ wanted
+        moves = (self.prepared.slopes @ (path / self.prepared.gain)) @ self.prepared.inverse.T
         return path, moves.ravel()
 
     def _decide(self, v: dict[str, Vector], parameters: Vector, u: Vector) -> None:
         path, asked = self._asked(v)
         held, plan, head = v["held"], v["plan"], v["head"]
-        level_rate = self._gains @ v["missed"].reshape(-1, 2)
-        ahead = self._future @ level_rate
+        level_rate = self.prepared.gains @ v["missed"].reshape(-1, 2)
+        ahead = self.prepared.future @ level_rate
         e = self._evaluated
         e.inputs[0][:], e.inputs[1][:], e.inputs[2][:] = plan, v["x"], held
         e.inputs[3][:] = (path[: self.problem.horizon] - ahead).ravel()

@@ -115,7 +115,9 @@ class MpcProgram:
         import casadi as ca
 
         theta, limits = ca.SX.sym("theta", self.F.shape[1]), ca.SX.sym("limits", 4)
-        position, move, angle, taut = (limits[i] for i in range(4))
+        q = self.arrays[0]
+        position, move = limits[0], limits[1]
+        angle, taut = limits[2] - float(q[rt.MPC_ANGLE_BACK]), limits[3] + float(q[rt.MPC_TAUT_BACK])
         free = ca.mtimes(ca.DM(self.arrays[_FIELDS["E"]]), theta)
         inf = rt.MPC_NO_BOUND
         ends = {

@@ -28,6 +28,7 @@ from ._disturbance import MeasuredDisturbance
 from ._lti import system
 from ._prediction import Problem, matrices
 from ._scenarios import chosen_scenarios, sample_pairs
+from ._tightening import Trial, tightened
 from ._tuning import (
     FULL_TRUST,
     Pair,
@@ -80,6 +81,9 @@ class MpcSettings:
         tautness_lever: motor angle that one radian of neck takes up [rad/rad].
         cocontraction_weight: on the error of co-contraction, against that of the tilt's inputs, squared.
         slack_weight: on violations of soft limits, against errors of the angles, squared.
+        tightening: whether soft limits are tightened until they hold in trials with the identified plant and with every
+            judged sample of a family.
+        measurement_bound: by how much a measured angle may be wrong in these trials [rad].
         disturbance_time: time constant of the output disturbance's rate [s]; None for the plant's own, as a load at its
             input makes it. A longer one follows what keeps changing, such as a payload carried round, less robustly.
         budget: iterations of the solver for each sample; beyond them the previous plan goes on.
@@ -111,8 +115,12 @@ class MpcSettings:
     minimum_tautness: float | None = None
     # Radius of the tendons' attachment over that of the winch: 52 mm / 7.5 mm (lab code; paper, section 3.1).
     tautness_lever: float = 6.93
-    cocontraction_weight: float = 1.0
+    # Light: where tendons must be taut, co-contraction gives way; at 1 the angles gave way by a quarter of a degree.
+    cocontraction_weight: float = 0.05
     slack_weight: float = 1e3
+    tightening: bool = False
+    # The observer of the 3DM-GX5-10 on the virtual neck is wrong by up to 0.34 deg near a limit, by 0.1 deg at rest.
+    measurement_bound: float = math.radians(0.35)
     disturbance_time: float | None = None
     budget: int = 100
     # The paper's own dead time and pole (Eq. 31: 0.08 s, 5.293 1/s).
@@ -140,6 +148,7 @@ class MpcSettings:
             require_between("disturbance_time", self.disturbance_time, 0.02, 20.0, "s")
         for name in ("cocontraction_weight", "slack_weight"):
             require_positive(name, getattr(self, name))
+        require_between("measurement_bound", self.measurement_bound, 0.0, 0.1, "rad")
         require_whole("budget", self.budget, 1, 10_000)
         require_between("least_delay", self.least_delay, 0.0, 1.0, "s")
         require_between("small_move_pole", self.small_move_pole, 0.0, 1000.0, "1/s")
@@ -184,6 +193,9 @@ class MpcSettings:
         bandwidth = self._fastest(model, nominal, samples) if self.bandwidth is None else self.bandwidth
         arrays, found = self._tuned(self._arrays(model, bandwidth), nominal, samples)
         found["bandwidth_rad_s"] = bandwidth
+        if self.tightening:
+            plants = [self._delayed(pair) for pair in [*self._families(nominal), *samples]]
+            arrays, found["back_off_rad"] = tightened(arrays, plants, self._trial())
         return MpcController(
             sample_time=Ts,
             arrays=arrays,
@@ -246,6 +258,16 @@ class MpcSettings:
             tautness=None if self.minimum_tautness is None else lever,
             disturbance_time=self.disturbance_time,
             guard=guard_samples(bandwidth, nominal[0].sample_time),
+        )
+
+    def _trial(self) -> Trial:
+        """Return what tightening is tried with."""
+        return Trial(
+            parameters=(self.position_limit, self.slew_limit, self.lead_limit, self.least_position),
+            angle_limit=self.angle_limit,
+            minimum_tautness=self.minimum_tautness,
+            tautness_lever=self.tautness_lever,
+            measurement_bound=self.measurement_bound,
         )
 
     def _families(self, nominal: Pair) -> list[Pair]:

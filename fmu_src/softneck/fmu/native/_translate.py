@@ -17,12 +17,33 @@ from ._expressions import Expressions
 from ._kinds import FAST
 from ._scope import Scope
 from ._statements import Statements, holds_view
-from ._types import INT, NONE, VECTOR, Arrays, Bundle, CTypes, TranslationError, Type, Value, View, lends
+from ._types import (
+    FLOAT,
+    INT,
+    MATRIX,
+    NONE,
+    VECTOR,
+    Arrays,
+    Bundle,
+    CTypes,
+    TranslationError,
+    Type,
+    Value,
+    View,
+    lends,
+)
 
 _MEMBERS = {
     "member_size": (2, INT, "sn_member_size(w, {})"),
     "member_initialise": (5, NONE, "sn_member_initialise(w, {})"),
     "member_step": (6, NONE, "sn_member_step(w, {})"),
+}
+# Functions whose loops `sn_wide.h` has by hand, several numbers side by side: types and result as in Python, bits too.
+# One that returns numbers fills them in behind its arguments.
+_PAIR = Bundle((FLOAT, FLOAT))
+_BY_HAND: dict[str, tuple[tuple[Type, ...], Type]] = {
+    "tree_children": ((MATRIX, INT, VECTOR), _PAIR),
+    "tree_cones": ((MATRIX, INT, INT, FLOAT, VECTOR, VECTOR), NONE),
 }
 _PASSES = 20
 
@@ -202,6 +223,14 @@ class _Runtime:
             if len(values) != count:
                 raise ex.scope.fail(node, f"`{name}` takes {count} arguments.")
             value = Value(code.format(", ".join(value.code for value in values)), kind)
+        elif _BY_HAND.get(name, ((), NONE))[0] == tuple(value.type for value in values):
+            kind = _BY_HAND[name][1]
+            arguments = "".join(f", {ex.scope.given(value)}" for value in values)
+            if kind != NONE:
+                filled = ex.scope.temporary(kind)
+                ex.scope.emit(f"sn_{name}(w{arguments}, {filled}.f);")
+                return Value(filled, kind)
+            value = Value(f"sn_{name}(w{arguments})", NONE)
         else:
             done = self.function(name, tuple(value.type for value in values))
             codes = [

@@ -1,0 +1,84 @@
+"""softneck drives jog and record, and what lets drives move."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from softneck.cli._arm import require_armed, words
+from softneck.cli._drives_target import sensor_of
+from softneck.core import SettingsError
+from softneck.drives import load_drives
+from softneck.signals import read_recording
+
+from ..data import ROOT
+from .conftest import Call
+
+EXAMPLE = ROOT / "examples" / "drives" / "drives.toml"
+
+
+def test_jog_says_what_it_expected_and_saw(call: Call) -> None:
+    said = call("drives", "jog", "2", "--simulated", "--json")
+    assert said.code == 0, said.err
+    found = json.loads(said.out)
+    assert (found["motor"], found["verdict"], found["holds"], found["phase"]) == (2, "ok", True, "done")
+    assert found["expected"]["direction_deg"] == pytest.approx(120.0)
+    assert "direction_deg" in call("drives", "jog", "1", "--simulated").out
+
+
+def test_record_is_a_recording_for_identify(call: Call) -> None:
+    said = call("drives", "record", "aprbs", "--duration", "12", "--simulated", "-o", "r.csv", "--json")
+    assert said.code == 0, said.err
+    found = json.loads(said.out)
+    assert found["completed"]
+    assert found["rows"] == len(read_recording("r.csv")) == 600
+    assert call("identify", "rls", "r.csv", "-o", "m.npz").code == 0
+    assert "r.csv: exists" in call("drives", "record", "sine", "--simulated", "-o", "r.csv").error
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("jog", "4", "--simulated"), "4 is not in the range"),
+        (("jog", "1"), "say which drives"),
+        (("jog", "1", "--simulated", "--amplitude", "9"), "--amplitude"),
+        (("jog", "1", "--simulated", "--pace", "-1"), "--pace"),
+        (("jog", "1", "--bus", "virtual:x", "--drives", EXAMPLE), "say --arm if they may. Nothing was sent"),
+        (("jog", "1", "--bus", "virtual:x", "--drives", EXAMPLE, "--pace", "2"), "--pace is for --simulated"),
+        (("jog", "1", "--bus", "socketcan:can_no", "--drives", EXAMPLE, "--arm"), "stdin is none"),
+        (("record", "music", "--simulated", "-o", "r.csv"), "`signal` must be one of"),
+        (("record", "sine", "--simulated", "-o", "r.txt"), "r.txt"),
+        (("record", "sine", "--simulated", "-o", "r.csv", "--max-position", "7"), "beyond the 6 rad of [limits]"),
+        (("record", "sine", "--simulated", "-o", "r.csv", "--payload", "9"), "--payload"),
+        (("record", "eq22", "--duration", "5", "--simulated", "-o", "r.csv", "--ramp", "0"), "--ramp"),
+    ],
+)
+def test_bad_input(call: Call, monkeypatch: pytest.MonkeyPatch, arguments: tuple[object, ...], message: str) -> None:
+    monkeypatch.setattr("sys.stdin", None)
+    said = call("drives", *arguments)
+    assert said.code == 2
+    assert message in said.error
+    assert said.out == ""
+
+
+def test_a_service_says_the_same_words(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert words("socketcan:can0") == "MOVE can0"
+    monkeypatch.setattr("sys.stdin", None)
+    monkeypatch.setenv("SOFTNECK_ARM", "MOVE can1")
+    with pytest.raises(SettingsError, match=r"SOFTNECK_ARM is `MOVE can1`; for socketcan:can0 it must be `MOVE can0`"):
+        require_armed("socketcan:can0", arm=True)
+    monkeypatch.setenv("SOFTNECK_ARM", "MOVE can0")
+    with pytest.raises(SettingsError, match="say --arm"):
+        require_armed("socketcan:can0", arm=False)
+    require_armed("socketcan:can0", arm=True)
+    assert "nobody was asked" in capsys.readouterr().err
+
+
+def test_a_recording_is_no_sensor_for_real_drives(tmp_path):
+    (tmp_path / "drives.toml").write_text(
+        EXAMPLE.read_text().replace('kind = "can" ', 'kind = "replay"\nfile = "run.csv" ', 1)
+    )
+    file = load_drives(tmp_path / "drives.toml")
+    with pytest.raises(SettingsError, match="for simulated drives; on socketcan:can0"):
+        sensor_of(file, "socketcan:can0")

@@ -1,0 +1,130 @@
+"""Tightened soft limits: what was promised holds on every sample of the plant, and did not without."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import control
+import numpy as np
+import pytest
+
+from softneck.core import SettingsError, load
+from softneck.design import MpcController, MpcSettings, bake_off_neck
+from softneck.design.mpc import _mpc_state_runtime as rt
+from softneck.estimation import LinearNeck
+
+from .mpc_neck import Neck
+
+LIMIT, TAUT, BOUND = 0.2, -0.2, math.radians(0.2)
+GAINS = (0.8, 1.0, 1.25)
+
+
+class Spread(LinearNeck):
+    """The neck of the bake-off, its gain 20 % lower to 25 % higher."""
+
+    def samples(self, output: str) -> list[control.TransferFunction]:
+        return [gain * self.tf(output) for gain in GAINS]
+
+
+@pytest.fixture(scope="module")
+def pair() -> tuple[MpcController, MpcController]:
+    """Without and with tightening."""
+    nominal = bake_off_neck()
+    settings = MpcSettings(
+        bandwidth=6.0, angle_limit=LIMIT, minimum_tautness=TAUT, worst_sensitivity=4.0, measurement_bound=BOUND
+    )
+    family = Spread(pitch=nominal.pitch, roll=nominal.roll)
+    return settings.design(family), replace(settings, tightening=True).design(family)
+
+
+def worst(controller: MpcController, gain: float, seed: int) -> tuple[float, float]:
+    """Return by how much angles and tautness pass their limits [rad], steps and errors being random."""
+    rng = np.random.default_rng(seed)
+    neck = Neck(controller, gain=gain)
+    lever = 6.93 * controller.arrays[8][:2].T
+    bias, beyond, slack = 0.5 * BOUND * rng.choice([-1.0, 1.0], 2), -math.inf, -math.inf
+    wanted, behind = np.zeros(2), [np.zeros(3)] * 5
+    for k in range(300):
+        if k % 60 == 0:
+            wanted = rng.choice([-1.3 * LIMIT, -LIMIT, 0.0, LIMIT, 1.3 * LIMIT], 2)
+        true = neck.y.copy()
+        beyond = max(beyond, float(np.abs(true).max()) - LIMIT)
+        # Most of the dead time is the drives': the motor is where it was asked to be four samples before.
+        slack = max(slack, TAUT - float((behind[0] - lever @ true).min()))
+        neck.y = true + bias + 0.5 * BOUND * rng.uniform(-1.0, 1.0, 2)
+        out = neck.step(float(wanted[0]), float(wanted[1]))
+        # `step` moved on from what was measured; the truth moves on from where it was.
+        neck.y = neck.y + math.exp(-5.293 * 0.02) * (true - neck_measured(neck))
+        behind = [*behind[1:], out]
+    return beyond, slack
+
+
+def neck_measured(neck: Neck) -> np.ndarray:
+    """Return the angles that the controller was last told."""
+    return neck.inputs[3:5]
+
+
+@pytest.mark.parametrize("gain", GAINS)
+def test_tightened_limits_hold_on_every_sample(pair: tuple[MpcController, MpcController], gain: float) -> None:
+    for seed in range(4):
+        beyond, slack = worst(pair[1], gain, seed)
+        assert beyond <= 0.0
+        assert slack <= 0.0
+
+
+def test_without_tightening_they_do_not(pair: tuple[MpcController, MpcController]) -> None:
+    found = [worst(pair[0], GAINS[-1], seed) for seed in range(4)]
+    assert min(beyond for beyond, _ in found) > math.radians(1.0)
+    assert max(slack for _, slack in found) > 0.0
+
+
+def test_the_back_off_is_what_the_bounds_lose(pair: tuple[MpcController, MpcController]) -> None:
+    loose, tight = pair
+    back = tight.design["back_off_rad"]
+    assert back["angle"] > 0.0
+    theta, motors = np.zeros(loose.arrays[10].shape[1]), np.zeros(3)
+    theta[-1] = 1.0
+    parameters = loose.initial_state().parameters
+    bounds = [c.program().bounds(theta, parameters, motors) for c in (loose, tight)]
+    kinds = loose.arrays[14][:, 0]
+    rows = {
+        rt.MPC_ROW_ANGLE_HIGH: (1, -back["angle"]), rt.MPC_ROW_ANGLE_LOW: (0, back["angle"]),
+        rt.MPC_ROW_TAUT: (0, back["tautness"]), rt.MPC_ROW_MOVE: (1, 0.0),
+    }  # fmt: skip
+    for kind, (side, change) in rows.items():
+        of = kinds == kind
+        # One addition of numbers below one.
+        np.testing.assert_allclose(bounds[1][side][of] - bounds[0][side][of], change, atol=1e-15)
+
+
+def test_the_casadi_function_knows_the_back_off(pair: tuple[MpcController, MpcController]) -> None:
+    tight = pair[1]
+    theta = np.zeros(tight.arrays[10].shape[1])
+    theta[-1] = 1.0
+    limits = [6.0, 12.5 * 0.02, LIMIT, TAUT]
+    *_, lower, upper = (np.array(item.full()).ravel() for item in tight.program().function()(theta, limits))
+    parameters = tight.initial_state().parameters
+    own = tight.program().bounds(theta, parameters, np.zeros(3))
+    # The block's position rows come back as fast as moves allow; soft rows are the same sums.
+    of = tight.arrays[14][:, 0] >= rt.MPC_ROW_ANGLE_HIGH
+    np.testing.assert_allclose(lower[of], own[0][of], rtol=1e-12)
+    np.testing.assert_allclose(upper[of], own[1][of], rtol=1e-12)
+
+
+def test_tightening_survives_a_file(pair: tuple[MpcController, MpcController], tmp_path: Path) -> None:
+    pair[1].save(tmp_path / "mpc.npz")
+    again = load(tmp_path / "mpc.npz")
+    np.testing.assert_array_equal(again.arrays[0], pair[1].arrays[0])
+
+
+def test_tightening_without_a_soft_limit_is_refused() -> None:
+    with pytest.raises(SettingsError, match="`tightening` needs a soft limit"):
+        MpcSettings(bandwidth=8.0, tightening=True).design(bake_off_neck())
+
+
+def test_a_limit_that_errors_use_up_is_refused() -> None:
+    settings = MpcSettings(bandwidth=8.0, angle_limit=0.02, tightening=True, measurement_bound=0.03)
+    with pytest.raises(SettingsError, match="no tightening keeps the soft limits"):
+        settings.design(bake_off_neck())

@@ -1,0 +1,393 @@
+"""Drives, inclinometer and host as processes of their own on a real bus: `python tests/drives/processes.py [CASE...]`.
+
+Prints one JSON line for each case. Without --bus it moves into a network namespace with nothing but a loopback of its
+own and uses UDP multicast there. What happened is judged from the drives' side: their process reports each change of a
+power state with its monotonic time, which all processes of a machine share.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+UDP = "udp_multicast:239.74.163.2"
+INSIDE = "SOFTNECK_OWN_NETWORK"
+NAMESPACE = (
+    ("unshare", "--net") if os.name == "posix" and os.geteuid() == 0 else ("unshare", "--net", "--map-root-user")
+)
+OFF, FAULT = "DISABLED", "FAULT"
+SLEEP = 0.01
+
+LOOP = (Path(__file__).parent / "processes_loop.toml").read_text()
+HANGS = (Path(__file__).parent / "hanging_observer.py").read_text()
+DRIVES = """profile = "ipos2015"
+bus.period_s = {period}
+ramp = {{ settle_s = 0.1, speed_rad_s = 3.0, tolerance_rad = 0.2 }}
+sensor = {{ kind = "can", node = 10 }}
+guarding.time_s = {guarding}
+""" + "".join(f"[[drive]]\nnode = {node}\npeak_current_A = 10.0\n" for node in (1, 2, 3))
+
+
+def write_project(folder: Path, *, duration: float = 3.0, period: float = 0.01, guarding: float = 0.1) -> None:
+    """Write controller, observer, loop files and drives file; no experiment is needed: the plant is Eq. 31's."""
+    import control
+
+    from softneck.design import PiSettings
+    from softneck.estimation import KalmanSettings, LinearNeck
+
+    step = 0.02
+    pole = math.exp(-5.293 * step)
+    tf = control.TransferFunction([0.0913 * (1.0 - pole)], [1.0, -pole, 0.0, 0.0, 0.0, 0.0], step)
+    model = LinearNeck(pitch=tf, roll=tf)
+    PiSettings().design(model).save(folder / "pi.npz")
+    KalmanSettings(sensor="paper").design(model).save(folder / "kalman.npz")
+    for name, seconds, observer in (
+        ("loop", 60.0, 'file = "kalman.npz"'), ("short", duration, 'file = "kalman.npz"'),
+        ("hangs", 60.0, 'python = "hanging_observer:make"'),
+    ):  # fmt: skip
+        (folder / f"{name}.toml").write_text(LOOP.format(duration=seconds, observer=observer), encoding="utf-8")
+    (folder / "hanging_observer.py").write_text(HANGS, encoding="utf-8")
+    (folder / "drives.toml").write_text(DRIVES.format(period=period, guarding=guarding), encoding="utf-8")
+
+
+@dataclass
+class World:
+    """The processes of one case; `patience` stretches all waiting, for slow machines [-]."""
+
+    folder: Path
+    bus: str = UDP
+    link: str = "lo"
+    period: float = 0.01
+    patience: float = 1.0
+    extra: tuple[str, ...] = ()
+    realtime: bool = False
+    drives_bus: str = ""
+    changes: list[dict[str, Any]] = field(default_factory=list)
+    told: list[str] = field(default_factory=list)
+    children: list[subprocess.Popen] = field(default_factory=list)
+
+    def start(self, loop: str = "loop") -> None:
+        """Start all three and wait until the controller runs."""
+        path = self.folder / "inclinometer.socket"
+        module = "softneck.drives.simulated"
+        self.sensor = self._spawn("-m", f"{module}.inclinometer", self.drives_bus or self.bus, str(path))
+        self.wait(path.exists, "the inclinometer", 60.0)
+        self.drives = self._spawn("-m", module, self.drives_bus or self.bus, "--homed", "--report",
+                                  "--cycle", str(self.period),
+                                  "--sensor-socket", str(path), stdout=subprocess.PIPE)  # fmt: skip
+        threading.Thread(target=self._read, daemon=True).start()
+        self.wait(lambda: len(self.changes) >= 3, "the drives", 60.0)
+        self.notify = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        address = self.folder / "notify.socket"
+        self.notify.bind(str(address))
+        threading.Thread(target=self._listen, args=(self.notify,), daemon=True).start()
+        os.environ["SOFTNECK_ARM"] = f"MOVE {self.bus.partition(':')[2]}"
+        os.environ.update(NOTIFY_SOCKET=str(address), WATCHDOG_USEC="400000")
+        try:
+            self.host = self.run(loop)
+        finally:
+            for name in ("NOTIFY_SOCKET", "WATCHDOG_USEC"):
+                del os.environ[name]
+        self.wait(lambda: "STATUS=running" in self.told or self.host.poll() is not None, "the loop", 60.0)
+        if self.host.poll() is not None:
+            raise RuntimeError(f"the host ended: {self.host.communicate()}")
+
+    def run(self, loop: str) -> subprocess.Popen:
+        """Start `softneck drives run`."""
+        code = "from softneck.cli import main; main()"
+        files = {"--loop": f"{loop}.toml", "--drives": "drives.toml", "-o": f"run_{time.monotonic_ns()}.csv"}
+        words = ["drives", "run", str(self.folder / "pi.npz"), "--bus", self.bus, "--arm", "--json"]
+        words += ["--override", "certificate", *self.extra, *(["--realtime"] if self.realtime else [])]
+        for option, name in files.items():
+            words += [option, str(self.folder / name)]
+        return self._spawn("-c", code, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+    def _spawn(
+        self, *arguments: str, stdout: int = subprocess.DEVNULL, stderr: int = subprocess.DEVNULL
+    ) -> subprocess.Popen:
+        # The simulated drives stand for hardware, which no other process holds up.
+        first = ["chrt", "-f", "41"] if self.realtime and arguments[0] == "-m" else []
+        command = [*first, sys.executable, *arguments]
+        child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=stdout, stderr=stderr)
+        self.children.append(child)
+        return child
+
+    def _read(self) -> None:
+        for line in self.drives.stdout or ():
+            self.changes.append(json.loads(line))
+
+    def _listen(self, source: socket.socket) -> None:
+        while True:
+            try:
+                self.told.append(source.recv(200).decode())
+            except OSError:
+                return
+
+    @property
+    def states(self) -> dict[int, str]:
+        """State of each drive as its own process said last."""
+        return {change["node"]: change["state"] for change in list(self.changes)}
+
+    def all(self, *states: str) -> bool:
+        """Whether all three are in one of `states`."""
+        return len(self.states) == 3 and all(state in states for state in self.states.values())
+
+    def left(self, since: float) -> float | None:
+        """When the last of the three left Operation Enabled after `since`, seconds later; None if one did not."""
+        times = {}
+        for change in list(self.changes):
+            if change["time_s"] >= since and change["state"] != "ENABLED":
+                times.setdefault(change["node"], change["time_s"])
+        return max(times.values()) - since if len(times) == 3 else None
+
+    def enabled_after(self, since: float) -> bool:
+        """Whether any drive was enabled again."""
+        return any(change["state"] == "ENABLED" and change["time_s"] > since for change in list(self.changes))
+
+    def wait(self, done: Callable[[], bool], what: str, seconds: float) -> None:
+        """Wait until `done`."""
+        until = time.monotonic() + seconds * self.patience
+        while not done():
+            if time.monotonic() > until:
+                raise RuntimeError(f"waited {seconds * self.patience:g} s for {what}")
+            time.sleep(SLEEP)
+
+    def ended(self, child: subprocess.Popen | None = None, seconds: float = 20.0) -> tuple[int, dict[str, Any], str]:
+        """Wait for a host; return exit code, JSON, last line on stderr."""
+        child = child or self.host
+        out, error = child.communicate(timeout=seconds * self.patience)
+        lines = error.decode().strip().splitlines()
+        return child.returncode, json.loads(out) if out.strip() else {}, lines[-1] if lines else ""
+
+    def close(self) -> None:
+        """End what this world started."""
+        for child in self.children:
+            if child.poll() is None:
+                child.kill()
+            child.wait()
+            for pipe in (child.stdout, child.stderr):
+                if pipe is not None and child is not self.drives:
+                    pipe.close()
+        if hasattr(self, "notify"):
+            self.notify.close()
+        (self.folder / "notify.socket").unlink(missing_ok=True)
+        (self.folder / "hung").unlink(missing_ok=True)
+
+
+def rest(world: World, since: float) -> dict[str, Any]:
+    """Wait a while and return what the drives say then."""
+    time.sleep(0.3 * world.patience)
+    return {"states": sorted(world.states.values()), "enabled_again": world.enabled_after(since)}
+
+
+def killed(world: World) -> dict[str, Any]:
+    """kill -9 of the host."""
+    since = time.monotonic()
+    world.host.kill()
+    world.wait(lambda: world.all(FAULT), "Fault", 5.0)
+    code = world.host.wait()
+    return {"reaction_s": world.left(since), "exit": code, **rest(world, since)}
+
+
+def paused(world: World) -> dict[str, Any]:
+    """SIGSTOP, a second, SIGCONT: the resumed master must not enable."""
+    since = time.monotonic()
+    world.host.send_signal(signal.SIGSTOP)
+    world.wait(lambda: world.all(FAULT), "Fault", 5.0)
+    time.sleep(1.0)
+    world.host.send_signal(signal.SIGCONT)
+    code, result, _ = world.ended()
+    return {"reaction_s": world.left(since), "exit": code, "event": result["fault"]["event"], **rest(world, since)}
+
+
+def hung(world: World) -> dict[str, Any]:
+    """A part of the controller never returns."""
+    world.wait((world.folder / "hung").exists, "the hang", 20.0)
+    time.sleep(0.01)
+    since = float((world.folder / "hung").read_text())
+    world.wait(lambda: world.all(FAULT), "Fault", 5.0)
+    fed = sum(text == "WATCHDOG=1" for text in world.told)
+    time.sleep(0.5)
+    still_fed = sum(text == "WATCHDOG=1" for text in world.told) > fed
+    world.host.kill()
+    return {"reaction_s": world.left(since), "exit": world.host.wait(), "still_fed": still_fed, **rest(world, since)}
+
+
+def second_master(world: World) -> dict[str, Any]:
+    """Another `softneck drives run` is refused, and the first one goes on."""
+    since = time.monotonic()
+    code, _, line = world.ended(world.run("short"), seconds=60.0)
+    went_on = world.all("ENABLED")
+    world.host.terminate()
+    first, result, _ = world.ended()
+    return {
+        "reaction_s": None,
+        "exit": first,
+        "event": (result["fault"] or {}).get("text"),
+        "second_exit": code,
+        "line": line,
+        "went_on": went_on,
+        **rest(world, since),
+    }
+
+
+def intruder(world: World) -> dict[str, Any]:
+    """A master that does not listen first sends SYNC messages."""
+    import can
+
+    interface, _, channel = world.bus.partition(":")
+    with can.Bus(interface=interface, channel=channel) as bus:
+        since = time.monotonic()
+        bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+        code, result, _ = world.ended()
+    return {"reaction_s": world.left(since), "exit": code, "event": result["fault"]["event"], **rest(world, since)}
+
+
+def cable(world: World) -> dict[str, Any]:
+    """The link goes down, and comes back a second later."""
+    since = time.monotonic()
+    subprocess.run(["ip", "link", "set", world.link, "down"], check=True)
+    world.wait(lambda: world.all(FAULT), "Fault", 5.0)
+    code, result, _ = world.ended()
+    bring_up(world.link)
+    time.sleep(0.5)
+    return {"reaction_s": world.left(since), "exit": code, "event": result["fault"]["event"], **rest(world, since)}
+
+
+def sensor_stopped(world: World) -> dict[str, Any]:
+    """The inclinometer's process stands still: the host goes to rest and off."""
+    since = time.monotonic()
+    world.sensor.send_signal(signal.SIGSTOP)
+    code, result, _ = world.ended()
+    fault = result["fault"]
+    return {"reaction_s": fault["time_s"] - since, "exit": code, "event": fault["event"], **rest(world, since)}
+
+
+def drives_gone(world: World) -> dict[str, Any]:
+    """kill -9 of the drives' process: none of them answers any more."""
+    since = time.monotonic()
+    world.drives.kill()
+    code, result, _ = world.ended()
+    fault = result["fault"]
+    return {"reaction_s": fault["time_s"] - since, "exit": code, "event": fault["event"], "states": ["gone"],
+            "enabled_again": False}  # fmt: skip
+
+
+def terminated(world: World) -> dict[str, Any]:
+    """SIGTERM: to rest, then off."""
+    since = time.monotonic()
+    world.host.terminate()
+    code, result, _ = world.ended()
+    told = {"ready": "READY=1" in world.told, "fed": "WATCHDOG=1" in world.told}
+    stopping = world.told[-1:] == ["STOPPING=1"]
+    return {
+        "reaction_s": None,
+        "exit": code,
+        "phase": result["phase"],
+        **told,
+        "stopping": stopping,
+        **rest(world, since),
+    }
+
+
+def undisturbed(world: World) -> dict[str, Any]:
+    """Nothing happens: the cycles."""
+    code, result, _ = world.ended(seconds=120.0)
+    return {"reaction_s": None, "exit": code, "times": result["times"], **rest(world, math.inf)}
+
+
+CASES: dict[str, tuple[Callable[[World], dict[str, Any]], dict[str, Any]]] = {
+    "killed": (killed, {"exit": -9, "states": [FAULT] * 3}),
+    "paused": (paused, {"exit": 1, "event": "stalled", "states": [FAULT] * 3}),
+    "hung": (hung, {"exit": -9, "still_fed": False, "states": [FAULT] * 3}),
+    "second_master": (second_master, {"exit": 143, "second_exit": 1, "went_on": True, "states": [OFF] * 3}),
+    "intruder": (intruder, {"exit": 1, "event": "second_master", "states": [OFF] * 3}),
+    "cable": (cable, {"exit": 1, "event": "bus_off", "states": [FAULT] * 3}),
+    "sensor_stopped": (sensor_stopped, {"exit": 1, "event": "sensor_lost", "states": [OFF] * 3}),
+    "drives_gone": (drives_gone, {"exit": 1, "event": "bus_silent", "states": ["gone"]}),
+    "terminated": (terminated, {"exit": 143, "phase": "done", "fed": True, "ready": True, "stopping": True,
+                                "states": [OFF] * 3}),
+    "undisturbed": (undisturbed, {"exit": 0, "states": [OFF] * 3}),
+}  # fmt: skip
+
+
+def play(name: str, world: World) -> dict[str, Any]:
+    """Run one case; `exact` tells whether all ended as it must."""
+    act, expected = CASES[name]
+    try:
+        world.start({"hung": "hangs", "undisturbed": "short"}.get(name, "loop"))
+        time.sleep(0.2)
+        found = act(world)
+    except (RuntimeError, subprocess.TimeoutExpired, KeyError, TypeError) as error:
+        found = {"problem": f"{type(error).__name__}: {error}", "states": sorted(world.states.values())}
+    finally:
+        world.close()
+    exact = all(found.get(key) == value for key, value in expected.items()) and found.get("enabled_again") is False
+    return {"case": name, "exact": exact, **found}
+
+
+def too_busy(found: dict[str, Any]) -> bool:
+    """Whether the machine could not run the loop: the host said that it stood still, though nobody stopped it."""
+    stalled = found.get("event") == "stalled" and found["case"] != "paused"
+    return not found["exact"] and (stalled or "stood still" in json.dumps(found))
+
+
+def bring_up(link: str) -> None:
+    """Set a link up; multicast over the loopback needs a route."""
+    subprocess.run(["ip", "link", "set", link, "up"], check=True)
+    if link == "lo":
+        subprocess.run(["ip", "link", "set", "lo", "multicast", "on"], check=True)
+        subprocess.run(["ip", "route", "add", "224.0.0.0/4", "dev", "lo"], check=True)
+
+
+def main() -> None:
+    """Play the cases, each `--repeat` times."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("cases", nargs="*", metavar="CASE", help=f"of {', '.join(CASES)}")
+    parser.add_argument("--repeat", type=int, default=1)
+    parser.add_argument("--bus", default=UDP)
+    parser.add_argument("--drives-bus", default="", help="where the drives are, if that interface is another one")
+    parser.add_argument("--link", default="lo")
+    parser.add_argument("--duration", type=float, default=3.0)
+    parser.add_argument("--period", type=float, default=0.01)
+    parser.add_argument("--guarding", type=float, default=0.1)
+    parser.add_argument("--patience", type=float, default=1.0)
+    parser.add_argument("--realtime", action="store_true", help="host and drives before all ordinary processes")
+    parser.add_argument("--attempts", type=int, default=1, help="where the machine was too busy for the loop")
+    parser.add_argument("--extra", action="append", default=[], help="further option of `softneck drives run`")
+    chosen = parser.parse_args()
+    if chosen.bus == UDP and INSIDE not in os.environ:
+        command = [*NAMESPACE, sys.executable, *sys.argv]
+        sys.exit(subprocess.run(command, env={**os.environ, INSIDE: "1"}, check=False).returncode)
+    if chosen.bus == UDP:
+        bring_up("lo")
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write_project(folder, duration=chosen.duration, period=chosen.period, guarding=chosen.guarding)
+        for case in chosen.cases or CASES:
+            for _ in range(chosen.repeat):
+                found: dict[str, Any] = {}
+                for attempt in range(chosen.attempts):
+                    world = World(folder, chosen.bus, chosen.link, chosen.period, chosen.patience, tuple(chosen.extra))
+                    world.realtime, world.drives_bus = chosen.realtime, chosen.drives_bus
+                    found = play(case, world)
+                    if not too_busy(found) or attempt == chosen.attempts - 1:
+                        break
+                print(json.dumps(found), flush=True)
+
+
+if __name__ == "__main__":
+    main()

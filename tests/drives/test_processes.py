@@ -1,0 +1,72 @@
+"""Faults of real processes: drives, inclinometer and host on UDP multicast in a network namespace of their own.
+
+End states are exact and told by the drives' process. Time bounds are generous (500 ms), for the machine that runs the
+tests is nobody's own; `benchmarks/drives_processes.py` measures.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from .processes import CASES, NAMESPACE, UDP, World, write_project
+
+SCRIPT = Path(__file__).with_name("processes.py")
+
+
+def allowed(*command: str) -> bool:
+    if any(shutil.which(name) is None for name in ("unshare", "ip", command[0])):
+        return False
+    return subprocess.run([*command, "true"], capture_output=True, check=False).returncode == 0
+
+
+pytestmark = pytest.mark.skipif(
+    sys.platform != "linux" or not allowed(*NAMESPACE),
+    reason="needs unshare and ip (util-linux, iproute2) and the right to a network namespace of its own",
+)
+# What `make test` runs; the rest is marked slow, and CI runs it too.
+SHORT = ("killed",)
+
+
+def played(case: str, *options: str) -> dict[str, Any]:
+    """Play one case; where the machine allows it, before its ordinary work."""
+    more = ["--realtime"] if allowed("chrt", "-f", "1") else []
+    command = [sys.executable, str(SCRIPT), case, "--attempts", "3", *more, *options]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize(
+    "case", [case if case in SHORT else pytest.param(case, marks=pytest.mark.slow) for case in CASES]
+)
+def test_the_end_state_is_exact(case: str) -> None:
+    found = played(case)
+    assert found["exact"], found
+    if found["reaction_s"] is not None:
+        assert 0.0 < found["reaction_s"] < 0.5
+
+
+def test_a_bus_that_is_down_is_one_line_and_nothing_moves(tmp_path: Path) -> None:
+    # A namespace begins with its loopback down: no multicast leaves or arrives.
+    write_project(tmp_path)
+    words = [f"{tmp_path}/pi.npz", "--loop", f"{tmp_path}/short.toml", "--drives", f"{tmp_path}/drives.toml"]
+    code = "from softneck.cli import main; main()"
+    command = [*NAMESPACE, sys.executable, "-c", code, "drives", "run", *words, "--bus", UDP, "--arm"]
+    done = subprocess.run(
+        [*command, "--override", "certificate"], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode in (1, 2)
+    assert done.stderr.strip().splitlines()[-1].startswith(f"softneck: bus {UDP} ")
+
+
+def test_a_case_that_cannot_start_is_not_exact(tmp_path: Path) -> None:
+    world = World(tmp_path)
+    assert not world.all("DISABLED")
+    assert world.left(0.0) is None

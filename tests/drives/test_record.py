@@ -1,0 +1,141 @@
+"""An experiment on simulated drives is the one on the virtual neck, and ends well whatever happens."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from softneck.core import CheckFailedError, SettingsError
+from softneck.drives import (
+    Ask,
+    Recorded,
+    Session,
+    VirtualLink,
+    default_drives,
+    drive_limits,
+    record_signal,
+    simulated_neck,
+)
+from softneck.drives.master import Master
+from softneck.identification import Rls
+from softneck.plant import NeckParameters, VirtualNeck, record
+from softneck.signals import Excitation, prepare, signal
+
+FILE = default_drives()
+# Next to no noise: what is compared is drives, not draws; none at all would look frozen.
+NECK = NeckParameters.paper().replace(noise_std=1e-6)
+
+
+def link_to(neck: NeckParameters = NECK) -> VirtualLink:
+    return VirtualLink(simulated_neck(FILE, neck, sample_time=0.02, homed=True))
+
+
+def excitation(name: str, duration: float | None = None, *, seed: int = 0) -> Excitation:
+    return prepare(signal(name, duration=duration, seed=seed), drive_limits(FILE), ramp_s=2.0)[0]
+
+
+def recorded(*excitations: Excitation, link: VirtualLink | None = None, **session: object) -> Recorded:
+    return record_signal(excitations, replace(Session(file=FILE, link=link or link_to()), **session))
+
+
+@pytest.mark.parametrize(("name", "duration"), [("eq22", 20.0), ("steps", None), ("rotation", None), ("aprbs", 20.0)])
+def test_it_equals_softneck_record_over_the_same_neck(name: str, duration: float | None) -> None:
+    played = excitation(name, duration)
+    found, wanted = recorded(played).recording, record(played, VirtualNeck(NECK))
+    assert found is not None
+    np.testing.assert_allclose(found.set_points, wanted.set_points, rtol=0, atol=1e-12)
+    gap = np.degrees(np.abs(found.outputs - wanted.outputs))
+    # Servo loops at 1 ms and a current limit against the neck's own drive model: 0.07 rad of a motor while it turns,
+    # at 5.2 deg/rad; 0.27 deg and 0.04 deg rms were found on the worst signal.
+    assert gap.max() < 0.4
+    assert np.sqrt(np.mean(gap**2)) < 0.06
+    assert np.abs(found.motor_positions - wanted.motor_positions).max() < 0.1
+
+
+def test_it_is_usable_by_identify_and_the_model_is_that_of_the_virtual_neck() -> None:
+    played = excitation("eq22", 40.0)
+    ours = recorded(played).recording
+    assert ours is not None
+    assert {"pitch_rate", "motor_position_1"} <= set(ours.channels)
+    one, two = (Rls().fit([item]).tf("pitch", angle_unit="rad") for item in (ours, record(played, VirtualNeck(NECK))))
+    # Angles agree to 0.06 deg rms of 10 deg rms: gains to about a percent.
+    assert one.dcgain() == pytest.approx(two.dcgain(), rel=0.02)
+
+
+def test_runs_are_numbered_and_never_joined() -> None:
+    parts = [excitation("aprbs", 6.0, seed=seed) for seed in (1, 2)]
+    result = recorded(*parts)
+    assert result.completed
+    assert result.recording is not None
+    one, two = result.recording.runs()
+    assert [int(one.run[0]), int(two.run[0])] == [1, 2]
+    assert [len(one), len(two)] == [300, 300]
+    np.testing.assert_allclose(two.set_points, parts[1].set_points, rtol=0, atol=1e-12)
+    assert two.time[0] - one.time[-1] == pytest.approx(3.02)
+
+
+def test_a_fault_in_the_middle_keeps_what_was_recorded() -> None:
+    link, played = link_to(), excitation("rotation")
+    whole = recorded(played)
+
+    def breaks(*_cycle: object) -> None:
+        if link.now > 12.0:
+            link.neck.drives[1].axis.trip(0x2310)
+
+    result = recorded(played, link=link, watches=(breaks,))
+    assert 100 < result.rows < result.planned
+    assert result.recording is not None
+    assert whole.recording is not None
+    assert not result.completed
+    n = result.rows
+    np.testing.assert_array_equal(result.recording.set_points, whole.recording.set_points[:n])
+    np.testing.assert_array_equal(result.recording.outputs, whole.recording.outputs[:n])
+    with pytest.raises(CheckFailedError, match=r"stopped at t = 12\.\d+ s.*softneck drives reset"):
+        result.require()
+    assert all(drive.axis.state != 0x27 for drive in link.neck.drives)
+
+
+@pytest.mark.parametrize(("ask", "fault", "phase"), [(Ask.LEAVE, None, "done"), (Ask.STOP, "operator", "stopped")])
+def test_an_operator_ends_it_with_the_drives_off(ask: Ask, fault: str | None, phase: str) -> None:
+    link = link_to()
+    last = {}
+
+    def watch(_now: float, _in: object, _out: object, _tilt: object, master: Master) -> None:
+        last[str(master.supervisor.phase)] = master.setpoints
+
+    result = recorded(
+        excitation("rotation"),
+        link=link,
+        watches=(watch,),
+        operator=lambda: ask if 12.0 <= link.now < 12.015 else None,
+    )
+    supervisor = result.ended.master.supervisor
+    assert (supervisor.fault.name if supervisor.fault else None, str(supervisor.phase)) == (fault, phase)
+    assert result.ended.left
+    assert 100 < result.rows < result.planned
+    assert all(drive.axis.state == 0x40 for drive in link.neck.drives)
+    if ask is Ask.LEAVE:
+        # At rest before they were switched off.
+        assert all(abs(value) < 1e-6 for value in last["ramp out"])
+
+
+@pytest.mark.parametrize("ask", list(Ask))
+def test_asked_before_anything_moved_it_only_switches_off(ask: Ask) -> None:
+    link = link_to()
+    result = recorded(excitation("rotation"), link=link, operator=lambda: ask)
+    assert result.rows == 0
+    assert result.recording is None
+    assert result.ended.master.supervisor.phase == "stopped"
+    assert all(drive.axis.state == 0x40 for drive in link.neck.drives)
+
+
+def test_what_the_drives_file_does_not_allow_is_refused() -> None:
+    for name in ("position", "speed", "slack"):
+        with pytest.raises(SettingsError, match=rf"--max-{name} 20 is beyond the .* of \[limits\] in the drives file"):
+            drive_limits(FILE, **{name: 20.0})
+    with pytest.raises(SettingsError, match=r"eq22 asks for .* rad/s.*ramp it in and out"):
+        recorded(signal("eq22", duration=10.0))
+    with pytest.raises(SettingsError, match="there is no signal"):
+        recorded()
