@@ -74,7 +74,7 @@ def build_compiled_fmu(
     members = _members(described_block(block), info or FmuInfo(), name, fmi, library.sources)
     members |= {f"binaries/{folder}/{name}{suffix}": data for folder, suffix, data in folders}
     with atomic_write(target, force=force) as temporary:
-        write_zip(temporary, members)
+        write_zip(temporary, members, library.streams)
     return library.origin
 
 

@@ -50,7 +50,8 @@ def compile_for(sources: Sources, platform: Platform) -> bytes:
     if not have_zig():
         raise SettingsError("zig is not here; install it with `pip install ziglang`.")
     extra = [] if platform.system == "win32" else ["-fPIC"]
-    gather = [] if platform.system == "darwin" else ["-Wl,--gc-sections"]
+    # Names of what nobody calls from outside: zig's linker for macOS would keep them.
+    gather = ["-Wl,-x"] if platform.system == "darwin" else ["-Wl,--gc-sections"]
     gather += ["-Wl,--hash-style=gnu"] if platform.system == "linux" else []
     # clang's -Os is two thirds of its -O2, and as fast. Code that aarch64's outliner has shortened deflates worse.
     small = ["-Os", "-fno-sanitize=undefined", "-w", "-s", "-mllvm", "-enable-machine-outliner=never"]

@@ -387,6 +387,39 @@ static sn_snapshot *sn_deserialise(sn_instance *s, const unsigned char *from, si
     return made;
 }
 
+/* "file:" with one to three slashes, %XX decoded; a plain path stays one. */
+static int sn_path_of(const char *uri, char *path, size_t room)
+{
+    size_t n = 0;
+    int file = strncmp(uri, "file:", 5) == 0;
+    if (file) {
+        uri += 5;
+        if (strncmp(uri, "//localhost/", 12) == 0)
+            uri += 11;
+        else if (strncmp(uri, "///", 3) == 0)
+            uri += 2;
+#ifdef _WIN32
+        if (uri[0] == '/' && uri[1] != '\0' && uri[2] == ':')
+            uri++;
+#endif
+    }
+    for (; *uri != '\0'; uri++) {
+        char c = *uri;
+        if (file && c == '%' && strspn(uri + 1, "0123456789abcdefABCDEF") >= 2) {
+            char digits[3] = {uri[1], uri[2], '\0'};
+            c = (char)strtol(digits, NULL, 16);
+            uri += 2;
+        }
+        if (n + 1 >= room || c == '\0')
+            return 0;
+        path[n++] = c;
+    }
+    while (n > 1 && path[n - 1] == '/')
+        n--;
+    path[n] = '\0';
+    return 1;
+}
+
 /* Make an instance from resources/model.bin; `resources` is a path. NULL where that fails; the reason was told. */
 static sn_instance *sn_instantiate(const char *resources, const char *guid, const char *name,
                                    void (*tell)(void *, int, const char *), void *environment, void *logger)
