@@ -233,12 +233,12 @@ def test_a_damaged_library_is_refused(tmp_path: Path) -> None:
     manifest = {
         "key": sources_key(),
         "platforms": ["x86_64-linux"],
-        "files": {"x86_64-linux.so": "0" * 64},
+        "files": {"x86_64-linux.so.deflate": "0" * 64},
         "refused": {},
     }
     (tmp_path / "manifest.json").write_text(json.dumps(manifest))
-    (tmp_path / "x86_64-linux.so").write_bytes(b"half a library")
-    with pytest.raises(FileFormatError, match=r"x86_64-linux.so: is damaged or missing; run `make native`"):
+    (tmp_path / "x86_64-linux.so.deflate").write_bytes(b"half a library")
+    with pytest.raises(FileFormatError, match=r"x86_64-linux.so.deflate: is damaged or missing; run `make native`"):
         _library.packaged_library(tmp_path)
     (tmp_path / "manifest.json").write_text("{")
     with pytest.raises(FileFormatError, match=r"manifest.json: is damaged"):

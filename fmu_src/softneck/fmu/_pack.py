@@ -2,23 +2,43 @@
 
 from __future__ import annotations
 
+import struct
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
-# The first moment a zip entry can carry.
-_EPOCH = (1980, 1, 1, 0, 0, 0)
+# PKWARE's APPNOTE 6.3: local header, entry of the directory, end of the directory.
+_LOCAL, _ENTRY, _END = "<4s5H3L2H", "<4s6H3L5H2L", "<4s4H2LH"
+_VERSION, _UNIX, _UTF8, _DEFLATED = 20, 3 << 8, 1 << 11, 8
+# 1980-01-01, the first moment that an entry can carry; rw-r--r-- of a plain file.
+_TIME, _DATE, _RIGHTS = 0, 33, 0o100644 << 16
 
 
-def write_zip(path: Path, members: Mapping[str, bytes]) -> None:
-    """Write `members` (archive name -> content) to `path`: sorted, deflated, with fixed times and rights."""
-    with zipfile.ZipFile(path, "w") as archive:
+def deflated(data: bytes) -> bytes:
+    """Return `data` as a raw deflate stream."""
+    packer = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
+    return packer.compress(data) + packer.flush()
+
+
+def write_zip(path: Path, members: Mapping[str, bytes], streams: Mapping[bytes, bytes] | None = None) -> None:
+    """Write `members` (archive name -> content) to `path`: sorted, deflated, with fixed times and rights.
+
+    `streams` holds content that was deflated before (by a slower, better packer); zipfile would not take it.
+    """
+    directory, offset = [], 0
+    with path.open("wb") as file:
         for name in sorted(members):
-            entry = zipfile.ZipInfo(name, _EPOCH)
-            entry.compress_type = zipfile.ZIP_DEFLATED
-            entry.create_system = 3  # Unix on every machine
-            entry.external_attr = 0o644 << 16
-            archive.writestr(entry, members[name])
+            data, title = members[name], name.encode()
+            packed = (streams or {}).get(data) or deflated(data)
+            sizes = (zlib.crc32(data), len(packed), len(data), len(title), 0)
+            common = (_VERSION, _UTF8, _DEFLATED, _TIME, _DATE, *sizes)
+            file.write(struct.pack(_LOCAL, b"PK\3\4", *common) + title + packed)
+            rest = (0, 0, 0, _RIGHTS, offset)
+            directory.append(struct.pack(_ENTRY, b"PK\1\2", _UNIX | _VERSION, *common, *rest) + title)
+            offset = file.tell()
+        count, size = len(directory), sum(map(len, directory))
+        file.write(b"".join(directory) + struct.pack(_END, b"PK\5\6", 0, 0, count, count, size, offset, 0))
 
 
 def read_zip(path: Path) -> dict[str, bytes]:

@@ -17,11 +17,12 @@ from .._documentation import documentation_page
 from .._icon import icon_png
 from .._info import FmuInfo
 from .._pack import write_zip
+from ._chunks import only_kinds
 from ._description3 import model_description3
 from ._library import Library, find_library
 from ._model_file import model_bytes, node_of
 from ._platforms import PLATFORMS
-from ._sources import FLAGS, MAIN, Sources
+from ._sources import FLAGS, GENERATED, MAIN, PROBE, Sources
 
 FMI_VERSIONS = (2, 3)
 _HOST = (
@@ -34,8 +35,8 @@ _REBUILD = """Rebuild the library of this FMU for any platform with a C99 compil
     cc {flags} -fPIC -shared -o {name}.so {main} -lm
 
 and put it into binaries/ under the folder of your platform. `sn_kinds.h` was generated from the runtimes of softneck
-{version}; all other files are written by hand. No fused multiply-add (-ffp-contract=off), no fast-math: all platforms
-give the same bits.
+{version} and holds what this model needs; all other files are written by hand. No fused multiply-add
+(-ffp-contract=off), no fast-math: all platforms give the same bits.
 """
 
 
@@ -73,7 +74,7 @@ def build_compiled_fmu(
     members = _members(described_block(block), info or FmuInfo(), name, fmi, library.sources)
     members |= {f"binaries/{folder}/{name}{suffix}": data for folder, suffix, data in folders}
     with atomic_write(target, force=force) as temporary:
-        write_zip(temporary, members)
+        write_zip(temporary, members, library.streams)
     return library.origin
 
 
@@ -131,7 +132,17 @@ def _members(block: Block, info: FmuInfo, name: str, fmi: int, sources: Sources)
     }
     if fmi == 3:
         members["sources/buildDescription.xml"] = _build_description(name)
-    return members | {f"sources/{file}": text.encode() for file, text in sources.files.items()}
+    files = _needed_sources(sources, node_of(block.runtime, block.arrays).modules, fmi)
+    return members | {f"sources/{file}": text.encode() for file, text in files.items()}
+
+
+def _needed_sources(sources: Sources, modules: set[str], fmi: int) -> dict[str, str]:
+    """Return the sources of this model's kinds and version of FMI alone: 40 kB less than those of the whole library."""
+    other = f"fmi{5 - fmi}.h"
+    files = {name: text for name, text in sources.files.items() if name not in (other, PROBE)}
+    files[GENERATED] = only_kinds(files[GENERATED], modules)
+    files[MAIN] = files[MAIN].replace(f'#include "{other}"\n', "")
+    return files
 
 
 def _build_description(name: str) -> bytes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 from typing import TYPE_CHECKING
 
-from ._types import BOOL, FLOAT, INT, MATRIX, VECTOR, Scalar, Value, View
+from ._types import BOOL, FLOAT, INT, MATRIX, VECTOR, Scalar, Value, View, length
 
 if TYPE_CHECKING:
     from ._expressions import Expressions
@@ -46,7 +46,7 @@ def numpy_call(ex: Expressions, node: ast.AST, name: str, values: list[Value]) -
             return _extreme(ex, node, name[:3], values)
         return ex.elementwise(node, f"sn_{name}", *values)
     if name in ("min", "max", "sum") and kinds == [MATRIX]:
-        return Value(_REDUCTIONS[name].format(f"sn_flat(w, {values[0].code})"), FLOAT)
+        return Value(_REDUCTIONS[name].format(f"sn_flat(w, {ex.scope.given(values[0])})"), FLOAT)
     if kinds == [VECTOR] and name in _REDUCTIONS:
         return Value(_REDUCTIONS[name].format(values[0].code), FLOAT)
     if kinds == [VECTOR] and name in _ENTRYWISE:
@@ -91,7 +91,7 @@ def _made(ex: Expressions, node: ast.AST, values: list[Value], *, whole: bool, v
         sizes = [ex.scalar(size, INT) for size in shape.elts]
         made = ex.room(f"sn_zeros2(w, {sizes[0]}, {sizes[1]})", MATRIX)
         if value:
-            ex.scope.emit(f"sn_fill2({made.code}, {value});")
+            ex.scope.emit(f"sn_fill2(&{made.code}, {value});")
         return made
     size = values[0]
     if size.type != INT:
@@ -106,7 +106,7 @@ def _made(ex: Expressions, node: ast.AST, values: list[Value], *, whole: bool, v
 
 def _dot(ex: Expressions, node: ast.AST, values: list[Value]) -> Value:
     a, b = values
-    codes = f"(w, {a.code}, {b.code})"
+    codes = f"(w, {ex.scope.given(a)}, {ex.scope.given(b)})"
     if a.type == b.type == VECTOR:
         return Value(f"sn_dot{codes}", FLOAT)
     if a.type == MATRIX and b.type == VECTOR:
@@ -137,14 +137,14 @@ def method(ex: Expressions, node: ast.Call, name: str, base: Value) -> Value:
     if name in ("max", "min", "sum") and not node.args:
         return numpy_call(ex, node, name, [base])
     if name == "copy" and not node.args and base.type.rank < 3:
-        return ex.room(f"sn_copied{base.type.rank}(w, {base.code})", base.type)
+        return ex.room(f"sn_copied{base.type.rank}(w, {ex.scope.given(base)})", base.type)
     if name in ("ravel", "flatten") and not node.args:
-        return base if base.type == VECTOR else ex.room(f"sn_flat(w, {base.code})", VECTOR)
+        return base if base.type == VECTOR else ex.room(f"sn_flat(w, {ex.scope.given(base)})", VECTOR)
     if name == "reshape":
         shape = node.args[0] if len(node.args) == 1 else ast.Tuple(node.args)
         sizes = shape.elts if isinstance(shape, ast.Tuple) else [shape]
         codes = [ex.scalar(size, INT) for size in sizes]
-        flat = base.code if base.type == VECTOR else f"sn_flat(w, {base.code})"
+        flat = base.code if base.type == VECTOR else f"sn_flat(w, {ex.scope.given(base)})"
         if len(codes) == 2 and base.type.rank < 3:
             return ex.room(f"sn_shaped(w, {flat}, {codes[0]}, {codes[1]})", MATRIX)
         if len(codes) == 1 and base.type == MATRIX:
@@ -170,7 +170,7 @@ def plain_call(ex: Expressions, node: ast.Call, name: str) -> Value:
         if name == "abs":
             return Value(f"{'fabs' if kinds[0] == FLOAT else 'sn_abs_i'}({value.code})", kinds[0])
     if name == "len" and len(values) == 1 and isinstance(kinds[0], View):
-        return Value(f"{values[0].code}.n{'' if kinds[0].rank == 1 else 0}", INT)
+        return Value(length(values[0].code, kinds[0], 0), INT)
     if name in ("min", "max") and len(values) > 1 and all(isinstance(kind, Scalar) for kind in kinds):
         return _extreme(ex, node, name, values)
     raise ex.scope.fail(node, "this function is not known.")

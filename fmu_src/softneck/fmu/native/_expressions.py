@@ -24,6 +24,7 @@ from ._types import (
     Type,
     Value,
     View,
+    length,
     unified,
     uniform,
 )
@@ -66,7 +67,7 @@ class Expressions:
 
     def _fixed(self, value: Value) -> bool:
         """Return whether later statements of the same expression cannot change a value."""
-        return value.known is not None or value.code.isidentifier()
+        return value.known is not None or value.code.isidentifier() or value.code in self.scope.lent.values()
 
     def scalar(self, node: ast.expr, kind: Scalar) -> str:
         """Return C of a number of one kind."""
@@ -89,7 +90,7 @@ class Expressions:
     def _name(self, node: ast.Name) -> Value:
         kind = self.scope.variables.get(node.id)
         if kind is not None:
-            return Value(f"v_{node.id}", kind)
+            return Value(self.scope.lent.get(node.id, f"v_{node.id}"), kind)
         if node.id in self.constants:
             return self.value(self.constants[node.id])
         raise self.scope.fail(node, "this name is not known, or not on every way here.")
@@ -99,9 +100,9 @@ class Expressions:
             return Value(_CONSTANTS[node.attr], FLOAT)
         base = self.value(node.value)
         if node.attr == "size" and isinstance(base.type, View):
-            return Value("(" + " * ".join(base.code + _length(base.type, i) for i in range(base.type.rank)) + ")", INT)
+            return Value("(" + " * ".join(length(base.code, base.type, i) for i in range(base.type.rank)) + ")", INT)
         if node.attr == "T" and base.type in (VECTOR, MATRIX):
-            return base if base.type == VECTOR else Value(f"sn_turned({base.code})", MATRIX)
+            return base if base.type == VECTOR else Value(f"sn_turned({self.scope.given(base)})", MATRIX)
         raise self.scope.fail(node, "this attribute is not known.")
 
     def _tuple(self, node: ast.Tuple) -> Value:
@@ -172,7 +173,7 @@ class Expressions:
             letters += {VECTOR: "v", MATRIX: "m"}.get(value.type, "s")  # type: ignore[arg-type]
         if letters in ("vm", "mv"):
             raise self.scope.fail(node, "a vector and a matrix of one shape there are not.")
-        a, b = (self.scope.cast(v, FLOAT) if isinstance(v.type, Scalar) else v.code for v in (left, right))
+        a, b = (self.scope.cast(v, FLOAT) if isinstance(v.type, Scalar) else self.scope.given(v) for v in (left, right))
         return self.room(f"{name}_{letters}(w, {a}, {b})", MATRIX if "m" in letters else VECTOR)
 
     def _power(self, node: ast.BinOp) -> Value:
@@ -261,7 +262,7 @@ class Expressions:
             if not isinstance(index, int) or not 0 <= index < len(base.type.ranks):
                 raise self.scope.fail(node, f"a constant below {len(base.type.ranks)} is needed here.")
             rank = base.type.ranks[index]
-            return Value(f"sn_array{rank}({base.code}, {index})", View(rank))
+            return Value(f"{base.code}->arrays[{index}].v{rank}", View(rank))
         if isinstance(base.type, Bundle):
             return self._entry(node, base, base.type)
         if isinstance(base.type, View):
@@ -272,7 +273,7 @@ class Expressions:
         base, index = self.value(attribute.value), self.value(node.slice).known
         if not isinstance(base.type, View) or not isinstance(index, int) or not 0 <= index < base.type.rank:
             raise self.scope.fail(node, "this dimension is not there.")
-        return Value(f"{base.code}{_length(base.type, index)}", INT)
+        return Value(length(base.code, base.type, index), INT)
 
     def _entry(self, node: ast.Subscript, base: Value, kind: Bundle) -> Value:
         index = self.value(node.slice)
@@ -283,9 +284,7 @@ class Expressions:
             raise self.scope.fail(node, "this entry of a tuple is not known.")
         held = self.scope.kept(base)
         place = self.scope.kept(index)
-        self.scope.emit(
-            f"if ((uint64_t){place.code} >= {len(kind.items)}u) {{ sn_fault(w, SN_INDEX); {place.code} = 0; }}"
-        )
+        self.scope.emit(f"if ((uint64_t){place.code} >= {len(kind.items)}u) sn_outside(w);")
         return Value(f"{held.code}.f[{place.code}]", kind.items[0])
 
     def part(self, node: ast.Subscript, base: Value, kind: View) -> Value:
@@ -300,10 +299,10 @@ class Expressions:
         if len(places) == 2 and kind == MATRIX:
             first, second = places
             if isinstance(first, ast.Slice) and not isinstance(second, ast.Slice):
-                column = Value(f"sn_column2(w, {base.code}, {self.place(second, base, kind, 1)})", VECTOR)
+                column = Value(f"sn_column2(w, {self.scope.place(base)}, {self.place(second, base, kind, 1)})", VECTOR)
                 return column if _all(first) else self._stretch(node, self.scope.kept(column), VECTOR, first)
             if isinstance(second, ast.Slice) and not isinstance(first, ast.Slice):
-                row = Value(f"sn_row2(w, {base.code}, {self.place(first, base, kind, 0)})", VECTOR)
+                row = Value(f"sn_row2(w, {self.scope.place(base)}, {self.place(first, base, kind, 0)})", VECTOR)
                 return row if _all(second) else self._stretch(node, self.scope.kept(row), VECTOR, second)
         raise self.scope.fail(node, "this part of an array is not known.")
 
@@ -312,11 +311,14 @@ class Expressions:
             return Value(f"(*sn_at_i(w, {base.code}, {self.place(places[0], base, kind, 0)}))", INT)
         if len(places) == kind.rank:
             indices = ", ".join(self.place(place, base, kind, i) for i, place in enumerate(places))
-            return Value(f"(*sn_at{kind.rank}(w, {base.code}, {indices}))", FLOAT)
-        code, rank = base.code, kind.rank
+            return Value(f"(*sn_at{kind.rank}(w, {self.scope.given(base)}, {indices}))", FLOAT)
+        rows = base
         for i, place in enumerate(places):
-            code, rank = f"sn_row{rank}(w, {code}, {self.place(place, base, kind, i)})", rank - 1
-        return Value(code, View(rank))
+            rank = kind.rank - i
+            rows = Value(
+                f"sn_row{rank}(w, {self.scope.given(rows)}, {self.place(place, base, kind, i)})", View(rank - 1)
+            )
+        return rows
 
     def place(self, node: ast.expr, base: Value, kind: View, dimension: int) -> str:
         """Return C of an index; a negative constant counts from the end."""
@@ -324,7 +326,7 @@ class Expressions:
         if index.type != INT:
             raise self.scope.fail(node, "an index must be a whole number.")
         if index.known is not None and index.known < 0:
-            return f"({base.code}{_length(kind, dimension)} - {-index.known})"
+            return f"({length(base.code, kind, dimension)} - {-index.known})"
         return index.code
 
     def _stretch(self, node: ast.AST, base: Value, kind: View, cut: ast.Slice) -> Value:
@@ -335,8 +337,8 @@ class Expressions:
         if not base.code.isidentifier():
             base = self.scope.kept(base)
         low = "0" if cut.lower is None else self.place(cut.lower, base, kind, 0)
-        high = f"{base.code}{_length(kind, 0)}" if cut.upper is None else self.place(cut.upper, base, kind, 0)
-        return Value(f"sn_cut{'2' if kind.rank == 2 else ''}(w, {base.code}, {low}, {high})", kind)
+        high = length(base.code, kind, 0) if cut.upper is None else self.place(cut.upper, base, kind, 0)
+        return Value(f"sn_cut{'2' if kind.rank == 2 else ''}(w, {self.scope.given(base)}, {low}, {high})", kind)
 
     # Calls
 
@@ -357,10 +359,6 @@ class Expressions:
         """Return a new array in a variable of its own: made once, in its turn."""
         self.scope.allocates = True
         return self.scope.kept(Value(code, kind))
-
-
-def _length(kind: View, dimension: int) -> str:
-    return ".n" if kind.rank == 1 else f".n{dimension}"
 
 
 def _all(cut: ast.Slice) -> bool:

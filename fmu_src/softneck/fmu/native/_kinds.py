@@ -29,4 +29,15 @@ _RANKS = {
     "softneck.loop._reference_runtime": "12",
 }
 
+# Which of a step's functions are compiled for speed, all others for size: those with so many loops within each other.
+# A network, a search among thousands of points, a quadratic program and the neck spend their time in every loop.
+FAST = {
+    "softneck.identification._rls_runtime": 1,
+    "softneck.identification._nlsm_runtime": 1,
+    "softneck.identification._nn_runtime": 1,
+    "softneck.plant._neck_runtime": 1,
+    "softneck.estimation._kalman_runtime": 2,
+    "softneck.design.mpc._mpc_runtime": 1,
+}
+
 RANKS: dict[str, tuple[int, ...]] = {name: tuple(map(int, ranks)) for name, ranks in _RANKS.items()}

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from ._types import BOOL, FLOAT, INT, Bundle, CTypes, Scalar, TranslationError, Type, Value, unified
+from ._types import BOOL, FLOAT, INT, Bundle, CTypes, Scalar, TranslationError, Type, Value, lends, unified
+
+# A variable, an array of the model, or what a parameter points to; and an entry of a tuple in one.
+_PLACE = re.compile(r"(?:[a-z]\w*|\(\*\w+\)|v_arrays->arrays\[\d+\]\.v\d)(?:\.f\d+|\.f\[\d+\])*")
 
 
 class Scope:
@@ -16,6 +20,7 @@ class Scope:
         lines: of C.
         variables: name -> type, widened from pass to pass.
         allocates: whether the function takes room in the workspace.
+        lent: parameter -> C, for those that are read where the caller keeps them.
     """
 
     def __init__(self, function: str, types: CTypes, variables: dict[str, Type]) -> None:
@@ -23,6 +28,7 @@ class Scope:
         self.lines: list[str] = []
         self.temporaries: list[tuple[str, Type]] = []
         self.allocates = False
+        self.lent: dict[str, str] = {}
         self.widened = False
 
     def emit(self, line: str) -> None:
@@ -48,6 +54,16 @@ class Scope:
         name = f"t{len(self.temporaries)}"
         self.temporaries.append((name, kind))
         return name
+
+    def place(self, value: Value) -> str:
+        """Return C of the place where `value` stands."""
+        if _PLACE.fullmatch(value.code):
+            return value.code[2:-1] if value.code.startswith("(*") and value.code.endswith(")") else f"&{value.code}"
+        return f"&{self.kept(value).code}"
+
+    def given(self, value: Value) -> str:
+        """Return C of an argument: matrices, cubes and tuples are read where they stand, all else is handed over."""
+        return self.place(value) if lends(value.type) else value.code
 
     def kept(self, value: Value) -> Value:
         """Return `value` in a variable of its own, evaluated here."""

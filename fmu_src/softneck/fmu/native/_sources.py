@@ -21,6 +21,7 @@ FLAGS = (
 )  # fmt: skip
 MAIN = "softneck.c"
 GENERATED = "sn_kinds.h"
+PROBE = "sn_probe.h"  # for zig and Windows alone
 
 
 @dataclass(frozen=True, slots=True)

@@ -134,9 +134,11 @@ class Statements:
             self.scope.emit(f"{place.code} = {self.scope.cast(value, place.type)};")
         elif place.type in (VECTOR, MATRIX) and isinstance(value.type, Scalar):
             rank = 1 if place.type == VECTOR else 2
-            self.scope.emit(f"sn_fill{rank}({place.code}, {self.scope.cast(value, FLOAT)});")
+            self.scope.emit(f"sn_fill{rank}({self.scope.given(place)}, {self.scope.cast(value, FLOAT)});")
         elif place.type in (VECTOR, MATRIX) and value.type == place.type:
-            self.scope.emit(f"sn_set{1 if place.type == VECTOR else 2}(w, {place.code}, {value.code});")
+            self.scope.emit(
+                f"sn_set{1 if place.type == VECTOR else 2}(w, {self.scope.given(place)}, {self.scope.given(value)});"
+            )
         else:
             raise self.scope.fail(node, f"{value.type} does not go into {place.type}.")
 
@@ -161,8 +163,8 @@ class Statements:
         if not number and value.type != place.type:
             raise self.scope.fail(node, f"{value.type} does not go into {place.type}.")
         letters = {(VECTOR, False): "iv", (VECTOR, True): "is", (MATRIX, False): "im", (MATRIX, True): "ims"}
-        code = self.scope.cast(value, FLOAT) if number else value.code
-        self.scope.emit(f"sn_{name}_{letters[(place.type, number)]}(w, {place.code}, {code});")
+        code = self.scope.cast(value, FLOAT) if number else self.scope.given(value)
+        self.scope.emit(f"sn_{name}_{letters[(place.type, number)]}(w, {self.scope.given(place)}, {code});")
 
     # Control
 
@@ -188,7 +190,7 @@ class Statements:
                 self.scope.emit(f"if (!{self.ex.truth(test, node)}) break;")
             elif not test.known:
                 self.scope.emit("break;")
-            self.scope.emit("if (SN_RARE(w->fault != NULL) || !sn_rounds(w, 1)) break;")
+            self.scope.emit("sn_rounds(w, 1);")
 
         self._rounds(node, "for (;;) {", head)
 
@@ -207,7 +209,7 @@ class Statements:
         self.scope.emit(f"{counter} = {first.code}; {end} = {last.code};")
         ahead, sign = (f"{end} - {counter}", "<") if step > 0 else (f"{counter} - {end}", ">")
         if first.known is None or last.known is None:
-            self.scope.emit(f"if (!sn_rounds(w, {ahead})) {end} = {counter};")
+            self.scope.emit(f"sn_rounds(w, {ahead});")
 
         def head() -> None:
             if target.id != "_":

@@ -12,10 +12,26 @@ from dataclasses import dataclass, field
 
 from softneck.core import bundle
 
+from ._chunks import defined, nested_loops, reached
 from ._expressions import Expressions
+from ._kinds import FAST
 from ._scope import Scope
 from ._statements import Statements, holds_view
-from ._types import FLOAT, INT, MATRIX, NONE, VECTOR, Arrays, Bundle, CTypes, TranslationError, Type, Value, View
+from ._types import (
+    FLOAT,
+    INT,
+    MATRIX,
+    NONE,
+    VECTOR,
+    Arrays,
+    Bundle,
+    CTypes,
+    TranslationError,
+    Type,
+    Value,
+    View,
+    lends,
+)
 
 _MEMBERS = {
     "member_size": (2, INT, "sn_member_size(w, {})"),
@@ -38,6 +54,7 @@ class _Done:
 
     name: str
     result: Type
+    lent: tuple[bool, ...]
 
 
 @dataclass(slots=True)
@@ -48,6 +65,7 @@ class Unit:
     functions: list[str] = field(default_factory=list)
     kinds: list[str] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
+    steps: list[str] = field(default_factory=list)
     _bodies: dict[str, str] = field(default_factory=dict)
 
     def add(self, module: str, ranks: tuple[int, ...]) -> None:
@@ -70,6 +88,7 @@ class Unit:
             raise TranslationError(f"{module}: {error}") from None
         number = len(self.names)
         self.names.append(module)
+        self.steps.append(step.name)
         text = ", ".join(map(str, ranks)) or "0"
         self.functions.append(f"static const signed char sn_ranks{number}[] = {{{text}}};\n")
         self.kinds.append(
@@ -83,7 +102,22 @@ class Unit:
         guard = '#ifndef SN_KINDS_H\n#define SN_KINDS_H\n\n#include "sn_vector.h"\n'
         table = "static const sn_kind sn_kinds[] = {\n" + "\n".join(self.kinds) + "\n};\n"
         count = f"static const int sn_kind_count = {len(self.kinds)};\n"
-        return "\n".join([head, guard, *self.types.declarations, "", *self.functions, table, count, "#endif\n"])
+        fast = self._fast()
+        functions = [
+            text if defined(text) in fast else text.replace("\nstatic ", "\nSN_SMALL static ", 1)
+            for text in self.functions
+        ]
+        return "\n".join([head, guard, *self.types.declarations, "", *functions, table, count, "#endif\n"])
+
+    def _fast(self) -> set[str]:
+        """Return the functions that are worth their room: loops of the steps that `FAST` names."""
+        pieces = {defined(text): text for text in self.functions}
+        depths = {name: nested_loops(text) for name, text in pieces.items()}
+        return {
+            name
+            for module, step in zip(self.names, self.steps, strict=True) if module in FAST
+            for name in reached(pieces, [step]) if depths[name] >= FAST[module]
+        }  # fmt: skip
 
     def keep(self, name: str, text: str) -> str:
         """Keep a function written under the placeholder @, and return its C name."""
@@ -126,9 +160,12 @@ class _Runtime:
         if not plain or len(names) != len(arguments):
             raise TranslationError(f"`{node.name}` takes plain arguments, all of them given.")
         variables: dict[str, Type] = dict(zip(names, arguments, strict=True))
+        bound = {part.id for part in ast.walk(node) if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store)}
+        lent = {name: f"(*v_{name})" for name, kind in variables.items() if lends(kind) and name not in bound}
         result: Type | None = None
         for _ in range(_PASSES):
             scope = Scope(node.name, self.unit.types, variables)
+            scope.lent = lent
             statements = Statements(node, scope, Expressions(scope, self.constants, self._call), result)
             statements.block(node.body)
             settled = not scope.widened and statements.result == result
@@ -139,7 +176,8 @@ class _Runtime:
             raise TranslationError(f"`{node.name}`: the types of its variables do not settle.")
         result = NONE if result is None else result
         text = self._text(node, names, arguments, scope, result)
-        return _Done(self.unit.keep(re.sub(r"\W", "_", node.name), text), result)
+        made = self.unit.keep(re.sub(r"\W", "_", node.name), text)
+        return _Done(made, result, tuple(name in lent for name in names))
 
     def _text(
         self, node: ast.FunctionDef, names: list[str], arguments: tuple[Type, ...], scope: Scope, result: Type
@@ -147,7 +185,12 @@ class _Runtime:
         spell = self.unit.types.name
         given = dict(zip(names, arguments, strict=True))
         widened = [name for name in names if scope.variables[name] != given[name]]
-        declared = [f"{spell(kind)} {'a' if name in widened else 'v'}_{name}" for name, kind in given.items()]
+        declared = [
+            f"const {spell(kind)} *v_{name}"
+            if name in scope.lent
+            else f"{spell(kind)} {'a' if name in widened else 'v'}_{name}"
+            for name, kind in given.items()
+        ]
         # An array that is returned may lie in the workspace: then the caller gives the room back.
         releases = scope.allocates and not holds_view(result)
         own = [(f"v_{name}", kind) for name, kind in scope.variables.items() if name not in given or name in widened]
@@ -162,7 +205,7 @@ class _Runtime:
         lines += ["leave: ;"] if "goto leave;" in scope.lines else []
         lines += ["w->top = top;"] if releases else []
         lines += ["return result;"] if result != NONE else []
-        head = f"static {spell(result)} @({', '.join(['sn_work *w', *declared])})"
+        head = f"static SN_INSIDE {spell(result)} @({', '.join(['sn_work *w', *declared])})"
         return f"/* {node.name} */\n{head}\n{{\n{indented(lines)}\n}}\n"
 
     def _call(self, node: ast.Call, ex: Expressions) -> Value | None:
@@ -182,7 +225,7 @@ class _Runtime:
             value = Value(code.format(", ".join(value.code for value in values)), kind)
         elif _BY_HAND.get(name, ((), NONE))[0] == tuple(value.type for value in values):
             kind = _BY_HAND[name][1]
-            arguments = "".join(f", {value.code}" for value in values)
+            arguments = "".join(f", {ex.scope.given(value)}" for value in values)
             if kind != NONE:
                 filled = ex.scope.temporary(kind)
                 ex.scope.emit(f"sn_{name}(w{arguments}, {filled}.f);")
@@ -190,7 +233,10 @@ class _Runtime:
             value = Value(f"sn_{name}(w{arguments})", NONE)
         else:
             done = self.function(name, tuple(value.type for value in values))
-            arguments = "".join(f", {value.code}" for value in values)
+            codes = [
+                ex.scope.place(value) if lent else value.code for value, lent in zip(values, done.lent, strict=True)
+            ]
+            arguments = "".join(f", {code}" for code in codes)
             value = Value(f"{done.name}(w{arguments})", done.result)
         if value.type == NONE:
             ex.scope.emit(f"{value.code};")

@@ -60,6 +60,16 @@ class Value:
     known: int | float | bool | None = None
 
 
+def lends(kind: Type) -> bool:
+    """Return whether a parameter is read where the caller keeps it: it is more than two registers hold."""
+    return isinstance(kind, Bundle) or (isinstance(kind, View) and kind.rank > 1)
+
+
+def length(code: str, kind: View, dimension: int) -> str:
+    """Return C of the length of an array along one dimension; arrays hold it in 32 bits, all counting is in 64."""
+    return f"(int64_t){code}.n{'' if kind.rank == 1 else dimension}"
+
+
 def unified(first: Type, second: Type, where: str) -> Type:
     """Return the type that holds both: whole numbers become floats, all else must be equal."""
     if first == second:

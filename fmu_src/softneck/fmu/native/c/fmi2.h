@@ -70,39 +70,6 @@ SN_EXPORT fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean on, size_t
     return c != NULL ? fmi2OK : fmi2Error;
 }
 
-/* "file:" with one to three slashes, %XX decoded; a plain path stays one. */
-static int sn_path_of(const char *uri, char *path, size_t room)
-{
-    size_t n = 0;
-    int file = strncmp(uri, "file:", 5) == 0;
-    if (file) {
-        uri += 5;
-        if (strncmp(uri, "//localhost/", 12) == 0)
-            uri += 11;
-        else if (strncmp(uri, "///", 3) == 0)
-            uri += 2;
-#ifdef _WIN32
-        if (uri[0] == '/' && uri[1] != '\0' && uri[2] == ':')
-            uri++;
-#endif
-    }
-    for (; *uri != '\0'; uri++) {
-        char c = *uri;
-        if (file && c == '%' && strspn(uri + 1, "0123456789abcdefABCDEF") >= 2) {
-            char digits[3] = {uri[1], uri[2], '\0'};
-            c = (char)strtol(digits, NULL, 16);
-            uri += 2;
-        }
-        if (n + 1 >= room || c == '\0')
-            return 0;
-        path[n++] = c;
-    }
-    while (n > 1 && path[n - 1] == '/')
-        n--;
-    path[n] = '\0';
-    return 1;
-}
-
 SN_EXPORT fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, fmi2String location,
                                         const fmi2CallbackFunctions *functions, fmi2Boolean visible, fmi2Boolean on)
 {

@@ -18,7 +18,7 @@ typedef struct {
     sn_v1 values, inputs, outputs, parameters, pending, state;
     unsigned char *warned;
     double start, time;
-    int64_t count;
+    int64_t count, states;
     int running, stale, stepping;
     char *instance_name;
     /* Of the version of FMI. */
@@ -64,6 +64,26 @@ static void sn_ready(sn_work *w)
     w->fault = NULL;
 }
 
+enum { SN_SIZE, SN_INITIALISE, SN_STEP };
+
+/* Let the kind do one of its three things; 0 where it broke a rule, `fault` then says which. Nothing else may stand
+ * here: what is in this function's registers is gone when `sn_fault` comes back to it. */
+static int sn_guarded(sn_instance *s, int what)
+{
+    const sn_node *root = &s->model.root;
+    sn_ready(&s->work);
+    if (SN_STAY(s->work.out) == 0) {
+        if (what == SN_SIZE)
+            s->states = root->kind->state_size(&s->work, root);
+        else if (what == SN_INITIALISE)
+            root->kind->initialise(&s->work, root, s->parameters, s->state, s->pending);
+        else
+            root->kind->step(&s->work, root, s->parameters, s->state, s->inputs, s->pending);
+        return 1;
+    }
+    return 0;
+}
+
 /* Room for what a step keeps for a while: many times what any kind takes. */
 static size_t sn_room_needed(const sn_node *node)
 {
@@ -82,31 +102,28 @@ static int sn_make_room(sn_instance *s)
 {
     const sn_model *m = &s->model;
     size_t ports = (size_t)m->n_in + m->n_out + m->n_par, i;
-    int64_t states;
     double *p;
     s->work.size = 262144u + sn_room_needed(&m->root) + 64u * ports;
     s->work.base = (unsigned char *)malloc(s->work.size);
     if (s->work.base == NULL)
         return 0;
     s->work.wide = sn_has_wide();
-    sn_ready(&s->work);
-    states = m->root.kind->state_size(&s->work, &m->root);
-    if (s->work.fault != NULL || states < 0 || states > SN_MOST_STATES) {
+    if (!sn_guarded(s, SN_SIZE) || s->states < 0 || s->states > SN_MOST_STATES) {
         sn_say(s, SN_FAIL, "%s", s->work.fault != NULL ? s->work.fault : "the model has too many states");
         return 0;
     }
-    p = (double *)calloc(ports + m->n_out + (size_t)states + 1u, sizeof(double));
+    p = (double *)calloc(ports + m->n_out + (size_t)s->states + 1u, sizeof(double));
     s->warned = (unsigned char *)calloc(m->n_in + 1u, 1);
     if (p == NULL || s->warned == NULL) {
         free(p);
         return 0;
     }
-    s->values = (sn_v1){p, (int64_t)ports, 1};
-    s->inputs = (sn_v1){p, m->n_in, 1};
-    s->outputs = (sn_v1){p + m->n_in, m->n_out, 1};
-    s->parameters = (sn_v1){p + m->n_in + m->n_out, m->n_par, 1};
-    s->pending = (sn_v1){p + ports, m->n_out, 1};
-    s->state = (sn_v1){p + ports + m->n_out, states, 1};
+    s->values = (sn_v1){p, (int32_t)ports, 1};
+    s->inputs = (sn_v1){p, (int32_t)m->n_in, 1};
+    s->outputs = (sn_v1){p + m->n_in, (int32_t)m->n_out, 1};
+    s->parameters = (sn_v1){p + m->n_in + m->n_out, (int32_t)m->n_par, 1};
+    s->pending = (sn_v1){p + ports, (int32_t)m->n_out, 1};
+    s->state = (sn_v1){p + ports + m->n_out, (int32_t)s->states, 1};
     for (i = 0; i < ports; i++) /* what nobody connects or sets was not measured */
         p[i] = i < m->n_in && (m->ports[i].flags & SN_MISSING) ? sn_from_bits(0x7ff8000000000000u) : m->ports[i].start;
     return 1;
@@ -127,12 +144,12 @@ static void sn_restart(sn_instance *s)
     s->stale = 1;
 }
 
-static int sn_failed(sn_instance *s)
+static int sn_worked(sn_instance *s, int what)
 {
-    if (s->work.fault == NULL)
-        return 0;
+    if (sn_guarded(s, what))
+        return 1;
     sn_say(s, SN_FAIL, "%s.", s->work.fault);
-    return 1;
+    return 0;
 }
 
 static int sn_check_outputs(sn_instance *s)
@@ -156,13 +173,10 @@ static int sn_check_outputs(sn_instance *s)
 
 static int sn_initialise(sn_instance *s)
 {
-    const sn_node *root = &s->model.root;
     if (!s->stale)
         return 1;
     memset(s->state.p, 0, (size_t)s->state.n * sizeof(double));
-    sn_ready(&s->work);
-    root->kind->initialise(&s->work, root, s->parameters, s->state, s->pending);
-    if (sn_failed(s) || !sn_check_outputs(s))
+    if (!sn_worked(s, SN_INITIALISE) || !sn_check_outputs(s))
         return 0;
     memcpy(s->outputs.p, s->pending.p, (size_t)s->pending.n * sizeof(double));
     s->stale = 0;
@@ -191,13 +205,10 @@ static int sn_run(sn_instance *s)
 
 static int sn_take_sample(sn_instance *s)
 {
-    const sn_node *root = &s->model.root;
     size_t bytes = (size_t)s->pending.n * sizeof(double);
     if (s->model.plant)
         memcpy(s->outputs.p, s->pending.p, bytes);
-    sn_ready(&s->work);
-    root->kind->step(&s->work, root, s->parameters, s->state, s->inputs, s->pending);
-    if (sn_failed(s))
+    if (!sn_worked(s, SN_STEP))
         return 0;
     s->count++;
     if (!s->model.plant)
@@ -374,6 +385,39 @@ static sn_snapshot *sn_deserialise(sn_instance *s, const unsigned char *from, si
         return NULL;
     }
     return made;
+}
+
+/* "file:" with one to three slashes, %XX decoded; a plain path stays one. */
+static int sn_path_of(const char *uri, char *path, size_t room)
+{
+    size_t n = 0;
+    int file = strncmp(uri, "file:", 5) == 0;
+    if (file) {
+        uri += 5;
+        if (strncmp(uri, "//localhost/", 12) == 0)
+            uri += 11;
+        else if (strncmp(uri, "///", 3) == 0)
+            uri += 2;
+#ifdef _WIN32
+        if (uri[0] == '/' && uri[1] != '\0' && uri[2] == ':')
+            uri++;
+#endif
+    }
+    for (; *uri != '\0'; uri++) {
+        char c = *uri;
+        if (file && c == '%' && strspn(uri + 1, "0123456789abcdefABCDEF") >= 2) {
+            char digits[3] = {uri[1], uri[2], '\0'};
+            c = (char)strtol(digits, NULL, 16);
+            uri += 2;
+        }
+        if (n + 1 >= room || c == '\0')
+            return 0;
+        path[n++] = c;
+    }
+    while (n > 1 && path[n - 1] == '/')
+        n--;
+    path[n] = '\0';
+    return 1;
 }
 
 /* Make an instance from resources/model.bin; `resources` is a path. NULL where that fails; the reason was told. */

@@ -101,6 +101,18 @@ static const char *sn_take_text(sn_reader *r)
     return text;
 }
 
+/* The view of an array without gaps. */
+static void sn_lay_out(sn_array *a, double *p)
+{
+    int32_t n0 = a->n[0], n1 = a->n[1], n2 = a->n[2];
+    if (a->rank == 1)
+        a->v1 = (sn_v1){p, n0, 1};
+    else if (a->rank == 2)
+        a->v2 = (sn_v2){p, n0, n1, n1, 1};
+    else
+        a->v3 = (sn_v3){p, n0, n1, n2, (int32_t)((int64_t)n1 * n2), n2, 1};
+}
+
 static int sn_take_array(sn_reader *r, sn_array *array, int rank)
 {
     uint64_t count = 1, most = (uint64_t)(r->end - r->at) / sizeof(double);
@@ -110,16 +122,18 @@ static int sn_take_array(sn_reader *r, sn_array *array, int rank)
     for (int i = 0; i < rank; i++) {
         uint64_t n;
         sn_take(r, &n, sizeof n);
-        if (n > most || (n > 0 && count > most / n))
+        if (n > most || n > SN_MOST_NUMBERS || (n > 0 && count > most / n))
             return sn_refuse(r, "an array is larger than the file.");
         count *= n;
-        array->n[i] = (int64_t)n;
+        array->n[i] = (int32_t)n;
     }
+    if (count > SN_MOST_NUMBERS)
+        return sn_refuse(r, "an array has more than 2^31 numbers.");
     /* To the next multiple of eight from the start: the numbers are used where they stand. */
     r->at += (8 - (size_t)(r->at - r->start) % 8) % 8;
     if (r->at > r->end || (uint64_t)(r->end - r->at) < count * sizeof(double))
         return sn_refuse(r, "it ends too early.");
-    array->p = (double *)(void *)r->at;
+    sn_lay_out(array, (double *)(void *)r->at);
     r->at += count * sizeof(double);
     return 1;
 }

@@ -9,86 +9,86 @@
 #define SN_MUL(a, b) ((a) * (b))
 #define SN_DIV(a, b) ((a) / (b))
 
-static int sn_same(sn_work *w, int64_t a, int64_t b)
+/* The common length of two. */
+static inline int64_t sn_same(sn_work *w, int64_t a, int64_t b)
 {
-    if (a != b)
+    if (SN_RARE(a != b))
         sn_fault(w, SN_SHAPE);
-    return a == b;
+    return a;
 }
 
 /* name_vv, _vs, _sv make a new vector; name_mm, _ms, _sm a new matrix; name_iv, _is, _im, _ims work in place. */
 #define SN_PAIRS(name, OP)                                                                                          \
-    static sn_v1 name##_vv(sn_work *w, sn_v1 a, sn_v1 b)                                                            \
+    static SN_INSIDE sn_v1 name##_vv(sn_work *w, sn_v1 a, sn_v1 b)                                                  \
     {                                                                                                               \
-        sn_v1 r = sn_new1(w, sn_same(w, a.n, b.n) ? a.n : 0);                                                       \
+        sn_v1 r = sn_new1(w, sn_same(w, a.n, b.n));                                                                 \
         for (int64_t i = 0; i < r.n; i++)                                                                           \
             r.p[i] = OP(a.p[i * a.s], b.p[i * b.s]);                                                                \
         return r;                                                                                                   \
     }                                                                                                               \
-    static sn_v1 name##_vs(sn_work *w, sn_v1 a, double b)                                                           \
+    static SN_INSIDE sn_v1 name##_vs(sn_work *w, sn_v1 a, double b)                                                 \
     {                                                                                                               \
         sn_v1 r = sn_new1(w, a.n);                                                                                  \
         for (int64_t i = 0; i < r.n; i++)                                                                           \
             r.p[i] = OP(a.p[i * a.s], b);                                                                           \
         return r;                                                                                                   \
     }                                                                                                               \
-    static sn_v1 name##_sv(sn_work *w, double a, sn_v1 b)                                                           \
+    static SN_INSIDE sn_v1 name##_sv(sn_work *w, double a, sn_v1 b)                                                 \
     {                                                                                                               \
         sn_v1 r = sn_new1(w, b.n);                                                                                  \
         for (int64_t i = 0; i < r.n; i++)                                                                           \
             r.p[i] = OP(a, b.p[i * b.s]);                                                                           \
         return r;                                                                                                   \
     }                                                                                                               \
-    static void name##_iv(sn_work *w, sn_v1 a, sn_v1 b)                                                             \
+    static SN_INSIDE void name##_iv(sn_work *w, sn_v1 a, sn_v1 b)                                                   \
     {                                                                                                               \
-        int64_t n = sn_same(w, a.n, b.n) ? a.n : 0;                                                                 \
+        int64_t n = sn_same(w, a.n, b.n);                                                                           \
         for (int64_t i = 0; i < n; i++)                                                                             \
             a.p[i * a.s] = OP(a.p[i * a.s], b.p[i * b.s]);                                                          \
     }                                                                                                               \
-    static void name##_is(sn_work *w, sn_v1 a, double b)                                                            \
+    static SN_INSIDE void name##_is(sn_work *w, sn_v1 a, double b)                                                  \
     {                                                                                                               \
         (void)w;                                                                                                    \
         for (int64_t i = 0; i < a.n; i++)                                                                           \
             a.p[i * a.s] = OP(a.p[i * a.s], b);                                                                     \
     }                                                                                                               \
-    static sn_v2 name##_mm(sn_work *w, sn_v2 a, sn_v2 b)                                                            \
+    static SN_INSIDE sn_v2 name##_mm(sn_work *w, const sn_v2 *a, const sn_v2 *b)                                    \
     {                                                                                                               \
-        int fits = sn_same(w, a.n0, b.n0) && sn_same(w, a.n1, b.n1);                                                \
-        sn_v2 r = sn_zeros2(w, fits ? a.n0 : 0, fits ? a.n1 : 0);                                                   \
+        sn_v2 r = sn_zeros2(w, sn_same(w, a->n0, b->n0), sn_same(w, a->n1, b->n1));                                 \
         for (int64_t i = 0; i < r.n0; i++)                                                                          \
             for (int64_t j = 0; j < r.n1; j++)                                                                      \
-                r.p[i * r.n1 + j] = OP(a.p[i * a.s0 + j * a.s1], b.p[i * b.s0 + j * b.s1]);                         \
+                r.p[i * r.n1 + j] = OP(a->p[i * a->s0 + j * a->s1], b->p[i * b->s0 + j * b->s1]);                   \
         return r;                                                                                                   \
     }                                                                                                               \
-    static sn_v2 name##_ms(sn_work *w, sn_v2 a, double b)                                                           \
+    static SN_INSIDE sn_v2 name##_ms(sn_work *w, const sn_v2 *a, double b)                                          \
     {                                                                                                               \
-        sn_v2 r = sn_zeros2(w, a.n0, a.n1);                                                                         \
+        sn_v2 r = sn_zeros2(w, a->n0, a->n1);                                                                       \
         for (int64_t i = 0; i < r.n0; i++)                                                                          \
             for (int64_t j = 0; j < r.n1; j++)                                                                      \
-                r.p[i * r.n1 + j] = OP(a.p[i * a.s0 + j * a.s1], b);                                                \
+                r.p[i * r.n1 + j] = OP(a->p[i * a->s0 + j * a->s1], b);                                             \
         return r;                                                                                                   \
     }                                                                                                               \
-    static sn_v2 name##_sm(sn_work *w, double a, sn_v2 b)                                                           \
+    static SN_INSIDE sn_v2 name##_sm(sn_work *w, double a, const sn_v2 *b)                                          \
     {                                                                                                               \
-        sn_v2 r = sn_zeros2(w, b.n0, b.n1);                                                                         \
+        sn_v2 r = sn_zeros2(w, b->n0, b->n1);                                                                       \
         for (int64_t i = 0; i < r.n0; i++)                                                                          \
             for (int64_t j = 0; j < r.n1; j++)                                                                      \
-                r.p[i * r.n1 + j] = OP(a, b.p[i * b.s0 + j * b.s1]);                                                \
+                r.p[i * r.n1 + j] = OP(a, b->p[i * b->s0 + j * b->s1]);                                             \
         return r;                                                                                                   \
     }                                                                                                               \
-    static void name##_im(sn_work *w, sn_v2 a, sn_v2 b)                                                             \
+    static SN_INSIDE void name##_im(sn_work *w, const sn_v2 *a, const sn_v2 *b)                                     \
     {                                                                                                               \
-        int64_t n = sn_same(w, a.n0, b.n0) && sn_same(w, a.n1, b.n1) ? a.n0 : 0;                                    \
+        int64_t n = sn_same(w, a->n0, b->n0), m = sn_same(w, a->n1, b->n1);                                         \
         for (int64_t i = 0; i < n; i++)                                                                             \
-            for (int64_t j = 0; j < a.n1; j++)                                                                      \
-                a.p[i * a.s0 + j * a.s1] = OP(a.p[i * a.s0 + j * a.s1], b.p[i * b.s0 + j * b.s1]);                  \
+            for (int64_t j = 0; j < m; j++)                                                                         \
+                a->p[i * a->s0 + j * a->s1] = OP(a->p[i * a->s0 + j * a->s1], b->p[i * b->s0 + j * b->s1]);         \
     }                                                                                                               \
-    static void name##_ims(sn_work *w, sn_v2 a, double b)                                                           \
+    static SN_INSIDE void name##_ims(sn_work *w, const sn_v2 *a, double b)                                          \
     {                                                                                                               \
         (void)w;                                                                                                    \
-        for (int64_t i = 0; i < a.n0; i++)                                                                          \
-            for (int64_t j = 0; j < a.n1; j++)                                                                      \
-                a.p[i * a.s0 + j * a.s1] = OP(a.p[i * a.s0 + j * a.s1], b);                                         \
+        for (int64_t i = 0; i < a->n0; i++)                                                                         \
+            for (int64_t j = 0; j < a->n1; j++)                                                                     \
+                a->p[i * a->s0 + j * a->s1] = OP(a->p[i * a->s0 + j * a->s1], b);                                   \
     }
 
 SN_PAIRS(sn_add, SN_ADD)
@@ -99,7 +99,7 @@ SN_PAIRS(sn_minimum, sn_min)
 SN_PAIRS(sn_maximum, sn_max)
 
 #define SN_EACH(name, OP)                                                                                           \
-    static sn_v1 name##_v(sn_work *w, sn_v1 a)                                                                      \
+    static SN_INSIDE sn_v1 name##_v(sn_work *w, sn_v1 a)                                                            \
     {                                                                                                               \
         sn_v1 r = sn_new1(w, a.n);                                                                                  \
         for (int64_t i = 0; i < r.n; i++)                                                                           \
@@ -115,7 +115,7 @@ SN_EACH(sn_log, sn_log)
 SN_EACH(sn_sin, sn_sin)
 SN_EACH(sn_cos, sn_cos)
 
-static sn_v1 sn_tanh_v(sn_work *w, sn_v1 a)
+static SN_INSIDE sn_v1 sn_tanh_v(sn_work *w, sn_v1 a)
 {
     sn_v1 r = sn_new1(w, a.n);
     if (a.s == 1)
@@ -126,20 +126,20 @@ static sn_v1 sn_tanh_v(sn_work *w, sn_v1 a)
     return r;
 }
 
-static void sn_fill1(sn_v1 a, double value)
+static SN_INSIDE void sn_fill1(sn_v1 a, double value)
 {
     for (int64_t i = 0; i < a.n; i++)
         a.p[i * a.s] = value;
 }
 
-static void sn_fill2(sn_v2 a, double value)
+static SN_INSIDE void sn_fill2(const sn_v2 *a, double value)
 {
-    for (int64_t i = 0; i < a.n0; i++)
-        for (int64_t j = 0; j < a.n1; j++)
-            a.p[i * a.s0 + j * a.s1] = value;
+    for (int64_t i = 0; i < a->n0; i++)
+        for (int64_t j = 0; j < a->n1; j++)
+            a->p[i * a->s0 + j * a->s1] = value;
 }
 
-static sn_v1 sn_copied1(sn_work *w, sn_v1 a)
+static SN_INSIDE sn_v1 sn_copied1(sn_work *w, sn_v1 a)
 {
     sn_v1 r = sn_new1(w, a.n);
     for (int64_t i = 0; i < r.n; i++)
@@ -147,66 +147,66 @@ static sn_v1 sn_copied1(sn_work *w, sn_v1 a)
     return r;
 }
 
-static sn_v2 sn_copied2(sn_work *w, sn_v2 a)
+static SN_INSIDE sn_v2 sn_copied2(sn_work *w, const sn_v2 *a)
 {
-    sn_v2 r = sn_zeros2(w, a.n0, a.n1);
+    sn_v2 r = sn_zeros2(w, a->n0, a->n1);
     for (int64_t i = 0; i < r.n0; i++)
         for (int64_t j = 0; j < r.n1; j++)
-            r.p[i * r.n1 + j] = a.p[i * a.s0 + j * a.s1];
+            r.p[i * r.n1 + j] = a->p[i * a->s0 + j * a->s1];
     return r;
 }
 
 /* to[:] = from; the two may overlap, as numpy allows. */
-static void sn_set1(sn_work *w, sn_v1 to, sn_v1 from)
+static SN_INSIDE void sn_set1(sn_work *w, sn_v1 to, sn_v1 from)
 {
-    if (!sn_same(w, to.n, from.n) || to.n == 0)
+    if (sn_same(w, to.n, from.n) == 0)
         return;
     if (to.s == 1 && from.s == 1) {
         memmove(to.p, from.p, (size_t)to.n * sizeof(double));
     } else {
         size_t top = w->top;
         from = sn_copied1(w, from);
-        if (from.n == to.n)
-            for (int64_t i = 0; i < to.n; i++)
-                to.p[i * to.s] = from.p[i];
+        for (int64_t i = 0; i < to.n; i++)
+            to.p[i * to.s] = from.p[i];
         w->top = top;
     }
 }
 
-static void sn_set2(sn_work *w, sn_v2 to, sn_v2 from)
+static SN_INSIDE void sn_set2(sn_work *w, const sn_v2 *to, const sn_v2 *from)
 {
     size_t top = w->top;
-    if (!sn_same(w, to.n0, from.n0) || !sn_same(w, to.n1, from.n1))
-        return;
-    from = sn_copied2(w, from);
-    if (from.n0 == to.n0)
-        for (int64_t i = 0; i < to.n0; i++)
-            for (int64_t j = 0; j < to.n1; j++)
-                to.p[i * to.s0 + j * to.s1] = from.p[i * from.n1 + j];
+    int64_t n0 = sn_same(w, to->n0, from->n0), n1 = sn_same(w, to->n1, from->n1);
+    const double *p = sn_copied2(w, from).p;
+    for (int64_t i = 0; i < n0; i++)
+        for (int64_t j = 0; j < n1; j++)
+            to->p[i * to->s0 + j * to->s1] = p[i * n1 + j];
     w->top = top;
 }
 
-static sn_v1 sn_flat(sn_work *w, sn_v2 m)
+static SN_INSIDE sn_v1 sn_flat(sn_work *w, const sn_v2 *m)
 {
-    sn_v1 v = {m.p, m.n0 * m.n1, 1};
-    return m.s1 == 1 && m.s0 == m.n1 ? v : sn_flat(w, sn_copied2(w, m));
+    int64_t n = (int64_t)m->n0 * m->n1;
+    sn_v1 v = {m->p, (int32_t)n, 1};
+    if (SN_RARE(n > SN_MOST_NUMBERS))
+        sn_fault(w, SN_SHAPE);
+    if (m->s1 != 1 || m->s0 != m->n1)
+        v.p = sn_copied2(w, m).p;
+    return v;
 }
 
-static sn_v2 sn_shaped(sn_work *w, sn_v1 v, int64_t n0, int64_t n1)
+static SN_INSIDE sn_v2 sn_shaped(sn_work *w, sn_v1 v, int64_t n0, int64_t n1)
 {
-    sn_v2 m = {v.p, n0, n1, n1 * v.s, v.s};
-    if (n0 < 0 || n1 < 0 || n0 > 2147483647 || n1 > 2147483647 || n0 * n1 != v.n) {
+    sn_v2 m = {v.p, (int32_t)n0, (int32_t)n1, (int32_t)(n1 * v.s), v.s};
+    if (n0 < 0 || n1 < 0 || n0 > SN_MOST_NUMBERS || n1 > SN_MOST_NUMBERS || n0 * n1 != v.n)
         sn_fault(w, SN_SHAPE);
-        m.n0 = m.n1 = 0;
-    }
     return m;
 }
 
 /* Four sums side by side, added in one fixed order: fast, and the same bits from every compiler. */
-static double sn_dot(sn_work *w, sn_v1 a, sn_v1 b)
+static SN_INSIDE double sn_dot(sn_work *w, sn_v1 a, sn_v1 b)
 {
     double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0;
-    int64_t i = 0, n = sn_same(w, a.n, b.n) ? a.n : 0;
+    int64_t i = 0, n = sn_same(w, a.n, b.n);
     if (a.s == 1 && b.s == 1) {
         for (; i + 4 <= n; i += 4) {
             s0 += a.p[i] * b.p[i];
@@ -227,37 +227,42 @@ static double sn_dot(sn_work *w, sn_v1 a, sn_v1 b)
     return (s0 + s2) + (s1 + s3);
 }
 
-static sn_v1 sn_dot_mv(sn_work *w, sn_v2 A, sn_v1 x)
+static SN_INSIDE sn_v1 sn_dot_mv(sn_work *w, const sn_v2 *A, sn_v1 x)
 {
-    sn_v1 r = sn_new1(w, sn_same(w, A.n1, x.n) ? A.n0 : 0);
+    sn_v1 r = sn_new1(w, A->n0);
+    (void)sn_same(w, A->n1, x.n);
 #ifdef SN_LANES
-    if (A.s1 == 1 && x.s == 1) {
-        sn_rows(w, r.p, A.p, x.p, r.n, A.s0, x.n);
+    if (A->s1 == 1 && x.s == 1) {
+        sn_rows(w, r.p, A->p, x.p, r.n, A->s0, x.n);
         return r;
     }
 #endif
     for (int64_t i = 0; i < r.n; i++) {
-        sn_v1 row = {A.p + i * A.s0, A.n1, A.s1};
+        sn_v1 row = {A->p + i * A->s0, A->n1, A->s1};
         r.p[i] = sn_dot(w, row, x);
     }
     return r;
 }
 
-static sn_v1 sn_dot_vm(sn_work *w, sn_v1 x, sn_v2 A) { return sn_dot_mv(w, sn_turned(A), x); }
-
-static sn_v2 sn_dot_mm(sn_work *w, sn_v2 A, sn_v2 B)
+static SN_INSIDE sn_v1 sn_dot_vm(sn_work *w, sn_v1 x, const sn_v2 *A)
 {
-    int fits = sn_same(w, A.n1, B.n0);
-    sn_v2 r = sn_zeros2(w, fits ? A.n0 : 0, fits ? B.n1 : 0);
+    sn_v2 t = sn_turned(A);
+    return sn_dot_mv(w, &t, x);
+}
+
+static SN_INSIDE sn_v2 sn_dot_mm(sn_work *w, const sn_v2 *A, const sn_v2 *B)
+{
+    sn_v2 r = sn_zeros2(w, A->n0, B->n1);
+    (void)sn_same(w, A->n1, B->n0);
     for (int64_t i = 0; i < r.n0; i++)
         for (int64_t j = 0; j < r.n1; j++) {
-            sn_v1 row = {A.p + i * A.s0, A.n1, A.s1}, column = {B.p + j * B.s1, B.n0, B.s0};
+            sn_v1 row = {A->p + i * A->s0, A->n1, A->s1}, column = {B->p + j * B->s1, B->n0, B->s0};
             r.p[i * r.n1 + j] = sn_dot(w, row, column);
         }
     return r;
 }
 
-static double sn_sum1(sn_v1 a)
+static SN_INSIDE double sn_sum1(sn_v1 a)
 {
     double total = 0.0;
     for (int64_t i = 0; i < a.n; i++)
@@ -265,7 +270,7 @@ static double sn_sum1(sn_v1 a)
     return total;
 }
 
-static double sn_largest(sn_work *w, sn_v1 a)
+static SN_INSIDE double sn_largest(sn_work *w, sn_v1 a)
 {
     double best = *sn_at1(w, a, 0);
     for (int64_t i = 1; i < a.n; i++)
@@ -274,7 +279,7 @@ static double sn_largest(sn_work *w, sn_v1 a)
     return best;
 }
 
-static double sn_least(sn_work *w, sn_v1 a)
+static SN_INSIDE double sn_least(sn_work *w, sn_v1 a)
 {
     double best = *sn_at1(w, a, 0);
     for (int64_t i = 1; i < a.n; i++)
@@ -284,11 +289,11 @@ static double sn_least(sn_work *w, sn_v1 a)
 }
 
 /* Insertion: members of an ensemble are few. NaN go last, as numpy puts them. */
-static sn_v1 sn_sorted(sn_work *w, sn_v1 a)
+static SN_INSIDE sn_v1 sn_sorted(sn_work *w, sn_v1 a)
 {
     sn_v1 r = sn_copied1(w, a);
-    int64_t rounds = sn_rounds(w, r.n > 65536 ? INT64_MAX : r.n * r.n) > 0 ? r.n : 0;
-    for (int64_t i = 1; i < rounds; i++) {
+    sn_rounds(w, (int64_t)r.n * r.n);
+    for (int64_t i = 1; i < r.n; i++) {
         double x = r.p[i];
         int64_t j = i;
         for (; j > 0 && (x < r.p[j - 1] || (r.p[j - 1] != r.p[j - 1] && x == x)); j--)
@@ -301,31 +306,27 @@ static sn_v1 sn_sorted(sn_work *w, sn_v1 a)
 /* Members of a runtime that holds others. */
 static const sn_node *sn_member(sn_work *w, const sn_node *node, int64_t i)
 {
-    if (i < 0 || i >= node->member_count) {
-        sn_fault(w, SN_INDEX);
-        return NULL;
-    }
+    if (i < 0 || i >= node->member_count)
+        sn_outside(w);
     return node->members + i;
 }
 
 static int64_t sn_member_size(sn_work *w, const sn_node *node, int64_t i)
 {
     const sn_node *member = sn_member(w, node, i);
-    return member != NULL ? member->kind->state_size(w, member) : 0;
+    return member->kind->state_size(w, member);
 }
 
-static void sn_member_initialise(sn_work *w, const sn_node *node, int64_t i, sn_v1 q, sn_v1 x, sn_v1 y)
+static SN_INSIDE void sn_member_initialise(sn_work *w, const sn_node *node, int64_t i, sn_v1 q, sn_v1 x, sn_v1 y)
 {
     const sn_node *member = sn_member(w, node, i);
-    if (member != NULL)
-        member->kind->initialise(w, member, q, x, y);
+    member->kind->initialise(w, member, q, x, y);
 }
 
-static void sn_member_step(sn_work *w, const sn_node *node, int64_t i, sn_v1 q, sn_v1 x, sn_v1 u, sn_v1 y)
+static SN_INSIDE void sn_member_step(sn_work *w, const sn_node *node, int64_t i, sn_v1 q, sn_v1 x, sn_v1 u, sn_v1 y)
 {
     const sn_node *member = sn_member(w, node, i);
-    if (member != NULL)
-        member->kind->step(w, member, q, x, u, y);
+    member->kind->step(w, member, q, x, u, y);
 }
 
 #endif

@@ -1,5 +1,5 @@
-/* The loops that take most of the time, four numbers at a time: AVX2 where the processor has it, else what it has. Every lane does
- * what the scalar code does, and the order of all sums is written down, so that the bits are the same either way. */
+/* The loops that take most of the time, four numbers at a time: AVX2 where the processor has it, else what it has. Every
+ * lane does what the scalar code does, and the order of all sums is written down: the bits are the same either way. */
 #ifndef SN_WIDE_H
 #define SN_WIDE_H
 
@@ -239,39 +239,34 @@ static void sn_tanh_all(const sn_work *w, double *y, const double *x, int64_t n)
 #endif
 
 /* What the runtimes' functions of these names do, with their checks made once for all entries; see `_translate.py`. */
-static void sn_tree_children(sn_work *w, sn_v2 nodes, int64_t node, sn_v1 x, double *result)
+static SN_INSIDE void sn_tree_children(sn_work *w, const sn_v2 *nodes, int64_t node, sn_v1 x, double *result)
 {
-    result[0] = result[1] = 0.0;
-    if (SN_RARE(node < 0 || node > nodes.n0 / 2 || 2 * node + 1 >= nodes.n0 || x.n > nodes.n1 / 2 || nodes.s1 != 1
-                || x.s != 1)) {
-        sn_fault(w, SN_INDEX);
-        return;
-    }
-    sn_two_boxes(w, nodes.p + 2 * node * nodes.s0, nodes.p + (2 * node + 1) * nodes.s0, x.p, x.n, result);
+    if (SN_RARE(node < 0 || node > nodes->n0 / 2 || 2 * node + 1 >= nodes->n0 || x.n > nodes->n1 / 2 || nodes->s1 != 1
+                || x.s != 1))
+        sn_outside(w);
+    sn_two_boxes(w, nodes->p + 2 * node * nodes->s0, nodes->p + (2 * node + 1) * nodes->s0, x.p, x.n, result);
 }
 
-static void sn_tree_cones(sn_work *w, sn_v2 points, int64_t first, int64_t count, double gamma, sn_v1 x, sn_v1 cones)
+static SN_INSIDE void sn_tree_cones(sn_work *w, const sn_v2 *points, int64_t first, int64_t count, double gamma,
+                                    sn_v1 x, sn_v1 cones)
 {
-    if (SN_RARE(first < 0 || count < 0 || first > points.n1 || count > points.n1 - first || count > cones.n
-                || x.n > points.n0 || points.s1 != 1 || x.s != 1 || cones.s != 1)) {
-        sn_fault(w, SN_INDEX);
-        return;
-    }
-    if (count == 0 || !sn_rounds(w, count))
-        return;
+    if (SN_RARE(first < 0 || count < 0 || first > points->n1 || count > points->n1 - first || count > cones.n
+                || x.n > points->n0 || points->s1 != 1 || x.s != 1 || cones.s != 1))
+        sn_outside(w);
+    sn_rounds(w, count);
 #ifdef SN_LANES
     if (count >= 4) {
         if (w->wide)
-            sn_cones_wide(cones.p, points.p + first, points.s0, count, x.p, x.n, gamma);
+            sn_cones_wide(cones.p, points->p + first, points->s0, count, x.p, x.n, gamma);
         else
-            sn_cones_plain(cones.p, points.p + first, points.s0, count, x.p, x.n, gamma);
+            sn_cones_plain(cones.p, points->p + first, points->s0, count, x.p, x.n, gamma);
         return;
     }
 #endif
     for (int64_t k = 0; k < count; k++) {
         double sum = 0.0;
         for (int64_t i = 0; i < x.n; i++) {
-            double gap = points.p[i * points.s0 + first + k] - x.p[i];
+            double gap = points->p[i * points->s0 + first + k] - x.p[i];
             sum += gap * gap;
         }
         cones.p[k] = gamma * sqrt(sum);

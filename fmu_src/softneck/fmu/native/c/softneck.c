@@ -12,5 +12,17 @@
 #define SN_EXPORT
 #endif
 
+#ifdef SN_OWN_PROBE
+#include "sn_probe.h"
+#endif
+
+/* What a step spends its time in comes first; all else may be slow, and is short. */
+#include "sn_kinds.h"
+#if defined(__clang__)
+#pragma clang attribute push(__attribute__((minsize)), apply_to = function)
+#endif
 #include "fmi2.h"
 #include "fmi3.h"
+#if defined(__clang__)
+#pragma clang attribute pop
+#endif
