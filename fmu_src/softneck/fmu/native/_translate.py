@@ -40,10 +40,10 @@ _MEMBERS = {
 }
 # Functions whose loops `sn_wide.h` has by hand, several numbers side by side: types and result as in Python, bits too.
 # One that returns numbers fills them in behind its arguments.
-_PAIR = Bundle((FLOAT, FLOAT))
+_FOUR = Bundle((FLOAT, FLOAT, FLOAT, FLOAT))
 _BY_HAND: dict[str, tuple[tuple[Type, ...], Type]] = {
-    "tree_children": ((MATRIX, INT, VECTOR), _PAIR),
-    "tree_cones": ((MATRIX, INT, INT, FLOAT, VECTOR, VECTOR), NONE),
+    "slant_children": ((MATRIX, INT, VECTOR, VECTOR), _FOUR),
+    "slant_leaf": ((MATRIX, VECTOR, INT, INT, FLOAT, VECTOR, VECTOR, VECTOR), NONE),
 }
 _PASSES = 20
 
