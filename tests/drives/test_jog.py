@@ -8,9 +8,22 @@ from dataclasses import replace
 import pytest
 
 from softneck.core import CheckFailedError, SettingsError
-from softneck.drives import Ask, DrivesFile, Jogged, Session, VirtualLink, default_drives, jog, simulated_neck
+from softneck.drives import (
+    Ask,
+    DrivesFile,
+    Jogged,
+    Session,
+    VirtualLink,
+    default_drives,
+    drive_limits,
+    jog,
+    neck_drives,
+    record_signal,
+    simulated_neck,
+)
 from softneck.drives._jog import judge
 from softneck.plant import NeckParameters
+from softneck.signals import prepare, signal
 
 PSI = (0.0, 2.0 * math.pi / 3.0, 4.0 * math.pi / 3.0)
 PAPER = NeckParameters.paper()
@@ -61,9 +74,10 @@ def test_swapped_nodes_are_named() -> None:
 
 
 def test_a_reversed_motor_is_seen_by_the_inclinometer() -> None:
-    """Limits that let it out as far as it likes, so that it reaches its rest."""
-    limits = replace(default_drives().limits, slack_unwind=10.0)
-    found = jogged(1, wired=reversed_first(), file=default_drives(limits=limits))
+    """Limits that let it out as far as it likes, so that it reaches its rest, and friction that hides its sign."""
+    file = default_drives()
+    limits, watch = replace(file.limits, slack_unwind=10.0), replace(file.watch, pushed=50.0)
+    found = jogged(1, wired=reversed_first(), file=default_drives(limits=limits, watch=watch))
     assert found.verdict == "wrong sign"
     assert found.table()["seen"]["direction_deg"] == pytest.approx(180.0, abs=DIRECTION)
 
@@ -71,10 +85,37 @@ def test_a_reversed_motor_is_seen_by_the_inclinometer() -> None:
 def test_a_reversed_motor_is_seen_by_its_current() -> None:
     found = jogged(1, wired=reversed_first())
     assert found.verdict == "wrong sign"
-    with pytest.raises(CheckFailedError, match=r"its tendon pushes \(-\d\.\d N\).*Change `reversed`"):
+    with pytest.raises(CheckFailedError, match=r"motor 1, about -\d\.\d N: its current .* pushes\. Change `reversed`"):
         found.require()
-    with pytest.raises(CheckFailedError, match="do not reach their rest"):
-        jogged(2, wired=reversed_first()).require()
+    # On the way in, before its tendon is tight: not after the 30 s that a ramp may take.
+    fault = found.ended.master.supervisor.fault
+    assert fault is not None
+    assert fault.time < 8.0
+    other = jogged(2, wired=reversed_first())
+    assert other.advice == "The current of motor 1 says that its tendon pushes: jog that one first."
+    with pytest.raises(CheckFailedError, match=r"pushes its tendon.*\(node 1\).*See `softneck drives jog 1`"):
+        other.require()
+
+
+@pytest.mark.parametrize("preset", ["paper", "lab"])
+@pytest.mark.parametrize("motor", [1, 2, 3])
+def test_record_and_run_name_a_reversed_motor_on_the_way_in(motor: int, preset: str) -> None:
+    neck = NeckParameters.preset(preset)
+    file = neck_drives(neck)
+    drives = list(file.drives)
+    drives[motor - 1] = replace(drives[motor - 1], scale=replace(drives[motor - 1].scale, reversed=True))
+    wired = replace(file, drives=(drives[0], drives[1], drives[2]))
+    played = prepare(signal("sine"), drive_limits(file), ramp_s=2.0)[0]
+    done = record_signal([played], Session(file=file, link=link_to(wired, neck)))
+    fault = done.ended.master.supervisor.fault
+    assert fault is not None
+    assert (fault.name, fault.node, done.rows) == ("pushed", motor, 0)
+    # The ramp in takes 1 to 6 s, at the end of which a tendon is tight; its time-out was 30 s.
+    assert fault.time < 8.0
+    with pytest.raises(
+        CheckFailedError, match=rf"is `reversed` of its drive right\? See `softneck drives jog {motor}`"
+    ):
+        done.require()
 
 
 def test_a_slack_tendon_does_not_move_the_neck() -> None:

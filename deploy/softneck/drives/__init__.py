@@ -33,6 +33,7 @@ from ._log_file import LoggedRun as LoggedRun
 from ._log_file import changed_files as changed_files
 from ._log_file import read_run_log as read_run_log
 from ._meaning import meaning as meaning
+from ._neck_file import neck_drives as neck_drives
 from ._notify import Notifier as Notifier
 from ._pilot import LoopPilot as LoopPilot
 from ._preflight import OVERRIDES as OVERRIDES
@@ -64,6 +65,7 @@ from ._snapshot import Snapshots as Snapshots
 from ._sources import ReplaySensor as ReplaySensor
 from ._sources import SensorSource as SensorSource
 from ._sources import open_sensor as open_sensor
+from ._times import CycleFigures as CycleFigures
 from ._times import CycleTimes as CycleTimes
 from ._units import DriveScale as DriveScale
 from ._units import acceleration_to_internal as acceleration_to_internal

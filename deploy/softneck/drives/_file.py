@@ -269,7 +269,7 @@ _KEYS: dict[str, dict[str, tuple[str, float]]] = {
     },
     "watch": {
         "following_rad": ("following", 1.0), "tilt_deg": ("tilt", math.radians(1.0)), "gain": ("gain", 1.0),
-        "pole_per_s": ("pole", 1.0),
+        "pole_per_s": ("pole", 1.0), "pushed_N": ("pushed", 1.0),
     },
     "ramp": {
         "speed_rad_s": ("speed", 1.0), "settle_s": ("settle", 1.0), "tolerance_rad": ("tolerance", 1.0),

@@ -24,8 +24,6 @@ LEAST, MOST = 0.1, 1.5
 _WIDTH = math.radians(30.0)
 # Less than this part of the tilt that is expected is no movement of the neck.
 _MOVED = 0.25
-# A tendon that is pushed with more than this [N] is one whose motor has the wrong sign.
-_PUSHED = -0.5
 # The mean angles must be known to this part of what is seen.
 _NOISE = 0.35
 
@@ -172,20 +170,20 @@ def jog_pilot(motor: int, amplitude: float) -> SignalPilot:
 def _stopped(ended: Ended, motor: int) -> tuple[str, str]:
     """Return verdict and advice for a jog that did not get to its end.
 
-    A tendon can only pull. Where the current of a motor at rest says that it is pushed, its sign is wrong, and such a
-    motor is mistaken for one whose tendon hangs: it may not be let out, and does not get to its rest.
+    A tendon can only pull: a motor whose current says that it is pushed has the wrong sign.
     """
     fault = ended.master.supervisor.fault
-    if fault is not None and fault.name == "ramp_timeout":
-        pushed = [number for number, force in enumerate(ended.tensions, start=1) if force < _PUSHED]
-        if motor in pushed:
-            force = ended.tensions[motor - 1]
+    if fault is not None and fault.name == "pushed":
+        nodes = ended.master.settings.bus.nodes
+        if fault.node == nodes[motor - 1]:
             return "wrong sign", (
-                f"Its current says that its tendon pushes ({force:.1f} N), and it does not get to its rest. Change "
-                "`reversed` of this drive, and zero it again."
+                f"{fault.detail.partition(':')[0]}: its current says that its tendon pushes. Change `reversed` of this "
+                "drive, and zero it again."
             )
-        if pushed:
-            return "stopped", f"The current of motor {pushed[0]} says that its tendon pushes: jog that one first."
+        return (
+            "stopped",
+            f"The current of motor {nodes.index(fault.node) + 1} says that its tendon pushes: jog that one first.",
+        )
     return "stopped", "It was stopped before it was done."
 
 

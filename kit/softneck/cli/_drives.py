@@ -15,6 +15,7 @@ from softneck.drives import (
     Keyboard,
     Report,
     default_drives,
+    neck_of,
     preflight,
     prepare,
     require_certified,
@@ -135,12 +136,13 @@ def zero_command(
 
     Its log holds frames: .blf or .log.
     """
-    chosen = target_of(drives_file, bus, simulated, arm)
+    parameters = load_neck(neck or "paper")
+    chosen = target_of(drives_file, bus, simulated, arm, neck=parameters)
     if any(path.suffix.lower() == ".mcap" for path in logs):
         raise SettingsError("zero has no cycles to replay; its --log ends in .blf or .log.")
     require_logs(logs, no_log=no_log, force=force)
     with (
-        open_link(chosen, moves=True, neck=neck or "paper") as link,
+        open_link(chosen, moves=True, neck=parameters) as link,
         opened_log(chosen, "zero", logs, no_log=no_log, force=force, ending=".blf") as log,
     ):
         link.tap = None if log is None else log.frame
@@ -192,8 +194,10 @@ def run_command(
     recording_suffix(path)
     refuse_existing(path, force=replace)
     require_logs(logs, no_log=no_log, force=force)
-    chosen, names = target_of(drives_file, bus, simulated, arm), checked_names(overrides)
+    names = checked_names(overrides)
     setup = load_loop(loop_file)
+    virtual = load_neck(neck) if neck else neck_of(setup.loop)
+    chosen = target_of(drives_file, bus, simulated, arm, neck=virtual)
     if not controller.is_file():
         raise SettingsError(f"{controller}: no such file.")
     require_certified(setup, controller, certificates, names)
@@ -215,7 +219,7 @@ def run_command(
             report = lambda done: tell(done, controller.name)  # noqa: E731
             if link is None:
                 result = run_simulated(
-                    deployed, chosen.file, neck=load_neck(neck) if neck else None, override=names, pace=pace,
+                    deployed, chosen.file, neck=virtual, override=names, pace=pace,
                     report=report, operator=keyboard, watches=watches, log=log, files=files,
                 )  # fmt: skip
             else:
@@ -240,8 +244,7 @@ def _print_run(path: Path, result: DrivesResult, *, as_json: bool) -> None:
     rows += [[name, str(count)] for name, count in result.counts.items()]
     if not result.simulated:
         times = result.times
-        figures = (times.quantile(0.5), times.quantile(0.99), times.longest_period)
-        rows.append(["cycle: median, p99, longest", ", ".join(f"{1e3 * value:.2f}" for value in figures) + " ms"])
+        rows.append(["cycle [ms]", str(times.figures())])
         rows.append(["missed cycles", f"{times.missed} of {times.count + times.missed}"])
     rows.append(["real-time factor", f"{result.real_time_factor:.1f}"])
     print_table(str(path), ["what", "value"], rows)

@@ -83,12 +83,12 @@ def jog_command(
     Exit code 1 if it does not: nodes swapped, a sign reversed, a tendon that hangs.
     """
     require_logs(logs, no_log=no_log, force=force)
-    chosen = target_of(drives_file, bus, simulated, arm)
-    _checked(chosen, pace)
     parameters = load_neck(neck or "paper")
+    chosen = target_of(drives_file, bus, simulated, arm, neck=parameters)
+    _checked(chosen, pace)
     angles = (parameters.tendon_angle_1, parameters.tendon_angle_2, parameters.tendon_angle_3)
     with (
-        open_link(chosen, moves=True, homed=True, neck=neck or "paper") as link,
+        open_link(chosen, moves=True, homed=True, neck=parameters) as link,
         opened_log(chosen, "jog", logs, no_log=no_log, force=force) as log,
     ):
         with progress("jog", quiet=as_json) as tell, Keyboard() as keyboard:
@@ -131,9 +131,9 @@ def _print_jog(found: Jogged, *, as_json: bool) -> None:
 @click.option("--ramp", type=float, default=2.0, show_default=True, metavar="S", help="From rest, and to it.")
 @click.option("--max-position", type=float, metavar="RAD", help="Clip set-points to +-RAD. [default: drives file]")
 @click.option(
-    "--max-speed", type=float, metavar="RAD/S", help="Slow them down. [default: a third of the drives file's]"
+    "--max-speed", type=float, metavar="RAD/S", help="Slow them down. [default: a quarter of the drives file's]"
 )
-@click.option("--max-slack", type=float, metavar="RAD", help="Pay out no more. [default: slack_unwind_rad]")
+@click.option("--max-slack", type=float, metavar="RAD", help="Pay out no more. [default: slack_unwind_rad, at most 3]")
 @click.option("--payload", type=float, default=0.0, metavar="KG", help="On the platform of --simulated.")
 @drives_options
 @override_option
@@ -154,13 +154,14 @@ def record_command(
     refuse_existing(output, force=force)
     require_logs(logs, no_log=no_log, force=force)
     require_between("--payload", payload, 0.0, 1.0, "kg")
-    chosen = target_of(drives_file, bus, simulated, arm)
+    parameters = load_neck(neck or "paper")
+    chosen = target_of(drives_file, bus, simulated, arm, neck=parameters)
     _checked(chosen, pace)
     limits = drive_limits(chosen.file, position=max_position, speed=max_speed, slack=max_slack)
     experiment = Experiment(signal=signal_name, limits=limits, duration=duration, seed=seed, runs=runs, ramp=ramp)
     prepared = experiment.prepared()
     with (
-        open_link(chosen, moves=True, homed=True, neck=neck or "paper", seed=seed) as link,
+        open_link(chosen, moves=True, homed=True, neck=parameters, seed=seed) as link,
         opened_log(chosen, "record", logs, no_log=no_log, force=force) as log,
     ):
         if isinstance(link, VirtualLink):

@@ -21,15 +21,16 @@ from softneck.drives import (
     VirtualLink,
     default_drives,
     load_drives,
+    neck_drives,
     open_bus,
     open_sensor,
     simulated_neck,
 )
 from softneck.drives.master import Frame, Tilt
+from softneck.plant import NeckParameters
 
 from ._arm import require_armed
 from ._console import note
-from ._neck import load_neck
 
 SAMPLE_TIME = 0.02
 # How long a command waits for a sample of the inclinometer [s].
@@ -60,23 +61,30 @@ def drives_options(function: Callable) -> Callable:
     return function
 
 
-def target_of(drives_file: Path | None, bus: str | None, simulated: bool, arm: bool) -> Target:
-    """Return which drives the options mean."""
+def target_of(
+    drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, *, neck: NeckParameters | None = None
+) -> Target:  # fmt: skip
+    """Return which drives the options mean; simulated ones without a file are set up for the virtual `neck`."""
     if (bus is None) == (not simulated):
         raise SettingsError("say which drives: --bus INTERFACE:CHANNEL, or --simulated.")
     if drives_file is None and not simulated:
         raise SettingsError("drives on a bus need --drives DRIVES.toml: their limits are not for us to guess.")
-    file = default_drives() if drives_file is None else load_drives(drives_file)
+    if drives_file is not None:
+        file = load_drives(drives_file)
+    else:
+        file = default_drives() if neck is None else neck_drives(neck)
     return Target(file, bus, simulated, arm)
 
 
 @contextlib.contextmanager
 def open_link(
-    chosen: Target, *, moves: bool, homed: bool = False, neck: str = "paper", seed: int = 0
+    chosen: Target, *, moves: bool, homed: bool = False, neck: NeckParameters | None = None, seed: int = 0
 ) -> Iterator[CanLink | VirtualLink]:
     """Yield the bus, or simulated drives on a virtual neck; what moves a bus must be armed."""
     if chosen.simulated:
-        yield VirtualLink(simulated_neck(chosen.file, load_neck(neck), sample_time=SAMPLE_TIME, homed=homed, seed=seed))
+        yield VirtualLink(
+            simulated_neck(chosen.file, neck or NeckParameters.paper(), sample_time=SAMPLE_TIME, homed=homed, seed=seed)
+        )
         return
     if moves:
         require_armed(str(chosen.bus), arm=chosen.arm)

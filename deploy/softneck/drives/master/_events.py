@@ -62,6 +62,7 @@ RULES: dict[str, Rule] = {
     "following": Rule(_R.STOP, 0, 0.2, "a motor does not follow its set-point"),
     "diverged": Rule(_R.STOP, 0, 0.2, "the measured tilt is not what the motors' positions give"),
     "tension": Rule(_R.STOP, 0, 0.2, "a tendon is pulled too hard"),
+    "pushed": Rule(_R.STOP, 0, 0.2, "a motor pushes its tendon, which can only pull"),
     "stalled": Rule(_R.STOP, 1, 0.0, "the control loop stood still for 5 cycles or more"),
     "late_cycle": Rule(_R.COUNT, 1, 0.0, "a cycle came late"),
     "clock": Rule(_R.STOP, 1, 0.0, "the clock went backwards"),
@@ -70,6 +71,10 @@ RULES: dict[str, Rule] = {
     "left": Rule(_R.COUNT, 1, 0.0, "the operator asked for the ramp to rest"),
     "operator": Rule(_R.STOP, 1, 0.0, "stopped by the operator"),
 }
+
+
+# Told also while no drive has power: what says that somebody else drives, or that a zero is lost.
+IDLE_TOO = frozenset({"second_master", "bus_off", "boot_up", "operator", "emergency"})
 
 
 @dataclass(frozen=True, slots=True)

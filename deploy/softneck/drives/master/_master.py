@@ -7,7 +7,7 @@ from collections import Counter, deque
 from collections.abc import Sequence
 
 from ._cia402 import DriveState, Goal
-from ._events import Event, Reaction
+from ._events import IDLE_TOO, Event, Reaction
 from ._fieldbus import Fieldbus
 from ._frame import Frame
 from ._gate import Gate, Tilt
@@ -177,7 +177,7 @@ class Master:
             return
         supervisor, active = self.supervisor, self.supervisor.phase in ACTIVE
         # While nothing has power only what could move or mislead counts.
-        for event in supervisor.react(now, events if active else [e for e in events if e.name in _IDLE_TOO]):
+        for event in supervisor.react(now, events if active else [e for e in events if e.name in IDLE_TOO]):
             self._told(event, judged=True)
 
     def _told(self, event: Event, *, judged: bool = False) -> None:
@@ -202,6 +202,8 @@ class Master:
             ):
                 events.append(Event(now, "drive_left", view.node, f"it is {view.state.name}"))
         if phase in _MOVED:
+            if phase is Phase.RAMP_IN:
+                self._watches.signs(now, self.settings.bus.nodes, self.tensions, events)
             self._watches.motors(now, self.setpoints, self.positions, self.settings.bus.nodes, self.tensions, events)
             if due:
                 last = self._gate.last
@@ -393,7 +395,3 @@ class Master:
         s = self.settings
         k, zero, p = s.counts_per_radian, s.zero_counts, self.setpoints
         return round(p[0] * k[0]) + zero, round(p[1] * k[1]) + zero, round(p[2] * k[2]) + zero
-
-
-# Told also while no drive has power: what says that somebody else drives, or that a zero is lost.
-_IDLE_TOO = frozenset({"second_master", "bus_off", "boot_up", "operator", "emergency"})

@@ -87,6 +87,8 @@ class WatchSettings:
         tilt: measured angle against the one that the motors' positions give [rad].
         gain: static tilt for one radian of theta_i or phi_i (Eq. 31: 0.483/5.293).
         pole: of that first-order model [1/s] (Eq. 31).
+        pushed: a tendon that seems to push with more than this on the way in is one whose motor has the wrong sign
+            [N]; friction of gear and sheaths does not reach it at the ramp's speed.
         tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
     """
 
@@ -94,6 +96,7 @@ class WatchSettings:
     tilt: float = math.radians(12.0)
     gain: float = 0.483 / 5.293
     pole: float = 5.293
+    pushed: float = 0.5
     tendon_angles: tuple[float, float, float] = (0.0, 2.0 * math.pi / 3.0, 4.0 * math.pi / 3.0)
 
     def __post_init__(self) -> None:
@@ -101,6 +104,7 @@ class WatchSettings:
         require_between("tilt", self.tilt, 0.01, 1.6, "rad")
         require_between("gain", self.gain, 0.001, 2.0, "rad/rad")
         require_between("pole", self.pole, 0.1, 100.0, "1/s")
+        require_between("pushed", self.pushed, 0.05, 200.0, "N")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""Model against measurement: does the neck tilt as its motors turn, do motors follow, do tendons bear it."""
+"""Model against measurement: does the neck tilt as its motors turn, do motors follow, do tendons bear it, and pull."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Leaky:
 
 
 class Watches:
-    """All three, over one run.
+    """All of them, over one run.
 
     Attributes:
         pitch, roll: that the model gives [rad].
@@ -70,6 +70,7 @@ class Watches:
         self._tilted = Patience()
         self._behind = tuple(Patience() for _ in range(3))
         self._pulled = tuple(Patience() for _ in range(3))
+        self._pushes = tuple(Patience() for _ in range(3))
 
     def align(self, pitch: float, roll: float, positions: Sequence[float]) -> None:
         """Take the angles before the motors move as those that belong to `positions`: a bias of sensor or link."""
@@ -87,6 +88,13 @@ class Watches:
                 events.append(Event(now, "following", nodes[i], f"{gap:.2f} rad behind"))
             if self._pulled[i].over(now, abs(tensions[i]) > self._limits.tension):
                 events.append(Event(now, "tension", nodes[i], f"about {tensions[i]:.1f} N"))
+
+    def signs(self, now: float, nodes: Sequence[int], tensions: Sequence[float], events: list[Event]) -> None:
+        """Look whether tendons pull; each cycle of the ramp in, in which every motor tightens its own."""
+        for i in range(3):
+            if self._pushes[i].over(now, tensions[i] < -self._settings.pushed):
+                text = f"motor {i + 1}, about {tensions[i]:.1f} N: is `reversed` of its drive right?"
+                events.append(Event(now, "pushed", nodes[i], f"{text} See `softneck drives jog {i + 1}`"))
 
     def tilt(self, now: float, step: float, positions: Sequence[float], measured: tuple[float, float] | None,
              events: list[Event]) -> None:  # fmt: skip
