@@ -115,7 +115,10 @@ def _drives(snapshot: Snapshot, *, narrow: bool) -> Table:
         table.add_row(
             f"node {drive.node}",
             Text(drive.state.name.lower().replace("_", " "), style=state),
-            Text(drive.nmt.name.lower().replace("_", " "), style="none" if drive.nmt is NodeState.OPERATIONAL else "yellow"),
+            Text(
+                drive.nmt.name.lower().replace("_", " "),
+                style="none" if drive.nmt is NodeState.OPERATIONAL else "yellow",
+            ),
             f"{drive.word:04X}h",
             Text(str(drive.silent), style="yellow" if drive.silent else "none"),
             Text(f"{drive.emergency:04X}h", style="bold red") if drive.emergency else "-",
