@@ -7,6 +7,7 @@ import io
 import itertools
 import math
 import os
+import subprocess
 import sys
 import threading
 from dataclasses import replace
@@ -15,7 +16,8 @@ import numpy as np
 import pytest
 from rich.console import Console, RenderableType
 
-from softneck.cli._drives_screen import from_line, render, to_line
+from softneck.cli._drives_picture import to_line
+from softneck.cli._drives_screen import from_line
 from softneck.cli._drives_view import LiveView, live_view
 from softneck.drives import CycleFigures, CycleTimes, DriveSnapshot, Snapshot
 from softneck.drives.master import DriveState, Event, NodeState, Phase
@@ -48,6 +50,10 @@ def _snapshot() -> Snapshot:
 
 def _text(snapshot: Snapshot, times: CycleFigures | None = None) -> str:
     return _drawn(render(snapshot, times or CycleFigures(), begin=100.0, title="pi.npz", duration=4.0))
+
+
+def render(snapshot: Snapshot, times: CycleFigures, *, size: tuple[int, int] = (104, 31), **more) -> RenderableType:
+    return from_line(to_line(snapshot, times, **more), size)
 
 
 def _drawn(what: RenderableType, width: int = 100) -> str:
@@ -117,16 +123,20 @@ def test_a_small_terminal_shows_all_of_it() -> None:
     assert len(_drawn(render(full, CycleFigures(), begin=100.0), 104).splitlines()) <= 31
 
 
-def test_what_is_drawn_elsewhere_is_the_same() -> None:
+def test_a_picture_is_one_line_and_markup_in_it_is_text() -> None:
     fault = Event(103.4, "emergency", 2, "code 2310h")
-    times = CycleFigures(0.010, 0.0125, 0.014, 101)
     stopped = replace(_snapshot(), phase=Phase.STOPPED, fault=fault, estimates=(math.nan, math.nan))
-    for snapshot in (_snapshot(), stopped):
-        line = to_line(snapshot, times, begin=100.0, title="pi [1].npz", duration=None)
-        assert line.count(b"\n") == 1
-        here = render(snapshot, times, begin=100.0, title="pi [1].npz", duration=None)
-        assert _drawn(from_line(line)) == _drawn(here)
-        assert "pi [1].npz" in _drawn(here)
+    line = to_line(stopped, CycleFigures(), title="pi [1].npz")
+    assert line.count(b"\n") == 1
+    assert "pi [1].npz" in _drawn(from_line(line))
+
+
+def test_the_drawing_process_imports_nothing_of_the_drives() -> None:
+    """It starts while a run begins: importing the drives costs seconds of processor time."""
+    heavy = ("softneck.drives", "scipy", "control", "numba", "matplotlib", "pandas")
+    code = f"import sys, softneck.cli._drives_screen; print([name for name in {heavy} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
 
 
 def test_the_newest_snapshot_and_the_last_thousand_cycles_count() -> None:

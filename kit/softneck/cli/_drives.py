@@ -244,7 +244,7 @@ def _print_run(path: Path, result: DrivesResult, *, as_json: bool) -> None:
     rows += [[name, str(count)] for name, count in result.counts.items()]
     if not result.simulated:
         times = result.times
-        rows.append(["cycle [ms]", str(times.figures())])
+        rows.append(["cycle", f"{times.figures()} ms"])
         rows.append(["missed cycles", f"{times.missed} of {times.count + times.missed}"])
     rows.append(["real-time factor", f"{result.real_time_factor:.1f}"])
     print_table(str(path), ["what", "value"], rows)

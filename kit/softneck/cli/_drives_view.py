@@ -23,7 +23,7 @@ from softneck.core import Vector
 from softneck.drives import CycleFigures, Snapshot, Snapshots, Watch
 from softneck.drives.master import Frame, Master, Tilt
 
-from ._drives_screen import to_line
+from ._drives_picture import to_line
 
 _PERIOD = 1.0 / 8.0
 # Percentiles are of so many of the last bus cycles: 10 s at 100 Hz.
