@@ -117,13 +117,16 @@ class FrameLog:
         from can.io.blf import BLFParseError, BLFReader
         from can.io.canutils import CanutilsLogReader
 
-        reader: type = BLFReader if self.path.suffix.lower() == ".blf" else CanutilsLogReader
+        binary = self.path.suffix.lower() == ".blf"
+        reader: Any = BLFReader if binary else CanutilsLogReader
         self.cut = ""
         count = 0
         try:
-            for message in reader(str(self.path)):
-                yield message.timestamp, not message.is_rx, _frame(message)
-                count += 1
+            # Opened here, for the readers leave the file open where it is damaged.
+            with self.path.open("rb" if binary else "r", encoding=None if binary else "ascii") as stream:
+                for message in reader(stream):
+                    yield message.timestamp, not message.is_rx, _frame(message)
+                    count += 1
         except OSError as error:
             raise FileFormatError(f"{self.path}: cannot be read ({error.strerror}).") from error
         except (ValueError, IndexError, struct.error, zlib.error, BLFParseError, UnicodeDecodeError) as error:

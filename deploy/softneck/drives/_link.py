@@ -172,12 +172,12 @@ class CanLink:
             frames.append(BUS_OFF)
         try:
             # Between asking for the time and here a deadline may pass; a negative wait is an error to some interfaces.
-            message = self._bus.recv(max(0.0, timeout))
+            message = self._next(max(0.0, timeout))
             while message is not None:
                 frame = self._frame(message)
                 if frame is not None:
                     frames.append(frame)
-                message = self._bus.recv(0.0)
+                message = self._next(0.0)
         except (can.CanError, OSError) as error:
             self.problem = reason(error)
             frames.append(BUS_OFF)
@@ -186,6 +186,12 @@ class CanLink:
             for frame in frames:
                 self.tap(now, False, frame)
         return frames
+
+    def _next(self, timeout: float) -> Any:
+        # Not `recv`: python-can 4 measures what is left of its time-out on the wall clock, and one that is set back by
+        # an hour meanwhile would let it wait for an hour. It does nothing else but filter, and no filter is set here.
+        message, _ = self._bus._recv_internal(timeout=timeout)
+        return message
 
     def close(self) -> None:
         """Close the bus."""

@@ -66,7 +66,7 @@ class LoggedRun:
             table = dict(self.facts["settings"])
             parts = {name: kind(**_tuples(table.pop(name))) for name, kind in _PARTS.items()}
             return MasterSettings(**_tuples(table), **parts)
-        except (KeyError, TypeError, ValueError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise FileFormatError(f"{self.path}: its settings do not fit this softneck ({error}).") from error
 
     def signals(self) -> LoopResult:
@@ -131,14 +131,14 @@ def read_run_log(path: str | Path) -> LoggedRun:
                 elif isinstance(record, Channel):
                     topics[record.id] = record.topic
                 elif isinstance(record, Message):
-                    topic, table = topics.get(record.channel_id), json.loads(record.data)
+                    topic = topics.get(record.channel_id)
                     if topic == "/cycle":
-                        cycles.append(decode_cycle(table))
+                        cycles.append(decode_cycle(_table(record.data)))
                     elif topic == "/signals":
-                        rows.append(table)
+                        rows.append({name: float(value) for name, value in _table(record.data).items()})
                         at.append(len(cycles) - 1)
                     elif topic == "/events":
-                        moment = cycles[-1].time if cycles else 0.0
+                        table, moment = _table(record.data), cycles[-1].time if cycles else 0.0
                         events.append((moment, str(table.get("name")), str(table.get("message"))))
     except OSError as error:
         raise FileFormatError(f"{source}: cannot be read ({error.strerror}).") from error
@@ -159,9 +159,17 @@ def _facts(source: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
             f"{source}: has log version {metadata.get('version')}; this softneck reads {LOG_VERSION}."
         )
     facts = json.loads(metadata["facts"])
-    if not isinstance(facts, dict) or not isinstance(facts.get("files", {}), dict):
+    files = facts.get("files", {}) if isinstance(facts, dict) else None
+    if not isinstance(files, dict) or not all(isinstance(entry, dict) for entry in files.values()):
         raise FileFormatError(f"{source}: its metadata are damaged.")
     return facts
+
+
+def _table(data: bytes) -> dict[str, Any]:
+    table = json.loads(data)
+    if not isinstance(table, dict):
+        raise ValueError("a message that is no table")  # noqa: TRY004  (bad content, told with all other damage)
+    return table
 
 
 def _tuples(table: Mapping[str, Any]) -> dict[str, Any]:

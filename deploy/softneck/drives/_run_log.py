@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -211,7 +212,8 @@ class RunLogger:
         self._thread.join()
         self._close_streams()
         if self.problem:
-            raise OutputError(f"{partial(self.paths[0])}: the log is not complete: {self.problem}.")
+            names = ", ".join(str(partial(path)) for path in self.paths)
+            raise OutputError(f"{names}: the log is not complete: {self.problem}. The run went on without it.")
         for path in self.paths:
             partial(path).replace(path)
         if self.lost:
@@ -232,7 +234,13 @@ class RunLogger:
 
     def _close_streams(self) -> None:
         for stream in self._streams:
-            stream.close()
+            try:
+                stream.close()
+            except OSError as error:
+                # What was kept back for a full disk does not fit now either; closing it again gives it up.
+                self.problem = self.problem or error.strerror or str(error)
+                with contextlib.suppress(OSError):
+                    stream.close()
         self._streams.clear()
 
     def _write(self) -> None:

@@ -1,0 +1,298 @@
+"""Parts around the control loop: what a service manager is told, how a run is asked to end, cycle times, snapshots."""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+import itertools
+import math
+import os
+import signal
+import socket
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from softneck.core import SettingsError
+from softneck.drives import Ask, CycleTimes, Notifier, Snapshots
+from softneck.drives import _timing as timing
+from softneck.drives._timing import Ending, steady
+
+from .bench import Bench
+
+unix = pytest.mark.skipif(not hasattr(socket, "AF_UNIX"), reason="needs Unix sockets")
+
+
+class Manager:
+    """The service manager's end of NOTIFY_SOCKET."""
+
+    def __init__(self, address: str) -> None:
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.socket.bind("\0" + address[1:] if address.startswith("@") else address)
+        self.socket.setblocking(False)
+        self.address = address
+
+    def told(self) -> list[str]:
+        """What came since the last call."""
+        lines = []
+        while True:
+            try:
+                lines.append(self.socket.recv(4096).decode())
+            except BlockingIOError:
+                return lines
+
+
+@pytest.fixture(params=["path", "abstract"])
+def manager(request: pytest.FixtureRequest, tmp_path: Path):
+    if request.param == "abstract" and sys.platform != "linux":
+        pytest.skip("abstract names are Linux's")
+    made = Manager(f"@softneck-{os.getpid()}" if request.param == "abstract" else str(tmp_path / "n"))
+    yield made
+    made.socket.close()
+
+
+# -- what a service manager is told -----------------------------------------------------------------------------------
+
+
+@unix
+def test_a_manager_hears_ready_phases_and_the_end_in_their_order(manager: Manager) -> None:
+    bench = Bench()
+    with Notifier({"NOTIFY_SOCKET": manager.address}) as notifier:
+        notifier.ready()
+        bench.start()
+        for k in range(5):
+            notifier.cycle(0.01 * k, bench.master)
+    assert manager.told() == ["READY=1", f"STATUS={bench.master.supervisor.phase}", "STOPPING=1"]
+    notifier.tell("never")
+    assert manager.told() == []
+
+
+@unix
+@given(times=st.lists(st.floats(0.0, 0.3), min_size=1, max_size=40))
+def test_signs_of_life_come_from_cycles_only_and_four_in_a_time_out(times: list[float]) -> None:
+    """However the cycles come: a quarter of the time-out lies between two of them, and at most one cycle more."""
+    bench, timeout = Bench(), 0.4
+    sent: list[str] = []
+    notifier = Notifier({"WATCHDOG_USEC": str(int(timeout * 1e6))})
+    notifier.tell = sent.append  # type: ignore[method-assign]
+    now, fed = 0.0, []
+    for step in times:
+        now += step
+        before = len(sent)
+        notifier.cycle(now, bench.master)
+        if "WATCHDOG=1" in sent[before:]:
+            fed.append(now)
+        # Never longer than a quarter without, unless no cycle came meanwhile.
+        assert now - fed[-1] < timeout / 4
+    assert all(later - earlier >= timeout / 4 for earlier, later in itertools.pairwise(fed))
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [
+        {},
+        {"WATCHDOG_USEC": "400000", "WATCHDOG_PID": str(os.getpid() + 1)},
+        {"WATCHDOG_USEC": "0"},
+        {"WATCHDOG_USEC": "soon"},
+        {"WATCHDOG_USEC": "-5"},
+    ],
+    ids=["no time-out", "another process'", "off", "no number", "negative"],
+)
+def test_no_watchdog_is_fed_that_is_not_ours(environment: dict[str, str]) -> None:
+    bench, sent = Bench(), []
+    notifier = Notifier(environment)
+    notifier.tell = sent.append  # type: ignore[method-assign]
+    for k in range(100):
+        notifier.cycle(0.1 * k, bench.master)
+    assert [text for text in sent if text.startswith("WATCHDOG")] == []
+
+
+@unix
+@pytest.mark.parametrize("address", ["", "relative/path", "/no/such/socket", "@nobody-listens-there", "vsock:2:1"])
+def test_a_manager_that_does_not_listen_stops_nothing(address: str) -> None:
+    with Notifier({"NOTIFY_SOCKET": address}) as notifier:
+        notifier.ready()
+        notifier.tell("STATUS=x")
+
+
+@unix
+def test_a_manager_that_reads_nothing_does_not_hold_up_the_loop(manager: Manager) -> None:
+    with Notifier({"NOTIFY_SOCKET": manager.address}) as notifier:
+        # More than any socket buffers; a blocking send would never return.
+        for _ in range(20_000):
+            notifier.tell("WATCHDOG=1")
+    assert 0 < len(manager.told()) < 20_000
+
+
+# -- being asked to end -----------------------------------------------------------------------------------------------
+
+
+def test_each_signal_is_one_request_and_the_second_one_is_at_once() -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    ending = Ending()
+    with ending.watched():
+        assert ending.ask() is None
+        signal.raise_signal(signal.SIGTERM)
+        assert [ending.ask() for _ in range(3)] == [Ask.LEAVE, None, None]
+        signal.raise_signal(signal.SIGTERM)
+        assert [ending.ask() for _ in range(3)] == [Ask.STOP, None, None]
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_two_signals_between_two_steps_stop_at_once() -> None:
+    ending = Ending()
+    with ending.watched():
+        signal.raise_signal(signal.SIGTERM)
+        signal.raise_signal(signal.SIGTERM)
+        assert ending.ask() is Ask.STOP
+
+
+def test_the_signal_is_given_back_after_an_error_and_left_alone_in_threads() -> None:
+    before = signal.getsignal(signal.SIGTERM)
+
+    def fails() -> None:
+        with Ending().watched():
+            raise SettingsError("whatever")
+
+    with pytest.raises(SettingsError, match="whatever"):
+        fails()
+    assert signal.getsignal(signal.SIGTERM) is before
+    seen: list[object] = []
+
+    def inside() -> None:
+        with Ending().watched():
+            seen.append(signal.getsignal(signal.SIGTERM))
+
+    thread = threading.Thread(target=inside)
+    thread.start()
+    thread.join()
+    assert seen == [before]
+
+
+# -- a steady process -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_nothing_is_collected_in_a_run_and_all_is_as_before_after_it(enabled: bool) -> None:
+    was = gc.isenabled()
+    try:
+        (gc.enable if enabled else gc.disable)()
+        with steady():
+            assert not gc.isenabled()
+            assert gc.get_freeze_count() > 0
+        assert gc.isenabled() == enabled
+        assert gc.get_freeze_count() == 0
+    finally:
+        (gc.enable if was else gc.disable)()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs Linux")
+def test_real_time_that_is_not_permitted_is_one_line_and_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuses(*_: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    class Libc:
+        locked = 0
+
+        def mlockall(self, _flags: int) -> int:
+            Libc.locked += 1
+            return 0
+
+        def munlockall(self) -> int:
+            Libc.locked -= 1
+            return 0
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuses)
+    monkeypatch.setattr(timing.ctypes, "CDLL", lambda *_, **__: Libc())
+    enabled = gc.isenabled()
+    message = r"--realtime is not permitted here \(Operation not permitted\); run as root.*Nothing was sent\."
+    with pytest.raises(SettingsError, match=message), steady(realtime=True):
+        pass
+    assert (Libc.locked, gc.isenabled()) == (0, enabled)
+
+
+# -- cycle times ------------------------------------------------------------------------------------------------------
+
+
+def times_of(moments: list[float], cycle: float = 0.01) -> CycleTimes:
+    times = CycleTimes(cycle)
+    for moment in moments:
+        times.take(moment, 0.0)
+    return times
+
+
+@given(st.lists(st.integers(1, 40), max_size=60), st.floats(1e-3, 1.0), st.floats(0.0, 1e6))
+def test_cycles_and_missed_ones_fill_the_run(periods: list[int], cycle: float, begin: float) -> None:
+    """A period of n cycles misses n - 1: together they are all that could have been."""
+    moments = [begin]
+    for period in periods:
+        moments.append(moments[-1] + period * cycle)
+    times = times_of(moments, cycle)
+    assert times.count == len(periods)
+    assert times.missed == sum(periods) - len(periods)
+    assert times.late == sum(period >= 2 for period in periods)
+    assert times.table()["missed_share"] == pytest.approx(times.missed / max(1, sum(periods)))
+
+
+@given(st.lists(st.floats(0.0, 0.19), min_size=1, max_size=200), st.floats(0.01, 1.0))
+def test_a_quantile_is_that_of_all_periods_to_ten_microseconds(periods: list[float], share: float) -> None:
+    moments = [0.0]
+    for period in periods:
+        moments.append(moments[-1] + period)
+    found = times_of(moments).quantile(share)
+    exact = sorted(periods)[max(0, math.ceil(share * len(periods) - 1e-9) - 1)]
+    # The upper edge of a bin of 10 us; sums of floats add a few 1e-15.
+    assert exact - 1e-9 <= found <= exact + 1e-5 + 1e-9
+
+
+@given(st.lists(st.floats(-1.0, 10.0), max_size=30))
+def test_a_jitter_is_neither_late_nor_missed_and_odd_clocks_do_no_harm(periods: list[float]) -> None:
+    moments, now = [0.0], 0.0
+    for period in periods:
+        now += period
+        moments.append(now)
+    times = times_of(moments)
+    assert times.missed >= 0
+    assert 0.0 <= times.quantile(0.99) <= 0.2
+    steady_times = times_of([0.01 * k + 0.004 * (k % 2) for k in range(50)])
+    assert (steady_times.late, steady_times.missed) == (0, 0)
+
+
+def test_nothing_was_measured_without_a_period() -> None:
+    for moments in ([], [1.0]):
+        assert times_of(moments).table() == {
+            "cycles": 0, "late": 0, "missed": 0, "missed_share": 0.0, "p50_s": 0.0, "p99_s": 0.0, "longest_s": 0.0,
+            "longest_step_s": 0.0,
+        }  # fmt: skip
+
+
+# -- snapshots --------------------------------------------------------------------------------------------------------
+
+
+def test_a_snapshot_is_frozen_and_no_later_step_changes_it() -> None:
+    bench, taker = Bench().start(), Snapshots()
+    bench.pass_time(0.5)
+    taken = taker.take(bench.master, bench.now)
+    kept = repr(taken)
+    bench.neck.drives[0].axis.trip(0x2310)
+    bench.pass_time(0.5)
+    assert repr(taken) == kept
+    after = taker.take(bench.master, bench.now)
+    assert (taken.fault, after.fault is not None) == (None, True)
+    assert sum(after.counts.values()) > sum(taken.counts.values())
+    with pytest.raises(dataclasses.FrozenInstanceError, match="cannot assign"):
+        taken.cycle = 0  # type: ignore[misc]
+
+
+def test_taking_a_snapshot_changes_nothing_and_two_takers_see_the_same() -> None:
+    bench = Bench().start()
+    bench.pass_time(0.5)
+    one, other = Snapshots(), Snapshots()
+    first = one.take(bench.master, bench.now)
+    assert repr(first) == repr(one.take(bench.master, bench.now)) == repr(other.take(bench.master, bench.now))
+    assert len(first.events) <= 5
+    assert list(first.events) == list(bench.master.events)[-len(first.events) :] if first.events else True
