@@ -7,16 +7,19 @@ import io
 import itertools
 import math
 import os
+import subprocess
 import sys
 import threading
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from rich.console import Console, RenderableType
 
-from softneck.cli._drives_screen import CycleTimes, from_line, render, to_line
+from softneck.cli._drives_picture import to_line
+from softneck.cli._drives_screen import from_line
 from softneck.cli._drives_view import LiveView, live_view
-from softneck.drives import DriveSnapshot, Snapshot
+from softneck.drives import CycleFigures, CycleTimes, DriveSnapshot, Snapshot
 from softneck.drives.master import DriveState, Event, NodeState, Phase
 
 DEG = math.pi / 180.0
@@ -45,8 +48,12 @@ def _snapshot() -> Snapshot:
     )
 
 
-def _text(snapshot: Snapshot, times: CycleTimes | None = None) -> str:
-    return _drawn(render(snapshot, times or CycleTimes(), begin=100.0, title="pi.npz", duration=4.0))
+def _text(snapshot: Snapshot, times: CycleFigures | None = None) -> str:
+    return _drawn(render(snapshot, times or CycleFigures(), begin=100.0, title="pi.npz", duration=4.0))
+
+
+def render(snapshot: Snapshot, times: CycleFigures, *, size: tuple[int, int] = (104, 31), **more) -> RenderableType:
+    return from_line(to_line(snapshot, times, **more), size)
 
 
 def _drawn(what: RenderableType, width: int = 100) -> str:
@@ -56,7 +63,7 @@ def _drawn(what: RenderableType, width: int = 100) -> str:
 
 
 def test_everything_is_on_the_screen() -> None:
-    text = _text(_snapshot(), CycleTimes(0.010, 0.0125, 0.014, 101))
+    text = _text(_snapshot(), CycleFigures(0.010, 0.0125, 0.014, 101))
     lines = [" ".join(line.strip("│ ").split()) for line in text.splitlines()]
     assert "pi.npz" in lines[0]
     # Sample 75 of 0.02 s; begun at 100 s of the clock.
@@ -95,19 +102,41 @@ def test_a_fault_is_named_and_what_is_not_known_is_a_dash() -> None:
 
 @pytest.mark.parametrize("width", [40, 80, 200])
 def test_no_width_breaks_it(width: int) -> None:
-    assert all(len(line) <= width for line in _drawn(render(_snapshot(), CycleTimes()), width).splitlines())
+    assert all(len(line) <= width for line in _drawn(render(_snapshot(), CycleFigures()), width).splitlines())
 
 
-def test_what_is_drawn_elsewhere_is_the_same() -> None:
+def test_a_small_terminal_shows_all_of_it() -> None:
     fault = Event(103.4, "emergency", 2, "code 2310h")
-    times = CycleTimes(0.010, 0.0125, 0.014, 101)
+    one, two, three = _snapshot().drives
+    drives = (one, replace(two, nmt=NodeState.PRE_OPERATIONAL, state=DriveState.SWITCHED_ON), three)
+    full = replace(_snapshot(), fault=fault, events=(fault,) * 5, drives=drives)
+    drawn = _drawn(render(full, CycleFigures(0.010, 0.0125, 0.014, 1000), begin=100.0, size=(80, 24)), 80)
+    lines = drawn.splitlines()
+    assert len(lines) <= 24
+    assert "…" not in drawn
+    words = [" ".join(line.strip("│ ").split()) for line in lines]
+    assert "motor set-point [rad] position [rad] lag [rad] tension [N] of limit" in words
+    assert "node 2 switched on pre operational 1237h 0 -" in words
+    assert "cycle [ms] p50 10.00 p99 12.50 max 14.00 due 10 late 4" in words
+    assert sum("emergency a drive sent an emergency (node 2)" in line for line in words) == 5
+    # As high as a large one may get: nothing is cropped there either.
+    assert len(_drawn(render(full, CycleFigures(), begin=100.0), 104).splitlines()) <= 31
+
+
+def test_a_picture_is_one_line_and_markup_in_it_is_text() -> None:
+    fault = Event(103.4, "emergency", 2, "code 2310h")
     stopped = replace(_snapshot(), phase=Phase.STOPPED, fault=fault, estimates=(math.nan, math.nan))
-    for snapshot in (_snapshot(), stopped):
-        line = to_line(snapshot, times, begin=100.0, title="pi [1].npz", duration=None)
-        assert line.count(b"\n") == 1
-        here = render(snapshot, times, begin=100.0, title="pi [1].npz", duration=None)
-        assert _drawn(from_line(line)) == _drawn(here)
-        assert "pi [1].npz" in _drawn(here)
+    line = to_line(stopped, CycleFigures(), title="pi [1].npz")
+    assert line.count(b"\n") == 1
+    assert "pi [1].npz" in _drawn(from_line(line))
+
+
+def test_the_drawing_process_imports_nothing_of_the_drives() -> None:
+    """It starts while a run begins: importing the drives costs seconds of processor time."""
+    heavy = ("softneck.drives", "scipy", "control", "numba", "matplotlib", "pandas")
+    code = f"import sys, softneck.cli._drives_screen; print([name for name in {heavy} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
 
 
 def test_the_newest_snapshot_and_the_last_thousand_cycles_count() -> None:
@@ -123,6 +152,21 @@ def test_the_newest_snapshot_and_the_last_thousand_cycles_count() -> None:
     text = _drawn(from_line(line))
     assert "bus cycle 1600" in text
     assert "p50 10.00   p99 14.00   max 14.00   (of 1000 cycles" in text
+
+
+def test_the_figures_of_the_view_and_of_the_result_agree() -> None:
+    times, now = CycleTimes(0.01), 0.0
+    gaps = np.random.default_rng(0).uniform(0.009, 0.013, 900)
+    times.take(now, 0.001)
+    for gap in gaps:
+        now += gap
+        times.take(now, 0.001)
+    whole, some = times.figures(), CycleFigures.of(gaps)
+    # The histogram has bins of 10 us, and both take the sample next to the quantile: 900 samples over 4 ms.
+    np.testing.assert_allclose(whole[:3], some[:3], rtol=0, atol=2.5e-5)
+    assert whole.number == some.number == 900
+    assert math.isnan(CycleTimes(0.01).figures().p50)
+    assert CycleFigures.of(gaps[:0]).number == 0
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")

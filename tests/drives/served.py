@@ -25,10 +25,14 @@ def main() -> int:
         neck = SimulatedNeck(NeckParameters.paper(), SimulatedSettings(homed=True))
         server = threading.Thread(target=serve, args=(theirs, neck), kwargs={"stopped": ended.is_set}, daemon=True)
         server.start()
-        powered = []
+        powered: list[bool] = []
+        any_powered: list[bool] = []
 
         def watch() -> None:
             while not ended.wait(0.02):
+                if any(drive.axis.state == 0x27 for drive in neck.drives) and not any_powered:
+                    any_powered.append(True)
+                    print("ANY POWER", flush=True)
                 if all(drive.axis.state == 0x27 for drive in neck.drives) and not powered:
                     powered.append(True)
                     print("POWERED", flush=True)

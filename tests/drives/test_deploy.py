@@ -145,7 +145,7 @@ def test_zero_tensions_every_tendon_and_marks_the_drives(profile: str) -> None:
     )  # fmt: skip
     assert all(pulled > 0.5 for pulled in zeroed.pulled)
     # At the end all three motors pull with the current of [zero], in steps of 0.3 mA.
-    assert tensions[0] == pytest.approx([0.0177] * 3, abs=3e-4)
+    assert tensions[0] == pytest.approx([0.0151] * 3, abs=3e-4)
     assert all(drive.axis.homed and drive.axis.state == 0x40 for drive in link.neck.drives)
     link.receive(0.5)
     # Nobody guards any more, and nobody faults for it.

@@ -230,7 +230,7 @@ def test_the_drive_watches_its_following_error() -> None:
 # -- fuzzing ----------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(cycles=st.lists(FRAMES, max_size=6), begun=st.booleans())
 def test_no_frame_crashes_the_master(cycles: list[list[Frame]], begun: bool) -> None:
     master = new_master()
@@ -247,7 +247,7 @@ def running() -> Bench:
     return Bench(off=frozenset(RULES)).start()
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(
     frames=FRAMES, tilt=st.none() | st.builds(Tilt, st.floats(), st.floats(), st.floats(), st.floats(), st.booleans())
 )

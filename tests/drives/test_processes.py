@@ -15,6 +15,8 @@ from typing import Any
 
 import pytest
 
+from softneck.drives import FrameLog, read_run_log, replay
+
 from .processes import CASES, NAMESPACE, UDP, World, write_project
 
 SCRIPT = Path(__file__).with_name("processes.py")
@@ -51,6 +53,21 @@ def test_the_end_state_is_exact(case: str) -> None:
     assert found["exact"], found
     if found["reaction_s"] is not None:
         assert 0.0 < found["reaction_s"] < 0.5
+
+
+@pytest.mark.slow
+def test_a_log_of_a_real_bus_gives_the_same_decisions(tmp_path: Path) -> None:
+    """Over UDP multicast, ended by SIGTERM; the files of the run are gone, so that its own answers are used."""
+    path = tmp_path / "run.mcap"
+    found = played("terminated", "--extra=--log", f"--extra={path}", "--extra=--log", f"--extra={tmp_path / 'run.blf'}",
+                   "--extra=--force")  # fmt: skip
+    assert found["exact"], found
+    log = read_run_log(path)
+    assert log.cut == ""
+    assert log.cycles[-1].phase == "done"
+    replay(log).require()
+    assert len(log.recording()) > 5
+    assert len(list(FrameLog(tmp_path / "run.blf"))) > 6 * len(log.cycles)
 
 
 def test_a_bus_that_is_down_is_one_line_and_nothing_moves(tmp_path: Path) -> None:

@@ -16,10 +16,12 @@ from softneck.drives import (
     default_drives,
     drive_limits,
     neck_drives,
+    preflight,
     record_signal,
     simulated_neck,
+    zero,
 )
-from softneck.drives.master import Master
+from softneck.drives.master import Master, Tilt
 from softneck.identification import Rls
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import Excitation, prepare, signal
@@ -195,3 +197,17 @@ def test_what_the_drives_file_does_not_allow_is_refused() -> None:
         recorded(signal("eq22", duration=10.0))
     with pytest.raises(SettingsError, match="there is no signal"):
         recorded()
+
+
+def test_the_first_experiment_after_zeroing_ends_as_planned() -> None:
+    """The tendons keep the tension of `zero`; the motors have what is left of their current."""
+    link = VirtualLink(simulated_neck(FILE, NECK, sample_time=0.02, homed=False))
+
+    def look() -> Tilt:
+        sample = link.neck.newest
+        return Tilt(sample.pitch, sample.roll, valid=sample.valid)
+
+    zero(link, FILE, look, guarding=preflight(link, FILE).guarding)
+    recorded = record_signal([excitation("eq22", 40.0)], Session(file=FILE, link=link))
+    recorded.require()
+    assert recorded.rows == recorded.planned

@@ -146,7 +146,7 @@ def test_a_sensor_that_must_be_asked(terminal: tuple[int, str]) -> None:
 @pytest.mark.parametrize(
     ("sent", "start", "message"),
     [
-        (b"\x75\x65\x80\x0e" * 400, 5.0, r"sends no lines such as i12\.34,o120\.00 at 9600 baud, but b'ue"),
+        (b"\x75\x65\x80\x0e" * 400, 0.3, r"sends no lines such as i12\.34,o120\.00 at 9600 baud, but b'ue"),
         (b"\n" + b"$GPGGA,1,2\n" * 30, 5.0, r"sends no .* but b'\$GPGGA,1,2': another sensor, or another baud rate\?"),
         (b"\n", 0.3, r"silent for 0\.3 s at 9600 baud\. Some firmware must be asked: `request = true`"),
     ],

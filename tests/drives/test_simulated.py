@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 import struct
 
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from softneck.drives.simulated import CanFrame, SimulatedDrive, SimulatedNeck, SimulatedSettings
+from softneck.drives.simulated.__main__ import hardware_stop
 from softneck.plant import NeckParameters
 
 CPR = 1539 / 65 * 2048 / (2 * math.pi)
@@ -219,3 +221,14 @@ def test_no_frame_crashes_a_drive(frames: list[CanFrame]) -> None:
     talk.frames(tuple(frames))
     talk.pass_time(0.01)
     assert math.isfinite(talk.drive.axis.motion[24])
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGUSR1"), reason="needs SIGUSR1")
+def test_the_hardware_stop_can_be_practised() -> None:
+    virtual = neck()
+    before = signal.getsignal(signal.SIGUSR1)
+    with hardware_stop(virtual):
+        for pressed in (True, False):
+            signal.raise_signal(signal.SIGUSR1)
+            assert [drive.axis.enable_input for drive in virtual.drives] == [not pressed] * 3
+    assert signal.getsignal(signal.SIGUSR1) is before

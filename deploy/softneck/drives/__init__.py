@@ -65,6 +65,7 @@ from ._snapshot import Snapshots as Snapshots
 from ._sources import ReplaySensor as ReplaySensor
 from ._sources import SensorSource as SensorSource
 from ._sources import open_sensor as open_sensor
+from ._times import CycleFigures as CycleFigures
 from ._times import CycleTimes as CycleTimes
 from ._units import DriveScale as DriveScale
 from ._units import acceleration_to_internal as acceleration_to_internal

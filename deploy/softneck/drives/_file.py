@@ -86,7 +86,8 @@ class ZeroSettings:
     """How `softneck drives zero` tensions the tendons.
 
     Attributes:
-        current: of the motor while it pulls [A].
+        current: of the motor while it pulls [A]; by default 3.25 N with [neck]'s radius, constant and efficiency, the
+            pretension of the virtual neck, so that its rest is the zero. At 3.8 N Eq. 22 leaves the motors behind.
         speed: of the winch while it pulls [rad/s].
         still: slower than this it has come to a stop [rad/s].
         still_time: for this long [s].
@@ -94,7 +95,7 @@ class ZeroSettings:
         tilt: the neck must be upright within this then [rad].
     """
 
-    current: float = 0.0177
+    current: float = 0.0151
     speed: float = 1.0
     still: float = 0.2
     still_time: float = 0.3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import signal
 import sys
@@ -73,8 +74,10 @@ class Keyboard:
         if threading.current_thread() is not threading.main_thread():
             return
 
-        def leave(_number: int, _frame: FrameType | None) -> None:
+        def leave(number: int, _frame: FrameType | None) -> None:
             self._interrupt()
+            if number == getattr(signal, "SIGHUP", None):
+                _leave_dead_terminal()
 
         def end(_number: int, _frame: FrameType | None) -> None:
             self._leave()
@@ -128,6 +131,22 @@ def _unix_keys(file: int) -> bytes:
     except OSError:
         # The terminal is gone; SIGHUP says so too.
         return b""
+
+
+def _leave_dead_terminal() -> None:
+    """Send what is still printed nowhere if the terminal is gone: it must not fail and cost what was recorded."""
+    import termios
+
+    for file in (1, 2):
+        try:
+            if os.isatty(file):
+                continue
+            termios.tcgetattr(file)
+        except (OSError, termios.error) as error:
+            if error.args[0] == errno.EIO:
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nowhere, file)
+                os.close(nowhere)
 
 
 def _restore(file: int, before: Any) -> None:

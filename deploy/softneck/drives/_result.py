@@ -102,6 +102,9 @@ def recording_of(signals: LoopResult, speeds: Matrix) -> Recording:
     return Recording(signals.time, signals.sample_time, channels)
 
 
+_UNHEARD = ("bus_off", "bus_silent")
+
+
 def require_unstopped(fault: Event | None, *, rehome: bool = False) -> None:
     """Raise CheckFailedError if `fault` ended a run early."""
     if fault is None:
@@ -109,9 +112,14 @@ def require_unstopped(fault: Event | None, *, rehome: bool = False) -> None:
     after = " Run `softneck drives zero` before the next run." if rehome else ""
     if fault.name == "operator":
         raise CheckFailedError(f"stopped at t = {fault.time:.3f} s by the operator. The drives are off.{after}")
+    # Where no word reaches the drives, what they do is theirs, and nobody here can know it.
+    off = (
+        "Nobody reaches the drives, whose own guarding stops them within 0.1 s"
+        if fault.name in _UNHEARD
+        else ("The drives are off")
+    )
     raise CheckFailedError(
-        f"stopped at t = {fault.time:.3f} s: {fault}. The drives are off; look for the cause, then "
-        f"`softneck drives reset`.{after}"
+        f"stopped at t = {fault.time:.3f} s: {fault}. {off}; look for the cause, then `softneck drives reset`.{after}"
     )
 
 

@@ -112,8 +112,12 @@ class _Motor:
             self.word(word)
             while self.state() is not state:
                 if self.link.now > until:
+                    found = self.state()
+                    advice = " Is the hardware stop released? Then `softneck drives reset`." * (
+                        found is DriveState.FAULT
+                    )
                     raise CheckFailedError(
-                        f"node {self.entry.node}: does not get to {state.name}; it is in {self.state().name}."
+                        f"node {self.entry.node}: does not get to {state.name}; it is in {found.name}.{advice}"
                     )
                 wait(self.link, _LOOK)
 

@@ -244,8 +244,7 @@ def _print_run(path: Path, result: DrivesResult, *, as_json: bool) -> None:
     rows += [[name, str(count)] for name, count in result.counts.items()]
     if not result.simulated:
         times = result.times
-        figures = (times.quantile(0.5), times.quantile(0.99), times.longest_period)
-        rows.append(["cycle: median, p99, longest", ", ".join(f"{1e3 * value:.2f}" for value in figures) + " ms"])
+        rows.append(["cycle", f"{times.figures()} ms"])
         rows.append(["missed cycles", f"{times.missed} of {times.count + times.missed}"])
     rows.append(["real-time factor", f"{result.real_time_factor:.1f}"])
     print_table(str(path), ["what", "value"], rows)

@@ -89,7 +89,11 @@ def open_link(
     if moves:
         require_armed(str(chosen.bus), arm=chosen.arm)
     with open_bus(str(chosen.bus), bit_rate=chosen.file.bit_rate) as link:
-        yield link
+        try:
+            yield link
+        finally:
+            if link.problem:
+                note(f"bus {chosen.bus}: {link.problem}")
 
 
 # As a shell says it of a process that SIGTERM ended: 128 + 15.

@@ -20,10 +20,10 @@ import numpy as np
 from rich.console import Console
 
 from softneck.core import Vector
-from softneck.drives import Snapshot, Snapshots, Watch
+from softneck.drives import CycleFigures, Snapshot, Snapshots, Watch
 from softneck.drives.master import Frame, Master, Tilt
 
-from ._drives_screen import CycleTimes, to_line
+from ._drives_picture import to_line
 
 _PERIOD = 1.0 / 8.0
 # Percentiles are of so many of the last bus cycles: 10 s at 100 Hz.
@@ -107,12 +107,8 @@ class LiveView:
             return None
         return to_line(newest, self._times(), begin=self._begin, title=self._title, duration=self._duration)
 
-    def _times(self) -> CycleTimes:
-        gaps = self._gaps[: min(self._shown, _CYCLES)].copy()
-        if not len(gaps):
-            return CycleTimes()
-        middle, high = np.percentile(gaps, (50, 99)).tolist()
-        return CycleTimes(middle, high, float(gaps.max()), len(gaps))
+    def _times(self) -> CycleFigures:
+        return CycleFigures.of(self._gaps[: min(self._shown, _CYCLES)].copy())
 
     def _feed(self, screen: subprocess.Popen[bytes]) -> None:
         # A process that draws no more ends the view, not the run.

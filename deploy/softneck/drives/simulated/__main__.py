@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import json
+import signal
 import socket
 import sys
 from collections.abc import Callable, Iterator
@@ -33,7 +34,10 @@ from ._server import STATES, serve
 def main(
     bus: str, neck: str, profile: str, homed: bool, seed: int, report: bool, cycle: float, sensor_socket: Path | None
 ) -> None:
-    """Simulate three drives (nodes 1 to 3), the neck and an inclinometer (node 10) on a bus, until Ctrl-C."""
+    """Simulate three drives (nodes 1 to 3), the neck and an inclinometer (node 10) on a bus, until Ctrl-C.
+
+    SIGUSR1 presses the hardware stop at the drives' Enable inputs, and releases it when it is sent again.
+    """
     import can
 
     interface, _, channel = bus.partition(":")
@@ -43,7 +47,11 @@ def main(
     virtual.move()
     virtual.sample(0.0)
     gc.freeze()
-    with can.Bus(interface=interface, channel=channel) as opened, _forwarded(sensor_socket) as sensor:
+    with (
+        can.Bus(interface=interface, channel=channel) as opened,
+        _forwarded(sensor_socket) as sensor,
+        hardware_stop(virtual),
+    ):
         click.echo(f"three {profile} drives on {bus}; Ctrl-C ends them", err=True)
         serve(opened, virtual, sensor=sensor, report=_print if report else None)
 
@@ -54,6 +62,25 @@ def _print(now: float, neck: SimulatedNeck, row: int) -> None:
             "counts": axis.getters[(0x6064, 0)]()}  # fmt: skip
     sys.stdout.write(json.dumps(line) + "\n")
     sys.stdout.flush()
+
+
+@contextlib.contextmanager
+def hardware_stop(neck: SimulatedNeck) -> Iterator[None]:
+    """Let SIGUSR1 open and close the Enable inputs of all drives, as the push-button does that one hand is at."""
+    number = getattr(signal, "SIGUSR1", None)
+    if number is None:
+        yield
+        return
+
+    def push(*_: object) -> None:
+        for drive in neck.drives:
+            drive.axis.enable_input = not drive.axis.enable_input
+
+    before = signal.signal(number, push)
+    try:
+        yield
+    finally:
+        signal.signal(number, before)
 
 
 @contextlib.contextmanager
