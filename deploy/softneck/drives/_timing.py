@@ -56,8 +56,11 @@ def _first_in_line() -> None:
         reason = os.strerror(ctypes.get_errno())
         raise SettingsError(f"--realtime: memory cannot be locked here ({reason}); {advice}. Nothing was sent.")
     try:
-        # Children of this process are not to inherit it.
+        # Children of this process are not to inherit it. Threads beside the loop (logs, view) come after it, but before
+        # ordinary processes: one that is put aside while it has the interpreter's lock would hold the loop up.
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(_PRIORITY))
+        for thread in _others():
+            os.sched_setscheduler(thread, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(_PRIORITY - 1))
     except OSError as error:
         libc.munlockall()
         raise SettingsError(
@@ -65,10 +68,17 @@ def _first_in_line() -> None:
         ) from error
 
 
+def _others() -> list[int]:
+    """Return the numbers of this process's other threads."""
+    own = threading.get_native_id()
+    return [thread.native_id for thread in threading.enumerate() if thread.native_id not in (None, own)]
+
+
 def _in_line_again() -> None:
     # Without CAP_SYS_NICE the reset-on-fork mark stays, which then means nothing.
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
+    for thread in (0, *_others()):
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(thread, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
     ctypes.CDLL(None).munlockall()
 
 
