@@ -79,7 +79,7 @@ After=basic.target systemd-udev-trigger.service
 Type=exec
 Environment=PYTHONPATH={pythonpath} OPENBLAS_NUM_THREADS=1 MPLBACKEND=Agg XDG_CACHE_HOME=/run/softneck/cache
 Environment=NUMBA_CPU_NAME=generic NUMBA_CPU_FEATURES= PATH=/usr/sbin:/usr/bin:/sbin:/bin
-ExecStart={python} /run/softneck/guest.py {period} {patience}
+ExecStart={python} /run/softneck/guest.py {period} {patience} {parts}
 ExecStopPost=/bin/sh -c 'echo {end} $EXIT_STATUS; sync; exec /bin/busybox poweroff -f'
 StandardOutput=tty
 StandardError=tty
@@ -113,6 +113,7 @@ def drop_in(python: Path, *, kvm: bool) -> str:
 def main() -> None:
     """Boot, play, print; exit code 1 if something was not as promised."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("parts", nargs="*", default=["stop", "hang", "kill", "unplug"], help="instead of all")
     parser.add_argument("--no-kvm", action="store_true")
     parser.add_argument("--seconds", type=float, default=3600.0, help="the guest is given up then [s]")
     chosen = parser.parse_args()
@@ -136,7 +137,9 @@ def main() -> None:
             "softneck-neck.service": UNIT.read_text(encoding="utf-8"),
             "drop_in.conf": changed,
             "nightly.target": TARGET,
-            "nightly.service": SERVICE.format(**given, period=period, patience=patience, end=END),
+            "nightly.service": SERVICE.format(
+                **given, period=period, patience=patience, parts=" ".join(chosen.parts), end=END
+            ),
         }
         print(f"changed for this guest: {changed.split()[1:] or 'nothing'}", flush=True)
         lines = boot(Guest(files=files, packages=PACKAGES, options="fstab=no", seconds=chosen.seconds), kvm=kvm)
