@@ -9,17 +9,12 @@ import subprocess
 import sys
 import threading
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import IO
 
 # Above the loop's own priority: the simulated drives stand for hardware, which no other process holds up.
 PRIORITY = 41
-IMPORTED = [
-    "softneck.cli",
-    "softneck.drives",
-    "softneck.drives.simulated",
-    "softneck.cosim",
-    "can.interfaces.socketcan",
-]
+IMPORTED = ["softneck.cli", "softneck.drives", "softneck.cosim", "can.interfaces.socketcan", "warmed"]
 
 
 def _run(words: tuple[str, ...], environment: dict[str, str], first: bool, out: Connection, error: Connection) -> None:
@@ -38,6 +33,12 @@ def _run(words: tuple[str, ...], environment: dict[str, str], first: bool, out: 
 
     sys.argv = ["softneck", *words[2:]]
     main()
+
+
+def imports_in(project: Path) -> None:
+    """Let the process that all are forked from play a run of `project` first: what is compiled is loaded then."""
+    os.environ["SOFTNECK_WARM"] = str(project)
+    os.environ["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
 
 
 class Forked:

@@ -25,9 +25,9 @@ from pathlib import Path
 from typing import Any
 
 try:
-    from .forked import Forked
+    from .forked import Forked, imports_in
 except ImportError:  # run as a script
-    from forked import Forked  # type: ignore[no-redef]
+    from forked import Forked, imports_in  # type: ignore[no-redef]
 
 UDP = "udp_multicast:239.74.163.2"
 INSIDE = "SOFTNECK_OWN_NETWORK"
@@ -427,6 +427,8 @@ def main() -> None:
             shutil.copytree(chosen.project, folder, dirs_exist_ok=True)
         else:
             write_project(folder, duration=chosen.duration, period=chosen.period, guarding=chosen.guarding)
+        if chosen.fork:
+            imports_in(folder)
         for case in chosen.cases or CASES:
             for _ in range(chosen.repeat):
                 found: dict[str, Any] = {}

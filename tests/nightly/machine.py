@@ -29,6 +29,7 @@ BUILD = ROOT / "build" / "nightly"
 SOURCES = tuple(str(ROOT / part) for part in ("kit", "identification", "fmu_src", "design", "deploy"))
 MODULES = ("virtio_pci", "9pnet_virtio", "9p", "overlay", "can", "can_raw", "can_dev", "vcan", "sja1000", "kvaser_pci")
 TOOLS = ("qemu-system-x86_64", "busybox", "modprobe", "cpio", "ip", "apt-get", "dpkg-deb")
+SHARE = "trans=virtio,version=9p2000.L,msize=512000,cache=loose,ro"
 BEGIN, END = "GUEST-BEGIN", "GUEST-END"
 
 INIT = """#!/bin/busybox sh
@@ -37,10 +38,11 @@ $b mount -t proc none /proc
 $b mount -t sysfs none /sys
 $b mount -t devtmpfs none /dev
 for module in {modules}; do $b insmod /modules/$module || echo "no $module"; done
-$b mount -t 9p -o trans=virtio,version=9p2000.L,msize=512000,cache=loose,ro root /lower
+$b mount -t 9p -o {share} root /lower
+{second}
 $b mount -t tmpfs -o size=80% none /upper
 $b mkdir /upper/files /upper/work
-$b mount -t overlay -o lowerdir={layers}/lower,upperdir=/upper/files,workdir=/upper/work none /host || $b poweroff -f
+$b mount -t overlay -o lowerdir={lower},upperdir=/upper/files,workdir=/upper/work none /host || $b poweroff -f
 for place in proc sys dev; do $b mount --move /$place /host/$place; done
 $b mkdir -p /host/dev/shm
 $b mount -t tmpfs none /host/dev/shm
@@ -119,10 +121,8 @@ def kernel() -> tuple[Path, str]:
     return base, version
 
 
-def layer(packages: Sequence[str]) -> str:
-    """Return the overlay's layers above the host's files, as the guest sees them."""
-    if not packages:
-        return ""
+def layer(packages: Sequence[str]) -> Path:
+    """Return the tree of the packages, which lies over the host's files."""
     folder = BUILD / "-".join(packages)
     if not folder.exists():
         for package in packages:
@@ -132,14 +132,14 @@ def layer(packages: Sequence[str]) -> str:
             if (folder / name).is_dir():
                 shutil.copytree(folder / name, folder / "usr" / name, symlinks=True, dirs_exist_ok=True)
                 shutil.rmtree(folder / name)
-    return f"/lower{folder}:"
+    return folder
 
 
 def initramfs(folder: Path, guest: Guest) -> tuple[Path, Path]:
     """Return kernel and archive: busybox, the modules in their order, and what the guest runs."""
     base, version = kernel()
     tree = folder / "tree"
-    for name in ("bin", "modules", "proc", "sys", "dev", "lower", "upper", "host", "files"):
+    for name in ("bin", "modules", "proc", "sys", "dev", "lower", "layer", "upper", "host", "files"):
         (tree / name).mkdir(parents=True)
     shutil.copy(str(shutil.which("busybox")), tree / "bin" / "busybox")
     names: list[str] = []
@@ -152,7 +152,10 @@ def initramfs(folder: Path, guest: Guest) -> tuple[Path, Path]:
                 names.append(path.name)
                 shutil.copy(path, tree / "modules" / path.name)
     start = guest.init or "/bin/bash /run/softneck/start.sh"
-    text = INIT.format(modules=" ".join(names), layers=layer(guest.packages), begin=BEGIN, start=start)
+    second = f"$b mount -t 9p -o {SHARE} layer /layer" if guest.packages else ""
+    lower = "/layer:/lower" if guest.packages else "/lower"
+    given = {"share": SHARE, "second": second, "lower": lower, "begin": BEGIN, "start": start}
+    text = INIT.format(modules=" ".join(names), **given)
     (tree / "init").write_text(text, encoding="utf-8")
     (tree / "init").chmod(0o755)
     for name, text in {"start.sh": START.format(end=END), **guest.files}.items():
@@ -168,13 +171,15 @@ def command_line(image: Path, archive: Path, guest: Guest, *, kvm: bool) -> list
     """Return QEMU's words: two emulated CAN controllers on one emulated bus, no network, console on stdout."""
     processor = ["-accel", "kvm", "-cpu", "host", "-smp", "2"] if kvm else [
         "-accel", "tcg", "-cpu", "max", "-smp", "1", "-icount", "shift=0,sleep=on"]  # fmt: skip
+    shares = [("root", "/")] + ([("layer", str(layer(guest.packages)))] if guest.packages else [])
+    local = "security_model=none,readonly=on,multidevs=remap"
+    files = [word for tag, path in shares for word in ("-virtfs", f"local,path={path},mount_tag={tag},{local}")]
     controller = ["-device", "kvaser_pci,canbus=canbus0"]
     return [
         "qemu-system-x86_64", *processor, "-m", "4096", "-nodefaults", "-display", "none", "-nic", "none",
         "-no-reboot", "-serial", "stdio", "-kernel", str(image), "-initrd", str(archive),
         "-append", f"console=ttyS0 quiet panic=-1 mitigations=off {guest.options}".strip(),
-        "-virtfs", "local,path=/,mount_tag=root,security_model=none,readonly=on,multidevs=remap",
-        "-object", "can-bus,id=canbus0", *controller, *controller,
+        *files, "-object", "can-bus,id=canbus0", *controller, *controller,
     ]  # fmt: skip
 
 

@@ -54,8 +54,8 @@ def prepare(folder: Path, period: float) -> None:
     project.mkdir()
     code = f"import pathlib, processes; processes.write_project(pathlib.Path({str(project)!r}), period={period})"
     subprocess.run([sys.executable, "-c", code], env=environment, check=True)
-    if not cache.exists():
-        warm = [sys.executable, str(SCRIPT), "undisturbed", "--duration", "1"]
+    if not list(cache.rglob("*.nbi")):
+        warm = [sys.executable, str(SCRIPT), "undisturbed", "--duration", "1", "--patience", "10"]
         subprocess.run(warm, env=environment, check=True, stdout=subprocess.DEVNULL)
 
 
