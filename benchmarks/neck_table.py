@@ -2,7 +2,8 @@
 
 `python benchmarks/neck_table.py [KIND...] [--workers 2] [--cases]`: orientations 0, 45 and 90 deg with payloads of 0 to
 1 kg, preset `paper` with the 3DM inclinometer and its observer, sequential order, judged on the true angle. Each kind
-is designed, with its defaults or the settings below, on what was identified on that neck.
+is designed, with its defaults or the settings below, on what was identified on that neck. `--seed`, `--size-deg`,
+`--payloads` and `--orientations-deg` ask for other steps than those the settings were chosen on.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import argparse
 import math
 import time
 from concurrent.futures import ProcessPoolExecutor
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 from softneck.core import KINDS, SoftneckError, kinds_of, resolve
@@ -51,13 +52,26 @@ def main() -> None:
     parser.add_argument("kinds", nargs="*", help="kinds of controller; all if none is named")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--cases", action="store_true", help="print every case as well")
+    usual = NeckSteps()
+    parser.add_argument("--seed", type=int, default=usual.seed, help="of the sensor's noise in the first run")
+    parser.add_argument("--size-deg", type=float, default=math.degrees(usual.size))
+    parser.add_argument("--payloads", type=float, nargs="+", default=usual.payloads, metavar="KG")
+    parser.add_argument(
+        "--orientations-deg", type=float, nargs="+", default=[math.degrees(o) for o in usual.orientations]
+    )
     options = parser.parse_args()
+    steps = NeckSteps(
+        seed=options.seed,
+        size=math.radians(options.size_deg),
+        payloads=tuple(options.payloads),
+        orientations=tuple(math.radians(angle) for angle in options.orientations_deg),
+    )
     kinds = options.kinds or list(kinds_of("controller"))
     begin = time.perf_counter()
     with ProcessPoolExecutor(max_workers=min(options.workers, len(kinds))) as pool:
-        rows = list(pool.map(row_of, kinds))
+        rows = list(pool.map(partial(row_of, steps=steps), kinds))
     bounds = ", ".join(f"{name} <= {bound:g} {unit}" for name, (_, bound, unit) in FIGURES.items())
-    print(f"worst (median) of {len(NeckSteps().cases())} cases; bounds: {bounds}")
+    print(f"worst (median) of {len(steps.cases())} cases; bounds: {bounds}")
     for cells in (NECK_HEAD, *table_cells(rows)):
         print("| " + " | ".join(cells) + " |")
     if options.cases:
@@ -65,14 +79,14 @@ def main() -> None:
     print(f"{time.perf_counter() - begin:.1f} s")
 
 
-def row_of(kind: str) -> NeckRow:
-    """Return the row of one kind, designed on what was identified."""
+def row_of(kind: str, steps: NeckSteps) -> NeckRow:
+    """Return the row of one kind, designed on what was identified, over `steps`."""
     if kind in LEFT_OUT:
         return NeckRow(name=kind, skipped=LEFT_OUT[kind])
     try:
         settings = resolve(KINDS[kind].settings)(**SETTINGS.get(kind, {}))
         controller = settings.design(identified_model() if kind in ON_MODEL else family())
-        return neck_row(kind, controller, observer(), NeckSteps())
+        return neck_row(kind, controller, observer(), steps)
     except SoftneckError as error:
         return NeckRow(name=kind, skipped=str(error))
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
-import importlib.util
 import json
-import os
 import subprocess
 import sys
 import zipfile
@@ -22,6 +19,7 @@ from softneck.cosim import Loop, LoopSetup, load_loop, reference_of, simulate, w
 from softneck.fmu import build_fmu
 from softneck.loop import BlockPart, SensorFault, StepReference
 
+from ..importers import need
 from ._foreign import build_foreign
 
 MASTERS = Path(__file__).with_name("masters")
@@ -44,18 +42,6 @@ at_s = 0.2
 rise_s = 0.5
 """
 _SPACE = "{http://ssp-standard.org/SSP1/SystemStructureDescription}"
-
-
-def need(package: str) -> None:
-    lacking = [] if importlib.util.find_spec(package) else [package]
-    if package == "ecospy":
-        try:
-            ctypes.CDLL("libtbb.so.12")
-        except OSError:
-            lacking.append("libtbb.so.12 (Debian: libtbb12)")
-    if lacking:
-        message = f"not installed: {', '.join(lacking)}"
-        pytest.fail(message) if os.environ.get("CI") else pytest.skip(message)
 
 
 @pytest.fixture(scope="module")

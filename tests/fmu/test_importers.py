@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
-import importlib.util
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -15,23 +12,12 @@ import pytest
 from softneck.core import load_runtime
 from softneck.fmu import build_fmu
 
+from ..importers import need
 from .every_kind import KINDS, TS, block_of, inputs_of
 
 SCRIPTS = Path(__file__).with_name("importers")
 PACKAGES = {"libcosim": "libcosimpy", "ecos": "ecospy", "pathsim": "pathsim_fmi"}
 ROWS = 60
-
-
-def need(package: str) -> None:
-    lacking = [] if importlib.util.find_spec(package) else [package]
-    if package == "ecospy":
-        try:
-            ctypes.CDLL("libtbb.so.12")
-        except OSError:
-            lacking.append("libtbb.so.12 (Debian: libtbb12)")
-    if lacking:
-        message = f"not installed: {', '.join(lacking)}"
-        pytest.fail(message) if os.environ.get("CI") else pytest.skip(message)
 
 
 @pytest.fixture(scope="module", params=list(KINDS))

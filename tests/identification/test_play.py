@@ -10,8 +10,7 @@ from softneck.identification import INFINITE, Model, Play, validate
 from softneck.identification._echo import fit_echo
 from softneck.identification._loaded_drive import FUNCTIONS, NO_LOAD, LoadedDrive, fit_loaded_drive
 from softneck.identification._play_terms import Data, Form, ridge
-from softneck.plant import NeckParameters, VirtualNeck, record
-from softneck.signals import MOTOR_POSITIONS, Recording, signal
+from softneck.signals import MOTOR_POSITIONS, Recording
 
 from ..data import TRUTH, drive_positions, neck_recording, short_neck
 
@@ -171,15 +170,6 @@ def test_the_hold_out_given_decides_and_without_one_the_model_says_so() -> None:
 
 # Measured: 97.9/97.4, 93.9/92.3, 97.6/97.3, 98.3/98.6; the least of issue 7.
 LEAST = {"validation": 95.0, "steps": 85.0, "sine": 85.0, "rotation": 85.0}
-
-
-@pytest.fixture(scope="module")
-def recordings() -> dict[str, Recording]:
-    """The paper's experiment on preset `paper`, seeds as in the demo."""
-    neck = VirtualNeck(NeckParameters.paper())
-    made = {n: record(signal(n), neck, seed=s) for s, n in enumerate(("eq22", "steps", "sine", "rotation"), start=1)}
-    made["train"], made["validation"] = made.pop("eq22").split(0.7)
-    return made
 
 
 @pytest.fixture(scope="module")

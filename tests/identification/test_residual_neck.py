@@ -6,20 +6,10 @@ import numpy as np
 import pytest
 
 from softneck.identification import INFINITE, Model, SetMembership, validate
-from softneck.plant import NeckParameters, VirtualNeck, record
-from softneck.signals import Recording, signal
+from softneck.signals import Recording
 
 # Measured: 97.6/97.6, 94.8/93.9, 96.9/94.2, 95.9/95.7. The least are what issue 5 asks for.
 LEAST = {"validation": 90.0, "steps": 80.0, "sine": 80.0, "rotation": 80.0}
-
-
-@pytest.fixture(scope="module")
-def recordings() -> dict[str, Recording]:
-    """The paper's experiment on preset `paper`, seeds as in the demo."""
-    neck = VirtualNeck(NeckParameters.paper())
-    made = {n: record(signal(n), neck, seed=s) for s, n in enumerate(("eq22", "steps", "sine", "rotation"), start=1)}
-    made["train"], made["validation"] = made.pop("eq22").split(0.7)
-    return made
 
 
 @pytest.fixture(scope="module")

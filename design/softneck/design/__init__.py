@@ -3,6 +3,7 @@
 from ._adaptive import AdaptiveSettings as AdaptiveSettings
 from ._assembly import AxisController as AxisController
 from ._assembly import pi_axis as pi_axis
+from ._axis_settings import AxisSettings as AxisSettings
 from ._bake_off import BakeOff as BakeOff
 from ._bake_off import BakeOffResult as BakeOffResult
 from ._bake_off import bake_off_neck as bake_off_neck
@@ -18,6 +19,7 @@ from ._fractional import FractionalPid as FractionalPid
 from ._fractional import fopi as fopi
 from ._hinf import HinfSettings as HinfSettings
 from ._limits import Limits as Limits
+from ._loop_settings import LoopSettings as LoopSettings
 from ._lqg import LqgSettings as LqgSettings
 from ._margins import Margins as Margins
 from ._margins import loop_margins as loop_margins

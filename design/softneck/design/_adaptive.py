@@ -25,6 +25,8 @@ _SIZES = np.geomspace(1e-3, 1.0, 695)
 class AdaptiveSettings(LoopSettings):
     """Online recursive least squares and a redesign in every sample, with what keeps it safe.
 
+    Limits, the order of the loop and what is doubted of the plant are those of `LoopSettings`.
+
     Attributes:
         max_sensitivity: bound on Ms of the loop that every redesign makes, with its delay in full.
         phase_margin: least phase margin [rad] of it.

@@ -50,6 +50,8 @@ class Found:
 class AxisSettings(LoopSettings, ABC):
     """Settings that all kinds of linear controller share; a kind adds its own and one synthesis.
 
+    Limits, the order of the loop and what is doubted of the plant are those of `LoopSettings`.
+
     Attributes:
         max_sensitivity: bound on Ms around every sample of the plant; what a kind chooses itself keeps it.
         reference_time: time constant of the reference filter [s]; None for the least with which no sample overshoots

@@ -25,6 +25,8 @@ _INPUTS = {"pitch": "theta_i", "roll": "phi_i"}
 class CustomSettings(AxisSettings):
     """A discrete `control` system as the controller of each axis; limits, filter and verification are as everywhere.
 
+    Reference filter, order and conditioning, with limits and loop, are those of `AxisSettings`.
+
     Attributes:
         controller: K of `v = K (r - y)`, or a system of two inputs, reference and angle, `v = K (r, y)`; one for both
             axes, or a mapping of "pitch" and "roll" to one each. Inputs named `pitch_reference` and `pitch` are found

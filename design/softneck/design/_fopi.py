@@ -22,6 +22,8 @@ from ._uncertain import UncertainAxis
 class FopiSettings(AxisSettings):
     """Fractional-order PI, `K (1 + Ki s^-lambda)`, iso-damped on the exact-delay plant; a PID with a derivative.
 
+    Reference filter, order and conditioning, with limits and loop, are those of `AxisSettings`.
+
     Attributes:
         crossover: [rad/s]; None for the largest whose loops keep `max_sensitivity` on all samples.
         phase_margin: where the phase is flat [rad].

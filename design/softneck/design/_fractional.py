@@ -95,44 +95,73 @@ def fopi(
     require_between("derivative_order", derivative_order, 0.05, 1.0)
     w = crossover * np.array([1.0 - _STEP, 1.0, 1.0 + _STEP])
     g = _response(G, w)
-    flat = -float(np.angle(g[2] / g[0]))
-    theta = phase_margin - math.pi - float(np.angle(g[1]))
-    rest = 1.0 + derivative * (1j * w) ** derivative_order
-
-    def integral(order: float) -> float:
-        """Return Ki with which C has the phase theta at the crossover."""
-        turned = np.exp(-1j * theta)
-        return -float(np.imag(rest[1] * turned)) / float(np.imag((1j * crossover) ** -order * turned))
-
-    def slope(order: float) -> float:
-        C = rest + integral(order) * (1j * w) ** -order
-        return float(np.angle(C[2] / C[0])) - flat
-
-    def right(order: float) -> bool:
-        """Return whether Ki is positive, and the phase is theta rather than theta + pi."""
-        C = rest[1] + integral(order) * (1j * crossover) ** -order
-        return integral(order) > 0.0 and float(np.real(C * np.exp(-1j * theta))) > 0.0
-
-    usable = [float(order) for order in _ORDERS if right(float(order))]
-    step = float(_ORDERS[1] - _ORDERS[0])
-    for low, high in itertools.pairwise(usable):
-        if high - low < 1.5 * step and slope(low) * slope(high) <= 0.0:
-            root: Any = brentq(slope, low, high, xtol=1e-10)
-            order = float(root)
-            Ki = integral(order)
-            C = rest[1] + Ki * (1j * crossover) ** -order
-            return FractionalPid(
-                gain=1.0 / float(np.abs(C * g[1])),
-                integral=Ki,
-                integral_order=order,
-                derivative=derivative,
-                derivative_order=derivative_order,
-                crossover=crossover,
-            )
-    raise SettingsError(
-        f"no integration order between 0 and 2 gives a flat phase at {crossover:.3g} rad/s with a phase margin of "
-        f"{math.degrees(phase_margin):.3g} deg; lower the crossover, or change the phase margin (50 to 100 deg)."
+    flat = _FlatPhase(
+        w=w,
+        rest=1.0 + derivative * (1j * w) ** derivative_order,
+        theta=phase_margin - math.pi - float(np.angle(g[1])),
+        slope=-float(np.angle(g[2] / g[0])),
     )
+    order = flat.order()
+    if order is None:
+        raise SettingsError(
+            f"no integration order between 0 and 2 gives a flat phase at {crossover:.3g} rad/s with a phase margin of "
+            f"{math.degrees(phase_margin):.3g} deg; lower the crossover, or change the phase margin (50 to 100 deg)."
+        )
+    return FractionalPid(
+        gain=1.0 / float(np.abs(flat.response(order)[1] * g[1])),
+        integral=flat.integral(order),
+        integral_order=order,
+        derivative=derivative,
+        derivative_order=derivative_order,
+        crossover=crossover,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class _FlatPhase:
+    """C/K = rest + Ki s^-order about the crossover, Ki such that its phase there is theta.
+
+    Attributes:
+        w: below, at and above the crossover (3,) [rad/s].
+        rest: what of C/K is without the integral (3,).
+        theta: the phase that C shall have at the crossover [rad].
+        slope: what its phase shall gain from the first to the last frequency [rad], so that the loop's is flat.
+    """
+
+    w: Vector
+    rest: np.ndarray
+    theta: float
+    slope: float
+
+    def integral(self, order: float) -> float:
+        """Return Ki with which C has the phase theta at the crossover."""
+        turned = np.exp(-1j * self.theta)
+        at = (1j * float(self.w[1])) ** -order
+        return -float(np.imag(self.rest[1] * turned)) / float(np.imag(at * turned))
+
+    def response(self, order: float) -> np.ndarray:
+        """Return C/K at the three frequencies (3,)."""
+        return self.rest + self.integral(order) * (1j * self.w) ** -order
+
+    def excess(self, order: float) -> float:
+        """Return what its phase gains too much [rad]."""
+        C = self.response(order)
+        return float(np.angle(C[2] / C[0])) - self.slope
+
+    def right(self, order: float) -> bool:
+        """Return whether Ki is positive, and the phase is theta rather than theta + pi."""
+        C = self.response(order)[1]
+        return self.integral(order) > 0.0 and float(np.real(C * np.exp(-1j * self.theta))) > 0.0
+
+    def order(self) -> float | None:
+        """Return the least order at which the loop's phase is flat."""
+        usable = [float(order) for order in _ORDERS if self.right(float(order))]
+        step = float(_ORDERS[1] - _ORDERS[0])
+        for low, high in itertools.pairwise(usable):
+            if high - low < 1.5 * step and self.excess(low) * self.excess(high) <= 0.0:
+                root: Any = brentq(self.excess, low, high, xtol=1e-10)
+                return float(root)
+        return None
 
 
 def _response(G: Any, w: Vector) -> Vector:

@@ -28,6 +28,8 @@ class HinfSettings(AxisSettings):
     gain; W3, if `cover`, the smallest weight over the samples: `|W3 T| < 1` then proves them stable. The slow pole of
     the controller becomes a true integrator.
 
+    Reference filter, order and conditioning, with limits and loop, are those of `AxisSettings`.
+
     Attributes:
         bandwidth: where W1 falls to 1 [rad/s]; None for the largest whose loops keep `max_sensitivity` on all samples.
         peak: what W1 allows `|S|` far up.

@@ -24,6 +24,8 @@ class LqgSettings(AxisSettings):
     driven by what the motors were really told, which is its conditioning (Astrom and Wittenmark 1997, Computer-
     Controlled Systems, sec. 9.2 and 11.4).
 
+    Reference filter, order and conditioning, with limits and loop, are those of `AxisSettings`.
+
     Attributes:
         load_rate: how fast the load is expected to wander against the noise [rad/s], the filter's speed; None for
             the largest whose loops keep `max_sensitivity` on all samples.

@@ -29,6 +29,8 @@ class NcfSettings(AxisSettings):
     The reference enters through Ks at rest, `v = W (Ks(0) r - Ks y)`, which overshoots less than the error alone
     (Skogestad and Postlethwaite 2005, sec. 9.4.3).
 
+    Reference filter, order and conditioning, with limits and loop, are those of `AxisSettings`.
+
     Attributes:
         crossover: of the shaped plant [rad/s]; None for the largest whose loops keep `max_sensitivity` on all samples.
         integral_time: Ti [s]; None for the plant's slowest time constant.

@@ -30,6 +30,8 @@ class PiSettings(LoopSettings):
     it rejects loads best (Astrom and Hagglund 2006, Advanced PID Control, sec. 6.8). What overshoot that
     leaves, a reference filter takes away.
 
+    Limits, the order of the loop and what is doubted of the plant are those of `LoopSettings`.
+
     Attributes:
         tuning: "nominal": on the identified plant and on its faster form; "samples": on every sample of the plant as
             well; "placement": the gains that put two poles of the nominal loop where they are wanted, exact for the

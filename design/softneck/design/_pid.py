@@ -77,6 +77,8 @@ class PidSettings(AxisSettings):
     `max_sensitivity` and `noise_gain`; "placement" puts three poles of the nominal loop where they are wanted
     (dominant pole placement, exact for the delay: Astrom and Hagglund 2006, Advanced PID Control, sec. 6.4).
 
+    Reference filter, order and conditioning, with limits and loop, are those of `AxisSettings`.
+
     Attributes:
         tuning: "samples" or "placement".
         noise_gain: bound on the gain from the angle's noise to the input, in units of 1/static gain.

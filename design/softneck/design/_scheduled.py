@@ -33,6 +33,8 @@ _BETWEEN = 4
 class ScheduledSettings(LoopSettings):
     """PI at every operating point of a family, gains linear over the inclination between them.
 
+    Limits, the order of the loop and what is doubted of the plant are those of `LoopSettings`.
+
     Attributes:
         max_sensitivity: bound on Ms at every operating point, on every plant there.
         phase_margin: least phase margin [rad] there.

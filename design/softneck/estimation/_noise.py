@@ -72,10 +72,7 @@ def fit_noise(
         SettingsError: a name in `fixed` that is none of the levels', or all of them.
         DataError: another sample time, missing channels, or fewer than 200 measurements.
     """
-    unknown = sorted(set(fixed) - set(observer.noise_names))
-    if unknown or len(set(fixed)) == len(observer.noise_names):
-        what = f"`{unknown[0]}` is no noise level" if unknown else "no noise level is left to estimate"
-        raise SettingsError(f"{what}; this filter has {', '.join(observer.noise_names)}.")
+    free = _free(observer.noise_names, fixed)
     given = [recordings] if isinstance(recordings, Recording) else list(recordings)
     runs = [run for recording in given for run in recording.runs()]
     for run in runs:
@@ -87,7 +84,33 @@ def fit_noise(
             f"got {cost.rows}. Record longer."
         )
     start = np.log10(observer.noise)
-    free = np.array([name not in fixed for name in observer.noise_names])
+    found, least, at_bound = _likeliest(cost, start, free)
+    noise = np.array(observer.noise)
+    noise[free] = 10.0 ** found[free]
+    levels = (float(noise[0]), float(noise[1]), float(noise[2]))
+    return NoiseFit(
+        observer=observer.with_noise(levels, sensor="data"),
+        names=observer.noise_names,
+        noise=levels,
+        start=observer.noise,
+        log_likelihood=(-0.5 * cost.of(start), -0.5 * least),
+        rows=cost.rows,
+        outliers=cost.outliers,
+        at_bound=tuple(name for name, held in zip(observer.noise_names, at_bound, strict=True) if held),
+    )
+
+
+def _free(names: Sequence[str], fixed: Sequence[str]) -> np.ndarray:
+    """Return which levels are estimated (3,); refuse a name that is none, and nothing left to estimate."""
+    unknown = sorted(set(fixed) - set(names))
+    if unknown or len(set(fixed)) == len(names):
+        what = f"`{unknown[0]}` is no noise level" if unknown else "no noise level is left to estimate"
+        raise SettingsError(f"{what}; this filter has {', '.join(names)}.")
+    return np.array([name not in fixed for name in names])
+
+
+def _likeliest(cost: _Cost, start: Vector, free: np.ndarray) -> tuple[Vector, float, np.ndarray]:
+    """Return the decadic logarithms of the levels, their cost, and which ran to the end of their range (3,)."""
     bounds = [(level - _DECADES, level + _DECADES) for level in start[free]]
 
     def of(levels: Vector) -> float:
@@ -96,26 +119,11 @@ def fit_noise(
         return cost.of(whole)
 
     found = minimize(of, start[free], method="Nelder-Mead", bounds=bounds, options={"xatol": 1e-3, "fatol": 1e-5})
-    noise = np.array(observer.noise)
-    noise[free] = 10.0**found.x
-    names = [name for name in observer.noise_names if name not in fixed]
-    at_bound = tuple(
-        name
-        for name, level, (low, high) in zip(names, found.x, bounds, strict=True)
-        # A hundredth of a decade: where the simplex stops.
-        if min(level - low, high - level) < 0.01
-    )
-    levels = (float(noise[0]), float(noise[1]), float(noise[2]))
-    return NoiseFit(
-        observer=observer.with_noise(levels, sensor="data"),
-        names=observer.noise_names,
-        noise=levels,
-        start=observer.noise,
-        log_likelihood=(-0.5 * cost.of(start), -0.5 * float(found.fun)),
-        rows=cost.rows,
-        outliers=cost.outliers,
-        at_bound=at_bound,
-    )
+    whole, at_bound = start.copy(), np.zeros(start.size, dtype=bool)
+    whole[free] = found.x
+    # A hundredth of a decade: where the simplex stops.
+    at_bound[free] = [min(x - low, high - x) < 0.01 for x, (low, high) in zip(found.x, bounds, strict=True)]
+    return whole, float(found.fun), at_bound
 
 
 class _Cost:

@@ -72,12 +72,7 @@ def command(
             recordings, output, train=train, refit_all=refit, seed=seed, html=html, force=force, as_json=as_json
         )
         return
-    if html is not None:
-        raise SettingsError(
-            f"--html goes with KIND auto; for `{kind}` use `softneck validate MODEL --data REC --html`."
-        )
-    if refit:
-        raise SettingsError(f"--refit goes with KIND auto; `{kind}` is trained on the part that --train says.")
+    _refuse_options_of_auto(kind, html=html is not None, refit=refit)
     entry = find_kind(kind, "model")
     estimator = apply_settings(resolve(entry.settings), settings, seed=seed)
     options = SearchOptions(searches, hold_out, strategy, plot)
@@ -104,6 +99,15 @@ def command(
         _print(path, model, held_out, found)
     if found is not None and found.interrupted:
         raise KeyboardInterrupt  # what was done is kept, and the exit code says that it is not all
+
+
+def _refuse_options_of_auto(kind: str, *, html: bool, refit: bool) -> None:
+    if html:
+        raise SettingsError(
+            f"--html goes with KIND auto; for `{kind}` use `softneck validate MODEL --data REC --html`."
+        )
+    if refit:
+        raise SettingsError(f"--refit goes with KIND auto; `{kind}` is trained on the part that --train says.")
 
 
 def _print(path: Path, model: Model, held_out: Validation | None, found: Search | None) -> None:

@@ -11,7 +11,8 @@ from softneck.loop import BlockPart, Loop, Part, fault_field, fault_keys, refere
 
 from ._fmu_part import FmuPart
 from ._isolated import IsolatedPart
-from ._loop_file import OBJECT, normal_table
+from ._loop_file import normal_table
+from ._loop_parts import OBJECT
 from ._simulate import LoopSetup
 
 _PARTS = ("plant", "observer", "controller")

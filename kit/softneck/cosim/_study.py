@@ -13,8 +13,10 @@ from typing import Any
 from softneck.core import Block, FileFormatError, SettingsError, SoftneckError, file_hash
 from softneck.loop import METRICS, Loop, LoopRun
 
-from ._loop_file import OBJECT, make_loop, normal_table, read_toml
+from ._loop_file import make_loop, normal_table
+from ._loop_parts import OBJECT
 from ._loop_table import check_key, loop_table, set_sources, settable, with_values
+from ._loop_values import read_toml
 from ._simulate import LoopSetup
 from ._vary import Points, Vary, flattened, make_vary
 

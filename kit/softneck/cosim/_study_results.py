@@ -14,7 +14,7 @@ import tomli_w
 
 from softneck.core import Matrix, SettingsError, Vector, atomic_write
 
-from ._loop_file import OBJECT
+from ._loop_parts import OBJECT
 from ._study import Study
 
 WORST = "worst"
