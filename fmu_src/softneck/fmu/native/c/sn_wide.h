@@ -131,8 +131,85 @@ SN_ROWS(sn_rows_plain, )
 #include <cpuid.h>
 #include <immintrin.h>
 #define SN_AVX2 __attribute__((target("avx2")))
-SN_TANH_ALL(sn_tanh_all_wide, SN_AVX2)
-SN_ROWS(sn_rows_wide, SN_AVX2)
+#define SN_PART SN_AVX2 static inline __attribute__((always_inline))
+
+/* SN_TANH4 in fewer instructions: what is no number passes through `min` and all that follows. */
+SN_PART __m256d sn_tanh4(__m256d x)
+{
+#define SN_4(x) _mm256_set1_pd(x)
+#define SN_UP(c, y) _mm256_add_pd(SN_4(c), _mm256_mul_pd(s, y))
+    const __m256d minus = SN_4(-0.0);
+    __m256d c = _mm256_min_pd(SN_4(22.0), _mm256_andnot_pd(minus, x)), shifted, k, r, s, even, odd, scale, e;
+    c = _mm256_add_pd(c, c);
+    shifted = _mm256_add_pd(_mm256_mul_pd(c, SN_4(SN_PER_LN2)), SN_4(SN_ROUNDER));
+    k = _mm256_sub_pd(shifted, SN_4(SN_ROUNDER));
+    r = _mm256_sub_pd(_mm256_sub_pd(c, _mm256_mul_pd(k, SN_4(SN_LN2_HIGH))), _mm256_mul_pd(k, SN_4(SN_LN2_LOW)));
+    scale = _mm256_castsi256_pd(
+        _mm256_slli_epi64(_mm256_add_epi64(_mm256_castpd_si256(shifted), _mm256_set1_epi64x(1023)), 52));
+    s = _mm256_mul_pd(r, r);
+    even = SN_UP(0.5, SN_UP(SN_E4, SN_UP(SN_E6, SN_UP(SN_E8, SN_UP(SN_E10, SN_UP(SN_E12, SN_4(SN_E14)))))));
+    odd = SN_UP(SN_E3, SN_UP(SN_E5, SN_UP(SN_E7, SN_UP(SN_E9, SN_UP(SN_E11, SN_4(SN_E13))))));
+    e = _mm256_add_pd(r, _mm256_mul_pd(s, _mm256_add_pd(even, _mm256_mul_pd(r, odd))));
+    e = _mm256_add_pd(_mm256_mul_pd(scale, e), _mm256_sub_pd(scale, SN_4(1.0)));
+    e = _mm256_div_pd(e, _mm256_add_pd(e, SN_4(2.0)));
+    return _mm256_or_pd(e, _mm256_and_pd(minus, x));
+#undef SN_UP
+#undef SN_4
+}
+
+SN_AVX2 static void sn_tanh_all_wide(double *restrict y, const double *restrict x, int64_t n)
+{
+    int64_t i = 0;
+    for (; i + 8 <= n; i += 8) {
+        __m256d a = sn_tanh4(_mm256_loadu_pd(x + i)), b = sn_tanh4(_mm256_loadu_pd(x + i + 4));
+        _mm256_storeu_pd(y + i, a);
+        _mm256_storeu_pd(y + i + 4, b);
+    }
+    for (; i + 4 <= n; i += 4)
+        _mm256_storeu_pd(y + i, sn_tanh4(_mm256_loadu_pd(x + i)));
+    for (; i < n; i++)
+        y[i] = sn_tanh(x[i]);
+}
+
+/* The sums of two rows, each as `sn_rows_plain` adds it; `first` and `second` are the next columns, from `i` on. */
+SN_PART __m128d sn_two_sums(__m256d a, __m256d b, const double *first, const double *second,
+                                          const double *x, int64_t n)
+{
+    __m128d p = _mm256_castpd256_pd128(a), q = _mm256_castpd256_pd128(b);
+    for (int64_t i = 0; i < n; i++) {
+        __m128d at = _mm_load_sd(x + i);
+        p = _mm_add_sd(p, _mm_mul_sd(_mm_load_sd(first + i), at));
+        q = _mm_add_sd(q, _mm_mul_sd(_mm_load_sd(second + i), at));
+    }
+    p = _mm_add_pd(p, _mm256_extractf128_pd(a, 1));
+    q = _mm_add_pd(q, _mm256_extractf128_pd(b, 1));
+    return _mm_add_pd(_mm_unpacklo_pd(p, q), _mm_unpackhi_pd(p, q));
+}
+
+/* Four rows side by side: compilers wait for each sum. The last four overlap those before. */
+SN_AVX2 static void sn_rows_wide(double *restrict y, const double *restrict A, const double *restrict x, int64_t rows,
+                                 int64_t gap, int64_t n)
+{
+    const int64_t whole = n & ~(int64_t)3;
+    if (rows < 4) {
+        sn_rows_plain(y, A, x, rows, gap, n);
+        return;
+    }
+    for (int64_t row = 0; row < rows; row += 4) {
+        int64_t k = row < rows - 4 ? row : rows - 4;
+        const double *a = A + k * gap, *b = a + gap, *c = b + gap, *d = c + gap;
+        __m256d p = _mm256_setzero_pd(), q = p, r = p, s = p;
+        for (int64_t i = 0; i < whole; i += 4) {
+            __m256d at = _mm256_loadu_pd(x + i);
+            p = _mm256_add_pd(p, _mm256_mul_pd(_mm256_loadu_pd(a + i), at));
+            q = _mm256_add_pd(q, _mm256_mul_pd(_mm256_loadu_pd(b + i), at));
+            r = _mm256_add_pd(r, _mm256_mul_pd(_mm256_loadu_pd(c + i), at));
+            s = _mm256_add_pd(s, _mm256_mul_pd(_mm256_loadu_pd(d + i), at));
+        }
+        _mm_storeu_pd(y + k, sn_two_sums(p, q, a + whole, b + whole, x + whole, n - whole));
+        _mm_storeu_pd(y + k + 2, sn_two_sums(r, s, c + whole, d + whole, x + whole, n - whole));
+    }
+}
 
 /* `sn_leaf_plain` once more, eight points at a time: compilers take roots and choices one by one. */
 SN_AVX2 static void sn_leaf_wide(double *best, const double *p, const double *values, int64_t gap, int64_t count,
@@ -163,7 +240,7 @@ SN_AVX2 static void sn_leaf_wide(double *best, const double *p, const double *va
 }
 
 /* Four sides of a box at a time, then both bounds of both children. Nothing that a step puts out is a sum of these. */
-SN_AVX2 static inline __m128d sn_apart(const double *node, const double *at, int64_t sides)
+SN_PART __m128d sn_apart(const double *node, const double *at, int64_t sides)
 {
     __m256d sum = _mm256_setzero_pd();
     for (int64_t i = 0; i < sides; i += 4) {
