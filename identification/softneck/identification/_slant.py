@@ -95,23 +95,31 @@ def slant_order(frame: Matrix, points: Matrix) -> np.ndarray:
     return tree_order(in_frame(frame, points))
 
 
+def _largest(points: Matrix) -> float:
+    """Return the largest sum of a point's components, row by row."""
+    total = np.zeros(points.shape[1])
+    for row in points:
+        total += np.abs(row)
+    return float(total.max())
+
+
 def slant_nodes(frame: Matrix, slope: float, points: Matrix, values: Vector) -> Matrix:
     """Return the nodes (2^(depth+1), 2 (1 + sides) + 2) over points in tree order; see `_slant_runtime`.
 
     Row 0, which is no node, holds the slope of the plane and the size of points and values.
     """
-    turned = in_frame(frame, points)
     sides, rows = len(frame) - 1, values.size
-    above = values - slope * turned[0]
     depth = depth_of(rows)
     nodes = np.zeros((2 << depth, 4 + 2 * sides))
     nodes[0, 0] = slope
-    nodes[0, 1] = np.abs(points).sum(axis=0).max()
+    nodes[0, 1] = _largest(points)
     nodes[0, 2] = np.abs(values).max()
-    for level in range(depth + 1):
-        cuts, there = borders(rows, level), nodes[1 << level : 2 << level]
-        there[:, 0:2] = low_high(turned[0], cuts).T
-        there[:, 2:4] = low_high(above, cuts).T
-        for i, row in enumerate(turned[1:]):
-            there[:, 4 + i], there[:, 4 + sides + i] = low_high(row, cuts)
+    # One direction after the other: memory holds no second copy of the points.
+    for i in range(1 + sides):
+        row = in_frame(frame[i : i + 1], points)[0]
+        columns = [(row, 3 + i, 3 + sides + i)] if i > 0 else [(row, 0, 1), (values - slope * row, 2, 3)]
+        for level in range(depth + 1):
+            there, cuts = nodes[1 << level : 2 << level], borders(rows, level)
+            for numbers, low, high in columns:
+                there[:, low], there[:, high] = low_high(numbers, cuts)
     return nodes

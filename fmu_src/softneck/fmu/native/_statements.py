@@ -84,7 +84,7 @@ class Statements:
                 for target, value in zip(node.targets[0].elts, held, strict=True):
                     self.assign(target, value)
                 return
-        value = self.ex.value(node.value)
+        value = self.ex.value(_not_copied(node))
         if len(node.targets) > 1:
             value = self.scope.kept(value)
         for target in node.targets:
@@ -248,3 +248,10 @@ def holds_view(kind: Type | None) -> bool:
     if isinstance(kind, Bundle):
         return any(holds_view(item) for item in kind.items)
     return isinstance(kind, View)
+
+
+def _not_copied(node: ast.Assign) -> ast.expr:
+    """Return what is assigned; of `a[i:j] = b.copy()` it is `b`, as what writes into a part lets the two overlap."""
+    call, into_part = node.value, len(node.targets) == 1 and isinstance(node.targets[0], ast.Subscript)
+    method = call.func if isinstance(call, ast.Call) and not call.args else None
+    return method.value if into_part and isinstance(method, ast.Attribute) and method.attr == "copy" else call

@@ -15,6 +15,7 @@
 #ifdef __GNUC__
 #define SN_LEAVES __attribute__((noinline, cold, noreturn))
 #define SN_APART __attribute__((noinline)) /* called so often that copies of it would be most of the library */
+#define SN_MERGED inline __attribute__((always_inline))
 #define SN_RARE(x) __builtin_expect(!!(x), 0)
 #if defined(__has_attribute)
 #if __has_attribute(minsize)
@@ -24,6 +25,7 @@
 #else
 #define SN_LEAVES
 #define SN_APART
+#define SN_MERGED inline
 #define SN_RARE(x) (x)
 #endif
 #ifndef SN_SMALL
@@ -261,6 +263,14 @@ static inline void sn_rounds(sn_work *w, int64_t rounds)
 
 /* Whole numbers, as Python counts. */
 SN_APART static int64_t sn_int(sn_work *w, double x)
+{
+    if (SN_RARE(!(x > -SN_WHOLE && x < SN_WHOLE)))
+        sn_fault(w, SN_NUMBER);
+    return (int64_t)x;
+}
+
+/* The same where it is called: what is compiled for speed takes it. */
+static inline int64_t sn_int_here(sn_work *w, double x)
 {
     if (SN_RARE(!(x > -SN_WHOLE && x < SN_WHOLE)))
         sn_fault(w, SN_NUMBER);
