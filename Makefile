@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test slow check docs benchmark native wheel nightly nightly-can clean
+.PHONY: demo test slow check docs benchmark native wheel nightly nightly-fmu nightly-can clean
 
 demo: $(VENV)/.installed
 	$(BIN)/softneck demo --out build/demo
@@ -32,19 +32,25 @@ benchmark: $(VENV)/.tested
 native: $(VENV)/.crossed
 	$(BIN)/python -m softneck.fmu.native
 
-# The library on other platforms, bit for bit, and many wrong bytes. Debian: wine64, qemu-user, libc6-arm64-cross.
-nightly: $(VENV)/.tested native
+nightly: nightly-fmu
+
+# The library on other platforms, bit for bit; wrong bytes under the sanitizers; libFuzzer for two minutes.
+# Debian: wine64 qemu-user libc6-arm64-cross gcc clang.
+nightly-fmu: $(VENV)/.tested native
 	SOFTNECK_NIGHTLY=1 $(BIN)/python -m pytest -q -n 0 tests/fmu/test_native_platforms.py
-	SOFTNECK_FUZZ_ROUNDS=3000 $(BIN)/python -m pytest -q -n 0 tests/fmu/test_native_errors.py -k sanitizers
+	SOFTNECK_FUZZ_ROUNDS=300 $(BIN)/python -m pytest -q -n 0 tests/fmu/test_native_errors.py -k sanitizers
+	SOFTNECK_FUZZ_SECONDS=120 $(BIN)/python -m pytest -q -n 0 -s tests/fmu/test_native_fuzzer.py
 
 # The drives over real SocketCAN in QEMU; its guest has not come up yet, so `nightly` leaves it out.
 # Debian: qemu-system-x86 busybox-static kmod cpio iproute2.
 nightly-can: $(VENV)/.tested
 	$(BIN)/python tests/nightly/socketcan.py
 
-# Exporting from this wheel needs no compiler.
+# Exporting from this wheel needs no compiler; the last line shows it.
 wheel: native
+	rm -rf build/dist
 	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir build/dist .
+	$(BIN)/python tests/nightly/wheel.py build/dist/*.whl
 
 clean:
 	rm -rf $(VENV) docs/_build .pytest_cache .ruff_cache

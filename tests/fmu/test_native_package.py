@@ -8,6 +8,7 @@ import shlex
 import shutil
 import struct
 import subprocess
+import sys
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,12 @@ import fmpy
 import numpy as np
 import pytest
 
+from softneck.core import SettingsError
 from softneck.fmu._pack import deflated, write_zip
 from softneck.fmu.native import build_compiled_fmu
 from softneck.fmu.native._chunks import only_kinds
 from softneck.fmu.native._library import packaged_library
-from softneck.fmu.native._sources import FLAGS, c_sources
+from softneck.fmu.native._sources import FLAGS, c_sources, sources_key
 
 from .every_kind import NATIVE, TS, block_of, inputs_of
 
@@ -40,6 +42,39 @@ def test_five_platforms_weigh_less_than_400_kilobytes(kind: str, tmp_path: Path)
         assert len([name for name in archive.namelist() if name.startswith("binaries/")]) == 5
         assert archive.testzip() is None
     assert (tmp_path / "Model.fmu").stat().st_size - data < MOST_BYTES
+
+
+def test_what_is_large_is_stored_at_once(tmp_path: Path) -> None:
+    members = {"resources/model.bin": bytes(1 << 24) + b"1", "small": bytes(1 << 20)}
+    write_zip(tmp_path / "large.zip", members)
+    with zipfile.ZipFile(tmp_path / "large.zip") as archive:
+        assert archive.testzip() is None
+        assert {name: archive.read(name) for name in archive.namelist()} == members
+        stored = {entry.filename: entry.compress_type == zipfile.ZIP_STORED for entry in archive.infolist()}
+    assert stored == {"resources/model.bin": True, "small": False}
+
+
+def test_what_is_too_large_for_a_zip_file_of_32_bits_is_refused(tmp_path: Path) -> None:
+    class Huge(bytes):
+        def __len__(self) -> int:
+            return 1 << 32
+
+    with pytest.raises(SettingsError, match="more than 4 GB"):
+        write_zip(tmp_path / "huge.zip", {"resources/model.bin": Huge()})
+
+
+def test_a_wheel_knows_its_libraries_in_its_own_folders(tmp_path: Path) -> None:
+    """The key of a checkout, whose packages lie in five folders, is that of a wheel, where they lie in one."""
+    root = Path(__file__).parents[2]
+    for source in ("kit", "identification", "fmu_src", "design", "deploy"):
+        ignored = shutil.ignore_patterns("__pycache__", "binaries")
+        shutil.copytree(root / source / "softneck", tmp_path / "softneck", ignore=ignored, dirs_exist_ok=True)
+    script = "import softneck.fmu.native._sources as s; print(s.HERE, s.sources_key())"
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=os.environ | {"PYTHONPATH": str(tmp_path)}, cwd=tmp_path,
+        capture_output=True, text=True, check=True, timeout=120,
+    )  # fmt: skip
+    assert done.stdout.split() == [str(tmp_path / "softneck" / "fmu" / "native"), sources_key()]
 
 
 def test_a_stream_deflated_before_gives_the_same_file(tmp_path: Path) -> None:
