@@ -6,7 +6,6 @@ import os
 import re
 import shlex
 import shutil
-import struct
 import subprocess
 import sys
 import zipfile
@@ -155,43 +154,3 @@ def test_fmi3_has_the_variables_of_fmi2(tmp_path: Path) -> None:
             variables = fmpy.read_model_description(str(tmp_path / "Model.fmu")).modelVariables
             facts.append([(v.name, v.valueReference, v.causality, v.unit) for v in variables if v.name != "time"])
         assert facts[0] == facts[1], kind
-
-
-# Mach-O: LC_SEGMENT_64, LC_LOAD_DYLIB, LC_CODE_SIGNATURE, LC_SYMTAB (mach-o/loader.h).
-_DYLIB, _SIGNATURE, _SYMTAB = 0xC, 0x1D, 0x2
-_DIRECTORY, _ADHOC = 0xFADE0C02, 0x2
-
-
-@needs_all
-@pytest.mark.parametrize("name", ["x86_64-darwin", "aarch64-darwin"])
-def test_a_library_for_macos_can_be_loaded_there(name: str) -> None:
-    """Never run on a Mac here: signed ad hoc (arm64 loads nothing unsigned), libSystem alone, all symbols of FMI."""
-    assert library is not None
-    data = library.binaries[name]
-    magic, _, _, kind, count, _ = struct.unpack_from("<6I", data)
-    assert (magic, kind) == (0xFEEDFACF, 6)  # 64 bits, a dylib
-    commands, at = [], 32
-    for _ in range(count):
-        command, size = struct.unpack_from("<2I", data, at)
-        commands.append((command & 0x7FFFFFFF, data[at : at + size]))
-        at += size
-    loaded = [text[24:].split(b"\0")[0] for command, text in commands if command == _DYLIB]
-    assert loaded == [b"/usr/lib/libSystem.B.dylib"]
-    table = next(text for command, text in commands if command == _SYMTAB)
-    symbols, number, strings, _ = struct.unpack_from("<4I", table, 8)
-    outside, inside = set(), set()
-    for i in range(number):
-        place, kind, _, _, _ = struct.unpack_from("<IBBHQ", data, symbols + 16 * i)
-        text = data[strings + place :].split(b"\0", 1)[0].decode()
-        (inside if kind & 0x0E else outside).add(text)
-    assert {"_fmi2Instantiate", "_fmi2DoStep", "_fmi3InstantiateCoSimulation", "_fmi3DoStep"} <= inside
-    known = {"malloc", "calloc", "realloc", "free", "memcpy", "memmove", "memset", "memchr", "bzero", "fopen", "fclose"}
-    known |= {"fread", "snprintf", "vsnprintf", "strlen", "strcmp", "strncmp", "strtol", "fmod", "setjmp", "longjmp"}
-    known |= {"memcmp", "memset_pattern16", "memcpy_chk", "strspn", "floor", "ceil"}
-    assert {text.strip("_") for text in outside} - {"dyld_stub_binder"} <= known
-    if name == "aarch64-darwin":
-        place = next(struct.unpack_from("<I", text, 8)[0] for command, text in commands if command == _SIGNATURE)
-        blobs = struct.unpack_from(">I", data, place + 8)[0]
-        offsets = [struct.unpack_from(">2I", data, place + 12 + 8 * i)[1] for i in range(blobs)]
-        heads = [struct.unpack_from(">4I", data, place + offset) for offset in offsets]
-        assert any(head[0] == _DIRECTORY and head[3] & _ADHOC for head in heads)
