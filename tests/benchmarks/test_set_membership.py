@@ -159,8 +159,10 @@ def test_tree_beside_numpy(benchmark: BenchmarkFixture) -> None:
             X[3:, i] = u[4 - int(lag) : STEPS + 1 - int(lag), int(channel)]
     X[1:, 0] = outputs[:-1, 0]
     X = X[10::20]
-    functions = load_functions("softneck.identification._tree_runtime")
-    expected = [functions.tree_bounds(W, y, arrays[7][0], GAMMA, x) for x in X] + np.array([-EPSILON, EPSILON])
+    functions = load_functions("softneck.identification._slant_runtime")
+    expected = [functions.slant_bounds(W, y, arrays[7][0], arrays[8][0], GAMMA, x) for x in X] + np.array(
+        [-EPSILON, EPSILON]
+    )
     plain = load_functions(RUNTIME).nlsm_bounds
     ways = {how: by_numpy(how, W, y) for how in NUMPY}
     ways["compiled, all points"] = lambda x: plain(W, y, GAMMA, EPSILON, x)

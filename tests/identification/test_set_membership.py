@@ -21,13 +21,14 @@ from softneck.identification import (
 )
 from softneck.identification._gamma import least_gammas
 from softneck.identification._regressors import regression
+from softneck.identification._slant import is_frame, slant_frames, slant_nodes, slant_order
 from softneck.identification._tree import LEAF, tree_nodes, tree_order
 
 from ..data import TS, neck_recording, recording_from, short_neck
 from .hard_sets import algorithm_1, hard_sets
 
 BOUNDS = load_functions("softneck.identification._nlsm_runtime")
-TREE = load_functions("softneck.identification._tree_runtime")
+SLANT = load_functions("softneck.identification._slant_runtime")
 CONES = load_functions("softneck.identification._cones_runtime")
 
 
@@ -62,19 +63,41 @@ def test_the_tree_gives_the_bounds_of_algorithm_1(
     data: tuple[np.ndarray, np.ndarray], slope: float, epsilon: float
 ) -> None:
     omega, y = data
-    points, values, nodes = in_tree_order(omega, y)
     size = max(float(np.abs(omega).max()), 1e-300)
     gamma = slope / size
-    for x in (omega[0], omega.mean(axis=0), omega[-1] + 0.3 * size, -5.0 * omega[len(y) // 2]):
-        low, high = TREE.tree_bounds(points, values, nodes, gamma, np.ascontiguousarray(x))
+    frames, slopes = slant_frames([(np.ascontiguousarray(omega.T), y)], np.array([gamma]))
+    order = slant_order(frames[0], np.ascontiguousarray(omega.T))
+    points, values = np.ascontiguousarray(omega[order].T), y[order]
+    nodes = slant_nodes(frames[0], slopes[0], points, values)
+    assert is_frame(frames[0])
+    assert 0.0 <= slopes[0] < gamma or slopes[0] == 0.0
+    for x in (omega[0], omega.mean(axis=0), omega[-1] + 0.3 * size, -5.0 * omega[len(y) // 2], 1e6 * omega[-1] + size):
+        x = np.ascontiguousarray(x)
+        low, high = SLANT.slant_bounds(points, values, nodes, frames[0], gamma, x)
         expected = algorithm_1(x, omega, y, gamma, epsilon)
         # Squares by ** or *, roots by ** or sqrt: some ulp of cones up to 50 * 6 * sqrt(11) = 1,000.
         np.testing.assert_allclose((low - epsilon, high + epsilon), expected, rtol=1e-12, atol=1e-12)
         # And those of all points in one stretch, to the bit: the tree leaves nothing out.
-        one = np.zeros((2, nodes.shape[1]))
-        one[1] = nodes[1]
-        if len(y) > LEAF:
-            assert TREE.tree_bounds(points, values, one, gamma, np.ascontiguousarray(x)) == (low, high)
+        best = np.array([-np.inf, np.inf])
+        SLANT.slant_leaf(points, values, 0, len(y), gamma, x, np.empty(len(y)), best)
+        assert tuple(best) == (low, high)
+
+
+def test_a_plane_among_the_values_is_followed_as_far_as_cones_allow() -> None:
+    rng = np.random.default_rng(0)
+    # Histories: two directions of width one, the others next to nothing.
+    W = rng.standard_normal((2, 3000)).T @ rng.standard_normal((2, 6)) + 1e-3 * rng.standard_normal((3000, 6))
+    slope = np.linalg.lstsq(W, W[:, 0] + 0.5 * W[:, 1], rcond=1e-2)[0]
+    y = W @ slope + 0.01 * rng.standard_normal(3000)
+    climb = float(np.linalg.norm(slope))
+    data = [(np.ascontiguousarray(W.T), y)]
+    frames, slopes = slant_frames(data, np.array([2.0 * climb]))
+    # The noise of 0.01 over 3,000 points of width one hardly turns the plane.
+    assert slopes[0] == pytest.approx(climb, rel=1e-3)
+    np.testing.assert_allclose(frames[0, 0], slope / climb, atol=1e-3)
+    assert frames.shape == (1, 5, 6)
+    # Cones flatter than every plane: there is none to follow.
+    assert slant_frames(data, np.array([0.0]))[1][0] == 0.0
 
 
 @given(data=hard_sets())

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from softneck.core import FileFormatError, Matrix
+from softneck.core import FileFormatError, Matrix, Vector
 
 from ._composed import COMPOSED, members, own_arrays
 from ._greybox_numbers import NUMBERS
-from ._tree import tree_nodes
+from ._slant import is_frame, slant_nodes
 
 # In the runtimes' order (see each kind's `_runtime` module).
 _ORDER = {
@@ -19,10 +19,10 @@ _ORDER = {
     "srivc": ("history", "drive", "redefinition", "a", "b", "delay", "source"),
     "subspace": ("history", "drive", "A", "B", "K", "delay"),
     "nlsm": (
-        "history", "drive", "table", "scale", "points", "values", "bounds", "nodes",
+        "history", "drive", "table", "scale", "points", "values", "bounds", "nodes", "frame",
         "redefinition", "a", "b", "delay",
     ),
-    "residual": ("history", "memory", "table", "scale", "points", "values", "bounds", "nodes"),
+    "residual": ("history", "memory", "table", "scale", "points", "values", "bounds", "nodes", "frame"),
     "ensemble": ("history", "memory"),
     "greybox": ("history", "drive", "neck", "sensor", "echo", "memory"),
     "play": (
@@ -137,10 +137,23 @@ def _check_set(arrays: Mapping[str, Matrix], n: int) -> None:
     for name, shape in {"scale": (n,), "points": (2, n, rows), "values": (2, rows), "bounds": (2, 2)}.items():
         _expect(arrays, name, shape)
     _within(np.array([rows]), 1, np.inf, "the number of points")
-    nodes = np.array([tree_nodes(*axis) for axis in zip(arrays["points"], arrays["values"], strict=True)])
+    frame, slopes = arrays["frame"], _slopes(arrays)
+    if frame.ndim != 3 or frame.shape[::2] != (2, n) or not all(is_frame(rows) for rows in frame):
+        raise FileFormatError("its array `frame` is of no directions square to each other; identify the model again.")
+    parts = zip(frame, slopes, arrays["points"], arrays["values"], strict=True)
+    nodes = np.array([slant_nodes(*axis) for axis in parts])
     # A tree of another shape would be read beyond its end, and one of other numbers would leave points out.
     if not np.array_equal(arrays["nodes"], nodes):
         raise FileFormatError("its array `nodes` is not the tree over its points; identify the model again.")
+
+
+def _slopes(arrays: Mapping[str, Matrix]) -> Vector:
+    """Return the climb (2,) of the values' plane of each axis, less than the cones'."""
+    nodes = arrays["nodes"]
+    slopes = nodes[:, 0, 0] if nodes.ndim == 3 and nodes.shape[0] == 2 and nodes.size else np.full(2, -1.0)
+    if not ((slopes >= 0.0) & ((slopes < arrays["bounds"][:, 0]) | (slopes == 0.0))).all():
+        raise FileFormatError("its array `nodes` is not the tree over its points; identify the model again.")
+    return slopes
 
 
 def _check_nn(arrays: Mapping[str, Matrix], history: float) -> None:

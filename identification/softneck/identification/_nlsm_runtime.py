@@ -1,7 +1,7 @@
 """Set membership (Eq. 18-20, Algorithm 1), alone or on a linear base.
 
-Arrays: H, drive, table, scale, W, y, (gamma, epsilon), tree nodes; then the base: redefinition, a, b, delay. An
-empty base is the paper's Eq. 21, fed back what it puts out. With one, the histories hold the base's outputs: what
+Arrays: H, drive, table, scale, W, y, (gamma, epsilon), tree nodes and frame; then the base: redefinition, a, b, delay.
+An empty base is the paper's Eq. 21, fed back what it puts out. With one, the histories hold the base's outputs: what
 the set adds to them is never fed back, and what is measured moves the base alone.
 """
 
@@ -10,7 +10,7 @@ import numpy as np
 from softneck.core._compiled_runtime import COMPILED
 from softneck.identification._arx_runtime import arx_output
 from softneck.identification._narx_runtime import narx_advance, narx_observe, narx_regressor
-from softneck.identification._tree_runtime import tree_bounds
+from softneck.identification._slant_runtime import slant_bounds
 
 
 def nlsm_bounds(
@@ -30,7 +30,7 @@ def nlsm_query(arrays: tuple[np.ndarray, ...], axis: int, x: np.ndarray) -> tupl
     gamma = arrays[6][axis, 0]
     epsilon = arrays[6][axis, 1]
     if COMPILED:
-        low, high = tree_bounds(arrays[4][axis], arrays[5][axis], arrays[7][axis], gamma, x)
+        low, high = slant_bounds(arrays[4][axis], arrays[5][axis], arrays[7][axis], arrays[8][axis], gamma, x)
         return low - epsilon, high + epsilon
     return nlsm_bounds(arrays[4][axis], arrays[5][axis], gamma, epsilon, x)
 
@@ -52,11 +52,11 @@ def step(
     for axis in range(2):
         narx_regressor(arrays, table, state, axis, x)
         low, high = nlsm_query(arrays, axis, x * scale)
-        base = arx_output(arrays[8], arrays[9][axis], arrays[10][axis], int(arrays[11][axis]), h, state, axis)
+        base = arx_output(arrays[9], arrays[10][axis], arrays[11][axis], int(arrays[12][axis]), h, state, axis)
         middle = 0.5 * (low + high)
         angles[axis] = base + middle
         outputs[5 + 2 * axis] = base + low
         outputs[6 + 2 * axis] = base + high
-        if arrays[10].shape[1] > 0:
+        if arrays[11].shape[1] > 0:
             state[8 * h + 11 + axis] = middle
     narx_advance(arrays, parameters, state, angles[0], angles[1], outputs)

@@ -1,9 +1,9 @@
 """Set membership on what the free run of any plant leaves over (see `_residual`).
 
-Arrays: H (1), memory (1), table, scale, points, values, (gamma, epsilon), tree nodes; then those of the base, the one
-member. State: motors m (H, 3) and base outputs y (H, 2), newest first; those of now (5), what the set adds now (2),
-random generator (6); then the base's state. What the set adds is never fed back, and what is measured moves the base
-alone, by what it is above that: the free run is as stable as the base's, and the set adds at most its own range.
+Arrays: H (1), memory (1), table, scale, points, values, (gamma, epsilon), tree nodes and frame; then those of the base,
+the one member. State: motors m (H, 3) and base outputs y (H, 2), newest first; those of now (5), what the set adds now
+(2), random generator (6); then the base's state. What the set adds is never fed back, and what is measured moves the
+base alone, by what it is above that: the free run is as stable as the base's, and the set adds at most its own range.
 """
 
 import math
@@ -13,9 +13,9 @@ import numpy as np
 from softneck.core._compiled_runtime import COMPILED
 from softneck.core._members_runtime import member_initialise, member_size, member_step
 from softneck.core._random_runtime import random_normal, random_seed
-from softneck.identification._tree_runtime import tree_bounds
+from softneck.identification._slant_runtime import slant_bounds
 
-OWN_ARRAYS = 8
+OWN_ARRAYS = 9
 
 
 def residual_own(arrays: tuple[np.ndarray, ...]) -> int:
@@ -50,7 +50,7 @@ def residual_query(arrays: tuple[np.ndarray, ...], axis: int, x: np.ndarray) -> 
     gamma = arrays[6][axis, 0]
     epsilon = arrays[6][axis, 1]
     if COMPILED:
-        low, high = tree_bounds(arrays[4][axis], arrays[5][axis], arrays[7][axis], gamma, x)
+        low, high = slant_bounds(arrays[4][axis], arrays[5][axis], arrays[7][axis], arrays[8][axis], gamma, x)
         return low - epsilon, high + epsilon
     squared = np.zeros(arrays[4].shape[2])
     for i in range(arrays[4].shape[1]):

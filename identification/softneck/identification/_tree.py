@@ -26,10 +26,10 @@ def tree_order(points: Matrix) -> np.ndarray:
     rows = points.shape[1]
     order = np.arange(rows)
     for level in range(depth_of(rows)):
-        borders = _borders(rows, level)
-        sides = np.array([_low_high(row[order], borders) for row in points])
+        cuts = borders(rows, level)
+        sides = np.array([low_high(row[order], cuts) for row in points])
         widest = np.argmax(sides[:, 1] - sides[:, 0], axis=0)
-        node = np.repeat(np.arange(widest.size), np.diff(borders))
+        node = np.repeat(np.arange(widest.size), np.diff(cuts))
         order = order[np.lexsort((points[widest[node], order], node))]
     return order
 
@@ -46,17 +46,17 @@ def tree_nodes(points: Matrix, values: Vector | Matrix) -> Matrix:
     values = np.atleast_2d(values)
     nodes = np.zeros((2 << depth, 2 * n + 2 * len(values)))
     for level in range(depth + 1):
-        borders = _borders(rows, level)
+        cuts = borders(rows, level)
         for i, row in enumerate((*points, *values)):
-            nodes[1 << level : 2 << level, 2 * i : 2 * i + 2] = _low_high(row, borders).T
+            nodes[1 << level : 2 << level, 2 * i : 2 * i + 2] = low_high(row, cuts).T
     return nodes
 
 
-def _borders(rows: int, level: int) -> np.ndarray:
+def borders(rows: int, level: int) -> np.ndarray:
     """Return the first column of each node of a level, and `rows` behind them."""
     return (np.arange((1 << level) + 1) * rows) >> level
 
 
-def _low_high(row: Vector, borders: np.ndarray) -> Matrix:
+def low_high(row: Vector, borders: np.ndarray) -> Matrix:
     """Return the least and the largest number (2, nodes) of each stretch."""
     return np.array([np.minimum.reduceat(row, borders[:-1]), np.maximum.reduceat(row, borders[:-1])])

@@ -120,11 +120,3 @@ def tree_tighten(
                 later[top] = far
                 top += 1
     return low, high
-
-
-def tree_bounds(
-    points: np.ndarray, values: np.ndarray, nodes: np.ndarray, gamma: float, x: np.ndarray
-) -> tuple[float, float]:
-    """Return max(y - gamma d) and min(y + gamma d) over `points` (n, N) in tree order and their `values` (N,)."""
-    nothing = (values, 0.0, 0.0)
-    return tree_tighten((points, values, nodes), (1, 2 * x.shape[0]), gamma, x, (-np.inf, np.inf), nothing)

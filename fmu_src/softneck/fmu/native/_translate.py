@@ -40,10 +40,10 @@ _MEMBERS = {
 }
 # Functions whose loops `sn_wide.h` has by hand, several numbers side by side: types and result as in Python, bits too.
 # One that returns numbers fills them in behind its arguments.
-_PAIR = Bundle((FLOAT, FLOAT))
+_FOUR = Bundle((FLOAT, FLOAT, FLOAT, FLOAT))
 _BY_HAND: dict[str, tuple[tuple[Type, ...], Type]] = {
-    "tree_children": ((MATRIX, INT, VECTOR), _PAIR),
-    "tree_cones": ((MATRIX, INT, INT, FLOAT, VECTOR, VECTOR), NONE),
+    "slant_children": ((MATRIX, INT, VECTOR, VECTOR), _FOUR),
+    "slant_leaf": ((MATRIX, VECTOR, INT, INT, FLOAT, VECTOR, VECTOR, VECTOR), NONE),
 }
 _PASSES = 20
 
@@ -103,10 +103,7 @@ class Unit:
         table = "static const sn_kind sn_kinds[] = {\n" + "\n".join(self.kinds) + "\n};\n"
         count = f"static const int sn_kind_count = {len(self.kinds)};\n"
         fast = self._fast()
-        functions = [
-            text if defined(text) in fast else text.replace("\nstatic ", "\nSN_SMALL static ", 1)
-            for text in self.functions
-        ]
+        functions = [_fast(text) if defined(text) in fast else _small(text) for text in self.functions]
         return "\n".join([head, guard, *self.types.declarations, "", *functions, table, count, "#endif\n"])
 
     def _fast(self) -> set[str]:
@@ -243,6 +240,15 @@ class _Runtime:
             return Value("", NONE)
         ex.scope.allocates |= holds_view(value.type)
         return ex.scope.kept(value)
+
+
+def _fast(text: str) -> str:
+    """Return a function that checks whole numbers where they stand."""
+    return text.replace("sn_int(", "sn_int_here(")
+
+
+def _small(text: str) -> str:
+    return text.replace("\nstatic ", "\nSN_SMALL static ", 1)
 
 
 def _constants(tree: ast.Module) -> dict[str, ast.expr]:

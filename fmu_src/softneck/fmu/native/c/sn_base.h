@@ -267,6 +267,14 @@ SN_APART static int64_t sn_int(sn_work *w, double x)
     return (int64_t)x;
 }
 
+/* The same where it is called: what is compiled for speed takes it. */
+static inline int64_t sn_int_here(sn_work *w, double x)
+{
+    if (SN_RARE(!(x > -SN_WHOLE && x < SN_WHOLE)))
+        sn_fault(w, SN_NUMBER);
+    return (int64_t)x;
+}
+
 static inline int64_t sn_times(sn_work *w, int64_t a, int64_t b)
 {
     /* Exact in int64 while both stay below 2^31; what an honest model counts does. */

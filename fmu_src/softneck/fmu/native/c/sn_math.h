@@ -253,7 +253,14 @@ static double sn_hypot(double x, double y)
 /* a % b of Python: the sign of b. */
 static double sn_fmod(double a, double b)
 {
-    double r = fmod(a, b);
+    double r, q;
+    /* Whole numbers, as random numbers are made of: the product is exact, and one more or less is made good. */
+    if (fabs(a) < SN_WHOLE && b > 0.0 && b < SN_WHOLE && a == (double)(int64_t)a && b == (double)(int64_t)b) {
+        q = a / b;
+        r = a - (double)(int64_t)q * b;
+        return r < 0.0 ? r + b : r < b ? r : r - b;
+    }
+    r = fmod(a, b);
     if (r != 0.0 && (r < 0.0) != (b < 0.0))
         r += b;
     return r;

@@ -5,6 +5,30 @@
 
 #include "sn_math.h"
 
+/* One child of `slant_children`, as in Python. */
+static inline void sn_child(const double *node, double squared, double along, const double *plane, double *result)
+{
+    double start = node[0] - along, stop = node[1] - along, best = plane[2] * sqrt(squared), d;
+    d = sn_min(sn_max(-best, start), stop);
+    result[0] = node[2] + plane[0] + (plane[1] * d + plane[3] * sqrt(d * d + squared)) - plane[4];
+    d = sn_min(sn_max(best, start), stop);
+    result[1] = node[3] + plane[0] + (plane[1] * d - plane[3] * sqrt(d * d + squared)) + plane[4];
+}
+
+static void sn_children_plain(const double *a, const double *b, const double *at, int64_t sides, const double *plane,
+                              double *result)
+{
+    double left = 0.0, right = 0.0, gap;
+    for (int64_t i = 1; i <= sides; i++) {
+        gap = sn_max(sn_max(a[3 + i] - at[i], at[i] - a[3 + sides + i]), 0.0);
+        left += gap * gap;
+        gap = sn_max(sn_max(b[3 + i] - at[i], at[i] - b[3 + sides + i]), 0.0);
+        right += gap * gap;
+    }
+    sn_child(a, left, at[0], plane, result);
+    sn_child(b, right, at[0], plane, result + 2);
+}
+
 #if defined(__GNUC__)
 typedef double sn_d4 __attribute__((vector_size(32)));
 typedef int64_t sn_l4 __attribute__((vector_size(32)));
@@ -71,105 +95,183 @@ typedef int64_t sn_l4 __attribute__((vector_size(32)));
         }                                                                                                           \
     }
 
-/* `tree_cones`: four points at a time, each point's sum in the order of its sides. The last four overlap those before:
- * what is worked out twice comes out equal. */
-#define SN_CONES(name, attribute)                                                                                   \
-    attribute static void name(double *restrict y, const double *restrict p, int64_t gap, int64_t count,             \
-                               const double *restrict x, int64_t n, double gamma)                                   \
-    {                                                                                                               \
-        for (int64_t k = 0; k < count; k += 8) {                                                                    \
-            int64_t one = k < count - 4 ? k : count - 4, two = k + 4 < count - 4 ? k + 4 : count - 4;               \
-            sn_d4 s = {0.0, 0.0, 0.0, 0.0}, t = s, a, b;                                                            \
-            for (int64_t i = 0; i < n; i++) {                                                                       \
-                memcpy(&a, p + i * gap + one, sizeof a);                                                            \
-                memcpy(&b, p + i * gap + two, sizeof b);                                                            \
-                a -= x[i];                                                                                          \
-                b -= x[i];                                                                                          \
-                s += a * a;                                                                                         \
-                t += b * b;                                                                                         \
-            }                                                                                                       \
-            for (int j = 0; j < 4; j++)                                                                             \
-                s[j] = sqrt(s[j]), t[j] = sqrt(t[j]);                                                               \
-            s *= gamma;                                                                                             \
-            t *= gamma;                                                                                             \
-            memcpy(y + one, &s, sizeof s);                                                                          \
-            memcpy(y + two, &t, sizeof t);                                                                          \
-        }                                                                                                           \
-    }
-
-typedef double sn_d2 __attribute__((vector_size(16)));
-typedef int64_t sn_l2 __attribute__((vector_size(16)));
-
-/* `tree_children`: both children side by side, each sum in the order of the sides; a gap below zero counts nothing. */
-static void sn_boxes_plain(const double *a, const double *b, const double *x, int64_t n, double *result)
+/* The cones of `slant_leaf`: four points at a time, each point's sum in the order of its sides, each lane its own bounds.
+ * The last four overlap those before: what is worked out twice comes out equal. `best` is low and high. */
+static void sn_leaf_plain(double *best, const double *p, const double *values, int64_t gap, int64_t count,
+                          const double *x, int64_t n, double gamma)
 {
-    sn_d2 sum = {0.0, 0.0};
-    for (int64_t i = 0; i < n; i++) {
-        sn_d2 low = {a[2 * i], b[2 * i]}, high = {a[2 * i + 1], b[2 * i + 1]}, below = low - x[i], above = x[i] - high;
-        sn_l2 first = below > above;
-        sn_d2 gap = (sn_d2)((first & (sn_l2)below) | (~first & (sn_l2)above));
-        gap = (sn_d2)((gap > 0.0) & (sn_l2)gap);
-        sum += gap * gap;
+    sn_d4 low = {best[0], best[0], best[0], best[0]}, high = {best[1], best[1], best[1], best[1]};
+    for (int64_t k = 0; k < count; k += 4) {
+        int64_t one = k < count - 4 ? k : count - 4;
+        sn_d4 s = {0.0, 0.0, 0.0, 0.0}, a, y;
+        sn_l4 in;
+        for (int64_t i = 0; i < n; i++) {
+            memcpy(&a, p + i * gap + one, sizeof a);
+            a -= x[i];
+            s += a * a;
+        }
+        memcpy(&y, values + one, sizeof y);
+        for (int j = 0; j < 4; j++)
+            s[j] = gamma * sqrt(s[j]);
+        a = y + s;
+        in = a < high;
+        high = (sn_d4)((in & (sn_l4)a) | (~in & (sn_l4)high));
+        a = y - s;
+        in = a > low;
+        low = (sn_d4)((in & (sn_l4)a) | (~in & (sn_l4)low));
     }
-    result[0] = sqrt(sum[0]);
-    result[1] = sqrt(sum[1]);
+    best[0] = sn_max(sn_max(low[0], low[2]), sn_max(low[1], low[3]));
+    best[1] = sn_min(sn_min(high[0], high[2]), sn_min(high[1], high[3]));
 }
 
 SN_TANH_ALL(sn_tanh_all_plain, )
 SN_ROWS(sn_rows_plain, )
-SN_CONES(sn_cones_plain, )
 
 #if defined(__x86_64__)
 #include <cpuid.h>
 #include <immintrin.h>
 #define SN_AVX2 __attribute__((target("avx2")))
-SN_TANH_ALL(sn_tanh_all_wide, SN_AVX2)
-SN_ROWS(sn_rows_wide, SN_AVX2)
+#define SN_PART SN_AVX2 static inline __attribute__((always_inline))
 
-/* SN_CONES once more: compilers take the roots one by one. */
-SN_AVX2 static void sn_cones_wide(double *restrict y, const double *restrict p, int64_t gap, int64_t count,
-                                  const double *restrict x, int64_t n, double gamma)
+/* SN_TANH4 in fewer instructions: what is no number passes through `min` and all that follows. */
+SN_PART __m256d sn_tanh4(__m256d x)
+{
+#define SN_4(x) _mm256_set1_pd(x)
+#define SN_UP(c, y) _mm256_add_pd(SN_4(c), _mm256_mul_pd(s, y))
+    const __m256d minus = SN_4(-0.0);
+    __m256d c = _mm256_min_pd(SN_4(22.0), _mm256_andnot_pd(minus, x)), shifted, k, r, s, even, odd, scale, e;
+    c = _mm256_add_pd(c, c);
+    shifted = _mm256_add_pd(_mm256_mul_pd(c, SN_4(SN_PER_LN2)), SN_4(SN_ROUNDER));
+    k = _mm256_sub_pd(shifted, SN_4(SN_ROUNDER));
+    r = _mm256_sub_pd(_mm256_sub_pd(c, _mm256_mul_pd(k, SN_4(SN_LN2_HIGH))), _mm256_mul_pd(k, SN_4(SN_LN2_LOW)));
+    scale = _mm256_castsi256_pd(
+        _mm256_slli_epi64(_mm256_add_epi64(_mm256_castpd_si256(shifted), _mm256_set1_epi64x(1023)), 52));
+    s = _mm256_mul_pd(r, r);
+    even = SN_UP(0.5, SN_UP(SN_E4, SN_UP(SN_E6, SN_UP(SN_E8, SN_UP(SN_E10, SN_UP(SN_E12, SN_4(SN_E14)))))));
+    odd = SN_UP(SN_E3, SN_UP(SN_E5, SN_UP(SN_E7, SN_UP(SN_E9, SN_UP(SN_E11, SN_4(SN_E13))))));
+    e = _mm256_add_pd(r, _mm256_mul_pd(s, _mm256_add_pd(even, _mm256_mul_pd(r, odd))));
+    e = _mm256_add_pd(_mm256_mul_pd(scale, e), _mm256_sub_pd(scale, SN_4(1.0)));
+    e = _mm256_div_pd(e, _mm256_add_pd(e, SN_4(2.0)));
+    return _mm256_or_pd(e, _mm256_and_pd(minus, x));
+#undef SN_UP
+#undef SN_4
+}
+
+SN_AVX2 static void sn_tanh_all_wide(double *restrict y, const double *restrict x, int64_t n)
+{
+    int64_t i = 0;
+    for (; i + 8 <= n; i += 8) {
+        __m256d a = sn_tanh4(_mm256_loadu_pd(x + i)), b = sn_tanh4(_mm256_loadu_pd(x + i + 4));
+        _mm256_storeu_pd(y + i, a);
+        _mm256_storeu_pd(y + i + 4, b);
+    }
+    for (; i + 4 <= n; i += 4)
+        _mm256_storeu_pd(y + i, sn_tanh4(_mm256_loadu_pd(x + i)));
+    for (; i < n; i++)
+        y[i] = sn_tanh(x[i]);
+}
+
+/* The sums of two rows, each as `sn_rows_plain` adds it; `first` and `second` are the next columns, from `i` on. */
+SN_PART __m128d sn_two_sums(__m256d a, __m256d b, const double *first, const double *second,
+                                          const double *x, int64_t n)
+{
+    __m128d p = _mm256_castpd256_pd128(a), q = _mm256_castpd256_pd128(b);
+    for (int64_t i = 0; i < n; i++) {
+        __m128d at = _mm_load_sd(x + i);
+        p = _mm_add_sd(p, _mm_mul_sd(_mm_load_sd(first + i), at));
+        q = _mm_add_sd(q, _mm_mul_sd(_mm_load_sd(second + i), at));
+    }
+    p = _mm_add_pd(p, _mm256_extractf128_pd(a, 1));
+    q = _mm_add_pd(q, _mm256_extractf128_pd(b, 1));
+    return _mm_add_pd(_mm_unpacklo_pd(p, q), _mm_unpackhi_pd(p, q));
+}
+
+/* Four rows side by side: compilers wait for each sum. The last four overlap those before. */
+SN_AVX2 static void sn_rows_wide(double *restrict y, const double *restrict A, const double *restrict x, int64_t rows,
+                                 int64_t gap, int64_t n)
+{
+    const int64_t whole = n & ~(int64_t)3;
+    if (rows < 4) {
+        sn_rows_plain(y, A, x, rows, gap, n);
+        return;
+    }
+    for (int64_t row = 0; row < rows; row += 4) {
+        int64_t k = row < rows - 4 ? row : rows - 4;
+        const double *a = A + k * gap, *b = a + gap, *c = b + gap, *d = c + gap;
+        __m256d p = _mm256_setzero_pd(), q = p, r = p, s = p;
+        for (int64_t i = 0; i < whole; i += 4) {
+            __m256d at = _mm256_loadu_pd(x + i);
+            p = _mm256_add_pd(p, _mm256_mul_pd(_mm256_loadu_pd(a + i), at));
+            q = _mm256_add_pd(q, _mm256_mul_pd(_mm256_loadu_pd(b + i), at));
+            r = _mm256_add_pd(r, _mm256_mul_pd(_mm256_loadu_pd(c + i), at));
+            s = _mm256_add_pd(s, _mm256_mul_pd(_mm256_loadu_pd(d + i), at));
+        }
+        _mm_storeu_pd(y + k, sn_two_sums(p, q, a + whole, b + whole, x + whole, n - whole));
+        _mm_storeu_pd(y + k + 2, sn_two_sums(r, s, c + whole, d + whole, x + whole, n - whole));
+    }
+}
+
+/* `sn_leaf_plain` once more, eight points at a time: compilers take roots and choices one by one. */
+SN_AVX2 static void sn_leaf_wide(double *best, const double *p, const double *values, int64_t gap, int64_t count,
+                                 const double *x, int64_t n, double gamma)
 {
     const __m256d slope = _mm256_set1_pd(gamma);
+    __m256d low = _mm256_set1_pd(best[0]), high = _mm256_set1_pd(best[1]);
+    double ends[8];
     for (int64_t k = 0; k < count; k += 8) {
         int64_t one = k < count - 4 ? k : count - 4, two = k + 4 < count - 4 ? k + 4 : count - 4;
         const double *first = p + one, *second = p + two;
-        __m256d s = _mm256_setzero_pd(), t = s;
+        __m256d s = _mm256_setzero_pd(), t = s, y = _mm256_loadu_pd(values + one), z = _mm256_loadu_pd(values + two);
         for (int64_t i = 0; i < n; i++, first += gap, second += gap) {
             __m256d at = _mm256_broadcast_sd(x + i);
             __m256d a = _mm256_sub_pd(_mm256_loadu_pd(first), at), b = _mm256_sub_pd(_mm256_loadu_pd(second), at);
             s = _mm256_add_pd(s, _mm256_mul_pd(a, a));
             t = _mm256_add_pd(t, _mm256_mul_pd(b, b));
         }
-        _mm256_storeu_pd(y + one, _mm256_mul_pd(slope, _mm256_sqrt_pd(s)));
-        _mm256_storeu_pd(y + two, _mm256_mul_pd(slope, _mm256_sqrt_pd(t)));
+        s = _mm256_mul_pd(slope, _mm256_sqrt_pd(s));
+        t = _mm256_mul_pd(slope, _mm256_sqrt_pd(t));
+        high = _mm256_min_pd(_mm256_add_pd(z, t), _mm256_min_pd(_mm256_add_pd(y, s), high));
+        low = _mm256_max_pd(_mm256_sub_pd(z, t), _mm256_max_pd(_mm256_sub_pd(y, s), low));
     }
+    _mm256_storeu_pd(ends, low);
+    _mm256_storeu_pd(ends + 4, high);
+    best[0] = sn_max(sn_max(ends[0], ends[2]), sn_max(ends[1], ends[3]));
+    best[1] = sn_min(sn_min(ends[4], ends[6]), sn_min(ends[5], ends[7]));
 }
 
-/* Two sides of both boxes at a time; their squares are added one side after the other. */
-SN_AVX2 static void sn_boxes_wide(const double *a, const double *b, const double *x, int64_t n, double *result)
+/* Four sides of a box at a time, then both bounds of both children. Nothing that a step puts out is a sum of these. */
+SN_PART __m128d sn_apart(const double *node, const double *at, int64_t sides)
 {
-    const __m256d zero = _mm256_setzero_pd();
-    __m128d sum = _mm_setzero_pd(), low, high, gap1;
-    int64_t i = 0;
-    for (; i + 2 <= n; i += 2) {
-        __m256d left = _mm256_loadu_pd(a + 2 * i), right = _mm256_loadu_pd(b + 2 * i);
-        __m256d at = _mm256_permute4x64_pd(_mm256_castpd128_pd256(_mm_loadu_pd(x + i)), 0x50);
-        __m256d gap = _mm256_max_pd(_mm256_sub_pd(_mm256_unpacklo_pd(left, right), at),
-                                    _mm256_sub_pd(at, _mm256_unpackhi_pd(left, right)));
-        gap = _mm256_max_pd(gap, zero);
-        gap = _mm256_mul_pd(gap, gap);
-        sum = _mm_add_pd(sum, _mm256_castpd256_pd128(gap));
-        sum = _mm_add_pd(sum, _mm256_extractf128_pd(gap, 1));
+    __m256d sum = _mm256_setzero_pd();
+    for (int64_t i = 0; i < sides; i += 4) {
+        __m256d x = _mm256_loadu_pd(at + 1 + i), gap;
+        gap = _mm256_max_pd(_mm256_sub_pd(_mm256_loadu_pd(node + 4 + i), x),
+                            _mm256_sub_pd(x, _mm256_loadu_pd(node + 4 + sides + i)));
+        gap = _mm256_max_pd(gap, _mm256_setzero_pd());
+        sum = _mm256_add_pd(sum, _mm256_mul_pd(gap, gap));
     }
-    if (i < n) {
-        low = _mm_set_pd(b[2 * i], a[2 * i]);
-        high = _mm_set_pd(b[2 * i + 1], a[2 * i + 1]);
-        gap1 = _mm_max_pd(_mm_sub_pd(low, _mm_set1_pd(x[i])), _mm_sub_pd(_mm_set1_pd(x[i]), high));
-        gap1 = _mm_max_pd(gap1, _mm_setzero_pd());
-        sum = _mm_add_pd(sum, _mm_mul_pd(gap1, gap1));
-    }
-    _mm_storeu_pd(result, _mm_sqrt_pd(sum));
+    return _mm_add_pd(_mm256_castpd256_pd128(sum), _mm256_extractf128_pd(sum, 1));
+}
+
+SN_AVX2 static void sn_children_wide(const double *a, const double *b, const double *at, int64_t sides,
+                                     const double *plane, double *result)
+{
+    const __m256d other = _mm256_setr_pd(0.0, -0.0, 0.0, -0.0); /* the sign of what is for the upper bound's child */
+    __m128d left = sn_apart(a, at, sides), right = sn_apart(b, at, sides);
+    __m128d both = _mm_add_pd(_mm_unpacklo_pd(left, right), _mm_unpackhi_pd(left, right));
+    __m256d squared = _mm256_permute4x64_pd(_mm256_castpd128_pd256(both), 0x50);
+    __m256d x = _mm256_broadcast_sd(at), A = _mm256_loadu_pd(a), B = _mm256_loadu_pd(b), r, start, stop, d, cone;
+    start = _mm256_permute2f128_pd(_mm256_unpacklo_pd(A, A), _mm256_unpacklo_pd(B, B), 0x20);
+    stop = _mm256_permute2f128_pd(_mm256_unpackhi_pd(A, A), _mm256_unpackhi_pd(B, B), 0x20);
+    r = _mm256_permute2f128_pd(A, B, 0x31);
+    d = _mm256_mul_pd(_mm256_broadcast_sd(plane + 2), _mm256_sqrt_pd(squared));
+    /* down the plane for what is below all cones, up for what is above them */
+    d = _mm256_xor_pd(d, _mm256_xor_pd(other, _mm256_set1_pd(-0.0)));
+    d = _mm256_min_pd(_mm256_max_pd(d, _mm256_sub_pd(start, x)), _mm256_sub_pd(stop, x));
+    cone = _mm256_sqrt_pd(_mm256_add_pd(_mm256_mul_pd(d, d), squared));
+    cone = _mm256_sub_pd(_mm256_mul_pd(_mm256_broadcast_sd(plane + 3), cone), _mm256_broadcast_sd(plane + 4));
+    r = _mm256_add_pd(_mm256_add_pd(r, _mm256_broadcast_sd(plane)), _mm256_mul_pd(_mm256_broadcast_sd(plane + 1), d));
+    _mm256_storeu_pd(result, _mm256_add_pd(r, _mm256_xor_pd(cone, other)));
 }
 
 /* Whether processor and operating system have AVX2. */
@@ -184,18 +286,10 @@ static int sn_has_wide(void)
 #else
 #define sn_tanh_all_wide sn_tanh_all_plain
 #define sn_rows_wide sn_rows_plain
-#define sn_cones_wide sn_cones_plain
-#define sn_boxes_wide sn_boxes_plain
+#define sn_leaf_wide sn_leaf_plain
+#define sn_children_wide sn_children_plain
 static int sn_has_wide(void) { return 0; }
 #endif
-
-static void sn_two_boxes(const sn_work *w, const double *a, const double *b, const double *x, int64_t n, double *result)
-{
-    if (w->wide)
-        sn_boxes_wide(a, b, x, n, result);
-    else
-        sn_boxes_plain(a, b, x, n, result);
-}
 
 static void sn_tanh_all(const sn_work *w, double *y, const double *x, int64_t n)
 {
@@ -216,20 +310,6 @@ static void sn_rows(const sn_work *w, double *y, const double *A, const double *
 #else
 static int sn_has_wide(void) { return 0; }
 
-static void sn_two_boxes(const sn_work *w, const double *a, const double *b, const double *x, int64_t n, double *result)
-{
-    double left = 0.0, right = 0.0, gap;
-    (void)w;
-    for (int64_t i = 0; i < n; i++) {
-        gap = sn_max(a[2 * i] - x[i], x[i] - a[2 * i + 1]);
-        left += gap > 0.0 ? gap * gap : 0.0;
-        gap = sn_max(b[2 * i] - x[i], x[i] - b[2 * i + 1]);
-        right += gap > 0.0 ? gap * gap : 0.0;
-    }
-    result[0] = sqrt(left);
-    result[1] = sqrt(right);
-}
-
 static void sn_tanh_all(const sn_work *w, double *y, const double *x, int64_t n)
 {
     (void)w;
@@ -239,37 +319,51 @@ static void sn_tanh_all(const sn_work *w, double *y, const double *x, int64_t n)
 #endif
 
 /* What the runtimes' functions of these names do, with their checks made once for all entries; see `_translate.py`. */
-static SN_INSIDE void sn_tree_children(sn_work *w, const sn_v2 *nodes, int64_t node, sn_v1 x, double *result)
+static SN_INSIDE void sn_slant_children(sn_work *w, const sn_v2 *nodes, int64_t node, sn_v1 at, sn_v1 plane,
+                                        double *result)
 {
-    if (SN_RARE(node < 0 || node > nodes->n0 / 2 || 2 * node + 1 >= nodes->n0 || x.n > nodes->n1 / 2 || nodes->s1 != 1
-                || x.s != 1))
+    int64_t sides = (int64_t)at.n - 1;
+    const double *a = nodes->p + 2 * node * nodes->s0, *b = a + nodes->s0;
+    if (SN_RARE(node < 0 || 2 * node + 1 >= nodes->n0 || sides < 0 || sides % 4 != 0 || 4 + 2 * sides > nodes->n1
+                || plane.n < 5 || nodes->s1 != 1 || at.s != 1 || plane.s != 1))
         sn_outside(w);
-    sn_two_boxes(w, nodes->p + 2 * node * nodes->s0, nodes->p + (2 * node + 1) * nodes->s0, x.p, x.n, result);
+#ifdef SN_LANES
+    if (w->wide) {
+        sn_children_wide(a, b, at.p, sides, plane.p, result);
+        return;
+    }
+#endif
+    sn_children_plain(a, b, at.p, sides, plane.p, result);
 }
 
-static SN_INSIDE void sn_tree_cones(sn_work *w, const sn_v2 *points, int64_t first, int64_t count, double gamma,
-                                    sn_v1 x, sn_v1 cones)
+static SN_INSIDE void sn_slant_leaf(sn_work *w, const sn_v2 *points, sn_v1 values, int64_t first, int64_t count,
+                                    double gamma, sn_v1 x, sn_v1 cones, sn_v1 best)
 {
-    if (SN_RARE(first < 0 || count < 0 || first > points->n1 || count > points->n1 - first || count > cones.n
-                || x.n > points->n0 || points->s1 != 1 || x.s != 1 || cones.s != 1))
+    const double *p = points->p + first, *y = values.p + first;
+    (void)cones;
+    if (SN_RARE(first < 0 || count < 0 || first > points->n1 || count > points->n1 - first || first > values.n
+                || count > values.n - first || x.n > points->n0 || best.n < 2 || points->s1 != 1 || x.s != 1
+                || values.s != 1 || best.s != 1))
         sn_outside(w);
     sn_rounds(w, count);
 #ifdef SN_LANES
     if (count >= 4) {
         if (w->wide)
-            sn_cones_wide(cones.p, points->p + first, points->s0, count, x.p, x.n, gamma);
+            sn_leaf_wide(best.p, p, y, points->s0, count, x.p, x.n, gamma);
         else
-            sn_cones_plain(cones.p, points->p + first, points->s0, count, x.p, x.n, gamma);
+            sn_leaf_plain(best.p, p, y, points->s0, count, x.p, x.n, gamma);
         return;
     }
 #endif
     for (int64_t k = 0; k < count; k++) {
         double sum = 0.0;
         for (int64_t i = 0; i < x.n; i++) {
-            double gap = points->p[i * points->s0 + first + k] - x.p[i];
+            double gap = p[i * points->s0 + k] - x.p[i];
             sum += gap * gap;
         }
-        cones.p[k] = gamma * sqrt(sum);
+        sum = gamma * sqrt(sum);
+        best.p[0] = sn_max(best.p[0], y[k] - sum);
+        best.p[1] = sn_min(best.p[1], y[k] + sum);
     }
 }
 

@@ -1,0 +1,117 @@
+"""The slanted tree over the points of a set: a kd-tree in the directions in which the points spread.
+
+Regressors are histories, so that points hardly leave a few directions, and what the values do over those is nearly a
+plane. Boxes along those directions are far tighter than boxes along the regressors, have fewer sides, and values over
+the plane range far less within one than values do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from softneck.core import Matrix, Vector
+
+from ._tree import borders, depth_of, low_high, tree_order
+
+# Of gamma, the most that the plane may climb: nearer to it, rounding of gamma^2 - m^2 would count.
+_STEEPEST = 0.98
+# Directions with less than this share of the widest spread hardly tell nodes apart, and the plane is steep over their
+# noise: they take part in neither.
+_THIN = 0.02
+_SAMPLE = 20_000
+# Other sides come in fours, as processors take them.
+_SIDES = 4
+_MOST_SIDES = 8
+
+
+def slant_frames(data: Sequence[tuple[Matrix, Vector]], gammas: Vector) -> tuple[Matrix, Vector]:
+    """Return a frame (1 + 4 or 1 + 8, n) for each points (n, N) and values (N,), and its plane's climb along row 0.
+
+    Rows are orthonormal; those behind the n-th are zero.
+    """
+    found = [_frame(points, values, float(gamma)) for (points, values), gamma in zip(data, gammas, strict=True)]
+    sides = _SIDES if max(wide for _, _, wide in found) <= _SIDES else _MOST_SIDES
+    return np.array([frame[: 1 + sides] for frame, _, _ in found]), np.array([slope for _, slope, _ in found])
+
+
+def _frame(points: Matrix, values: Vector, gamma: float) -> tuple[Matrix, float, int]:
+    """Return the frame with all sides that may be, the plane's climb, and how many sides tell nodes apart."""
+    n = len(points)
+    # Directions and plane may be anything: a part of the points finds good ones.
+    some = slice(None, None, max(1, values.size // _SAMPLE))
+    P, y = points[:, some], values[some] - values[some].mean()
+    # Sums of squares of any size neither overflow nor vanish.
+    size = float(np.abs(P).max()) or 1.0
+    P = P / size
+    P -= P.mean(axis=1, keepdims=True)
+    spread, follows = P @ P.T, P @ y
+    variance, V = np.linalg.eigh(spread)
+    slope = np.zeros(n)
+    # The plane follows the directions of widest spread, as long as it climbs less than cones do.
+    for j in range(n - 1, -1, -1):
+        if variance[j] <= _THIN**2 * variance[-1]:
+            break
+        more = slope + V[:, j] * (V[:, j] @ follows / variance[j])
+        if float(np.linalg.norm(more)) > _STEEPEST * gamma * size:
+            break
+        slope = more
+    climb = float(np.linalg.norm(slope))
+    along = slope / climb if climb > 0.0 else V[:, -1]
+    # What is square to it, widest first.
+    across = np.linalg.qr(np.column_stack([along, np.eye(n)]))[0][:, 1:]
+    variance, V = np.linalg.eigh(across.T @ spread @ across)
+    rows = (across @ V[:, ::-1]).T[:_MOST_SIDES]
+    frame = np.zeros((1 + _MOST_SIDES, n))
+    frame[0] = along
+    frame[1 : 1 + len(rows)] = rows
+    wide = np.sum(variance > _THIN**2 * max(float(along @ spread @ along), variance.max(initial=0.0)))
+    return frame, climb / size, int(wide)
+
+
+def is_frame(frame: Matrix) -> bool:
+    """Return whether the rows of a frame are orthonormal, but for rows of zeros: then no length in it is too long."""
+    known = frame[np.any(frame != 0.0, axis=1)]
+    sides = len(frame) - 1
+    return (
+        sides >= 0
+        and sides % _SIDES == 0
+        and bool(np.allclose(known @ known.T, np.eye(len(known)), rtol=0, atol=1e-13))
+    )
+
+
+def in_frame(frame: Matrix, points: Matrix) -> Matrix:
+    """Return the points (n, N) along the rows of `frame`, summed in one order: the same bits on every machine."""
+    turned = np.zeros((len(frame), points.shape[1]))
+    for row, direction in zip(turned, frame, strict=True):
+        for weight, component in zip(direction, points, strict=True):
+            row += weight * component
+    return turned
+
+
+def slant_order(frame: Matrix, points: Matrix) -> np.ndarray:
+    """Return the order (N,) of the columns of `points` in which each node is one stretch of them."""
+    return tree_order(in_frame(frame, points))
+
+
+def slant_nodes(frame: Matrix, slope: float, points: Matrix, values: Vector) -> Matrix:
+    """Return the nodes (2^(depth+1), 2 (1 + sides) + 2) over points in tree order; see `_slant_runtime`.
+
+    Row 0, which is no node, holds the slope of the plane and the size of points and values.
+    """
+    turned = in_frame(frame, points)
+    sides, rows = len(frame) - 1, values.size
+    above = values - slope * turned[0]
+    depth = depth_of(rows)
+    nodes = np.zeros((2 << depth, 4 + 2 * sides))
+    nodes[0, 0] = slope
+    nodes[0, 1] = np.abs(points).sum(axis=0).max()
+    nodes[0, 2] = np.abs(values).max()
+    for level in range(depth + 1):
+        cuts, there = borders(rows, level), nodes[1 << level : 2 << level]
+        there[:, 0:2] = low_high(turned[0], cuts).T
+        there[:, 2:4] = low_high(above, cuts).T
+        for i, row in enumerate(turned[1:]):
+            there[:, 4 + i], there[:, 4 + sides + i] = low_high(row, cuts)
+    return nodes
