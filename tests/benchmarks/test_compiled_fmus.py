@@ -1,7 +1,8 @@
 """Cost of a compiled FMU's step; run with `pytest tests/benchmarks/test_compiled_fmus.py --benchmark-only -p no:xdist`.
 
 All kinds in one run, fmpy's low-level `doStep` alone, inputs set before each. The last lines are the table of
-docs/howto/fmus_compiled.md: times of the compiled FMU and of the pythonfmu one of the same model, side by side.
+docs/howto/fmus_compiled.md: times of the compiled FMU and of the pythonfmu one of the same model, side by side, and
+what of the former is fmpy's own: a `doStep` over no time, in which the FMU has nothing to do.
 """
 
 from __future__ import annotations
@@ -20,11 +21,20 @@ from fmpy.fmi2 import FMU2Slave
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from softneck.core import Block
-from softneck.design import MpcSettings, PiSettings, bake_off_neck
+from softneck.design import FopiSettings, HinfSettings, MpcSettings, PiSettings, bake_off_neck
 from softneck.estimation import KalmanSettings
 from softneck.fmu import build_fmu, unpacked
 from softneck.fmu.native import build_compiled_fmu
-from softneck.identification import Network, Play, Rls, SetMembership, combine
+from softneck.identification import (
+    GreyBox,
+    Network,
+    NeuralStateSpace,
+    Play,
+    Residual,
+    Rls,
+    SetMembership,
+    combine,
+)
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import Recording, signal
 
@@ -81,11 +91,18 @@ _KINDS = {
     ),
     "set membership, 7k x 10": _Kind(make=lambda: _set(7_000), wanted=5.0, outputs=2),
     "set membership, 1M x 10": _Kind(make=lambda: _set(1_000_000), wanted=15.0, outputs=2, python=False),
-    "ensemble": _Kind(make=_ensemble),
+    # What is fitted hardly matters to a step's time: a few rounds do.
+    "nss": _Kind(make=lambda: NeuralStateSpace(starts=1, iterations=3).fit(_training()).block()),
+    "greybox": _Kind(make=lambda: GreyBox(evaluations=3).fit(_training()).block()),
+    "residual of any (rls)": _Kind(make=lambda: Residual(base="rls").fit(_training()).block()),
+    "ensemble (play, rls)": _Kind(make=_ensemble),
     # 20 ms at 500 times real time.
     "virtual neck": _Kind(make=lambda: VirtualNeck(NeckParameters.paper()).block(), wanted=40.0),
-    "kalman": _Kind(make=lambda: KalmanSettings().design(bake_off_neck()).block()),
+    "observer (kalman)": _Kind(make=lambda: KalmanSettings().design(bake_off_neck()).block()),
+    "observer (kalman, steady)": _Kind(make=lambda: KalmanSettings(steady=True).design(bake_off_neck()).block()),
     "pi": _Kind(make=lambda: PiSettings().design(bake_off_neck()).block()),
+    "fopi": _Kind(make=lambda: FopiSettings().design(bake_off_neck()).block()),
+    "hinf": _Kind(make=lambda: HinfSettings(bandwidth=4.0, gain_spread=0.0).design(bake_off_neck()).block()),
     "mpc, 30 unknowns": _Kind(
         make=lambda: MpcSettings(bandwidth=8.0, lead_limit=12.0).design(bake_off_neck()).block(), wanted=30.0
     ),
@@ -151,6 +168,15 @@ class _Run:
             taken[i] = clock() - begin
         return float(np.median(taken))
 
+    def seconds_of_nothing(self, steps: int) -> float:
+        """Return the median of a `doStep` over no time: what fmpy takes for the call."""
+        doStep, clock, taken, now = self.fmu.doStep, time.perf_counter, np.empty(steps), self.k * self.period
+        for i in range(steps):
+            begin = clock()
+            doStep(now, 0.0)
+            taken[i] = clock() - begin
+        return float(np.median(taken))
+
 
 @pytest.fixture(scope="module")
 def trivial(tmp_path_factory: pytest.TempPathFactory) -> Iterator[_Run]:
@@ -164,11 +190,22 @@ def trivial(tmp_path_factory: pytest.TempPathFactory) -> Iterator[_Run]:
 def table(request: pytest.FixtureRequest) -> Iterator[list[str]]:
     lines: list[str] = []
     yield lines
-    head = "| step of | compiled [us] | wanted [us] | pythonfmu [us] | times faster | trivial pythonfmu [us] |"
+    head = "| step of | compiled [us] | of it fmpy [us] | wanted [us] | pythonfmu [us] | times faster | trivial [us] |"
     capture = request.config.pluginmanager.get_plugin("capturemanager")
     if lines and capture is not None:
         with capture.global_and_fixture_disabled():
-            print("\n" + "\n".join([head, "|---|---|---|---|---|---|", *lines]))
+            print("\n" + "\n".join([head, "|---|---|---|---|---|---|---|", *lines]))
+
+
+def test_empty(benchmark: BenchmarkFixture, table: list[str], tmp_path: Path) -> None:
+    """The cheapest thing that fmpy can call: what every other row has in it."""
+    block = _KINDS["linear (rls)"].make()
+    build_compiled_fmu(block, tmp_path / "Compiled.fmu")
+    with unpacked(tmp_path / "Compiled.fmu") as folder:
+        run = _Run(folder, np.zeros((0, 0)), block.sample_time)
+        benchmark.pedantic(lambda: run.fmu.doStep(0.0, 0.0), rounds=STEPS)
+        table.append(f"| empty | {1e6 * run.seconds_of_nothing(STEPS):.2f} | | | | | |")
+        run.fmu.freeInstance()
 
 
 @pytest.mark.parametrize("name", list(_KINDS))
@@ -185,6 +222,7 @@ def test_do_step(
         run.seconds(300)
         benchmark.pedantic(lambda now: run.fmu.doStep(now, run.period), setup=lambda: ((run.hold(),), {}), rounds=STEPS)
         compiled = 1e6 * run.seconds(STEPS) / kind.outputs
+        empty = 1e6 * run.seconds_of_nothing(STEPS) / kind.outputs
         python = float("nan")
         if kind.python:
             build_fmu(block, tmp_path / "Python.fmu")
@@ -196,8 +234,11 @@ def test_do_step(
     wanted = "" if kind.wanted is None else f"{kind.wanted:g}"
     unit = " (each output)" if kind.outputs > 1 else ""
     benchmark.extra_info |= {"compiled us": compiled, "wanted us": wanted, "pythonfmu us": python, "trivial us": plain}
+    benchmark.extra_info["fmpy us"] = empty
     ratio = python / compiled
-    table.append(f"| {name}{unit} | {compiled:.2f} | {wanted} | {python:.1f} | {ratio:.1f} | {plain:.2f} |")
+    table.append(
+        f"| {name}{unit} | {compiled:.2f} | {empty:.2f} | {wanted} | {python:.1f} | {ratio:.1f} | {plain:.2f} |"
+    )
 
 
 @pytest.mark.parametrize("name", ["linear (rls)", "set membership, paper", "virtual neck"])

@@ -103,7 +103,7 @@ class Unit:
         table = "static const sn_kind sn_kinds[] = {\n" + "\n".join(self.kinds) + "\n};\n"
         count = f"static const int sn_kind_count = {len(self.kinds)};\n"
         fast = self._fast()
-        functions = [_fast(text) if defined(text) in fast else _small(text) for text in self.functions]
+        functions = [_whole_here(text) if defined(text) in fast else _small(text) for text in self.functions]
         return "\n".join([head, guard, *self.types.declarations, "", *functions, table, count, "#endif\n"])
 
     def _fast(self) -> set[str]:
@@ -242,7 +242,7 @@ class _Runtime:
         return ex.scope.kept(value)
 
 
-def _fast(text: str) -> str:
+def _whole_here(text: str) -> str:
     """Return a function that checks whole numbers where they stand."""
     return text.replace("sn_int(", "sn_int_here(")
 

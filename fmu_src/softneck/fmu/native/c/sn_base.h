@@ -15,6 +15,7 @@
 #ifdef __GNUC__
 #define SN_LEAVES __attribute__((noinline, cold, noreturn))
 #define SN_APART __attribute__((noinline)) /* called so often that copies of it would be most of the library */
+#define SN_MERGED inline __attribute__((always_inline))
 #define SN_RARE(x) __builtin_expect(!!(x), 0)
 #if defined(__has_attribute)
 #if __has_attribute(minsize)
@@ -24,6 +25,7 @@
 #else
 #define SN_LEAVES
 #define SN_APART
+#define SN_MERGED inline
 #define SN_RARE(x) (x)
 #endif
 #ifndef SN_SMALL

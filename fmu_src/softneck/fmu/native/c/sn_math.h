@@ -2,7 +2,7 @@
  *
  * Each reduces its argument by a multiple of a constant that is split into parts (Cody and Waite 1980, Software Manual
  * for the Elementary Functions) and sums the Taylor series of what is left until a term falls below a tenth of the
- * last digit. sqrt, fabs, floor, ceil and fmod are exact in IEEE arithmetic and are the library's. Compile without
+ * last digit, in pairs of terms rather than one after the other, as processors work on several at once. sqrt, fabs, floor, ceil and fmod are exact in IEEE arithmetic and are the library's. Compile without
  * contraction to fused multiply-add. */
 #ifndef SN_MATH_H
 #define SN_MATH_H
@@ -50,14 +50,13 @@ static inline int sn_infinite(double x) { return x == x && x - x != 0.0; }
 #define SN_E11 0x1.ae64567f544e4p-26
 #define SN_E12 0x1.1eed8eff8d898p-29
 #define SN_E13 0x1.6124613a86d09p-33
-#define SN_E14 0x1.93974a8c07c9dp-37
 
 /* exp(r) - 1 for |r| <= ln(2)/2. */
-static inline double sn_expm1_small(double r)
+static SN_MERGED double sn_expm1_small(double r)
 {
-    double s = r * r;
-    double even = 0.5 + s * (SN_E4 + s * (SN_E6 + s * (SN_E8 + s * (SN_E10 + s * (SN_E12 + s * SN_E14)))));
-    double odd = SN_E3 + s * (SN_E5 + s * (SN_E7 + s * (SN_E9 + s * (SN_E11 + s * SN_E13))));
+    double s = r * r, t = s * s, u = t * t;
+    double even = ((0.5 + s * SN_E4) + t * (SN_E6 + s * SN_E8)) + u * (SN_E10 + s * SN_E12);
+    double odd = ((SN_E3 + s * SN_E5) + t * (SN_E7 + s * SN_E9)) + u * (SN_E11 + s * SN_E13);
     return r + s * (even + r * odd);
 }
 
@@ -131,19 +130,21 @@ static int sn_quarters(double x, double *r, double *t)
 static inline double sn_sin_small(double r, double t)
 {
     double z = r * r;
-    double p = -0x1.5555555555555p-3 + z * (0x1.1111111111111p-7 + z * (-0x1.a01a01a01a01ap-13
-        + z * (0x1.71de3a556c734p-19 + z * (-0x1.ae64567f544e4p-26 + z * (1.6059043836821613e-10
-        + z * (-7.647163731819816e-13 + z * 2.8114572543455206e-15))))));
+    double z2 = z * z, z4 = z2 * z2;
+    double p = ((-0x1.5555555555555p-3 + z * 0x1.1111111111111p-7) + z2 * (-0x1.a01a01a01a01ap-13
+        + z * 0x1.71de3a556c734p-19)) + z4 * ((-0x1.ae64567f544e4p-26 + z * 1.6059043836821613e-10)
+        + z2 * (-7.647163731819816e-13 + z * 2.8114572543455206e-15));
     return r + (t * (1.0 - 0.5 * z) + r * z * p);
 }
 
 static inline double sn_cos_small(double r, double t)
 {
     double z = r * r, half = 0.5 * z, high = 1.0 - half;
-    double p = 0x1.5555555555555p-5 + z * (-0x1.6c16c16c16c17p-10 + z * (0x1.a01a01a01a01ap-16
-        + z * (-0x1.27e4fb7789f5cp-22 + z * (0x1.1eed8eff8d898p-29 + z * (-1.1470745597729725e-11
-        + z * (4.779477332387385e-14 - z * 1.5619206968586225e-16))))));
-    return high + (((1.0 - high) - half) + (z * z * p - r * t));
+    double z2 = z * z, z4 = z2 * z2;
+    double p = ((0x1.5555555555555p-5 - z * 0x1.6c16c16c16c17p-10) + z2 * (0x1.a01a01a01a01ap-16
+        - z * 0x1.27e4fb7789f5cp-22)) + z4 * ((0x1.1eed8eff8d898p-29 - z * 1.1470745597729725e-11)
+        + z2 * (4.779477332387385e-14 - z * 1.5619206968586225e-16));
+    return high + (((1.0 - high) - half) + (z2 * p - r * t));
 }
 
 static double sn_sin(double x)
@@ -196,7 +197,7 @@ static inline double sn_tanh(double x)
 static inline double sn_atan_small(double t)
 {
     double z = t * t;
-    return -t * z * (1.0 / 3.0 - z * (1.0 / 5.0 - z * (1.0 / 7.0 - z * (1.0 / 9.0 - z * (1.0 / 11.0 - z / 13.0)))));
+    return -t * z * (1.0 / 3.0 - z * (1.0 / 5.0 - z * (1.0 / 7.0 - z * (1.0 / 9.0 - z * (1.0 / 11.0 - z * (1.0 / 13.0))))));
 }
 
 /* atan(y / x) for 0 <= y <= x, x > 0: next to the nearest eighth. */
