@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test slow check docs benchmark native wheel nightly nightly-can clean
+.PHONY: demo test slow check docs benchmark native wheel nightly nightly-fmu nightly-can clean
 
 demo: $(VENV)/.installed
 	$(BIN)/softneck demo --out build/demo
@@ -32,10 +32,14 @@ benchmark: $(VENV)/.tested
 native: $(VENV)/.crossed
 	$(BIN)/python -m softneck.fmu.native
 
-# The library on other platforms, bit for bit, and many wrong bytes. Debian: wine64, qemu-user, libc6-arm64-cross.
-nightly: $(VENV)/.tested native
+nightly: nightly-fmu
+
+# The library on other platforms, bit for bit; wrong bytes under the sanitizers; libFuzzer for two minutes.
+# Debian: wine64 qemu-user libc6-arm64-cross gcc clang.
+nightly-fmu: $(VENV)/.tested native
 	SOFTNECK_NIGHTLY=1 $(BIN)/python -m pytest -q -n 0 tests/fmu/test_native_platforms.py
-	SOFTNECK_FUZZ_ROUNDS=3000 $(BIN)/python -m pytest -q -n 0 tests/fmu/test_native_errors.py -k sanitizers
+	SOFTNECK_FUZZ_ROUNDS=300 $(BIN)/python -m pytest -q -n 0 tests/fmu/test_native_errors.py -k sanitizers
+	SOFTNECK_FUZZ_SECONDS=120 $(BIN)/python -m pytest -q -n 0 -s tests/fmu/test_native_fuzzer.py
 
 # In QEMU, with Debian's kernel: the drives over real SocketCAN, and the service under a real systemd.
 # Debian: qemu-system-x86 busybox-static kmod cpio iproute2. Minutes with KVM; an hour or two without.
@@ -49,8 +53,11 @@ nightly-systemd: $(VENV)/.tested
 	$(BIN)/python tests/nightly/systemd_unit.py
 
 # Exporting from this wheel needs no compiler.
+# Exporting from this wheel needs no compiler; the last line shows it.
 wheel: native
+	rm -rf build/dist
 	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir build/dist .
+	$(BIN)/python tests/nightly/wheel.py build/dist/*.whl
 
 clean:
 	rm -rf $(VENV) docs/_build .pytest_cache .ruff_cache

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import shutil
+import subprocess
+import sys
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +21,7 @@ from softneck.fmu.native import build_compiled_fmu
 from softneck.plant import NeckParameters, VirtualNeck
 
 from ..fmu.every_kind import _linear
-from .test_ssp import LOOP, PACKAGES, run_in
+from .test_ssp import LOOP, MASTERS, PACKAGES, run_in
 
 pytestmark = pytest.mark.skipif(
     shutil.which("cc") is None and not os.environ.get("CI"), reason="no C compiler here, and no library is built"
@@ -45,9 +49,34 @@ def test_other_masters_compute_our_jacobi_loop_without_python(master: str, tmp_p
         ("plant", "pitch"): "pitch", ("plant", "tension_1"): "tension_1", ("observer", "pitch"): "pitch_estimate",
         ("controller", "motor_setpoint_1"): "motor_setpoint_1", ("reference", "pitch_reference"): "pitch_reference",
     }  # fmt: skip
-    theirs = run_in(master, archive, list(signals), 100, tmp_path)
+    compared = {"in its Python binding": run_in(master, archive, list(signals), 100, tmp_path)}
+    if sys.platform == "linux":
+        compared["from C, with no Python in the process"] = _run_from_c(master, archive, list(signals), 100, tmp_path)
+    for how, theirs in compared.items():
+        _assert_equal(how, signals, theirs, ours)
+    assert np.abs(ours["pitch"]).max() > 0.02  # the loop does move
+
+
+def _assert_equal(how: str, signals: dict[tuple[str, str], str], theirs: np.ndarray, ours: Any) -> None:
     for (part, name), column in zip(signals, theirs.T, strict=True):
         # The limit; the controller runs in Python in ours, all else in the same library.
         expected = ours[signals[part, name]]
-        np.testing.assert_allclose(column[1:], expected[1:], rtol=0, atol=1e-12, err_msg=f"{part}.{name}")
-    assert np.abs(ours["pitch"]).max() > 0.02  # the loop does move
+        np.testing.assert_allclose(column[1:], expected[1:], rtol=0, atol=1e-12, err_msg=f"{part}.{name} {how}")
+
+
+def _run_from_c(master: str, archive: Path, signals: list[tuple[str, str]], rows: int, folder: Path) -> np.ndarray:
+    specification = importlib.util.find_spec(PACKAGES[master])
+    assert specification is not None
+    assert specification.origin is not None
+    name = {"libcosim": "libcosimc.so", "ecos": "libecosc.so"}[master]
+    library = next(path for path in Path(specification.origin).parent.rglob(name) if path.is_file())
+    command = ["cc", "-std=c99", "-D_DEFAULT_SOURCE", "-o", str(folder / "host"), str(MASTERS / "host.c"), "-ldl"]
+    subprocess.run(command, check=True, timeout=120)
+    names = [f"{part}::{variable}" for part, variable in signals]
+    done = subprocess.run(
+        [str(folder / "host"), master, str(library), str(archive), "0.02", str(rows), *names], capture_output=True,
+        timeout=120, check=False, cwd=folder,
+    )  # fmt: skip
+    assert done.returncode == 0, (done.returncode, done.stderr[-2000:])
+    values = np.frombuffer(done.stdout[-rows * len(names) * 8 :], dtype=float)  # masters may talk on stdout before
+    return values.reshape(rows, len(names))

@@ -6,8 +6,8 @@ import os
 import re
 import shlex
 import shutil
-import struct
 import subprocess
+import sys
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -17,11 +17,12 @@ import fmpy
 import numpy as np
 import pytest
 
+from softneck.core import SettingsError
 from softneck.fmu._pack import deflated, write_zip
 from softneck.fmu.native import build_compiled_fmu
 from softneck.fmu.native._chunks import only_kinds
 from softneck.fmu.native._library import packaged_library
-from softneck.fmu.native._sources import FLAGS, c_sources
+from softneck.fmu.native._sources import FLAGS, c_sources, sources_key
 
 from .every_kind import NATIVE, TS, block_of, inputs_of
 
@@ -40,6 +41,39 @@ def test_five_platforms_weigh_less_than_400_kilobytes(kind: str, tmp_path: Path)
         assert len([name for name in archive.namelist() if name.startswith("binaries/")]) == 5
         assert archive.testzip() is None
     assert (tmp_path / "Model.fmu").stat().st_size - data < MOST_BYTES
+
+
+def test_what_is_large_is_stored_at_once(tmp_path: Path) -> None:
+    members = {"resources/model.bin": bytes(1 << 24) + b"1", "small": bytes(1 << 20)}
+    write_zip(tmp_path / "large.zip", members)
+    with zipfile.ZipFile(tmp_path / "large.zip") as archive:
+        assert archive.testzip() is None
+        assert {name: archive.read(name) for name in archive.namelist()} == members
+        stored = {entry.filename: entry.compress_type == zipfile.ZIP_STORED for entry in archive.infolist()}
+    assert stored == {"resources/model.bin": True, "small": False}
+
+
+def test_what_is_too_large_for_a_zip_file_of_32_bits_is_refused(tmp_path: Path) -> None:
+    class Huge(bytes):
+        def __len__(self) -> int:
+            return 1 << 32
+
+    with pytest.raises(SettingsError, match="more than 4 GB"):
+        write_zip(tmp_path / "huge.zip", {"resources/model.bin": Huge()})
+
+
+def test_a_wheel_knows_its_libraries_in_its_own_folders(tmp_path: Path) -> None:
+    """The key of a checkout, whose packages lie in five folders, is that of a wheel, where they lie in one."""
+    root = Path(__file__).parents[2]
+    for source in ("kit", "identification", "fmu_src", "design", "deploy"):
+        ignored = shutil.ignore_patterns("__pycache__", "binaries")
+        shutil.copytree(root / source / "softneck", tmp_path / "softneck", ignore=ignored, dirs_exist_ok=True)
+    script = "import softneck.fmu.native._sources as s; print(s.HERE, s.sources_key())"
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=os.environ | {"PYTHONPATH": str(tmp_path)}, cwd=tmp_path,
+        capture_output=True, text=True, check=True, timeout=120,
+    )  # fmt: skip
+    assert done.stdout.split() == [str(tmp_path / "softneck" / "fmu" / "native"), sources_key()]
 
 
 def test_a_stream_deflated_before_gives_the_same_file(tmp_path: Path) -> None:
@@ -120,43 +154,3 @@ def test_fmi3_has_the_variables_of_fmi2(tmp_path: Path) -> None:
             variables = fmpy.read_model_description(str(tmp_path / "Model.fmu")).modelVariables
             facts.append([(v.name, v.valueReference, v.causality, v.unit) for v in variables if v.name != "time"])
         assert facts[0] == facts[1], kind
-
-
-# Mach-O: LC_SEGMENT_64, LC_LOAD_DYLIB, LC_CODE_SIGNATURE, LC_SYMTAB (mach-o/loader.h).
-_DYLIB, _SIGNATURE, _SYMTAB = 0xC, 0x1D, 0x2
-_DIRECTORY, _ADHOC = 0xFADE0C02, 0x2
-
-
-@needs_all
-@pytest.mark.parametrize("name", ["x86_64-darwin", "aarch64-darwin"])
-def test_a_library_for_macos_can_be_loaded_there(name: str) -> None:
-    """Never run on a Mac here: signed ad hoc (arm64 loads nothing unsigned), libSystem alone, all symbols of FMI."""
-    assert library is not None
-    data = library.binaries[name]
-    magic, _, _, kind, count, _ = struct.unpack_from("<6I", data)
-    assert (magic, kind) == (0xFEEDFACF, 6)  # 64 bits, a dylib
-    commands, at = [], 32
-    for _ in range(count):
-        command, size = struct.unpack_from("<2I", data, at)
-        commands.append((command & 0x7FFFFFFF, data[at : at + size]))
-        at += size
-    loaded = [text[24:].split(b"\0")[0] for command, text in commands if command == _DYLIB]
-    assert loaded == [b"/usr/lib/libSystem.B.dylib"]
-    table = next(text for command, text in commands if command == _SYMTAB)
-    symbols, number, strings, _ = struct.unpack_from("<4I", table, 8)
-    outside, inside = set(), set()
-    for i in range(number):
-        place, kind, _, _, _ = struct.unpack_from("<IBBHQ", data, symbols + 16 * i)
-        text = data[strings + place :].split(b"\0", 1)[0].decode()
-        (inside if kind & 0x0E else outside).add(text)
-    assert {"_fmi2Instantiate", "_fmi2DoStep", "_fmi3InstantiateCoSimulation", "_fmi3DoStep"} <= inside
-    known = {"malloc", "calloc", "realloc", "free", "memcpy", "memmove", "memset", "memchr", "bzero", "fopen", "fclose"}
-    known |= {"fread", "snprintf", "vsnprintf", "strlen", "strcmp", "strncmp", "strtol", "fmod", "setjmp", "longjmp"}
-    known |= {"memcmp", "memset_pattern16", "memcpy_chk", "strspn", "floor", "ceil"}
-    assert {text.strip("_") for text in outside} - {"dyld_stub_binder"} <= known
-    if name == "aarch64-darwin":
-        place = next(struct.unpack_from("<I", text, 8)[0] for command, text in commands if command == _SIGNATURE)
-        blobs = struct.unpack_from(">I", data, place + 8)[0]
-        offsets = [struct.unpack_from(">2I", data, place + 12 + 8 * i)[1] for i in range(blobs)]
-        heads = [struct.unpack_from(">4I", data, place + offset) for offset in offsets]
-        assert any(head[0] == _DIRECTORY and head[3] & _ADHOC for head in heads)

@@ -10,6 +10,7 @@ from ._svg import line_chart
 
 _DURATION = 4.0
 _AT = 0.5
+_MANY = 1_000_000  # numbers
 # role -> the input that steps (the first of these that there is), by how much, and what shows the answer.
 _STEPS = {
     "plant": (("motor_setpoint_1",), 2.0, ("pitch", "roll")),
@@ -50,8 +51,9 @@ def _is_shown(name: str, shown: tuple[str, ...]) -> bool:
 
 
 def _answers(block: Block, u: Matrix) -> Matrix:
-    # Plain: the picture's bytes must not depend on who compiled what. Row 0 of a plant is its start.
-    runtime = load_runtime(block.runtime, compiled=False)
+    # Plain: the picture's bytes must not depend on who compiled what. A million points would take 20 s so, and their
+    # search gives the same bits either way. Row 0 of a plant is its start.
+    runtime = load_runtime(block.runtime, compiled=sum(array.size for array in block.arrays) > _MANY)
     parameters = np.array([port.start for port in block.parameters])
     state, y = np.zeros(runtime.state_size(block.arrays)), np.zeros((len(u) + 1, len(block.outputs)))
     with np.errstate(all="ignore"):

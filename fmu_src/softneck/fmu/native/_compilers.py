@@ -55,7 +55,9 @@ def compile_for(sources: Sources, platform: Platform) -> bytes:
     gather += ["-Wl,--hash-style=gnu"] if platform.system == "linux" else []
     # clang's -Os is two thirds of its -O2, and as fast. Code that aarch64's outliner has shortened deflates worse.
     small = ["-Os", "-fno-sanitize=undefined", "-w", "-s", "-mllvm", "-enable-machine-outliner=never"]
-    small += ["-mllvm", "-inline-threshold=0", "-mllvm", "-inlinehint-threshold=60"]
+    # Macs with Intel processors: 5 kB less; a step of predictive control or the observer takes half as long again.
+    hint = 10 if platform.name == "x86_64-darwin" else 60
+    small += ["-mllvm", "-inline-threshold=0", "-mllvm", f"-inlinehint-threshold={hint}"]
     # Nothing is thrown through C. Windows asks for the tables, and zig's own parts there need them.
     windows = ["-rtlib=none", "-DSN_OWN_PROBE"]
     small += windows if platform.system == "win32" else ["-fno-asynchronous-unwind-tables", "-fno-unwind-tables"]

@@ -15,7 +15,7 @@ class Platform:
         name: what users type, and FMI 3's name of the folder.
         fmi2: FMI 2's name of the folder; "" where that version has none.
         suffix: of the library.
-        target: zig's name; glibc 2.17 is ten years old and more.
+        target: zig's name; glibc 2.17 is of 2012, macOS 11 of 2020, the first for Apple's own processors.
         system, machines: what Python calls it.
     """
 
@@ -33,8 +33,8 @@ PLATFORMS = {
         Platform("x86_64-linux", "linux64", ".so", "x86_64-linux-gnu.2.17", "linux", ("x86_64", "amd64")),
         Platform("aarch64-linux", "", ".so", "aarch64-linux-gnu.2.17", "linux", ("aarch64", "arm64")),
         Platform("x86_64-windows", "win64", ".dll", "x86_64-windows-gnu", "win32", ("x86_64", "amd64")),
-        Platform("x86_64-darwin", "darwin64", ".dylib", "x86_64-macos", "darwin", ("x86_64", "amd64")),
-        Platform("aarch64-darwin", "", ".dylib", "aarch64-macos", "darwin", ("aarch64", "arm64")),
+        Platform("x86_64-darwin", "darwin64", ".dylib", "x86_64-macos.11.0", "darwin", ("x86_64", "amd64")),
+        Platform("aarch64-darwin", "", ".dylib", "aarch64-macos.11.0", "darwin", ("aarch64", "arm64")),
     )
 }
 

@@ -60,7 +60,9 @@ def sources_key() -> str:
     Far faster than translating: it tells whether a library that is there is still the right one.
     """
     digest = hashlib.sha256(repr((FLAGS, sorted(RANKS.items()))).encode())
-    for path in sorted({*HERE.glob("*.py"), *(HERE / "c").glob("*.[ch]"), *_runtime_files()}):
+    # By name: a wheel has the packages in other folders than a checkout.
+    files = {*HERE.glob("*.py"), *(HERE / "c").glob("*.[ch]"), *_runtime_files()}
+    for path in sorted(files, key=lambda path: path.name):
         digest.update(path.name.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:32]
 
