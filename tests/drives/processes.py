@@ -56,6 +56,7 @@ class World:
     realtime: bool = False
     drives_bus: str = ""
     forking: bool = False
+    profile: str = "ipos2015"
     changes: list[dict[str, Any]] = field(default_factory=list)
     told: list[str] = field(default_factory=list)
     children: list[Any] = field(default_factory=list)
@@ -67,7 +68,7 @@ class World:
         self.sensor = self._spawn("-m", f"{module}.inclinometer", self.drives_bus or self.bus, str(path))
         self.wait(path.exists, "the inclinometer", 60.0)
         self.drives = self._spawn("-m", module, self.drives_bus or self.bus, "--homed", "--report",
-                                  "--cycle", str(self.period),
+                                  "--cycle", str(self.period), "--profile", self.profile,
                                   "--sensor-socket", str(path), stdout=subprocess.PIPE)  # fmt: skip
         threading.Thread(target=self._read, daemon=True).start()
         self.wait(lambda: len(self.changes) >= 3, "the drives", 60.0)
@@ -367,6 +368,7 @@ def main() -> None:
     parser.add_argument("--patience", type=float, default=1.0)
     parser.add_argument("--realtime", action="store_true", help="host and drives before all ordinary processes")
     parser.add_argument("--attempts", type=int, default=1, help="where the machine was too busy for the loop")
+    parser.add_argument("--profile", default="ipos2015", help="ds402 is guarded by heartbeats, without remote frames")
     parser.add_argument("--project", type=Path, help="what write_project wrote, instead of writing it")
     parser.add_argument("--fork", action="store_true", help="import once and fork: for slow machines")
     parser.add_argument("--extra", action="append", default=[], help="further option of `softneck drives run`")
@@ -381,7 +383,9 @@ def main() -> None:
         if chosen.project:
             shutil.copytree(chosen.project, folder, dirs_exist_ok=True)
         else:
-            write_project(folder, duration=chosen.duration, period=chosen.period, guarding=chosen.guarding)
+            write_project(
+                folder, duration=chosen.duration, period=chosen.period, guarding=chosen.guarding, profile=chosen.profile
+            )
         if chosen.fork:
             imports_in(folder)
         for case in chosen.cases or CASES:
@@ -390,7 +394,7 @@ def main() -> None:
                 for attempt in range(chosen.attempts):
                     world = World(folder, chosen.bus, chosen.link, chosen.period, chosen.patience, tuple(chosen.extra))
                     world.realtime, world.drives_bus = chosen.realtime, chosen.drives_bus
-                    world.forking = chosen.fork
+                    world.forking, world.profile = chosen.fork, chosen.profile
                     found = play(case, world)
                     if not too_busy(found) or attempt == chosen.attempts - 1:
                         break

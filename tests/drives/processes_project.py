@@ -10,7 +10,7 @@ from typing import Any
 
 LOOP = (Path(__file__).parent / "processes_loop.toml").read_text()
 HANGS = (Path(__file__).parent / "hanging_observer.py").read_text()
-DRIVES = """profile = "ipos2015"
+DRIVES = """profile = "{profile}"
 bus.period_s = {period}
 ramp = {{ settle_s = 0.1, speed_rad_s = 3.0, tolerance_rad = 0.2 }}
 sensor = {{ kind = "can", node = 10 }}
@@ -18,7 +18,9 @@ guarding.time_s = {guarding}
 """ + "".join(f"[[drive]]\nnode = {node}\npeak_current_A = 10.0\n" for node in (1, 2, 3))
 
 
-def write_project(folder: Path, *, duration: float = 3.0, period: float = 0.01, guarding: float = 0.1) -> None:
+def write_project(
+    folder: Path, *, duration: float = 3.0, period: float = 0.01, guarding: float = 0.1, profile: str = "ipos2015"
+) -> None:
     """Write controller, observer, loop files and drives file; no experiment is needed: the plant is Eq. 31's."""
     import control
 
@@ -37,7 +39,9 @@ def write_project(folder: Path, *, duration: float = 3.0, period: float = 0.01, 
     ):  # fmt: skip
         (folder / f"{name}.toml").write_text(LOOP.format(duration=seconds, observer=observer), encoding="utf-8")
     (folder / "hanging_observer.py").write_text(HANGS, encoding="utf-8")
-    (folder / "drives.toml").write_text(DRIVES.format(period=period, guarding=guarding), encoding="utf-8")
+    (folder / "drives.toml").write_text(
+        DRIVES.format(profile=profile, period=period, guarding=guarding), encoding="utf-8"
+    )
 
 
 def too_busy(found: dict[str, Any]) -> bool:
