@@ -26,8 +26,10 @@ from typing import Any
 
 try:
     from .forked import Forked, imports_in
+    from .processes_project import bring_up, too_busy, write_project
 except ImportError:  # run as a script
     from forked import Forked, imports_in  # type: ignore[no-redef]
+    from processes_project import bring_up, too_busy, write_project  # type: ignore[no-redef]
 
 UDP = "udp_multicast:239.74.163.2"
 INSIDE = "SOFTNECK_OWN_NETWORK"
@@ -39,37 +41,6 @@ ARM = "SOFTNECK_ARM"
 # linux/can/error.h
 CAN_ERR_BUSOFF = 0x40
 SLEEP = 0.01
-
-LOOP = (Path(__file__).parent / "processes_loop.toml").read_text()
-HANGS = (Path(__file__).parent / "hanging_observer.py").read_text()
-DRIVES = """profile = "ipos2015"
-bus.period_s = {period}
-ramp = {{ settle_s = 0.1, speed_rad_s = 3.0, tolerance_rad = 0.2 }}
-sensor = {{ kind = "can", node = 10 }}
-guarding.time_s = {guarding}
-""" + "".join(f"[[drive]]\nnode = {node}\npeak_current_A = 10.0\n" for node in (1, 2, 3))
-
-
-def write_project(folder: Path, *, duration: float = 3.0, period: float = 0.01, guarding: float = 0.1) -> None:
-    """Write controller, observer, loop files and drives file; no experiment is needed: the plant is Eq. 31's."""
-    import control
-
-    from softneck.design import PiSettings
-    from softneck.estimation import KalmanSettings, LinearNeck
-
-    step = 0.02
-    pole = math.exp(-5.293 * step)
-    tf = control.TransferFunction([0.0913 * (1.0 - pole)], [1.0, -pole, 0.0, 0.0, 0.0, 0.0], step)
-    model = LinearNeck(pitch=tf, roll=tf)
-    PiSettings().design(model).save(folder / "pi.npz")
-    KalmanSettings(sensor="paper").design(model).save(folder / "kalman.npz")
-    for name, seconds, observer in (
-        ("loop", 60.0, 'file = "kalman.npz"'), ("short", duration, 'file = "kalman.npz"'),
-        ("hangs", 60.0, 'python = "hanging_observer:make"'),
-    ):  # fmt: skip
-        (folder / f"{name}.toml").write_text(LOOP.format(duration=seconds, observer=observer), encoding="utf-8")
-    (folder / "hanging_observer.py").write_text(HANGS, encoding="utf-8")
-    (folder / "drives.toml").write_text(DRIVES.format(period=period, guarding=guarding), encoding="utf-8")
 
 
 @dataclass
@@ -85,6 +56,7 @@ class World:
     realtime: bool = False
     drives_bus: str = ""
     forking: bool = False
+    profile: str = "ipos2015"
     changes: list[dict[str, Any]] = field(default_factory=list)
     told: list[str] = field(default_factory=list)
     children: list[Any] = field(default_factory=list)
@@ -96,7 +68,7 @@ class World:
         self.sensor = self._spawn("-m", f"{module}.inclinometer", self.drives_bus or self.bus, str(path))
         self.wait(path.exists, "the inclinometer", 60.0)
         self.drives = self._spawn("-m", module, self.drives_bus or self.bus, "--homed", "--report",
-                                  "--cycle", str(self.period),
+                                  "--cycle", str(self.period), "--profile", self.profile,
                                   "--sensor-socket", str(path), stdout=subprocess.PIPE)  # fmt: skip
         threading.Thread(target=self._read, daemon=True).start()
         self.wait(lambda: len(self.changes) >= 3, "the drives", 60.0)
@@ -384,20 +356,6 @@ def play(name: str, world: World) -> dict[str, Any]:
     return {"case": name, "exact": exact, **found}
 
 
-def too_busy(found: dict[str, Any]) -> bool:
-    """Whether the machine could not run the loop: the host said that it stood still, though nobody stopped it."""
-    stalled = found.get("event") == "stalled" and found["case"] != "paused"
-    return not found["exact"] and (stalled or "stood still" in json.dumps(found))
-
-
-def bring_up(link: str) -> None:
-    """Set a link up; multicast over the loopback needs a route."""
-    subprocess.run(["ip", "link", "set", link, "up"], check=True)
-    if link == "lo":
-        subprocess.run(["ip", "link", "set", "lo", "multicast", "on"], check=True)
-        subprocess.run(["ip", "route", "add", "224.0.0.0/4", "dev", "lo"], check=True)
-
-
 def main() -> None:
     """Play the cases, each `--repeat` times."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -412,6 +370,7 @@ def main() -> None:
     parser.add_argument("--patience", type=float, default=1.0)
     parser.add_argument("--realtime", action="store_true", help="host and drives before all ordinary processes")
     parser.add_argument("--attempts", type=int, default=1, help="where the machine was too busy for the loop")
+    parser.add_argument("--profile", default="ipos2015", help="ds402 is guarded by heartbeats, without remote frames")
     parser.add_argument("--project", type=Path, help="what write_project wrote, instead of writing it")
     parser.add_argument("--fork", action="store_true", help="import once and fork: for slow machines")
     parser.add_argument("--extra", action="append", default=[], help="further option of `softneck drives run`")
@@ -426,7 +385,9 @@ def main() -> None:
         if chosen.project:
             shutil.copytree(chosen.project, folder, dirs_exist_ok=True)
         else:
-            write_project(folder, duration=chosen.duration, period=chosen.period, guarding=chosen.guarding)
+            write_project(
+                folder, duration=chosen.duration, period=chosen.period, guarding=chosen.guarding, profile=chosen.profile
+            )
         if chosen.fork:
             imports_in(folder)
         for case in chosen.cases or CASES:
@@ -435,7 +396,7 @@ def main() -> None:
                 for attempt in range(chosen.attempts):
                     world = World(folder, chosen.bus, chosen.link, chosen.period, chosen.patience, tuple(chosen.extra))
                     world.realtime, world.drives_bus = chosen.realtime, chosen.drives_bus
-                    world.forking = chosen.fork
+                    world.forking, world.profile = chosen.fork, chosen.profile
                     found = play(case, world)
                     if not too_busy(found) or attempt == chosen.attempts - 1:
                         break

@@ -50,7 +50,7 @@ $b mount -t tmpfs none /host/run
 $b mkdir -p /host/run/softneck
 $b cp /files/* /host/run/softneck
 echo {begin}
-exec $b switch_root /host {start}
+exec $b switch_root /host /bin/bash /run/softneck/start.sh
 """
 # Process 1 of a guest without systemd.
 START = """/bin/bash /run/softneck/guest.sh 2>&1
@@ -64,16 +64,14 @@ class Guest:
     """What a guest runs.
 
     Attributes:
-        files: texts put into its /run/softneck; `guest.sh` is its first process, unless there is an `init`.
+        files: texts put into its /run/softneck; `start.sh` becomes process 1, by default it runs `guest.sh` and ends.
         packages: Debian packages unpacked over the host's files.
-        init: path of the first process, "" for `guest.sh`.
         options: further words of the kernel's command line.
         seconds: when it is given up [s].
     """
 
     files: dict[str, str]
     packages: tuple[str, ...] = ()
-    init: str = ""
     options: str = ""
     seconds: float = 1800.0
 
@@ -151,10 +149,9 @@ def initramfs(folder: Path, guest: Guest) -> tuple[Path, Path]:
             if line.startswith("insmod ") and path.name not in names:
                 names.append(path.name)
                 shutil.copy(path, tree / "modules" / path.name)
-    start = guest.init or "/bin/bash /run/softneck/start.sh"
     second = f"$b mount -t 9p -o {SHARE} layer /layer" if guest.packages else ""
     lower = "/layer:/lower" if guest.packages else "/lower"
-    given = {"share": SHARE, "second": second, "lower": lower, "begin": BEGIN, "start": start}
+    given = {"share": SHARE, "second": second, "lower": lower, "begin": BEGIN}
     text = INIT.format(modules=" ".join(names), **given)
     (tree / "init").write_text(text, encoding="utf-8")
     (tree / "init").chmod(0o755)

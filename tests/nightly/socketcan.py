@@ -27,6 +27,9 @@ CASES = {
                     "bus_off", "sensor_stopped", "drives_gone", "unarmed"),
     "can0/can1": ("undisturbed", "terminated", "unarmed", "killed", "hung", "intruder", "cable", "drives_gone"),
 }  # fmt: skip
+# QEMU's SJA1000 (hw/net/can/can_sja1000.c) stores a remote frame of length 1 with a byte that it does not
+# release again: its FIFO is out of step for good. Node guarding asks by just these; the other profile uses heartbeats.
+PROFILES = {"can0/can1": "ds402"}
 GUEST = """export PATH={path} HOME=/run/softneck PYTHONPATH={sources} OPENBLAS_NUM_THREADS=1 MPLBACKEND=Agg
 export XDG_CACHE_HOME=/run/softneck/cache NUMBA_CPU_NAME=generic NUMBA_CPU_FEATURES= TMPDIR=/run/softneck
 # Compiled functions are good for a source of exactly this time stamp.
@@ -40,20 +43,23 @@ ip -brief link show type vcan; ip -details link show type can | grep -E '^[0-9]|
 play() {{
     echo "== $1"
     {python} {script} --bus socketcan:${{1%%/*}} --drives-bus socketcan:${{1##*/}} --link ${{1%%/*}} \\
-        --project {project} --fork --attempts=2 --realtime {relaxed} "${{@:2}}"
+        --profile $2 --project {project}/$2 --fork --attempts=2 --realtime {relaxed} "${{@:3}}"
 }}
 {plays}
 """
 
 
 def prepare(folder: Path, period: float) -> None:
-    """Write the cases' project, and compile for any processor: the guest would need minutes."""
-    project, cache = folder / "project", BUILD / "cache"
+    """Write the cases' project for each profile, and compile for any processor: the guest would need minutes."""
+    cache = BUILD / "cache"
     environment = {**os.environ, "XDG_CACHE_HOME": str(cache), "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
     environment["PYTHONPATH"] = ":".join((*SOURCES, str(SCRIPT.parent)))
-    project.mkdir()
-    code = f"import pathlib, processes; processes.write_project(pathlib.Path({str(project)!r}), period={period})"
-    subprocess.run([sys.executable, "-c", code], env=environment, check=True)
+    for profile in ("ipos2015", "ds402"):
+        project = folder / profile
+        project.mkdir()
+        code = f"import pathlib, processes_project as p; p.write_project(pathlib.Path({str(project)!r}), "
+        code += f"period={period}, profile={profile!r})"
+        subprocess.run([sys.executable, "-c", code], env=environment, check=True)
     if not list(cache.rglob("*.nbi")):
         warm = [sys.executable, str(SCRIPT), "undisturbed", "--duration", "1", "--patience", "10"]
         subprocess.run(warm, env=environment, check=True, stdout=subprocess.DEVNULL)
@@ -98,9 +104,12 @@ def main() -> None:
     with tempfile.TemporaryDirectory(dir=BUILD) as name:
         folder = Path(name)
         prepare(folder, period)
-        plays = "\n".join(f"play {bus} --repeat {chosen.repeat} {' '.join(names)}" for bus, names in cases.items())
+        plays = "\n".join(
+            f"play {bus} {PROFILES.get(bus, 'ipos2015')} --repeat {chosen.repeat} {' '.join(names)}"
+            for bus, names in cases.items()
+        )
         script = GUEST.format(
-            path=os.environ["PATH"], sources=":".join(SOURCES), cache=BUILD / "cache", project=folder / "project",
+            path=os.environ["PATH"], sources=":".join(SOURCES), cache=BUILD / "cache", project=folder,
             python=sys.executable, script=SCRIPT, relaxed=relaxed, plays=plays,
         )  # fmt: skip
         print(f"cycle {1e3 * period:g} ms{'' if kvm else ', patience 10: an emulated machine'}", flush=True)

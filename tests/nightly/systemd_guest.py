@@ -25,7 +25,17 @@ class Bench:
         """Start the drives; `patience` stretches all waiting [-]."""
         self.patience, self.failed = patience, 0
         self.changes: list[dict] = []
-        words = ["-m", "softneck.drives.simulated", "socketcan:can1", "--homed", "--report", "--cycle", period]
+        words = [
+            "-m",
+            "softneck.drives.simulated",
+            "socketcan:can1",
+            "--homed",
+            "--profile",
+            "ds402",
+            "--report",
+            "--cycle",
+            period,
+        ]
         # They stand for hardware, which no other process holds up.
         self.drives = subprocess.Popen(
             ["chrt", "-f", "41", sys.executable, *words], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL

@@ -91,7 +91,7 @@ TimeoutStopSec=5
 def certified(folder: Path, period: float) -> Path:
     """Return a project whose controller is certified for exactly its loop, and whose observer hangs on demand."""
     prepare(folder, period)
-    project = folder / "project"
+    project = folder / "ds402"
     (project / "hanging_observer.py").write_text(OBSERVER, encoding="utf-8")
     (project / "hangs.toml").replace(project / "loop.toml")
     code = "from softneck.cli import main; main()"
