@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test slow check docs benchmark native wheel nightly nightly-fmu nightly-can clean
+.PHONY: demo test slow check docs benchmark native wheel nightly nightly-fmu nightly-can nightly-systemd clean
 
 demo: $(VENV)/.installed
 	$(BIN)/softneck demo --out build/demo
@@ -32,7 +32,7 @@ benchmark: $(VENV)/.tested
 native: $(VENV)/.crossed
 	$(BIN)/python -m softneck.fmu.native
 
-nightly: nightly-fmu
+nightly: nightly-fmu nightly-can nightly-systemd
 
 # The library on other platforms, bit for bit; wrong bytes under the sanitizers; libFuzzer for two minutes.
 # Debian: wine64 qemu-user libc6-arm64-cross gcc clang.
@@ -43,16 +43,12 @@ nightly-fmu: $(VENV)/.tested native
 
 # In QEMU, with Debian's kernel: the drives over real SocketCAN, and the service under a real systemd.
 # Debian: qemu-system-x86 busybox-static kmod cpio iproute2. Minutes with KVM; an hour or two without.
-nightly: nightly-can nightly-systemd
-
 nightly-can: $(VENV)/.tested
 	$(BIN)/python tests/nightly/socketcan.py
 
-.PHONY: nightly-systemd
 nightly-systemd: $(VENV)/.tested
 	$(BIN)/python tests/nightly/systemd_unit.py
 
-# Exporting from this wheel needs no compiler.
 # Exporting from this wheel needs no compiler; the last line shows it.
 wheel: native
 	rm -rf build/dist
