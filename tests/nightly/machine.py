@@ -30,6 +30,7 @@ SOURCES = tuple(str(ROOT / part) for part in ("kit", "identification", "fmu_src"
 MODULES = ("virtio_pci", "9pnet_virtio", "9p", "overlay", "can", "can_raw", "can_dev", "vcan", "sja1000", "kvaser_pci")
 TOOLS = ("qemu-system-x86_64", "busybox", "modprobe", "cpio", "ip", "apt-get", "dpkg-deb")
 SHARE = "trans=virtio,version=9p2000.L,msize=512000,cache=loose,ro"
+COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
 BEGIN, END = "GUEST-BEGIN", "GUEST-END"
 
 INIT = """#!/bin/busybox sh
@@ -199,7 +200,7 @@ def _watched(command: list[str], seconds: float) -> list[str]:
 
         def read() -> None:
             for line in machine.stdout or ():
-                arrived.put(line.rstrip())
+                arrived.put(COLOUR.sub("", line.rstrip()))
             arrived.put(None)
 
         threading.Thread(target=read, daemon=True).start()
