@@ -55,8 +55,8 @@ def machine(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     if platform.name == "x86_64-windows":
         # The first start makes a configuration and leaves services behind; a pipe that they inherit would never end.
         command = [*_runner(platform.name), "cmd", "/c", "exit"]
-        quiet = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        subprocess.run(command, env=_wine(folder), check=False, timeout=300, **quiet)
+        null = subprocess.DEVNULL
+        subprocess.run(command, env=_wine(folder), check=False, timeout=300, stdin=null, stdout=null, stderr=null)
     return request.param, folder
 
 
