@@ -302,16 +302,9 @@ def terminated(world: World) -> dict[str, Any]:
     since = time.monotonic()
     world.host.terminate()
     code, result, _ = world.ended()
-    told = {"ready": "READY=1" in world.told, "fed": "WATCHDOG=1" in world.told}
-    stopping = world.told[-1:] == ["STOPPING=1"]
-    return {
-        "reaction_s": None,
-        "exit": code,
-        "phase": result["phase"],
-        **told,
-        "stopping": stopping,
-        **rest(world, since),
-    }
+    told = {what: f"{word}=1" in world.told for what, word in (("ready", "READY"), ("fed", "WATCHDOG"))}
+    told["stopping"] = world.told[-1:] == ["STOPPING=1"]
+    return {"reaction_s": None, "exit": code, "phase": result["phase"], **told, **rest(world, since)}
 
 
 def undisturbed(world: World) -> dict[str, Any]:
@@ -357,7 +350,7 @@ def play(name: str, world: World) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Play the cases, each `--repeat` times."""
+    """Play the cases, all of them `--repeat` times."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("cases", nargs="*", metavar="CASE", help=f"of {', '.join(SOCKETCAN_CASES)}")
     parser.add_argument("--repeat", type=int, default=1)
@@ -390,8 +383,8 @@ def main() -> None:
             )
         if chosen.fork:
             imports_in(folder)
-        for case in chosen.cases or CASES:
-            for _ in range(chosen.repeat):
+        for _ in range(chosen.repeat):
+            for case in chosen.cases or CASES:
                 found: dict[str, Any] = {}
                 for attempt in range(chosen.attempts):
                     world = World(folder, chosen.bus, chosen.link, chosen.period, chosen.patience, tuple(chosen.extra))
