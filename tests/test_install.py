@@ -1,0 +1,47 @@
+"""Installing softneck compiles nothing: no program is started, and a wheel is for every platform."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+# What pip calls, with every way to start a program refused (PEP 578's events).
+CALL = """
+import sys
+
+def refuse(event, arguments):
+    if event in {"subprocess.Popen", "os.exec", "os.fork", "os.forkpty", "os.posix_spawn", "os.spawn", "os.system"}:
+        sys.exit(f"installing starts a program: {event} {arguments}")
+
+sys.addaudithook(refuse)
+from hatchling import build
+print(getattr(build, sys.argv[1])(sys.argv[2]))
+"""
+
+
+@pytest.mark.parametrize("hook", ["build_wheel", "build_editable"])
+def test_installing_starts_no_program(hook: str, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", CALL, hook, str(tmp_path)],
+        cwd=ROOT, env={"PATH": ""}, capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    assert wheel.name.endswith("-py3-none-any.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+    # Libraries for FMUs are data, made by `make native` before; nothing is a module in machine code.
+    assert not [name for name in names if name.endswith((".so", ".pyd", ".dll", ".dylib"))]
+    assert any(name.endswith("softneck.c") for name in names) == (hook == "build_wheel")
+
+
+def test_a_program_that_is_started_would_be_seen(tmp_path: Path) -> None:
+    code = CALL.partition("from hatchling")[0] + "import subprocess; subprocess.run(['true'])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 1
+    assert "installing starts a program" in done.stderr
