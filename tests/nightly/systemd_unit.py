@@ -77,7 +77,7 @@ SERVICE = """[Unit]
 After=basic.target systemd-udev-trigger.service
 [Service]
 Type=exec
-Environment=PYTHONPATH={pythonpath} OPENBLAS_NUM_THREADS=1 MPLBACKEND=Agg XDG_CACHE_HOME=/run/softneck/cache
+Environment=PYTHONPATH={pythonpath} OPENBLAS_NUM_THREADS=1 MPLBACKEND=Agg XDG_CACHE_HOME=/var/cache/softneck
 Environment=NUMBA_CPU_NAME=generic NUMBA_CPU_FEATURES= PATH=/usr/sbin:/usr/bin:/sbin:/bin
 ExecStart={python} /run/softneck/guest.py {period} {patience} {parts}
 ExecStopPost=/bin/sh -c 'echo {end} $EXIT_STATUS; sync; exec /bin/busybox poweroff -f'
