@@ -107,6 +107,8 @@ def drop_in(python: Path, *, kvm: bool) -> str:
     lines = [] if kvm else ["TimeoutStartSec=1200", "TimeoutStopSec=600"]
     if python.parts[1] in ("root", "home"):
         lines.append("ProtectHome=read-only")
+    # systemd forgets how a unit ended that nothing refers to any more.
+    lines.append("ExecStopPost=/bin/sh -c 'echo $$SERVICE_RESULT $$EXIT_CODE $$EXIT_STATUS > /opt/neck/ended'")
     return "\n".join(["[Service]", *lines, ""])
 
 
@@ -141,7 +143,7 @@ def main() -> None:
                 **given, period=period, patience=patience, parts=" ".join(chosen.parts), end=END
             ),
         }
-        print(f"changed for this guest: {changed.split()[1:] or 'nothing'}", flush=True)
+        print(f"changed for this guest: {changed.splitlines()[1:]}", flush=True)
         lines = boot(Guest(files=files, packages=PACKAGES, options="fstab=no", seconds=chosen.seconds), kvm=kvm)
     held = [line for line in lines if line.startswith(("yes ", "NO "))]
     good = sum(line.startswith("yes ") for line in held)
