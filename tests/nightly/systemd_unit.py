@@ -77,7 +77,7 @@ SERVICE = """[Unit]
 After=basic.target systemd-udev-trigger.service
 [Service]
 Type=exec
-Environment=PYTHONPATH={pythonpath} OPENBLAS_NUM_THREADS=1 MPLBACKEND=Agg XDG_CACHE_HOME=/run/softneck/cache
+Environment=PYTHONPATH={pythonpath} OPENBLAS_NUM_THREADS=1 MPLBACKEND=Agg XDG_CACHE_HOME=/var/cache/softneck
 Environment=NUMBA_CPU_NAME=generic NUMBA_CPU_FEATURES= PATH=/usr/sbin:/usr/bin:/sbin:/bin
 ExecStart={python} /run/softneck/guest.py {period} {patience} {parts}
 ExecStopPost=/bin/sh -c 'echo {end} $EXIT_STATUS; sync; exec /bin/busybox poweroff -f'
@@ -107,6 +107,8 @@ def drop_in(python: Path, *, kvm: bool) -> str:
     lines = [] if kvm else ["TimeoutStartSec=1200", "TimeoutStopSec=600"]
     if python.parts[1] in ("root", "home"):
         lines.append("ProtectHome=read-only")
+    # systemd forgets how a unit ended that nothing refers to any more.
+    lines.append("ExecStopPost=/bin/sh -c 'echo $$SERVICE_RESULT $$EXIT_CODE $$EXIT_STATUS > /opt/neck/ended'")
     return "\n".join(["[Service]", *lines, ""])
 
 
@@ -141,7 +143,7 @@ def main() -> None:
                 **given, period=period, patience=patience, parts=" ".join(chosen.parts), end=END
             ),
         }
-        print(f"changed for this guest: {changed.split()[1:] or 'nothing'}", flush=True)
+        print(f"changed for this guest: {changed.splitlines()[1:]}", flush=True)
         lines = boot(Guest(files=files, packages=PACKAGES, options="fstab=no", seconds=chosen.seconds), kvm=kvm)
     held = [line for line in lines if line.startswith(("yes ", "NO "))]
     good = sum(line.startswith("yes ") for line in held)

@@ -117,7 +117,7 @@ def _packed(data: bytes) -> bytes:
     """Return a deflate stream: zopfli needs a second for a library and saves 4 % of every FMU that is ever made."""
     if find_spec("zopfli") is None:
         return deflated(data)
-    from zopfli import zlib as zopfli
+    from zopfli import zlib as zopfli  # pyright: ignore[reportMissingImports]  (of the group native alone)
 
     return zopfli.compress(data)[2:-4]  # without zlib's head and checksum
 
