@@ -92,7 +92,6 @@ class World:
         code = "from softneck.cli import main; main()"
         files = {"--loop": f"{loop}.toml", "--drives": "drives.toml", "-o": f"run_{time.monotonic_ns()}.csv"}
         words = ["drives", "run", str(self.folder / "pi.npz"), "--bus", self.bus, "--json", *(["--arm"] if arm else [])]
-        words += ["--override", "certificate", *self.extra, *(["--realtime"] if self.realtime else [])]
         # On SocketCAN a run is logged unasked, into the folder of whoever plays this.
         words += [] if "--log" in self.extra else ["--no-log"]
         words += ["--override", "certificate", *self.extra, *(["--realtime"] if self.realtime and realtime else [])]
@@ -385,17 +384,16 @@ def main() -> None:
             )
         if chosen.fork:
             imports_in(folder)
-        for _ in range(chosen.repeat):
-            for case in chosen.cases or CASES:
-                found: dict[str, Any] = {}
-                for attempt in range(chosen.attempts):
-                    world = World(folder, chosen.bus, chosen.link, chosen.period, chosen.patience, tuple(chosen.extra))
-                    world.realtime, world.drives_bus = chosen.realtime, chosen.drives_bus
-                    world.forking, world.profile = chosen.fork, chosen.profile
-                    found = play(case, world)
-                    if not too_busy(found) or attempt == chosen.attempts - 1:
-                        break
-                print(json.dumps(found), flush=True)
+        for case in [*(chosen.cases or CASES)] * chosen.repeat:
+            found: dict[str, Any] = {}
+            for attempt in range(chosen.attempts):
+                world = World(folder, chosen.bus, chosen.link, chosen.period, chosen.patience, tuple(chosen.extra))
+                world.realtime, world.drives_bus = chosen.realtime, chosen.drives_bus
+                world.forking, world.profile = chosen.fork, chosen.profile
+                found = play(case, world)
+                if not too_busy(found) or attempt == chosen.attempts - 1:
+                    break
+            print(json.dumps(found), flush=True)
 
 
 if __name__ == "__main__":
