@@ -38,7 +38,7 @@ nightly: $(VENV)/.tested native
 	SOFTNECK_FUZZ_ROUNDS=3000 $(BIN)/python -m pytest -q -n 0 tests/fmu/test_native_errors.py -k sanitizers
 
 # In QEMU, with Debian's kernel: the drives over real SocketCAN, and the service under a real systemd.
-# Debian: qemu-system-x86 busybox-static kmod cpio iproute2. Minutes with KVM; an hour or two without.
+# Debian: qemu-system-x86 busybox-static kmod cpio iproute2. Without KVM 20 to 40 minutes each.
 nightly: nightly-can nightly-systemd
 
 nightly-can: $(VENV)/.tested
