@@ -42,10 +42,7 @@ nightly-fmu: $(VENV)/.tested native
 	SOFTNECK_FUZZ_SECONDS=120 $(BIN)/python -m pytest -q -n 0 -s tests/fmu/test_native_fuzzer.py
 
 # In QEMU, with Debian's kernel: the drives over real SocketCAN, and the service under a real systemd.
-# Debian: qemu-system-x86 busybox-static kmod cpio iproute2. Minutes with KVM; an hour or two without.
 # Debian: qemu-system-x86 busybox-static kmod cpio iproute2. Without KVM 20 to 40 minutes each.
-nightly: nightly-can nightly-systemd
-
 nightly-can: $(VENV)/.tested
 	$(BIN)/python tests/nightly/socketcan.py
 
