@@ -5,7 +5,6 @@ Little-endian as all five platforms are. Head (32 bytes): magic, format, byte-or
 
 from __future__ import annotations
 
-import re
 import struct
 import zlib
 from dataclasses import dataclass
@@ -94,12 +93,6 @@ def model_bytes(block: Block, name: str, guid: str) -> bytes:
     body = b"".join(writer.parts)
     head = _MAGIC + struct.pack("<IIQII", FORMAT, _MARK, _HEAD + len(body), zlib.crc32(body), 0)
     return head + body
-
-
-def model_guid(data: bytes) -> str:
-    """Return the GUID in the bytes of a model file that we have just written; for tests and `softneck info`."""
-    found = re.search(rb"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}", data[:4096])
-    return found[0].decode() if found else ""
 
 
 class _Writer:
