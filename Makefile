@@ -28,9 +28,9 @@ docs: $(VENV)/.documented
 benchmark: $(VENV)/.tested
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-only
 
-# The library of compiled FMUs for all five platforms, cross-compiled by zig into fmu_src/softneck/fmu/native/binaries.
+# The library of compiled FMUs for all five platforms, cross-compiled by zig into softneck/fmu/compiled/binaries.
 native: $(VENV)/.crossed
-	$(BIN)/python -m softneck.fmu.native
+	$(BIN)/python -m softneck.fmu.compiled
 
 nightly: nightly-fmu nightly-can nightly-systemd
 

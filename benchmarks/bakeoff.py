@@ -15,19 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import SoftneckError, load
-from softneck.design import (
-    BakeOffResult,
-    FopiSettings,
-    HinfSettings,
-    LqgSettings,
-    NcfSettings,
-    PidSettings,
-    PiSettings,
-    bake_off_neck,
-    bake_off_samples,
-    block_stepper,
-    run_bake_off,
-)
+from softneck.design import FopiSettings, HinfSettings, LqgSettings, NcfSettings, PidSettings, PiSettings
+from softneck.design.plants._step_and_load import StepAndLoadResult
+from tests.oracles.bake_off import bake_off_neck, bake_off_samples, block_stepper, run_bake_off
 
 # What issue 11 asks of one controller: worst overshoot [%], nominal settling [s], worst rms under the load [deg].
 WANTED = (5.0, 0.95, 0.55)
@@ -69,7 +59,7 @@ def main(words: list[str]) -> None:
         line("pi, nominal plant", judged(Path(folder) / "nominal.npz"), "")
 
 
-def designed(settings: Any, path: Path) -> tuple[BakeOffResult, str]:
+def designed(settings: Any, path: Path) -> tuple[StepAndLoadResult, str]:
     """Return what the controller does that was saved to `path`, and a note."""
     began = time.process_time()
     controller = settings.design(bake_off_samples())
@@ -80,7 +70,7 @@ def designed(settings: Any, path: Path) -> tuple[BakeOffResult, str]:
     return judged(path), f"{seconds:6.2f} s   {nominal:.2f} / {worst:.2f}"
 
 
-def judged(path: str | Path) -> BakeOffResult:
+def judged(path: str | Path) -> StepAndLoadResult:
     """Return what the controller in a file does."""
     return run_bake_off(block_stepper(load(path, role="controller").block()))
 
@@ -116,7 +106,7 @@ def heading() -> None:
     print(f"{columns}  all three   processor   Ms nominal / worst")
 
 
-def line(name: str, result: BakeOffResult, note: str) -> None:
+def line(name: str, result: StepAndLoadResult, note: str) -> None:
     """Print one row."""
     settling, overshoot, rms = result.row.values()
     holds = overshoot <= WANTED[0] and settling <= WANTED[1] and rms <= WANTED[2]

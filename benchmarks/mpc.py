@@ -16,11 +16,13 @@ import daqp
 import numpy as np
 from scipy import sparse
 
-from softneck.core import load, load_functions, load_runtime
-from softneck.design import MpcController, MpcSettings, NmpcSettings, bake_off_neck
+from softneck.core import load
+from softneck.design import MpcController, MpcSettings, NmpcSettings
 from softneck.identification import Network
 from softneck.plant import NeckParameters, VirtualNeck, record
+from softneck.runtime import load_functions, load_runtime
 from softneck.signals import signal
+from tests.oracles.bake_off import bake_off_neck
 
 _POLE = math.exp(-5.293 * 0.02)
 _GAIN = math.radians(27.691) / 5.293
@@ -107,7 +109,7 @@ def cold(c: MpcController, theta: np.ndarray, low: np.ndarray, high: np.ndarray)
 
 def own(c: MpcController) -> Callable[..., np.ndarray]:
     """Return the block's solver, warm."""
-    a, f = c.arrays, load_functions("softneck.design.mpc._dual_runtime")
+    a, f = c.arrays, load_functions("softneck.design.predictive._dual_runtime")
     sign, lam = np.zeros(len(a[14])), np.zeros(len(a[14]))
 
     def solve(theta: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -218,7 +220,7 @@ def do_mpc_times(samples: int) -> list[float]:
 
 def optimality(c: MpcController, states: int) -> None:
     """Check answers at random states, limits anywhere, against daqp from scratch at 1e-12."""
-    a, f = c.arrays, load_functions("softneck.design.mpc._mpc_runtime")
+    a, f = c.arrays, load_functions("softneck.design.predictive._mpc_runtime")
     solve, parameters, rng = own(c), c.initial_state().parameters, np.random.default_rng(1)
     worst, worst_cost, active = 0.0, 0.0, []
     for _ in range(states):

@@ -30,11 +30,13 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from softneck.core import Matrix, Vector
-from softneck.design import MpcSettings, NeckSteps, NmpcSettings, PiSettings
+from softneck.design import MpcSettings, NmpcSettings, PiSettings
 from softneck.identification import Network
-from softneck.loop import AheadReference, BlockPart, Loop, LoopResult, RecordingReference, run_loop
+from softneck.loop import BlockPart, Loop, LoopResult, RecordingReference, run_loop
+from softneck.loop._preview import AheadReference
 from softneck.plant import VirtualNeck, record
 from softneck.signals import TENDON_ANGLES, redefinition_matrix, signal
+from tests.oracles.neck_table import NeckSteps
 
 TS = 0.02
 LIMIT = math.radians(15.0)

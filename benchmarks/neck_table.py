@@ -15,12 +15,13 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import cache, partial
 from typing import Any
 
-from softneck.core import KINDS, SoftneckError, kinds_of, resolve
-from softneck.design import FIGURES, NECK_HEAD, NeckRow, NeckSteps, neck_row, table_cells
+from softneck.core import KINDS, SoftneckError, resolve
+from softneck.core._kinds import kinds_of
 from softneck.estimation import KalmanObserver, KalmanSettings
 from softneck.identification import Family, FamilySettings, Model, Rls
 from softneck.plant import VirtualNeck, record
 from softneck.signals import Recording, signal
+from tests.oracles.neck_table import FIGURES, NECK_HEAD, NeckRow, NeckSteps, neck_row, table_cells
 
 # What a kind is designed on, where its own default is not the family over the payloads.
 ON_MODEL: set[str] = set()

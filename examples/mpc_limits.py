@@ -17,12 +17,16 @@ from pathlib import Path
 import numpy as np
 
 from softneck.core import Matrix, Vector
-from softneck.design import MpcSettings, bake_off_neck
+from softneck.design import MpcSettings
+from softneck.estimation import AxisPlant, LinearNeck
 from softneck.loop import BlockPart
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.plots import Chart, Curve, Level, Panel, chart_figure
 
 TS = 0.02
+# Eq. 31 of the paper, sampled: exp(-0.08 s) 27.691/(s + 5.293) deg/rad.
+_A = math.exp(-5.293 * TS)
+TILT = AxisPlant(np.array([math.radians(27.691) / 5.293 * (1.0 - _A)]), np.array([1.0, -_A]), 4, TS).tf()
 LIMIT = math.radians(12.0)
 SLEW = 4.0
 TAUT = -0.2
@@ -53,7 +57,7 @@ def run(rows: int = 300) -> Run:
     """Close the loop over the virtual neck, by hand: plant, then controller."""
     # Eq. 31 is what the paper identified; on our neck it is 20 % off, which the controller must find out.
     settings = MpcSettings(angle_limit=LIMIT, slew_limit=SLEW, minimum_tautness=TAUT)
-    controller = settings.design(bake_off_neck())
+    controller = settings.design(LinearNeck(pitch=TILT, roll=TILT))
     part, neck = controller.part(), BlockPart(VirtualNeck(NeckParameters.paper()).block(noise_seed=1))
     names = [port.name for port in neck.outputs]
     seen = neck.start(0.0, {})

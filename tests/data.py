@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from softneck.core import Matrix, Vector
-from softneck.signals import MOTOR_POSITIONS, SET_POINTS, Recording, signal
+from softneck.signals import SET_POINTS, Recording, signal
+from softneck.signals.recording._channels import MOTOR_POSITIONS
 
 ROOT = Path(__file__).parents[1]
 LAYOUTS = ROOT / "examples" / "layouts"

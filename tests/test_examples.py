@@ -34,7 +34,7 @@ def test_the_pictures_of_set_membership_are_those_of_the_docs(tmp_path: Path, mo
 
 @pytest.mark.slow
 def test_taut_tendons_make_every_kind_hold(capsys: pytest.CaptureFixture[str]) -> None:
-    runpy.run_path(str(ROOT / "examples" / "taut_tendons.py"), run_name="__main__")
+    runpy.run_path(str(ROOT / "benchmarks" / "taut_tendons.py"), run_name="__main__")
     before, after = capsys.readouterr().out.split("co-contraction at least")
     assert before.count("do not hold") == 3
     assert after.count("| hold") == 3

@@ -20,24 +20,15 @@ import pytest
 from fmpy.fmi2 import FMU2Slave
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from softneck.core import Block
-from softneck.design import FopiSettings, HinfSettings, MpcSettings, PiSettings, bake_off_neck
+from softneck.design import FopiSettings, HinfSettings, MpcSettings, PiSettings
 from softneck.estimation import KalmanSettings
-from softneck.fmu import build_fmu, unpacked
-from softneck.fmu.native import build_compiled_fmu
-from softneck.identification import (
-    GreyBox,
-    Network,
-    NeuralStateSpace,
-    Play,
-    Residual,
-    Rls,
-    SetMembership,
-    combine,
-)
+from softneck.fmu import build_compiled_fmu, build_fmu, unpacked
+from softneck.identification import GreyBox, Network, NeuralStateSpace, Play, Residual, Rls, SetMembership, combine
 from softneck.plant import NeckParameters, VirtualNeck, record
+from softneck.runtime import Block
 from softneck.signals import Recording, signal
 
+from ..oracles.bake_off import bake_off_neck
 from .test_fmu import _trivial
 from .test_set_membership import arrays_of, motion
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from softneck.core import load_runtime
 from softneck.estimation import KalmanObserver, KalmanSettings
+from softneck.runtime import load_runtime
 
 from ..estimation.necks import neck
 

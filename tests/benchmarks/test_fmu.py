@@ -18,12 +18,12 @@ from fmpy.fmi2 import FMU2Slave
 from pytest_benchmark.fixture import BenchmarkFixture
 from pythonfmu import FmuBuilder
 
-from softneck.core import Block
 from softneck.design import PiSettings
 from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.fmu import build_fmu, unpacked
 from softneck.identification import Network, Play, Rls, SetMembership
 from softneck.plant import NeckParameters, VirtualNeck
+from softneck.runtime import Block
 from softneck.signals import Recording, redefine, signal
 
 TS = 0.02

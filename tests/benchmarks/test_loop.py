@@ -19,10 +19,11 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from softneck.core import Port, Vector
-from softneck.cosim import FmuPart, Loop, simulate, write_ssp
+from softneck.core import Vector
+from softneck.cosim import FmuPart, simulate, write_ssp
 from softneck.fmu import unpacked
-from softneck.loop import StepReference
+from softneck.loop import Loop, StepReference
+from softneck.runtime import Port
 
 from ..cosim._foreign import NAMES, build_foreign
 

@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from softneck.core import resolve
-from softneck.core._kinds import KINDS
+from softneck.core import KINDS, resolve
 from softneck.identification import INFINITE, nrmse_fit, validate
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import Recording, signal

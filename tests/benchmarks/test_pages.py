@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from softneck.plots import Section, histogram_chart, page, recording_chart, residual_chart, validation_chart
+from softneck.plots import Section, page
+from softneck.plots._charts import recording_chart, validation_chart
+from softneck.plots._judgement_charts import histogram_chart, residual_chart
 
 from ..browser import shown
 

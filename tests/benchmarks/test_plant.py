@@ -12,8 +12,9 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 from scipy.integrate import solve_ivp
 
-from softneck.core import load_functions, load_runtime
-from softneck.plant import RUNTIME, NeckParameters, VirtualNeck, simulate_batch
+from softneck.plant import NeckParameters, VirtualNeck, simulate_batch
+from softneck.plant._neck import RUNTIME
+from softneck.runtime import load_functions, load_runtime
 from softneck.signals import signal
 
 TS = 0.02

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from softneck.signals import quality
+from softneck.signals import assess_quality
 
 from ..data import neck_recording
 
 
 def test_quality_of_30000_rows(benchmark: BenchmarkFixture) -> None:
     neck = neck_recording(30_000)
-    found = benchmark(lambda: quality(neck).as_dict())
+    found = benchmark(lambda: assess_quality(neck).as_dict())
     assert found["severity"] in ("ok", "note")

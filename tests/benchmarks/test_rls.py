@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from softneck.core import load_functions
 from softneck.identification import Recursion
+from softneck.runtime import load_functions
 
 ROWS = 2_000_000
-UD, STANDARD = "softneck.identification._ud_runtime", "softneck.identification._recursion_runtime"
+UD, STANDARD = "softneck.identification.linear._ud_runtime", "softneck.identification.linear._recursion_runtime"
 
 
 @pytest.fixture(scope="module")

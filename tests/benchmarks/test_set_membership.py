@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from softneck.core import load_functions, load_runtime
 from softneck.identification import PAPER_EQ21, Cones, ConeSet, OnlineCones, gamma_curve
-from softneck.identification._arrays import no_base
-from softneck.identification._set_ground import set_arrays
+from softneck.identification.linear._arrays import no_base
+from softneck.identification.set_membership._regressor import set_arrays
+from softneck.runtime import load_functions, load_runtime
 
-RUNTIME = "softneck.identification._nlsm_runtime"
+RUNTIME = "softneck.identification.set_membership._nlsm_runtime"
 STEPS = 2000
 # A little above the slope of the function below, as the knee of its curve has it, and 4 sigma of its noise.
 GAMMA, EPSILON, SIGMA = 0.6, 4e-3, 1e-3
@@ -159,7 +159,7 @@ def test_tree_beside_numpy(benchmark: BenchmarkFixture) -> None:
             X[3:, i] = u[4 - int(lag) : STEPS + 1 - int(lag), int(channel)]
     X[1:, 0] = outputs[:-1, 0]
     X = X[10::20]
-    functions = load_functions("softneck.identification._slant_runtime")
+    functions = load_functions("softneck.identification.set_membership._principal_tree_runtime")
     expected = [functions.slant_bounds(W, y, arrays[7][0], arrays[8][0], GAMMA, x) for x in X] + np.array(
         [-EPSILON, EPSILON]
     )
@@ -255,7 +255,7 @@ def test_gamma_curve_of_7000(benchmark: BenchmarkFixture, scaling: str) -> None:
     curve = benchmark.pedantic(gamma_curve, (points, values), rounds=3, warmup_rounds=1)
     assert curve.epsilon.size == 32
     started = time.perf_counter()
-    expected = load_functions("softneck.identification._cones_runtime", compiled=False).least_gammas(
+    expected = load_functions("softneck.identification.set_membership._cones_runtime", compiled=False).least_gammas(
         points, values, curve.epsilon[::15], np.zeros((3, 2))
     )
     benchmark.extra_info["numpy, 3 of 32 steps [s]"] = round(time.perf_counter() - started, 2)

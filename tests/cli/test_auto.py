@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from softneck.core import load
-from softneck.identification import _auto
+from softneck.identification.selection import _auto
 from softneck.signals import write_recording
 
 from ..data import neck_recording

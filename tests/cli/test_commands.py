@@ -79,7 +79,7 @@ def test_ctrl_c_during_identify_leaves_no_file(
     def interrupted(*_args: object, **_more: object) -> None:
         raise KeyboardInterrupt
 
-    for where in ("softneck.identification._rls.Rls._search", "numpy.savez_compressed"):
+    for where in ("softneck.identification.linear._rls.Rls._search", "numpy.savez_compressed"):
         with monkeypatch.context() as patch:
             patch.setattr(where, interrupted)
             said = call("identify", "rls", recording, "-o", "m.npz", "--json")

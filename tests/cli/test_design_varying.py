@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from softneck.core import load
-from softneck.fmu import build_fmu, describe
+from softneck.fmu import build_fmu, fmu_info
 from softneck.identification import Rls
 
 from ..data import neck_recording
@@ -40,7 +40,7 @@ def test_one_model_makes_an_adaptive_controller_and_its_fmu(call: Call, files: P
     assert "starts from" in said.out
     made = load(files / "a.npz")
     assert made.design["settings"]["dead_zone"] == pytest.approx(math.radians(0.05))
-    path = build_fmu(made.block(), files / "A.fmu", info=describe(made))
+    path = build_fmu(made.block(), files / "A.fmu", info=fmu_info(made))
     assert path is None or Path(files / "A.fmu").is_file()
 
 

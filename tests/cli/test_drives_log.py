@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from softneck.cli import main
-from softneck.cli._drives_log import log_folder, opened_log
-from softneck.cli._drives_target import Target
+from softneck.cli.drives._log import log_folder, opened_log
+from softneck.cli.drives._target import Target
 from softneck.core import CheckFailedError, OutputError
-from softneck.drives import default_drives, read_run_log, run_facts
+from softneck.drives import default_drives, read_run_log
+from softneck.drives.logs._run_log import run_facts
 from softneck.signals import read_recording
 
 from ..drives.conftest import Project

@@ -6,8 +6,8 @@ import json
 
 import pytest
 
-from softneck.cli._arm import require_armed, words
-from softneck.cli._drives_target import sensor_of
+from softneck.cli.drives._arm import require_armed, words
+from softneck.cli.drives._target import sensor_of
 from softneck.core import SettingsError
 from softneck.drives import load_drives
 from softneck.signals import read_recording

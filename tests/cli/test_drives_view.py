@@ -16,11 +16,14 @@ import numpy as np
 import pytest
 from rich.console import Console, RenderableType
 
-from softneck.cli._drives_picture import to_line
-from softneck.cli._drives_screen import from_line
-from softneck.cli._drives_view import LiveView, live_view
-from softneck.drives import CycleFigures, CycleTimes, DriveSnapshot, Snapshot
-from softneck.drives.master import DriveState, Event, NodeState, Phase
+from softneck.cli.drives._picture import to_line
+from softneck.cli.drives._screen import from_line
+from softneck.cli.drives._view import LiveView, live_view
+from softneck.drives.logs._times import CycleFigures, CycleTimes
+from softneck.drives.master import Event, Phase
+from softneck.drives.master._cia402 import DriveState
+from softneck.drives.master._nmt import NodeState
+from softneck.drives.running._snapshot import DriveSnapshot, Snapshot
 
 DEG = math.pi / 180.0
 
@@ -134,7 +137,7 @@ def test_a_picture_is_one_line_and_markup_in_it_is_text() -> None:
 def test_the_drawing_process_imports_nothing_of_the_drives() -> None:
     """It starts while a run begins: importing the drives costs seconds of processor time."""
     heavy = ("softneck.drives", "scipy", "control", "numba", "matplotlib", "pandas")
-    code = f"import sys, softneck.cli._drives_screen; print([name for name in {heavy} if name in sys.modules])"
+    code = f"import sys, softneck.cli.drives._screen; print([name for name in {heavy} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from softneck.core import load
-from softneck.identification import row_hashes
+from softneck.identification.models._rows import row_hashes
 from softneck.signals import read_recording, write_recording
 
 from ..data import neck_recording
@@ -55,7 +55,7 @@ def test_lists_angles_and_words_are_values_too(call: Call, recording: Path, hold
 def test_an_interrupted_search_keeps_what_it_has_and_says_130(
     call: Call, recording: Path, hold_out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from softneck.identification import _search
+    from softneck.identification.selection import _search
 
     real = _search.attempt
     done: list[int] = []

@@ -14,7 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
-from softneck.core import FORMAT_VERSION, FileFormatError, load, read_archive, write_archive
+from softneck.core import FileFormatError, load, read_archive, write_archive
+from softneck.core._archive import FORMAT_VERSION
 
 NAMES = st.text("abcdefgh_", min_size=1, max_size=8).filter(lambda name: name != "header")
 JSON = st.recursive(

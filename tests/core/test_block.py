@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softneck.core import Block, DataError, SettingsError, load_runtime
+from softneck.core import DataError, SettingsError
 from softneck.plant import NeckParameters, VirtualNeck
+from softneck.runtime import Block, load_runtime
 
 KINDS = ("rls", "mimo", "oe", "srivc", "subspace", "nlsm", "residual", "nn", "neck")
 

@@ -11,8 +11,10 @@ from threading import Barrier
 import numpy as np
 import pytest
 
-from softneck.core import KINDS, SettingsError, bundle, content_name, load_runtime, resolve
-from softneck.core import _bundle as bundle_module
+from softneck.core import KINDS, SettingsError, resolve
+from softneck.runtime import _bundle as bundle_module
+from softneck.runtime import bundle, load_runtime
+from softneck.runtime._bundle import content_name
 
 RUNTIMES = sorted({kind.runtime for kind in KINDS.values() if kind.runtime} | {"softneck.plant._neck_runtime"})
 
@@ -51,7 +53,7 @@ def test_a_foreign_import_is_refused(runtime_folder: Path, imported: str) -> Non
 
 
 def test_two_definitions_of_one_name_are_refused(runtime_folder: Path) -> None:
-    text = "from softneck.core._random_runtime import random_normal\n\n\ndef random_seed(s):\n    return 0\n" + STEP
+    text = "from softneck.runtime._random_runtime import random_normal\n\n\ndef random_seed(s):\n    return 0\n" + STEP
     (runtime_folder / "twice_a_runtime.py").write_text(text)
     with pytest.raises(SettingsError, match=r"_random_runtime and twice_a_runtime both define `random_seed`"):
         bundle("twice_a_runtime")

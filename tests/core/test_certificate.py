@@ -11,13 +11,12 @@ from softneck.core import (
     CheckFailedError,
     FileFormatError,
     OutputError,
-    certificate_contents,
-    certificate_path,
     check_certificate,
     file_hash,
     read_certificate,
     write_certificate,
 )
+from softneck.core._certificate import certificate_contents, certificate_path
 
 
 def _written(folder: Path, *, holds: bool = True, kind: str = "verify") -> tuple[Path, Path]:

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from softneck.core import load_functions
+from softneck.runtime import load_functions
 
-RUNTIME = "softneck.core._random_runtime"
+RUNTIME = "softneck.runtime._random_runtime"
 PLAIN = load_functions(RUNTIME, compiled=False)
 FAST = load_functions(RUNTIME)
 N = 20_000

@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from softneck.core import (
     DataError,
     SettingsError,
-    finite_vector,
     require_between,
     require_finite,
     require_one_of,
     require_positive,
     to_si,
 )
+from softneck.core._checks import finite_vector
 
 PAIRS = [("deg", "rad", math.pi / 180), ("deg/s", "rad/s", math.pi / 180), ("ms", "s", 1e-3), ("mm", "m", 1e-3),
          ("g", "kg", 1e-3)]  # fmt: skip

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from softneck.core import DataError, Port
+from softneck.core import DataError
+from softneck.runtime import Port
 
 SETPOINTS = tuple(Port(name=f"motor_setpoint_{j}", unit="rad") for j in (1, 2, 3))
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError, FileFormatError, SettingsError
-from softneck.cosim import FmuError, FmuPart, IsolatedPart, Loop, LoopRun, LoopState, load_loop, simulate
-from softneck.loop import BlockPart, SensorFault, StepReference
+from softneck.cosim import FmuError, FmuPart, IsolatedPart, load_loop, simulate
+from softneck.loop import BlockPart, Loop, LoopRun, LoopState, SensorFault, StepReference
 
 from ._foreign import NAMES, build_foreign
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from softneck.core import FileFormatError, SettingsError, SoftneckError, file_hash
-from softneck.cosim import FmuPart, Loop, load_loop, simulate
+from softneck.cosim import FmuPart, load_loop, simulate
 from softneck.fmu import build_fmu
-from softneck.loop import BlockPart, NeckFault, SensorFault, StepReference
+from softneck.loop import BlockPart, Loop, NeckFault, SensorFault, StepReference
 from softneck.signals import read_recording, write_recording
 
 from .conftest import LOOP

@@ -15,9 +15,11 @@ import pytest
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] - it has no stubs
 
 from softneck.core import OutputError, SettingsError
-from softneck.cosim import Loop, LoopSetup, load_loop, reference_of, simulate, write_ssp
+from softneck.cosim import load_loop, simulate, write_ssp
+from softneck.cosim.loops._loop_file import reference_of
+from softneck.cosim.loops._simulate import LoopSetup
 from softneck.fmu import build_fmu
-from softneck.loop import BlockPart, SensorFault, StepReference
+from softneck.loop import BlockPart, Loop, SensorFault, StepReference
 
 from ..importers import need
 from ._foreign import build_foreign

@@ -17,7 +17,7 @@ import pytest
 from softneck.cosim import load_loop, simulate, write_ssp
 from softneck.design import PiSettings
 from softneck.estimation import KalmanSettings
-from softneck.fmu.native import build_compiled_fmu
+from softneck.fmu import build_compiled_fmu
 from softneck.plant import NeckParameters, VirtualNeck
 
 from ..fmu.every_kind import _linear

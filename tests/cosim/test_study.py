@@ -25,12 +25,14 @@ from softneck.cosim import (
     simulate,
     study,
     worst_runs,
-    write_worst,
 )
-from softneck.cosim._loop_table import loop_table
-from softneck.cosim._store import Store
-from softneck.cosim._study_run import failed_row
-from softneck.loop import METRICS, StepReference, make_fault
+from softneck.cosim.loops._loop_table import loop_table
+from softneck.cosim.studies._store import Store
+from softneck.cosim.studies._study_results import write_worst
+from softneck.cosim.studies._study_run import failed_row
+from softneck.loop import StepReference
+from softneck.loop._faults import make_fault
+from softneck.loop._metrics import METRICS
 
 LOOP = """
 duration_s = 1.0
@@ -134,7 +136,7 @@ def test_a_loop_object_and_its_table_are_one(folder: Path, loop_file: Path) -> N
 
 
 def test_every_fault_has_keys_again() -> None:
-    from softneck.loop import fault_keys
+    from softneck.loop._faults import fault_keys
 
     push = make_fault("push", {"x_n": 2.0, "y_n": 1.0, "start_s": 1.0, "duration_s": 0.5})
     for fault in (push, make_fault("payload_step", {"payload_kg": 0.5}), make_fault("motor_stuck", {"motor": 3})):
@@ -288,7 +290,7 @@ class _Unsendable:
     role, sample_time, inputs = "controller", 0.02, ()
 
     def __init__(self) -> None:
-        from softneck.core import Port
+        from softneck.runtime import Port
 
         self.outputs = tuple(Port(name=f"motor_setpoint_{j}", unit="rad") for j in (1, 2, 3))
         self.lock = threading.Lock()

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softneck.core import SettingsError
-from softneck.cosim._vary import Points, flattened, make_vary
+from softneck.cosim.studies._vary import Points, flattened, make_vary
 
 
 def points(vary: dict[str, Any], runs: int | None = None, seed: int = 0, sampling: str = "latin_hypercube") -> Points:

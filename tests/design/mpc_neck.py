@@ -7,12 +7,11 @@ import math
 import control
 import numpy as np
 
-from softneck.core import load_runtime
-from softneck.design import (
-    MpcController,
-    bake_off_samples,
-)
+from softneck.design import MpcController
 from softneck.estimation import LinearNeck
+from softneck.runtime import load_runtime
+
+from ..oracles.bake_off import bake_off_samples
 
 TS = 0.02
 GAIN = math.radians(27.691) / 5.293

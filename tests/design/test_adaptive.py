@@ -13,14 +13,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from softneck.core import Block, SettingsError, State, load, load_runtime
+from softneck.core import SettingsError, load
 from softneck.design import AdaptiveSettings, LinearController, VaryingController
-from softneck.design._assembly import assemble
-from softneck.design._following import following_axis
-from softneck.design._tuning import Gains
+from softneck.design.linear._assembly import assemble
+from softneck.design.linear._tuning import Gains
+from softneck.design.varying._model_following import following_axis
 from softneck.estimation import AxisPlant, LinearNeck
 from softneck.identification import Recursion
 from softneck.loop import BlockPart, Loop, LoopResult, run_loop
+from softneck.runtime import Block, State, load_runtime
 from softneck.signals import redefine
 
 from .test_pi import POLE, TS, B, DelayedNeck, neck

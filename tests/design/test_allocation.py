@@ -12,13 +12,15 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from softneck.core import SettingsError, load, load_functions, read_archive, write_archive
-from softneck.design import LinearController, NeckSteps, PiSettings, neck_step
+from softneck.core import SettingsError, load, read_archive, write_archive
+from softneck.design import LinearController, PiSettings
+from softneck.runtime import load_functions
 from softneck.signals import redefinition_matrix
 
+from ..oracles.neck_table import NeckSteps, neck_step
 from .test_neck_table import neck
 
-RUNTIME = load_functions("softneck.design._allocation_runtime")
+RUNTIME = load_functions("softneck.design.linear._allocation_runtime")
 TILT = st.tuples(st.floats(-9.0, 9.0), st.floats(-9.0, 9.0))
 COMMON = st.floats(-8.0, 8.0)
 POSITION = st.floats(0.5, 6.0)

@@ -10,16 +10,11 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError, SettingsError
-from softneck.design import (
-    BakeOff,
-    PiSettings,
-    bake_off_neck,
-    bake_off_plant,
-    bake_off_plants,
-    block_stepper,
-    run_bake_off,
-)
+from softneck.design import PiSettings
+from softneck.design.plants._step_and_load import StepAndLoad
 from softneck.estimation import AxisPlant
+
+from ..oracles.bake_off import bake_off_neck, bake_off_plant, bake_off_plants, block_stepper, run_bake_off
 
 TS = 0.02
 
@@ -70,7 +65,7 @@ def test_what_is_asked_beyond_the_limits_is_cut() -> None:
 def test_settling_overshoot_and_rms_are_what_they_say() -> None:
     """A gain without feedback: the paper's pole, a settling of delay + 3 time constants, and the load in full."""
     plant = bake_off_plant()
-    found = run_bake_off(lambda: lambda r, _: r / plant.static_gain, [plant], BakeOff(slew_limit=100.0))
+    found = run_bake_off(lambda: lambda r, _: r / plant.static_gain, [plant], StepAndLoad(slew_limit=100.0))
     # 4 + 1 samples until it moves; one sample more at most, as the border falls between two.
     assert found.settling[0] == pytest.approx(0.08 - math.log(0.05) / 5.293, abs=TS)
     assert found.overshoot[0] == 0.0
@@ -94,6 +89,6 @@ def test_it_says_what_does_not_fit() -> None:
     with pytest.raises(SettingsError, match=r"sample time is 0.01 s; the test's is 0.02 s"):
         run_bake_off(lambda: lambda _r, _y: 0.0, [bake_off_plant(sample_time=0.01)])
     with pytest.raises(SettingsError, match="`duration` must be beyond `load_at`"):
-        BakeOff(duration=3.0)
+        StepAndLoad(duration=3.0)
     with pytest.raises(SettingsError, match=r"every 0.02 s, the bake-off every 0.01 s"):
-        block_stepper(PiSettings().design(bake_off_neck()).block(), BakeOff(sample_time=0.01))
+        block_stepper(PiSettings().design(bake_off_neck()).block(), StepAndLoad(sample_time=0.01))

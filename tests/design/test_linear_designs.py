@@ -11,32 +11,21 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from softneck.core import SettingsError
-from softneck.design import (
-    AxisController,
-    BakeOff,
-    FractionalPid,
-    HinfSettings,
-    LqgSettings,
-    NcfSettings,
-    PidGains,
-    PidSettings,
-    PiSettings,
-    bake_off_neck,
-    bake_off_plant,
-    bake_off_plants,
-    block_stepper,
-    fopi,
-    reduce_controller,
-    run_bake_off,
-)
-from softneck.design._axis_loop import (
+from softneck.design import HinfSettings, LqgSettings, NcfSettings, PidSettings, PiSettings, fopi, reduce_controller
+from softneck.design.linear._assembly import AxisController
+from softneck.design.linear._axis_loop import (
     axis_margins,
     closed_radius,
     conditioning_gain,
     delayed_form,
     feedback_response,
 )
-from softneck.design._sweep import make_sweep
+from softneck.design.linear._fractional import FractionalPid
+from softneck.design.linear._pid import PidGains
+from softneck.design.linear._sweep import make_sweep
+from softneck.design.plants._step_and_load import StepAndLoad
+
+from ..oracles.bake_off import bake_off_neck, bake_off_plant, bake_off_plants, block_stepper, run_bake_off
 
 TS = 0.02
 PLANT = bake_off_plant()
@@ -50,8 +39,8 @@ def axis_of(controller: Any) -> AxisController:
 
 
 @pytest.mark.parametrize("settings", [HinfSettings(), LqgSettings(), PiSettings()], ids=["hinf", "lqg", "pi"])
-@pytest.mark.parametrize("test", [BakeOff(), BakeOff(reference=0.5, slew_limit=0.1)], ids=["small", "limited"])
-def test_the_sweep_of_a_search_is_the_bake_off(settings: Any, test: BakeOff) -> None:
+@pytest.mark.parametrize("test", [StepAndLoad(), StepAndLoad(reference=0.5, slew_limit=0.1)], ids=["small", "limited"])
+def test_the_sweep_of_a_search_is_the_bake_off(settings: Any, test: StepAndLoad) -> None:
     controller = settings.design(bake_off_neck())
     plants = bake_off_plants()[::9]
     axis = axis_of(controller)

@@ -11,16 +11,14 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from softneck.core import DataError, load_functions, load_runtime
-from softneck.design import (
-    MeasuredDisturbance,
-    MpcController,
-    MpcSettings,
-    bake_off_neck,
-)
-from softneck.design.mpc import _mpc_state_runtime as rt
-from softneck.loop import AheadReference, BlockPart, Loop, RotationReference, run_loop
+from softneck.core import DataError
+from softneck.design import MeasuredDisturbance, MpcController, MpcSettings
+from softneck.design.predictive import _mpc_state_runtime as rt
+from softneck.loop import BlockPart, Loop, RotationReference, run_loop
+from softneck.loop._preview import AheadReference
+from softneck.runtime import load_functions, load_runtime
 
+from ..oracles.bake_off import bake_off_neck
 from .mpc_neck import GAIN, POLE, SOLVED, TS, Neck
 
 
@@ -52,7 +50,7 @@ def bounds(controller: MpcController, theta: np.ndarray) -> tuple[np.ndarray, np
 @pytest.mark.parametrize("kind", ["plain", "soft"])
 def test_the_runtimes_solver_equals_daqp(kind: str, request: pytest.FixtureRequest) -> None:
     controller: MpcController = request.getfixturevalue(kind)
-    f = load_functions("softneck.design.mpc._dual_runtime")
+    f = load_functions("softneck.design.predictive._dual_runtime")
     a = controller.arrays
     m = len(a[14])
     sign, lam, most = np.zeros(m), np.zeros(m), 0

@@ -10,16 +10,11 @@ import numpy as np
 import pytest
 
 from softneck.core import FileFormatError, SettingsError, load
-from softneck.design import (
-    MpcController,
-    MpcSettings,
-    bake_off_neck,
-    block_stepper,
-    run_bake_off,
-)
-from softneck.design.mpc import _mpc_state_runtime as rt
+from softneck.design import MpcController, MpcSettings
+from softneck.design.predictive import _mpc_state_runtime as rt
 from softneck.estimation import LinearNeck
 
+from ..oracles.bake_off import bake_off_neck, block_stepper, run_bake_off
 from .mpc_neck import SOLVED, TS, Neck, Samples
 
 

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from softneck.core import SettingsError, load
-from softneck.design import MpcController, MpcSettings, bake_off_neck
-from softneck.design.mpc import _mpc_state_runtime as rt
+from softneck.design import MpcController, MpcSettings
+from softneck.design.predictive import _mpc_state_runtime as rt
 from softneck.estimation import LinearNeck
 
+from ..oracles.bake_off import bake_off_neck
 from .mpc_neck import Neck
 
 LIMIT, TAUT, BOUND = 0.2, -0.2, math.radians(0.2)

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from softneck.core import SettingsError
-from softneck.design import NECK_HEAD, NeckRow, NeckSteps, PiSettings, neck_step, neck_table, table_cells
+from softneck.design import PiSettings
 from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.loop import metrics
+
+from ..oracles.neck_table import NECK_HEAD, NeckRow, NeckSteps, neck_step, neck_table, table_cells
 
 TS = 0.02
 

@@ -7,14 +7,15 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from softneck.core import DataError, SettingsError, load, load_runtime
+from softneck.core import DataError, SettingsError, load
 from softneck.design import NmpcController, NmpcSettings
-from softneck.design.mpc._gauss_newton import cost_function
-from softneck.design.mpc._horizon_estimate import disturbance_ahead, estimate_gains
-from softneck.design.mpc._model_steps import NONLINEAR_KINDS, step_function
+from softneck.design.predictive._gauss_newton import cost_function
+from softneck.design.predictive._model_steps import NONLINEAR_KINDS, step_function
+from softneck.design.predictive._nmpc_prepared import disturbance_ahead, estimate_gains
 from softneck.estimation import LinearNeck
 from softneck.identification import GreyBox, Model, Network, NeuralStateSpace, Play, Rls
 from softneck.plant import NeckParameters, VirtualNeck, record
+from softneck.runtime import load_runtime
 from softneck.signals import Recording, signal
 
 

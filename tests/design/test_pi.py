@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
-from softneck.core import FileFormatError, Port, SettingsError, Vector, load, read_archive, write_archive
-from softneck.design import AxisController, LinearController, PiSettings, loop_margins, pi_axis
+from softneck.core import FileFormatError, SettingsError, Vector, load, read_archive, write_archive
+from softneck.design import LinearController, PiSettings, loop_margins
+from softneck.design.linear._assembly import AxisController, pi_axis
 from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.loop import BlockPart, Loop, LoopResult, StepReference, metrics, run_loop
+from softneck.runtime import Port
 from softneck.signals import redefine
 
 TS = 0.02

@@ -14,7 +14,6 @@ from scipy.io import loadmat
 
 from softneck.core import SettingsError, load
 from softneck.design import (
-    BakeOff,
     CustomSettings,
     FopiSettings,
     HinfSettings,
@@ -23,15 +22,19 @@ from softneck.design import (
     NcfSettings,
     PidSettings,
     PiSettings,
+    uncertain_plant,
+)
+from softneck.design.plants._step_and_load import StepAndLoad
+from softneck.estimation import LinearNeck
+
+from ..oracles.bake_off import (
     bake_off_neck,
     bake_off_plant,
     bake_off_plants,
     bake_off_samples,
     block_stepper,
     run_bake_off,
-    uncertain_plant,
 )
-from softneck.estimation import LinearNeck
 
 TS = 0.02
 # The bake-off's samples are the uncertain plant; the motor that moves most has 2/3 of theta_i.
@@ -92,7 +95,7 @@ def test_the_figures_of_the_bake_off_are_reached_from_the_file(kind: str, tmp_pa
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_a_load_leaves_no_error(kind: str) -> None:
     """The integrator is exact, also where synthesis only knows a slow pole."""
-    test = BakeOff(load_at=10.0, duration=40.0)
+    test = StepAndLoad(load_at=10.0, duration=40.0)
     angles = run_bake_off(block_stepper(robust(kind).block()), [bake_off_plant()], test).angles[0]
     # The slowest mode of all (fopi's, 25 s) has not died out entirely; the others have.
     limit = 1e-2 if kind.startswith("fopi") else 1e-9
@@ -122,7 +125,7 @@ def test_limits_cost_little(kind: str) -> None:
     """With half the slew that it was designed for, conditioning keeps the overshoot near."""
     if kind == "pi":
         pytest.skip("has Hanus' conditioning, and a filter that is given")
-    test = BakeOff(slew_limit=0.125)
+    test = StepAndLoad(slew_limit=0.125)
     found = run_bake_off(block_stepper(robust(kind).block(), test), bake_off_plants()[::7], test)
     # Half more than what the design allows within its limits; lqg's filter takes the plant for the nominal one.
     assert found.overshoot.max() <= (12.0 if kind == "lqg" else 6.0)

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from softneck.core import load_runtime
 from softneck.design import LinearController, PiSettings
 from softneck.estimation import LinearNeck
+from softneck.runtime import load_runtime
 from softneck.signals import redefine
 
 TS = 0.02

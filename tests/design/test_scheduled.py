@@ -14,14 +14,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from softneck.core import DataError, FileFormatError, SettingsError, load, load_runtime, read_archive, write_archive
+from softneck.core import DataError, FileFormatError, SettingsError, load, read_archive, write_archive
 from softneck.design import LinearController, ScheduledSettings, VaryingController
-from softneck.design._assembly import assemble
-from softneck.design._following import following_axis
-from softneck.design._tuning import Gains
+from softneck.design.linear._assembly import assemble
+from softneck.design.linear._tuning import Gains
+from softneck.design.varying._model_following import following_axis
 from softneck.estimation import LinearNeck, axis_plant
 from softneck.identification import Family, FamilySettings, Lpv
 from softneck.loop import BlockPart, Loop, StepReference, metrics, run_loop
+from softneck.runtime import load_runtime
 
 from ..data import neck_recording
 from .test_pi import DelayedNeck

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from softneck.core import SettingsError
-from softneck.design import bake_off_plant, hinfsyn, loopsyn, makeweight, mixsyn, ncfsyn
+from softneck.design import hinfsyn, loopsyn, makeweight, mixsyn, ncfsyn
+
+from ..oracles.bake_off import bake_off_plant
 
 TS = 0.02
 PLANT = bake_off_plant()
@@ -97,7 +99,7 @@ def test_ncf_reaches_the_margin_of_the_hankel_norm(plant: Any) -> None:
     """e_max = sqrt(1 - |[N M]|_H^2) (Glover and McFarlane 1989, Theorem 4.2), N M of python-control's Gramians."""
     from scipy.linalg import solve_continuous_are, solve_continuous_lyapunov
 
-    from softneck.design._bilinear import to_continuous
+    from softneck.design.robust._bilinear import to_continuous
 
     W = control.TransferFunction([4.0, 21.0], [5.0, 0.0])
     found = ncfsyn(plant, W)

@@ -10,17 +10,11 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError, SettingsError
-from softneck.design import (
-    bake_off_neck,
-    bake_off_plant,
-    bake_off_plants,
-    bake_off_samples,
-    makeweight,
-    ucover,
-    uncertain_plant,
-)
-from softneck.design._bilinear import drawn_out, to_continuous, to_discrete
+from softneck.design import makeweight, ucover, uncertain_plant
+from softneck.design.robust._bilinear import drawn_out, to_continuous, to_discrete
 from softneck.estimation import LinearNeck
+
+from ..oracles.bake_off import bake_off_neck, bake_off_plant, bake_off_plants, bake_off_samples
 
 TS = 0.02
 

@@ -17,7 +17,7 @@ import pytest
 
 from softneck.cli._main import group
 from softneck.core import KINDS, resolve
-from softneck.drives._run_log import _SCHEMAS, METADATA
+from softneck.drives.logs._run_log import _SCHEMAS, METADATA
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -149,7 +149,7 @@ def test_what_is_not_there_is_found(line: str, why: str | None) -> None:
 
 
 def test_every_file_of_the_source_tree_that_a_page_names_is_there() -> None:
-    named = of_all_pages(r"\b((?:tests|benchmarks|examples|deploy|kit|design|identification|fmu_src)/[\w./-]*\w)")
+    named = of_all_pages(r"\b((?:tests|benchmarks|examples|softneck|design|identification|fmu_src)/[\w./-]*\w)")
     assert len(named) > 20
     assert [item for item in named if not (ROOT / item[1]).exists()] == []
 

@@ -6,25 +6,14 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import replace
 
-from softneck.drives import DrivesFile, VirtualLink, VirtualRun, default_drives, simulated_neck
-from softneck.drives._objects import (
-    Write,
-    guarding_writes,
-    limit_writes,
-    mode_writes,
-    option_writes,
-    pdo_writes,
-)
-from softneck.drives.master import (
-    Command,
-    Frame,
-    Master,
-    MasterSettings,
-    Measured,
-    Phase,
-    RampSettings,
-    nmt_frame,
-)
+from softneck.drives import DrivesFile, default_drives, simulated_neck
+from softneck.drives.bus._link import VirtualLink
+from softneck.drives.bus._objects import Write, guarding_writes, limit_writes, mode_writes, option_writes, pdo_writes
+from softneck.drives.master import Frame, Master, MasterSettings, Phase
+from softneck.drives.master._measured import Measured
+from softneck.drives.master._nmt import Command, nmt_frame
+from softneck.drives.master._settings import RampSettings
+from softneck.drives.running._virtual import VirtualRun
 from softneck.drives.simulated import SimulatedDrive
 from softneck.plant import NeckParameters
 

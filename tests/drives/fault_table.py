@@ -10,8 +10,9 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from softneck.drives._objects import Write
-from softneck.drives.master import BUS_OFF, Frame, MasterSettings, Phase
+from softneck.drives.bus._objects import Write
+from softneck.drives.master import Frame, MasterSettings, Phase
+from softneck.drives.master._frame import BUS_OFF
 
 from .bench import DISABLED, FAULT, REACTION, Bench, T
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from softneck.drives._objects import Write
+from softneck.drives.bus._objects import Write
 from softneck.drives.master import MasterSettings
 
 from .fault_table import (

@@ -20,27 +20,26 @@ from hypothesis import strategies as st
 
 from softneck.core import CheckFailedError, SettingsError
 from softneck.drives import (
-    BusError,
     CanInclinometer,
     CanLink,
     PythonInclinometer,
-    SensorError,
     SerialInclinometer,
-    VirtualLink,
     default_drives,
     open_bus,
     preflight,
-    require_reset,
-    require_stopped,
     reset,
     scan,
     simulated_neck,
     stop,
 )
-from softneck.drives._python_sensor import make_python_sensor
-from softneck.drives._sensor import look_at
-from softneck.drives._why import reason
-from softneck.drives.master import BUS_OFF, Frame, Tilt
+from softneck.drives.bus._link import BusError, VirtualLink
+from softneck.drives.bus._why import reason
+from softneck.drives.master import Frame, Tilt
+from softneck.drives.master._frame import BUS_OFF
+from softneck.drives.running._stop import require_reset, require_stopped
+from softneck.drives.sensing._python_sensor import make_python_sensor
+from softneck.drives.sensing._sensor import look_at
+from softneck.drives.sensing._serial import SensorError
 from softneck.plant import NeckParameters
 
 

@@ -13,12 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from softneck.core import FileFormatError, SettingsError, SoftneckError
-from softneck.drives import DrivesFile, SdoError, VirtualLink, default_drives, load_drives, preflight, simulated_neck
-from softneck.drives._link import open_bus
-from softneck.drives._objects import SIZES, require_eds
-from softneck.drives._sdo import Objects, load_eds
+from softneck.drives import DrivesFile, default_drives, load_drives, open_bus, preflight, simulated_neck
+from softneck.drives.bus._link import VirtualLink
+from softneck.drives.bus._objects import SIZES, require_eds
+from softneck.drives.bus._sdo import Objects, SdoError, load_eds
 from softneck.drives.master import Frame
-from softneck.drives.simulated import PROFILES
+from softneck.drives.simulated._profiles import PROFILES
 from softneck.plant import NeckParameters
 
 from ..data import ROOT

@@ -17,19 +17,20 @@ from softneck.cosim import load_loop, simulate
 from softneck.drives import (
     CanInclinometer,
     CanLink,
-    DriveEntry,
-    DriveScale,
-    VirtualLink,
     default_drives,
     preflight,
     prepare,
-    require_certified,
     run_on_bus,
     run_simulated,
     simulated_neck,
     zero,
 )
-from softneck.drives.master import RampSettings, Tilt
+from softneck.drives.bus._file import DriveEntry
+from softneck.drives.bus._link import VirtualLink
+from softneck.drives.bus._units import DriveScale
+from softneck.drives.master import Tilt
+from softneck.drives.master._settings import RampSettings
+from softneck.drives.running._certified import require_certified
 from softneck.drives.simulated import SimulatedNeck, SimulatedSettings, serve
 from softneck.plant import NeckParameters
 

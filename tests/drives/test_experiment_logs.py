@@ -12,24 +12,23 @@ import pytest
 
 from softneck.core import CheckFailedError, FileFormatError
 from softneck.drives import (
-    Ask,
     CanInclinometer,
     CanLink,
     Experiment,
-    Operator,
-    RunLogger,
-    Session,
-    VirtualLink,
     default_drives,
-    drive_limits,
     jog,
-    jog_pilot,
     read_run_log,
     record_signal,
     replay,
     simulated_neck,
 )
-from softneck.drives.master import RampSettings
+from softneck.drives.bus._link import VirtualLink
+from softneck.drives.commissioning._jog import jog_pilot
+from softneck.drives.commissioning._record import drive_limits
+from softneck.drives.logs._run_log import RunLogger
+from softneck.drives.master._settings import RampSettings
+from softneck.drives.running._ask import Ask, Operator
+from softneck.drives.running._bus_loop import Session
 from softneck.drives.simulated import SimulatedNeck, SimulatedSettings, serve
 from softneck.plant import NeckParameters
 from softneck.signals import Recording

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
 
-from softneck.drives.master import BUS_OFF, Frame, Phase
+from softneck.drives.master import Frame, Phase
+from softneck.drives.master._frame import BUS_OFF
 
 from .bench import DISABLED, ENABLED, FAULT, Bench
 

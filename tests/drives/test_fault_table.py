@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from softneck.drives.master import RULES, Phase, Reaction
+from softneck.drives.master import Phase
+from softneck.drives.master._events import RULES, Reaction
 
 from .bench import Bench
 from .fault_table import Scenario, short_dropout

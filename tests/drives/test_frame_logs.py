@@ -7,9 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from softneck.drives import FrameLog, RunLogger, meaning
-from softneck.drives._cycle import frame_of, frame_text
-from softneck.drives.master import BUS_OFF, Frame
+from softneck.drives.bus._meaning import meaning
+from softneck.drives.logs._cycle import frame_of, frame_text
+from softneck.drives.logs._frame_log import FrameLog
+from softneck.drives.logs._run_log import RunLogger
+from softneck.drives.master import Frame
+from softneck.drives.master._frame import BUS_OFF
 
 FRAMES = st.builds(Frame, st.integers(0, 0x7FF), st.binary(max_size=8), st.booleans(), st.booleans())
 

@@ -14,9 +14,11 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 from softneck.core import FileFormatError, OutputError, SoftneckError
-from softneck.drives import FrameLog, RunLogger, changed_files, read_run_log, replay, run_facts
-from softneck.drives._cycle import LoggedPilot
-from softneck.drives._run_log import LOG_VERSION, METADATA
+from softneck.drives import read_run_log, replay
+from softneck.drives.logs._cycle import LoggedPilot
+from softneck.drives.logs._frame_log import FrameLog
+from softneck.drives.logs._log_file import changed_files
+from softneck.drives.logs._run_log import LOG_VERSION, METADATA, RunLogger, run_facts
 
 from .bench import Bench
 

@@ -8,20 +8,12 @@ from dataclasses import replace
 import pytest
 
 from softneck.core import CheckFailedError, SettingsError
-from softneck.drives import (
-    Ask,
-    DrivesFile,
-    Jogged,
-    Session,
-    VirtualLink,
-    default_drives,
-    drive_limits,
-    jog,
-    neck_drives,
-    record_signal,
-    simulated_neck,
-)
-from softneck.drives._jog import judge
+from softneck.drives import DrivesFile, default_drives, jog, neck_drives, record_signal, simulated_neck
+from softneck.drives.bus._link import VirtualLink
+from softneck.drives.commissioning._jog import Jogged, judge
+from softneck.drives.commissioning._record import drive_limits
+from softneck.drives.running._ask import Ask
+from softneck.drives.running._bus_loop import Session
 from softneck.plant import NeckParameters
 from softneck.signals import prepare, signal
 

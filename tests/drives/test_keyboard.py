@@ -14,8 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from softneck.drives import FrameLog, read_run_log, replay
-from softneck.drives.master import RULES, Reaction, state_of
+from softneck.drives import read_run_log, replay
+from softneck.drives.logs._frame_log import FrameLog
+from softneck.drives.master._cia402 import state_of
+from softneck.drives.master._events import RULES, Reaction
 from softneck.signals import read_recording
 
 from ..data import ROOT

@@ -20,20 +20,13 @@ from hypothesis import strategies as st
 
 from softneck.core import CheckFailedError, DataError, FileFormatError, OutputError, SettingsError
 from softneck.cosim import load_loop
-from softneck.drives import (
-    FrameLog,
-    LoopPilot,
-    RunLogger,
-    changed_files,
-    default_drives,
-    prepare,
-    read_run_log,
-    replay,
-    run_facts,
-    run_simulated,
-)
-from softneck.drives._cycle import Cycle, LoggedPilot, decode_cycle, encode_cycle
+from softneck.drives import default_drives, prepare, read_run_log, replay, run_simulated
+from softneck.drives.logs._cycle import Cycle, LoggedPilot, decode_cycle, encode_cycle
+from softneck.drives.logs._frame_log import FrameLog
+from softneck.drives.logs._log_file import changed_files
+from softneck.drives.logs._run_log import RunLogger, run_facts
 from softneck.drives.master import Frame, Phase, Tilt
+from softneck.drives.running._pilot import LoopPilot
 
 from .bench import Bench
 from .conftest import Project
@@ -221,7 +214,7 @@ import os, signal, sys, time
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from softneck.drives import RunLogger, run_facts
-from softneck.drives._cycle import LoggedPilot
+from softneck.drives.logs._cycle import LoggedPilot
 from tests.drives.bench import Bench
 bench = Bench()
 folder = Path(sys.argv[1])
@@ -273,7 +266,7 @@ def test_the_loop_does_not_wait_for_the_disk(tmp_path: Path) -> None:
 
 
 def log_entry(k: int):
-    from softneck.drives._run_log import _Entry
+    from softneck.drives.logs._run_log import _Entry
 
     return _Entry([], None, None, (), 0.01 * k)
 

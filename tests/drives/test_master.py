@@ -10,22 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from softneck.drives.master import (
-    NEXT,
-    RULES,
-    DriveState,
-    Frame,
-    Goal,
-    Limiter,
-    LimitSettings,
-    Master,
-    MasterSettings,
-    Phase,
-    Signal,
-    Tilt,
-    control_word,
-    state_of,
-)
+from softneck.drives.master import Frame, Master, MasterSettings, Phase, Tilt
+from softneck.drives.master._cia402 import DriveState, Goal, control_word, state_of
+from softneck.drives.master._events import RULES
+from softneck.drives.master._limiter import Limiter
+from softneck.drives.master._settings import LimitSettings
+from softneck.drives.master._supervisor import NEXT, Signal
 from softneck.drives.simulated import _power as power
 
 from .bench import ENABLED, Bench, Script, T

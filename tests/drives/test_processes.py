@@ -15,7 +15,8 @@ from typing import Any
 
 import pytest
 
-from softneck.drives import FrameLog, read_run_log, replay
+from softneck.drives import read_run_log, replay
+from softneck.drives.logs._frame_log import FrameLog
 
 from .processes import CASES, NAMESPACE, UDP, World, write_project
 

@@ -9,7 +9,7 @@ import threading
 import pytest
 
 from softneck.core import SettingsError
-from softneck.drives._timing import steady
+from softneck.drives.running._timing import steady
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="SCHED_FIFO is Linux's")

@@ -8,20 +8,12 @@ import numpy as np
 import pytest
 
 from softneck.core import CheckFailedError, SettingsError
-from softneck.drives import (
-    Ask,
-    Recorded,
-    Session,
-    VirtualLink,
-    default_drives,
-    drive_limits,
-    neck_drives,
-    preflight,
-    record_signal,
-    simulated_neck,
-    zero,
-)
+from softneck.drives import default_drives, neck_drives, preflight, record_signal, simulated_neck, zero
+from softneck.drives.bus._link import VirtualLink
+from softneck.drives.commissioning._record import Recorded, drive_limits
 from softneck.drives.master import Master, Tilt
+from softneck.drives.running._ask import Ask
+from softneck.drives.running._bus_loop import Session
 from softneck.identification import Rls
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import Excitation, prepare, signal

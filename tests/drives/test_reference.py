@@ -51,7 +51,7 @@ def test_run_and_replay_have_the_keys_of_the_reference(
 
 
 def test_every_command_has_a_row() -> None:
-    from softneck.cli._drives import command
+    from softneck.cli.drives._commands import command
 
     for name in command.commands:
         assert keys_of(name), name

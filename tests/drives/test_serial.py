@@ -14,7 +14,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from softneck.drives import SensorError, SerialInclinometer, TiltLines, tilt_of_line
+from softneck.drives import SerialInclinometer
+from softneck.drives.sensing._serial import SensorError, TiltLines, tilt_of_line
 
 
 def line(inclination: float, orientation: float) -> bytes:

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from softneck.drives.simulated import CanFrame, SimulatedDrive, SimulatedNeck, SimulatedSettings
+from softneck.drives.simulated import SimulatedDrive, SimulatedNeck, SimulatedSettings
 from softneck.drives.simulated.__main__ import hardware_stop
+from softneck.drives.simulated._frame import CanFrame
 from softneck.plant import NeckParameters
 
 CPR = 1539 / 65 * 2048 / (2 * math.pi)

@@ -8,17 +8,13 @@ import math
 import numpy as np
 
 from softneck.cosim import load_loop
-from softneck.drives import (
-    DrivesResult,
-    Snapshot,
-    Snapshots,
-    VirtualLink,
-    default_drives,
-    prepare,
-    recorded,
-    run_simulated,
-)
-from softneck.drives.master import DriveState, Frame, Master, NodeState, Phase
+from softneck.drives import DrivesResult, Snapshots, default_drives, prepare, run_simulated
+from softneck.drives.bus._link import VirtualLink
+from softneck.drives.master import Frame, Master, Phase
+from softneck.drives.master._cia402 import DriveState
+from softneck.drives.master._nmt import NodeState
+from softneck.drives.running._snapshot import Snapshot
+from softneck.drives.running._virtual import recorded
 
 from .bench import Bench
 from .conftest import STEP, Project

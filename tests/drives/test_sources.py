@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from softneck.core import FileFormatError, SettingsError, SoftneckError
-from softneck.drives import DrivesFile, SensorError, load_drives, open_sensor
+from softneck.drives import DrivesFile, load_drives, open_sensor
+from softneck.drives.sensing._serial import SensorError
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import signal, write_recording
 

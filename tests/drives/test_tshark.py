@@ -10,8 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from softneck.drives import VirtualLink, default_drives, preflight, simulated_neck
-from softneck.drives.master import Frame, NodeState
+from softneck.drives import default_drives, preflight, simulated_neck
+from softneck.drives.bus._link import VirtualLink
+from softneck.drives.master import Frame
+from softneck.drives.master._nmt import NodeState
 from softneck.plant import NeckParameters
 
 from .bench import Bench

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softneck.core import DataError, SettingsError
-from softneck.drives import (
+from softneck.drives.bus._units import (
     DriveScale,
     acceleration_to_internal,
     counts_to_position,

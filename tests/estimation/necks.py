@@ -8,8 +8,8 @@ from typing import Any
 import control
 import numpy as np
 
-from softneck.core import Block, load_runtime
 from softneck.estimation import KalmanObserver, LinearNeck
+from softneck.runtime import Block, load_runtime
 from softneck.signals import Recording, redefine, signal
 
 TS = 0.02

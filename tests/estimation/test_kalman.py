@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError, FileFormatError, SettingsError, load, read_archive, write_archive
-from softneck.estimation import SENSORS, KalmanSettings, LinearNeck, axis_plant
+from softneck.estimation import KalmanSettings, LinearNeck, axis_plant
+from softneck.estimation._sensors import SENSORS
 from softneck.signals import Recording
 
 from .necks import TS, neck, recording, run_block

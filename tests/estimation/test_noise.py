@@ -10,7 +10,8 @@ import pytest
 
 from softneck.core import DataError, SettingsError
 from softneck.estimation import KalmanObserver, KalmanSettings, consistency, fit_noise
-from softneck.plots import chart_figure, consistency_chart, consistency_figure
+from softneck.plots import chart_figure, consistency_figure
+from softneck.plots._estimation_charts import consistency_chart
 from softneck.signals import Recording
 
 from .necks import changed, neck, recording

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softneck.core import DataError, SettingsError, State
+from softneck.core import DataError, SettingsError
 from softneck.design import PiSettings
 from softneck.estimation import KalmanSettings, UkfObserver, UkfPart, consistency, ukf
 from softneck.identification import Model, Network, Play, Rls
 from softneck.loop import BlockPart, Loop, StepReference, run_loop
 from softneck.plant import NeckParameters, VirtualNeck, record
+from softneck.runtime import State
 from softneck.signals import Recording, signal
 
 from ..data import ROOT

@@ -9,7 +9,6 @@ from functools import cache
 import control
 import numpy as np
 
-from softneck.core import Block
 from softneck.design import (
     AdaptiveSettings,
     CustomSettings,
@@ -38,6 +37,7 @@ from softneck.identification import (
     combine,
 )
 from softneck.plant import NeckParameters, VirtualNeck
+from softneck.runtime import Block
 from softneck.signals import Recording, redefine, signal
 
 TS = 0.02

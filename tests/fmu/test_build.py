@@ -13,8 +13,9 @@ import fmpy
 import pytest
 from fmpy.validation import validate_fmu
 
-from softneck.core import Block, OutputError, Port, SettingsError
-from softneck.fmu import FmuInfo, build_fmu, describe
+from softneck.core import OutputError, SettingsError
+from softneck.fmu import FmuInfo, build_fmu, fmu_info
+from softneck.runtime import Block, Port
 
 KINDS = ["lag", "controller", "neck", "pi"]
 
@@ -169,7 +170,7 @@ def test_what_is_told_of_a_model_escapes_what_it_was_told(toys: Any) -> None:
         def summary(self) -> str:
             return "a lag & more\nsecond line"
 
-    info = describe(Thing(), scores="fit < 90 %", stop_time=4.0)
+    info = fmu_info(Thing(), scores="fit < 90 %", stop_time=4.0)
     assert (info.description, info.stop_time) == ("a lag & more", 4.0)
     for text in ("a lag &amp; more", "&lt;b&gt;", "fit &lt; 90 %", "What it is not good for"):
         assert text in info.documentation

@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softneck.core import _compile, have_numba
-from softneck.fmu import _build, _slave_compiled, build_fmu, unpacked
+from softneck.fmu import build_fmu, unpacked
+from softneck.fmu.python import _build, _slave_compiled
+from softneck.runtime import _compile
+from softneck.runtime._compile import have_numba
 
 from .every_kind import KINDS, TS, block_of, inputs_of
 
@@ -94,7 +96,7 @@ def test_fmus_keep_compiled_code_where_softneck_does() -> None:
     ("kind", "cost"), [("rls", "light"), ("kalman", "light"), ("nn", "middling"), ("nlsm", "heavy"), ("neck", "heavy")]
 )
 def test_the_cost_decides_what_is_compiled(kind: str, cost: str) -> None:
-    from softneck.fmu._cost import plain_cost
+    from softneck.fmu.describe._cost import plain_cost
 
     # The paper's 7,000 points; the network's lines do not depend on its size.
     block = _many_points() if kind == "nlsm" else block_of(kind)

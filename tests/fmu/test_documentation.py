@@ -13,8 +13,9 @@ import pytest
 from PIL import Image
 
 from softneck.core import SettingsError
-from softneck.fmu import FmuInfo, _build, build_fmu, describe
-from softneck.fmu._svg import line_chart
+from softneck.fmu import FmuInfo, build_fmu, fmu_info
+from softneck.fmu.describe._svg import line_chart
+from softneck.fmu.python import _build
 from softneck.identification import Rls, validate
 
 from .every_kind import KINDS, block_of, recording
@@ -67,7 +68,7 @@ def test_scores_and_free_run_of_a_validation_are_shown(tmp_path: Path) -> None:
     data = recording()
     model = Rls().fit(data.rows(0, 500))
     judged = validate(model, data, names=("rls", "my <data>"))
-    page = _page(build_fmu(model.block(), tmp_path / "Rls.fmu", info=describe(model, validation=judged)))
+    page = _page(build_fmu(model.block(), tmp_path / "Rls.fmu", info=fmu_info(model, validation=judged)))
     fit = judged.fits["inf"]["pitch"]
     assert fit is not None
     assert f"<td>this model</td><td>free run</td><td>{fit:.2f}</td>" in page
@@ -77,7 +78,7 @@ def test_scores_and_free_run_of_a_validation_are_shown(tmp_path: Path) -> None:
 
 
 def test_a_model_without_scores_says_so() -> None:
-    text = describe(Rls().fit(recording())).documentation
+    text = fmu_info(Rls().fit(recording())).documentation
     assert "None were given when this FMU was built" in text
 
 

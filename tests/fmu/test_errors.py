@@ -123,7 +123,7 @@ def test_a_host_that_lacks_something_is_told_at_instantiation(change: str, messa
 
 
 def test_a_runtime_that_takes_the_slave_s_names_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from softneck.fmu._module import slave_module
+    from softneck.fmu.python._module import slave_module
 
     text = "import numpy as np\n\n\ndef _fmu_print(a):\n    return a\n\n\ndef step(a, b, c, d, e):\n    return None\n"
     (tmp_path / "toy_clash_runtime.py").write_text(text)

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softneck.core import load_runtime
 from softneck.fmu import build_fmu
+from softneck.runtime import load_runtime
 
 from ..importers import need
 from .every_kind import KINDS, TS, block_of, inputs_of

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from fmpy.validation import validate_fmu
 
-from softneck.core import Block, load_runtime
-from softneck.cosim import drive_fmu
+from softneck.cosim.parts._free_run import drive_fmu
 from softneck.fmu import build_fmu
+from softneck.runtime import Block, load_runtime
 
 from .every_kind import KINDS, MOTORS, TS, block_of, inputs_of, recording
 

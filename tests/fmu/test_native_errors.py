@@ -22,10 +22,10 @@ import pytest
 
 from softneck.cli import main
 from softneck.core import FileFormatError, SettingsError
-from softneck.fmu import build_fmu
-from softneck.fmu.native import _library, build_compiled_fmu, c_sources
-from softneck.fmu.native._model_file import model_bytes
-from softneck.fmu.native._sources import Sources
+from softneck.fmu import build_compiled_fmu, build_fmu
+from softneck.fmu.compiled import _library
+from softneck.fmu.compiled._model_file import model_bytes
+from softneck.fmu.compiled._sources import Sources, c_sources
 
 from .every_kind import NATIVE, block_of
 
@@ -191,8 +191,8 @@ def test_hostile_files_and_states_break_nothing_under_the_sanitizers(tmp_path: P
 
 
 def test_a_kind_that_is_not_in_the_library_is_named(tmp_path: Path) -> None:
-    block = dataclasses.replace(block_of("rls"), runtime="softneck.core._random_runtime")
-    with pytest.raises(SettingsError, match=r"`softneck.core._random_runtime` cannot be in a compiled FMU"):
+    block = dataclasses.replace(block_of("rls"), runtime="softneck.runtime._random_runtime")
+    with pytest.raises(SettingsError, match=r"`softneck.runtime._random_runtime` cannot be in a compiled FMU"):
         build_compiled_fmu(block, tmp_path / "X.fmu")
     flat = dataclasses.replace(block_of("rls"), arrays=tuple(array.ravel() for array in block_of("rls").arrays))
     with pytest.raises(SettingsError, match="has arrays of ranks"):
@@ -200,10 +200,10 @@ def test_a_kind_that_is_not_in_the_library_is_named(tmp_path: Path) -> None:
 
 
 def test_a_kind_that_the_translator_refused_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from softneck.fmu.native import _build
+    from softneck.fmu.compiled import _build
 
     library = _library.find_library()
-    refused = {"softneck.identification._rls_runtime": "`step`: `np.linalg.solve(A, b)`: no C is known."}
+    refused = {"softneck.identification.linear._rls_runtime": "`step`: `np.linalg.solve(A, b)`: no C is known."}
     changed = dataclasses.replace(library, sources=dataclasses.replace(library.sources, refused=refused))
     monkeypatch.setattr(_build, "find_library", lambda: changed)
     with pytest.raises(SettingsError, match=r"_rls_runtime` cannot be in a compiled FMU: `step`: `np.linalg"):
@@ -211,7 +211,7 @@ def test_a_kind_that_the_translator_refused_says_why(tmp_path: Path, monkeypatch
 
 
 def test_platforms_that_are_unknown_or_not_built_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from softneck.fmu.native import _build
+    from softneck.fmu.compiled import _build
 
     library = _library.find_library()
     only = dataclasses.replace(library, binaries={"aarch64-linux": b"not run here"})
@@ -228,7 +228,7 @@ def test_platforms_that_are_unknown_or_not_built_are_named(tmp_path: Path, monke
 
 
 def test_a_damaged_library_is_refused(tmp_path: Path) -> None:
-    from softneck.fmu.native._sources import sources_key
+    from softneck.fmu.compiled._sources import sources_key
 
     manifest = {
         "key": sources_key(),

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from softneck.fmu.native import c_sources
-from softneck.fmu.native._model_file import model_bytes
+from softneck.fmu.compiled._model_file import model_bytes
+from softneck.fmu.compiled._sources import c_sources
 
 from .every_kind import NATIVE, block_of
 

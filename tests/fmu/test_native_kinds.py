@@ -19,9 +19,8 @@ import pytest
 from fmpy.fmi3 import FMU3Slave
 from fmpy.validation import validate_fmu
 
-from softneck.core import Block
-from softneck.fmu import build_fmu, unpacked
-from softneck.fmu.native import build_compiled_fmu
+from softneck.fmu import build_compiled_fmu, build_fmu, unpacked
+from softneck.runtime import Block
 
 from .every_kind import NATIVE, TS, block_of, inputs_of
 

@@ -12,7 +12,7 @@ import fmpy
 import lief
 import pytest
 
-from softneck.fmu.native._library import packaged_library
+from softneck.fmu.compiled._library import packaged_library
 
 library = packaged_library()
 pytestmark = pytest.mark.skipif(library is None, reason="the libraries of these sources are not built: make native")

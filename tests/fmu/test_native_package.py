@@ -18,11 +18,11 @@ import numpy as np
 import pytest
 
 from softneck.core import SettingsError
-from softneck.fmu._pack import deflated, write_zip
-from softneck.fmu.native import build_compiled_fmu
-from softneck.fmu.native._chunks import only_kinds
-from softneck.fmu.native._library import packaged_library
-from softneck.fmu.native._sources import FLAGS, c_sources, sources_key
+from softneck.fmu import build_compiled_fmu
+from softneck.fmu.compiled._library import packaged_library
+from softneck.fmu.compiled._sources import FLAGS, c_sources, sources_key
+from softneck.fmu.compiled.translate._chunks import only_kinds
+from softneck.fmu.python._pack import deflated, write_zip
 
 from .every_kind import NATIVE, TS, block_of, inputs_of
 
@@ -63,17 +63,15 @@ def test_what_is_too_large_for_a_zip_file_of_32_bits_is_refused(tmp_path: Path) 
 
 
 def test_a_wheel_knows_its_libraries_in_its_own_folders(tmp_path: Path) -> None:
-    """The key of a checkout, whose packages lie in five folders, is that of a wheel, where they lie in one."""
+    """The key of a checkout is that of its copy elsewhere: no path is part of it."""
     root = Path(__file__).parents[2]
-    for source in ("kit", "identification", "fmu_src", "design", "deploy"):
-        ignored = shutil.ignore_patterns("__pycache__", "binaries")
-        shutil.copytree(root / source / "softneck", tmp_path / "softneck", ignore=ignored, dirs_exist_ok=True)
-    script = "import softneck.fmu.native._sources as s; print(s.HERE, s.sources_key())"
+    shutil.copytree(root / "softneck", tmp_path / "softneck", ignore=shutil.ignore_patterns("__pycache__", "binaries"))
+    script = "import softneck.fmu.compiled._sources as s; print(s.HERE, s.sources_key())"
     done = subprocess.run(
         [sys.executable, "-c", script], env=os.environ | {"PYTHONPATH": str(tmp_path)}, cwd=tmp_path,
         capture_output=True, text=True, check=True, timeout=120,
     )  # fmt: skip
-    assert done.stdout.split() == [str(tmp_path / "softneck" / "fmu" / "native"), sources_key()]
+    assert done.stdout.split() == [str(tmp_path / "softneck" / "fmu" / "compiled"), sources_key()]
 
 
 def test_a_stream_deflated_before_gives_the_same_file(tmp_path: Path) -> None:
@@ -138,7 +136,7 @@ def _outputs(path: Path, block: Any, u: np.ndarray, running: Any, fmi: int) -> n
 
 def test_the_sources_of_one_kind_hold_no_other() -> None:
     text = c_sources().files["sn_kinds.h"]
-    alone = only_kinds(text, {"softneck.identification._rls_runtime"})
+    alone = only_kinds(text, {"softneck.identification.linear._rls_runtime"})
     assert "sn_kind_count = 1;" in alone
     assert "mpc_" not in alone
     assert len(alone) < len(text) / 10

@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softneck.core import Block
-from softneck.fmu.native import PLATFORMS, c_sources
-from softneck.fmu.native._compilers import compile_for, have_zig
-from softneck.fmu.native._model_file import model_bytes
+from softneck.fmu.compiled._compilers import compile_for, have_zig
+from softneck.fmu.compiled._model_file import model_bytes
+from softneck.fmu.compiled._platforms import PLATFORMS
+from softneck.fmu.compiled._sources import c_sources
+from softneck.runtime import Block
 
 from .every_kind import NATIVE, TS, block_of, inputs_of
 

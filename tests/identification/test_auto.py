@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError, SettingsError
-from softneck.identification import REFITTED, Choice, Play, choose, kinds_to_try, refit
-from softneck.identification._auto import ALIKE
+from softneck.identification import Choice, Play, choose, refit
+from softneck.identification.selection._auto import ALIKE, REFITTED, kinds_to_try
 
 from ..data import neck_recording
 

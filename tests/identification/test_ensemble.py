@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from softneck.core import FileFormatError, SettingsError, bundle
-from softneck.core._composition import prefixed
+from softneck.core import FileFormatError, SettingsError
 from softneck.identification import Ensemble, Model, Play, Residual, SetMembership, combine
-from softneck.identification._arrays import check_arrays
+from softneck.identification.models._arrays import check_arrays
+from softneck.runtime import bundle
+from softneck.runtime._composition import prefixed
 
 from ..data import neck_recording, short_neck
 
@@ -117,6 +118,6 @@ def test_names_of_a_member_get_a_prefix_and_nothing_else_changes() -> None:
 
 
 def test_a_module_without_members_takes_none() -> None:
-    plain = "softneck.identification._rls_runtime"
+    plain = "softneck.identification.linear._rls_runtime"
     with pytest.raises(SettingsError, match="takes no members: it does not say OWN_ARRAYS"):
-        bundle(f"softneck.core._members_runtime({plain}:6)")
+        bundle(f"softneck.runtime._members_runtime({plain}:6)")

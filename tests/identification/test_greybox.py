@@ -7,16 +7,17 @@ import itertools
 import numpy as np
 import pytest
 
-from softneck.core import load_functions
 from softneck.identification import INFINITE, GreyBox, Model, validate
-from softneck.identification._greybox import INTERRUPTED
-from softneck.identification._greybox_numbers import NUMBERS
+from softneck.identification.structured._greybox import INTERRUPTED
+from softneck.identification.structured._greybox_numbers import NUMBERS
 from softneck.plant import NeckParameters, VirtualNeck, record
-from softneck.signals import MOTOR_POSITIONS, SET_POINTS, Recording, signal
+from softneck.runtime import load_functions
+from softneck.signals import SET_POINTS, Recording, signal
+from softneck.signals.recording._channels import MOTOR_POSITIONS
 
 from ..data import TS, neck_recording
 
-FUNCTIONS = load_functions("softneck.identification._greybox_fit_runtime")
+FUNCTIONS = load_functions("softneck.identification.structured._greybox_fit_runtime")
 GUESS = np.array([number.guess for number in NUMBERS])
 NAMES = [number.name for number in NUMBERS]
 DELAY = np.full(3, 3.0)

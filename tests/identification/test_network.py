@@ -10,7 +10,7 @@ import pytest
 
 from softneck.core import DataError, SettingsError, silent
 from softneck.identification import Network
-from softneck.identification._levenberg import Layers, jacobian, random_layers, train
+from softneck.identification.networks._levenberg import Layers, jacobian, random_layers, train
 
 from ..data import neck_recording, short_neck
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softneck.core import load_functions
 from softneck.identification import Model, Network
-from softneck.identification._echo import fit_correction
-from softneck.identification._levenberg import jacobian, levenberg, random_layers
-from softneck.identification._network import INTERRUPTED
+from softneck.identification.models._error_feedback import fit_correction
+from softneck.identification.networks._levenberg import jacobian, levenberg, random_layers
+from softneck.identification.networks._network import INTERRUPTED
+from softneck.runtime import load_functions
 
 from ..data import neck_recording, short_neck
 
-FUNCTIONS = load_functions("softneck.identification._nn_fit_runtime")
+FUNCTIONS = load_functions("softneck.identification.networks._nn_fit_runtime")
 RNG = np.random.default_rng(5)
 NET = random_layers(4, (5, 3), RNG)
 Z = RNG.standard_normal((24, 4))

@@ -5,15 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softneck.core import DataError, SettingsError, load_functions
+from softneck.core import DataError, SettingsError
 from softneck.identification import INFINITE, Model, NeuralStateSpace, validate
-from softneck.identification._contraction import Contraction, whitening
-from softneck.identification._loaded_drive import fit_loaded_drive
-from softneck.identification._nss_problem import FUNCTIONS, Records, Shape, free_run
-from softneck.identification._nss_start import linear_start, whitened
-from softneck.identification._nss_training import BestMap, Training, random_start
-from softneck.identification._state_space_network import INTERRUPTED
+from softneck.identification.models._loaded_drive import fit_loaded_drive
+from softneck.identification.networks._contraction import Contraction, whitening
+from softneck.identification.networks._nss_problem import FUNCTIONS, Records, Shape, free_run
+from softneck.identification.networks._nss_start import linear_start, whitened
+from softneck.identification.networks._nss_training import BestMap, Training, random_start
+from softneck.identification.networks._state_space_network import INTERRUPTED
 from softneck.plant import NeckParameters, VirtualNeck, record
+from softneck.runtime import load_functions
 from softneck.signals import signal
 
 from ..data import neck_recording, short_neck

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softneck.core import DataError, SettingsError, load_functions
+from softneck.core import DataError, SettingsError
 from softneck.identification import INFINITE, Model, Play, validate
-from softneck.identification._echo import fit_echo
-from softneck.identification._loaded_drive import FUNCTIONS, NO_LOAD, LoadedDrive, fit_loaded_drive
-from softneck.identification._play_terms import Data, Form, ridge
-from softneck.signals import MOTOR_POSITIONS, Recording
+from softneck.identification.models._error_feedback import fit_echo
+from softneck.identification.models._loaded_drive import FUNCTIONS, NO_LOAD, LoadedDrive, fit_loaded_drive
+from softneck.identification.structured._play_terms import Data, Form, ridge
+from softneck.runtime import load_functions
+from softneck.signals import Recording
+from softneck.signals.recording._channels import MOTOR_POSITIONS
 
 from ..data import TRUTH, drive_positions, neck_recording, short_neck
 

@@ -9,8 +9,10 @@ import control
 import numpy as np
 import pytest
 
-from softneck.core import DataError, SettingsError, load_functions
-from softneck.identification import Rls, continuous_parameters
+from softneck.core import DataError, SettingsError
+from softneck.identification import Rls
+from softneck.identification.models._linear_systems import continuous_parameters
+from softneck.runtime import load_functions
 from softneck.signals import concatenate, redefine, signal
 
 from ..data import TRUTH, TS, Truth, neck_recording, recording_from
@@ -21,7 +23,7 @@ def test_the_standard_form_ends_where_least_squares_does(n: int) -> None:
     rng = np.random.default_rng(n)
     Phi, y = rng.standard_normal((400, n)), rng.standard_normal(400)
     theta, F = np.zeros(n), 1e8 * np.eye(n)
-    load_functions("softneck.identification._recursion_runtime").rls_recursion(Phi, y, theta, F, 1.0)
+    load_functions("softneck.identification.linear._recursion_runtime").rls_recursion(Phi, y, theta, F, 1.0)
     # The start theta = 0 weighs 1e-8 against 400 rows of unit size; the first rows bring F from 1e8 to order one,
     # which leaves eps * 1e8 = 2.2e-8 of rounding in it, and that much again for every parameter.
     np.testing.assert_allclose(theta, np.linalg.lstsq(Phi, y)[0], rtol=0, atol=1e-8 + 2.2e-8 * n)

@@ -9,7 +9,8 @@ import pytest
 
 from softneck.core import DataError, SettingsError, load
 from softneck.design import PiSettings
-from softneck.identification import OnlineRls, OnlineState, Rls
+from softneck.identification import OnlineRls, Rls
+from softneck.identification.linear._online_rls import OnlineState
 
 from ..data import TRUTH, TS, neck_recording
 

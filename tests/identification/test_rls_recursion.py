@@ -9,12 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from softneck.core import DataError, FileFormatError, Matrix, SettingsError, Vector, load, load_functions
-from softneck.identification import Recursion, RecursionState
+from softneck.core import DataError, FileFormatError, Matrix, SettingsError, Vector, load
+from softneck.identification import Recursion
+from softneck.identification.linear._recursion import RecursionState
 from softneck.plots import convergence_figure
+from softneck.runtime import load_functions
 
-UD = "softneck.identification._ud_runtime"
-STANDARD = "softneck.identification._recursion_runtime"
+UD = "softneck.identification.linear._ud_runtime"
+STANDARD = "softneck.identification.linear._recursion_runtime"
 
 
 def rows(n: int, count: int, seed: int = 0) -> tuple[Matrix, Vector]:

@@ -9,27 +9,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from softneck.core import DataError, SettingsError, load_functions
-from softneck.identification import (
-    PAPER_EQ21,
-    Model,
-    SetMembership,
-    gamma_curve,
-    noise_level,
-    offending_pair,
-    outside_seen,
-)
-from softneck.identification._gamma import least_gammas
-from softneck.identification._regressors import regression
-from softneck.identification._slant import is_frame, slant_frames, slant_nodes, slant_order
-from softneck.identification._tree import LEAF, tree_nodes, tree_order
+from softneck.core import DataError, SettingsError
+from softneck.identification import PAPER_EQ21, Model, SetMembership, gamma_curve, offending_pair, outside_seen
+from softneck.identification.models._regressors import regression
+from softneck.identification.set_membership._gamma import least_gammas
+from softneck.identification.set_membership._principal_tree import is_frame, slant_frames, slant_nodes, slant_order
+from softneck.identification.set_membership._set_membership import noise_level
+from softneck.identification.set_membership._tree import LEAF, tree_nodes, tree_order
+from softneck.runtime import load_functions
 
 from ..data import TS, neck_recording, recording_from, short_neck
 from .hard_sets import algorithm_1, hard_sets
 
-BOUNDS = load_functions("softneck.identification._nlsm_runtime")
-SLANT = load_functions("softneck.identification._slant_runtime")
-CONES = load_functions("softneck.identification._cones_runtime")
+BOUNDS = load_functions("softneck.identification.set_membership._nlsm_runtime")
+SLANT = load_functions("softneck.identification.set_membership._principal_tree_runtime")
+CONES = load_functions("softneck.identification.set_membership._cones_runtime")
 
 
 @st.composite
@@ -166,7 +160,7 @@ def test_without_the_compiler_gamma_is_the_same(monkeypatch: pytest.MonkeyPatch)
     points, values = rng.standard_normal((4, 300)), rng.standard_normal(300)
     slacks = np.array([0.5, 0.0, 1.0])
     fast, fast_pairs = least_gammas(points, values, slacks)
-    monkeypatch.setattr("softneck.identification._gamma.have_numba", lambda: False)
+    monkeypatch.setattr("softneck.identification.set_membership._gamma.have_numba", lambda: False)
     slow, slow_pairs = least_gammas(points, values, slacks)
     np.testing.assert_allclose(fast, slow, rtol=1e-12)
     np.testing.assert_array_equal(np.sort(fast_pairs), np.sort(slow_pairs))

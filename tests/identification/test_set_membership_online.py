@@ -77,7 +77,7 @@ def test_many_at_once_are_as_one_by_one(stream: tuple[np.ndarray, np.ndarray, li
 
 
 def test_trees_are_few_and_a_point_is_rebuilt_a_logarithmic_number_of_times(monkeypatch: pytest.MonkeyPatch) -> None:
-    import softneck.identification._online as module
+    import softneck.identification.set_membership._online as module
 
     planted: list[int] = []
     original = module.plant

@@ -7,7 +7,7 @@ import pytest
 
 from softneck.core import SettingsError
 from softneck.identification import INFINITE, PAPER_EQ21, SetMembership, fit_drive, validate
-from softneck.identification._regressors import lag_table
+from softneck.identification.models._regressors import lag_table
 
 from ..data import neck_recording
 

@@ -14,7 +14,7 @@ from scipy.signal import lfilter
 
 from softneck.core import DataError, Matrix, SettingsError, Vector
 from softneck.identification import OutputError, Srivc, load_model
-from softneck.identification._srivc_fit import Continuous, Search
+from softneck.identification.linear._srivc_fit import Continuous, Search
 from softneck.signals import SET_POINTS, Recording, motors_from, redefine, signal
 
 from ..data import TS, neck_recording, recording_from

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from softneck.core import DataError
-from softneck.identification import PAPER_EQ21, Model, Rls, validate
-from softneck.identification._novelty import QUANTILES, Novelty
+from softneck.identification import PAPER_EQ21, Model, Novelty, Rls, validate
+from softneck.identification.validation._novelty import QUANTILES
 from softneck.signals import Recording
 
 from ..data import neck_recording, recording_from

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from softneck.identification import WARM_UP, Rls, validate
-from softneck.identification._repeats import noise_ceiling, noise_deviation
+from softneck.identification.validation._noise_ceiling import noise_ceiling, noise_deviation
 from softneck.signals import Recording, concatenate, signal
 
 from ..data import neck_recording, recording_from

@@ -10,7 +10,7 @@ from statsmodels.stats.diagnostic import acorr_ljungbox
 from statsmodels.tsa.stattools import acf, ccf
 
 from softneck.identification import Rls, validate
-from softneck.identification._residual_tests import LAGS, ResidualTests, residual_tests
+from softneck.identification.validation._residual_tests import LAGS, ResidualTests, residual_tests
 from softneck.signals import concatenate
 
 from ..data import neck_recording

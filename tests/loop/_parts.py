@@ -6,7 +6,8 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from softneck.core import Port, SettingsError, Vector
+from softneck.core import SettingsError, Vector
+from softneck.runtime import Port
 
 SETPOINTS = tuple(Port(name=f"motor_setpoint_{j}", unit="rad") for j in (1, 2, 3))
 POSITIONS = tuple(Port(name=f"motor_position_{j}", unit="rad") for j in (1, 2, 3))

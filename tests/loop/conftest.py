@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from softneck.core import Block
+from softneck.runtime import Block
 
 _TOYS = str(Path(__file__).parents[1] / "fmu" / "toys")
 if _TOYS not in sys.path:

@@ -9,11 +9,10 @@ from typing import Any
 import control
 import pytest
 
-from softneck.core import Block, DataError
+from softneck.core import DataError
 from softneck.design import PiSettings
 from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.loop import (
-    FAULT_KINDS,
     BlockPart,
     Loop,
     LoopRun,
@@ -21,10 +20,11 @@ from softneck.loop import (
     RotationReference,
     SensorFault,
     StepReference,
-    make_fault,
     run_loop,
 )
+from softneck.loop._faults import FAULT_KINDS, make_fault
 from softneck.plant import NeckParameters, VirtualNeck
+from softneck.runtime import Block
 
 _KEYS: dict[str, dict[str, Any]] = {
     "sensor_bias": {"size_deg": 2.0}, "sensor_outlier": {"size_deg": 5.0, "share": 0.2, "seed": 3},

@@ -8,20 +8,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from softneck.core import DataError, Port, SettingsError
-from softneck.loop import (
-    FAULT_KINDS,
-    Fault,
-    Loop,
-    LoopResult,
-    LoopRun,
-    MotorFault,
-    NeckFault,
-    SensorFault,
-    SineReference,
-    make_fault,
-    run_loop,
-)
+from softneck.core import DataError, SettingsError
+from softneck.loop import Fault, Loop, LoopResult, LoopRun, MotorFault, NeckFault, SensorFault, SineReference, run_loop
+from softneck.loop._faults import FAULT_KINDS, make_fault
+from softneck.runtime import Port
 
 from ._parts import SETPOINTS, FunctionPart, lag_plant, p_controller, ports, relay_observer
 

@@ -7,8 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from softneck.core import DataError, Port, SettingsError
+from softneck.core import DataError, SettingsError
 from softneck.loop import Loop, StepReference, run_loop
+from softneck.runtime import Port
 
 from ._parts import POSITIONS, SETPOINTS, FunctionPart, lag_plant, p_controller, ports, relay_observer
 

@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softneck.core import Block, DataError, FileFormatError, Port, SettingsError
-from softneck.loop import BlockPart, Loop, LoopRun, LoopState, LoopStep, StepReference, run_loop
+from softneck.core import DataError, FileFormatError, SettingsError
+from softneck.loop import BlockPart, Loop, LoopRun, LoopState, StepReference, run_loop
+from softneck.loop._run import LoopStep
+from softneck.runtime import Block, Port
 
 from ._parts import FunctionPart, lag_plant, p_controller, ports
 

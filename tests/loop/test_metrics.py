@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softneck.core import SettingsError
-from softneck.loop import SETTLING_BAND, LoopResult, check_limits, metrics
+from softneck.loop import LoopResult, check_limits, metrics
+from softneck.loop._metrics import SETTLING_BAND
 
 TS = 0.02
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softneck.core import SettingsError, load_runtime
+from softneck.core import SettingsError
 from softneck.loop import (
     RampReference,
     RecordingReference,
@@ -15,6 +15,7 @@ from softneck.loop import (
     SineReference,
     StepReference,
 )
+from softneck.runtime import load_runtime
 
 EVERY: dict[str, Reference] = {
     "step": StepReference(pitch=0.2, roll=-0.1, cocontraction=0.4, at=0.3),

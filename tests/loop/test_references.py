@@ -8,14 +8,8 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError, SettingsError
-from softneck.loop import (
-    RampReference,
-    RecordingReference,
-    RotationReference,
-    SineReference,
-    StepReference,
-    make_reference,
-)
+from softneck.loop import RampReference, RecordingReference, RotationReference, SineReference, StepReference
+from softneck.loop._references import make_reference
 
 
 def test_a_step_is_on_at_the_sample_it_names() -> None:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softneck.core import DataError, SettingsError, load_runtime
+from softneck.core import DataError, SettingsError
 from softneck.plant import NeckParameters, VirtualNeck, record, simulate_batch
+from softneck.runtime import load_runtime
 from softneck.signals import Excitation, signal
 
 NECK = VirtualNeck(NeckParameters.paper())

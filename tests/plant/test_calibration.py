@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softneck.identification import Rls, continuous_parameters, nrmse_fit, validate
+from softneck.identification import Rls, nrmse_fit, validate
+from softneck.identification.models._linear_systems import continuous_parameters
 from softneck.plant import NeckParameters, VirtualNeck, record
-from softneck.signals import Recording, pitch_roll, signal
+from softneck.signals import Recording, signal
+from softneck.signals.importing._tilt import pitch_roll
 
 OPEN_LOOP = Path(__file__).parents[3] / "shared" / "data" / "neck_openloop" / "spring_test_0gr.csv"
 # Later work is scored on these: a change needs an issue of its own.

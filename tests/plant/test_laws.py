@@ -7,9 +7,10 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 
-from softneck.core import Block, State
-from softneck.plant import NeckParameters, VirtualNeck, free_lengths, neck_energy, potential_energy
+from softneck.plant import NeckParameters, VirtualNeck, neck_energy
+from softneck.plant._energy import free_lengths, potential_energy
 from softneck.plant._mechanics_runtime import neck_constants, neck_load, neck_rates, neck_substeps
+from softneck.runtime import Block, State
 
 # Where the plant's outputs are in its port order.
 TENSIONS = slice(10, 13)

@@ -7,7 +7,9 @@ import pytest
 from matplotlib.patches import Rectangle
 
 from softneck.core import DataError, SettingsError
-from softneck.plots import Chart, Curve, Level, Panel, chart_figure, recording_chart, timeline, validation_chart
+from softneck.plots import Chart, Curve, Level, Panel, chart_figure
+from softneck.plots._charts import recording_chart, validation_chart
+from softneck.plots._timeline import timeline
 
 
 def _wave(columns: int, rows: int = 100) -> np.ndarray:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError
-from softneck.plots import cost_chart, cost_figure, histogram_chart, histogram_figure, residual_chart, residual_figure
+from softneck.plots import cost_figure, histogram_figure, residual_figure
+from softneck.plots._judgement_charts import cost_chart, histogram_chart, residual_chart
 
 LAGS, CROSS_LAGS = np.arange(26), np.arange(-25, 26)
 

@@ -8,14 +8,8 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from softneck.plots import (
-    correlation_figure,
-    faults_figure,
-    quality_page,
-    region_figure,
-    spectrum_figure,
-)
-from softneck.signals import Quality, Recording, concatenate, quality
+from softneck.plots import correlation_figure, faults_figure, quality_page, region_figure, spectrum_figure
+from softneck.signals import Quality, Recording, assess_quality, concatenate
 
 from ..data import neck_recording
 
@@ -44,7 +38,7 @@ CASES = {"clean": neck_recording(1200), "faulty": faulty(), "still": still()}
 @pytest.fixture(params=list(CASES))
 def case(request: pytest.FixtureRequest) -> tuple[Recording, Quality]:
     recording = CASES[request.param]
-    return recording, quality(recording)
+    return recording, assess_quality(recording)
 
 
 def texts(figure: Figure) -> str:
@@ -61,23 +55,23 @@ def test_the_page_of_any_recording_holds_five_pictures_and_every_finding(case: t
 
 
 def test_the_spectrum_has_its_line_at_the_bandwidth() -> None:
-    (ax,) = spectrum_figure(quality(CASES["clean"]), "t").axes
+    (ax,) = spectrum_figure(assess_quality(CASES["clean"]), "t").axes
     upright = [line for line in ax.lines if len(set(np.asarray(line.get_xdata()).tolist())) == 1]
     assert [np.asarray(line.get_xdata())[0] for line in upright] == [4.0]
 
 
 def test_the_correlation_shows_its_numbers_and_a_motor_that_rests() -> None:
-    found = quality(CASES["clean"])
+    found = assess_quality(CASES["clean"])
     assert f"{found.correlation[0, 1]:.2f}" in texts(correlation_figure(found, "t"))
-    assert "never\nmoves" in texts(correlation_figure(quality(CASES["still"]), "t"))
+    assert "never\nmoves" in texts(correlation_figure(assess_quality(CASES["still"]), "t"))
 
 
 def test_every_sort_of_fault_is_marked() -> None:
     recording = CASES["faulty"]
-    found = quality(recording)
+    found = assess_quality(recording)
     (legend,) = faults_figure(recording, found, "t").legends
     assert {text.get_text() for text in legend.get_texts()} == {"missed", "frozen", "clipped", "spikes"}
 
 
 def test_a_behaviour_that_never_took_place_is_named() -> None:
-    assert "never" in texts(region_figure(CASES["still"], quality(CASES["still"]), "t"))
+    assert "never" in texts(region_figure(CASES["still"], assess_quality(CASES["still"]), "t"))

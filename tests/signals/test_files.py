@@ -13,15 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from softneck.core import DataError, FileFormatError, OutputError, SoftneckError
-from softneck.identification import row_hashes
-from softneck.signals import (
-    SET_POINTS,
-    Recording,
-    concatenate,
-    known_channels,
-    read_recording,
-    write_recording,
-)
+from softneck.identification.models._rows import row_hashes
+from softneck.signals import SET_POINTS, Recording, concatenate, read_recording, write_recording
+from softneck.signals.recording._channels import known_channels
 
 from ..data import changed, csv_lines, neck_recording
 

@@ -13,19 +13,17 @@ from scipy.io import savemat
 
 from softneck.core import DataError, FileFormatError, SettingsError
 from softneck.signals import (
-    MOTOR_POSITIONS,
     SET_POINTS,
     Layout,
     Recording,
     guess_layout,
     import_log,
-    known_channels,
     layout_toml,
     parse_layout,
     read_layout,
-    si_unit,
 )
-from softneck.signals._layout import Source, Term
+from softneck.signals.importing._layout import Source, Term
+from softneck.signals.recording._channels import MOTOR_POSITIONS, known_channels, si_unit
 
 from ..data import LAYOUTS, TS, neck_recording
 

@@ -18,13 +18,13 @@ from softneck.signals import (
     Recording,
     guess_layout,
     import_log,
-    known_channels,
     layout_toml,
     parse_layout,
     read_layout,
     read_recording,
     write_recording,
 )
+from softneck.signals.recording._channels import known_channels
 
 from ..data import neck_recording
 

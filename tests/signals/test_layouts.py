@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from softneck.core import DataError, FileFormatError, SettingsError, SoftneckError
-from softneck.signals import Imported, import_log, read_layout
+from softneck.signals import import_log, read_layout
+from softneck.signals.importing._log import Imported
 
 from ..data import LAYOUTS
 

@@ -15,7 +15,7 @@ from scipy.io import savemat
 
 from softneck.core import DataError, FileFormatError, SettingsError, SoftneckError
 from softneck.signals import Recording, import_log, read_layout
-from softneck.signals._mat import mat_arrays
+from softneck.signals.importing._mat import mat_arrays
 
 CHANNELS = ("motor_setpoint_1", "motor_setpoint_2", "motor_setpoint_3", "pitch", "roll")
 K = np.arange(30.0)
@@ -208,7 +208,7 @@ def test_version_4_and_two_variables_of_one_name_are_refused(tmp_path: Path) -> 
 
 
 def test_a_small_file_that_unpacks_to_a_huge_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("softneck.signals._mat5._MAX_BYTES", 10_000)
+    monkeypatch.setattr("softneck.signals.importing._mat5._MAX_BYTES", 10_000)
     savemat(tmp_path / "a.mat", {"log": np.zeros((2000, 6))}, do_compression=True)
     with pytest.raises(FileFormatError, match="a compressed variable is cut off or too large"):
         mat_arrays(tmp_path / "a.mat")

@@ -15,10 +15,10 @@ from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import (
     SET_POINTS,
     Recording,
+    assess_quality,
     concatenate,
     import_log,
     motors_from,
-    quality,
     read_layout,
     redefine,
     signal,
@@ -35,7 +35,7 @@ def from_inputs(inputs: np.ndarray) -> Recording:
 
 
 def topics(recording: Recording, severity: str) -> set[str]:
-    return {finding.topic for finding in quality(recording).findings if finding.severity == severity}
+    return {finding.topic for finding in assess_quality(recording).findings if finding.severity == severity}
 
 
 @pytest.mark.parametrize("preset", ["paper", "lab"])
@@ -55,7 +55,7 @@ def test_the_papers_tests_have_no_faulty_channels(name: str, noise: bool) -> Non
 
 def test_parseval_the_density_integrates_to_the_variance() -> None:
     recording = recording_from(signal("multisine", duration=200.0).set_points)
-    found = quality(recording).spectrum
+    found = assess_quality(recording).spectrum
     variance = redefine(recording.set_points).var(axis=0)
     # Welch's windows weigh the samples of one record unevenly: 10 % at 9 segments.
     np.testing.assert_allclose(found.density.sum(axis=0) * found.omega[1], variance, rtol=0.1)
@@ -64,7 +64,7 @@ def test_parseval_the_density_integrates_to_the_variance() -> None:
 @given(omega=st.floats(0.6, 60.0))
 def test_a_sine_has_its_power_where_it_is(omega: float) -> None:
     t = np.arange(3000) * TS
-    found = quality(from_inputs(2.0 * np.sin(omega * t)[:, None] * [1.0, 0.5, 0.1])).spectrum
+    found = assess_quality(from_inputs(2.0 * np.sin(omega * t)[:, None] * [1.0, 0.5, 0.1])).spectrum
     line = found.omega[1]
     # Hann's main lobe is two lines to either side; 1 % of the mean up to 4 rad/s lies within it and one side lobe.
     if omega < 4.0 - 3 * line:
@@ -79,7 +79,7 @@ def test_a_sine_has_its_power_where_it_is(omega: float) -> None:
 def test_slow_excitation_is_a_warning_and_its_frequency_is_named() -> None:
     t = np.arange(6000) * TS
     slow = np.column_stack([3 * np.sin(0.5 * t), 3 * np.sin(0.37 * t), np.sin(0.3 * t)])
-    said = [f for f in quality(from_inputs(slow)).findings if f.topic == "excitation"]
+    said = [f for f in assess_quality(from_inputs(slow)).findings if f.topic == "excitation"]
     assert [(f.severity, f.channel) for f in said] == [("warning", "theta_i"), ("warning", "phi_i")]
     assert "real power up to 0." in said[0].message
 
@@ -91,7 +91,7 @@ def test_the_condition_is_that_of_the_paper_regressor_written_out() -> None:
     lags = [u[k - lag, j] for j in range(3) for lag in (2, 3)]
     X = np.column_stack([y[k - 1], *lags, M[k - 3]])
     R = np.corrcoef(X.T)
-    found = quality(recording).conditioning["pitch"]
+    found = assess_quality(recording).conditioning["pitch"]
     # The correlation matrix squares the condition: 1e-16 * cond^2 (1e4) leaves 1e-10.
     assert found.number == pytest.approx(np.sqrt(np.linalg.cond(R)), rel=1e-6)
     assert found.columns[:3] == ("y(k-1)", "u1(k-2)", "u1(k-3)")
@@ -102,7 +102,7 @@ def test_motors_with_one_sum_make_the_regressor_singular() -> None:
     t = np.arange(3000) * TS
     inputs = np.column_stack([3 * np.sin(1.3 * t) + np.sin(3.7 * t), 3 * np.cos(1.9 * t) + np.sin(4.3 * t), 0 * t])
     recording = from_inputs(inputs)
-    assert quality(recording).conditioning["pitch"].number == np.inf
+    assert assess_quality(recording).conditioning["pitch"].number == np.inf
     assert "regressors" in topics(recording, "warning")
     assert "co-contraction" in topics(recording, "note")
 
@@ -110,7 +110,7 @@ def test_motors_with_one_sum_make_the_regressor_singular() -> None:
 def test_a_motor_that_never_moves_is_named() -> None:
     P = signal("multisine", duration=40.0).set_points.copy()
     P[:, 2] = 0.5
-    found = quality(recording_from(P, noise=1e-3))
+    found = assess_quality(recording_from(P, noise=1e-3))
     assert found.conditioning["roll"].weakest == ("u3(k-2)", "u3(k-3)")
     assert np.isnan(found.correlation[2]).all()
     said = [f for f in found.findings if f.channel == SET_POINTS[2]]
@@ -119,9 +119,9 @@ def test_a_motor_that_never_moves_is_named() -> None:
 
 def test_the_correlation_is_numpys_and_two_motors_as_one_are_a_warning() -> None:
     P = signal("aprbs", duration=60.0).set_points.copy()
-    np.testing.assert_allclose(quality(recording_from(P)).correlation, np.corrcoef(P.T), atol=1e-12)
+    np.testing.assert_allclose(assess_quality(recording_from(P)).correlation, np.corrcoef(P.T), atol=1e-12)
     P[:, 1] = -P[:, 0]
-    found = quality(recording_from(P))
+    found = assess_quality(recording_from(P))
     assert found.correlation[0, 1] == pytest.approx(-1.0, abs=1e-12)
     assert "correlation" in topics(recording_from(P), "warning")
 
@@ -131,38 +131,38 @@ def test_each_behaviour_is_seen_when_it_happens_and_missed_when_not() -> None:
     for j in range(3):
         alone = rest.copy()
         alone[100:] = 3.0 * np.eye(3)[j]
-        found = quality(recording_from(alone)).region.behaviours
+        found = assess_quality(recording_from(alone)).region.behaviours
         expected = {f"tendon {i + 1} alone": (2.0 if i == j else 0.0) for i in range(3)}
         # 100 samples of 20 ms.
         assert {name: found[name] for name in expected} == pytest.approx(expected)
         assert found["co-contraction"] == 0.0
     together = rest + 2.0
-    assert quality(recording_from(together)).region.behaviours["co-contraction"] == pytest.approx(4.0)
-    assert quality(recording_from(together)).region.behaviours["holding still"] == pytest.approx(4.0)
+    assert assess_quality(recording_from(together)).region.behaviours["co-contraction"] == pytest.approx(4.0)
+    assert assess_quality(recording_from(together)).region.behaviours["holding still"] == pytest.approx(4.0)
 
 
 def test_the_papers_signal_misses_what_the_paper_says_and_mixed_does_not() -> None:
     neck = VirtualNeck(NeckParameters.preset("paper"))
     missing = ("tendon 1 alone", "tendon 2 alone", "tendon 3 alone", "co-contraction", "holding still")
-    assert quality(record(signal("eq22"), neck)).region.never == missing
-    assert quality(record(signal("mixed"), neck)).region.never == ()
+    assert assess_quality(record(signal("eq22"), neck)).region.never == missing
+    assert assess_quality(record(signal("mixed"), neck)).region.never == ()
 
 
 def test_coverage_is_whole_where_the_motors_went_everywhere() -> None:
     # A grid of motor positions a third of a cell apart reaches every cell of the hexagon.
     axis = np.arange(-2.0, 2.01, 1 / 6)
     P = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
-    region = quality(recording_from(P), motor_limit=2.0).region
+    region = assess_quality(recording_from(P), motor_limit=2.0).region
     assert region.tilt_coverage == 1.0
     assert region.delta_coverage == 1.0
-    corner = quality(recording_from(np.zeros((50, 3))), motor_limit=2.0).region
+    corner = assess_quality(recording_from(np.zeros((50, 3))), motor_limit=2.0).region
     assert 0.0 < corner.tilt_coverage < 0.1
 
 
 def test_runs_with_the_same_set_points_show_the_noise() -> None:
     P = signal("aprbs", duration=30.0).set_points
     pair = [recording_from(P, noise=2e-3, seed=seed) for seed in (1, 2)]
-    found = quality(concatenate([*pair, neck_recording(1500)])).repeats
+    found = assess_quality(concatenate([*pair, neck_recording(1500)])).repeats
     assert [repeat.runs for repeat in found] == [(0, 1)]
     # The standard deviation of 1,500 samples scatters by 1.8 %.
     np.testing.assert_allclose(found[0].rms, 2e-3, rtol=0.08)
@@ -171,7 +171,7 @@ def test_runs_with_the_same_set_points_show_the_noise() -> None:
 def test_nothing_reaches_across_runs() -> None:
     """Runs in another order have the same spectrum, condition, correlation and region."""
     parts = [recording_from(signal("multisine", duration=30.0, seed=s).set_points, noise=1e-3) for s in (1, 2, 3)]
-    one, other = quality(concatenate(parts)), quality(concatenate(parts[::-1]))
+    one, other = assess_quality(concatenate(parts)), assess_quality(concatenate(parts[::-1]))
     # Sums in another order: rounding.
     np.testing.assert_allclose(one.spectrum.density, other.spectrum.density, rtol=1e-9, atol=1e-15)
     assert one.conditioning["roll"].number == pytest.approx(other.conditioning["roll"].number, rel=1e-9)
@@ -190,7 +190,7 @@ def test_any_recording_has_a_report(rows: int, runs: int, scale: float, missing:
     channels = dict(zip(SET_POINTS, scale * rng.standard_normal((3, rows)), strict=True))
     recording = Recording(np.arange(rows) * TS, TS, {**channels, "pitch": y[0], "roll": y[1]},
                           np.sort(rng.integers(0, runs, rows)))  # fmt: skip
-    found = quality(recording)
+    found = assess_quality(recording)
     assert found.text()
     assert found.severity in ("note", "warning")
     assert json.dumps(found.as_dict(), default=lambda value: value.tolist())
@@ -198,13 +198,13 @@ def test_any_recording_has_a_report(rows: int, runs: int, scale: float, missing:
 
 def test_a_wrong_limit_is_refused() -> None:
     with pytest.raises(SettingsError, match=r"`motor_limit` must be positive \[rad\]; got -1"):
-        quality(neck_recording(200), motor_limit=-1.0)
+        assess_quality(neck_recording(200), motor_limit=-1.0)
 
 
 def test_what_the_real_recordings_are_told(shared_data: Path) -> None:
     def report(path: str, layout: str) -> set[tuple[str, str]]:
         recording = import_log(shared_data / path, read_layout(LAYOUTS / f"{layout}.toml")).recording
-        return {(f.severity, f.topic) for f in quality(recording).findings if f.severity != "ok"}
+        return {(f.severity, f.topic) for f in assess_quality(recording).findings if f.severity != "ok"}
 
     # The platform shakes at times, by up to 4 deg at 24.8 s: that is motion, and no sample of it is a spike.
     steps = report("neck_openloop/spring_test_0gr.csv", "neck_openloop")

@@ -9,7 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from softneck.signals import OUTPUTS, ChannelQuality, Recording, Stretch, quality
+from softneck.signals import Recording, assess_quality
+from softneck.signals.quality._channel_faults import ChannelQuality, Stretch
+from softneck.signals.recording._channels import OUTPUTS
 
 from ..data import neck_recording
 
@@ -18,7 +20,7 @@ FAULTS = ("missed", "frozen", "clipped", "outliers")
 
 
 def channel(recording: Recording, name: str) -> ChannelQuality:
-    return quality(recording).channels[name]
+    return assess_quality(recording).channels[name]
 
 
 def rows(stretches: tuple[Stretch, ...]) -> set[int]:
@@ -36,7 +38,7 @@ def others_are_clean(found: ChannelQuality, fault: str) -> bool:
 
 
 def test_a_clean_recording_has_no_fault() -> None:
-    for found in quality(CLEAN).channels.values():
+    for found in assess_quality(CLEAN).channels.values():
         assert others_are_clean(found, "none"), found.name
 
 
@@ -151,13 +153,13 @@ def test_a_channel_without_steps_has_none(seed: int) -> None:
 @pytest.mark.parametrize("noise", [1e-4, 1e-3, 1e-2])
 def test_the_noise_is_estimated_through_the_motion(noise: float) -> None:
     # The MAD of 2,396 correlated differences scatters by 4 %; levels that change add a little.
-    found = quality(neck_recording(2400, seed=6, noise=noise)).channels
+    found = assess_quality(neck_recording(2400, seed=6, noise=noise)).channels
     for axis in OUTPUTS:
         assert found[axis].noise == pytest.approx(noise, rel=0.15)
 
 
 def test_a_channel_without_samples_says_so() -> None:
-    found = quality(CLEAN.with_channels(pitch=np.full(len(CLEAN), np.nan)))
+    found = assess_quality(CLEAN.with_channels(pitch=np.full(len(CLEAN), np.nan)))
     assert found.channels["pitch"].missed_rows == len(CLEAN)
     said = [finding for finding in found.findings if finding.channel == "pitch"]
     assert [(finding.severity, finding.topic) for finding in said] == [("warning", "dropouts")]
@@ -170,11 +172,11 @@ def test_faults_never_reach_across_runs() -> None:
     frozen[1189:1208] = frozen[1189]
     missed[1198:1203] = np.nan
     recording = Recording(CLEAN.time, 0.02, {**CLEAN.channels, "pitch": frozen, "roll": missed}, run)
-    found = quality(recording).channels
+    found = assess_quality(recording).channels
     # 11 and 8 equal samples in two runs are not the 19 of one, and 20 would be frozen.
     frozen[1187:1208] = frozen[1187]
     assert found["pitch"].frozen == ()
     assert [(s.start, s.stop, s.run) for s in found["roll"].missed] == [(1198, 1200, 0), (1200, 1203, 1)]
     longer = Recording(CLEAN.time, 0.02, {**CLEAN.channels, "pitch": frozen}, run)
-    assert quality(longer).channels["pitch"].frozen == ()
-    assert quality(Recording(CLEAN.time, 0.02, longer.channels)).channels["pitch"].frozen != ()
+    assert assess_quality(longer).channels["pitch"].frozen == ()
+    assert assess_quality(Recording(CLEAN.time, 0.02, longer.channels)).channels["pitch"].frozen != ()

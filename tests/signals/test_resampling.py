@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softneck.core import DataError
-from softneck.signals import Imported, Recording, concatenate, import_log, parse_layout, resampled
+from softneck.signals import Recording, concatenate, import_log, parse_layout, resampled
+from softneck.signals.importing._log import Imported
 
 LAYOUT = """
 [time]

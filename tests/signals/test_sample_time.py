@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softneck.core import DataError
-from softneck.signals import estimate_sample_time, import_log, read_layout
+from softneck.signals import import_log, read_layout
+from softneck.signals.importing._sample_time import estimate_sample_time
 
 from ..data import LAYOUTS
 

@@ -11,7 +11,7 @@ from softneck.core import Vector
 from softneck.design import LinearController, PiSettings
 from softneck.estimation import LinearNeck
 from softneck.identification import Family
-from softneck.identification._family import AxisFamily
+from softneck.identification.uncertainty._family import AxisFamily
 
 TS = 0.02
 PAPER = np.array([math.radians(27.69) / 5.293, 5.293, 0.08])  # Eq. 31

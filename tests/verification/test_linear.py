@@ -9,7 +9,8 @@ import control
 import numpy as np
 import pytest
 
-from softneck.design import diskmargin, mu_bounds, nugap, two_scalars
+from softneck.design import diskmargin, mu_bounds, nugap
+from softneck.design.robust._mu import two_scalars
 from softneck.verification._gaps import gaps
 from softneck.verification._linear import LinearLaw, judged, margins, radii
 from softneck.verification._plants import (

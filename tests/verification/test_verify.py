@@ -13,14 +13,7 @@ import numpy as np
 import pytest
 
 from softneck.cli._main import run
-from softneck.core import (
-    CheckFailedError,
-    FileFormatError,
-    SettingsError,
-    check_certificate,
-    load,
-    read_certificate,
-)
+from softneck.core import CheckFailedError, FileFormatError, SettingsError, check_certificate, load, read_certificate
 from softneck.cosim import load_loop, simulate
 from softneck.design import LinearController
 from softneck.loop import BlockPart, Loop, StepReference, run_loop

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from softneck.core import Block, Port
+from softneck.runtime import Block, Port
 
 SAMPLE_TIME = 0.02
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from softneck.core._random_runtime import random_normal, random_seed
+from softneck.runtime._random_runtime import random_normal, random_seed
 
 
 def state_size(arrays: tuple[np.ndarray, ...]) -> int:

@@ -1,3 +1,0 @@
-"""The `softneck` command."""
-
-from ._main import main as main

@@ -1,0 +1,118 @@
+"""softneck identify auto: all kinds, ranked by free run over rows held out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from softneck.core import SettingsError, refuse_existing
+from softneck.identification import INFINITE, Choice, choose, refit
+from softneck.identification.selection._auto import REFITTED, Tried
+from softneck.plots import Section, Table, page, validation_figure, write_page
+from softneck.signals import Recording, concatenate, read_recording
+
+from .shared._console import note, percent, print_json, print_table, progress
+from .shared._options import target
+
+_HEAD = ["kind", "free run", "one step", "persistence", "trained in", "size", ""]
+
+
+def identify_auto(
+    recordings: tuple[Path, ...],
+    output: Path | None,
+    *,
+    train: float,
+    refit_all: bool,
+    seed: int | None,
+    html: Path | None,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Try the kinds, save the chosen model, and explain."""
+    path, replace = target(output, "models/auto.npz", force=force)
+    refuse_existing(path, force=replace)
+    if html is not None:
+        refuse_existing(html, force=force)
+    parts = [read_recording(source) for source in recordings]
+    head, tail, other = _split(parts, train)
+    with progress("identify auto", quiet=as_json) as report:
+        choice = choose(head, tail, other_excitation=other, seed=seed or 0, progress=report)
+    model = choice.chosen.model
+    if model is None:
+        raise SettingsError("the chosen kind has no model.")
+    if refit_all:
+        with progress(f"identify {choice.chosen.kind} on all rows", quiet=as_json) as report:
+            model = refit(choice, parts, progress=report)
+    model.save(path, force=replace)
+    if html is not None:
+        write_page(html, _page(choice), force=force)
+    if as_json:
+        print_json({**_facts(choice, path), "refit": refit_all})
+        return
+    print_table("Fit [%] on the rows held out, pitch/roll", _HEAD, _rows(choice))
+    click.echo(f"{choice.why}\n{path}\n{model.summary()}")
+    for remark in [*choice.remarks, *([REFITTED] if refit_all else [])]:
+        note(remark)
+
+
+def _split(parts: list[Recording], train: float) -> tuple[Recording, Recording, bool]:
+    """Return what to train on, what to hold out, and whether that is another experiment."""
+    if len(parts) > 1:
+        return concatenate(parts[:-1]), parts[-1], True
+    if not 0.0 < train < 1.0:
+        raise SettingsError(f"--train: `auto` has to hold rows out; give a part below 1, got {train:g}.")
+    head, tail = parts[0].split(train)
+    return head, tail, False
+
+
+def _rows(choice: Choice) -> list[list[str]]:
+    return [_row(one, one is choice.chosen) for one in choice.ranking]
+
+
+def _row(one: Tried, chosen: bool) -> list[str]:
+    if one.judged is None or one.model is None:
+        return [one.kind, "-", "-", "-", f"{one.seconds:.1f} s", "-", one.failure[:60]]
+    fits, held = one.judged.fits, one.judged.persistence["1"]
+    size = sum(array.size for array in one.model.arrays.values())
+    return [
+        one.kind,
+        f"{percent(fits[INFINITE]['pitch'])}/{percent(fits[INFINITE]['roll'])}",
+        f"{percent(fits['1']['pitch'])}/{percent(fits['1']['roll'])}",
+        f"{percent(held['pitch'])}/{percent(held['roll'])}",
+        f"{one.seconds:.1f} s",
+        f"{size} numbers",
+        "chosen" if chosen else "",
+    ]
+
+
+def _facts(choice: Choice, path: Path) -> dict:
+    return {
+        "model": str(path),
+        "chosen": choice.chosen.kind,
+        "why": choice.why,
+        "remarks": list(choice.remarks),
+        "ranking": [
+            {
+                "kind": one.kind,
+                "seconds": one.seconds,
+                "failure": one.failure or None,
+                "hold_out": None if one.judged is None else one.judged.as_dict(),
+            }
+            for one in choice.ranking
+        ],
+    }
+
+
+def _page(choice: Choice) -> str:
+    table = Table("Fit [%] on the rows held out, pitch/roll", _HEAD, _rows(choice))
+    sections = [Section("Which model", text=[choice.why, *choice.remarks], tables=[table])]
+    for one in choice.ranking:
+        if one.judged is None or (one is not choice.chosen and one is not choice.ranking[0]):
+            continue
+        curves = {"free run": one.judged.free_run}
+        figure = validation_figure(one.judged.time, one.judged.measured, curves, one.kind)
+        sections.append(
+            Section(one.kind, text=[one.model.summary() if one.model else ""], figures=[(one.kind, figure)])
+        )
+    return page("identify auto", sections)

@@ -1,0 +1,66 @@
+"""softneck design: a controller from an identified linear model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from softneck.core import KINDS, SettingsError, find_kind, load, refuse_existing, resolve
+from softneck.core._kinds import kinds_of
+
+from .shared._console import print_json, progress
+from .shared._options import apply_settings, force_option, json_option, output_option, set_option, target
+
+_KINDS = "\n".join(f"  {name:9} {KINDS[name].summary}" for name in kinds_of("controller"))
+
+
+@click.command(
+    "design",
+    help="Design a controller of KIND on an identified linear MODEL or a FAMILY; of several files the first is the "
+    "nominal plant and all are samples that the controller must hold on."
+    f"\n\n\b\nKinds:\n{_KINDS}",
+    epilog="Example: softneck design pi rls.npz -o pi.npz --set phase_margin_deg=60",
+)
+@click.argument("kind")
+@click.argument("models", nargs=-1, required=True, metavar="MODEL|FAMILY...", type=click.Path(path_type=Path))
+@output_option("controller", "CONTROLLER")
+@click.option("--mat", type=click.Path(path_type=Path), metavar="FILE.mat", help="Write it for MATLAB as well.")
+@set_option
+@force_option
+@json_option
+def command(
+    kind: str,
+    models: tuple[Path, ...],
+    output: Path | None,
+    mat: Path | None,
+    settings: tuple[str, ...],
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Design a controller of KIND on identified linear models or a family."""
+    entry = find_kind(kind, "controller")
+    path, replace = target(output, f"controllers/{kind}.npz", force=force, ending=".npz")
+    refuse_existing(path, force=replace)
+    if mat is not None:
+        target(mat, "", force=force, ending=".mat")
+        refuse_existing(mat, force=force)
+    plants = [_linear(model) for model in models]
+    with progress(f"design {kind}", quiet=as_json):
+        controller = apply_settings(resolve(entry.settings), settings).design(plants[0] if len(plants) == 1 else plants)
+    controller.save(path, force=replace)
+    if mat is not None:
+        if not hasattr(controller, "to_mat"):
+            raise SettingsError(f"a controller of kind {kind} is not linear and cannot be written to a MAT file.")
+        controller.to_mat(mat, force=force)
+    if as_json:
+        print_json({"controller": str(path), "kind": kind, "summary": controller.summary()})
+        return
+    click.echo(f"{path}\n{controller.summary()}")
+
+
+def _linear(path: Path) -> Any:
+    """Open a model or a family."""
+    thing = load(path)
+    return thing if hasattr(thing, "tf") else load(path, role="model")  # which says what it is

@@ -1,0 +1,128 @@
+"""softneck doctor: what of this machine works."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from importlib import metadata
+from pathlib import Path
+
+import click
+
+from softneck.core import silent
+
+from .shared._console import print_json, print_table, progress
+from .shared._options import json_option
+
+# Extra -> the module it brings, and what for.
+_EXTRAS = {
+    "slycot": ("slycot", "H-infinity by SLICOT"),
+    "sklearn": ("sklearn", "set membership as a scikit-learn regressor"),
+    "dask": ("distributed", "studies on a cluster"),
+}
+
+
+@click.command("doctor", epilog="Example: softneck doctor --json")
+@click.option("--compile", "compile_now", is_flag=True, help="Compile the models' code now.")
+@json_option
+def command(compile_now: bool, as_json: bool) -> None:
+    """Say what of this machine works: packages, compilers, FMU platforms, CAN, extras."""
+    if compile_now:
+        _compile(quiet=as_json)
+    checks = [_python(), *_packages(), _compiler(), _fmu_platform(), _compiled_fmus(), _can(), *_extras()]
+    bad = [check for check in checks if check["state"] == "missing"]
+    if as_json:
+        print_json({"checks": checks, "healthy": not bad})
+    else:
+        rows = [[check["name"], check["state"], check["detail"]] for check in checks]
+        print_table("softneck doctor", ["what", "state", "detail"], rows)
+    click.get_current_context().exit(1 if bad else 0)
+
+
+def _compile(*, quiet: bool) -> None:
+    """Run the shortest demo once: numba keeps what it compiled on the way."""
+    from softneck.report import DemoSettings, run_demo
+
+    with progress("compile", quiet=quiet) as report, tempfile.TemporaryDirectory() as folder:
+        settings = DemoSettings(out=Path(folder), duration=40.0, iterations=1, compare_rows=2)
+        run_demo(settings, tell=lambda what: report(0.0, what) or silent)
+
+
+def _check(name: str, state: str, detail: str) -> dict[str, str]:
+    return {"name": name, "state": state, "detail": detail}
+
+
+def _python() -> dict[str, str]:
+    return _check("python", "ok", f"{platform.python_version()} on {platform.system()} {platform.machine()}")
+
+
+def _needed() -> list[str]:
+    """Return the names of all packages that the installed softneck asks for."""
+    asked = [line for line in metadata.requires("softneck") or [] if "extra ==" not in line]
+    return [re.split(r"[^\w.-]", line, maxsplit=1)[0] for line in asked]
+
+
+def _packages() -> list[dict[str, str]]:
+    found = []
+    for name in _needed():
+        try:
+            found.append(_check(name, "ok", metadata.version(name)))
+        except metadata.PackageNotFoundError:
+            found.append(_check(name, "missing", f"pip install {name}"))
+    return found
+
+
+def _compiler() -> dict[str, str]:
+    compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+    if compiler:
+        return _check("C compiler", "ok", compiler)
+    if importlib.util.find_spec("ziglang"):
+        return _check("C compiler", "ok", "ziglang wheel")
+    return _check("C compiler", "absent", "not needed: a wheel brings compiled FMUs along")
+
+
+def _fmu_platform() -> dict[str, str]:
+    from pythonfmu.builder import FmuBuilder
+
+    if FmuBuilder.has_binary():
+        return _check("pythonfmu binary", "ok", f"{platform.system()} {platform.machine()}")
+    return _check("pythonfmu binary", "missing", "pythonfmu ships linux64 and win64 only; FMUs will not run here")
+
+
+def _compiled_fmus() -> dict[str, str]:
+    from softneck.core import FileFormatError
+    from softneck.fmu.compiled._library import platforms_built
+    from softneck.fmu.compiled._platforms import PLATFORMS
+
+    try:
+        built, how = platforms_built()
+    except FileFormatError as error:
+        return _check("compiled FMUs", "missing", str(error))
+    if not built:
+        return _check("compiled FMUs", "optional", how)
+    state = "ok" if len(built) == len(PLATFORMS) else "optional"
+    return _check("compiled FMUs", state, f"{', '.join(built)} ({how})")
+
+
+def _can() -> dict[str, str]:
+    ip = shutil.which("ip")
+    if ip is None or not sys.platform.startswith("linux"):
+        return _check("CAN interfaces", "absent", "iproute2 is not installed" if ip is None else "no SocketCAN here")
+    shown = subprocess.run([ip, "-o", "link", "show", "type", "can"], capture_output=True, text=True, check=False)
+    names = [line.split(":")[1].strip() for line in shown.stdout.splitlines() if ":" in line]
+    return _check("CAN interfaces", "ok" if names else "absent", ", ".join(names) or "none; drives can be simulated")
+
+
+def _extras() -> list[dict[str, str]]:
+    checks = [
+        _check(f"extra {name}", "ok" if importlib.util.find_spec(module) else "absent", what)
+        for name, (module, what) in _EXTRAS.items()
+    ]
+    jit = "off by NUMBA_DISABLE_JIT" if os.environ.get("NUMBA_DISABLE_JIT", "0") != "0" else "on"
+    return [*checks, _check("compiled runtimes", "ok" if jit == "on" else "absent", f"numba {jit}")]

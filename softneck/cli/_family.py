@@ -1,0 +1,114 @@
+"""softneck family: an uncertain linear plant from several recordings or operating points."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from softneck.core import refuse_existing
+from softneck.identification import Family, FamilySettings
+from softneck.plots import Section, Table, cover_figure, local_map_figure, page, write_page
+from softneck.signals import read_recording
+
+from .shared._console import print_json, progress
+from .shared._options import apply_settings, force_option, json_option, output_option, set_option, target
+
+_SCOPES = ("windows", "operating points", "recordings")
+
+
+@click.command(
+    "family", epilog="Example: softneck family 0g.csv 400g.csv 1000g.csv -o neck_family.npz --html family.html"
+)
+@click.argument("recordings", nargs=-1, required=True, type=click.Path(path_type=Path))
+@output_option("family", "FAMILY")
+@set_option
+@click.option("--html", type=click.Path(path_type=Path), help="Write a page with maps and the weight.")
+@force_option
+@json_option
+def command(
+    recordings: tuple[Path, ...],
+    output: Path | None,
+    settings: tuple[str, ...],
+    html: Path | None,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Fit local models over windows, operating points and RECORDINGS (payloads); wrap them into an uncertain plant."""
+    chosen = apply_settings(FamilySettings, settings)
+    path, replace = target(output, "families/family.npz", force=force)
+    refuse_existing(path, force=replace)
+    if html is not None:
+        refuse_existing(html, force=force)
+    parts = [read_recording(source) for source in recordings]
+    with progress("family", quiet=as_json) as report:
+        family = chosen.fit(parts, progress=report)
+    family.save(path, force=replace)
+    if html is not None:
+        write_page(html, _page(family, [source.stem for source in recordings]), force=force)
+    if as_json:
+        print_json(_facts(path, family))
+        return
+    click.echo(f"{path}\n{family.summary()}")
+
+
+def _facts(path: Path, family: Family) -> dict[str, Any]:
+    axes = {
+        name: {
+            "nominal": _named(axis.nominal),
+            "box": {"low": _named(axis.box[0]), "high": _named(axis.box[1])},
+            "samples": int(axis.used.sum()),
+            "largest_relative_error": float(axis.envelope.max()),
+            "covered": family.covered(name),
+            "weight": {"numerator": axis.weight[0], "denominator": axis.weight[1]},
+        }
+        for name, axis in family.axes.items()
+    }
+    return {
+        "family": str(path),
+        "sample_time_s": family.sample_time,
+        "axes": axes,
+        "cross_gains": {"from": ["theta_i", "phi_i", "delta_i"], "pitch": family.cross[0], "roll": family.cross[1]},
+        "compression": _named(family.compression),
+        "settings": family.settings,
+        "findings": family.findings,
+        "summary": family.summary(),
+    }
+
+
+def _named(numbers: np.ndarray) -> dict[str, float]:
+    return dict(zip(("static_gain", "pole", "delay_s"), numbers.tolist(), strict=True))
+
+
+def _page(family: Family, names: list[str]) -> str:
+    sections = [Section("The plant", text=family.summary().splitlines())]
+    for name, axis in family.axes.items():
+        figures = []
+        for number, what in enumerate(_SCOPES):
+            groups = {}
+            for index, recording in enumerate([*names, "several"]):
+                row = (axis.where[:, 0] == number) & (axis.where[:, 1] == (index if index < len(names) else -1))
+                if row.any():
+                    groups[recording] = (axis.where[row, 3], axis.samples[row], axis.std[row])
+            if groups:
+                title = f"{name}: {what}"
+                figures.append((title, local_map_figure(groups, title)))
+        title = f"{name}: the weight over its samples"
+        figures.append((title, cover_figure(family.frequency, *_cover(family, name), title)))
+        head = ["", "static gain [deg/rad]", "pole [1/s]", "dead time [ms]"]
+        rows = [[label, *_numbers(row)] for label, row in zip(("least", "largest"), axis.box, strict=True)]
+        rows.append(["nominal", *_numbers(axis.nominal)])
+        sections.append(Section(name, tables=[Table("Box", head, rows)], figures=figures))
+    return page("Family of linear models", sections)
+
+
+def _cover(family: Family, name: str) -> tuple[np.ndarray, np.ndarray]:
+    s = 1j * family.frequency
+    above, below = family.axes[name].weight
+    return family.errors(name), np.abs(np.polyval(above, s) / np.polyval(below, s))
+
+
+def _numbers(row: np.ndarray) -> list[str]:
+    return [f"{np.degrees(row[0]):.2f}", f"{row[1]:.2f}", f"{1e3 * row[2]:.0f}"]

@@ -1,0 +1,155 @@
+"""softneck fmu: models, observers, controllers and the virtual neck as FMUs."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import click
+
+from softneck.core import FileFormatError, SettingsError, load
+from softneck.cosim.loops._loop_file import is_loop_file, reference_of
+from softneck.fmu import build_compiled_fmu, build_fmu, fmu_info
+from softneck.fmu.compiled._platforms import PLATFORMS
+from softneck.fmu.describe._describe import Buildable
+from softneck.identification import Model, Validation, validate
+from softneck.plant import NeckParameters, VirtualNeck
+
+from .shared._console import print_json, progress
+from .shared._neck import load_neck
+from .shared._options import force_option, json_option, output_option, target
+from .shared._recordings import read_together
+
+
+@click.command("fmu", epilog="Example: softneck fmu build/demo/models/rls.npz -o Rls.fmu")
+@click.argument("file", required=False)
+@output_option("FMU", "X.fmu")
+@click.option("--all", "folder", type=click.Path(path_type=Path), help="Build one FMU of every file of ours in DIR.")
+@click.option(
+    "--data", multiple=True, type=click.Path(path_type=Path), help="A recording to score a model on, inside the FMU."
+)
+@click.option(
+    "--backend",
+    type=click.Choice(["python", "compiled"]),
+    default="python",
+    show_default=True,
+    help="What runs inside: Python and numpy of the host, or a C library that needs neither.",
+)
+@click.option("--fmi", type=click.Choice(["2", "3"]), default="2", show_default=True, help="FMI version; 3: compiled.")
+@click.option(
+    "--platform",
+    "platforms",
+    multiple=True,
+    metavar="NAME",
+    help=f"Of a compiled FMU, only for these: {', '.join(PLATFORMS)}.  [default: all that are built]",
+)
+@force_option
+@json_option
+def command(
+    file: str | None, output: Path | None, folder: Path | None, data: tuple[Path, ...],
+    backend: str, fmi: str, platforms: tuple[str, ...], force: bool, as_json: bool,
+) -> None:  # fmt: skip
+    """Package FILE as a Co-Simulation FMU of FMI 2.0 or 3.0.
+
+    FILE is a model, observer or controller (.npz), a neck parameter file (.toml), a neck preset (paper, lab), or a
+    loop file, of whose [reference] a reference FMU is made.
+    """
+    if backend == "python" and (fmi != "2" or platforms):
+        raise SettingsError("--fmi 3 and --platform are of compiled FMUs; add `--backend compiled`.")
+    origin = ""
+    jobs, replace = _what(file, folder, output, force=force)
+    # All are read before any is written: one bad file stops the command with nothing done.
+    things = [(source, open_buildable(source), path) for source, path in jobs if folder is None or _can_be_fmu(source)]
+    built, left_out = [], [str(source) for source, _ in jobs if source not in {source for source, _, _ in things}]
+    with progress("build FMU", quiet=as_json) as report:
+        for number, (source, thing, path) in enumerate(things):
+            report(number / len(things), path.name)
+            judged = _judge(thing, source, data) if data else None
+            block, info = thing.block(), fmu_info(thing, validation=judged)
+            if backend == "compiled":
+                origin = build_compiled_fmu(block, path, info=info, force=replace, fmi=int(fmi), platforms=platforms)
+            else:
+                build_fmu(block, path, info=info, force=replace)
+            built.append({"source": str(source), "fmu": str(path)})
+    if as_json:
+        print_json({"fmus": built, "left_out": left_out} | ({"libraries": origin} if origin else {}))
+        return
+    for entry in built:
+        click.echo(f"{entry['fmu']}  from {entry['source']}")
+    if origin:
+        click.echo(f"libraries: {origin}")
+    for source in left_out:
+        click.echo(f"left out: {source}, which is no model, observer or controller")
+
+
+def open_buildable(source: str | Path) -> Buildable:
+    """Return what `source` names: a file of ours, a neck file or a neck preset."""
+    if Path(source).suffix == ".npz":
+        thing = load(source)
+        if not hasattr(thing, "block"):
+            raise FileFormatError(f"{source}: is no model, observer or controller, so that no FMU can be made of it.")
+        return thing
+    if Path(source).suffix not in ("", ".toml"):
+        raise FileFormatError(
+            f"{source}: no FMU can be made of a `{Path(source).suffix}` file; give a model, controller or observer "
+            "(.npz), a neck or loop file (.toml), or a preset (paper, lab)."
+        )
+    if is_loop_file(Path(source)):
+        return reference_of(Path(source))
+    return VirtualNeck(load_neck(str(source)))
+
+
+def _can_be_fmu(source: str | Path) -> bool:
+    return Path(source).suffix != ".npz" or hasattr(load(source), "block")
+
+
+def _judge(thing: Buildable, source: str | Path, data: tuple[Path, ...]) -> Validation | None:
+    """Return the scores of a model on recordings as one, each run of its own; None for what is no model."""
+    if not isinstance(thing, Model):
+        return None
+    names = (Path(source).name, ", ".join(path.name for path in data))
+    return validate(thing, read_together(data), names=names)
+
+
+def _what(
+    file: str | None, folder: Path | None, output: Path | None, *, force: bool
+) -> tuple[list[tuple[str | Path, Path]], bool]:
+    """Return (source, FMU) pairs and whether existing FMUs may be replaced."""
+    if file is not None and folder is None:
+        path, replace = target(output, f"fmus/{_stem(file)}.fmu", force=force)
+        return [(file, path)], replace
+    if folder is not None and file is None:
+        return _jobs(folder, output or Path("build/fmus")), force or output is None
+    raise SettingsError("name one FILE, or a folder with --all.")
+
+
+def _jobs(folder: Path, out: Path) -> list[tuple[str | Path, Path]]:
+    if not folder.is_dir():
+        raise FileFormatError(f"{folder}: is no folder.")
+    sources = sorted(path for path in folder.iterdir() if path.suffix == ".npz" or _is_neck(path))
+    if not sources:
+        raise FileFormatError(f"{folder}: holds no model, observer, controller or neck file.")
+    jobs: dict[Path, Path] = {}
+    for path in sources:
+        fmu = out / f"{_stem(path.name)}.fmu"
+        if fmu in jobs:
+            raise SettingsError(f"{jobs[fmu]} and {path} would both become {fmu}; rename one of them.")
+        jobs[fmu] = path
+    return [(path, fmu) for fmu, path in jobs.items()]
+
+
+def _is_neck(path: Path) -> bool:
+    """Return whether a file means to be a neck's; what is wrong in it is said when it is read."""
+    if path.suffix != ".toml":
+        return False
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError):
+        return False
+    return not set(content).isdisjoint({"preset", *NeckParameters.names()})
+
+
+def _stem(file: str) -> str:
+    """Return a name that FMI allows, out of a file's: `my-model.npz` becomes `my_model`."""
+    stem = "".join(c if c.isascii() and c.isalnum() else "_" for c in Path(file).stem)
+    return f"m_{stem}" if stem[:1].isdigit() else stem

@@ -1,0 +1,150 @@
+"""softneck identify: a model from recordings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from softneck.core import KINDS, SettingsError, find_kind, refuse_existing, resolve
+from softneck.core._kinds import kinds_of
+from softneck.identification import INFINITE, Model, Search, Validation, validate
+from softneck.signals import Recording
+
+from ._auto import identify_auto
+from ._search import (
+    SearchOptions,
+    hold_out_option,
+    plot_option,
+    print_search,
+    run_search,
+    search_option,
+    strategy_option,
+    write_plot,
+)
+from .shared._console import note, percent, print_json, progress
+from .shared._options import apply_settings, force_option, json_option, output_option, set_option, target
+from .shared._recordings import read_together
+
+_KINDS = "\n".join(f"  {name:8} {KINDS[name].summary}" for name in kinds_of("model"))
+_KINDS += "\n  auto     tries them all and takes the best in free run"
+
+
+@click.command(
+    "identify",
+    help=f"Identify a model of KIND from one or more recordings.\n\n\b\nKinds:\n{_KINDS}",
+    epilog="Example: softneck identify rls neck.csv -o rls.npz --set na=1 --set delay=0.08",
+)
+@click.argument("kind")
+@click.argument("recordings", nargs=-1, required=True, type=click.Path(path_type=Path))
+@output_option("model", "MODEL")
+@click.option("--train", default=0.7, show_default=True, help="Part of each run, from its start, to train on.")
+@click.option("--html", type=click.Path(path_type=Path), help="With KIND auto: write a page with the ranking.")
+@click.option("--refit", is_flag=True, help="With KIND auto: train the chosen kind again, on all rows; judged before.")
+@click.option("--seed", type=int, help="Seed of kinds that start at random.")
+@set_option
+@search_option
+@hold_out_option
+@strategy_option
+@plot_option
+@force_option
+@json_option
+def command(
+    kind: str,
+    recordings: tuple[Path, ...],
+    output: Path | None,
+    train: float,
+    html: Path | None,
+    refit: bool,
+    seed: int | None,
+    settings: tuple[str, ...],
+    searches: tuple[str, ...],
+    hold_out: Path | None,
+    strategy: str,
+    plot: Path | None,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Identify a model of KIND from one or more recordings."""
+    if kind == "auto":
+        if settings:
+            raise SettingsError("--set: `auto` takes no settings; name the kind that they are for.")
+        identify_auto(
+            recordings, output, train=train, refit_all=refit, seed=seed, html=html, force=force, as_json=as_json
+        )
+        return
+    _refuse_options_of_auto(kind, html=html is not None, refit=refit)
+    entry = find_kind(kind, "model")
+    estimator = apply_settings(resolve(entry.settings), settings, seed=seed)
+    options = SearchOptions(searches, hold_out, strategy, plot)
+    if not 0.0 < train <= 1.0:
+        raise SettingsError(f"--train: the part to train on must be in (0, 1]; got {train:g}.")
+    path, replace = target(output, f"models/{kind}.npz", force=force, ending=".npz")
+    refuse_existing(path, force=replace)
+    if plot is not None:
+        refuse_existing(plot, force=force)
+    whole = read_together(recordings)
+    # All of it to train on leaves nothing to hold out.
+    head, tail = (whole, None) if train == 1.0 else whole.split(train)
+    found = run_search(estimator, head, options, quiet=as_json)
+    with progress(f"identify {kind}", quiet=as_json) as report:
+        model = found.model if found is not None else estimator.fit(head, progress=report)
+    with progress("hold-out", quiet=as_json):
+        held_out = _hold_out(model, tail)
+    model.save(path, force=replace)
+    if found is not None and plot is not None:
+        write_plot(found, plot, force=force)
+    if as_json:
+        print_json(_facts(path, model, held_out, found))
+    else:
+        _print(path, model, held_out, found)
+    if found is not None and found.interrupted:
+        raise KeyboardInterrupt  # what was done is kept, and the exit code says that it is not all
+
+
+def _refuse_options_of_auto(kind: str, *, html: bool, refit: bool) -> None:
+    if html:
+        raise SettingsError(
+            f"--html goes with KIND auto; for `{kind}` use `softneck validate MODEL --data REC --html`."
+        )
+    if refit:
+        raise SettingsError(f"--refit goes with KIND auto; `{kind}` is trained on the part that --train says.")
+
+
+def _print(path: Path, model: Model, held_out: Validation | None, found: Search | None) -> None:
+    if found is not None:
+        print_search(found)
+        for remark in found.remarks:
+            note(remark)
+    click.echo(f"{path}\n{model.summary()}")
+    if held_out is None:
+        click.echo("nothing was held out: judge it with `softneck validate` on another recording")
+        return
+    one, free = held_out.fits["1"], held_out.fits[INFINITE]
+    held = held_out.persistence["1"]
+    what = "hold-out" if found is None else "end of the recording, which no trial saw,"
+    click.echo(f"{what} of {held_out.rows_scored} rows, fit [%] pitch/roll:")
+    click.echo(f"  persistence {percent(held['pitch'])}/{percent(held['roll'])}")
+    click.echo(f"  one step    {percent(one['pitch'])}/{percent(one['roll'])}")
+    click.echo(f"  free run    {percent(free['pitch'])}/{percent(free['roll'])}")
+
+
+def _hold_out(model: Model, tail: Recording | None) -> Validation | None:
+    # A hold-out of a second or less says nothing.
+    if tail is None or all(len(run) < 75 for run in tail.runs()):
+        return None
+    return validate(model, tail, horizons=(1, INFINITE))
+
+
+def _facts(path: Path, model: Model, held_out: Validation | None, found: Search | None) -> dict:
+    facts = {
+        "model": str(path),
+        "kind": model.kind,
+        "sample_time_s": model.sample_time,
+        "rows_trained": int(model.training_rows.size),
+        "settings": dict(model.settings),
+        "findings": {name: value for name, value in model.findings.items() if name != "search"},
+        "summary": model.summary(),
+        "hold_out": None if held_out is None else held_out.as_dict(),
+    }
+    return facts if found is None else facts | {"search": found.as_dict()}

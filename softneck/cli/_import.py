@@ -1,0 +1,119 @@
+"""softneck import: a foreign log becomes a recording."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import click
+
+from softneck.core import DataError, SettingsError, atomic_write, refuse_existing
+from softneck.signals import guess_layout, import_log, read_layout, write_recording
+from softneck.signals.importing._log import Imported
+from softneck.signals.recording._files import recording_suffix
+
+from .shared._console import note, print_json
+from .shared._options import force_option, json_option, output_option, target
+
+
+@click.command(
+    "import",
+    epilog="Example: softneck import log.csv --guess -o neck.csv, then edit neck.layout.toml and go on with "
+    "softneck import log.csv --layout neck.layout.toml -o neck.csv --force",
+)
+@click.argument("log", type=click.Path(path_type=Path))
+@click.option("--layout", "layout_file", type=click.Path(path_type=Path), help="How to read the log.")
+@click.option("--guess", is_flag=True, help="Propose a layout, say why, and write it beside the recording.")
+@output_option("recording", "REC")
+@force_option
+@json_option
+def command(log: Path, layout_file: Path | None, guess: bool, output: Path | None, force: bool, as_json: bool) -> None:
+    """Turn any logger's table LOG into a recording, by a layout file or by a guess at one.
+
+    The .mcap log of `softneck drives run --log` needs neither.
+    """
+    if log.suffix.lower() == ".mcap":
+        _run_log(log, output, force=force, as_json=as_json, layout=guess or layout_file is not None)
+        return
+    if log.suffix.lower() == ".blf":
+        raise SettingsError(f"{log}: holds CAN frames only; import the `.mcap` log of the same run.")
+    if guess == (layout_file is not None):
+        what = "both were given" if guess else "neither was given"
+        raise SettingsError(f"import needs either --layout LAYOUT.toml or --guess; {what}.")
+    path, replace = target(output, f"recordings/{log.stem}.csv", force=force)
+    recording_suffix(path)
+    refuse_existing(path, force=replace)
+    facts: dict[str, Any] = {}
+    if layout_file is None:
+        imported, facts = _by_guess(log, path, replace)
+    else:
+        imported = import_log(log, read_layout(layout_file))
+    write_recording(path, imported.recording, force=replace)
+    _tell(path, imported, facts, as_json)
+
+
+def _run_log(log: Path, output: Path | None, *, force: bool, as_json: bool, layout: bool) -> None:
+    """Import the log of a run on drives."""
+    from softneck.drives import read_run_log  # the drives take a while to import
+
+    if layout:
+        raise SettingsError(f"{log}: is a log of ours, whose columns are known; leave --layout and --guess out.")
+    path, replace = target(output, f"recordings/{log.stem}.csv", force=force)
+    recording_suffix(path)
+    refuse_existing(path, force=replace)
+    run = read_run_log(log)
+    recording = run.recording()
+    notes = (f"{log}: {run.cut}: imported up to the cut",) if run.cut else ()
+    write_recording(path, recording, force=replace)
+    _tell(path, Imported(recording, notes), {}, as_json)
+
+
+def _by_guess(log: Path, path: Path, replace: bool) -> tuple[Imported, dict[str, Any]]:
+    """Guess a layout, write it beside the recording, and import by it.
+
+    Raises:
+        DataError: what a recording needs was not found; the proposal is written as far as it goes.
+    """
+    proposal = path.with_suffix(".layout.toml")
+    refuse_existing(proposal, force=replace)
+    guess = guess_layout(log)
+    for line in guess.lines:
+        note(line)
+    with atomic_write(proposal, force=replace) as temporary:
+        temporary.write_text(guess.text, encoding="utf-8")
+    if guess.missing:
+        raise DataError(
+            f"{log}: not found: {'; '.join(guess.missing)}. Fill it into {proposal}, then use --layout {proposal}."
+        )
+    try:
+        imported = import_log(log, guess.layout)
+    except DataError as error:
+        raise DataError(f"{error} (The proposed layout is in {proposal}.)") from error
+    facts = {"layout_file": str(proposal), "layout": tomllib.loads(guess.text), "reasons": list(guess.lines)}
+    return imported, facts
+
+
+def _tell(path: Path, imported: Imported, more: dict[str, Any], as_json: bool) -> None:
+    recording = imported.recording
+    missed = int((recording.outputs != recording.outputs).any(axis=1).sum())
+    facts = {
+        "recording": str(path),
+        "rows": len(recording),
+        "runs": len(recording.runs()),
+        "sample_time_s": recording.sample_time,
+        "missed_samples": missed,
+        "notes": list(imported.notes),
+        **more,
+    }
+    if as_json:
+        print_json(facts)
+        return
+    for remark in imported.notes:
+        note(remark)
+    if more:
+        note(f"the proposed layout is in {more['layout_file']}; edit it and use --layout if anything is wrong")
+    click.echo(
+        f"{path}: {len(recording)} rows in {facts['runs']} run(s) at {1e3 * recording.sample_time:g} ms, "
+        f"{missed} with a missed sample"
+    )

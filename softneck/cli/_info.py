@@ -1,0 +1,188 @@
+"""softneck info: what a file is."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import click
+import fmpy
+
+from softneck.core import DataError, FileFormatError, SettingsError, file_hash, load, read_archive, refuse_existing
+from softneck.cosim import load_study
+from softneck.plant import NeckParameters, VirtualNeck
+from softneck.signals import Guess, Layout, assess_quality, guess_layout, read_layout, read_recording
+
+from ._info_log import describe_log, is_candump
+from .shared._console import print_json, progress
+from .shared._options import force_option, json_option
+
+_RECORDINGS = (".csv", ".parquet")
+# Reading and checking a smaller file takes well under 2 s.
+_LARGE = 20_000_000
+
+
+@click.command("info", epilog="Example: softneck info eq22.csv --html quality.html")
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option("--html", type=click.Path(path_type=Path), metavar="FILE", help="Page on a recording's quality.")
+@force_option
+@json_option
+def command(file: Path, html: Path | None, force: bool, as_json: bool) -> None:
+    """Say what FILE is: a recording, model, observer, controller, FMU, loop, layout, neck, study, certificate or log
+    (tables, and those of `softneck drives run --log`).
+
+    Of a recording it tells the quality too: faults of its channels, and what its inputs can teach a model. Of a log it
+    tells what `softneck import --guess` would take each column for.
+    """
+    if not file.is_file():
+        raise FileFormatError(f"{file}: no such file.")
+    if html is not None:
+        if file.suffix.lower() not in _RECORDINGS:
+            raise SettingsError(f"{file}: `--html` shows the quality of a recording (`.csv`, `.parquet`) only.")
+        refuse_existing(html, force=force)
+    described = _describe(file, html, force=force, quiet=as_json)
+    found = described.pop("quality", None)
+    facts = {"file": str(file), **described, "sha256": file_hash(file)}
+    if as_json:
+        print_json(facts if found is None else {**facts, "quality": found.as_dict()})
+        return
+    for key, value in facts.items():
+        lines = value.splitlines() if isinstance(value, str) else value
+        text = "\n  ".join(lines) if isinstance(lines, list) else value
+        click.echo(f"{key}: {text}")
+    if found is not None:
+        click.echo("\nquality:")
+        for line in found.lines():
+            click.echo(f"  {line}" if line else "")
+
+
+def _describe(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dict[str, Any]:
+    match file.suffix.lower():
+        case ".csv" | ".parquet":
+            try:
+                return _recording(file, html, force=force, quiet=quiet)
+            except (DataError, FileFormatError) as error:
+                return _log(file, html, error)
+        case ".npz":
+            header, _ = read_archive(file)
+            thing = load(file)
+            return {"type": type(thing).__name__.lower(), "kind": header["kind"], "summary": thing.summary()}
+        case ".fmu":
+            return _fmu(file)
+        case ".toml":
+            return _toml(file)
+        case ".json":
+            return _certificate(file)
+        case ".mcap" | ".blf":
+            return describe_log(file)
+        case ".log" if is_candump(file):
+            return describe_log(file)
+        case _:
+            return _log(file, html, None)
+
+
+def _recording(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dict[str, Any]:
+    """Return what a recording holds and its quality, and write the page."""
+    quick = html is None and file.stat().st_size < _LARGE
+    with progress("info", quiet=quiet or quick) as report:
+        report(0.0, "reading")
+        recording = read_recording(file)
+        report(0.6, "checking")
+        found = assess_quality(recording)
+        if html is not None:
+            from softneck.plots import quality_page, write_page  # matplotlib takes a while to import
+
+            report(0.8, "drawing")
+            write_page(html, quality_page(recording, found, f"Quality of {file.name}"), force=force)
+    return {
+        "type": "recording",
+        "rows": len(recording),
+        "runs": len(recording.runs()),
+        "duration_s": len(recording) * recording.sample_time,
+        "sample_time_s": recording.sample_time,
+        "channels": ", ".join(recording.channels),
+        **({} if html is None else {"html": str(html)}),
+        "quality": found,
+    }
+
+
+def _log(file: Path, html: Path | None, error: DataError | FileFormatError | None) -> dict[str, Any]:
+    """Return what a foreign log seems to hold; `error` is why it is no recording, where it has a recording's ending.
+
+    Raises:
+        DataError, FileFormatError: it is a recording with a fault, or no log either.
+    """
+    try:
+        guess = guess_layout(file)
+    except (DataError, FileFormatError) as reason:
+        raise error or FileFormatError(
+            f"{file}: is no file of softneck by its ending, and no log either ({str(reason).removeprefix(f'{file}: ')})"
+        ) from reason
+    if error is not None and _is_titled(guess):
+        raise error
+    if html is not None:
+        raise SettingsError(f"{file}: `--html` shows the quality of a recording, and this is a log; import it first.")
+    return {
+        "type": "log",
+        "columns": list(guess.lines),
+        "missing": list(guess.missing) or "nothing that a recording needs",
+        "import": f"softneck import {file} --guess -o {file.stem}.recording.csv",
+    }
+
+
+def _is_titled(guess: Guess) -> bool:
+    """Whether a table has the form and the titles of a recording: a fault in it is for its user to mend."""
+    titled = [line for line in guess.lines if "titled as in a recording" in line]
+    return guess.layout.form == Layout(channels={}).form and len(titled) > 0
+
+
+def _fmu(file: Path) -> dict[str, Any]:
+    try:
+        description = fmpy.read_model_description(str(file), validate=False)
+    except Exception as error:  # fmpy raises bare Exception
+        raise FileFormatError(
+            f"{file}: is no FMU ({str(error).splitlines()[0] if str(error) else error!r})."
+        ) from error
+    by_causality = {
+        f"{causality}s": ", ".join(v.name for v in description.modelVariables if v.causality == causality)
+        for causality in ("input", "output", "parameter")
+    }
+    return {
+        "type": "FMU",
+        "model": description.modelName,
+        "fmi_version": description.fmiVersion,
+        "description": description.description or "",
+        "tool": description.generationTool or "",
+        **by_causality,
+    }
+
+
+def _toml(file: Path) -> dict[str, Any]:
+    """Say what a TOML file is: a loop names a plant, a study what varies, a layout channels; else it must be a neck."""
+    try:
+        table = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise FileFormatError(f"{file}: is no TOML file ({error}).") from error
+    if "plant" in table:
+        return {"type": "loop", "parts": ", ".join(name for name in table if isinstance(table[name], dict))}
+    if "vary" in table:
+        study = load_study(file)
+        return {"type": "study", "runs": len(study.points), "varies": ", ".join(study.vary)}
+    if "channels" in table:
+        layout = read_layout(file)
+        tilt = ["pitch, roll (from the tilt)"] if layout.inclination else []
+        return {"type": "layout", "channels": ", ".join([*layout.channels, *tilt])}
+    neck = NeckParameters.from_toml(file)
+    return {"type": "neck", "summary": VirtualNeck(neck).summary()}
+
+
+def _certificate(file: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise FileFormatError(f"{file}: is no JSON file ({error}).") from error
+    if not isinstance(content, dict):
+        raise FileFormatError(f"{file}: holds no JSON object, so it is no file of softneck.")
+    return {"type": "certificate" if "limits" in content else "JSON", "keys": ", ".join(content)}

@@ -1,0 +1,109 @@
+"""The group of all subcommands, and the one place where errors become a line and an exit code."""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from importlib import import_module, metadata
+
+import click
+
+from softneck.core import SoftneckError
+
+# Subcommand -> module and what it does; a module is imported when its command is called, so that
+# `softneck --help` answers at once.
+_COMMANDS = {
+    "demo": ("_demo", "Run the main job: experiment, models, FMUs, controller, closed loop, report."),
+    "doctor": ("_doctor", "Say what of this machine works."),
+    "info": ("_info", "Say what a file is."),
+    "record": ("_record", "Record a signal on the virtual neck."),
+    "import": ("_import", "Turn any logger's table into a recording, by a layout file."),
+    "identify": ("_identify", "Identify a model from recordings."),
+    "validate": ("_validate", "Judge models on rows that they were not trained on."),
+    "reproduce-paper": ("_reproduce_paper", "Run the paper on the virtual neck, ours beside its tables and figures."),
+    "family": ("_family", "Fit an uncertain linear plant over inclinations and payloads."),
+    "fmu": ("_fmu", "Package models, observers, controllers or the virtual neck as FMUs."),
+    "observer": ("_observer", "Build a Kalman filter over a linear model."),
+    "design": ("_design", "Design a controller on a linear model."),
+    "verify": ("_verify", "Prove a controller on what it claims, or fail loudly."),
+    "simulate": ("_simulate", "Close the loop that a TOML file describes and judge it."),
+    "study": ("_study", "Run a loop many times over what varies: ranking, Pareto front, worst cases."),
+    "ssp": ("_ssp", "Write a loop as an SSP file for other simulators."),
+    "drives": ("drives._commands", "Run controllers on CANopen drives, or on simulated ones."),
+    "report": ("_report", "Write one page on a whole project: data, models, certificates, loops, studies."),
+    "new": ("_new", "Begin a project whose closed-loop test passes at once."),
+}
+_INTERRUPTED, _BAD_INPUT, _OUR_FAULT = 130, 2, 3
+
+
+class _LazyGroup(click.Group):
+    """A group whose subcommands are imported on demand."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names in the order of the work."""
+        del ctx
+        return list(_COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import and return one subcommand."""
+        del ctx
+        entry = _COMMANDS.get(cmd_name)
+        return import_module(f"softneck.cli.{entry[0]}").command if entry else None
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List all subcommands without importing them."""
+        del ctx
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, text) in _COMMANDS.items()])
+
+
+@click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(metadata.version("softneck"), prog_name="softneck")
+def group() -> None:
+    """From a logged experiment on a tendon-driven soft robotic neck to a verified controller.
+
+    \b
+    Exit codes: 0 done, 1 a check that did not hold, 2 bad input, 3 a fault of ours, 130 Ctrl-C.
+    """
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line and exit with its code."""
+    sys.exit(run(arguments))
+
+
+def run(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit code; an error is one line on stderr."""
+    try:
+        code = group.main(args=arguments, prog_name="softneck", standalone_mode=False)
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.format_message(), err=True)
+        return _BAD_INPUT
+    except click.ClickException as error:
+        return _fail(error.format_message(), _BAD_INPUT)
+    except (KeyboardInterrupt, click.Abort):
+        return _fail("interrupted; files already finished are kept, none is half written", _INTERRUPTED)
+    except SoftneckError as error:
+        return _fail(str(error), error.exit_code)
+    except BrokenPipeError:
+        # The reader of a pipe went away: no error of the user's.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as error:
+        return _fail(f"{error.filename or 'input/output'}: {error.strerror or error}", _BAD_INPUT)
+    except Exception as error:  # the edge: anything unforeseen is our fault, and says so
+        if os.environ.get("SOFTNECK_TRACEBACK"):
+            traceback.print_exc()
+        return _fail(
+            f"a fault of softneck, not of yours: {type(error).__name__}: {error} "
+            "(set SOFTNECK_TRACEBACK=1 and report what it prints)",
+            _OUR_FAULT,
+        )
+    return code if isinstance(code, int) else 0
+
+
+def _fail(message: str, code: int) -> int:
+    click.echo("softneck: " + " ".join(message.split()), err=True)
+    return code

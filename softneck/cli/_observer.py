@@ -1,0 +1,90 @@
+"""softneck observer: a Kalman filter from a saved linear model and a sensor preset."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from softneck.core import SettingsError, find_kind, refuse_existing, resolve
+from softneck.identification import load_model
+from softneck.signals import read_recording
+
+from .shared._console import print_json
+from .shared._options import apply_settings, force_option, json_option, output_option, set_option, target
+
+if TYPE_CHECKING:
+    from softneck.estimation._noise import NoiseFit
+
+
+@click.command("observer", epilog="Example: softneck observer rls.npz -o observer.npz --sensor paper")
+@click.argument("model", type=click.Path(path_type=Path))
+@output_option("observer", "OBSERVER")
+@click.option("--sensor", help="Sensor preset: its noise is the measurement noise. [default: paper]")
+@click.option(
+    "--data",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    metavar="REC",
+    help="Estimate the noise levels from this recording (maximum likelihood); with --sensor all but that of the "
+    "measurement. May be given several times.",
+)
+@click.option("--gyro", is_flag=True, help="Driven by the gyro's rates, with their bias as a state (form=gyro).")
+@set_option
+@force_option
+@json_option
+def command(
+    model: Path,
+    output: Path | None,
+    sensor: str | None,
+    data: tuple[Path, ...],
+    gyro: bool,
+    settings: tuple[str, ...],
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Build a Kalman filter over the linear MODEL.
+
+    Three forms: the model with a disturbance on each axis (default), --gyro, and --set form=kinematic.
+    """
+    kind = find_kind("kalman", "observer")
+    path, replace = target(output, "observers/kalman.npz", force=force, ending=".npz")
+    refuse_existing(path, force=replace)
+    if gyro and any(setting.replace(" ", "").startswith("form=") for setting in settings):
+        raise SettingsError("--gyro is --set form=gyro; give one of them.")
+    chosen = apply_settings(resolve(kind.settings), settings, sensor=sensor, form="gyro" if gyro else None)
+    observer = chosen.design(load_model(model))
+    told: dict[str, Any] = {}
+    lines: list[str] = []
+    if data:
+        fit, lines = _fitted(observer, data, fixed=() if sensor is None else (observer.noise_names[0],))
+        observer = fit.observer
+        told = {"fit": {"rows": fit.rows, "outliers": fit.outliers, "log_likelihood": list(fit.log_likelihood),
+                        "at_bound": list(fit.at_bound)}}  # fmt: skip
+    observer.save(path, force=replace)
+    if as_json:
+        noise = dict(zip(observer.noise_names, observer.noise, strict=True))
+        summary = {"observer": str(path), "kind": kind.name, "form": observer.form, "noise": noise}
+        print_json({**summary, **told, "summary": observer.summary()})
+        return
+    click.echo("\n".join([str(path), observer.summary(), *lines]))
+
+
+def _fitted(observer: Any, data: tuple[Path, ...], *, fixed: tuple[str, ...]) -> tuple[NoiseFit, list[str]]:
+    """Return the noise levels that the recordings support, and what to say about them."""
+    # Imported here: `softneck --help` must not wait for scipy's optimisers.
+    from softneck.estimation import consistency, fit_noise
+
+    recordings = [read_recording(path) for path in data]
+    fit = fit_noise(observer, recordings, fixed=fixed)
+    before, after = fit.log_likelihood
+    lines = [
+        f"  noise from {fit.rows} measurements, {fit.outliers} outliers left out; "
+        f"log likelihood of each {before:.2f} -> {after:.2f}"
+    ]
+    if fit.at_bound:
+        lines.append(f"  not told by the data: {', '.join(fit.at_bound)}")
+    for path, recording in zip(data, recordings, strict=True):
+        lines += [f"  {path.name}: {line}" for line in consistency(fit.observer, recording).summary().splitlines()]
+    return fit, lines

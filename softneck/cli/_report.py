@@ -1,0 +1,49 @@
+"""softneck report: one page on a whole project."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from softneck.core import refuse_existing
+from softneck.plots import write_page
+from softneck.report import project_page, read_project
+from softneck.report._project import Project
+
+from .shared._console import note, print_json, progress
+from .shared._options import force_option, json_option, target
+
+
+@click.command("report", epilog="Example: softneck report my_neck -o my_neck.html")
+@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), metavar="FILE", help="The page. [default: build/report.html]"
+)
+@click.option("--no-run", is_flag=True, help="Do not run the loop files.")
+@force_option
+@json_option
+def command(folder: Path, output: Path | None, no_run: bool, force: bool, as_json: bool) -> None:
+    """Write one self-contained page on all that DIR holds, to send to a colleague.
+
+    Data quality, models and their fits on rows that they were not trained on, uncertain plants, observers and
+    controllers, certificates, FMUs, loops (run anew) and studies, with interactive plots; it opens offline. Files that
+    cannot be read are listed in it.
+    """
+    path, replace = target(output, "report.html", force=force, ending=".html")
+    refuse_existing(path, force=replace)
+    with progress("report", quiet=as_json) as report:
+        project = read_project(folder, run_loops=not no_run, progress=lambda done, word: report(0.8 * done, word))
+        report(0.8, "drawing")
+        write_page(path, project_page(project), force=replace)
+    if as_json:
+        print_json({"report": str(path), **_counts(project), "problems": project.problems})
+        return
+    click.echo(f"{path}: " + ", ".join(f"{count} {name}" for name, count in _counts(project).items() if count))
+    for name, problem in project.problems.items():
+        note(f"{name}: {' '.join(problem.split())}")
+
+
+def _counts(project: Project) -> dict[str, int]:
+    names = ("recordings", "models", "families", "observers", "controllers", "certificates", "fmus", "loops", "studies")
+    return {name: len(getattr(project, name)) for name in names}

@@ -1,0 +1,83 @@
+"""softneck simulate: a closed loop over FMUs and files, judged against its limits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+from markupsafe import Markup
+
+from softneck.core import CheckFailedError, refuse_existing, write_certificate
+from softneck.cosim import Result, load_loop, simulate
+from softneck.plots import Section, Table, neck_view, page, write_page
+from softneck.plots._charts import loop_chart
+from softneck.signals import write_recording
+from softneck.signals.recording._files import recording_suffix
+
+from .shared._console import print_json, print_table, progress
+from .shared._options import force_option, json_option, output_option, target
+
+
+@click.command("simulate", epilog="Example: softneck simulate build/demo/loops/pitch_step.toml --html loop.html")
+@click.argument("loop_file", metavar="LOOP.toml", type=click.Path(path_type=Path))
+@output_option("recording of the run", "REC")
+@click.option("--certificate", type=click.Path(path_type=Path), help="Write what held, with the hashes of all files.")
+@click.option("--html", type=click.Path(path_type=Path), help="Write a page with plots, and beside it the neck in 3-D.")
+@force_option
+@json_option
+def command(
+    loop_file: Path, output: Path | None, certificate: Path | None, html: Path | None, force: bool, as_json: bool
+) -> None:
+    """Close the loop that LOOP.toml describes; exit code 1 if one of its limits does not hold."""
+    path, replace = target(output, f"results/{loop_file.stem}.csv", force=force)
+    recording_suffix(path)
+    refuse_existing(path, force=replace)
+    view = html.with_name(f"{html.stem}_3d.html") if html is not None else None
+    for extra in (certificate, html, view):
+        if extra is not None:
+            refuse_existing(extra, force=force)
+    with progress("simulate", quiet=as_json) as report:
+        result = simulate(load_loop(loop_file), report=lambda done: report(done, loop_file.name))
+    write_recording(path, result.recording(), force=replace)
+    if certificate is not None:
+        write_certificate(certificate, result.certificate(), force=force)
+    if html is not None and view is not None:
+        write_page(view, neck_view(result.recording(), title=f"Loop {loop_file.stem}"), force=force)
+        write_page(html, _page(loop_file.stem, result, view), force=force)
+    if as_json:
+        print_json(result.report())
+    else:
+        _print(path, result)
+    failed = [row["metric"] for row in result.limits if not row["holds"]]
+    if failed:
+        raise CheckFailedError(f"{loop_file}: {len(failed)} limit(s) do not hold: {', '.join(failed)}.")
+
+
+def _print(path: Path, result: Result) -> None:
+    print_table(str(path), *_metrics(result))
+    if result.limits:
+        print_table("Limits", *_limits(result))
+    click.echo(f"{result.real_time_factor:.0f} times real time")
+
+
+def _metrics(result: Result) -> tuple[list[str], list[list[str]]]:
+    rows = []
+    for part, values in result.metrics.items():
+        rows += [[f"{part}.{name}", "-" if value is None else f"{value:.3f}"] for name, value in values.items()]
+    return ["metric", "value"], rows
+
+
+def _limits(result: Result) -> tuple[list[str], list[list[str]]]:
+    rows = []
+    for row in result.limits:
+        value = "-" if row["value"] is None else f"{row['value']:.3f}"
+        rows.append([row["metric"], f"{row['limit']:g}", value, "holds" if row["holds"] else "fails"])
+    return ["metric", "limit", "value", "verdict"], rows
+
+
+def _page(name: str, result: Result, view: Path) -> str:
+    tables = [Table("Limits", *_limits(result)), Table("Metrics", *_metrics(result))]
+    chart = loop_chart(result.signals.time, result.signals.signals, name)
+    words = f"Order {result.order}, metrics of the {result.angle} angle, {result.real_time_factor:.0f} times real time."
+    link = Markup('<a href="{}">The neck in 3-D</a>').format(view.name)
+    return page(f"Loop {name}", [Section("Result", text=[words, link], tables=tables, charts=[chart])])

@@ -1,0 +1,42 @@
+"""softneck ssp: a loop as one SSP file for other simulators."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from softneck.core import file_hash
+from softneck.cosim import load_loop, write_ssp
+
+from .shared._console import note, print_json, progress
+from .shared._options import force_option, json_option, output_option, target
+
+
+@click.command("ssp", epilog="Example: softneck ssp build/demo/loops/pitch_step.toml -o pitch_step.ssp")
+@click.argument("loop_file", metavar="LOOP.toml", type=click.Path(path_type=Path))
+@output_option("SSP archive", "X.ssp")
+@click.option(
+    "--backend",
+    type=click.Choice(["python", "compiled"]),
+    default="python",
+    show_default=True,
+    help="What runs in the FMUs that are made here: Python and numpy, or a C library that needs neither.",
+)
+@force_option
+@json_option
+def command(loop_file: Path, output: Path | None, backend: str, force: bool, as_json: bool) -> None:
+    """Write the loop of LOOP.toml as an SSP 1.0 archive: plant, observer, controller and reference FMUs.
+
+    Masters that read it set all inputs and then step all: they compute what `order = "jacobi"` does.
+    """
+    path, replace = target(output, f"ssp/{loop_file.stem}.ssp", force=force)
+    with progress("ssp", quiet=as_json):
+        setup = load_loop(loop_file)
+        write_ssp(setup, path, force=replace, compiled=backend == "compiled")
+    if as_json:
+        print_json({"ssp": str(path), "sha256": file_hash(path), "parts": [*setup.loop.parts, "reference"]})
+        return
+    click.echo(str(path))
+    if setup.loop.order == "sequential":
+        note('the loop file is sequential; an SSP master computes what it gives with order = "jacobi".')

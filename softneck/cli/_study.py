@@ -1,0 +1,86 @@
+"""softneck study: many runs of one loop, ranked, with a report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+import pandas as pd
+
+from softneck.core import CheckFailedError
+from softneck.cosim import load_study, pareto_front, rank
+from softneck.cosim.studies._run_study import run_study
+from softneck.cosim.studies._store import read_description
+from softneck.cosim.studies._study_results import write_worst
+from softneck.plots import write_page
+from softneck.report import study_page
+from softneck.report._study_page import failures, study_head, study_rows
+
+from .shared._console import note, print_json, print_table, progress
+from .shared._options import force_option, json_option
+
+
+@click.command("study", epilog="Example: softneck study study.toml -o build/study --workers 2")
+@click.argument("study_file", metavar="STUDY.toml", type=click.Path(path_type=Path))
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), metavar="DIR",
+    help="Folder of runs, report and worst cases. [default: build/studies/NAME]",
+)  # fmt: skip
+@click.option("--workers", type=int, help="Local processes. [default: one for each core]")
+@click.option("--dask", metavar="ADDRESS", help="Run on this Dask scheduler instead, such as tcp://head:8786.")
+@click.option("--resume", is_flag=True, help="Go on with the study that DIR holds.")
+@click.option("--worst", type=click.IntRange(min=0), default=3, show_default=True, help="Worst runs as loop files.")
+@force_option
+@json_option
+def command(
+    study_file: Path,
+    output: Path | None,
+    workers: int | None,
+    dask: str | None,
+    resume: bool,
+    worst: int,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Run the loop of STUDY.toml over all that its [vary] names; exit code 1 if every run failed.
+
+    \b
+    DIR gets  runs.parquet   a row for each run: what varied, seed, metrics, limits, error
+              report.html    ranking, Pareto front, distributions, influences
+              worst/         the worst runs as loop files for softneck simulate
+    Ctrl-C or a crash loses no finished run: --resume goes on.
+    """
+    study = load_study(study_file)
+    folder = output if output is not None else Path("build") / "studies" / study_file.stem
+    replace = force or (output is None and not resume)
+    with progress(f"study of {len(study.points)} runs", quiet=as_json) as report:
+        runs = run_study(study, folder, workers=workers, dask=dask, resume=resume, force=replace, report=report)
+    write_page(folder / "report.html", study_page(read_description(folder), runs), force=True)
+    paths = write_worst(study, runs, folder / "worst", count=worst) if worst else []
+    if as_json:
+        print_json(_summary(runs, folder, study.objectives, paths))
+    else:
+        print_table(str(folder), *_table(runs, list(study.vary), study.objectives))
+        failed = sum(failures(runs))
+        note(f"{len(runs)} runs, {failed} failed; report: {folder / 'report.html'}")
+    if all(failures(runs)):
+        raise CheckFailedError(f"{study_file}: every run failed; the first said: {runs['error'].iloc[0]}")
+
+
+def _table(runs: pd.DataFrame, keys: list[str], objectives: tuple[str, ...]) -> tuple[list[str], list[list[str]]]:
+    return study_head(keys, objectives), study_rows(runs, keys, objectives)
+
+
+def _summary(runs: pd.DataFrame, folder: Path, objectives: tuple[str, ...], worst: list[Path]) -> dict[str, Any]:
+    held = runs["holds"].dropna().tolist()
+    return {
+        "folder": str(folder),
+        "runs": len(runs),
+        "failed": sum(failures(runs)),
+        "holds_share": sum(held) / len(held) if held else None,
+        "objectives": list(objectives),
+        "best": [int(run) for run in rank(runs, objectives)["run"].head(10)],
+        "pareto_front": [int(run) for run in pareto_front(runs, objectives)["run"]],
+        "worst": [str(path) for path in worst],
+    }

@@ -1,0 +1,99 @@
+"""softneck validate: what a model is worth, beside persistence, one step and k steps ahead and in free run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from softneck.core import SettingsError, refuse_existing
+from softneck.identification import INFINITE, Rules, Validation, compare, load_model
+from softneck.plots import write_page
+from softneck.signals import read_recording
+
+from .shared._console import print_json, print_table, progress
+from .shared._options import force_option, json_option
+from .shared._recordings import read_together
+from .shared._validate_table import fit_table, remarks
+
+_NOTE = (
+    "Fit is 100 (1 - |y - yhat| / |y - mean y|) in %. Persistence repeats the last sample; a one-step fit that is not "
+    "above it says nothing. The free run (inf) is what an FMU of the plant does. Best linear is fitted on the judged "
+    "rows: no linear model of the set-points has a better free run on them."
+)
+
+
+@click.command(
+    "validate",
+    epilog="Example: softneck validate rls.npz nn.npz --data neck.csv --horizon 1,25,inf --html fit.html",
+)
+@click.argument("models", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--data", "data", multiple=True, required=True, type=click.Path(path_type=Path), help="A recording.")
+@click.option("--horizon", default="1,5,25,inf", show_default=True, help="Samples ahead; inf is the free run.")
+@click.option(
+    "--motors",
+    type=click.Choice(["simulated", "measured"]),
+    default="simulated",
+    show_default=True,
+    help="Free run from set-points alone, or with logged motor positions as the paper does.",
+)
+@click.option("--include-training", is_flag=True, help="Score rows that the model was trained on as well.")
+@click.option(
+    "--training",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    help="What the models were trained on, to say how novel the data is.",
+)
+@click.option("--html", type=click.Path(path_type=Path), help="Write a page with plots.")
+@force_option
+@json_option
+def command(
+    models: tuple[Path, ...],
+    data: tuple[Path, ...],
+    horizon: str,
+    motors: str,
+    include_training: bool,
+    training: tuple[Path, ...],
+    html: Path | None,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Judge MODELs on the rows of recordings that they were not trained on."""
+    horizons = _horizons(horizon)
+    if html is not None:
+        refuse_existing(html, force=force)
+    loaded = {str(path): load_model(path) for path in models}
+    recordings = {str(path): read_recording(path) for path in data}
+    rules = Rules(horizons, motors, include_training)
+    known = read_together(training) if training else None
+    with progress("validate", quiet=as_json) as report:
+        comparison = compare(loaded, recordings, rules=rules, training=known, progress=report)
+    results = list(comparison.validations)
+    if html is not None:
+        write_page(html, _page(results), force=force)
+    if as_json:
+        print_json(comparison.as_dict())
+        return
+    print_table("Fit in %, errors in deg, pitch/roll", *fit_table(results))
+    for result in results:
+        for line in remarks(result):
+            click.echo(line)
+    click.echo(_NOTE)
+
+
+def _horizons(text: str) -> tuple[int | str, ...]:
+    horizons: list[int | str] = []
+    for word in text.split(","):
+        if word.strip() == INFINITE:
+            horizons.append(INFINITE)
+        elif word.strip().isdecimal() and 1 <= int(word) <= 10_000:
+            horizons.append(int(word))
+        else:
+            raise SettingsError(f"--horizon takes numbers of samples and `inf`, such as 1,5,25,inf; got `{word}`.")
+    return tuple(dict.fromkeys(horizons))
+
+
+def _page(results: list[Validation]) -> str:
+    from softneck.report import validation_page  # it draws in all of the project, which the table does not need
+
+    return validation_page(results)

@@ -1,0 +1,121 @@
+"""softneck verify: a controller against all that its plant may be, or exit code 1."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from softneck.core import CheckFailedError, SettingsError, file_hash, load, refuse_existing, write_certificate
+from softneck.core._certificate import CERTIFICATE_ENDING
+from softneck.loop._loop import ORDERS
+from softneck.verification import Verification, read_requirements, verify
+from softneck.verification._requirements import DEFAULT_FILE
+
+from .shared._console import print_json, print_table, progress
+from .shared._options import force_option, json_option, output_option, target
+
+_PATH = click.Path(path_type=Path)
+
+
+def _print_requirements(context: click.Context, _: click.Parameter, value: bool) -> None:
+    if value:
+        click.echo(DEFAULT_FILE.read_text(encoding="utf-8"), nl=False)
+        context.exit()
+
+
+@click.command(
+    "verify",
+    epilog="Example: softneck verify pi.npz neck_family.npz -o pi.certificate.json --html pi.html",
+)
+@click.argument("controller", type=_PATH)
+@click.argument("plants", metavar="MODEL|FAMILY...", nargs=-1, required=True, type=_PATH)
+@click.option("--requirements", type=_PATH, metavar="TOML", help="What must hold, where it differs from the defaults.")
+@click.option(
+    "--print-requirements", is_flag=True, is_eager=True, expose_value=False, callback=_print_requirements,
+    help="Print the default requirements and exit.",
+)  # fmt: skip
+@click.option("--observer", type=_PATH, help="Observer of the loops over the virtual neck; hashed like the controller.")
+@click.option("--order", type=click.Choice(ORDERS), help="Of the loop. [default: that of the controller's design]")
+@output_option("certificate", "CERTIFICATE")
+@click.option("--html", type=_PATH, help="Write a page with the verdict, and all behind it in plots.")
+@force_option
+@json_option
+def command(
+    controller: Path,
+    plants: tuple[Path, ...],
+    requirements: Path | None,
+    observer: Path | None,
+    order: str | None,
+    output: Path | None,
+    html: Path | None,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Verify CONTROLLER on every plant of the linear MODELs and FAMILYs and on the virtual neck.
+
+    Writes a certificate: each requirement with its value, limit and worst plant, and the hashes of all files read;
+    beside it a loop file for every worst plant, for `softneck simulate`. Exit code 1 if a requirement does not hold.
+    """
+    path, replace = target(output, f"certificates/{controller.stem}{CERTIFICATE_ENDING}", force=force, ending=".json")
+    refuse_existing(path, force=replace)
+    if html is not None:
+        refuse_existing(html, force=force)
+    asked = read_requirements(requirements)
+    things, eyes = _opened(plants), None if observer is None else load(observer, role="observer")
+    files = {"controller": controller, **{f"plant {k}": item for k, item in enumerate(plants, start=1)}}
+    files |= {} if requirements is None else {"requirements": requirements}
+    files |= {} if observer is None else {"observer": observer}
+    neck_file = Path(str(asked.neck["preset"]))
+    files |= {"neck": neck_file} if neck_file.suffix == ".toml" else {}
+    judged = load(controller, role="controller")
+    with progress("verify", quiet=as_json) as report:
+        found = verify(
+            judged, things, asked, order=order, observer=eyes, progress=report,
+            files={role: (str(item), file_hash(item)) for role, item in files.items()},
+        )  # fmt: skip
+    folder = path.with_name(f"{path.name.removesuffix('.json').removesuffix('.certificate')}_worst")
+    loops = found.write_worst(folder, controller=controller, observer=observer, force=True)
+    contents = found.contents(loops)
+    write_certificate(path, contents, force=replace)
+    if html is not None:
+        _write_page(html, found, controller, path, force=force)
+    if as_json:
+        print_json(contents)
+    else:
+        _print(path, found, folder)
+    if not found.holds:
+        listed = ", ".join(verdict.requirement.metric for verdict in found.failed)
+        raise CheckFailedError(f"{controller}: {len(found.failed)} requirement(s) do not hold: {listed}.")
+
+
+def _opened(plants: tuple[Path, ...]) -> dict[str, Any]:
+    things: dict[str, Any] = {}
+    for item in plants:
+        thing = load(item)
+        if not hasattr(thing, "tf"):
+            raise SettingsError(f"{item}: a linear MODEL or a FAMILY is needed; this is a {type(thing).__name__}.")
+        things[item.name if item.name not in things else str(item)] = thing
+    return things
+
+
+def _write_page(html: Path, found: Verification, controller: Path, certificate: Path, *, force: bool) -> None:
+    from softneck.plots import write_page
+    from softneck.verification import verification_page
+
+    write_page(html, verification_page(found, controller.name, certificate.name), force=force)
+
+
+def _print(path: Path, found: Verification, folder: Path) -> None:
+    from softneck.verification._page import verdict_table
+
+    table = verdict_table(found)
+    print_table(str(path), table.head, table.rows)
+    for item in found.agreements:
+        if not item.agree:
+            answers = ", ".join(f"{method} {value}" for method, value in item.answers.items())
+            click.echo(f"methods disagree: {item.question} {item.note} ({answers})")
+    for name, why in found.evidence.not_computed.items():
+        click.echo(f"not computed: {name}: {why}")
+    click.echo(f"{found.summary()}; worst plants as loops in {folder}")

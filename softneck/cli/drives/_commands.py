@@ -1,0 +1,286 @@
+"""softneck drives: the CANopen drives, or simulated ones that speak the same frames."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import Any
+
+import click
+
+from softneck.core import CheckFailedError, SettingsError, refuse_existing
+from softneck.cosim import load_loop
+from softneck.drives import (
+    DrivesResult,
+    default_drives,
+    preflight,
+    prepare,
+    reset,
+    run_on_bus,
+    run_simulated,
+    scan,
+    stop,
+    zero,
+)
+from softneck.drives.running._certified import require_certified
+from softneck.drives.running._deploy import neck_of
+from softneck.drives.running._keyboard import Keyboard
+from softneck.drives.running._preflight import Report
+from softneck.drives.running._stop import require_reset, require_stopped
+from softneck.signals import write_recording
+from softneck.signals.recording._files import recording_suffix
+
+from ..shared._console import note, print_json, print_table, progress
+from ..shared._neck import load_neck
+from ..shared._options import force_option, json_option, output_option, target
+from ._log import acting_files, log_options, opened_log, require_logs
+from ._move import jog_command, record_command
+from ._replay import replay_command
+from ._target import (
+    Target,
+    checked_names,
+    drives_options,
+    leave_if_asked,
+    look_of,
+    neck_option,
+    open_drives,
+    open_link,
+    override_option,
+    sensor_of,
+    sensor_or_reason,
+    target_of,
+)
+from ._view import live_view
+
+
+@click.group(
+    "drives",
+    epilog="Example: softneck drives check --simulated. Every command takes --json, and --help tells its options.",
+)
+def command() -> None:
+    """CANopen drives (CiA 301/402): scan, check, jog, zero, record, run, replay, stop, reset.
+
+    While drives move on a bus, Escape and space stop them at once; Ctrl-C ramps to rest first.
+
+    What these commands do was shown on simulated drives only; no hardware was at hand.
+    """
+
+
+@command.command("scan")
+@drives_options
+@json_option
+def scan_command(drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, as_json: bool) -> None:
+    """List the nodes on the bus; sends reads only. Exit code 1 if none answers."""
+    if bus is not None and drives_file is None:
+        chosen = Target(default_drives(), bus, False, arm)
+    else:
+        chosen = target_of(drives_file, bus, simulated, arm)
+    with open_link(chosen, moves=False) as link:
+        found = scan(link)
+    if as_json:
+        print_json({"nodes": found})
+    else:
+        rows = [[str(item["node"]), str(item["name"] or "-"), str(item["firmware"] or "-"), str(item["serial"] or "-"),
+                 str(item["state"] or "-")] for item in found]  # fmt: skip
+        print_table(f"{len(found)} node(s)", ["node", "name", "firmware", "serial", "state"], rows)
+    if not found:
+        raise CheckFailedError(
+            f"{bus or 'the bus'}: no node answers. Are the drives on, is the bit rate theirs, is the line terminated "
+            "(60 ohm between CAN_H and CAN_L)?"
+        )
+
+
+@command.command("check", epilog="Example: softneck drives check --simulated")
+@drives_options
+@override_option
+@json_option
+def check_command(
+    drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, overrides: tuple[str, ...], as_json: bool
+) -> None:
+    """Pre-flight: identity, firmware, factors, modes, options, limits, guarding; each value written is read back.
+
+    Writes the configuration, moves nothing. Exit code 1 if a check does not hold.
+    """
+    chosen = target_of(drives_file, bus, simulated, arm)
+    names = checked_names(overrides)
+    with open_link(chosen, moves=False, homed=True) as link:
+        sensor = None if chosen.simulated else sensor_or_reason(chosen.file, str(chosen.bus))
+        report = preflight(link, chosen.file, override=names, sensor=sensor)
+    _show(report, as_json=as_json)
+    report.require()
+
+
+def _show(report: Report, *, as_json: bool) -> None:
+    if as_json:
+        print_json(report.table())
+        return
+    rows = []
+    for row in report.rows:
+        verdict = "ok" if row.holds else "overridden" if row.name in report.overridden else "fails"
+        rows.append([f"{row.node or 'bus'} {row.name}", row.found, verdict])
+    print_table(f"Pre-flight, guarding by {report.guarding}", ["check", "found", "verdict"], rows)
+
+
+@command.command("zero", epilog="Example: softneck drives zero --drives drives.toml --bus socketcan:can0 --arm")
+@drives_options
+@override_option
+@neck_option
+@log_options
+@force_option
+@json_option
+def zero_command(
+    drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, overrides: tuple[str, ...],
+    neck: str | None, logs: tuple[Path, ...], no_log: bool, force: bool, as_json: bool,
+) -> None:  # fmt: skip
+    """Tension each tendon gently, set the encoders' zero there, and verify with the inclinometer.
+
+    Its log holds frames: .blf or .log.
+    """
+    parameters = load_neck(neck or "paper")
+    chosen = target_of(drives_file, bus, simulated, arm, neck=parameters)
+    if any(path.suffix.lower() == ".mcap" for path in logs):
+        raise SettingsError("zero has no cycles to replay; its --log ends in .blf or .log.")
+    require_logs(logs, no_log=no_log, force=force)
+    with (
+        open_link(chosen, moves=True, neck=parameters) as link,
+        opened_log(chosen, "zero", logs, no_log=no_log, force=force, ending=".blf") as log,
+    ):
+        link.tap = None if log is None else log.frame
+        look = look_of(link, chosen.file)
+        report = preflight(link, chosen.file, override=checked_names(overrides))
+        report.require()
+        with Keyboard() as keyboard:
+            try:
+                zeroed = zero(link, chosen.file, look, guarding=report.guarding, operator=keyboard)
+            except CheckFailedError as error:
+                if keyboard.interrupted or keyboard.terminated:
+                    note(str(error))
+                leave_if_asked(keyboard)
+                raise
+    if as_json:
+        print_json(zeroed.table())
+        return
+    rows = [[f"node {node}", f"{pulled:.3f}"] for node, pulled in zip(zeroed.nodes, zeroed.pulled, strict=True)]
+    print_table("Zeroed", ["motor", "pulled [rad]"], rows)
+
+
+@command.command("run", epilog="Example: softneck drives run pi.npz --loop loop.toml --simulated")
+@click.argument("controller", metavar="CONTROLLER", type=click.Path(path_type=Path))
+@click.option("--loop", "loop_file", required=True, type=click.Path(path_type=Path), metavar="LOOP.toml",
+              help="Observer, reference and duration; its plant gives the virtual neck of --simulated.")  # fmt: skip
+@click.option("--certificate", "certificates", multiple=True, type=click.Path(path_type=Path),
+              help="Of `softneck verify` or `softneck simulate`; several may cover the files together.")  # fmt: skip
+@drives_options
+@override_option
+@neck_option
+@click.option("--pace", type=float, help="With --simulated: this multiple of real time instead of as fast as possible.")
+@log_options
+@click.option("--realtime", is_flag=True, help="On a bus: before all ordinary processes (SCHED_FIFO), memory locked.")
+@output_option("recording of the run", "REC")
+@force_option
+@json_option
+def run_command(
+    controller: Path, loop_file: Path, certificates: tuple[Path, ...], drives_file: Path | None, bus: str | None,
+    simulated: bool, arm: bool, overrides: tuple[str, ...], neck: str | None, pace: float | None, realtime: bool,
+    logs: tuple[Path, ...], no_log: bool, output: Path | None, force: bool, as_json: bool,
+) -> None:  # fmt: skip
+    """Run CONTROLLER in the loop of LOOP.toml on the drives: enable, ramp in, control, ramp out, switch off.
+
+    Refused unless certificates cover controller, observer and loop file and hold. Exit code 1 if anything stopped it,
+    143 if SIGTERM ended it (to rest, then off).
+    On a terminal (stderr) a live view shows the run, on a bus and with --pace; not with --json.
+    """
+    path, replace = target(output, f"results/drives_{loop_file.stem}.csv", force=force)
+    recording_suffix(path)
+    refuse_existing(path, force=replace)
+    require_logs(logs, no_log=no_log, force=force)
+    names = checked_names(overrides)
+    setup = load_loop(loop_file)
+    virtual = load_neck(neck) if neck else neck_of(setup.loop)
+    chosen = target_of(drives_file, bus, simulated, arm, neck=virtual)
+    if not controller.is_file():
+        raise SettingsError(f"{controller}: no such file.")
+    require_certified(setup, controller, certificates, names)
+    deployed = prepare(setup, controller)
+    for text in deployed.notes:
+        note(text)
+    files = acting_files(setup, loop_file, controller, drives_file)
+    live = not as_json and (not chosen.simulated or pace is not None)
+    sensor: Any = None if chosen.simulated else sensor_of(chosen.file, str(chosen.bus))
+    with contextlib.ExitStack() as stack:
+        link = None if chosen.simulated else stack.enter_context(open_drives(chosen))
+        log = stack.enter_context(opened_log(chosen, "run", logs, no_log=no_log, force=force))
+        with (
+            live_view(controller.name, deployed.loop.duration, wanted=live) as watches,
+            # Two things that draw in place would draw over each other; the view tells the time as well.
+            progress("drives", quiet=as_json or bool(watches)) as tell,
+            Keyboard() as keyboard,
+        ):
+            report = lambda done: tell(done, controller.name)  # noqa: E731
+            if link is None:
+                result = run_simulated(
+                    deployed, chosen.file, neck=virtual, override=names, pace=pace,
+                    report=report, operator=keyboard, watches=watches, log=log, files=files,
+                )  # fmt: skip
+            else:
+                result = run_on_bus(
+                    deployed, chosen.file, link, sensor, override=names, report=report, operator=keyboard,
+                    watches=watches, realtime=realtime, log=log, files=files,
+                )  # fmt: skip
+        # Before the log is closed: a full disk must not cost the recording and the result as well.
+        if len(result.signals.time) > 1:
+            write_recording(path, result.recording(), force=replace)
+        _print_run(path, result, as_json=as_json)
+        leave_if_asked(keyboard, terminated=result.terminated)
+        result.require()
+
+
+def _print_run(path: Path, result: DrivesResult, *, as_json: bool) -> None:
+    values: dict[str, Any] = result.table()
+    if as_json:
+        print_json(values)
+        return
+    rows = [["phase", result.phase], ["bus cycles", str(result.cycles)]]
+    rows += [[name, str(count)] for name, count in result.counts.items()]
+    if not result.simulated:
+        times = result.times
+        rows.append(["cycle", f"{times.figures()} ms"])
+        rows.append(["missed cycles", f"{times.missed} of {times.count + times.missed}"])
+    rows.append(["real-time factor", f"{result.real_time_factor:.1f}"])
+    print_table(str(path), ["what", "value"], rows)
+
+
+@command.command("stop")
+@drives_options
+@json_option
+def stop_command(drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, as_json: bool) -> None:
+    """Quick stop, then no voltage, for every drive; always allowed. Exit code 1 if one may still have power."""
+    chosen = target_of(drives_file, bus, simulated, arm)
+    with open_link(chosen, moves=False) as link:
+        states = stop(link, chosen.file)
+    _states(states, "stopped", as_json=as_json)
+    require_stopped(states)
+
+
+@command.command("reset")
+@drives_options
+@json_option
+def reset_command(drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, as_json: bool) -> None:
+    """Acknowledge latched faults; nothing else ever does, and nothing moves by it. Exit code 1 if a fault stays."""
+    chosen = target_of(drives_file, bus, simulated, arm)
+    with open_link(chosen, moves=False) as link:
+        states = reset(link, chosen.file)
+    _states(states, "reset", as_json=as_json)
+    require_reset(states)
+
+
+def _states(states: dict[int, str], what: str, *, as_json: bool) -> None:
+    if as_json:
+        print_json({what: [{"node": node, "state": state} for node, state in states.items()]})
+    else:
+        print_table(what, ["node", "state"], [[str(node), state] for node, state in states.items()])
+
+
+command.add_command(replay_command)
+command.add_command(jog_command)
+command.add_command(record_command)

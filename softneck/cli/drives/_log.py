@@ -1,0 +1,125 @@
+"""The logs of commands that move drives: those asked for, and on drives that may be real one in any case."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+import click
+import platformdirs
+
+from softneck.core import OutputError, SettingsError
+from softneck.cosim.loops._simulate import LoopSetup
+from softneck.drives.bus._link import HARMLESS
+from softneck.drives.logs._run_log import RunLogger, require_log_paths
+
+from ..shared._console import note
+from ._target import Target
+
+
+def log_options(function: Callable) -> Callable:
+    """Add the options that say what is logged."""
+    options = (
+        click.option(
+            "--log", "logs", multiple=True, type=click.Path(path_type=Path), metavar="FILE",
+            help="Log of what happened: .mcap holds all (`softneck drives replay`, `import`, Foxglove), .blf and .log "
+            "(candump) the frames. May be given several times. [default: on a bus that may move something a file under "
+            "~/.local/state/softneck/log, or in $LOGS_DIRECTORY]",
+        ),
+        click.option("--no-log", is_flag=True, help="No log on such a bus either."),
+    )  # fmt: skip
+    for option in reversed(options):
+        function = option(function)
+    return function
+
+
+def require_logs(logs: Sequence[Path], *, no_log: bool, force: bool) -> None:
+    """Raise where the options cannot be followed, before anybody is asked to arm anything."""
+    if logs and no_log:
+        raise SettingsError("--log and --no-log: say one of them.")
+    require_log_paths(logs, force=force)
+
+
+@contextlib.contextmanager
+def opened_log(
+    chosen: Target, command: str, logs: Sequence[Path], *, no_log: bool, force: bool, ending: str = ".mcap"
+) -> Iterator[RunLogger | None]:
+    """Yield a logger, None where nothing is logged; what it wrote has its names at the end.
+
+    Args:
+        chosen: the drives; where they may be real and no log is asked for, one is written to `log_folder`.
+        command: what runs, for its name.
+        logs: those asked for.
+        no_log: write none that was not asked for.
+        force: replace existing files.
+        ending: of the one that was not asked for.
+
+    Raises:
+        OutputError: it cannot be written (before anything moves), or is not complete.
+    """
+    own = not logs and not no_log and not chosen.simulated and str(chosen.bus).partition(":")[0] not in HARMLESS
+    paths = [_new_path(command, ending)] if own else list(logs)
+    if not paths:
+        yield None
+        return
+    # In virtual time the clock begins at 0, and the same run gives the same log.
+    epoch = 0.0 if chosen.simulated else time.time() - time.monotonic()
+    try:
+        log = RunLogger(paths, force=force, wait=chosen.simulated, epoch=epoch)
+    except OutputError as error:
+        raise OutputError(f"{error} Or --no-log. Nothing was sent." if own else str(error)) from error
+    if own:
+        note(f"log: {paths[0]}")
+    try:
+        yield log
+    except BaseException:
+        # What went wrong is what is to be told; that its log is not complete comes before it.
+        try:
+            log.close()
+        except OutputError as error:
+            note(str(error))
+        _drop_empty(log, own=own)
+        raise
+    log.close()
+    _drop_empty(log, own=own)
+
+
+def _drop_empty(log: RunLogger, *, own: bool) -> None:
+    """Remove a log that nobody asked for of a run that did not begin."""
+    for path in log.paths:
+        if own and path.suffix == ".mcap" and not log.described and path.is_file():
+            path.unlink()
+            note(f"log: {path} is removed: nothing moved")
+
+
+def log_folder() -> Path:
+    """Return where logs go that nobody named: what systemd gives by LogsDirectory=, else the user's own."""
+    given = os.environ.get("LOGS_DIRECTORY", "").partition(":")[0]
+    return Path(given) if given else platformdirs.user_log_path("softneck", appauthor=False)
+
+
+def _new_path(command: str, ending: str) -> Path:
+    """Return a path that is free; names sort by time."""
+    stem = f"{command}_{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
+    folder, number = log_folder(), 1
+    path = folder / f"{stem}{ending}"
+    while path.exists() or path.with_name(f"{path.stem}.part{ending}").exists():
+        number += 1
+        path = folder / f"{stem}_{number}{ending}"
+    return path
+
+
+def acting_files(
+    setup: LoopSetup, loop_file: Path, controller: Path, drives_file: Path | None
+) -> Mapping[str, str | Path]:
+    """Return role -> path of all files that act in a run, for its log."""
+    files: dict[str, str | Path] = {role: path for role, (path, _) in setup.files.items()}
+    return {**files, "loop": loop_file, "controller": controller, **drives_of(drives_file)}
+
+
+def drives_of(drives_file: Path | None) -> Mapping[str, str | Path]:
+    """Return role -> path of the drives file where there is one, for a log."""
+    return {} if drives_file is None else {"drives": drives_file}

@@ -1,0 +1,77 @@
+"""softneck drives replay: a recorded run through the same core gives the same decisions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from softneck.core import FileFormatError, SettingsError, SoftneckError
+from softneck.cosim import load_loop
+from softneck.drives import Experiment, prepare, read_run_log, replay
+from softneck.drives.commissioning._jog import jog_pilot
+from softneck.drives.logs._log_file import LoggedRun, changed_files
+from softneck.drives.master._measured import Pilot
+from softneck.drives.running._pilot import LoopPilot
+
+from ..shared._console import note, print_json, print_table
+from ..shared._options import json_option
+
+
+@click.command("replay", epilog="Example: softneck drives replay run.mcap")
+@click.argument("log", metavar="LOG", type=click.Path(path_type=Path))
+@click.option("--loop", "loop_file", type=click.Path(path_type=Path), metavar="LOOP.toml",
+              help="The run's loop file, where it is no longer where the log says.")  # fmt: skip
+@click.option("--controller", type=click.Path(path_type=Path), help="The run's controller, the same.")
+@click.option("--core-only", is_flag=True, help="Use the logged answers of the controller instead of computing them.")
+@json_option
+def replay_command(log: Path, loop_file: Path | None, controller: Path | None, core_only: bool, as_json: bool) -> None:
+    """Feed what a run saw to the same core and controller again, and compare every frame out, bit for bit.
+
+    LOG is the .mcap of `run`, `jog` or `record` with --log; one that is cut is replayed up to the cut, and says so.
+    Exit code 0 if all is equal, 1 with the first difference if not. Nothing is sent to any bus.
+    """
+    if log.suffix.lower() in (".log", ".blf"):
+        raise SettingsError(f"{log}: holds frames only; replay needs the `.mcap` of the run.")
+    run = read_run_log(log)
+    notes = changed_files(run)
+    pilot = None if core_only else _pilot(run, loop_file, controller)
+    if pilot is None:
+        notes.append("the controller was not computed again: its logged answers were used")
+    result = replay(run, pilot, notes)
+    for text in result.notes:
+        note(text)
+    if as_json:
+        print_json({"log": str(log), **result.table()})
+    else:
+        rows = [["cycles", str(result.cycles)], ["frames out", str(result.frames)],
+                ["controller's answers", str(result.answers)], ["phase", result.phase],
+                ["fault", result.fault or "none"],
+                ["equal", "yes" if result.difference is None else "no"]]  # fmt: skip
+        print_table(str(log), ["what", "value"], rows)
+    result.require()
+
+
+def _pilot(run: LoggedRun, loop_file: Path | None, controller: Path | None) -> Pilot | None:
+    """Return what led the run: controller and observer, a jog or an experiment.
+
+    None where the log names none, or the files of the loop are gone.
+    """
+    try:
+        if "jog" in run.facts:
+            return jog_pilot(**run.facts["jog"])
+        if "record" in run.facts:
+            return Experiment.of(run.facts["record"]).pilot()
+    except (SoftneckError, TypeError) as error:
+        raise FileFormatError(f"{run.path}: what it played does not fit this softneck ({error}).") from error
+    files = {role: Path(str(entry.get("path"))) for role, entry in run.facts.get("files", {}).items()}
+    loop = loop_file or files.get("loop")
+    chosen = controller or files.get("controller")
+    if loop is None or chosen is None:
+        return None
+    for path, given in ((loop, loop_file), (chosen, controller)):
+        if not path.is_file():
+            if given is not None:
+                raise SettingsError(f"{path}: no such file.")
+            return None
+    return LoopPilot(prepare(load_loop(loop), chosen).loop)

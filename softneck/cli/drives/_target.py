@@ -1,0 +1,202 @@
+"""What the subcommands of `softneck drives` share: which drives, over which bus, with which inclinometer."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+
+from softneck.core import SettingsError, SoftneckError
+from softneck.drives import (
+    CanLink,
+    DrivesFile,
+    default_drives,
+    load_drives,
+    neck_drives,
+    open_bus,
+    open_sensor,
+    simulated_neck,
+)
+from softneck.drives.bus._link import HARMLESS, VirtualLink
+from softneck.drives.master import Frame, Tilt
+from softneck.drives.running._keyboard import Keyboard
+from softneck.drives.running._preflight import OVERRIDES
+from softneck.drives.sensing._sensor import Sensor
+from softneck.plant import NeckParameters
+
+from ..shared._console import note
+from ._arm import require_armed
+
+SAMPLE_TIME = 0.02
+# How long a command waits for a sample of the inclinometer [s].
+_LOOK = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """Which drives a command talks to."""
+
+    file: DrivesFile
+    bus: str | None
+    simulated: bool
+    arm: bool
+
+
+def drives_options(function: Callable) -> Callable:
+    """Add the options that say which drives."""
+    options = (
+        click.option("--drives", "drives_file", type=click.Path(path_type=Path), metavar="DRIVES.toml",
+                     help="Node ids, gear, encoder, signs, limits, sensor, guarding."),
+        click.option("--bus", metavar="INTERFACE:CHANNEL", help="Such as socketcan:can0, virtual:x."),
+        click.option("--simulated", is_flag=True, help="Simulated drives on the virtual neck, in this process."),
+        click.option("--arm", is_flag=True, help="Let drives on a bus move."),
+    )  # fmt: skip
+    for option in reversed(options):
+        function = option(function)
+    return function
+
+
+def target_of(
+    drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, *, neck: NeckParameters | None = None
+) -> Target:  # fmt: skip
+    """Return which drives the options mean; simulated ones without a file are set up for the virtual `neck`."""
+    if (bus is None) == (not simulated):
+        raise SettingsError("say which drives: --bus INTERFACE:CHANNEL, or --simulated.")
+    if drives_file is None and not simulated:
+        raise SettingsError("drives on a bus need --drives DRIVES.toml: their limits are not for us to guess.")
+    if drives_file is not None:
+        file = load_drives(drives_file)
+    else:
+        file = default_drives() if neck is None else neck_drives(neck)
+    return Target(file, bus, simulated, arm)
+
+
+@contextlib.contextmanager
+def open_link(
+    chosen: Target, *, moves: bool, homed: bool = False, neck: NeckParameters | None = None, seed: int = 0
+) -> Iterator[CanLink | VirtualLink]:
+    """Yield the bus, or simulated drives on a virtual neck; what moves a bus must be armed."""
+    if chosen.simulated:
+        yield VirtualLink(
+            simulated_neck(chosen.file, neck or NeckParameters.paper(), sample_time=SAMPLE_TIME, homed=homed, seed=seed)
+        )
+        return
+    if moves:
+        require_armed(str(chosen.bus), arm=chosen.arm)
+    with open_bus(str(chosen.bus), bit_rate=chosen.file.bit_rate) as link:
+        try:
+            yield link
+        finally:
+            if link.problem:
+                note(f"bus {chosen.bus}: {link.problem}")
+
+
+# As a shell says it of a process that SIGTERM ended: 128 + 15.
+_TERMINATED = 143
+
+
+def leave_if_asked(keyboard: Keyboard, *, terminated: bool = False) -> None:
+    """End the command as somebody at the keyboard, or SIGTERM, asked; after its results are out."""
+    if keyboard.interrupted:
+        raise KeyboardInterrupt
+    if terminated or keyboard.terminated:
+        note("ended by SIGTERM; the drives are off.")
+        click.get_current_context().exit(_TERMINATED)
+
+
+@contextlib.contextmanager
+def open_drives(chosen: Target) -> Iterator[CanLink]:
+    """Yield the bus to drives that are to move."""
+    with open_link(chosen, moves=True) as link:
+        if isinstance(link, VirtualLink):
+            raise SettingsError("drives on a bus are asked.")
+        yield link
+
+
+def checked_names(names: Sequence[str]) -> tuple[str, ...]:
+    """Return `names` if each may be overridden."""
+    for name in names:
+        if name not in OVERRIDES:
+            raise SettingsError(f"--override takes one of {', '.join(OVERRIDES)}; got `{name}`.")
+    return tuple(names)
+
+
+override_option = click.option(
+    "--override", "overrides", multiple=True, metavar="NAME",
+    help=f"Let a check fail, by name: {', '.join(OVERRIDES)}.",
+)  # fmt: skip
+neck_option = click.option("--neck", metavar="paper|lab|NECK.toml", help="The virtual neck of --simulated.")
+
+
+def look_of(link: CanLink | VirtualLink, file: DrivesFile) -> Callable[[], Tilt | None]:
+    """Return what gives the newest sample of the inclinometer."""
+    if isinstance(link, VirtualLink):
+
+        def sample() -> Tilt:
+            taken = link.neck.newest
+            return Tilt(taken.pitch, taken.roll, taken.pitch_rate, taken.roll_rate, taken.valid)
+
+        return sample
+    sensor = sensor_of(file, link.name)
+
+    def look() -> Tilt | None:
+        until = link.now + _LOOK
+        while link.now < until:
+            tilt = sensor.read(link.now, link.receive(0.02))
+            if tilt is not None:
+                return tilt
+        return None
+
+    return look
+
+
+def sensor_of(file: DrivesFile, bus: str) -> Any:
+    """Return the inclinometer that the drives file names, open until the command ends.
+
+    Raises:
+        SettingsError: a recording as sensor where the drives may be real.
+        SoftneckError: see `open_sensor`; nothing was sent to the drives yet.
+    """
+    if file.sensor_kind == "replay" and bus.partition(":")[0] not in HARMLESS:
+        raise SettingsError(
+            f'[sensor] kind "replay" is for simulated drives; on {bus} the loop would not see the neck it moves.'
+        )
+    return click.get_current_context().with_resource(_told(file))
+
+
+@contextlib.contextmanager
+def _told(file: DrivesFile) -> Iterator[Any]:
+    """Yield the inclinometer; say at the end what happened to it, which no drive and no watch can know."""
+    with open_sensor(file.sensor_kind, file.sensor_node, file.sensor_source) as sensor:
+        try:
+            yield sensor
+        finally:
+            problem = getattr(sensor, "problem", "")
+            if problem:
+                note(f"inclinometer {sensor.name}: {problem}")
+
+
+class _NoSensor:
+    """In the place of an inclinometer that cannot be opened, for a check that goes on and reports it."""
+
+    def __init__(self, problem: str) -> None:
+        self.problem = problem
+
+    def take(self, frames: Sequence[Frame]) -> None:
+        del frames
+
+    def read(self, now: float, frames: Sequence[Frame]) -> Tilt | None:
+        del now, frames
+        return None
+
+
+def sensor_or_reason(file: DrivesFile, bus: str) -> Sensor:
+    """Return the inclinometer, or something silent that knows why there is none."""
+    try:
+        return sensor_of(file, bus)
+    except SoftneckError as error:
+        return _NoSensor(str(error))

@@ -1,0 +1,5 @@
+"""What several subcommands share: options, tables, progress, recordings and necks by name.
+
+Prints; computes nothing.
+May import `core`, `signals` and `plant`.
+"""

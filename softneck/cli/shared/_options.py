@@ -1,0 +1,78 @@
+"""Options that several subcommands share."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import tomllib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from softneck.core import SettingsError
+from softneck.core._kinds import make_settings
+
+json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout and nothing else.")
+force_option = click.option("--force", is_flag=True, help="Replace an existing file.")
+set_option = click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="A setting of the kind; angles in rad, or KEY_deg=VALUE.",
+)
+
+
+def output_option(what: str, metavar: str, *, required: bool = False) -> Callable:
+    """Return the option `-o`; without it a command writes under build/."""
+    help_text = f"Where to write the {what}." + ("" if required else " [default: under build/]")
+    return click.option(
+        "-o", "--output", type=click.Path(path_type=Path), metavar=metavar, required=required, help=help_text
+    )
+
+
+def target(output: Path | None, default: str, *, force: bool, ending: str | None = None) -> tuple[Path, bool]:
+    """Return where to write and whether what stands there may be replaced: always under build/.
+
+    Raises:
+        SettingsError: another ending than `ending`, by which files are known.
+    """
+    if output is not None and ending is not None and output.suffix.lower() != ending:
+        raise SettingsError(f"{output}: must end in `{ending}`, by which softneck knows the file.")
+    return (output, force) if output is not None else (Path("build") / default, True)
+
+
+def apply_settings(settings_class: type, assignments: Sequence[str], **more: Any) -> Any:
+    """Return `settings_class` with `KEY=VALUE` assignments and `more`, both checked against its fields.
+
+    Raises:
+        SettingsError: no `=`, an unknown key, or a value that does not fit.
+    """
+    values: dict[str, Any] = {}
+    fields = {field.name for field in dataclasses.fields(settings_class)}
+    for assignment in assignments:
+        key, separator, text = assignment.partition("=")
+        if not separator:
+            raise SettingsError(f"--set takes KEY=VALUE; got `{assignment}`.")
+        name, value = in_radians(key.strip(), value_of(text.strip()), fields)
+        values[name] = value
+    values |= {key: value for key, value in more.items() if value is not None and key in fields}
+    return make_settings(settings_class, values)
+
+
+def in_radians(key: str, value: Any, fields: set[str]) -> tuple[str, Any]:
+    """Return `key` and `value`; an angle may be given as `key_deg` in degrees."""
+    angle = key.removesuffix("_deg")
+    if key in fields or angle not in fields or isinstance(value, bool) or not isinstance(value, int | float):
+        return key, value
+    return angle, math.radians(value)
+
+
+def value_of(text: str) -> Any:
+    """Read a value as TOML does (number, true, [list]); anything else is a string."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text

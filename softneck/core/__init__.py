@@ -1,0 +1,9 @@
+"""Errors, checks, array types, units, archives, certificates and the table of kinds.
+
+For every room.
+Imports nothing of ours.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,181 @@
+"""The table of kinds: a constant, resolved on demand, read by the command line, FMU builder and validation."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from ._archive import read_archive
+from ._errors import FileFormatError, SettingsError
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """One kind of thing that can be saved and stepped.
+
+    Attributes:
+        name: what users type and what a file's header says.
+        role: "model", "observer", "controller", "family" or "state".
+        settings: dotted path of the settings class whose `fit` or `design` makes it.
+        result: dotted path of the class that a file becomes, by its `from_archive`.
+        runtime: dotted name of the runtime module (see `core.bundle`); "" for what no loop steps.
+        summary: one line for `--help` and the docs.
+        arrays: dotted path of a model's array layout: names in the runtime's order, and their checks.
+    """
+
+    name: str
+    role: str
+    settings: str
+    result: str
+    runtime: str
+    summary: str
+    arrays: str = ""
+
+
+_IDENT, _DESIGN = "softneck.identification", "softneck.design"
+_MODEL = f"{_IDENT}:Model"
+KINDS: dict[str, Kind] = {
+    kind.name: kind
+    for kind in (
+        Kind("rls", "model", "softneck.identification:Rls", _MODEL, f"{_IDENT}.linear._rls_runtime",
+             "recursive least squares over the redefined inputs, with dead time (Eq. 23-30)",
+             f"{_IDENT}.linear._arrays:RLS"),
+        Kind("oe", "model", "softneck.identification:OutputError", _MODEL, f"{_IDENT}.linear._oe_runtime",
+             "output error: transfer functions with dead time that simulate best (Gauss-Newton)",
+             f"{_IDENT}.linear._arrays:OE"),
+        Kind("srivc", "model", "softneck.identification:Srivc", _MODEL, f"{_IDENT}.linear._oe_runtime",
+             "continuous-time K exp(-L s)/(s + p) by refined instrumental variables, with confidence intervals",
+             f"{_IDENT}.linear._arrays:OE"),
+        Kind("subspace", "model", "softneck.identification:Subspace", _MODEL, f"{_IDENT}.linear._state_space_runtime",
+             "state space from the three motors to both angles (N4SID), without redefinition",
+             f"{_IDENT}.linear._arrays:STATE_SPACE"),
+        Kind("nlsm", "model", "softneck.identification:SetMembership", _MODEL, f"{_IDENT}.set_membership._nlsm_runtime",
+             "nonlinear set membership (Eq. 12-21, Algorithm 1)",
+             f"{_IDENT}.set_membership._arrays:NLSM"),
+        Kind("nn", "model", "softneck.identification:Network", _MODEL, f"{_IDENT}.networks._nn_runtime",
+             "NLARX neural network, two hidden layers of 25 (section 6.2)",
+             f"{_IDENT}.networks._arrays:NN"),
+        Kind("play", "model", "softneck.identification:Play", _MODEL, f"{_IDENT}.structured._play_runtime",
+             "play operators and low-pass filters, ridge on their polynomial; no feedback, strong in free run",
+             f"{_IDENT}.structured._arrays:PLAY"),
+        Kind("nss", "model", "softneck.identification:NeuralStateSpace", _MODEL, f"{_IDENT}.networks._nss_runtime",
+             "neural state space over play operators, contracting; trained over its whole free run",
+             f"{_IDENT}.networks._arrays:NSS"),
+        Kind("greybox", "model", "softneck.identification:GreyBox", _MODEL, f"{_IDENT}.structured._greybox_runtime",
+             "equations of a tendon-driven neck, their 16 numbers fitted by the error of its free run",
+             f"{_IDENT}.structured._arrays:GREYBOX"),
+        Kind("residual", "model", "softneck.identification:Residual", _MODEL,
+             f"{_IDENT}.uncertainty._residual_runtime",
+             "any other kind, and set membership on what its free run leaves over, with bounds",
+             f"{_IDENT}.uncertainty._arrays:RESIDUAL"),
+        Kind("ensemble", "model", "softneck.identification:Ensemble", _MODEL,
+             f"{_IDENT}.uncertainty._ensemble_runtime",
+             "the median of several kinds, with their spread as bounds",
+             f"{_IDENT}.uncertainty._arrays:ENSEMBLE"),
+        Kind("rls_state", "state", "softneck.identification:Recursion", "softneck.identification:RecursionState",
+             "", "what a recursive least squares remembers"),
+        Kind("rls_online", "state", "softneck.identification:OnlineRls", "softneck.identification:OnlineState",
+             "", "what a neck identified sample by sample has learnt"),
+        Kind("family", "family", "softneck.identification:FamilySettings", "softneck.identification:Family", "",
+             "uncertain linear plant: nominal, box, samples and a weight over them"),
+        Kind("kalman", "observer", "softneck.estimation:KalmanSettings", "softneck.estimation:KalmanObserver",
+             "softneck.estimation._kalman_runtime",
+             "Kalman filter over an identified linear model with a disturbance state"),
+        Kind("pi", "controller", "softneck.design:PiSettings", "softneck.design:LinearController",
+             f"{_DESIGN}.linear._linear_controller_runtime",
+             "PI with reference filter, anti-windup and tendon allocation"),
+        Kind("scheduled", "controller", "softneck.design:ScheduledSettings", "softneck.design:VaryingController",
+             f"{_DESIGN}.varying._scheduled_runtime",
+             "robust PI at every inclination of a family, gains interpolated without bumps"),
+        Kind("adaptive", "controller", "softneck.design:AdaptiveSettings", "softneck.design:VaryingController",
+             f"{_DESIGN}.varying._adaptive_runtime",
+             "recursive least squares as the neck moves, gains redesigned in every sample, with safeguards"),
+        Kind("hinf", "controller", "softneck.design:HinfSettings", "softneck.design:LinearController",
+             f"{_DESIGN}.linear._linear_controller_runtime",
+             "H-infinity mixed sensitivity on the exact-delay plant, verified on every sample"),
+        Kind("ncf", "controller", "softneck.design:NcfSettings", "softneck.design:LinearController",
+             f"{_DESIGN}.linear._linear_controller_runtime",
+             "loop shaping with normalised coprime factors (Glover, McFarlane)"),
+        Kind("pid", "controller", "softneck.design:PidSettings", "softneck.design:LinearController",
+             f"{_DESIGN}.linear._linear_controller_runtime",
+             "PID tuned on the worst sample of the plant, or by placed poles"),
+        Kind("fopi", "controller", "softneck.design:FopiSettings", "softneck.design:LinearController",
+             f"{_DESIGN}.linear._linear_controller_runtime",
+             "fractional-order PI or PID, iso-damped"),
+        Kind("lqg", "controller", "softneck.design:LqgSettings", "softneck.design:LinearController",
+             f"{_DESIGN}.linear._linear_controller_runtime",
+             "LQG whose filter estimates a load on the input: its integral action"),
+        Kind("custom", "controller", "softneck.design:CustomSettings", "softneck.design:LinearController",
+             f"{_DESIGN}.linear._linear_controller_runtime",
+             "a system of your own from python-control (in Python: CustomSettings(controller=K))"),
+        Kind("mpc", "controller", "softneck.design:MpcSettings", "softneck.design:MpcController",
+             f"{_DESIGN}.predictive._mpc_runtime",
+             "linear predictive control: limits, preview and co-contraction in one QP for each sample"),
+        Kind("nmpc", "controller", "softneck.design:NmpcSettings", "softneck.design:NmpcController",
+             f"{_DESIGN}.predictive._nmpc_runtime",
+             "nonlinear predictive control over nn, play, greybox or nss: one Gauss-Newton step for each sample"),
+    )
+}  # fmt: skip
+
+
+def kinds_of(role: str) -> tuple[str, ...]:
+    """Return the names of all kinds of one role."""
+    return tuple(kind.name for kind in KINDS.values() if kind.role == role)
+
+
+def find_kind(name: str, role: str) -> Kind:
+    """Return the kind of that name; raise SettingsError with the known ones if there is none."""
+    kind = KINDS.get(name)
+    if kind is None or kind.role != role:
+        raise SettingsError(f"`{name}` is no kind of {role}; use one of {', '.join(kinds_of(role))}.")
+    return kind
+
+
+def make_settings(settings_class: type, values: Mapping[str, Any]) -> Any:
+    """Return `settings_class(**values)`.
+
+    Raises:
+        SettingsError: a key that the class does not have, or a value of the wrong type.
+    """
+    fields = {field.name for field in dataclasses.fields(settings_class)}
+    unknown = sorted(set(values) - fields)
+    if unknown:
+        raise SettingsError(f"unknown setting `{unknown[0]}`; this kind has {', '.join(sorted(fields))}.")
+    try:
+        return settings_class(**values)
+    except TypeError as error:
+        raise SettingsError(f"a setting has a value of the wrong type ({error}).") from error
+
+
+def resolve(path: str) -> Any:
+    """Import `package.module:name` and return the object."""
+    module, _, name = path.partition(":")
+    return getattr(import_module(module), name)
+
+
+def load(path: str | Path, *, role: str | None = None) -> Any:
+    """Open any model, observer or controller file of ours.
+
+    Args:
+        path: the `.npz` file.
+        role: "model", "observer" or "controller" when only that will do.
+
+    Raises:
+        FileFormatError: no file of ours, another version, damaged, or of another role.
+    """
+    header, arrays = read_archive(path)
+    kind = KINDS.get(str(header.get("kind")))
+    if kind is None:
+        raise FileFormatError(f"{path}: holds the unknown kind `{header.get('kind')}`; a newer softneck wrote it?")
+    if role is not None and kind.role != role:
+        raise FileFormatError(f"{path}: is a {kind.role} ({kind.name}), not a {role}.")
+    try:
+        return resolve(kind.result).from_archive(header, arrays)
+    except FileFormatError as error:
+        raise FileFormatError(f"{path}: {error}") from error
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise FileFormatError(f"{path}: its header and arrays do not fit together ({error}).") from error

@@ -1,0 +1,193 @@
+"""Loop files: a TOML text that describes a loop."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from softneck.core import FileFormatError, SettingsError, SoftneckError, file_hash
+from softneck.loop import Fault, Loop, Part, ReferenceBlock
+from softneck.loop._faults import make_fault
+from softneck.loop._preview import AheadReference
+
+from ..parts._fmu_part import FmuPart
+from ..parts._isolated import IsolatedPart
+from ._loop_parts import OBJECT, PRESETS, SOURCES, PartOpener
+from ._loop_values import number, numbers, read_toml, refuse_unknown, tables, texts
+from ._simulate import LoopSetup
+
+_TOP = (
+    "duration_s", "sample_time_s", "order", "plant", "observer", "controller", "reference", "part", "connections",
+    "fault", "limits", "angle", "folder",
+)  # fmt: skip
+_SAME_SAMPLE_TIME = 1e-6
+
+
+def load_loop(path: str | Path) -> LoopSetup:
+    """Read a loop file and open all it names; relative paths start at the file's folder.
+
+    Raises:
+        FileFormatError: no such file or no TOML.
+        SettingsError: unknown or missing keys, or values that do not fit; the line names the key.
+    """
+    source = Path(path)
+    table = read_toml(source)
+    try:
+        return _setup(table, source)
+    except SoftneckError as error:
+        if str(error).startswith(str(source)):
+            raise
+        raise type(error)(f"{source}: {error}") from error
+
+
+def is_loop_file(path: Path) -> bool:
+    """Return whether `path` is a TOML file with a [reference]."""
+    if path.suffix != ".toml" or not path.is_file():
+        return False
+    try:
+        return "reference" in read_toml(path)
+    except FileFormatError:
+        return False
+
+
+def reference_of(path: str | Path) -> ReferenceBlock:
+    """Return the [reference] of a loop file as a block, of which `build_fmu` makes a reference FMU.
+
+    Its sample time is the file's `sample_time_s`, 20 ms if it states none; its other parts are not opened.
+
+    Raises:
+        SettingsError: the reference is an FMU already, or wrong.
+    """
+    source = Path(path)
+    table = read_toml(source)
+    try:
+        reference = PartOpener(source.parent).reference(table["reference"])
+        if isinstance(reference, AheadReference):
+            reference = reference.reference
+        if hasattr(reference, "advance"):
+            raise SettingsError("[reference] is an FMU already.")
+        return ReferenceBlock(reference, sample_time=number("sample_time_s", table.get("sample_time_s", 0.02)))  # pyright: ignore[reportArgumentType]
+    except SoftneckError as error:
+        raise type(error)(f"{source}: {error}") from error
+
+
+def make_loop(table: Mapping[str, Any], folder: str | Path = ".", *, opened: dict[Any, Any] | None = None) -> LoopSetup:
+    """Return the loop that a table with the keys of a loop file describes; relative paths start at `folder`.
+
+    From Python, plant, observer, controller and reference may also be the things themselves: a part, a block, what
+    has a `block()` such as a model or `VirtualNeck`, the path of an FMU or a file, a reference. `opened` remembers
+    files and FMUs for the next loop of the same.
+
+    Raises:
+        SettingsError: unknown or missing keys, or values that do not fit; the line names the key.
+    """
+    return _setup(normal_table(table), Path(folder), opened)
+
+
+def _setup(table: Mapping[str, Any], source: Path, opened: dict[Any, Any] | None = None) -> LoopSetup:
+    """Return the loop of a normal table; `source` is its file, or the folder at which its paths start."""
+    refuse_unknown("the file", table, _TOP)
+    for key in ("duration_s", "plant", "controller", "reference"):
+        if key not in table:
+            raise SettingsError(f"`{key}` is missing.")
+    folder = source if source.is_dir() else source.parent
+    step = number("sample_time_s", table.get("sample_time_s", 0.02))
+    opener = PartOpener(folder / str(table.get("folder", ".")), step=step, opened=opened)
+    if not source.is_dir():
+        opener.files["loop"] = (str(source), file_hash(source))
+    described = {name: table[name] for name in SOURCES if name in table}
+    others = _named_parts(table.get("part", []))
+    parts = {name: opener.part(name, part) for name, part in described.items()}
+    parts |= {name: opener.other(name, part) for name, part in others.items()}
+    described |= others
+    reference = opener.reference(table["reference"], parts["controller"].sample_time)
+    if isinstance(reference, FmuPart | IsolatedPart):
+        parts["reference"], described["reference"] = reference, table["reference"]
+    inputs, parameters = _constants(parts, described)
+    loop = Loop(
+        plant=parts["plant"],
+        observer=parts.get("observer"),
+        controller=parts["controller"],
+        reference=reference,
+        duration=number("duration_s", table["duration_s"]),
+        order=table.get("order", "sequential"),
+        plant_parameters=parameters.pop("plant"),
+        plant_inputs=inputs.pop("plant"),
+        observer_parameters=parameters.pop("observer", {}),
+        controller_parameters=parameters.pop("controller"),
+        other_parameters=parameters,
+        other_inputs=inputs,
+        others={name: parts[name] for name in others},
+        faults=_faults(table.get("fault", [])),
+        connections=texts("[connections]", table.get("connections", {})),
+    )
+    _check_sample_time(loop, table.get("sample_time_s"))
+    limits = numbers("[limits]", table.get("limits", {}))
+    return LoopSetup(loop=loop, limits=limits, files=dict(opener.files), angle=table.get("angle", "true"))
+
+
+def _constants(
+    parts: Mapping[str, Part], described: Mapping[str, Any]
+) -> tuple[dict[str, dict[str, float]], dict[str, dict[str, float]]]:
+    """Return constant inputs and parameters by part: what the file calls a parameter may be one of a part's inputs."""
+    inputs, parameters = {}, {}
+    for name, part in parts.items():
+        chosen = numbers(f"[{name}] parameters", described[name].get("parameters", {}))
+        ports = {port.name for port in part.inputs}
+        inputs[name] = {key: value for key, value in chosen.items() if key in ports}
+        parameters[name] = {key: value for key, value in chosen.items() if key not in ports}
+    return inputs, parameters
+
+
+def normal_table(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a loop's table in which every part is a table, as in a loop file."""
+    made = dict(table)
+    for name in ("plant", "observer", "controller", "reference"):
+        value = made.get(name)
+        if value is None or isinstance(value, Mapping):
+            continue
+        if isinstance(value, str | Path) and name != "reference":
+            made[name] = {_source_key(name, str(value)): str(value)}
+        else:
+            made[name] = {OBJECT: value}
+    return {key: value for key, value in made.items() if value is not None}
+
+
+def _source_key(part: str, text: str) -> str:
+    if text.endswith(".fmu"):
+        return "fmu"
+    if part == "plant":
+        return "neck" if text in PRESETS or text.endswith(".toml") else "model"
+    return "file"
+
+
+def _named_parts(listed: Any) -> dict[str, Mapping[str, Any]]:
+    named: dict[str, Mapping[str, Any]] = {}
+    for table in tables("part", listed):
+        name = table.get("name")
+        if not isinstance(name, str):
+            raise SettingsError("each [[part]] needs a `name`.")
+        if name in named:
+            raise SettingsError(f"two [[part]] are named `{name}`.")
+        named[name] = table
+    return named
+
+
+def _faults(listed: Any) -> tuple[Fault, ...]:
+    faults = []
+    for place, table in enumerate(tables("fault", listed), start=1):
+        values = {key: value for key, value in table.items() if key != "kind"}
+        try:
+            faults.append(make_fault(str(table.get("kind", "")), values))
+        except SettingsError as error:
+            raise SettingsError(f"[[fault]] {place}: {error}") from error
+    return tuple(faults)
+
+
+def _check_sample_time(loop: Loop, given: Any) -> None:
+    if given is None:
+        return
+    step = min(part.sample_time for part in loop.parts.values())
+    if abs(number("sample_time_s", given) - step) > _SAME_SAMPLE_TIME * step:
+        raise SettingsError(f"`sample_time_s` is {given:g}, but the fastest part runs at {step:g} s; state that.")

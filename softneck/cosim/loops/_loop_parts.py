@@ -1,0 +1,182 @@
+"""The parts that a loop's table names: files of ours, FMUs, necks, and what Python makes."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from softneck.core import DataError, FileFormatError, SettingsError, file_hash, load
+from softneck.loop import BlockPart, Part, RecordingReference, Reference
+from softneck.loop._preview import AheadReference
+from softneck.loop._references import make_reference
+from softneck.plant import NeckParameters, VirtualNeck
+from softneck.runtime import Block
+from softneck.signals import read_recording
+
+from ..parts._fmu_part import FmuPart
+from ..parts._isolated import IsolatedPart
+from ._loop_values import number, refuse_unknown, texts
+
+# Table -> (the keys that say where the part comes from, the role of a file of ours).
+SOURCES = {
+    "plant": (("fmu", "model", "neck", "python"), "model"),
+    "observer": (("fmu", "file", "python"), "observer"),
+    "controller": (("fmu", "file", "python"), "controller"),
+}
+_OTHER_SOURCES = ("fmu", "file", "python")
+# A table from Python may hold the part itself.
+OBJECT = "object"
+# What may stand beside `fmu`: how an FMU that nobody here wrote becomes a part, and where it runs.
+_FMU_KEYS = ("names", "units", "sample_time_s", "isolated", "timeout_s")
+_REFERENCES = ("step", "ramp", "sine", "rotation", "recording")
+# What `neck` may be beside a file of parameters.
+PRESETS = ("paper", "lab")
+
+
+class PartOpener:
+    """Opens what the tables of one loop name, and remembers the hash of each file."""
+
+    def __init__(self, folder: Path, *, step: float = 0.02, opened: dict[Any, Any] | None = None) -> None:
+        """Open relative to `folder`; necks step every `step` [s], `opened` remembers parts for the next loop."""
+        self.folder, self.files = folder, dict[str, tuple[str, str]]()
+        self._step, self._opened = step, opened
+
+    def part(self, name: str, table: Any) -> Part:
+        """Return plant, observer or controller."""
+        keys, role = SOURCES[name]
+        return self._made(name, table, keys, role, as_role=name)
+
+    def other(self, name: str, table: Mapping[str, Any]) -> Part:
+        """Return what a [[part]] describes."""
+        rest = {key: value for key, value in table.items() if key not in ("name", "role")}
+        return self._made(name, rest, _OTHER_SOURCES, None, as_role=str(table.get("role", "controller")))
+
+    def reference(self, table: Any, sample_time: float = 0.02) -> Reference | Part:
+        """Return what the table [reference] describes; with `ahead_s` a part that tells it so long before."""
+        if isinstance(table, dict) and "ahead_s" in table:
+            rest = {key: value for key, value in table.items() if key != "ahead_s"}
+            made = self.reference(rest)
+            if hasattr(made, "advance"):
+                raise SettingsError("[reference] ahead_s: an FMU cannot be asked what it will say; leave it out.")
+            return AheadReference(made, number("[reference] ahead_s", table["ahead_s"]), sample_time=sample_time)  # pyright: ignore[reportArgumentType]
+        if isinstance(table, dict) and OBJECT in table:
+            given: Any = table[OBJECT]
+            part: Any = given if callable(given) else _part_of("reference", given)
+            return part
+        if isinstance(table, dict) and "fmu" in table:
+            return self._made("reference", table, ("fmu",), None, as_role="reference")
+        if not isinstance(table, dict) or table.get("kind") not in _REFERENCES:
+            raise SettingsError(f"[reference] kind must be one of {', '.join(_REFERENCES)}.")
+        values = {key: value for key, value in table.items() if key != "kind"}
+        if table["kind"] != "recording":
+            return make_reference(table["kind"], values)
+        refuse_unknown("[reference]", values, ("file",))
+        recording = read_recording(self._file("reference", str(values.get("file", ""))))
+        if len(recording.runs()) > 1:
+            raise DataError("[reference] file: the recording has several runs; cut out the one to follow.")
+        channels = recording.channels
+        pitch, roll = (channels.get(f"{axis}_reference", channels[axis]) for axis in ("pitch", "roll"))
+        time = recording.time - recording.time[0]
+        return RecordingReference(
+            time=time, pitch=pitch, roll=roll, cocontraction=channels.get("cocontraction_reference")
+        )
+
+    def _made(self, name: str, table: Any, keys: tuple[str, ...], role: str | None, *, as_role: str) -> Part:
+        if not isinstance(table, dict):
+            raise SettingsError(f"`{name}` must be a table: [{name}].")
+        extra = (OBJECT,) if OBJECT in table else _FMU_KEYS if "fmu" in table else ()
+        refuse_unknown(f"[{name}]", table, (*keys, "parameters", *extra))
+        given = [key for key in (*keys, OBJECT) if key in table]
+        if len(given) != 1:
+            raise SettingsError(
+                f"[{name}] needs exactly one of {', '.join(keys)}; it has {', '.join(given) or 'none'}."
+            )
+        key, value = given[0], table[given[0]]
+        if key == OBJECT:
+            return _part_of(name, value)
+        if not isinstance(value, str):
+            raise SettingsError(f"[{name}] {key} must be a text; got {value!r}.")
+        if key == "python":
+            return self._from_python(name, value)
+        if key == "neck" and value in PRESETS:
+            return BlockPart(VirtualNeck(NeckParameters.preset(value)).block(sample_time=self._step))
+        file = self._file(name, value)
+        if key == "neck":
+            return BlockPart(VirtualNeck(NeckParameters.from_toml(file)).block(sample_time=self._step))
+        settings = sorted((k, repr(v)) for k, v in table.items() if k != "parameters")
+        if key == "fmu":
+            return self._open((name, file, *settings), lambda: _fmu_part(file, f"[{name}]", table, as_role))
+        thing = self._open((role, file), lambda: load(file, role=role))
+        return BlockPart(thing.block())
+
+    def _open(self, key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
+        """Return what `make` opens, remembered if this reader shares what it opens; a changed file is opened again."""
+        if self._opened is None:
+            return make()
+        stat = key[1].stat()
+        full = (*key, stat.st_mtime_ns, stat.st_size)
+        if full not in self._opened:
+            self._opened[full] = make()
+        return self._opened[full]
+
+    def _from_python(self, name: str, path: str) -> Part:
+        """Call `package.module:factory`; modules beside the loop file are found too."""
+        module_name, _, factory = path.partition(":")
+        try:
+            with _importable(self.folder):
+                module = import_module(module_name)
+            made = getattr(module, factory)()
+        except (ImportError, AttributeError, ValueError) as error:
+            raise SettingsError(
+                f"[{name}] python = `{path}` cannot be called ({error}); write package.module:factory."
+            ) from error
+        if module.__file__:
+            self.files[name] = (module.__file__, file_hash(module.__file__))
+        return _part_of(name, made, f" python = `{path}` returned")
+
+    def _file(self, role: str, name: str) -> Path:
+        path = self.folder / name
+        if not path.is_file():
+            raise FileFormatError(f"[{role}]: there is no file {path}.")
+        self.files[role] = (str(path), self._open(("hash", path), lambda: file_hash(path)))
+        return path
+
+
+def _part_of(name: str, made: Any, said: str = " is") -> Part:
+    """Return a part out of a part, a block, or what has a block."""
+    made = made.block() if hasattr(made, "block") and not hasattr(made, "advance") else made
+    if isinstance(made, Block):
+        return BlockPart(made)
+    if not all(hasattr(made, item) for item in ("inputs", "outputs", "sample_time", "start", "advance", "close")):
+        raise SettingsError(f"[{name}]{said} a {type(made).__name__}, not a Block or a Part.")
+    return made
+
+
+def _fmu_part(file: Path, where: str, table: Mapping[str, Any], role: str) -> Part:
+    isolated = table.get("isolated", False)
+    if not isinstance(isolated, bool):
+        raise SettingsError(f"{where} isolated must be true or false; got {isolated!r}.")
+    step = table.get("sample_time_s")
+    settings: dict[str, Any] = {
+        "role": role,
+        "names": texts(f"{where} names", table.get("names", {})),
+        "units": texts(f"{where} units", table.get("units", {})),
+        "sample_time": None if step is None else number("sample_time_s", step),
+    }
+    if not isolated:
+        return FmuPart(file, **settings)
+    return IsolatedPart(file, **settings, timeout=number("timeout_s", table.get("timeout_s", 10.0)))
+
+
+@contextmanager
+def _importable(folder: Path) -> Iterator[None]:
+    before = list(sys.path)
+    sys.path.insert(0, str(folder.resolve()))
+    try:
+        yield
+    finally:
+        sys.path[:] = before

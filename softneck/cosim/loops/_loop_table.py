@@ -1,0 +1,172 @@
+"""Loops as tables: the table of a loop object, dotted keys into it, and the same table with other values."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+from softneck.core import SettingsError
+from softneck.loop import BlockPart, Loop, Part
+from softneck.loop._faults import fault_field, fault_keys
+from softneck.loop._references import reference_field, reference_keys
+
+from ..parts._fmu_part import FmuPart
+from ..parts._isolated import IsolatedPart
+from ._loop_file import normal_table
+from ._loop_parts import OBJECT
+from ._simulate import LoopSetup
+
+_PARTS = ("plant", "observer", "controller")
+_SOURCES = ("fmu", "model", "file", "neck", "python", OBJECT)
+_PLAIN = ("duration_s", "order", "angle", "sample_time_s")
+
+
+def loop_table(loop: Loop | LoopSetup) -> dict[str, Any]:
+    """Return the table of which `make_loop` makes `loop` again; parts that no file describes stand in it themselves."""
+    setup = loop if isinstance(loop, LoopSetup) else LoopSetup(loop=loop)
+    plain = setup.loop
+    table: dict[str, Any] = {"duration_s": plain.duration, "order": plain.order, "angle": setup.angle}
+    parameters, constants = plain.parameters, plain.constants
+    for name, part in plain.parts.items():
+        chosen = {**parameters.get(name, {}), **constants.get(name, {})}
+        described = {**_described(part), **({"parameters": chosen} if chosen else {})}
+        if name in plain.others:
+            table.setdefault("part", []).append({"name": name, "role": part.role, **described})
+        else:
+            table[name] = described
+    if "reference" not in table:
+        table["reference"] = reference_keys(plain.reference) or {OBJECT: plain.reference}  # pyright: ignore[reportArgumentType]
+    if plain.faults:
+        table["fault"] = [fault_keys(fault) for fault in plain.faults]
+    if plain.connections:
+        table["connections"] = dict(plain.connections)
+    if setup.limits:
+        table["limits"] = dict(setup.limits)
+    return table
+
+
+def with_values(table: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the loop's table with other values under dotted keys; whole parts are replaced first."""
+    made = {key: copy.copy(value) for key, value in table.items()}
+    for key in sorted(values, key=lambda key: key.count(".")):
+        _put(made, key, values[key])
+    return made
+
+
+def check_key(table: Mapping[str, Any], key: str, names: Mapping[str, set[str] | None]) -> None:
+    """Raise SettingsError unless `key` leads to something in the loop.
+
+    Args:
+        table: of the loop.
+        key: dotted, such as "plant.parameters.payload", "reference.pitch_deg", "fault.0.start_s".
+        names: part -> parameters and inputs that may be set; None where the part does not say.
+    """
+    head, _, rest = key.partition(".")
+    if not rest:
+        if head in (*_PLAIN, *_PARTS, "reference"):
+            return
+        raise SettingsError(f"the loop has no key `{key}`; it has {', '.join((*_PLAIN, *_PARTS))} and keys below them.")
+    if head in ("fault", "part"):
+        entry, _, rest = _entry(table, key)
+        if head == "fault":
+            _check_field(key, rest, fault_field(str(entry.get("kind")), rest), f"a {entry.get('kind')}")
+            return
+        head = str(entry["name"])
+    elif head == "reference":
+        reference = table.get("reference", {})
+        if OBJECT not in reference and "fmu" not in reference:
+            kind = str(reference.get("kind"))
+            known = reference_field(kind, rest) or ("file" if rest == "file" and kind == "recording" else None)
+            _check_field(key, rest, known, f"a {kind} reference")
+            return
+    elif head not in table:
+        raise SettingsError(f"the loop has no {head}, so no key `{key}`.")
+    _check_part_key(key, head, rest, names)
+
+
+def set_sources(key: str) -> bool:
+    """Return whether `key` says which part stands in the loop."""
+    parts = key.split(".")
+    return parts[0] in (*_PARTS, "reference", "part") and (len(parts) == 1 or parts[-1] in _SOURCES)
+
+
+def settable(part: Part) -> set[str] | None:
+    """Return the names of a part's parameters and inputs; None if the part does not say its parameters."""
+    block = getattr(part, "block", None)
+    parameters = getattr(part, "parameters", getattr(block, "parameters", None))
+    return None if parameters is None else {port.name for port in (*parameters, *part.inputs)}
+
+
+def _check_part_key(key: str, part: str, rest: str, names: Mapping[str, set[str] | None]) -> None:
+    if rest in _SOURCES or rest in ("sample_time_s", "names", "units"):
+        return
+    group, _, name = rest.partition(".")
+    known = names.get(part, set())
+    if group != "parameters" or not name:
+        raise SettingsError(f"the loop has no key `{key}`; what a part takes is written {part}.parameters.NAME.")
+    if known is not None and name not in known:
+        raise SettingsError(
+            f"the loop has no key `{key}`: the {part} has {', '.join(sorted(known)) or 'no parameters'}."
+        )
+
+
+def _check_field(key: str, rest: str, field: str | None, where: str) -> None:
+    if field is None:
+        raise SettingsError(f"the loop has no key `{key}`: `{rest}` is nothing of {where}.")
+
+
+def _entry(table: Mapping[str, Any], key: str) -> tuple[dict[str, Any], int, str]:
+    """Return the table of a list that a key such as "fault.0.start_s" leads to, its place, and the rest of the key."""
+    head, _, below = key.partition(".")
+    place, _, rest = below.partition(".")
+    entries = table.get(head, [])
+    named = [str(entry.get("name", "")) for entry in entries]
+    if place in named:
+        return entries[named.index(place)], named.index(place), rest
+    if not place.isdecimal() or int(place) >= len(entries) or not rest:
+        count = f"{len(entries)} ({', '.join(f'{head}.{i}' for i in range(len(entries)))})" if entries else "none"
+        raise SettingsError(f"the loop has no key `{key}`: of [[{head}]] it has {count}.")
+    return entries[int(place)], int(place), rest
+
+
+def _put(table: dict[str, Any], key: str, value: Any) -> None:
+    head, _, rest = key.partition(".")
+    if not rest:
+        table[head] = normal_table({head: value})[head]
+        return
+    if head in ("fault", "part"):
+        entry, place, rest = _entry(table, key)
+        changed = dict(entry)
+        table[head] = [*table[head][:place], changed, *table[head][place + 1 :]]
+        field = fault_field if head == "fault" else None
+    else:
+        changed = table[head] = dict(table.get(head, {}))
+        field = reference_field if head == "reference" else None
+    if field is not None:
+        # The same in another unit gives way.
+        kind = str(changed.get("kind"))
+        for old in [k for k in changed if k != "kind" and field(kind, k) == (field(kind, rest) or "")]:
+            del changed[old]
+        changed[rest] = value
+    elif rest in _SOURCES:
+        for source in _SOURCES:
+            changed.pop(source, None)
+        changed[rest] = value
+    else:
+        group, _, name = rest.partition(".")
+        if name:
+            changed[group] = {**changed.get(group, {}), name: value}
+        else:
+            changed[group] = value
+
+
+def _described(part: Part) -> dict[str, Any]:
+    """Return how a table names a part; an FMU by its file, so that other processes can open it."""
+    if isinstance(part, FmuPart | IsolatedPart):
+        names = {theirs: ours for ours, theirs in part.native_names.items()}
+        table = {"fmu": str(part.path.resolve()), "sample_time_s": part.sample_time, "names": names}
+        if part.units:
+            table["units"] = dict(part.units)
+        return table | ({"isolated": True, "timeout_s": part.timeout} if isinstance(part, IsolatedPart) else {})
+    return {OBJECT: part.block if isinstance(part, BlockPart) else part}

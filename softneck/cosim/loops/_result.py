@@ -1,0 +1,103 @@
+"""What a simulated loop leaves for people, programs and files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import pandas as pd
+
+from softneck.core import DataError, Vector, to_si
+from softneck.core._certificate import certificate_contents
+from softneck.loop import LoopResult, check_limits, metrics
+from softneck.signals import Recording
+from softneck.signals.recording._channels import file_unit, known_channels
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Result:
+    """One simulated loop.
+
+    Attributes:
+        signals: all signals, named as in a recording, with their units.
+        bounds: metric -> upper limit, as in the loop file.
+        wall_time: what the run took [s].
+        files: what it was told to read: role -> (path, SHA-256).
+        order: "sequential" or "jacobi".
+        angle: which angle the metrics judge, "true" or "measured".
+    """
+
+    signals: LoopResult
+    bounds: Mapping[str, float] = field(default_factory=dict)
+    wall_time: float = 0.0
+    files: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    order: str = "sequential"
+    angle: str = "true"
+
+    def __getitem__(self, name: str) -> Vector:
+        """Return one signal (N,) in SI."""
+        return self.signals[name]
+
+    @property
+    def metrics(self) -> dict[str, dict[str, float | None]]:
+        """Rise, settling, overshoot and errors of each axis, and what the motors did."""
+        return metrics(self.signals, angle=self.angle)
+
+    @property
+    def limits(self) -> list[dict[str, Any]]:
+        """For each limit of the loop: metric, limit, value, holds."""
+        return check_limits(self.metrics, self.bounds)
+
+    @property
+    def holds(self) -> bool:
+        """Whether all limits hold."""
+        return all(row["holds"] for row in self.limits)
+
+    @property
+    def real_time_factor(self) -> float:
+        """Simulated time over the time it took."""
+        return len(self.signals.time) * self.signals.sample_time / max(self.wall_time, 1e-9)
+
+    @property
+    def frame(self) -> pd.DataFrame:
+        """All signals as a table; the columns say their unit as in a recording's file."""
+        columns = {"time [s]": self.signals.time}
+        for name, values in self.signals.signals.items():
+            unit, factor = _shown(name, self.signals.units[name])
+            columns[f"{name} [{unit}]"] = values * factor
+        return pd.DataFrame(columns)
+
+    def recording(self) -> Recording:
+        """Return the run as a recording: its channels of those names, with pitch and roll true where offered."""
+        known = set(known_channels())
+        channels = {name: values for name, values in self.signals.signals.items() if name in known}
+        for axis in ("pitch", "roll"):
+            channels.setdefault(axis, self.signals.angle(axis))
+        return Recording(self.signals.time, self.signals.sample_time, channels)
+
+    def report(self) -> dict[str, Any]:
+        """Return the JSON of `softneck simulate`."""
+        return {"metrics": self.metrics, "limits": self.limits, "real_time_factor": self.real_time_factor}
+
+    def certificate(self) -> dict[str, Any]:
+        """Return what held, with the hash of every file that was read."""
+        more = {
+            "limits": self.limits,
+            "metrics": self.metrics,
+            "order": self.order,
+            "angle": self.angle,
+            "sample_time_s": self.signals.sample_time,
+            "duration_s": len(self.signals.time) * self.signals.sample_time,
+        }
+        return certificate_contents("simulate", holds=self.holds, files=self.files, more=more)
+
+
+def _shown(name: str, unit: str) -> tuple[str, float]:
+    """Return the unit in which a table shows a signal, and the factor to it."""
+    try:
+        to_unit, si = to_si(unit or "1")
+    except DataError:
+        return unit, 1.0  # a foreign FMU's own unit stays as it is
+    shown = file_unit(name) if name in known_channels() else {"rad": "deg", "rad/s": "deg/s"}.get(si, si)
+    return (shown, to_unit / to_si(shown)[0]) if to_si(shown)[1] == si else (unit or "1", 1.0)

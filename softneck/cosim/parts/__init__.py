@@ -1,0 +1,5 @@
+"""FMUs as parts of a loop, in this process or in one of their own.
+
+All FMI calls of ours are made here.
+May import `fmu`.
+"""

@@ -1,0 +1,160 @@
+"""The variables of an FMU as ports, and the calls that move them."""
+
+from __future__ import annotations
+
+import ctypes
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import fmpy
+import numpy as np
+from fmpy.model_description import ModelDescription, ScalarVariable
+
+from softneck.core import FileFormatError
+from softneck.runtime import Port
+
+# FMI type -> (C type, numpy type, name in fmi2Get... or fmi3Get...); FMI 2.0 above, FMI 3.0 below.
+TYPES: dict[str, tuple[Any, Any, str]] = {
+    "Real": (ctypes.c_double, np.float64, "Real"),
+    "Integer": (ctypes.c_int, np.int32, "Integer"),
+    "Enumeration": (ctypes.c_int, np.int32, "Integer"),
+    "Boolean": (ctypes.c_int, np.int32, "Boolean"),
+}
+_TYPES_3: dict[str, tuple[Any, Any, str]] = {
+    "Float64": (ctypes.c_double, np.float64, "Float64"),
+    "Float32": (ctypes.c_float, np.float32, "Float32"),
+    **{
+        f"{u.upper()}Int{bits}": (getattr(ctypes, f"c_{u}int{bits}"), f"{u}int{bits}", f"{u.upper()}Int{bits}")
+        for u in ("", "u")
+        for bits in (8, 16, 32, 64)
+    },
+    "Enumeration": (ctypes.c_int64, np.int64, "Int64"),
+    "Boolean": (ctypes.c_bool, np.bool_, "Boolean"),
+}
+
+
+def types_of(version: int) -> dict[str, tuple[Any, Any, str]]:
+    """Return FMI type -> (C type, numpy type, name in the C calls) of an FMI version."""
+    return TYPES if version == 2 else _TYPES_3
+
+
+@dataclass(frozen=True, slots=True)
+class Annotation:
+    """What softneck's FMUs say about themselves beyond FMI; empty for others.
+
+    Attributes:
+        kind, role: of the block, "" for foreign FMUs.
+        missing: names of variables whose NaN means "not measured".
+    """
+
+    kind: str = ""
+    role: str = ""
+    missing: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Description:
+    """An FMU's description as far as a loop needs it.
+
+    Attributes:
+        path: of the FMU.
+        model: fmpy's own description.
+        annotation: see `Annotation`.
+        variables: our name -> variable, for all that can be numbers.
+        version: of FMI, 2 or 3.
+        units: our name -> unit, where the user knows better than the FMU.
+    """
+
+    path: Path
+    model: ModelDescription
+    annotation: Annotation
+    variables: Mapping[str, ScalarVariable]
+    version: int = 2
+    units: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def identifier(self) -> str:
+        """Return the name of the FMU's binary."""
+        experiment = self.model.coSimulation
+        return (experiment.modelIdentifier or "") if experiment is not None else ""
+
+    def ports(self, causality: str) -> tuple[Port, ...]:
+        """Return the ports of one causality ("input", "output", "parameter") in the FMU's order."""
+        return tuple(
+            self._port(name, variable) for name, variable in self.variables.items() if variable.causality == causality
+        )
+
+    def _port(self, name: str, variable: ScalarVariable) -> Port:
+        declared = variable.declaredType
+        return Port(
+            name=name,
+            unit=self.units.get(name) or variable.unit or (declared.unit if declared is not None else "") or "1",
+            description=variable.description or "",
+            start=_number(variable.start, 0.0),
+            minimum=_number(variable.min if variable.min is not None else getattr(declared, "min", None), None),
+            maximum=_number(variable.max if variable.max is not None else getattr(declared, "max", None), None),
+            nominal=_number(variable.nominal, None),
+            boolean=variable.type == "Boolean",
+            missing=variable.name in self.annotation.missing,
+        )
+
+
+def read_description(
+    path: Path, folder: Path, names: Mapping[str, str], units: Mapping[str, str] | None = None
+) -> Description:
+    """Read the description of the FMU `path`, unpacked in `folder`.
+
+    Args:
+        path: for messages.
+        folder: where it is unpacked.
+        names: the FMU's variable name -> ours, for FMUs that use others.
+        units: our name -> unit, for FMUs that state none or a wrong one.
+
+    Raises:
+        FileFormatError: no valid FMI 2.0 or 3.0 Co-Simulation FMU, or it lacks a variable of `names`.
+    """
+    try:
+        model = fmpy.read_model_description(str(folder), validate=False)
+    except Exception as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise FileFormatError(f"{path}: its modelDescription.xml cannot be read ({reason}).") from error
+    version = {"2": 2, "3": 3}.get(str(model.fmiVersion).partition(".")[0])
+    if version is None:
+        raise FileFormatError(f"{path}: is an FMI {model.fmiVersion} FMU; softneck runs FMI 2.0 and 3.0.")
+    if model.coSimulation is None:
+        raise FileFormatError(f"{path}: is for Model Exchange only; a Co-Simulation FMU is needed.")
+    known = {variable.name for variable in model.modelVariables}
+    absent = sorted(set(names) - known)
+    if absent:
+        raise FileFormatError(f"{path}: has no variable {', '.join(absent)}; it has {', '.join(sorted(known))}.")
+    numbers = [v for v in model.modelVariables if v.type in types_of(version) and not v.dimensions]
+    variables: dict[str, ScalarVariable] = {}
+    for variable in numbers:
+        name = names.get(variable.name, variable.name)
+        if name in variables:
+            raise FileFormatError(f"{path}: {variables[name].name} and {variable.name} are both named `{name}`.")
+        variables[name] = variable
+    for name in units or {}:
+        if name not in variables:
+            raise FileFormatError(f"{path}: a unit is given for `{name}`, which is no variable of it.")
+    return Description(path, model, _annotation(folder), variables, version, units or {})
+
+
+def _annotation(folder: Path) -> Annotation:
+    root = ET.parse(folder / "modelDescription.xml").getroot()
+    block = root.find("VendorAnnotations/Tool[@name='softneck']/Block")
+    if block is None:
+        return Annotation()
+    return Annotation(block.get("kind", ""), block.get("role", ""), frozenset(block.get("missing", "").split()))
+
+
+def _number(text: Any, default: Any) -> Any:
+    """Return an XML attribute as a float; Booleans become 0.0 and 1.0."""
+    if text is None:
+        return default
+    if str(text) in ("true", "false"):
+        return 1.0 if str(text) == "true" else 0.0
+    return float(text)

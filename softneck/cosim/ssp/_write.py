@@ -1,0 +1,147 @@
+"""A loop as an SSP 1.0 archive: its FMUs, who feeds whom, parameters, geometry, in one file for other masters."""
+
+from __future__ import annotations
+
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from softneck.core import OutputError, SettingsError, atomic_write, refuse_existing
+from softneck.fmu import FmuInfo, build_compiled_fmu, build_fmu
+from softneck.loop import BlockPart, Loop, Part, ReferenceBlock
+from softneck.loop._wiring import Wiring, wire
+from softneck.runtime import Port
+
+from ..loops._simulate import LoopSetup
+from ..parts._fmu_part import FmuPart
+from ..parts._isolated import IsolatedPart
+from ._description import Component, Link, system_description
+
+# Fixed, so that the same loop gives the same bytes.
+_DATE = (1980, 1, 1, 0, 0, 0)
+
+
+def write_ssp(loop: Loop | LoopSetup, path: str | Path, *, force: bool = False, compiled: bool = False) -> Path:
+    """Write `loop` as an SSP 1.0 archive and return its path.
+
+    Parts that are no FMUs become some; so does the reference. A master that sets all inputs first and then steps all
+    computes what `simulate` does with order "jacobi".
+
+    Args:
+        loop: a loop or what `load_loop` returned.
+        path: `NAME.ssp`.
+        force: replace an existing file.
+        compiled: what is made here needs no Python; FMUs that the loop names stay what they are.
+
+    Raises:
+        SettingsError: faults, or a part that can be no FMU; the line names it.
+        OutputError: the file exists or cannot be written.
+    """
+    target = Path(path)
+    if target.suffix != ".ssp":
+        raise SettingsError(f"{target}: the name of an SSP file must end in `.ssp`.")
+    refuse_existing(target, force=force)
+    plain = loop.loop if isinstance(loop, LoopSetup) else loop
+    if plain.faults:
+        raise SettingsError("an SSP file cannot hold the loop's faults; take [[fault]] out of a copy of the loop file.")
+    step = min(part.sample_time for part in plain.parts.values())
+    if not hasattr(plain.reference, "advance"):
+        block = ReferenceBlock(plain.reference, sample_time=step, duration=plain.duration).block()  # pyright: ignore[reportArgumentType]
+        plain = replace(plain, reference=BlockPart(block))
+    wiring = wire(plain.parts, plain.constants, plain.connections)
+    with tempfile.TemporaryDirectory(prefix="softneck-ssp-") as folder:
+        sources = {name: _fmu_of(name, part, Path(folder), compiled) for name, part in plain.parts.items()}
+        parts = [_component(name, part, sources[name], plain, wiring) for name, part in plain.parts.items()]
+        text = system_description(target.stem, parts, _links(plain, wiring), step=step, duration=plain.duration)
+        members = {"SystemStructure.ssd": text}
+        members |= {f"resources/{source.name}": source.read_bytes() for source in sources.values()}
+        _write(target, members, force=force)
+    return target
+
+
+def _fmu_of(name: str, part: Part, folder: Path, compiled: bool) -> Path:
+    """Return an FMU of `part`, in `folder` if it must be made or renamed."""
+    if isinstance(part, FmuPart | IsolatedPart):
+        renamed = folder / f"{name}_{part.path.name}"
+        renamed.write_bytes(part.path.read_bytes())
+        return renamed
+    if not isinstance(part, BlockPart):
+        raise SettingsError(
+            f"the {name} is a {type(part).__name__}, of which no FMU can be built; give an FMU or a file."
+        )
+    target, info = folder / f"{name}.fmu", FmuInfo(description=f"{part.block.kind} of a loop")
+    if compiled:
+        build_compiled_fmu(part.block, target, info=info)
+        return target
+    return build_fmu(part.block, target, info=info)
+
+
+@dataclass(frozen=True, slots=True)
+class _Names:
+    """Our names -> those of the FMU, where a mapping renames them."""
+
+    table: Mapping[str, str]
+
+    def of(self, name: str) -> str:
+        return self.table.get(name, name)
+
+
+def _names(part: Part) -> _Names:
+    return _Names(part.native_names if isinstance(part, FmuPart | IsolatedPart) else {})
+
+
+def _component(name: str, part: Part, source: Path, loop: Loop, wiring: Wiring) -> Component:
+    names = _names(part)
+    tap = wiring.taps[name]
+    constants = {
+        port.name: wiring.start[slot]
+        for port, owner, slot in zip(tap.ports, tap.owners, tap.slots.tolist(), strict=True)
+        # NaN is what an FMU of ours takes by itself where nobody connects.
+        if not owner and wiring.start[slot] == wiring.start[slot]
+    }
+    known = {port.name: port for port in (*part.inputs, *_parameters(part))}
+    values = {**constants, **loop.parameters.get(name, {})}
+    for key in values:
+        if key not in known:
+            raise SettingsError(f"`{key}` is no parameter of the {name}; it has {', '.join(known) or 'none'}.")
+    return Component(
+        name=name,
+        source=f"resources/{source.name}",
+        inputs=tuple(_renamed(port, names) for port in part.inputs),
+        outputs=tuple(_renamed(port, names) for port in part.outputs),
+        values=tuple((_renamed(known[key], names), float(value)) for key, value in values.items()),
+    )
+
+
+def _parameters(part: Part) -> tuple[Port, ...]:
+    return part.block.parameters if isinstance(part, BlockPart) else getattr(part, "parameters", ())
+
+
+def _renamed(port: Port, names: _Names) -> Port:
+    return replace(port, name=names.of(port.name))
+
+
+def _links(loop: Loop, wiring: Wiring) -> list[Link]:
+    links = []
+    parts = loop.parts
+    for name, tap in wiring.taps.items():
+        factors = tap.factors if tap.factors is not None else [1.0] * len(tap.ports)
+        for port, owner, slot, factor in zip(tap.ports, tap.owners, tap.slots.tolist(), factors, strict=True):
+            if owner:
+                output = next(item.port.name for item in wiring.named if item.slot == slot)
+                origin = (owner, _names(parts[owner]).of(output))
+                links.append(Link(origin, (name, _names(parts[name]).of(port.name)), float(factor)))
+    return links
+
+
+def _write(target: Path, members: Mapping[str, bytes], *, force: bool) -> None:
+    try:
+        with atomic_write(target, force=force) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+            for name, data in members.items():
+                info = zipfile.ZipInfo(name, _DATE)
+                info.compress_type = zipfile.ZIP_DEFLATED
+                archive.writestr(info, data)
+    except OSError as error:
+        raise OutputError(f"{target}: cannot be written: {error.strerror or error}.") from error

@@ -1,0 +1,232 @@
+"""A study: one loop, what varies in it, how often, and what is asked of the runs."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from softneck.core import FileFormatError, SettingsError, SoftneckError, file_hash
+from softneck.loop import Loop, LoopRun
+from softneck.loop._metrics import METRICS
+from softneck.runtime import Block
+
+from ..loops._loop_file import make_loop, normal_table
+from ..loops._loop_parts import OBJECT
+from ..loops._loop_table import check_key, loop_table, set_sources, settable, with_values
+from ..loops._loop_values import read_toml
+from ..loops._simulate import LoopSetup
+from ._vary import Points, Vary, flattened, make_vary
+
+_TOP = ("loop", "runs", "seed", "sampling", "objectives", "vary")
+Source = str | Path | Mapping[str, Any] | Loop | LoopSetup
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Study:
+    """Many runs of one loop; a study file describes one, `study` runs it.
+
+    Attributes:
+        loop: the table of a loop, as in a loop file.
+        vary: dotted key -> how it varies.
+        runs: how many; None for all points of the grids.
+        seed: of everything that is drawn.
+        sampling: "latin_hypercube" or "monte_carlo".
+        objectives: metrics to be small; the first one ranks, all of them span the Pareto front.
+        folder: where relative paths of the loop start.
+        name: for titles.
+    """
+
+    loop: Mapping[str, Any]
+    vary: Mapping[str, Vary]
+    runs: int | None = None
+    seed: int = 0
+    sampling: str = "latin_hypercube"
+    objectives: tuple[str, ...] = ("pitch.rms_error_deg", "motors.total_variation_rad")
+    folder: Path = field(default_factory=Path.cwd)
+    name: str = "study"
+
+    def __post_init__(self) -> None:
+        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
+            raise SettingsError(f"`seed` must be a whole number that is not negative; got {self.seed!r}.")
+        for metric in self.objectives:
+            if metric not in METRICS:
+                raise SettingsError(f"`{metric}` is no metric to be an objective; use some of {', '.join(METRICS)}.")
+        if not self.objectives:
+            raise SettingsError("`objectives` is empty; name at least one metric.")
+
+    @cached_property
+    def points(self) -> Points:
+        """The runs: what each puts into the loop."""
+        return Points(self.vary, self.runs, self.seed, self.sampling)
+
+    def table(self, run: int) -> dict[str, Any]:
+        """Return the loop of one run, as the table of a loop file."""
+        if not 0 <= run < len(self.points):
+            raise SettingsError(f"the study has runs 0 to {len(self.points) - 1}; there is no {run}.")
+        return with_values(self.loop, self.points[run].values)
+
+    def setup(self, run: int, *, opened: dict[Any, Any] | None = None) -> LoopSetup:
+        """Return the loop of one run, ready for `simulate`."""
+        return make_loop(self.table(run), self.folder, opened=opened)
+
+    def check(self) -> None:
+        """Open the loop of the first run with each part in turn, and find every key in it.
+
+        Raises:
+            SettingsError: a key that the loop does not have, or a loop that cannot be.
+        """
+        first = self.points[0].values
+        kinds = {key: value for key, value in first.items() if set_sources(key)}
+        turns: list[dict[str, Any]] = [kinds]
+        turns += [{**kinds, key: value} for key in kinds for value in self.vary[key].values]
+        names: dict[str, set[str] | None] = {}
+        table = with_values(self.loop, kinds)
+        for key in self.vary:
+            if set_sources(key):
+                check_key(table, key, {})
+        for turn in turns:
+            table = with_values(self.loop, turn)
+            setup = make_loop(table, self.folder)
+            for name, part in setup.loop.parts.items():
+                more = settable(part)
+                names[name] = None if more is None else (names.get(name) or set()) | more
+        for key in self.vary:
+            check_key(table, key, names)
+        LoopRun(make_loop(with_values(self.loop, kinds), self.folder).loop)
+
+    def description(self) -> dict[str, Any]:
+        """Return what the study is, as JSON values, with the hash of every file that it names."""
+        files = sorted(set(_texts([self.loop, [v.values for v in self.vary.values()]])))
+        hashes = {name: file_hash(self.folder / name) for name in files if (self.folder / name).is_file()}
+        return {
+            "loop": _plain(self.loop),
+            "vary": {
+                key: {"kind": v.kind, "values": _plain(v.values), "labels": list(v.labels)}
+                for key, v in self.vary.items()
+            },
+            "runs": len(self.points),
+            "seed": self.seed,
+            "sampling": self.sampling,
+            "files": hashes,
+        }
+
+    @property
+    def digest(self) -> str:
+        """A hash of all that decides the numbers."""
+        return hashlib.sha256(json.dumps(self.description(), sort_keys=True).encode()).hexdigest()
+
+
+def make_study(
+    loop: Source,
+    *,
+    vary: Mapping[str, Any],
+    runs: int | None = None,
+    seed: int = 0,
+    sampling: str = "latin_hypercube",
+    objectives: Sequence[str] | None = None,
+    name: str = "study",
+    folder: str | Path | None = None,
+) -> Study:
+    """Return a study of `loop`: a loop file, its table, or a loop; `vary` is as [vary] in a study file.
+
+    Without `objectives` they are the error of the axis that the reference is about, and the moves of the motors.
+
+    Raises:
+        SettingsError: an empty or contradictory range, or no such metric.
+        FileFormatError: no such loop file.
+    """
+    table, start = _opened(loop)
+    chosen = {key: make_vary(key, given) for key, given in flattened(vary)}
+    limits = table.get("limits", {})
+    return Study(
+        loop=table, vary=chosen, runs=runs, seed=seed, sampling=sampling, folder=Path(folder) if folder else start,
+        objectives=tuple(objectives) if objectives else _objectives(table, limits), name=name,
+    )  # fmt: skip
+
+
+def load_study(path: str | Path) -> Study:
+    """Read a study file; its loop file is looked for beside it.
+
+    Raises:
+        FileFormatError: no such file or no TOML.
+        SettingsError: unknown or missing keys, an empty or contradictory range.
+    """
+    source = Path(path)
+    table = read_toml(source)
+    try:
+        made = _from_table(source, table)
+        len(made.points)  # numbers of runs that cannot be are the file's fault too
+        return made
+    except SoftneckError as error:
+        raise (error if str(error).startswith(str(source)) else type(error)(f"{source}: {error}")) from error
+
+
+def _from_table(source: Path, table: Mapping[str, Any]) -> Study:
+    for key in table:
+        if key not in _TOP:
+            raise SettingsError(f"`{key}` is no key of a study; it takes {', '.join(_TOP)}.")
+    if "loop" not in table:
+        raise SettingsError("`loop` is missing: name the loop file.")
+    if not isinstance(table.get("vary", {}), dict):
+        raise SettingsError("`vary` must be a table: [vary].")
+    rest = {key: table[key] for key in ("runs", "seed", "sampling", "objectives") if key in table}
+    loop = table["loop"]
+    if isinstance(loop, str):
+        loop = source.parent / loop
+    return make_study(
+        loop, vary=table.get("vary", {}), name=source.stem,
+        folder=source.parent if isinstance(loop, Mapping) else None, **rest,
+    )  # fmt: skip
+
+
+def _opened(loop: Source) -> tuple[Mapping[str, Any], Path]:
+    if isinstance(loop, str | Path):
+        path = Path(loop)
+        if not path.is_file():
+            raise FileFormatError(f"there is no loop file {path}.")
+        return read_toml(path), path.parent.resolve()
+    if isinstance(loop, Loop | LoopSetup):
+        return loop_table(loop), Path.cwd()
+    return normal_table(loop), Path.cwd()
+
+
+def _objectives(table: Mapping[str, Any], limits: Mapping[str, float]) -> tuple[str, ...]:
+    reference = table.get("reference", {})
+    stated = {
+        key.partition("_")[0] for key, value in reference.items() if value and key.startswith(("pitch_", "roll_"))
+    }
+    limited = {name.partition(".")[0] for name in limits} & {"pitch", "roll"}
+    axis = "roll" if "roll" in (stated or limited) and "pitch" not in (stated or limited) else "pitch"
+    return (f"{axis}.rms_error_deg", "motors.total_variation_rad")
+
+
+def _texts(value: Any) -> list[str]:
+    """Return all texts in nested tables and lists."""
+    if isinstance(value, str):
+        return [value]
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    return [text for item in value for text in _texts(item)] if isinstance(value, list | tuple) else []
+
+
+def _plain(value: Any) -> Any:
+    """Return `value` as JSON; of a part that is no file, a hash of what it does."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, Path):
+        return str(value)
+    block = value.block() if callable(getattr(value, "block", None)) else value
+    if not isinstance(block, Block):
+        return {OBJECT: f"{type(value).__module__}.{type(value).__qualname__}"}
+    text = repr((block.kind, block.runtime, block.sample_time, block.inputs, block.outputs, block.parameters))
+    content = hashlib.sha256(text.encode() + b"".join(array.tobytes() for array in block.arrays)).hexdigest()
+    return {OBJECT: block.kind, "sha256": content}

@@ -1,0 +1,286 @@
+"""What every linear design shares: the plant it takes, its limits, its reference filter and its verification."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from softneck.core import Matrix, SettingsError, require_between, require_one_of, require_whole
+from softneck.estimation import AxisPlant
+from softneck.estimation._axis import AXES
+from softneck.signals import redefinition_matrix
+
+from ..plants._step_and_load import StepAndLoad
+from ..plants._uncertain import UncertainAxis, uncertain_plant
+from ._assembly import AxisController, assemble
+from ._axis_loop import axis_margins, conditioning_candidates, sensitivities, unstable_samples
+from ._controller import LinearController
+from ._loop_settings import LoopSettings
+from ._margins import Margins
+from ._reduction import reduce_axis
+from ._sweep import Sweep, make_sweep
+
+# A reference filter slower than this [samples] would be no answer to overshoot.
+_SLOWEST = 100
+CONDITIONINGS = ("hanus", "tuned")
+# Another conditioning than Hanus' must overshoot less by this [%].
+_WORTH_IT = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """What a synthesis made of one axis.
+
+    Attributes:
+        controller: of the axis.
+        gains: its numbers by name, for people.
+        notes: more numbers, such as gamma.
+    """
+
+    controller: AxisController
+    gains: dict[str, float]
+    notes: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AxisSettings(LoopSettings, ABC):
+    """Settings that all kinds of linear controller share; a kind adds its own and one synthesis.
+
+    Limits, the order of the loop and what is doubted of the plant are those of `LoopSettings`.
+
+    Attributes:
+        max_sensitivity: bound on Ms around every sample of the plant; what a kind chooses itself keeps it.
+        reference_time: time constant of the reference filter [s]; None for the least with which no sample overshoots
+            by more than `overshoot_pct`, from half the plant's lag on.
+        overshoot_pct: of a step of 10 deg, within the limits.
+        gain_spread: relative; a plant without samples of its own is taken at both ends of it as well.
+        controller_order: states that balanced reduction leaves to the axis' controller; 0 for all.
+        conditioning: "hanus" (what a limit took away is taken from the reference), or "tuned": of that and of
+            predictors that follow the limited output faster, the one that overshoots least on the worst sample in a
+            step of 20 deg and in one with half the slew.
+    """
+
+    KIND: ClassVar[str]
+
+    max_sensitivity: float = 2.0
+    reference_time: float | None = None
+    overshoot_pct: float = 4.0
+    gain_spread: float = 0.2
+    controller_order: int = 0
+    conditioning: str = "tuned"
+
+    def __post_init__(self) -> None:
+        LoopSettings.__post_init__(self)
+        require_between("max_sensitivity", self.max_sensitivity, 1.05, 10.0)
+        if self.reference_time is not None:
+            require_between("reference_time", self.reference_time, 0.0, 60.0, "s")
+        require_between("overshoot_pct", self.overshoot_pct, 0.1, 100.0, "%")
+        require_between("gain_spread", self.gain_spread, 0.0, 0.9)
+        require_whole("controller_order", self.controller_order, 0, 100)
+        require_one_of("conditioning", self.conditioning, CONDITIONINGS)
+
+    def design(self, plant: Any) -> LinearController:
+        """Return the controller for `plant`, whatever `uncertain_plant` takes; verified on every sample.
+
+        Raises:
+            SettingsError: a plant that does not fit, no solution, or a loop that does not hold on every sample.
+        """
+        uncertain = uncertain_plant(plant)
+        axes = {name: self._prepared(uncertain.axis(name)) for name in AXES}
+        made: dict[str, tuple[AxisController, float, dict[str, Any]]] = {}
+        for name, axis in axes.items():
+            if name == "roll" and self._shared() and axis.same_as(axes["pitch"]):
+                made["roll"] = made["pitch"]
+                continue
+            try:
+                made[name] = self._made(axis, name)
+            except SettingsError as error:
+                raise SettingsError(f"{name}: {error}") from error
+        times = [made[name][1] for name in AXES]
+        return LinearController(
+            kind=self.KIND,
+            sample_time=uncertain.sample_time,
+            arrays=assemble(
+                (made["pitch"][0], made["roll"][0]),
+                reference_times=(times[0], times[1], max(times)),
+                sample_time=uncertain.sample_time,
+                tendon_angles=self.tendon_angles,
+            ),
+            limits=self.limits(),
+            order=self.order,
+            design={
+                "settings": self._stored(),
+                "extra_delay": self.extra_delay,
+                **{name: item[2] for name, item in made.items()},
+            },
+        )
+
+    @abstractmethod
+    def _synthesise(self, axis: UncertainAxis, name: str) -> Found:
+        """Return the controller of one axis, "pitch" or "roll"."""
+
+    def _shared(self) -> bool:
+        """Return whether equal axes get the same controller."""
+        return True
+
+    def _stored(self) -> dict[str, Any]:
+        """Return the settings as JSON values."""
+        return asdict(self)
+
+    def _prepared(self, axis: UncertainAxis) -> UncertainAxis:
+        """Return the axis as it is designed for."""
+        taken = axis.prepared(self.least_delay, self.small_move_pole)
+        if len(axis.samples) > 1 or self.gain_spread == 0.0:
+            return taken
+        scales = (1.0 - self.gain_spread, 1.0 + self.gain_spread)
+        more = tuple(scaled(plant, scale) for plant in taken.samples for scale in scales)
+        return UncertainAxis(taken.nominal, (*taken.samples, *more))
+
+    def _made(self, axis: UncertainAxis, name: str) -> tuple[AxisController, float, dict[str, Any]]:
+        found = self._synthesise(axis, name)
+        controller, reduction = found.controller, {}
+        if 0 < self.controller_order < controller.A.shape[0]:
+            controller, reduction = reduce_axis(controller, axis.nominal, self.extra_delay, self.controller_order)
+        margins = axis_margins(controller, axis.nominal, self.extra_delay)
+        self._hold(controller, axis)
+        time = self._reference_time(controller, axis) if self.reference_time is None else self.reference_time
+        if self.conditioning == "tuned":
+            controller = self._conditioned(controller, time, axis)
+        worst = float(sensitivities(controller, axis.samples, self.extra_delay).max())
+        findings = {
+            "gains": {**found.gains, "reference_time_s": time},
+            "dead_time_s": (axis.nominal.delay + self.extra_delay) * axis.sample_time,
+            "margins": margins_json(margins),
+            "states": int(controller.A.shape[0]),
+            "samples": len(axis.samples),
+            "worst_sensitivity": worst,
+            **found.notes,
+            **reduction,
+        }
+        return controller, time, findings
+
+    def _hold(self, controller: AxisController, axis: UncertainAxis) -> None:
+        """Raise unless the loop is stable around every sample, its delay exact."""
+        lost = unstable_samples(controller, axis.samples, self.extra_delay)
+        if lost:
+            raise SettingsError(
+                f"the loop is not stable around {len(lost)} of {len(axis.samples)} samples (the first is sample "
+                f"{lost[0]}); ask for less speed, or lower `max_sensitivity`."
+            )
+
+    def _reference_time(self, controller: AxisController, axis: UncertainAxis) -> float:
+        """Return the least time [s] with which no sample overshoots by more, by halving in whole samples."""
+        sweep, L = self._sweep(axis), controller.conditioning()
+
+        def keeps(samples: int) -> bool:
+            return bool(sweep.run(controller, samples * axis.sample_time, L).overshoot.max() <= self.overshoot_pct)
+
+        low, high = _first_filter(axis.nominal), _SLOWEST
+        if keeps(low):
+            return low * axis.sample_time
+        if not keeps(high):
+            raise SettingsError(
+                f"no reference filter up to {high * axis.sample_time:g} s keeps the overshoot below "
+                f"{self.overshoot_pct:g} % on every sample; lower `max_sensitivity`, or give `reference_time`."
+            )
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (low, middle) if keeps(middle) else (middle, high)
+        return high * axis.sample_time
+
+    def _conditioned(self, controller: AxisController, time: float, axis: UncertainAxis) -> AxisController:
+        """Return the controller with the conditioning that overshoots least where limits matter."""
+        usual = self._sweep(axis)
+        large = replace(usual, test=replace(usual.test, reference=2.0 * usual.test.reference))
+        slow = replace(usual, test=replace(usual.test, slew_limit=0.5 * usual.test.slew_limit))
+
+        def worst(L: Matrix) -> float:
+            with np.errstate(over="ignore", invalid="ignore"):
+                peaks = [float(sweep.run(controller, time, L).overshoot.max()) for sweep in (large, slow)]
+            return max(peaks) if np.isfinite(peaks).all() else math.inf
+
+        best, least = controller.conditioning(), worst(controller.conditioning()) - _WORTH_IT
+        for L in conditioning_candidates(controller):
+            found = worst(L)
+            # What is asked for within the limits must not suffer.
+            if found < least and usual.run(controller, time, L).overshoot.max() <= self.overshoot_pct:
+                best, least = L, found
+        return replace(controller, L=best)
+
+    def _sweep(self, axis: UncertainAxis) -> Sweep:
+        """Return the samples ready for steps within the limits of the motors."""
+        # The motor that moves most has 2/3 of theta_i (Eq. 9), 0.577 of phi_i: the tighter one is taken.
+        share = float(np.abs(np.linalg.inv(redefinition_matrix(np.array(self.tendon_angles)))[:, :2]).max())
+        test = StepAndLoad(
+            sample_time=axis.sample_time,
+            position_limit=self.position_limit / share,
+            slew_limit=self.slew_limit * axis.sample_time / share,
+        )
+        return make_sweep(axis.samples, extra_delay=self.extra_delay, test=test)
+
+    def _keeps_all(self, controller: AxisController, axis: UncertainAxis) -> bool:
+        """Return whether every sample is stable and keeps `max_sensitivity`."""
+        worst = sensitivities(controller, axis.samples, self.extra_delay).max()
+        return bool(worst <= self.max_sensitivity) and not unstable_samples(controller, axis.samples, self.extra_delay)
+
+    def _fastest(
+        self, build: Callable[[float], Found], axis: UncertainAxis, *, low: float, high: float, what: str
+    ) -> Found:
+        """Return what `build(speed)` gives at the largest speed [rad/s] whose loops all keep `max_sensitivity`.
+
+        Raises:
+            SettingsError: not even the lowest does.
+        """
+        best: Found | None = None
+        tried = low
+        found = _attempt(build, tried)
+        if found is not None and self._keeps_all(found.controller, axis):
+            best = found
+        if best is None:
+            raise SettingsError(
+                f"not even a {what} of {low:.3g} rad/s keeps Ms <= {self.max_sensitivity:g} on all "
+                f"{len(axis.samples)} samples; raise `max_sensitivity`, or give `{what}` and see what is lost."
+            )
+        # Two decades to 3 %.
+        for _ in range(math.ceil(math.log2(math.log(high / low) / 0.03))):
+            tried = math.sqrt(low * high)
+            found = _attempt(build, tried)
+            if found is not None and self._keeps_all(found.controller, axis):
+                low, best = tried, found
+            else:
+                high = tried
+        return best
+
+
+def _first_filter(plant: AxisPlant) -> int:
+    """Return half the plant's lag [samples]: a reference that is faster only runs into the motors' limits."""
+    return min(round(0.5 * slowest_time(plant) / plant.sample_time), _SLOWEST // 2)
+
+
+def _attempt(build: Callable[[float], Found], speed: float) -> Found | None:
+    """Return what `build` makes, or None where the synthesis has no solution there."""
+    try:
+        return build(speed)
+    except SettingsError:
+        return None
+
+
+def scaled(plant: AxisPlant, factor: float) -> AxisPlant:
+    """Return the plant with its gain times `factor`."""
+    return AxisPlant(factor * plant.numerator, plant.denominator, plant.delay, plant.sample_time)
+
+
+def slowest_time(plant: AxisPlant) -> float:
+    """Return the time constant [s] of the slowest pole."""
+    radius = float(np.abs(np.roots(plant.denominator)).max(initial=1e-9))
+    return -plant.sample_time / math.log(max(radius, 1e-9))
+
+
+def margins_json(margins: Margins) -> dict[str, float | None]:
+    """Return margins as JSON values; None stands for infinity."""
+    return {name: value if math.isfinite(value) else None for name, value in asdict(margins).items()}

@@ -1,0 +1,194 @@
+"""The linear controller: what every linear design becomes, in loops, FMUs and files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import control
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.io import savemat
+
+from softneck.core import FileFormatError, Matrix, Vector, atomic_write, write_archive
+from softneck.runtime import Block, State
+
+from ._limits import Limits
+from ._ports import controller_inputs, controller_outputs
+
+_RUNTIME = "softneck.design.linear._linear_controller_runtime"
+_ARRAYS = (
+    "Af",
+    "Bf",
+    "Cf",
+    "Df",
+    "A",
+    "Br",
+    "By",
+    "C",
+    "Dr",
+    "Dy",
+    "L",
+    "align",
+    "rest",
+    "T",
+    "T_inverse",
+    "constants",
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class LinearController:
+    """A designed controller of pitch and roll with reference filter, limits, conditioning and allocation.
+
+    Attributes:
+        kind: name in the table of kinds.
+        sample_time: [s].
+        arrays: what the runtime reads, see `_linear_parts_runtime`.
+        limits: of the set-points.
+        order: of the loop it is for.
+        design: JSON values: the settings, gains and margins by axis, for `summary` and the header.
+    """
+
+    kind: str
+    sample_time: float
+    arrays: tuple[Matrix, ...]
+    limits: Limits
+    order: str
+    design: Mapping[str, Any]
+
+    def block(self) -> Block:
+        """Return the controller as a block of role "controller"."""
+        return Block(
+            kind=self.kind,
+            role="controller",
+            runtime=_RUNTIME,
+            sample_time=self.sample_time,
+            arrays=self.arrays,
+            inputs=controller_inputs(),
+            outputs=controller_outputs(),
+            parameters=self.limits.ports(),
+        )
+
+    def initial_state(self, **parameters: float) -> State:
+        """Return the state at the start; parameters are the limits by name."""
+        return self.block().initial_state(**parameters)
+
+    def step(self, state: State, inputs: ArrayLike) -> tuple[State, Vector]:
+        """Return the next state and the set-points valid now; inputs and outputs as in `block()`."""
+        return self.block().step(state, inputs)
+
+    def ss(self) -> control.StateSpace:
+        """Return it without limits, from (pitch_reference, roll_reference, pitch, roll) to (theta_i, phi_i)."""
+        Af, Bf, Cf, Df, A, Br, By, C, Dr, Dy = self.arrays[:10]
+        Af, Bf, Cf, Df = Af[:2, :2], Bf[:2, :2], Cf[:2, :2], Df[:2, :2]
+        states = np.block([[Af, np.zeros((2, A.shape[0]))], [Br @ Cf, A]])
+        inputs = np.block([[Bf, np.zeros((2, 2))], [Br @ Df, By]])
+        return control.StateSpace(
+            states,
+            inputs,
+            np.hstack([Dr @ Cf, C]),
+            np.hstack([Dr @ Df, Dy]),
+            self.sample_time,
+            inputs=["pitch_reference", "roll_reference", "pitch", "roll"],
+            outputs=["theta_i", "phi_i"],
+            name=self.kind,
+        )
+
+    def to_mat(self, path: str | Path, *, force: bool = False) -> None:
+        """Write `ss()` to a MATLAB file: A, B, C, D, Ts, InputName, OutputName."""
+        system = self.ss()
+        values = {
+            "A": system.A, "B": system.B, "C": system.C, "D": system.D, "Ts": self.sample_time,
+            "InputName": np.array(system.input_labels, dtype=object),
+            "OutputName": np.array(system.output_labels, dtype=object),
+        }  # fmt: skip
+        with atomic_write(path, force=force) as temporary, temporary.open("wb") as file:
+            savemat(file, values)
+
+    def summary(self) -> str:
+        """Return some lines for people."""
+        lines = [
+            f"{self.kind} controller, {self.sample_time * 1e3:g} ms, {self.order} order, "
+            f"{self.design.get('extra_delay', 0)} samples of delay added to the plant for it",
+            *self.limits.lines(self.sample_time),
+        ]
+        for axis in ("pitch", "roll"):
+            item = self.design.get(axis, {})
+            gains = ", ".join(f"{name} {value:.4g}" for name, value in item.get("gains", {}).items())
+            lines.append(f"  {axis}: {gains}; designed for a dead time of {1e3 * item.get('dead_time_s', 0.0):g} ms")
+            lines += _findings(item)
+            for title, key in (("as identified", "margins"), ("small moves", "margins_small_moves")):
+                if key in item:
+                    lines.append(f"    {title}: {_margins(item[key])}")
+        return "\n".join(lines)
+
+    def save(self, path: str | Path, *, force: bool = False) -> None:
+        """Write the controller to one `.npz` file."""
+        block = self.block()
+        header = {
+            "kind": self.kind,
+            "sample_time": self.sample_time,
+            **asdict(self.limits),
+            "order": self.order,
+            "design": dict(self.design),
+            "inputs": [port.name for port in block.inputs],
+            "outputs": [port.name for port in block.outputs],
+            "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
+        }
+        write_archive(path, header, dict(zip(_ARRAYS, self.arrays, strict=True)), force=force)
+
+    @classmethod
+    def from_archive(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> LinearController:
+        """Return the controller that `save` wrote; `softneck.core.load` calls this."""
+        items = tuple(np.ascontiguousarray(arrays[name], dtype=np.float64) for name in _ARRAYS)
+        m, n = items[0].shape[0], items[4].shape[0]
+        shapes = (
+            (m, m), (m, 3), (3, m), (3, 3), (n, n), (n, 2), (n, 2), (2, n), (2, 2), (2, 2), (n, 2),
+            (n, 4), (m, 3), (3, 3), (3, 3), (1,),
+        )  # fmt: skip
+        if any(item.shape != shape or not np.isfinite(item).all() for item, shape in zip(items, shapes, strict=True)):
+            raise FileFormatError("the controller's arrays have wrong shapes or are not finite; design it again.")
+        return cls(
+            kind=str(header["kind"]),
+            sample_time=float(header["sample_time"]),
+            arrays=items,
+            # Files of the first version do not know the rules for taut tendons.
+            limits=Limits(**{item.name: float(header[item.name]) for item in fields(Limits) if item.name in header}),
+            order=str(header["order"]),
+            design=dict(header["design"]),
+        )
+
+
+def _findings(item: Mapping[str, Any]) -> list[str]:
+    """Return a line on the samples that a design was verified on, and one on its reduction."""
+    lines = []
+    if item.get("samples", 1) > 1:
+        worst, lost = item.get("worst_sensitivity"), item.get("samples_unstable", 0)
+        held = f"stable on all {item['samples']} samples" if not lost else f"NOT stable on {lost} of {item['samples']}"
+        lines.append(f"    {held}" + (f", worst Ms {worst:.3g}" if worst is not None else ""))
+    if "gamma" in item:
+        lines.append(f"    gamma {item['gamma']:.4g}")
+    if "reduction" in item:
+        loss = item["reduction"]
+        lines.append(
+            f"    reduced to {item['states']} of {loss['states_before']} states: error at most "
+            f"{loss['error_bound']:.3g} at any frequency, Ms {loss['sensitivity_before']:.4g} before, "
+            f"{loss['sensitivity_after']:.4g} after"
+        )
+    return lines
+
+
+def _margins(values: Mapping[str, float | None]) -> str:
+    """Return margins as text; None stands for infinity, which JSON does not have."""
+    units = (("gain margin", "gain", 1.0, ""), ("phase margin", "phase", math.degrees(1.0), " deg"),
+             ("Ms", "sensitivity", 1.0, ""), ("crossover", "crossover", 1.0, " rad/s"),
+             ("delay margin", "delay", 1e3, " ms"))  # fmt: skip
+    parts = []
+    for title, key, factor, unit in units:
+        value = values.get(key)
+        parts.append(f"{title} inf" if value is None else f"{title} {factor * value:.3g}{unit}")
+    return ", ".join(parts)

@@ -1,0 +1,219 @@
+"""The uncertain plant of a design: a nominal plant and samples of what it may be, for both axes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import control
+import numpy as np
+
+from softneck.core import DataError, SettingsError, SoftneckError, require_one_of
+from softneck.estimation import AxisPlant, LinearNeck, axis_plant
+from softneck.estimation._axis import AXES
+
+# Coefficients below this part of the largest are rounding of a characteristic polynomial.
+_ROUNDING = 1e-11
+_INPUTS = {"pitch": "theta_i", "roll": "phi_i"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UncertainAxis:
+    """What one axis may be.
+
+    Attributes:
+        nominal: the plant that synthesis takes.
+        samples: every plant that the controller must hold on; the nominal one is the first.
+    """
+
+    nominal: AxisPlant
+    samples: tuple[AxisPlant, ...]
+
+    @property
+    def sample_time(self) -> float:
+        """[s]."""
+        return self.nominal.sample_time
+
+    def same_as(self, other: UncertainAxis) -> bool:
+        """Return whether both are the same plants, so that one synthesis does for both."""
+        mine, its = (self.nominal, *self.samples), (other.nominal, *other.samples)
+        return len(mine) == len(its) and all(
+            a.delay == b.delay
+            and np.array_equal(a.numerator, b.numerator)
+            and np.array_equal(a.denominator, b.denominator)
+            for a, b in zip(mine, its, strict=True)
+        )
+
+    def prepared(self, least_delay: float, small_move_pole: float) -> UncertainAxis:
+        """Return it with a nominal dead time of at least `least_delay` [s], and the form of small moves as a sample.
+
+        The samples stay as they are; see `PiSettings` for why a single fit needs both.
+        """
+        nominal = self.nominal.delayed(least_delay)
+        faster = nominal.faster(small_move_pole) if small_move_pole > 0.0 else nominal
+        more = () if faster is nominal else (faster,)
+        return UncertainAxis(nominal, (nominal, *more, *self.samples[1:]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UncertainPlant:
+    """Both axes of an uncertain neck; what every design of this package works on."""
+
+    pitch: UncertainAxis
+    roll: UncertainAxis
+
+    @property
+    def sample_time(self) -> float:
+        """[s]."""
+        return self.pitch.sample_time
+
+    def axis(self, name: str) -> UncertainAxis:
+        """Return "pitch" or "roll"."""
+        require_one_of("axis", name, AXES)
+        return self.pitch if name == "pitch" else self.roll
+
+    def tf(self, output: str) -> control.TransferFunction:
+        """Return the nominal plant of an axis, as a model's `tf`."""
+        return self.axis(output).nominal.tf()
+
+    def samples(self, output: str) -> list[control.TransferFunction]:
+        """Return the samples of an axis, as a family's `samples`."""
+        return [plant.tf() for plant in self.axis(output).samples]
+
+
+def uncertain_plant(source: Any) -> UncertainPlant:
+    """Return what a design works on.
+
+    Args:
+        source: a family, an identified linear model, a discrete `control.StateSpace` or `TransferFunction`, a list
+            of those (the first is nominal), or a mapping of "pitch" and "roll" to such systems or lists. A
+            scalar system without names stands for both axes; one of two outputs is read by its signal names
+            (theta_i, phi_i to pitch, roll), or in that order where it has none.
+
+    Raises:
+        SettingsError: not linear, discrete or stable; different sample times; names that do not match.
+        DataError: a plant that is zero, not strictly proper or not finite, or of the other sign.
+    """
+    if isinstance(source, UncertainPlant):
+        return source
+    if isinstance(source, Mapping):
+        return _of_mapping(source)
+    if isinstance(source, Sequence) and not isinstance(source, str):
+        if not source:
+            raise DataError("the list of samples is empty; the first is the nominal plant.")
+        each = [uncertain_plant(item) for item in source]
+        return _joined({axis: [s for item in each for s in item.axis(axis).samples] for axis in AXES})
+    if isinstance(source, control.StateSpace | control.TransferFunction):
+        return _joined({axis: [_plant(_of_system(source, axis), axis, "the plant")] for axis in AXES})
+    if not hasattr(source, "tf"):
+        raise SettingsError(
+            f"a linear model is needed, one with `tf`; got {type(source).__name__}. "
+            "Identify `rls`, or give a discrete control.TransferFunction."
+        )
+    return _joined({axis: _of_model(source, axis) for axis in AXES})
+
+
+def _of_model(model: Any, axis: str) -> list[AxisPlant]:
+    nominal = axis_plant(model, axis)
+    samples = model.samples(axis) if callable(getattr(model, "samples", None)) else []
+    return [nominal, *(_plant(item, axis, f"sample {i} of the family") for i, item in enumerate(samples))]
+
+
+def _of_mapping(source: Mapping[str, Any]) -> UncertainPlant:
+    if set(source) != set(AXES):
+        got = ", ".join(str(name) for name in source) or "nothing"
+        raise SettingsError(f"the plant must have the axes pitch and roll; got {got}.")
+    axes: dict[str, list[AxisPlant]] = {}
+    for axis in AXES:
+        value = source[axis]
+        items = list(value) if isinstance(value, Sequence) else [value]
+        if not items:
+            raise DataError(f"{axis} has no samples; the first is the nominal plant.")
+        axes[axis] = [
+            item if isinstance(item, AxisPlant) else _plant(_scalar(item, axis), axis, f"sample {i} of {axis}")
+            for i, item in enumerate(items)
+        ]
+    return _joined(axes)
+
+
+def _joined(axes: Mapping[str, list[AxisPlant]]) -> UncertainPlant:
+    times = {axis: plants[0].sample_time for axis, plants in axes.items()}
+    if not math.isclose(*times.values(), rel_tol=1e-9):
+        raise SettingsError(
+            f"pitch and roll have different sample times, {times['pitch']:g} s and {times['roll']:g} s; resample one."
+        )
+    for axis, plants in axes.items():
+        for i, plant in enumerate(plants):
+            if not math.isclose(plant.sample_time, times[axis], rel_tol=1e-9):
+                raise SettingsError(
+                    f"sample {i} of {axis} has a sample time of {plant.sample_time:g} s, the nominal plant "
+                    f"{times[axis]:g} s; identify or resample it at {times[axis]:g} s."
+                )
+            if plant.static_gain * plants[0].static_gain <= 0.0:
+                raise DataError(
+                    f"sample {i} of {axis} has a static gain of {plant.static_gain:.4g} rad/rad, the nominal plant "
+                    f"{plants[0].static_gain:.4g}: no controller with integral action holds both signs. "
+                    "Leave that sample out, or check the signs of its recording."
+                )
+    made = {axis: UncertainAxis(plants[0], tuple(plants)) for axis, plants in axes.items()}
+    return UncertainPlant(made["pitch"], made["roll"])
+
+
+def _plant(system: Any, axis: str, what: str) -> AxisPlant:
+    tf: Any = _polynomials(system) if isinstance(system, control.StateSpace) else system
+    neck = LinearNeck(pitch=tf, roll=tf)
+    try:
+        return axis_plant(neck, axis)
+    except SoftneckError as error:
+        raise type(error)(f"{what}: {error}") from error
+
+
+def _polynomials(system: Any) -> control.TransferFunction:
+    """Return the transfer function of a state space, what rounding left of its dead time taken away."""
+    found: Any = control.ss2tf(system)
+    num, den = (np.asarray(part[0][0]) for part in (found.num, found.den))
+    for part in (num, den):
+        part[np.abs(part) < _ROUNDING * np.abs(part).max(initial=0.0)] = 0.0
+    return control.TransferFunction(num, den, system.dt)
+
+
+def _scalar(system: Any, axis: str) -> Any:
+    """Return `system`, which must be scalar and, where it has names, that of `axis`."""
+    if not isinstance(system, control.StateSpace | control.TransferFunction):
+        raise SettingsError(
+            f"{axis} must be a discrete control.StateSpace or TransferFunction; got {type(system).__name__}."
+        )
+    if system.ninputs != 1 or system.noutputs != 1:
+        raise SettingsError(f"{axis} must have one input and one output; got {system.ninputs} and {system.noutputs}.")
+    names = ((system.input_labels[0], _INPUTS[axis]), (system.output_labels[0], axis))
+    for label, wanted in names:
+        if label in (*_INPUTS, *_INPUTS.values()) and label != wanted:
+            raise SettingsError(
+                f"a signal of {axis} is named {label}; it must be {wanted}. Rename it or swap the axes."
+            )
+    return system
+
+
+def _of_system(system: Any, axis: str) -> Any:
+    """Return the part of `system` from the axis' redefined input to its angle."""
+    if system.ninputs == 1 and system.noutputs == 1:
+        label = system.output_labels[0]
+        if label in AXES:
+            raise SettingsError(f"the system is that of {label} alone; give both, as {{'pitch': ..., 'roll': ...}}.")
+        return system
+    inputs, outputs = list(system.input_labels), list(system.output_labels)
+    if len(inputs) == len(outputs) == 2 and all(_default(name) for name in (*inputs, *outputs)):
+        i = AXES.index(axis)
+        return system[i, i]
+    if _INPUTS[axis] not in inputs or axis not in outputs:
+        raise SettingsError(
+            f"the system's signals are {', '.join(inputs)} to {', '.join(outputs)}; a design needs theta_i, phi_i to "
+            "pitch, roll. Rename them with `system.update_names(inputs=..., outputs=...)`."
+        )
+    return system[outputs.index(axis), inputs.index(_INPUTS[axis])]
+
+
+def _default(label: str) -> bool:
+    return label.startswith(("u[", "y["))

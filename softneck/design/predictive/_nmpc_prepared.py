@@ -1,0 +1,97 @@
+"""What a nonlinear predictive controller computes once: references, disturbance, in the order of the horizon."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Protocol
+
+import numpy as np
+
+from softneck.core import Matrix
+from softneck.estimation import AxisPlant
+from softneck.identification import Model
+from softneck.runtime import State
+
+from ._gauss_newton import NonlinearProblem
+
+# Samples without measurement until the motors hold, and samples after which a model has settled.
+COAST = 25
+SETTLE = 200
+
+
+class NonlinearController(Protocol):
+    """What preparation, solver, arrays and part need of an `NmpcController`."""
+
+    @property
+    def settings(self) -> Any: ...
+    @property
+    def model(self) -> Model: ...
+    @property
+    def sample_time(self) -> float: ...
+    @property
+    def inputs(self) -> Any: ...
+    @property
+    def outputs(self) -> Any: ...
+    @property
+    def solver(self) -> Any: ...
+    def plants(self) -> tuple[AxisPlant, AxisPlant]: ...
+    def problem(self) -> NonlinearProblem: ...
+    def initial_state(self, **parameters: float) -> State: ...
+
+
+class Preparation:
+    """Filters over the horizon, the moves that a moving reference asks for itself, and the disturbance's gains."""
+
+    def __init__(self, controller: NonlinearController) -> None:
+        """Prepare `controller`."""
+        s, Ts = controller.settings, controller.sample_time
+        p = self.problem = controller.problem()
+        plants = controller.plants()
+        pole = max(float(-plant.denominator[1]) for plant in plants)
+        if s.disturbance_time is not None:
+            pole = math.exp(-Ts / s.disturbance_time)
+        self.gains = estimate_gains(pole, s.window)
+        self.future = disturbance_ahead(pole, p.horizon)
+        self.gain = np.array([plant.static_gain for plant in plants])
+        self.ahead = round(s.preview / Ts)
+        self.keep = math.exp(-Ts / s.reference_time) if s.reference_time > 0.0 else 0.0
+        self.lead = min(round(s.reference_time / Ts), self.ahead)
+        delay = max(plant.delay for plant in plants)
+        L = p.horizon + delay + 1
+        i = np.arange(1, L + 1)
+        self.decay = self.keep**i
+        lag = i[:, None] - i[None, :]
+        self.filter = np.where(lag >= 0, (1.0 - self.keep) * self.keep ** np.maximum(lag, 0), 0.0)
+        self.asked_at = np.minimum(i + self.lead, max(self.ahead, 1)) - 1
+        ends = (*p.starts[1:], p.horizon)
+        middles = np.array([-0.5, *(0.5 * (a + b) for a, b in zip(p.starts, ends, strict=True))]) + delay
+        places = np.clip(middles, 0.0, L - 1.0)
+        low = np.minimum(np.floor(places).astype(int), L - 2)
+        weights = np.zeros((places.size, L))
+        weights[np.arange(places.size), low] += 1.0 - (places - low)
+        weights[np.arange(places.size), low + 1] += places - low
+        self.slopes = np.diff(weights, axis=0)
+        self.inverse = np.linalg.inv(p.T)[:, :2]
+
+
+def estimate_gains(pole: float, window: int) -> Matrix:
+    """Return (2, window): level and rate of the disturbance of now from what the model missed, newest first.
+
+    Of all `o(k+1) = o(k) + r(k)`, `r(k+1) = a r(k)` the one nearest to the last `window` residuals, in least squares:
+    with the model's inputs known and its state that of its free run the estimation over the horizon is linear.
+
+    Args:
+        pole: a, the plant's slowest.
+        window: residuals, at least 2.
+    """
+    back = np.arange(window)
+    # i samples ago the level was lower by the rates since then, r(k-j) = a^-j r(k).
+    since = np.concatenate([[0.0], np.cumsum(pole ** -back[1:].astype(float))])
+    regressor = np.column_stack([np.ones(window), -since])
+    return np.linalg.pinv(regressor)
+
+
+def disturbance_ahead(pole: float, horizon: int) -> Matrix:
+    """Return (horizon, 2): what level and rate of now make of the next samples."""
+    i = np.arange(1, horizon + 1)
+    return np.column_stack([np.ones(horizon), (1.0 - pole**i) / (1.0 - pole)])

@@ -1,0 +1,73 @@
+"""The linear predictive controller as a part of a loop: watched, and solved by daqp where asked."""
+
+from __future__ import annotations
+
+import math
+import time as clock
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from softneck.core import Vector, require_one_of
+from softneck.loop import BlockPart
+from softneck.runtime import Block, load_functions
+
+from . import _mpc_state_runtime as rt
+from ._program import MpcInfo, MpcProgram, explain
+
+
+class MpcPart(BlockPart):
+    """A predictive controller that a loop steps; a `softneck.loop.Part` with `info` of its last sample."""
+
+    def __init__(self, controller: Block, *, solver: str = "own") -> None:
+        """Adapt a controller's block; `solver` is "own" (the block's) or "daqp"."""
+        require_one_of("solver", solver, ("own", "daqp"))
+        super().__init__(controller)
+        self._program = MpcProgram(controller.arrays) if solver == "daqp" else None
+        self._functions = load_functions("softneck.design.predictive._mpc_runtime")
+        self._took = math.nan
+
+    def advance(self, time: float, inputs: Vector) -> Vector:
+        """Step once and return the set-points."""
+        begin = clock.perf_counter()
+        outputs = super().advance(time, inputs) if self._program is None else self._with_daqp(self._program, inputs)
+        self._took = clock.perf_counter() - begin
+        return outputs
+
+    @property
+    def info(self) -> MpcInfo:
+        """What the last sample decided, and how long it took."""
+        return replace(explain(self.block.arrays, self._state), time=self._took)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Samples since the start on which the previous plan went on, and on which a soft limit was not kept."""
+        return {
+            "previous_plan": int(self._state[rt.MPC_SHIFTED]),
+            "softened": int(self._state[rt.MPC_SOFTENED]),
+        }
+
+    def _with_daqp(self, program: MpcProgram, inputs: Vector) -> Vector:
+        """Do what the runtime's `step` does, with another solver in its middle."""
+        f, arrays, state, parameters = self._functions, self.block.arrays, self._state, self._parameters
+        if not f.mpc_begin(arrays, state, inputs):
+            state[rt.MPC_STATUS] = rt.MPC_HOLDING
+        else:
+            m = arrays[14].shape[0]
+            theta, lower, upper = np.empty(arrays[10].shape[1]), np.empty(m), np.empty(m)
+            held = state[rt.MPC_COUNTERS : rt.MPC_COUNTERS + 3]
+            f.mpc_parameter(arrays, state, theta)
+            f.mpc_bounds(arrays, parameters, held, inputs[5:8], theta, lower, upper)
+            z, flag, lam = program.solve(theta, lower, upper)
+            f.mpc_take(arrays, state, theta, z, lam, lower, upper, flag > 0)
+            state[rt.MPC_ITERATIONS] = program.iterations
+            f.mpc_move(arrays, state, lower, upper, parameters[0])
+        f.mpc_predict(arrays, state)
+        self._outputs[:] = state[rt.MPC_COUNTERS : rt.MPC_COUNTERS + 3]
+        return self._outputs.copy()
+
+    def start(self, time: float, parameters: Mapping[str, float]) -> Vector:
+        """Return the outputs at the start; unknown parameters raise SettingsError."""
+        self._took = math.nan
+        return super().start(time, parameters)

@@ -1,0 +1,200 @@
+"""The QP of a predictive controller outside of its block: as CasADi functions, solved by daqp, explained."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from softneck.core import Matrix, SettingsError, Vector
+from softneck.runtime import load_functions
+
+from . import _mpc_state_runtime as rt
+from ._arrays import NAMES
+
+# daqp's own default is 1e-6; the block's solver ends at 1e-10.
+_TOLERANCE = 1e-10
+ROW_NAMES = ("slew", "position", "slack", "angle", "angle", "tautness")
+STATUS_NAMES = ("not started", "optimal", "softened", "previous plan", "holding")
+_OF_MOTORS = (rt.MPC_ROW_MOVE, rt.MPC_ROW_POSITION, rt.MPC_ROW_TAUT)
+_FIELDS = {name: place for place, name in enumerate(NAMES)}
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class MpcInfo:
+    """What a sample's QP said.
+
+    Attributes:
+        status: "optimal", "softened" (a soft limit cannot be kept), "previous plan" (no answer in the budget),
+            "holding" (disabled or without measurement) or "not started".
+        iterations: rows added and dropped by the solver.
+        residual: of the KKT conditions.
+        slack: largest violation of a soft limit that is planned, scaled to the limit's unit [rad].
+        active: names of the active limits.
+        set_points: (N, 3) planned motor set-points from the next sample on [rad].
+        angles: (N, 2) pitch and roll that the nominal plant makes of them, each a dead time and a sample later [rad].
+        reference: (N, 2) what they are to be then [rad].
+        time: of the solution [s]; NaN where it was not taken.
+    """
+
+    status: str
+    iterations: int
+    residual: float
+    slack: float
+    active: tuple[str, ...]
+    set_points: Matrix
+    angles: Matrix
+    reference: Matrix
+    time: float = float("nan")
+
+
+class MpcProgram:
+    """`min 1/2 z'Hz + (F theta)'z, lower <= A z <= upper` of a controller's arrays, kept warm in a daqp model."""
+
+    def __init__(self, arrays: tuple[Matrix, ...], *, budget: int | None = None) -> None:
+        """Set daqp up.
+
+        Args:
+            arrays: of an `MpcController`.
+            budget: iterations of daqp; None for the controller's own.
+        """
+        import daqp
+
+        self.iterations = 0
+        self.arrays = arrays
+        self.H, self.F, self.A = (arrays[_FIELDS[name]] for name in ("H", "F", "A"))
+        m = self.A.shape[0]
+        self._functions = load_functions("softneck.design.predictive._mpc_runtime")
+        self._rest, self._order = self._rows()
+        self._model: Any = daqp.Model()
+        wide = np.full(m, 1e30)
+        flag, _ = self._model.setup(
+            self.H, np.zeros(self.H.shape[0]), self.A[self._rest], wide[self._order], -wide, np.zeros(m, dtype=np.int32)
+        )
+        if flag < 0:
+            raise SettingsError(f"daqp refuses the controller's QP (flag {flag}); review its weights.")
+        limit = int(arrays[0][rt.MPC_BUDGET]) if budget is None else budget
+        self._model.settings = {"primal_tol": _TOLERANCE, "dual_tol": _TOLERANCE, "iter_limit": max(limit, 1)}
+
+    def _rows(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rows without the bounds, and the order in which daqp sees all: those on one variable first."""
+        nz, m = self.A.shape[1], self.A.shape[0]
+        eye = np.eye(nz)
+        place = {tuple(row): i for i, row in reversed(list(enumerate(self.A.tolist())))}
+        found = [place.get(tuple(row)) for row in eye.tolist()]
+        simple = all(i is not None for i in found)
+        first = [i for i in found if i is not None] if simple else []
+        taken = set(first)
+        rest = np.array([i for i in range(m) if i not in taken], dtype=np.int64)
+        return rest, np.concatenate([np.array(first, dtype=np.int64), rest])
+
+    def bounds(self, theta: Vector, parameters: Vector, motors: Vector) -> tuple[Vector, Vector]:
+        """Return the bounds (m,) of all rows under those limits, motors (3,) being where they are [rad]."""
+        m = self.A.shape[0]
+        lower, upper = np.empty(m), np.empty(m)
+        held = np.ascontiguousarray(theta[-5:-2])
+        self._functions.mpc_bounds(self.arrays, parameters, held, np.asarray(motors, float), theta, lower, upper)
+        return lower, upper
+
+    def solve(self, theta: Vector, lower: Vector, upper: Vector) -> tuple[Vector, int, Vector]:
+        """Return z (nz,), daqp's exit flag (1 or 2 when solved) and the multipliers (m,), positive at upper bounds."""
+        self._model.update(f=self.F @ theta, bupper=upper[self._order], blower=lower[self._order])
+        z, _, flag, found = self._model.solve()
+        self.iterations = int(found["iterations"])
+        multipliers = np.zeros(upper.size)
+        multipliers[self._order] = found["lam"]
+        return z, int(flag), multipliers
+
+    def function(self) -> Any:
+        """Return `casadi.Function` theta, limits -> H, f, A, lower, upper: the QP as any solver takes it.
+
+        Limits are position [rad], move per sample [rad], angle [rad] and tautness [rad]; the lead limit, which is
+        the block's own matter, is left out.
+        """
+        import casadi as ca
+
+        theta, limits = ca.SX.sym("theta", self.F.shape[1]), ca.SX.sym("limits", 4)
+        q = self.arrays[0]
+        position, move = limits[0], limits[1]
+        angle, taut = limits[2] - float(q[rt.MPC_ANGLE_BACK]), limits[3] + float(q[rt.MPC_TAUT_BACK])
+        free = ca.mtimes(ca.DM(self.arrays[_FIELDS["E"]]), theta)
+        inf = rt.MPC_NO_BOUND
+        ends = {
+            rt.MPC_ROW_MOVE: (-move, move), rt.MPC_ROW_POSITION: (-position, position), rt.MPC_ROW_SLACK: (0.0, inf),
+            rt.MPC_ROW_ANGLE_HIGH: (-inf, angle), rt.MPC_ROW_ANGLE_LOW: (-angle, inf), rt.MPC_ROW_TAUT: (taut, inf),
+        }  # fmt: skip
+        rows = [ends[kind] for kind in self.arrays[_FIELDS["kinds"]][:, 0]]
+        lower = ca.vertcat(*(row[0] for row in rows)) - free
+        upper = ca.vertcat(*(row[1] for row in rows)) - free
+        return ca.Function(
+            "mpc_qp", [theta, limits],
+            [ca.DM(self.H), ca.mtimes(ca.DM(self.F), theta), ca.DM(self.A), lower, upper],
+            ["theta", "limits"], ["H", "f", "A", "lower", "upper"],
+        )  # fmt: skip
+
+
+def residual(
+    program: MpcProgram, theta: Vector, z: Vector, multipliers: Vector, bounds: tuple[Vector, Vector]
+) -> float:
+    """Return the largest residual of the KKT conditions of any answer, by the block's own function."""
+    functions = load_functions("softneck.design.predictive._mpc_runtime")
+    return float(functions.mpc_residual(program.arrays, theta, z, multipliers, *bounds))
+
+
+def explain(arrays: tuple[Matrix, ...], state: Vector) -> MpcInfo:
+    """Return what the sample that led to `state` decided."""
+    places = rt.mpc_places(arrays)
+    functions = load_functions("softneck.design.predictive._mpc_runtime")
+    q = arrays[0]
+    plan, signs = state[places[5] : places[6]], state[places[6] : places[7]]
+    starts = arrays[_FIELDS["starts"]].astype(int)
+    N = int(q[rt.MPC_ROWS]) - int(q[rt.MPC_PAST])
+    head = rt.MPC_COUNTERS
+    age = int(state[rt.MPC_AGE])
+    moves = np.zeros((N, 3))
+    for i, start in enumerate(starts):
+        if start > age:
+            moves[start - age - 1] = plan[3 * i : 3 * i + 3]
+    theta = np.zeros(arrays[_FIELDS["K"]].shape[1])
+    functions.mpc_parameter(arrays, state, theta)
+    # The state stands one sample on: what is held now was the plan's first move.
+    set_points = state[head : head + 3] + np.cumsum(moves, axis=0)
+    angles, reference = _predicted(arrays, theta, set_points)
+    kinds = arrays[_FIELDS["kinds"]]
+    active = tuple(
+        f"{ROW_NAMES[int(kind)]} {('upper', 'lower')[int(sign < 0)]} "
+        + (("motor " + str(int(which) + 1)) if kind in _OF_MOTORS else ("pitch", "roll")[int(which) % 2])
+        for (kind, which), sign in zip(kinds, signs, strict=True)
+        if sign != 0.0 and kind != rt.MPC_ROW_SLACK
+    )
+    return MpcInfo(
+        status=STATUS_NAMES[int(state[rt.MPC_STATUS])],
+        iterations=int(state[rt.MPC_ITERATIONS]),
+        residual=float(state[rt.MPC_RESIDUAL]),
+        slack=float(state[rt.MPC_SLACK]),
+        active=active,
+        set_points=set_points,
+        angles=angles,
+        reference=reference,
+    )
+
+
+def _predicted(arrays: tuple[Matrix, ...], theta: Vector, set_points: Matrix) -> tuple[Matrix, Matrix]:
+    """Return predicted angles and references (N, 2) of the nominal plant from theta on."""
+    q = arrays[0]
+    n, S, L = int(q[rt.MPC_ORDER]), int(q[rt.MPC_SCENARIOS]), int(q[rt.MPC_ROWS])
+    N = set_points.shape[0]
+    inputs = set_points @ arrays[_FIELDS["T"]].T
+    angles, reference = np.zeros((N, 2)), np.zeros((N, 2))
+    first = 2 * S * (n + 2)
+    for axis in range(2):
+        A, B = arrays[1][axis * n : (axis + 1) * n], arrays[2][axis]
+        a, delay = arrays[3][axis, 2], int(arrays[5][axis])
+        level, rate = theta[2 * S * n + 2 * axis : 2 * S * n + 2 * axis + 2]
+        x = theta[axis * n : (axis + 1) * n]
+        for i in range(N):
+            x = A @ x + B * inputs[i, axis]
+            angles[i, axis] = x[0] + level + rate * (1.0 - a ** (delay + 1 + i)) / (1.0 - a)
+            reference[i, axis] = theta[first + axis * L + delay + i]
+    return angles, reference

@@ -1,0 +1,342 @@
+"""Linear model predictive control: what is asked, and the controller that does it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from softneck.core import (
+    SettingsError,
+    Vector,
+    require_between,
+    require_finite,
+    require_one_of,
+    require_positive,
+    require_whole,
+)
+from softneck.estimation import axis_plant
+from softneck.estimation._axis import HasTransferFunctions
+from softneck.estimation._settings import ORDERS
+from softneck.signals import TENDON_ANGLES, redefinition_matrix
+
+from ..linear._limits import require_taut
+from ..linear._margins import frequencies
+from ..linear._ports import MAX_MOTOR
+from ._arrays import Tuning, assemble, observer_bandwidth, with_filter, with_gains
+from ._controller import MpcController
+from ._disturbance import MeasuredDisturbance
+from ._lti import system
+from ._prediction import Problem, matrices
+from ._scenarios import chosen_scenarios, sample_pairs
+from ._tightening import Trial, tightened
+from ._tuning import FULL_TRUST, Pair, keeps_bounds, move_weight, observer_trust, radius, reference_time, sensitivity
+
+# Samples of the last hold: ten moves over thirty samples, dense where they matter.
+_SPACING = (0, 1, 2, 3, 4, 6, 8, 11, 15, 20)
+# Of Ms at 5 % between frequencies; a peak is missed by less than 1 %.
+_THINNING = 5
+# Bandwidths that are tried [rad/s], and how often the range is halved: to 2 %.
+_BANDWIDTHS = (1.0, 40.0)
+_HALVINGS = 7
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MpcSettings:
+    """Model predictive control of both axes over an identified linear model, moves of the motors as unknowns.
+
+    Weights follow from `bandwidth`, the observer from `max_sensitivity`, the reference filter from `overshoot_pct`.
+
+    Attributes:
+        bandwidth: of the slowest pole of the loop without dead time [rad/s]; None for the fastest that keeps the
+            robustness while the observer believes all that is measured.
+        max_sensitivity: bound on Ms, on the identified plant and on its faster form.
+        worst_sensitivity: bound on Ms on every sample of a family.
+        reference_time: time constant of the reference filter [s]; None for the least with which no plant overshoots by
+            more than `overshoot_pct`.
+        overshoot_pct: of a step, without limits, on all plants and gains within `gain_spread`.
+        gain_spread: relative spread of the plant's gain that the filter allows for.
+        horizon: N, samples predicted behind the dead time.
+        moves: times at which the motors move within the horizon; in between they are held.
+        scenarios: with a family, that many of its samples are predicted beside the nominal plant, and all must keep
+            the limits; 0 for the nominal plant alone.
+        preview: how far ahead the reference is known [s]; the controller then has the inputs
+            `pitch_reference_ahead` and `roll_reference_ahead`.
+        disturbances: measured ones, each an input more.
+        position_limit: of each motor [rad].
+        slew_limit: of each motor [rad/s].
+        lead_limit: how far a set-point may be from its motor [rad].
+        least_position: no motor below this [rad]: with a little more than rest no tendon is let loose.
+        angle_limit: soft limit of pitch and roll [rad]; None for none.
+        minimum_tautness: least motor position beyond that at which a tendon follows the neck [rad], soft; None for no
+            limit. With pretension it is negative: rest counts as 0.
+        tautness_lever: motor angle that one radian of neck takes up [rad/rad].
+        cocontraction_weight: on the error of co-contraction, against that of the tilt's inputs, squared.
+        slack_weight: on violations of soft limits, against errors of the angles, squared.
+        tightening: whether soft limits are tightened until they hold in trials with the identified plant and with every
+            judged sample of a family.
+        measurement_bound: by how much a measured angle may be wrong in these trials [rad].
+        disturbance_time: time constant of the output disturbance's rate [s]; None for the plant's own, as a load at its
+            input makes it. A longer one follows what keeps changing, such as a payload carried round, less robustly.
+        budget: iterations of the solver for each sample; beyond them the previous plan goes on.
+        least_delay: the dead time is taken as at least this [s]; a fit of free runs hides it in the pole.
+        small_move_pole: the design must hold as well where the slowest pole is as fast as this [1/s]; 0 for the
+            identified plant alone.
+        order: of the loop; "jacobi" adds one sample for the controller and one for the observer.
+        observer: whether the loop will have an observer.
+        tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
+    """
+
+    bandwidth: float | None = None
+    max_sensitivity: float = 1.5
+    worst_sensitivity: float = 2.5
+    reference_time: float | None = 0.2
+    overshoot_pct: float = 2.0
+    gain_spread: float = 0.2
+    horizon: int = 30
+    moves: int = 10
+    scenarios: int = 0
+    preview: float = 0.0
+    disturbances: tuple[MeasuredDisturbance, ...] = ()
+    position_limit: float = 6.0
+    slew_limit: float = 12.5
+    # More than the drives of the neck fall behind at the paper's fastest signals, 0.4 rad.
+    lead_limit: float = 1.0
+    least_position: float = -6.0
+    angle_limit: float | None = None
+    minimum_tautness: float | None = None
+    # Radius of the tendons' attachment over that of the winch: 52 mm / 7.5 mm (lab code; paper, section 3.1).
+    tautness_lever: float = 6.93
+    # Light: where tendons must be taut, co-contraction gives way; at 1 the angles gave way by a quarter of a degree.
+    cocontraction_weight: float = 0.05
+    slack_weight: float = 1e3
+    tightening: bool = False
+    # The observer of the 3DM-GX5-10 on the virtual neck is wrong by up to 0.34 deg near a limit, by 0.1 deg at rest.
+    measurement_bound: float = math.radians(0.35)
+    disturbance_time: float | None = None
+    budget: int = 100
+    # The paper's own dead time and pole (Eq. 31: 0.08 s, 5.293 1/s).
+    least_delay: float = 0.08
+    small_move_pole: float = 5.293
+    order: str = "sequential"
+    observer: bool = True
+    tendon_angles: tuple[float, float, float] = tuple(TENDON_ANGLES.tolist())
+
+    def __post_init__(self) -> None:
+        if self.bandwidth is not None:
+            require_between("bandwidth", self.bandwidth, 0.5, 100.0, "rad/s")
+        require_between("max_sensitivity", self.max_sensitivity, 1.05, 4.0)
+        require_between("worst_sensitivity", self.worst_sensitivity, self.max_sensitivity, 10.0)
+        if self.reference_time is not None:
+            require_between("reference_time", self.reference_time, 0.0, 60.0, "s")
+        require_between("overshoot_pct", self.overshoot_pct, 0.1, 100.0, "%")
+        require_between("gain_spread", self.gain_spread, 0.0, 0.9)
+        require_whole("horizon", self.horizon, 1, 200)
+        require_whole("moves", self.moves, 1, self.horizon)
+        require_whole("scenarios", self.scenarios, 0, 8)
+        require_between("preview", self.preview, 0.0, 4.0, "s")
+        self._check_limits()
+        if self.disturbance_time is not None:
+            require_between("disturbance_time", self.disturbance_time, 0.02, 20.0, "s")
+        for name in ("cocontraction_weight", "slack_weight"):
+            require_positive(name, getattr(self, name))
+        require_between("measurement_bound", self.measurement_bound, 0.0, 0.1, "rad")
+        require_whole("budget", self.budget, 1, 10_000)
+        require_between("least_delay", self.least_delay, 0.0, 1.0, "s")
+        require_between("small_move_pole", self.small_move_pole, 0.0, 1000.0, "1/s")
+        require_one_of("order", self.order, ORDERS)
+
+    def _check_limits(self) -> None:
+        require_between("position_limit", self.position_limit, 0.01, 6.0, "rad")
+        require_between("slew_limit", self.slew_limit, 0.01, 1000.0, "rad/s")
+        require_between("lead_limit", self.lead_limit, 0.01, 12.0, "rad")
+        require_between("tautness_lever", self.tautness_lever, 0.0, 100.0, "rad/rad")
+        require_taut(self.least_position, -MAX_MOTOR, self.position_limit)
+        if self.angle_limit is not None:
+            require_between("angle_limit", self.angle_limit, 0.01, 0.8, "rad")
+        if self.minimum_tautness is not None:
+            require_finite("minimum_tautness", self.minimum_tautness, "rad")
+            if self.minimum_tautness >= self.position_limit:
+                raise SettingsError(
+                    f"`minimum_tautness` {self.minimum_tautness:g} rad and `position_limit` {self.position_limit:g} "
+                    "rad contradict each other: no motor could pull that far. Lower the first."
+                )
+
+    @property
+    def extra_delay(self) -> int:
+        """Samples that the loop's order adds to the plant's delay."""
+        return 0 if self.order == "sequential" else 1 + int(self.observer)
+
+    @property
+    def starts(self) -> tuple[int, ...]:
+        """Samples of the horizon at which the motors move."""
+        return spaced_starts(self.horizon, self.moves)
+
+    def design(self, model: HasTransferFunctions) -> MpcController:
+        """Return the controller for `model`, anything with `tf("pitch")` and `tf("roll")`, or for a `Family`.
+
+        Raises:
+            SettingsError: a model that is not linear, discrete and stable, limits that contradict each other, or a
+                robustness that nothing keeps.
+        """
+        nominal = self._nominal(model)
+        Ts = nominal[0].sample_time
+        samples = sample_pairs(model, self.least_delay)
+        bandwidth = self._fastest(model, nominal, samples) if self.bandwidth is None else self.bandwidth
+        arrays, found = self._tuned(self._arrays(model, bandwidth), nominal, samples)
+        found["bandwidth_rad_s"] = bandwidth
+        if self.tightening:
+            plants = [self._delayed(pair) for pair in [*self._families(nominal), *samples]]
+            arrays, found["back_off_rad"] = tightened(arrays, plants, self._trial())
+        return MpcController(
+            sample_time=Ts,
+            arrays=arrays,
+            position_limit=self.position_limit,
+            slew_limit=self.slew_limit,
+            lead_limit=self.lead_limit,
+            least_position=self.least_position,
+            angle_limit=self.angle_limit,
+            minimum_tautness=self.minimum_tautness,
+            disturbances=self.disturbances,
+            order=self.order,
+            design={"settings": asdict(self), "extra_delay": self.extra_delay, **found},
+        )
+
+    def _fastest(self, model: HasTransferFunctions, nominal: Pair, samples: list[Pair]) -> float:
+        bounds, w = self._bounds(nominal, samples), self._frequencies(nominal)
+
+        def keeps(bandwidth: float) -> bool:
+            return keeps_bounds(self._arrays(model, bandwidth), bounds, self.extra_delay, w)
+
+        low, high = _BANDWIDTHS
+        if not keeps(low):
+            raise SettingsError(
+                f"not even a bandwidth of {low:g} rad/s keeps Ms <= {self.max_sensitivity:g} "
+                f"({self.worst_sensitivity:g} on the samples of a family); raise these bounds."
+            )
+        for _ in range(_HALVINGS):
+            middle = math.sqrt(low * high)
+            low, high = (middle, high) if keeps(middle) else (low, middle)
+        return low
+
+    def _arrays(self, model: HasTransferFunctions, bandwidth: float) -> tuple[Any, ...]:
+        problem = self.problem(model, bandwidth)
+        Ts = problem.scenarios[0].pitch.sample_time
+        tuning = Tuning(
+            trust=FULL_TRUST, reference_time=self.reference_time or 0.0, preview=round(self.preview / Ts),
+            budget=self.budget, disturbances=self.disturbances,
+        )  # fmt: skip
+        return assemble(problem, matrices(problem), tuning)
+
+    def problem(self, model: HasTransferFunctions, bandwidth: float) -> Problem:
+        """Return what is asked with that bandwidth [rad/s], in numbers, before observer and filter are tuned."""
+        nominal = self._nominal(model)
+        scenarios = chosen_scenarios(model, self._delayed(nominal), self.scenarios, self.least_delay, self.extra_delay)
+        T = redefinition_matrix(np.array(self.tendon_angles))
+        weights: Vector = np.array([1.0 / plant.static_gain**2 for plant in nominal])
+        # For symmetric tendons |P|^2 = 2/3 (theta^2 + phi^2) + 3 delta^2: the weight on an input becomes one on motors.
+        on_input = max(move_weight(plant, bandwidth) for plant in nominal)
+        lever = self.tautness_lever * T[:2].T
+        return Problem(
+            scenarios=tuple(scenarios),
+            horizon=self.horizon,
+            starts=self.starts,
+            T=T,
+            output_weight=weights,
+            move_weight=1.5 * on_input,
+            cocontraction_weight=self.cocontraction_weight,
+            slack_weight=self.slack_weight * float(weights.max()),
+            angles=self.angle_limit is not None,
+            tautness=None if self.minimum_tautness is None else lever,
+            disturbance_time=self.disturbance_time,
+            guard=guard_samples(bandwidth, nominal[0].sample_time),
+        )
+
+    def _trial(self) -> Trial:
+        """Return what tightening is tried with."""
+        return Trial(
+            parameters=(self.position_limit, self.slew_limit, self.lead_limit, self.least_position),
+            angle_limit=self.angle_limit,
+            minimum_tautness=self.minimum_tautness,
+            tautness_lever=self.tautness_lever,
+            measurement_bound=self.measurement_bound,
+        )
+
+    def _families(self, nominal: Pair) -> list[Pair]:
+        """Return what the neck may be: as identified, and faster."""
+        if self.small_move_pole == 0.0:
+            return [nominal]
+        fast = (nominal[0].faster(self.small_move_pole), nominal[1].faster(self.small_move_pole))
+        return [nominal] if fast == nominal else [nominal, fast]
+
+    def _bounds(self, nominal: Pair, samples: list[Pair]) -> list[tuple[Pair, float]]:
+        bounds = [(pair, self.max_sensitivity) for pair in self._families(nominal)]
+        return bounds + [(pair, self.worst_sensitivity) for pair in samples]
+
+    def _frequencies(self, nominal: Pair) -> Vector:
+        return frequencies(nominal[0].sample_time)[::_THINNING]
+
+    def _nominal(self, model: HasTransferFunctions) -> Pair:
+        first, second = (axis_plant(model, axis).delayed(self.least_delay) for axis in ("pitch", "roll"))
+        if not math.isclose(first.sample_time, second.sample_time, rel_tol=1e-9):
+            raise SettingsError(
+                f"pitch and roll have different sample times, {first.sample_time:g} s and {second.sample_time:g} s."
+            )
+        return first, second
+
+    def _delayed(self, pair: Pair) -> Pair:
+        first, second = (replace(plant, delay=plant.delay + self.extra_delay) for plant in pair)
+        return first, second
+
+    def _tuned(
+        self, arrays: tuple[Any, ...], nominal: Pair, samples: list[Pair]
+    ) -> tuple[tuple[Any, ...], dict[str, Any]]:
+        """Return the arrays with observer and filter, and what was found."""
+        families, w = self._families(nominal), self._frequencies(nominal)
+        bounds = self._bounds(nominal, samples)
+        arrays = with_gains(arrays, observer_trust(arrays, bounds, self.extra_delay, w))
+        time = self.reference_time
+        if time is None:
+            spread = [scaled(pair, 1.0 + s) for pair in families for s in (-self.gain_spread, 0.0, self.gain_spread)]
+            time = reference_time(
+                arrays, [*spread, *samples], self.extra_delay, overshoot=self.overshoot_pct / 100.0
+            )  # fmt: skip
+        arrays = with_filter(arrays, time)
+        parts = system(arrays)
+        found = {
+            "observer_bandwidth_rad_s": observer_bandwidth(arrays[3][0], nominal[0].sample_time),
+            "reference_time_s": time,
+            "sensitivity": [sensitivity(parts, pair, self.extra_delay, w) for pair in families],
+            "worst_sensitivity": max(
+                (sensitivity(parts, pair, self.extra_delay, w) for pair in samples), default=None
+            ),
+            "spectral_radius": max(radius(parts, pair, self.extra_delay) for pair in families),
+            "dead_time_s": [(plant.delay + self.extra_delay) * plant.sample_time for plant in nominal],
+            "starts": list(self.starts),
+        }  # fmt: skip
+        return arrays, found
+
+
+def guard_samples(bandwidth: float, sample_time: float) -> int:
+    """Return after how many samples soft limits are looked at: the time constant of the loop."""
+    return max(1, round(1.0 / (bandwidth * sample_time)))
+
+
+def spaced_starts(horizon: int, moves: int) -> tuple[int, ...]:
+    """Return samples at which the motors move: dense at first, sparse later."""
+    places = np.interp(np.linspace(0.0, 9.0, moves), np.arange(10), np.array(_SPACING) * horizon / 30.0)
+    starts = [0]
+    for place in places[1:]:
+        starts.append(max(starts[-1] + 1, round(float(place))))
+    # Squeezed together at the end where there are as many moves as samples.
+    for i in range(moves):
+        starts[-1 - i] = min(starts[-1 - i], horizon - 1 - i)
+    return tuple(starts)
+
+
+def scaled(pair: Pair, factor: float) -> Pair:
+    """Return both plants with their gain times `factor`."""
+    first, second = (replace(plant, numerator=factor * plant.numerator) for plant in pair)
+    return first, second

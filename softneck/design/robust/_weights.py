@@ -1,0 +1,143 @@
+"""Weights by the numbers that engineers have: gains at both ends, a corner, a cover of samples."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import control
+import numpy as np
+
+from softneck.core import DataError, SettingsError, require_positive, require_whole
+from softneck.identification.uncertainty._envelope import envelope_weight
+
+from ._bilinear import drawn_out, to_discrete
+
+# An exact integrator in a weight leaves the synthesis without a solution; this far below the corner nobody sees it.
+_LEAST_POLE = 1e-9
+
+
+def makeweight(
+    low: float, corner: tuple[float, float] | float, high: float, *, order: int = 1, dt: float | None = None
+) -> control.TransferFunction:
+    """Return W with `|W| = low` at rest, `high` far up, and a given size between them.
+
+    `W = ((h s + l p)/(s + p))^order` with l, h the order-th roots; p follows from the corner (MATLAB's makeweight).
+
+    Args:
+        low: gain at frequency zero; finite: an integrator in a weight has no stabilising solution.
+        corner: frequency [rad/s] and the size there; a frequency alone means size 1.
+        high: gain far up.
+        order: of W.
+        dt: sample time [s]; None for a continuous weight. The size at the corner is exact in both.
+
+    Raises:
+        SettingsError: the corner's size is not between `low` and `high`, or a number is not positive and finite.
+    """
+    frequency, size = corner if isinstance(corner, tuple) else (float(corner), 1.0)
+    for name, value in (("low", low), ("high", high), ("corner", frequency), ("size at the corner", size)):
+        require_positive(name, value)
+    require_whole("order", order, 1, 4)
+    if not min(low, high) < size < max(low, high):
+        raise SettingsError(
+            f"the size {size:g} at the corner must lie between `low` {low:g} and `high` {high:g}; "
+            "otherwise no weight of one slope passes through all three."
+        )
+    l, h, m = (value ** (1.0 / order) for value in (low, high, size))
+    w = float(drawn_out(np.array([frequency]), dt)[0]) if dt else frequency
+    if not 0.0 < w < math.inf or (dt and frequency >= math.pi / dt):
+        raise SettingsError(f"the corner {frequency:g} rad/s must be below the Nyquist frequency of dt = {dt} s.")
+    p = w * math.sqrt((h**2 - m**2) / (m**2 - l**2))
+    above, below = np.array([1.0]), np.array([1.0])
+    for _ in range(order):
+        above, below = np.convolve(above, [h, l * p]), np.convolve(below, [1.0, p])
+    return control.TransferFunction(above, below) if not dt else _discrete(above, below, dt)
+
+
+def ucover(
+    samples: Sequence[Any], nominal: Any | None = None, *, order: int = 2, points: int = 100
+) -> control.TransferFunction:
+    """Return W, stable and of minimum phase, with `|G/G0 - 1| <= |W|` for every sample at every frequency.
+
+    Args:
+        samples: scalar `control` systems of one sample time, or a list of `AxisPlant`.
+        nominal: G0; the first sample if None.
+        order: of W, 1 to 3.
+        points: of the frequency grid, four decades up to the Nyquist frequency (1e-2 to 1e3 rad/s if continuous).
+
+    Returns:
+        W with the samples' `dt`, named after their output.
+
+    Raises:
+        SettingsError: different sample times.
+        DataError: no samples, or samples all alike.
+    """
+    systems = [_system(item) for item in samples]
+    if not systems:
+        raise DataError("`ucover` needs samples.")
+    G0 = systems[0] if nominal is None else _system(nominal)
+    dt = float(G0.dt or 0.0)
+    for i, item in enumerate(systems):
+        if not math.isclose(float(item.dt or 0.0), dt, rel_tol=1e-9, abs_tol=1e-15):
+            raise SettingsError(f"sample {i} has dt = {item.dt}, the nominal plant dt = {G0.dt}; resample it.")
+    # Up to 0.999 of Nyquist: tan(w Ts/2) has its pole there.
+    w = np.geomspace(1e-2, 1e3, points) if dt == 0.0 else np.geomspace(1e-4, 0.999, points) * math.pi / dt
+    at = 1j * w if dt == 0.0 else np.exp(1j * w * dt)
+    base = np.asarray(G0(at))
+    errors = np.array([np.abs(np.asarray(item(at)) / base - 1.0) for item in systems])
+    envelope = errors.max(axis=0)
+    if envelope.max() < 1e-12:
+        raise DataError("the samples are all alike; there is no uncertainty to cover.")
+    above, below = envelope_weight(w if dt == 0.0 else drawn_out(w, dt), envelope, order)
+    W = control.TransferFunction(above, below) if dt == 0.0 else _discrete(above, below, dt)
+    W.name = f"W_{G0.output_labels[0]}" if not G0.output_labels[0].startswith("y[") else "W"
+    return W
+
+
+def weight_image(weight: Any, dt: float, name: str) -> control.StateSpace | None:
+    """Return a weight as a continuous system for synthesis at `dt`, after the checks that spare a hang or a lie.
+
+    Args:
+        weight: None, a number, or a scalar system: continuous, or of the plant's sample time.
+        dt: of the plant; 0 if continuous.
+        name: for messages.
+
+    Raises:
+        SettingsError: another sample time, an integrator, an unstable or improper weight.
+    """
+    from ._bilinear import to_continuous
+
+    if weight is None:
+        return None
+    if isinstance(weight, int | float):
+        require_positive(name, float(weight))
+        return control.StateSpace([], [], [], [[float(weight)]], 0)
+    if weight.ninputs != 1 or weight.noutputs != 1:
+        raise SettingsError(f"{name} must have one input and one output; got {weight.ninputs} and {weight.noutputs}.")
+    wdt = float(weight.dt or 0.0)
+    if wdt != 0.0 and not math.isclose(wdt, dt, rel_tol=1e-9):
+        raise SettingsError(f"{name} has dt = {wdt:g} s, the plant dt = {dt:g} s; make it with `makeweight(..., dt=)`.")
+    if isinstance(weight, control.TransferFunction):
+        above, below = (np.trim_zeros(np.asarray(p[0][0]), "f") for p in (weight.num, weight.den))
+        if above.size > below.size:
+            raise SettingsError(f"{name} has more zeros than poles; add a fast pole, as `makeweight` does.")
+    image = to_continuous(weight)
+    poles = np.linalg.eigvals(np.asarray(image.A)) if image.nstates else np.zeros(0)
+    if poles.size and float(np.min(np.abs(poles))) < _LEAST_POLE:
+        raise SettingsError(
+            f"{name} has an integrator, with which no stabilising solution exists; move its pole to 1e-4 rad/s "
+            "(`makeweight(1e4, ...)`). The design still gives the controller a true integrator."
+        )
+    if poles.size and float(np.max(poles.real)) >= 0.0:
+        raise SettingsError(f"{name} is not stable (a pole at {np.max(poles.real):.3g} rad/s); weights must be.")
+    return image
+
+
+def _discrete(above: np.ndarray, below: np.ndarray, dt: float) -> control.TransferFunction:
+    made: Any = control.ss2tf(to_discrete(control.TransferFunction(above, below), dt))
+    return control.TransferFunction(made.num, made.den, dt)
+
+
+def _system(item: Any) -> Any:
+    return item.tf() if hasattr(item, "observable_form") else item

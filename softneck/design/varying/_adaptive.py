@@ -1,0 +1,221 @@
+"""Indirect adaptive control: settings, the loop that its redesign keeps, and its checks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from softneck.core import Matrix, SettingsError, Vector, require_between
+from softneck.estimation import AxisPlant, axis_plant
+from softneck.estimation._axis import HasTransferFunctions
+from softneck.runtime import Port
+
+from ..linear._assembly import assemble, pi_axis
+from ..linear._loop_settings import LoopSettings
+from ..linear._margins import frequencies
+from ._operating_points import AXES
+from ._varying import RUNTIMES, VaryingController
+
+# Sizes of the loop kappa z^-d / (z - 1) that are tried, 1 % apart.
+_SIZES = np.geomspace(1e-3, 1.0, 695)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AdaptiveSettings(LoopSettings):
+    """Online recursive least squares and a redesign in every sample, with what keeps it safe.
+
+    Limits, the order of the loop and what is doubted of the plant are those of `LoopSettings`.
+
+    Attributes:
+        max_sensitivity: bound on Ms of the loop that every redesign makes, with its delay in full.
+        phase_margin: least phase margin [rad] of it.
+        small_move_pole: the nominal plant itself is taken as at least as fast as this [1/s]; 0: as identified.
+        forgetting: lambda of the recursion, for the samples it takes in.
+        start_covariance: diagonal of F(0); small trusts the identified plant, so that no first step is one of learning.
+        covariance_bound: on the trace of F.
+        dead_zone: errors of the band-passed angle up to this [rad] teach nothing.
+        excitation: band-passed input [rad], rms over the last second, below which nothing is learnt.
+        band: centre of the band-pass of the regression [rad/s].
+        gain_range: the static gain stays within this part of the nominal one, up and down, 0.5 for half to 1.5 times.
+        pole_range: the pole stays within the nominal one divided and multiplied by this.
+        distrust: the nominal plant is used where its mean square prediction error is this many times smaller.
+        gain_rate: change of lag and gain in use [1/s].
+        reference_time: time constant of the reference filter [s].
+        leak_time: over which the integral gives up what is beyond a limit [s].
+    """
+
+    max_sensitivity: float = 1.5
+    phase_margin: float = math.radians(60.0)
+    # 4 s of motion.
+    forgetting: float = 0.995
+    # One step of 15 deg teaches about as much.
+    start_covariance: float = 0.5
+    covariance_bound: float = 100.0
+    # The filtered noise of the 3DM inclinometer.
+    dead_zone: float = math.radians(0.02)
+    excitation: float = 0.05
+    # The neck's own pole, and about the crossover.
+    band: float = 5.0
+    gain_range: float = 0.5
+    pole_range: float = 2.0
+    distrust: float = 1.5
+    gain_rate: float = 1.0
+    reference_time: float = 0.06
+    leak_time: float = 3.0
+    lead_limit: float = 0.8
+
+    def __post_init__(self) -> None:
+        LoopSettings.__post_init__(self)
+        require_between("max_sensitivity", self.max_sensitivity, 1.05, 4.0)
+        require_between("phase_margin", self.phase_margin, 0.1, 1.5, "rad")
+        require_between("forgetting", self.forgetting, 0.9, 1.0)
+        require_between("start_covariance", self.start_covariance, 1e-9, 1e12)
+        require_between("covariance_bound", self.covariance_bound, 1e-6, 1e12)
+        require_between("dead_zone", self.dead_zone, 0.0, 0.1, "rad")
+        require_between("excitation", self.excitation, 0.0, 10.0, "rad")
+        require_between("band", self.band, 0.1, 50.0, "rad/s")
+        require_between("gain_range", self.gain_range, 0.0, 0.9)
+        require_between("pole_range", self.pole_range, 1.0, 10.0)
+        require_between("distrust", self.distrust, 1.0, 100.0)
+        require_between("gain_rate", self.gain_rate, 0.0, 10.0, "1/s")
+        require_between("reference_time", self.reference_time, 0.0, 60.0, "s")
+        require_between("leak_time", self.leak_time, 0.1, 60.0, "s")
+
+    def design(self, model: HasTransferFunctions) -> VaryingController:
+        """Return the controller that starts from `model`, of one pole and a dead time in each axis.
+
+        Raises:
+            SettingsError: another model, or a box that the nominal gains do not stand.
+        """
+        if isinstance(model, Sequence):
+            raise SettingsError(
+                f"adaptive control starts from one model or a family; got {len(model)} models. Name one."
+            )
+        plants = [self._plant(model, axis) for axis in AXES]
+        Ts = plants[0].sample_time
+        if not math.isclose(Ts, plants[1].sample_time, rel_tol=1e-9):
+            raise SettingsError(
+                f"pitch and roll have different sample times, {Ts:g} s and {plants[1].sample_time:g} s."
+            )
+        delays = [plant.delay + self.extra_delay for plant in plants]
+        kappas = [self._loop(plant, delay) for plant, delay in zip(plants, delays, strict=True)]
+        worst = [
+            self._box_sensitivity(axis, plant, delay, kappa)
+            for axis, plant, delay, kappa in zip(AXES, plants, delays, kappas, strict=True)
+        ]
+        found = {
+            axis: {"static_gain": plant.static_gain, "pole": _pole(plant), "kappa": kappa, "largest_ms_nominal": ms,
+                   "dead_time_s": delay * Ts}
+            for axis, plant, kappa, ms, delay in zip(AXES, plants, kappas, worst, delays, strict=True)
+        }  # fmt: skip
+        return VaryingController(
+            kind="adaptive",
+            runtime=RUNTIMES["adaptive"],
+            sample_time=Ts,
+            arrays=self._arrays(plants, delays, kappas),
+            limits=self.limits(),
+            order=self.order,
+            parameters=(
+                Port(name="adapt", description="1: learn; 0: nominal gains", start=1.0, minimum=0.0, maximum=1.0),
+            ),
+            lines=tuple(_line(axis, values) for axis, values in found.items()),
+            design={"settings": asdict(self), "extra_delay": self.extra_delay, **found},
+        )
+
+    def _plant(self, model: HasTransferFunctions, axis: str) -> AxisPlant:
+        plant = axis_plant(model, axis)
+        if plant.order != 1 or plant.denominator[1] >= 0.0:
+            raise SettingsError(
+                f"{axis}: adaptive control takes a plant of one pole and a dead time; this one is of order "
+                f"{plant.order}. Identify `rls`, or `srivc` or `oe` of order 1."
+            )
+        late = plant.delayed(self.least_delay)
+        return late.faster(self.small_move_pole) if self.small_move_pole > 0.0 else late
+
+    def _loop(self, plant: AxisPlant, delay: int) -> float:
+        """Return the largest kappa up to which kappa z^-d/(z - 1) keeps both bounds."""
+        w = frequencies(plant.sample_time, lowest=1e-3 / plant.sample_time)
+        z = np.exp(1j * w * plant.sample_time)
+        shape = z ** (-delay) / (z - 1.0)
+        best = 0.0
+        for size in _SIZES:
+            L = size * shape
+            # |L| falls with the frequency, so it crosses 1 once.
+            crossing = L[np.abs(L) >= 1.0]
+            margin = abs(float(np.angle(-crossing[-1]))) if crossing.size else math.pi
+            if np.min(np.abs(1.0 + L)) * self.max_sensitivity < 1.0 or margin < self.phase_margin:
+                break
+            best = float(size)
+        if best == 0.0:
+            raise SettingsError(f"no gain keeps Ms and the phase margin with a delay of {delay} samples; ask for less.")
+        return best
+
+    def _box_sensitivity(self, axis: str, plant: AxisPlant, delay: int, kappa: float) -> float:
+        """Return the largest Ms of the nominal gains at the corners of the box; refuse an unstable one."""
+        a0, b0 = -float(plant.denominator[1]), float(plant.numerator[0])
+        w = frequencies(plant.sample_time)
+        z = np.exp(1j * w * plant.sample_time)
+        worst = 0.0
+        low, high, weak, strong = self._box(plant)
+        for a in (low, high):
+            for gain in (weak, strong):
+                b = gain * (1.0 - a)
+                above = kappa * b / b0 * np.array([1.0, -a0])
+                below = np.convolve([1.0, -1.0], np.append([1.0, -a], np.zeros(delay)))
+                radius = float(np.abs(np.roots(np.polyadd(above, below))).max())
+                if radius >= 1.0:
+                    raise SettingsError(
+                        f"{axis}: the nominal gains, which must hold where nothing was learnt, are not stable at a "
+                        f"corner of the box (spectral radius {radius:.4f}); lower `gain_range` or `pole_range`, or "
+                        "`max_sensitivity`."
+                    )
+                S = 1.0 / (1.0 + np.polyval(above, z) / np.polyval(below, z))
+                worst = max(worst, float(np.abs(S).max()))
+        return worst
+
+    def _box(self, plant: AxisPlant) -> Vector:
+        """Return least and largest a, and least and largest static gain."""
+        a, K = -float(plant.denominator[1]), plant.static_gain
+        gains = sorted((K * (1.0 - self.gain_range), K * (1.0 + self.gain_range)))
+        return np.array([a**self.pole_range, a ** (1.0 / self.pole_range), *gains])
+
+    def _arrays(self, plants: list[AxisPlant], delays: list[int], kappas: list[float]) -> dict[str, Matrix]:
+        """Return the arrays of the runtime by name."""
+        Ts = plants[0].sample_time
+        time = self.reference_time
+        common = assemble(
+            (pi_axis(1.0, 1.0, Ts), pi_axis(1.0, 1.0, Ts)),
+            reference_times=(time, time, time),
+            sample_time=Ts,
+            tendon_angles=self.tendon_angles,
+        )
+        names = ("Af", "Bf", "Cf", "Df", "rest", "T", "T_inverse", "constants")
+        guards = [
+            self.forgetting, self.covariance_bound, self.dead_zone,
+            max(-float(plant.denominator[1]) for plant in plants) ** (1.0 / (2.0 * self.pole_range)), self.excitation,
+            math.exp(-self.band * Ts), self.distrust, min(self.gain_rate * Ts, 0.5), Ts / self.leak_time,
+            min(self.start_covariance, 0.5 * self.covariance_bound),
+        ]  # fmt: skip
+        return dict(zip(names, (*common[:4], *common[12:16]), strict=True)) | {
+            "nominal": np.array([[-plant.denominator[1], plant.numerator[0]] for plant in plants]),
+            "box": np.array([self._box(plant) for plant in plants]),
+            "delays": np.array(delays, dtype=np.float64),
+            "loop": np.array(kappas),
+            "guards": np.array(guards),
+        }
+
+
+def _pole(plant: AxisPlant) -> float:
+    return -math.log(-float(plant.denominator[1])) / plant.sample_time
+
+
+def _line(axis: str, found: dict[str, float]) -> str:
+    gain = math.degrees(found["static_gain"])
+    return (
+        f"  {axis}: starts from {gain:.3g} deg/rad, pole {found['pole']:.3g} 1/s, dead time "
+        f"{1e3 * found['dead_time_s']:g} ms; kappa {found['kappa']:.3g}; largest Ms of the nominal gains in the box "
+        f"{found['largest_ms_nominal']:.3g}"
+    )

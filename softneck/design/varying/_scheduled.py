@@ -1,0 +1,200 @@
+"""Gain scheduling over the inclination: a robust PI at every operating point, interpolated without bumps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from softneck.core import Matrix, SettingsError, require_between
+from softneck.estimation import AxisPlant
+from softneck.estimation._axis import HasTransferFunctions
+from softneck.identification import Family
+
+from ..linear._assembly import assemble
+from ..linear._loop_settings import LoopSettings
+from ..linear._margins import frequencies
+from ..linear._tuning import Gains, tune_pi
+from ._model_following import following_axis
+from ._operating_points import AXES, OperatingPoint, family_points, model_points
+from ._varying import RUNTIMES, VaryingController
+
+# The arrays of `assemble`, in its order, and those that follow the inclination.
+_NAMES = (
+    "Af", "Bf", "Cf", "Df", "A", "Br", "By", "C", "Dr", "Dy", "L", "align", "rest", "T", "T_inverse", "constants"
+)  # fmt: skip
+_VARYING = ("A", "Br", "By", "C", "Dr", "Dy", "L", "align")
+# Between two operating points the loop is judged at so many places.
+_BETWEEN = 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScheduledSettings(LoopSettings):
+    """PI at every operating point of a family, gains linear over the inclination between them.
+
+    Limits, the order of the loop and what is doubted of the plant are those of `LoopSettings`.
+
+    Attributes:
+        max_sensitivity: bound on Ms at every operating point, on every plant there.
+        phase_margin: least phase margin [rad] there.
+        inclinations: [rad] of several models given by themselves, one each; empty for a family, which knows its own.
+        schedule_time: time constant of the lag through which the inclination is seen [s].
+        reference_time: time constant of the reference filter [s].
+        leak_time: over which the integral gives up what is beyond a limit [s].
+    """
+
+    max_sensitivity: float = 1.5
+    phase_margin: float = math.radians(60.0)
+    inclinations: tuple[float, ...] | list[float] = ()
+    # As slow as the loop's own time constant.
+    schedule_time: float = 0.3
+    # The model that is followed is the filter; this one only keeps the slew limit out of a step.
+    reference_time: float = 0.06
+    leak_time: float = 3.0
+    lead_limit: float = 0.8
+
+    def __post_init__(self) -> None:
+        LoopSettings.__post_init__(self)
+        require_between("max_sensitivity", self.max_sensitivity, 1.05, 4.0)
+        require_between("phase_margin", self.phase_margin, 0.1, 1.5, "rad")
+        require_between("schedule_time", self.schedule_time, 0.0, 60.0, "s")
+        require_between("reference_time", self.reference_time, 0.0, 60.0, "s")
+        require_between("leak_time", self.leak_time, 0.1, 60.0, "s")
+        for inclination in self.inclinations:
+            require_between("inclinations", inclination, 0.0, 1.5, "rad")
+
+    def design(self, plant: Family | Sequence[HasTransferFunctions]) -> VaryingController:
+        """Return the controller for a family, or for several linear models at `inclinations`.
+
+        Raises:
+            SettingsError: fewer than two operating points, no gains that keep the robustness, or a loop between two
+                points that does not keep it.
+        """
+        points = [self._with_doubt(point) for point in self._points(plant)]
+        sample_time = points[0].plants[0][0].sample_time
+        gains = [tuple(self._tune(point, axis) for axis in range(2)) for point in points]
+        memory = math.exp(-sample_time / self.schedule_time) if self.schedule_time > 0.0 else 0.0
+        arrays = self._arrays(points, gains, sample_time) | {
+            "knots": np.array([point.inclination for point in points]),
+            "memory": np.array([memory]),
+        }
+        found = self._between(points, gains)
+        return VaryingController(
+            kind="scheduled",
+            runtime=RUNTIMES["scheduled"],
+            sample_time=sample_time,
+            arrays=arrays,
+            limits=self.limits(),
+            order=self.order,
+            lines=tuple(_lines(points, gains, found)),
+            design={
+                "settings": asdict(self),
+                "extra_delay": self.extra_delay,
+                "inclinations_deg": [math.degrees(point.inclination) for point in points],
+                "gains": [[asdict(axis) for axis in pair] for pair in gains],
+                "largest_ms": found,
+            },
+        )
+
+    def _points(self, plant: Family | Sequence[HasTransferFunctions]) -> list[OperatingPoint]:
+        if isinstance(plant, Family):
+            if self.inclinations:
+                raise SettingsError("`inclinations` are for several models; a family knows its own. Leave them out.")
+            return family_points(plant)
+        models = list(plant) if isinstance(plant, Sequence) else [plant]
+        return model_points(models, self.inclinations)
+
+    def _with_doubt(self, point: OperatingPoint) -> OperatingPoint:
+        """Return the point with what the axes may be besides: later, and faster in small moves."""
+        pairs = []
+        for plants in point.plants:
+            late = [plant.delayed(self.least_delay) for plant in plants]
+            quick = [late[0].faster(self.small_move_pole)] if self.small_move_pole > 0.0 else []
+            pairs.append((*late, *(plant for plant in quick if plant is not late[0])))
+        return OperatingPoint(point.inclination, (pairs[0], pairs[1]))
+
+    def _followed(self, plant: AxisPlant) -> AxisPlant:
+        """Return the plant whose response is asked for: no slower than small moves are."""
+        return plant.faster(self.small_move_pole) if self.small_move_pole > 0.0 else plant
+
+    def _tune(self, point: OperatingPoint, axis: int) -> Gains:
+        try:
+            return tune_pi(point.plants[axis], self.extra_delay, self.max_sensitivity, self.phase_margin)
+        except SettingsError as error:
+            where = f"{AXES[axis]} at {math.degrees(point.inclination):.3g} deg of inclination"
+            raise SettingsError(f"{where}: {error}") from error
+
+    def _arrays(
+        self, points: Sequence[OperatingPoint], gains: Sequence[Sequence[Gains]], sample_time: float
+    ) -> dict[str, Matrix]:
+        """Return the arrays of the runtime: those of every point below each other where they differ."""
+        # One delay line for all points of an axis, or their states would not mean the same.
+        delays = [max(point.plants[axis][0].delay for point in points) + self.extra_delay for axis in range(2)]
+        axes = [
+            [
+                following_axis(pair[axis], self._followed(point.plants[axis][0]), delays[axis], self.leak_time)
+                for point, pair in zip(points, gains, strict=True)
+            ]
+            for axis in range(2)
+        ]
+        each = [
+            assemble(
+                (pitch, roll),
+                reference_times=(self.reference_time, self.reference_time, self.reference_time),
+                sample_time=sample_time,
+                tendon_angles=self.tendon_angles,
+            )
+            for pitch, roll in zip(*axes, strict=True)
+        ]
+        return {
+            name: np.vstack([arrays[i] for arrays in each]) if name in _VARYING else each[0][i]
+            for i, name in enumerate(_NAMES)
+        }
+
+    def _between(self, points: Sequence[OperatingPoint], gains: Sequence[Sequence[Gains]]) -> float:
+        """Return the largest Ms of all frozen loops at and between the points; refuse an unstable one.
+
+        Between two points the plants of both must stand the gains there.
+        """
+        worst = 0.0
+        for low in range(len(points) - 1):
+            for part in np.linspace(0.0, 1.0, _BETWEEN + 1):
+                for axis in range(2):
+                    mixed = _mixed(gains[low][axis], gains[low + 1][axis], float(part))
+                    for plant in (points[low].plants[axis][0], points[low + 1].plants[axis][0]):
+                        where = points[low].inclination + part * (points[low + 1].inclination - points[low].inclination)
+                        worst = max(worst, self._sensitivity(plant, mixed, AXES[axis], float(where)))
+        return worst
+
+    def _sensitivity(self, plant: AxisPlant, gains: Gains, axis: str, inclination: float) -> float:
+        """Return Ms of a frozen loop, whose stability is read off its closed-loop poles."""
+        rate = plant.sample_time / gains.integral_time
+        above = np.convolve(gains.gain * np.array([1.0, rate - 1.0]), plant.numerator)
+        below = np.convolve([1.0, -1.0], np.append(plant.denominator, np.zeros(plant.delay + self.extra_delay)))
+        radius = float(np.abs(np.roots(np.polyadd(above, below))).max())
+        if radius >= 1.0:
+            raise SettingsError(
+                f"{axis} at {math.degrees(inclination):.3g} deg, between two operating points, is not stable (spectral "
+                f"radius {radius:.4f}): the points differ too much; give more of them."
+            )
+        w = frequencies(plant.sample_time)
+        pi = gains.gain * (1.0 + rate / (np.exp(1j * w * plant.sample_time) - 1.0))
+        return float(np.max(1.0 / np.abs(1.0 + pi * plant.response(w, extra_delay=self.extra_delay))))
+
+
+def _mixed(low: Gains, high: Gains, part: float) -> Gains:
+    """Return the gains between: K and K/Ti are linear, as the runtime's matrices are."""
+    gain = (1.0 - part) * low.gain + part * high.gain
+    rate = (1.0 - part) * low.gain / low.integral_time + part * high.gain / high.integral_time
+    return Gains(gain, gain / rate)
+
+
+def _lines(points: Sequence[OperatingPoint], gains: Sequence[Sequence[Gains]], worst: float) -> list[str]:
+    lines = [
+        f"  at {math.degrees(point.inclination):5.1f} deg: "
+        + "; ".join(f"{name} K {g.gain:.4g}, Ti {g.integral_time:.3g} s" for name, g in zip(AXES, pair, strict=True))
+        for point, pair in zip(points, gains, strict=True)
+    ]
+    return [*lines, f"  largest Ms of all loops at and between these inclinations: {worst:.3g}"]

@@ -1,0 +1,143 @@
+"""Controllers whose gains vary as they run - scheduled or adaptive - in loops, FMUs and files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from softneck.core import FileFormatError, Matrix, Vector, write_archive
+from softneck.runtime import Block, Port, State
+
+from ..linear._limits import Limits
+from ..linear._ports import controller_inputs, controller_outputs
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class VaryingController:
+    """A designed controller of pitch and roll whose gains follow the inclination or what it learns.
+
+    Attributes:
+        kind: "scheduled" or "adaptive".
+        runtime: dotted name of the runtime module, which says what `arrays` are.
+        sample_time: [s].
+        arrays: by name, in the runtime's order.
+        limits: of the set-points.
+        order: of the loop it is for.
+        parameters: more parameters of the block, after the limits.
+        lines: for `summary`.
+        design: JSON values: settings and what was found.
+    """
+
+    kind: str
+    runtime: str
+    sample_time: float
+    arrays: Mapping[str, Matrix]
+    limits: Limits
+    order: str
+    parameters: tuple[Port, ...] = ()
+    lines: tuple[str, ...] = ()
+    design: Mapping[str, Any] = field(default_factory=dict)
+
+    def block(self) -> Block:
+        """Return the controller as a block of role "controller"."""
+        return Block(
+            kind=self.kind,
+            role="controller",
+            runtime=self.runtime,
+            sample_time=self.sample_time,
+            arrays=tuple(self.arrays.values()),
+            inputs=controller_inputs(),
+            outputs=controller_outputs(),
+            parameters=(*self.limits.ports(), *self.parameters),
+        )
+
+    def initial_state(self, **parameters: float) -> State:
+        """Return the state at the start; parameters are the limits by name."""
+        return self.block().initial_state(**parameters)
+
+    def step(self, state: State, inputs: ArrayLike) -> tuple[State, Vector]:
+        """Return the next state and the set-points valid now; inputs and outputs as in `block()`."""
+        return self.block().step(state, inputs)
+
+    def summary(self) -> str:
+        """Return some lines for people."""
+        head = (
+            f"{self.kind} controller, {self.sample_time * 1e3:g} ms, {self.order} order, "
+            f"{self.design.get('extra_delay', 0)} samples of delay added to the plant for it"
+        )
+        return "\n".join([head, *self.limits.lines(self.sample_time), *self.lines])
+
+    def save(self, path: str | Path, *, force: bool = False) -> None:
+        """Write the controller to one `.npz` file."""
+        block = self.block()
+        header = {
+            "kind": self.kind,
+            "sample_time": self.sample_time,
+            "limits": asdict(self.limits),
+            "order": self.order,
+            "names": list(self.arrays),
+            "parameters": [asdict(port) for port in self.parameters],
+            "lines": list(self.lines),
+            "design": dict(self.design),
+            "inputs": [port.name for port in block.inputs],
+            "outputs": [port.name for port in block.outputs],
+            "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
+        }
+        write_archive(path, header, self.arrays, force=force)
+
+    @classmethod
+    def from_archive(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> VaryingController:
+        """Return the controller that `save` wrote; `softneck.core.load` calls this."""
+        kind = str(header["kind"])
+        read = {str(name): np.ascontiguousarray(arrays[name], dtype=np.float64) for name in header["names"]}
+        if not all(np.isfinite(array).all() for array in read.values()) or not _fits(kind, read):
+            raise FileFormatError("the controller's arrays have wrong shapes or are not finite; design it again.")
+        return cls(
+            kind=kind,
+            runtime=RUNTIMES[kind],
+            sample_time=float(header["sample_time"]),
+            arrays=read,
+            limits=Limits(**header["limits"]),
+            order=str(header["order"]),
+            parameters=tuple(Port(**port) for port in header["parameters"]),
+            lines=tuple(str(line) for line in header["lines"]),
+            design=dict(header["design"]),
+        )
+
+
+RUNTIMES = {
+    "scheduled": "softneck.design.varying._scheduled_runtime",
+    "adaptive": "softneck.design.varying._adaptive_runtime",
+}
+
+
+def _fits(kind: str, arrays: Mapping[str, np.ndarray]) -> bool:
+    """Return whether the arrays fit each other as the runtime of `kind` reads them."""
+    expected = _scheduled_shapes(arrays) if kind == "scheduled" else _adaptive_shapes(arrays)
+    return {name: array.shape for name, array in arrays.items()} == expected
+
+
+def _filter_shapes(f: int) -> dict[str, tuple[int, ...]]:
+    return {"Af": (f, f), "Bf": (f, 3), "Cf": (3, f), "Df": (3, 3)}
+
+
+def _scheduled_shapes(arrays: Mapping[str, np.ndarray]) -> dict[str, tuple[int, ...]]:
+    f, n, m = arrays["Af"].shape[0], arrays["A"].shape[1], arrays["knots"].size
+    return _filter_shapes(f) | {
+        "A": (m * n, n), "Br": (m * n, 2), "By": (m * n, 2), "C": (m * 2, n), "Dr": (m * 2, 2), "Dy": (m * 2, 2),
+        "L": (m * n, 2), "align": (m * n, 4), "rest": (f, 3), "T": (3, 3), "T_inverse": (3, 3), "constants": (1,),
+        "knots": (m,), "memory": (1,),
+    }  # fmt: skip
+
+
+def _adaptive_shapes(arrays: Mapping[str, np.ndarray]) -> dict[str, tuple[int, ...]]:
+    f = arrays["Af"].shape[0]
+    return _filter_shapes(f) | {
+        "rest": (f, 3), "T": (3, 3), "T_inverse": (3, 3), "constants": (1,), "nominal": (2, 2), "box": (2, 4),
+        "delays": (2,), "loop": (2,), "guards": arrays["guards"].shape,
+    }  # fmt: skip

@@ -1,0 +1,392 @@
+"""`drives.toml`: node ids, gear, encoder, signs, limits, sensor, guarding, read strictly."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from softneck.core import (
+    DataError,
+    FileFormatError,
+    SettingsError,
+    require_between,
+    require_one_of,
+    require_positive,
+    require_whole,
+)
+
+from ..master import MasterSettings
+from ..master._fieldbus import BusSettings
+from ..master._settings import LimitSettings, RampSettings, SensorSettings, WatchSettings
+from ._sensor_source import SENSORS, SOURCE_KEYS, SensorSource, make_source
+from ._units import DriveScale, current_to_internal, internal_to_current
+
+PROFILES = ("ipos2015", "ds402")
+# Time in which a drive must notice that the master is gone [s] (fault table: 110 ms with its own slow loop).
+_LONGEST_LIFE = 0.1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DriveEntry:
+    """One [[drive]].
+
+    Attributes:
+        node: number on the bus.
+        scale: gear, encoder, sign, slow loop, peak current.
+        current_limit: of the motor [A].
+        vendor, product, serial: identity (1018h), None where any will do.
+        firmware: text of 100Ah, None where any will do.
+    """
+
+    node: int
+    scale: DriveScale
+    current_limit: float = 0.0299
+    vendor: int | None = None
+    product: int | None = None
+    serial: int | None = None
+    firmware: str | None = None
+
+    def __post_init__(self) -> None:
+        require_whole("node", self.node, 1, 126)
+        require_positive("current_limit_A", self.current_limit, "A")
+        if self.current_limit > self.scale.peak_current:
+            raise SettingsError(
+                f"`current_limit_A` {self.current_limit:g} is beyond the drive's peak current "
+                f"{self.scale.peak_current:g} A; lower it, or correct `peak_current_A`."
+            )
+        if current_to_internal(self.current_limit, self.scale) == 0:
+            raise SettingsError(
+                f"`current_limit_A` {self.current_limit:g} is less than one unit of a drive with a peak current of "
+                f"{self.scale.peak_current:g} A; is it in amperes?"
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Guarding:
+    """How drives notice that the master is gone.
+
+    Attributes:
+        kind: "auto" probes for a heartbeat consumer (1016h) and takes life guarding where there is none.
+        time: after which they act [s].
+    """
+
+    kind: str = "auto"
+    time: float = 0.1
+
+    def __post_init__(self) -> None:
+        require_one_of("kind", self.kind, ("auto", "life", "heartbeat"))
+        require_between("time_s", self.time, 0.02, _LONGEST_LIFE, "s")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ZeroSettings:
+    """How `softneck drives zero` tensions the tendons.
+
+    Attributes:
+        current: of the motor while it pulls [A]; by default 3.25 N with [neck]'s radius, constant and efficiency, the
+            pretension of the virtual neck, so that its rest is the zero. At 3.8 N Eq. 22 leaves the motors behind.
+        speed: of the winch while it pulls [rad/s].
+        still: slower than this it has come to a stop [rad/s].
+        still_time: for this long [s].
+        timeout: for each tendon [s].
+        tilt: the neck must be upright within this then [rad].
+    """
+
+    current: float = 0.0151
+    speed: float = 1.0
+    still: float = 0.2
+    still_time: float = 0.3
+    timeout: float = 10.0
+    tilt: float = math.radians(5.0)
+
+    def __post_init__(self) -> None:
+        require_positive("current_A", self.current, "A")
+        require_between("speed_rad_s", self.speed, 0.05, 5.0, "rad/s")
+        require_between("still_rad_s", self.still, 0.001, self.speed * 0.9, "rad/s")
+        require_between("still_s", self.still_time, 0.05, 10.0, "s")
+        require_between("timeout_s", self.timeout, 0.5, 120.0, "s")
+        require_between("tilt_deg", math.degrees(self.tilt), 0.1, 45.0, "deg")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Neck:
+    """What turns motor current into tension.
+
+    Attributes:
+        winch_radius: [m].
+        torque_constant: [N m/A].
+        efficiency: of the gear.
+    """
+
+    winch_radius: float = 0.0075
+    torque_constant: float = 0.0839
+    efficiency: float = 0.81
+
+    def __post_init__(self) -> None:
+        require_positive("winch_radius_m", self.winch_radius, "m")
+        require_positive("torque_constant_Nm_A", self.torque_constant, "N m/A")
+        require_between("gear_efficiency", self.efficiency, 0.1, 1.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DrivesFile:
+    """All of `drives.toml`.
+
+    Attributes:
+        profile: "ipos2015" or "ds402".
+        drives: of motors 1, 2, 3.
+        eds: an EDS of one's own, None for ours.
+        cycle: bus period [s].
+        bit_rate: [bit/s].
+        guarding, zero, neck, limits, sensor, watch, ramps: the tables of those names.
+        sensor_kind, sensor_node: "simulated", or "can" for a CiA 410 inclinometer at that node; others need
+            `sensor_source`.
+        quick_stop: deceleration of a quick stop (6085h) [rad/s^2].
+        following: window (6065h) [rad]; following_time: its time-out (6066h) [s].
+    """
+
+    profile: str
+    drives: tuple[DriveEntry, DriveEntry, DriveEntry]
+    eds: Path | None = None
+    cycle: float = 0.01
+    bit_rate: int = 1_000_000
+    guarding: Guarding = field(default_factory=Guarding)
+    zero: ZeroSettings = field(default_factory=ZeroSettings)
+    neck: Neck = field(default_factory=Neck)
+    limits: LimitSettings = field(default_factory=LimitSettings)
+    sensor: SensorSettings = field(default_factory=SensorSettings)
+    watch: WatchSettings = field(default_factory=WatchSettings)
+    ramps: RampSettings = field(default_factory=RampSettings)
+    sensor_kind: str = "simulated"
+    sensor_node: int = 10
+    sensor_source: SensorSource = field(default_factory=SensorSource)
+    quick_stop: float = 200.0
+    following: float = 2.0
+    following_time: float = 0.2
+
+    def __post_init__(self) -> None:
+        require_one_of("profile", self.profile, PROFILES)
+        require_between("period_s", self.cycle, 0.005, 0.05, "s")
+        require_whole("bit_rate", self.bit_rate, 10_000, 1_000_000)
+        require_between("quick_stop_rad_s2", self.quick_stop, 1.0, 1e5, "rad/s^2")
+        require_between("following_rad", self.following, 0.01, 20.0, "rad")
+        require_between("following_s", self.following_time, 0.01, 0.2, "s")
+        require_one_of("kind", self.sensor_kind, SENSORS)
+        require_whole("node", self.sensor_node, 1, 126)
+        nodes = self.nodes
+        if len(set(nodes)) != 3:
+            raise SettingsError(f"the three drives need three node numbers; got {nodes[0]}, {nodes[1]}, {nodes[2]}.")
+
+    @property
+    def nodes(self) -> tuple[int, int, int]:
+        """Node numbers of motors 1 to 3."""
+        one, two, three = (drive.node for drive in self.drives)
+        return one, two, three
+
+    @property
+    def guard_cycles(self) -> int:
+        """Cycles between two signs of life of ours: five of them fit into the guarding time."""
+        return max(1, math.floor(self.guarding.time / 5.0 / self.cycle + 1e-9))
+
+    def master_settings(self, sample_time: float, *, guarding: str = "life") -> MasterSettings:
+        """Return the master's settings for controllers of `sample_time` [s].
+
+        Raises:
+            SettingsError: the bus period does not divide the sample time.
+        """
+        ratio = sample_time / self.cycle
+        if round(ratio) < 1 or not math.isclose(ratio, round(ratio), rel_tol=1e-6):
+            raise SettingsError(
+                f"the bus period {self.cycle:g} s must divide the controller's sample time {sample_time:g} s; "
+                "change `period_s` of [bus]."
+            )
+        scales = [drive.scale for drive in self.drives]
+        k = [scale.counts_per_radian for scale in scales]
+        neck = self.neck
+        n = [
+            internal_to_current(1, scale) * neck.torque_constant * neck.efficiency * scale.gear / neck.winch_radius
+            for scale in scales
+        ]
+        if self.profile == "ds402":
+            raise_per_mille = [math.copysign(1e-3 * 0.06, scale.counts_per_radian) for scale in scales]
+            n = [unit * neck.torque_constant * neck.efficiency * scale.gear / neck.winch_radius
+                 for unit, scale in zip(raise_per_mille, scales, strict=True)]  # fmt: skip
+        bus = BusSettings(nodes=self.nodes, cycle=self.cycle, guarding=guarding, guard_cycles=self.guard_cycles)
+        return MasterSettings(
+            counts_per_radian=(k[0], k[1], k[2]),
+            newton_per_unit=(n[0], n[1], n[2]),
+            sample_cycles=round(ratio),
+            bus=bus,
+            limits=self.limits,
+            sensor=self.sensor,
+            watch=self.watch,
+            ramps=self.ramps,
+        )
+
+
+def load_drives(path: str | Path) -> DrivesFile:
+    """Read a drives file.
+
+    Raises:
+        FileFormatError: no such file or no TOML.
+        SettingsError: an unknown or missing key, or a value that does not fit; the line names table and key.
+    """
+    source = Path(path)
+    try:
+        table = tomllib.loads(source.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise FileFormatError(f"{source}: cannot be read ({error.strerror}).") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise FileFormatError(f"{source}: is no TOML ({error}).") from error
+    try:
+        return make_drives(table, source.parent)
+    except (SettingsError, DataError, FileFormatError) as error:
+        raise type(error)(f"{source}: {error}") from error
+
+
+# Table -> key in the file -> (field, factor to SI).
+_KEYS: dict[str, dict[str, tuple[str, float]]] = {
+    "guarding": {"kind": ("kind", 0.0), "time_s": ("time", 1.0)},
+    "zero": {
+        "current_A": ("current", 1.0), "speed_rad_s": ("speed", 1.0), "still_rad_s": ("still", 1.0),
+        "still_s": ("still_time", 1.0), "timeout_s": ("timeout", 1.0), "tilt_deg": ("tilt", math.radians(1.0)),
+    },
+    "neck": {
+        "winch_radius_m": ("winch_radius", 1.0), "torque_constant_Nm_A": ("torque_constant", 1.0),
+        "gear_efficiency": ("efficiency", 1.0),
+    },
+    "limits": {
+        "position_rad": ("position", 1.0), "speed_rad_s": ("speed", 1.0), "acceleration_rad_s2": ("acceleration", 1.0),
+        "persistent_s": ("persistent", 1.0), "tension_N": ("tension", 1.0), "slack_N": ("slack", 1.0),
+        "slack_unwind_rad": ("slack_unwind", 1.0),
+    },
+    "sensor": {
+        "dropout_s": ("dropout", 1.0), "frozen_samples": ("frozen_samples", 0.0), "bad_samples": ("bad_samples", 0.0),
+        "angle_deg": ("angle", math.radians(1.0)), "rate_deg_s": ("rate", math.radians(1.0)),
+        "margin_deg": ("margin", math.radians(1.0)), "on_loss": ("on_loss", 0.0), "hold_s": ("hold", 1.0),
+    },
+    "watch": {
+        "following_rad": ("following", 1.0), "tilt_deg": ("tilt", math.radians(1.0)), "gain": ("gain", 1.0),
+        "pole_per_s": ("pole", 1.0), "pushed_N": ("pushed", 1.0),
+    },
+    "ramp": {
+        "speed_rad_s": ("speed", 1.0), "settle_s": ("settle", 1.0), "tolerance_rad": ("tolerance", 1.0),
+        "enable_timeout_s": ("enable_timeout", 1.0), "timeout_s": ("timeout", 1.0),
+    },
+    "bus": {"period_s": ("cycle", 1.0), "bit_rate": ("bit_rate", 0.0)},
+    "quick": {
+        "quick_stop_rad_s2": ("quick_stop", 1.0), "following_rad": ("following", 1.0),
+        "following_s": ("following_time", 1.0),
+    },
+    "scale": {
+        "peak_current_A": ("peak_current", 1.0), "gear": ("gear", 1.0), "encoder_counts": ("counts_per_turn", 1.0),
+        "slow_loop_s": ("slow_loop", 1.0), "reversed": ("reversed", 0.0),
+    },
+    "drive": {
+        "node": ("node", 0.0), "current_limit_A": ("current_limit", 1.0), "vendor": ("vendor", 0.0),
+        "product": ("product", 0.0), "serial": ("serial", 0.0), "firmware": ("firmware", 0.0),
+    },
+}  # fmt: skip
+_TOP = ("profile", "eds", "bus", "guarding", "drive", "limits", "stop", "sensor", "watch", "zero", "ramp", "neck")
+_CLASSES = {
+    "guarding": Guarding, "zero": ZeroSettings, "neck": Neck, "limits": LimitSettings, "sensor": SensorSettings,
+    "watch": WatchSettings, "ramp": RampSettings,
+}  # fmt: skip
+_FIELDS = {"ramp": "ramps"}
+
+
+def make_drives(table: Mapping[str, Any], folder: Path = Path()) -> DrivesFile:
+    """Return what a table with the keys of a drives file describes; an EDS is looked for in `folder`."""
+    _refuse_unknown("the file", table, _TOP)
+    if "profile" not in table:
+        raise SettingsError(f"`profile` is missing; it is one of {', '.join(PROFILES)}.")
+    entries = table.get("drive")
+    if not isinstance(entries, list) or len(entries) != 3:
+        count = len(entries) if isinstance(entries, list) else 0
+        raise SettingsError(f"three [[drive]] tables are needed, motors 1 to 3 in this order; there are {count}.")
+    one, two, three = (_drive(number, entry) for number, entry in enumerate(entries, start=1))
+    values: dict[str, Any] = {"profile": table["profile"], "drives": (one, two, three)}
+    for name, setting in _CLASSES.items():
+        if name not in table:
+            continue
+        content = dict(_table(name, table[name]))
+        if name == "sensor":
+            values |= {f"sensor_{key}": content.pop(key) for key in ("kind", "node") if key in content}
+            kind, own = values.get("sensor_kind", "simulated"), [key for key in content if key in SOURCE_KEYS]
+            values["sensor_source"] = make_source(kind, {key: content.pop(key) for key in own}, folder)
+        values[_FIELDS.get(name, name)] = _made(f"[{name}]", setting, name, content)
+    values |= _values("[bus]", "bus", _table("bus", table.get("bus", {})))
+    values |= _values("[stop]", "quick", _table("stop", table.get("stop", {})))
+    if "eds" in table:
+        values["eds"] = folder / str(table["eds"])
+    return DrivesFile(**values)
+
+
+def _drive(number: int, entry: Any) -> DriveEntry:
+    where = f"[[drive]] {number}"
+    content = dict(_table(where, entry))
+    known = {**_KEYS["scale"], **_KEYS["drive"]}
+    _refuse_unknown(where, content, tuple(known))
+    for key in ("node", "peak_current_A"):
+        if key not in content:
+            raise SettingsError(f"{where}: `{key}` is missing.")
+    scale = {key: value for key, value in content.items() if key in _KEYS["scale"]}
+    rest = {key: value for key, value in content.items() if key in _KEYS["drive"]}
+    try:
+        made = _made(where, DriveScale, "scale", scale)
+        return DriveEntry(scale=made, **_values(where, "drive", rest))
+    except (SettingsError, DataError) as error:
+        text = str(error)
+        raise SettingsError(text if text.startswith(where) else f"{where}: {text}") from error
+
+
+def _made(where: str, setting: type, name: str, content: Mapping[str, Any]) -> Any:
+    try:
+        return setting(**_values(where, name, content))
+    except SettingsError as error:
+        raise SettingsError(f"{where}: {error}") from error
+
+
+def _values(where: str, name: str, content: Mapping[str, Any]) -> dict[str, Any]:
+    keys = _KEYS[name]
+    _refuse_unknown(where, content, tuple(keys))
+    return {keys[key][0]: _value(f"{where} {key}", value, keys[key][1]) for key, value in content.items()}
+
+
+_WHOLE = ("node", "vendor", "product", "serial", "bit_rate", "frozen_samples", "bad_samples")
+
+
+def _value(where: str, value: Any, factor: float) -> Any:
+    key = where.rpartition(" ")[2]
+    if factor == 0.0:
+        wanted: type = bool if key == "reversed" else int if key in _WHOLE else str
+        if not isinstance(value, wanted) or (wanted is int and isinstance(value, bool)):
+            words = {bool: "true or false", int: "a whole number", str: "a text"}
+            raise SettingsError(f"{where} must be {words[wanted]}; got {value!r}.")
+        return value
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise SettingsError(f"{where} must be a number; got {value!r}.")
+    return factor * value
+
+
+def _table(name: str, value: Any) -> Mapping[str, Any]:
+    if not isinstance(value, dict):
+        raise SettingsError(f"`{name}` must be a table.")
+    return value
+
+
+def _refuse_unknown(where: str, table: Mapping[str, Any], known: tuple[str, ...]) -> None:
+    unknown = [key for key in table if key not in known]
+    if unknown:
+        raise SettingsError(f"`{unknown[0]}` is no key of {where}; it takes {', '.join(known)}.")
+
+
+def default_drives(profile: str = "ipos2015", **changes: Any) -> DrivesFile:
+    """Return the file for simulated drives that nobody wrote one for: nodes 1 to 3, the lab's set-up."""
+    one, two, three = (DriveEntry(node=node, scale=DriveScale(peak_current=10.0)) for node in (1, 2, 3))
+    return dataclasses.replace(DrivesFile(profile=profile, drives=(one, two, three)), **changes)

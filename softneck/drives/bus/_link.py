@@ -1,0 +1,242 @@
+"""What carries frames: simulated drives in virtual time, or a bus of python-can."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Protocol
+
+from softneck.core import SettingsError, SoftneckError
+
+from ..master import Frame
+from ..master._frame import BUS_OFF
+from ..simulated import SimulatedNeck
+from ..simulated._frame import CanFrame
+from ._why import reason
+
+# Interfaces whose far end is a program on this machine: no drive can be behind them.
+HARMLESS = ("virtual", "udp_multicast")
+
+
+class BusError(SoftneckError):
+    """A bus cannot be opened or does not work; the line says which and why."""
+
+
+class Link(Protocol):
+    """Sends and receives frames; its clock is monotonic.
+
+    Attributes:
+        problem: why frames no longer pass, "" while they do.
+    """
+
+    problem: str
+
+    @property
+    def now(self) -> float:
+        """Time [s]."""
+        ...
+
+    def send(self, frames: Sequence[Frame]) -> None:
+        """Send `frames` now."""
+        ...
+
+    def receive(self, timeout: float) -> list[Frame]:
+        """Return what came, waiting for at most `timeout` [s] where nothing is there."""
+        ...
+
+
+class VirtualLink:
+    """The bus to simulated drives in virtual time: waiting is what lets time pass.
+
+    Attributes:
+        neck: what hangs on it.
+        cut: no frame passes.
+        tap: called with (time, from_master, frame) for each frame that is on the wire.
+        lose: returns whether a frame is lost: (from_master, frame).
+        inject: frames of somebody else, delivered to both sides with the next exchange.
+        sampling: whether passing time makes the inclinometer sample; else whoever steps the link does.
+    """
+
+    def __init__(self, neck: SimulatedNeck) -> None:
+        """Begin at t = 0."""
+        self.neck = neck
+        self.cycle = neck.settings.cycle
+        self._step = 0
+        self._inbox: deque[Frame] = deque()
+        self.cut = False
+        self.problem = ""
+        self.tap: Callable[[float, bool, Frame], None] | None = None
+        self.lose: Callable[[bool, Frame], bool] | None = None
+        self.inject: list[Frame] = []
+        self.sampling = True
+        self._samples = max(1, round(neck.settings.sample_time / self.cycle))
+
+    @property
+    def now(self) -> float:
+        """Virtual time [s]."""
+        return self._step * self.cycle
+
+    def send(self, frames: Sequence[Frame]) -> None:
+        """Deliver at once; answers can be received at once."""
+        kept = [frame for frame in frames if self._passes(True, frame)]
+        for frame in self.inject:
+            kept.append(frame)
+            self._inbox.append(frame)
+        self.inject.clear()
+        now = self.now
+        answers = self.neck.run([CanFrame(frame[0], frame[1], frame[2]) for frame in kept], now)
+        for answer in answers:
+            frame = Frame(answer[0], answer[1], answer[2])
+            if self._passes(False, frame):
+                self._inbox.append(frame)
+
+    def pass_time(self) -> None:
+        """Let one cycle pass: drives, neck, and what the drives say by themselves."""
+        self.neck.move()
+        self._step += 1
+        if self.sampling and self._step % self._samples == 0:
+            self.neck.sample(self.now)
+
+    def receive(self, timeout: float) -> list[Frame]:
+        """Return what is there; else let time pass until something comes or `timeout` [s] is over."""
+        passed = 0.0
+        while not self._inbox and passed < timeout - 1e-9:
+            self.pass_time()
+            passed += self.cycle
+            self.send(())
+        return self.drain()
+
+    def drain(self) -> list[Frame]:
+        """Return what is there now."""
+        frames = list(self._inbox)
+        self._inbox.clear()
+        return frames
+
+    def _passes(self, from_master: bool, frame: Frame) -> bool:
+        if self.cut or (self.lose is not None and self.lose(from_master, frame)):
+            return False
+        if self.tap is not None:
+            self.tap(self.now, from_master, frame)
+        return True
+
+
+class CanLink:
+    """A bus of python-can; frames of our own that come back are dropped.
+
+    Attributes:
+        tap: called with (time, from_master, frame) for each frame that was sent or came.
+        problem: what the bus last refused a frame with, "" if it never did.
+    """
+
+    def __init__(self, bus: Any, name: str, *, echoes: bool = False) -> None:
+        """Use the open `bus`; `echoes` tells that it hands back what we sent, as UDP multicast does."""
+        self._bus, self.name = bus, name
+        self._sent: deque[tuple[int, bytes, bool]] | None = deque(maxlen=4096) if echoes else None
+        self.problem = ""
+        self.tap: Callable[[float, bool, Frame], None] | None = None
+
+    @property
+    def now(self) -> float:
+        """Monotonic time [s]: no jump of the wall clock moves it."""
+        return time.monotonic()
+
+    def send(self, frames: Sequence[Frame]) -> None:
+        """Send all; a bus that refuses is told to the master as bus-off."""
+        import can
+
+        for frame in frames:
+            message = can.Message(
+                arbitration_id=frame.identifier,
+                data=None if frame.remote else frame.data,
+                dlc=1 if frame.remote else None,
+                is_remote_frame=frame.remote,
+                is_extended_id=False,
+            )
+            try:
+                self._bus.send(message, timeout=0.0)
+            except (can.CanError, OSError) as error:
+                self.problem = reason(error)
+                return
+            if self.tap is not None:
+                self.tap(self.now, True, frame)
+            if self._sent is not None:
+                self._sent.append((frame.identifier, b"" if frame.remote else frame.data, frame.remote))
+
+    def receive(self, timeout: float) -> list[Frame]:
+        """Return all that is there, waiting for the first one for at most `timeout` [s]."""
+        import can
+
+        frames: list[Frame] = []
+        if self.problem:
+            frames.append(BUS_OFF)
+        try:
+            # Between asking for the time and here a deadline may pass; a negative wait is an error to some interfaces.
+            message = self._next(max(0.0, timeout))
+            while message is not None:
+                frame = self._frame(message)
+                if frame is not None:
+                    frames.append(frame)
+                message = self._next(0.0)
+        except (can.CanError, OSError) as error:
+            self.problem = reason(error)
+            frames.append(BUS_OFF)
+        if self.tap is not None and frames:
+            now = self.now
+            for frame in frames:
+                self.tap(now, False, frame)
+        return frames
+
+    def _next(self, timeout: float) -> Any:
+        # Not `recv`: python-can 4 measures what is left of its time-out on the wall clock, and one that is set back by
+        # an hour meanwhile would let it wait for an hour. It does nothing else but filter, and no filter is set here.
+        message, _ = self._bus._recv_internal(timeout=timeout)
+        return message
+
+    def close(self) -> None:
+        """Close the bus."""
+        self._bus.shutdown()
+
+    def _frame(self, message: Any) -> Frame | None:
+        if message.is_error_frame:
+            # SocketCAN error class "bus-off" (linux/can/error.h: CAN_ERR_BUSOFF, 40h).
+            return BUS_OFF if message.arbitration_id & 0x40 else Frame(0, b"", error=True)
+        if message.is_extended_id:
+            return None
+        data = b"" if message.is_remote_frame else bytes(message.data)
+        key = (message.arbitration_id, data, message.is_remote_frame)
+        if self._sent is not None and key in self._sent:
+            self._sent.remove(key)
+            return None
+        return Frame(*key)
+
+
+@contextlib.contextmanager
+def open_bus(text: str, *, bit_rate: int = 1_000_000) -> Iterator[CanLink]:
+    """Yield the bus `INTERFACE:CHANNEL`, such as `socketcan:can0`.
+
+    Raises:
+        SettingsError: no INTERFACE:CHANNEL.
+        BusError: it cannot be opened; the line says why.
+    """
+    import can
+
+    interface, colon, channel = text.partition(":")
+    if not colon or not interface or not channel:
+        raise SettingsError(f"--bus takes INTERFACE:CHANNEL, such as socketcan:can0; got `{text}`.")
+    if interface not in can.interfaces.BACKENDS:
+        raise SettingsError(f"--bus {text}: python-can has no interface `{interface}`; try socketcan:can0.")
+    # What python-can has to say of a bus that fails is in the exception; without a handler it would print it as well.
+    logging.getLogger("can").addHandler(logging.NullHandler())
+    options: dict[str, Any] = {} if interface in ("socketcan", *HARMLESS) else {"bitrate": bit_rate}
+    try:
+        bus = can.Bus(interface=interface, channel=channel, receive_own_messages=False, **options)
+    except Exception as error:  # vendors' drivers that are missing raise what comes: NameError, AttributeError, ...
+        raise BusError(f"bus {text} cannot be opened: {reason(error)} Nothing was sent.") from error
+    link = CanLink(bus, text, echoes=interface == "udp_multicast")
+    try:
+        yield link
+    finally:
+        link.close()

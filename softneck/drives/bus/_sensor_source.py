@@ -1,0 +1,70 @@
+"""Which inclinometer a drives file names, and where its samples come from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from softneck.core import SettingsError, require_between, require_whole
+
+SENSORS = ("simulated", "can", "serial", "replay", "python")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorSource:
+    """Where the inclinometer's samples come from, beside its kind.
+
+    Attributes:
+        port, baud, request, start: of kind "serial", see `SerialInclinometer`.
+        file: of kind "replay": a recording, or the log of a run.
+        python: of kind "python": `package.module:factory`, called with `options`.
+        options: for the factory.
+        folder: of the drives file, where files and modules are looked for.
+    """
+
+    port: str = ""
+    baud: int = 9600
+    request: bool = False
+    start: float = 10.0
+    file: str = ""
+    python: str = ""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    folder: Path = Path()
+
+    def __post_init__(self) -> None:
+        require_whole("baud", self.baud, 300, 4_000_000)
+        require_between("start_s", self.start, 0.1, 120.0, "s")
+
+
+# Key of [sensor] in the drives file -> (field, type).
+SOURCE_KEYS: dict[str, tuple[str, type]] = {
+    "port": ("port", str),
+    "baud": ("baud", int),
+    "request": ("request", bool),
+    "start_s": ("start", float),
+    "file": ("file", str),
+    "python": ("python", str),
+    "options": ("options", dict),
+}
+_NEEDS = {"serial": "port", "replay": "file", "python": "python"}
+
+
+def make_source(kind: str, table: Mapping[str, Any], folder: Path) -> SensorSource:
+    """Return the source that the keys `SOURCE_KEYS` of a table [sensor] describe.
+
+    Raises:
+        SettingsError: a key of another type, or one that the kind needs is missing.
+    """
+    values: dict[str, Any] = {}
+    for key, value in table.items():
+        name, wanted = SOURCE_KEYS[key]
+        number = wanted is float and isinstance(value, int) and not isinstance(value, bool)
+        if not (number or isinstance(value, wanted)) or (wanted is int and isinstance(value, bool)):
+            raise SettingsError(f"[sensor] {key} must be of type {wanted.__name__}; got {value!r}.")
+        values[name] = value
+    needed = _NEEDS.get(kind)
+    if needed is not None and not values.get(needed):
+        raise SettingsError(f'[sensor] kind = "{kind}" needs `{needed}`.')
+    return SensorSource(**values, folder=folder)

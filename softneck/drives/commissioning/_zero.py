@@ -1,0 +1,261 @@
+"""Zeroing: tension each tendon gently, then call that zero, and look at the inclinometer whether it may be."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from canopen.objectdictionary import ObjectDictionary
+
+from softneck.core import CheckFailedError, SoftneckError
+
+from ..bus._file import DriveEntry, DrivesFile
+from ..bus._link import Link
+from ..bus._objects import (
+    HOMED_MARK,
+    MASTER_NODE,
+    Write,
+    current_write,
+    disarm_writes,
+    option_writes,
+    speed_of_units,
+    speed_units,
+)
+from ..bus._sdo import Objects, load_eds
+from ..bus._units import counts_to_position
+from ..master import Frame, Tilt
+from ..master._cia402 import DriveState, state_of
+from ..running._ask import Operator
+from ..running._stop import wait
+
+_VELOCITY, _HOMING, _HERE = 3, 6, 35
+# Between two looks at a drive [s].
+_LOOK = 0.02
+# Speeds of 606Ch and of 6064h differ by less than this part, or the slow loop is not what the drives file says.
+_SLOW_LOOP_TOLERANCE = 0.25
+# What is slower than this tells nothing about the slow loop [rad/s].
+_FAST_ENOUGH = 0.3
+_SETTLE = 1.0
+_ENABLE_TIME = 1.0
+
+Look = Callable[[], Tilt | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Zeroed:
+    """What zeroing found, for each motor.
+
+    Attributes:
+        nodes: of the drives.
+        pulled: how far each winch turned until its tendon was tight [rad].
+        pitch, roll: of the neck then [rad].
+    """
+
+    nodes: tuple[int, ...]
+    pulled: tuple[float, ...]
+    pitch: float
+    roll: float
+
+    def table(self) -> dict[str, Any]:
+        """Return the JSON of `softneck drives zero`."""
+        return {
+            "zeroed": True,
+            "motors": [{"node": n, "pulled_rad": p} for n, p in zip(self.nodes, self.pulled, strict=True)],
+            "pitch_deg": math.degrees(self.pitch),
+            "roll_deg": math.degrees(self.roll),
+        }
+
+
+class _Motor:
+    """One drive while it is zeroed."""
+
+    def __init__(self, link: Link, entry: DriveEntry, file: DrivesFile, dictionary: ObjectDictionary) -> None:
+        self.entry, self.file = entry, file
+        self.objects = Objects(link, entry.node, dictionary)
+        self.link = link
+        self.start = self.pulled = 0.0
+
+    def position(self) -> float:
+        return counts_to_position(self.objects.read(0x6064), self.entry.scale)
+
+    def speed(self) -> float:
+        return speed_of_units(self.objects.read(0x606C), self.entry, self.file.profile)
+
+    def state(self) -> DriveState:
+        return state_of(self.objects.read(0x6041))
+
+    def word(self, value: int) -> None:
+        self.objects.write(0x6040, 0, value)
+
+    def prepare(self) -> None:
+        zero = self.file.zero
+        pull = speed_units(zero.speed, self.entry, self.file.profile)
+        writes = [
+            *option_writes(),
+            Write(0x6065, 0, 0, "zero"),
+            Write(0x607D, 1, -(2**31), "zero"),
+            Write(0x607D, 2, 2**31 - 1, "zero"),
+            Write(0x6083, 0, max(1, abs(pull)), "zero"),
+            Write(0x6085, 0, max(1, abs(pull)), "zero"),
+            current_write(zero.current, self.entry, self.file.profile, "zero"),
+            Write(0x60FF, 0, 0, "zero"),
+            Write(0x6060, 0, _VELOCITY, "zero"),
+        ]
+        for write in writes:
+            if self.objects.written(write.index, write.subindex, write.value) != write.value:
+                raise CheckFailedError(f"node {self.entry.node}: {write.index:04X}h does not keep {write.value}.")
+
+    def enable(self) -> None:
+        until = self.link.now + _ENABLE_TIME
+        for word, state in ((0x06, DriveState.READY), (0x07, DriveState.SWITCHED_ON), (0x0F, DriveState.ENABLED)):
+            self.word(word)
+            while self.state() is not state:
+                if self.link.now > until:
+                    found = self.state()
+                    advice = " Is the hardware stop released? Then `softneck drives reset`." * (
+                        found is DriveState.FAULT
+                    )
+                    raise CheckFailedError(
+                        f"node {self.entry.node}: does not get to {state.name}; it is in {found.name}.{advice}"
+                    )
+                wait(self.link, _LOOK)
+
+
+def zero(link: Link, file: DrivesFile, look: Look, *, guarding: str, operator: Operator | None = None) -> Zeroed:
+    """Tension the tendons of motors 1 to 3, set the encoders' zero there, verify, and switch the drives off.
+
+    Args:
+        link: to the bus; the drives are configured and their nodes operational or pre-operational.
+        file: with the settings.
+        look: returns the inclinometer's newest sample.
+        guarding: "life" or "heartbeat", as the pre-flight set it up; it is fed from here while tendons are pulled.
+        operator: asked every 20 ms; whatever is asked for switches the drives off.
+
+    Raises:
+        CheckFailedError: a tendon does not get tight in time, the neck is not upright, or the slow loop is another.
+    """
+    dictionary = load_eds(file.profile, file.eds)
+    motors = [_Motor(link, entry, file, dictionary) for entry in file.drives]
+    guard = _feeder(link, file, guarding, operator)
+    try:
+        for motor in motors:
+            motor.prepare()
+            motor.start = motor.position()
+            motor.enable()
+            _tension(link, motor, guard)
+        # What the later ones pulled may have loosened the first: all pull on with their small current.
+        _rest(link, _SETTLE, guard)
+        tilt = _upright(file, look)
+        for motor in motors:
+            _set_zero(link, motor)
+    finally:
+        _off(motors, guarding)
+    pulled = tuple(motor.pulled for motor in motors)
+    return Zeroed(file.nodes, pulled, tilt.pitch, tilt.roll)
+
+
+def _tension(link: Link, motor: _Motor, guard: Callable[[], None]) -> None:
+    zero, node = motor.file.zero, motor.entry.node
+    motor.objects.write(0x60FF, 0, speed_units(zero.speed, motor.entry, motor.file.profile))
+    begin = link.now
+    still_since: float | None = None
+    before, before_at, ratios = motor.position(), link.now, []
+    while True:
+        _rest(link, _LOOK, guard)
+        now, position, speed = link.now, motor.position(), motor.speed()
+        moved = (position - before) / max(now - before_at, 1e-6)
+        if abs(moved) > _FAST_ENOUGH and abs(speed) > 0.01:
+            ratios.append(speed / moved)
+        before, before_at = position, now
+        if abs(speed) > zero.still or now - begin < 2.0 * _LOOK:
+            still_since = None
+        elif still_since is None:
+            still_since = now
+        elif now - still_since >= zero.still_time:
+            break
+        if now - begin > zero.timeout:
+            raise CheckFailedError(
+                f"node {node}: the tendon of this motor did not get tight within {zero.timeout:g} s; "
+                "is it attached, does the winch turn the right way (`reversed`)?"
+            )
+        if motor.state() is not DriveState.ENABLED:
+            raise CheckFailedError(
+                f"node {node}: left Operation Enabled while it pulled; it is in {motor.state().name}."
+            )
+    motor.pulled = position - motor.start
+    middle = sorted(ratios)[len(ratios) // 2] if len(ratios) >= 3 else 1.0
+    if abs(middle - 1.0) > _SLOW_LOOP_TOLERANCE:
+        raise CheckFailedError(
+            f"node {node}: its speed (606Ch) is {middle:.2f} times that of its position; the drives file's "
+            "`slow_loop_s`, `gear` or `encoder_counts` is not the drive's."
+        )
+
+
+def _upright(file: DrivesFile, look: Look) -> Tilt:
+    tilt = look()
+    if tilt is None or not tilt.valid:
+        raise CheckFailedError("the inclinometer gives no sample; the zero cannot be verified.")
+    worst = max(abs(tilt.pitch), abs(tilt.roll))
+    if not worst <= file.zero.tilt:
+        raise CheckFailedError(
+            f"the neck leans by pitch {math.degrees(tilt.pitch):.1f}, roll {math.degrees(tilt.roll):.1f} deg with all "
+            f"tendons tight; {math.degrees(file.zero.tilt):g} deg are allowed. No zero was set: look for a tendon that "
+            "slipped or hangs."
+        )
+    return tilt
+
+
+def _set_zero(link: Link, motor: _Motor) -> None:
+    objects = motor.objects
+    objects.write(0x607C, 0, HOMED_MARK)
+    objects.write(0x6098, 0, _HERE)
+    # The drive holds while its mode changes: its speed is zero and the tendon is tight.
+    objects.write(0x60FF, 0, 0)
+    objects.write(0x6060, 0, _HOMING)
+    motor.word(0x1F)
+    wait(link, _LOOK)
+    word = objects.read(0x6041)
+    counts = objects.read(0x6064)
+    if not word & 0x1000 or abs(counts - HOMED_MARK) > 50:
+        raise CheckFailedError(f"node {motor.entry.node}: homing did not end (status {word:04X}h, position {counts}).")
+
+
+def _feeder(link: Link, file: DrivesFile, guarding: str, operator: Operator | None) -> Callable[[], None]:
+    """Return what tells the drives that we live: guarding requests, or our heartbeat."""
+    if guarding == "life":
+        frames = [Frame(0x700 + node, b"\0", remote=True) for node in file.nodes]
+    else:
+        frames = [Frame(0x700 + MASTER_NODE, b"\x05")]
+
+    def feed() -> None:
+        if operator is not None and operator() is not None:
+            raise CheckFailedError("stopped by the operator. The drives are off; zero them again.")
+        link.send(frames)
+
+    return feed
+
+
+def _off(motors: list[_Motor], guarding: str) -> None:
+    """Switch all off and end their guarding; one that does not answer must not keep the others on."""
+    for motor in motors:
+        try:
+            motor.word(0x06)
+            motor.word(0x00)
+        except SoftneckError:
+            continue
+    for motor in motors:
+        try:
+            for write in disarm_writes(guarding):
+                motor.objects.write(write.index, write.subindex, write.value)
+        except SoftneckError:
+            continue
+
+
+def _rest(link: Link, seconds: float, guard: Callable[[], None]) -> None:
+    """Wait, feeding the drives' guarding from here: a master that hangs stops feeding."""
+    until = link.now + seconds
+    while link.now < until - 1e-9:
+        guard()
+        wait(link, min(_LOOK, until - link.now))

@@ -1,0 +1,171 @@
+"""One cycle of the master as it is logged: all that it saw, decided and sent, as text that reads back to the bit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from ..master import Frame, Master, Tilt
+from ..master._measured import Measured, Pilot
+
+Triple = tuple[float, float, float]
+# What the pilot was asked and what it said: ("start", None), ("finished", bool), ("step", set-points or None), or
+# (what, "Error: text") where it raised.
+Answer = tuple[str, Any]
+
+
+class Cycle(NamedTuple):
+    """What went into one step of the master, and what came out.
+
+    Attributes:
+        time: of the step [s], monotonic.
+        received: frames in, in their order.
+        tilt: the inclinometer's sample, None if none came.
+        taken: requests from outside since the step before: (start, finish or stop; why).
+        answers: of the pilot in this step.
+        sent: frames out.
+        phase: after the step.
+        positions, setpoints, tensions: of the motors [rad], [rad], [N].
+    """
+
+    time: float
+    received: tuple[Frame, ...]
+    tilt: Tilt | None
+    taken: tuple[tuple[str, str], ...]
+    answers: tuple[Answer, ...]
+    sent: tuple[Frame, ...]
+    phase: str
+    positions: Triple
+    setpoints: Triple
+    tensions: Triple
+
+
+class LoggedPilot:
+    """Passes on to `pilot` and keeps what it answered, until `take`."""
+
+    def __init__(self, pilot: Pilot) -> None:
+        """Listen to `pilot`."""
+        self._pilot = pilot
+        self._answers: list[Answer] = []
+
+    def start(self) -> None:
+        """Begin anew."""
+        try:
+            self._pilot.start()
+        except Exception as error:
+            self._answers.append(("start", f"{type(error).__name__}: {error}"))
+            raise
+        self._answers.append(("start", None))
+
+    def step(self, measured: Measured) -> Triple | None:
+        """Return what the pilot returns."""
+        try:
+            answer = self._pilot.step(measured)
+        except Exception as error:
+            self._answers.append(("step", f"{type(error).__name__}: {error}"))
+            raise
+        self._answers.append(("step", answer))
+        return answer
+
+    def finished(self, index: int) -> bool:
+        """Return what the pilot returns."""
+        try:
+            answer = self._pilot.finished(index)
+        except Exception as error:
+            self._answers.append(("finished", f"{type(error).__name__}: {error}"))
+            raise
+        self._answers.append(("finished", answer))
+        return answer
+
+    def take(self) -> tuple[Answer, ...]:
+        """Return the answers since the last call."""
+        answers = tuple(self._answers)
+        self._answers.clear()
+        return answers
+
+
+def cycle_of(
+    master: Master, pilot: LoggedPilot, now: float, received: Sequence[Frame], tilt: Tilt | None, sent: Sequence[Frame]
+) -> Cycle:
+    """Return the step that `master` has just done."""
+    return Cycle(
+        now, tuple(received), tilt, master.taken, pilot.take(), tuple(sent), str(master.supervisor.phase),
+        master.positions, master.setpoints, master.tensions,
+    )  # fmt: skip
+
+
+def encode_cycle(cycle: Cycle) -> dict[str, Any]:
+    """Return JSON values of a cycle; what is empty is left out, numbers that are not finite are texts."""
+    table: dict[str, Any] = {
+        "time": cycle.time,
+        "phase": cycle.phase,
+        "received": [frame_text(frame) for frame in cycle.received],
+        "sent": [frame_text(frame) for frame in cycle.sent],
+        "positions": _numbers(cycle.positions),
+        "setpoints": _numbers(cycle.setpoints),
+        "tensions": _numbers(cycle.tensions),
+    }
+    if cycle.tilt is not None:
+        table["tilt"] = [*_numbers(cycle.tilt[:4]), cycle.tilt.valid]
+    if cycle.taken:
+        table["taken"] = [list(pair) for pair in cycle.taken]
+    if cycle.answers:
+        table["answers"] = [[what, _answer(value)] for what, value in cycle.answers]
+    return table
+
+
+def decode_cycle(table: dict[str, Any]) -> Cycle:
+    """Return the cycle that `encode_cycle` made `table` of.
+
+    Raises:
+        KeyError, TypeError, ValueError: it made none.
+    """
+    tilt = table.get("tilt")
+    return Cycle(
+        float(table["time"]),
+        tuple(frame_of(text) for text in table["received"]),
+        None if tilt is None else Tilt(*(float(value) for value in tilt[:4]), valid=bool(tilt[4])),
+        tuple((str(what), str(why)) for what, why in table.get("taken", ())),
+        tuple((str(what), _read_answer(value)) for what, value in table.get("answers", ())),
+        tuple(frame_of(text) for text in table["sent"]),
+        str(table["phase"]),
+        _triple(table["positions"]),
+        _triple(table["setpoints"]),
+        _triple(table["tensions"]),
+    )
+
+
+def frame_text(frame: Frame) -> str:
+    """Return `201#0f00a1b2c3d4`; after `#` stand R for a remote request, X for what is about the bus, not from it."""
+    kind = ("R" if frame.remote else "") + ("X" if frame.error else "")
+    return f"{frame.identifier:03X}#{kind}{frame.data.hex()}"
+
+
+def frame_of(text: str) -> Frame:
+    """Return the frame of `frame_text`.
+
+    Raises:
+        ValueError: it is none.
+    """
+    number, _, data = text.partition("#")
+    digits = data.lstrip("RX")
+    kind = data[: len(data) - len(digits)]
+    return Frame(int(number, 16), bytes.fromhex(digits), "R" in kind, "X" in kind)
+
+
+def _answer(value: Any) -> Any:
+    return _numbers(value) if isinstance(value, tuple) else value
+
+
+def _read_answer(value: Any) -> Any:
+    return _triple(value) if isinstance(value, list) else value
+
+
+def _numbers(values: Sequence[float]) -> list[Any]:
+    return [float(value) if math.isfinite(value) else repr(float(value)) for value in values]
+
+
+def _triple(values: Sequence[Any]) -> Triple:
+    a, b, c = (float(value) for value in values)
+    return a, b, c

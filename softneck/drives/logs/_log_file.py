@@ -1,0 +1,206 @@
+"""Reads the log of a run back: what it was, its cycles and its signals, up to where the file is cut."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softneck.core import DataError, FileFormatError, Vector, file_hash
+from softneck.loop import LoopResult
+from softneck.signals import Recording
+
+from ..master import MasterSettings
+from ..master._fieldbus import BusSettings
+from ..master._settings import LimitSettings, RampSettings, SensorSettings, WatchSettings
+from ._cycle import Cycle, decode_cycle
+from ._motion import motion_at
+from ._result import recording_of, signal_units
+from ._rows import experiment_channels, experiment_recording, experiment_table
+from ._run_log import LOG_VERSION, METADATA
+
+# No record of ours comes near; a damaged length must not reserve the memory of the machine.
+_LARGEST = 1 << 26
+_PARTS: dict[str, type] = {
+    "bus": BusSettings,
+    "limits": LimitSettings,
+    "sensor": SensorSettings,
+    "watch": WatchSettings,
+    "ramps": RampSettings,
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoggedRun:
+    """The log of one run.
+
+    Attributes:
+        path: of the file.
+        facts: what `run_facts` said.
+        cycles: steps of the master, in their order.
+        rows: one for each sample of the controller while it ran: signal -> value in SI.
+        row_cycles: in which step of `cycles` each row was logged.
+        events: (time [s], name, text).
+        cut: why reading ended early, "" if the log is complete.
+    """
+
+    path: Path
+    facts: Mapping[str, Any]
+    cycles: tuple[Cycle, ...]
+    rows: tuple[Mapping[str, float], ...]
+    events: tuple[tuple[float, str, str], ...]
+    cut: str = ""
+    row_cycles: tuple[int, ...] = ()
+
+    def settings(self) -> MasterSettings:
+        """Return the settings of the run's master.
+
+        Raises:
+            FileFormatError: they are damaged, or of another version.
+        """
+        try:
+            table = dict(self.facts["settings"])
+            parts = {name: kind(**_tuples(table.pop(name))) for name, kind in _PARTS.items()}
+            return MasterSettings(**_tuples(table), **parts)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise FileFormatError(f"{self.path}: its settings do not fit this softneck ({error}).") from error
+
+    def signals(self) -> LoopResult:
+        """Return the rows as the result of the run had them."""
+        names = list(dict.fromkeys(name for row in self.rows for name in row))
+        signals: dict[str, Vector] = {name: np.array([row.get(name, math.nan) for row in self.rows]) for name in names}
+        step = self.sample_time
+        return LoopResult(np.arange(len(self.rows)) * step, signals, signal_units(names), step)
+
+    @property
+    def sample_time(self) -> float:
+        """Of the controller [s]."""
+        settings = self.settings()
+        return settings.sample_cycles * settings.bus.cycle
+
+    def recording(self) -> Recording:
+        """Return the run as a recording, the same as `softneck drives run -o` or `record -o` writes.
+
+        Raises:
+            DataError: the controller did not run.
+        """
+        if len(self.rows) < 2:
+            raise DataError(f"{self.path}: the controller did not run, so that there is nothing to identify from.")
+        times = np.array([cycle.time for cycle in self.cycles])
+        positions = np.array([cycle.positions for cycle in self.cycles]).reshape(-1, 3)
+        if "run" not in self.rows[0]:
+            return recording_of(self.signals(), motion_at(times, positions, self.row_cycles)[1])
+        # A row of an experiment is logged when its set-points were sent to their end.
+        late = self.settings().sample_cycles - 1
+        columns = experiment_channels(
+            experiment_table(self.rows), *motion_at(times, positions, [cycle - late for cycle in self.row_cycles])
+        )
+        run = np.array([row["run"] for row in self.rows])
+        recording = experiment_recording(columns, run, self.sample_time)
+        if recording is None:
+            raise DataError(f"{self.path}: holds no angles, so that there is nothing to identify from.")
+        return recording
+
+
+def read_run_log(path: str | Path) -> LoggedRun:
+    """Read a `.mcap` log of `softneck drives`; one that is cut is read up to the cut.
+
+    Raises:
+        FileFormatError: no such file, no MCAP, or none of ours.
+    """
+    from mcap.records import Channel, Message, Metadata
+    from mcap.stream_reader import StreamReader
+
+    source = Path(path)
+    facts: dict[str, Any] | None = None
+    topics: dict[int, str] = {}
+    cycles: list[Cycle] = []
+    rows: list[Mapping[str, float]] = []
+    at: list[int] = []
+    events: list[tuple[float, str, str]] = []
+    cut = ""
+    try:
+        with source.open("rb") as stream:
+            for record in StreamReader(stream, record_size_limit=_LARGEST, validate_crcs=True).records:
+                if isinstance(record, Metadata) and record.name == METADATA:
+                    facts = _facts(source, record.metadata)
+                elif isinstance(record, Channel):
+                    topics[record.id] = record.topic
+                elif isinstance(record, Message):
+                    topic = topics.get(record.channel_id)
+                    if topic == "/cycle":
+                        cycles.append(decode_cycle(_table(record.data)))
+                    elif topic == "/signals":
+                        rows.append({name: float(value) for name, value in _table(record.data).items()})
+                        at.append(len(cycles) - 1)
+                    elif topic == "/events":
+                        table, moment = _table(record.data), cycles[-1].time if cycles else 0.0
+                        events.append((moment, str(table.get("name")), str(table.get("message"))))
+    except OSError as error:
+        raise FileFormatError(f"{source}: cannot be read ({error.strerror}).") from error
+    except FileFormatError:
+        raise
+    except _damage() as error:
+        if facts is None:
+            raise FileFormatError(f"{source}: is no log of `softneck drives` ({_word(error)}).") from error
+        cut = f"ends in the middle ({_word(error)})"
+    if facts is None:
+        raise FileFormatError(f"{source}: is MCAP, but no log of `softneck drives`: it has no `{METADATA}`.")
+    return LoggedRun(source, facts, tuple(cycles), tuple(rows), tuple(events), cut, tuple(at))
+
+
+def _facts(source: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
+    if metadata.get("version") != str(LOG_VERSION):
+        raise FileFormatError(
+            f"{source}: has log version {metadata.get('version')}; this softneck reads {LOG_VERSION}."
+        )
+    facts = json.loads(metadata["facts"])
+    files = facts.get("files", {}) if isinstance(facts, dict) else None
+    if not isinstance(files, dict) or not all(isinstance(entry, dict) for entry in files.values()):
+        raise FileFormatError(f"{source}: its metadata are damaged.")
+    return facts
+
+
+def _table(data: bytes) -> dict[str, Any]:
+    table = json.loads(data)
+    if not isinstance(table, dict):
+        raise ValueError("a message that is no table")  # noqa: TRY004  (bad content, told with all other damage)
+    return table
+
+
+def _tuples(table: Mapping[str, Any]) -> dict[str, Any]:
+    values = {key: tuple(value) if isinstance(value, list) else value for key, value in table.items()}
+    return {key: frozenset(value) if key == "off" else value for key, value in values.items()}
+
+
+def _damage() -> tuple[type[Exception], ...]:
+    """Return what damaged bytes make of mcap's reader and its decompressor: it has no common base class."""
+    import zstandard
+    from mcap.exceptions import McapError
+
+    return (
+        McapError, zstandard.ZstdError, EOFError, ValueError, KeyError, TypeError, IndexError, RuntimeError,
+        ArithmeticError, MemoryError, struct.error,
+    )  # fmt: skip
+
+
+def _word(error: BaseException) -> str:
+    return " ".join(str(error).split())[:120] or type(error).__name__
+
+
+def changed_files(log: LoggedRun) -> list[str]:
+    """Return a line for each file of the run that is gone or is not what it was."""
+    lines = []
+    for role, entry in log.facts.get("files", {}).items():
+        path = Path(str(entry.get("path")))
+        if not path.is_file():
+            lines.append(f"{role} {path} is gone")
+        elif file_hash(path) != entry.get("sha256"):
+            lines.append(f"{role} {path} was changed since the run")
+    return lines

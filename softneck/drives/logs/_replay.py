@@ -1,0 +1,180 @@
+"""A recorded run through the same core: the same frames in must give the same frames out, bit for bit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from softneck.core import CheckFailedError, DataError
+
+from ..bus._meaning import meaning
+from ..master import Master
+from ..master._measured import Measured, Pilot
+from ._cycle import Answer, Cycle, LoggedPilot, Triple, cycle_of
+from ._log_file import LoggedRun
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """Where a replay first did something else.
+
+    Attributes:
+        cycle: number of the step.
+        time: [s] after the first one.
+        what: in which it differs, in words.
+        logged, replayed: both sides.
+    """
+
+    cycle: int
+    time: float
+    what: str
+    logged: str
+    replayed: str
+
+    def __str__(self) -> str:
+        """One line."""
+        return f"cycle {self.cycle}, t = {self.time:.3f} s: {self.what}: logged {self.logged}, replayed {self.replayed}"
+
+
+@dataclass(frozen=True, slots=True)
+class Replay:
+    """What a replay found.
+
+    Attributes:
+        cycles: steps that were replayed.
+        frames: out, that were compared.
+        answers: of the controller that were computed again and compared; 0 where the logged ones were used.
+        phase, fault: in which the replayed run ended, and why.
+        difference: the first one, None if there is none.
+        notes: what the reader of the result must know.
+    """
+
+    cycles: int
+    frames: int
+    answers: int
+    phase: str
+    fault: str
+    difference: Difference | None
+    notes: tuple[str, ...] = ()
+
+    def require(self) -> None:
+        """Raise CheckFailedError if anything differs."""
+        if self.difference is not None:
+            raise CheckFailedError(f"the replay differs from the log at {self.difference}.")
+
+    def table(self) -> dict[str, Any]:
+        """Return the JSON of `softneck drives replay`."""
+        found = self.difference
+        return {
+            "equal": found is None,
+            "cycles": self.cycles,
+            "frames": self.frames,
+            "controller_answers": self.answers,
+            "phase": self.phase,
+            "fault": self.fault or None,
+            "first_difference": None if found is None else {
+                "cycle": found.cycle, "time_s": found.time, "what": found.what, "logged": found.logged,
+                "replayed": found.replayed,
+            },
+            "notes": list(self.notes),
+        }  # fmt: skip
+
+
+class _Recalled:
+    """A pilot that answers what the log says that one answered."""
+
+    def __init__(self) -> None:
+        self.answers: list[Answer] = []
+
+    def start(self) -> None:
+        self._next("start")
+
+    def step(self, measured: Measured) -> Triple | None:
+        del measured
+        return self._next("step")
+
+    def finished(self, index: int) -> bool:
+        del index
+        return bool(self._next("finished"))
+
+    def _next(self, what: str) -> Any:
+        if not self.answers or self.answers[0][0] != what:
+            raise _Astray(f"the core asked for `{what}`, which it did not in the logged run")
+        value = self.answers.pop(0)[1]
+        if isinstance(value, str):
+            # The same event has the same text; the exception itself is gone.
+            name, _, text = value.partition(": ")
+            raise type(name if name.isidentifier() else "LoggedError", (Exception,), {})(text)
+        return value
+
+
+class _Astray(Exception):
+    """The replayed core asks for what the logged one did not."""
+
+
+def replay(log: LoggedRun, pilot: Pilot | None = None, notes: Iterable[str] = ()) -> Replay:
+    """Feed the log's frames, samples, requests and times to a new master and compare all that it sends.
+
+    Args:
+        log: of the run.
+        pilot: the run's controller, which is then computed again and compared too; without it the core gets the
+            logged answers of the controller.
+        notes: for the result.
+
+    Raises:
+        DataError: the log has no cycles.
+    """
+    if not log.cycles:
+        raise DataError(f"{log.path}: holds no cycle of the master; there is nothing to replay.")
+    recalled = _Recalled()
+    listened = LoggedPilot(recalled if pilot is None else pilot)
+    master = Master(log.settings(), listened)
+    begin, frames, answers, found = log.cycles[0].time, 0, 0, None
+    done = 0
+    for number, cycle in enumerate(log.cycles):
+        recalled.answers = list(cycle.answers)
+        for what, why in cycle.taken:
+            _ask_again(master, what, why)
+        sent = master.step(cycle.time, cycle.received, cycle.tilt)
+        again = cycle_of(master, listened, cycle.time, cycle.received, cycle.tilt, sent)
+        frames += len(sent)
+        answers += sum(what == "step" for what, _ in again.answers) if pilot is not None else 0
+        done = number + 1
+        where = _first(cycle, again)
+        if where is not None:
+            found = Difference(number, cycle.time - begin, *where)
+            break
+    fault = master.supervisor.fault
+    told = [*notes, *([f"{log.path}: {log.cut}: replayed up to the cut"] if log.cut else [])]
+    return Replay(
+        done, frames, answers, str(master.supervisor.phase), "" if fault is None else str(fault), found, tuple(told)
+    )
+
+
+def _ask_again(master: Master, what: str, why: str) -> None:
+    if what == "stop":
+        master.stop(why)
+    elif what == "leave":
+        master.leave(why)
+    else:
+        (master.start if what == "start" else master.finish)()
+
+
+def _first(logged: Cycle, again: Cycle) -> tuple[str, str, str] | None:
+    """Return what differs first in one step: the controller's answer, then the frames, then the phase."""
+    # By their text: NaN is not equal to itself, and 0.0 is to -0.0.
+    if repr(logged.answers) != repr(again.answers):
+        return "the controller's answer", _answers(logged.answers), _answers(again.answers)
+    if logged.sent != again.sent:
+        for one, other in zip(logged.sent, again.sent, strict=False):
+            if one != other:
+                return f"frame {one.identifier:03X}h", meaning(one), meaning(other)
+        return "number of frames", str(len(logged.sent)), str(len(again.sent))
+    if logged.phase != again.phase:
+        return "phase", logged.phase, again.phase
+    return None
+
+
+def _answers(answers: Sequence[Answer]) -> str:
+    return "; ".join(f"{what} {value}" for what, value in answers) or "none"

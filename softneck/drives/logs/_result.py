@@ -1,0 +1,148 @@
+"""What a run on drives leaves: its signals as `softneck simulate` names them, and what happened."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from softneck.core import CheckFailedError, Matrix
+from softneck.loop import LoopResult, metrics
+from softneck.signals import Recording
+from softneck.signals.recording._channels import known_channels
+
+from ..master import Event
+from ._motion import speed_channels
+from ._times import CycleTimes
+
+_RATES = ("pitch_rate_measured", "roll_rate_measured")
+
+
+def signal_units(names: Iterable[str]) -> dict[str, str]:
+    """Return the unit of each signal of a run."""
+    units = {name: "N" if "tension" in name else "1" if name == "healthy" else "rad" for name in names}
+    return units | ({"compression": "m"} if "compression" in units else {})
+
+
+def recording_of(signals: LoopResult, speeds: Matrix) -> Recording:
+    """Return a run as a recording: as measured, with true angles and tensions where simulated drives know them.
+
+    Args:
+        signals: of the run.
+        speeds: of the motors at its samples, (time, 3) [rad/s].
+    """
+    known = set(known_channels())
+    channels = {name: values for name, values in signals.signals.items() if name in known}
+    for axis in ("pitch", "roll"):
+        channels.setdefault(axis, signals[f"{axis}_measured"])
+    for j in (1, 2, 3):
+        channels.setdefault(f"tension_{j}", signals[f"tension_estimate_{j}"])
+    for rate in _RATES:
+        if not np.isfinite(channels.get(rate, np.nan)).any():
+            channels.pop(rate, None)
+    if np.isfinite(speeds).any():
+        channels |= speed_channels(speeds)
+    return Recording(signals.time, signals.sample_time, channels)
+
+
+_UNHEARD = ("bus_off", "bus_silent")
+
+
+def require_unstopped(fault: Event | None, *, rehome: bool = False) -> None:
+    """Raise CheckFailedError if `fault` ended a run early."""
+    if fault is None:
+        return
+    after = " Run `softneck drives zero` before the next run." if rehome else ""
+    if fault.name == "operator":
+        raise CheckFailedError(f"stopped at t = {fault.time:.3f} s by the operator. The drives are off.{after}")
+    # Where no word reaches the drives, what they do is theirs, and nobody here can know it.
+    off = (
+        "Nobody reaches the drives, whose own guarding stops them within 0.1 s"
+        if fault.name in _UNHEARD
+        else ("The drives are off")
+    )
+    raise CheckFailedError(
+        f"stopped at t = {fault.time:.3f} s: {fault}. {off}; look for the cause, then `softneck drives reset`.{after}"
+    )
+
+
+def fault_table(fault: Event | None) -> dict[str, Any] | None:
+    """Return what JSON holds of what ended a run early."""
+    if fault is None:
+        return None
+    return {"time_s": fault.time, "event": fault.name, "node": fault.node, "text": str(fault)}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DrivesResult:
+    """One run on drives.
+
+    Attributes:
+        signals: one row for each sample of the controller while it ran.
+        phase: in which the run ended: "done" or "stopped".
+        fault: what ended it early, None if nothing did.
+        counts: how often each event happened.
+        events: the last of them.
+        rehome: whether a drive lost its zero.
+        cycles: of the bus.
+        cycle: bus period [s].
+        wall_time: [s].
+        simulated: whether the drives were.
+        times: of the cycles, in real time.
+        terminated: whether SIGTERM asked for the end.
+        speeds: of the motors at the rows of `signals`, (rows, 3) [rad/s].
+    """
+
+    signals: LoopResult
+    phase: str
+    fault: Event | None
+    counts: Mapping[str, int]
+    events: tuple[Event, ...]
+    rehome: bool
+    cycles: int
+    cycle: float
+    wall_time: float
+    simulated: bool
+    times: CycleTimes
+    notes: tuple[str, ...] = field(default=())
+    terminated: bool = False
+    speeds: Matrix = field(default_factory=lambda: np.zeros((0, 3)))
+
+    @property
+    def completed(self) -> bool:
+        """Whether the loop ran to its end and nothing stopped it."""
+        return self.fault is None and self.phase == "done" and not self.terminated
+
+    @property
+    def real_time_factor(self) -> float:
+        """Time on the bus over the time it took."""
+        return self.cycles * self.cycle / max(self.wall_time, 1e-9)
+
+    def require(self) -> None:
+        """Raise CheckFailedError if something ended the run early."""
+        require_unstopped(self.fault, rehome=self.rehome)
+
+    def recording(self) -> Recording:
+        """Return the run as a recording: as measured, with true angles where simulated drives know them."""
+        return recording_of(self.signals, self.speeds)
+
+    def table(self) -> dict[str, Any]:
+        """Return the JSON of `softneck drives run`."""
+        return {
+            "completed": self.completed,
+            "phase": self.phase,
+            "fault": fault_table(self.fault),
+            "rehome": self.rehome,
+            "events": dict(self.counts),
+            "simulated": self.simulated,
+            "cycles": self.cycles,
+            "cycle_s": self.cycle,
+            "real_time_factor": self.real_time_factor,
+            "longest_step_s": self.times.longest_step,
+            "times": None if self.simulated else self.times.table(),
+            "terminated": self.terminated,
+            "metrics": metrics(self.signals) if len(self.signals.time) > 1 else None,
+            "notes": list(self.notes),
+        }  # fmt: skip

@@ -1,0 +1,322 @@
+"""Writes the log of a run: frames and all that replay needs, in a thread beside the control loop."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import math
+import queue
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+from softneck.core import OutputError, SettingsError, file_hash, refuse_existing
+
+from ..master import Event, Frame, Master, MasterSettings, Tilt
+from ._cycle import Cycle, LoggedPilot, cycle_of, encode_cycle
+from ._frame_log import FRAME_LOGS, BlfSink, CandumpSink
+
+RUN_LOG = ".mcap"
+LOG_VERSION = 1
+METADATA = "softneck.run"
+# Files are handed to the operating system this often [s]: what a killed process may lose beside a piece of a file.
+_FLUSH = 0.25
+# Uncompressed bytes in one piece: a cycle has 400 or more, so that a piece is filled in less than 1 s at 20 Hz.
+_PIECE = 8192
+# Cycles that may wait for the disk before the loop drops them: 200 s at 100 Hz.
+_WAITING = 20_000
+_SCHEMAS: dict[str, dict[str, Any]] = {
+    "softneck.Cycle": {
+        "type": "object",
+        "properties": {
+            "time": {"type": "number"},
+            "phase": {"type": "string"},
+            "received": {"type": "array", "items": {"type": "string"}},
+            "sent": {"type": "array", "items": {"type": "string"}},
+            "positions": {"type": "array", "items": {"type": "number"}},
+            "setpoints": {"type": "array", "items": {"type": "number"}},
+            "tensions": {"type": "array", "items": {"type": "number"}},
+        },
+    },
+    "softneck.Signals": {"type": "object", "additionalProperties": {"type": "number"}},
+    # A well-known schema: Foxglove shows it in its log panel.
+    "foxglove.Log": {
+        "type": "object",
+        "properties": {
+            "timestamp": {
+                "type": "object",
+                "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
+            },
+            "level": {"type": "integer"},
+            "message": {"type": "string"},
+            "name": {"type": "string"},
+        },
+    },
+}
+_TOPICS = {"/cycle": "softneck.Cycle", "/signals": "softneck.Signals", "/events": "foxglove.Log"}
+
+
+class _Entry(NamedTuple):
+    frames: list[tuple[float, bool, Frame]]
+    cycle: Cycle | None = None
+    signals: Mapping[str, float] | None = None
+    events: tuple[Event, ...] = ()
+    time: float = 0.0
+
+
+def log_endings() -> str:
+    """Return the endings that `RunLogger` takes, as a text."""
+    return ", ".join((RUN_LOG, *FRAME_LOGS))
+
+
+def partial(path: Path) -> Path:
+    """Return the name of a log that is not finished."""
+    return path.with_name(f"{path.stem}.part{path.suffix}")
+
+
+def require_log_paths(paths: Sequence[Path], *, force: bool = False) -> None:
+    """Raise where `RunLogger` would not write to `paths`.
+
+    Raises:
+        SettingsError: an ending that is none of a log.
+        OutputError: a file exists.
+    """
+    for path in paths:
+        if path.suffix.lower() not in (RUN_LOG, *FRAME_LOGS):
+            raise SettingsError(f"{path}: a log ends in {log_endings()}; `.mcap` holds all, the others frames.")
+        for taken in (path, partial(path)):
+            refuse_existing(taken, force=force)
+
+
+def run_facts(
+    settings: MasterSettings, files: Mapping[str, str | Path], *, simulated: bool, **more: Any
+) -> dict[str, Any]:
+    """Return what a log says about its run: the master's settings and the files, by hash, that acted in it."""
+    return {
+        "softneck": version("softneck"),
+        "settings": dataclasses.asdict(settings)
+        | {"bus": dataclasses.asdict(settings.bus) | {"off": sorted(settings.bus.off)}},
+        "simulated": simulated,
+        "files": {role: {"path": str(Path(path).resolve()), "sha256": file_hash(path)} for role, path in files.items()},
+        **more,
+    }
+
+
+class RunLogger:
+    """Writes logs of one run. The loop puts a few references into a queue; a thread makes text of them.
+
+    Logs have `.part` before their ending until the run is over; one that a killed process leaves behind can be read.
+
+    Attributes:
+        lost: cycles that were dropped because the disk did not keep up.
+        problem: why writing ended, "" if it did not.
+        described: whether a run began: before that a log holds nothing to replay.
+    """
+
+    def __init__(self, paths: Sequence[Path], *, force: bool = False, wait: bool = False, epoch: float = 0.0) -> None:
+        """Open the files.
+
+        Args:
+            paths: the ending says what is written.
+            force: replace existing files.
+            wait: the loop may wait for the disk, as in virtual time.
+            epoch: wall-clock time [s] of t = 0 of the loop's clock; taken once, so that a jump of the wall clock
+                does not matter.
+
+        Raises:
+            SettingsError: an ending that is none of a log, or two alike.
+            OutputError: a file exists or cannot be written.
+        """
+        self.paths = tuple(paths)
+        require_log_paths(self.paths, force=force)
+        self.lost, self.problem, self.described = 0, "", False
+        self._wait, self._epoch = wait, epoch
+        self._frames: list[tuple[float, bool, Frame]] = []
+        self._row: Mapping[str, float] | None = None
+        self._seen: Event | None = None
+        self._queue: queue.Queue[_Entry | Mapping[str, Any] | None] = queue.Queue(_WAITING)
+        self._streams: list[BinaryIO] = []
+        self._sinks: list[Any] = []
+        for path in self.paths:
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                stream = partial(path).open("wb")
+            except OSError as error:
+                self._close_streams()
+                raise OutputError(f"{path}: cannot be written: {error.strerror}. Choose another folder.") from error
+            self._streams.append(stream)
+            kind = {RUN_LOG: _McapSink, ".log": CandumpSink, ".blf": BlfSink}[path.suffix.lower()]
+            self._sinks.append(kind(stream))
+        self._thread = threading.Thread(target=self._write, name="softneck-log", daemon=True)
+        self._thread.start()
+
+    def describe(self, facts: Mapping[str, Any]) -> None:
+        """Say what the run is; before the first cycle."""
+        self.described = True
+        self._put(dict(facts))
+
+    def frame(self, now: float, from_master: bool, frame: Frame) -> None:
+        """Take one frame on the wire; it is written with the cycle."""
+        self._frames.append((now, from_master, frame))
+        if len(self._frames) >= 256:
+            self._put(_Entry(self._swap()))
+
+    def signals(self, row: Mapping[str, float] | None) -> None:
+        """Take the row of a sample of the controller; it is written with the cycle."""
+        self._row = row
+
+    def watch(self, pilot: LoggedPilot) -> Callable[..., None]:
+        """Return what is to be called after each step of a master that asks `pilot`."""
+
+        def watch(
+            now: float, received: Sequence[Frame], sent: Sequence[Frame], tilt: Tilt | None, master: Master
+        ) -> None:
+            row, self._row = self._row, None
+            cycle = cycle_of(master, pilot, now, received, tilt, sent)
+            self._put(_Entry(self._swap(), cycle, row, self._news(master), now))
+
+        return watch
+
+    def _news(self, master: Master) -> tuple[Event, ...]:
+        news = []
+        for event in reversed(master.events):
+            if event is self._seen:
+                break
+            news.append(event)
+        if news:
+            self._seen = news[0]
+        return tuple(reversed(news))
+
+    def __enter__(self) -> RunLogger:
+        """Be a context."""
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Close, whatever happened: a log of what went wrong is worth most."""
+        self.close()
+
+    def close(self) -> None:
+        """Write what is left and give the files their names.
+
+        Raises:
+            OutputError: a log is not complete; the line says why.
+        """
+        if not self._thread.is_alive() and not self._streams:
+            return
+        self._queue.put(_Entry(self._swap()))
+        self._queue.put(None)
+        self._thread.join()
+        self._close_streams()
+        if self.problem:
+            names = ", ".join(str(partial(path)) for path in self.paths)
+            raise OutputError(f"{names}: the log is not complete: {self.problem}. The run went on without it.")
+        for path in self.paths:
+            partial(path).replace(path)
+        if self.lost:
+            raise OutputError(f"{self.paths[0]}: {self.lost} cycle(s) were dropped: the disk did not keep up.")
+
+    def _swap(self) -> list[tuple[float, bool, Frame]]:
+        frames, self._frames = self._frames, []
+        return frames
+
+    def _put(self, entry: _Entry | Mapping[str, Any]) -> None:
+        if self._wait:
+            self._queue.put(entry)
+            return
+        try:
+            self._queue.put_nowait(entry)
+        except queue.Full:
+            self.lost += 1
+
+    def _close_streams(self) -> None:
+        for stream in self._streams:
+            try:
+                stream.close()
+            except OSError as error:
+                # What was kept back for a full disk does not fit now either; closing it again gives it up.
+                self.problem = self.problem or error.strerror or str(error)
+                with contextlib.suppress(OSError):
+                    stream.close()
+        self._streams.clear()
+
+    def _write(self) -> None:
+        flushed = time.monotonic()
+        while True:
+            try:
+                entry = self._queue.get(timeout=_FLUSH)
+            except queue.Empty:
+                entry = _Entry([])
+            if self.problem:
+                if entry is None:
+                    return
+                continue
+            try:
+                if entry is None:
+                    for sink in self._sinks:
+                        sink.close()
+                    return
+                self._take(entry)
+                if time.monotonic() - flushed >= _FLUSH:
+                    for stream in self._streams:
+                        stream.flush()
+                    flushed = time.monotonic()
+            except OSError as error:
+                self.problem = error.strerror or str(error)
+
+    def _take(self, entry: _Entry | Mapping[str, Any]) -> None:
+        for sink in self._sinks:
+            if isinstance(sink, _McapSink):
+                if isinstance(entry, _Entry):
+                    sink.entry(self._epoch, entry)
+                else:
+                    sink.describe(entry)
+            elif isinstance(entry, _Entry):
+                for now, from_master, frame in entry.frames:
+                    sink.add(self._epoch + now, from_master, frame)
+
+
+class _McapSink:
+    """Writes MCAP with JSON messages, in small compressed pieces."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        from mcap.writer import Writer
+
+        self._writer = Writer(stream, chunk_size=_PIECE)
+        self._writer.start(profile="", library=f"softneck {version('softneck')}")
+        schemas = {
+            name: self._writer.register_schema(name, "jsonschema", json.dumps(schema).encode())
+            for name, schema in _SCHEMAS.items()
+        }
+        self._channels = {
+            topic: self._writer.register_channel(topic, "json", schemas[schema]) for topic, schema in _TOPICS.items()
+        }
+
+    def describe(self, facts: Mapping[str, Any]) -> None:
+        self._writer.add_metadata(METADATA, {"version": str(LOG_VERSION), "facts": json.dumps(facts)})
+
+    def entry(self, epoch: float, entry: _Entry) -> None:
+        if entry.cycle is None:
+            return
+        stamp = max(0, round((epoch + entry.time) * 1e9))
+        self._add("/cycle", stamp, encode_cycle(entry.cycle))
+        if entry.signals is not None:
+            # A number that is missing is left out: JSON has none for it.
+            row = {name: value for name, value in entry.signals.items() if math.isfinite(value)}
+            self._add("/signals", stamp, row)
+        for event in entry.events:
+            seconds, rest = divmod(stamp, 1_000_000_000)
+            self._add("/events", stamp, {
+                "timestamp": {"sec": seconds, "nsec": rest}, "level": 2 if event.rule.reaction == "count" else 4,
+                "message": str(event), "name": event.name, "node": event.node,
+            })  # fmt: skip
+
+    def close(self) -> None:
+        self._writer.finish()
+
+    def _add(self, topic: str, stamp: int, table: Mapping[str, Any]) -> None:
+        data = json.dumps(table, separators=(",", ":"), allow_nan=False).encode()
+        self._writer.add_message(self._channels[topic], stamp, data, stamp)

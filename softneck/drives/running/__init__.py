@@ -1,0 +1,5 @@
+"""Runs: pre-flight, enabling, ramps, the loop, ramps, off; keyboard, service, live snapshots.
+
+One session for every command that moves the neck.
+May import `drives.sensing`, `.logs`, `.bus`.
+"""

@@ -1,0 +1,277 @@
+"""The loop on the bus that `run`, `record` and `jog` share: pre-flight, enabling, ramps, the pilot, ramps, off.
+
+On simulated drives it runs in virtual time, on a bus at the pace of the monotonic clock. Who wants to see what happens
+(logs, recordings, a watchdog, a display) is called once a cycle.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from softneck.core import SettingsError, SoftneckError
+
+from ..bus._file import DrivesFile
+from ..bus._link import CanLink, VirtualLink
+from ..bus._objects import disarm_writes
+from ..bus._sdo import Objects, SdoError, load_eds
+from ..logs._cycle import LoggedPilot
+from ..logs._result import fault_table, require_unstopped
+from ..logs._run_log import RunLogger, run_facts
+from ..logs._times import CycleTimes
+from ..master import Frame, Master, MasterSettings, Tilt
+from ..master._measured import Pilot
+from ..master._nmt import Command as NmtCommand
+from ..master._nmt import nmt_frame
+from ..master._supervisor import ACTIVE
+from ..sensing._sensor import Sensor
+from ._ask import Ask, Operator
+from ._notify import Notifier
+from ._preflight import preflight
+from ._stop import stop
+from ._timing import Ending, steady
+from ._virtual import VirtualRun, Watch
+
+# Before the first cycle on a bus each drive is given this time to become operational [s].
+_START_TIME = 0.1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Session:
+    """What a pilot is run on.
+
+    Attributes:
+        file: how drives and master are set up.
+        link: to simulated drives, or an open bus.
+        sensor: the inclinometer on a bus; simulated drives have their own.
+        override: names of pre-flight checks that may fail.
+        pace: of simulated drives, in multiples of real time; None: as fast as possible.
+        watches: called after each cycle with (now, frames in, frames out, sample of the inclinometer or None, master).
+            On a bus they run in the control loop: what takes long belongs to another thread or process.
+        operator: asked each cycle what somebody at the keyboard wants.
+        settings: changes the master's settings, for tests.
+        log: where frames and cycles are written; whoever opened it closes it.
+        files: role -> path of what acts in the run, for the log.
+        facts: what else the log says about the run; `replay` computes an experiment or a jog again from it.
+        realtime: on a bus, run before all ordinary processes (SCHED_FIFO), with memory locked.
+    """
+
+    file: DrivesFile
+    link: CanLink | VirtualLink
+    sensor: Sensor | None = None
+    override: Collection[str] = ()
+    pace: float | None = None
+    watches: tuple[Watch, ...] = ()
+    operator: Operator | None = None
+    settings: Callable[[MasterSettings], MasterSettings] | None = None
+    log: RunLogger | None = None
+    files: Mapping[str, str | Path] = field(default_factory=dict)
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    realtime: bool = False
+
+    @property
+    def simulated(self) -> bool:
+        """Whether time is virtual."""
+        return isinstance(self.link, VirtualLink)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ended:
+    """A run that is over; its drives are off.
+
+    Attributes:
+        master: as it ended.
+        times: of the cycles, in real time.
+        wall_time: [s].
+        terminated: whether SIGTERM asked for the end.
+        tensions: estimated when the drives last had power [N].
+    """
+
+    master: Master
+    times: CycleTimes
+    wall_time: float
+    terminated: bool = False
+    tensions: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def require(self) -> None:
+        """Raise CheckFailedError if something stopped the drives."""
+        supervisor = self.master.supervisor
+        require_unstopped(supervisor.fault, rehome=supervisor.rehome)
+
+    @property
+    def left(self) -> bool:
+        """Whether the operator ended it, at once or by the ramp out."""
+        counts = self.master.counts
+        return counts["left"] + counts["operator"] > 0
+
+    def table(self) -> dict[str, Any]:
+        """Return what JSON holds of it."""
+        master = self.master
+        return {
+            "phase": str(master.supervisor.phase),
+            "fault": fault_table(master.supervisor.fault),
+            "rehome": master.supervisor.rehome,
+            "events": dict(master.counts),
+            "cycles": master.cycle,
+            "cycle_s": master.settings.bus.cycle,
+            "real_time_factor": master.cycle * master.settings.bus.cycle / max(self.wall_time, 1e-9),
+        }
+
+
+def run_session(
+    session: Session, pilot: Pilot, *, sample_time: float, most: float, begin: Callable[[Master], None] | None = None
+) -> Ended:
+    """Check the drives, enable them, ramp in, let `pilot` lead, ramp out, switch off.
+
+    On a bus SIGTERM ends it by the ramp to rest, a second one at once. A service manager is told (sd_notify) when the
+    pre-flight holds, in which phase the run is, and from each cycle that the loop is alive.
+
+    Args:
+        session: on what.
+        pilot: gives set-points each `sample_time`.
+        sample_time: [s]; a multiple of the bus period.
+        most: length of what the pilot does [s].
+        begin: called with the master before the first cycle.
+
+    Raises:
+        CheckFailedError: the pre-flight failed; nothing moved.
+        SettingsError: real time is asked for and not permitted; nothing was sent.
+    """
+    if session.simulated:
+        return _run_session(session, pilot, sample_time, most, begin, Notifier({}))
+    with steady(realtime=session.realtime), Notifier() as notifier:
+        return _run_session(session, pilot, sample_time, most, begin, notifier)
+
+
+def _run_session(
+    session: Session,
+    pilot: Pilot,
+    sample_time: float,
+    most: float,
+    begin: Callable[[Master], None] | None,
+    notifier: Notifier,
+) -> Ended:
+    file, link = session.file, session.link
+    file.master_settings(sample_time)
+    log = session.log
+    if log is not None:
+        link.tap = log.frame
+    checked = preflight(link, file, override=session.override, homed=True, sensor=session.sensor)
+    checked.require()
+    settings = file.master_settings(sample_time, guarding=checked.guarding)
+    settings = settings if session.settings is None else session.settings(settings)
+    if log is not None:
+        log.describe(run_facts(settings, session.files, simulated=session.simulated, **session.facts))
+        pilot = LoggedPilot(pilot)
+        session = replace(session, watches=(*session.watches, log.watch(pilot)))
+    master = Master(settings, pilot)
+    link.send([nmt_frame(NmtCommand.START, node) for node in file.nodes])
+    if begin is not None:
+        begin(master)
+    times, ending = CycleTimes(file.cycle), Ending()
+    tensions = [(0.0, 0.0, 0.0)]
+
+    def remember(_now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Tilt | None, master: Master) -> None:
+        if master.supervisor.phase in ACTIVE:
+            tensions[0] = master.tensions
+
+    session = replace(session, watches=(remember, *session.watches))
+    started = time.perf_counter()
+    master.start()
+    if isinstance(link, VirtualLink):
+        link.receive(_START_TIME)
+        _in_virtual_time(session, link, master, times, most)
+    else:
+        time.sleep(_START_TIME)
+        link.receive(0.0)
+        notifier.ready()
+        with ending.watched():
+            _in_real_time(session, link, master, times, notifier, ending)
+    disarm(link, file, checked.guarding)
+    return Ended(master, times, time.perf_counter() - started, ending.asked > 0, tensions[0])
+
+
+def _in_virtual_time(
+    session: Session, link: VirtualLink, master: Master, times: CycleTimes, most: float
+) -> None:  # fmt: skip
+    begin, first = time.perf_counter(), link.now
+
+    def ends(_now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Tilt | None, _master: Master) -> None:
+        now = time.perf_counter()
+        times.take(now, 0.0)
+        if session.operator is not None:
+            _ask(master, session.operator())
+        if session.pace is not None:
+            rest = begin + (link.now - first + link.cycle) / session.pace - now
+            if rest > 0.0:
+                time.sleep(rest)
+
+    run = VirtualRun(link, master, watches=(*session.watches, ends))
+    run.run(most)
+
+
+def _in_real_time(
+    session: Session, link: CanLink, master: Master, times: CycleTimes, notifier: Notifier, ending: Ending
+) -> None:
+    """Step the master at its period until it is done."""
+    sensor, operator = session.sensor, session.operator
+    if sensor is None:
+        raise SettingsError("drives on a bus need an inclinometer.")
+    period = master.settings.bus.cycle
+    due = link.now
+    try:
+        while not master.finished:
+            rest = due - link.now
+            if rest > 0.0:
+                time.sleep(rest)
+            now = link.now
+            # All that is there, so that one late TPDO does not leave a lag for ever.
+            frames = link.receive(0.0)
+            tilt = None
+            if master.sample_due:
+                tilt = sensor.read(now, frames)
+            else:
+                sensor.take(frames)
+            if operator is not None:
+                _ask(master, operator())
+            _ask(master, ending.ask())
+            out = master.step(now, frames, tilt)
+            link.send(out)
+            times.take(now, link.now - now)
+            notifier.cycle(now, master)
+            for watch in session.watches:
+                watch(now, frames, out, tilt, master)
+            due = max(due + period, now + 0.5 * period) if link.now - due > period else due + period
+    except BaseException:
+        # Whatever happens here must not leave a drive on: this loop is what feeds them.
+        _emergency_stop(link, session.file)
+        raise
+
+
+def _ask(master: Master, ask: Ask | None) -> None:
+    if ask is Ask.STOP:
+        master.stop("asked to")
+    elif ask is Ask.LEAVE:
+        master.leave("asked to")
+
+
+def disarm(link: CanLink | VirtualLink, file: DrivesFile, guarding: str) -> None:
+    """End the guarding of drives that are off; one that does not answer keeps it, and faults: so be it."""
+    dictionary = load_eds(file.profile, file.eds)
+    for node in file.nodes:
+        objects = Objects(link, node, dictionary)
+        try:
+            for write in disarm_writes(guarding):
+                objects.write(write.index, write.subindex, write.value)
+        except (SdoError, SoftneckError):
+            continue
+
+
+def _emergency_stop(link: CanLink, file: DrivesFile) -> None:
+    try:
+        stop(link, file)
+    except SoftneckError:
+        return

@@ -1,0 +1,218 @@
+"""A whole run: pre-flight, enabling, ramps, the loop, ramps, off; on simulated drives or on a bus."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from softneck.core import SettingsError, load
+from softneck.cosim import FmuPart
+from softneck.cosim.loops._simulate import LoopSetup
+from softneck.loop import BlockPart, Loop, Part
+from softneck.plant import NeckParameters
+
+from ..bus._file import DrivesFile
+from ..bus._link import CanLink, VirtualLink
+from ..logs._result import DrivesResult
+from ..logs._run_log import RunLogger
+from ..master import Frame, Master, MasterSettings, Tilt
+from ..sensing._sensor import Sensor
+from ._ask import Operator
+from ._bus_loop import Session, run_session
+from ._pilot import LoopPilot
+from ._run_signals import RunLog
+from ._virtual import Watch, simulated_neck
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Deployed:
+    """A loop that is ready for drives.
+
+    Attributes:
+        loop: with the controller that is to run.
+        neck: the virtual neck that the loop's plant is, None if it is none.
+        notes: what of the loop file does not apply on drives.
+    """
+
+    loop: Loop
+    neck: NeckParameters | None
+    notes: tuple[str, ...] = ()
+
+
+def prepare(setup: LoopSetup, controller: Path | None = None) -> Deployed:
+    """Return the loop of `setup` with the controller in file `controller`, an FMU or a file of ours.
+
+    Raises:
+        SettingsError: a controller that does not fit the loop.
+    """
+    loop, notes = setup.loop, []
+    if controller is not None:
+        part: Part
+        if controller.suffix.lower() == ".fmu":
+            part = FmuPart(controller, role="controller")
+        else:
+            part = BlockPart(load(controller, role="controller").block())
+        loop = replace(loop, controller=part)
+    if loop.faults:
+        notes.append(f"the loop file's {len(loop.faults)} fault(s) are not acted out on drives")
+    return Deployed(loop, neck_of(loop), tuple(notes))
+
+
+def neck_of(loop: Loop) -> NeckParameters | None:
+    """Return the virtual neck that a loop's plant is, with the loop's own values; None for any other plant."""
+    block = getattr(loop.plant, "block", None)
+    ports = getattr(loop.plant, "parameters", None) or getattr(block, "parameters", ())
+    starts = {port.name: port.start for port in ports}
+    names = NeckParameters.names()
+    if not all(name in starts for name in names):
+        return None
+    values = {name: starts[name] for name in names}
+    values |= {name: value for name, value in loop.plant_parameters.items() if name in values}
+    return NeckParameters(**values)
+
+
+def noise_seed(loop: Loop) -> int:
+    """Return the seed of the loop's virtual neck."""
+    return int(loop.plant_parameters.get("noise_seed", 0))
+
+
+def run_simulated(
+    deployed: Deployed,
+    file: DrivesFile,
+    *,
+    neck: NeckParameters | None = None,
+    override: Collection[str] = (),
+    pace: float | None = None,
+    report: Callable[[float], None] | None = None,
+    watches: Sequence[Watch] = (),
+    operator: Operator | None = None,
+    hook: Callable[[VirtualLink], None] | None = None,
+    settings: Callable[[MasterSettings], MasterSettings] | None = None,
+    log: RunLogger | None = None,
+    files: Mapping[str, str | Path] | None = None,
+) -> DrivesResult:
+    """Run the whole loop on simulated drives, in virtual time.
+
+    Args:
+        deployed: the loop.
+        file: how drives and master are set up.
+        neck: the virtual neck; that of the loop where it has one and none is given.
+        override: names of pre-flight checks that may fail.
+        pace: at this multiple of real time; as fast as possible if not given.
+        report: called now and then with the done fraction.
+        watches: called after each bus cycle, see `Session`.
+        operator: asked each cycle what the operator wants.
+        hook: called after each bus cycle, to let things go wrong.
+        settings: changes the master's settings, for tests.
+        log: where frames and cycles are written.
+        files: role -> path of what acts, for the log; `replay` looks for "loop" and "controller".
+
+    Raises:
+        CheckFailedError: the pre-flight failed.
+        SettingsError: no neck is known.
+    """
+    parameters = neck or deployed.neck
+    if parameters is None:
+        raise SettingsError("the loop's plant is no virtual neck; say which one the drives shall turn (--neck).")
+    loop = deployed.loop
+    pilot = LoopPilot(loop)
+    virtual = simulated_neck(file, parameters, sample_time=pilot.sample_time, seed=noise_seed(loop))
+    disturbances = {name: value for name, value in loop.plant_inputs.items() if not name.startswith("motor_")}
+    virtual.set(**disturbances)
+    link = VirtualLink(virtual)
+    more = [*watches]
+    if hook is not None:
+        more.append(lambda _now, _in, _out, _tilt, _master: hook(link))
+    session = Session(
+        file=file, link=link, override=override, pace=pace, watches=tuple(more), operator=operator, settings=settings,
+        log=log, files=files or {},
+    )  # fmt: skip
+    return _run(deployed, pilot, session, report)
+
+
+def run_on_bus(
+    deployed: Deployed,
+    file: DrivesFile,
+    link: CanLink,
+    sensor: Sensor,
+    *,
+    override: Collection[str] = (),
+    report: Callable[[float], None] | None = None,
+    watches: Sequence[Watch] = (),
+    operator: Operator | None = None,
+    log: RunLogger | None = None,
+    files: Mapping[str, str | Path] | None = None,
+    realtime: bool = False,
+) -> DrivesResult:
+    """Run the loop on the drives behind `link`, at the pace of the monotonic clock.
+
+    Args:
+        deployed: the loop.
+        file: how drives and master are set up.
+        link: an open bus.
+        sensor: the inclinometer.
+        override: names of pre-flight checks that may fail.
+        report: called now and then with the done fraction.
+        watches: called after each bus cycle, see `Session`.
+        operator: asked each cycle what the operator wants.
+        log: where frames and cycles are written.
+        files: role -> path of what acts, for the log; `replay` looks for "loop" and "controller".
+        realtime: see `Session`.
+
+    Raises:
+        CheckFailedError: the pre-flight failed; nothing moved.
+        SettingsError: `realtime` is not permitted; nothing was sent.
+    """
+    pilot = LoopPilot(deployed.loop)
+    pilot.warm()
+    session = Session(
+        file=file, link=link, sensor=sensor, override=override, watches=tuple(watches), operator=operator,
+        log=log, files=files or {},
+        realtime=realtime,
+    )  # fmt: skip
+    return _run(deployed, pilot, session, report)
+
+
+def _run(
+    deployed: Deployed, pilot: LoopPilot, session: Session, report: Callable[[float], None] | None
+) -> DrivesResult:
+    log = RunLog(pilot)
+    rows = max(1, round(deployed.loop.duration / pilot.sample_time))
+    neck = session.link.neck if isinstance(session.link, VirtualLink) else None
+
+    def watch(now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Tilt | None, master: Master) -> None:
+        row = log.take(now, master, None if neck is None else neck.truth())
+        if not master.ran:
+            return
+        if session.log is not None:
+            session.log.signals(row)
+        if report is not None and master.index % 50 == 0:
+            report(min(1.0, master.index / rows))
+
+    try:
+        ended = run_session(
+            replace(session, watches=(watch, *session.watches)),
+            pilot,
+            sample_time=pilot.sample_time,
+            most=deployed.loop.duration,
+        )
+    finally:
+        pilot.close()
+    master = ended.master
+    return DrivesResult(
+        signals=log.result(pilot.sample_time, truth=session.simulated),
+        phase=str(master.supervisor.phase),
+        fault=master.supervisor.fault,
+        counts=dict(master.counts),
+        events=tuple(master.events),
+        rehome=master.supervisor.rehome,
+        cycles=master.cycle,
+        cycle=master.settings.bus.cycle,
+        wall_time=ended.wall_time,
+        simulated=session.simulated,
+        times=ended.times,
+        notes=deployed.notes,
+        terminated=ended.terminated,
+        speeds=log.speeds(),
+    )

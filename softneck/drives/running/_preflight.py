@@ -1,0 +1,344 @@
+"""Before anything moves: who is on the bus, are they the drives of the file, do they take every value."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from softneck.core import CheckFailedError, SoftneckError
+
+from ..bus._file import DriveEntry, DrivesFile
+from ..bus._link import BusError, Link
+from ..bus._objects import (
+    CSP,
+    HOMED_MARK,
+    MASTER_NODE,
+    Write,
+    guarding_writes,
+    limit_writes,
+    mode_writes,
+    option_writes,
+    pdo_writes,
+    require_eds,
+)
+from ..bus._sdo import Objects, SdoError, load_eds
+from ..master import Frame
+from ..master._cia402 import DriveState, state_of
+from ..master._nmt import Command, nmt_frame
+from ..sensing._sensor import LOOK, Sensor, look_at
+
+# Another master shows within this time [s]: heartbeats and SYNCs come faster.
+LISTEN = 1.0
+# All nodes answer within this time [s] after the last request.
+_SCAN_TIME = 0.2
+# What a row may be overridden by; a missing drive or a second master never.
+OVERRIDES = ("certificate", "identity", "firmware", "modes", "homed")
+_DRIVE = 0x192  # device profile in 1000h
+# Default of 6502h in the manual: no bit for the cyclic mode though the drive has it.
+_NO_CSP_BIT = 0x001F0065
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One line of the report.
+
+    Attributes:
+        node: of the drive, 0 for the bus.
+        name: what was looked at; `--override` takes it where it may be overridden.
+        found: what was there.
+        holds: whether it is as it must be.
+        advice: what to do where it is not.
+    """
+
+    node: int
+    name: str
+    found: str
+    holds: bool
+    advice: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What a check found.
+
+    Attributes:
+        rows: all lines.
+        guarding: "life" or "heartbeat", as it was set up.
+        overridden: names that were let pass by the user.
+    """
+
+    rows: tuple[Row, ...]
+    guarding: str
+    overridden: tuple[str, ...] = ()
+
+    @property
+    def holds(self) -> bool:
+        """Whether all that was not overridden holds."""
+        return all(row.holds or row.name in self.overridden for row in self.rows)
+
+    def require(self) -> None:
+        """Raise CheckFailedError with the first line that does not hold."""
+        failed = [row for row in self.rows if not row.holds and row.name not in self.overridden]
+        if failed:
+            row = failed[0]
+            where = f"node {row.node}: " if row.node else ""
+            more = f" ({len(failed)} checks failed in all)" if len(failed) > 1 else ""
+            raise CheckFailedError(f"{where}{row.name}: {row.found}. {row.advice}{more} Nothing was moved.")
+
+    def table(self) -> dict[str, Any]:
+        """Return the JSON of `softneck drives check`."""
+        rows = [
+            {"node": row.node, "check": row.name, "found": row.found, "holds": row.holds, "advice": row.advice}
+            for row in self.rows
+        ]
+        return {
+            "holds": self.holds,
+            "guarding": self.guarding,
+            "overridden": list(self.overridden),
+            "rows": rows,
+        }
+
+
+@dataclass(slots=True)
+class _Rows:
+    rows: list[Row] = field(default_factory=list)
+
+    def add(self, node: int, name: str, found: str, holds: bool, advice: str = "") -> None:
+        self.rows.append(Row(node, name, found, holds, "" if holds else advice))
+
+
+def foreign_master(frames: Sequence[Frame]) -> str:
+    """Return what in `frames` only a master sends, "" if nothing does."""
+    for frame in frames:
+        if frame.error:
+            continue
+        if frame.identifier == 0x000:
+            return "an NMT command"
+        if frame.identifier == 0x080:
+            return "a SYNC"
+        if 0x600 < frame.identifier < 0x680:
+            return f"an SDO request to node {frame.identifier - 0x600}"
+        if frame.remote and 0x700 < frame.identifier < 0x780:
+            return f"a guarding request to node {frame.identifier - 0x700}"
+        if frame.identifier == 0x700 + MASTER_NODE:
+            return "a master's heartbeat"
+    return ""
+
+
+def set_points_of_others(frames: Sequence[Frame], nodes: Collection[int]) -> str:
+    """Return which set-point frame somebody else sends to our nodes, "" if none."""
+    known = {0x200 + node: node for node in nodes}
+    return next(
+        (f"set-points to node {known[f.identifier]}" for f in frames if f.identifier in known and not f.error), ""
+    )
+
+
+def listen(link: Link, nodes: Collection[int], seconds: float = LISTEN) -> str:
+    """Return what another master sends while we are silent, "" if there is none."""
+    until = link.now + seconds
+    while link.now < until:
+        frames = link.receive(until - link.now)
+        found = foreign_master(frames) or set_points_of_others(frames, nodes)
+        if found:
+            return found
+    return ""
+
+
+def require_bus(link: Link) -> None:
+    """Raise BusError if the bus refused a frame: whoever sends nothing hears nothing, which is no drive's fault."""
+    if link.problem:
+        raise BusError(f"the bus takes no frames: {link.problem} Nothing was moved.")
+
+
+def scan(link: Link) -> list[dict[str, Any]]:
+    """Ask every node number for its device type; return what answers, with identity where it tells."""
+    link.receive(0.0)
+    for node in range(1, 127):
+        link.send([Frame(0x600 + node, bytes([0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0]))])
+    require_bus(link)
+    answers: dict[int, int] = {}
+    until = link.now + _SCAN_TIME
+    while link.now < until:
+        for frame in link.receive(until - link.now):
+            node = frame.identifier - 0x580
+            if 1 <= node <= 126 and len(frame.data) == 8 and not frame.error and frame.data[1:4] == b"\x00\x10\x00":
+                answers[node] = int.from_bytes(frame.data[4:8], "little")
+    dictionary = load_eds("ipos2015")
+    return [_identity(Objects(link, node, dictionary), kind) for node, kind in sorted(answers.items())]
+
+
+def _identity(objects: Objects, kind: int) -> dict[str, Any]:
+    found: dict[str, Any] = {"node": objects.node, "device_type": kind, "drive": kind & 0xFFFF == _DRIVE}
+    for name, subindex in (("vendor", 1), ("product", 2), ("revision", 3), ("serial", 4)):
+        found[name] = _or_none(lambda sub=subindex: objects.read(0x1018, sub))
+    found["name"] = _or_none(lambda: objects.read_text(0x1008))
+    found["firmware"] = _or_none(lambda: objects.read_text(0x100A))
+    word = _or_none(lambda: objects.read(0x6041))
+    found["state"] = None if word is None else state_of(int(word)).name
+    return found
+
+
+def _or_none(read: Any) -> Any:
+    try:
+        return read()
+    except SdoError:
+        return None
+
+
+def preflight(
+    link: Link, file: DrivesFile, *, override: Collection[str] = (), homed: bool = False, sensor: Sensor | None = None
+) -> Report:
+    """Check all drives and write their configuration, each value read back; nothing moves.
+
+    Args:
+        link: to the bus.
+        file: what the drives should be.
+        override: names of rows that may fail.
+        homed: whether the drives' zero is needed.
+        sensor: the inclinometer, which must give a sample.
+
+    Raises:
+        FileFormatError: an EDS that does not fit.
+        BusError: the bus takes no frames.
+    """
+    dictionary = load_eds(file.profile, file.eds)
+    require_eds(dictionary, file.profile, str(file.eds or f"{file.profile}.eds"))
+    rows = _Rows()
+    other = listen(link, file.nodes)
+    rows.add(0, "second master", other or "none", not other, "Stop the other master before this one starts.")
+    if other:
+        return Report(tuple(rows.rows), "none")
+    link.send([nmt_frame(Command.PRE_OPERATIONAL, node) for node in file.nodes])
+    require_bus(link)
+    guarding = file.guarding.kind
+    for entry in file.drives:
+        objects = Objects(link, entry.node, dictionary)
+        try:
+            kind = _check_drive(objects, file, entry, guarding, rows)
+            if homed:
+                found = objects.read(0x607C)
+                advice = "Run `softneck drives zero`: a drive loses its zero with every reset."
+                rows.add(entry.node, "homed", "yes" if found == HOMED_MARK else "no", found == HOMED_MARK, advice)
+        except SdoError as error:
+            if error.aborted:
+                rows.add(entry.node, "objects", str(error), False, "Is this a drive of the profile in the drives file?")
+            else:
+                rows.add(entry.node, "present", "no answer", False, "Is it on, is its node number and bit rate right?")
+            continue
+        guarding = guarding if guarding != "auto" else kind
+    if sensor is not None:
+        _check_sensor(link, file, sensor, rows)
+    return Report(tuple(rows.rows), guarding, tuple(override))
+
+
+def _check_sensor(link: Link, file: DrivesFile, sensor: Sensor, rows: _Rows) -> None:
+    """Look for one sample that may be an angle of the neck; a drive must not get power without."""
+    on_bus = file.sensor_kind == "can"
+    if on_bus:
+        # After power-up a CANopen node says nothing by itself before it is started (CiA 301, 7.3.2).
+        link.send([nmt_frame(Command.START, file.sensor_node)])
+    tilt = look_at(sensor, link, LOOK)
+    node, holds, found = file.sensor_node if on_bus else 0, False, f"no sample within {LOOK:g} s"
+    advice = "Is it on, is `node` of [sensor] right?" if on_bus else "Is it plugged in and does it send?"
+    if tilt is not None:
+        angles = [math.degrees(angle) for angle in (tilt.pitch, tilt.roll)]
+        holds = tilt.valid and all(abs(angle) <= math.degrees(file.sensor.angle) for angle in angles)
+        found = f"pitch {angles[0]:.2f}, roll {angles[1]:.2f} deg"
+        advice = "That is no angle of the neck: is it mounted upright, is it the right sensor?"
+    rows.add(node, "inclinometer", found, holds, getattr(sensor, "problem", "") or advice)
+
+
+def _check_drive(objects: Objects, file: DrivesFile, entry: DriveEntry, guarding: str, rows: _Rows) -> str:
+    """Add the rows of one drive; return the guarding it got."""
+    node = entry.node
+    kind = objects.read(0x1000)
+    rows.add(node, "present", f"device type {kind:08X}h", kind & 0xFFFF == _DRIVE, "It is no CiA 402 drive.")
+    _check_identity(objects, entry, rows)
+    _check_factors(objects, node, rows)
+    word = objects.read(0x6041)
+    state = state_of(word)
+    quiet = state in (DriveState.DISABLED, DriveState.READY, DriveState.SWITCHED_ON)
+    rows.add(node, "state", state.name, quiet, "Run `softneck drives reset` and look for the cause first."
+             if state is DriveState.FAULT else "Run `softneck drives stop`.")  # fmt: skip
+    _check_modes(objects, node, rows)
+    rows.add(node, "slow loop", f"{entry.scale.slow_loop * 1e3:g} ms by the drives file; `zero` measures it", True)
+    if guarding == "auto":
+        guarding = _probe(objects)
+    for topic, writes in (
+        ("modes", mode_writes(file)),
+        ("options", option_writes()),
+        ("limits", limit_writes(file, entry)),
+        ("guarding", guarding_writes(file, guarding, MASTER_NODE)),
+        ("mapping", pdo_writes(entry, file.profile)),
+    ):
+        _apply(objects, topic, writes, rows)
+    return guarding
+
+
+def _check_identity(objects: Objects, entry: DriveEntry, rows: _Rows) -> None:
+    wrong, found = [], []
+    for name, subindex, wanted in (("vendor", 1, entry.vendor), ("product", 2, entry.product),
+                                   ("serial", 4, entry.serial)):  # fmt: skip
+        value = objects.read(0x1018, subindex)
+        found.append(f"{name} {value}")
+        if wanted is not None and value != wanted:
+            wrong.append(f"{name} {value} instead of {wanted}")
+    text = ", ".join(wrong or found)
+    rows.add(entry.node, "identity", text, not wrong, "Is this the motor that the drives file means?")
+    firmware = _or_none(lambda: objects.read_text(0x100A))
+    holds = entry.firmware is None or firmware == entry.firmware
+    rows.add(entry.node, "firmware", firmware or "not told", holds, f"The drives file says {entry.firmware}.")
+
+
+def _check_factors(objects: Objects, node: int, rows: _Rows) -> None:
+    wrong = []
+    for index in (0x6093, 0x6094, 0x6097):
+        pair = [_or_none(lambda i=index, s=sub: objects.read(i, s)) for sub in (1, 2)]
+        if None not in pair and pair[0] != pair[1]:
+            wrong.append(f"{index:04X}h is {pair[0]}/{pair[1]}")
+    advice = "Set the factor group to 1/1 and save it: positions are in encoder counts here."
+    rows.add(node, "factor group", ", ".join(wrong) or "neutral", not wrong, advice)
+
+
+def _check_modes(objects: Objects, node: int, rows: _Rows) -> None:
+    modes = objects.read(0x6502) & 0xFFFFFFFF
+    said = bool(modes & 0x80) or modes == _NO_CSP_BIT
+    try:
+        taken = objects.written(0x6060, 0, CSP) == CSP
+    except SdoError as error:
+        if not error.aborted:
+            raise
+        taken = False
+    found = f"6502h is {modes:08X}h, mode 8 is {'taken' if taken else 'refused'}"
+    rows.add(node, "modes", found, said and taken, "The cyclic synchronous position mode is needed.")
+
+
+def _probe(objects: Objects) -> str:
+    """Return "heartbeat" where the drive has a consumer (1016h), else "life"."""
+    try:
+        objects.read(0x1016, 1)
+    except (SdoError, SoftneckError):
+        return "life"
+    return "heartbeat"
+
+
+def _apply(objects: Objects, topic: str, writes: Sequence[Write], rows: _Rows) -> None:
+    """Write all of one topic and read each back."""
+    for write in writes:
+        place = f"{write.index:04X}h:{write.subindex}"
+        try:
+            found = objects.written(write.index, write.subindex, write.value)
+        except SdoError as error:
+            if not error.aborted:
+                raise
+            advice = "The value is beyond what the drive takes; change the drives file."
+            rows.add(objects.node, topic, str(error).rstrip("."), False, advice)
+            return
+        bits = 0xFFFFFFFF
+        if found & bits != write.value & bits:
+            advice = "The drive did not keep what was written; change the drives file or its set-up."
+            rows.add(objects.node, topic, f"{place} reads {found} after {write.value} was written", False, advice)
+            return
+    rows.add(objects.node, topic, f"{len(writes)} values written and read back", True)

@@ -1,0 +1,102 @@
+"""A pilot that plays set-points, and a log of what was sent and measured meanwhile."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from softneck.core import Matrix, Vector
+
+from ..bus._link import VirtualLink
+from ..logs._motion import Motion
+from ..logs._rows import COLUMNS, experiment_channels
+from ..master import Frame, Master, Phase, Tilt
+from ..master._measured import Measured
+
+if TYPE_CHECKING:
+    from ._bus_loop import Session
+
+
+class SignalPilot:
+    """Plays set-points (rows, 3) [rad], one row each sample."""
+
+    def __init__(self, set_points: Matrix) -> None:
+        """Play `set_points` from the first row on."""
+        self._rows = [(float(a), float(b), float(c)) for a, b, c in set_points]
+
+    def start(self) -> None:
+        """Nothing is kept between samples."""
+
+    def step(self, measured: Measured) -> tuple[float, float, float] | None:
+        """Return the set-points of this sample."""
+        return self._rows[measured.index]
+
+    def finished(self, index: int) -> bool:
+        """Return whether all rows were played."""
+        return index >= len(self._rows)
+
+
+class SignalLog:
+    """One row for each sample while the pilot leads; to be called after each cycle (see `Session`).
+
+    Row k holds what was measured at t_k and the set-points that were sent for [t_k, t_k+1), which are those of the
+    pilot unless a limit clamped them. An angle that did not come or was not believed is NaN.
+    """
+
+    def __init__(self, rows: int, *, run: Vector | None = None, session: Session | None = None) -> None:
+        """Make room for `rows`; with a `session` each row goes into its log too, with its number in `run`."""
+        self._table = np.full((rows, len(COLUMNS)), np.nan)
+        self._first: list[int] = []
+        self._motion = Motion()
+        self._run = run
+        self._log = None if session is None else session.log
+        link = None if session is None else session.link
+        self._truth = link.neck.truth if isinstance(link, VirtualLink) else None
+        self._cycles = 0
+        self._complete = False
+        self.index = -1
+
+    def __call__(
+        self, now: float, frames_in: Sequence[Frame], frames_out: Sequence[Frame], tilt: Tilt | None, master: Master
+    ) -> None:
+        """Take what this cycle measured and sent."""
+        del frames_in, frames_out
+        self._motion.take(now, master.positions)
+        if master.supervisor.phase is not Phase.RUNNING or master.index >= len(self._table):
+            return
+        if master.index != self.index:
+            self.index, self._cycles = master.index, 0
+            self._first.append(len(self._motion) - 1)
+            self._measure(self._table[self.index], tilt, master)
+        self._cycles += 1
+        self._complete = self._cycles == master.settings.sample_cycles
+        self._table[self.index, :3] = master.setpoints
+        if self._complete and self._log is not None:
+            row = dict(zip(COLUMNS, self._table[self.index].tolist(), strict=True))
+            self._log.signals({**row, "run": 1.0 if self._run is None else float(self._run[self.index])})
+
+    def _measure(self, row: Vector, tilt: Tilt | None, master: Master) -> None:
+        if tilt is not None and master.tilt is tilt:
+            row[3:7] = tilt.pitch, tilt.roll, tilt.pitch_rate, tilt.roll_rate
+        if self._truth is None:
+            row[7:10] = master.tensions
+        else:
+            truth = self._truth()
+            row[7:] = [truth[name] for name in COLUMNS[7:]]
+
+    @property
+    def rows(self) -> int:
+        """Samples whose set-points were sent to their end."""
+        return self.index + 1 if self._complete or self.index < 0 else self.index
+
+    def columns(self) -> dict[str, Vector]:
+        """Return the channels of a recording; those only that were measured."""
+        return experiment_channels(self._table[: self.rows], *self._motion.at(self._first[: self.rows]))
+
+
+def raised_cosine(rows: int) -> Vector:
+    """Return a smooth way from 0 to 1 over `rows` samples, (rows,), the last one 1."""
+    return 0.5 - 0.5 * np.cos(math.pi * np.arange(1, rows + 1) / rows)

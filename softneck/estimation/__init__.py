@@ -1,0 +1,9 @@
+"""Observers: Kalman filters over linear models, unscented ones over nonlinear models.
+
+filterpy designs and judges; our runtimes run in loops and FMUs.
+May import `identification` and below.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,11 @@
+from ._axis import AxisPlant as AxisPlant
+from ._axis import LinearNeck as LinearNeck
+from ._axis import axis_plant as axis_plant
+from ._consistency import consistency as consistency
+from ._kalman import KalmanObserver as KalmanObserver
+from ._noise import fit_noise as fit_noise
+from ._offline import Estimates as Estimates
+from ._settings import KalmanSettings as KalmanSettings
+from ._ukf import UkfObserver as UkfObserver
+from ._ukf import ukf as ukf
+from ._ukf_part import UkfPart as UkfPart

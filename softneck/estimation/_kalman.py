@@ -1,0 +1,255 @@
+"""The Kalman observer: filterpy for design and offline use, a numpy runtime in loops and FMUs."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from filterpy.kalman import KalmanFilter
+from numpy.typing import ArrayLike
+
+from softneck.core import FileFormatError, Matrix, SettingsError, Vector, write_archive
+from softneck.runtime import Block, Port, State
+from softneck.signals import Recording
+
+from ._forms import NOISES, STATES
+from ._kalman_parts_runtime import (
+    KALMAN_CONSTANTS,
+    KALMAN_DIVIDER,
+    KALMAN_FROZEN,
+    KALMAN_GATE,
+    KALMAN_LEAD,
+    KALMAN_REJECTIONS,
+    KALMAN_TIMEOUT,
+)
+from ._offline import Estimates, filter_recording, smooth_recording
+from ._steady import steady_gains, system
+
+_RUNTIME = "softneck.estimation._kalman_runtime"
+_STEADY = "softneck.estimation._steady_kalman_runtime"
+_ARRAYS = ("F", "B", "H", "first_noise", "second_noise", "P0", "PF", "sources", "constants")
+_GAINS = ("gain", "inverse_spread", "start_gain", "start_inverse_spread", "forced_gain", "forced_inverse_spread")
+_MEASURED = ("pitch", "roll")
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class KalmanObserver:
+    """A designed Kalman filter; `KalmanSettings.design` makes it.
+
+    Attributes:
+        form: "model", "gyro" or "kinematic".
+        sample_time: [s].
+        arrays: F (n, n), B (n, 2), H (2, n), unit covariances of the two process noises (n, n), P0 (n, n) at the
+            start, PF (n, n) of a forced acceptance, sources (2, 3 or 2) and constants; with steady gains six more.
+        noise: standard deviations, named and in the units of `noise_names`.
+        sensor: name of the preset, "none" where the noise was given, "data" where it was estimated.
+        order: of the loop it is for.
+        gate_level: chi-square level of the gate.
+    """
+
+    form: str = "model"
+    sample_time: float
+    arrays: tuple[Matrix, ...]
+    noise: tuple[float, float, float]
+    sensor: str
+    order: str
+    gate_level: float
+
+    def __post_init__(self) -> None:
+        for i, name in ((3, "first_noise"), (4, "second_noise"), (5, "P0"), (6, "PF")):
+            _require_covariance(name, self.arrays[i])
+
+    @property
+    def delays(self) -> tuple[int, int]:
+        """Samples that set-points need to act on pitch and roll, beyond the first; 0 where they do not act."""
+        return (int(self.arrays[8][0]), int(self.arrays[8][1])) if self.form == "model" else (0, 0)
+
+    @property
+    def noise_names(self) -> tuple[str, ...]:
+        """Names of the noise levels."""
+        return tuple(name for name, _ in NOISES[self.form])
+
+    @property
+    def is_steady(self) -> bool:
+        """Whether gains are constant."""
+        return len(self.arrays) > len(_ARRAYS)
+
+    @property
+    def lead(self) -> float:
+        """How far the estimate runs ahead of the measurement [s]: the sensor's delay."""
+        return float(self.arrays[8][KALMAN_LEAD]) * self.sample_time
+
+    def with_noise(self, noise: Sequence[float], *, sensor: str = "none") -> KalmanObserver:
+        """Return the same filter with other noise levels, steady gains made anew."""
+        levels = (float(noise[0]), float(noise[1]), float(noise[2]))
+        for (name, unit), value in zip(NOISES[self.form], levels, strict=True):
+            if not (math.isfinite(value) and value > 0.0):
+                raise SettingsError(f"`{name}` must be positive [{unit}]; got {value}.")
+        bare = dataclasses.replace(self, noise=levels, sensor=sensor, arrays=self.arrays[: len(_ARRAYS)])
+        return bare.steady() if self.is_steady else bare
+
+    def steady(self) -> KalmanObserver:
+        """Return the filter with the gains that it converges to while measurements come regularly."""
+        arrays = self.arrays[: len(_ARRAYS)]
+        return dataclasses.replace(self, arrays=(*arrays, *steady_gains(arrays, self.noise)))
+
+    def block(self) -> Block:
+        """Return the filter as a block of role "observer"."""
+        inputs, outputs = observer_ports(self.form)
+        levels = list(zip(NOISES[self.form], self.noise, strict=True))
+        return Block(
+            kind="kalman",
+            role="observer",
+            runtime=_STEADY if self.is_steady else _RUNTIME,
+            sample_time=self.sample_time,
+            arrays=self.arrays,
+            inputs=inputs,
+            outputs=outputs,
+            parameters=tuple(
+                # Levels of process noise are part of constant gains and cannot be changed there.
+                Port(name=name, unit=unit, start=value, minimum=1e-9, maximum=1e3 if unit != "rad" else math.pi,
+                     description="standard deviation")
+                for (name, unit), value in (levels[:1] if self.is_steady else levels)
+            ),
+        )  # fmt: skip
+
+    def initial_state(self, **parameters: float) -> State:
+        """Return the state at the start; parameters are the noise levels by name."""
+        return self.block().initial_state(**parameters)
+
+    def step(self, state: State, inputs: ArrayLike) -> tuple[State, Vector]:
+        """Return the next state and the outputs valid now; inputs and outputs as in `block()`."""
+        return self.block().step(state, inputs)
+
+    def filterpy(self) -> KalmanFilter:
+        """Return a configured `filterpy.kalman.KalmanFilter` (2 inputs, 2 measurements).
+
+        Give `predict(u)` the inputs that act, (2, 1): delayed theta_i and phi_i, or rates of the gyro; and
+        `update(None)` where nothing was measured: a NaN in `update` would stay in its state for good.
+        """
+        F, _, Q, R = system(self.arrays, self.noise)
+        kf: Any = KalmanFilter(dim_x=F.shape[0], dim_z=2, dim_u=2)
+        kf.F, kf.B, kf.H = F.copy(), self.arrays[1].copy(), self.arrays[2].copy()
+        kf.P, kf.Q, kf.R = self.arrays[5].copy(), Q, R
+        return kf
+
+    def estimate(self, recording: Recording) -> Estimates:
+        """Run filterpy over a recording; each of its runs starts anew. Missing samples are predicted over.
+
+        Raises:
+            DataError: another sample time, or no gyro rates where the form needs them.
+        """
+        return filter_recording(self, recording)
+
+    def smooth(self, recording: Recording) -> Estimates:
+        """Return the best estimates from a whole run, what comes after each row included (Rauch, Tung, Striebel 1965).
+
+        For offline use: no online filter knows what comes. Raises as `estimate`.
+        """
+        return smooth_recording(self, recording)
+
+    def summary(self) -> str:
+        """Return some lines for people."""
+        n, c, d = self.arrays[0].shape[0], self.arrays[8], self.delays
+        acts = f"; set-points act after {d[0] + 1} and {d[1] + 1} samples" if self.form == "model" else ""
+        levels = [
+            f"{name.removesuffix('_noise_std')} {math.degrees(value):.3g} {unit.replace('rad', 'deg')}"
+            for (name, unit), value in zip(NOISES[self.form], self.noise, strict=True)
+        ]
+        lines = [
+            f"kalman observer, {self.sample_time * 1e3:g} ms, {self.order} order, sensor {self.sensor}",
+            f"  {self.form} form, {'constant gains' if self.is_steady else 'gains from the covariance'}",
+            f"  {n} states: {STATES[self.form]}{acts}",
+            f"  noise: {', '.join(levels)}",
+            f"  gate: chi-square level {self.gate_level:g} (innovation <= {c[KALMAN_GATE]:.3g}); "
+            f"by force after {c[KALMAN_REJECTIONS]:g} rejections",
+            f"  healthy until {c[KALMAN_TIMEOUT] * self.sample_time * 1e3:g} ms without an accepted measurement"
+            + (f" or {c[KALMAN_FROZEN]:g} identical ones" if c[KALMAN_FROZEN] > 0 else ""),
+        ]
+        if c[KALMAN_DIVIDER] > 1 or self.lead > 0:
+            lines.append(
+                f"  measured every {c[KALMAN_DIVIDER] * self.sample_time * 1e3:g} ms, late by {self.lead * 1e3:g} ms"
+            )
+        return "\n".join(lines)
+
+    def save(self, path: str | Path, *, force: bool = False) -> None:
+        """Write the observer to one `.npz` file."""
+        block = self.block()
+        header = {
+            "kind": "kalman",
+            "form": self.form,
+            "sample_time": self.sample_time,
+            "noise": dict(zip(self.noise_names, self.noise, strict=True)),
+            "sensor": self.sensor,
+            "order": self.order,
+            "gate_level": self.gate_level,
+            "inputs": [port.name for port in block.inputs],
+            "outputs": [port.name for port in block.outputs],
+            "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
+        }
+        names = (*_ARRAYS, *(_GAINS if self.is_steady else ()))
+        write_archive(path, header, dict(zip(names, self.arrays, strict=True)), force=force)
+
+    @classmethod
+    def from_archive(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> KalmanObserver:
+        """Return the observer that `save` wrote; `softneck.core.load` calls this."""
+        form = str(header["form"])
+        names = (*_ARRAYS, *(_GAINS if _GAINS[0] in arrays else ()))
+        items = tuple(np.ascontiguousarray(arrays[name], dtype=np.float64) for name in names)
+        n = items[0].shape[0]
+        source = (2, 2) if form == "gyro" else (2, 3)
+        shapes = ((n, n), (n, 2), (2, n), *([(n, n)] * 4), source, (KALMAN_CONSTANTS,), *([(n, 2), (2, 2)] * 3))
+        if any(
+            item.shape != shape or not np.isfinite(item).all()
+            for item, shape in zip(items, shapes[: len(items)], strict=True)
+        ):
+            raise FileFormatError("the observer's arrays have wrong shapes or are not finite; design it again.")
+        levels = [float(header["noise"][name]) for name, _ in NOISES[form]]
+        try:
+            return cls(
+                form=form,
+                sample_time=float(header["sample_time"]),
+                arrays=items,
+                noise=(levels[0], levels[1], levels[2]),
+                sensor=str(header["sensor"]),
+                order=str(header["order"]),
+                gate_level=float(header["gate_level"]),
+            )
+        except SettingsError as error:
+            raise FileFormatError(f"{error} Design the observer again.") from error
+
+
+def observer_ports(form: str) -> tuple[tuple[Port, ...], tuple[Port, ...]]:
+    """Return the inputs and outputs of a filter of one form."""
+    u = tuple(Port(name=f"motor_setpoint_{j}", unit="rad", minimum=-6.0, maximum=6.0) for j in (1, 2, 3))
+    y = tuple(Port(name=f"{a}_measured", unit="rad", description=f"measured {a}", missing=True) for a in _MEASURED)
+    valid = Port(name="measurement_valid", description="whether the angles were measured", start=1.0, boolean=True)
+    rates = tuple(
+        Port(name=f"{a}_rate_measured", unit="rad/s", description=f"{a} rate of the gyro", missing=True)
+        for a in _MEASURED
+    )
+    outputs = (
+        *(Port(name=a, unit="rad", description=f"estimated {a}") for a in _MEASURED),
+        *(Port(name=f"{a}_rate", unit="rad/s", description=f"estimated rate of {a}") for a in _MEASURED),
+        Port(name="innovation", description="normalised innovation squared; 0 when nothing was measured"),
+        Port(name="healthy", description="a measurement was accepted in time", boolean=True),
+    )
+    return (*u, *y, valid, *(rates if form == "gyro" else ())), outputs
+
+
+def _require_covariance(name: str, P: Matrix) -> None:
+    """Raise SettingsError unless `P` is symmetric and no direction has a negative variance."""
+    largest = float(np.abs(P).max(initial=0.0))
+    # 1e-9 of the largest: what rounding leaves of a zero eigenvalue.
+    if not np.isfinite(P).all() or not np.allclose(P, P.T, rtol=0.0, atol=1e-9 * largest):
+        raise SettingsError(f"the covariance `{name}` must be finite and symmetric.")
+    least = float(np.linalg.eigvalsh(P).min())
+    if least < -1e-9 * largest:
+        raise SettingsError(
+            f"the covariance `{name}` must be positive semidefinite; its least eigenvalue is {least:.3g}."
+        )

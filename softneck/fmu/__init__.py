@@ -1,0 +1,9 @@
+"""FMUs out of blocks: FMI 2.0 through pythonfmu, FMI 2.0 and 3.0 without Python.
+
+What an importer sees is written once, in `fmu.describe`.
+May import `design` and below; no loop over FMUs is closed here.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

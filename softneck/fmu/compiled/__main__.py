@@ -1,0 +1,28 @@
+"""`python -m softneck.fmu.compiled`: cross-compile the library for all platforms; `make native` calls it."""
+
+from __future__ import annotations
+
+import sys
+
+from softneck.core import SoftneckError
+
+from ._library import BINARIES, build_all
+
+
+def main() -> int:
+    """Build all libraries and print their sizes; 2 where that fails."""
+    try:
+        library = build_all()
+    except SoftneckError as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    for name, data in library.binaries.items():
+        sys.stdout.write(f"{name}: {len(data) / 1e3:.0f} kB\n")
+    for module, reason in library.sources.refused.items():
+        sys.stdout.write(f"left out: {module}: {reason}\n")
+    sys.stdout.write(f"{BINARIES}\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,158 @@
+"""A block as an FMU without Python: FMI 2.0 or 3.0, the library of each platform, the model as a resource."""
+
+from __future__ import annotations
+
+import hashlib
+import uuid
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
+
+from softneck.core import SettingsError, atomic_write, refuse_existing
+from softneck.runtime import Block
+
+from ..describe._description import Identity, described_block, model_description
+from ..describe._documentation import documentation_page
+from ..describe._icon import icon_png
+from ..describe._info import FmuInfo
+from ..python._build import check_block, generation_date, license_text, model_name
+from ..python._pack import write_zip
+from ._description3 import model_description3
+from ._library import Library, find_library
+from ._model_file import model_bytes, node_of
+from ._platforms import PLATFORMS
+from ._sources import FLAGS, GENERATED, MAIN, PROBE, Sources
+from .translate._chunks import only_kinds
+
+FMI_VERSIONS = (2, 3)
+_HOST = (
+    "Nothing: no Python, no compiler, no library beyond those of the operating system. "
+    "Set non-finite inputs and the FMU answers with an error status and a message; NaN means `not measured` where the "
+    "table says so."
+)
+_REBUILD = """Rebuild the library of this FMU for any platform with a C99 compiler, for instance
+
+    cc {flags} -fPIC -shared -o {name}.so {main} -lm
+
+and put it into binaries/ under the folder of your platform. `sn_kinds.h` was generated from the runtimes of softneck
+{version} and holds what this model needs; all other files are written by hand. No fused multiply-add
+(-ffp-contract=off), no fast-math: all platforms give the same bits.
+"""
+
+
+def build_compiled_fmu(
+    block: Block, path: str | Path, *, info: FmuInfo | None = None, force: bool = False, fmi: int = 2,
+    platforms: Sequence[str] = (),
+) -> str:  # fmt: skip
+    """Write `block` as a Co-Simulation FMU that needs no Python, and return one line on where its libraries come from.
+
+    Variables, timing and state are those of `build_fmu`. The same block, info and libraries give the same bytes.
+
+    Args:
+        block: what to package.
+        path: `NAME.fmu`; NAME becomes the model name.
+        info: what the FMU says about itself.
+        force: replace an existing file.
+        fmi: 2 or 3.
+        platforms: that the FMU must run on, e.g. "x86_64-windows"; none: all whose library is here.
+
+    Raises:
+        SettingsError: NAME is no FMI identifier, the kind cannot be compiled, or a platform is not built.
+        FileFormatError: a library is damaged.
+        OutputError: the file exists or cannot be written.
+    """
+    target = Path(path)
+    name = model_name(target)
+    refuse_existing(target, force=force)
+    check_block(block)
+    if fmi not in FMI_VERSIONS:
+        raise SettingsError(f"FMI {fmi} is not known; take 2 or 3.")
+    modules = node_of(block.runtime, block.arrays).modules
+    library = find_library()
+    _check_kinds(modules, library.sources)
+    folders = _folders(library, platforms, fmi)
+    members = _members(described_block(block), info or FmuInfo(), name, fmi, library.sources)
+    members |= {f"binaries/{folder}/{name}{suffix}": data for folder, suffix, data in folders}
+    with atomic_write(target, force=force) as temporary:
+        write_zip(temporary, members, library.streams)
+    return library.origin
+
+
+def _check_kinds(modules: set[str], sources: Sources) -> None:
+    for module in sorted(modules & sources.refused.keys()):
+        raise SettingsError(
+            f"`{module}` cannot be in a compiled FMU: {sources.refused[module]} Use `--backend python`."
+        )
+
+
+def _folders(library: Library, wanted: Sequence[str], fmi: int) -> list[tuple[str, str, bytes]]:
+    """Return (folder, suffix, bytes) of each library that goes into the FMU."""
+    for name in wanted:
+        if name not in PLATFORMS:
+            raise SettingsError(f"there is no platform `{name}`; known are {', '.join(PLATFORMS)}.")
+        if name not in library.binaries:
+            raise SettingsError(
+                f"the library for {name} is not built, only that for {', '.join(library.binaries)}; "
+                "run `make native` in a source checkout, or install a wheel of softneck."
+            )
+        if fmi == 2 and not PLATFORMS[name].fmi2:
+            raise SettingsError(f"FMI 2.0 has no folder for {name}; take `--fmi 3`.")
+    found = []
+    for name, data in library.binaries.items():
+        platform = PLATFORMS[name]
+        folder = platform.name if fmi == 3 else platform.fmi2
+        if folder and (not wanted or name in wanted):
+            found.append((folder, platform.suffix, data))
+    if not found:
+        raise SettingsError(f"FMI 2.0 has no folder for {', '.join(library.binaries)}; take `--fmi 3`.")
+    return found
+
+
+def _members(block: Block, info: FmuInfo, name: str, fmi: int, sources: Sources) -> dict[str, bytes]:
+    tool = f"softneck {version('softneck')} (compiled)"
+    content = hashlib.sha256()
+    for part in (
+        model_bytes(block, name, ""),
+        repr((info, tool, fmi)).encode(),
+        *map(str.encode, sources.files.values()),
+    ):
+        content.update(part)
+    guid = str(uuid.uuid5(uuid.NAMESPACE_OID, content.hexdigest()))
+    identity = Identity(name, guid, generation_date(), tool, (MAIN,))
+    describe = model_description if fmi == 2 else model_description3
+    members = {
+        "modelDescription.xml": describe(block, info, identity),
+        "resources/model.bin": model_bytes(block, name, guid),
+        "documentation/index.html": documentation_page(name, block, info, _HOST).encode(),
+        "documentation/licenses/license.txt": license_text("softneck", info.license).encode(),
+        ("model.png" if fmi == 2 else "terminalsAndIcons/icon.png"): icon_png(block.kind, block.role),
+        "sources/README.txt": _REBUILD.format(
+            flags=" ".join(FLAGS), name=name, main=MAIN, version=version("softneck")
+        ).encode(),
+    }
+    if fmi == 3:
+        members["sources/buildDescription.xml"] = _build_description(name)
+    files = _needed_sources(sources, node_of(block.runtime, block.arrays).modules, fmi)
+    return members | {f"sources/{file}": text.encode() for file, text in files.items()}
+
+
+def _needed_sources(sources: Sources, modules: set[str], fmi: int) -> dict[str, str]:
+    """Return the sources of this model's kinds and version of FMI alone: 40 kB less than those of the whole library."""
+    other = f"fmi{5 - fmi}.h"
+    files = {name: text for name, text in sources.files.items() if name not in (other, PROBE)}
+    files[GENERATED] = only_kinds(files[GENERATED], modules)
+    files[MAIN] = files[MAIN].replace(f'#include "{other}"\n', "")
+    return files
+
+
+def _build_description(name: str) -> bytes:
+    """Return how FMI 3 wants to be told to compile (section 2.5.2.1)."""
+    root = Element("fmiBuildDescription", fmiVersion="3.0")
+    options = " ".join(flag for flag in FLAGS if flag.startswith("-f"))
+    configuration = SubElement(root, "BuildConfiguration", modelIdentifier=name)
+    files = SubElement(configuration, "SourceFileSet", language="C99", compilerOptions=options)
+    SubElement(files, "SourceFile", name=MAIN)
+    SubElement(configuration, "Library", name="m", external="true")
+    indent(root)
+    return b'<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="utf-8") + b"\n"

@@ -1,0 +1,167 @@
+"""Where the libraries of the platforms come from: those that `make native` built, else this machine's compiler.
+
+`make native` writes `binaries/`: one library a platform, the generated source, and a manifest with the digest of all
+that they were made of. A wheel carries that folder, so that exporting needs no compiler.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zlib
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+
+import platformdirs
+
+from softneck.core import FileFormatError, SettingsError, atomic_write
+
+from ..python._pack import deflated
+from ._compilers import compile_for, compile_here, local_compiler
+from ._platforms import PLATFORMS, here
+from ._sources import GENERATED, HERE, Sources, c_sources, sources_key
+
+BINARIES = HERE / "binaries"
+_MANIFEST = "manifest.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Library:
+    """Libraries and what they were made of.
+
+    Attributes:
+        binaries: platform -> bytes.
+        sources: all C sources.
+        origin: one line for people: who compiled them.
+        streams: bytes -> the same deflated, where that was done already.
+    """
+
+    binaries: dict[str, bytes]
+    sources: Sources
+    origin: str
+    streams: dict[bytes, bytes] = field(default_factory=dict)
+
+
+def find_library() -> Library:
+    """Return the libraries that are here, compiling for this machine only where none are.
+
+    Raises:
+        FileFormatError: a library is damaged.
+        SettingsError: there is none, and no C compiler.
+    """
+    return packaged_library() or _local_library()
+
+
+def packaged_library(folder: Path = BINARIES) -> Library | None:
+    """Return what `make native` built, if it is there and was made of the sources of now.
+
+    Raises:
+        FileFormatError: a file is damaged.
+    """
+    manifest = _manifest(folder)
+    if manifest is None or manifest["key"] != sources_key():
+        return None
+    content: dict[str, bytes] = {}
+    for name, digest in manifest["files"].items():
+        path = folder / name
+        data = path.read_bytes() if path.is_file() else b""
+        if hashlib.sha256(data).hexdigest() != digest:
+            raise FileFormatError(f"{path}: is damaged or missing; run `make native`, or install softneck again.")
+        content[name] = data
+    files = {path.name: path.read_text(encoding="utf-8") for path in sorted((HERE / "c").glob("*.[ch]"))}
+    files[GENERATED] = content[GENERATED].decode()
+    packed = {name: content[_file_name(name)] for name in manifest["platforms"]}
+    binaries = {name: zlib.decompress(data, -zlib.MAX_WBITS) for name, data in packed.items()}
+    streams = {binaries[name]: data for name, data in packed.items()}
+    return Library(binaries, Sources(files, manifest["refused"]), "built with this softneck", streams)
+
+
+def _file_name(platform: str) -> str:
+    return f"{platform}{PLATFORMS[platform].suffix}.deflate"
+
+
+def platforms_built() -> tuple[list[str], str]:
+    """Return the platforms that an FMU would be made for now, and how; nothing is compiled."""
+    manifest = _manifest(BINARIES)
+    if manifest is not None and manifest["key"] == sources_key():
+        return list(manifest["platforms"]), "built with this softneck"
+    stale = "; those in binaries/ are of other sources, run `make native`" if manifest is not None else ""
+    machine, compiler = here(), local_compiler()
+    if machine is None or compiler is None:
+        return [], f"none is built and there is no C compiler{stale}"
+    return [machine.name], f"by {compiler[0]} at the first export{stale}"
+
+
+def build_all(folder: Path = BINARIES) -> Library:
+    """Cross-compile for all platforms with zig and write them to `folder`: `make native`."""
+    sources = c_sources()
+    binaries = {name: compile_for(sources, platform) for name, platform in PLATFORMS.items()}
+    files = {_file_name(name): _packed(data) for name, data in binaries.items()}
+    files[GENERATED] = sources.files[GENERATED].encode()
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, data in files.items():
+        (folder / name).write_bytes(data)
+    digests = {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}
+    manifest = {
+        "key": sources_key(), "platforms": list(binaries), "files": digests, "refused": sources.refused,
+    }  # fmt: skip
+    for path in folder.iterdir():  # of another version
+        if path.name not in files:
+            path.unlink()
+    (folder / _MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
+    return Library(binaries, sources, "built with this softneck")
+
+
+def _packed(data: bytes) -> bytes:
+    """Return a deflate stream: zopfli needs a second for a library and saves 4 % of every FMU that is ever made."""
+    if find_spec("zopfli") is None:
+        return deflated(data)
+    from zopfli import zlib as zopfli  # pyright: ignore[reportMissingImports]  (of the group native alone)
+
+    return zopfli.compress(data)[2:-4]  # without zlib's head and checksum
+
+
+def _local_library() -> Library:
+    """Return the library of this machine: from the user's cache, or compiled now."""
+    machine, compiler = here(), local_compiler()
+    if machine is None or compiler is None:
+        raise SettingsError(
+            "there is no compiled library here and no C compiler to make one; run `make native` (it needs "
+            "`pip install ziglang`), install a C compiler, or use `--backend python`."
+        )
+    folder = _cache_folder() / sources_key()
+    library, generated, refused = folder / f"library{machine.suffix}", folder / GENERATED, folder / "refused.json"
+    if not refused.is_file():
+        sources = c_sources()
+        folder.mkdir(parents=True, exist_ok=True)
+        # The last one is the sign that all are there.
+        for path, data in (
+            (library, compile_here(sources, compiler)),
+            (generated, sources.files[GENERATED].encode()),
+            (refused, json.dumps(sources.refused).encode()),
+        ):
+            with atomic_write(path, force=True) as temporary:
+                temporary.write_bytes(data)
+    files = {path.name: path.read_text(encoding="utf-8") for path in sorted((HERE / "c").glob("*.[ch]"))}
+    files[GENERATED] = generated.read_text(encoding="utf-8")
+    sources = Sources(files, json.loads(refused.read_text(encoding="utf-8")))
+    origin = f"compiled by {compiler[0]} for this machine alone ({machine.name}); `make native` builds all platforms"
+    return Library({machine.name: library.read_bytes()}, sources, origin)
+
+
+def _cache_folder() -> Path:
+    return Path(platformdirs.user_cache_dir("softneck", appauthor=False)) / "native"
+
+
+def _manifest(folder: Path) -> dict | None:
+    path = folder / _MANIFEST
+    if not path.is_file():
+        return None
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+        if {"key", "platforms", "files", "refused"} <= manifest.keys() and set(manifest["platforms"]) <= set(PLATFORMS):
+            return manifest
+    except (ValueError, AttributeError, TypeError):
+        pass
+    raise FileFormatError(f"{path}: is damaged; run `make native`, or install softneck again.")

@@ -1,0 +1,138 @@
+"""`resources/model.bin`: what the library reads; `c/sn_model.h` is the other side of it, and checks every length.
+
+Little-endian as all five platforms are. Head (32 bytes): magic, format, byte-order mark, length, CRC-32 of the rest.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from softneck.core import Matrix, SettingsError
+from softneck.runtime import Block, Port
+
+from .translate._kinds import RANKS
+
+_MAGIC = b"SNMODEL\0"
+FORMAT = 1
+_MARK = 0x01020304
+_HEAD = 32
+_BOOLEAN, _MISSING = 1, 2
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """A runtime module, its own arrays, and its members."""
+
+    module: str
+    arrays: tuple[Matrix, ...]
+    members: tuple[Node, ...] = ()
+
+    @property
+    def modules(self) -> set[str]:
+        """The modules of this node and all below."""
+        return {self.module}.union(*(member.modules for member in self.members))
+
+
+def node_of(runtime: str, arrays: tuple[Matrix, ...]) -> Node:
+    """Return the tree that runtime name `outer(inner:11,other:13)` and its arrays stand for.
+
+    Raises:
+        SettingsError: a runtime that is not in the table, or arrays of other ranks than those there.
+    """
+    outer, _, inner = runtime.partition("(")
+    pairs = [part.rpartition(":") for part in _split(inner[:-1])] if inner else []
+    if outer not in RANKS:
+        raise SettingsError(
+            f"`{outer}` cannot be in a compiled FMU: it is not in the table of softneck.fmu.compiled; "
+            "use `--backend python`."
+        )
+    own = len(arrays) - sum(int(count) for _, _, count in pairs)
+    ranks = tuple(array.ndim for array in arrays[: max(own, 0)])
+    if ranks != RANKS[outer]:
+        raise SettingsError(
+            f"`{outer}` has arrays of ranks {ranks} and the compiled library expects {RANKS[outer]}; "
+            "use `--backend python`, or correct the table of softneck.fmu.compiled."
+        )
+    members, first = [], own
+    for name, _, count in pairs:
+        members.append(node_of(name, arrays[first : first + int(count)]))
+        first += int(count)
+    return Node(outer, arrays[:own], tuple(members))
+
+
+def _split(inner: str) -> list[str]:
+    """Split at the commas that are in no brackets."""
+    parts, depth, start = [], 0, 0
+    for i, letter in enumerate(inner):
+        depth += {"(": 1, ")": -1}.get(letter, 0)
+        if letter == "," and depth == 0:
+            parts.append(inner[start:i])
+            start = i + 1
+    return [*parts, inner[start:]]
+
+
+def model_bytes(block: Block, name: str, guid: str) -> bytes:
+    """Return the file of `block`; `guid` is what hosts hand over to show that description and model belong together.
+
+    Raises:
+        SettingsError: the library does not know the block's kind.
+    """
+    writer = _Writer()
+    writer.text(name)
+    writer.text(guid)
+    writer.plain("<d", float(block.sample_time))
+    ports = (block.inputs, block.outputs, block.parameters)
+    # A reference steps like a plant: sample k gives what is read at k + 1.
+    writer.plain("<4I", block.role in ("plant", "reference"), *map(len, ports))
+    for port in (port for group in ports for port in group):
+        writer.port(port)
+    writer.node(node_of(block.runtime, block.arrays))
+    body = b"".join(writer.parts)
+    head = _MAGIC + struct.pack("<IIQII", FORMAT, _MARK, _HEAD + len(body), zlib.crc32(body), 0)
+    return head + body
+
+
+class _Writer:
+    def __init__(self) -> None:
+        self.parts: list[bytes] = []
+        self._size = _HEAD
+
+    def add(self, data: bytes) -> None:
+        """Append bytes."""
+        self.parts.append(data)
+        self._size += len(data)
+
+    def plain(self, form: str, *values: float) -> None:
+        """Append numbers."""
+        self.add(struct.pack(form, *values))
+
+    def text(self, text: str) -> None:
+        """Append a text with its length and a zero."""
+        data = text.encode() + b"\0"
+        self.plain("<I", len(data))
+        self.add(data)
+
+    def port(self, port: Port) -> None:
+        """Append a port."""
+        self.text(port.name)
+        self.text("1" if port.boolean else port.unit)
+        low = -np.inf if port.minimum is None else float(port.minimum)
+        high = np.inf if port.maximum is None else float(port.maximum)
+        flags = _BOOLEAN * port.boolean | _MISSING * port.missing
+        self.plain("<3dI", float(port.start), low, high, flags)
+
+    def node(self, node: Node) -> None:
+        """Append a tree of runtimes with their arrays."""
+        self.text(node.module)
+        self.plain("<I", len(node.arrays))
+        for array in node.arrays:
+            self.plain(f"<I{array.ndim}Q", array.ndim, *array.shape)
+            self.add(bytes(-self._size % 8))
+            self.add(np.ascontiguousarray(array, dtype="<f8").tobytes())
+        self.plain("<I", len(node.members))
+        for member in node.members:
+            self.node(member)

@@ -1,0 +1,195 @@
+"""Calls of numpy, math and Python's own functions in C."""
+
+from __future__ import annotations
+
+import ast
+from typing import Protocol
+
+from ._scope import Scope
+from ._types import BOOL, FLOAT, INT, MATRIX, VECTOR, Scalar, Type, Value, View, length
+
+# numpy's and math's name -> C, of one number.
+_EACH = {
+    "sqrt": "sqrt", "sin": "sn_sin", "cos": "sn_cos", "tan": "sn_tan", "tanh": "sn_tanh", "exp": "sn_exp",
+    "log": "sn_log", "atan": "sn_atan", "arctan": "sn_atan", "asin": "sn_asin", "arcsin": "sn_asin",
+    "acos": "sn_acos", "arccos": "sn_acos", "fabs": "fabs", "abs": "fabs",
+}  # fmt: skip
+_PAIR = {"atan2": "sn_atan2", "arctan2": "sn_atan2", "hypot": "sn_hypot", "fmod": "fmod", "copysign": "copysign"}
+_TESTS = {"isfinite": "sn_finite", "isnan": "sn_nan", "isinf": "sn_infinite"}
+_ENTRYWISE = {
+    "sqrt": "sn_sqrt_v", "tanh": "sn_tanh_v", "exp": "sn_exp_v", "log": "sn_log_v", "sin": "sn_sin_v",
+    "cos": "sn_cos_v", "abs": "sn_absolute_v", "fabs": "sn_absolute_v", "sort": "sn_sorted", "copy": "sn_copied1",
+}  # fmt: skip
+_REDUCTIONS = {"max": "sn_largest(w, {})", "min": "sn_least(w, {})", "sum": "sn_sum1({})"}
+_LIKE = {"empty_like": "zeros", "zeros_like": "zeros", "ones_like": "ones"}
+_MADE = {"empty": 0.0, "zeros": 0.0, "ones": 1.0}
+
+
+class Expressions(Protocol):
+    """What a call needs of the expressions around it; see `_expressions.Expressions`."""
+
+    scope: Scope
+
+    def ordered(self, nodes: list[ast.expr]) -> list[Value]: ...
+    def scalar(self, node: ast.expr, kind: Scalar) -> str: ...
+    def elementwise(self, node: ast.AST, name: str, left: Value, right: Value) -> Value: ...
+    def truth(self, value: Value, node: ast.AST) -> str: ...
+    def room(self, code: str, kind: Type) -> Value: ...
+
+
+def numpy_call(ex: Expressions, node: ast.AST, name: str, values: list[Value]) -> Value:
+    """Return the C of `np.NAME(...)` or `math.NAME(...)`."""
+    if name in _MADE:
+        return _made(ex, node, values, whole=_whole(ex, node), value=_MADE[name])
+    if isinstance(node, ast.Call) and node.keywords:
+        raise ex.scope.fail(node, "keywords are not known here.")
+    kinds = [value.type for value in values]
+    numbers = all(isinstance(kind, Scalar) for kind in kinds)
+    if numbers and len(values) in (1, 2):
+        found = _of_numbers(name, [ex.scope.cast(value, FLOAT) for value in values], kinds[0] == INT)
+        if found is not None:
+            return found
+    if name == "dot" and len(values) == 2:
+        return _dot(ex, node, values)
+    if name in ("minimum", "maximum") and len(values) == 2:
+        if numbers:
+            return _extreme(ex, node, name[:3], values)
+        return ex.elementwise(node, f"sn_{name}", *values)
+    if name in ("min", "max", "sum") and kinds == [MATRIX]:
+        return Value(_REDUCTIONS[name].format(f"sn_flat(w, {ex.scope.given(values[0])})"), FLOAT)
+    if kinds == [VECTOR] and name in _REDUCTIONS:
+        return Value(_REDUCTIONS[name].format(values[0].code), FLOAT)
+    if kinds == [VECTOR] and name in _ENTRYWISE:
+        return ex.room(f"{_ENTRYWISE[name]}(w, {values[0].code})", VECTOR)
+    if kinds == [VECTOR] and name in _LIKE:
+        made = ex.room(f"sn_zeros1(w, {values[0].code}.n)", VECTOR)
+        if _LIKE[name] == "ones":
+            ex.scope.emit(f"sn_fill1({made.code}, 1.0);")
+        return made
+    raise ex.scope.fail(node, f"no C is known for `{name}` of these.")
+
+
+def _of_numbers(name: str, codes: list[str], whole: bool) -> Value | None:
+    if len(codes) == 2:
+        return Value(f"{_PAIR[name]}({codes[0]}, {codes[1]})", FLOAT) if name in _PAIR else None
+    if name in _EACH:
+        return Value(f"{_EACH[name]}({codes[0]})", FLOAT)
+    if name in _TESTS:
+        return Value("1" if whole else f"{_TESTS[name]}({codes[0]})", BOOL)
+    if name in ("floor", "ceil"):
+        # A whole number as math gives it; numpy's floats of them hold the same.
+        return Value(f"sn_int(w, {name}({codes[0]}))", INT)
+    return None
+
+
+def _whole(ex: Expressions, node: ast.AST) -> bool:
+    whole = False
+    for keyword in node.keywords if isinstance(node, ast.Call) else []:
+        name = ast.unparse(keyword.value)
+        if keyword.arg != "dtype" or name not in ("np.int64", "np.float64", "int", "float"):
+            raise ex.scope.fail(node, "arrays are of float64 or int64.")
+        whole = name in ("np.int64", "int")
+    return whole
+
+
+def _made(ex: Expressions, node: ast.AST, values: list[Value], *, whole: bool, value: float) -> Value:
+    """Return a new array; one that numpy leaves unset is zero here."""
+    if not isinstance(node, ast.Call) or len(node.args) != 1:
+        raise ex.scope.fail(node, "one shape is needed.")
+    shape = node.args[0]
+    if isinstance(shape, ast.Tuple) and len(shape.elts) == 2 and not whole:
+        sizes = [ex.scalar(size, INT) for size in shape.elts]
+        made = ex.room(f"sn_zeros2(w, {sizes[0]}, {sizes[1]})", MATRIX)
+        if value:
+            ex.scope.emit(f"sn_fill2(&{made.code}, {value});")
+        return made
+    size = values[0]
+    if size.type != INT:
+        raise ex.scope.fail(node, "arrays are made with one or two dimensions.")
+    made = ex.room(f"sn_zeros{'_i' if whole else '1'}(w, {size.code})", View(1, whole))
+    if value and whole:
+        raise ex.scope.fail(node, "whole numbers are made as zeros.")
+    if value:
+        ex.scope.emit(f"sn_fill1({made.code}, {value});")
+    return made
+
+
+def _dot(ex: Expressions, node: ast.AST, values: list[Value]) -> Value:
+    a, b = values
+    codes = f"(w, {ex.scope.given(a)}, {ex.scope.given(b)})"
+    if a.type == b.type == VECTOR:
+        return Value(f"sn_dot{codes}", FLOAT)
+    if a.type == MATRIX and b.type == VECTOR:
+        return ex.room(f"sn_dot_mv{codes}", VECTOR)
+    if a.type == VECTOR and b.type == MATRIX:
+        return ex.room(f"sn_dot_vm{codes}", VECTOR)
+    if a.type == b.type == MATRIX:
+        return ex.room(f"sn_dot_mm{codes}", MATRIX)
+    raise ex.scope.fail(node, "products are known of vectors and matrices.")
+
+
+def array_of(ex: Expressions, node: ast.Call) -> Value:
+    """Return `np.array([a, b, ...])` of numbers."""
+    items = node.args[0].elts if len(node.args) == 1 and isinstance(node.args[0], ast.List | ast.Tuple) else []
+    values = ex.ordered(items)
+    if not items or node.keywords or not all(isinstance(value.type, Scalar) for value in values):
+        raise ex.scope.fail(node, "`np.array` is known of a list of numbers.")
+    made = ex.room(f"sn_zeros1(w, {len(values)})", VECTOR)
+    for i, value in enumerate(values):
+        ex.scope.emit(f"*sn_at1(w, {made.code}, {i}) = {ex.scope.cast(value, FLOAT)};")
+    return made
+
+
+def method(ex: Expressions, node: ast.Call, name: str, base: Value) -> Value:
+    """Return the C of `base.NAME(...)`."""
+    if node.keywords or not isinstance(base.type, View) or base.type.whole:
+        raise ex.scope.fail(node, "this method is not known.")
+    if name in ("max", "min", "sum") and not node.args:
+        return numpy_call(ex, node, name, [base])
+    if name == "copy" and not node.args and base.type.rank < 3:
+        return ex.room(f"sn_copied{base.type.rank}(w, {ex.scope.given(base)})", base.type)
+    if name in ("ravel", "flatten") and not node.args:
+        return base if base.type == VECTOR else ex.room(f"sn_flat(w, {ex.scope.given(base)})", VECTOR)
+    if name == "reshape":
+        shape = node.args[0] if len(node.args) == 1 else ast.Tuple(node.args)
+        sizes = shape.elts if isinstance(shape, ast.Tuple) else [shape]
+        codes = [ex.scalar(size, INT) for size in sizes]
+        flat = base.code if base.type == VECTOR else f"sn_flat(w, {ex.scope.given(base)})"
+        if len(codes) == 2 and base.type.rank < 3:
+            return ex.room(f"sn_shaped(w, {flat}, {codes[0]}, {codes[1]})", MATRIX)
+        if len(codes) == 1 and base.type == MATRIX:
+            return ex.room(flat, VECTOR)
+    raise ex.scope.fail(node, "this method is not known.")
+
+
+def plain_call(ex: Expressions, node: ast.Call, name: str) -> Value:
+    """Return the C of a call of one of Python's own functions."""
+    if node.keywords:
+        raise ex.scope.fail(node, "keywords are not known here.")
+    values = ex.ordered(node.args)
+    kinds = [value.type for value in values]
+    if len(values) == 1 and isinstance(kinds[0], Scalar):
+        value = values[0]
+        if name == "float":
+            return Value(ex.scope.cast(value, FLOAT), FLOAT, value.known)
+        if name == "bool":
+            return Value(ex.truth(value, node), BOOL)
+        if name == "int":
+            code = f"sn_int(w, {value.code})" if kinds[0] == FLOAT else ex.scope.cast(value, INT)
+            return Value(code, INT)
+        if name == "abs":
+            return Value(f"{'fabs' if kinds[0] == FLOAT else 'sn_abs_i'}({value.code})", kinds[0])
+    if name == "len" and len(values) == 1 and isinstance(kinds[0], View):
+        return Value(length(values[0].code, kinds[0], 0), INT)
+    if name in ("min", "max") and len(values) > 1 and all(isinstance(kind, Scalar) for kind in kinds):
+        return _extreme(ex, node, name, values)
+    raise ex.scope.fail(node, "this function is not known.")
+
+
+def _extreme(ex: Expressions, node: ast.AST, name: str, values: list[Value]) -> Value:
+    del node
+    kind = FLOAT if any(value.type == FLOAT for value in values) else INT
+    code = ex.scope.cast(values[0], kind)
+    for value in values[1:]:
+        code = f"sn_{name}{'' if kind == FLOAT else '_i'}({code}, {ex.scope.cast(value, kind)})"
+    return Value(code, kind)

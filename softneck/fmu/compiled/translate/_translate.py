@@ -1,0 +1,267 @@
+"""Runtimes in C: each function of a runtime once for each combination of types that it is called with.
+
+numba does the same when it compiles: the types of the arrays decide all others. What is written here is plain C99
+over `sn_base.h` and `sn_vector.h`; whatever is not known there is an error that names function and line, never a guess.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from dataclasses import dataclass, field
+
+from softneck.runtime import bundle
+
+from ._chunks import defined, nested_loops, reached
+from ._expressions import Expressions
+from ._kinds import FAST
+from ._scope import Scope
+from ._statements import Statements, holds_view
+from ._types import FLOAT, INT, MATRIX, NONE, VECTOR, Arrays, Bundle, CTypes, TranslationError, Type, Value, View, lends
+
+_MEMBERS = {
+    "member_size": (2, INT, "sn_member_size(w, {})"),
+    "member_initialise": (5, NONE, "sn_member_initialise(w, {})"),
+    "member_step": (6, NONE, "sn_member_step(w, {})"),
+}
+# Functions whose loops `sn_wide.h` has by hand, several numbers side by side: types and result as in Python, bits too.
+# One that returns numbers fills them in behind its arguments.
+_FOUR = Bundle((FLOAT, FLOAT, FLOAT, FLOAT))
+_BY_HAND: dict[str, tuple[tuple[Type, ...], Type]] = {
+    "slant_children": ((MATRIX, INT, VECTOR, VECTOR), _FOUR),
+    "slant_leaf": ((MATRIX, VECTOR, INT, INT, FLOAT, VECTOR, VECTOR, VECTOR), NONE),
+}
+_PASSES = 20
+
+
+@dataclass(frozen=True, slots=True)
+class _Done:
+    """A function in C: its name there and what it returns."""
+
+    name: str
+    result: Type
+    lent: tuple[bool, ...]
+
+
+@dataclass(slots=True)
+class Unit:
+    """C of several runtimes; functions that come out equal are written once."""
+
+    types: CTypes = field(default_factory=CTypes)
+    functions: list[str] = field(default_factory=list)
+    kinds: list[str] = field(default_factory=list)
+    names: list[str] = field(default_factory=list)
+    steps: list[str] = field(default_factory=list)
+    _bodies: dict[str, str] = field(default_factory=dict)
+
+    def add(self, module: str, ranks: tuple[int, ...]) -> None:
+        """Add runtime `module`, whose arrays have `ranks`.
+
+        Raises:
+            TranslationError: it uses what is not known in C; the unit is as it was before.
+        """
+        before = (list(self.types.declarations), list(self.functions), dict(self._bodies))
+        runtime = _Runtime(self, module)
+        arrays = Arrays(ranks)
+        try:
+            size = runtime.function("state_size", (arrays,))
+            start = runtime.function("initialise", (arrays, VECTOR, VECTOR, VECTOR))
+            step = runtime.function("step", (arrays, VECTOR, VECTOR, VECTOR, VECTOR))
+            if size.result != INT or start.result != NONE or step.result != NONE:
+                raise TranslationError(f"{module}: `state_size` returns a whole number, the others nothing.")
+        except TranslationError as error:
+            self.functions, self._bodies = before[1], before[2]
+            raise TranslationError(f"{module}: {error}") from None
+        number = len(self.names)
+        self.names.append(module)
+        self.steps.append(step.name)
+        text = ", ".join(map(str, ranks)) or "0"
+        self.functions.append(f"static const signed char sn_ranks{number}[] = {{{text}}};\n")
+        self.kinds.append(
+            f'    {{"{module}", sn_ranks{number}, {len(ranks)}, {int(runtime.has_members)}, '
+            f"{size.name}, {start.name}, {step.name}}},"
+        )
+
+    def text(self) -> str:
+        """Return the C file."""
+        head = "/* Generated from the runtimes of softneck: do not edit. */\n"
+        guard = '#ifndef SN_KINDS_H\n#define SN_KINDS_H\n\n#include "sn_vector.h"\n'
+        table = "static const sn_kind sn_kinds[] = {\n" + "\n".join(self.kinds) + "\n};\n"
+        count = f"static const int sn_kind_count = {len(self.kinds)};\n"
+        fast = self._fast()
+        functions = [_whole_here(text) if defined(text) in fast else _small(text) for text in self.functions]
+        return "\n".join([head, guard, *self.types.declarations, "", *functions, table, count, "#endif\n"])
+
+    def _fast(self) -> set[str]:
+        """Return the functions that are worth their room: loops of the steps that `FAST` names."""
+        pieces = {defined(text): text for text in self.functions}
+        depths = {name: nested_loops(text) for name, text in pieces.items()}
+        return {
+            name
+            for module, step in zip(self.names, self.steps, strict=True) if module in FAST
+            for name in reached(pieces, [step]) if depths[name] >= FAST[module]
+        }  # fmt: skip
+
+    def keep(self, name: str, text: str) -> str:
+        """Keep a function written under the placeholder @, and return its C name."""
+        if text not in self._bodies:
+            unique = f"{name}_{len(self._bodies)}"
+            self._bodies[text] = unique
+            self.functions.append(text.replace("@", unique))
+        return self._bodies[text]
+
+
+class _Runtime:
+    """One runtime module on its way to C."""
+
+    def __init__(self, unit: Unit, module: str) -> None:
+        tree = ast.parse(bundle(module, loops=False))
+        self.unit = unit
+        self.definitions = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
+        self.constants = _constants(tree)
+        # C is compiled: loops over branches beat whole arrays.
+        self.constants |= {"COMPILED": ast.Constant(True)} if "COMPILED" in self.constants else {}
+        self.has_members = "member_step" in self.definitions
+        self._done: dict[tuple[str, tuple[Type, ...]], _Done | None] = {}
+
+    def function(self, name: str, arguments: tuple[Type, ...]) -> _Done:
+        """Return the C function for these types of arguments."""
+        key = (name, arguments)
+        if key not in self._done:
+            if name not in self.definitions:
+                raise TranslationError(f"there is no function `{name}`.")
+            self._done[key] = None
+            self._done[key] = self._written(self.definitions[name], arguments)
+        done = self._done[key]
+        if done is None:
+            raise TranslationError(f"`{name}` calls itself.")
+        return done
+
+    def _written(self, node: ast.FunctionDef, arguments: tuple[Type, ...]) -> _Done:
+        names = [argument.arg for argument in node.args.args]
+        plain = not (node.args.kwonlyargs or node.args.vararg or node.args.kwarg or node.args.defaults)
+        if not plain or len(names) != len(arguments):
+            raise TranslationError(f"`{node.name}` takes plain arguments, all of them given.")
+        variables: dict[str, Type] = dict(zip(names, arguments, strict=True))
+        bound = {part.id for part in ast.walk(node) if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store)}
+        lent = {name: f"(*v_{name})" for name, kind in variables.items() if lends(kind) and name not in bound}
+        result: Type | None = None
+        for _ in range(_PASSES):
+            scope = Scope(node.name, self.unit.types, variables)
+            scope.lent = lent
+            statements = Statements(node, scope, Expressions(scope, self.constants, self._call), result)
+            statements.block(node.body)
+            settled = not scope.widened and statements.result == result
+            result = statements.result
+            if settled:
+                break
+        else:
+            raise TranslationError(f"`{node.name}`: the types of its variables do not settle.")
+        result = NONE if result is None else result
+        text = self._text(node, names, arguments, scope, result)
+        made = self.unit.keep(re.sub(r"\W", "_", node.name), text)
+        return _Done(made, result, tuple(name in lent for name in names))
+
+    def _text(
+        self, node: ast.FunctionDef, names: list[str], arguments: tuple[Type, ...], scope: Scope, result: Type
+    ) -> str:
+        spell = self.unit.types.name
+        given = dict(zip(names, arguments, strict=True))
+        widened = [name for name in names if scope.variables[name] != given[name]]
+        declared = [
+            f"const {spell(kind)} *v_{name}"
+            if name in scope.lent
+            else f"{spell(kind)} {'a' if name in widened else 'v'}_{name}"
+            for name, kind in given.items()
+        ]
+        # An array that is returned may lie in the workspace: then the caller gives the room back.
+        releases = scope.allocates and not holds_view(result)
+        own = [(f"v_{name}", kind) for name, kind in scope.variables.items() if name not in given or name in widened]
+        lines = [f"{spell(kind)} {name}{_zero(kind)};" for name, kind in own + scope.temporaries]
+        lines += ["size_t top = w->top;"] if releases else []
+        lines += [f"{spell(result)} result{_zero(result)};"] if result != NONE else []
+        lines += [
+            f"v_{name} = {scope.cast(Value(f'a_{name}', given[name]), scope.variables[name])};" for name in widened
+        ]
+        lines += [f"(void){name};" for name in ("w", *(f"v_{name}" for name in names))]
+        lines += scope.lines
+        lines += ["leave: ;"] if "goto leave;" in scope.lines else []
+        lines += ["w->top = top;"] if releases else []
+        lines += ["return result;"] if result != NONE else []
+        head = f"static SN_INSIDE {spell(result)} @({', '.join(['sn_work *w', *declared])})"
+        return f"/* {node.name} */\n{head}\n{{\n{indented(lines)}\n}}\n"
+
+    def _call(self, node: ast.Call, ex: Expressions) -> Value | None:
+        """Return the C of a call of a function of this runtime; None for what is none of its own."""
+        name = node.func.id if isinstance(node.func, ast.Name) else ""
+        if name == "member_count" and self.has_members:
+            return Value("(int64_t)v_arrays->member_count", INT)
+        if name not in self.definitions:
+            return None
+        if node.keywords:
+            raise ex.scope.fail(node, "keywords are not known here.")
+        values = ex.ordered(node.args)
+        if name in _MEMBERS:
+            count, kind, code = _MEMBERS[name]
+            if len(values) != count:
+                raise ex.scope.fail(node, f"`{name}` takes {count} arguments.")
+            value = Value(code.format(", ".join(value.code for value in values)), kind)
+        elif _BY_HAND.get(name, ((), NONE))[0] == tuple(value.type for value in values):
+            kind = _BY_HAND[name][1]
+            arguments = "".join(f", {ex.scope.given(value)}" for value in values)
+            if kind != NONE:
+                filled = ex.scope.temporary(kind)
+                ex.scope.emit(f"sn_{name}(w{arguments}, {filled}.f);")
+                return Value(filled, kind)
+            value = Value(f"sn_{name}(w{arguments})", NONE)
+        else:
+            done = self.function(name, tuple(value.type for value in values))
+            codes = [
+                ex.scope.place(value) if lent else value.code for value, lent in zip(values, done.lent, strict=True)
+            ]
+            arguments = "".join(f", {code}" for code in codes)
+            value = Value(f"{done.name}(w{arguments})", done.result)
+        if value.type == NONE:
+            ex.scope.emit(f"{value.code};")
+            return Value("", NONE)
+        ex.scope.allocates |= holds_view(value.type)
+        return ex.scope.kept(value)
+
+
+def _whole_here(text: str) -> str:
+    """Return a function that checks whole numbers where they stand."""
+    return text.replace("sn_int(", "sn_int_here(")
+
+
+def _small(text: str) -> str:
+    return text.replace("\nstatic ", "\nSN_SMALL static ", 1)
+
+
+def _constants(tree: ast.Module) -> dict[str, ast.expr]:
+    """Return the constants of a runtime: `A = 1`, and `A, B = 1, 2`."""
+    found: dict[str, ast.expr] = {}
+    for node in tree.body:
+        if not isinstance(node, ast.Assign):
+            continue
+        for target in node.targets:
+            if isinstance(target, ast.Name):
+                found[target.id] = node.value
+            elif isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple):
+                names = [part.id if isinstance(part, ast.Name) else "" for part in target.elts]
+                found.update(zip(names, node.value.elts, strict=False))
+    return found
+
+
+def indented(lines: list[str]) -> str:
+    """Return C statements, each as deep as the brackets that are open before it."""
+    depth, shown = 1, []
+    for line in lines:
+        shown.append("    " * (depth - line.startswith("}")) + line)
+        depth += line.count("{") - line.count("}")
+    return "\n".join(shown)
+
+
+def _zero(kind: Type) -> str:
+    if isinstance(kind, View | Bundle):
+        return " = {0}"
+    return " = NULL" if isinstance(kind, Arrays) else " = 0"

@@ -1,0 +1,125 @@
+"""What an FMU tells people about the model, observer, controller or neck inside it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from html import escape
+from typing import Any, Protocol
+
+import numpy as np
+
+from softneck.identification import Validation
+from softneck.runtime import Block
+
+from ._info import FmuInfo
+from ._svg import line_chart
+
+_AXES = ("pitch", "roll")
+# Of a free run, in the picture [s].
+_SHOWN = 30.0
+_HEADINGS = {
+    "plant": "How it was identified",
+    "observer": "How it was designed",
+    "controller": "How it was designed",
+    "reference": "What it gives",
+}
+
+_LIMITS = {
+    "plant": (
+        "An identified plant is good where its training data were: other payloads, other tendons and slower or wilder "
+        "motions than those recorded are guesses. In free run an error stays; nothing pulls it back."
+    ),
+    "observer": "It assumes the linear plant it was designed on; far from there its innovation says so.",
+    "controller": "It was designed on a linear plant; verify the loop on the virtual neck before it moves hardware.",
+}
+_KIND_LIMITS = {
+    "virtual_neck": (
+        "It stands in for a neck that was never weighed: its parameters are the paper's or yours, its friction and its "
+        "link are simple. What holds on it has yet to hold on hardware."
+    ),
+}
+
+
+class Buildable(Protocol):
+    """Anything an FMU is made of."""
+
+    def block(self) -> Block:
+        """Return the block that steps."""
+        ...
+
+    def summary(self) -> str:
+        """Return a few lines for people."""
+        ...
+
+
+def fmu_info(
+    thing: Buildable, *, scores: str = "", validation: Validation | None = None, stop_time: float = 10.0
+) -> FmuInfo:
+    """Return the texts of an FMU of `thing`: how it was made, its scores, its plot and what it is not good for.
+
+    Args:
+        thing: model, observer, controller or neck.
+        scores: what was scored, as plain text.
+        validation: of a model on data it was not trained on; its fits and its free run are shown.
+        stop_time: of the default experiment [s].
+    """
+    block = thing.block()
+    summary = thing.summary()
+    parts = [f"<h2>{_HEADINGS[block.role]}</h2><pre>{escape(summary)}</pre>"]
+    asked: Any = getattr(thing, "settings", None) or {}
+    settings: dict[str, Any] = dict(asked) if isinstance(asked, Mapping) else asdict(asked)
+    if settings:
+        rows = "".join(f"<tr><td>{escape(str(k))}</td><td>{escape(str(v))}</td></tr>" for k, v in settings.items())
+        parts.append(f"<h2>Settings</h2><table>{rows}</table>")
+    if scores:
+        parts.append(f"<h2>Scores</h2><pre>{escape(scores)}</pre>")
+    if validation is not None:
+        parts += ["<h2>Scores</h2>", _fits(validation), _free_run(validation)]
+    elif hasattr(thing, "training_rows") and not scores:
+        parts.append("<h2>Scores</h2><p>None were given when this FMU was built (softneck fmu --data).</p>")
+    limits = _KIND_LIMITS.get(block.kind, _LIMITS.get(block.role, ""))
+    if limits:
+        parts.append(f"<h2>What it is not good for</h2><p>{limits}</p>")
+    return FmuInfo(
+        description=summary.splitlines()[0] if summary else block.kind,
+        author="softneck",
+        license="BSD-3-Clause (runtime); the model is its author's",
+        documentation="\n".join(parts),
+        stop_time=stop_time,
+    )
+
+
+def _fits(validation: Validation) -> str:
+    rows = []
+    for name, scores in (("persistence", validation.persistence), ("this model", validation.fits)):
+        for horizon, fit in scores.items():
+            cells = "".join(f"<td>{_percent(fit.get(axis))}</td>" for axis in _AXES)
+            ahead = {"inf": "free run", "1": "one sample ahead"}.get(horizon, f"{horizon} samples ahead")
+            rows.append(f"<tr><td>{name}</td><td>{ahead}</td>{cells}</tr>")
+    head = "<tr><th></th><th></th><th>pitch</th><th>roll</th></tr>"
+    diverged = "" if validation.diverged is None else f" Its free run diverged at t = {validation.diverged:g} s."
+    return (
+        f"<p>NRMSE fit in %, on {validation.rows_scored} rows of {escape(validation.data)}; "
+        f"{validation.rows_left_out} rows that it was trained on are left out.{diverged}</p>"
+        f"<table>{head}{''.join(rows)}</table>"
+    )
+
+
+def _percent(fit: float | None) -> str:
+    return "-" if fit is None else f"{fit:.2f}"
+
+
+def _free_run(validation: Validation) -> str:
+    """Return both angles over the first stretch, at most half a minute of it."""
+    stretch = validation.run == validation.run[0]
+    time = validation.time[stretch]
+    keep = time < time[0] + _SHOWN
+    figures = []
+    for column, axis in enumerate(_AXES):
+        curves = {
+            "measured": np.degrees(validation.measured[stretch, column][keep]),
+            "free run": np.degrees(validation.free_run[stretch, column][keep]),
+        }
+        figures.append(f"<figure>{line_chart(time[keep], curves, title=axis, unit='deg')}</figure>")
+    return "".join(figures)

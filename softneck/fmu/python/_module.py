@@ -1,0 +1,113 @@
+"""One module out of a kind's runtime and the slave, under a name that its content decides, and a loader for it.
+
+pythonfmu's binary compiles and runs the slave's script anew for every instance and never lets go of its
+names: what it finds there is therefore short, and takes the module from where Python keeps modules.
+"""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from softneck.core import SettingsError
+from softneck.runtime import bundle
+from softneck.runtime._bundle import content_name
+from softneck.runtime._compile import COMPILE_OPTIONS, compiled_name
+
+from ..describe._documentation import MINIMUM_PYTHON
+
+# Stated in the FMU and checked before anything else: old hosts must get past the syntax of this part.
+_CHECK = f'''"""A softneck FMU: generated, do not edit."""
+import sys
+
+
+def _fmu_refuse(text):
+    text = "softneck FMU: " + text
+    if sys.stderr is not None:
+        sys.stderr.write(text + "\\n")
+        sys.stderr.flush()
+    raise ImportError(text)
+
+
+if sys.version_info < {MINIMUM_PYTHON}:
+    _fmu_refuse("it needs Python {".".join(map(str, MINIMUM_PYTHON))} or newer; this host runs " + sys.version.split()[0] + ".")
+try:
+    import numpy
+except ImportError:
+    _fmu_refuse("it needs numpy in the Python of this host (" + sys.executable + "); install it there.")
+'''  # noqa: E501
+# The binary (pythonfmu 0.7) gives up a reference to the script's names for every instance that it never took.
+_TAKE = """import ctypes
+
+from {name} import SoftneckSlave
+
+ctypes.pythonapi.Py_IncRef(ctypes.py_object(globals()))
+"""
+_SLAVE = ("_slave_compiled.py", "_slave_exit.py", "_slave.py")
+
+
+@dataclass(frozen=True, slots=True)
+class SlaveModule:
+    """What an FMU runs.
+
+    Attributes:
+        name, source: of the module with runtime and slave.
+        script_name, script: of what pythonfmu's binary loads for each instance.
+        runtime: name under which softneck and the FMUs keep the compiled runtime.
+        options: numba's, for that.
+    """
+
+    name: str
+    source: str
+    script_name: str
+    script: str
+    runtime: str
+    options: dict[str, Any]
+
+
+def slave_module(runtime: str) -> SlaveModule:
+    """Return the module of the FMU of runtime module `runtime`.
+
+    Raises:
+        SettingsError: the runtime defines a name that the slave uses.
+    """
+    text = bundle(runtime)
+    parts = [Path(__file__).with_name(name).read_text(encoding="utf-8") for name in _SLAVE]
+    clash = _names(text) & set[str]().union(*map(_names, parts))
+    if clash:
+        raise SettingsError(f"runtime module {runtime} defines {', '.join(sorted(clash))}; the FMU's slave does too.")
+    border = _constant(parts[0], "_FMU_BORDER")
+    source = border + text + border + "\n".join(map(_without_own_imports, parts))
+    name = content_name(source)
+    script = f"{_CHECK}{_TAKE.format(name=name)}"
+    return SlaveModule(name, source, content_name(script, "softneck_fmu"), script, compiled_name(text), COMPILE_OPTIONS)
+
+
+def _without_own_imports(source: str) -> str:
+    lines = source.splitlines()
+    for node in ast.parse(source).body:
+        own = isinstance(node, ast.ImportFrom) and (node.module or "").startswith("softneck.")
+        docstring = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+        if own or docstring:
+            for number in range(node.lineno, (node.end_lineno or node.lineno) + 1):
+                lines[number - 1] = ""
+    return "\n".join(lines).strip("\n") + "\n"
+
+
+def _names(source: str) -> set[str]:
+    names: set[str] = set()
+    for node in ast.parse(source).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names.add(node.name)
+        for target in node.targets if isinstance(node, ast.Assign) else []:
+            names.update({target.id} if isinstance(target, ast.Name) else set())
+    return names
+
+
+def _constant(source: str, name: str) -> str:
+    for node in ast.parse(source).body:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == name:
+            return str(ast.literal_eval(node.value))
+    raise SettingsError(f"the slave does not say {name}.")

@@ -1,0 +1,316 @@
+"""The one FMI 2.0 slave: every FMU carries this text behind the runtime of its kind (`_module.py`).
+
+It knows nothing of kinds: ports, sample time and arrays come from `resources/block.json` and
+`resources/arrays.npy`, the three functions of the runtime from the module it stands in. It must run
+where softneck is not: standard library, numpy and pythonfmu's base class only.
+
+Timing: sample n is at t_0 + n T_s. It is taken in the communication step that begins at or before it,
+with the inputs held then. A plant's new outputs show when communication reaches sample n + 1, those of
+everything else at once.
+"""
+
+import contextvars
+import ctypes
+import json
+import math
+import sys
+import traceback
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pythonfmu.fmi2slave import Fmi2Slave
+
+from ._runtime_names import initialise, state_size, step
+from ._slave_compiled import _FMU_SWITCH, _fmu_compiled_step, _fmu_print
+from ._slave_exit import _fmu_release_at_exit
+
+# Share of a sample time: hosts add up their time, and 1e6 steps of 2 ms are off by 1e-7 s at most.
+_FMU_SAME_TIME = 1e-4
+_FMU_WARNING = 1
+_FMU_ERROR = 3
+_FMU_CATEGORY = {_FMU_WARNING: "logStatusWarning", _FMU_ERROR: "logStatusError"}
+_FMU_VECTORS = ("variables", "pending", "memory")
+
+
+class _FmuMessage:
+    """One entry of the log queue, as pythonfmu's binary reads it."""
+
+    def __init__(self, status: int, text: str) -> None:
+        self.status = status
+        self.category = _FMU_CATEGORY[status]
+        self.msg = text.replace("%", "%%")  # FMI loggers take the message for a printf format
+        self.debug = False
+
+
+def _fmu_guarded(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Say why a call failed, on stderr and in the FMI log, before the binary turns it into a status."""
+
+    @wraps(method)
+    def call(self: "SoftneckSlave", *arguments: Any) -> Any:
+        try:
+            return method(self, *arguments)
+        except BaseException as error:
+            self._fail(error)
+            raise
+
+    return call
+
+
+def _fmu_keep_alive(*things: object) -> None:
+    # On an exception pythonfmu 0.7 releases instance, class and log queue, and releases them again at the
+    # next reset or free: without these references the second call after an error runs on freed memory.
+    for thing in things:
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(thing))
+
+
+def _fmu_arrays(path: Path, shapes: list[list[int]]) -> tuple[np.ndarray, ...]:
+    """Return the arrays that stand behind each other in one file."""
+    flat = np.load(path, allow_pickle=False).astype(np.float64, copy=False)
+    arrays, first = [], 0
+    for shape in shapes:
+        last = first + math.prod(shape)
+        arrays.append(flat[first:last].reshape(shape))
+        first = last
+    return tuple(arrays)
+
+
+def _fmu_quiet() -> Callable[..., Any]:
+    """Return a way to call plain numpy without its warnings, which are the host's to switch."""
+    if int(np.__version__.split(".")[0]) >= 2:
+        # numpy 2 keeps its error state in the context: entering one costs a tenth of `errstate`.
+        context = contextvars.copy_context()
+        context.run(np.seterr, all="ignore")
+        return context.run
+
+    def call(function: Callable[..., None], *arguments: Any) -> None:
+        with np.errstate(all="ignore"):
+            function(*arguments)
+
+    return call
+
+
+class SoftneckSlave(Fmi2Slave):
+    """A softneck block as an FMI slave; value references count inputs, outputs, parameters."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.folder = kwargs["resources"]
+        _fmu_release_at_exit(self.folder)
+        self.facts = json.loads(Path(self.folder, "block.json").read_text(encoding="utf-8"))
+        self.arrays = _fmu_arrays(Path(self.folder, "arrays.npy"), self.facts["shapes"])
+        self.modelName = self.facts["name"]
+        self.queue: list[_FmuMessage] = []
+        self.warned: set[str] = set()
+        self.ports = self.facts["inputs"] + self.facts["outputs"] + self.facts["parameters"]
+        n_in, n_out = len(self.facts["inputs"]), len(self.facts["outputs"])
+        self.n_in, self.n_known = n_in, n_in + n_out
+        self.plant = self.facts["role"] in ("plant", "reference")
+        self.sample_time = self.facts["sample_time"]
+        self.start, self.count, self.running, self.stale = 0.0, 0, False, True
+        self.variables = np.array([port["start"] for port in self.ports], dtype=np.float64)
+        # What nobody connects or sets was not measured.
+        self.variables[:n_in][[port["missing"] for port in self.facts["inputs"]]] = np.nan
+        self.pending = np.zeros(n_out)
+        self.memory = np.zeros(state_size(self.arrays))
+        self.advance: Callable[..., None] | None = None
+        self.compiled = False
+        self.quietly = _fmu_quiet()
+        self._view()
+
+    def _view(self) -> None:
+        self.inputs = self.variables[: self.n_in]
+        self.outputs = self.variables[self.n_in : self.n_known]
+        self.parameters = self.variables[self.n_known :]
+
+    def _get_log_queue(self) -> list[_FmuMessage]:
+        return self.queue
+
+    def tell(self, status: int, text: str) -> None:
+        """Put `text` into the FMI log and on stderr: hosts show the log only when asked to."""
+        self.queue.append(_FmuMessage(status, text))
+        _fmu_print(text)
+
+    def _fail(self, error: BaseException) -> None:
+        self.tell(_FMU_ERROR, f"{self.facts['name']}: {error}")
+        if not isinstance(error, ValueError):
+            _fmu_print(traceback.format_exc())
+        _fmu_keep_alive(self, type(self), self.queue)
+
+    # Life cycle
+
+    @_fmu_guarded
+    def setup_experiment(self, start_time: float, *_: Any) -> None:
+        """Take the start time."""
+        self.start, self.count = float(start_time), 0
+        if self.folder in sys.path:  # the binary put it there to find this module, once for each instance
+            sys.path.remove(self.folder)
+
+    @_fmu_guarded
+    def enter_initialization_mode(self) -> None:
+        """Nothing to do: outputs follow the parameters until the mode is left."""
+
+    @_fmu_guarded
+    def exit_initialization_mode(self) -> None:
+        """Fix the parameters."""
+        self._initialise()
+        self.running = True
+
+    def _initialise(self) -> None:
+        if self.stale:
+            self.memory[:] = 0.0
+            self.quietly(initialise, self.arrays, self.parameters, self.memory, self.pending)
+            self.outputs[:] = self.pending
+            if self.advance is None:
+                self._choose(always=False)
+            self.stale = False
+
+    def _choose(self, *, always: bool) -> None:
+        """Take `step` from numba where that pays, or where it must be (`always`), else as it stands here."""
+        found = _fmu_compiled_step(self.facts, self.folder, always=always)
+        self.compiled, self.advance = found is not None, found or step
+        if found is not None:  # what numba takes its time for is done now, on copies
+            found(self.arrays, self.parameters, self.memory.copy(), np.zeros(self.n_in), self.pending.copy())
+
+    def do_step(self, current_time: float, step_size: float) -> bool:
+        """Take all samples in [current_time, current_time + step_size)."""
+        try:
+            if self.stale:
+                self._initialise()
+            end = current_time + step_size
+            slack = _FMU_SAME_TIME * self.sample_time
+            while self.start + self.count * self.sample_time < end - slack:
+                self._take_sample()
+            # A plant's next outputs belong to the next sample: they show when that is reached.
+            if self.plant and self.start + self.count * self.sample_time <= end + slack:
+                self.outputs[:] = self.pending
+        except BaseException as error:
+            self._fail(error)
+            raise
+        return True  # False would be "discard", on which hosts cut the result off without a word
+
+    def _take_sample(self) -> None:
+        if self.plant:
+            self.outputs[:] = self.pending
+        if self.compiled:
+            self.advance(self.arrays, self.parameters, self.memory, self.inputs, self.pending)  # type: ignore[misc]
+        else:
+            self.quietly(step, self.arrays, self.parameters, self.memory, self.inputs, self.pending)
+        self.count += 1
+        if not self.plant:
+            self.outputs[:] = self.pending
+        if not math.isfinite(sum(self.pending.tolist())):
+            self._check_outputs()
+
+    def _check_outputs(self) -> None:
+        for port, value in zip(self.facts["outputs"], self.pending.tolist(), strict=True):
+            if math.isinf(value) or (math.isnan(value) and not port["missing"]):
+                time = self.start + self.count * self.sample_time
+                raise ValueError(f"output {port['name']} became {value} at t = {time:.6g} s: the model has diverged.")
+
+    # Variables
+
+    @_fmu_guarded
+    def set_real(self, references: list[int], values: list[float]) -> None:
+        """Set inputs and parameters."""
+        for reference, value in zip(references, values, strict=True):
+            self._set(reference, float(value))
+
+    @_fmu_guarded
+    def set_boolean(self, references: list[int], values: list[bool]) -> None:
+        """Set Boolean inputs and parameters; inside they are 0.0 and 1.0."""
+        for reference, value in zip(references, values, strict=True):
+            self._set(reference, 1.0 if value else 0.0)
+
+    @_fmu_guarded
+    def get_real(self, references: list[int]) -> list[float]:
+        """Return values of any variables."""
+        self._initialise()
+        values = self.variables.tolist()
+        return [self._shown(values[reference], reference) for reference in references]
+
+    def _shown(self, value: float, reference: int) -> float:
+        """Return an input that was never set as its start value: hosts expect a number."""
+        return self.ports[reference]["start"] if value != value and reference < self.n_in else value
+
+    @_fmu_guarded
+    def get_boolean(self, references: list[int]) -> list[bool]:
+        """Return values of Boolean variables."""
+        self._initialise()
+        return [bool(self.variables[reference] != 0.0) for reference in references]
+
+    def _set(self, reference: int, value: float) -> None:
+        port = self.ports[reference]
+        if value - value != 0.0 and not (port["missing"] and value != value):
+            raise ValueError(f"{port['name']} was set to {value}; it must be finite.")
+        # A limit that a saturating controller works out may miss the stated one by rounding.
+        slack = 1e-9 * (1.0 + abs(value))
+        outside = not port["low"] - slack <= value <= port["high"] + slack and value == value
+        if reference < self.n_in:
+            if outside and port["name"] not in self.warned:
+                self._warn_outside(port, value)
+        elif reference < self.n_known:
+            raise ValueError(f"{port['name']} is an output and cannot be set.")
+        elif self.running:
+            raise ValueError(f"{port['name']} is fixed; set it before the initialisation ends.")
+        elif outside:
+            text = f"between {port['low']:g} and {port['high']:g} [{port['unit']}]"
+            raise ValueError(f"{port['name']} must be {text}; it was set to {value:g}.")
+        else:
+            self.stale = True
+        self.variables[reference] = value
+
+    def _warn_outside(self, port: dict[str, Any], value: float) -> None:
+        self.warned.add(port["name"])
+        hint = " Is it in degrees?" if port["name"].endswith("_reference") and port["unit"] == "rad" else ""
+        span = f"{port['low']:g} to {port['high']:g} {port['unit']}"
+        self.tell(_FMU_WARNING, f"{self.facts['name']}: {port['name']} = {value:g} is outside {span}.{hint}")
+
+    # The whole state, to the bit
+
+    @_fmu_guarded
+    def _get_fmu_state(self) -> dict[str, Any]:
+        self._initialise()
+        vectors = {name: getattr(self, name).astype("<f8").tobytes() for name in _FMU_VECTORS}
+        counters = {"start": self.start, "count": self.count, "running": self.running, "compiled": self.compiled}
+        return {"guid": self.facts["guid"], **counters, **vectors}
+
+    @_fmu_guarded
+    def _set_fmu_state(self, state: dict[str, Any]) -> None:
+        sizes = {name: getattr(self, name).nbytes for name in _FMU_VECTORS}
+        if state.get("guid") != self.facts["guid"] or sizes != {name: len(state.get(name, b"")) for name in sizes}:
+            raise ValueError("the FMU state comes from another FMU or is damaged.")
+        for name in _FMU_VECTORS:
+            getattr(self, name)[:] = np.frombuffer(state[name], dtype="<f8")
+        self.start, self.count, self.running = state["start"], state["count"], state["running"]
+        self.stale = False
+        # Compiled and plain steps differ in the last digit, and a replay must not.
+        if self.advance is None or state["compiled"] != self.compiled:
+            self._resume(state["compiled"])
+
+    def _resume(self, compiled: bool) -> None:
+        if compiled:
+            self._choose(always=True)
+        else:
+            self.compiled, self.advance = False, step
+        if compiled and not self.compiled:
+            self.tell(
+                _FMU_WARNING,
+                f"{self.facts['name']}: this state was saved by compiled steps and goes on by plain ones, "
+                f"which differ in the last digit (numba is not here, or {_FMU_SWITCH} is 0).",
+            )
+
+    @staticmethod
+    def _fmu_state_to_bytes(state: dict[str, Any]) -> bytes:
+        plain = {name: value.hex() if name in _FMU_VECTORS else value for name, value in state.items()}
+        return json.dumps(plain, sort_keys=True).encode()
+
+    @staticmethod
+    def _fmu_state_from_bytes(state: bytes) -> dict[str, Any]:
+        try:
+            plain = json.loads(state.decode())
+            return {name: bytes.fromhex(value) if name in _FMU_VECTORS else value for name, value in plain.items()}
+        except (ValueError, AttributeError, TypeError):
+            return {}  # refused by name when it is set: there is an instance then that can tell

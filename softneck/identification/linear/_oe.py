@@ -1,0 +1,214 @@
+"""Output error: transfer functions with dead time whose free run fits best."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from softneck.core import (
+    DataError,
+    Matrix,
+    Progress,
+    Vector,
+    require_between,
+    require_one_of,
+    require_positive,
+    require_whole,
+    silent,
+)
+from softneck.signals import TENDON_ANGLES, Recording, redefine, redefinition_matrix
+
+from ..models._drive import fit_drive
+from ..models._fitting import fitted_model, training_recording
+from ..models._free_run import delay_samples, free_run_fit
+from ..models._model import Model
+from ..models._state_space import axes_system, lss_arrays
+from ._oe_fit import OutputErrorFit, default_starts, fit_output_error, largest_radius, pole_radius
+from ._regression import arx_rows, require_excitation
+
+AXES = ("pitch", "roll")
+SOURCES = ("set_points", "positions")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutputError:
+    """Transfer functions from theta_i to pitch and phi_i to roll by output error (Ljung 1999, sec. 4.2 and 10.2).
+
+    Unbiased under output noise, where `rls` is not. It has no noise model: a prediction some samples ahead is the
+    free run started again from the measured outputs.
+
+    Attributes:
+        nf, nb: poles, and coefficients of the numerator.
+        delay: dead time [s]; None takes the one of the least cost.
+        max_delay: end of that search [s].
+        source: what drives the model: "set_points", or "positions" of the motors, which in free run the drive model
+            makes from the set-points.
+    """
+
+    nf: int = 1
+    nb: int = 1
+    delay: float | None = None
+    max_delay: float = 0.3
+    source: str = "set_points"
+
+    def __post_init__(self) -> None:
+        require_whole("nf", self.nf, 1, 10)
+        require_whole("nb", self.nb, 1, 100)
+        if self.delay is not None:
+            require_between("delay", self.delay, 0.0, 2.0, "s")
+        require_positive("max_delay", self.max_delay, "s")
+        require_one_of("source", self.source, SOURCES)
+
+    def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
+        """Identify both axes; runs are never joined and each has its own start, missed samples are not judged.
+
+        Raises:
+            DataError: too short, constant, not enough excitation, or no stable model.
+        """
+        recording = training_recording(recordings)
+        inputs = axis_runs(recording, self.source)
+        found, delays, curves, beside = [], [], {}, {}
+        for axis, name in enumerate(AXES):
+            progress(axis / 2, name)
+            fit, d, curves[name], beside[name] = self._fit_axis(recording.sample_time, inputs[axis], name)
+            found.append(fit)
+            delays.append(float(d))
+        progress(1.0, "done")
+        arrays, functions = axis_arrays(
+            recording, [fit.f for fit in found], [fit.b for fit in found], delays, self.source
+        )
+        return fitted_model(
+            "oe",
+            self,
+            recording,
+            arrays=arrays,
+            findings={
+                **functions,
+                "delay_criterion": "output_error",
+                "delay_curve": curves,
+                "parameter_std": [np.sqrt(np.diag(fit.covariance)).tolist() for fit in found],
+                "least_squares_beside": beside,
+                **_warnings(inputs, found),
+            },
+        )
+
+    def _fit_axis(
+        self, sample_time: float, runs: list[tuple[Vector, Vector]], name: str
+    ) -> tuple[OutputErrorFit, int, list[list[float]], dict[str, Any]]:
+        """Return the best fit, its dead time, the cost curve (delay [s], fit [%], one-step rms), and plain ARX."""
+        columns = [(y[:, None], u[:, None]) for u, y in runs]
+        spread = _spread(runs)
+        best: tuple[OutputErrorFit, int] | None = None
+        curve: list[list[float]] = []
+        last: list[Vector] = []
+        for d in delay_samples(self.delay, self.max_delay, sample_time, columns):
+            Phi, Y = arx_rows(columns, self.nf, self.nb, d)
+            require_excitation(name, Phi)
+            arx = np.linalg.lstsq(Phi, Y[:, 0])[0]
+            # The optimum of one dead time is a good start for the next; all others only where there is none yet.
+            starts = [*last, arx[: self.nf]] if last else default_starts(self.nf, sample_time, arx[: self.nf])
+            fit = fit_output_error(runs, self.nf, self.nb, d, starts)
+            if fit is None:
+                continue
+            last = [fit.f]
+            one_step = Y[:, 0] - Phi @ np.concatenate([fit.f, fit.b])
+            percent = 100.0 * (1.0 - np.sqrt(fit.cost / spread))
+            curve.append([d * sample_time, percent, float(np.sqrt(np.mean(one_step**2)))])
+            if best is None or fit.cost < best[0].cost:
+                best = (fit, d)
+        if best is None:
+            raise DataError(f"no dead time gives a stable model of {name}; record with more excitation.")
+        d = best[1]
+        again = fit_output_error(runs, self.nf, self.nb, d, [best[0].f, *default_starts(self.nf, sample_time, None)])
+        fit = again if again is not None and again.cost < best[0].cost else best[0]
+        return fit, d, curve, _beside(columns, self.nf, self.nb, d, sample_time)
+
+
+def axis_runs(recording: Recording, source: str) -> list[list[tuple[Vector, Vector]]]:
+    """Return (input, output) of each run for pitch and for roll, the input from set-points or logged positions.
+
+    Raises:
+        DataError: positions are asked for and were not logged, or only in part.
+    """
+    if source == "positions" and not recording.has_motor_positions:
+        raise DataError("no motor positions were logged; use `source=set_points`.")
+    runs: list[list[tuple[Vector, Vector]]] = [[], []]
+    for run in recording.runs():
+        motors = run.motor_positions if source == "positions" else run.set_points
+        if not np.isfinite(motors).all():
+            raise DataError("some motor positions were missed; fill them or use `source=set_points`.")
+        U = redefine(motors)
+        for axis in range(2):
+            y = run.outputs[:, axis]
+            if np.isfinite(y).any():
+                runs[axis].append((np.ascontiguousarray(U[:, axis]), y))
+    return runs
+
+
+def axis_arrays(
+    recording: Recording, a: list[Vector], b: list[Vector], delays: list[float], source: str
+) -> tuple[dict[str, Matrix], dict[str, Any]]:
+    """Return the arrays that the runtime reads, and what `findings` must say beside them.
+
+    A model of one pole starts from its last measured output; one of more poles has a Kalman observer, as the last
+    outputs determine a slow state beside a fast one only through their noise.
+    """
+    drive = fit_drive(recording)
+    if max(part.size for part in a) > 1:
+        common = int(min(delays))
+        late = [int(d) - common for d in delays]
+        system = axes_system(a, [np.concatenate([np.zeros(d), part]) for d, part in zip(late, b, strict=True)])
+        functions = {
+            name: {"a": a[axis].tolist(), "b": b[axis].tolist(), "delay": int(delays[axis])}
+            for axis, name in enumerate(AXES)
+        }
+        arrays = lss_arrays(system, delay=common, drive=drive.array, source=int(source == "positions"))
+        return arrays, {"transfer_functions": functions}
+    # Both axes stand in one table.
+    na, nb = max(part.size for part in a), max(part.size for part in b)
+    A, B = np.zeros((2, na)), np.zeros((2, nb))
+    for axis in range(2):
+        A[axis, : a[axis].size], B[axis, : b[axis].size] = a[axis], b[axis]
+    history = max(na, max(delays) + nb, drive.delay.max())
+    arrays = {
+        "history": np.array([float(int(history))]),
+        "drive": drive.array,
+        "redefinition": redefinition_matrix(TENDON_ANGLES),
+        "a": A,
+        "b": B,
+        "delay": np.array(delays),
+        "source": np.array([float(source == "positions")]),
+    }
+    return arrays, {}
+
+
+def _beside(columns: list[tuple[Matrix, Matrix]], na: int, nb: int, d: int, sample_time: float) -> dict[str, Any]:
+    """Return what plain least squares (ARX) makes of the same orders and dead time: its bias under noise shows."""
+    Phi, Y = arx_rows(columns, na, nb, d)
+    theta = np.linalg.lstsq(Phi, Y[:, 0])[0]
+    slowest = pole_radius(theta[:na])
+    return {
+        "slowest_pole_1_per_s": float(-np.log(slowest)) / sample_time if slowest > 0.0 else None,
+        "static_gain": float(theta[na:].sum() / (1.0 + theta[:na].sum())),
+        "free_run_fit": _finite(free_run_fit(columns, theta[:na], theta[None, na:], d)),
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+def _spread(runs: list[tuple[Vector, Vector]]) -> float:
+    y = np.concatenate([y[np.isfinite(y)] for _, y in runs])
+    return float(np.sum((y - y.mean()) ** 2))
+
+
+def _warnings(runs: list[list[tuple[Vector, Vector]]], found: list[OutputErrorFit]) -> dict[str, list[str]]:
+    said = [
+        f"{name}: its slowest pole is at the bound of a third of the longest run, a drift; lower `nf` or record longer."
+        for name, axis, fit in zip(AXES, runs, found, strict=True)
+        if pole_radius(fit.f) > largest_radius(axis) - 1e-3 * (1.0 - largest_radius(axis))
+    ]
+    return {"warnings": said} if said else {}

@@ -1,0 +1,251 @@
+"""Recursive least squares over the redefined inputs or the motors, with dead time (section 4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from softneck.core import (
+    DataError,
+    Matrix,
+    Progress,
+    SettingsError,
+    Vector,
+    require_between,
+    require_one_of,
+    require_positive,
+    require_whole,
+    silent,
+)
+from softneck.runtime import load_functions
+from softneck.signals import TENDON_ANGLES, Recording, redefine, redefinition_matrix
+
+from ..models._drive import fit_drive
+from ..models._fitting import fitted_model, training_recording
+from ..models._free_run import delay_samples, free_run_fit
+from ..models._model import WARM_UP, Model
+from ..models._scores import nrmse_fit
+from ..models._state_space import lss_arrays, varx_system
+from ._recursion import EXACT_START, Recursion, require_forgetting
+from ._regression import arx_rows, require_excitation
+
+_STANDARD, _UD = "softneck.identification.linear._recursion_runtime", "softneck.identification.linear._ud_runtime"
+# F(0) of the standard form; a weaker start would cost it more digits than the start's pull does.
+_STANDARD_START = 1e8
+STRUCTURES = ("siso", "miso", "mimo")
+_AXES = ("pitch", "roll")
+Curve = list[list[float]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rls:
+    """ARX model of each axis by recursive least squares (Eq. 23-30) over theta_i and phi_i (Eq. 9, 10).
+
+    Attributes:
+        na, nb: orders of Eq. 23.
+        delay: dead time [s]; None searches it.
+        delay_by: the search's criterion on the training rows: "free_run" (simulation) or "one_step" (prediction).
+        max_delay: end of the search [s].
+        forgetting: lambda in (0, 1]; 1 for Eq. 29, below for a constant forgetting factor (CFF-RLS).
+        structure: "siso" over theta_i and phi_i, "miso" (each output from the three motors and its own past) or
+            "mimo" (from the three motors and both pasts).
+        form: "ud" (Bierman's factors) or "standard" (Eq. 29 as printed).
+        covariance_bound: on the trace of F where `forgetting` is below 1; 0 for none.
+        dead_zone: prediction errors up to this size [rad] change nothing.
+        stable: halve a step that would make a pole unstable (not for "mimo").
+    """
+
+    na: int = 1
+    nb: int = 1
+    delay: float | None = None
+    delay_by: str = "free_run"
+    max_delay: float = 0.3
+    forgetting: float = 1.0
+    structure: str = "siso"
+    form: str = "ud"
+    covariance_bound: float = 1e8
+    dead_zone: float = 0.0
+    stable: bool = False
+
+    def __post_init__(self) -> None:
+        # A hundred samples are 2 s: no neck remembers longer.
+        require_whole("na", self.na, 1, 100)
+        require_whole("nb", self.nb, 1, 100)
+        if self.delay is not None:
+            require_between("delay", self.delay, 0.0, 2.0, "s")
+        require_one_of("delay_by", self.delay_by, ("free_run", "one_step"))
+        require_positive("max_delay", self.max_delay, "s")
+        require_forgetting(self.forgetting)
+        require_one_of("structure", self.structure, STRUCTURES)
+        require_one_of("form", self.form, ("ud", "standard"))
+        require_between("covariance_bound", self.covariance_bound, 0.0, 1e15)
+        require_between("dead_zone", self.dead_zone, 0.0, np.pi, "rad")
+        if self.form == "standard" and (self.dead_zone > 0.0 or self.stable):
+            raise SettingsError("form `standard` is Eq. 28-30 alone; `dead_zone` and `stable` need form `ud`.")
+        if self.stable and self.structure == "mimo":
+            raise SettingsError("`stable` watches the poles of one output; use structure `siso` or `miso` with it.")
+
+    def recursion(self) -> Recursion:
+        """Return the recursion of one output, for use sample by sample."""
+        inputs = {"siso": 1, "miso": 3, "mimo": 3}[self.structure]
+        outputs = 2 if self.structure == "mimo" else 1
+        return Recursion(
+            parameters=outputs * self.na + inputs * self.nb,
+            forgetting=self.forgetting,
+            covariance_bound=self.covariance_bound if self.forgetting < 1.0 else 0.0,
+            dead_zone=self.dead_zone,
+            poles=self.na if self.stable else 0,
+            start_covariance=EXACT_START,
+        )
+
+    def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
+        """Identify pitch from theta_i and roll from phi_i, or both from the motors.
+
+        Args:
+            recordings: one or several of one sample time; their runs are never joined.
+            progress: called with the part done and a word on it.
+
+        Raises:
+            DataError: too short, constant, without two usable rows, or not enough excitation.
+        """
+        recording = training_recording(recordings)
+        fit = self._fit_siso if self.structure == "siso" else self._fit_motors
+        arrays, findings = fit(recording, progress)
+        progress(1.0, "done")
+        return fitted_model(
+            "rls", self, recording, arrays=arrays, findings={"delay_criterion": self.delay_by, **findings}
+        )
+
+    def _fit_siso(self, recording: Recording, progress: Progress) -> tuple[dict[str, Matrix], dict]:
+        drive = fit_drive(recording)
+        runs = [(run.outputs, redefine(run.set_points)) for run in recording.runs()]
+        a, b, delays, stds, numbers = [], [], [], [], []
+        curves: dict[str, Curve] = {}
+        for axis, name in enumerate(_AXES):
+            progress(axis / 2, name)
+            one = [(Y[:, [axis]], U[:, [axis]]) for Y, U in runs]
+            d, theta, std, curves[name], number = self._search(recording.sample_time, one, name)
+            a.append(theta[: self.na])
+            b.append(theta[self.na :])
+            delays.append(float(d))
+            stds.append(std.tolist())
+            numbers.append(number)
+        history = max(self.na, max(delays) + self.nb, drive.delay.max())
+        arrays = {
+            "history": np.array([float(int(history))]),
+            "drive": drive.array,
+            "redefinition": redefinition_matrix(TENDON_ANGLES),
+            "a": np.array(a),
+            "b": np.array(b),
+            "delay": np.array(delays),
+        }
+        return arrays, {"delay_curve": curves, "condition_number": numbers, "parameter_std": stds}
+
+    def _search(
+        self, sample_time: float, runs: list[tuple[Matrix, Matrix]], name: str
+    ) -> tuple[int, Vector, Vector, Curve, float]:
+        """Return delay [samples], theta, its std, the cost curve (delay [s], free-run fit [%], one-step rms), cond."""
+        best: tuple[float, int, Vector, Vector, float] | None = None
+        curve: Curve = []
+        for d in delay_samples(self.delay, self.max_delay, sample_time, runs):
+            theta, std, one_step, number = self._least_squares(runs, d, name)
+            free = free_run_fit(runs, theta[: self.na], theta[self.na :].reshape(-1, self.nb), d)
+            curve.append([d * sample_time, free, one_step])
+            cost = -free if self.delay_by == "free_run" else one_step
+            if best is None or cost < best[0]:
+                best = (cost, d, theta, std, number)
+        if best is None or not np.isfinite(best[0]):
+            raise DataError(
+                f"no dead time gives a stable one-step model of {name}; record with more excitation or set `delay`."
+            )
+        return best[1], best[2], best[3], curve, best[4]
+
+    def _least_squares(
+        self, runs: list[tuple[Matrix, Matrix]], d: int, name: str
+    ) -> tuple[Vector, Vector, float, float]:
+        """Return theta, its standard deviation, the one-step rms and the condition number."""
+        Phi, Y = arx_rows(runs, self.na, self.nb, d)
+        y = np.ascontiguousarray(Y[:, 0])
+        number = require_excitation(name, Phi)
+        theta, F = self._recurse(Phi, y)
+        e = y - Phi @ theta
+        rms = float(np.sqrt(np.mean(e**2)))
+        free = max(y.size - theta.size, 1)
+        return theta, rms * np.sqrt(y.size / free * np.diag(F)), rms, number
+
+    def _recurse(self, Phi: Matrix, y: Vector) -> tuple[Vector, Matrix]:
+        n = Phi.shape[1]
+        if self.form == "standard":
+            theta, F = np.zeros(n), _STANDARD_START * np.eye(n)
+            load_functions(_STANDARD).rls_recursion(Phi, y, theta, F, self.forgetting)
+            return theta, F
+        recursion = self.recursion()
+        state = recursion.initial_state()
+        if self.forgetting < 1.0 or self.dead_zone > 0.0 or self.stable:
+            state, _ = recursion.run(state, Phi, y)
+        else:
+            load_functions(_UD).ud_recursion(Phi, y, state.theta, state.factor, state.scale, 1.0)
+        return state.theta, state.covariance
+
+    def _fit_motors(self, recording: Recording, progress: Progress) -> tuple[dict[str, Matrix], dict]:
+        """Fit both outputs over the three motors; "miso" takes a dead time each, "mimo" one for both."""
+        drive = fit_drive(recording).array
+        Ts = recording.sample_time
+        runs = [(run.outputs, run.set_points) for run in recording.runs()]
+        if self.structure == "miso":
+            found = []
+            for axis, name in enumerate(_AXES):
+                progress(axis / 2, name)
+                found.append(self._search(Ts, [(Y[:, [axis]], U) for Y, U in runs], name))
+            delays = [d for d, *_ in found]
+            arrays = self._motor_arrays([theta for _, theta, *_ in found], delays, drive)
+            curves = {name: curve for name, (*_, curve, _) in zip(_AXES, found, strict=True)}
+            return arrays, {"delay_curve": curves, "condition_number": [number for *_, number in found]}
+        best, curves = None, {name: [] for name in _AXES}
+        tried = delay_samples(self.delay, self.max_delay, Ts, runs)
+        for step, d in enumerate(tried):
+            progress(step / len(tried), f"{1e3 * d * Ts:.0f} ms")
+            both = [self._least_squares(_own_first(runs, axis), d, name) for axis, name in enumerate(_AXES)]
+            arrays = self._motor_arrays([theta for theta, *_ in both], [d, d], drive)
+            fits = _fits(Model(kind="rls", sample_time=Ts, arrays=arrays), recording)
+            for name, fit, (_, _, rms, _) in zip(_AXES, fits, both, strict=True):
+                curves[name].append([d * Ts, fit, rms])
+            cost = -sum(fits) if self.delay_by == "free_run" else sum(rms for _, _, rms, _ in both)
+            if best is None or cost < best[0]:
+                best = (cost, arrays, [number for *_, number in both])
+        if best is None or not np.isfinite(best[0]):
+            raise DataError("no dead time gives a stable model of both outputs; record more or set `delay`.")
+        return best[1], {"delay_curve": curves, "condition_number": best[2]}
+
+    def _motor_arrays(self, thetas: list[Vector], delays: list[int], drive: Matrix) -> dict[str, Matrix]:
+        return motor_arrays(self, thetas, delays, drive)
+
+
+def motor_arrays(settings: Rls, thetas: list[Vector], delays: list[int], drive: Matrix) -> dict[str, Matrix]:
+    """Return the runtime's arrays of parameters over the three motors, one vector for each output."""
+    na, nb, common = settings.na, settings.nb, min(delays)
+    p = max(na, nb + max(delays) - common)
+    A, B = np.zeros((p, 2, 2)), np.zeros((p, 2, 3))
+    for axis, (theta, d) in enumerate(zip(thetas, delays, strict=True)):
+        A[:na, axis, axis] = theta[:na]
+        rest = theta[na:]
+        if settings.structure == "mimo":
+            A[:na, axis, 1 - axis] = rest[:na]
+            rest = rest[na:]
+        late = d - common
+        B[late : late + nb, axis] = rest.reshape(3, nb).T
+    return lss_arrays(varx_system(A, B), delay=common, drive=drive, history=p + common)
+
+
+def _own_first(runs: list[tuple[Matrix, Matrix]], axis: int) -> list[tuple[Matrix, Matrix]]:
+    return [(Y[:, [axis, 1 - axis]], U) for Y, U in runs]
+
+
+def _fits(model: Model, recording: Recording) -> list[float]:
+    """Return the free-run fits [%] of both outputs; -inf where the model is unstable."""
+    if np.abs(np.linalg.eigvals(model.arrays["A"])).max() >= 1.0:
+        return [-np.inf, -np.inf]
+    simulated = model.simulate(recording)
+    starts = np.concatenate([np.arange(len(run)) for run in recording.runs()]) >= WARM_UP
+    return [nrmse_fit(recording.outputs[starts, axis], simulated[starts, axis]) for axis in range(2)]

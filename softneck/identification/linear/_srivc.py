@@ -1,0 +1,185 @@
+"""Continuous-time transfer functions with dead time, as the paper's Eq. 31 has them, with confidence intervals."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from softneck.core import (
+    DataError,
+    Progress,
+    SettingsError,
+    Vector,
+    require_between,
+    require_one_of,
+    require_positive,
+    require_whole,
+    silent,
+)
+from softneck.signals import Recording
+
+from ..models._fitting import fitted_model, training_recording
+from ..models._free_run import delay_samples
+from ..models._model import Model
+from ._oe import AXES, SOURCES, axis_arrays, axis_runs
+from ._regression import arx_rows, require_excitation
+from ._srivc_fit import Runs, Search, SrivcFit, with_delay
+from ._srivc_intervals import Intervals, bootstrap
+
+# Poles [1/s] to start from: the neck's 5, and a third and three times that.
+_POLES = (5.0, 1.7, 15.0)
+_CAUTION = (
+    "intervals say how far noise moves the estimate of one linear system; on a neck that is nonlinear they do not "
+    "hold its gain, pole and dead time elsewhere in its range: take a `family` for that"
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Srivc:
+    """`K exp(-L s)/(s + p)`, or more poles and zeros, by simplified refined instrumental variables (Garnier 2015).
+
+    Set-points are held between samples, so the sampled model is exact, with any dead time between samples.
+
+    Attributes:
+        order: poles.
+        zeros: zeros, below `order`.
+        delay: dead time [s]; None estimates it, also between samples.
+        max_delay: bound on it [s].
+        source: "set_points", or "positions" of the motors, see `OutputError`.
+        resamples: of the bootstrap; 0 for no intervals.
+        level: of the intervals.
+        seed: of the bootstrap.
+    """
+
+    order: int = 1
+    zeros: int = 0
+    delay: float | None = None
+    max_delay: float = 0.3
+    source: str = "set_points"
+    resamples: int = 200
+    level: float = 0.95
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        require_whole("order", self.order, 1, 6)
+        require_whole("zeros", self.zeros, 0, 5)
+        if self.zeros >= self.order:
+            raise SettingsError(f"`zeros` must be below `order` {self.order}; got {self.zeros}.")
+        if self.delay is not None:
+            require_between("delay", self.delay, 0.0, 2.0, "s")
+        require_positive("max_delay", self.max_delay, "s")
+        require_one_of("source", self.source, SOURCES)
+        require_whole("resamples", self.resamples, 0, 100_000)
+        require_between("level", self.level, 0.5, 0.9999)
+        require_whole("seed", self.seed, 0, 2**31 - 1)
+
+    def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
+        """Identify both axes; runs are never joined and each has its own start, missed samples are not judged.
+
+        Raises:
+            DataError: too short, constant, not enough excitation, or no stable model.
+        """
+        recording = training_recording(recordings)
+        generator = np.random.default_rng(self.seed)
+        sampled, continuous, curves, intervals = [], {}, {}, {}
+        for axis, (name, runs) in enumerate(zip(AXES, axis_runs(recording, self.source), strict=True)):
+            progress(axis / 2, name)
+            fit, curves[name] = self.fit_axis(runs, recording.sample_time, name)
+            model = fit.model
+            sampled.append(model.sampled(recording.sample_time))
+            continuous[name] = {"b": model.b.tolist(), "a": [1.0, *model.a.tolist()], "delay_s": model.delay}
+            if self.resamples > 0:
+                found = self.intervals(runs, recording.sample_time, fit, generator)
+                intervals[name] = found.as_dict()
+        progress(1.0, "done")
+        a, b, d = ([entry[i] for entry in sampled] for i in range(3))
+        arrays, functions = axis_arrays(recording, a, b, [float(samples) for samples in d], self.source)
+        said = {"intervals": intervals, "level": self.level, "caution": _CAUTION} if intervals else {}
+        return fitted_model(
+            "srivc",
+            self,
+            recording,
+            arrays=arrays,
+            findings={
+                **functions,
+                "continuous": continuous,
+                "delay_criterion": "output_error",
+                "delay_curve": curves,
+                **said,
+            },
+        )
+
+    def fit_axis(self, runs: Runs, sample_time: float, name: str) -> tuple[SrivcFit, list[list[float]]]:
+        """Return the fit and the cost curve: rows of (delay [s], fit [%], one-step rms) at whole samples.
+
+        Args:
+            runs: input and output of each run, (time,) each.
+            sample_time: [s].
+            name: of the axis, for messages.
+        """
+        columns = [(y[:, None], u[:, None]) for u, y in runs]
+        measured = np.concatenate([y[np.isfinite(y)] for _, y in runs])
+        spread = float(np.sum((measured - measured.mean()) ** 2))
+        search = self.search(sample_time)
+        fixed = Search(**{**asdict(search), "free_delay": False})
+        best, fits, curve = None, {}, []
+        last: SrivcFit | None = None
+        for d in delay_samples(self.delay, self.max_delay, sample_time, columns):
+            Phi, _ = arx_rows(columns, self.order, self.order, d)
+            require_excitation(name, Phi)
+            L = d * sample_time if self.delay is None else self.delay
+            fit = fixed.improve(runs, with_delay(last.model, L), last.starts) if last is not None else None
+            fit = fit or _best([fixed.start(runs, pole, L) for pole in _POLES])
+            if fit is None:
+                continue
+            last = fits[d] = fit
+            curve.append([L, 100.0 * (1.0 - float(np.sqrt(fit.cost / spread))), _one_step(columns, fit, sample_time)])
+            if best is None or fit.cost < fits[best].cost:
+                best = d
+        if best is None:
+            raise DataError(f"no dead time gives a stable model of {name}; record with more excitation.")
+        if self.delay is not None:
+            return fits[best], curve
+        # The derivative by the dead time has a step at each sample: try from both sides.
+        nearby = [fits[d] for d in (best - 1, best, best + 1) if d in fits]
+        middle = [
+            search.improve(runs, with_delay(f.model, f.model.delay + 0.5 * sample_time), f.starts) for f in nearby
+        ]
+        free = _best([*middle, *(search.improve(runs, f.model, f.starts) for f in nearby)])
+        return (free if free is not None and free.cost < fits[best].cost else fits[best]), curve
+
+    def search(self, sample_time: float) -> Search:
+        """Return how one axis is fitted."""
+        return Search(
+            sample_time=sample_time,
+            order=self.order,
+            zeros=self.zeros,
+            max_delay=self.max_delay,
+            free_delay=self.delay is None,
+        )
+
+    def intervals(self, runs: Runs, sample_time: float, fit: SrivcFit, generator: np.random.Generator) -> Intervals:
+        """Return the bootstrap's intervals of one axis."""
+        return bootstrap(
+            self.search(sample_time), runs, fit, count=self.resamples, generator=generator, level=self.level
+        )
+
+
+def _best(fits: list[SrivcFit | None]) -> SrivcFit | None:
+    there = [fit for fit in fits if fit is not None]
+    return min(there, key=lambda fit: fit.cost) if there else None
+
+
+def _one_step(columns: list, fit: SrivcFit, sample_time: float) -> float:
+    """Return the rms error [rad] of the sampled model one step ahead."""
+    a, b, d = fit.model.sampled(sample_time)
+    errors = []
+    for Y, U in columns:
+        y: Vector = Y[:, 0]
+        lag = max(a.size, b.size + d)
+        predicted = sum(-a[i] * y[lag - i - 1 : y.size - i - 1] for i in range(a.size)) + sum(
+            b[j] * U[lag - d - j - 1 : y.size - d - j - 1, 0] for j in range(b.size)
+        )
+        errors.append(y[lag:] - predicted)
+    return float(np.sqrt(np.nanmean(np.concatenate(errors) ** 2)))

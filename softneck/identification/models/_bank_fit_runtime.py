@@ -1,0 +1,45 @@
+"""Loops over the drive and the bank of `_bank_runtime`, for training."""
+
+import numpy as np
+
+from softneck.identification.models._bank_runtime import bank_advance, drive_advance, drive_limit, load_advance
+
+
+def drive_run(drive: np.ndarray, load: np.ndarray, targets: np.ndarray, start: np.ndarray, motors: np.ndarray) -> None:
+    """Fill `motors` (time, 3) for set-points `targets` (time, 3), standing at `start` (3,) before."""
+    m = start.copy()
+    q = start.copy()
+    motors[0] = m
+    for k in range(targets.shape[0] - 1):
+        load_advance(load, m, q)
+        for j in range(3):
+            back = k + 1 - int(drive[j, 1])
+            target = targets[back, j] if back >= 0 else start[j]
+            m[j] = drive_advance(drive[j, 0], target, m[j], drive_limit(load, q, j))
+        motors[k + 1] = m
+
+
+def bank_run(
+    redefinition: np.ndarray, widths: np.ndarray, chain: np.ndarray, motors: np.ndarray, signals: np.ndarray
+) -> None:
+    """Fill `signals` (time, n) with the bank along `motors` (time, 3), at rest at the first row before."""
+    n = int(chain[1])
+    count = widths.shape[0]
+    plays = np.zeros(3 * count)
+    bank = np.zeros(3 * (count + 1) * n)
+    for c in range(3):
+        v = 0.0
+        for j in range(3):
+            v += redefinition[c, j] * motors[0, j]
+        # Plays that came from zero, as a model's do that starts from rest and is then held.
+        for i in range(count + 1):
+            x = v
+            if i > 0:
+                x = max(v - widths[i - 1], min(v + widths[i - 1], 0.0))
+                plays[c * count + i - 1] = x
+            for o in range(n):
+                bank[(c * (count + 1) + i) * n + o] = x
+    signals[0] = bank
+    for k in range(motors.shape[0] - 1):
+        bank_advance(redefinition, widths, chain, motors[k], plays, bank)
+        signals[k + 1] = bank

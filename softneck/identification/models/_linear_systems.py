@@ -1,0 +1,238 @@
+"""Linear kinds as python-control systems, and as the paper writes them (Eq. 31)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import control
+import numpy as np
+from scipy.linalg import logm
+
+from softneck.core import Matrix, SettingsError, Vector, require_one_of, require_whole
+from softneck.signals import TENDON_ANGLES, redefinition_matrix
+
+from ._state_space import system_of
+
+KINDS = ("rls", "oe", "srivc", "subspace")
+STATE_SPACE = "softneck.identification.linear._state_space_runtime"
+_OUTPUTS = ("pitch", "roll")
+_REDEFINED = ("theta_i", "phi_i", "delta_i")
+_MOTORS = ("motor_setpoint_1", "motor_setpoint_2", "motor_setpoint_3")
+
+
+class Linear(Protocol):
+    """What is asked of a model here."""
+
+    @property
+    def kind(self) -> str:
+        """Its name in the table of kinds."""
+        ...
+
+    @property
+    def sample_time(self) -> float:
+        """[s]."""
+        ...
+
+    @property
+    def arrays(self) -> Mapping[str, Matrix]:
+        """What its runtime reads."""
+        ...
+
+    @property
+    def findings(self) -> Mapping[str, Any]:
+        """What its estimator found."""
+        ...
+
+
+def transfer_function(model: Linear, output: str, input: str | None, angle_unit: str) -> control.TransferFunction:
+    """Return the discrete transfer function from `input` to `output`, with its delay in full.
+
+    Raises:
+        SettingsError: the kind is not linear, or an unknown input, output or unit.
+    """
+    name, scale = _checked(model, output, input, angle_unit)
+    axes = model.findings.get("transfer_functions")
+    if axes is not None:
+        numerator, denominator, delay = _of_findings(axes, _OUTPUTS.index(output), name)
+    elif "A" in model.arrays:
+        numerator, denominator, delay = _of_state_space(model.arrays, _OUTPUTS.index(output), name)
+    else:
+        numerator, denominator, delay = _of_axis(model.arrays, _OUTPUTS.index(output), name)
+    # In powers of z: the numerator b_1 z^(n-1-d)... needs n = max(na, nb + d) so that no power is negative.
+    a, b = denominator[1:], numerator
+    n = max(a.size, b.size + delay)
+    below, above = np.zeros(n + 1), np.zeros(n + 1)
+    below[: a.size + 1] = denominator
+    above[1 + delay : 1 + delay + b.size] = b
+    return control.TransferFunction(
+        scale * above, below, model.sample_time, inputs=[name], outputs=[output], name=f"G_{output}"
+    )
+
+
+def state_space(model: Linear) -> control.StateSpace:
+    """Return both outputs as one discrete state space, from the motors where the model has them as inputs."""
+    _require_linear(model.kind)
+    if "A" in model.arrays and "transfer_functions" not in model.findings:
+        A, B, C, _ = system_of(model.arrays)
+        A, B, C = _delayed(A, B, C, int(model.arrays["delay"][0]))
+        inputs = list(_MOTORS)
+    else:
+        parts = [control.ss(transfer_function(model, output, None, "rad")) for output in _OUTPUTS]
+        joined: Any = control.append(*parts)
+        A, B, C = np.asarray(joined.A), np.asarray(joined.B), np.asarray(joined.C)
+        inputs = list(_REDEFINED[:2])
+    D = np.zeros((2, B.shape[1]))
+    return control.StateSpace(A, B, C, D, model.sample_time, inputs=inputs, outputs=list(_OUTPUTS), name="neck")
+
+
+def continuous_function(
+    model: Linear, output: str, input: str | None, angle_unit: str, pade: int
+) -> control.TransferFunction:
+    """Return the continuous-time transfer function behind samples held by a zero-order hold.
+
+    Raises:
+        SettingsError: a pole at zero or on the negative real axis, which no continuous system has.
+    """
+    name, scale = _checked(model, output, input, angle_unit)
+    require_whole("pade", pade, 0, 12)
+    axis = _OUTPUTS.index(output)
+    found = model.findings.get("continuous")
+    if found is not None and name == _REDEFINED[axis]:
+        b, a, delay = found[output]["b"], found[output]["a"], float(found[output]["delay_s"])
+    else:
+        b, a, delay = _continuous(model, output, name)
+    G = control.TransferFunction(scale * np.asarray(b), np.asarray(a))
+    if pade > 0 and delay > 0.0:
+        G = G * control.TransferFunction(*control.pade(delay, pade))
+    return control.TransferFunction(G.num, G.den, inputs=[name], outputs=[output], name=f"G_{output}")
+
+
+def describe(model: Linear) -> list[str]:
+    """Return each axis in the paper's form, `G = exp(-L s) K/(s + p)`, in degrees, where it has one real pole."""
+    if "A" in model.arrays and "transfer_functions" not in model.findings:
+        poles = np.linalg.eigvals(model.arrays["A"])
+        delay = model.arrays["delay"][0] * model.sample_time
+        return [f"{poles.size} states, dead time {delay:.3g} s, poles {np.array2string(poles, precision=4)}"]
+    return [_describe_axis(model, axis) for axis in (0, 1)]
+
+
+def _describe_axis(model: Linear, axis: int) -> str:
+    name = _OUTPUTS[axis]
+    numbers = continuous_parameters(model.sample_time, model.arrays, axis)
+    found = model.findings.get("continuous")
+    if found is not None and len(found[name]["a"]) == 2:
+        numbers = (found[name]["b"][0], found[name]["a"][1], found[name]["delay_s"])
+    if numbers is None:
+        G: Any = transfer_function(model, name, None, "deg")
+        poles = np.roots(np.trim_zeros(np.asarray(G.den[0][0]), "b"))
+        gain = float(G.dcgain())
+        delay = _dead_time(np.asarray(G.num[0][0]), np.asarray(G.den[0][0])) * model.sample_time
+        return (
+            f"{name}: discrete poles {np.array2string(poles, precision=4)}, "
+            f"static gain {gain:.3f} deg/rad, dead time {delay:.2f} s"
+        )
+    K, p, L = numbers
+    gain = np.degrees(K / p)
+    return f"{name}: G(s) = exp(-{L:.2f} s) {np.degrees(K):.3f}/(s + {p:.3f}) deg/rad, static gain {gain:.3f}"
+
+
+def continuous_parameters(
+    sample_time: float, arrays: Mapping[str, Matrix], axis: int
+) -> tuple[float, float, float] | None:
+    """Return K [rad/(rad s)], pole p [1/s] and dead time L [s] of a one-pole axis; None for another order."""
+    if "a" not in arrays:
+        return None
+    a, b = arrays["a"][axis], arrays["b"][axis]
+    if a.size != 1 or b.size != 1 or not 0.0 < -a[0] < 1.0:
+        return None
+    p = -np.log(-a[0]) / sample_time
+    return float(b[0] * p / (1.0 + a[0])), float(p), float(arrays["delay"][axis] * sample_time)
+
+
+def _continuous(model: Linear, output: str, name: str) -> tuple[Vector, Vector, float]:
+    """Undo the zero-order hold: return numerator, denominator and dead time [s]."""
+    G = transfer_function(model, output, name, "rad")
+    below, above = np.asarray(G.den[0][0]), np.trim_zeros(np.asarray(G.num[0][0]), "f")
+    delay = _dead_time(above, below)
+    S: Any = control.ss(control.TransferFunction(above, below[: below.size - delay], model.sample_time))
+    poles = np.linalg.eigvals(S.A)
+    if (np.abs(poles) < 1e-9).any() or ((np.abs(poles.imag) < 1e-12) & (poles.real <= 0.0)).any():
+        raise SettingsError(
+            f"{output} has no continuous-time form: a pole at zero or on the negative real axis. Lower its order, "
+            "or identify `srivc`."
+        )
+    n = S.A.shape[0]
+    joint = np.eye(n + 1)
+    joint[:n, :n], joint[:n, n:] = S.A, S.B
+    L = np.real(logm(joint)) / model.sample_time
+    continuous: Any = control.ss2tf(control.StateSpace(L[:n, :n], L[:n, n:], S.C, S.D))
+    return np.asarray(continuous.num[0][0]), np.asarray(continuous.den[0][0]), delay * model.sample_time
+
+
+def _dead_time(numerator: Vector, denominator: Vector) -> int:
+    """Return the samples that poles at zero delay, beyond the one that a strictly proper system has itself."""
+    above = np.trim_zeros(numerator, "f")
+    at_zero = denominator.size - np.trim_zeros(denominator, "b").size
+    return min(at_zero, denominator.size - above.size - 1) if above.size else 0
+
+
+def _of_findings(axes: Mapping[str, Any], axis: int, name: str) -> tuple[Vector, Vector, int]:
+    """Return one axis of a model whose arrays hold both in one state space."""
+    entry = axes[_OUTPUTS[axis]]
+    arrays = {
+        "redefinition": redefinition_matrix(TENDON_ANGLES),
+        "a": np.array([entry["a"]] * 2),
+        "b": np.array([entry["b"]] * 2),
+        "delay": np.array([entry["delay"]] * 2),
+    }
+    return _of_axis(arrays, axis, name)
+
+
+def _of_axis(arrays: Mapping[str, Matrix], axis: int, name: str) -> tuple[Vector, Vector, int]:
+    weight = 1.0
+    if name in _MOTORS:
+        weight = float(arrays["redefinition"][axis, _MOTORS.index(name)])
+    elif name != _REDEFINED[axis]:
+        weight = 0.0  # what Eq. 9-11 neglect
+    return weight * arrays["b"][axis], np.concatenate([[1.0], arrays["a"][axis]]), int(arrays["delay"][axis])
+
+
+def _of_state_space(arrays: Mapping[str, Matrix], axis: int, name: str) -> tuple[Vector, Vector, int]:
+    A, B, C, _ = system_of(arrays)
+    if name in _MOTORS:
+        b = B[:, _MOTORS.index(name)]
+    else:
+        b = B @ np.linalg.inv(redefinition_matrix(TENDON_ANGLES))[:, _REDEFINED.index(name)]
+    # c (zI - A)^-1 b = (det(zI - A + b c) - det(zI - A)) / det(zI - A).
+    denominator = np.real(np.poly(A))
+    numerator = np.real(np.poly(A - np.outer(b, C[axis]))) - denominator
+    return numerator[1:], denominator, int(arrays["delay"][0])
+
+
+def _delayed(A: Matrix, B: Matrix, C: Matrix, delay: int) -> tuple[Matrix, Matrix, Matrix]:
+    """Return the system with `delay` samples of its inputs as states."""
+    n, m = B.shape
+    size = n + m * delay
+    F, G, H = np.zeros((size, size)), np.zeros((size, m)), np.zeros((C.shape[0], size))
+    F[:n, :n], H[:, :n] = A, C
+    if delay == 0:
+        return A, B, C
+    F[:n, n : n + m] = B
+    F[n : size - m, n + m :] = np.eye(size - n - m)
+    G[size - m :] = np.eye(m)
+    return F, G, H
+
+
+def _checked(model: Linear, output: str, input: str | None, angle_unit: str) -> tuple[str, float]:
+    _require_linear(model.kind)
+    require_one_of("output", output, _OUTPUTS)
+    require_one_of("angle_unit", angle_unit, ("rad", "deg"))
+    name = _REDEFINED[_OUTPUTS.index(output)] if input is None else input
+    require_one_of("input", name, _REDEFINED + _MOTORS)
+    return name, 180.0 / np.pi if angle_unit == "deg" else 1.0
+
+
+def _require_linear(kind: str) -> None:
+    if kind not in KINDS:
+        raise SettingsError(f"a model of kind `{kind}` is not linear; use one of kind {', '.join(KINDS)}.")

@@ -1,0 +1,267 @@
+"""The identified plant: one class for all kinds, as their runtimes share one `step` form."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import control
+import numpy as np
+from numpy.typing import ArrayLike
+
+from softneck.core import (
+    KINDS,
+    DataError,
+    FileFormatError,
+    Matrix,
+    SettingsError,
+    Vector,
+    require_one_of,
+    write_archive,
+)
+from softneck.core import load as load_file
+from softneck.core._checks import finite_vector
+from softneck.runtime import Block, State
+from softneck.signals import Recording
+
+from . import _linear_systems as _linear
+from . import _ports
+from ._arrays import check_arrays
+from ._composed import memory_of, runtime_of, set_now
+
+# A free run starts from this many measured samples, for every kind; they are not scored.
+WARM_UP = 25
+_MOTORS = ("simulated", "measured")
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Model:
+    """A plant identified from recordings: motor set-points in, pitch and roll out.
+
+    Attributes:
+        kind: name in the table of kinds.
+        sample_time: [s].
+        arrays: what the runtime reads, in its order.
+        settings: what the estimator was asked for.
+        findings: what it found: cost curves, noise, parameters.
+        training_rows: hashes of the rows it was trained on (see `row_hashes`).
+    """
+
+    kind: str
+    sample_time: float
+    arrays: Mapping[str, Matrix]
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    findings: Mapping[str, Any] = field(default_factory=dict)
+    training_rows: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.uint64))
+
+    def block(self) -> Block:
+        """Return the model as a block, as the FMU builder and loops take it."""
+        return Block(
+            kind=self.kind,
+            role="plant",
+            runtime=runtime_of(self.kind, self.arrays),
+            sample_time=self.sample_time,
+            arrays=tuple(self.arrays.values()),
+            inputs=_ports.INPUTS,
+            outputs=_ports.outputs(self.kind),
+            parameters=_ports.PARAMETERS,
+        )
+
+    def initial_state(self, recording: Recording | None = None, **parameters: float) -> State:
+        """Return the state at t_0: at rest, or as if the neck had stood at the first row of `recording`.
+
+        Args:
+            recording: whose first pitch, roll and motor positions the neck had held before.
+            **parameters: start values by name (`pitch_start`, `roll_start` [rad], ...), without a recording.
+        """
+        block = self.block()
+        if recording is None:
+            return block.initial_state(**{"use_measurement": 1.0, **parameters})
+        if parameters:
+            raise SettingsError("`initial_state` takes a recording or start values, not both.")
+        y0 = np.nan_to_num(recording.outputs[0])
+        logged = recording.motor_positions[0]
+        m0 = np.where(np.isfinite(logged), logged, recording.set_points[0])
+        start = block.initial_state(use_measurement=1.0, pitch_start=y0[0], roll_start=y0[1])
+        held = np.tile(np.concatenate([m0, y0, m0]), (memory_of(self.arrays), 1))
+        state, _ = block.run(start, held)
+        outputs = start.outputs.copy()
+        outputs[2:5] = m0
+        # The last `step` moved the outputs of now; set them back to what the first row says.
+        values = state.values.copy()
+        set_now(self.kind, self.arrays, values, m0, y0)
+        return State(values, state.parameters, outputs)
+
+    def step(self, state: State, inputs: ArrayLike, *, measured: ArrayLike | None = None) -> tuple[State, Vector]:
+        """Hold the set-points over [t_k, t_k+1); return the state and the outputs at t_k+1.
+
+        Args:
+            state: at t_k.
+            inputs: (3,) motor set-points [rad].
+            measured: pitch and roll, or those and three motor positions, measured at t_k [rad]; NaN where not.
+
+        Returns:
+            The next state and (pitch, roll, three motor positions, and bounds for set membership) [rad].
+
+        Raises:
+            DataError: wrong sizes or set-points that are not finite.
+        """
+        u = np.full(8, np.nan)
+        u[:3] = finite_vector("inputs", inputs, 3)
+        if measured is not None:
+            values = np.asarray(measured, dtype=np.float64).ravel()
+            if values.size not in (2, 5):
+                raise DataError(f"`measured` must have 2 or 5 entries (pitch, roll, motors); got {values.size}.")
+            u[3 : 3 + values.size] = values
+        return self.block().step(state, u)
+
+    def simulate(self, recording: Recording, *, motors: str = "simulated", warm_up: int = WARM_UP) -> Matrix:
+        """Free run: return the outputs (time, n_out) [rad] from set-points alone; row 0 is the start.
+
+        Args:
+            recording: whose set-points drive the model; its first `warm_up` samples align each run.
+            motors: "measured" feeds logged motor positions throughout, as the paper does.
+            warm_up: samples at the start of each run in which the measured outputs are fed.
+        """
+        self._check(recording)
+        require_one_of("motors", motors, _MOTORS)
+        return np.concatenate([self._free_run(run, motors, warm_up) for run in recording.runs()])
+
+    def predict(self, recording: Recording, horizon: int = 1, *, motors: str = "simulated") -> Matrix:
+        """Return the outputs (time, n_out) [rad] predicted `horizon` samples ahead from measured ones.
+
+        The first rows of each run, with no such past, are predicted from its first row.
+        """
+        self._check(recording)
+        require_one_of("motors", motors, _MOTORS)
+        if horizon < 1:
+            raise DataError(f"`horizon` must be at least 1 sample; got {horizon}.")
+        parts: list[Matrix] = []
+        for run in recording.runs():
+            start = self.initial_state(run)
+            rows = _input_rows(run, "measured")
+            if horizon == 1:
+                _, predicted = self.block().run(start, rows)
+            else:
+                free = _input_rows(run, motors, outputs=False)
+                predicted = self.block().run_horizon(start, rows, free, horizon)
+            parts.append(np.vstack([start.outputs, predicted[:-1]]))
+        return np.concatenate(parts)
+
+    def tf(
+        self,
+        output: str,
+        *,
+        angle_unit: str = "rad",
+        input: str | None = None,
+        continuous: bool = False,
+        pade: int = 3,
+    ) -> control.TransferFunction:
+        """Return a transfer function to `output` (linear kinds); in discrete time its dead time is exact.
+
+        Args:
+            output: "pitch" or "roll".
+            angle_unit: of the output, "rad" or "deg".
+            input: "theta_i", "phi_i", "delta_i" or "motor_setpoint_1".., the others held; None takes the redefined
+                input of `output` (Eq. 9, 10).
+            continuous: return K/(s + p) and the like, the dead time as a Pade approximation.
+            pade: its order; 0 leaves the dead time out.
+        """
+        G = _linear.transfer_function(self, output, input, angle_unit)
+        return _linear.continuous_function(self, output, input, angle_unit, pade) if continuous else G
+
+    def ss(self) -> control.StateSpace:
+        """Return the state space to (pitch, roll) [rad] from (theta_i, phi_i), or from the motors where it has them."""
+        return _linear.state_space(self)
+
+    def summary(self) -> str:
+        """Return a few lines on what the model is, in degrees."""
+        lines = [f"{self.kind}: {KINDS[self.kind].summary}", f"sample time {1e3 * self.sample_time:g} ms"]
+        if self.kind in _linear.KINDS:
+            lines += _linear.describe(self)
+        lines += [f"{key}: {_short(value)}" for key, value in self.findings.items() if _is_plain(value)]
+        lines.append(f"trained on {self.training_rows.size} rows")
+        return "\n".join(lines)
+
+    def save(self, path: str | Path, *, force: bool = False) -> None:
+        """Write the model to an `.npz` file.
+
+        Raises:
+            OutputError: the file exists (and not `force`) or cannot be written.
+        """
+        header = {
+            "kind": self.kind,
+            "sample_time": self.sample_time,
+            "channels": {"inputs": ["motor_setpoint_1", "motor_setpoint_2", "motor_setpoint_3"], "unit": "rad"},
+            "arrays": list(self.arrays),
+            "settings": dict(self.settings),
+            "findings": dict(self.findings),
+        }
+        write_archive(path, header, {**self.arrays, "training_rows": self.training_rows}, force=force)
+
+    @classmethod
+    def from_archive(cls, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Model:
+        """Return the model that `save` wrote."""
+        model = cls(
+            kind=header["kind"],
+            sample_time=float(header["sample_time"]),
+            arrays={name: arrays[name] for name in header["arrays"]},
+            settings=header["settings"],
+            findings=header["findings"],
+            training_rows=arrays["training_rows"],
+        )
+        check_arrays(model.kind, model.arrays)
+        _check_header(model)
+        return model
+
+    def _check(self, recording: Recording) -> None:
+        if not np.isclose(recording.sample_time, self.sample_time, rtol=1e-3):
+            raise DataError(
+                f"the model was identified at {self.sample_time:g} s and the recording is at "
+                f"{recording.sample_time:g} s; resample it (`softneck.signals.resampled`) or identify again."
+            )
+        if len(recording) < 2:
+            raise DataError(f"a run needs at least 2 rows; got {len(recording)}.")
+
+    def _free_run(self, run: Recording, motors: str, warm_up: int) -> Matrix:
+        start = self.initial_state(run)
+        rows = _input_rows(run, motors, outputs=False)
+        rows[:warm_up] = _input_rows(run, "measured")[:warm_up]
+        _, outputs = self.block().run(start, rows)
+        return np.vstack([start.outputs, outputs[:-1]])
+
+
+def _check_header(model: Model) -> None:
+    if not 0.0 < model.sample_time < 10.0:
+        raise FileFormatError(f"its sample time of {model.sample_time} s is none of a neck.")
+    if not isinstance(model.settings, dict) or not isinstance(model.findings, dict):
+        raise FileFormatError("its settings and findings must be tables.")
+    if model.training_rows.dtype != np.uint64 or model.training_rows.ndim != 1:
+        raise FileFormatError("its training rows are no hashes.")
+
+
+def load_model(path: str | Path) -> Model:
+    """Open a model file; raises FileFormatError for anything else."""
+    return load_file(path, role="model")
+
+
+def _input_rows(run: Recording, motors: str, *, outputs: bool = True) -> Matrix:
+    rows = np.full((len(run), 8), np.nan)
+    rows[:, :3] = run.set_points
+    if outputs:
+        rows[:, 3:5] = run.outputs
+    if motors == "measured" and run.has_motor_positions:
+        rows[:, 5:] = run.motor_positions
+    return rows
+
+
+def _is_plain(value: Any) -> bool:
+    return isinstance(value, int | float | str) or (isinstance(value, list) and len(value) <= 4)
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(_short(item) for item in value)
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

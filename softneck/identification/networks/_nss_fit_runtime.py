@@ -1,0 +1,156 @@
+"""Free runs of a neural state space over prepared inputs, with exact derivatives by all its weights.
+
+Weights stand in the order A, B, E, F, G, h, D, C, c, row by row, for n states, p inputs and q neurons (see
+`_nss_map_runtime`). `begin` (time,) says where a state is set: 1 to zero, 2 to the row of `states`.
+"""
+
+import numpy as np
+
+from softneck.identification.networks._nss_map_runtime import nss_inputs, nss_next
+
+
+def nss_signals(redefinition: np.ndarray, widths: np.ndarray, motors: np.ndarray, V: np.ndarray) -> None:
+    """Fill `V` (time, 3 (1 + widths)) with the inputs along `motors` (time, 3); plays come from zero."""
+    plays = np.zeros(3 * widths.shape[0])
+    for k in range(motors.shape[0]):
+        nss_inputs(redefinition, widths, motors[k], plays, V[k])
+
+
+def nss_free(
+    w: np.ndarray,
+    n: int,
+    q: int,
+    V: np.ndarray,
+    begin: np.ndarray,
+    states: np.ndarray,
+    gain: np.ndarray,
+    measured: np.ndarray,
+    seen: np.ndarray,
+    Y: np.ndarray,
+) -> None:
+    """Fill `Y` (time, 2) with free runs, and `seen` (time, n) with the states behind them.
+
+    With a `gain` (n, 2) that is not zero each state is corrected by `gain (measured - y)` first, where `measured`
+    (time, 2) is a number, and `seen` holds what it was corrected to.
+    """
+    p = V.shape[1]
+    edge = np.cumsum(np.array([n * n, n * p, n * q, q * n, q * p, q, q * q, 2 * n]))
+    A = w[: edge[0]].copy().reshape(n, n)
+    B = w[edge[0] : edge[1]].copy().reshape(n, p)
+    E = w[edge[1] : edge[2]].copy().reshape(n, q)
+    F = w[edge[2] : edge[3]].copy().reshape(q, n)
+    G = w[edge[3] : edge[4]].copy().reshape(q, p)
+    h = w[edge[4] : edge[5]].copy()
+    D = w[edge[5] : edge[6]].copy().reshape(q, q)
+    C = w[edge[6] : edge[7]].copy().reshape(2, n)
+    c = w[edge[7] :].copy()
+    x = np.zeros(n)
+    ahead = np.zeros(n)
+    t = np.empty(q)
+    for k in range(V.shape[0]):
+        if begin[k] == 1:
+            x[:] = 0.0
+        elif begin[k] == 2:
+            x[:] = states[k]
+        for a in range(2):
+            total = c[a]
+            for i in range(n):
+                total += C[a, i] * x[i]
+            Y[k, a] = total
+        for a in range(2):
+            if np.isfinite(measured[k, a]):
+                for i in range(n):
+                    x[i] += gain[i, a] * (measured[k, a] - Y[k, a])
+        seen[k] = x
+        nss_next(A, B, E, F, G, h, D, x, V[k], t, ahead)
+        x[:] = ahead
+
+
+def nss_sensitivities(
+    w: np.ndarray,
+    n: int,
+    q: int,
+    V: np.ndarray,
+    begin: np.ndarray,
+    states: np.ndarray,
+    rows: np.ndarray,
+    Y: np.ndarray,
+    J: np.ndarray,
+) -> None:
+    """As `nss_free` without a gain; where `rows` (time,) is r >= 0, J[2 r] and J[2 r + 1] are dy(k)/dw."""
+    p = V.shape[1]
+    edge = np.cumsum(np.array([n * n, n * p, n * q, q * n, q * p, q, q * q, 2 * n]))
+    A = w[: edge[0]].copy().reshape(n, n)
+    B = w[edge[0] : edge[1]].copy().reshape(n, p)
+    E = w[edge[1] : edge[2]].copy().reshape(n, q)
+    F = w[edge[2] : edge[3]].copy().reshape(q, n)
+    G = w[edge[3] : edge[4]].copy().reshape(q, p)
+    h = w[edge[4] : edge[5]].copy()
+    D = w[edge[5] : edge[6]].copy().reshape(q, q)
+    C = w[edge[6] : edge[7]].copy().reshape(2, n)
+    c = w[edge[7] :].copy()
+    inner = int(edge[6])  # C and c do not move the state
+    x = np.zeros(n)
+    ahead = np.zeros(n)
+    t = np.empty(q)
+    slope = np.empty((n, n))
+    R = np.empty((n, q))
+    S = np.zeros((n, inner))
+    moved = np.zeros((n, inner))
+    for k in range(V.shape[0]):
+        if begin[k] == 1:
+            x[:] = 0.0
+            S[:] = 0.0
+        elif begin[k] == 2:
+            x[:] = states[k]
+            S[:] = 0.0
+        r = rows[k]
+        for a in range(2):
+            total = c[a]
+            for i in range(n):
+                total += C[a, i] * x[i]
+            Y[k, a] = total
+            if r >= 0:
+                line = J[2 * r + a]
+                line[:] = 0.0
+                for i in range(n):
+                    weight = C[a, i]
+                    for l in range(inner):
+                        line[l] += weight * S[i, l]
+                    line[inner + a * n + i] = x[i]
+                line[inner + 2 * n + a] = 1.0
+        nss_next(A, B, E, F, G, h, D, x, V[k], t, ahead)
+        # R: how the sums into the neurons, those behind each of them included, move the state.
+        for i in range(n):
+            for j in range(q - 1, -1, -1):
+                total = E[i, j]
+                for l in range(j + 1, q):
+                    total += R[i, l] * D[l, j]
+                R[i, j] = total * (1.0 - t[j] * t[j])
+        for i in range(n):
+            for j in range(n):
+                slope[i, j] = A[i, j]
+                for l in range(q):
+                    slope[i, j] += R[i, l] * F[l, j]
+        for i in range(n):
+            row = moved[i]
+            row[:] = 0.0
+            for j in range(n):
+                weight = slope[i, j]
+                for l in range(inner):
+                    row[l] += weight * S[j, l]
+            for j in range(n):
+                row[i * n + j] += x[j]
+            for j in range(p):
+                row[edge[0] + i * p + j] += V[k, j]
+            for j in range(q):
+                row[edge[1] + i * q + j] += t[j]
+                for l in range(n):
+                    row[edge[2] + j * n + l] += R[i, j] * x[l]
+                for l in range(p):
+                    row[edge[3] + j * p + l] += R[i, j] * V[k, l]
+                row[edge[4] + j] += R[i, j]
+                for l in range(j):
+                    row[edge[5] + j * q + l] += R[i, j] * t[l]
+        S, moved = moved, S
+        x[:] = ahead

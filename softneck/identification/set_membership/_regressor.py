@@ -1,0 +1,110 @@
+"""What a set of form `paper_eq21`, `lags` or `residual` stands on: its regressor, its drives and its base."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from softneck.core import Matrix, SettingsError, Vector
+from softneck.signals import Recording
+
+from ..linear._arrays import no_base
+from ..models._drive import DriveModel
+from ..models._model import WARM_UP, Model
+from ..models._regressors import history_length, motor_signals, regression
+from ..models._scores import nrmse_fit
+from ._gamma import least_gammas
+from ._principal_tree import slant_frames, slant_nodes, slant_order
+from ._residual_form import residual_rows
+
+Data = Sequence[tuple[Matrix, Vector]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ground:
+    """All of a set but its points and their scale.
+
+    Attributes:
+        table: the regressor, rows (source, channel, lag).
+        drive: supplies motor positions in free run.
+        base: the linear model of form `residual`, or None.
+        measured: whether the set is made of logged motor positions, where there are any.
+    """
+
+    table: Matrix
+    drive: DriveModel
+    base: Model | None
+    measured: bool
+
+    def data(self, recording: Recording) -> Data:
+        """Return each axis' regressors (n, N), not scaled, and targets (N,)."""
+        if self.base is not None:
+            base, measured = self.base, self.measured and recording.has_motor_positions
+            return [residual_rows(recording, base, self.table, axis, measured=measured) for axis in range(2)]
+        recording = motor_signals(recording, self.drive, again=not self.measured)
+        pairs = [regression(recording, self.table, axis) for axis in range(2)]
+        return [(X.T, y) for X, y in pairs]
+
+    def arrays(self, data: Data, scale: Vector, gamma: Vector, epsilon: Vector) -> dict[str, Matrix]:
+        """Return the runtime's arrays of the set of `data`; gamma and epsilon (2,), scale (n,)."""
+        history = history_length(self.table, self.drive)
+        base = no_base()
+        if self.base is not None:
+            history = max(history, int(self.base.arrays["history"][0]))
+            base = {name: self.base.arrays[name] for name in base}
+        return {
+            "history": np.array([float(history)]),
+            "drive": self.drive.array,
+            "table": self.table,
+            "scale": scale,
+            **set_arrays([(scaled(X, scale), y) for X, y in data], gamma, epsilon),
+            **base,
+        }
+
+    def free_run(self, arrays: dict[str, Matrix], recording: Recording) -> tuple[float, float, float]:
+        """Return the sum of both axes' free-run fits [%], the bounds' coverage (0 to 1) and mean width [rad].
+
+        The score of a run that left all bounds is -inf.
+        """
+        model = Model(kind="nlsm", sample_time=recording.sample_time, arrays=arrays)
+        y, Y = recording.outputs[WARM_UP:], model.simulate(recording)[WARM_UP:]
+        fits = [nrmse_fit(y[:, axis], Y[:, axis]) for axis in range(2)]
+        low, high, there = Y[:, [5, 7]], Y[:, [6, 8]], np.isfinite(y)
+        coverage = float(((low <= y) & (y <= high))[there].mean()) if there.any() else 0.0
+        return float(sum(fits)) if np.isfinite(fits).all() else -np.inf, coverage, float(np.mean(high - low))
+
+
+def gammas(data: Data, scale: Vector, epsilons: Sequence[Vector]) -> list[Vector]:
+    """Return the least gamma (2,) for each epsilon (2,), by the paper's rule."""
+    columns = [
+        least_gammas(scaled(X, scale), y, np.array([epsilon[axis] for epsilon in epsilons]))[0]
+        for axis, (X, y) in enumerate(data)
+    ]
+    return [np.array(pair) for pair in zip(*columns, strict=True)]
+
+
+def scaled(points: Matrix, scale: Vector) -> Matrix:
+    """Return points (n, N) in the norm of Eq. 16, each component times its weight."""
+    return np.ascontiguousarray(points * scale[:, None])
+
+
+def set_arrays(points: Data, gamma: Vector, epsilon: Vector) -> dict[str, Matrix]:
+    rows = min(values.size for _, values in points)
+    if rows < 2:
+        raise SettingsError("a set needs at least 2 points.")
+    W = np.empty((len(points), points[0][0].shape[0], rows))
+    y = np.empty((len(points), rows))
+    # Filled in place: with the data at hand and the tree, memory holds 2.9 times the data (of eight sides: 3.3).
+    points = [(given[:, :rows], values[:rows]) for given, values in points]
+    frames, slopes = slant_frames(points, gamma)
+    for axis, (given, values) in enumerate(points):
+        order = slant_order(frames[axis], given)
+        for row, given_row in zip(W[axis], given, strict=True):
+            row[:] = given_row[order]
+        y[axis] = values[order]
+    nodes = np.array([slant_nodes(*axis) for axis in zip(frames, slopes, W, y, strict=True)])
+    return {
+        "points": W, "values": y, "bounds": np.column_stack([gamma, epsilon]), "nodes": nodes, "frame": frames,
+    }  # fmt: skip

@@ -1,0 +1,242 @@
+"""Nonlinear set membership identification (section 3): the data set is the model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from softneck.core import (
+    KINDS,
+    DataError,
+    Progress,
+    SettingsError,
+    Vector,
+    find_kind,
+    require_one_of,
+    require_positive,
+    resolve,
+    silent,
+)
+from softneck.signals import Recording
+
+from ..models._drive import DriveModel, fit_drive
+from ..models._fitting import fitted_model, training_recording
+from ..models._model import WARM_UP, Model
+from ..models._regressors import lag_table
+from ._contradiction import require_feasible
+from ._extrapolation import usual_widths
+from ._regressor import Ground, gammas, scaled
+from ._residual_form import residual_lags
+from ._scaling import RULES, HoldOut, Tried, grouped_scale, ruled_scale
+
+FORMS = ("paper_eq21", "lags", "residual")
+_MOTORS = ("measured", "simulated")
+# Kinds whose arrays hold `a`, `b`, `delay` over the redefined set-points, as the runtime runs them.
+_BASES = tuple(name for name in ("rls", "oe") if name in KINDS)
+# Eq. 21: y(k-1); u_i(k-2), u_i(k-3); M_i(k-3).
+_EQ21_LAGS = ((1,), (2, 3), (3,))
+# A lag is a sample; a minute at 1 ms is the longest history a file may hold.
+_LONGEST_LAG = 60_000
+# Free run of form `residual` hardly depends on it, the width of its bounds does: below what the base and the last
+# 0.8 s leave unexplained, gamma and the width grow a hundredfold.
+_RESIDUAL_SIGMAS = (4.0, 8.0, 16.0, 32.0)
+# The knee of gamma*(epsilon) lies at 3 to 5 sigma of the noise; in free run more is better, as the model's own
+# errors stand in the regressor too. The hold-out decides.
+_EPSILON_SIGMAS = (3.0, 5.0, 8.0, 12.0)
+# Weight of the output in the regressor, set-points having 1: half a decade apart up to the paper's own, 57.3, which
+# logs angles in degrees beside motors in radians. A high weight trusts the fed-back output and drifts in free run.
+_OUTPUT_WEIGHTS = (3.0, 10.0, 30.0, 57.29577951308232)
+# Weights of measured motors beside set-points, tried with the best weight of the output. A position is what bends
+# the neck, a set-point what will: 10 gains 10 points in free run on sine and rotation (virtual neck, `paper`), 0.3
+# lost as many.
+_MOTOR_WEIGHTS = (3.0, 10.0)
+# Of the base's angles: a radian of motor tilts the neck by about 0.2 rad, so that 5 makes the two equal in the norm.
+_ANGLE_WEIGHTS = (1.0, 2.0, 5.0, 10.0)
+# The end of the training rows on which epsilon and the scale are chosen, in free run.
+_HOLD_OUT = 0.2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetMembership:
+    """The estimator of Eq. 12-20 and Algorithm 1, one set for each axis, over the regressor of Eq. 21 or another.
+
+    Attributes:
+        form: "paper_eq21"; "lags", the same estimator over other lags; or "residual": set membership over simulated
+            signals on what the free run of a linear base leaves over, where nothing is fed back and so nothing drifts.
+        output_lags, setpoint_lags, motor_lags: lags [samples] in the regressor, of the output (both outputs of the
+            base in form "residual"), of all set-points and of all motor positions; None takes the form's own. Not
+            for "paper_eq21", whose lags are Eq. 21's.
+        scale: weights of the regressor's components in the norm of Eq. 16: "auto" chooses one for outputs and one
+            for motors by free run on the last fifth of the training rows; "none" takes SI units as they are; "std"
+            divides each by its standard deviation (a trap, see docs); or a vector as long as the regressor.
+        output_weight: weight of the outputs, all others having 1: the scale without a choice.
+        epsilon: noise bound of Eq. 15 [rad]; None chooses it by the same free run (form "residual": so that the
+            bounds are narrowest among equal fits).
+        motors: whose positions M the set is made of: "measured", logged ones where there are any, or "simulated",
+            the drive model's, as in every free run. None: "simulated" for form "residual", else "measured".
+        base: linear kind of one pole that form "residual" stands on.
+    """
+
+    form: str = "paper_eq21"
+    output_lags: tuple[int, ...] | None = None
+    setpoint_lags: tuple[int, ...] | None = None
+    motor_lags: tuple[int, ...] | None = None
+    scale: str | tuple[float, ...] = "auto"
+    output_weight: float | None = None
+    epsilon: float | None = None
+    motors: str | None = None
+    base: str = "oe"
+
+    def __post_init__(self) -> None:
+        require_one_of("form", self.form, FORMS)
+        for name in ("output_lags", "setpoint_lags", "motor_lags"):
+            object.__setattr__(self, name, self._checked_lags(name))
+        if isinstance(self.scale, str):
+            require_one_of("scale", self.scale, RULES)
+        else:
+            object.__setattr__(self, "scale", _checked_scale(self.scale))
+        if self.epsilon is not None:
+            require_positive("epsilon", self.epsilon, "rad")
+        if self.output_weight is not None:
+            require_positive("output_weight", self.output_weight)
+            if self.scale != "auto":
+                raise SettingsError("`output_weight` is a scale of its own; leave `scale` at auto beside it.")
+        if self.motors is not None:
+            require_one_of("motors", self.motors, _MOTORS)
+        require_one_of("base", self.base, _BASES)
+
+    def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
+        """Store the data set and find gamma and epsilon that are consistent with all of it.
+
+        gamma is the paper's: the least for which f_u(i) >= y(i) and f_l(i) <= y(i) at every point.
+
+        Raises:
+            DataError: too short, constant, or `epsilon` so small that no function fits the data.
+            SettingsError: a `scale` of another length than the regressor.
+        """
+        recording = training_recording(recordings)
+        noise = np.array([noise_level(recording, axis) for axis in range(2)])
+        drive = fit_drive(recording)
+        ground = self._ground(recording, drive)
+        data = ground.data(recording)
+        chosen, tried = self._choose(ground, recording, noise, progress)
+        scale = chosen.scale if chosen.scale.size else ruled_scale(self.scale, ground.table, data)
+        gamma = gammas(data, scale, [chosen.epsilon])[0]
+        sets = [(scaled(X, scale), y) for X, y in data]
+        require_feasible(recording, ground.table, sets, gamma, chosen.epsilon)
+        arrays = ground.arrays(data, scale, gamma, chosen.epsilon)
+        progress(1.0, "done")
+        findings = {"form": self.form, "noise_deg": np.degrees(noise).tolist(), **_findings(chosen, tried, scale)}
+        findings |= {"gamma": gamma.tolist(), "points": int(arrays["values"].shape[1])}
+        findings |= usual_widths(sets, gamma, chosen.epsilon)
+        return fitted_model("nlsm", self, recording, arrays=arrays, findings=findings)
+
+    def _ground(self, recording: Recording, drive: DriveModel) -> Ground:
+        """Return the set's ground; the base of form `residual` is identified on `recording`."""
+        residual = self.form == "residual"
+        if residual:
+            own = residual_lags(recording.sample_time)
+            preset = (own, (), own)
+        else:
+            preset = _EQ21_LAGS
+        given = (self.output_lags, self.setpoint_lags, self.motor_lags)
+        lags = [known if lag is None else lag for lag, known in zip(given, preset, strict=True)]
+        return Ground(
+            table=lag_table(*lags, both_outputs=residual),
+            drive=drive,
+            base=resolve(find_kind(self.base, "model").settings)().fit(recording) if residual else None,
+            measured=(self.motors or ("simulated" if residual else "measured")) == "measured",
+        )
+
+    def _choose(
+        self, ground: Ground, recording: Recording, noise: Vector, progress: Progress
+    ) -> tuple[Tried, list[Tried]]:
+        """Return scale and epsilon, and all that were tried; an empty scale is left to `ruled_scale`."""
+        table = ground.table
+        if self.epsilon is not None:
+            epsilons = [np.full(2, self.epsilon)]
+        elif self.form == "residual":
+            epsilons = [sigmas * noise for sigmas in _RESIDUAL_SIGMAS]
+        else:
+            epsilons = [sigmas * noise for sigmas in _EPSILON_SIGMAS]
+        weighted = self.output_weight is not None
+        if len(epsilons) == 1 and (weighted or self.scale != "auto"):
+            scale = np.zeros(0) if self.output_weight is None else grouped_scale(table, self.output_weight)
+            return Tried(self.output_weight, None, scale, epsilons[0], np.nan, np.nan, np.nan, np.nan), []
+        head, tail = recording.split(1.0 - _HOLD_OUT)
+        if len(tail) <= 2 * WARM_UP:
+            raise DataError(
+                "the record is too short to choose epsilon and the scale; record longer, or set epsilon and "
+                "output_weight."
+            )
+        # The drives are known from all rows: they are no part of what is chosen.
+        first = self._ground(head, ground.drive)
+        hold_out = HoldOut(first, first.data(head), tail, epsilons, narrow=self.form == "residual")
+        if self.scale != "auto":
+            tried = hold_out.fixed(ruled_scale(self.scale, table, hold_out.data))
+            return replace(tried[0], scale=np.zeros(0)), tried
+        outputs, motors = self._weights(table)
+        tried = hold_out.choose(outputs, motors, progress)
+        return tried[0], tried
+
+    def _weights(self, table: np.ndarray) -> tuple[Sequence[float], Sequence[float]]:
+        """Return the weights to try of outputs and of motors beside 1; what the regressor lacks has none."""
+        sources = set(table[:, 0].astype(int).tolist())
+        if self.output_weight is not None:
+            return (self.output_weight,), ()
+        if self.form == "residual":
+            return (_ANGLE_WEIGHTS if 3 in sources else (1.0,)), ()
+        # Without set-points, a weight of motors is that of outputs upside down.
+        motors = _MOTOR_WEIGHTS if {1, 2} <= sources else ()
+        return (_OUTPUT_WEIGHTS if 0 in sources else (1.0,)), motors
+
+    def _checked_lags(self, name: str) -> tuple[int, ...] | None:
+        lags: Any = getattr(self, name)
+        if lags is None:
+            return None
+        if self.form == "paper_eq21":
+            raise SettingsError(f"form `paper_eq21` has the lags of Eq. 21; take form `lags` to set `{name}`.")
+        lags = (lags,) if isinstance(lags, int) else tuple(lags)
+        whole = all(isinstance(lag, int) and not isinstance(lag, bool) and 1 <= lag <= _LONGEST_LAG for lag in lags)
+        if not whole or len(set(lags)) != len(lags):
+            raise SettingsError(f"`{name}` must be different whole numbers of samples from 1 on; got {list(lags)}.")
+        return tuple(sorted(lags))
+
+
+def _checked_scale(scale: Any) -> tuple[float, ...]:
+    try:
+        values = np.asarray(scale, dtype=np.float64)
+    except (TypeError, ValueError):
+        values = np.zeros(0)
+    if values.ndim != 1 or not values.size or not (np.isfinite(values) & (values > 0.0)).all():
+        raise SettingsError(f"`scale` must be one of {', '.join(RULES)}, or a list of positive numbers; got {scale!r}.")
+    return tuple(values.tolist())
+
+
+def noise_level(recording: Recording, axis: int) -> float:
+    """Return the standard deviation [rad] of white noise on one output, from its third differences.
+
+    A motion of 4 rad/s sampled at 20 ms leaves almost nothing there; the median is not moved by jerks.
+    """
+    differences = [np.diff(run.outputs[:, axis], 3) for run in recording.runs() if len(run) > 3]
+    d = np.concatenate(differences)
+    d = d[np.isfinite(d)]
+    # 20 = 1 + 9 + 9 + 1, squares of the binomials; 0.6745 is the quartile of a standard normal.
+    sigma = float(np.median(np.abs(d))) / 0.6745 / np.sqrt(20.0)
+    return max(sigma, 1e-7)  # a noise-free simulation: rounding is left
+
+
+def _findings(chosen: Tried, tried: list[Tried], scale: Vector) -> dict[str, Any]:
+    weights = {"output_weight": chosen.output_weight, "motor_weight": chosen.motor_weight}
+    return {
+        "epsilon_deg": np.degrees(chosen.epsilon).tolist(),
+        **{name: weight for name, weight in weights.items() if weight is not None},
+        "scale": scale.tolist(),
+        # Rows: both weights, epsilon of pitch [deg], sum of both fits [%], coverage, mean width [deg].
+        "hold_out_curve": [
+            [t.output_weight, t.motor_weight, float(np.degrees(t.epsilon[0])), *t.judgement] for t in tried
+        ],
+    }

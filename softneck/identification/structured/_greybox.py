@@ -1,0 +1,231 @@
+"""Kind `greybox`: the equations of a tendon-driven neck with unknown numbers, fitted by the error of its free run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import OptimizeResult, least_squares
+
+from softneck.core import DataError, Matrix, Progress, Vector, require_whole, silent
+from softneck.runtime import load_functions
+from softneck.signals import Recording
+
+from ..models._error_feedback import fit_echo
+from ..models._fitting import training_recording
+from ..models._loaded_drive import drive_start, fit_loaded_drive
+from ..models._model import Model
+from ..models._rows import row_hashes
+from ._greybox_numbers import NUMBERS, decode
+
+_FUNCTIONS = "softneck.identification.structured._greybox_fit_runtime"
+# An error of a motor counts as much as one of the tilt twenty times smaller: about the ratio of their ranges.
+_MOTOR_WEIGHT = 0.05
+# How much a number a spread away from its guess counts, as an error [rad] of one row: next to nothing.
+_PRIOR = 0.005
+# The start is unknown for so long [s], a held input is forgotten after so long.
+_SETTLED, _MEMORY = 0.5, 3.0
+_DELAYS = (2, 1, 3, 4)
+_TYPICAL_DRIVE_DELAY = 0.08
+_THIN = 2
+_ECHO = 8
+INTERRUPTED = "the fit was interrupted; these are the best numbers until then"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GreyBox:
+    """Tendon kinematics, slack, hysteresis, stalling drives, lag and dead time; 16 numbers, by output error.
+
+    The equations are in `_neck_model_runtime`; findings hold each number with its unit and 95 % confidence.
+
+    Attributes:
+        evaluations: at most so many steps of Gauss-Newton for each dead time.
+        sensor_delay: dead time of the inclinometer in samples; None tries 1 to 4.
+    """
+
+    evaluations: int = 40
+    sensor_delay: int | None = None
+
+    def __post_init__(self) -> None:
+        require_whole("evaluations", self.evaluations, 1, 10_000)
+        if self.sensor_delay is not None:
+            require_whole("sensor_delay", self.sensor_delay, 0, 100)
+
+    def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
+        """Identify the numbers; Ctrl-C keeps the best so far.
+
+        Args:
+            recordings: one or several of one sample time; their runs are never joined.
+            progress: called with the part done and the error.
+
+        Raises:
+            DataError: too short or constant.
+        """
+        recording = training_recording(recordings)
+        problem = _Problem.of(recording)
+        delays = _DELAYS if self.sensor_delay is None else (self.sensor_delay,)
+        best: tuple[float, int, Vector] | None = None
+        start = np.array([number.encode(number.guess) for number in NUMBERS])
+        interrupted = False
+        tell = _Telling(progress, len(delays) * self.evaluations * (len(NUMBERS) + 1))
+        for delay in delays:
+            tell.what = f"dead time {delay}"
+            try:
+                found = problem.search(start, delay, self.evaluations, tell)
+            except KeyboardInterrupt:
+                interrupted = True
+                if tell.best is not None and (best is None or tell.best[0] < best[0]):
+                    best = (tell.best[0], delay, tell.best[1])
+                break
+            if best is None or found.cost < best[0]:
+                best = (float(found.cost), delay, found.x)
+                start = found.x
+        if best is None or not np.isfinite(best[0]):
+            raise DataError("no numbers of the grey box give a finite error; look for wild values in the recording.")
+        model = _model(self, problem, recording, best[1], best[2])
+        progress(1.0, "done")
+        if interrupted:
+            return replace(model, findings={**model.findings, "interrupted": INTERRUPTED})
+        return model
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Problem:
+    """All runs as arrays; the drives' dead times are known beforehand."""
+
+    sample_time: float
+    runs: list[tuple[Matrix, Vector, Matrix, Matrix]]
+    drive: Matrix
+    logged: bool
+
+    @classmethod
+    def of(cls, recording: Recording) -> _Problem:
+        Ts = recording.sample_time
+        drive = fit_loaded_drive(recording).drive.copy()
+        if not recording.has_motor_positions:
+            drive[:, 1] = max(round(_TYPICAL_DRIVE_DELAY / Ts), 1)
+        drive[:, 1] = np.maximum(drive[:, 1], 1.0)
+        runs = [
+            (np.ascontiguousarray(run.set_points), drive_start(run), run.motor_positions, run.outputs)
+            for run in recording.runs()
+        ]
+        return cls(Ts, runs, drive, recording.has_motor_positions)
+
+    def simulate(self, numbers: Vector, delay: int) -> list[tuple[Matrix, Matrix]]:
+        """Return motors and outputs of all runs."""
+        settle = round(_SETTLED / self.sample_time)
+        parts = []
+        for u, start, _, y in self.runs:
+            M, Y = np.empty(u.shape), np.empty(y.shape)
+            load_functions(_FUNCTIONS).neck_run(
+                numbers, self.sample_time, self.drive[:, 1], delay, settle, u, start, M, Y
+            )
+            parts.append((M, Y))
+        return parts
+
+    def errors(self, x: Vector, delay: int) -> Vector:
+        """Return the errors that are minimised: of tilts, of motors, and of the numbers against their guesses."""
+        skip = round(_SETTLED / self.sample_time)
+        guess = np.array([number.encode(number.guess) for number in NUMBERS])
+        spread = np.array([number.spread for number in NUMBERS])
+        parts = [_PRIOR * (x - guess) / spread]
+        for (M, Y), (_, _, m, y) in zip(self.simulate(decode(x), delay), self.runs, strict=True):
+            parts.append((Y - y)[skip::_THIN].ravel())
+            if self.logged:
+                parts.append(_MOTOR_WEIGHT * (M - m)[skip::_THIN].ravel())
+        return np.nan_to_num(np.concatenate(parts))
+
+    def search(self, start: Vector, delay: int, evaluations: int, tell: _Telling) -> OptimizeResult:
+        """Return scipy's result of a trust-region Gauss-Newton from `start`."""
+        low = np.array([number.encode(number.low) for number in NUMBERS])
+        high = np.array([number.encode(number.high) for number in NUMBERS])
+
+        def errors(x: Vector) -> Vector:
+            e = self.errors(x, delay)
+            tell.see(0.5 * float(e @ e), x)
+            return e
+
+        inside = np.clip(start, low + 1e-6 * (high - low), high - 1e-6 * (high - low))
+        return least_squares(errors, inside, bounds=(low, high), x_scale="jac", max_nfev=evaluations, xtol=1e-5)
+
+
+class _Telling:
+    """Reports the search, and remembers the best for Ctrl-C."""
+
+    def __init__(self, progress: Progress, expected: int) -> None:
+        self.progress, self.expected, self.calls = progress, expected, 0
+        self.what = ""
+        self.best: tuple[float, Vector] | None = None
+
+    def see(self, cost: float, x: Vector) -> None:
+        """Take note of one evaluation."""
+        self.calls += 1
+        if self.best is None or cost < self.best[0]:
+            self.best = (cost, x.copy())
+        if self.calls % 20 == 1:
+            self.progress(min(self.calls / self.expected, 0.99), f"{self.what}, loss {self.best[0]:.4g}")
+
+
+def _model(settings: GreyBox, problem: _Problem, recording: Recording, delay: int, x: Vector) -> Model:
+    numbers = decode(x)
+    skip = round(_SETTLED / problem.sample_time)
+    errors = [y - Y for (_, Y), (_, _, _, y) in zip(problem.simulate(numbers, delay), problem.runs, strict=True)]
+    for error in errors:
+        error[:skip] = np.nan
+    echo = np.array([fit_echo([error[:, axis] for error in errors], _ECHO) for axis in range(2)])
+    drive = np.column_stack([np.full(3, np.exp(-numbers[0] * problem.sample_time)), problem.drive[:, 1]])
+    arrays = {
+        "history": np.array([float(max(_ECHO, drive[:, 1].max()))]),
+        "drive": drive,
+        "neck": numbers,
+        "sensor": np.array([float(delay), problem.sample_time]),
+        "echo": echo,
+        "memory": np.array([np.ceil(_MEMORY / problem.sample_time)]),
+    }
+    return Model(
+        kind="greybox",
+        sample_time=problem.sample_time,
+        arrays=arrays,
+        settings={"evaluations": settings.evaluations, "sensor_delay": settings.sensor_delay},
+        findings={"sensor_delay": delay, "numbers": _table(problem, x, delay, errors)},
+        training_rows=row_hashes(recording),
+    )
+
+
+def _table(problem: _Problem, x: Vector, delay: int, errors: Sequence[Matrix]) -> list[dict]:
+    """Return each number with unit, 95 % interval (linearised, the errors' colour taken into account) and range."""
+    J = np.empty((problem.errors(x, delay).size, x.size))
+    for i in range(x.size):
+        # A ten-thousandth of a number: far above rounding, far below its curvature.
+        step = np.zeros(x.size)
+        step[i] = 1e-4
+        J[:, i] = (problem.errors(x + step, delay) - problem.errors(x - step, delay)) / 2e-4
+    e = problem.errors(x, delay)
+    covariance = np.linalg.pinv(J.T @ J) * float(e @ e) / max(e.size - x.size, 1) * _colour(errors)
+    half = 1.96 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    rows = []
+    for i, number in enumerate(NUMBERS):
+        value, low, high = (number.decode(x[i] + shift) for shift in (0.0, -half[i], half[i]))
+        at_bound = min(value - number.low, number.high - value) < 1e-3 * (number.high - number.low) * 0.01
+        rows.append(
+            {
+                "name": number.name, "unit": number.unit, "value": value, "low": max(low, number.low),
+                "high": min(high, number.high), "at_bound": bool(at_bound), "about": number.about,
+            }
+        )  # fmt: skip
+    return rows
+
+
+def _colour(errors: Sequence[Matrix]) -> float:
+    """Return how many samples of the errors say as much as one of white noise: `1 + 2 sum r(k)` to its first zero."""
+    e = np.nan_to_num(np.concatenate(errors))[:, 0]
+    e = e - e.mean()
+    power = max(float(e @ e), 1e-300)
+    total = 1.0
+    for lag in range(1, min(500, e.size - 1)):
+        r = float(e[lag:] @ e[:-lag]) / power
+        if r <= 0.0:
+            break
+        total += 2.0 * r
+    return total / _THIN if total > _THIN else 1.0

@@ -1,0 +1,90 @@
+"""The median of several models, with their spread as bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+
+from softneck.core import KINDS, Progress, SettingsError, find_kind, require_whole, resolve, silent
+from softneck.signals import Recording
+
+from ..models._composed import COMPOSED, memory_of, prefixed_arrays
+from ..models._fitting import one_recording
+from ..models._model import Model
+from ..models._rows import row_hashes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ensemble:
+    """Median of the free runs of several kinds; `pitch_lower` and `pitch_upper` are the least and the largest.
+
+    Attributes:
+        members: kinds, each with its default settings; one named twice is trained with another seed.
+        seed: of the first member that starts at random; the next have the next seeds.
+    """
+
+    members: tuple[str, ...] = ("play", "greybox", "nn")
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "members", tuple(self.members))
+        require_whole("seed", self.seed, 0, 2**62)
+        if len(self.members) < 2:
+            raise SettingsError(f"an ensemble needs at least two members; got {', '.join(self.members) or 'none'}.")
+        for kind in self.members:
+            find_kind(kind, "model")
+            if kind in COMPOSED:
+                raise SettingsError(f"a model of kind `{kind}` holds others itself and cannot be a member.")
+
+    def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
+        """Identify every member on the same recordings.
+
+        Raises:
+            DataError: what any member raises.
+        """
+        recording = one_recording(recordings)
+        models = []
+        for number, kind in enumerate(self.members):
+            part = _part(progress, number, len(self.members), kind)
+            models.append(seeded(kind, self.seed + number).fit(recording, progress=part))
+        progress(1.0, "done")
+        joined = combine(models)
+        return replace(joined, settings=asdict(self), training_rows=row_hashes(recording))
+
+
+def combine(models: Sequence[Model]) -> Model:
+    """Return the ensemble of models that are there already.
+
+    Raises:
+        SettingsError: fewer than two, of different sample times, or one that holds others itself.
+    """
+    if len(models) < 2:
+        raise SettingsError(f"an ensemble needs at least two models; got {len(models)}.")
+    if not np.allclose([model.sample_time for model in models], models[0].sample_time, rtol=1e-6):
+        raise SettingsError("the models of an ensemble must have one sample time.")
+    memory = max(memory_of(model.arrays) for model in models)
+    arrays = {
+        "history": np.ones(1),
+        "memory": np.array([float(memory)]),
+        **prefixed_arrays([(model.kind, model.arrays) for model in models]),
+    }
+    return Model(
+        kind="ensemble",
+        sample_time=models[0].sample_time,
+        arrays=arrays,
+        settings={"members": [model.kind for model in models]},
+        findings={"members": ", ".join(model.kind for model in models)},
+        training_rows=np.unique(np.concatenate([model.training_rows for model in models])),
+    )
+
+
+def seeded(kind: str, seed: int):
+    """Return the default settings of a kind, with `seed` where it has one."""
+    settings = resolve(KINDS[kind].settings)()
+    return replace(settings, seed=seed) if hasattr(settings, "seed") else settings
+
+
+def _part(progress: Progress, number: int, count: int, kind: str) -> Progress:
+    return lambda done, what: progress((number + done) / count, f"{kind}: {what}")

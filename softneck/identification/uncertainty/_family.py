@@ -1,0 +1,242 @@
+"""The family of linear models over inclination, direction and payload, as an uncertain plant for design."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import control
+import numpy as np
+
+from softneck.core import FileFormatError, Matrix, SettingsError, Vector, require_one_of, write_archive
+
+from ..linear._srivc_fit import Continuous
+from ._lpv import Lpv
+
+AXES = ("pitch", "roll")
+SCOPES = ("window", "point", "recording")
+_INPUTS = {"pitch": "theta_i", "roll": "phi_i"}
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class AxisFamily:
+    """What one axis may be.
+
+    Attributes:
+        samples: (n, 3) static gain [rad/rad], pole [1/s], dead time [s] of every local model.
+        std: (n, 4) standard deviations of those, and of K.
+        where: (n, 5) scope (0 window, 1 point, 2 recording), recording, time [s], inclination, direction [rad].
+        used: (n,) 1 where the sample is in the uncertain plant, else 0.
+        nominal: (3,) middle of the box, its dead time in whole samples.
+        box: (2, 3) least and largest of the samples used.
+        weight: (2, order + 1) numerator and denominator of W(s): `|G/G0 - 1| <= |W|` for every sample used.
+        envelope: (m,) largest relative error of the samples used at the family's frequencies.
+    """
+
+    samples: Matrix
+    std: Matrix
+    where: Matrix
+    used: Vector
+    nominal: Vector
+    box: Matrix
+    weight: Matrix
+    envelope: Vector
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Family:
+    """An uncertain linear plant; `FamilySettings.fit` makes it and a design reads it.
+
+    Attributes:
+        sample_time: [s].
+        axes: pitch and roll.
+        frequency: (m,) at which the weight was fitted [rad/s], up to the Nyquist frequency.
+        cross: (2, 3) static gains from theta_i, phi_i, delta_i to pitch and roll [rad/rad]; NaN where not excited.
+        cross_std: (2, 3).
+        compression: (3,) static gain [m/rad], pole [1/s], dead time [s] of G_delta; NaN where not recorded.
+        lpv: gain and pole over the inclination, or None.
+        settings, findings: what was asked and what was found.
+    """
+
+    sample_time: float
+    axes: dict[str, AxisFamily]
+    frequency: Vector
+    cross: Matrix
+    cross_std: Matrix
+    compression: Vector
+    lpv: Lpv | None = None
+    settings: dict[str, Any] = field(default_factory=dict)
+    findings: dict[str, Any] = field(default_factory=dict)
+
+    def nominal(self, output: str) -> Continuous:
+        """Return the nominal plant of an axis, `K exp(-L s)/(s + p)`."""
+        return one_pole(self._axis(output).nominal)
+
+    def tf(self, output: str, *, continuous: bool = False, pade: int = 3) -> control.TransferFunction:
+        """Return the nominal transfer function: sampled with its dead time in full, or continuous with a Pade one."""
+        return self._system(self.nominal(output), output, continuous, pade)
+
+    def samples(self, output: str) -> list[control.TransferFunction]:
+        """Return every sample of the uncertain plant, sampled as `tf` is."""
+        axis = self._axis(output)
+        return [self._system(one_pole(row), output, False, 0) for row in axis.samples[axis.used > 0.5]]
+
+    def weight(self, output: str) -> control.TransferFunction:
+        """Return W(s), stable and of minimum phase."""
+        above, below = self._axis(output).weight
+        return control.TransferFunction(np.trim_zeros(above, "f"), np.trim_zeros(below, "f"), name=f"W_{output}")
+
+    def errors(self, output: str) -> Matrix:
+        """Return `|G/G0 - 1|` (n, m) of the samples used, at the family's frequencies."""
+        axis = self._axis(output)
+        return relative_errors(axis.samples[axis.used > 0.5], axis.nominal, self.frequency, self.sample_time)
+
+    def covered(self, output: str) -> float:
+        """Return the largest `|G/G0 - 1| / |W|` over all samples used and a dense grid; at most 1."""
+        axis = self._axis(output)
+        w = np.geomspace(self.frequency[0], self.frequency[-1], 5 * self.frequency.size)
+        W = np.abs(np.polyval(axis.weight[0], 1j * w) / np.polyval(axis.weight[1], 1j * w))
+        errors = relative_errors(axis.samples[axis.used > 0.5], axis.nominal, w, self.sample_time)
+        return float(np.max(errors / W))
+
+    def summary(self) -> str:
+        """Return a few lines, in degrees."""
+        lines = [f"family of {self.findings.get('recordings', 0)} recordings, {1e3 * self.sample_time:g} ms"]
+        for name, axis in self.axes.items():
+            counts = [int(np.sum(axis.where[:, 0] == scope)) for scope in range(3)]
+            low, high = axis.box
+            gain, pole, delay = axis.nominal
+            lines.append(
+                f"{name}: G(s) = exp(-{delay:.3f} s) {np.degrees(gain * pole):.2f}/(s + {pole:.2f}) deg/rad; "
+                f"gain {np.degrees(low[0]):.2f} to {np.degrees(high[0]):.2f} deg/rad, "
+                f"pole {low[1]:.2f} to {high[1]:.2f} 1/s, dead time {1e3 * low[2]:.0f} to {1e3 * high[2]:.0f} ms"
+            )
+            lines.append(
+                f"  {counts[0]} windows, {counts[1]} operating points, {counts[2]} recordings; "
+                f"{int(axis.used.sum())} samples in the plant, |G/G0 - 1| at most {axis.envelope.max():.2f}, "
+                f"by the weight covered to {self.covered(name):.3f}"
+            )
+        lines.append(_cross_line(self.cross))
+        if np.isfinite(self.compression).all():
+            K, p, L = self.compression
+            lines.append(f"compression: G_delta(s) = exp(-{L:.3f} s) {1e3 * K * p:.3f}/(s + {p:.2f}) mm/rad")
+        else:
+            lines.append("compression: not recorded or not excited, so there is no G_delta")
+        for key in ("free_run_fit", "caution"):
+            if key in self.findings:
+                lines.append(f"{key}: {self.findings[key]}")
+        return "\n".join(lines)
+
+    def save(self, path: str | Path, *, force: bool = False) -> None:
+        """Write the family to an `.npz` file."""
+        arrays: dict[str, np.ndarray] = {
+            "frequency": self.frequency,
+            "cross": self.cross,
+            "cross_std": self.cross_std,
+            "compression": self.compression,
+        }
+        for name, axis in self.axes.items():
+            arrays |= {f"{name}_{key}": getattr(axis, key) for key in AxisFamily.__dataclass_fields__}
+        if self.lpv is not None:
+            arrays |= {f"lpv_{key}": getattr(self.lpv, key) for key in ("knots", "gains", "poles", "delays")}
+        header = {
+            "kind": "family",
+            "sample_time": self.sample_time,
+            "settings": self.settings,
+            "findings": self.findings,
+            "lpv_source": None if self.lpv is None else self.lpv.source,
+        }
+        write_archive(path, header, arrays, force=force)
+
+    @classmethod
+    def from_archive(cls, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Family:
+        """Return the family that `save` wrote."""
+        for name, array in arrays.items():
+            if array.dtype != np.float64:
+                raise FileFormatError(f"its array `{name}` is not of floats.")
+        axes = {
+            name: AxisFamily(**{key: arrays[f"{name}_{key}"] for key in AxisFamily.__dataclass_fields__})
+            for name in AXES
+        }
+        for name, axis in axes.items():
+            _check(name, axis, arrays["frequency"].size)
+        lpv = None
+        if header["lpv_source"] is not None:
+            parts = {key: arrays[f"lpv_{key}"] for key in ("knots", "gains", "poles", "delays")}
+            m = parts["knots"].size
+            if parts["gains"].shape != (2, m) or parts["poles"].shape != (2, m) or parts["delays"].shape != (2,):
+                raise FileFormatError("its interpolation has arrays that do not fit each other.")
+            lpv = Lpv(**parts, source=str(header["lpv_source"]))
+        return cls(
+            sample_time=float(header["sample_time"]),
+            axes=axes,
+            frequency=arrays["frequency"],
+            cross=arrays["cross"],
+            cross_std=arrays["cross_std"],
+            compression=arrays["compression"],
+            lpv=lpv,
+            settings=header["settings"],
+            findings=header["findings"],
+        )
+
+    def _axis(self, output: str) -> AxisFamily:
+        require_one_of("output", output, AXES)
+        return self.axes[output]
+
+    def _system(self, model: Continuous, output: str, continuous: bool, pade: int) -> control.TransferFunction:
+        names = {"inputs": [_INPUTS[output]], "outputs": [output]}
+        if continuous:
+            if not 0 <= pade <= 12:
+                raise SettingsError(f"`pade` must be between 0 and 12; got {pade}.")
+            G = control.TransferFunction(model.b, np.concatenate([[1.0], model.a]))
+            if pade > 0 and model.delay > 0.0:
+                G = G * control.TransferFunction(*control.pade(model.delay, pade))
+            return control.TransferFunction(G.num, G.den, **names)
+        a, b, d = model.sampled(self.sample_time)
+        b = b if b[-1] != 0.0 else b[:-1]
+        below = np.concatenate([[1.0], a, np.zeros(d + b.size - a.size)])
+        return control.TransferFunction(b, below, self.sample_time, **names)
+
+
+def one_pole(numbers: Vector) -> Continuous:
+    """Return the model of static gain [rad/rad], pole [1/s] and dead time [s]."""
+    gain, pole, delay = (float(value) for value in numbers)
+    return Continuous(a=np.array([pole]), b=np.array([gain * pole]), delay=delay)
+
+
+def relative_errors(samples: Matrix, nominal: Vector, frequency: Vector, sample_time: float) -> Matrix:
+    """Return `|G/G0 - 1|` (n, m) of all samples at `frequency` [rad/s], inputs held between samples."""
+    G0 = _response(one_pole(nominal), frequency, sample_time)
+    return np.array([np.abs(_response(one_pole(row), frequency, sample_time) / G0 - 1.0) for row in samples])
+
+
+def _response(model: Continuous, frequency: Vector, sample_time: float) -> np.ndarray:
+    a, b, d = model.sampled(sample_time)
+    z = np.exp(1j * frequency * sample_time)
+    return np.polyval(b, z) / np.polyval(np.concatenate([[1.0], a]), z) * z ** (a.size - b.size - d)
+
+
+def _cross_line(cross: Matrix) -> str:
+    def gain(axis: int, source: int) -> str:
+        value = cross[axis, source]
+        return "not excited" if not np.isfinite(value) else f"{np.degrees(value):+.2f}"
+
+    return (
+        f"neglected by Eq. 9-11 [deg/rad]: phi_i to pitch {gain(0, 1)}, theta_i to roll {gain(1, 0)}, "
+        f"delta_i to pitch {gain(0, 2)}, delta_i to roll {gain(1, 2)}"
+    )
+
+
+def _check(name: str, axis: AxisFamily, frequencies: int) -> None:
+    n = axis.samples.shape[0]
+    shapes = {
+        "samples": (n, 3), "std": (n, 4), "where": (n, 5), "used": (n,), "nominal": (3,), "box": (2, 3),
+        "weight": (2, axis.weight.shape[-1]), "envelope": (frequencies,),
+    }  # fmt: skip
+    for key, shape in shapes.items():
+        if getattr(axis, key).shape != shape:
+            raise FileFormatError(f"its array `{name}_{key}` has shape {getattr(axis, key).shape}; {shape} is needed.")
+    for key in ("samples", "nominal", "box", "weight"):
+        if not np.isfinite(getattr(axis, key)).all():
+            raise FileFormatError(f"its array `{name}_{key}` is not finite.")

@@ -1,0 +1,245 @@
+"""From recordings to a family: local models, their box, and a weight over their envelope."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from softneck.core import (
+    DataError,
+    Progress,
+    Vector,
+    require_between,
+    require_one_of,
+    require_positive,
+    require_whole,
+    silent,
+)
+from softneck.signals import Recording
+
+from ..linear._oe import SOURCES
+from ..linear._srivc_fit import Search
+from ..models._checks import check_training
+from ._cross_gains import cross_gains, fit_compression
+from ._envelope import envelope_weight
+from ._family import AXES, SCOPES, AxisFamily, Family, one_pole, relative_errors
+from ._local_models import Local, Window, fit_local, windows
+from ._lpv import Lpv, fit_lpv
+
+_FREQUENCIES = 100
+# From a tenth of the neck's slowest time constants.
+_LOWEST = 0.05
+# Local models faster than this are stopped, not found: 40 1/s are 25 ms.
+_FASTEST = 40.0
+_CAUTION = (
+    "each local model is linear and of one pole; what lies between them or beyond the recordings is not covered, "
+    "and hysteresis shows as dead time and pole"
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FamilySettings:
+    """Local models `K exp(-L s)/(s + p)` by `srivc`, and the uncertain plant over them.
+
+    Every recording (payload) is cut into windows; windows of one inclination and direction make an operating point.
+
+    Attributes:
+        window: length of a window [s]; shorter runs are one window.
+        inclination_step: width of the operating points [rad].
+        directions: sectors of direction; 1 takes all together.
+        include_windows: put single windows into the plant as well, not points and recordings alone.
+        widen: standard deviations by which each sample widens the box and the plant.
+        weight_order: of W, 1 to 3.
+        max_delay: bound on dead times [s].
+        source: "set_points", or "positions" of the motors.
+        lpv_knots: fit an interpolation of gain and pole over so many inclinations, judged in free run on the last
+            30 % of each run; 0 for none.
+    """
+
+    window: float = 8.0
+    inclination_step: float = float(np.radians(7.5))
+    directions: int = 4
+    include_windows: bool = False
+    widen: float = 0.0
+    weight_order: int = 2
+    max_delay: float = 0.3
+    source: str = "set_points"
+    lpv_knots: int = 0
+
+    def __post_init__(self) -> None:
+        require_between("window", self.window, 1.0, 1000.0, "s")
+        require_between("inclination_step", self.inclination_step, 0.001, np.pi, "rad")
+        require_whole("directions", self.directions, 1, 72)
+        require_between("widen", self.widen, 0.0, 5.0)
+        require_whole("weight_order", self.weight_order, 1, 3)
+        require_positive("max_delay", self.max_delay, "s")
+        require_one_of("source", self.source, SOURCES)
+        require_whole("lpv_knots", self.lpv_knots, 0, 12)
+
+    def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Family:
+        """Return the family of one or several recordings of one sample time.
+
+        Raises:
+            DataError: too short, other sample times, or too few local models that say enough.
+        """
+        parts = recordings if isinstance(recordings, list) else [recordings]
+        sample_time = _one_sample_time(parts)
+        for part in parts:
+            check_training(part)
+        frequency = np.geomspace(_LOWEST, np.pi / sample_time, _FREQUENCIES)
+        search = Search(sample_time=sample_time, offset=True, max_delay=self.max_delay, fastest=_FASTEST)
+        cut = [
+            window
+            for number, part in enumerate(parts)
+            for window in windows(part, number, length=self.window, lead=self.max_delay, source=self.source)
+        ]
+        axes, dropped = {}, {}
+        for axis, name in enumerate(AXES):
+            progress(0.4 * axis, f"local models of {name}")
+            found, lost = self._local_models(search, cut, axis, len(parts))
+            dropped[name] = lost
+            axes[name] = self._axis(name, found, frequency, sample_time, lost)
+        progress(0.8, "cross gains")
+        nominal = [one_pole(axes[name].nominal) for name in AXES]
+        cross, cross_std = cross_gains(parts, nominal, self.source)
+        squeezed = fit_compression(parts, Search(sample_time=sample_time, offset=True), self.source)
+        lpv, fits = self._lpv(parts, axes, sample_time) if self.lpv_knots > 0 else (None, {})
+        progress(1.0, "done")
+        return Family(
+            sample_time=sample_time,
+            axes=axes,
+            frequency=frequency,
+            cross=cross,
+            cross_std=cross_std,
+            compression=_numbers(squeezed),
+            lpv=lpv,
+            settings=asdict(self),
+            findings={
+                "recordings": len(parts),
+                "windows": len(cut),
+                "windows_that_said_too_little": dropped,
+                "caution": _CAUTION,
+                **fits,
+            },
+        )
+
+    def _local_models(
+        self, search: Search, cut: Sequence[Window], axis: int, recordings: int
+    ) -> tuple[list[Local], int]:
+        """Return the local models of an axis: windows, operating points, recordings; and how many windows gave none."""
+        single = [fit_local(search, [window], axis, scope="window") for window in cut]
+        there = [local for local in single if local is not None]
+        near = one_pole(np.median([local.numbers for local in there], axis=0)) if there else None
+        # A point is made of windows that said something alone; one that stood still adds nothing.
+        useful = [window for window, local in zip(cut, single, strict=True) if local is not None]
+        points: dict[tuple[int, int, int], list[Window]] = {}
+        for window in useful:
+            sector = round(window.direction / (2 * np.pi) * self.directions) % self.directions
+            key = (window.recording, int(window.inclination / self.inclination_step), sector)
+            points.setdefault(key, []).append(window)
+        found = [*there]
+        found += [fit_local(search, group, axis, scope="point", near=near) for _, group in sorted(points.items())]
+        for number in range(recordings):
+            group = [window for window in useful if window.recording == number]
+            found.append(fit_local(search, group, axis, scope="recording", near=near))
+        return [local for local in found if local is not None], len(cut) - len(there)
+
+    def _axis(self, name: str, found: list[Local], frequency: Vector, sample_time: float, lost: int) -> AxisFamily:
+        used = np.array([local.scope != "window" or self.include_windows for local in found], dtype=float)
+        if used.sum() < 2:
+            raise DataError(
+                f"{name}: only {int(used.sum())} local models say enough ({lost} windows do not) where a family needs "
+                "2; record with more motion of it, or set `window` longer."
+            )
+        samples = np.array([local.numbers for local in found])
+        std = np.array([local.std for local in found])
+        plants = self._plants(samples[used > 0.5], std[used > 0.5])
+        box = np.array([plants.min(axis=0), plants.max(axis=0)])
+        nominal = 0.5 * (box[0] + box[1])
+        # Whole samples: a dead time between two puts a zero beside z = -1, where no relative error is finite.
+        nominal[2] = round(nominal[2] / sample_time) * sample_time
+        errors = relative_errors(plants, nominal, frequency, sample_time)
+        envelope = errors.max(axis=0)
+        above, below = self._weight(frequency, envelope, plants, nominal, sample_time)
+        size = max(above.size, below.size)
+        weight = np.array([np.concatenate([np.zeros(size - part.size), part]) for part in (above, below)])
+        where = [
+            [SCOPES.index(x.scope), x.recording, x.time if np.isfinite(x.time) else -1.0, x.inclination, x.direction]
+            for x in found
+        ]
+        return AxisFamily(
+            samples=samples,
+            std=std,
+            where=np.array(where, dtype=float),
+            used=used,
+            nominal=nominal,
+            box=box,
+            weight=weight,
+            envelope=envelope,
+        )
+
+    def _plants(self, samples: np.ndarray, std: np.ndarray) -> np.ndarray:
+        """Return the samples, and where asked each moved by its own uncertainty to all sides."""
+        if self.widen == 0.0:
+            return samples
+        moved = [samples]
+        for column in range(3):
+            for sign in (-1.0, 1.0):
+                other = samples.copy()
+                other[:, column] += sign * self.widen * std[:, column]
+                moved.append(other)
+        plants = np.concatenate(moved)
+        plants[:, 0] = np.maximum(plants[:, 0], 0.1 * samples[:, 0].min())
+        plants[:, 1] = np.maximum(plants[:, 1], 0.1 * samples[:, 1].min())
+        plants[:, 2] = np.maximum(plants[:, 2], 0.0)
+        return plants
+
+    def _weight(
+        self, frequency: Vector, envelope: Vector, plants: np.ndarray, nominal: Vector, sample_time: float
+    ) -> tuple[Vector, Vector]:
+        above, below = envelope_weight(frequency, envelope, self.weight_order)
+        # Between the grid's points the samples may stand a little higher than its lines.
+        w = np.geomspace(frequency[0], frequency[-1], 5 * frequency.size)
+        W = np.abs(np.polyval(above, 1j * w) / np.polyval(below, 1j * w))
+        excess = float(np.max(relative_errors(plants, nominal, w, sample_time) / W))
+        return above * max(1.0, excess), below
+
+    def _lpv(self, parts: list[Recording], axes: dict[str, AxisFamily], sample_time: float) -> tuple[Lpv, dict]:
+        """Return the interpolation, and its free-run fits on the last 30 % of each run beside those of one model."""
+        halves = [part.split(0.7) for part in parts]
+        head, tail = [first for first, _ in halves], [second for _, second in halves]
+        nominal = np.array([axes[name].nominal for name in AXES])
+        start = Lpv(
+            knots=np.zeros(1),
+            gains=nominal[:, :1],
+            poles=nominal[:, 1:2],
+            delays=np.round([np.median(axes[name].samples[axes[name].used > 0.5, 2]) / sample_time for name in AXES]),
+            source=self.source,
+        )
+        one = fit_lpv(head, start, 1)
+        many = fit_lpv(head, one, self.lpv_knots) if self.lpv_knots > 1 else one
+        fits: dict[str, Any] = {
+            name: [model.fit(part) for part in tail] for name, model in (("invariant", one), ("lpv", many))
+        }
+        return many, {"free_run_fit": {name: np.round(np.mean(f, axis=0), 2).tolist() for name, f in fits.items()}}
+
+
+def _one_sample_time(parts: list[Recording]) -> float:
+    if not parts:
+        raise DataError("there is no recording to work on.")
+    for part in parts:
+        if not np.isclose(part.sample_time, parts[0].sample_time, rtol=1e-6):
+            raise DataError(
+                f"recordings of different sample times cannot be used together: {parts[0].sample_time:g} s and "
+                f"{part.sample_time:g} s. Resample one of them."
+            )
+    return parts[0].sample_time
+
+
+def _numbers(model: Any) -> Vector:
+    if model is None:
+        return np.full(3, np.nan)
+    return np.array([model.b[0] / model.a[0], model.a[0], model.delay])

@@ -1,0 +1,195 @@
+"""Local models: one pole and dead time around an operating point, over windows, points and whole recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from softneck.core import Matrix, Vector
+from softneck.signals import Recording, redefine
+
+from ..linear._srivc_fit import Continuous, Runs, Search, SrivcFit
+
+# Below this spread of its input a window says nothing of an axis [rad]: 0.05 rad move the neck by 0.3 deg.
+_LEAST_INPUT = 0.05
+# A local model is kept where these are known to better than these parts of themselves.
+_WORST_GAIN, _WORST_POLE = 0.3, 0.6
+_LEAST_FIT = 50.0
+_POLES = (5.0, 1.5, 15.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Local:
+    """One local model of one axis.
+
+    Attributes:
+        scope: "window", "point" or "recording".
+        recording: index of the recording; -1 for a point over several.
+        time: middle of the window [s]; NaN for others.
+        inclination, direction: mean tilt and its direction [rad].
+        model: `K exp(-L s)/(s + p)`.
+        std: (4,) standard deviations of static gain, pole, dead time and K.
+        fit: [%] of the window's own variation.
+    """
+
+    scope: str
+    recording: int
+    time: float
+    inclination: float
+    direction: float
+    model: Continuous
+    std: Vector
+    fit: float
+
+    @property
+    def numbers(self) -> Vector:
+        """(3,) static gain [rad/rad], pole [1/s] and dead time [s]."""
+        return np.array([self.model.b[0] / self.model.a[0], self.model.a[0], self.model.delay])
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Window:
+    """A stretch of one run, with rows before it whose outputs are not judged.
+
+    Attributes:
+        recording: index.
+        time: of its middle [s].
+        inputs: (time, 3) theta_i, phi_i, delta_i.
+        outputs: (time, 2), NaN in the rows before.
+        inclination, direction: means over it [rad].
+    """
+
+    recording: int
+    time: float
+    inputs: Matrix
+    outputs: Matrix
+    inclination: float
+    direction: float
+
+    def run(self, axis: int) -> tuple[Vector, Vector]:
+        """Return input and output of an axis."""
+        return np.ascontiguousarray(self.inputs[:, axis]), np.ascontiguousarray(self.outputs[:, axis])
+
+    def excited(self, axis: int) -> bool:
+        """Return whether the axis is driven and measured in it."""
+        y = self.outputs[:, axis]
+        return float(self.inputs[:, axis].std()) > _LEAST_INPUT and int(np.isfinite(y).sum()) > 0.5 * y.size
+
+
+def tilt(outputs: Matrix) -> tuple[Vector, Vector]:
+    """Return inclination and direction (time,) [rad] of pitch and roll (time, 2)."""
+    p, r = np.tan(outputs[:, 0]), np.tan(outputs[:, 1])
+    return np.arctan(np.hypot(p, r)), np.arctan2(p, -r)
+
+
+def windows(recording: Recording, number: int, *, length: float, lead: float, source: str) -> list[Window]:
+    """Cut every run into half-overlapping windows of `length` [s], a shorter run of at least half of it into one.
+
+    Args:
+        recording: to cut.
+        number: its index.
+        length: of a window [s].
+        lead: rows before a window whose inputs still act in it [s].
+        source: "set_points" or "positions".
+    """
+    Ts = recording.sample_time
+    size, before = round(length / Ts), round(lead / Ts)
+    cut: list[Window] = []
+    for run in recording.runs():
+        U = redefine(run.motor_positions if source == "positions" else run.set_points)
+        Y = run.outputs
+        if len(run) < size // 2:
+            continue
+        for start in range(0, max(len(run) - size, 0) + 1, max(size // 2, 1)):
+            first, stop = max(start - before, 0), min(start + size, len(run))
+            outputs = Y[first:stop].copy()
+            outputs[: start - first] = np.nan
+            inclination, direction = tilt(Y[start:stop])
+            # The mean of a direction is that of its vector.
+            mean = np.nanmean(inclination * np.exp(1j * direction))
+            cut.append(
+                Window(
+                    recording=number,
+                    time=float(run.time[start] + 0.5 * (stop - start) * Ts),
+                    inputs=U[first:stop],
+                    outputs=outputs,
+                    inclination=float(np.nanmean(inclination)),
+                    direction=float(np.angle(mean)),
+                )
+            )
+    return cut
+
+
+def fit_local(
+    search: Search, group: Sequence[Window], axis: int, *, scope: str, near: Continuous | None = None
+) -> Local | None:
+    """Fit one model to all windows of a group, each with its own start and offset; None where they say too little.
+
+    Args:
+        search: how to fit.
+        group: windows.
+        axis: 0 pitch, 1 roll.
+        scope: of the result.
+        near: model to start from as well.
+    """
+    chosen = [window for window in group if window.excited(axis)]
+    if not chosen:
+        return None
+    runs: Runs = [window.run(axis) for window in chosen]
+    fits = [search.start(runs, pole, delay) for pole in _POLES for delay in (0.3 * search.max_delay,)]
+    if near is not None:
+        fits.append(search.improve(runs, near, [np.zeros(2) for _ in runs]))
+    there = [fit for fit in fits if fit is not None]
+    if not there:
+        return None
+    best = min(there, key=lambda fit: fit.cost)
+    std, percent = _quality(search, runs, best)
+    model = best.model
+    gain, pole = model.b[0] / model.a[0], model.a[0]
+    sure = std[0] < _WORST_GAIN * abs(gain) and std[1] < _WORST_POLE * pole and percent > _LEAST_FIT
+    # A pole at its bound was not found but stopped.
+    if not sure or gain <= 0.0 or pole > 0.98 * search.fastest:
+        return None
+    weights = np.array([window.inputs.shape[0] for window in chosen], dtype=float)
+    inclination = float(np.average([window.inclination for window in chosen], weights=weights))
+    direction = float(np.angle(np.average([np.exp(1j * w.direction) for w in chosen], weights=weights)))
+    numbers = {window.recording for window in chosen}
+    return Local(
+        scope=scope,
+        recording=numbers.pop() if len(numbers) == 1 else -1,
+        time=chosen[0].time if scope == "window" else float("nan"),
+        inclination=inclination,
+        direction=direction,
+        model=model,
+        std=std,
+        fit=percent,
+    )
+
+
+def _quality(search: Search, runs: Runs, fit: SrivcFit) -> tuple[Vector, float]:
+    """Return standard deviations of static gain, pole, dead time and K, and the fit [%] about each run's mean."""
+    errors = [(y - s)[np.isfinite(y)] for (_, y), s in zip(runs, fit.simulated, strict=True)]
+    spread = sum(float(np.sum((y[np.isfinite(y)] - np.nanmean(y)) ** 2)) for _, y in runs)
+    e = np.concatenate(errors)
+    # Errors that stay for n samples count as one in n.
+    variance = float(np.mean(e**2)) * _correlation_time(errors, round(1.0 / search.sample_time))
+    covariance = variance * np.linalg.pinv(fit.information, hermitian=True)
+    p, K = fit.model.a[0], fit.model.b[0]
+    slope = np.array([-K / p**2, 1.0 / p, 0.0])
+    gain = float(np.sqrt(max(slope @ covariance @ slope, 0.0)))
+    a, b, L = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return np.array([gain, a, L, b]), 100.0 * (1.0 - float(np.sqrt(fit.cost / max(spread, 1e-300))))
+
+
+def _correlation_time(errors: Sequence[Vector], lags: int) -> float:
+    """Return the sum of the autocorrelation over both sides, while it is positive, at least 1."""
+    power = sum(float(e @ e) for e in errors)
+    total = 1.0
+    for k in range(1, lags + 1):
+        r = sum(float(e[k:] @ e[:-k]) for e in errors if e.size > k) / max(power, 1e-300)
+        if r <= 0.05:
+            break
+        total += 2.0 * r
+    return total

@@ -1,0 +1,87 @@
+"""Interpolation of gain and pole over the inclination, fitted and judged in free run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from softneck.core import DataError, Matrix, Vector
+from softneck.runtime import load_functions
+from softneck.signals import Recording, redefine
+
+from ..models._model import WARM_UP
+from ..models._scores import nrmse_fit
+from ._local_models import tilt
+
+_RUNTIME = "softneck.identification.uncertainty._lpv_runtime"
+_FASTEST = 60.0
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Lpv:
+    """Gain and pole of each axis over the inclination, linear between knots.
+
+    Attributes:
+        knots: (m,) inclinations [rad]; one knot is a linear time-invariant model.
+        gains: (2, m) angle over redefined input [rad/rad].
+        poles: (2, m) [1/s].
+        delays: (2,) samples.
+        source: "set_points" or "positions".
+    """
+
+    knots: Vector
+    gains: Matrix
+    poles: Matrix
+    delays: Vector
+    source: str = "set_points"
+
+    def simulate(self, recording: Recording, *, warm_up: int = WARM_UP) -> Matrix:
+        """Free run: return pitch and roll (time, 2) [rad]; each run starts from `warm_up` measured rows."""
+        parts = []
+        for run in recording.runs():
+            U = redefine(run.motor_positions if self.source == "positions" else run.set_points)[:, :2]
+            Y = np.zeros((len(run), 2))
+            load_functions(_RUNTIME).lpv_simulate(
+                self.knots, self.gains, self.poles, self.delays, run.sample_time,
+                np.ascontiguousarray(U), run.outputs, warm_up, Y,
+            )  # fmt: skip
+            parts.append(Y)
+        return np.concatenate(parts)
+
+    def fit(self, recording: Recording) -> tuple[float, float]:
+        """Return the free-run fits [%] of pitch and roll, the first 25 rows of each run left out."""
+        scored = np.concatenate([np.arange(len(run)) for run in recording.runs()]) >= WARM_UP
+        Y, y = self.simulate(recording)[scored], recording.outputs[scored]
+        return nrmse_fit(y[:, 0], Y[:, 0]), nrmse_fit(y[:, 1], Y[:, 1])
+
+
+def fit_lpv(recordings: Sequence[Recording], start: Lpv, knots: int) -> Lpv:
+    """Fit gains and poles at knots spread over the inclinations met, in free run, from an invariant model.
+
+    Raises:
+        DataError: the inclination hardly moves.
+    """
+    met = np.concatenate([tilt(r.outputs)[0] for r in recordings])
+    met = met[np.isfinite(met)]
+    at = np.unique(np.quantile(met, np.linspace(0.02, 0.98, knots))) if knots > 1 else np.zeros(1)
+    if at.size < knots or (knots > 1 and np.diff(at).min() < 1e-3):
+        raise DataError(f"the inclination hardly moves, so {knots} knots over it are too many; take fewer `lpv_knots`.")
+    first = np.concatenate([np.repeat(start.gains.mean(axis=1), knots), np.repeat(start.poles.mean(axis=1), knots)])
+    target = [r.outputs for r in recordings]
+
+    def model(x: Vector) -> Lpv:
+        gains, poles = np.exp(x).reshape(2, 2, knots)
+        poles = np.minimum(poles, _FASTEST)
+        return Lpv(knots=at, gains=gains, poles=poles, delays=start.delays, source=start.source)
+
+    def residual(x: Vector) -> Vector:
+        tried = model(x)
+        errors = [tried.simulate(r) - y for r, y in zip(recordings, target, strict=True)]
+        e = np.concatenate([error.ravel() for error in errors])
+        return np.where(np.isfinite(e), e, 0.0)
+
+    found = least_squares(residual, np.log(np.maximum(first, 1e-6)), max_nfev=40, x_scale=0.3, ftol=1e-6)
+    return model(np.asarray(found.x))

@@ -1,0 +1,138 @@
+"""Kind `residual`: any model, and set membership on what its free run leaves over, with bounds."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from softneck.core import (
+    DataError,
+    Matrix,
+    Progress,
+    SettingsError,
+    Vector,
+    find_kind,
+    require_positive,
+    require_whole,
+    silent,
+)
+from softneck.signals import Recording
+
+from ..models._composed import COMPOSED, memory_of, prefixed_arrays
+from ..models._fitting import training_recording
+from ..models._model import WARM_UP, Model
+from ..models._regressors import lag_table
+from ..models._rows import row_hashes
+from ..models._scores import nrmse_fit
+from ..set_membership._regressor import gammas, scaled, set_arrays
+from ..set_membership._residual_form import residual_lags, residual_rows
+from ..set_membership._set_membership import noise_level
+from ._ensemble import seeded
+
+# Of the noise: below what the base and the last 0.8 s leave unexplained, gamma and the bounds' width grow a
+# hundredfold; the fit hardly feels it.
+_SIGMAS = (4.0, 8.0, 16.0, 32.0)
+_HOLD_OUT = 0.2
+# Fits [points] that are alike.
+_ALIKE = 0.5
+# A radian of motor tilts the neck by about 0.2 rad: 5 makes the two equal in the norm.
+_ANGLE_WEIGHT = 5.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Residual:
+    """A base of any kind, and set membership (Algorithm 1) over simulated signals on what its free run leaves over.
+
+    Attributes:
+        base: kind, with its default settings.
+        epsilon: noise bound [rad]; None takes 4, 8, 16 or 32 standard deviations of the noise,
+            whichever gives the narrowest bounds among equal fits.
+        angle_weight: weight of the base's angles in the regressor's norm, motors having 1.
+        seed: of a base that starts at random.
+    """
+
+    base: str = "play"
+    epsilon: float | None = None
+    angle_weight: float = _ANGLE_WEIGHT
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        find_kind(self.base, "model")
+        if self.base in COMPOSED:
+            raise SettingsError(f"a model of kind `{self.base}` holds others itself and cannot be a base.")
+        if self.epsilon is not None:
+            require_positive("epsilon", self.epsilon, "rad")
+        require_positive("angle_weight", self.angle_weight)
+        require_whole("seed", self.seed, 0, 2**62)
+
+    def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
+        """Identify the base, then the set on the residual of its free run over the same rows.
+
+        Raises:
+            DataError: what the base raises, or `epsilon` so small that no function fits the residual.
+        """
+        recording = training_recording(recordings)
+        base = seeded(self.base, self.seed).fit(recording, progress=lambda done, what: progress(0.9 * done, what))
+        progress(0.9, "set membership on what it leaves over")
+        model = self.on(base, recording)
+        progress(1.0, "done")
+        return model
+
+    def on(self, base: Model, recording: Recording) -> Model:
+        """Return a set over the residual of a base that is there already."""
+        noise = np.array([noise_level(recording, axis) for axis in range(2)])
+        given = self.epsilon
+        epsilon = self._narrowest(base, recording, noise) if given is None else np.full(2, given)
+        arrays, gamma = self._arrays(base, recording, epsilon)
+        findings = {
+            "base": base.kind,
+            "epsilon_deg": np.degrees(epsilon).tolist(),
+            "gamma": gamma.tolist(),
+            "points": int(arrays["values"].shape[1]),
+            **{key: value for key, value in base.findings.items() if key in ("remark", "interrupted")},
+        }
+        return Model(
+            kind="residual",
+            sample_time=recording.sample_time,
+            arrays=arrays,
+            settings={**asdict(self), "base": base.kind},
+            findings=findings,
+            training_rows=np.unique(np.concatenate([base.training_rows, row_hashes(recording)])),
+        )
+
+    def _narrowest(self, base: Model, recording: Recording, noise: Vector) -> Vector:
+        """Return the epsilon (2,) whose bounds are narrowest over the last fifth of each run, among equal fits."""
+        head, tail = recording.split(1.0 - _HOLD_OUT)
+        if len(tail) <= 2 * WARM_UP:
+            return _SIGMAS[0] * noise
+        found: list[tuple[float, float, Vector]] = []
+        for sigmas in _SIGMAS:
+            arrays, _ = self._arrays(base, head, sigmas * noise)
+            Y = Model(kind="residual", sample_time=head.sample_time, arrays=arrays).simulate(tail)[WARM_UP:]
+            fit = sum(nrmse_fit(tail.outputs[WARM_UP:, axis], Y[:, axis]) for axis in range(2)) / 2.0
+            found.append((fit, float(np.mean(Y[:, [6, 8]] - Y[:, [5, 7]])), sigmas * noise))
+        best = max(fit for fit, _, _ in found)
+        return min((entry for entry in found if entry[0] >= best - _ALIKE), key=lambda entry: entry[1])[2]
+
+    def _arrays(self, base: Model, recording: Recording, epsilon: Vector) -> tuple[dict[str, Matrix], Vector]:
+        lags = residual_lags(recording.sample_time)
+        table = lag_table(lags, (), lags, both_outputs=True)
+        scale = np.where(table[:, 0] == 3, self.angle_weight, 1.0)
+        rows = [residual_rows(recording, base, table, axis) for axis in range(2)]
+        points = [(scaled(X, scale), y) for X, y in rows]
+        gamma = gammas(rows, scale, [epsilon])[0]
+        if gamma.max() > 1e100:
+            raise DataError(
+                f"epsilon {np.degrees(epsilon).round(4).tolist()} deg is below the noise: equal regressors have "
+                "residuals further apart. Set `epsilon` higher."
+            )
+        arrays = {
+            "history": np.array([float(table[:, 2].max())]),
+            "memory": np.array([float(memory_of(base.arrays))]),
+            "table": table,
+            "scale": scale,
+            **set_arrays(points, gamma, epsilon),
+            **prefixed_arrays([(base.kind, base.arrays)]),
+        }
+        return arrays, gamma

@@ -1,0 +1,122 @@
+"""The tables of scores that a `Validation` holds: horizon -> axis -> value."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from softneck.core import Matrix, Vector
+
+from ..models._model import Model
+from ..models._scores import nrmse_fit, r_squared, rmse, worst_error
+from ..set_membership._extrapolation import knows_what_it_saw, outside_seen
+from ._bootstrap import fit_intervals
+from ._scored_rows import Rows, Stretch
+
+INFINITE = "inf"
+AXES = ("pitch", "roll")
+# Bounds of set membership follow pitch, roll and three motors in its outputs.
+_LOWER, _UPPER = (5, 7), (6, 8)
+
+
+def score_tables(
+    time: Vector, measured: dict[str, Matrix], predicted: dict[str, Matrix], *, lost: bool
+) -> dict[str, Any]:
+    """Return the tables of scores by their names in `Validation`; a lost free run has none."""
+    tables: dict[str, Any] = {name: {} for name in ("fits", "rmse_deg", "r2", "worst_deg", "worst_time")}
+    for h, y in measured.items():
+        for table in tables.values():
+            table[h] = dict.fromkeys(AXES)
+        if lost and h == INFINITE:
+            continue
+        for i, axis in enumerate(AXES):
+            pair = (y[:, i], predicted[h][:, i])
+            worst, row = worst_error(*pair)
+            tables["fits"][h][axis] = _number(nrmse_fit(*pair))
+            tables["rmse_deg"][h][axis] = _number(np.degrees(rmse(*pair)))
+            tables["r2"][h][axis] = _number(r_squared(*pair))
+            tables["worst_deg"][h][axis] = _number(np.degrees(worst))
+            tables["worst_time"][h][axis] = float(time[row]) if row >= 0 else None
+    return tables
+
+
+def run_tables(
+    stretches: Sequence[Stretch],
+    rows_of_all: Rows,
+    measured: dict[str, Matrix],
+    predicted: dict[str, Matrix],
+    lost: list[float | None],
+) -> list[dict[str, Any]]:
+    """Return the same tables for each stretch by itself, beside what tells it apart."""
+    entries = []
+    for number, stretch in enumerate(stretches):
+        rows = rows_of_all.stretch == number
+        scores = score_tables(
+            rows_of_all.time[rows],
+            {h: y[rows] for h, y in measured.items()},
+            {h: y[rows] for h, y in predicted.items()},
+            lost=lost[number] is not None,
+        )
+        scores["worst_time_s"] = scores.pop("worst_time")
+        entries.append(
+            {
+                "stretch": number,
+                "run": stretch.run,
+                "start_s": float(stretch.recording.time[0]),
+                "rows_scored": int(stretch.scored.sum()),
+                "diverged": lost[number],
+                **scores,
+            }
+        )
+    return entries
+
+
+def interval_tables(
+    rows: Rows, measured: dict[str, Matrix], predicted: dict[str, Matrix], sample_time: float, *, lost: bool
+) -> dict[str, dict[str, list[float] | None]]:
+    """Return the bootstrap's interval of each fit."""
+    result: dict[str, dict[str, list[float] | None]] = {h: dict.fromkeys(AXES) for h in measured}
+    kept = [h for h in measured if not (lost and h == INFINITE)]
+    if kept:
+        found = fit_intervals([measured[h] for h in kept], [predicted[h] for h in kept], rows.stretch, sample_time)
+        result |= {h: dict(zip(AXES, pair, strict=True)) for h, pair in zip(kept, found, strict=True)}
+    return result
+
+
+def free_run_bounds(free: Matrix) -> tuple[Matrix, Matrix]:
+    """Return the lower and upper bounds (time, 2) among a model's outputs; NaN where its kind has none."""
+    if free.shape[1] <= max(_UPPER):
+        nothing = np.full((len(free), 2), np.nan)
+        return nothing, nothing
+    return free[:, list(_LOWER)], free[:, list(_UPPER)]
+
+
+def coverage_tables(
+    measured: Matrix, lower: Matrix, upper: Matrix
+) -> tuple[dict[str, float] | None, dict[str, float] | None]:
+    """Return how many measured samples lie within the bounds [%], and how wide these are [deg]."""
+    there = np.isfinite(measured) & np.isfinite(lower) & np.isfinite(upper)
+    if not there.any():
+        return None, None
+    inside = (measured >= lower) & (measured <= upper) & there
+    count = np.maximum(there.sum(axis=0), 1)
+    width = np.where(there, upper - lower, 0.0).sum(axis=0) / count
+    coverage = 100.0 * inside.sum(axis=0) / count
+    return dict(zip(AXES, coverage.tolist(), strict=True)), dict(zip(AXES, np.degrees(width).tolist(), strict=True))
+
+
+def outside_table(model: Model, measured: Matrix, free: Matrix) -> dict[str, float] | None:
+    """Return how many measured samples [%] the bounds flag as outside what a set membership model has seen."""
+    lower, upper = free_run_bounds(free)
+    there = np.isfinite(measured) & np.isfinite(lower) & np.isfinite(upper)
+    if not there.any() or not knows_what_it_saw(model):
+        return None
+    flagged = outside_seen(model, free) & there
+    share = 100.0 * flagged.sum(axis=0) / np.maximum(there.sum(axis=0), 1)
+    return dict(zip(AXES, share.tolist(), strict=True))
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,124 @@
+"""Which rows are judged: stretches of rows that the model was not trained on, less those that set its start."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from softneck.core import DataError, Matrix, Vector
+from softneck.signals import Recording
+
+from ..models._model import WARM_UP
+from ..models._rows import known_rows
+
+# Far predictions cost `horizon` steps for each row, and neighbours err alike: so many steps are enough. 3,000 rows,
+# the paper's validation, are all predicted 25 samples ahead; of 30,000 every tenth one, which is 0.2 s after the last.
+_MOST_STEPS = 75_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stretch:
+    """Rows of one run that follow each other.
+
+    Attributes:
+        recording: those rows alone.
+        scored: (time,) which of them are judged; never the first 25, a row that the model was trained on, or one
+            where neither angle was measured.
+        run: number of the run, as the recording counts.
+    """
+
+    recording: Recording
+    scored: np.ndarray
+    run: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """The rows of all stretches, one stretch after the other.
+
+    Attributes:
+        time: (time,) [s].
+        stretch: (time,) number of the stretch.
+        since: (time,) samples since its start.
+        measured: (time, 2) [rad]; NaN where missed or not scored.
+        set_points: (time, 3) [rad].
+    """
+
+    time: Vector
+    stretch: np.ndarray
+    since: np.ndarray
+    measured: Matrix
+    set_points: Matrix
+
+    def judged(self, horizon: int | None) -> Matrix:
+        """Return `measured`, NaN as well where there are not `horizon` samples of past; None is the free run."""
+        if horizon is None:
+            return self.measured
+        # A row with less past than the horizon was not predicted from that far back.
+        past = self.since - horizon
+        return np.where(((past >= 0) & (past % self.stride(horizon) == 0))[:, None], self.measured, np.nan)
+
+    def stride(self, horizon: int) -> int:
+        """Return n where only every n-th row is predicted `horizon` samples ahead: of more than 75,000 steps."""
+        steps = int((self.since >= horizon).sum()) * horizon
+        return 1 if horizon == 1 else max(-(-steps // _MOST_STEPS), 1)
+
+
+def unseen_stretches(recording: Recording, hashes: np.ndarray) -> tuple[list[Stretch], int]:
+    """Return the stretches of rows whose hash is not in `hashes`, and how many rows were left out.
+
+    Raises:
+        DataError: nothing is left to judge.
+    """
+    stretches: list[Stretch] = []
+    left_out = longest = 0
+    for run in recording.runs():
+        seen = known_rows(run, hashes) if hashes.size else np.zeros(len(run), dtype=bool)
+        left_out += int(seen.sum())
+        longest = max(longest, len(run))
+        for start, stop in _unseen(seen):
+            mask = ~seen[start:stop]
+            mask[:WARM_UP] = False
+            part = run.rows(start, stop)
+            mask &= np.isfinite(part.outputs).any(axis=1)
+            if mask.any():
+                stretches.append(Stretch(part, mask, int(run.run[0])))
+    if not stretches:
+        raise DataError(f"nothing is left to judge: {_why(len(recording), left_out, longest)}")
+    return stretches, left_out
+
+
+def pooled(stretches: list[Stretch]) -> Rows:
+    """Return the rows of all stretches."""
+    outputs = [np.where(s.scored[:, None], s.recording.outputs, np.nan) for s in stretches]
+    return Rows(
+        time=np.concatenate([s.recording.time for s in stretches]),
+        stretch=np.repeat(np.arange(len(stretches)), [len(s.recording) for s in stretches]),
+        since=np.concatenate([np.arange(len(s.recording)) for s in stretches]),
+        measured=np.concatenate(outputs),
+        set_points=np.concatenate([s.recording.set_points for s in stretches]),
+    )
+
+
+def _why(rows: int, left_out: int, longest: int) -> str:
+    if longest <= WARM_UP:
+        return (
+            f"{longest} rows are too few, as the first {WARM_UP} of each run set the initial state and are not "
+            "scored; record longer runs."
+        )
+    if left_out == rows:
+        return f"all {left_out} rows were used to train the model; use another recording or --include-training."
+    return (
+        f"{left_out} of {rows} rows were used to train the model and no {WARM_UP + 1} others follow each other; "
+        "use another recording or --include-training."
+    )
+
+
+def _unseen(seen: np.ndarray) -> list[tuple[int, int]]:
+    """Return the borders of stretches between long parts that were seen; a few rows seen do not break one."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], seen.astype(np.int8), [0]])))
+    long = [(a, b) for a, b in edges.reshape(-1, 2).tolist() if b - a > WARM_UP]
+    starts = [0, *(b for _, b in long)]
+    stops = [*(a for a, _ in long), seen.size]
+    return [(a, b) for a, b in zip(starts, stops, strict=True) if b - a > WARM_UP]

@@ -1,0 +1,287 @@
+"""Honest validation: every model beside persistence and the best linear one, one step, k steps and in free run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from softneck.core import DataError, Matrix, Vector, require_one_of
+from softneck.signals import Recording
+
+from ..models._model import Model
+from ._baselines import Baselines, baselines
+from ._divergence import divergence
+from ._horizons import predict
+from ._novelty import Novelty, novelty
+from ._residual_tests import ResidualTests, residual_tests
+from ._score_tables import (
+    INFINITE,
+    coverage_tables,
+    free_run_bounds,
+    interval_tables,
+    outside_table,
+    run_tables,
+    score_tables,
+)
+from ._scored_rows import Rows, Stretch, pooled, unseen_stretches
+
+_HORIZONS = (1, 5, 25, INFINITE)
+
+Scores = dict[str, dict[str, float | None]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Validation:
+    """One model on one recording.
+
+    Scores are tables horizon -> axis -> value ("1", ..., "inf"; "pitch", "roll"), None where the free run diverged or
+    nothing was measured or moved; all but `per_run` are over the rows of all runs together.
+
+    Attributes:
+        model, data: their names.
+        rows_scored, rows_left_out: rows judged, and rows left out because the model was trained on them.
+        rows_by_horizon: rows judged at each horizon: those with so much past, and of long records not all.
+        persistence, fits: fit [%] of repeating the last sample, and of the model.
+        rmse_deg, r2: root mean square error [deg]; R2 = 1 - SSE/SST.
+        worst_deg, worst_time: largest absolute error [deg] and when it was [s].
+        intervals: 95 % interval [low, high] of `fits` by a bootstrap over blocks.
+        best_linear: fit [%] that no linear model of the set-points beats on these rows (see `best_linear`).
+        noise_ceiling: axis -> fit [%] of a perfect model; None where no set-points were repeated.
+        per_run: the same scores for each stretch of rows that follow each other, with its `stretch`, `run`,
+            `start_s`, `rows_scored` and `diverged`.
+        diverged: time [s] at which the first free run left the data's range, or None.
+        residual_tests: of the one-step errors; `white` and `uncorrelated` are their verdicts.
+        novelty: how far the judged rows lie from the training rows, where these are known.
+        coverage_pct, mean_width_deg: of set membership in free run: axis -> measured samples within the bounds [%],
+            and their mean distance [deg]; None for other kinds.
+        outside_pct: of set membership in free run: axis -> measured samples [%] at which the bounds are wider than
+            training's usually are (see `outside_seen`); None for other kinds.
+        time, run: (time,) [s] and the number of the stretch, for plots: no line joins two of them.
+        measured, free_run, one_step: (time, 2) [rad], NaN where nothing is scored.
+        lower, upper: (time, 2) [rad] bounds of the free run, NaN where there are none.
+    """
+
+    model: str
+    data: str
+    rows_scored: int
+    rows_left_out: int
+    rows_by_horizon: dict[str, int]
+    persistence: Scores
+    fits: Scores
+    rmse_deg: Scores
+    r2: Scores
+    worst_deg: Scores
+    worst_time: Scores
+    intervals: dict[str, dict[str, list[float] | None]]
+    best_linear: Scores
+    noise_ceiling: dict[str, float | None]
+    per_run: list[dict[str, Any]]
+    diverged: float | None
+    residual_tests: ResidualTests
+    novelty: Novelty | None
+    coverage_pct: dict[str, float] | None
+    mean_width_deg: dict[str, float] | None
+    outside_pct: dict[str, float] | None
+    time: Vector
+    run: np.ndarray
+    measured: Matrix
+    free_run: Matrix
+    one_step: Matrix
+    lower: Matrix
+    upper: Matrix
+
+    @property
+    def white(self) -> bool:
+        """Whether the one-step errors are white noise, as far as 25 lags tell (99 %)."""
+        return self.residual_tests.white
+
+    @property
+    def uncorrelated(self) -> bool:
+        """Whether the one-step errors follow no input at lags 0 to 25 (99 %)."""
+        return self.residual_tests.uncorrelated
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the entry of the public face's JSON."""
+        return {
+            "model": self.model,
+            "data": self.data,
+            "rows_scored": self.rows_scored,
+            "rows_left_out": self.rows_left_out,
+            "rows_by_horizon": self.rows_by_horizon,
+            "fits": {
+                "persistence": self.persistence,
+                "model": self.fits,
+                "best_linear": self.best_linear,
+                "noise_ceiling": self.noise_ceiling,
+            },
+            "intervals": self.intervals,
+            "rmse_deg": self.rmse_deg,
+            "worst_deg": self.worst_deg,
+            "worst_time_s": self.worst_time,
+            "r2": self.r2,
+            "diverged": self.diverged,
+            "residuals": {
+                "white": self.white,
+                "uncorrelated_with_inputs": self.uncorrelated,
+                **self.residual_tests.as_dict(),
+            },
+            "novelty": None if self.novelty is None else self.novelty.as_dict(),
+            "coverage_pct": self.coverage_pct,
+            "mean_width_deg": self.mean_width_deg,
+            "outside_pct": self.outside_pct,
+            "per_run": self.per_run,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """How models are judged; see `validate`."""
+
+    horizons: tuple[int | str, ...] = _HORIZONS
+    motors: str = "simulated"
+    include_training: bool = False
+
+    def __post_init__(self) -> None:
+        require_one_of("motors", self.motors, ("simulated", "measured"))
+        for horizon in self.horizons:
+            if horizon != INFINITE and (not isinstance(horizon, int) or horizon < 1):
+                raise DataError(f"a horizon is a number of samples from 1, or `inf`; got {horizon!r}.")
+
+
+def validate(
+    model: Model,
+    recording: Recording,
+    *,
+    names: tuple[str, str] = ("model", "data"),
+    horizons: Sequence[int | str] = _HORIZONS,
+    motors: str = "simulated",
+    include_training: bool = False,
+    training: Recording | None = None,
+) -> Validation:
+    """Judge a model on the rows of a recording that it was not trained on.
+
+    Each stretch of unseen rows starts from 25 measured samples, which are not scored. A free run then has the
+    set-points alone, or the logged motor positions as well (`motors="measured"`).
+
+    Args:
+        model: of any kind.
+        recording: at the model's sample time; its runs are never joined.
+        names: of model and data, for reports.
+        horizons: samples ahead; "inf" is the free run.
+        motors: "simulated" or "measured".
+        include_training: whether rows that the model was trained on are judged too.
+        training: what the model was trained on, for `novelty`.
+
+    Raises:
+        DataError: nothing is left to judge, another sample time, no motor positions to measure, or a horizon longer
+            than every stretch.
+    """
+    rules = Rules(tuple(horizons), motors, include_training)
+    check_training_data(model, training)
+    parts = judged_parts(model, recording, rules)
+    return judge(model, parts, rules, names=names, training=training)
+
+
+def check_training_data(model: Model, training: Recording | None) -> None:
+    """Raise DataError where the training data is at another sample time than the model."""
+    if training is not None:
+        model._check(training)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Parts:
+    """What of a recording is judged, and what stands beside any model on it."""
+
+    stretches: list[Stretch]
+    left_out: int
+    rows: Rows
+    baselines: Baselines
+
+
+def judged_parts(
+    model: Model, recording: Recording, rules: Rules, known: dict[bytes, Baselines] | None = None
+) -> Parts:
+    """Return the stretches that a model has not seen; `known` keeps baselines for models that saw the same rows."""
+    model._check(recording)  # its sample time, before anything is computed
+    if rules.motors == "measured" and not recording.has_motor_positions:
+        raise DataError(
+            "motors=measured needs logged motor positions and the recording has none; judge it with --motors simulated."
+        )
+    if not np.isfinite(recording.outputs).any():
+        raise DataError("neither pitch nor roll was ever measured; there is nothing to judge.")
+    hashes = np.zeros(0, dtype=np.uint64) if rules.include_training else model.training_rows
+    stretches, left_out = unseen_stretches(recording, hashes)
+    longest = max(len(s.recording) for s in stretches)
+    finite = [int(h) for h in rules.horizons if h != INFINITE]
+    if finite and max(finite) >= longest:
+        raise DataError(
+            f"a horizon of {max(finite)} samples is longer than what is judged: the longest stretch of rows that the "
+            f"model was not trained on has {longest}."
+        )
+    rows = pooled(stretches)
+    key = np.isfinite(rows.measured).tobytes() + rows.stretch.tobytes() + rows.time.tobytes()
+    known = {} if known is None else known
+    if key not in known:
+        known[key] = baselines(recording, stretches, rows, rules.horizons)
+    return Parts(stretches, left_out, rows, known[key])
+
+
+def judge(
+    model: Model, parts: Parts, rules: Rules, *, names: tuple[str, str], training: Recording | None = None
+) -> Validation:
+    """Return the validation of a model on its parts of a recording."""
+    rows, horizons = parts.rows, [str(h) for h in rules.horizons]
+    outputs = _predictions(model, parts, rules)
+    lost: list[float | None] = [None] * len(parts.stretches)
+    if INFINITE in outputs:
+        lost = divergence(rows.time, rows.stretch, outputs[INFINITE][:, :2], rows.measured)
+    first = min((t for t in lost if t is not None), default=None)
+    measured = {h: rows.judged(None if h == INFINITE else int(h)) for h in horizons}
+    predicted = {h: outputs[h][:, :2] for h in horizons}
+    scores = score_tables(rows.time, measured, predicted, lost=first is not None)
+    tests = residual_tests(rows.measured - outputs["1"][:, :2], rows.set_points, rows.stretch)
+    free = outputs.get(INFINITE, np.full((rows.time.size, 2), np.nan))
+    lower, upper = free_run_bounds(free)
+    coverage, width = coverage_tables(rows.measured, lower, upper)
+    return Validation(
+        model=names[0],
+        data=names[1],
+        rows_scored=int(sum(stretch.scored.sum() for stretch in parts.stretches)),
+        rows_left_out=parts.left_out,
+        rows_by_horizon={h: int(np.isfinite(y).any(axis=1).sum()) for h, y in measured.items()},
+        persistence=parts.baselines.persistence,
+        **scores,
+        intervals=interval_tables(rows, measured, predicted, model.sample_time, lost=first is not None),
+        best_linear=parts.baselines.best_linear,
+        noise_ceiling=parts.baselines.noise_ceiling,
+        per_run=run_tables(parts.stretches, rows, measured, predicted, lost),
+        diverged=first,
+        residual_tests=tests,
+        novelty=novelty(model, parts.stretches, training),
+        coverage_pct=coverage,
+        mean_width_deg=width,
+        outside_pct=outside_table(model, rows.measured, free),
+        time=rows.time,
+        run=rows.stretch,
+        measured=rows.measured,
+        free_run=free[:, :2],
+        one_step=outputs["1"][:, :2],
+        lower=lower,
+        upper=upper,
+    )
+
+
+def _predictions(model: Model, parts: Parts, rules: Rules) -> dict[str, Matrix]:
+    """Return horizon -> outputs (time, n_out) of all stretches; one step ahead always, for the residual tests."""
+    runs = [stretch.recording for stretch in parts.stretches]
+    result: dict[str, Matrix] = {}
+    for horizon in dict.fromkeys((1, *rules.horizons)):
+        if horizon == INFINITE:
+            result[INFINITE] = np.concatenate([model.simulate(run, motors=rules.motors) for run in runs])
+        else:
+            k = int(horizon)
+            result[str(k)] = predict(model, runs, k, motors=rules.motors, stride=parts.rows.stride(k))
+    return result

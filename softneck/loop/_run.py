@@ -1,0 +1,367 @@
+"""One run of a loop: started, advanced row by row, saved, resumed, judged."""
+
+from __future__ import annotations
+
+import math
+import time as clock
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from softneck.core import DataError, Matrix, SettingsError, Vector, to_si
+from softneck.runtime import Port
+
+from ._compiled_rows import CompiledRows, can_compile
+from ._disturbed_bus import place_faults
+from ._loop import Loop
+from ._order import late, step_order
+from ._part import BlockPart, Part
+from ._result import LoopResult
+from ._state import LoopState, Saved
+from ._wiring import REFERENCE_PORTS, Named, Wiring, wire
+
+# Ratio of two sample times that should be whole; 1e-6 allows 0.02 / 0.01 in binary and nothing else.
+_RATIO_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopStep:
+    """What a step callback sees: the signals of one row."""
+
+    index: int
+    time: float
+    values: Vector
+    columns: Mapping[str, int]
+
+    def __getitem__(self, name: str) -> float:
+        """Return a signal by its name in the result; raise DataError with the known names if there is none."""
+        try:
+            return float(self.values[self.columns[name]])
+        except KeyError:
+            raise DataError(f"the loop has no signal `{name}`; it has {', '.join(self.columns)}.") from None
+
+
+# Called after each row; returning True stops the run there.
+StepCallback = Callable[[LoopStep], bool | None]
+
+
+def run_loop(
+    loop: Loop,
+    report: Callable[[float], None] | None = None,
+    *,
+    on_step: StepCallback | None = None,
+    pace: float | None = None,
+    resume: LoopState | None = None,
+    keep: bool = False,
+    compiled: bool = False,
+) -> LoopResult:
+    """Run `loop` from t = 0 and return its signals, one row for each sample of the fastest part.
+
+    Args:
+        loop: what to run.
+        report: called now and then with the done fraction, 0 to 1.
+        on_step: called after each row; it stops the run by returning True.
+        pace: run at this multiple of real time; as fast as possible if not given.
+        resume: go on from here instead of t = 0.
+        keep: leave the parts loaded for the next run; `loop.close()` releases them.
+        compiled: run all rows as one compiled function where all parts are blocks and nobody watches the steps: the
+            same bits, much sooner once it is compiled; other loops run as always.
+
+    Raises:
+        SettingsError: sample times that do not divide, inputs without a source, algebraic loops.
+        DataError: a part returned NaN or infinity; the message names part, variable and time.
+    """
+    run = LoopRun(loop, compiled=compiled)
+    try:
+        if resume is not None:
+            run.restore(resume)
+        run.advance(report=report, on_step=on_step, pace=pace)
+    except BaseException:
+        run.close()
+        raise
+    if not keep:
+        run.close()
+    return run.result()
+
+
+class LoopRun:
+    """A loop that is running; use it in a `with` statement, which releases the parts at the end.
+
+    Attributes:
+        loop: what runs.
+        row, rows: the next row and their number in all.
+        step: base step [s], the shortest sample time.
+    """
+
+    def __init__(self, loop: Loop, *, compiled: bool = False) -> None:
+        """Wire `loop`; the parts start with the first `advance` or `restore`.
+
+        `compiled` takes compiled rows where all parts are blocks.
+        """
+        self.loop, self._parts = loop, loop.parts
+        self.step, self._ratios = _schedule(self._parts)
+        wiring = wire(self._parts, loop.constants, loop.connections)
+        sequential = loop.order == "sequential"
+        self._order = step_order(self._parts, wiring.taps) if sequential else ()
+        self._wiring, stages = place_faults(loop.faults, wiring, self._parts, self.step)
+        self._stages = stages if loop.faults else None
+        self._memories = tuple(acting.memory for acting in (*stages.sensors, *stages.plant))
+        self.row, self.rows = 0, max(1, round(loop.duration / self.step))
+        self._late = tuple(name for name, part in self._parts.items() if late(part))
+        self._bus, self._pending = self._wiring.start.copy(), {}
+        self._started = False
+        self._cycle = self._sequential if sequential else self._jacobi
+        self._columns = _columns(self._wiring)
+        self._table = np.empty((self.rows, self._bus.size))
+        self._reference = _reference_table(loop, self.step, self.rows)
+        self._compiled: CompiledRows | None = None
+        self._compile = compiled and can_compile(self._parts)
+
+    def __enter__(self) -> LoopRun:
+        """Return the run itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Release the parts."""
+        self.close()
+
+    def close(self) -> None:
+        """Release the parts."""
+        self._started = False
+        self.loop.close()
+
+    def advance(
+        self,
+        rows: int | None = None,
+        *,
+        report: Callable[[float], None] | None = None,
+        on_step: StepCallback | None = None,
+        pace: float | None = None,
+    ) -> bool:
+        """Run `rows` more rows, all that are left if not given; return whether the end is reached.
+
+        Raises:
+            DataError: a part returned NaN or infinity; the message names part, variable and time.
+        """
+        self._start()
+        stop = self.rows if rows is None else min(self.rows, self.row + rows)
+        stride = max(1, self.rows // 100)
+        if pace is not None and not pace > 0.0:
+            raise SettingsError(f"`pace` must be positive (1 is real time); got {pace}.")
+        if self._compile and on_step is None and pace is None:
+            self._advance_compiled(stop, stride, report)
+            return self.row == self.rows
+        begin, first = clock.perf_counter(), self.row
+        cycle = self._cycle
+        for k in range(self.row, stop):
+            cycle(k)
+            self.row = k + 1
+            if report is not None and (k + 1) % stride == 0:
+                report((k + 1) / self.rows)
+            if pace is not None:
+                _wait_until(begin + (k + 1 - first) * self.step / pace)
+            if on_step is not None and on_step(LoopStep(k, k * self.step, self._table[k], self._columns)):
+                self._table = self._table[: self.row]
+                self.rows = self.row
+                break
+        return self.row == self.rows
+
+    def _advance_compiled(self, stop: int, stride: int, report: Callable[[float], None] | None) -> None:
+        rows = self._compiled = self._compiled or self._compiled_rows()
+        while self.row < stop:
+            end = stop if report is None else min(stop, (self.row // stride + 1) * stride)
+            self.row, problem, part = rows.run(self.row, end, self._pending, self._bus, self._table)
+            if problem:
+                self._explain(rows.names[part], self.row * self.step)
+            if report is not None:
+                report(self.row / self.rows)
+
+    def _compiled_rows(self) -> CompiledRows:
+        blocks = {name: part for name, part in self._parts.items() if isinstance(part, BlockPart)}
+        return CompiledRows(
+            blocks, self._wiring, sequential=self.loop.order == "sequential", order=self._order, late=self._late,
+            ratios=self._ratios, reference=self._reference, stages=self._stages, rows=self.rows,
+        )  # fmt: skip
+
+    def _explain(self, name: str, time: float) -> None:
+        """Raise what the Python rows would raise of part `name`, whose inputs or outputs the compiled ones refused."""
+        self._wiring.taps[name].read(self._bus, time)
+        part = self._parts[name]
+        if isinstance(part, BlockPart):
+            self._checked(name, part.memory[2], time)
+
+    def result(self) -> LoopResult:
+        """Return the signals of all rows so far."""
+        signals, units = {}, {}
+        by_slot = {item.slot: item for item in self._wiring.named}
+        for name, slot in self._columns.items():
+            signals[name], units[name] = _in_si(self._table[: self.row, slot], by_slot[slot].port)
+        return LoopResult(np.arange(self.row) * self.step, signals, units, self.step)
+
+    def state(self) -> LoopState:
+        """Return all that the run remembers.
+
+        Raises:
+            SettingsError: a part that cannot save its state.
+        """
+        self._start()
+        parts = {name: _saved(name, part).get_state() for name, part in self._parts.items()}
+        return LoopState(
+            row=self.row, order=self.loop.order, step=self.step, bus=self._bus.copy(),
+            pending={name: values.copy() for name, values in self._pending.items()},
+            memories=tuple(memory.copy() for memory in self._memories), table=self._table[: self.row].copy(),
+            parts=parts,
+        )  # fmt: skip
+
+    def restore(self, state: LoopState) -> None:
+        """Go on from `state`, which a loop like this one saved, here or in another process.
+
+        Raises:
+            DataError: the state is of another loop.
+        """
+        self._start()
+        state.check(
+            order=self.loop.order, step=self.step, bus=self._bus, memories=self._memories, parts=set(self._parts)
+        )
+        if state.row > self.rows:
+            raise DataError(f"the state is at row {state.row}; this loop ends at row {self.rows}: make it longer.")
+        for name, part in self._parts.items():
+            _saved(name, part).set_state(state.parts[name])
+        self.row = state.row
+        self._bus[:] = state.bus
+        self._pending = {name: values.copy() for name, values in state.pending.items()}
+        for memory, saved in zip(self._memories, state.memories, strict=True):
+            memory[:] = saved
+        self._table[: self.row] = state.table
+
+    def _start(self) -> None:
+        if self._started:
+            return
+        self._started = True
+        parameters = self.loop.parameters
+        for name, part in self._parts.items():
+            outputs = self._checked(name, part.start(0.0, parameters.get(name, {})), 0.0)
+            self._bus[self._wiring.spans[name]] = outputs
+            if name in self._late:
+                self._pending[name] = outputs.copy()
+
+    def _sequential(self, k: int) -> None:
+        """Read the plant at t_k, step observer, then controller, then plant."""
+        time, bus = self._arrive(k), self._bus
+        for name in self._order:
+            if k % self._ratios[name] == 0:
+                bus[self._wiring.spans[name]] = self._advance(name, time)
+        if self._stages is not None:
+            self._stages.actuate(bus, k)
+        self._table[k] = bus
+        for name in self._late:
+            if k % self._ratios[name] == 0:
+                self._pending[name] = self._advance(name, time)
+
+    def _jacobi(self, k: int) -> None:
+        """Set the inputs of all from what is on the bus at t_k, step all; the outputs are seen at t_k+1."""
+        time, bus = self._arrive(k), self._bus
+        if self._stages is not None:
+            self._stages.actuate(bus, k)
+        self._table[k] = bus
+        due = [name for name in self._parts if k % self._ratios[name] == 0]
+        outputs = {name: self._advance(name, time) for name in due}
+        for name, values in outputs.items():
+            if name in self._late:
+                self._pending[name] = values
+            else:
+                bus[self._wiring.spans[name]] = values
+
+    def _arrive(self, k: int) -> float:
+        """Put on the bus what becomes valid at t_k: the plant's outputs and the reference."""
+        bus, spans = self._bus, self._wiring.spans
+        for name in self._late:
+            if k % self._ratios[name] == 0:
+                bus[spans[name]] = self._pending[name]
+        if self._reference is not None:
+            bus[spans["reference"]] = self._reference[k]
+        if self._stages is not None:
+            self._stages.sense(bus, k)
+        return k * self.step
+
+    def _advance(self, name: str, time: float) -> Vector:
+        inputs = self._wiring.taps[name].read(self._bus, time)
+        return self._checked(name, self._parts[name].advance(time, inputs), time)
+
+    def _checked(self, name: str, outputs: Vector, time: float) -> Vector:
+        # One sum tells whether a closer look is needed; in Python, which warns of no inf - inf.
+        if math.isfinite(sum(outputs.tolist())):
+            return outputs
+        for port, value in zip(self._parts[name].outputs, outputs, strict=True):
+            if not math.isfinite(value) and not (port.missing and math.isnan(value)):
+                raise DataError(f"output `{port.name}` of the {name} became {value} in the step at t = {time:g} s.")
+        return outputs
+
+
+def _schedule(parts: Mapping[str, Part]) -> tuple[float, dict[str, int]]:
+    """Return the base step [s] (the shortest sample time) and each part's multiple of it."""
+    step = min(part.sample_time for part in parts.values())
+    ratios = {}
+    for name, part in parts.items():
+        ratio = part.sample_time / step
+        if not math.isclose(ratio, round(ratio), rel_tol=_RATIO_TOLERANCE):
+            listed = ", ".join(f"{other} {item.sample_time:g} s" for other, item in parts.items())
+            raise SettingsError(f"the sample times do not divide: {listed}; each must be a multiple of the shortest.")
+        ratios[name] = round(ratio)
+    return step, ratios
+
+
+def _reference_table(loop: Loop, step: float, rows: int) -> Matrix | None:
+    """Return (rows, 4) all samples of a reference that is a function; None for one that is a part."""
+    if hasattr(loop.reference, "advance"):
+        return None
+    function: Callable[[float], tuple[float, float, float]] = loop.reference  # pyright: ignore[reportAssignmentType]
+    table = np.ones((rows, len(REFERENCE_PORTS)))
+    for k in range(rows):
+        table[k, :3] = function(k * step)
+    bad = np.flatnonzero(~np.isfinite(table).all(axis=1))
+    if bad.size:
+        k = int(bad[0])
+        raise DataError(f"the reference is {table[k, :3].tolist()} at t = {k * step:g} s; it must be finite.")
+    return table
+
+
+def _columns(wiring: Wiring) -> dict[str, int]:
+    """Return name in the result -> place on the bus; what a sensor says goes before what the plant meant."""
+    faulty = {item.port.name for item in wiring.named if item.part == "sensor"}
+    columns: dict[str, int] = {}
+    for item in wiring.named:
+        name = _signal_name(item, columns, faulty)
+        columns[name] = item.slot
+    return columns
+
+
+def _in_si(values: Vector, port: Port) -> tuple[Vector, str]:
+    """Return a signal (N,) in SI with its unit; one of a unit that nobody knows stays as it is."""
+    try:
+        factor, unit = to_si(port.unit or "1")
+    except DataError:
+        return values.copy(), port.unit
+    return (values.copy(), port.unit) if factor == 1.0 else (values * factor, unit)
+
+
+def _signal_name(item: Named, taken: Mapping[str, int], faulty: set[str]) -> str:
+    name = item.port.name
+    if item.part == "observer" and name not in ("innovation", "healthy"):
+        return f"{name}_estimate"
+    if item.part == "plant" and name in faulty:
+        return f"plant_{name}"
+    return name if name not in taken else f"{item.part}_{name}"
+
+
+def _saved(name: str, part: Part) -> Saved:
+    if not isinstance(part, Saved):
+        raise SettingsError(f"the {name} cannot save its state; give it `get_state` and `set_state`, or use an FMU.")
+    return part
+
+
+def _wait_until(moment: float) -> None:
+    rest = moment - clock.perf_counter()
+    if rest > 0.0:
+        clock.sleep(rest)

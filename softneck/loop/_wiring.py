@@ -1,0 +1,295 @@
+"""Who feeds whom: inputs connected to outputs by name, with units converted, on one vector of signals.
+
+All outputs, references and constants of a loop lie side by side in the "bus"; the inputs of a part are a
+selection of it, so that a step costs one gather.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from softneck.core import DataError, SettingsError, Vector, to_si
+from softneck.runtime import Port
+
+from ._part import Part
+
+REFERENCE_PORTS = (
+    Port(name="pitch_reference", unit="rad", description="wanted pitch"),
+    Port(name="roll_reference", unit="rad", description="wanted roll"),
+    Port(name="cocontraction_reference", unit="rad", description="wanted co-contraction delta_i (Eq. 11)"),
+    Port(name="enabled", description="whether the controller may move the motors", start=1.0, boolean=True),
+)
+
+# Where an input comes from, best source first; a name without an entry connects to an equal name.
+_SOURCES: dict[str, tuple[tuple[str, str], ...]] = {
+    "pitch_measured": (("plant", "pitch_measured"), ("plant", "pitch")),
+    "roll_measured": (("plant", "roll_measured"), ("plant", "roll")),
+    "pitch_rate_measured": (("plant", "pitch_rate_measured"), ("plant", "pitch_rate")),
+    "roll_rate_measured": (("plant", "roll_rate_measured"), ("plant", "roll_rate")),
+    "healthy": (("observer", "healthy"), ("plant", "measurement_valid")),
+}
+_MEASURED = ("pitch", "roll", "pitch_rate", "roll_rate")
+_USUAL = ("plant", "observer", "controller", "reference")
+# What holds where nobody says otherwise: measurements are valid, controllers enabled.
+_DEFAULTS = {"healthy": 1.0, "measurement_valid": 1.0, "enabled": 1.0}
+
+
+@dataclass(frozen=True, slots=True)
+class Named:
+    """A place on the bus that a result shows.
+
+    Attributes:
+        slot: position in the bus.
+        part: whose it is; "sensor" and "fault" for copies that faults change.
+        port: name and unit.
+    """
+
+    slot: int
+    part: str
+    port: Port
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tap:
+    """The inputs of one part as a selection of the bus.
+
+    Attributes:
+        part: its name in the loop.
+        ports: of the inputs.
+        owners: part that feeds each input, "" for a constant.
+        sources: text "plant `pitch`" of each source, for messages.
+        slots: (n_in,) positions in the bus.
+        factors: (n_in,) unit of the source to unit of the input; None where all are one.
+        fragile: positions among the inputs where a missing value may come but must not.
+    """
+
+    part: str
+    ports: tuple[Port, ...]
+    owners: tuple[str, ...]
+    sources: tuple[str, ...]
+    slots: np.ndarray
+    factors: Vector | None
+    fragile: np.ndarray
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the inputs."""
+        return tuple(port.name for port in self.ports)
+
+    def read(self, bus: Vector, time: float) -> Vector:
+        """Return the inputs (n_in,) from the bus; raise DataError if a needed one is missing."""
+        u = bus[self.slots] if self.factors is None else bus[self.slots] * self.factors
+        if self.fragile.size and not np.isfinite(u[self.fragile]).all():
+            i = self.fragile[~np.isfinite(u[self.fragile])][0]
+            raise DataError(
+                f"input `{self.names[i]}` of the {self.part} is {u[i]} at t = {time:g} s (from {self.sources[i]}); "
+                "put an observer between that bridges missing measurements."
+            )
+        return u
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Wiring:
+    """All connections of a loop.
+
+    Attributes:
+        start: (n_bus,) the bus with its start values and constants.
+        named: what of it a result shows.
+        spans: part -> its outputs in the bus.
+        taps: part -> its inputs.
+    """
+
+    start: Vector
+    named: tuple[Named, ...]
+    spans: Mapping[str, slice]
+    taps: Mapping[str, Tap]
+
+
+def wire(
+    parts: Mapping[str, Part],
+    constants: Mapping[str, Mapping[str, float]],
+    connections: Mapping[str, str] | None = None,
+) -> Wiring:
+    """Connect the parts "plant", "controller" and others by name.
+
+    Args:
+        parts: name in the loop -> part.
+        constants: part -> values of inputs that nobody else writes, such as `payload` of the plant.
+        connections: "part.input" -> "part.output" for what names alone do not say.
+
+    Raises:
+        SettingsError: an input without a source, two writers, units that do not fit, an unknown name.
+    """
+    _check_plant(parts["plant"], constants.get("plant", {}))
+    ports = [(name, port) for name, part in parts.items() for port in part.outputs]
+    if "reference" not in parts:
+        ports += [("reference", port) for port in REFERENCE_PORTS]
+    slots = {(name, port.name): i for i, (name, port) in enumerate(ports)}
+    links = _links(connections or {}, parts, slots, constants)
+    extra: list[float] = []
+
+    taps = {}
+    for name, part in parts.items():
+        _check_constants(name, part, constants.get(name, {}))
+        finder = _Finder(name, parts, slots, constants.get(name, {}), links)
+        places = []
+        for value in map(finder.source, part.inputs):
+            if isinstance(value, tuple):
+                places.append(slots[value])
+            else:
+                extra.append(value)
+                places.append(len(ports) + len(extra) - 1)
+        taps[name] = _tap(name, part, places, ports)
+    start = np.array([port.start for _, port in ports] + extra)
+    named = tuple(Named(i, part, port) for i, (part, port) in enumerate(ports))
+    return Wiring(start, named, _spans(parts), taps)
+
+
+def _links(
+    connections: Mapping[str, str],
+    parts: Mapping[str, Part],
+    slots: Mapping[tuple[str, str], int],
+    constants: Mapping[str, Mapping[str, float]],
+) -> dict[tuple[str, str], tuple[str, str]]:
+    """Return (part, input) -> (part, output) of the connections that the user wrote."""
+    links = {}
+    for target, origin in connections.items():
+        (part, name), (owner, output) = _ends(target), _ends(origin)
+        if part not in parts or name not in {port.name for port in parts[part].inputs}:
+            raise SettingsError(f"connection to `{target}`: there is no such input; {_offers(part, parts, 'inputs')}")
+        if (owner, output) not in slots:
+            raise SettingsError(
+                f"connection from `{origin}`: there is no such output; {_offers(owner, parts, 'outputs')}"
+            )
+        if name in constants.get(part, {}):
+            raise SettingsError(f"input `{name}` of the {part} has two writers: `{origin}` and a constant.")
+        links[part, name] = (owner, output)
+    return links
+
+
+def _ends(text: str) -> tuple[str, str]:
+    part, dot, name = text.partition(".")
+    if not dot or not part or not name:
+        raise SettingsError(f"a connection is written part.variable; got `{text}`.")
+    return part, name
+
+
+def _offers(part: str, parts: Mapping[str, Part], what: str) -> str:
+    if part not in parts:
+        return f"the parts are {', '.join(parts)}."
+    return f"the {part} has {', '.join(port.name for port in getattr(parts[part], what)) or 'none'}."
+
+
+def _check_plant(plant: Part, constants: Mapping[str, float]) -> None:
+    names = [port.name for port in plant.inputs]
+    for j in (1, 2, 3):
+        if f"motor_setpoint_{j}" not in names:
+            raise SettingsError(f"the plant has no input `motor_setpoint_{j}`; its inputs are {', '.join(names)}.")
+    for name in constants:
+        if name.startswith("motor_setpoint_"):
+            raise SettingsError(f"the plant's input `{name}` has two writers: the controller and a constant.")
+
+
+def _check_constants(name: str, part: Part, constants: Mapping[str, float]) -> None:
+    names = [port.name for port in part.inputs]
+    for constant in constants:
+        if constant not in names:
+            raise SettingsError(f"`{constant}` is no input of the {name}; its inputs are {', '.join(names)}.")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Finder:
+    """Finds what feeds the inputs of part `name`."""
+
+    name: str
+    parts: Mapping[str, Part]
+    slots: Mapping[tuple[str, str], int]
+    constants: Mapping[str, float]
+    links: Mapping[tuple[str, str], tuple[str, str]]
+
+    def source(self, port: Port) -> tuple[str, str] | float:
+        """Return (part, output) that feeds `port`, or the constant that it gets."""
+        if (self.name, port.name) in self.links:
+            return self.links[self.name, port.name]
+        if port.name in self.constants:
+            return float(self.constants[port.name])
+        if self.name == "plant" and not port.name.startswith("motor_setpoint_"):
+            return math.nan if port.missing else port.start
+        for candidate in _candidates(self.name, port.name, self.parts):
+            if candidate in self.slots:
+                return candidate
+        others = [part for part in self._further() if (part, port.name) in self.slots]
+        if len(others) > 1:
+            raise SettingsError(
+                f"input `{port.name}` of the {self.name} has {len(others)} writers: {', '.join(others)}; "
+                "say which in [connections]."
+            )
+        if others:
+            return others[0], port.name
+        if port.name in _DEFAULTS:
+            return _DEFAULTS[port.name]
+        tried = " or ".join(f"`{out}` of the {part}" for part, out in _candidates(self.name, port.name, self.parts))
+        raise SettingsError(f"nothing feeds input `{port.name}` of the {self.name}; it would take {tried}.")
+
+    def _further(self) -> list[str]:
+        """Return the parts beyond the usual candidates that may feed part `name`."""
+        # A further part may read any other; the usual ones never fall back silently on each other.
+        usual = _USUAL if self.name in _USUAL else ()
+        return [part for part in self.parts if part != self.name and part not in usual]
+
+
+def _candidates(name: str, wanted: str, parts: Mapping[str, Part]) -> Iterator[tuple[str, str]]:
+    if wanted in _SOURCES:
+        yield from _SOURCES[wanted]
+    elif wanted.startswith("motor_setpoint_"):
+        yield ("controller", wanted)
+    elif name == "controller" and wanted in _MEASURED:
+        # With an observer its estimate or nothing: a silent fall-back would hide a wrong observer.
+        yield from [("observer", wanted)] if "observer" in parts else _SOURCES[f"{wanted}_measured"]
+    else:
+        yield from ((part, wanted) for part in ("reference", "plant", "observer") if part != name)
+
+
+def _tap(name: str, part: Part, places: list[int], ports: list[tuple[str, Port]]) -> Tap:
+    factors, owners, sources, fragile = [], [], [], []
+    for i, (port, place) in enumerate(zip(part.inputs, places, strict=True)):
+        if place >= len(ports):
+            factors.append(1.0)
+            owners.append("")
+            sources.append("a constant")
+            continue
+        owner, origin = ports[place]
+        factors.append(_factor(f"`{origin.name}` of the {owner}", origin, f"`{port.name}` of the {name}", port))
+        owners.append(owner)
+        sources.append(f"{owner} `{origin.name}`")
+        if origin.missing and not port.missing:
+            fragile.append(i)
+    index = np.array(fragile, dtype=np.intp)
+    scale = None if all(factor == 1.0 for factor in factors) else np.array(factors)
+    return Tap(name, tuple(part.inputs), tuple(owners), tuple(sources), np.array(places, dtype=np.intp), scale, index)
+
+
+def _factor(origin: str, source: Port, target: str, port: Port) -> float:
+    """Return the factor from the unit of `source` to that of `port`."""
+    if source.unit == port.unit or source.boolean or port.boolean or {"", "1"} & {source.unit, port.unit}:
+        return 1.0  # foreign FMUs often state no unit: then there is nothing to convert
+    try:
+        (a, si_a), (b, si_b) = to_si(source.unit), to_si(port.unit)
+    except DataError as error:
+        raise SettingsError(f"{origin} [{source.unit}] cannot feed {target} [{port.unit}]: {error}") from error
+    if si_a != si_b:
+        raise SettingsError(f"{origin} is in [{source.unit}] but {target} in [{port.unit}]; give both the same unit.")
+    return a / b
+
+
+def _spans(parts: Mapping[str, Part]) -> dict[str, slice]:
+    spans, first = {}, 0
+    for name, part in parts.items():
+        spans[name] = slice(first, first + len(part.outputs))
+        first += len(part.outputs)
+    spans.setdefault("reference", slice(first, first + len(REFERENCE_PORTS)))
+    return spans

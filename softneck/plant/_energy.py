@@ -1,0 +1,120 @@
+"""The neck's energy, written from the potentials themselves and not from the forces of the runtime.
+
+It is what the tests hold the forces against: at rest the potential is least, and without actuation the
+sum never rises.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from softneck.core import Vector
+from softneck.runtime import State
+
+from ._parameters import NeckParameters
+
+_GRAVITY = 9.80665
+# As in the link's runtime: the compressed link rests on itself.
+_WALL_RATIO = 50.0
+
+
+@dataclass(frozen=True, slots=True)
+class NeckEnergy:
+    """The parts of the neck's energy [J].
+
+    Attributes:
+        kinetic: of platform, payload and link.
+        elastic: of the link's bending and compression.
+        hysteresis: stored in the hysteresis element.
+        tendons: stored in the tendons.
+        gravity: of platform, payload and link, zero at the base plate.
+    """
+
+    kinetic: float
+    elastic: float
+    hysteresis: float
+    tendons: float
+    gravity: float
+
+    @property
+    def total(self) -> float:
+        """Sum of all parts [J]."""
+        return self.kinetic + self.elastic + self.hysteresis + self.tendons + self.gravity
+
+
+def neck_energy(state: State, *, payload: float = 0.0) -> NeckEnergy:
+    """Return the energy of the virtual neck in `state` (of its block), base upright, no push.
+
+    Args:
+        state: of the block of `VirtualNeck`.
+        payload: mass on the platform [kg].
+    """
+    names = NeckParameters.names()
+    p = dict(zip(names, state.parameters.tolist(), strict=False))
+    x = state.values
+    length, radius = p["link_length"], p["platform_radius"]
+    carried = ((p["platform_mass"], p["platform_height"]), (payload, p["payload_height"]), (0.25 * p["link_mass"], 0.0))
+    inertia = sum(m * (0.5 * length + c) ** 2 for m, c in carried) + 0.25 * p["platform_mass"] * radius**2
+    mass = sum(m for m, _ in carried)
+    parts = _potentials(p, x[:3], x[8:11], x[19:22], payload)
+    return NeckEnergy(
+        kinetic=float(0.5 * inertia * (x[3] ** 2 + x[4] ** 2) + 0.5 * mass * x[5] ** 2),
+        elastic=parts[0],
+        hysteresis=float(0.5 * p["hysteresis_torque"] / p["hysteresis_angle"] * (x[6] ** 2 + x[7] ** 2)),
+        tendons=parts[1],
+        gravity=parts[2],
+    )
+
+
+def potential_energy(
+    parameters: NeckParameters,
+    coordinates: ArrayLike,
+    positions: ArrayLike,
+    free_lengths: ArrayLike,
+    *,
+    payload: float = 0.0,
+) -> float:
+    """Return the potential energy [J] of link, tendons and gravity; the hysteresis element is left out.
+
+    Args:
+        parameters: the neck.
+        coordinates: (3,) bending vector [rad] and compression [m].
+        positions: (3,) of the winches [rad].
+        free_lengths: (3,) of the unstretched tendons at winch position zero [m]; `free_lengths(state)`.
+        payload: mass on the platform [kg].
+    """
+    p = {name: float(getattr(parameters, name)) for name in NeckParameters.names()}
+    q, P, free = (np.asarray(v, dtype=np.float64) for v in (coordinates, positions, free_lengths))
+    return sum(_potentials(p, q, P, free, payload))
+
+
+def free_lengths(state: State) -> Vector:
+    """Return the tendons' unstretched lengths [m] at winch position zero, (3,)."""
+    return state.values[19:22].copy()
+
+
+def _potentials(p: dict[str, float], q: Vector, P: Vector, free: Vector, payload: float) -> tuple[float, float, float]:
+    """Return (link, tendons, gravity) [J]."""
+    b, s = q[:2], q[2]
+    beta = float(np.hypot(b[0], b[1]))
+    skew = np.array([1.0 + p["stiffness_asymmetry"], 1.0 - p["stiffness_asymmetry"]])
+    rest = np.array([p["rest_pitch"], p["rest_roll"]])
+    bending = 0.5 * p["bending_stiffness"] * float(skew @ (b - rest) ** 2) + 0.25 * p["bending_stiffening"] * beta**4
+    wall = 0.5 * _WALL_RATIO * p["axial_stiffness"] * max(0.0, s - p["compression_limit"]) ** 2
+    axial = 0.5 * p["axial_stiffness"] * s**2 + 0.25 * p["axial_stiffening"] * s**4
+    length = p["link_length"] - s
+    tendons = 0.0
+    for j in range(3):
+        angle = p[f"tendon_angle_{j + 1}"]
+        lean = b[0] * math.cos(angle) + b[1] * math.sin(angle)
+        chord = float(np.sinc(beta / (2.0 * np.pi))) * (length - p["attachment_radius"] * lean)
+        stretch = chord - free[j] + p["winch_radius"] * P[j]
+        tendons += 0.5 * p["tendon_stiffness"] * max(0.0, stretch) ** 2
+    masses = ((p["platform_mass"], p["platform_height"]), (payload, p["payload_height"]), (0.25 * p["link_mass"], 0.0))
+    top = length * float(np.sinc(beta / np.pi))
+    gravity = _GRAVITY * sum(m * (top + c * math.cos(beta)) for m, c in masses)
+    return bending + float(wall + axial), float(tendons), float(gravity)

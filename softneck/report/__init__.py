@@ -1,0 +1,9 @@
+"""Pages on whole jobs: the demo, the paper, a project, a study, a validation.
+
+Computes what it shows through the rooms below; no method lives here.
+May import everything but `cli`.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

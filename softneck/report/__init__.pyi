@@ -1,0 +1,9 @@
+from ._demo import DemoSettings as DemoSettings
+from ._demo import run_demo as run_demo
+from ._paper_page import paper_page as paper_page
+from ._project import read_project as read_project
+from ._project_page import project_page as project_page
+from ._reproduce import ReproduceSettings as ReproduceSettings
+from ._reproduce import reproduce as reproduce
+from ._study_page import study_page as study_page
+from ._validation_page import validation_page as validation_page

@@ -1,0 +1,108 @@
+"""The demo's report: the experiment, each validation, the FMUs, the loop."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from softneck.cosim import Result
+from softneck.identification import INFINITE, Model
+from softneck.plots import Chart, Section, Table
+from softneck.plots._charts import delay_chart, loop_chart, recording_chart, validation_chart
+from softneck.signals import Recording
+
+from ._closing import Designed
+from ._experiments import Experiments, Judged
+from ._packaging import Packaged
+from ._tables import FIT_HEAD, FIT_NOTE, fit_rows, fmu_rows, loop_rows
+
+_TITLES = {
+    "identification": "Identification: Eq. 22 with Table 2, the part that models are trained on",
+    "validation": "Validation: the rest of Eq. 22",
+    "steps": "Test 1: steps of 8 s, one tendon after the other",
+    "sine": "Test 2: sine of rising frequency",
+    "rotation": "Test 3: rotation",
+}
+
+
+def sections(
+    *,
+    experiments: Experiments,
+    models: Mapping[str, Model],
+    judged: Mapping[tuple[str, str], Judged],
+    packaged: Mapping[str, Packaged],
+    designed: Designed,
+    loops: Mapping[str, Result],
+    shortened: bool,
+) -> Sequence[Section]:
+    """Return the report's sections."""
+    return [
+        _overview(judged, packaged, loops, shortened),
+        _experiment_section(experiments),
+        _model_section(models),
+        *(_validation_section(data, judged, models) for data in experiments.judged),
+        _design_section(designed),
+        *(_loop_section(name, result) for name, result in loops.items()),
+    ]
+
+
+def _overview(
+    judged: Mapping[tuple[str, str], Judged],
+    packaged: Mapping[str, Packaged],
+    loops: Mapping[str, Result],
+    shortened: bool,
+) -> Section:
+    words = [FIT_NOTE]
+    if shortened:
+        words.insert(0, "This is the quick form: the experiment is shorter than the paper's and the training less.")
+    tables = [
+        Table("Models, ours beside the paper's", FIT_HEAD, fit_rows(judged)),
+        Table("FMUs in fmpy against the Python models, free run", *fmu_rows(packaged)),
+        Table("Closed loops over FMUs against the virtual neck", *loop_rows(loops)),
+    ]
+    return Section("Results", text=words, tables=tables)
+
+
+def _experiment_section(experiments: Experiments) -> Section:
+    recordings = {"identification": experiments.identification, **experiments.judged}
+    return Section("Experiment", charts=[_chart(recording, _TITLES[name]) for name, recording in recordings.items()])
+
+
+def _chart(recording: Recording, title: str) -> Chart:
+    return recording_chart(recording.time, recording.set_points, recording.outputs, title, run=recording.run)
+
+
+def _model_section(models: Mapping[str, Model]) -> Section:
+    rows = [[name, line] for name, model in models.items() for line in model.summary().splitlines()[1:]]
+    caption = "The dead time's cost: a flat curve says that hysteresis lag hides in the pole."
+    curve = delay_chart(models["rls"].findings["delay_curve"], "Dead time of the linear model", caption=caption)
+    return Section("Models", tables=[Table("What was identified", ["model", "finding"], rows, text=2)], charts=[curve])
+
+
+def _validation_section(data: str, judged: Mapping[tuple[str, str], Judged], models: Mapping[str, Model]) -> Section:
+    results = {name: judged[name, data].free for name in models}
+    first = next(iter(results.values()))
+    free = {name: r.free_run if r.fits[INFINITE]["pitch"] is not None else np.full_like(r.free_run, np.nan)
+            for name, r in results.items()}  # fmt: skip
+    one = {name: r.one_step for name, r in results.items()}
+    charts = [
+        validation_chart(first.time, first.measured, free, "Free run from set-points alone"),
+        validation_chart(first.time, first.measured, one, "One step ahead"),
+    ]
+    return Section(f"Models on {data}", charts=charts)
+
+
+def _design_section(designed: Designed) -> Section:
+    rows = [["controller", line] for line in designed.controller.summary().splitlines()]
+    rows += [["observer", line] for line in designed.observer.summary().splitlines()]
+    words = ["Both were designed on the identified linear model and run below against the virtual neck, another plant."]
+    return Section(
+        "Design", text=words, tables=[Table("Controller and Kalman filter", ["part", "finding"], rows, text=2)]
+    )
+
+
+def _loop_section(name: str, result: Result) -> Section:
+    caption = "Plant, observer and controller are FMUs in fmpy; the plant is the virtual neck with its inclinometer."
+    chart = loop_chart(result.signals.time, result.signals.signals, name, caption=caption)
+    return Section(f"Loop {name}", charts=[chart])

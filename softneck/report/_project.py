@@ -1,0 +1,160 @@
+"""What a project folder holds: every file that softneck knows, sorted; what cannot be read is said."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from softneck.core import KINDS, FileFormatError, Progress, SoftneckError, load, read_archive, silent
+from softneck.cosim import load_loop, read_runs, simulate
+from softneck.cosim.loops._loop_file import is_loop_file
+from softneck.cosim.studies._store import read_description
+from softneck.signals import assess_quality, read_recording
+
+# Folders that are no part of a project, beside those whose name begins with a dot.
+_SKIPPED = ("__pycache__", "node_modules", "site-packages", "worst", "runs.parts")
+# Larger logs are no recordings to draw in a page that goes by mail.
+_LARGEST = 200_000_000
+
+
+@dataclass(slots=True, eq=False)
+class Project:
+    """The things of a project, by their path relative to its folder.
+
+    Attributes:
+        folder: of the project.
+        recordings: path -> (recording, its quality).
+        models, observers, controllers, families: path -> what `load` returns.
+        fmus: path -> fmpy's description.
+        certificates: path -> content.
+        loops: path -> result of its run.
+        studies: path of the folder -> (description, runs).
+        problems: path -> why it could not be read or run.
+    """
+
+    folder: Path
+    recordings: dict[str, Any] = field(default_factory=dict)
+    models: dict[str, Any] = field(default_factory=dict)
+    observers: dict[str, Any] = field(default_factory=dict)
+    controllers: dict[str, Any] = field(default_factory=dict)
+    families: dict[str, Any] = field(default_factory=dict)
+    fmus: dict[str, Any] = field(default_factory=dict)
+    certificates: dict[str, Any] = field(default_factory=dict)
+    loops: dict[str, Any] = field(default_factory=dict)
+    studies: dict[str, Any] = field(default_factory=dict)
+    problems: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing of ours was found."""
+        found = (self.recordings, self.models, self.observers, self.controllers, self.families, self.fmus)
+        return not any((*found, self.certificates, self.loops, self.studies, self.problems))
+
+
+def read_project(folder: str | Path, *, run_loops: bool = True, progress: Progress = silent) -> Project:
+    """Read all files of a project; loops are simulated, studies are taken as they stand.
+
+    Args:
+        folder: of the project.
+        run_loops: whether to run the loop files, Python parts of the user's own included.
+        progress: called with the part done and a word.
+
+    Raises:
+        FileFormatError: no such folder, or nothing in it that softneck knows.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise FileFormatError(f"{root}: is no folder; name that of a project.")
+    project = Project(root)
+    files = list(_files(root))
+    for number, path in enumerate(files):
+        name = path.relative_to(root).as_posix()
+        progress(number / len(files), name)
+        try:
+            if run_loops or path.suffix.lower() != ".toml":
+                _READERS[path.suffix.lower()](project, path, name)
+        except SoftneckError as error:
+            project.problems[name] = str(error).removeprefix(f"{path}: ")
+    if project.is_empty:
+        raise FileFormatError(f"{root}: holds nothing of softneck; `softneck new {root}` begins a project.")
+    return project
+
+
+def _files(root: Path) -> Iterator[Path]:
+    """Yield files in the order of their names; a study's folder as its `study.json` alone."""
+    entries = sorted(root.iterdir())
+    if (root / "study.json").is_file() and _is_study(root / "study.json"):
+        yield root / "study.json"
+        entries = [entry for entry in entries if entry.is_dir()]
+    for entry in entries:
+        if entry.name.startswith(".") or entry.name in _SKIPPED or entry.is_symlink():
+            continue
+        if entry.is_dir():
+            yield from _files(entry)
+        elif entry.suffix.lower() in _READERS:
+            yield entry
+
+
+def _loop(project: Project, path: Path, name: str) -> None:
+    if is_loop_file(path):
+        project.loops[name] = simulate(load_loop(path), compiled=True)
+
+
+def _recording(project: Project, path: Path, name: str) -> None:
+    if path.stat().st_size > _LARGEST:
+        project.problems[name] = f"larger than {_LARGEST / 1e6:.0f} MB: left out"
+        return
+    recording = read_recording(path)
+    project.recordings[name] = (recording, assess_quality(recording))
+
+
+def _archive(project: Project, path: Path, name: str) -> None:
+    header, _ = read_archive(path)
+    role = {"family": project.families, "observer": project.observers, "controller": project.controllers}
+    thing = load(path)
+    if header.get("kind") != "loop_state" and hasattr(thing, "summary"):
+        role.get(_role(str(header.get("kind"))), project.models)[name] = thing
+
+
+def _role(kind: str) -> str:
+    return KINDS[kind].role if kind in KINDS else ""
+
+
+def _fmu(project: Project, path: Path, name: str) -> None:
+    import fmpy
+
+    try:
+        project.fmus[name] = fmpy.read_model_description(str(path), validate=False)
+    except Exception as error:  # fmpy raises bare Exception
+        raise FileFormatError(f"{path}: is no FMU ({' '.join(str(error).split())}).") from error
+
+
+def _json(project: Project, path: Path, name: str) -> None:
+    if path.name == "study.json" and _is_study(path):
+        description, runs = read_description(path.parent), read_runs(path.parent)
+        project.studies[Path(name).parent.as_posix()] = (description, runs)
+        return
+    content = _content(path)
+    if content.get("certificate"):
+        project.certificates[name] = content
+
+
+def _is_study(path: Path) -> bool:
+    return "study" in _content(path)
+
+
+def _content(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+_READERS: dict[str, Callable[[Project, Path, str], None]] = {
+    ".csv": _recording, ".parquet": _recording, ".npz": _archive, ".fmu": _fmu, ".json": _json,
+    ".toml": _loop,
+}  # fmt: skip

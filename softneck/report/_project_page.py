@@ -1,0 +1,245 @@
+"""The report of a whole project: one page that opens offline, for a colleague."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from softneck.core import SoftneckError, file_hash
+from softneck.cosim import Result
+from softneck.identification import INFINITE, validate
+from softneck.plots import Chart, Section, Table, page
+from softneck.plots._charts import loop_chart, recording_chart, validation_chart
+from softneck.signals import Recording
+
+from ._project import Project
+from ._study_page import study_sections
+from ._validation_page import drawable
+
+# Charts of one sort at most, so that the page stays small enough for mail; tables hold everything.
+_MOST_CHARTS = 4
+# Recordings on which each model is judged.
+_MOST_DATA = 6
+_HORIZONS: tuple[int | str, ...] = (1, 25, INFINITE)
+
+
+def project_page(project: Project) -> str:
+    """Return the HTML page of a project: what it holds, what that is worth, what held and what failed."""
+    title = f"Project {project.folder.resolve().name}"
+    sections = [_overview(project), _data(project), _models(project), _uncertain(project), _design(project)]
+    sections += [_certificates(project), _fmus(project), _loops(project), *_studies(project), _problems(project)]
+    now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    kept = [section for section in sections if section is not None]
+    return page(title, kept, footer=f"softneck report, {now}. All plots and tables are in this file.")
+
+
+def _overview(project: Project) -> Section:
+    loops = [result for result in project.loops.values() if result.limits]
+    held = sum(result.holds for result in loops)
+    certified = sum(bool(content.get("holds")) for content in project.certificates.values())
+    lines = [
+        ("recordings", len(project.recordings), "-"),
+        ("models", len(project.models), "-"),
+        ("uncertain plants", len(project.families), "-"),
+        ("observers and controllers", len(project.observers) + len(project.controllers), "-"),
+        ("certificates", len(project.certificates), _verdict(certified, len(project.certificates))),
+        ("FMUs", len(project.fmus), "-"),
+        ("loops", len(project.loops), _verdict(held, len(loops))),
+        ("studies", len(project.studies), "-"),
+        ("files that could not be read or run", len(project.problems), "fails" if project.problems else "-"),
+    ]
+    rows = [[name, str(count), verdict] for name, count, verdict in lines]
+    return Section("Overview", tables=[Table("What is there", ["", "number", "verdict"], rows)])
+
+
+def _verdict(held: int, of: int) -> str:
+    return "-" if not of else "holds" if held == of else "fails"
+
+
+def _data(project: Project) -> Section | None:
+    if not project.recordings:
+        return None
+    rows, findings, charts = [], [], []
+    for name, (recording, found) in project.recordings.items():
+        seconds = len(recording) * recording.sample_time
+        rows.append([
+            name, str(len(recording)), str(len(recording.runs())), f"{seconds:.1f}",
+            f"{1e3 * recording.sample_time:g}", found.severity,
+        ])  # fmt: skip
+        findings += [[name, str(finding)] for finding in found.findings if finding.severity != "ok"]
+        if len(charts) < _MOST_CHARTS:
+            charts.append(_recorded(name, recording))
+    head = ["recording", "rows", "runs", "length [s]", "sample time [ms]", "worst finding"]
+    tables = [Table("Recordings", head, rows)]
+    if findings:
+        tables.append(Table("What was found in them", ["recording", "finding"], findings, text=2))
+    return Section("Data", tables=tables, charts=charts)
+
+
+def _recorded(name: str, recording: Recording) -> Chart:
+    return recording_chart(recording.time, recording.set_points, recording.outputs, name, run=recording.run)
+
+
+def _models(project: Project) -> Section | None:
+    if not project.models:
+        return None
+    head = [
+        "model on data",
+        "rows judged",
+        "one step",
+        "25 steps",
+        "free run",
+        "rms free [deg]",
+        "persistence, one step",
+    ]
+    rows, charts, texts = [], [], []
+    for name, model in project.models.items():
+        texts.append([name, getattr(model, "kind", type(model).__name__), *_first_lines(model)])
+        for data, (recording, _) in list(project.recordings.items())[:_MOST_DATA]:
+            try:
+                result = validate(model, recording, names=(name, data), horizons=_HORIZONS)
+            except (SoftneckError, AttributeError):
+                # Another sample time, or nothing left that the model was not trained on.
+                continue
+            rows.append([f"{name} on {data}", str(result.rows_scored), *_fits(result)])
+            if len(charts) < _MOST_CHARTS:
+                charts.append(_judged(result, f"{name} on {data}: free run"))
+    tables = [Table("Models", ["model", "kind", "summary"], texts, text=3)]
+    if rows:
+        tables.append(Table("Fits in %, pitch/roll, on rows that the model was not trained on", head, rows))
+    words = [] if rows else ["No recording of this project has rows on which a model can be judged."]
+    if len(project.recordings) > _MOST_DATA:
+        words.append(f"Judged on the first {_MOST_DATA} of {len(project.recordings)} recordings.")
+    return Section("Models", text=words, tables=tables, charts=charts)
+
+
+def _fits(result: Any) -> list[str]:
+    cells = [_pair(result.fits[str(h)], 1) for h in _HORIZONS]
+    return [*cells, _pair(result.rmse_deg[INFINITE], 2), _pair(result.persistence["1"], 1)]
+
+
+def _judged(result: Any, title: str) -> Chart:
+    return validation_chart(
+        result.time, result.measured, {"free run": drawable(result.free_run)}, title, run=result.run
+    )
+
+
+def _uncertain(project: Project) -> Section | None:
+    return _summaries("Uncertain plant", project.families)
+
+
+def _design(project: Project) -> Section | None:
+    return _summaries("Observers and controllers", {**project.observers, **project.controllers})
+
+
+def _summaries(title: str, things: Mapping[str, Any]) -> Section | None:
+    if not things:
+        return None
+    rows = [[name if not i else "", line] for name, thing in things.items() for i, line in enumerate(_lines(thing))]
+    return Section(title, tables=[Table(title, ["file", "summary"], rows, text=2)])
+
+
+def _lines(thing: Any) -> list[str]:
+    return [line for line in str(thing.summary()).splitlines() if line.strip()] or ["-"]
+
+
+def _first_lines(thing: Any) -> list[str]:
+    return ["; ".join(_lines(thing)[:2])[:200]]
+
+
+def _certificates(project: Project) -> Section | None:
+    if not project.certificates:
+        return None
+    rows, details = [], []
+    for name, content in project.certificates.items():
+        stale = _changed(project.folder, name, content)
+        asked = content.get("requirements") or content.get("limits") or []
+        verdict = "holds" if content.get("holds") else "fails"
+        rows.append([name, str(content["certificate"]), str(len(asked)), ", ".join(stale) or "none", verdict])
+        details += [_requirement(name, row) for row in asked if isinstance(row, Mapping)]
+    head = ["certificate", "of", "requirements", "files changed since", "verdict"]
+    tables = [Table("Certificates", head, rows, text=2)]
+    if details:
+        tables.append(
+            Table("What was required", ["certificate", "metric", "value", "limit", "verdict"], details, text=2)
+        )
+    return Section("Verification", tables=tables)
+
+
+def _requirement(name: str, row: Mapping[str, Any]) -> list[str]:
+    verdict = "holds" if row.get("holds") else "fails"
+    return [name, str(row.get("metric", "")), _cell(row.get("value")), _cell(row.get("limit")), verdict]
+
+
+def _changed(folder: Path, name: str, content: Mapping[str, Any]) -> list[str]:
+    """Return the files of a certificate that are there and are no longer what they were."""
+    changed = []
+    for entry in content.get("files", {}).values():
+        path = Path(str(entry.get("path", "")))
+        places = [path, folder / path, (folder / name).parent / path]
+        there = next((place for place in places if place.is_file()), None)
+        if there is not None and file_hash(there) != entry.get("sha256"):
+            changed.append(path.name)
+    return changed
+
+
+def _fmus(project: Project) -> Section | None:
+    if not project.fmus:
+        return None
+    rows = []
+    for name, model in project.fmus.items():
+        counts = [str(sum(v.causality == c for v in model.modelVariables)) for c in ("input", "output", "parameter")]
+        rows.append([name, f"FMI {model.fmiVersion}", " ".join((model.description or "").split())[:120], *counts])
+    head = ["FMU", "version", "what it is", "inputs", "outputs", "parameters"]
+    return Section("FMUs", tables=[Table("FMUs", head, rows, text=3)])
+
+
+def _loops(project: Project) -> Section | None:
+    if not project.loops:
+        return None
+    metrics, limits, charts = [], [], []
+    for name, result in project.loops.items():
+        metrics.append([name, *_metrics(result)])
+        for row in result.limits:
+            verdict = "holds" if row["holds"] else "fails"
+            limits.append([name, row["metric"], _cell(row["value"]), _cell(row["limit"]), verdict])
+        if len(charts) < _MOST_CHARTS:
+            charts.append(loop_chart(result.signals.time, result.signals.signals, name))
+    head = ["loop", "overshoot [%]", "settling [s]", "rms error [deg]", "largest set-point [rad]"]
+    tables = [Table("Loops, pitch/roll", head, metrics)]
+    if limits:
+        tables.append(Table("Limits", ["loop", "metric", "value", "limit", "verdict"], limits, text=2))
+    return Section("Loops", text=["Run anew for this page."], tables=tables, charts=charts)
+
+
+def _metrics(result: Result) -> list[str]:
+    table = result.metrics
+    names = ("overshoot_pct", "settling_s", "rms_error_deg")
+    cells = [_pair({axis: table[axis][name] for axis in ("pitch", "roll")}, 2) for name in names]
+    return [*cells, _cell(table["motors"]["max_rad"])]
+
+
+def _studies(project: Project) -> list[Section]:
+    sections = []
+    for name, (description, runs) in project.studies.items():
+        for part in study_sections(description, runs) if len(runs) else []:
+            sections.append(Section(f"Study {name}: {part.title}", part.text, part.tables, part.figures, part.charts))
+    return sections
+
+
+def _problems(project: Project) -> Section | None:
+    if not project.problems:
+        return None
+    rows = [[name, " ".join(text.split())[:300]] for name, text in project.problems.items()]
+    table = Table("Files that could not be read or run", ["file", "why"], rows, text=2)
+    return Section("Problems", tables=[table])
+
+
+def _pair(values: Mapping[str, float | None], digits: int) -> str:
+    return "/".join("-" if value is None else f"{value:.{digits}f}" for value in values.values())
+
+
+def _cell(value: Any) -> str:
+    return "-" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)

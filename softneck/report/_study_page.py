@@ -1,0 +1,177 @@
+"""The report of a study: who ranks where, the Pareto front, how metrics are spread, what they depend on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from softneck.cosim import grouped, pareto_front, rank, worst_runs
+from softneck.plots import Chart, Section, Table, page
+from softneck.plots._study_charts import correlations, distribution_chart, influence_chart, pareto_chart
+
+# Numbers that varied, at most so many panels: those that matter most.
+_MOST_PANELS = 6
+_SHOWN = 10
+_KEY_METRICS = ("rise_s", "settling_s", "overshoot_pct", "rms_error_deg")
+
+
+def study_page(description: Mapping[str, Any], runs: pd.DataFrame) -> str:
+    """Return the HTML page of a study.
+
+    Args:
+        description: what `study.json` in its folder says.
+        runs: its table.
+    """
+    return page(f"Study {description['name']}", study_sections(description, runs))
+
+
+def study_sections(description: Mapping[str, Any], runs: pd.DataFrame) -> list[Section]:
+    """Return the sections of a study's page; few words where no run succeeded."""
+    failed = failures(runs)
+    objectives = list(description["objectives"])
+    vary = description["study"]["vary"]
+    sections = [_overview(description, runs, objectives)]
+    if not all(failed):
+        sections += [_ranking(runs, list(vary), objectives), _trade(runs, vary, objectives)]
+        sections += [_spread(runs, vary, objectives)]
+        inputs = _numbers(runs, vary)
+        if inputs:
+            sections.append(_influence(runs, inputs, objectives[0]))
+    if any(failed):
+        sections.append(_failures(runs))
+    return sections
+
+
+def study_rows(
+    runs: pd.DataFrame, keys: Sequence[str], objectives: Sequence[str], count: int = _SHOWN
+) -> list[list[str]]:
+    """Return the best runs as rows of text: number, what varied, objectives, verdict."""
+    return [_row(row, keys, objectives) for row in rank(runs, objectives).head(count).to_dict("records")]
+
+
+def study_head(keys: Sequence[str], objectives: Sequence[str]) -> list[str]:
+    """Return the titles of `study_rows`."""
+    return ["run", *map(short, keys), *objectives, "limits"]
+
+
+def failures(runs: pd.DataFrame) -> list[bool]:
+    """Return for each run whether it ended with an error."""
+    return [bool(error) for error in runs["error"].tolist()]
+
+
+def short(key: str) -> str:
+    """Return a key without what all keys of its part share."""
+    return key.replace(".parameters.", ".")
+
+
+def _overview(description: Mapping[str, Any], runs: pd.DataFrame, objectives: list[str]) -> Section:
+    study = description["study"]
+    failed, held = sum(failures(runs)), runs["holds"].dropna().tolist()
+    text = [f"{len(runs)} of {study['runs']} runs, seed {study['seed']}, {study['sampling'].replace('_', ' ')}."]
+    if held:
+        text.append(f"{100.0 * sum(held) / len(held):.1f} % keep all limits.")
+    if failed:
+        text.append(f"{failed} failed with an error.")
+    rows = [[short(key), item["kind"], _range(item)] for key, item in study["vary"].items()]
+    tables = [Table("What varied", ["key", "kind", "values"], rows, text=3)]
+    by = _groups(study["vary"])
+    if by:
+        table = grouped(runs, by, objectives)
+        tables.append(
+            Table("By group", list(table.columns), [[_text(v) for v in row] for row in table.to_numpy()], len(by))
+        )
+    return Section("Result", text=text, tables=tables)
+
+
+def _ranking(runs: pd.DataFrame, keys: list[str], objectives: list[str]) -> Section:
+    worst = [_row(row, keys, objectives) for row in worst_runs(runs, objectives, 5).to_dict("records")]
+    head = study_head(keys, objectives)
+    tables = [
+        Table("Best runs", head, study_rows(runs, keys, objectives)),
+        Table("Worst runs", head, worst),
+    ]
+    words = f"Ranked by limits kept, then {objectives[0]}. The worst runs stand as loop files in the folder `worst`."
+    return Section("Ranking", text=[words], tables=tables)
+
+
+def _trade(runs: pd.DataFrame, vary: Mapping[str, Any], objectives: list[str]) -> Section:
+    pair = (objectives[0], objectives[1] if len(objectives) > 1 else "motors.total_variation_rad")
+    front = pareto_front(runs, pair)
+    charts: list[Chart] = []
+    if len(front):
+        groups = {
+            name: (part[pair[0]].to_numpy(float), part[pair[1]].to_numpy(float)) for name, part in _split(runs, vary)
+        }
+        edge = (front[pair[0]].to_numpy(float), front[pair[1]].to_numpy(float))
+        caption = f"{len(front)} runs that no other beats in both."
+        charts.append(pareto_chart(groups, edge, pair, "Pareto front", caption=caption))
+    rows = [_row(row, list(vary), pair) for row in front.head(_SHOWN).to_dict("records")]
+    return Section("Pareto front", tables=[Table("On the front", study_head(list(vary), pair), rows)], charts=charts)
+
+
+def _spread(runs: pd.DataFrame, vary: Mapping[str, Any], objectives: list[str]) -> Section:
+    axis = objectives[0].partition(".")[0]
+    wanted = [*objectives, *(f"{axis}.{name}" for name in _KEY_METRICS)]
+    metrics = [name for name in dict.fromkeys(wanted) if np.isfinite(runs[name].to_numpy(float)).any()]
+    values = {metric: {name: part[metric].to_numpy(float) for name, part in _split(runs, vary)} for metric in metrics}
+    return Section("Distributions", charts=[distribution_chart(values, "How the metrics are spread")])
+
+
+def _influence(runs: pd.DataFrame, inputs: dict[str, np.ndarray], metric: str) -> Section:
+    y = runs[metric].to_numpy(float)
+    found = correlations(inputs, y)
+    order = sorted(found, key=lambda key: -abs(np.nan_to_num(found[key])))
+    rows = [[short(key), _text(found[key])] for key in order]
+    broken = np.array(failures(runs)) | np.array([value is False for value in runs["holds"].tolist()])
+    shown = {short(key): inputs[key] for key in order[:_MOST_PANELS]}
+    chart = influence_chart(shown, (metric, y), broken, f"What {metric} depends on")
+    table = Table(f"Rank correlation with {metric} (Spearman)", ["key", "correlation"], rows)
+    return Section("Influence", tables=[table], charts=[chart])
+
+
+def _failures(runs: pd.DataFrame) -> Section:
+    failed = [row for row in runs.to_dict("records") if row["error"]]
+    rows = [[str(row["run"]), str(row["error"])[:300]] for row in failed[:20]]
+    return Section("Failed runs", tables=[Table(f"{len(failed)} runs failed", ["run", "error"], rows, text=2)])
+
+
+def _pair(runs: pd.DataFrame, pair: tuple[str, str]) -> tuple[np.ndarray, np.ndarray]:
+    return runs[pair[0]].to_numpy(float), runs[pair[1]].to_numpy(float)
+
+
+def _split(runs: pd.DataFrame, vary: Mapping[str, Any]) -> list[tuple[str, pd.DataFrame]]:
+    """Return the runs by the first key that has names for values; all together if there is none."""
+    by = _groups(vary)
+    if not by:
+        return [("runs", runs)]
+    return [(str(name), part) for name, part in runs.groupby(by[0], sort=False)]
+
+
+def _groups(vary: Mapping[str, Any]) -> list[str]:
+    """Return the keys whose values are a few names, such as controllers."""
+    named = [key for key, item in vary.items() if item["labels"] and any(isinstance(x, str) for x in item["labels"])]
+    return [key for key in named if len(vary[key]["labels"]) <= 12]
+
+
+def _numbers(runs: pd.DataFrame, vary: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    numeric = [key for key, item in vary.items() if item["kind"] != "seed" and pd.api.types.is_numeric_dtype(runs[key])]
+    return {key: runs[key].to_numpy(float) for key in numeric}
+
+
+def _row(row: Mapping[Any, Any], keys: Sequence[str], objectives: Sequence[str]) -> list[str]:
+    verdict = "fails" if row["error"] else "-" if pd.isna(row["holds"]) else "holds" if row["holds"] else "fails"
+    return [str(row["run"]), *(_text(row[key]) for key in keys), *(_text(row[name]) for name in objectives), verdict]
+
+
+def _range(item: Mapping[str, Any]) -> str:
+    values = item["labels"] or item["values"]
+    return ", ".join(_text(value) for value in values)
+
+
+def _text(value: Any) -> str:
+    if value is None or (isinstance(value, float) and np.isnan(value)):
+        return "-"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,193 @@
+"""The page of `softneck validate`: fits, then every model beside what was measured, its errors and residual tests."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softneck.core import Matrix
+from softneck.identification import INFINITE, Validation
+from softneck.plots import Chart, Section, Table, page
+from softneck.plots._charts import validation_chart
+from softneck.plots._judgement_charts import histogram_chart, residual_chart
+
+VALIDATION_NOTE = (
+    "Fit is 100 (1 - |y - yhat| / |y - mean y|) in %, pitch/roll. Persistence repeats the last sample: a one-step fit "
+    "that is not above it says nothing. Best linear was fitted on the judged rows themselves: no linear model of the "
+    "set-points has a better free run on them. The free run has the set-points alone (or the logged motors, if asked "
+    "for); that is what an FMU of the plant does. Rows that a model was trained on are left out."
+)
+_ERROR = "Error is measured minus predicted; where a row is not scored, or was not recorded, nothing is drawn."
+_RESIDUALS = (
+    "A model that has caught everything leaves white errors that no set-point foretells: 99 of 100 bars within the "
+    "dashed bounds. Positive lags: the error follows the set-point, so that a bar outside is a gain or a lag that the "
+    "model misses; slow or periodic set-points spread it over many lags, negative ones too. Set-points made by a "
+    "controller from the outputs show at negative lags."
+)
+_HEAD = [
+    "model on data", "samples ahead", "persistence", "best linear", "model", "95 % interval", "rms [deg]",
+    "worst [deg]", "R2",
+]  # fmt: skip
+# A free run beyond this has diverged [rad]; it is not drawn from there on, for the rest to stay readable.
+_DRAWN = np.pi
+
+
+def validation_page(results: Sequence[Validation], *, title: str = "Validation") -> str:
+    """Return one self-contained page with interactive plots of all results.
+
+    Where several models were judged on the same rows, a chart of all their free runs comes first.
+
+    Args:
+        results: of `validate`, one for each model and recording.
+        title: of the page.
+    """
+    sections = [_overview(results), *_comparisons(results), *(_section(result) for result in results)]
+    return page(title, sections, footer="Written by softneck.")
+
+
+def _overview(results: Sequence[Validation]) -> Section:
+    rows = []
+    for r in results:
+        for h in r.fits:
+            tables = (r.persistence, r.best_linear, r.fits, r.intervals)
+            rows.append(
+                [
+                    _name(r),
+                    "free run" if h == INFINITE else h,
+                    *(_cell(table.get(h, {}), 1) for table in tables),
+                    _cell(r.rmse_deg[h], 2),
+                    _cell(r.worst_deg[h], 1),
+                    _cell(r.r2[h], 3),
+                ]
+            )
+    fits = Table("Fit in %, errors in deg, pitch/roll", _HEAD, rows)
+    counts = [[_name(r), str(r.rows_scored), str(r.rows_left_out), *_verdicts(r)] for r in results]
+    head = ["model on data", "rows judged", "left out", "one-step errors white", "follow no input", "free run diverged"]
+    return Section("Fits", text=[VALIDATION_NOTE], tables=[fits, Table("What was judged", head, counts)])
+
+
+def _verdicts(r: Validation) -> list[str]:
+    tested = not np.isnan(r.residual_tests.p_value).any()
+    words = ["-" if not tested else "holds" if verdict else "fails" for verdict in (r.white, r.uncorrelated)]
+    return [*words, "no" if r.diverged is None else f"at {r.diverged:.2f} s"]
+
+
+def _comparisons(results: Sequence[Validation]) -> list[Section]:
+    """Put the free runs of models that were judged on the same rows into one chart."""
+    groups: dict[tuple[str, bytes, bytes], list[Validation]] = {}
+    for r in results:
+        if INFINITE in r.fits:
+            groups.setdefault((r.data, r.time.tobytes(), r.measured.tobytes()), []).append(r)
+    sections = []
+    for group in groups.values():
+        if len(group) > 1:
+            data = Path(group[0].data).stem
+            runs = {Path(r.model).stem: drawable(r.free_run) for r in group}
+            runs = runs if len(runs) == len(group) else {r.model: drawable(r.free_run) for r in group}
+            chart = validation_chart(
+                group[0].time, group[0].measured, runs, "Free runs", run=group[0].run, caption=_ERROR
+            )
+            sections.append(Section(f"All models on {data}", charts=[chart]))
+    return sections
+
+
+def _section(r: Validation) -> Section:
+    predictions = {"one step": drawable(r.one_step)}
+    if INFINITE in r.fits:
+        predictions["free run"] = drawable(r.free_run)
+    bounds = _bounds_of(r)
+    caption = _ERROR + (" The band holds the model's bounds of its free run." if bounds else "")
+    curves = validation_chart(
+        r.time, r.measured, predictions, "Measured and predicted", bounds=bounds, run=r.run, caption=caption
+    )
+    charts = [curves, _residuals(r)]
+    for name, values in predictions.items():
+        errors = r.measured - values
+        if np.isfinite(errors).any(axis=0).all():
+            charts.append(histogram_chart(errors, f"Errors, {name}"))
+    return Section(_name(r), text=_remarks(r), tables=_run_tables(r), charts=charts)
+
+
+def _residuals(r: Validation) -> Chart:
+    tests = r.residual_tests
+    return residual_chart(
+        (tests.lags, tests.autocorrelation, tests.bound),
+        (tests.cross_lags, tests.cross_correlation, tests.cross_bound),
+        "Residual tests of the one-step errors",
+        caption=_RESIDUALS,
+    )
+
+
+def _remarks(r: Validation) -> list[str]:
+    p_values = "/".join(f"{p:.2g}" for p in r.residual_tests.p_value)
+    words = ["There are too few one-step errors to test whether they are white."]
+    if not np.isnan(r.residual_tests.p_value).any():
+        words = [
+            f"One step ahead the errors are {'white' if r.white else 'not white'} (portmanteau p {p_values}) and "
+            f"{'follow no set-point' if r.uncorrelated else 'follow the set-points'} (99 %)."
+        ]
+    if r.diverged is not None:
+        words.append(f"The free run diverged at {r.diverged:.2f} s and is not drawn beyond half a turn.")
+    if any(fit is not None for fit in r.noise_ceiling.values()):
+        ceiling = _cell(r.noise_ceiling, 1)
+        words.append(f"Repeated set-points say that a perfect model would fit {ceiling} % (noise ceiling).")
+    if r.coverage_pct is not None and r.mean_width_deg is not None:
+        words.append(
+            f"The bounds of the free run hold {_cell(r.coverage_pct, 1)} % of the samples and are "
+            f"{_cell(r.mean_width_deg, 1)} deg wide in the mean."
+        )
+    if r.outside_pct is not None:
+        words.append(
+            f"At {_cell(r.outside_pct, 1)} % of the samples the bounds are wider than 99 % of the training rows have "
+            "them: the model has never seen that."
+        )
+    if r.novelty is not None and r.novelty.larger is not None:
+        p50, p90, p99, most = (f"{value:.1f}" for value in r.novelty.larger)
+        words.append(
+            f"Novelty: the judged rows lie {p50} (median), {p90} (90 %), {p99} (99 %), {most} (largest) times as far "
+            "from the training rows as these from each other."
+        )
+    return words
+
+
+def _run_tables(r: Validation) -> list[Table]:
+    """Return the scores of each stretch, where there are several."""
+    if len(r.per_run) < 2:
+        return []
+    horizons = [str(horizon) for horizon in r.fits]
+    head = ["run", "from [s]", "rows", *("free run" if h == INFINITE else f"{h} ahead" for h in horizons)]
+    rows = [
+        [str(e["run"]), f"{e['start_s']:.2f}", str(e["rows_scored"]), *(_cell(e["fits"][h], 1) for h in horizons)]
+        for e in r.per_run
+    ]
+    return [Table("Fit [%] of each run, pitch/roll", head, rows)]
+
+
+def _cell(values: dict[str, Any], digits: int) -> str:
+    return "/".join(_text(value, digits) for value in values.values())
+
+
+def _text(value: float | Iterable[float] | None, digits: int) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, float | int):
+        return f"{value:.{digits}f}"
+    return "..".join(f"{edge:.{digits}f}" for edge in value)
+
+
+def _name(r: Validation) -> str:
+    return f"{Path(r.model).stem} on {Path(r.data).stem}"
+
+
+def drawable(values: Matrix) -> Matrix:
+    with np.errstate(invalid="ignore"):
+        return np.where(np.abs(values) < _DRAWN, values, np.nan)
+
+
+def _bounds_of(r: Validation) -> tuple[Matrix, Matrix] | None:
+    if not np.isfinite(r.lower).any():
+        return None
+    return drawable(r.lower), drawable(r.upper)

@@ -1,0 +1,9 @@
+"""Blocks that step, and the runtime texts behind them: bundled, compiled by numba, plain Python without it.
+
+A runtime module (`_*_runtime.py`) imports numpy, math and other runtimes only.
+Knows no kind; may import `core`.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,158 @@
+"""Runtime bundles as callable functions: compiled by numba where it is installed, plain Python where not."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from types import FunctionType, ModuleType
+from typing import Any
+
+import platformdirs
+
+from softneck.core import atomic_write
+
+from ._bundle import bundle, content_name
+
+# No fast-math: compiled and plain Python must agree to rounding. No GIL: batches run on all cores.
+COMPILE_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
+# One thread at a time loads: a cache alone lets two begin, and CPython 3.11's `ast` fails in two threads at once.
+_LOADING = threading.RLock()
+
+
+@dataclass(frozen=True, slots=True)
+class Runtime:
+    """The functions of one kind; see `_loops_runtime` for the loops.
+
+    Attributes:
+        state_size: (arrays) -> length of the state vector.
+        initialise: (arrays, parameters, state, outputs) fills the state and the outputs at t_0.
+        step: (arrays, parameters, state, inputs, outputs) advances by one sample, in place.
+        run_steps: the same over rows of inputs.
+        run_horizon: predictions a number of steps ahead from every row.
+        compiled: whether numba compiled them.
+    """
+
+    state_size: Callable[..., int]
+    initialise: Callable[..., None]
+    step: Callable[..., None]
+    run_steps: Callable[..., None]
+    run_horizon: Callable[..., None]
+    compiled: bool
+
+
+def load_runtime(module: str, *, compiled: bool = True) -> Runtime:
+    """Return the functions of runtime module `module`; `compiled=False` gives plain Python.
+
+    The bundle is written to the user's cache folder so that numba keeps the compiled code between runs.
+    """
+    with _LOADING:
+        return _runtime(module, compiled)
+
+
+def load_functions(module: str, *, compiled: bool = True) -> ModuleType:
+    """Return a namespace with the functions of runtime module `module`, which has no `step` of its own."""
+    with _LOADING:
+        return _functions(module, compiled)
+
+
+@cache
+def _runtime(module: str, compiled: bool) -> Runtime:
+    namespace = _import_text(bundle(module), compiled=compiled)
+    done = compiled and _compile(namespace)
+    names = ("state_size", "initialise", "step", "run_steps", "run_horizon")
+    return Runtime(*(getattr(namespace, name) for name in names), compiled=done)
+
+
+@cache
+def _functions(module: str, compiled: bool) -> ModuleType:
+    namespace = _import_text(bundle(module, loops=False), compiled=compiled)
+    if compiled:
+        _compile(namespace)
+    return namespace
+
+
+def load_linked(module: str, runtimes: Sequence[str]) -> ModuleType:
+    """Return the functions of runtime module `module`, whose `part_step(part, ...)` calls the step of `runtimes[part]`.
+
+    The steps are those that `load_runtime` compiled: they are linked, not compiled again, and give the same bits.
+    """
+    with _LOADING:
+        return _linked(module, tuple(runtimes))
+
+
+@cache
+def _linked(module: str, runtimes: tuple[str, ...]) -> ModuleType:
+    arguments = "parameters, state, inputs, outputs"
+    lines = ["from softneck.runtime import load_runtime"]
+    for i, runtime in enumerate(runtimes):
+        # Its content's name is part of this text: another runtime makes another module, and another cache.
+        lines.append(f'linked_{i} = load_runtime("{runtime}").step  # {compiled_name(bundle(runtime))}')
+    lines += ["del load_runtime", "", "", f"def part_step(part, arrays, {arguments}):"]
+    for i in range(len(runtimes)):
+        # Constant indices: a compiler knows the type of each part's arrays then.
+        lines += [f"    if part == {i}:", f"        linked_{i}(arrays[{i}], {arguments})"]
+    text = bundle(module, loops=False, skip=("part_step",)) + "\n".join(lines) + "\n"
+    namespace = _import_text(text, compiled=True)
+    _compile(namespace)
+    return namespace
+
+
+def compiled_name(text: str) -> str:
+    """Return the name under which the bundle `text` and its compiled code are kept; FMUs keep theirs there too."""
+    # numba's cache does not look at its options: they belong to the name.
+    return content_name(f"{text}\n# {COMPILE_OPTIONS}")
+
+
+def have_numba() -> bool:
+    """Return whether numba is installed, without importing it."""
+    return importlib.util.find_spec("numba") is not None
+
+
+def _compile(namespace: ModuleType) -> bool:
+    if not have_numba():
+        return False
+    from numba import njit
+
+    if "COMPILED" in vars(namespace):
+        vars(namespace)["COMPILED"] = 1  # see `_compiled_runtime`; numba takes it as a constant
+    for name, value in list(vars(namespace).items()):
+        if isinstance(value, FunctionType):
+            setattr(namespace, name, njit(**COMPILE_OPTIONS)(value))
+    return True
+
+
+def _import_text(text: str, *, compiled: bool) -> ModuleType:
+    name = compiled_name(text)
+    path = _cache_folder() / f"{name}.py"
+    if not path.is_file() or path.read_text(encoding="utf-8") != text:
+        with atomic_write(path, force=True) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    alias = f"{name}_compiled" if compiled else name
+    spec = importlib.util.spec_from_file_location(alias, path)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"cannot import the runtime bundle {path}")
+    namespace = importlib.util.module_from_spec(spec)
+    sys.modules[alias] = namespace  # numba rebuilds cached functions by their module's name
+    spec.loader.exec_module(namespace)
+    return namespace
+
+
+def _cache_folder() -> Path:
+    folder = Path(platformdirs.user_cache_dir("softneck", appauthor=False)) / "runtime"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
+    except OSError:
+        return _temporary_folder()
+
+
+@cache
+def _temporary_folder() -> Path:
+    return Path(tempfile.mkdtemp(prefix="softneck-runtime-"))

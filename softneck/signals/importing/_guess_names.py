@@ -1,0 +1,182 @@
+"""The part of a guess that goes by the titles of the columns, checked against the data where there is a choice."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+
+import numpy as np
+
+from softneck.core import SoftneckError
+
+from ..recording._channels import MOTOR_POSITIONS, MOTORS, SET_POINTS, parse_column
+from ._column_shapes import lagged
+from ._draft import Draft, Pick, say
+from ._layout import Column, Term
+from ._sample_time import velocity_period
+
+# Rates agree with differences of positions; below it they are another motion.
+_RATE = 0.9
+_VELOCITIES = tuple(f"motor_velocity_{j}" for j in MOTORS)
+
+Family = tuple[Column, Column, Column]
+
+
+def by_names(draft: Draft) -> None:
+    """Take what titles name."""
+    own = _own_titles(draft)
+    by_role: dict[str, list[tuple[int, Column]]] = defaultdict(list)
+    for column, title in draft.titles.items():
+        if column not in own:
+            by_role[title.role].append((title.rank, column))
+    _time_and_run(draft, by_role)
+    positions = _families(draft, "position", own)
+    if positions and not draft.has(MOTOR_POSITIONS):
+        _take(draft, MOTOR_POSITIONS, positions[0])
+    _set_points(draft, own)
+    _velocities(draft, own)
+    _platform(draft, by_role)
+    for role in ("pitch_reference", "roll_reference", "pitch_rate", "roll_rate"):
+        if role not in draft.picks and by_role[role]:
+            column = min(by_role[role], key=lambda entry: entry[0])[1]
+            draft.pick(role, column, draft.titles[column].why)
+
+
+def _own_titles(draft: Draft) -> set[Column]:
+    """Take columns that are titled as in a recording of ours."""
+    own: set[Column] = set()
+    for column in draft.titles:
+        try:
+            channel, _ = parse_column(str(column))
+        except SoftneckError:
+            continue
+        if channel not in draft.picks:
+            unit = str(column)[str(column).rindex("[") + 1 : -1].strip()
+            draft.picks[channel] = Pick((Term(column),), "it is titled as in a recording of softneck", unit)
+            own.add(column)
+    return own
+
+
+def _time_and_run(draft: Draft, by_role: dict[str, list[tuple[int, Column]]]) -> None:
+    for _, column in sorted(by_role["time"], key=lambda entry: entry[0]):
+        step = np.diff(draft.moving.get(column, np.zeros(0)))
+        rising = float((step > 0).mean()) if step.size else 0.0
+        if "time" in draft.picks:
+            draft.passed_over[column] = f"{say(draft.picks['time'].terms[0].column)} names time more clearly"
+        elif rising > 0.5:
+            draft.pick("time", column, f"{draft.titles[column].why}, and it rises from row to row")
+        else:
+            draft.passed_over[column] = "it does not rise from row to row, so it is no time"
+    for _, column in by_role["run"]:
+        values = draft.sniffed.columns[column]
+        if "run" not in draft.picks and np.isfinite(values).all() and np.array_equal(values, np.round(values)):
+            draft.pick("run", column, draft.titles[column].why)
+
+
+def _families(draft: Draft, role: str, own: set[Column]) -> list[Family]:
+    """Return three columns of one kind, numbered 1 to 3 or 0 to 2, the clearest names first."""
+    groups: dict[tuple[int, str], dict[int, Column]] = defaultdict(dict)
+    for column, title in draft.titles.items():
+        if title.role == role and title.motor is not None and column not in own:
+            groups[title.rank, title.family].setdefault(title.motor, column)
+    found = [(rank, group) for (rank, _), group in groups.items() if sorted(group) in ([1, 2, 3], [0, 1, 2])]
+    return [_sorted(group) for _, group in sorted(found, key=lambda entry: entry[0])]
+
+
+def _sorted(group: dict[int, Column]) -> Family:
+    first, second, third = (group[number] for number in sorted(group))
+    return first, second, third
+
+
+def _take(draft: Draft, channels: tuple[str, ...], family: Family, more: str = "") -> None:
+    for channel, column in zip(channels, family, strict=True):
+        draft.pick(channel, column, draft.titles[column].why + more)
+
+
+def _set_points(draft: Draft, own: set[Column]) -> None:
+    """Take the set-points; of several kinds, those that the positions follow most closely."""
+    families = _families(draft, "set-point", own)
+    if not families or draft.has(SET_POINTS):
+        return
+    if len(families) == 1 or not draft.has(MOTOR_POSITIONS):
+        _take(draft, SET_POINTS, families[0])
+        return
+    scores = [_follow(draft, family) for family in families]
+    best = int(np.argmax(scores))
+    _take(draft, SET_POINTS, families[best], f", and the positions follow it (correlation {scores[best]:.2f})")
+    for family, score in zip(families, scores, strict=True):
+        for column in family if family is not families[best] else ():
+            draft.passed_over[column] = (
+                f"the positions follow {say(families[best][0])} and its like more closely than it"
+            )
+            if score > 0.999 * scores[best]:
+                draft.passed_over[column] += ", by little: check"
+
+
+def _follow(draft: Draft, family: Family) -> float:
+    """Return how well the positions follow a family at least; 0 for what stands still."""
+    pairs = [
+        lagged(draft.moving[column], draft.values(position), 10)[0] if column in draft.moving else 0.0
+        for column, position in zip(family, MOTOR_POSITIONS, strict=True)
+    ]
+    return min(pairs)
+
+
+def _velocities(draft: Draft, own: set[Column]) -> None:
+    """Take named velocities, or a command of speed less its error where that is the rate of the positions."""
+    if draft.has(_VELOCITIES):
+        return
+    named = _families(draft, "velocity", own)
+    if named:
+        _take(draft, _VELOCITIES, named[0])
+        return
+    if not draft.has(MOTOR_POSITIONS):
+        return
+    commands = [family for family in _families(draft, "set-point", own) if family[0] not in draft.used()]
+    for command in commands:
+        for error in _families(draft, "ignored", own):
+            if not all(column in draft.moving for column in (*command, *error)):
+                continue
+            speeds = [draft.moving[c] - draft.moving[e] for c, e in zip(command, error, strict=True)]
+            agree = min(
+                velocity_period(draft.values(position), speed, draft.runs())[1]
+                for position, speed in zip(MOTOR_POSITIONS, speeds, strict=True)
+            )
+            if agree > _RATE:
+                why = f"their difference is the rate of the position (correlation {agree:.2f} or more)"
+                for channel, c, e in zip(_VELOCITIES, command, error, strict=True):
+                    draft.picks[channel] = Pick((Term(c), Term(e, -1.0)), why)
+                    draft.passed_over.pop(c, None)
+                return
+
+
+def _platform(draft: Draft, by_role: dict[str, list[tuple[int, Column]]]) -> None:
+    """Take pitch and roll, or else inclination and orientation."""
+    best = {role: _best(draft, by_role[role]) for role in ("pitch", "roll", "inclination", "orientation")}
+    for pair in (("pitch", "roll"), ("inclination", "orientation")):
+        columns = [best[role] for role in pair]
+        if draft.has(("pitch", "roll")) or None in columns:
+            continue
+        for role, column in zip(pair, columns, strict=True):
+            if column is not None and role not in draft.picks:
+                draft.pick(role, column, draft.titles[column].why)
+        break
+    for role in ("pitch", "roll"):
+        column = best[role]
+        if column is not None and role not in draft.picks and "inclination" not in draft.picks:
+            draft.pick(role, column, draft.titles[column].why)
+    for role in ("pitch", "roll", "yaw", "inclination", "orientation"):
+        for _, column in by_role[role]:
+            if column not in draft.used():
+                draft.passed_over.setdefault(column, _not_taken(draft, role))
+
+
+def _best(draft: Draft, entries: list[tuple[int, Column]]) -> Column | None:
+    moving = [entry for entry in entries if entry[1] in draft.moving]
+    return min(moving or entries, key=lambda entry: entry[0])[1] if entries else None
+
+
+def _not_taken(draft: Draft, role: str) -> str:
+    if role == "yaw":
+        return "yaw is no channel of a recording; where your second axis is yaw, write it as `roll` with its sign"
+    taken = role if role in draft.picks else "pitch"
+    return f"{say(draft.picks[taken].terms[0].column)} was taken" if taken in draft.picks else "its pair is not there"

@@ -1,0 +1,129 @@
+"""The part of a guess that goes by the data: for files without a header, and names that say nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..recording._channels import MOTOR_POSITIONS, MOTORS, SET_POINTS
+from ._column_shapes import (
+    FOLLOWS,
+    answers,
+    clock,
+    correlation,
+    followed,
+    leads,
+    motors_and_answers,
+    rates,
+    sums,
+    triples,
+)
+from ._draft import Draft, Pick
+from ._layout import Term
+
+_VELOCITIES = tuple(f"motor_velocity_{j}" for j in MOTORS)
+# More columns than this are a dump of something, and all pairs of them are too many.
+_MOST = 40
+# A term that adds less than this part of the motion is noise of the fit.
+_COUNTS = 0.05
+_AXIS = {"pitch": "theta_i", "roll": "phi_i"}
+
+
+def by_shapes(draft: Draft) -> None:
+    """Take for what is still missing the columns whose data behave like it."""
+    _clock(draft)
+    _rates(draft)
+    _set_points(draft)
+    _motors_without_rates(draft)
+    motors = draft.motors()
+    if motors is None or draft.has(("pitch", "roll")) or "inclination" in draft.picks:
+        return
+    for axis, (column, r) in answers(draft.moving, motors, draft.free()[:_MOST]).items():
+        if axis not in draft.picks:
+            _answer(draft, axis, column, r)
+
+
+def _answer(draft: Draft, axis: str, column: str | int, r: float) -> None:
+    why = f"it answers {_AXIS[axis]} of the motors with correlation {r:.2f}; of other columns none does so more"
+    sign = -1.0 if r < 0 else 1.0
+    draft.pick(axis, column, why + ("; turned round, so that it rises with it" if r < 0 else ""), sign=sign, sure=False)
+
+
+def _clock(draft: Draft) -> None:
+    if "time" in draft.picks:
+        return
+    free = {name: draft.moving[name] for name in draft.free()}
+    column = clock(free)
+    if column is None:
+        return
+    step = np.diff(free[column])
+    draft.pick("time", column, f"it rises by equal steps of {np.median(step):.4g}", sure=False)
+
+
+def _rates(draft: Draft) -> None:
+    if draft.has(MOTOR_POSITIONS) or draft.has(_VELOCITIES):
+        return
+    free = {name: draft.moving[name] for name in draft.free()[:_MOST]}
+    found = rates(free, draft.runs())
+    if found is None:
+        return
+    positions, velocities, agree = found
+    for names, columns, what in (
+        (MOTOR_POSITIONS, positions, "has three rates beside it"),
+        (_VELOCITIES, velocities, "is one"),
+    ):
+        for channel, column in zip(names, columns, strict=True):
+            draft.pick(
+                channel, column, f"of three like columns it {what}: differences agree with correlation {agree:.2f}"
+            )
+
+
+def _set_points(draft: Draft) -> None:
+    if draft.has(SET_POINTS) or not draft.has(MOTOR_POSITIONS):
+        return
+    positions = [draft.picks[name].terms[0].column for name in MOTOR_POSITIONS]
+    free = draft.free()[:_MOST]
+    if any(column not in draft.moving for column in positions):
+        return
+    found = followed(draft.moving, positions, free)
+    if found is not None:
+        for channel, column in zip(SET_POINTS, found[0], strict=True):
+            draft.pick(channel, column, f"the position follows it (correlation {found[1]:.2f} or more)", sure=False)
+        return
+    pair, factors, R2 = sums(draft.moving, positions, free[:12])
+    if R2 < FOLLOWS:
+        return
+    parts = np.abs(factors) * np.array([[draft.moving[name].std()] for name in pair])
+    for j, channel in enumerate(SET_POINTS):
+        counts = parts[:, j] > _COUNTS * parts[:, j].sum()
+        terms = tuple(Term(name, float(f"{factors[i, j]:.4g}")) for i, name in enumerate(pair) if counts[i])
+        why = f"the position follows this sum (R2 {R2:.3f} or more); its factors were fitted to the data"
+        draft.picks[channel] = Pick(terms, why, draft.picks[MOTOR_POSITIONS[j]].unit, sure=False)
+
+
+def _motors_without_rates(draft: Draft) -> None:
+    """Take the three columns to which two others answer; of two such triples the leading one is the set-points."""
+    if draft.has(SET_POINTS) or draft.has(MOTOR_POSITIONS):
+        return
+    free = draft.free()[:_MOST]
+    found = motors_and_answers(draft.moving, free)
+    if found is None:
+        return
+    first, axes = found
+    taken = {*first, *(column for column, _ in axes.values())}
+    rest = {name: draft.moving[name] for name in free if name not in taken}
+    alike = [
+        other
+        for other in triples(rest)
+        if min(correlation(draft.moving[a], draft.moving[b]) for a, b in zip(first, other, strict=True)) > FOLLOWS
+    ]
+    why = "of three neighbours to which two other columns answer best it is one"
+    if alike:
+        other = alike[0]
+        first, other = (first, other) if leads(draft.moving, first, other) else (other, first)
+        for channel, column in zip(MOTOR_POSITIONS, other, strict=True):
+            draft.pick(channel, column, f"{why}, and it trails the set-point", sure=False)
+    for channel, column in zip(SET_POINTS, first, strict=True):
+        draft.pick(channel, column, why, sure=False)
+    for axis, (column, r) in axes.items():
+        if axis not in draft.picks:
+            _answer(draft, axis, column, r)

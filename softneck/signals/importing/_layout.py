@@ -1,0 +1,248 @@
+"""The layout of a foreign log: a TOML file that says which column is what."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from softneck.core import FileFormatError, SettingsError, SoftneckError, to_si
+
+from ..recording._channels import known_channels, si_unit
+from ..recording._files import WHITESPACE, TextForm
+
+Column = str | int
+DUPLICATES = ("first", "last")
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """One column times a factor."""
+
+    column: Column
+    factor: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Where a channel comes from: the sum of terms, in `unit`, times `sign`."""
+
+    terms: tuple[Term, ...]
+    unit: str
+    sign: float = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layout:
+    """How a log is read.
+
+    Attributes:
+        channels: channel name -> source.
+        inclination, orientation: sources of the tilt vector, instead of pitch and roll.
+        time: the time column's source, or None.
+        sample_time: true sample time [s]; None takes it from the time column.
+        estimate: take the sample time at which logged positions and velocities agree.
+        new_run_at_restart: a time that goes back starts a new run.
+        duplicates: which row to keep of those with one time stamp, `first` or `last`; None refuses them.
+        run: the column that numbers the runs, or None.
+        variable: the matrix of a MAT file; None takes its vectors by name.
+        header: whether the first line names the columns.
+        delimiter: between cells, one character or `whitespace`.
+        decimal: the decimal mark, `.` or `,`.
+        skip: lines before the table.
+        unit_row: whether the line below the names holds units; it is left out.
+        rows: first and last row (not included) to take.
+    """
+
+    channels: Mapping[str, Source]
+    inclination: Source | None = None
+    orientation: Source | None = None
+    time: Source | None = None
+    sample_time: float | None = None
+    estimate: bool = False
+    new_run_at_restart: bool = False
+    duplicates: str | None = None
+    run: Column | None = None
+    variable: str | None = None
+    header: bool = True
+    delimiter: str = ","
+    decimal: str = "."
+    skip: int = 0
+    unit_row: bool = False
+    rows: tuple[int, int] | None = None
+
+    @property
+    def form(self) -> TextForm:
+        """How a text is a table."""
+        return TextForm(self.header, self.delimiter, self.decimal, self.skip, self.unit_row)
+
+
+def read_layout(path: str | Path) -> Layout:
+    """Read a layout file (docs, "Layouts").
+
+    Raises:
+        FileFormatError: no such file or no TOML.
+        SettingsError: a key, channel or unit that a layout does not have.
+    """
+    source = Path(path)
+    try:
+        text = source.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise FileFormatError(f"{source}: no such file.") from None
+    except (UnicodeDecodeError, OSError, ValueError) as error:  # ValueError: a null character in the path
+        raise FileFormatError(f"{source}: is no TOML file ({error}).") from error
+    try:
+        return parse_layout(text)
+    except FileFormatError as error:
+        raise FileFormatError(f"{source}: {error}") from error
+    except SoftneckError as error:
+        raise SettingsError(f"{source}: {error}") from error
+
+
+def parse_layout(text: str) -> Layout:
+    """Return the layout that a TOML text holds; the inverse of `layout_toml`.
+
+    Raises:
+        FileFormatError: no TOML.
+        SettingsError: a key, channel or unit that a layout does not have.
+    """
+    try:
+        table = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:  # int() refuses thousands of digits
+        raise FileFormatError(f"is no TOML file ({error}).") from error
+    try:
+        return _layout(table)
+    except SoftneckError:
+        raise
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise SettingsError(f"a value is of the wrong type ({error}).") from error
+
+
+def _layout(table: dict[str, Any]) -> Layout:
+    _known_keys(table, {"file", "time", "channels", "tilt"}, "the layout")
+    file, time = table.get("file", {}), table.get("time", {})
+    tilt = table.get("tilt", {})
+    _known_keys(file, {"header", "delimiter", "decimal", "skip", "unit_row", "rows", "variable"}, "[file]")
+    _known_keys(
+        time,
+        {"column", "unit", "factor", "sample_time_s", "new_run_at_restart", "duplicates", "run_column"},
+        "[time]",
+    )
+    _known_keys(tilt, {"inclination", "orientation"}, "[tilt]")
+    if len(tilt) == 1:
+        raise SettingsError("[tilt] needs both `inclination` and `orientation`.")
+    if type(time.get("run_column", "")) not in (str, int):
+        raise SettingsError(f"[time] run_column must be a name or an index; got {time['run_column']!r}.")
+    rows = file.get("rows")
+    if rows is not None and not (
+        isinstance(rows, list) and [type(row) for row in rows] == [int, int] and 0 <= rows[0] < rows[1]
+    ):
+        raise SettingsError(f"[file] rows must be [first, last] with 0 <= first < last; got {rows}.")
+    if file.get("unit_row") is True and file.get("header") is False:
+        raise SettingsError("[file] unit_row is the line below the names; a file without `header` has none.")
+    return Layout(
+        channels={name: _channel_source(name, entry) for name, entry in table.get("channels", {}).items()},
+        inclination=_source(tilt["inclination"], "rad", "[tilt] inclination") if tilt else None,
+        orientation=_source(tilt["orientation"], "rad", "[tilt] orientation") if tilt else None,
+        time=_time_source(time),
+        sample_time=None if time.get("sample_time_s") == "estimate" else _positive(time.get("sample_time_s")),
+        estimate=time.get("sample_time_s") == "estimate",
+        new_run_at_restart=_flag(time, "new_run_at_restart", default=False),
+        duplicates=_choice(time, "duplicates", DUPLICATES, None),
+        run=time.get("run_column"),
+        variable=str(file["variable"]) if "variable" in file else None,
+        header=_flag(file, "header", default=True),
+        delimiter=_delimiter(file.get("delimiter", ",")),
+        decimal=_choice(file, "decimal", (".", ","), ".") or ".",
+        skip=_skip(file.get("skip", 0)),
+        unit_row=_flag(file, "unit_row", default=False),
+        rows=(rows[0], rows[1]) if rows is not None else None,
+    )
+
+
+def _time_source(time: dict[str, Any]) -> Source | None:
+    if "column" not in time:
+        return None
+    return _source({"unit": "s", **_only(time, "column", "unit", "factor")}, "s", "[time]")
+
+
+def _channel_source(name: str, entry: Any) -> Source:
+    if name not in known_channels() or name == "time":
+        raise SettingsError(f"[channels.{name}]: no channel of a recording; known: {', '.join(known_channels())}.")
+    return _source(entry, si_unit(name), f"[channels.{name}]")
+
+
+def _source(entry: Any, quantity: str, where: str) -> Source:
+    if not isinstance(entry, dict):
+        raise SettingsError(f"{where} must be a table with `column` (or `terms`) and `unit`.")
+    _known_keys(entry, {"column", "terms", "unit", "sign", "factor"}, where)
+    terms = entry.get("terms", [_only(entry, "column", "factor")])
+    for term in terms:
+        if not isinstance(term, dict) or type(term.get("column")) not in (str, int):
+            raise SettingsError(f"{where} needs `column`: a name, or an index from 0 for a file without header.")
+        _known_keys(term, {"column", "factor"}, where)
+    if "unit" not in entry:
+        raise SettingsError(f"{where} names no unit.")
+    if to_si(entry["unit"])[1] != quantity:
+        raise SettingsError(f"{where} cannot be in `{entry['unit']}`; its SI unit is {quantity}.")
+    parsed = tuple(Term(term["column"], _factor(term.get("factor", 1.0), where)) for term in terms)
+    if entry.get("sign", 1) not in (1, -1) or isinstance(entry.get("sign"), bool):
+        raise SettingsError(f"{where}: sign must be 1 or -1; got {entry['sign']!r}. Scale it by `factor`.")
+    return Source(parsed, entry["unit"], float(entry.get("sign", 1)))
+
+
+def _factor(value: Any, where: str) -> float:
+    number = float(value)
+    if not math.isfinite(number) or number == 0.0:
+        raise SettingsError(f"{where}: a factor must be a finite number other than 0; got {value}.")
+    return number
+
+
+def _only(entry: dict[str, Any], *keys: str) -> dict[str, Any]:
+    return {key: entry[key] for key in keys if key in entry}
+
+
+def _positive(value: Any) -> float | None:
+    if value is None:
+        return None
+    if not isinstance(value, int | float) or not 0 < value < float("inf"):
+        raise SettingsError(f"[time] sample_time_s must be a positive number or `estimate`; got {value!r}.")
+    return float(value)
+
+
+def _known_keys(table: Any, known: set[str], where: str) -> None:
+    if not isinstance(table, dict):
+        raise SettingsError(f"{where} must be a table.")
+    unknown = sorted(set(table) - known)
+    if unknown:
+        raise SettingsError(f"{where} has the unknown key `{unknown[0]}`; known: {', '.join(sorted(known))}.")
+
+
+def _flag(table: dict[str, Any], key: str, *, default: bool) -> bool:
+    value = table.get(key, default)
+    if not isinstance(value, bool):
+        raise SettingsError(f"`{key}` must be true or false; got {value!r}.")
+    return value
+
+
+def _choice(table: dict[str, Any], key: str, allowed: tuple[str, ...], default: str | None) -> str | None:
+    value = table.get(key, default)
+    if value is not default and value not in allowed:
+        raise SettingsError(f"`{key}` must be one of {', '.join(allowed)}; got {value!r}.")
+    return value
+
+
+def _skip(value: Any) -> int:
+    if type(value) is not int or not 0 <= value < 10**6:
+        raise SettingsError(f"[file] skip must be a number of lines; got {value!r}.")
+    return value
+
+
+def _delimiter(value: Any) -> str:
+    # More than one character would be a regular expression to the reader of tables, and some of those never end.
+    if value != WHITESPACE and not (isinstance(value, str) and len(value) == 1):
+        raise SettingsError(f"[file] delimiter must be one character or `{WHITESPACE}`; got {value!r}.")
+    return value

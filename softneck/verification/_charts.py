@@ -1,0 +1,233 @@
+"""The charts of a verification, as plain data that pages and matplotlib draw."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from softneck.core import Vector
+from softneck.plots import Chart, Curve, Level, Panel
+from softneck.plots._style import BLUE, GREEN, GREY, ORANGE
+
+from ._evidence import Evidence, LinearEvidence
+from ._linear import inverse, loops
+from ._neck_loops import NeckRun
+from ._plants import AXES, QUANTITIES
+from ._steps import Steps
+
+RED, PURPLE = "#D55E00", "#CC79A7"
+# Responses that an envelope is taken over; more would not be seen.
+_MOST = 240
+_FREQUENCY = "frequency [rad/s]"
+_CAPTION = f"Band: an even choice of up to {_MOST} plants; black: nominal; red: the plant with the least disk margin."
+# Disk margins are shown in five colours between these.
+_LEVELS = ((0.0, RED), (0.3, ORANGE), (0.5, PURPLE), (0.7, BLUE), (0.9, GREEN))
+
+
+def frequency_charts(part: LinearEvidence, w: Vector) -> list[Chart]:
+    """Return Bode envelopes of the open loops, the gang of four of each axis, and their sensitivities."""
+    rows = _chosen(part)
+    P, L = loops(part.plants.take(rows), part.law, w)
+    S = inverse(np.eye(2) + L)
+    PS, CS = S @ P, -part.law.feedback(w) @ S
+    charts = [_bode(part, rows, S, w)]
+    for i, axis in enumerate(AXES):
+        own = S[..., i, i]
+        gang = {
+            "|S|, from load at the angle": np.abs(own), "|T|, from reference to angle": np.abs(1.0 - own),
+            "|PS|, from load at the input [rad/rad]": np.abs(PS[..., i, i]),
+            "|CS|, from noise to input [rad/rad]": np.abs(CS[..., i, i]),
+        }  # fmt: skip
+        worst = _worst_in(part, rows, f"{axis}.disk_margin")
+        panels = [_envelope(w, values, name, worst) for name, values in gang.items()]
+        charts.append(
+            Chart(
+                f"Gang of four: {axis}", panels, _FREQUENCY, columns=2, row_height=2.6,
+                caption=_CAPTION,
+            )
+        )  # fmt: skip
+    return charts
+
+
+def _chosen(part: LinearEvidence) -> np.ndarray:
+    """Return the rows that are drawn: the first, an even choice, and the worst ones."""
+    n = len(part.plants)
+    rows = np.unique(np.linspace(0, n - 1, min(n, _MOST)).astype(int))
+    worst = [int(np.argmin(part.margins[f"{axis}.disk_margin"])) for axis in AXES]
+    return np.unique(np.concatenate([[0], rows, worst]))
+
+
+def _worst_in(part: LinearEvidence, rows: np.ndarray, metric: str) -> int:
+    return int(np.argmin(part.margins[metric][rows]))
+
+
+def _bode(part: LinearEvidence, rows: np.ndarray, S: np.ndarray, w: Vector) -> Chart:
+    panels = []
+    for i, axis in enumerate(AXES):
+        L = 1.0 / S[..., i, i] - 1.0
+        worst = _worst_in(part, rows, f"{axis}.disk_margin")
+        phase = np.degrees(np.unwrap(np.angle(L), axis=1))
+        # All start near the phase of an integrator.
+        phase -= 360.0 * np.round((phase[:, :1] + 90.0) / 360.0)
+        panels.append(_envelope(w, np.abs(L), f"|L| of {axis}", worst, level=1.0))
+        panels.append(
+            _envelope(w, phase, f"phase of {axis} [deg]", worst, level=-180.0, log=False, y_range=(-540.0, 30.0))
+        )
+    return Chart(
+        "Bode envelopes of the open loops", panels, _FREQUENCY, columns=2, row_height=2.6,
+        caption=_CAPTION,
+    )  # fmt: skip
+
+
+def _envelope(
+    w: Vector, values: np.ndarray, label: str, worst: int, *, level: float | None = None, log: bool = True,
+    y_range: tuple[float, float] | None = None,
+) -> Panel:  # fmt: skip
+    shown = np.maximum(values, 1e-6) if log else values
+    curves = [
+        Curve(w, shown.min(axis=0), "all plants", "#56B4E9", "band", upper=shown.max(axis=0)),
+        Curve(w, shown[worst], "worst", RED, width=1.2),
+        Curve(w, shown[0], "nominal", "black", width=1.2),
+    ]
+    levels = () if level is None else (Level(level),)
+    if log and y_range is None:
+        top = float(shown.max())
+        y_range = (max(float(shown.min()), 1e-3 * min(top, 1.0)), 1.3 * top)
+    return Panel(curves, label, levels=levels, log_x=True, log_y=log, y_range=y_range)
+
+
+def margin_map(part: LinearEvidence) -> Chart:
+    """Return where in gain, pole and dead time the disk margin is small, of each axis."""
+    panels = []
+    scale = np.array([math.degrees(1.0), 1.0, 1e3])
+    units = ("static gain [deg/rad]", "pole [1/s]", "dead time [ms]")
+    for i, axis in enumerate(AXES):
+        margins, numbers = part.margins[f"{axis}.disk_margin"], part.plants.numbers[:, i] * scale
+        for x, y in ((0, 2), (0, 1)):
+            curves = []
+            for k, (low, colour) in enumerate(_LEVELS):
+                high = _LEVELS[k + 1][0] if k + 1 < len(_LEVELS) else math.inf
+                rows = (margins >= low) & (margins < high)
+                label = f"{low:g} to {high:g}" if math.isfinite(high) else f"{low:g} and more"
+                if rows.any():
+                    curves.append(Curve(numbers[rows, x], numbers[rows, y], label, colour, "points", 2.2))
+            panels.append(
+                Panel(curves, units[y], units[x], title=f"{axis}: disk margin over {QUANTITIES[x]} and {QUANTITIES[y]}")
+            )
+    return Chart("Margin map", panels, columns=2, linked=False, row_height=3.0)
+
+
+def mu_charts(part: LinearEvidence) -> list[Chart]:
+    """Return the structured singular value over frequency with its bounds; nothing where the middle is not stable."""
+    panels = []
+    for rows in part.structured:
+        for row in rows:
+            if not np.isfinite(row.upper).all():
+                continue
+            found = row.lower > 0.0
+            curves = [
+                Curve(row.frequency, row.upper, "upper bound", BLUE, width=1.4),
+                Curve(row.frequency[found], row.lower[found], "lower bound, around the peak", ORANGE, "points", 2.0),
+            ]
+            levels = [Level(1.0, "certain below", RED)]
+            if row.sampled > 0.0:
+                levels.append(Level(row.sampled, "sampled plants in a scaled box", GREEN))
+            top = max(1.1, 1.1 * float(row.upper.max()))
+            panels.append(Panel(curves, f"mu, {row.axes}", levels=levels, log_x=True, y_range=(0.0, top)))
+    return (
+        [Chart("Structured singular value for stability of the box", panels, _FREQUENCY, row_height=2.4)]
+        if panels
+        else []
+    )
+
+
+def delay_sensitivity(part: LinearEvidence, sample_time: float) -> Chart:
+    """Return margins of the worst plant against delay that is added to the loop."""
+    ms = 1e3 * sample_time * part.delays[:, 0]
+    stable = part.delays[:, 1] < 1.0
+    peaks = np.where(stable, part.delays[:, 3], np.nan)
+    panels = [
+        Panel([Curve(ms, part.delays[:, 2], "least disk margin", BLUE, "marked")], "disk margin", legend=False),
+        Panel([Curve(ms, peaks, "largest sensitivity", ORANGE, "marked")], "Ms", legend=False),
+        Panel(
+            [Curve(ms, part.delays[:, 1], "largest spectral radius", GREY, "marked")], "spectral radius",
+            levels=(Level(1.0),), legend=False,
+        ),
+    ]  # fmt: skip
+    return Chart(
+        "Sensitivity to delay", panels, "delay added to every plant [ms]", row_height=1.8,
+        caption="Of the worst of nominal, corners and the first samples; no sensitivity where one is not stable.",
+    )  # fmt: skip
+
+
+def gap_chart(part: LinearEvidence) -> Chart:
+    """Return the nu-gaps of all plants, sorted, beside the controller's margin."""
+    panels = []
+    for pair in part.gaps:
+        for axis, found in zip(AXES, pair, strict=True):
+            share = np.linspace(0.0, 100.0, found.gap.size)
+            curve = Curve(share, np.sort(found.gap), "nu-gap to the nominal", BLUE)
+            panels.append(Panel([curve], axis, levels=(Level(found.margin, "margin b of the nominal loop", RED),)))
+    return Chart(
+        "Nu-gaps", panels, "part of the plants [%]", columns=2, row_height=2.2,
+        caption="Plants with a gap below the margin are proven stable by the gap alone.",
+    )  # fmt: skip
+
+
+def step_chart(steps: Steps, names: Sequence[str]) -> Chart:
+    """Return the steps of all plants, the worst drawn through, and what its motors did."""
+    t = steps.time
+    panels = []
+    finite: np.ndarray = np.asarray(np.isfinite(steps.angles).all(axis=2))
+    worst = int(np.argmax(steps.metrics["overshoot_pct"]))
+    axis_of = int(steps.worse["overshoot_pct"][worst])
+    for i, axis in enumerate(AXES):
+        y = np.degrees(steps.angles[i][finite[i]]) if finite[i].any() else np.zeros((1, t.size))
+        row = worst if i == axis_of else int(np.argmax(np.where(finite[i], np.max(steps.angles[i], axis=1), -np.inf)))
+        settling = int(np.argmax(steps.metrics["load_rms_deg"]))
+        curves = [
+            Curve(t, y.min(axis=0), "all plants", "#56B4E9", "band", upper=y.max(axis=0)),
+            Curve(t, np.degrees(_drawable(steps.angles[i, settling])), "worst under the load", ORANGE),
+            Curve(t, np.degrees(_drawable(steps.angles[i, row])), "worst overshoot", RED, width=1.2),
+            Curve(t, np.degrees(_drawable(steps.angles[i, 0])), "nominal", "black", width=1.2),
+        ]
+        panels.append(Panel(curves, f"{axis} [deg]"))
+    motors = [
+        Curve(t, _drawable(steps.motors[axis_of, worst, :, j]), f"motor {j + 1}", colour, "step")
+        for j, colour in enumerate((BLUE, ORANGE, GREEN))
+    ]
+    panels.append(Panel(motors, "set-point [rad]", title=f"motors on {names[worst]}"))
+    return Chart("Steps against every plant, then a load", panels, row_height=2.6)
+
+
+def _drawable(y: Vector) -> Vector:
+    """Return `y` without what is too large to draw."""
+    return np.where(np.isfinite(y) & (np.abs(y) < 1e3), y, np.nan)
+
+
+def neck_chart(evidence: Evidence) -> Chart:
+    """Return all loops over the virtual neck: the way along the step, the worst overshoot drawn through."""
+    runs = [run for run in evidence.necks if run.result is not None]
+    if not runs:
+        raise ValueError("no loop over the virtual neck came to its end")
+    worst = max(runs, key=lambda run: run.metrics["overshoot_pct"])
+    slow = max(runs, key=lambda run: run.metrics["settling_s"])
+    along = {id(run): _along(run) for run in runs}
+    table = np.array(list(along.values()))
+    t = runs[0].result.time if runs[0].result is not None else np.zeros(0)
+    curves = [
+        Curve(t, table.min(axis=0), "all loops", "#56B4E9", "band", upper=table.max(axis=0)),
+        Curve(t, along[id(slow)], f"slowest: {slow.name}", ORANGE),
+        Curve(t, along[id(worst)], f"largest overshoot: {worst.name}", RED, width=1.2),
+        Curve(t, table[0], runs[0].name, "black", width=1.2),
+    ]
+    return Chart("Steps of the virtual neck", [Panel(curves, "true angle along the step [deg]")], row_height=3.4)
+
+
+def _along(run: NeckRun) -> Vector:
+    if run.result is None:
+        return np.zeros(0)
+    c, s = math.cos(run.orientation), math.sin(run.orientation)
+    return np.degrees(c * run.result.angle("pitch") + s * run.result.angle("roll"))

@@ -1,0 +1,301 @@
+"""All that is computed for a verification, metric by metric, with the plant behind every value."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from softneck.core import Progress, Vector
+from softneck.runtime import Block
+
+from ._confidence import MarginInterval, intervals
+from ._gaps import Gaps, gaps
+from ._laws import Judged
+from ._linear import LinearLaw, judged, margins
+from ._neck_loops import STEP_AT, NeckRun, neck_changes, run_necks
+from ._plants import AXES, Plants, UncertainNeck, all_plants, join, nominal_plants
+from ._requirements import Requirements
+from ._search import Found, search
+from ._steps import Steps, StepTest, run_steps
+from ._structured import StructuredResult, structured
+
+# Samples of delay that are added to see how the loop stands it.
+_DELAYS = 9
+# Plants that are tried at each: nominals, corners and the first samples.
+_DELAY_PLANTS = 60
+# Points that scale a box up; the corners are among them.
+_SCALED = 200
+
+Describe = Callable[[int], dict[str, Any]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Values:
+    """The values of one metric over what was tried.
+
+    Attributes:
+        values: (n,).
+        describe: row -> what stands in the certificate about that plant.
+    """
+
+    values: Vector
+    describe: Describe
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearEvidence:
+    """What linear methods say about one linear form.
+
+    Attributes:
+        name: of the frozen point, "" for a linear controller.
+        law: the form.
+        plants: tried, with the delay that the order adds: those of the boxes, then the worst that the search found.
+        margins: name -> (n,).
+        found: by the search; None where it was switched off.
+        structured: by neck.
+        gaps: by neck: pitch and roll.
+        intervals: of the margins.
+        delays: rows of (samples added, largest radius, least disk margin, largest sensitivity).
+    """
+
+    name: str
+    law: LinearLaw
+    plants: Plants
+    margins: dict[str, Vector]
+    found: Found | None
+    structured: list[list[StructuredResult]]
+    gaps: list[tuple[Gaps, Gaps]]
+    intervals: list[MarginInterval]
+    delays: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """All that was computed.
+
+    Attributes:
+        plants: of the boxes, with the delay that the order adds.
+        frequency: (m,) [rad/s].
+        linear: one for each linear form.
+        steps: of all plants and the worst that the searches found; `stepped` are those plants.
+        necks: loops over the virtual neck.
+        metrics: name -> values.
+        not_computed: metric or check -> why.
+    """
+
+    plants: Plants
+    frequency: Vector
+    linear: list[LinearEvidence]
+    steps: Steps
+    stepped: Plants
+    necks: list[NeckRun]
+    metrics: dict[str, Values] = field(default_factory=dict)
+    not_computed: dict[str, str] = field(default_factory=dict)
+
+
+def gather(
+    controller: Judged,
+    necks: Sequence[UncertainNeck],
+    asked: Requirements,
+    *,
+    observer: Block | None,
+    progress: Progress,
+) -> Evidence:
+    """Compute all evidence; what the requirements do not need is computed too, where it is cheap."""
+    sources = list(necks)
+    seed = int(asked.sampling["seed"])
+    base = all_plants(sources, int(asked.sampling["plants"]), seed)
+    plants = base.later(controller.extra)
+    w = judged(base.sample_time)
+    linear = []
+    for number, (name, law) in enumerate(controller.laws.items()):
+        progress(0.5 * number / len(controller.laws), "margins" + (f" at {name}" if name else ""))
+        linear.append(_linear(name, law, plants, sources, controller.extra, w, asked, detailed=number == 0))
+    progress(0.5, "steps against every plant")
+    stepped = join([plants, *(part.plants.take(np.arange(len(plants), len(part.plants))) for part in linear)])
+    test = StepTest(
+        step=math.radians(asked.step["size_deg"]), duration=float(asked.step["duration_s"]),
+        noise=math.radians(asked.step["noise_deg"]), load=float(asked.step["load_rad"]), seed=seed,
+    )  # fmt: skip
+    steps = run_steps(stepped, controller.block, test)
+    runs = run_necks(
+        controller.block, asked.neck, order=controller.order, observer=observer, seed=seed,
+        progress=lambda done, text: progress(0.6 + 0.4 * done, text),
+    ) if asked.neck["necks"] else []  # fmt: skip
+    evidence = Evidence(plants, w, linear, steps, stepped, runs)
+    _tell(evidence, controller, asked, observer is not None)
+    progress(1.0, "done")
+    return evidence
+
+
+def _linear(
+    name: str, law: LinearLaw, plants: Plants, necks: list[UncertainNeck], extra: int, w: Vector, asked: Requirements,
+    *, detailed: bool,
+) -> LinearEvidence:  # fmt: skip
+    seed, generations = int(asked.sampling["seed"]), int(asked.sampling["search_generations"])
+    found = search(necks, law, w, extra=extra, generations=generations, seed=seed) if generations else None
+    tried = plants if found is None else join([plants, found.plants.later(extra)])
+    table = margins(tried, law, w)
+    drawn = np.random.default_rng(seed).uniform(-1.0, 1.0, (_SCALED, 2, 3))
+    drawn[: _SCALED // 3] = np.sign(drawn[: _SCALED // 3])
+    wanted = any(item.metric == "robust.sensitivity" for item in asked.bounds)
+    parts = [structured(neck, law, extra=extra, drawn=drawn, performance=wanted or detailed) for neck in necks]
+    nominals = [plant.later(extra) for plant in nominal_plants(necks)]
+    distances = []
+    for source, nominal in enumerate(nominals):
+        first, second = gaps(nominal, tried.take(np.flatnonzero(tried.source == source)), law, w)
+        distances.append((first, second))
+    ratio = np.zeros((2, len(tried)))
+    for source, pair in enumerate(distances):
+        for i in (0, 1):
+            ratio[i, tried.source == source] = pair[i].ratio
+    table |= {f"{axis}.nu_gap_ratio": ratio[i] for i, axis in enumerate(AXES)}
+    spread = [row for neck in necks for row in intervals(neck, law, w, extra=extra)] if detailed else []
+    return LinearEvidence(name, law, tried, table, found, parts, distances, spread, _delays(plants, law, w))
+
+
+def _delays(plants: Plants, law: LinearLaw, w: Vector) -> np.ndarray:
+    rows = []
+    few = plants.take(np.arange(min(_DELAY_PLANTS, len(plants))))
+    for samples in range(_DELAYS):
+        table = margins(few.later(samples), law, w)
+        disks = np.minimum(table["pitch.disk_margin"], table["roll.disk_margin"])
+        peaks = np.maximum(table["pitch.sensitivity"], table["roll.sensitivity"])
+        rows.append([samples, table["stability.radius"].max(), disks.min(), peaks.max()])
+    return np.array(rows)
+
+
+def _tell(evidence: Evidence, controller: Judged, asked: Requirements, observer: bool) -> None:
+    """Fill metrics and what was not computed."""
+    metrics, absent = evidence.metrics, evidence.not_computed
+    for part in evidence.linear:
+        _tell_linear(evidence, part)
+    if not evidence.linear:
+        for name in ("stability", "axes", "mimo", "robust"):
+            absent[name] = controller.why
+    elif observer:
+        absent["observer in the linear checks"] = (
+            "margins are of controller and plant alone; the observer is in the loops over the virtual neck"
+        )
+    if not asked.sampling["search_generations"]:
+        absent["stability.searched_radius"] = "the search is switched off (search_generations = 0)"
+    if evidence.linear and not evidence.linear[0].intervals:
+        absent["confidence intervals of the margins"] = "no FAMILY was given that knows its samples' uncertainty"
+    if any(part.name for part in evidence.linear):
+        absent["stability between frozen points"] = (
+            "linear checks hold at frozen points; motion between them is simulated"
+        )
+    for name, values in evidence.steps.metrics.items():
+        metrics[f"step.{name}"] = Values(values, _step_describer(evidence, name))
+    if not evidence.necks:
+        absent["neck"] = "no loops over the virtual neck were asked for (necks = 0)"
+        return
+    for name in evidence.necks[0].metrics:
+        values = np.array([run.metrics[name] for run in evidence.necks])
+        metrics[f"neck.{name}"] = Values(values, _neck_describer(evidence, controller, asked))
+
+
+def _tell_linear(evidence: Evidence, part: LinearEvidence) -> None:
+    count = len(evidence.plants)
+    describe = _plant_describer(part)
+    table = dict(part.margins)
+    radius = table.pop("stability.radius")
+    _add(evidence, "stability.radius", Values(radius[:count], describe))
+    if part.found is not None:
+        _add(evidence, "stability.searched_radius", Values(radius[count:], lambda row: describe(count + row)))
+        # The largest radius met on the way counts, though the plant named is the worst at the end.
+        met = np.array([part.found.radius])
+        worst = count + int(np.argmax(radius[count:]))
+        _add(evidence, "stability.searched_radius", Values(met, lambda _: describe(worst)))
+    for name, values in table.items():
+        _add(evidence, name, Values(values, _with_axis(describe, name)))
+    smaller = {name.partition(".")[2] for name in table if name.startswith("pitch.")}
+    for name in smaller:
+        for axis in AXES:
+            _add(evidence, f"axes.{name}", evidence_of(part, f"{axis}.{name}", describe))
+    for rows in part.structured:
+        for row in rows:
+            about = _structured_describer(row, part.name)
+            _add(evidence, "robust.mu", Values(np.array([row.mu]), about))
+            if not math.isnan(row.worst_sensitivity):
+                _add(evidence, "robust.sensitivity", Values(np.array([row.worst_sensitivity]), about))
+
+
+def evidence_of(part: LinearEvidence, name: str, describe: Describe) -> Values:
+    """Return the values of one margin with a describer that knows its axis."""
+    return Values(part.margins[name], _with_axis(describe, name))
+
+
+def _add(evidence: Evidence, name: str, more: Values) -> None:
+    """Put more values behind those that a metric has already."""
+    before = evidence.metrics.get(name)
+    if before is None:
+        evidence.metrics[name] = more
+        return
+    count = before.values.size
+
+    def describe(row: int) -> dict[str, Any]:
+        return before.describe(row) if row < count else more.describe(row - count)
+
+    evidence.metrics[name] = Values(np.concatenate([before.values, more.values]), describe)
+
+
+def _with_axis(describe: Describe, name: str) -> Describe:
+    axis = name.partition(".")[0]
+    return lambda row: {**describe(row), "axis": axis if axis in AXES else "both"}
+
+
+def plant_facts(plants: Plants, row: int) -> dict[str, Any]:
+    """Return one plant as JSON values."""
+    axes = {
+        axis: dict(zip(("static_gain_rad_per_rad", "pole_per_s", "dead_time_s"), numbers.tolist(), strict=True))
+        for axis, numbers in zip(AXES, plants.numbers[row], strict=True)
+    }
+    return {
+        "kind": "linear", "name": plants.names[row], **axes, "cross": plants.cross[row].tolist(),
+        "numerator": plants.numerator[row].tolist(), "denominator": plants.denominator[row].tolist(),
+        "delay_samples": plants.delay[row].tolist(), "sample_time_s": plants.sample_time,
+    }  # fmt: skip
+
+
+def _plant_describer(part: LinearEvidence) -> Describe:
+    point = {"frozen_point": part.name} if part.name else {}
+    return lambda row: {**plant_facts(part.plants, row), "axis": "both", **point}
+
+
+def _structured_describer(row: StructuredResult, point: str) -> Describe:
+    at = float(row.frequency[int(np.argmax(row.upper))])
+    facts = {"kind": "box", "name": "the whole box", "axis": row.axes, "frequency_rad_s": at}
+    return lambda _: {**facts, "frozen_point": point} if point else facts
+
+
+def _step_describer(evidence: Evidence, name: str) -> Describe:
+    worse = evidence.steps.worse[name]
+    return lambda row: {**plant_facts(evidence.stepped, row), "axis": AXES[int(worse[row])]}
+
+
+def _neck_describer(evidence: Evidence, controller: Judged, asked: Requirements) -> Describe:
+    def describe(row: int) -> dict[str, Any]:
+        run = evidence.necks[row]
+        size = float(asked.neck["size_deg"])
+        return {
+            "kind": "neck", "name": run.name, "parameters": neck_changes(run.parameters), "payload_kg": run.payload,
+            "pitch_deg": size * math.cos(run.orientation), "roll_deg": size * math.sin(run.orientation),
+            "seed": run.seed, "at_s": STEP_AT, "duration_s": STEP_AT + float(asked.neck["duration_s"]),
+            "sample_time_s": controller.block.sample_time, "order": controller.order,
+        }  # fmt: skip
+
+    return describe
+
+
+def worst_row(values: Mapping[str, Values], metric: str, bound: str) -> int:
+    """Return the row of the worst value of a metric: NaN first, else the least for "min", the largest for others."""
+    found = values[metric].values
+    missing = np.flatnonzero(np.isnan(found))
+    if missing.size:
+        return int(missing[0])
+    return int(np.argmin(found) if bound == "min" else np.argmax(found))

@@ -1,0 +1,217 @@
+"""Stability and margins of many loops at once, on their exact discrete responses."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import control
+import numpy as np
+
+from softneck.core import Matrix, SettingsError, Vector
+from softneck.design.robust._mu import two_scalars
+
+from ._plants import Plants
+
+# Margins that are better large, and better small; of each axis, and of both together.
+LARGE = ("disk_margin", "gain_margin", "phase_margin_deg", "delay_margin_ms")
+SMALL = ("sensitivity", "complementary", "control_sensitivity")
+MIMO = "mimo_disk_margin"
+# Plants whose responses are held in memory at once.
+_CHUNK = 64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearLaw:
+    """The feedback part of a controller, `u = Ky(z) y`, and its way from the reference.
+
+    Attributes:
+        A: (n, n).
+        Br, By: (n, 2).
+        C: (2, n).
+        Dr, Dy: (2, 2).
+        sample_time: [s].
+    """
+
+    A: Matrix
+    Br: Matrix
+    By: Matrix
+    C: Matrix
+    Dr: Matrix
+    Dy: Matrix
+    sample_time: float
+
+    @classmethod
+    def of(cls, system: Any) -> LinearLaw:
+        """Return it of a system from (pitch_reference, roll_reference, pitch, roll) to (theta_i, phi_i).
+
+        Raises:
+            SettingsError: other channels or not discrete.
+        """
+        if not isinstance(system, control.StateSpace | control.TransferFunction):
+            raise SettingsError(
+                f"the controller's linear form is a {type(system).__name__}, not a python-control system."
+            )
+        wanted = (["pitch_reference", "roll_reference", "pitch", "roll"], ["theta_i", "phi_i"])
+        given = (list(system.input_labels), list(system.output_labels))
+        if given != wanted:
+            raise SettingsError(
+                f"the controller goes from {', '.join(given[0])} to {', '.join(given[1])}; softneck verifies one from "
+                f"{', '.join(wanted[0])} to {', '.join(wanted[1])}."
+            )
+        form: Any = control.ss(system)
+        if form.dt in (0, None) or isinstance(form.dt, bool):
+            raise SettingsError("the controller's linear form must be discrete, with its sample time as dt.")
+        A, B, C, D = (np.asarray(item, dtype=np.float64) for item in (form.A, form.B, form.C, form.D))
+        return cls(A, B[:, :2], B[:, 2:], C, D[:, :2], D[:, 2:], float(form.dt))
+
+    def feedback(self, frequency: Vector) -> np.ndarray:
+        """Return Ky (m, 2, 2) at `frequency` [rad/s]."""
+        return self._response(frequency, self.By, self.Dy)
+
+    def forward(self, frequency: Vector) -> np.ndarray:
+        """Return the way from the reference (m, 2, 2)."""
+        return self._response(frequency, self.Br, self.Dr)
+
+    @property
+    def coupled(self) -> bool:
+        """Whether one axis' angle moves the other's input."""
+        Ky = np.abs(self.feedback(np.geomspace(0.1, math.pi / self.sample_time, 20)))
+        # 1e-9: rounding of an allocation that is diagonal.
+        return bool((Ky[:, 0, 1] + Ky[:, 1, 0]).max() > 1e-9 * Ky.max())
+
+    def _response(self, frequency: Vector, B: Matrix, D: Matrix) -> np.ndarray:
+        z = np.exp(1j * frequency * self.sample_time)
+        n = self.A.shape[0]
+        if n == 0:
+            return np.broadcast_to(D.astype(complex), (z.size, 2, 2))
+        inner = np.linalg.solve(z[:, None, None] * np.eye(n) - self.A, np.broadcast_to(B, (z.size, *B.shape)))
+        return self.C @ inner + D
+
+
+def judged(sample_time: float, points: int = 360) -> Vector:
+    """Return the frequencies [rad/s] on which loops are judged, from 0.02 up to the Nyquist frequency."""
+    return np.geomspace(0.02, math.pi / sample_time, points)
+
+
+def radii(plants: Plants, law: LinearLaw) -> Vector:
+    """Return the spectral radius (n,) of every closed loop, its delay exact."""
+    A, B, C = _plant_matrices(plants)
+    n, order, nc = len(plants), A.shape[1], law.A.shape[0]
+    closed = np.zeros((n, order + nc, order + nc))
+    closed[:, :order, :order] = A + B @ law.Dy @ C
+    closed[:, :order, order:] = B @ law.C
+    closed[:, order:, :order] = law.By @ C
+    closed[:, order:, order:] = law.A
+    return np.abs(np.linalg.eigvals(closed)).max(axis=1)
+
+
+def _plant_matrices(plants: Plants) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return A (n, N, N), B (n, N, 2), C (n, 2, N): observable form of each axis behind a line of its delay."""
+    n, q = len(plants), plants.numerator.shape[2] - 1
+    D = int(plants.delay.max(initial=0))
+    size = q + D
+    A, B, C = np.zeros((n, 2 * size, 2 * size)), np.zeros((n, 2 * size, 2)), np.zeros((n, 2, 2 * size))
+    rows = np.arange(n)
+    for i in (0, 1):
+        at = i * size
+        own = slice(at, at + q)
+        A[:, own, at] = -plants.denominator[:, i, 1:]
+        A[:, at + np.arange(q - 1), at + 1 + np.arange(q - 1)] = 1.0
+        source = np.zeros((n, 2))
+        source[:, i], source[:, 1 - i] = 1.0, plants.cross[:, i]
+        b = plants.numerator[:, i, 1:]
+        delay = plants.delay[:, i]
+        # The input comes from the end of the delay line, or straight from the controller where there is none.
+        late = rows[delay > 0]
+        A[late[:, None], at + np.arange(q)[None, :], (at + q + delay[late] - 1)[:, None]] += b[late]
+        now = rows[delay == 0]
+        B[now, own, :] = b[now][:, :, None] * source[now][:, None, :]
+        if D:
+            B[:, at + q, :] = source
+            A[:, at + q + 1 + np.arange(D - 1), at + q + np.arange(D - 1)] = 1.0
+        C[:, i, at] = 1.0
+    return A, B, C
+
+
+def loops(plants: Plants, law: LinearLaw, w: Vector) -> tuple[np.ndarray, np.ndarray]:
+    """Return the plants P and the open loops at their outputs -P Ky, both (n, m, 2, 2)."""
+    G = plants.response(w)
+    P = np.empty((len(plants), w.size, 2, 2), dtype=complex)
+    P[:, :, 0, 0], P[:, :, 1, 1] = G[:, 0], G[:, 1]
+    P[:, :, 0, 1], P[:, :, 1, 0] = plants.cross[:, :1] * G[:, 0], plants.cross[:, 1:] * G[:, 1]
+    return P, -P @ law.feedback(w)
+
+
+def inverse(M: np.ndarray) -> np.ndarray:
+    """Return the inverses of 2 x 2 matrices (..., 2, 2)."""
+    a, b, c, d = M[..., 0, 0], M[..., 0, 1], M[..., 1, 0], M[..., 1, 1]
+    found = np.empty_like(M)
+    found[..., 0, 0], found[..., 0, 1], found[..., 1, 0], found[..., 1, 1] = d, -b, -c, a
+    return found / (a * d - b * c)[..., None, None]
+
+
+def margins(plants: Plants, law: LinearLaw, w: Vector, radius: Vector | None = None) -> dict[str, Vector]:
+    """Return name -> (n,) margins of every plant: `pitch.disk_margin`, ..., `mimo.disk_margin`, `stability.radius`.
+
+    A loop that is not stable has margin 0 (gain margin 1) and infinite peaks.
+    """
+    size = radii(plants, law) if radius is None else radius
+    parts = [
+        _margins(plants.take(np.arange(k, min(k + _CHUNK, len(plants)))), law, w) for k in range(0, len(plants), _CHUNK)
+    ]
+    found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    unstable = size >= 1.0
+    for name in found:
+        last = name.partition(".")[2]
+        found[name][unstable] = math.inf if last in SMALL else 1.0 if last == "gain_margin" else 0.0
+    return {"stability.radius": size, **found}
+
+
+def _margins(plants: Plants, law: LinearLaw, w: Vector) -> dict[str, Vector]:
+    P, L = loops(plants, law, w)
+    eye = np.eye(2)
+    S = inverse(eye + L)
+    CS = -law.feedback(w) @ S
+    found: dict[str, Vector] = {}
+    for i, axis in enumerate(("pitch", "roll")):
+        own = S[..., i, i]
+        found[f"{axis}.sensitivity"] = np.abs(own).max(axis=1)
+        found[f"{axis}.complementary"] = np.abs(1.0 - own).max(axis=1)
+        found[f"{axis}.control_sensitivity"] = np.abs(CS[..., i, i]).max(axis=1)
+        # S - T = 2 S - 1; radius of the balanced disk is 2 / max |S - T|.
+        found[f"{axis}.disk_margin"] = 2.0 / np.abs(2.0 * own - 1.0).max(axis=1)
+        for name, values in classical(1.0 / own - 1.0, w).items():
+            found[f"{axis}.{name}"] = values
+    at_input = inverse(eye - law.feedback(w) @ P)
+    sizes = [two_scalars(M - 0.5 * eye).max(axis=1) for M in (S, at_input)]
+    found["mimo.disk_margin"] = 1.0 / np.maximum(*sizes)
+    return found
+
+
+def classical(L: np.ndarray, w: Vector) -> dict[str, Vector]:
+    """Return gain, phase [deg] and delay margins [ms] of scalar loops (n, m), by straight lines between frequencies.
+
+    The gain margin is the factor, up or down, whichever is nearer; so is the phase.
+    """
+    n = L.shape[0]
+    x = np.log(w)
+    phase = np.unwrap(np.angle(L), axis=1)
+    size = np.log(np.maximum(np.abs(L), 1e-300))
+    gain = np.full(n, math.inf)
+    # Where the phase passes an odd multiple of pi.
+    turns = np.floor((phase + math.pi) / (2.0 * math.pi))
+    for i, k in np.argwhere(turns[:, 1:] != turns[:, :-1]):
+        border = 2.0 * math.pi * max(turns[i, k], turns[i, k + 1]) - math.pi
+        part = (border - phase[i, k]) / (phase[i, k + 1] - phase[i, k])
+        gain[i] = min(gain[i], abs(size[i, k] + part * (size[i, k + 1] - size[i, k])))
+    least, delay = np.full(n, math.inf), np.full(n, math.inf)
+    for i, k in np.argwhere((size[:, 1:] > 0.0) != (size[:, :-1] > 0.0)):
+        part = size[i, k] / (size[i, k] - size[i, k + 1])
+        angle = phase[i, k] + part * (phase[i, k + 1] - phase[i, k])
+        left = (angle + math.pi) % (2.0 * math.pi)
+        at = math.exp(x[k] + part * (x[k + 1] - x[k]))
+        least[i] = min(least[i], left, 2.0 * math.pi - left)
+        delay[i] = min(delay[i], left / at)
+    return {"gain_margin": np.exp(gain), "phase_margin_deg": np.degrees(least), "delay_margin_ms": 1e3 * delay}

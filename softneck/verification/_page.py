@@ -1,0 +1,189 @@
+"""The page of a verification: the verdict at one glance, and all behind it below."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from softneck.plots import Section, Table, page
+
+from ._charts import delay_sensitivity, frequency_charts, gap_chart, margin_map, mu_charts, neck_chart, step_chart
+from ._evidence import LinearEvidence
+from ._plants import AXES
+from ._verify import Verdict, Verification
+
+_BOUNDS = {"min": ">=", "max": "<=", "below": "<"}
+
+
+def verdict_table(found: Verification) -> Table:
+    """Return the requirements with value, limit, verdict and worst plant."""
+    rows = [
+        [
+            verdict.requirement.metric, number(verdict.value),
+            f"{_BOUNDS[verdict.requirement.bound]} {verdict.requirement.limit:g}", _word(verdict), _plant(verdict),
+        ]
+        for verdict in found.verdicts
+    ]  # fmt: skip
+    return Table("Requirements", ["metric", "value", "limit", "verdict", "worst plant"], rows)
+
+
+def number(value: Any) -> str:
+    """Return a value for a table: `-` where there is none."""
+    if value is None:
+        return "-"
+    if not isinstance(value, int | float | np.floating):
+        return str(value)
+    return f"{value:.4g}"
+
+
+def _word(verdict: Verdict) -> str:
+    return {True: "holds", False: "fails", None: "not computed"}[verdict.holds]
+
+
+def _plant(verdict: Verdict) -> str:
+    if verdict.note:
+        return verdict.note.removeprefix("not computed: ")
+    worst = verdict.worst
+    where = f", {worst['axis']}" if worst.get("axis") in AXES else ""
+    point = f" (frozen at {worst['frozen_point']})" if worst.get("frozen_point") else ""
+    return f"{worst.get('name', '')}{where}{point}"
+
+
+def verification_page(found: Verification, controller: str, certificate: str = "") -> str:
+    """Return the HTML text of the page.
+
+    Args:
+        found: the verification.
+        controller, certificate: names of their files, for the title and the text.
+    """
+    evidence = found.evidence
+    sections = [_first(found, certificate), _methods(found)]
+    for part in evidence.linear:
+        sections += _linear_sections(found, part)
+    stepped = step_chart(evidence.steps, evidence.stepped.names)
+    text = [
+        "The controller's own runtime with all its limits, against every plant with its delay and noisy angles: a step "
+        "of pitch and, in a run of its own, of roll; half way a load is added to the plant's input."
+    ]
+    sections.append(Section("Steps", text=text, tables=[_spread(found, "step")], charts=[stepped]))
+    if evidence.necks:
+        charts = [neck_chart(evidence)] if any(run.result is not None for run in evidence.necks) else []
+        sections.append(Section("Virtual neck", tables=[_spread(found, "neck"), _runs(found)], charts=charts))
+    sections.append(_plants(found))
+    words = "holds" if found.holds else "does not hold"
+    return page(f"{controller} {words}", sections, footer="Written by softneck verify.")
+
+
+def _first(found: Verification, certificate: str) -> Section:
+    text = [f"{'Holds' if found.holds else 'Fails'}: {found.summary()}."]
+    if certificate:
+        text.append(f"Certificate: {certificate}. Each worst plant stands beside it as a loop for softneck simulate.")
+    text += [f"Methods disagree: {item.question} {item.note}." for item in found.agreements if not item.agree]
+    text += [f"Not computed: {name}: {why}." for name, why in found.evidence.not_computed.items()]
+    table = verdict_table(found)
+    return Section("Verdict", text=text, tables=[Table("Requirements", table.head, table.rows)])
+
+
+def _methods(found: Verification) -> Section:
+    rows = []
+    for item in found.agreements:
+        for k, (method, value) in enumerate(item.answers.items()):
+            first = k == 0
+            rows.append([
+                item.question if first else "", method, number(value),
+                ("agree" if item.agree else "disagree") if first else "", item.note if first else "",
+            ])  # fmt: skip
+    head = ["question", "method", "answer", "", "note"]
+    return Section("Methods side by side", tables=[Table("No average is taken", head, rows, text=2)])
+
+
+def _linear_sections(found: Verification, part: LinearEvidence) -> list[Section]:
+    title = f" at {part.name}" if part.name else ""
+    evidence, Ts = found.evidence, part.plants.sample_time
+    mu = [
+        [
+            neck.name, row.axes, f"{row.mu:.3f}", f"{row.lower.max():.3f}",
+            f"{row.sampled:.3f}" if row.sampled else f"none up to {row.sampled_scale:.2g} of the box",
+            number(None if math.isnan(row.worst_sensitivity) else row.worst_sensitivity),
+        ]
+        for neck, rows in zip(found.necks, part.structured, strict=True) for row in rows
+    ]  # fmt: skip
+    head = ["plants", "axis", "mu upper", "mu lower", "sampled in a scaled box", "worst Ms, bound"]
+    sections = [
+        Section(
+            f"Frequency responses{title}",
+            tables=[_margin_table(part)], charts=[*frequency_charts(part, evidence.frequency), margin_map(part)],
+        ),
+        Section(
+            f"Structured singular value{title}", tables=[Table("Bounds", head, mu, text=2)], charts=mu_charts(part)
+        ),
+        Section(
+            f"Delay and gaps{title}", tables=[_delay_table(part, Ts)],
+            charts=[delay_sensitivity(part, Ts), gap_chart(part)],
+        ),
+    ]  # fmt: skip
+    if part.intervals:
+        rows = [
+            [row.plant, row.metric, number(row.value), f"+-{row.half_width:.3g}", row.most] for row in part.intervals
+        ]
+        table = Table("95 % intervals", ["plant", "margin", "value", "half width", "most by"], rows, text=2)
+        text = ["What the confidence intervals of the identified numbers leave open about the margins, to first order."]
+        sections.append(Section(f"Confidence{title}", text=text, tables=[table]))
+    return sections
+
+
+def _margin_table(part: LinearEvidence) -> Table:
+    rows = []
+    for name, values in part.margins.items():
+        finite = values[np.isfinite(values)]
+        middle = float(np.median(finite)) if finite.size else math.inf
+        rows.append([name, *(number(float(v)) for v in (values[0], middle, values.min(), values.max()))])
+    return Table("Margins over all plants tried", ["margin", "nominal", "median", "least", "largest"], rows)
+
+
+def _delay_table(part: LinearEvidence, sample_time: float) -> Table:
+    rows = [
+        [f"{int(row[0])}", f"{1e3 * sample_time * row[0]:.0f}", *(number(float(value)) for value in row[1:])]
+        for row in part.delays
+    ]
+    head = ["samples added", "[ms]", "spectral radius", "least disk margin", "largest Ms"]
+    return Table("The same controller with more delay", head, rows)
+
+
+def _spread(found: Verification, group: str) -> Table:
+    rows = []
+    for name, values in found.evidence.metrics.items():
+        if name.startswith(f"{group}."):
+            v = values.values
+            worst = values.describe(int(np.argmax(v)))["name"]
+            rows.append([name.partition(".")[2], *(number(float(x)) for x in (v[0], np.median(v), v.max())), worst])
+    return Table("Over all of them", ["metric", "nominal", "median", "worst", "worst plant"], rows)
+
+
+def _runs(found: Verification) -> Table:
+    runs = found.evidence.necks
+    names = list(runs[0].metrics)
+    rows = [[run.name, *(number(run.metrics[name]) for name in names)] for run in runs]
+    return Table("Each loop", ["neck, payload, direction", *names], rows)
+
+
+def _plants(found: Verification) -> Section:
+    rows = []
+    for neck in found.necks:
+        for axis, box in zip(AXES, neck.axes, strict=True):
+            for title, values in (("least", box.low), ("nominal", box.nominal), ("largest", box.high)):
+                numbers = [f"{math.degrees(values[0]):.2f}", f"{values[1]:.2f}", f"{1e3 * values[2]:.0f}"]
+                rows.append([neck.name, axis, title, *numbers])
+    head = ["source", "axis", "", "static gain [deg/rad]", "pole [1/s]", "dead time [ms]"]
+    cross = [
+        f"{neck.name}: phi_i into pitch {neck.cross[0]:+.3f} of theta_i's gain, theta_i into roll {neck.cross[1]:+.3f}."
+        for neck in found.necks
+    ]
+    files = [[role, path, digest] for role, (path, digest) in found.files.items()]
+    tables = [Table("Boxes", head, rows, text=3)]
+    if files:
+        tables.append(Table("Files", ["role", "path", "SHA-256"], files, text=3))
+    text = [f"{len(found.evidence.plants)} plants, {found.order_words()}.", *cross]
+    return Section("Plants and files", text=text, tables=tables)

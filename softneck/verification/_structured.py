@@ -1,0 +1,228 @@
+"""The structured singular value of a loop over its box, on the exact discrete response.
+
+Behind a zero-order hold an axis without its dead time is `y0+ = y0 + alpha (K u - y0)`, alpha = 1 - exp(-p Ts): gain
+and pole enter once each, as real scalars, exactly. The dead time is a complex scalar whose weight is the largest
+relative change that a dead time of the box makes to any plant of the box. So the loop is `z = M w`, `w = Delta z` with
+two real and one complex scalar for an axis, and `mu < 1` at every frequency proves stability of the whole box.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from softneck.core import Vector
+from softneck.design.robust._mu import Structure, mu_lower, mu_upper
+from softneck.design.robust._robustness import worst_gains
+
+from ._linear import LinearLaw, radii
+from ._plants import UncertainNeck, make_plants
+
+# Dead times and poles of a box that its weight is taken over.
+_DELAYS, _POLES = 15, 5
+# What lies between those is covered by this part more; and a complex change of this size is always allowed for, since
+# purely real uncertainty may have peaks that no grid meets.
+_ROOM, _LEAST = 1.01, 0.01
+_FREQUENCIES, _PERFORMANCE_FREQUENCIES = 90, 24
+# The box is grown up to this many times to find what makes the loop unstable.
+_LARGEST_SCALE = 4.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StructuredResult:
+    """Bounds over frequency, and what sampling says beside them.
+
+    Attributes:
+        axes: "pitch", "roll", or "both" where they are coupled.
+        frequency: (m,) [rad/s].
+        upper, lower: (m,) bounds of mu for stability; the lower one is found around the peak only, 0 elsewhere.
+        sampled: 1 / the least scale of the box at which a sampled plant was unstable; 0 where none was.
+        sampled_scale: up to which the box was scaled.
+        worst_sensitivity: that no plant of the box exceeds (skewed mu); inf where stability itself is not certain.
+    """
+
+    axes: str
+    frequency: Vector
+    upper: Vector
+    lower: Vector
+    sampled: float
+    sampled_scale: float
+    worst_sensitivity: float
+
+    @property
+    def mu(self) -> float:
+        """The largest upper bound."""
+        return float(self.upper.max())
+
+
+def structured(
+    neck: UncertainNeck, law: LinearLaw, *, extra: int, drawn: np.ndarray, performance: bool
+) -> list[StructuredResult]:
+    """Return the bounds of each axis, or of both together where plant or controller couple them.
+
+    Args:
+        neck: with its box.
+        law: the controller's linear form.
+        extra: samples of delay that the loop's order adds.
+        drawn: (n, 2, 3) from -1 to 1 across the box, scaled up to find instability.
+        performance: whether the worst sensitivity is bounded too.
+    """
+    Ts = neck.sample_time
+    w = np.geomspace(0.05, math.pi / Ts, _FREQUENCIES)
+    whole = law.coupled or bool(np.any(neck.cross != 0.0))
+    results = []
+    for axes in [(0, 1)] if whole else [(0,), (1,)]:
+        M, blocks = interconnection(neck, law, w, axes, extra)
+        sampled, scale = _sampled(neck, law, axes, extra, drawn)
+        name = "both" if whole else ("pitch", "roll")[axes[0]]
+        if not _middle_is_stable(neck, law, axes, extra):
+            # The bound grows the box from a stable middle; without one there is nothing to grow.
+            never = np.full(w.size, math.inf)
+            results.append(StructuredResult(name, w, never, never, math.inf, scale, math.inf))
+            continue
+        upper, lower = _bounds(M, blocks)
+        sensitivity = math.nan
+        if performance:
+            at = np.geomspace(0.3, math.pi / Ts, _PERFORMANCE_FREQUENCIES)
+            sensitivity = max(_worst_sensitivity(neck, law, at, axes, extra))
+        results.append(StructuredResult(name, w, upper, lower, sampled, scale, sensitivity))
+    return results
+
+
+def _middle_is_stable(neck: UncertainNeck, law: LinearLaw, axes: Sequence[int], extra: int) -> bool:
+    """Return whether the loop around which the box is modelled is stable; an axis that is not judged is nominal."""
+    numbers = np.stack([box.nominal for box in neck.axes])
+    for i in axes:
+        box, Ts = neck.axes[i], neck.sample_time
+        alpha = 1.0 - 0.5 * np.exp(-np.array([box.low[1], box.high[1]]) * Ts).sum()
+        numbers[i] = [box.middle[0], -math.log1p(-alpha) / Ts, box.middle[2]]
+    return bool(radii(make_plants(neck, numbers[None], [""]).later(extra), law)[0] < 1.0)
+
+
+def _bounds(M: np.ndarray, blocks: list[tuple[int, int]]) -> tuple[Vector, Vector]:
+    """Return both bounds (m,); the lower one, which is slow, around the peak only and 0 elsewhere."""
+    shape = Structure.of(blocks)
+    upper = mu_upper(M, shape)[0]
+    peak = int(np.argmax(upper))
+    near = np.arange(max(0, peak - 3), min(upper.size, peak + 4))
+    lower = np.zeros(upper.size)
+    lower[near] = np.minimum(mu_lower(M[near], shape), upper[near])
+    return upper, lower
+
+
+def interconnection(
+    neck: UncertainNeck, law: LinearLaw, w: Vector, axes: Sequence[int], extra: int, *, judged: int | None = None
+) -> tuple[np.ndarray, list[tuple[int, int]]]:
+    """Return M (m, rows, columns) over `w` [rad/s] and its blocks; `judged` adds the sensitivity of that axis last."""
+    n = len(axes)
+    parts = [_axis(neck.axes[i], w, neck.sample_time, extra) for i in axes]
+    X = np.eye(n) if n == 1 else np.array([[1.0, neck.cross[0]], [neck.cross[1], 1.0]])
+    Ky = law.feedback(w)[:, list(axes)][:, :, list(axes)]
+    V = X @ Ky
+    m = w.size
+    P = np.zeros((m, n, n), dtype=complex)
+    H, F, E = np.zeros((m, n, 3 * n), complex), np.zeros((m, 3 * n, n), complex), np.zeros((m, 3 * n, 3 * n), complex)
+    for k, part in enumerate(parts):
+        own = slice(3 * k, 3 * k + 3)
+        P[:, k, k], H[:, k, own], F[:, own, k], E[:, own, own] = part
+    # y = P u' + H w, u' = V (y + d), z = F u' + E w.
+    S = np.linalg.inv(np.eye(n) - P @ V)
+    M = F @ V @ S @ H + E
+    blocks = [(-1, 0), (-1, 0), (1, 0)] * n
+    keep = [r for k, i in enumerate(axes) for r in _uncertain(neck, i, 3 * k)]
+    M = M[:, keep][:, :, keep]
+    blocks = [blocks[r] for r in keep]
+    if judged is None:
+        return M, blocks
+    # e = y + d: from d to e stands S; from w, S H; from d to z, F V S.
+    d = list(axes).index(judged)
+    top = np.concatenate([M, (F @ V @ S)[:, keep][:, :, [d]]], axis=2)
+    bottom = np.concatenate([(S @ H)[:, [d]][:, :, keep], S[:, [d]][:, :, [d]]], axis=2)
+    return np.concatenate([top, bottom], axis=1), blocks
+
+
+def _uncertain(neck: UncertainNeck, axis: int, start: int) -> list[int]:
+    """Return which of gain and pole of an axis are uncertain, and its dead time, which always is a little."""
+    widths = neck.axes[axis].widths
+    return [start + k for k in range(3) if widths[k] > 0.0 or k == 2]
+
+
+def _axis(box: Any, w: Vector, Ts: float, extra: int) -> tuple[np.ndarray, ...]:
+    """Return P (m,), H (m, 3), F (m, 3), E (m, 3, 3) of one axis around the middle of its box."""
+    z = np.exp(1j * w * Ts)
+    K, _, L = box.middle
+    rK = box.widths[0]
+    ends = 1.0 - np.exp(-np.array([box.low[1], box.high[1]]) * Ts)
+    alpha, r = 0.5 * (ends[0] + ends[1]), 0.5 * (ends[1] - ends[0])
+    middle = -math.log1p(-alpha) / Ts
+    rest = np.polyval(box.rest[0], z) / np.polyval(box.rest[1], z) * z**-extra
+    D = _delay_factor(middle, L, z, Ts) * rest
+    W = _delay_weight(box, middle, z, Ts)
+    lag = 1.0 / (z - 1.0 + alpha)
+    # x = K u + rK w1; y0 = lag (alpha x + r w2); z1 = u, z2 = x - y0, z3 = D y0; y = D y0 + W w3.
+    m = w.size
+    P = D * lag * alpha * K
+    H = np.stack([D * lag * alpha * rK, D * lag * r, W], axis=1)
+    F = np.stack([np.ones(m), K * (1.0 - lag * alpha), P], axis=1)
+    E = np.zeros((m, 3, 3), dtype=complex)
+    E[:, 1, 0], E[:, 1, 1] = rK * (1.0 - lag * alpha), -lag * r
+    E[:, 2, 0], E[:, 2, 1] = D * lag * alpha * rK, D * lag * r
+    return P, H, F, E
+
+
+def _delay_factor(p: float, L: float, z: np.ndarray, Ts: float) -> np.ndarray:
+    """Return what a dead time L does to the sampled lag of pole p: exact, also between samples."""
+    d = math.floor(L / Ts + 1e-9)
+    part = min(max(L / Ts - d, 0.0), 1.0)
+    a, late = math.exp(-p * Ts), math.exp(-p * Ts * (1.0 - part))
+    return ((1.0 - late) + (late - a) / z) / (1.0 - a) * z**-d
+
+
+def _delay_weight(box: Any, middle: float, z: np.ndarray, Ts: float) -> Vector:
+    base = _delay_factor(middle, box.middle[2], z, Ts)
+    delays = np.linspace(box.low[2], box.high[2], _DELAYS)
+    poles = np.unique(np.linspace(box.low[1], box.high[1], _POLES))
+    changes = [np.abs(_delay_factor(p, L, z, Ts) / base - 1.0) for p, L in itertools.product(poles, delays)]
+    return np.maximum(_ROOM * np.max(changes, axis=0), _LEAST)
+
+
+def _worst_sensitivity(neck: UncertainNeck, law: LinearLaw, w: Vector, axes: Sequence[int], extra: int) -> list[float]:
+    peaks = []
+    for axis in axes:
+        M, blocks = interconnection(neck, law, w, axes, extra, judged=axis)
+        peaks.append(float(worst_gains(M, blocks).max()))
+    return peaks
+
+
+def _sampled(
+    neck: UncertainNeck, law: LinearLaw, axes: Sequence[int], extra: int, drawn: np.ndarray
+) -> tuple[float, float]:
+    """Return 1 / the least scale of the box at which a drawn plant is unstable (0 for none), and the largest tried."""
+    middle, widths = (np.stack([getattr(box, name) for box in neck.axes]) for name in ("middle", "widths"))
+    held = np.zeros((2, 3))
+    held[list(axes)] = 1.0
+    # Gains and poles keep their sign, dead times stay above zero: beyond that the box means nothing.
+    room = np.where(held * widths > 0.0, 0.98 * np.abs(middle) / np.maximum(widths, 1e-12), math.inf)
+    limit = min(_LARGEST_SCALE, float(room[:, :2].min()))
+
+    def unstable(scale: float) -> bool:
+        numbers = middle + scale * drawn * held * widths
+        numbers[..., 2] = np.maximum(numbers[..., 2], 0.0)
+        plants = make_plants(neck, numbers, [""] * len(numbers)).later(extra)
+        return bool((radii(plants, law) >= 1.0).any())
+
+    # Where the largest box hides an unstable plant, the least scale is sought by halves from the first that fails.
+    scales = np.linspace(limit / 8.0, limit, 8)
+    failing = next((k for k, scale in enumerate(scales) if unstable(float(scale))), None)
+    if failing is None:
+        return 0.0, limit
+    low, high = (0.0 if failing == 0 else float(scales[failing - 1])), float(scales[failing])
+    for _ in range(5):
+        half = 0.5 * (low + high)
+        low, high = (low, half) if unstable(half) else (half, high)
+    return 1.0 / high, limit

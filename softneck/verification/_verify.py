@@ -1,0 +1,299 @@
+"""Verification: a controller against all that its plant may be, requirement by requirement."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softneck.core import DataError, Progress, SettingsError, silent
+from softneck.core._certificate import certificate_contents
+
+from ._agreement import Agreement, agreements
+from ._evidence import Evidence, gather, worst_row
+from ._laws import Judged, judge
+from ._neck_loops import check_blocks
+from ._plants import AXES, UncertainNeck, neck_of_family, neck_of_model
+from ._requirements import Requirement, Requirements, read_requirements
+from ._steps import check_ports
+from ._worst import write_linear, write_neck
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verdict:
+    """One requirement and what came of it.
+
+    Attributes:
+        requirement: metric, bound and limit.
+        value: of the worst plant; inf where a level is never reached, None where it was not computed.
+        holds: None where it was not computed and only the defaults ask for it.
+        worst: the plant behind the value, as JSON values.
+        note: why it was not computed.
+    """
+
+    requirement: Requirement
+    value: float | None
+    holds: bool | None
+    worst: Mapping[str, Any]
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Verification:
+    """What a verification found.
+
+    Attributes:
+        verdicts: one for each requirement.
+        evidence: all that was computed.
+        agreements: methods side by side.
+        controller: as it was judged.
+        necks: the sources of plants.
+        requirements: that were asked.
+        files: role -> (path, SHA-256) of every file read.
+        observer: whether the loops over the virtual neck had one.
+        wall_time: [s].
+    """
+
+    verdicts: list[Verdict]
+    evidence: Evidence
+    agreements: list[Agreement]
+    controller: Judged
+    necks: list[UncertainNeck]
+    requirements: Requirements
+    files: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    observer: bool = False
+    wall_time: float = 0.0
+
+    @property
+    def holds(self) -> bool:
+        """Whether no requirement fails."""
+        return all(verdict.holds is not False for verdict in self.verdicts)
+
+    @property
+    def failed(self) -> list[Verdict]:
+        """Those that do not hold."""
+        return [verdict for verdict in self.verdicts if verdict.holds is False]
+
+    def order_words(self) -> str:
+        """Return what the loop's order adds, in words."""
+        extra = self.controller.extra
+        words = "no sample" if extra == 0 else f"{extra} sample{'s' if extra > 1 else ''}"
+        return f"{self.controller.order} order: {words} of delay added to every plant"
+
+    def summary(self) -> str:
+        """Return a line or two for people."""
+        count = len(self.verdicts)
+        text = (
+            f"{count - len(self.failed)} of {count} requirements hold"
+            if self.failed
+            else f"all {count} requirements hold"
+        )
+        absent = sum(verdict.holds is None for verdict in self.verdicts)
+        text += f", {absent} of them not computed" if absent else ""
+        return (
+            f"{text}; {len(self.evidence.plants)} plants, {len(self.evidence.necks)} loops over the virtual neck, "
+            f"{self.order_words()}; {self.wall_time:.1f} s"
+        )
+
+    def contents(self, loops: Mapping[int, Path] | None = None) -> dict[str, Any]:
+        """Return the certificate's JSON values; `loops`: number of a verdict -> the loop file of its worst plant."""
+        rows = []
+        for number, verdict in enumerate(self.verdicts):
+            item = verdict.requirement
+            row = {
+                "metric": item.metric, "bound": item.bound, "limit": item.limit, "value": verdict.value,
+                "holds": verdict.holds, "worst": dict(verdict.worst),
+            }  # fmt: skip
+            if verdict.note:
+                row["note"] = verdict.note
+            if loops and number in loops:
+                row["loop"] = str(loops[number])
+            rows.append(row)
+        evidence = self.evidence
+        more = {
+            "requirements": rows,
+            "disagreements": [asdict(item) for item in self.agreements if not item.agree],
+            "methods": [asdict(item) for item in self.agreements],
+            "not_computed": evidence.not_computed,
+            "order": self.controller.order,
+            "extra_delay_samples": self.controller.extra,
+            "sample_time_s": self.controller.block.sample_time,
+            "controller_kind": self.controller.block.kind,
+            "observer": self.observer,
+            "plants": {
+                "count": len(evidence.plants),
+                "sources": [
+                    {"name": neck.name, "kind": neck.kind, "cross": neck.cross, **_box(neck)} for neck in self.necks
+                ],
+            },
+            "virtual_neck_loops": len(evidence.necks),
+            "delay_sensitivity": [
+                dict(zip(("samples_added", "spectral_radius", "disk_margin", "sensitivity"), row, strict=True))
+                for part in evidence.linear[:1] for row in part.delays
+            ],
+            "confidence": [asdict(row) for part in evidence.linear for row in part.intervals],
+            "nu_gap": [
+                {"source": neck.name, "axis": axis, "largest_gap": pair[i].gap.max(), "margin": pair[i].margin}
+                for part in evidence.linear[:1] for neck, pair in zip(self.necks, part.gaps, strict=True)
+                for i, axis in enumerate(AXES)
+            ],
+            "settings": {
+                name: dict(getattr(self.requirements, name)) for name in ("uncertainty", "sampling", "step", "neck")
+            },
+        }  # fmt: skip
+        return certificate_contents("verify", holds=self.holds, files=self.files, more=plain(more))
+
+    def write_worst(
+        self, folder: str | Path, *, controller: str | Path, observer: str | Path | None = None, force: bool = False
+    ) -> dict[int, Path]:
+        """Write a loop file for the worst plant of each requirement; return number of the verdict -> file.
+
+        Args:
+            folder: where.
+            controller, observer: their files, which the loop files name.
+            force: replace what stands there.
+        """
+        target, files = Path(folder), {}
+        for number, verdict in enumerate(self.verdicts):
+            worst, name = dict(verdict.worst), verdict.requirement.metric.replace(".", "_")
+            if worst.get("kind") == "linear":
+                facts = {
+                    "name": worst["name"], "numerator": worst["numerator"], "denominator": worst["denominator"],
+                    "delay": worst["delay_samples"], "cross": worst["cross"], "sample_time": worst["sample_time_s"],
+                    "axis": 1 if worst["axis"] == "roll" else 0,
+                }  # fmt: skip
+                files[number] = write_linear(
+                    target, name, facts, controller=Path(controller), step=self.requirements.step, force=force
+                )
+            elif worst.get("kind") == "neck":
+                seen = None if observer is None else Path(observer)
+                files[number] = write_neck(target, name, worst, controller=Path(controller), observer=seen, force=force)
+        return files
+
+
+def sources_of(things: Mapping[str, Any], requirements: Requirements) -> list[UncertainNeck]:
+    """Return models and families as sources of plants: name -> model (anything with `tf`) or family.
+
+    Raises:
+        SettingsError: none, an empty family, one that is not linear.
+    """
+    if not things:
+        raise SettingsError("no plant: give at least one MODEL or FAMILY.")
+    asked = requirements.uncertainty
+    spread = {
+        "gain": asked["gain_pct"] / 100.0, "pole": asked["pole_pct"] / 100.0, "delay": asked["delay_ms"] / 1e3,
+    }  # fmt: skip
+    necks = []
+    for name, thing in things.items():
+        if hasattr(thing, "axes") and hasattr(thing, "cross"):
+            necks.append(neck_of_family(thing, name))
+        elif hasattr(thing, "tf"):
+            necks.append(neck_of_model(thing, name, spread))
+        else:
+            raise SettingsError(f"{name}: a linear model or a family is needed; this is a {type(thing).__name__}.")
+    return necks
+
+
+def verify(
+    controller: Any,
+    plants: Mapping[str, Any] | Sequence[Any] | Any,
+    requirements: Requirements | None = None,
+    *,
+    order: str | None = None,
+    observer: Any = None,
+    files: Mapping[str, tuple[str, str]] | None = None,
+    progress: Progress = silent,
+) -> Verification:
+    """Judge a controller on all that its plant may be.
+
+    Args:
+        controller: anything with `block()`; with `ss()` linear checks too.
+        plants: a linear model or a family, several, or name -> one.
+        requirements: what is asked; the defaults if not given.
+        order: of the loop; the one that the controller was designed for if not given.
+        observer: for the loops over the virtual neck; none if not given.
+        files: role -> (path, SHA-256) of all that was read for it, for the certificate.
+        progress: called now and then.
+
+    Raises:
+        SettingsError: another sample time, other channels, no plants.
+    """
+    begin = time.perf_counter()
+    asked = read_requirements() if requirements is None else requirements
+    necks = sources_of(_named(plants), asked)
+    eyes = None if observer is None else observer.block()
+    judged = judge(controller, order=order, observer=observer is not None)
+    check_ports(judged.block)
+    check_blocks(judged.block, eyes)
+    for neck in necks:
+        if not math.isclose(neck.sample_time, judged.block.sample_time, rel_tol=1e-6):
+            raise SettingsError(
+                f"the controller has a sample time of {judged.block.sample_time:g} s, {neck.name} one of "
+                f"{neck.sample_time:g} s; design it on a model of its own sample time."
+            )
+    evidence = gather(judged, necks, asked, observer=eyes, progress=progress)
+    return Verification(
+        verdicts=[_verdict(item, evidence) for item in asked.bounds],
+        evidence=evidence,
+        agreements=agreements(evidence),
+        controller=judged,
+        necks=necks,
+        requirements=asked,
+        files=dict(files or {}),
+        observer=observer is not None,
+        wall_time=time.perf_counter() - begin,
+    )
+
+
+def _named(plants: Any) -> dict[str, Any]:
+    if isinstance(plants, Mapping):
+        return dict(plants)
+    items = list(plants) if isinstance(plants, Sequence) else [plants]
+    return {f"plant {k}" if len(items) > 1 else "plant": item for k, item in enumerate(items, start=1)}
+
+
+def _verdict(item: Requirement, evidence: Evidence) -> Verdict:
+    values = evidence.metrics.get(item.metric)
+    if values is None:
+        group = item.metric.partition(".")[0]
+        group = "axes" if group in AXES else group
+        why = evidence.not_computed.get(item.metric, evidence.not_computed.get(group, "it was not computed"))
+        note = f"not computed: {why}"
+        return Verdict(item, None, False if item.asked else None, {}, note)
+    row = worst_row(evidence.metrics, item.metric, item.bound)
+    value = float(values.values[row])
+    return Verdict(item, value, item.holds(value), plain(values.describe(row)))
+
+
+def _box(neck: UncertainNeck) -> dict[str, Any]:
+    return {
+        axis: {
+            "nominal": box.nominal, "low": box.low, "high": box.high, "samples": box.samples.shape[0],
+            "unit": ["rad/rad", "1/s", "s"],
+        }
+        for axis, box in zip(AXES, neck.axes, strict=True)
+    }  # fmt: skip
+
+
+def plain(value: Any) -> Any:
+    """Return JSON values of numbers, arrays, tables: what is not finite becomes None."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, int | np.integer):
+        return int(value)
+    if isinstance(value, float | np.floating):
+        return float(value) if math.isfinite(value) else None
+    if value is None or isinstance(value, str):
+        return value
+    raise DataError(f"a certificate cannot hold a {type(value).__name__}.")
