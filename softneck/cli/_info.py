@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import click
-import fmpy
 
 from softneck.core import DataError, FileFormatError, SettingsError, file_hash, load, read_archive, refuse_existing
 from softneck.cosim import load_study
@@ -139,6 +138,8 @@ def _is_titled(guess: Guess) -> bool:
 
 
 def _fmu(file: Path) -> dict[str, Any]:
+    import fmpy
+
     try:
         description = fmpy.read_model_description(str(file), validate=False)
     except Exception as error:  # fmpy raises bare Exception

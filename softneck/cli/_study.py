@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
-import pandas as pd
 
 from softneck.core import CheckFailedError
 from softneck.cosim import load_study, pareto_front, rank
@@ -19,6 +18,9 @@ from softneck.report._study_page import failures, study_head, study_rows
 
 from .shared._console import note, print_json, print_table, progress
 from .shared._options import force_option, json_option
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @click.command("study", epilog="Example: softneck study study.toml -o build/study --workers 2")

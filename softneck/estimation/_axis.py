@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-import control
 import numpy as np
-from scipy.linalg import fractional_matrix_power
 
 from softneck.core import DataError, Matrix, SettingsError, Vector
+
+if TYPE_CHECKING:
+    import control
+
 
 AXES = ("pitch", "roll")
 
@@ -113,6 +115,8 @@ class AxisPlant:
         Raises:
             SettingsError: the new sample time does not divide the old one, or a pole has no real root.
         """
+        from scipy.linalg import fractional_matrix_power
+
         ratio = round(self.sample_time / sample_time)
         # 1e-6: sample times such as 0.02 / 2 are off by rounding only.
         if ratio < 1 or not math.isclose(ratio * sample_time, self.sample_time, rel_tol=1e-6):
@@ -141,6 +145,8 @@ class AxisPlant:
 
     def tf(self, *, extra_delay: int = 0) -> control.TransferFunction:
         """Return it as a `control.TransferFunction` with `extra_delay` samples more."""
+        import control
+
         denominator = np.concatenate([self.denominator, np.zeros(self.delay + extra_delay)])
         return control.TransferFunction(self.numerator, denominator, self.sample_time)
 
@@ -152,6 +158,8 @@ def axis_plant(model: HasTransferFunctions, axis: str) -> AxisPlant:
         SettingsError: the model is not linear, not discrete, or not stable.
         DataError: its transfer function is not strictly proper or not finite.
     """
+    import control
+
     if not hasattr(model, "tf"):
         raise SettingsError(f"a linear model is needed, one with `tf`; got {type(model).__name__}. Identify `rls`.")
     system: Any = model.tf(axis)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
 from softneck.core import DataError, Vector
 from softneck.signals import Recording
@@ -136,6 +135,8 @@ def _nees(
 
 
 def _squares(time: Vector, values: Vector, level: float) -> Squares:
+    from scipy.stats import chi2
+
     tails = np.array([0.5 - 0.5 * level, 0.5 + 0.5 * level])
     low, high = chi2.ppf(tails, _DEGREES)
     n = values.size

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import block_diag, solve_discrete_lyapunov
 
 from softneck.core import Matrix, Vector
 
@@ -68,6 +67,8 @@ class Form:
 
 def model_form(plants: Sequence[AxisPlant]) -> Form:
     """Return model states and an output disturbance that walks, on each axis."""
+    from scipy.linalg import solve_discrete_lyapunov
+
     axes: list[tuple[Matrix, ...]] = []
     for plant in plants:
         A, b, c = plant.observable_form()
@@ -108,4 +109,6 @@ def _both(axes: Sequence[tuple[Matrix, ...]]) -> Form:
 
 
 def _diagonal(*blocks: Matrix) -> Matrix:
+    from scipy.linalg import block_diag
+
     return np.asarray(block_diag(*blocks), dtype=np.float64)

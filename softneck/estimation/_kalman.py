@@ -7,10 +7,9 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from filterpy.kalman import KalmanFilter
 from numpy.typing import ArrayLike
 
 from softneck.core import FileFormatError, Matrix, SettingsError, Vector, write_archive
@@ -29,6 +28,10 @@ from ._kalman_parts_runtime import (
 )
 from ._offline import Estimates, filter_recording, smooth_recording
 from ._steady import steady_gains, system
+
+if TYPE_CHECKING:
+    from filterpy.kalman import KalmanFilter
+
 
 _RUNTIME = "softneck.estimation._kalman_runtime"
 _STEADY = "softneck.estimation._steady_kalman_runtime"
@@ -132,6 +135,8 @@ class KalmanObserver:
         Give `predict(u)` the inputs that act, (2, 1): delayed theta_i and phi_i, or rates of the gyro; and
         `update(None)` where nothing was measured: a NaN in `update` would stay in its state for good.
         """
+        from filterpy.kalman import KalmanFilter
+
         F, _, Q, R = system(self.arrays, self.noise)
         kf: Any = KalmanFilter(dim_x=F.shape[0], dim_z=2, dim_u=2)
         kf.F, kf.B, kf.H = F.copy(), self.arrays[1].copy(), self.arrays[2].copy()

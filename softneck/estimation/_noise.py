@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize
 
 from softneck.core import DataError, Matrix, SettingsError, Vector
 from softneck.runtime import load_functions
@@ -112,6 +111,8 @@ def _free(names: Sequence[str], fixed: Sequence[str]) -> np.ndarray:
 
 def _likeliest(cost: _Cost, start: Vector, free: np.ndarray) -> tuple[Vector, float, np.ndarray]:
     """Return the decadic logarithms of the levels, their cost, and which ran to the end of their range (3,)."""
+    from scipy.optimize import minimize
+
     bounds = [(level - _DECADES, level + _DECADES) for level in start[free]]
 
     def of(levels: Vector) -> float:

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
 from softneck.core import (
     Matrix,
@@ -163,6 +162,8 @@ class KalmanSettings:
             delays: samples that set-points need to act on pitch and on roll, beyond the first.
             period: the filter's sample time [s].
         """
+        from scipy.stats import chi2
+
         lags = [0.0, 0.0]
         if self.form == "model":
             lags = [delay + float(self.order == "jacobi") for delay in delays]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import solve_discrete_are
 
 from softneck.core import Matrix, SettingsError
 
@@ -15,6 +14,8 @@ def steady_covariance(arrays: tuple[Matrix, ...], noise: tuple[float, float, flo
 
     Over the m samples of a period the state goes by F^m, with the noise of all m (Anderson and Moore 1979, sec. 4.4).
     """
+    from scipy.linalg import solve_discrete_are
+
     F, H, Q, R = system(arrays, noise)
     Fm, Qm = np.eye(F.shape[0]), np.zeros_like(Q)
     for _ in range(int(arrays[8][KALMAN_DIVIDER])):

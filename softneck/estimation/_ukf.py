@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Any, NoReturn
 
 import numpy as np
-from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from numpy.typing import ArrayLike
 
 from softneck.core import DataError, Matrix, SettingsError, Vector, require_whole
@@ -170,6 +169,8 @@ class UkfObserver:
 
     def _predicted(self, base: Vector, x: Vector, P: Matrix, past: Matrix, *, widen: bool) -> Any:
         """Return filterpy's filter one sample on."""
+        from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
+
         n, L = x.size, self.memory
         # Weights of 1/2n on every point and none on the middle one: no covariance can become indefinite.
         points = MerweScaledSigmaPoints(n, alpha=1.0, beta=2.0, kappa=0.0)

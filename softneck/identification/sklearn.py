@@ -7,7 +7,6 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
-from sklearn.utils.validation import check_is_fitted, validate_data
 
 from softneck.core import SoftneckError
 
@@ -46,6 +45,8 @@ class SetMembershipRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> SetMembershipRegressor:
         """Store the data (N, n) and (N,) or (N, m), and find what gamma and epsilon leave open."""
+        from sklearn.utils.validation import validate_data
+
         given: tuple[Any, Any] = (X, y)  # scikit-learn's own annotation knows strings only
         X, y = validate_data(self, *given, multi_output=True, y_numeric=True, dtype=np.float64, ensure_min_samples=2)
         y = np.asarray(y, dtype=np.float64)
@@ -62,6 +63,8 @@ class SetMembershipRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def predict(self, X: ArrayLike, *, return_bounds: bool = False) -> Any:
         """Return the central estimate, or with `return_bounds` (estimate, f_l, f_u)."""
+        from sklearn.utils.validation import check_is_fitted, validate_data
+
         check_is_fitted(self)
         X = validate_data(self, cast(Any, X), reset=False, dtype=np.float64)
         low, high = self.cones_.bounds(X, workers=self._workers())

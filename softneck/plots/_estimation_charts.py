@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-import matplotlib.figure
 import numpy as np
 
 from softneck.core import Vector
@@ -12,6 +11,9 @@ from softneck.core import Vector
 from ._chart import Chart, Curve, Level, Panel
 from ._matplotlib import chart_figure
 from ._style import BLUE, GREY, ORANGE
+
+if TYPE_CHECKING:
+    import matplotlib.figure
 
 
 class NormalisedSquares(Protocol):

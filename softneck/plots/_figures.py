@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from softneck.core import Matrix, Vector
 
 from ._charts import delay_chart, loop_chart, recording_chart, validation_chart
 from ._judgement_charts import cost_chart, histogram_chart, residual_chart
 from ._matplotlib import chart_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def recording_figure(

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from softneck.core import Matrix, Vector
 
 from ._style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, label, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 _COLOURS = (BLUE, ORANGE, GREEN, RED, PURPLE, GREY)
 _QUANTITIES = ("static gain [deg/rad]", "pole [1/s]", "dead time [ms]")

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING
 
 from ._chart import Chart, Curve, Panel, bar_width
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 
 _DASHES = {"dashed": "--", "dotted": ":"}
 
@@ -18,6 +21,9 @@ def chart_figure(chart: Chart, *, width: float = 10.0) -> Figure:
         chart: what to draw.
         width: of the figure [inch].
     """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(width, chart.row_height * chart.rows + 0.4), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(chart.rows, chart.columns, sharex=chart.linked, squeeze=False).ravel()

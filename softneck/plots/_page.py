@@ -7,15 +7,18 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import jinja2
 from markupsafe import Markup
-from matplotlib.figure import Figure
 
 from softneck.core import atomic_write
 
 from ._chart import Chart
 from ._interactive import draw, library
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 _TEMPLATE = """<!doctype html>
 <html lang="en">
@@ -137,6 +140,8 @@ def page(title: str, sections: Sequence[Section], *, footer: str = "") -> str:
 
     The page forbids itself every request, by its content security policy.
     """
+    import jinja2
+
     template = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(_TEMPLATE)
     parts = [
         {

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-from matplotlib.artist import Artist
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 
 from softneck.core import Vector, to_si
 from softneck.signals import SET_POINTS, Quality, Recording, redefine
@@ -16,6 +13,12 @@ from softneck.signals.quality._region import reachable_hexagon
 from softneck.signals.recording._channels import MOTOR_POSITIONS, OUTPUTS, file_unit
 
 from ._style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, label, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 
 _INPUT_COLOURS = (BLUE, ORANGE, GREEN)
 _INPUT_NAMES = (r"$\theta_i$", r"$\phi_i$", r"$\delta_i$")
@@ -47,6 +50,9 @@ def spectrum_figure(quality: Quality, title: str) -> Figure:
 
 def region_figure(recording: Recording, quality: Quality, title: str) -> Figure:
     """Draw the (theta_i, phi_i) visited, coloured by delta_i, in the hexagon that the motors reach."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     P = recording.motor_positions
     P = P[np.isfinite(P).all(axis=1)]
     theta, phi, delta = redefine(P[:: max(1, len(P) // _POINTS)]).T
@@ -88,6 +94,10 @@ def _behaviours(ax: Axes, quality: Quality) -> None:
 
 def channels_figure(recording: Recording, quality: Quality, title: str) -> Figure:
     """Draw how often each value occurs: a clipped channel piles up at its edge, a quantised one shows its levels."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import NullFormatter
+
     names = _shown(recording)
     columns = 3
     figure = Figure(figsize=(10.0, 2.2 * -(-len(names) // columns) + 0.4), layout="constrained")
@@ -155,6 +165,9 @@ def faults_figure(recording: Recording, quality: Quality, title: str) -> Figure:
 
 def correlation_figure(quality: Quality, title: str) -> Figure:
     """Draw the correlation between the motors' set-points; grey where a motor never moves."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(4.6, 3.8), layout="constrained")
     FigureCanvasAgg(figure)
     ax = figure.subplots()

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
-
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any
 
 from ._style import BLUE, GREY, ORANGE, label
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 # Fits further below the best are no candidates and would flatten the curve.
 _DEPTH = 25.0
@@ -22,6 +23,9 @@ def search_figure(curves: Mapping[str, Sequence[Sequence[Any]]], title: str, *, 
         title: of the figure.
         best: setting -> the chosen value.
     """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(10.0, 2.6 * len(curves) + 0.4), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(len(curves), 1, squeeze=False)[:, 0]

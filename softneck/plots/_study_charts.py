@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from softneck.core import DataError, Vector
 
 from ._chart import Chart, Curve, Panel
 from ._matplotlib import chart_figure
 from ._style import BLUE, GREY, RED, looks
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 _POINT = 1.6
 _BINS = 40

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-import control
 import numpy as np
 
 from softneck.core import require_whole
@@ -99,6 +98,8 @@ def _redefined(experiments: Experiments) -> Chart:
 
 
 def _step_responses(model: Model) -> Chart:
+    import control
+
     t = np.arange(0.0, 1.5, model.sample_time)
     panels = []
     for axis in AXES:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from softneck.cosim import grouped, pareto_front, rank, worst_runs
 from softneck.plots import Chart, Section, Table, page
 from softneck.plots._study_charts import correlations, distribution_chart, influence_chart, pareto_chart
+
+if TYPE_CHECKING:
+    import pandas as pd
+
 
 # Numbers that varied, at most so many panels: those that matter most.
 _MOST_PANELS = 6
@@ -157,11 +160,15 @@ def _groups(vary: Mapping[str, Any]) -> list[str]:
 
 
 def _numbers(runs: pd.DataFrame, vary: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    import pandas as pd
+
     numeric = [key for key, item in vary.items() if item["kind"] != "seed" and pd.api.types.is_numeric_dtype(runs[key])]
     return {key: runs[key].to_numpy(float) for key in numeric}
 
 
 def _row(row: Mapping[Any, Any], keys: Sequence[str], objectives: Sequence[str]) -> list[str]:
+    import pandas as pd
+
     verdict = "fails" if row["error"] else "-" if pd.isna(row["holds"]) else "holds" if row["holds"] else "fails"
     return [str(row["run"]), *(_text(row[key]) for key in keys), *(_text(row[name]) for name in objectives), verdict]
 

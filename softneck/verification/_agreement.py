@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import control
 import numpy as np
 
 from ._evidence import Evidence, LinearEvidence
@@ -136,6 +135,8 @@ def _classical(part: LinearEvidence) -> list[Agreement]:
 
 
 def _by_control(plants: Plants, law: LinearLaw, axis: int, row: int) -> list[float]:
+    import control
+
     above, below = plants.numerator[row, axis], plants.denominator[row, axis]
     plant = control.TransferFunction(above, np.append(below, np.zeros(plants.delay[row, axis])), plants.sample_time)
     own = control.StateSpace(

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import control
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector
@@ -49,6 +48,8 @@ class LinearLaw:
         Raises:
             SettingsError: other channels or not discrete.
         """
+        import control
+
         if not isinstance(system, control.StateSpace | control.TransferFunction):
             raise SettingsError(
                 f"the controller's linear form is a {type(system).__name__}, not a python-control system."

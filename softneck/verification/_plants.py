@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.stats import qmc
 
 from softneck.core import Matrix, SettingsError, Vector
 from softneck.estimation import AxisPlant, axis_plant
@@ -252,6 +251,8 @@ def all_plants(necks: list[UncertainNeck], count: int, seed: int) -> Plants:
 
 
 def _of_neck(neck: UncertainNeck, count: int, seed: int, source: int) -> Plants:
+    from scipy.stats import qmc
+
     numbers: list[np.ndarray] = [np.stack([box.nominal for box in neck.axes])]
     names = [f"{neck.name}: nominal"]
     signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import differential_evolution
 
 from softneck.core import Matrix, Vector
 
@@ -93,6 +92,8 @@ class _Task:
 
 
 def _evolve(function: Callable[[Matrix], Vector], unknowns: int, generations: int, seed: int) -> Vector:
+    from scipy.optimize import differential_evolution
+
     result = differential_evolution(
         function, [(0.0, 1.0)] * unknowns, vectorized=True, updating="deferred", popsize=_CROWD, maxiter=generations,
         init="sobol", rng=np.random.default_rng(seed), polish=False, tol=1e-6,

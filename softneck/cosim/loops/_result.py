@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any
 
 from softneck.core import DataError, Vector, to_si
 from softneck.core._certificate import certificate_contents
 from softneck.loop import LoopResult, check_limits, metrics
 from softneck.signals import Recording
 from softneck.signals.recording._channels import file_unit, known_channels
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -62,6 +63,8 @@ class Result:
     @property
     def frame(self) -> pd.DataFrame:
         """All signals as a table; the columns say their unit as in a recording's file."""
+        import pandas as pd
+
         columns = {"time [s]": self.signals.time}
         for name, values in self.signals.signals.items():
             unit, factor = _shown(name, self.signals.units[name])

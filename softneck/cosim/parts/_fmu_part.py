@@ -6,11 +6,9 @@ import shutil
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import fmpy
 import numpy as np
-from fmpy.fmi1 import FMICallException
 
 from softneck.core import (
     DataError,
@@ -25,6 +23,10 @@ from softneck.fmu import unpack, unpacked
 
 from ._native import ERROR, FATAL, Bank, CallError, Native
 from ._variables import Description, read_description
+
+if TYPE_CHECKING:
+    from fmpy.fmi1 import FMICallException
+
 
 _ROLES = ("plant", "observer", "controller", "reference")
 # What pythonfmu's binary says of every Python exception; the reason stands in the line before.
@@ -166,6 +168,8 @@ class FmuPart:
 
     def _fresh(self) -> Native:
         """Return an instance before its initialisation."""
+        from fmpy.fmi1 import FMICallException
+
         if self._native is not None and not self._broken:
             try:
                 self._native.reset()
@@ -195,6 +199,8 @@ class FmuPart:
         return self._bank(parameters), np.array([float(value) for value in parameters.values()])
 
     def _do(self, what: str, call: Callable[..., Any], *arguments: Any) -> Any:
+        from fmpy.fmi1 import FMICallException
+
         try:
             return call(*arguments)
         except (FMICallException, CallError) as error:
@@ -214,6 +220,8 @@ class FmuPart:
 
 
 def _check_platform(description: Description, folder: Path) -> None:
+    import fmpy
+
     name = description.identifier
     wanted = fmpy.platform if description.version == 2 else fmpy.platform_tuple
     if (folder / "binaries" / wanted / f"{name}{fmpy.sharedLibraryExtension}").is_file():

@@ -10,23 +10,17 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from fmpy import calloc, free
-from fmpy.fmi2 import (
-    FMU2Slave,
-    fmi2CallbackAllocateMemoryTYPE,
-    fmi2CallbackFreeMemoryTYPE,
-    fmi2CallbackFunctions,
-    fmi2CallbackLoggerTYPE,
-)
-from fmpy.fmi3 import FMU3Slave
-from fmpy.model_description import ScalarVariable
 
 from softneck.core import Vector
 
 from ._variables import Description, types_of
+
+if TYPE_CHECKING:
+    from fmpy.model_description import ScalarVariable
+
 
 OK_OR_WARNING, ERROR, FATAL = 1, 3, 4
 _STATUS = ("OK", "a warning", "discard", "an error", "a fatal error", "pending")
@@ -55,6 +49,9 @@ class Native:
 
     def __init__(self, description: Description, folder: Path, log: Log) -> None:
         """Load the library that lies in `folder` and instantiate; raise what fmpy raises if that fails."""
+        from fmpy.fmi2 import FMU2Slave
+        from fmpy.fmi3 import FMU3Slave
+
         self.version = description.version
         common = {
             "guid": description.model.guid,
@@ -70,6 +67,14 @@ class Native:
 
     def instantiate(self) -> None:
         """Create the instance and prepare the call of a step."""
+        from fmpy import calloc, free
+        from fmpy.fmi2 import (
+            fmi2CallbackAllocateMemoryTYPE,
+            fmi2CallbackFreeMemoryTYPE,
+            fmi2CallbackFunctions,
+            fmi2CallbackLoggerTYPE,
+        )
+
         if self.version == 2:
             # Without fmpy's logger proxy: that is one for the process, and an FMU's log would reach another part.
             callbacks = fmi2CallbackFunctions()

@@ -7,14 +7,16 @@ import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import fmpy
 import numpy as np
-from fmpy.model_description import ModelDescription, ScalarVariable
 
 from softneck.core import FileFormatError
 from softneck.runtime import Port
+
+if TYPE_CHECKING:
+    from fmpy.model_description import ModelDescription, ScalarVariable
+
 
 # FMI type -> (C type, numpy type, name in fmi2Get... or fmi3Get...); FMI 2.0 above, FMI 3.0 below.
 TYPES: dict[str, tuple[Any, Any, str]] = {
@@ -116,6 +118,8 @@ def read_description(
     Raises:
         FileFormatError: no valid FMI 2.0 or 3.0 Co-Simulation FMU, or it lacks a variable of `names`.
     """
+    import fmpy
+
     try:
         model = fmpy.read_model_description(str(folder), validate=False)
     except Exception as error:

@@ -7,9 +7,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
 from pathlib import Path
-from typing import Any
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any
 
 from softneck.core import OutputError, Progress, SettingsError, silent
 
@@ -17,6 +15,10 @@ from ._executors import Crew, check_sendable, crew
 from ._store import Store
 from ._study import Source, Study, make_study
 from ._study_run import Chunk, Row, failed_row, release, run_chunk
+
+if TYPE_CHECKING:
+    import pandas as pd
+
 
 # So much work at a time [s]: a kill loses no more than this, and giving out costs little of it.
 _CHUNK_S = 0.5

@@ -8,17 +8,18 @@ import uuid
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
-
-import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
+from typing import TYPE_CHECKING, Any
 
 from softneck.core import FileFormatError, OutputError, SettingsError, atomic_write
 from softneck.loop._metrics import METRICS
 
 from ._study import Study
 from ._vary import Vary
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+
 
 RUNS, DESCRIPTION, _PARTS = "runs.parquet", "study.json", "runs.parts"
 # Small files are joined whenever there are so many of them: a folder stays readable, a merge stays rare.
@@ -62,6 +63,8 @@ class Store:
 
     def add(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Write rows of runs that ended; they are there to stay when this returns."""
+        import pyarrow as pa
+
         table = pa.Table.from_pylist([dict(row) for row in rows], schema=self._schema)
         self._write(table, self._parts / f"{rows[0]['run']:08d}-{uuid.uuid4().hex[:8]}.parquet")
         self.done.update(row["run"] for row in rows)
@@ -93,6 +96,8 @@ class Store:
             file.unlink(missing_ok=True)
 
     def _write(self, table: pa.Table, path: Path) -> None:
+        import pyarrow.parquet as pq
+
         with atomic_write(path, force=True) as temporary:
             pq.write_table(table, temporary)
 
@@ -117,6 +122,8 @@ class Store:
 
 def schema(vary: Mapping[str, Vary]) -> pa.Schema:
     """Return the columns of a study's runs with their types."""
+    import pyarrow as pa
+
     fields = [("run", pa.int64()), ("sample", pa.int64()), ("seed", pa.int64())]
     fields += [(key, _type_of(item)) for key, item in vary.items()]
     fields += [(metric, pa.float64()) for metric in METRICS]
@@ -141,6 +148,9 @@ def read_runs(folder: str | Path) -> pd.DataFrame:
     Raises:
         FileFormatError: the folder holds no study.
     """
+    import pandas as pd
+    import pyarrow.parquet as pq
+
     read_description(Path(folder))
     files = _files(Path(folder))
     if not files:
@@ -150,6 +160,9 @@ def read_runs(folder: str | Path) -> pd.DataFrame:
 
 def read_tables(files: Sequence[Path], columns: pa.Schema, chosen: list[str] | None = None) -> pa.Table:
     """Return the rows of all files, each run once, by its number."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     empty = columns.empty_table().select(chosen or columns.names)
     try:
         table = pa.concat_tables([empty, *(pq.read_table(file, columns=chosen) for file in files)])
@@ -176,6 +189,8 @@ def _frame(table: pa.Table) -> pd.DataFrame:
 
 
 def _type_of(vary: Vary) -> pa.DataType:
+    import pyarrow as pa
+
     if vary.kind == "seed":
         return pa.int64()
     labels = vary.labels

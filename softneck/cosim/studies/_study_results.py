@@ -6,10 +6,9 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 import tomli_w
 
 from softneck.core import Matrix, SettingsError, Vector, atomic_write
@@ -17,11 +16,17 @@ from softneck.core import Matrix, SettingsError, Vector, atomic_write
 from ..loops._loop_parts import OBJECT
 from ._study import Study
 
+if TYPE_CHECKING:
+    import pandas as pd
+
+
 WORST = "worst"
 
 
 def rank(runs: pd.DataFrame, objectives: Sequence[str]) -> pd.DataFrame:
     """Return the runs, best first: those that keep limits by the objectives in turn, then others, then failed."""
+    import pandas as pd
+
     _check(runs, objectives)
     keys = pd.DataFrame({"failed": runs["error"] != "", "broken": ~runs["holds"].fillna(True).astype(bool)})
     for metric in objectives:
@@ -56,6 +61,8 @@ def _front(values: Matrix) -> np.ndarray:
 
 def grouped(runs: pd.DataFrame, by: Sequence[str], metrics: Sequence[str]) -> pd.DataFrame:
     """Return for each combination of values of `by`: runs, failed ones, share that holds, spread of the metrics."""
+    import pandas as pd
+
     rows = []
     for values, part in runs.groupby(list(by), sort=False):
         row: dict[str, Any] = dict(zip(by, values if isinstance(values, tuple) else (values,), strict=True))

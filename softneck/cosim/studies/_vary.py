@@ -9,7 +9,6 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm, qmc
 
 from softneck.core import Matrix, SettingsError, require_one_of
 
@@ -46,6 +45,8 @@ class Vary:
 
     def pick(self, u: float) -> tuple[Any, Any]:
         """Return the value at quantile `u` (0 to 1) and what a table shows of it."""
+        from scipy.stats import norm
+
         if self.kind == "choices":
             i = min(int(u * len(self.values)), len(self.values) - 1)
             return self.values[i], self.labels[i]
@@ -170,6 +171,8 @@ def _number_of_runs(runs: int | None, grid: int, *, random: bool) -> int:
 
 def _quantiles(samples: int, keys: int, seed: int, sampling: str) -> Matrix:
     """Return (samples, keys) of 0 to 1, none of them exactly 0 or 1."""
+    from scipy.stats import qmc
+
     rng = np.random.default_rng(seed)
     if keys == 0:
         return np.zeros((samples, 0))

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from softneck.core import Matrix, SettingsError, Vector
 from softneck.signals import redefinition_matrix
@@ -78,6 +77,8 @@ def assemble(
         sample_time: [s].
         tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
     """
+    from scipy.linalg import block_diag
+
     a = np.array([math.exp(-sample_time / time) if time > 0.0 else 0.0 for time in reference_times])
     # rf_k = a rf_k-1 + (1 - a) r_k, with state a rf_k-1: what is asked now acts now.
     Af, Bf, Cf, Df = np.diag(a), np.diag(a * (1.0 - a)), np.eye(3), np.diag(1.0 - a)

@@ -6,9 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import control
 import numpy as np
-from scipy.linalg import solve_discrete_are
 
 from softneck.core import Matrix, SettingsError, Vector
 from softneck.estimation import AxisPlant
@@ -41,6 +39,8 @@ def conditioning_gain(A: Matrix, B: Matrix, C: Matrix, D: float) -> Matrix:
     Otherwise the gain of the innovations form of v: the Kalman predictor of a state driven by r as by noise, which
     is B/D with its unstable zeros mirrored (Anderson and Moore 1979, sec. 9.3), and exists for D = 0.
     """
+    from scipy.linalg import solve_discrete_are
+
     if abs(D) > 1e-9:
         L = B / D
         if float(np.abs(np.linalg.eigvals(A - L @ C)).max(initial=0.0)) <= _FORGETS:
@@ -66,6 +66,8 @@ def conditioning_candidates(axis: AxisController) -> list[Matrix]:
 
     The smaller the noise ascribed to the output, the faster the state follows what the motors could do.
     """
+    from scipy.linalg import solve_discrete_are
+
     n = axis.A.shape[0]
     size = max(float(np.linalg.norm(axis.Br)), 1e-12)
     Q = axis.Br @ axis.Br.T + (_SPREAD * size) ** 2 * np.eye(n)
@@ -118,6 +120,8 @@ def axis_margins(axis: AxisController, plant: AxisPlant, extra_delay: int) -> Ma
     Raises:
         SettingsError: the closed loop is not stable.
     """
+    import control
+
     radius = closed_radius(axis, plant, extra_delay)
     if radius >= 1.0:
         raise SettingsError(f"the closed loop is not stable (spectral radius {radius:.4f}); ask for less.")

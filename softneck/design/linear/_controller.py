@@ -6,18 +6,20 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import control
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.io import savemat
 
 from softneck.core import FileFormatError, Matrix, Vector, atomic_write, write_archive
 from softneck.runtime import Block, State
 
 from ._limits import Limits
 from ._ports import controller_inputs, controller_outputs
+
+if TYPE_CHECKING:
+    import control
+
 
 _RUNTIME = "softneck.design.linear._linear_controller_runtime"
 _ARRAYS = (
@@ -83,6 +85,8 @@ class LinearController:
 
     def ss(self) -> control.StateSpace:
         """Return it without limits, from (pitch_reference, roll_reference, pitch, roll) to (theta_i, phi_i)."""
+        import control
+
         Af, Bf, Cf, Df, A, Br, By, C, Dr, Dy = self.arrays[:10]
         Af, Bf, Cf, Df = Af[:2, :2], Bf[:2, :2], Cf[:2, :2], Df[:2, :2]
         states = np.block([[Af, np.zeros((2, A.shape[0]))], [Br @ Cf, A]])
@@ -100,6 +104,8 @@ class LinearController:
 
     def to_mat(self, path: str | Path, *, force: bool = False) -> None:
         """Write `ss()` to a MATLAB file: A, B, C, D, Ts, InputName, OutputName."""
+        from scipy.io import savemat
+
         system = self.ss()
         values = {
             "A": system.A, "B": system.B, "C": system.C, "D": system.D, "Ts": self.sample_time,

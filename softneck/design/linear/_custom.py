@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import control
 import numpy as np
 
 from softneck.core import DataError, SettingsError
@@ -57,6 +56,8 @@ class CustomSettings(AxisSettings):
         return {key: value for key, value in stored.items() if key != "controller"}
 
     def _synthesise(self, axis: UncertainAxis, name: str) -> Found:
+        import control
+
         K = self._of(name)
         if not math.isclose(float(K.dt), axis.sample_time, rel_tol=1e-9):
             raise SettingsError(
@@ -68,6 +69,8 @@ class CustomSettings(AxisSettings):
 
 
 def _require_system(K: Any) -> None:
+    import control
+
     if not isinstance(K, control.StateSpace | control.TransferFunction):
         raise SettingsError(f"`controller` must be a control.StateSpace or TransferFunction; got {type(K).__name__}.")
     if K.noutputs != 1 or K.ninputs not in (1, 2):
@@ -86,6 +89,8 @@ def _require_system(K: Any) -> None:
 
 def _of_two(K: Any, name: str) -> AxisController:
     """Return the axis of a system from reference and angle, found by name where it has names."""
+    import control
+
     labels = list(K.input_labels)
     wanted = [f"{name}_reference", name]
     if all(label.startswith("u[") for label in labels):

@@ -5,13 +5,15 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import control
 import numpy as np
-from scipy.optimize import brentq
 
 from softneck.core import Matrix, SettingsError, Vector, require_between, require_positive, require_whole
+
+if TYPE_CHECKING:
+    import control
+
 
 # Integration orders that are searched; the ends are 0 and 2, where the realisation would lose its integrator.
 _ORDERS = np.linspace(0.05, 1.95, 96)
@@ -54,6 +56,8 @@ class FractionalPid:
         The poles and zeros of the integral are mapped bilinearly, which costs no phase, those of a derivative as
         exp(s dt); gains are exact at the crossover (Oustaloup et al. 2000, IEEE TCAS-I 47:25).
         """
+        import control
+
         require_positive("dt", dt, "s")
         require_whole("sections", sections, 1, 25)
         poles, residues, direct = _term(1.0 - self.integral_order, self.crossover, dt, sections, integrator=True)
@@ -155,6 +159,8 @@ class _FlatPhase:
 
     def order(self) -> float | None:
         """Return the least order at which the loop's phase is flat."""
+        from scipy.optimize import brentq
+
         usable = [float(order) for order in _ORDERS if self.right(float(order))]
         step = float(_ORDERS[1] - _ORDERS[0])
         for low, high in itertools.pairwise(usable):
@@ -165,6 +171,8 @@ class _FlatPhase:
 
 
 def _response(G: Any, w: Vector) -> Vector:
+    import control
+
     if hasattr(G, "response") and not isinstance(G, control.StateSpace | control.TransferFunction):
         return np.asarray(G.response(w))
     if not isinstance(G, control.StateSpace | control.TransferFunction) or G.dt is None or G.dt is True:

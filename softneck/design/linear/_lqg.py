@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from scipy.linalg import solve_discrete_are
 
 from softneck.core import Matrix, SettingsError, Vector, require_between, require_positive
 
@@ -55,6 +54,8 @@ class LqgSettings(AxisSettings):
         )
 
     def _built(self, axis: UncertainAxis, rate: float) -> Found:
+        from scipy.linalg import solve_discrete_are
+
         gain, dt = axis.nominal.static_gain, axis.sample_time
         A, B, C = delayed_form(scaled(axis.nominal, 1.0 / gain), self.extra_delay)
         try:
@@ -70,6 +71,8 @@ class LqgSettings(AxisSettings):
 
 def _filter(A: Matrix, B: Vector, C: Vector, walk: float, noise: float) -> Vector:
     """Return the gain M (n + 1,) with which the filter corrects plant and load; the angle's noise has variance 1."""
+    from scipy.linalg import solve_discrete_are
+
     n = A.shape[0]
     whole, out = _with_load(A, B), np.append(C, 0.0)
     Q = np.zeros((n + 1, n + 1))

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import control
 import numpy as np
 
 from softneck.core import SettingsError, Vector
+
+if TYPE_CHECKING:
+    import control
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +48,8 @@ def loop_margins(loop: control.TransferFunction) -> Margins:
     Raises:
         SettingsError: the closed loop is not stable.
     """
+    import control
+
     dt: Any = loop.dt
     closed: Any = control.feedback(loop, 1)
     poles = np.asarray(closed.poles())

@@ -8,7 +8,6 @@ from functools import partial
 from typing import ClassVar
 
 import numpy as np
-from scipy.optimize import minimize
 
 from softneck.core import SettingsError, Vector, require_between, require_one_of, require_positive
 from softneck.estimation import AxisPlant
@@ -141,6 +140,8 @@ class PidSettings(AxisSettings):
 
     def _tuned(self, axis: UncertainAxis, dt: float) -> PidGains:
         """Return the gains that do best on the worst sample, by Nelder and Mead from gains that surely hold."""
+        from scipy.optimize import minimize
+
         gain = axis.nominal.static_gain
         lag = slowest_time(axis.nominal)
         dead = (axis.nominal.delay + 1 + self.extra_delay) * dt

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import control
 import numpy as np
-from scipy.linalg import schur, solve_discrete_lyapunov, solve_sylvester
 
 from softneck.core import Matrix, SettingsError, Vector, require_whole
 from softneck.estimation import AxisPlant
 
 from ._assembly import AxisController
 from ._axis_loop import axis_margins, conditioning_gain
+
+if TYPE_CHECKING:
+    import control
+
 
 # Poles beyond this are kept as they are: integrators, which have no Gramian.
 _BORDER = 1.0 - 1e-7
@@ -40,6 +42,8 @@ def reduce_controller(system: Any, order: int) -> Reduced:
     Raises:
         SettingsError: continuous, fewer states asked than it has integrators, or more than it has.
     """
+    import control
+
     full: Any = control.ss(system)
     if not full.dt or full.dt is True:
         raise SettingsError("`reduce_controller` takes a discrete system with its dt in seconds.")
@@ -73,6 +77,8 @@ def reduce_axis(
 
 def _truncated(A: Matrix, B: Matrix, C: Matrix, order: int) -> tuple[Matrix, Matrix, Matrix, Vector, float]:
     """Return A, B, C of `order` states, the Hankel singular values of the stable part, and the error's bound."""
+    from scipy.linalg import schur, solve_discrete_lyapunov, solve_sylvester
+
     split: Any = schur(A, output="real", sort=lambda x, y: np.hypot(x, y) < _BORDER)
     T, Z, stable = split
     n = A.shape[0]

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import control
 import numpy as np
-from scipy.signal import lfilter
 
 from softneck.core import Matrix, SettingsError, Vector
 from softneck.estimation import AxisPlant
 
 from ._axis_loop import coarse
 from ._margins import frequencies
+
+if TYPE_CHECKING:
+    import control
+
 
 # Loop gains that are tried, in units of the plant's static gain, 5 % apart and refined to 0.1 % at the border.
 _SIZES = np.geomspace(1e-2, 1e2, 190)
@@ -106,6 +109,8 @@ def reference_time(plants: Plants, extra_delay: int, gains: Gains, *, gain_sprea
     Raises:
         SettingsError: none does that is fast enough.
     """
+    from scipy.signal import lfilter
+
     sample_time = plants[0].sample_time
     rows = math.ceil(_HORIZON / sample_time)
     scales = (1.0 - gain_spread, 1.0, 1.0 + gain_spread) if gain_spread > 0.0 else (1.0,)
@@ -120,6 +125,8 @@ def reference_time(plants: Plants, extra_delay: int, gains: Gains, *, gain_sprea
 
 def open_loop(plant: AxisPlant, extra_delay: int, gains: Gains) -> control.TransferFunction:
     """Return the discrete open loop of a PI with the plant, its delay exact."""
+    import control
+
     rate = plant.sample_time / gains.integral_time
     pi = control.TransferFunction([gains.gain, gains.gain * (rate - 1.0)], [1.0, -1.0], plant.sample_time)
     return pi * plant.tf(extra_delay=extra_delay)
@@ -162,6 +169,8 @@ def _slowest_time(plant: AxisPlant) -> float:
 
 def _step_response(plant: AxisPlant, extra_delay: int, gains: Gains, rows: int, scale: float) -> Vector:
     """Return the closed loop's step response (rows,), the plant's gain scaled, without limits."""
+    from scipy.signal import lfilter
+
     loop = open_loop(plant, extra_delay, gains)
     numerator, denominator = scale * np.asarray(loop.num[0][0]), np.asarray(loop.den[0][0])
     padded = np.concatenate([np.zeros(denominator.size - numerator.size), numerator])

@@ -5,14 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import control
 import numpy as np
 
 from softneck.core import DataError, SettingsError, SoftneckError, require_one_of
 from softneck.estimation import AxisPlant, LinearNeck, axis_plant
 from softneck.estimation._axis import AXES
+
+if TYPE_CHECKING:
+    import control
+
 
 # Coefficients below this part of the largest are rounding of a characteristic polynomial.
 _ROUNDING = 1e-11
@@ -96,6 +99,8 @@ def uncertain_plant(source: Any) -> UncertainPlant:
         SettingsError: not linear, discrete or stable; different sample times; names that do not match.
         DataError: a plant that is zero, not strictly proper or not finite, or of the other sign.
     """
+    import control
+
     if isinstance(source, UncertainPlant):
         return source
     if isinstance(source, Mapping):
@@ -162,6 +167,8 @@ def _joined(axes: Mapping[str, list[AxisPlant]]) -> UncertainPlant:
 
 
 def _plant(system: Any, axis: str, what: str) -> AxisPlant:
+    import control
+
     tf: Any = _polynomials(system) if isinstance(system, control.StateSpace) else system
     neck = LinearNeck(pitch=tf, roll=tf)
     try:
@@ -172,6 +179,8 @@ def _plant(system: Any, axis: str, what: str) -> AxisPlant:
 
 def _polynomials(system: Any) -> control.TransferFunction:
     """Return the transfer function of a state space, what rounding left of its dead time taken away."""
+    import control
+
     found: Any = control.ss2tf(system)
     num, den = (np.asarray(part[0][0]) for part in (found.num, found.den))
     for part in (num, den):
@@ -181,6 +190,8 @@ def _polynomials(system: Any) -> control.TransferFunction:
 
 def _scalar(system: Any, axis: str) -> Any:
     """Return `system`, which must be scalar and, where it has names, that of `axis`."""
+    import control
+
     if not isinstance(system, control.StateSpace | control.TransferFunction):
         raise SettingsError(
             f"{axis} must be a discrete control.StateSpace or TransferFunction; got {type(system).__name__}."

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve_discrete_are
 
 from softneck.core import Matrix, Vector
 
@@ -91,6 +90,8 @@ def observer_gains(poles: Vector, trust: float) -> Matrix:
         poles: (plants,) of the rates.
         trust: > 0.
     """
+    from scipy.linalg import solve_discrete_are
+
     rows = []
     C = np.array([[1.0, 0.0]])
     for a in poles:

@@ -6,9 +6,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import control
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -22,6 +21,10 @@ from ._disturbance import MeasuredDisturbance
 from ._lti import lti
 from ._part import MpcPart
 from ._program import MpcInfo, MpcProgram, explain
+
+if TYPE_CHECKING:
+    import control
+
 
 _RUNTIME = "softneck.design.predictive._mpc_runtime"
 

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-import control
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from softneck.core import Matrix, Vector
 from softneck.runtime import load_runtime
 
 from . import _mpc_state_runtime as rt
+
+if TYPE_CHECKING:
+    import control
+
 
 # Far beyond anything: no limit acts.
 _FREE = 1e12
@@ -22,6 +27,8 @@ def lti(arrays: tuple[Matrix, ...], *, name: str = "mpc") -> control.StateSpace:
     Its matrices are what the runtime's own `step` does to unit vectors. With preview the reference counts as known
     only when it comes.
     """
+    import control
+
     A, B, C, D = system(arrays)
     return control.StateSpace(
         A, B, C, D, float(arrays[0][0]),

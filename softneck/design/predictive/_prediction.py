@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.linalg import solve_discrete_are
 
 from softneck.core import Matrix, SettingsError, Vector
 from softneck.estimation import AxisPlant
@@ -274,6 +273,8 @@ def _terminal(p: Problem, scenario: Scenario, ends: list[Any], motors: Any, comm
 
 def terminal_matrix(p: Problem, scenario: Scenario) -> Matrix:
     """Return P (2n + 3, 2n + 3) of the Riccati equation for states of both axes and motors, moves as inputs."""
+    from scipy.linalg import solve_discrete_are
+
     n = p.order
     A, B = np.eye(2 * n + 3), np.zeros((2 * n + 3, 3))
     Q = np.zeros_like(A)

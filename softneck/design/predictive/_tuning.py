@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.linalg import block_diag, solve_discrete_are
 
 from softneck.core import Matrix, SettingsError, Vector
 from softneck.estimation import AxisPlant
@@ -42,6 +41,8 @@ def move_weight(plant: AxisPlant, bandwidth: float) -> float:
 
 def _slowest(plant: AxisPlant, weight: float) -> float:
     """Return the spectral radius of the loop of (states, held input) under the LQR."""
+    from scipy.linalg import solve_discrete_are
+
     A0, B0, C0 = plant.observable_form()
     n = plant.order
     A, B = np.eye(n + 1), np.zeros((n + 1, 1))
@@ -76,6 +77,8 @@ def closed(
     parts: tuple[Matrix, Matrix, Matrix, Matrix], plants: Pair, extra_delay: int
 ) -> tuple[Matrix, Matrix, Matrix]:
     """Return A, B (from both references) and C (to both angles) of the loop with its dead time in full."""
+    from scipy.linalg import block_diag
+
     A, B, C, D = parts
     sides = [_realised(plant, plant.delay + extra_delay) for plant in plants]
     Ap, Bp, Cp = (np.asarray(block_diag(*items)) for items in zip(*sides, strict=True))

@@ -7,16 +7,20 @@ synthesis in s is one of the discrete plant with its delay as poles at zero (Che
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import control
 import numpy as np
 
 from softneck.core import SettingsError, Vector
 
+if TYPE_CHECKING:
+    import control
+
 
 def to_continuous(system: Any) -> control.StateSpace:
     """Return the continuous image of a discrete system; a continuous one as it is."""
+    import control
+
     discrete: Any = control.ss(system)
     if discrete.dt == 0:
         return discrete
@@ -35,6 +39,8 @@ def to_continuous(system: Any) -> control.StateSpace:
 
 def to_discrete(system: Any, sample_time: float) -> control.StateSpace:
     """Return the discrete system of which `system` is the image."""
+    import control
+
     continuous: Any = control.ss(system)
     T = sample_time
     A, B, C, D = (np.asarray(p, dtype=np.float64) for p in (continuous.A, continuous.B, continuous.C, continuous.D))

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
-import control
 import numpy as np
 
 from softneck.core import SettingsError, require_between, require_one_of, require_positive
@@ -15,6 +14,10 @@ from ..linear._axis_settings import AxisSettings, Found, slowest_time
 from ..plants._uncertain import UncertainAxis
 from ._synthesis import METHODS, Synthesis, mixsyn
 from ._weights import makeweight, ucover
+
+if TYPE_CHECKING:
+    import control
+
 
 # Gain of W1 at rest: its pole lies this far below the bandwidth and becomes an integrator afterwards.
 _AT_REST = 1e4
@@ -64,6 +67,8 @@ class HinfSettings(AxisSettings):
         )
 
     def _built(self, axis: UncertainAxis, bandwidth: float, W3: Any) -> Found:
+        import control
+
         gain, dt = axis.nominal.static_gain, axis.sample_time
         G = axis.nominal.tf(extra_delay=self.extra_delay) / gain
         W1 = makeweight(_AT_REST, bandwidth, 1.0 / self.peak, dt=dt)
@@ -108,6 +113,8 @@ def with_integrator(K: Any) -> control.StateSpace:
     Raises:
         SettingsError: K has no pole near 1.
     """
+    import control
+
     A = np.asarray(K.A, dtype=np.float64)
     values, vectors = np.linalg.eig(A)
     i = int(np.argmin(np.abs(values - 1.0)))

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import control
 import numpy as np
 
 from softneck.core import SettingsError, require_positive
@@ -57,6 +56,8 @@ class NcfSettings(AxisSettings):
         )
 
     def _built(self, axis: UncertainAxis, crossover: float) -> Found:
+        import control
+
         plant, dt = axis.nominal, axis.sample_time
         gain = plant.static_gain
         if crossover >= math.pi / dt:

@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import control
 import numpy as np
-from scipy.linalg import solve_continuous_are, solve_discrete_are, sqrtm
 
 from softneck.core import Matrix, SettingsError, Vector
 
@@ -62,12 +60,16 @@ Realisation = tuple[Matrix, Matrix, Matrix, Matrix]
 
 
 def _state_space(P: Any) -> Any:
+    import control
+
     if is_data(P):
         raise SettingsError("the nu-gap needs poles: give state space or transfer functions, not frequency data.")
     return control.ss(P)
 
 
 def _transpose(system: Any) -> Any:
+    import control
+
     return control.StateSpace(system.A.T, system.C.T, system.B.T, system.D.T, system.dt)
 
 
@@ -78,6 +80,8 @@ def _transposed(factors: Realisation) -> Realisation:
 
 def _right_factors(system: Any, dt: float) -> Realisation:
     """Return [N; M], stable, with `N* N + M* M = I` and `P = N M^-1` (Zhou, Doyle and Glover 1996, sec. 13.8)."""
+    from scipy.linalg import solve_continuous_are, solve_discrete_are, sqrtm
+
     A, B, C, D = (np.asarray(item, dtype=np.float64) for item in (system.A, system.B, system.C, system.D))
     n, m = A.shape[0], B.shape[1]
     R = np.eye(m) + D.T @ D

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.linalg import cholesky, schur, solve
 
 from softneck.core import Matrix, SettingsError
 
@@ -97,6 +96,8 @@ def solve_at(plant: Partition, gamma: float) -> tuple[Matrix, Matrix, Matrix, Ma
 
     Zhou, Doyle and Glover (1996), Theorem 17.1.
     """
+    from scipy.linalg import cholesky
+
     A, B1, B2, C1, C2, D11 = plant.A, plant.B1, plant.B2, plant.C1, plant.C2, plant.D11
     n, m1, m2, p1, p2 = A.shape[0], B1.shape[1], B2.shape[1], C1.shape[0], C2.shape[0]
     a, b = p1 - m2, m1 - p2
@@ -141,6 +142,8 @@ def _restored(plant: Partition, A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> t
 
 def _riccati(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, S: Matrix) -> Matrix | None:
     """Return the stabilising X >= 0 of A'X + XA + Q - (XB + S) R^-1 (B'X + S') = 0, R of any sign; None if none is."""
+    from scipy.linalg import schur, solve
+
     n = A.shape[0]
     RB, RS = solve(R, B.T, assume_a="sym"), solve(R, S.T, assume_a="sym")
     H = np.block([[A - B @ RS, -B @ RB], [-Q + S @ RS, -(A - B @ RS).T]])

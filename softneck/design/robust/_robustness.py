@@ -11,9 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import control
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from softneck.core import SettingsError, Vector, require_between
 
@@ -262,6 +260,8 @@ def response(system: Any, frequency: Vector) -> Array:
 
 def highest(function: Callable[[Vector], Vector], w: Vector, *, refine: bool = True) -> tuple[float, float]:
     """Return where the largest of `function` over the grid is, refined between its neighbours, and its value."""
+    from scipy.optimize import minimize_scalar
+
     values = function(w)
     best = int(np.argmax(values))
     where, value = float(w[best]), float(values[best])
@@ -299,6 +299,8 @@ def grid(system: Any, frequency: Vector | None) -> Vector:
 
 def is_data(system: Any) -> bool:
     """Return whether `system` is frequency response data; refuse what is no system."""
+    import control
+
     if not isinstance(system, control.StateSpace | control.TransferFunction | control.FrequencyResponseData):
         raise SettingsError(
             f"a control.StateSpace, TransferFunction or FrequencyResponseData is needed; got {type(system).__name__}."
@@ -314,6 +316,8 @@ def _square(L: Any) -> int:
 
 
 def _closed_loop_is_stable(L: Any) -> bool:
+    import control
+
     if is_data(L):
         return True
     back: Any = control.StateSpace([], [], [], np.eye(L.ninputs), L.dt)

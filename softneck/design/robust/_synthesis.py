@@ -5,17 +5,19 @@ from __future__ import annotations
 import importlib.util
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import control
 import numpy as np
-from scipy.linalg import solve_continuous_are
 
 from softneck.core import Matrix, SettingsError, require_between, require_one_of
 
 from ._bilinear import to_continuous, to_discrete
 from ._riccati import least_gamma, partition, solve_at
 from ._weights import weight_image
+
+if TYPE_CHECKING:
+    import control
+
 
 METHODS = ("auto", "slycot", "riccati")
 # The optimal controller has a pole near infinity (3e9 rad/s); a little above gamma it is an ordinary one.
@@ -97,6 +99,8 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, method: str = "auto", above: float
     Raises:
         SettingsError: as said, or no controller exists.
     """
+    import control
+
     require_one_of("method", method, METHODS)
     require_between("above", above, 1.001, 100.0)
     dt = _dt_of(P)
@@ -145,6 +149,9 @@ def ncfsyn(G: Any, W: Any = None, *, above: float = _ABOVE) -> Synthesis:
 
 def ncf_parts(G: Any, W: Any, *, above: float = _ABOVE) -> tuple[Synthesis, Any]:
     """Return the continuous images of Ks, for negative feedback, and of W."""
+    import control
+    from scipy.linalg import solve_continuous_are
+
     require_between("above", above, 1.001, 100.0)
     dt = _dt_of(G)
     weight: Any = control.StateSpace([], [], [], [[1.0]], 0) if W is None else control.ss(W)
@@ -182,6 +189,8 @@ def loopsyn(G: Any, Gd: Any, *, above: float = _ABOVE) -> Synthesis:
     Raises:
         SettingsError: a plant with zeros outside the stability border; shape with `ncfsyn` there.
     """
+    import control
+
     dt = _dt_of(G)
     zeros: Any = np.asarray(control.zeros(G))
     outside = zeros[np.abs(zeros) >= 1.0] if dt else zeros[zeros.real >= 0.0]
@@ -205,6 +214,8 @@ def loopsyn(G: Any, Gd: Any, *, above: float = _ABOVE) -> Synthesis:
 
 def _augmented(G: Any, weights: list[Any]) -> control.StateSpace:
     """Return P from (r, u) to (W1 e, W2 u, W3 y, e) with e = r - G u (python-control's `augw`, which warns)."""
+    import control
+
     one = control.StateSpace([], [], [], [[1.0]], 0)
     blocks = [(W, part) for W, part in zip(weights, ("e", "u", "y"), strict=True) if W is not None]
     A, B, C, D = (np.asarray(part, dtype=np.float64) for part in (G.A, G.B, G.C, G.D))
@@ -229,6 +240,8 @@ def _augmented(G: Any, weights: list[Any]) -> control.StateSpace:
 
 
 def _by_slycot(P: Any, nmeas: int, ncon: int, above: float) -> tuple[float, control.StateSpace]:
+    import control
+
     try:
         from slycot import sb10ad
         from slycot.exceptions import SlycotError
@@ -262,6 +275,8 @@ def _verified(closed: Any, bound: float) -> float:
 
 def _coprime(G: Any, K: Any) -> float:
     """Return `|[K; 1] (1 + G K)^-1 [1, G]|` on a grid, which 1/margin is; raise if the loop is not stable."""
+    import control
+
     closed: Any = control.feedback(G * K, 1)
     if float(np.max(np.linalg.eigvals(np.asarray(closed.A)).real, initial=-np.inf)) >= 0.0:
         raise SettingsError("what came out is not stable: shape a slower loop, or build further `above` gamma.")
@@ -271,6 +286,8 @@ def _coprime(G: Any, K: Any) -> float:
 
 
 def _dt_of(system: Any) -> float:
+    import control
+
     if not isinstance(system, control.StateSpace | control.TransferFunction):
         raise SettingsError(f"a control.StateSpace or TransferFunction is needed; got {type(system).__name__}.")
     if system.dt is None or system.dt is True:
@@ -284,5 +301,7 @@ def _number(value: complex) -> str:
 
 def _named(K: Any, G: Any, dt: float) -> control.StateSpace:
     """Return K, from the plant's outputs to its inputs by name."""
+    import control
+
     parts: list[Matrix] = [np.asarray(part) for part in (K.A, K.B, K.C, K.D)]
     return control.StateSpace(*parts, dt, inputs=list(G.output_labels), outputs=list(G.input_labels))

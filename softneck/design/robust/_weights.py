@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import control
 import numpy as np
 
 from softneck.core import DataError, SettingsError, require_positive, require_whole
 from softneck.identification.uncertainty._envelope import envelope_weight
 
 from ._bilinear import drawn_out, to_discrete
+
+if TYPE_CHECKING:
+    import control
+
 
 # An exact integrator in a weight leaves the synthesis without a solution; this far below the corner nobody sees it.
 _LEAST_POLE = 1e-9
@@ -35,6 +38,8 @@ def makeweight(
     Raises:
         SettingsError: the corner's size is not between `low` and `high`, or a number is not positive and finite.
     """
+    import control
+
     frequency, size = corner if isinstance(corner, tuple) else (float(corner), 1.0)
     for name, value in (("low", low), ("high", high), ("corner", frequency), ("size at the corner", size)):
         require_positive(name, value)
@@ -73,6 +78,8 @@ def ucover(
         SettingsError: different sample times.
         DataError: no samples, or samples all alike.
     """
+    import control
+
     systems = [_system(item) for item in samples]
     if not systems:
         raise DataError("`ucover` needs samples.")
@@ -106,6 +113,8 @@ def weight_image(weight: Any, dt: float, name: str) -> control.StateSpace | None
     Raises:
         SettingsError: another sample time, an integrator, an unstable or improper weight.
     """
+    import control
+
     from ._bilinear import to_continuous
 
     if weight is None:
@@ -135,6 +144,8 @@ def weight_image(weight: Any, dt: float, name: str) -> control.StateSpace | None
 
 
 def _discrete(above: np.ndarray, below: np.ndarray, dt: float) -> control.TransferFunction:
+    import control
+
     made: Any = control.ss2tf(to_discrete(control.TransferFunction(above, below), dt))
     return control.TransferFunction(made.num, made.den, dt)
 

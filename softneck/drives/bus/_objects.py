@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-
-from canopen.objectdictionary import ObjectDictionary
+from typing import TYPE_CHECKING
 
 from softneck.core import FileFormatError
 
 from ._file import DriveEntry, DrivesFile
 from ._sdo import is_integer
 from ._units import acceleration_to_internal, current_to_internal, position_to_counts
+
+if TYPE_CHECKING:
+    from canopen.objectdictionary import ObjectDictionary
+
 
 # Home offset [counts] that `softneck drives zero` sets: no drive has it after a reset, so it proves the zero.
 HOMED_MARK = 1

@@ -5,18 +5,18 @@ from __future__ import annotations
 import logging
 import struct
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import canopen
-from canopen.objectdictionary import ObjectDictionary, ODVariable
-from canopen.objectdictionary.datatypes import INTEGER_TYPES
 from canopen.sdo.client import SdoClient
-from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from softneck.core import FileFormatError, SoftneckError
 
 from ..master import Frame
 from ._link import Link
+
+if TYPE_CHECKING:
+    from canopen.objectdictionary import ObjectDictionary
+
 
 # A drive answers within some slow-loop samples; 0.3 s is canopen's own patience.
 _ANSWER_TIME = 0.3
@@ -39,6 +39,9 @@ def load_eds(profile: str, path: Path | None = None) -> ObjectDictionary:
     Raises:
         FileFormatError: no EDS.
     """
+    import canopen
+    from canopen.objectdictionary import ObjectDictionary
+
     source = path or Path(__file__).parent / "eds" / f"{profile}.eds"
     try:
         dictionary = canopen.import_od(str(source))
@@ -91,6 +94,8 @@ class Objects:
         return self.read(index, subindex)
 
     def _call(self, index: int, subindex: int, act: Any, *, value: int | None = None) -> Any:
+        from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
+
         place = f"{index:04X}h" + (f":{subindex}" if subindex else "")
         try:
             entry = self._client[index]
@@ -134,11 +139,15 @@ class _Network:
 
 
 def _plain(dictionary: ObjectDictionary, index: int) -> bool:
+    from canopen.objectdictionary import ODVariable
+
     return isinstance(dictionary[index], ODVariable)
 
 
 def is_integer(dictionary: ObjectDictionary, index: int, subindex: int) -> tuple[bool, int]:
     """Return whether an object is an integer there, and its size in bytes."""
+    from canopen.objectdictionary.datatypes import INTEGER_TYPES
+
     variable = dictionary.get_variable(index, subindex)
     if variable is None or variable.data_type not in INTEGER_TYPES:
         return False, 0

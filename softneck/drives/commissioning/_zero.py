@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
-
-from canopen.objectdictionary import ObjectDictionary
+from typing import TYPE_CHECKING, Any
 
 from softneck.core import CheckFailedError, SoftneckError
 
@@ -29,6 +27,10 @@ from ..master import Frame, Tilt
 from ..master._cia402 import DriveState, state_of
 from ..running._ask import Operator
 from ..running._stop import wait
+
+if TYPE_CHECKING:
+    from canopen.objectdictionary import ObjectDictionary
+
 
 _VELOCITY, _HOMING, _HERE = 3, 6, 35
 # Between two looks at a drive [s].

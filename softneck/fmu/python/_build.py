@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pythonfmu import FmuBuilder
 
 from softneck.core import SettingsError, atomic_write, refuse_existing
 from softneck.runtime import Block, Port
@@ -146,6 +145,8 @@ def _flat(arrays: tuple[np.ndarray, ...]) -> bytes:
 
 def _through_pythonfmu(module: str, source: str, resources: Mapping[str, bytes]) -> dict[str, bytes]:
     """Return the members of the FMU that pythonfmu builds from the slave and its resources."""
+    from pythonfmu import FmuBuilder
+
     with tempfile.TemporaryDirectory(prefix="softneck-fmu-") as folder:
         script = Path(folder) / f"{module}.py"
         script.write_text(source, encoding="utf-8")

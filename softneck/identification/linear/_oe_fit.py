@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter
 
 from softneck.core import Matrix, Vector
 
@@ -160,6 +159,8 @@ def _finish(runs: Runs, nf: int, nb: int, d: int, f: Vector) -> OutputErrorFit:
 
 def _input_columns(u: Vector, f: Vector, nb: int, d: int) -> Matrix:
     """Return `u(k - d - j) / F` for j = 1..nb as (time, nb), u(0) held before the record."""
+    from scipy.signal import lfilter
+
     F = np.concatenate([[1.0], f])
     gain = u[0] / F.sum()
     # From equilibrium with the held input; the start of the run takes up whatever else it was.
@@ -197,6 +198,8 @@ def _without(Q: Matrix, X: Matrix) -> Matrix:
 
 
 def _filtered(F: Vector, x: Vector) -> Vector:
+    from scipy.signal import lfilter
+
     return np.asarray(lfilter([1.0], F, x))
 
 

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import expm
 
 from softneck.core import Matrix, Vector
 from softneck.runtime import load_functions
@@ -246,6 +245,8 @@ def _held(A: Matrix, e: Vector, delay: float, sample_time: float) -> tuple[int, 
 
 
 def _expm_pair(A: Matrix, e: Vector, time: float) -> tuple[Matrix, Vector]:
+    from scipy.linalg import expm
+
     n = e.size
     joint = np.zeros((n + 1, n + 1))
     joint[:n, :n], joint[:n, n] = A, e
@@ -255,6 +256,8 @@ def _expm_pair(A: Matrix, e: Vector, time: float) -> tuple[Matrix, Vector]:
 
 def _joined(A: Matrix, e: Vector, Ts: float) -> tuple[Matrix, Vector, Vector]:
     """Return the transition and the weights of an input's sample and the next one, joined by a straight line."""
+    from scipy.linalg import expm
+
     n = e.size
     joint = np.zeros((n + 2, n + 2))
     joint[:n, :n], joint[:n, n], joint[n, n + 1] = A, e, 1.0 / Ts
@@ -264,6 +267,8 @@ def _joined(A: Matrix, e: Vector, Ts: float) -> tuple[Matrix, Vector, Vector]:
 
 def _free_responses(A: Matrix, size: int, sample_time: float) -> Matrix:
     """Return the first row of exp(A t), (size, n): what starts can leave on the output."""
+    from scipy.linalg import expm
+
     n = A.shape[0]
     Ad = np.asarray(expm(A * sample_time))
     rows = np.zeros((size, n))

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import norm
 
 from softneck.core import Matrix, Vector
 
@@ -59,6 +58,8 @@ def bootstrap(
     The bounds are the estimate and its bootstrap standard deviation times the normal quantile: with a few hundred
     resamples that is steadier than their percentiles.
     """
+    from scipy.stats import norm
+
     block = max(round(_BLOCK / search.sample_time), 1)
     residuals = [y - simulated for (_, y), simulated in zip(runs, fit.simulated, strict=True)]
     drawn = [_draw(residuals, block, generator) for _ in range(count)]

@@ -11,8 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve_discrete_are
-from scipy.signal import lfilter
 
 from softneck.core import DataError, Matrix, Vector
 
@@ -112,6 +110,8 @@ class _Windows:
 
 def _input_matrix(runs: Runs, A: Matrix, C: Matrix) -> tuple[Matrix, Vector]:
     """Return B (n, nu) and the cost by least squares of the free run, each run with a start of its own."""
+    from scipy.signal import lfilter
+
     n, ny = A.shape[0], C.shape[0]
     nu = runs[0][0].shape[1]
     modes, V = np.linalg.eig(A)
@@ -139,6 +139,8 @@ def _input_matrix(runs: Runs, A: Matrix, C: Matrix) -> tuple[Matrix, Vector]:
 
 def _gain(windows: _Windows, states: Matrix, A: Matrix, B: Matrix, C: Matrix) -> Matrix:
     """Return the Kalman gain of the noise that the state sequence leaves over."""
+    from scipy.linalg import solve_discrete_are
+
     follows = np.concatenate(windows.follows)
     at = np.flatnonzero(follows)
     U, Y = np.concatenate(windows.inputs), np.concatenate(windows.outputs)

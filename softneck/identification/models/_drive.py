@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter
 
 from softneck.core import Matrix, Vector
 from softneck.signals import Recording
@@ -76,6 +75,8 @@ def _first(m: Vector, u: Vector) -> float:
 
 
 def _simulate(u: Vector, start: float, a: float, d: int) -> Vector:
+    from scipy.signal import lfilter
+
     if d == 0:
         return u.copy()
     # Before the record began the drive had reached its position.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.signal import lfilter
 
 from softneck.core import Vector
 
@@ -58,6 +57,8 @@ def fit_correction(errors: list[Vector], sample_time: float) -> Vector:
 
     The largest gain is taken whose squared error is at most 1.4 times the least.
     """
+    from scipy.signal import lfilter
+
     memory = float(np.exp(-sample_time / _MEMORY))
     powers = []
     for gain in _GAINS:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.signal import lfilter, lfiltic
 
 from softneck.core import DataError, Matrix, Vector
 
@@ -42,6 +41,8 @@ def free_run_fit(runs: Sequence[tuple[Matrix, Matrix]], a: Vector, B: Matrix, d:
         B: (nu, nb) numerators.
         d: dead time in samples.
     """
+    from scipy.signal import lfilter, lfiltic
+
     denominator = np.concatenate([[1.0], a])
     if np.abs(np.roots(denominator)).max(initial=0.0) >= 1.0:
         return -np.inf

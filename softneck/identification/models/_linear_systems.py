@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-import control
 import numpy as np
-from scipy.linalg import logm
 
 from softneck.core import Matrix, SettingsError, Vector, require_one_of, require_whole
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
 from ._state_space import system_of
+
+if TYPE_CHECKING:
+    import control
+
 
 KINDS = ("rls", "oe", "srivc", "subspace")
 STATE_SPACE = "softneck.identification.linear._state_space_runtime"
@@ -51,6 +53,8 @@ def transfer_function(model: Linear, output: str, input: str | None, angle_unit:
     Raises:
         SettingsError: the kind is not linear, or an unknown input, output or unit.
     """
+    import control
+
     name, scale = _checked(model, output, input, angle_unit)
     axes = model.findings.get("transfer_functions")
     if axes is not None:
@@ -72,6 +76,8 @@ def transfer_function(model: Linear, output: str, input: str | None, angle_unit:
 
 def state_space(model: Linear) -> control.StateSpace:
     """Return both outputs as one discrete state space, from the motors where the model has them as inputs."""
+    import control
+
     _require_linear(model.kind)
     if "A" in model.arrays and "transfer_functions" not in model.findings:
         A, B, C, _ = system_of(model.arrays)
@@ -94,6 +100,8 @@ def continuous_function(
     Raises:
         SettingsError: a pole at zero or on the negative real axis, which no continuous system has.
     """
+    import control
+
     name, scale = _checked(model, output, input, angle_unit)
     require_whole("pade", pade, 0, 12)
     axis = _OUTPUTS.index(output)
@@ -152,6 +160,9 @@ def continuous_parameters(
 
 def _continuous(model: Linear, output: str, name: str) -> tuple[Vector, Vector, float]:
     """Undo the zero-order hold: return numerator, denominator and dead time [s]."""
+    import control
+    from scipy.linalg import logm
+
     G = transfer_function(model, output, name, "rad")
     below, above = np.asarray(G.den[0][0]), np.trim_zeros(np.asarray(G.num[0][0]), "f")
     delay = _dead_time(above, below)

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize
-from scipy.special import expit, logit
 
 from softneck.core import Matrix, Vector
 from softneck.runtime import load_functions
@@ -53,6 +51,8 @@ class LoadedDrive:
 
 def fit_loaded_drive(recording: Recording) -> LoadedDrive:
     """Identify drives with a common limit from logged positions; no limit where it explains nothing."""
+    from scipy.optimize import minimize
+
     plain = LoadedDrive(fit_drive(recording).array, NO_LOAD)
     if not recording.has_motor_positions:
         return plain
@@ -118,6 +118,8 @@ def _gaps(runs: list[tuple[Matrix, Matrix]], j: int, d: int) -> tuple[Vector, Ve
 
 
 def _from(x: Vector, drive: Matrix) -> LoadedDrive:
+    from scipy.special import expit, logit
+
     poles = expit(logit(np.clip(drive[:, 0], 1e-3, 1.0 - 1e-3)) + x[0])
     return LoadedDrive(np.column_stack([poles, drive[:, 1]]), np.array([expit(x[1]), *x[2:]]))
 

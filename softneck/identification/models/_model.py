@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import control
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -30,6 +29,10 @@ from . import _linear_systems as _linear
 from . import _ports
 from ._arrays import check_arrays
 from ._composed import memory_of, runtime_of, set_now
+
+if TYPE_CHECKING:
+    import control
+
 
 # A free run starts from this many measured samples, for every kind; they are not scored.
 WARM_UP = 25

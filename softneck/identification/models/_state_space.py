@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.linalg import block_diag, null_space, solve_discrete_are
 
 from softneck.core import Matrix, Vector
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
@@ -37,6 +36,8 @@ def lss_arrays(
         source: 1 where u are motor positions.
         history: samples held when a run starts; None takes as many as the observer needs to settle.
     """
+    from scipy.linalg import null_space
+
     A, B, C, K = system
     n = A.shape[0]
     start = _standing(A, C)
@@ -86,6 +87,8 @@ def axes_system(a: list[Vector], b: list[Vector]) -> tuple[Matrix, Matrix, Matri
         a: denominators without their leading ones.
         b: numerators, b_1 first.
     """
+    from scipy.linalg import block_diag
+
     parts = [_observer_form(*axis) for axis in zip(a, b, strict=True)]
     T = redefinition_matrix(TENDON_ANGLES)
     A, C = np.asarray(block_diag(*(F for F, _, _ in parts))), np.zeros((2, sum(len(F) for F, _, _ in parts)))
@@ -96,6 +99,8 @@ def axes_system(a: list[Vector], b: list[Vector]) -> tuple[Matrix, Matrix, Matri
 
 def _observer_form(a: Vector, b: Vector) -> tuple[Matrix, Vector, Vector]:
     """Return A (n, n), B (n,) and the gain K (n,) of one axis, its output the first state."""
+    from scipy.linalg import solve_discrete_are
+
     n = max(a.size, b.size)
     F = np.eye(n, k=1)
     F[: a.size, 0] = -a
@@ -108,6 +113,8 @@ def _observer_form(a: Vector, b: Vector) -> tuple[Matrix, Vector, Vector]:
 
 def _standing(A: Matrix, C: Matrix) -> Matrix:
     """Return X (n, 2), the states with C X = I that move least in one sample."""
+    from scipy.linalg import null_space
+
     n = A.shape[0]
     P = np.linalg.pinv(C)
     N = null_space(C)

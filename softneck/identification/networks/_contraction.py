@@ -16,7 +16,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cholesky, solve_discrete_lyapunov
 
 from softneck.core import Matrix, Vector
 
@@ -87,6 +86,8 @@ class Contraction:
 
         F may be made smaller.
         """
+        from scipy.linalg import cholesky
+
         n, q, r = self.states, self.neurons, self.rate
         H11 = (2.0 - 1.0 / r**2) * np.eye(n)
         room = float(np.linalg.eigvalsh(H11 - A.T @ A).min())
@@ -135,6 +136,8 @@ def whitening(A: Matrix, covariance: Matrix, rate: float) -> Matrix:
         covariance: (n, n) P of the states.
         rate: below 1.
     """
+    from scipy.linalg import cholesky, solve_discrete_lyapunov
+
     scaled = A / rate
     noise = covariance - scaled @ covariance @ scaled.T
     values, vectors = np.linalg.eigh((noise + noise.T) / 2.0)

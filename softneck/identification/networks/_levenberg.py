@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from softneck.core import DataError, Matrix, Progress, Vector
 
@@ -149,6 +148,8 @@ def levenberg(
 
 
 def _solve(A: Matrix, g: Vector, damping: float) -> Vector:
+    from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
     try:
         return cho_solve(cho_factor(A + damping * np.eye(g.size)), g)
     except LinAlgError:

@@ -7,7 +7,6 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from softneck.core import DataError, Matrix, Progress, SettingsError, require_positive, require_whole, silent
 from softneck.runtime import load_functions
@@ -122,6 +121,8 @@ class Network:
         self, train: Recording, judge: Recording, drive: LoadedDrive, progress: Progress
     ) -> tuple[list[dict], bool]:
         """Return the arrays of both axes, and whether Ctrl-C ended it."""
+        from threadpoolctl import threadpool_limits
+
         told = [(0.0, "pitch"), (0.0, "roll")]
         stop = threading.Event()
         interrupted = False

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import block_diag, solve_discrete_are
 
 from softneck.core import DataError, Matrix, Vector
 from softneck.signals import Recording, redefine
@@ -73,6 +72,8 @@ def whitened(fits: list[OutputErrorFit], records: Records, neurons: int) -> tupl
 
     States are those of both axes and one of co-contraction, which no output shows yet.
     """
+    from scipy.linalg import block_diag, solve_discrete_are
+
     scales = records.scales
     chain = scales.inputs.size // 3
     parts = [_observer_form(fit, np.exp(-records.sample_time / _SLOWEST_START)) for fit in fits]

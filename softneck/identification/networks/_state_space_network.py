@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from softneck.core import DataError, Matrix, Progress, require_positive, require_whole, silent
 from softneck.runtime import load_functions
@@ -91,6 +90,8 @@ class NeuralStateSpace:
         Raises:
             DataError: too short, constant, or fewer rows than weights.
         """
+        from threadpoolctl import threadpool_limits
+
         recording = training_recording(recordings)
         progress(0.0, "drives and linear model")
         drive = fit_loaded_drive(recording)

@@ -8,10 +8,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from softneck.core import DataError, Progress, SettingsError, require_one_of, require_whole, silent
 from softneck.signals import Recording
@@ -19,6 +18,10 @@ from softneck.signals import Recording
 from ..models._model import WARM_UP, Model
 from ..models._rows import known_rows, row_hashes
 from ._trials import Estimator, Trial, attempt, settings_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+
 
 STRATEGIES = ("grid", "coordinate")
 RULES = ("one_standard_error", "best")
@@ -92,6 +95,8 @@ class Search:
 
     def frame(self) -> pd.DataFrame:
         """Return the cost table: settings, fits on the hold-out [%], size, time and why a trial has no fit."""
+        import pandas as pd
+
         rows = [
             {
                 **{name: _cell(value) for name, value in trial.settings.items()},

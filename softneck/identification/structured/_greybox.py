@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.optimize import OptimizeResult, least_squares
 
 from softneck.core import DataError, Matrix, Progress, Vector, require_whole, silent
 from softneck.runtime import load_functions
@@ -18,6 +18,10 @@ from ..models._loaded_drive import drive_start, fit_loaded_drive
 from ..models._model import Model
 from ..models._rows import row_hashes
 from ._greybox_numbers import NUMBERS, decode
+
+if TYPE_CHECKING:
+    from scipy.optimize import OptimizeResult
+
 
 _FUNCTIONS = "softneck.identification.structured._greybox_fit_runtime"
 # An error of a motor counts as much as one of the tilt twenty times smaller: about the ratio of their ranges.
@@ -138,6 +142,8 @@ class _Problem:
 
     def search(self, start: Vector, delay: int, evaluations: int, tell: _Telling) -> OptimizeResult:
         """Return scipy's result of a trust-region Gauss-Newton from `start`."""
+        from scipy.optimize import least_squares
+
         low = np.array([number.encode(number.low) for number in NUMBERS])
         high = np.array([number.encode(number.high) for number in NUMBERS])
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.signal import lfilter
 
 from softneck.core import Matrix, Vector
 from softneck.signals import Recording, redefine
@@ -71,6 +70,8 @@ def fit_compression(recordings: Sequence[Recording], search: Search, source: str
 
 def _unit_response(model: Continuous, u: Vector, sample_time: float) -> Vector:
     """Return the response to `u` of the model scaled to a static gain of one, from rest at u(0)."""
+    from scipy.signal import lfilter
+
     scaled = Continuous(a=model.a, b=model.a[-1:], delay=model.delay)
     a, b, d = scaled.sampled(sample_time)
     return u[0] + np.asarray(lfilter(np.concatenate([np.zeros(1 + d), b]), np.concatenate([[1.0], a]), u - u[0]))

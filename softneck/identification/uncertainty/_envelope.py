@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import linprog
 
 from softneck.core import Matrix, SettingsError, Vector, require_whole
 
@@ -56,6 +55,8 @@ def envelope_weight(frequency: Vector, envelope: Vector, order: int) -> tuple[Ve
 
 def _feasible(x: Vector, e: Vector, order: int, closeness: float) -> Vector | None:
     """Return the coefficients of N and D in rising powers of x, or None where none are that close."""
+    from scipy.optimize import linprog
+
     powers = x[:, None] ** np.arange(order + 1) / (1.0 + x[:, None] ** order)
     e2 = e[:, None] ** 2
     # Rows by their own size: e spans decades.

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import control
 import numpy as np
 
 from softneck.core import FileFormatError, Matrix, SettingsError, Vector, require_one_of, write_archive
 
 from ..linear._srivc_fit import Continuous
 from ._lpv import Lpv
+
+if TYPE_CHECKING:
+    import control
+
 
 AXES = ("pitch", "roll")
 SCOPES = ("window", "point", "recording")
@@ -84,6 +87,8 @@ class Family:
 
     def weight(self, output: str) -> control.TransferFunction:
         """Return W(s), stable and of minimum phase."""
+        import control
+
         above, below = self._axis(output).weight
         return control.TransferFunction(np.trim_zeros(above, "f"), np.trim_zeros(below, "f"), name=f"W_{output}")
 
@@ -185,6 +190,8 @@ class Family:
         return self.axes[output]
 
     def _system(self, model: Continuous, output: str, continuous: bool, pade: int) -> control.TransferFunction:
+        import control
+
         names = {"inputs": [_INPUTS[output]], "outputs": [output]}
         if continuous:
             if not 0 <= pade <= 12:

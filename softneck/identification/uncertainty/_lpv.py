@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from softneck.core import DataError, Matrix, Vector
 from softneck.runtime import load_functions
@@ -64,6 +63,8 @@ def fit_lpv(recordings: Sequence[Recording], start: Lpv, knots: int) -> Lpv:
     Raises:
         DataError: the inclination hardly moves.
     """
+    from scipy.optimize import least_squares
+
     met = np.concatenate([tilt(r.outputs)[0] for r in recordings])
     met = met[np.isfinite(met)]
     at = np.unique(np.quantile(met, np.linspace(0.02, 0.98, knots))) if knots > 1 else np.zeros(1)

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.signal import lfilter
 
 from softneck.core import Matrix
 from softneck.signals import Recording
@@ -88,6 +87,8 @@ def _response_columns(run: Recording) -> Matrix:
 
 def _filtered(numerator: list[float], denominator: list[float], x: Matrix) -> Matrix:
     """Return a first-order filter of x (time, 3) that had stood at x(0) before."""
+    from scipy.signal import lfilter
+
     gain = sum(numerator) / sum(denominator)
     # Steady state of the transposed direct form: z = y - b0 x.
     z = (gain - numerator[0]) * x[:1]

@@ -10,7 +10,6 @@ is drawn equally often and no block joins two runs. A fit needs only sums over r
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from softneck.core import Matrix, Vector
 
@@ -35,6 +34,8 @@ def fit_intervals(
         stretch: (time,) number of the stretch of rows; sorted.
         sample_time: [s].
     """
+    from scipy.sparse import csr_array
+
     errors = [y - yhat for y, yhat in zip(measured, predicted, strict=True)]
     length = block_length(np.column_stack([*errors, measured[0]]), stretch, sample_time)
     if length is None:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any
 
 from softneck.core import DataError, Progress, SettingsError, silent
 from softneck.signals import Recording
@@ -14,6 +12,9 @@ from softneck.signals import Recording
 from ..models._model import Model
 from ._baselines import Baselines
 from ._validation import Rules, Validation, check_training_data, judge, judged_parts
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,6 +33,8 @@ class Comparison:
         Columns: model, data, horizon, axis, fit, low, high (95 % interval), persistence, best_linear, noise_ceiling
         [%], rmse_deg, worst_deg, worst_time_s, r2, rows_scored, diverged_s; NaN where there is none.
         """
+        import pandas as pd
+
         rows = [row for v in self.validations for row in _rows(v)]
         return pd.DataFrame(rows).astype(dict.fromkeys(_NUMBERS, float))
 

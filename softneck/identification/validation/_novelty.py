@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from softneck.core import DataError, Matrix, Vector
 from softneck.signals import Recording, concatenate
@@ -131,6 +130,8 @@ def _quantiles(known: Matrix, asked: Matrix) -> tuple[Vector, Vector]:
 
 def _distances(known: Matrix, asked: Matrix) -> tuple[Vector, Vector]:
     """Return the quantiles of distances from `asked` (rows, n) to `known` and inside `known`."""
+    from scipy.spatial import KDTree
+
     points = known[:: -(-len(known) // _MOST_KNOWN)]
     some = asked[:: -(-len(asked) // _MOST_ASKED)]
     tree = KDTree(points)

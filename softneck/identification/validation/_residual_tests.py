@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
 from softneck.core import Matrix, Vector
 
@@ -75,6 +74,8 @@ def residual_tests(errors: Matrix, inputs: Matrix, stretch: np.ndarray) -> Resid
         inputs: the set-points.
         stretch: (time,) number of the stretch of rows; sorted.
     """
+    from scipy.stats import chi2
+
     edges = np.flatnonzero(np.diff(stretch)) + 1
     autocorrelation, bound, p_value = np.zeros((2, LAGS + 1)), np.full(2, np.nan), np.full(2, np.nan)
     cross, cross_bound = np.zeros((2, inputs.shape[1], 2 * LAGS + 1)), np.full((2, inputs.shape[1]), np.nan)
@@ -120,4 +121,6 @@ def _normalised(sums: Vector, a: Vector, b: Vector) -> Vector:
 
 def _sigmas(tests: int) -> float:
     """Return the two-sided 99 % bound of a standard normal, shared by so many tests."""
+    from scipy.stats import chi2
+
     return float(np.sqrt(chi2.ppf(1.0 - (1.0 - LEVEL) / tests, 1)))

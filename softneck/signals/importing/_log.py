@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 
 from softneck.core import DataError, FileFormatError, SoftneckError, Vector, to_si
 
@@ -20,6 +20,9 @@ from ._layout import Column, Layout, Source
 from ._mat import read_mat
 from ._sample_time import estimate_sample_time
 from ._tilt import pitch_roll
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from softneck.core import DataError, FileFormatError
 
 from ._mat5 import read_mat5
+
+if TYPE_CHECKING:
+    import pandas as pd
+
 
 # Structures of logs are one or two deep; deeper ones are loops or hostile.
 _MAX_DEPTH = 4
@@ -71,6 +74,8 @@ def _by_name(arrays: Iterator[tuple[str, np.ndarray]]) -> dict[str, np.ndarray]:
 
 
 def _matrix(source: Path, arrays: dict[str, np.ndarray], variable: str) -> pd.DataFrame:
+    import pandas as pd
+
     if variable not in arrays:
         raise DataError(f"{source}: there is no variable `{variable}` with numbers; the file has {_listed(arrays)}.")
     array = arrays[variable]
@@ -78,6 +83,8 @@ def _matrix(source: Path, arrays: dict[str, np.ndarray], variable: str) -> pd.Da
 
 
 def _vectors(source: Path, arrays: dict[str, np.ndarray], wanted: tuple[str, ...]) -> pd.DataFrame:
+    import pandas as pd
+
     vectors = {name: array.ravel() for name, array in arrays.items() if 1 in array.shape and array.size > 1}
     if not vectors:
         raise DataError(

@@ -6,15 +6,19 @@ import re
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 
 from softneck.core import DataError, FileFormatError, Vector
 
 from ..recording._files import WHITESPACE, TextForm, read_table
 from ._layout import Column, Layout
 from ._mat import mat_arrays, mat_table
+
+if TYPE_CHECKING:
+    import pandas as pd
+
 
 # Enough lines to tell a format, whatever the size of the log.
 _HEAD_BYTES = 2**16
@@ -86,6 +90,8 @@ def sniff(path: str | Path) -> Sniffed:
 
 def _numbers(column: pd.Series) -> Vector | None:
     """Return a column's numbers, or None where it holds words, dates or lists."""
+    import pandas as pd
+
     if column.dtype.kind in "biuf":
         return column.to_numpy(dtype=np.float64)
     if column.dtype.kind in "mMc":

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import ndimage
 
 from softneck.core import Vector, to_si
 
@@ -271,6 +270,8 @@ def _rests_at_limit(y: Vector, equal: np.ndarray, recording: Recording) -> tuple
 
 def _outliers(recording: Recording, y: Vector, quantum: float, noise: float) -> tuple[Stretch, ...]:
     """Return spikes: what a running median of 5 removes, against its robust scale (Hampel's identifier)."""
+    from scipy import ndimage
+
     spikes = np.zeros(y.size, dtype=bool)
     residual = np.zeros(y.size)
     for start, stop in true_stretches(np.ones(y.size, dtype=bool), recording.run):

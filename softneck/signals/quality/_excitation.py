@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import signal as dsp
 
 from softneck.core import Matrix, Vector
 
@@ -101,6 +100,8 @@ class Repeat:
 
 def spectrum(recording: Recording) -> Spectrum:
     """Return the spectrum of the redefined set-points, averaged over runs by their rows."""
+    from scipy import signal as dsp
+
     runs = [redefine(run.set_points) for run in recording.runs()]
     size = min(_SEGMENT, max(len(u) for u in runs))
     density, rows = np.zeros((size // 2 + 1, 3)), 0

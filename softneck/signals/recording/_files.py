@@ -5,18 +5,19 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
-from pyarrow import ArrowException, Table
-from pyarrow.csv import WriteOptions, write_csv
-from pyarrow.parquet import ParquetFile
 
 from softneck.core import DataError, FileFormatError, SoftneckError, Vector, atomic_write, to_si
 
 from ._channels import MOTOR_POSITIONS, OUTPUTS, column_name, file_unit, known_channels, may_miss, parse_column
 from ._recording import Recording
 from ._times import median_step
+
+if TYPE_CHECKING:
+    import pandas as pd
+
 
 # The delimiter that means any number of blanks or tabs.
 WHITESPACE = "whitespace"
@@ -41,6 +42,9 @@ def write_recording(path: str | Path, recording: Recording, *, force: bool = Fal
 
 def _write_csv(frame: pd.DataFrame, path: Path) -> None:
     """Write a table of numbers by Arrow, ten times as fast as by pandas; shortest digits that read back the same."""
+    from pyarrow import Table
+    from pyarrow.csv import WriteOptions, write_csv
+
     with path.open("wb") as file:
         file.write((",".join(map(str, frame.columns)) + "\n").encode())
         write_csv(Table.from_pandas(frame, preserve_index=False), file, WriteOptions(include_header=False))
@@ -48,6 +52,8 @@ def _write_csv(frame: pd.DataFrame, path: Path) -> None:
 
 def recording_frame(recording: Recording) -> pd.DataFrame:
     """Return the recording as a table whose columns say their unit, as in its file."""
+    import pandas as pd
+
     columns: dict[str, np.ndarray] = {column_name("time"): recording.time}
     for name in known_channels():
         if name in recording.channels:
@@ -89,6 +95,10 @@ def read_table(source: Path, suffix: str, form: TextForm) -> pd.DataFrame:
     Raises:
         FileFormatError: no such file, or it is no table.
     """
+    import pandas as pd
+    from pyarrow import ArrowException
+    from pyarrow.parquet import ParquetFile
+
     if not source.is_file():
         raise FileFormatError(f"{source}: no such file.")
     try:
@@ -116,6 +126,8 @@ def read_table(source: Path, suffix: str, form: TextForm) -> pd.DataFrame:
 
 
 def _from_frame(frame: pd.DataFrame) -> Recording:
+    import pandas as pd
+
     run = np.zeros(0, dtype=np.int64)
     channels: dict[str, Vector] = {}
     for title in map(str, frame.columns):
@@ -158,6 +170,8 @@ def numbers(column: pd.Series, name: str, *, missing: bool, nan_words: bool = Fa
     Raises:
         DataError: text, a written-out NaN, or an empty cell where none is allowed.
     """
+    import pandas as pd
+
     values = np.asarray(pd.to_numeric(column, errors="coerce"), dtype=np.float64)
     bad = np.isnan(values)
     if missing and bad.any():

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
 
 from softneck.core import DataError, Vector, require_positive
 
@@ -158,6 +157,8 @@ def resample(samples: Samples, sample_time: float) -> tuple[Samples, float]:
 
 def _measured(t: Vector, x: Vector, grid: Vector, before: np.ndarray, after: np.ndarray) -> Vector:
     """Return x (time,) at `grid` (instants,) between its samples `before` and `after`."""
+    from scipy.interpolate import PchipInterpolator
+
     seen = np.isfinite(x)
     missed = ~(seen[before] & seen[after])
     values = x[before]
