@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from softneck.core import SettingsError, refuse_existing
-from softneck.identification import INFINITE, Choice, choose, refit
-from softneck.identification.selection._auto import REFITTED, Tried
-from softneck.plots import Section, Table, page, validation_figure, write_page
-from softneck.signals import Recording, concatenate, read_recording
 
 from .shared._console import note, percent, print_json, print_table, progress
 from .shared._options import target
+
+if TYPE_CHECKING:
+    from softneck.identification import Choice
+    from softneck.identification.selection._auto import Tried
+    from softneck.signals import Recording
+
 
 _HEAD = ["kind", "free run", "one step", "persistence", "trained in", "size", ""]
 
@@ -30,6 +33,11 @@ def identify_auto(
     as_json: bool,
 ) -> None:
     """Try the kinds, save the chosen model, and explain."""
+    from softneck.identification import choose, refit
+    from softneck.identification.selection._auto import REFITTED
+    from softneck.plots import write_page
+    from softneck.signals import read_recording
+
     path, replace = target(output, "models/auto.npz", force=force)
     refuse_existing(path, force=replace)
     if html is not None:
@@ -58,6 +66,8 @@ def identify_auto(
 
 def _split(parts: list[Recording], train: float) -> tuple[Recording, Recording, bool]:
     """Return what to train on, what to hold out, and whether that is another experiment."""
+    from softneck.signals import concatenate
+
     if len(parts) > 1:
         return concatenate(parts[:-1]), parts[-1], True
     if not 0.0 < train < 1.0:
@@ -71,6 +81,8 @@ def _rows(choice: Choice) -> list[list[str]]:
 
 
 def _row(one: Tried, chosen: bool) -> list[str]:
+    from softneck.identification import INFINITE
+
     if one.judged is None or one.model is None:
         return [one.kind, "-", "-", "-", f"{one.seconds:.1f} s", "-", one.failure[:60]]
     fits, held = one.judged.fits, one.judged.persistence["1"]
@@ -105,6 +117,8 @@ def _facts(choice: Choice, path: Path) -> dict:
 
 
 def _page(choice: Choice) -> str:
+    from softneck.plots import Section, Table, page, validation_figure
+
     table = Table("Fit [%] on the rows held out, pitch/roll", _HEAD, _rows(choice))
     sections = [Section("Which model", text=[choice.why, *choice.remarks], tables=[table])]
     for one in choice.ranking:

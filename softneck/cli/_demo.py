@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from softneck.core import CheckFailedError, OutputError
-from softneck.report import DemoSettings, run_demo
-from softneck.report._demo import Demo
-from softneck.report._tables import FIT_HEAD, FIT_NOTE, fit_rows, fmu_rows, loop_rows
 
 from .shared._console import note, print_json, print_table
 from .shared._options import force_option, json_option
 from .shared._stages import Stages
+
+if TYPE_CHECKING:
+    from softneck.report._demo import Demo
 
 
 @click.command("demo", epilog="Example: softneck demo --out build/demo --quick")
@@ -27,6 +28,8 @@ def command(out: Path | None, quick: bool, force: bool, as_json: bool) -> None:
     Records the paper's experiment on the virtual neck, identifies RLS, set membership and a network, judges them
     beside the paper's figures, packages all as FMUs, and closes the loop over FMUs against the virtual neck.
     """
+    from softneck.report import DemoSettings, run_demo
+
     folder = out or Path("build/demo")
     _refuse_foreign(folder, force=force)
     settings = DemoSettings.quick(folder) if quick else DemoSettings(out=folder)
@@ -50,6 +53,8 @@ def _refuse_foreign(folder: Path, *, force: bool) -> None:
 
 
 def _print(demo: Demo) -> None:
+    from softneck.report._tables import FIT_HEAD, FIT_NOTE, fit_rows, fmu_rows, loop_rows
+
     print_table("Models, ours beside the paper's (fit in %, pitch/roll)", FIT_HEAD, fit_rows(demo.judged))
     click.echo(FIT_NOTE + "\n")
     print_table("FMUs in fmpy against the Python models, free run", *fmu_rows(demo.packaged))

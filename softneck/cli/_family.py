@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
 
 from softneck.core import refuse_existing
-from softneck.identification import Family, FamilySettings
-from softneck.plots import Section, Table, cover_figure, local_map_figure, page, write_page
-from softneck.signals import read_recording
 
 from .shared._console import print_json, progress
 from .shared._options import apply_settings, force_option, json_option, output_option, set_option, target
+
+if TYPE_CHECKING:
+    from softneck.identification import Family
+
 
 _SCOPES = ("windows", "operating points", "recordings")
 
@@ -37,6 +38,10 @@ def command(
     as_json: bool,
 ) -> None:
     """Fit local models over windows, operating points and RECORDINGS (payloads); wrap them into an uncertain plant."""
+    from softneck.identification import FamilySettings
+    from softneck.plots import write_page
+    from softneck.signals import read_recording
+
     chosen = apply_settings(FamilySettings, settings)
     path, replace = target(output, "families/family.npz", force=force)
     refuse_existing(path, force=replace)
@@ -83,6 +88,8 @@ def _named(numbers: np.ndarray) -> dict[str, float]:
 
 
 def _page(family: Family, names: list[str]) -> str:
+    from softneck.plots import Section, Table, cover_figure, local_map_figure, page
+
     sections = [Section("The plant", text=family.summary().splitlines())]
     for name, axis in family.axes.items():
         figures = []

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from softneck.core import FileFormatError, SettingsError, load
-from softneck.cosim.loops._loop_file import is_loop_file, reference_of
-from softneck.fmu import build_compiled_fmu, build_fmu, fmu_info
 from softneck.fmu.compiled._platforms import PLATFORMS
-from softneck.fmu.describe._describe import Buildable
-from softneck.identification import Model, Validation, validate
-from softneck.plant import NeckParameters, VirtualNeck
 
 from .shared._console import print_json, progress
 from .shared._neck import load_neck
 from .shared._options import force_option, json_option, output_option, target
 from .shared._recordings import read_together
+
+if TYPE_CHECKING:
+    from softneck.fmu.describe._describe import Buildable
+    from softneck.identification import Validation
 
 
 @click.command("fmu", epilog="Example: softneck fmu build/demo/models/rls.npz -o Rls.fmu")
@@ -54,6 +54,8 @@ def command(
     FILE is a model, observer or controller (.npz), a neck parameter file (.toml), a neck preset (paper, lab), or a
     loop file, of whose [reference] a reference FMU is made.
     """
+    from softneck.fmu import build_compiled_fmu, build_fmu, fmu_info
+
     if backend == "python" and (fmi != "2" or platforms):
         raise SettingsError("--fmi 3 and --platform are of compiled FMUs; add `--backend compiled`.")
     origin = ""
@@ -84,6 +86,9 @@ def command(
 
 def open_buildable(source: str | Path) -> Buildable:
     """Return what `source` names: a file of ours, a neck file or a neck preset."""
+    from softneck.cosim.loops._loop_file import is_loop_file, reference_of
+    from softneck.plant import VirtualNeck
+
     if Path(source).suffix == ".npz":
         thing = load(source)
         if not hasattr(thing, "block"):
@@ -105,6 +110,8 @@ def _can_be_fmu(source: str | Path) -> bool:
 
 def _judge(thing: Buildable, source: str | Path, data: tuple[Path, ...]) -> Validation | None:
     """Return the scores of a model on recordings as one, each run of its own; None for what is no model."""
+    from softneck.identification import Model, validate
+
     if not isinstance(thing, Model):
         return None
     names = (Path(source).name, ", ".join(path.name for path in data))
@@ -140,6 +147,8 @@ def _jobs(folder: Path, out: Path) -> list[tuple[str | Path, Path]]:
 
 def _is_neck(path: Path) -> bool:
     """Return whether a file means to be a neck's; what is wrong in it is said when it is read."""
+    from softneck.plant import NeckParameters
+
     if path.suffix != ".toml":
         return False
     try:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from softneck.core import KINDS, SettingsError, find_kind, refuse_existing, resolve
 from softneck.core._kinds import kinds_of
-from softneck.identification import INFINITE, Model, Search, Validation, validate
-from softneck.signals import Recording
 
 from ._auto import identify_auto
 from ._search import (
@@ -25,6 +24,11 @@ from ._search import (
 from .shared._console import note, percent, print_json, progress
 from .shared._options import apply_settings, force_option, json_option, output_option, set_option, target
 from .shared._recordings import read_together
+
+if TYPE_CHECKING:
+    from softneck.identification import Model, Search, Validation
+    from softneck.signals import Recording
+
 
 _KINDS = "\n".join(f"  {name:8} {KINDS[name].summary}" for name in kinds_of("model"))
 _KINDS += "\n  auto     tries them all and takes the best in free run"
@@ -112,6 +116,8 @@ def _refuse_options_of_auto(kind: str, *, html: bool, refit: bool) -> None:
 
 
 def _print(path: Path, model: Model, held_out: Validation | None, found: Search | None) -> None:
+    from softneck.identification import INFINITE
+
     if found is not None:
         print_search(found)
         for remark in found.remarks:
@@ -131,6 +137,8 @@ def _print(path: Path, model: Model, held_out: Validation | None, found: Search 
 
 def _hold_out(model: Model, tail: Recording | None) -> Validation | None:
     # A hold-out of a second or less says nothing.
+    from softneck.identification import INFINITE, validate
+
     if tail is None or all(len(run) < 75 for run in tail.runs()):
         return None
     return validate(model, tail, horizons=(1, INFINITE))

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from softneck.core import DataError, SettingsError, atomic_write, refuse_existing
-from softneck.signals import guess_layout, import_log, read_layout, write_recording
-from softneck.signals.importing._log import Imported
-from softneck.signals.recording._files import recording_suffix
 
 from .shared._console import note, print_json
 from .shared._options import force_option, json_option, output_option, target
+
+if TYPE_CHECKING:
+    from softneck.signals.importing._log import Imported
 
 
 @click.command(
@@ -33,6 +33,9 @@ def command(log: Path, layout_file: Path | None, guess: bool, output: Path | Non
 
     The .mcap log of `softneck drives run --log` needs neither.
     """
+    from softneck.signals import import_log, read_layout, write_recording
+    from softneck.signals.recording._files import recording_suffix
+
     if log.suffix.lower() == ".mcap":
         _run_log(log, output, force=force, as_json=as_json, layout=guess or layout_file is not None)
         return
@@ -56,6 +59,9 @@ def command(log: Path, layout_file: Path | None, guess: bool, output: Path | Non
 def _run_log(log: Path, output: Path | None, *, force: bool, as_json: bool, layout: bool) -> None:
     """Import the log of a run on drives."""
     from softneck.drives import read_run_log  # the drives take a while to import
+    from softneck.signals import write_recording
+    from softneck.signals.importing._log import Imported
+    from softneck.signals.recording._files import recording_suffix
 
     if layout:
         raise SettingsError(f"{log}: is a log of ours, whose columns are known; leave --layout and --guess out.")
@@ -75,6 +81,8 @@ def _by_guess(log: Path, path: Path, replace: bool) -> tuple[Imported, dict[str,
     Raises:
         DataError: what a recording needs was not found; the proposal is written as far as it goes.
     """
+    from softneck.signals import guess_layout, import_log
+
     proposal = path.with_suffix(".layout.toml")
     refuse_existing(proposal, force=replace)
     guess = guess_layout(log)

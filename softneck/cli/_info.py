@@ -5,18 +5,19 @@ from __future__ import annotations
 import json
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from softneck.core import DataError, FileFormatError, SettingsError, file_hash, load, read_archive, refuse_existing
-from softneck.cosim import load_study
-from softneck.plant import NeckParameters, VirtualNeck
-from softneck.signals import Guess, Layout, assess_quality, guess_layout, read_layout, read_recording
 
 from ._info_log import describe_log, is_candump
 from .shared._console import print_json, progress
 from .shared._options import force_option, json_option
+
+if TYPE_CHECKING:
+    from softneck.signals import Guess
+
 
 _RECORDINGS = (".csv", ".parquet")
 # Reading and checking a smaller file takes well under 2 s.
@@ -84,6 +85,8 @@ def _describe(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dic
 
 def _recording(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dict[str, Any]:
     """Return what a recording holds and its quality, and write the page."""
+    from softneck.signals import assess_quality, read_recording
+
     quick = html is None and file.stat().st_size < _LARGE
     with progress("info", quiet=quiet or quick) as report:
         report(0.0, "reading")
@@ -113,6 +116,8 @@ def _log(file: Path, html: Path | None, error: DataError | FileFormatError | Non
     Raises:
         DataError, FileFormatError: it is a recording with a fault, or no log either.
     """
+    from softneck.signals import guess_layout
+
     try:
         guess = guess_layout(file)
     except (DataError, FileFormatError) as reason:
@@ -133,6 +138,8 @@ def _log(file: Path, html: Path | None, error: DataError | FileFormatError | Non
 
 def _is_titled(guess: Guess) -> bool:
     """Whether a table has the form and the titles of a recording: a fault in it is for its user to mend."""
+    from softneck.signals import Layout
+
     titled = [line for line in guess.lines if "titled as in a recording" in line]
     return guess.layout.form == Layout(channels={}).form and len(titled) > 0
 
@@ -162,6 +169,10 @@ def _fmu(file: Path) -> dict[str, Any]:
 
 def _toml(file: Path) -> dict[str, Any]:
     """Say what a TOML file is: a loop names a plant, a study what varies, a layout channels; else it must be a neck."""
+    from softneck.cosim import load_study
+    from softneck.plant import NeckParameters, VirtualNeck
+    from softneck.signals import read_layout
+
     try:
         table = tomllib.loads(file.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

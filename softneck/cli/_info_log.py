@@ -5,12 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from softneck.drives import read_run_log
-from softneck.drives.bus._meaning import meaning
-from softneck.drives.logs._frame_log import FrameLog
-from softneck.drives.master import Frame
+if TYPE_CHECKING:
+    from softneck.drives.master import Frame
+
 
 _CANDUMP = re.compile(rb"\(\d+\.\d+\) \S+ [0-9A-Fa-f]{3,8}#")
 
@@ -23,6 +22,8 @@ def is_candump(file: Path) -> bool:
 
 def describe_log(file: Path) -> dict[str, Any]:
     """Return what a run's log holds: frames, duration, nodes, first error, and where it is cut."""
+    from softneck.drives.logs._frame_log import FrameLog
+
     if file.suffix.lower() == ".mcap":
         return _run(file)
     log = FrameLog(file)
@@ -39,6 +40,8 @@ def describe_log(file: Path) -> dict[str, Any]:
 
 
 def _run(file: Path) -> dict[str, Any]:
+    from softneck.drives import read_run_log
+
     log = read_run_log(file)
     cycles = log.cycles
     begin = cycles[0].time if cycles else 0.0
@@ -79,6 +82,8 @@ def _nodes(frames: Iterable[Frame]) -> str:
 
 
 def _first_error(frames: Iterable[tuple[float, Frame]]) -> str:
+    from softneck.drives.bus._meaning import meaning
+
     begin: float | None = None
     for time, frame in frames:
         begin = time if begin is None else begin

@@ -6,10 +6,11 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
-from importlib import import_module, metadata
+from importlib import import_module
 
 import click
 
+from softneck import __version__
 from softneck.core import SoftneckError
 
 # Subcommand -> module and what it does; a module is imported when its command is called, so that
@@ -60,7 +61,7 @@ class _LazyGroup(click.Group):
 
 
 @click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
-@click.version_option(metadata.version("softneck"), prog_name="softneck")
+@click.version_option(__version__, prog_name="softneck")
 def group() -> None:
     """From a logged experiment on a tendon-driven soft robotic neck to a verified controller.
 

@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from softneck.core import SettingsError, find_kind, refuse_existing, resolve
-from softneck.identification import load_model
-from softneck.signals import read_recording
 
 from .shared._console import print_json
 from .shared._options import apply_settings, force_option, json_option, output_option, set_option, target
@@ -48,6 +46,8 @@ def command(
 
     Three forms: the model with a disturbance on each axis (default), --gyro, and --set form=kinematic.
     """
+    from softneck.identification import load_model
+
     kind = find_kind("kalman", "observer")
     path, replace = target(output, "observers/kalman.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
@@ -75,6 +75,7 @@ def _fitted(observer: Any, data: tuple[Path, ...], *, fixed: tuple[str, ...]) ->
     """Return the noise levels that the recordings support, and what to say about them."""
     # Imported here: `softneck --help` must not wait for scipy's optimisers.
     from softneck.estimation import consistency, fit_noise
+    from softneck.signals import read_recording
 
     recordings = [read_recording(path) for path in data]
     fit = fit_noise(observer, recordings, fixed=fixed)

@@ -7,9 +7,7 @@ from pathlib import Path
 import click
 
 from softneck.core import refuse_existing, require_between
-from softneck.plant import VirtualNeck, record
 from softneck.signals import Limits, prepare, signal, signal_names, write_recording
-from softneck.signals.recording._files import recording_suffix
 
 from .shared._console import print_json, progress
 from .shared._neck import load_neck
@@ -50,6 +48,9 @@ def command(
     as_json: bool,
 ) -> None:
     """Record SIGNAL on the virtual neck."""
+    from softneck.plant import VirtualNeck, record
+    from softneck.signals.recording._files import recording_suffix
+
     recording_suffix(output)
     refuse_existing(output, force=force)
     require_between("--payload", payload, 0.0, 1.0, "kg")

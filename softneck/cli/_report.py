@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from softneck.core import refuse_existing
-from softneck.plots import write_page
-from softneck.report import project_page, read_project
-from softneck.report._project import Project
 
 from .shared._console import note, print_json, progress
 from .shared._options import force_option, json_option, target
+
+if TYPE_CHECKING:
+    from softneck.report._project import Project
 
 
 @click.command("report", epilog="Example: softneck report my_neck -o my_neck.html")
@@ -30,6 +31,9 @@ def command(folder: Path, output: Path | None, no_run: bool, force: bool, as_jso
     controllers, certificates, FMUs, loops (run anew) and studies, with interactive plots; it opens offline. Files that
     cannot be read are listed in it.
     """
+    from softneck.plots import write_page
+    from softneck.report import project_page, read_project
+
     path, replace = target(output, "report.html", force=force, ending=".html")
     refuse_existing(path, force=replace)
     with progress("report", quiet=as_json) as report:

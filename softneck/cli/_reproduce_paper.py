@@ -7,10 +7,6 @@ from pathlib import Path
 import click
 
 from softneck.core import refuse_existing
-from softneck.plots import write_page
-from softneck.report import ReproduceSettings, paper_page, reproduce
-from softneck.report._paper_page import LINEAR_HEAD, grouped, linear_facts, linear_rows
-from softneck.report._paper_tables import PAPER_HEAD, PAPER_NOTE, paper_entries
 
 from .shared._console import note, print_json, print_table
 from .shared._options import force_option, json_option
@@ -34,6 +30,11 @@ def command(html: Path | None, seed: int, necks: int, force: bool, as_json: bool
     Records Eq. 22 and the three tests, identifies set membership, network and RLS, and prints ours beside the
     paper's, like with like. Takes about a minute.
     """
+    from softneck.plots import write_page
+    from softneck.report import ReproduceSettings, paper_page, reproduce
+    from softneck.report._paper_page import LINEAR_HEAD, grouped, linear_facts, linear_rows
+    from softneck.report._paper_tables import PAPER_HEAD, PAPER_NOTE, paper_entries
+
     if html is not None:
         refuse_existing(html, force=force)
     with Stages(quiet=as_json) as stages:

@@ -6,17 +6,19 @@ import dataclasses
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from softneck.core import SettingsError, atomic_write
-from softneck.identification import Search, search
-from softneck.plots import search_figure
-from softneck.signals import Recording, read_recording
 
 from .shared._console import percent, print_table, progress
 from .shared._options import in_radians, value_of
+
+if TYPE_CHECKING:
+    from softneck.identification import Search
+    from softneck.signals import Recording
+
 
 # A longer table is read in the model or the JSON, not on a screen.
 _MOST_ROWS = 40
@@ -64,6 +66,9 @@ class SearchOptions:
 
 def run_search(estimator: Any, train: Recording, options: SearchOptions, *, quiet: bool) -> Search | None:
     """Return the search that the options ask for, or None where they ask for none."""
+    from softneck.identification import search
+    from softneck.signals import read_recording
+
     if options.hold_out is None:
         return None
     vary = values_to_try(estimator, options.searches)
@@ -123,6 +128,8 @@ def print_search(found: Search) -> None:
 
 def write_plot(found: Search, path: Path, *, force: bool) -> None:
     """Write the cost curves as PNG."""
+    from softneck.plots import search_figure
+
     figure = search_figure(found.curves, "Settings tried, judged by free run on the hold-out", best=found.best)
     with atomic_write(path, force=force) as temporary:
         figure.savefig(temporary, format="png", dpi=120)

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 from markupsafe import Markup
 
 from softneck.core import CheckFailedError, refuse_existing, write_certificate
-from softneck.cosim import Result, load_loop, simulate
-from softneck.plots import Section, Table, neck_view, page, write_page
-from softneck.plots._charts import loop_chart
-from softneck.signals import write_recording
-from softneck.signals.recording._files import recording_suffix
 
 from .shared._console import print_json, print_table, progress
 from .shared._options import force_option, json_option, output_option, target
+
+if TYPE_CHECKING:
+    from softneck.cosim import Result
 
 
 @click.command("simulate", epilog="Example: softneck simulate build/demo/loops/pitch_step.toml --html loop.html")
@@ -29,6 +28,11 @@ def command(
     loop_file: Path, output: Path | None, certificate: Path | None, html: Path | None, force: bool, as_json: bool
 ) -> None:
     """Close the loop that LOOP.toml describes; exit code 1 if one of its limits does not hold."""
+    from softneck.cosim import load_loop, simulate
+    from softneck.plots import neck_view, write_page
+    from softneck.signals import write_recording
+    from softneck.signals.recording._files import recording_suffix
+
     path, replace = target(output, f"results/{loop_file.stem}.csv", force=force)
     recording_suffix(path)
     refuse_existing(path, force=replace)
@@ -76,6 +80,9 @@ def _limits(result: Result) -> tuple[list[str], list[list[str]]]:
 
 
 def _page(name: str, result: Result, view: Path) -> str:
+    from softneck.plots import Section, Table, page
+    from softneck.plots._charts import loop_chart
+
     tables = [Table("Limits", *_limits(result)), Table("Metrics", *_metrics(result))]
     chart = loop_chart(result.signals.time, result.signals.signals, name)
     words = f"Order {result.order}, metrics of the {result.angle} angle, {result.real_time_factor:.0f} times real time."

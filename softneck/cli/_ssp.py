@@ -7,7 +7,6 @@ from pathlib import Path
 import click
 
 from softneck.core import file_hash
-from softneck.cosim import load_loop, write_ssp
 
 from .shared._console import note, print_json, progress
 from .shared._options import force_option, json_option, output_option, target
@@ -30,6 +29,8 @@ def command(loop_file: Path, output: Path | None, backend: str, force: bool, as_
 
     Masters that read it set all inputs and then step all: they compute what `order = "jacobi"` does.
     """
+    from softneck.cosim import load_loop, write_ssp
+
     path, replace = target(output, f"ssp/{loop_file.stem}.ssp", force=force)
     with progress("ssp", quiet=as_json):
         setup = load_loop(loop_file)

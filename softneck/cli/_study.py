@@ -8,13 +8,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from softneck.core import CheckFailedError
-from softneck.cosim import load_study, pareto_front, rank
-from softneck.cosim.studies._run_study import run_study
-from softneck.cosim.studies._store import read_description
-from softneck.cosim.studies._study_results import write_worst
-from softneck.plots import write_page
-from softneck.report import study_page
-from softneck.report._study_page import failures, study_head, study_rows
 
 from .shared._console import note, print_json, print_table, progress
 from .shared._options import force_option, json_option
@@ -53,6 +46,14 @@ def command(
               worst/         the worst runs as loop files for softneck simulate
     Ctrl-C or a crash loses no finished run: --resume goes on.
     """
+    from softneck.cosim import load_study
+    from softneck.cosim.studies._run_study import run_study
+    from softneck.cosim.studies._store import read_description
+    from softneck.cosim.studies._study_results import write_worst
+    from softneck.plots import write_page
+    from softneck.report import study_page
+    from softneck.report._study_page import failures
+
     study = load_study(study_file)
     folder = output if output is not None else Path("build") / "studies" / study_file.stem
     replace = force or (output is None and not resume)
@@ -71,10 +72,15 @@ def command(
 
 
 def _table(runs: pd.DataFrame, keys: list[str], objectives: tuple[str, ...]) -> tuple[list[str], list[list[str]]]:
+    from softneck.report._study_page import study_head, study_rows
+
     return study_head(keys, objectives), study_rows(runs, keys, objectives)
 
 
 def _summary(runs: pd.DataFrame, folder: Path, objectives: tuple[str, ...], worst: list[Path]) -> dict[str, Any]:
+    from softneck.cosim import pareto_front, rank
+    from softneck.report._study_page import failures
+
     held = runs["holds"].dropna().tolist()
     return {
         "folder": str(folder),

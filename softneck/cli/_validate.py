@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from softneck.core import SettingsError, refuse_existing
-from softneck.identification import INFINITE, Rules, Validation, compare, load_model
-from softneck.plots import write_page
-from softneck.signals import read_recording
 
 from .shared._console import print_json, print_table, progress
 from .shared._options import force_option, json_option
 from .shared._recordings import read_together
 from .shared._validate_table import fit_table, remarks
+
+if TYPE_CHECKING:
+    from softneck.identification import Validation
+
 
 _NOTE = (
     "Fit is 100 (1 - |y - yhat| / |y - mean y|) in %. Persistence repeats the last sample; a one-step fit that is not "
@@ -59,6 +61,10 @@ def command(
     as_json: bool,
 ) -> None:
     """Judge MODELs on the rows of recordings that they were not trained on."""
+    from softneck.identification import Rules, compare, load_model
+    from softneck.plots import write_page
+    from softneck.signals import read_recording
+
     horizons = _horizons(horizon)
     if html is not None:
         refuse_existing(html, force=force)
@@ -82,6 +88,8 @@ def command(
 
 
 def _horizons(text: str) -> tuple[int | str, ...]:
+    from softneck.identification import INFINITE
+
     horizons: list[int | str] = []
     for word in text.split(","):
         if word.strip() == INFINITE:

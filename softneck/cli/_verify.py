@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from softneck.core import CheckFailedError, SettingsError, file_hash, load, refuse_existing, write_certificate
 from softneck.core._certificate import CERTIFICATE_ENDING
 from softneck.loop._loop import ORDERS
-from softneck.verification import Verification, read_requirements, verify
-from softneck.verification._requirements import DEFAULT_FILE
 
 from .shared._console import print_json, print_table, progress
 from .shared._options import force_option, json_option, output_option, target
+
+if TYPE_CHECKING:
+    from softneck.verification import Verification
+
 
 _PATH = click.Path(path_type=Path)
 
 
 def _print_requirements(context: click.Context, _: click.Parameter, value: bool) -> None:
+    from softneck.verification._requirements import DEFAULT_FILE
+
     if value:
         click.echo(DEFAULT_FILE.read_text(encoding="utf-8"), nl=False)
         context.exit()
@@ -58,6 +62,8 @@ def command(
     Writes a certificate: each requirement with its value, limit and worst plant, and the hashes of all files read;
     beside it a loop file for every worst plant, for `softneck simulate`. Exit code 1 if a requirement does not hold.
     """
+    from softneck.verification import read_requirements, verify
+
     path, replace = target(output, f"certificates/{controller.stem}{CERTIFICATE_ENDING}", force=force, ending=".json")
     refuse_existing(path, force=replace)
     if html is not None:

@@ -12,9 +12,10 @@ import json
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+
+from softneck import __version__
 
 from ._errors import CheckFailedError, FileFormatError
 from ._files import atomic_write, file_hash
@@ -65,7 +66,7 @@ def certificate_contents(
     contents = {
         "certificate": kind,
         "certificate_version": CERTIFICATE_VERSION,
-        "softneck": version("softneck"),
+        "softneck": __version__,
         "holds": bool(holds),
         **more,
         "files": {role: {"path": path, "sha256": digest} for role, (path, digest) in files.items()},

@@ -4,31 +4,11 @@ from __future__ import annotations
 
 import contextlib
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from softneck.core import CheckFailedError, SettingsError, refuse_existing
-from softneck.cosim import load_loop
-from softneck.drives import (
-    DrivesResult,
-    default_drives,
-    preflight,
-    prepare,
-    reset,
-    run_on_bus,
-    run_simulated,
-    scan,
-    stop,
-    zero,
-)
-from softneck.drives.running._certified import require_certified
-from softneck.drives.running._deploy import neck_of
-from softneck.drives.running._keyboard import Keyboard
-from softneck.drives.running._preflight import Report
-from softneck.drives.running._stop import require_reset, require_stopped
-from softneck.signals import write_recording
-from softneck.signals.recording._files import recording_suffix
 
 from ..shared._console import note, print_json, print_table, progress
 from ..shared._neck import load_neck
@@ -52,6 +32,10 @@ from ._target import (
 )
 from ._view import live_view
 
+if TYPE_CHECKING:
+    from softneck.drives import DrivesResult
+    from softneck.drives.running._preflight import Report
+
 
 @click.group(
     "drives",
@@ -71,6 +55,8 @@ def command() -> None:
 @json_option
 def scan_command(drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, as_json: bool) -> None:
     """List the nodes on the bus; sends reads only. Exit code 1 if none answers."""
+    from softneck.drives import default_drives, scan
+
     if bus is not None and drives_file is None:
         chosen = Target(default_drives(), bus, False, arm)
     else:
@@ -101,6 +87,8 @@ def check_command(
 
     Writes the configuration, moves nothing. Exit code 1 if a check does not hold.
     """
+    from softneck.drives import preflight
+
     chosen = target_of(drives_file, bus, simulated, arm)
     names = checked_names(overrides)
     with open_link(chosen, moves=False, homed=True) as link:
@@ -136,6 +124,9 @@ def zero_command(
 
     Its log holds frames: .blf or .log.
     """
+    from softneck.drives import preflight, zero
+    from softneck.drives.running._keyboard import Keyboard
+
     parameters = load_neck(neck or "paper")
     chosen = target_of(drives_file, bus, simulated, arm, neck=parameters)
     if any(path.suffix.lower() == ".mcap" for path in logs):
@@ -190,6 +181,14 @@ def run_command(
     143 if SIGTERM ended it (to rest, then off).
     On a terminal (stderr) a live view shows the run, on a bus and with --pace; not with --json.
     """
+    from softneck.cosim import load_loop
+    from softneck.drives import prepare, run_on_bus, run_simulated
+    from softneck.drives.running._certified import require_certified
+    from softneck.drives.running._deploy import neck_of
+    from softneck.drives.running._keyboard import Keyboard
+    from softneck.signals import write_recording
+    from softneck.signals.recording._files import recording_suffix
+
     path, replace = target(output, f"results/drives_{loop_file.stem}.csv", force=force)
     recording_suffix(path)
     refuse_existing(path, force=replace)
@@ -255,6 +254,9 @@ def _print_run(path: Path, result: DrivesResult, *, as_json: bool) -> None:
 @json_option
 def stop_command(drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, as_json: bool) -> None:
     """Quick stop, then no voltage, for every drive; always allowed. Exit code 1 if one may still have power."""
+    from softneck.drives import stop
+    from softneck.drives.running._stop import require_stopped
+
     chosen = target_of(drives_file, bus, simulated, arm)
     with open_link(chosen, moves=False) as link:
         states = stop(link, chosen.file)
@@ -267,6 +269,9 @@ def stop_command(drives_file: Path | None, bus: str | None, simulated: bool, arm
 @json_option
 def reset_command(drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, as_json: bool) -> None:
     """Acknowledge latched faults; nothing else ever does, and nothing moves by it. Exit code 1 if a fault stays."""
+    from softneck.drives import reset
+    from softneck.drives.running._stop import require_reset
+
     chosen = target_of(drives_file, bus, simulated, arm)
     with open_link(chosen, moves=False) as link:
         states = reset(link, chosen.file)

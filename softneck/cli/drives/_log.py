@@ -7,17 +7,19 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 import platformdirs
 
 from softneck.core import OutputError, SettingsError
-from softneck.cosim.loops._simulate import LoopSetup
-from softneck.drives.bus._link import HARMLESS
-from softneck.drives.logs._run_log import RunLogger, require_log_paths
 
 from ..shared._console import note
 from ._target import Target
+
+if TYPE_CHECKING:
+    from softneck.cosim.loops._simulate import LoopSetup
+    from softneck.drives.logs._run_log import RunLogger
 
 
 def log_options(function: Callable) -> Callable:
@@ -38,6 +40,8 @@ def log_options(function: Callable) -> Callable:
 
 def require_logs(logs: Sequence[Path], *, no_log: bool, force: bool) -> None:
     """Raise where the options cannot be followed, before anybody is asked to arm anything."""
+    from softneck.drives.logs._run_log import require_log_paths
+
     if logs and no_log:
         raise SettingsError("--log and --no-log: say one of them.")
     require_log_paths(logs, force=force)
@@ -60,6 +64,9 @@ def opened_log(
     Raises:
         OutputError: it cannot be written (before anything moves), or is not complete.
     """
+    from softneck.drives.bus._link import HARMLESS
+    from softneck.drives.logs._run_log import RunLogger
+
     own = not logs and not no_log and not chosen.simulated and str(chosen.bus).partition(":")[0] not in HARMLESS
     paths = [_new_path(command, ending)] if own else list(logs)
     if not paths:

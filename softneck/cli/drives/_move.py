@@ -5,20 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from softneck.core import SettingsError, refuse_existing, require_between
-from softneck.drives import CanLink, Experiment, jog, record_signal
-from softneck.drives.bus._link import VirtualLink
-from softneck.drives.commissioning._jog import Jogged
-from softneck.drives.commissioning._record import Recorded, drive_limits
-from softneck.drives.logs._run_log import RunLogger
-from softneck.drives.running._bus_loop import Session
-from softneck.drives.running._keyboard import Keyboard
 from softneck.signals import signal_names, write_recording
-from softneck.signals.recording._files import recording_suffix
 
 from ..shared._console import note, print_json, print_table, progress
 from ..shared._neck import load_neck
@@ -36,6 +28,16 @@ from ._target import (
     target_of,
 )
 
+if TYPE_CHECKING:
+    from softneck.drives import CanLink
+    from softneck.drives.bus._link import VirtualLink
+    from softneck.drives.commissioning._jog import Jogged
+    from softneck.drives.commissioning._record import Recorded
+    from softneck.drives.logs._run_log import RunLogger
+    from softneck.drives.running._bus_loop import Session
+    from softneck.drives.running._keyboard import Keyboard
+
+
 _pace_option = click.option("--pace", type=float, help="With --simulated: this multiple of real time.")
 
 
@@ -43,6 +45,9 @@ def _session(
     chosen: Target, link: CanLink | VirtualLink, keyboard: Keyboard, overrides: tuple[str, ...], pace: float | None,
     log: RunLogger | None, files: Mapping[str, str | Path],
 ) -> Session:  # fmt: skip
+    from softneck.drives.bus._link import VirtualLink
+    from softneck.drives.running._bus_loop import Session
+
     sensor = None if isinstance(link, VirtualLink) else sensor_of(chosen.file, str(chosen.bus))
     return Session(
         file=chosen.file, link=link, sensor=sensor, override=checked_names(overrides), pace=pace, operator=keyboard,
@@ -77,6 +82,9 @@ def jog_command(
     Says whether a positive move tilts the neck the way that the neck's tendon angle says; the drives must be zeroed.
     Exit code 1 if it does not: nodes swapped, a sign reversed, a tendon that hangs.
     """
+    from softneck.drives import jog
+    from softneck.drives.running._keyboard import Keyboard
+
     require_logs(logs, no_log=no_log, force=force)
     parameters = load_neck(neck or "paper")
     chosen = target_of(drives_file, bus, simulated, arm, neck=parameters)
@@ -145,6 +153,12 @@ def record_command(
     as_json: bool,
 ) -> None:  # fmt: skip
     """Record SIGNAL on the drives."""
+    from softneck.drives import Experiment, record_signal
+    from softneck.drives.bus._link import VirtualLink
+    from softneck.drives.commissioning._record import drive_limits
+    from softneck.drives.running._keyboard import Keyboard
+    from softneck.signals.recording._files import recording_suffix
+
     recording_suffix(output)
     refuse_existing(output, force=force)
     require_logs(logs, no_log=no_log, force=force)

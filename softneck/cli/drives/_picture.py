@@ -7,14 +7,15 @@ seconds of processor time, just when a run begins.
 from __future__ import annotations
 
 import json
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from softneck.drives.logs._times import CycleFigures
 from softneck.drives.master import Phase
 from softneck.drives.master._cia402 import DriveState
-from softneck.drives.master._events import Reaction
-from softneck.drives.master._nmt import NodeState
-from softneck.drives.running._snapshot import DriveSnapshot, Snapshot
+
+if TYPE_CHECKING:
+    from softneck.drives.logs._times import CycleFigures
+    from softneck.drives.running._snapshot import DriveSnapshot, Snapshot
+
 
 _PHASES = {Phase.RUNNING: "bold green", Phase.DONE: "bold green", Phase.STOPPING: "bold red", Phase.STOPPED: "bold red",
            Phase.RETREAT: "bold yellow"}  # fmt: skip
@@ -33,6 +34,8 @@ def to_line(
         title: what runs.
         duration: of the loop [s].
     """
+    from softneck.drives.master._events import Reaction
+
     picture: dict[str, Any] = {
         "title": title,
         "phase": str(snapshot.phase),
@@ -59,6 +62,8 @@ def to_line(
 
 
 def _drive(drive: DriveSnapshot) -> dict[str, Any]:
+    from softneck.drives.master._nmt import NodeState
+
     good = drive.state is DriveState.ENABLED
     return {
         "node": drive.node,

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from softneck.core import FileFormatError, SettingsError, SoftneckError
-from softneck.cosim import load_loop
-from softneck.drives import Experiment, prepare, read_run_log, replay
-from softneck.drives.commissioning._jog import jog_pilot
-from softneck.drives.logs._log_file import LoggedRun, changed_files
-from softneck.drives.master._measured import Pilot
-from softneck.drives.running._pilot import LoopPilot
 
 from ..shared._console import note, print_json, print_table
 from ..shared._options import json_option
+
+if TYPE_CHECKING:
+    from softneck.drives.logs._log_file import LoggedRun
+    from softneck.drives.master._measured import Pilot
 
 
 @click.command("replay", epilog="Example: softneck drives replay run.mcap")
@@ -31,6 +30,9 @@ def replay_command(log: Path, loop_file: Path | None, controller: Path | None, c
     LOG is the .mcap of `run`, `jog` or `record` with --log; one that is cut is replayed up to the cut, and says so.
     Exit code 0 if all is equal, 1 with the first difference if not. Nothing is sent to any bus.
     """
+    from softneck.drives import read_run_log, replay
+    from softneck.drives.logs._log_file import changed_files
+
     if log.suffix.lower() in (".log", ".blf"):
         raise SettingsError(f"{log}: holds frames only; replay needs the `.mcap` of the run.")
     run = read_run_log(log)
@@ -57,6 +59,11 @@ def _pilot(run: LoggedRun, loop_file: Path | None, controller: Path | None) -> P
 
     None where the log names none, or the files of the loop are gone.
     """
+    from softneck.cosim import load_loop
+    from softneck.drives import Experiment, prepare
+    from softneck.drives.commissioning._jog import jog_pilot
+    from softneck.drives.running._pilot import LoopPilot
+
     try:
         if "jog" in run.facts:
             return jog_pilot(**run.facts["jog"])

@@ -11,13 +11,13 @@ from __future__ import annotations
 import json
 import math
 import os
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rich.console import Console, Group, RenderableType
-from rich.live import Live
-from rich.panel import Panel
-from rich.table import Table
-from rich.text import Text
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+    from rich.table import Table
+    from rich.text import Text
+
 
 _BAR = 20
 # What all of it needs [columns], [lines]: with a fault's line and five events.
@@ -32,6 +32,9 @@ def render(picture: dict[str, Any], size: tuple[int, int] = (_WIDE, _HIGH)) -> R
         picture: what `to_line` wrote.
         size: columns and lines of the terminal; on 80 x 24 columns move together and empty lines are left out.
     """
+    from rich.console import Group
+    from rich.panel import Panel
+
     narrow, low = size[0] < _WIDE, size[1] < _HIGH
     blocks: list[list[RenderableType]] = [
         [_head(picture)],
@@ -48,6 +51,8 @@ def render(picture: dict[str, Any], size: tuple[int, int] = (_WIDE, _HIGH)) -> R
 
 
 def _head(picture: dict[str, Any]) -> Text:
+    from rich.text import Text
+
     text = Text()
     text.append(picture["phase"], style=picture["phase_style"])
     of = "" if picture["duration"] is None else f" of {picture['duration']:.1f}"
@@ -83,6 +88,8 @@ def _motors(picture: dict[str, Any], *, narrow: bool, low: bool) -> Table:
 
 
 def _drives(picture: dict[str, Any], *, narrow: bool) -> Table:
+    from rich.text import Text
+
     word = "status" if narrow else "status word"
     table = _table(narrow, "drive", "state", "NMT", word, "silent [cycles]", "emergency")
     table.columns[1].justify = table.columns[2].justify = "left"
@@ -99,6 +106,8 @@ def _drives(picture: dict[str, Any], *, narrow: bool) -> Table:
 
 
 def _bar(value: float, most: float, length: int) -> Text:
+    from rich.text import Text
+
     share = min(max(value / most, 0.0), 1.0) if math.isfinite(value) else 0.0
     full = round(share * length)
     style = "red" if share > 0.9 else "yellow" if share > 0.75 else "green"
@@ -106,6 +115,8 @@ def _bar(value: float, most: float, length: int) -> Text:
 
 
 def _timing(picture: dict[str, Any], *, narrow: bool) -> Text:
+    from rich.text import Text
+
     text = Text.assemble(("cycle [ms]  " if narrow else "cycle time [ms]  ", "bold"), picture["times"])
     late = picture["counts"].get("late_cycle", 0)
     due = f"due {1e3 * picture['period']:g}"
@@ -115,6 +126,8 @@ def _timing(picture: dict[str, Any], *, narrow: bool) -> Text:
 
 
 def _events(picture: dict[str, Any]) -> list[Text]:
+    from rich.text import Text
+
     lines = [Text("last events", style="bold")]
     for time, name, text, serious in picture["events"]:
         line = f"{time:9.2f} s  {name}  {text}"
@@ -125,11 +138,16 @@ def _events(picture: dict[str, Any]) -> list[Text]:
 
 
 def _counts(picture: dict[str, Any]) -> Text:
+    from rich.text import Text
+
     counted = "   ".join(f"{name} {count}" for name, count in sorted(picture["counts"].items()))
     return Text.assemble(("counts  ", "bold"), counted or "none")
 
 
 def _table(narrow: bool, *names: str) -> Table:
+    from rich.table import Table
+    from rich.text import Text
+
     table = Table(box=None, pad_edge=False, padding=(0, 1 if narrow else 2), header_style="bold")
     for i, name in enumerate(names):
         # As text: rich takes [rad] in a string for markup.
@@ -138,6 +156,8 @@ def _table(narrow: bool, *names: str) -> Table:
 
 
 def _title(title: str) -> Text | None:
+    from rich.text import Text
+
     return Text(title) if title else None
 
 
@@ -152,6 +172,10 @@ def from_line(line: bytes, size: tuple[int, int] = (_WIDE, _HIGH)) -> Renderable
 
 def main() -> None:
     """Draw the newest line that came on standard input, on standard error, until there are no more."""
+    from rich.console import Console
+    from rich.live import Live
+    from rich.panel import Panel
+
     if hasattr(os, "nice"):
         os.nice(_NICE)
     rest = b""

@@ -6,30 +6,24 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from softneck.core import SettingsError, SoftneckError
-from softneck.drives import (
-    CanLink,
-    DrivesFile,
-    default_drives,
-    load_drives,
-    neck_drives,
-    open_bus,
-    open_sensor,
-    simulated_neck,
-)
-from softneck.drives.bus._link import HARMLESS, VirtualLink
-from softneck.drives.master import Frame, Tilt
-from softneck.drives.running._keyboard import Keyboard
 from softneck.drives.running._preflight import OVERRIDES
-from softneck.drives.sensing._sensor import Sensor
-from softneck.plant import NeckParameters
 
 from ..shared._console import note
 from ._arm import require_armed
+
+if TYPE_CHECKING:
+    from softneck.drives import CanLink, DrivesFile
+    from softneck.drives.bus._link import VirtualLink
+    from softneck.drives.master import Frame, Tilt
+    from softneck.drives.running._keyboard import Keyboard
+    from softneck.drives.sensing._sensor import Sensor
+    from softneck.plant import NeckParameters
+
 
 SAMPLE_TIME = 0.02
 # How long a command waits for a sample of the inclinometer [s].
@@ -64,6 +58,8 @@ def target_of(
     drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, *, neck: NeckParameters | None = None
 ) -> Target:  # fmt: skip
     """Return which drives the options mean; simulated ones without a file are set up for the virtual `neck`."""
+    from softneck.drives import default_drives, load_drives, neck_drives
+
     if (bus is None) == (not simulated):
         raise SettingsError("say which drives: --bus INTERFACE:CHANNEL, or --simulated.")
     if drives_file is None and not simulated:
@@ -80,6 +76,10 @@ def open_link(
     chosen: Target, *, moves: bool, homed: bool = False, neck: NeckParameters | None = None, seed: int = 0
 ) -> Iterator[CanLink | VirtualLink]:
     """Yield the bus, or simulated drives on a virtual neck; what moves a bus must be armed."""
+    from softneck.drives import open_bus, simulated_neck
+    from softneck.drives.bus._link import VirtualLink
+    from softneck.plant import NeckParameters
+
     if chosen.simulated:
         yield VirtualLink(
             simulated_neck(chosen.file, neck or NeckParameters.paper(), sample_time=SAMPLE_TIME, homed=homed, seed=seed)
@@ -111,6 +111,8 @@ def leave_if_asked(keyboard: Keyboard, *, terminated: bool = False) -> None:
 @contextlib.contextmanager
 def open_drives(chosen: Target) -> Iterator[CanLink]:
     """Yield the bus to drives that are to move."""
+    from softneck.drives.bus._link import VirtualLink
+
     with open_link(chosen, moves=True) as link:
         if isinstance(link, VirtualLink):
             raise SettingsError("drives on a bus are asked.")
@@ -134,6 +136,9 @@ neck_option = click.option("--neck", metavar="paper|lab|NECK.toml", help="The vi
 
 def look_of(link: CanLink | VirtualLink, file: DrivesFile) -> Callable[[], Tilt | None]:
     """Return what gives the newest sample of the inclinometer."""
+    from softneck.drives.bus._link import VirtualLink
+    from softneck.drives.master import Tilt
+
     if isinstance(link, VirtualLink):
 
         def sample() -> Tilt:
@@ -161,6 +166,8 @@ def sensor_of(file: DrivesFile, bus: str) -> Any:
         SettingsError: a recording as sensor where the drives may be real.
         SoftneckError: see `open_sensor`; nothing was sent to the drives yet.
     """
+    from softneck.drives.bus._link import HARMLESS
+
     if file.sensor_kind == "replay" and bus.partition(":")[0] not in HARMLESS:
         raise SettingsError(
             f'[sensor] kind "replay" is for simulated drives; on {bus} the loop would not see the neck it moves.'
@@ -171,6 +178,8 @@ def sensor_of(file: DrivesFile, bus: str) -> Any:
 @contextlib.contextmanager
 def _told(file: DrivesFile) -> Iterator[Any]:
     """Yield the inclinometer; say at the end what happened to it, which no drive and no watch can know."""
+    from softneck.drives import open_sensor
+
     with open_sensor(file.sensor_kind, file.sensor_node, file.sensor_source) as sensor:
         try:
             yield sensor

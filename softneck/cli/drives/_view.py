@@ -15,18 +15,20 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 import numpy as np
-from rich.console import Console
 
 from softneck.core import Vector
-from softneck.drives import Snapshots
-from softneck.drives.logs._times import CycleFigures
-from softneck.drives.master import Frame, Master, Tilt
-from softneck.drives.running._snapshot import Snapshot
-from softneck.drives.running._virtual import Watch
 
 from ._picture import to_line
+
+if TYPE_CHECKING:
+    from softneck.drives.logs._times import CycleFigures
+    from softneck.drives.master import Frame, Master, Tilt
+    from softneck.drives.running._snapshot import Snapshot
+    from softneck.drives.running._virtual import Watch
+
 
 _PERIOD = 1.0 / 8.0
 # Percentiles are of so many of the last bus cycles: 10 s at 100 Hz.
@@ -47,6 +49,8 @@ class LiveView:
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         """Prepare; `duration` [s] is the loop's, `terminal` a file descriptor (default: standard error)."""
+        from softneck.drives import Snapshots
+
         self._title, self._duration, self._terminal, self._clock = title, duration, terminal, clock
         self._snapshots = Snapshots()
         self._newest: Snapshot | None = None
@@ -111,6 +115,8 @@ class LiveView:
         return to_line(newest, self._times(), begin=self._begin, title=self._title, duration=self._duration)
 
     def _times(self) -> CycleFigures:
+        from softneck.drives.logs._times import CycleFigures
+
         return CycleFigures.of(self._gaps[: min(self._shown, _CYCLES)].copy())
 
     def _feed(self, screen: subprocess.Popen[bytes]) -> None:
@@ -131,6 +137,8 @@ class LiveView:
 @contextlib.contextmanager
 def live_view(title: str, duration: float, *, wanted: bool) -> Iterator[tuple[Watch, ...]]:
     """Yield the `watches` of a run; none, and nothing is drawn, if not `wanted` or stderr is no terminal."""
+    from rich.console import Console
+
     if not (wanted and Console(stderr=True).is_terminal):
         yield ()
         return

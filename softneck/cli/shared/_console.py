@@ -9,10 +9,6 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import click
-from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-from rich.table import Table
-from rich.text import Text
 
 from softneck.core import Progress as ProgressCallback
 from softneck.core import silent
@@ -32,6 +28,10 @@ def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) 
 
     All of it is printed as it is: rich would take `[rad]` in a string for markup, `:key:` for a picture.
     """
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
     table = Table(header_style="bold", pad_edge=False)
     for index, name in enumerate(head):
         table.add_column(Text(name), justify="left" if index == 0 else "right", no_wrap=True)
@@ -51,9 +51,13 @@ def note(message: str) -> None:
 @contextlib.contextmanager
 def progress(what: str, *, quiet: bool = False) -> Iterator[ProgressCallback]:
     """Yield a callback (part done, word) that draws a bar on stderr; a line where stderr is no terminal."""
+
     if quiet:
         yield silent
         return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
     console = Console(stderr=True)
     if not console.is_terminal:
         note(f"{what} ...")

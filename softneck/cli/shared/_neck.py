@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from softneck.core import SettingsError
-from softneck.plant import NeckParameters
+
+if TYPE_CHECKING:
+    from softneck.plant import NeckParameters
+
 
 _PRESETS = ("paper", "lab")
 
@@ -16,6 +20,8 @@ def load_neck(name: str) -> NeckParameters:
     Raises:
         SettingsError: neither a preset nor a neck file.
     """
+    from softneck.plant import NeckParameters
+
     if name == "paper":
         return NeckParameters.paper()
     if name == "lab":

@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from softneck.core import DataError
-from softneck.signals import Recording, concatenate, read_recording
+
+if TYPE_CHECKING:
+    from softneck.signals import Recording
 
 
 def read_together(paths: Sequence[Path]) -> Recording:
@@ -16,6 +19,8 @@ def read_together(paths: Sequence[Path]) -> Recording:
     Raises:
         DataError: their sample times differ; the line names two that do.
     """
+    from softneck.signals import concatenate, read_recording
+
     recordings = [read_recording(path) for path in paths]
     for path, recording in zip(paths, recordings, strict=True):
         if not math.isclose(recording.sample_time, recordings[0].sample_time, rel_tol=1e-6):

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from softneck.identification import Validation
-
 from ._console import percent
+
+if TYPE_CHECKING:
+    from softneck.identification import Validation
+
 
 Head = list[str]
 Cells = list[list[str]]

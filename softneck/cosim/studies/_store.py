@@ -6,10 +6,10 @@ import json
 import shutil
 import uuid
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from softneck import __version__
 from softneck.core import FileFormatError, OutputError, SettingsError, atomic_write
 from softneck.loop._metrics import METRICS
 
@@ -201,6 +201,6 @@ def _type_of(vary: Vary) -> pa.DataType:
 
 def _description(study: Study) -> dict[str, Any]:
     return {
-        "format": 1, "softneck": version("softneck"), "name": study.name, "folder": str(study.folder),
+        "format": 1, "softneck": __version__, "name": study.name, "folder": str(study.folder),
         "objectives": list(study.objectives), "digest": study.digest, "study": study.description(),
     }  # fmt: skip

@@ -7,8 +7,6 @@ import struct
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from canopen.sdo.client import SdoClient
-
 from softneck.core import FileFormatError, SoftneckError
 
 from ..master import Frame
@@ -16,6 +14,7 @@ from ._link import Link
 
 if TYPE_CHECKING:
     from canopen.objectdictionary import ObjectDictionary
+    from canopen.sdo.client import SdoClient
 
 
 # A drive answers within some slow-loop samples; 0.3 s is canopen's own patience.
@@ -59,8 +58,12 @@ class Objects:
 
     def __init__(self, link: Link, node: int, dictionary: ObjectDictionary) -> None:
         """Talk to `node` over `link`, with names and types of `dictionary`."""
+        from canopen.sdo.client import SdoClient
+
         self.node = node
-        self._client = _Client(0x600 + node, 0x580 + node, dictionary)
+        self._client = SdoClient(0x600 + node, 0x580 + node, dictionary)
+        # The network below has put the answer into the queue before canopen looks, or there is none.
+        self._client.RESPONSE_TIMEOUT = 0.0
         self._client.network = _Network(link, self._client, 0x580 + node)  # pyright: ignore[reportAttributeAccessIssue]
         self._dictionary = dictionary
 
@@ -111,11 +114,6 @@ class Objects:
             raise SdoError(f"node {self.node} sends what is no answer (object {place}: {error}).") from error
         except KeyError as error:
             raise SdoError(f"the EDS has no object {place}; it does not fit the drive's profile.") from error
-
-
-class _Client(SdoClient):
-    # The network shim below has put the answer into the queue before canopen looks, or there is none.
-    RESPONSE_TIMEOUT = 0.0
 
 
 class _Network:

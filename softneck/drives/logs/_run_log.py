@@ -10,10 +10,10 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
+from softneck import __version__
 from softneck.core import OutputError, SettingsError, file_hash, refuse_existing
 
 from ..master import Event, Frame, Master, MasterSettings, Tilt
@@ -97,7 +97,7 @@ def run_facts(
 ) -> dict[str, Any]:
     """Return what a log says about its run: the master's settings and the files, by hash, that acted in it."""
     return {
-        "softneck": version("softneck"),
+        "softneck": __version__,
         "settings": dataclasses.asdict(settings)
         | {"bus": dataclasses.asdict(settings.bus) | {"off": sorted(settings.bus.off)}},
         "simulated": simulated,
@@ -286,7 +286,7 @@ class _McapSink:
         from mcap.writer import Writer
 
         self._writer = Writer(stream, chunk_size=_PIECE)
-        self._writer.start(profile="", library=f"softneck {version('softneck')}")
+        self._writer.start(profile="", library=f"softneck {__version__}")
         schemas = {
             name: self._writer.register_schema(name, "jsonschema", json.dumps(schema).encode())
             for name, schema in _SCHEMAS.items()

@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 import uuid
 from collections.abc import Sequence
-from importlib.metadata import version
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
+from softneck import __version__
 from softneck.core import SettingsError, atomic_write, refuse_existing
 from softneck.runtime import Block
 
@@ -110,7 +110,7 @@ def _folders(library: Library, wanted: Sequence[str], fmi: int) -> list[tuple[st
 
 
 def _members(block: Block, info: FmuInfo, name: str, fmi: int, sources: Sources) -> dict[str, bytes]:
-    tool = f"softneck {version('softneck')} (compiled)"
+    tool = f"softneck {__version__} (compiled)"
     content = hashlib.sha256()
     for part in (
         model_bytes(block, name, ""),
@@ -128,7 +128,7 @@ def _members(block: Block, info: FmuInfo, name: str, fmi: int, sources: Sources)
         "documentation/licenses/license.txt": license_text("softneck", info.license).encode(),
         ("model.png" if fmi == 2 else "terminalsAndIcons/icon.png"): icon_png(block.kind, block.role),
         "sources/README.txt": _REBUILD.format(
-            flags=" ".join(FLAGS), name=name, main=MAIN, version=version("softneck")
+            flags=" ".join(FLAGS), name=name, main=MAIN, version=__version__
         ).encode(),
     }
     if fmi == 3:

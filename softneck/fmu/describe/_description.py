@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from importlib.metadata import version
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
+from softneck import __version__
 from softneck.core import SettingsError
 from softneck.runtime import Block, Port
 
@@ -53,7 +54,7 @@ def described_block(block: Block) -> Block:
 
 def generation_tool() -> str:
     """Return the name and version of what builds the FMU."""
-    return f"softneck {version('softneck')} (PythonFMU {version('pythonfmu')})"
+    return f"softneck {__version__} (PythonFMU {version('pythonfmu')})"
 
 
 def model_description(block: Block, info: FmuInfo, identity: Identity) -> bytes:

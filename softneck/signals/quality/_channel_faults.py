@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from softneck.core import Vector, to_si
 
@@ -270,14 +271,13 @@ def _rests_at_limit(y: Vector, equal: np.ndarray, recording: Recording) -> tuple
 
 def _outliers(recording: Recording, y: Vector, quantum: float, noise: float) -> tuple[Stretch, ...]:
     """Return spikes: what a running median of 5 removes, against its robust scale (Hampel's identifier)."""
-    from scipy import ndimage
-
     spikes = np.zeros(y.size, dtype=bool)
     residual = np.zeros(y.size)
     for start, stop in true_stretches(np.ones(y.size, dtype=bool), recording.run):
         rows = start + np.flatnonzero(np.isfinite(y[start:stop]))
         if rows.size >= _SPIKE_WINDOW:
-            residual[rows] = y[rows] - ndimage.median_filter(y[rows], _SPIKE_WINDOW, mode="nearest")
+            padded = np.pad(y[rows], _SPIKE_WINDOW // 2, mode="edge")
+            residual[rows] = y[rows] - np.median(sliding_window_view(padded, _SPIKE_WINDOW), axis=1)
     size = np.abs(residual)
     floor = max(_SPIKE_FLOOR * (np.nanpercentile(y, 99) - np.nanpercentile(y, 1)), 4.0 * quantum)
     # Most samples of a smooth channel pass the filter unchanged: its noise is the better scale there.

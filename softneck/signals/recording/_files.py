@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +13,7 @@ import numpy as np
 from softneck.core import DataError, FileFormatError, SoftneckError, Vector, atomic_write, to_si
 
 from ._channels import MOTOR_POSITIONS, OUTPUTS, column_name, file_unit, known_channels, may_miss, parse_column
+from ._plain_csv import read_plain_csv
 from ._recording import Recording
 from ._times import median_step
 
@@ -71,9 +73,10 @@ def read_recording(path: str | Path) -> Recording:
         DataError: columns, units, numbers or times are not those of a recording; the line says which.
     """
     source = Path(path)
-    frame = read_table(source, recording_suffix(source), TextForm())
+    suffix = recording_suffix(source)
+    plain = read_plain_csv(source) if suffix == ".csv" else None
     try:
-        return _from_frame(frame)
+        return _from_columns(plain if plain is not None else _columns(read_table(source, suffix, TextForm())))
     except SoftneckError as error:
         raise DataError(f"{source}: {error}") from error
 
@@ -125,21 +128,27 @@ def read_table(source: Path, suffix: str, form: TextForm) -> pd.DataFrame:
         raise FileFormatError(f"{source}: cannot be read as a table ({reason}).") from error
 
 
-def _from_frame(frame: pd.DataFrame) -> Recording:
+def _columns(frame: pd.DataFrame) -> dict[str, pd.Series]:
+    """Return title -> column, without the empty one that a delimiter at the end of each line makes."""
     import pandas as pd
 
+    columns = {str(title): pd.Series(frame[title]) for title in frame.columns}
+    return {
+        title: cells for title, cells in columns.items() if not (title.startswith("Unnamed: ") and cells.isna().all())
+    }
+
+
+def _from_columns(columns: Mapping[str, pd.Series | Vector]) -> Recording:
     run = np.zeros(0, dtype=np.int64)
     channels: dict[str, Vector] = {}
-    for title in map(str, frame.columns):
+    for title, cells in columns.items():
         if title.strip() == "run":
-            run = integers(pd.Series(frame[title]))
+            run = integers(cells)
             continue
-        if title.startswith("Unnamed: ") and pd.Series(frame[title]).isna().all():
-            continue  # a delimiter at the end of each line
         name, factor = parse_column(title)
         if name in channels:
             raise DataError(f"channel `{name}` stands in two columns; drop one.")
-        channels[name] = factor * numbers(pd.Series(frame[title]), name, missing=may_miss(name))
+        channels[name] = factor * numbers(cells, name, missing=may_miss(name))
     if "time" not in channels:
         raise DataError("there is no column `time [s]`.")
     time = channels.pop("time")
@@ -158,7 +167,7 @@ def _require_samples(recording: Recording) -> None:
             )
 
 
-def numbers(column: pd.Series, name: str, *, missing: bool, nan_words: bool = False) -> Vector:
+def numbers(column: pd.Series | Vector, name: str, *, missing: bool, nan_words: bool = False) -> Vector:
     """Return a column as floats; an empty cell is NaN where `missing` samples are allowed.
 
     Args:
@@ -170,6 +179,8 @@ def numbers(column: pd.Series, name: str, *, missing: bool, nan_words: bool = Fa
     Raises:
         DataError: text, a written-out NaN, or an empty cell where none is allowed.
     """
+    if isinstance(column, np.ndarray):
+        return _numbers_only(column, name, missing=missing)
     import pandas as pd
 
     values = np.asarray(pd.to_numeric(column, errors="coerce"), dtype=np.float64)
@@ -182,12 +193,23 @@ def numbers(column: pd.Series, name: str, *, missing: bool, nan_words: bool = Fa
     if bad.any():
         row = int(np.argmax(bad))
         cell = "an empty cell" if pd.isna(column.iloc[row]) else f"`{column.iloc[row]}`"
-        hint = "A missing sample is an empty cell." if missing else "Mend the log or cut it before that row."
-        raise DataError(f"column `{name}` holds {cell} at row {row} (the first is 0), where a number is needed. {hint}")
+        raise _no_number(name, cell, row, missing=missing)
     return values
 
 
-def integers(column: pd.Series) -> np.ndarray:
+def _numbers_only(values: Vector, name: str, *, missing: bool) -> Vector:
+    """Return a column of numbers; NaN stands for an empty cell."""
+    if not missing and np.isnan(values).any():
+        raise _no_number(name, "an empty cell", int(np.argmax(np.isnan(values))), missing=missing)
+    return values
+
+
+def _no_number(name: str, cell: str, row: int, *, missing: bool) -> DataError:
+    hint = "A missing sample is an empty cell." if missing else "Mend the log or cut it before that row."
+    return DataError(f"column `{name}` holds {cell} at row {row} (the first is 0), where a number is needed. {hint}")
+
+
+def integers(column: pd.Series | Vector) -> np.ndarray:
     """Return the column `run`; raise DataError where it holds no integers."""
     values = numbers(column, "run", missing=False)
     # Beyond 2^53 a float names no single integer.
