@@ -246,7 +246,7 @@ class NmpcController:
         """Return the controller as a block of role "controller", for FMUs: numpy alone, no CasADi and no daqp."""
         from ._nmpc_arrays import controller_arrays
 
-        runtime = f"softneck.design.predictive._tangent_{self.model.kind}_runtime:{len(self.model.arrays)}"
+        runtime = f"softneck.design.predictive.tangents._{self.model.kind}_runtime:{len(self.model.arrays)}"
         return Block(
             kind="nmpc",
             role="controller",

@@ -1,0 +1,45 @@
+"""Files of format 1 that an earlier version wrote still load and give the numbers that it gave (`tests/golden`)."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softneck.core import KINDS, load, read_archive
+
+from ..data import ROOT
+from .small_blocks import GOLDEN_ROWS, NO_FILE, block_of, compiled_run
+
+GOLDEN = ROOT / "tests" / "golden"
+FILES = sorted(GOLDEN.glob("*.npz"))
+OUTPUTS: dict[str, list[list[float]]] = json.loads((GOLDEN / "outputs.json").read_text(encoding="utf-8"))
+
+
+def test_every_kind_has_a_file_and_what_is_stepped_has_outputs() -> None:
+    assert {read_archive(path)[0]["kind"] for path in FILES} == set(KINDS)
+    stepped = {path.stem for path in FILES if KINDS[read_archive(path)[0]["kind"]].role not in ("state", "family")}
+    assert set(OUTPUTS) == stepped | set(NO_FILE)
+
+
+@pytest.mark.parametrize("name", OUTPUTS)
+def test_outputs_are_those_of_the_version_that_wrote_the_file(name: str) -> None:
+    expected = np.array(OUTPUTS[name])
+    seen = compiled_run(block_of(name, GOLDEN), GOLDEN_ROWS, "missing")
+    # Equal to the bit on the machine that wrote them (`same_as_commit.py`). Another machine's libm and sums of another
+    # length of vector are off by a few 1e-16 of each signal's size; 1e-12 is what `test_native_kinds.py` grants too.
+    scale = np.maximum(np.nanmax(np.abs(expected), axis=0), 1e-3)
+    np.testing.assert_allclose(seen / scale, expected / scale, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_a_file_is_saved_as_it_was(path: Path, tmp_path: Path) -> None:
+    load(path).save(tmp_path / path.name)
+    (header, arrays), (new_header, new_arrays) = read_archive(path), read_archive(tmp_path / path.name)
+    assert new_header == header
+    assert list(new_arrays) == list(arrays)
+    for name, array in arrays.items():
+        assert new_arrays[name].dtype == array.dtype
+        np.testing.assert_array_equal(new_arrays[name], array)
