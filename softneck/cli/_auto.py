@@ -8,7 +8,7 @@ import click
 
 from softneck.core import SettingsError, refuse_existing
 from softneck.identification import INFINITE, Choice, choose, refit
-from softneck.identification.selection._auto import REFITTED, Tried
+from softneck.identification.selection._auto import REFITTED, KindTrial
 from softneck.plots import Section, Table, page, validation_figure, write_page
 from softneck.signals import Recording, concatenate, read_recording
 
@@ -70,7 +70,7 @@ def _rows(choice: Choice) -> list[list[str]]:
     return [_row(one, one is choice.chosen) for one in choice.ranking]
 
 
-def _row(one: Tried, chosen: bool) -> list[str]:
+def _row(one: KindTrial, chosen: bool) -> list[str]:
     if one.judged is None or one.model is None:
         return [one.kind, "-", "-", "-", f"{one.seconds:.1f} s", "-", one.failure[:60]]
     fits, held = one.judged.fits, one.judged.persistence["1"]

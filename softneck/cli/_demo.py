@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from softneck.core import CheckFailedError, OutputError
+from softneck.core import CheckFailedError, OutputFileError
 from softneck.report import DemoSettings, run_demo
 from softneck.report._demo import Demo
 from softneck.report._tables import FIT_HEAD, FIT_NOTE, fit_rows, fmu_rows, loop_rows
@@ -46,7 +46,7 @@ def _refuse_foreign(folder: Path, *, force: bool) -> None:
     """Refuse a folder that holds something, unless it lies under build/ or `force` allows it."""
     inside = folder.resolve().is_relative_to(Path("build").resolve())
     if not inside and not force and folder.is_dir() and any(folder.iterdir()):
-        raise OutputError(f"{folder}: is not empty; use --force to replace files in it or choose another folder.")
+        raise OutputFileError(f"{folder}: is not empty; use --force to replace files in it or choose another folder.")
 
 
 def _print(demo: Demo) -> None:

@@ -10,7 +10,7 @@ import click
 
 from softneck.core import DataError, SettingsError, atomic_write, refuse_existing
 from softneck.signals import guess_layout, import_log, read_layout, write_recording
-from softneck.signals.importing._log import Imported
+from softneck.signals.importing._log import ImportResult
 from softneck.signals.recording._files import recording_suffix
 
 from .shared._console import note, print_json
@@ -66,10 +66,10 @@ def _run_log(log: Path, output: Path | None, *, force: bool, as_json: bool, layo
     recording = run.recording()
     notes = (f"{log}: {run.cut}: imported up to the cut",) if run.cut else ()
     write_recording(path, recording, force=replace)
-    _tell(path, Imported(recording, notes), {}, as_json)
+    _tell(path, ImportResult(recording, notes), {}, as_json)
 
 
-def _by_guess(log: Path, path: Path, replace: bool) -> tuple[Imported, dict[str, Any]]:
+def _by_guess(log: Path, path: Path, replace: bool) -> tuple[ImportResult, dict[str, Any]]:
     """Guess a layout, write it beside the recording, and import by it.
 
     Raises:
@@ -94,7 +94,7 @@ def _by_guess(log: Path, path: Path, replace: bool) -> tuple[Imported, dict[str,
     return imported, facts
 
 
-def _tell(path: Path, imported: Imported, more: dict[str, Any], as_json: bool) -> None:
+def _tell(path: Path, imported: ImportResult, more: dict[str, Any], as_json: bool) -> None:
     recording = imported.recording
     missed = int((recording.outputs != recording.outputs).any(axis=1).sum())
     facts = {

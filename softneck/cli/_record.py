@@ -8,7 +8,7 @@ import click
 
 from softneck.core import refuse_existing, require_between
 from softneck.plant import VirtualNeck, record
-from softneck.signals import Limits, prepare, signal, signal_names, write_recording
+from softneck.signals import SetPointLimits, prepare, signal, signal_names, write_recording
 from softneck.signals.recording._files import recording_suffix
 
 from .shared._console import print_json, progress
@@ -54,7 +54,7 @@ def command(
     refuse_existing(output, force=force)
     require_between("--payload", payload, 0.0, 1.0, "kg")
     bounds = {"position": max_position, "speed": max_speed, "slack": max_slack}
-    limits = Limits(**{name: value for name, value in bounds.items() if value is not None})
+    limits = SetPointLimits(**{name: value for name, value in bounds.items() if value is not None})
     excitation, changes = prepare(signal(signal_name, duration=duration, seed=seed), limits, ramp_s=ramp)
     with progress("record", quiet=as_json):
         recording = record(excitation, VirtualNeck(load_neck(neck)), seed=seed, payload=payload, noise=not no_noise)
@@ -64,5 +64,5 @@ def command(
         print_json({**facts, "signal": signal_name, "changes": changes.as_dict()})
         return
     click.echo(f"{output}: {len(recording)} rows of {signal_name} at {1e3 * recording.sample_time:g} ms")
-    if ramp > 0 or limits != Limits():
+    if ramp > 0 or limits != SetPointLimits():
         click.echo(f"set-points: {changes}")

@@ -35,7 +35,7 @@ def write_archive(
     """Write `header` (JSON values) and `arrays` to `path` in one piece.
 
     Raises:
-        OutputError: the file exists (and not `force`) or cannot be written.
+        OutputFileError: the file exists (and not `force`) or cannot be written.
     """
     text = json.dumps({"format": "softneck", "format_version": FORMAT_VERSION, **header})
     contents = {_HEADER: np.frombuffer(text.encode(), dtype=np.uint8), **arrays}

@@ -77,7 +77,7 @@ def write_certificate(path: str | Path, contents: Mapping[str, Any], *, force: b
     """Write what `certificate_contents` returned, in one piece.
 
     Raises:
-        OutputError: the file exists (and not `force`) or cannot be written.
+        OutputFileError: the file exists (and not `force`) or cannot be written.
     """
     with atomic_write(path, force=force) as temporary:
         temporary.write_text(json.dumps(contents, indent=2, allow_nan=False) + "\n", encoding="utf-8")

@@ -16,7 +16,7 @@ _KIND = "loop_state"
 
 
 @runtime_checkable
-class Saved(Protocol):
+class SaveablePart(Protocol):
     """A part that can save its state: what it returns must be enough for a new one of its kind to go on."""
 
     def get_state(self) -> bytes:

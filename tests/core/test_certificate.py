@@ -10,7 +10,7 @@ import pytest
 from softneck.core import (
     CheckFailedError,
     FileFormatError,
-    OutputError,
+    OutputFileError,
     check_certificate,
     file_hash,
     read_certificate,
@@ -105,7 +105,7 @@ def test_a_certificate_without_files_is_refused(tmp_path: Path) -> None:
     write_certificate(path, certificate_contents("verify", holds=True, files={}, more={}))
     with pytest.raises(FileFormatError, match="names no files"):
         read_certificate(path)
-    with pytest.raises(OutputError, match="exists already"):
+    with pytest.raises(OutputFileError, match="exists already"):
         write_certificate(path, {})
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from softneck.core import FileFormatError, OutputError, SettingsError, load
+from softneck.core import FileFormatError, OutputFileError, SettingsError, load
 from softneck.cosim import (
     load_loop,
     load_study,
@@ -208,7 +208,7 @@ def test_a_folder_of_another_study(place: Path) -> None:
     made = load_study(place / "study.toml")
     study(made, workers=0, output=place / "out")
     before = {path.name: path.read_bytes() for path in (place / "out").iterdir()}
-    with pytest.raises(OutputError, match="holds a study already; --resume continues it"):
+    with pytest.raises(OutputFileError, match="holds a study already; --resume continues it"):
         study(made, workers=0, output=place / "out")
     (place / "study.toml").write_text(STUDY.replace("seed = 7", "seed = 8"))
     with pytest.raises(SettingsError, match=r"holds another study \(other seed\)"):

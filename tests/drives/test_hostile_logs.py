@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
-from softneck.core import FileFormatError, OutputError, SoftneckError
+from softneck.core import FileFormatError, OutputFileError, SoftneckError
 from softneck.drives import read_run_log, replay
 from softneck.drives.logs._cycle import LoggedPilot
 from softneck.drives.logs._frame_log import FrameLog
@@ -207,7 +207,7 @@ def test_a_full_disk_costs_the_log_but_not_the_run(tmp_path: Path, ending: str) 
     bench.pass_time(3.0)
     assert (str(bench.master.supervisor.phase), bench.master.supervisor.fault) == ("running", None)
     with pytest.raises(
-        OutputError, match=r"run\.part\..*the log is not complete: No space left on device\. The run went"
+        OutputFileError, match=r"run\.part\..*the log is not complete: No space left on device\. The run went"
     ):
         log.close()
     assert not (tmp_path / f"run{ending}").exists()
@@ -217,7 +217,7 @@ def test_a_full_disk_costs_the_log_but_not_the_run(tmp_path: Path, ending: str) 
 
 def test_a_folder_that_cannot_be_written_is_told_before_anything_moves(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
-    with pytest.raises(OutputError, match=r"run\.mcap: cannot be written: .*Choose another folder"):
+    with pytest.raises(OutputFileError, match=r"run\.mcap: cannot be written: .*Choose another folder"):
         RunLogger([tmp_path / "file" / "run.mcap"])
 
 

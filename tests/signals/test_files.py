@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from softneck.core import DataError, FileFormatError, OutputError, SoftneckError
+from softneck.core import DataError, FileFormatError, OutputFileError, SoftneckError
 from softneck.identification.models._rows import row_hashes
 from softneck.signals import SET_POINTS, Recording, concatenate, read_recording, write_recording
 from softneck.signals.recording._channels import known_channels
@@ -163,7 +163,7 @@ def test_another_ending_is_refused(tmp_path: Path) -> None:
 def test_an_existing_recording_is_kept(tmp_path: Path) -> None:
     write_recording(tmp_path / "a.csv", neck_recording(120))
     before = (tmp_path / "a.csv").read_bytes()
-    with pytest.raises(OutputError, match="exists already; use --force"):
+    with pytest.raises(OutputFileError, match="exists already; use --force"):
         write_recording(tmp_path / "a.csv", neck_recording(130))
     assert (tmp_path / "a.csv").read_bytes() == before
 

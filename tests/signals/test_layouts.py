@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from softneck.core import DataError, FileFormatError, SettingsError, SoftneckError
 from softneck.signals import import_log, read_layout
-from softneck.signals.importing._log import Imported
+from softneck.signals.importing._log import ImportResult
 
 from ..data import LAYOUTS
 
@@ -32,7 +32,7 @@ terms = [{ column = "a", factor = 0.5 }, { column = "b", factor = -2.0 }]
 LOG = "t, a, b, p, r\n" + "\n".join(f"{20 * k}, {k}, {2 * k}, {3 * k}, {4 * k}" for k in range(30))
 
 
-def imported(folder: Path, layout: str = LAYOUT, log: str = LOG) -> Imported:
+def imported(folder: Path, layout: str = LAYOUT, log: str = LOG) -> ImportResult:
     (folder / "layout.toml").write_text(layout)
     (folder / "log.csv").write_text(log)
     return import_log(folder / "log.csv", read_layout(folder / "layout.toml"))

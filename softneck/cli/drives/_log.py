@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 import platformdirs
 
-from softneck.core import OutputError, SettingsError
+from softneck.core import OutputFileError, SettingsError
 from softneck.cosim.loops._simulate import LoopSetup
 from softneck.drives.bus._link import HARMLESS
 from softneck.drives.logs._run_log import RunLogger, require_log_paths
@@ -58,7 +58,7 @@ def opened_log(
         ending: of the one that was not asked for.
 
     Raises:
-        OutputError: it cannot be written (before anything moves), or is not complete.
+        OutputFileError: it cannot be written (before anything moves), or is not complete.
     """
     own = not logs and not no_log and not chosen.simulated and str(chosen.bus).partition(":")[0] not in HARMLESS
     paths = [_new_path(command, ending)] if own else list(logs)
@@ -69,8 +69,8 @@ def opened_log(
     epoch = 0.0 if chosen.simulated else time.time() - time.monotonic()
     try:
         log = RunLogger(paths, force=force, wait=chosen.simulated, epoch=epoch)
-    except OutputError as error:
-        raise OutputError(f"{error} Or --no-log. Nothing was sent." if own else str(error)) from error
+    except OutputFileError as error:
+        raise OutputFileError(f"{error} Or --no-log. Nothing was sent." if own else str(error)) from error
     if own:
         note(f"log: {paths[0]}")
     try:
@@ -79,7 +79,7 @@ def opened_log(
         # What went wrong is what is to be told; that its log is not complete comes before it.
         try:
             log.close()
-        except OutputError as error:
+        except OutputFileError as error:
             note(str(error))
         _drop_empty(log, own=own)
         raise

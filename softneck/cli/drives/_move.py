@@ -12,8 +12,8 @@ import click
 from softneck.core import SettingsError, refuse_existing, require_between
 from softneck.drives import CanLink, Experiment, jog, record_signal
 from softneck.drives.bus._link import VirtualLink
-from softneck.drives.commissioning._jog import Jogged
-from softneck.drives.commissioning._record import Recorded, drive_limits
+from softneck.drives.commissioning._jog import JogResult
+from softneck.drives.commissioning._record import ExperimentResult, drive_limits
 from softneck.drives.logs._run_log import RunLogger
 from softneck.drives.running._bus_loop import Session
 from softneck.drives.running._keyboard import Keyboard
@@ -99,7 +99,7 @@ def jog_command(
         found.require()
 
 
-def _print_jog(found: Jogged, *, as_json: bool) -> None:
+def _print_jog(found: JogResult, *, as_json: bool) -> None:
     values = found.table()
     if as_json:
         print_json(values)
@@ -178,7 +178,7 @@ def record_command(
 
 
 def _print_record(
-    output: Path, recorded: Recorded, facts: dict[str, Any], changes: str, *, as_json: bool
+    output: Path, recorded: ExperimentResult, facts: dict[str, Any], changes: str, *, as_json: bool
 ) -> None:  # fmt: skip
     if as_json:
         where = None if recorded.recording is None else str(output)

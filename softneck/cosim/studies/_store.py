@@ -10,7 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from softneck.core import FileFormatError, OutputError, SettingsError, atomic_write
+from softneck.core import FileFormatError, OutputFileError, SettingsError, atomic_write
 from softneck.loop._metrics import METRICS
 
 from ._study import Study
@@ -40,13 +40,13 @@ class Store:
         """Begin the study in `folder`, or go on with what is there.
 
         Raises:
-            OutputError: the folder holds a study and neither `resume` nor `force` is given.
+            OutputFileError: the folder holds a study and neither `resume` nor `force` is given.
             SettingsError: `resume` in a folder of another study, or of none.
         """
         self.folder, self._schema = folder, schema(study.vary)
         self._parts = folder / _PARTS
         if (folder / DESCRIPTION).exists() and not (resume or force):
-            raise OutputError(f"{folder}: holds a study already; --resume continues it, --force replaces it.")
+            raise OutputFileError(f"{folder}: holds a study already; --resume continues it, --force replaces it.")
         if resume:
             self._check_same(study)
         else:
@@ -57,7 +57,7 @@ class Store:
         try:
             self._parts.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise OutputError(f"{self._parts}: cannot be written: {error.strerror}.") from error
+            raise OutputFileError(f"{self._parts}: cannot be written: {error.strerror}.") from error
         self.done = set(self._table(["run"]).column("run").to_pylist())
         self._files = len(list(self._parts.glob("*.parquet")))
 

@@ -20,7 +20,7 @@ from ..loops._loop_parts import OBJECT
 from ..loops._loop_table import check_key, loop_table, set_sources, settable, with_values
 from ..loops._loop_values import read_toml
 from ..loops._simulate import LoopSetup
-from ._vary import Points, Vary, flattened, make_vary
+from ._vary import StudyPoints, Vary, flattened, make_vary
 
 _TOP = ("loop", "runs", "seed", "sampling", "objectives", "vary")
 Source = str | Path | Mapping[str, Any] | Loop | LoopSetup
@@ -60,9 +60,9 @@ class Study:
             raise SettingsError("`objectives` is empty; name at least one metric.")
 
     @cached_property
-    def points(self) -> Points:
+    def points(self) -> StudyPoints:
         """The runs: what each puts into the loop."""
-        return Points(self.vary, self.runs, self.seed, self.sampling)
+        return StudyPoints(self.vary, self.runs, self.seed, self.sampling)
 
     def table(self, run: int) -> dict[str, Any]:
         """Return the loop of one run, as the table of a loop file."""

@@ -26,7 +26,7 @@ from ._virtual import Watch, simulated_neck
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Deployed:
+class Deployment:
     """A loop that is ready for drives.
 
     Attributes:
@@ -40,7 +40,7 @@ class Deployed:
     notes: tuple[str, ...] = ()
 
 
-def prepare(setup: LoopSetup, controller: Path | None = None) -> Deployed:
+def prepare(setup: LoopSetup, controller: Path | None = None) -> Deployment:
     """Return the loop of `setup` with the controller in file `controller`, an FMU or a file of ours.
 
     Raises:
@@ -56,7 +56,7 @@ def prepare(setup: LoopSetup, controller: Path | None = None) -> Deployed:
         loop = replace(loop, controller=part)
     if loop.faults:
         notes.append(f"the loop file's {len(loop.faults)} fault(s) are not acted out on drives")
-    return Deployed(loop, neck_of(loop), tuple(notes))
+    return Deployment(loop, neck_of(loop), tuple(notes))
 
 
 def neck_of(loop: Loop) -> NeckParameters | None:
@@ -78,7 +78,7 @@ def noise_seed(loop: Loop) -> int:
 
 
 def run_simulated(
-    deployed: Deployed,
+    deployed: Deployment,
     file: DrivesFile,
     *,
     neck: NeckParameters | None = None,
@@ -132,7 +132,7 @@ def run_simulated(
 
 
 def run_on_bus(
-    deployed: Deployed,
+    deployed: Deployment,
     file: DrivesFile,
     link: CanLink,
     sensor: Sensor,
@@ -175,7 +175,7 @@ def run_on_bus(
 
 
 def _run(
-    deployed: Deployed, pilot: LoopPilot, session: Session, report: Callable[[float], None] | None
+    deployed: Deployment, pilot: LoopPilot, session: Session, report: Callable[[float], None] | None
 ) -> DrivesResult:
     log = RunLog(pilot)
     rows = max(1, round(deployed.loop.duration / pilot.sample_time))

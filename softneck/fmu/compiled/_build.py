@@ -60,7 +60,7 @@ def build_compiled_fmu(
     Raises:
         SettingsError: NAME is no FMI identifier, the kind cannot be compiled, or a platform is not built.
         FileFormatError: a library is damaged.
-        OutputError: the file exists or cannot be written.
+        OutputFileError: the file exists or cannot be written.
     """
     target = Path(path)
     name = model_name(target)

@@ -49,7 +49,7 @@ def build_fmu(block: Block, path: str | Path, *, info: FmuInfo | None = None, fo
 
     Raises:
         SettingsError: NAME is no FMI identifier, or the block cannot be packaged.
-        OutputError: the file exists or cannot be written.
+        OutputFileError: the file exists or cannot be written.
     """
     target = Path(path)
     name = model_name(target)

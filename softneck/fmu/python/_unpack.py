@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
-from softneck.core import FileFormatError, OutputError
+from softneck.core import FileFormatError, OutputFileError
 
 # A three-platform FMU weighs a few MB; more than this wants to fill the disk.
 _MAX_BYTES = 2 * 2**30
@@ -44,7 +44,7 @@ def unpack(path: str | Path) -> Path:
             raise
         raise FileFormatError(f"{source}: is no FMU or is damaged ({error}).") from error
     except OSError as error:
-        raise OutputError(f"{source}: cannot be unpacked: {error.strerror or error}.") from error
+        raise OutputFileError(f"{source}: cannot be unpacked: {error.strerror or error}.") from error
     return folder
 
 
@@ -75,4 +75,4 @@ def _plain_folder() -> Path:
     for folder in (tempfile.gettempdir(), "/tmp", "/var/tmp", str(Path.home())):
         if _PLAIN.fullmatch(folder) and Path(folder).is_dir():
             return Path(folder)
-    raise OutputError("no temporary folder has a plain path (letters, digits, _ . - only); set TMPDIR to one.")
+    raise OutputFileError("no temporary folder has a plain path (letters, digits, _ . - only); set TMPDIR to one.")

@@ -9,11 +9,11 @@ import numpy as np
 from softneck.core import DataError, Matrix, Vector
 from softneck.signals import Recording
 
-from ._forest import Points
+from ._forest import PointTree
 from ._gamma import RULES, least_gammas
 
 
-def require_allowed(points: Points, output: int, gamma: float, epsilon: float, rule: str) -> None:
+def require_allowed(points: PointTree, output: int, gamma: float, epsilon: float, rule: str) -> None:
     """Raise DataError, naming the pair, unless the data allow (gamma, epsilon): else no function fits (FSS empty)."""
     P, y = points.points, points.values[output]
     least, pairs = least_gammas(P, y, np.array([RULES[rule] * epsilon]), nodes=points.own_nodes(output))

@@ -30,7 +30,7 @@ _NAMES = {"\t": "a tab", ";": "`;`", ",": "`,`", WHITESPACE: "blanks"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sniffed:
+class SniffResult:
     """A log's columns and how they were read.
 
     Attributes:
@@ -48,7 +48,7 @@ class Sniffed:
     units: dict[Column, str]
 
 
-def sniff(path: str | Path) -> Sniffed:
+def sniff(path: str | Path) -> SniffResult:
     """Read a log of unknown form.
 
     Raises:
@@ -85,7 +85,7 @@ def sniff(path: str | Path) -> Sniffed:
             "Is this a log? If so, write its delimiter into a layout and use --layout."
         )
     named = {name: unit for name, unit in zip(frame.columns, units, strict=False) if unit}
-    return Sniffed(columns, tuple(words), form, lines, named)
+    return SniffResult(columns, tuple(words), form, lines, named)
 
 
 def _numbers(column: pd.Series) -> Vector | None:

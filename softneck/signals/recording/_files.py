@@ -27,7 +27,7 @@ def write_recording(path: str | Path, recording: Recording, *, force: bool = Fal
     """Write a `.csv` or `.parquet` recording; a missing sample becomes an empty cell.
 
     Raises:
-        OutputError: the file exists (and not `force`) or cannot be written.
+        OutputFileError: the file exists (and not `force`) or cannot be written.
         DataError: another ending than `.csv` or `.parquet`, or a channel without a sample.
     """
     suffix = recording_suffix(path)

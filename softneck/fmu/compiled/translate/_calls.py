@@ -25,8 +25,8 @@ _LIKE = {"empty_like": "zeros", "zeros_like": "zeros", "ones_like": "ones"}
 _MADE = {"empty": 0.0, "zeros": 0.0, "ones": 1.0}
 
 
-class Expressions(Protocol):
-    """What a call needs of the expressions around it; see `_expressions.Expressions`."""
+class CallContext(Protocol):
+    """What the translation of a call needs of `_expressions.Expressions`."""
 
     scope: Scope
 
@@ -37,7 +37,7 @@ class Expressions(Protocol):
     def room(self, code: str, kind: Type) -> Value: ...
 
 
-def numpy_call(ex: Expressions, node: ast.AST, name: str, values: list[Value]) -> Value:
+def numpy_call(ex: CallContext, node: ast.AST, name: str, values: list[Value]) -> Value:
     """Return the C of `np.NAME(...)` or `math.NAME(...)`."""
     if name in _MADE:
         return _made(ex, node, values, whole=_whole(ex, node), value=_MADE[name])
@@ -82,7 +82,7 @@ def _of_numbers(name: str, codes: list[str], whole: bool) -> Value | None:
     return None
 
 
-def _whole(ex: Expressions, node: ast.AST) -> bool:
+def _whole(ex: CallContext, node: ast.AST) -> bool:
     whole = False
     for keyword in node.keywords if isinstance(node, ast.Call) else []:
         name = ast.unparse(keyword.value)
@@ -92,7 +92,7 @@ def _whole(ex: Expressions, node: ast.AST) -> bool:
     return whole
 
 
-def _made(ex: Expressions, node: ast.AST, values: list[Value], *, whole: bool, value: float) -> Value:
+def _made(ex: CallContext, node: ast.AST, values: list[Value], *, whole: bool, value: float) -> Value:
     """Return a new array; one that numpy leaves unset is zero here."""
     if not isinstance(node, ast.Call) or len(node.args) != 1:
         raise ex.scope.fail(node, "one shape is needed.")
@@ -114,7 +114,7 @@ def _made(ex: Expressions, node: ast.AST, values: list[Value], *, whole: bool, v
     return made
 
 
-def _dot(ex: Expressions, node: ast.AST, values: list[Value]) -> Value:
+def _dot(ex: CallContext, node: ast.AST, values: list[Value]) -> Value:
     a, b = values
     codes = f"(w, {ex.scope.given(a)}, {ex.scope.given(b)})"
     if a.type == b.type == VECTOR:
@@ -128,7 +128,7 @@ def _dot(ex: Expressions, node: ast.AST, values: list[Value]) -> Value:
     raise ex.scope.fail(node, "products are known of vectors and matrices.")
 
 
-def array_of(ex: Expressions, node: ast.Call) -> Value:
+def array_of(ex: CallContext, node: ast.Call) -> Value:
     """Return `np.array([a, b, ...])` of numbers."""
     items = node.args[0].elts if len(node.args) == 1 and isinstance(node.args[0], ast.List | ast.Tuple) else []
     values = ex.ordered(items)
@@ -140,7 +140,7 @@ def array_of(ex: Expressions, node: ast.Call) -> Value:
     return made
 
 
-def method(ex: Expressions, node: ast.Call, name: str, base: Value) -> Value:
+def method(ex: CallContext, node: ast.Call, name: str, base: Value) -> Value:
     """Return the C of `base.NAME(...)`."""
     if node.keywords or not isinstance(base.type, View) or base.type.whole:
         raise ex.scope.fail(node, "this method is not known.")
@@ -162,7 +162,7 @@ def method(ex: Expressions, node: ast.Call, name: str, base: Value) -> Value:
     raise ex.scope.fail(node, "this method is not known.")
 
 
-def plain_call(ex: Expressions, node: ast.Call, name: str) -> Value:
+def plain_call(ex: CallContext, node: ast.Call, name: str) -> Value:
     """Return the C of a call of one of Python's own functions."""
     if node.keywords:
         raise ex.scope.fail(node, "keywords are not known here.")
@@ -186,7 +186,7 @@ def plain_call(ex: Expressions, node: ast.Call, name: str) -> Value:
     raise ex.scope.fail(node, "this function is not known.")
 
 
-def _extreme(ex: Expressions, node: ast.AST, name: str, values: list[Value]) -> Value:
+def _extreme(ex: CallContext, node: ast.AST, name: str, values: list[Value]) -> Value:
     del node
     kind = FLOAT if any(value.type == FLOAT for value in values) else INT
     code = ex.scope.cast(values[0], kind)
