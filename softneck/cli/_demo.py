@@ -17,7 +17,7 @@ from .shared._stages import Stages
 
 
 @click.command("demo", epilog="Example: softneck demo --out build/demo --quick")
-@click.option("--out", type=click.Path(path_type=Path), help="Folder for everything. [default: build/demo]")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder for all results. [default: build/demo]")
 @click.option("--quick", is_flag=True, help="A shorter experiment and less training: under 30 s.")
 @force_option
 @json_option

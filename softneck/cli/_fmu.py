@@ -55,7 +55,7 @@ def command(
     loop file, of whose [reference] a reference FMU is made.
     """
     if backend == "python" and (fmi != "2" or platforms):
-        raise SettingsError("--fmi 3 and --platform are of compiled FMUs; add `--backend compiled`.")
+        raise SettingsError("--fmi 3 and --platform are for compiled FMUs only; add `--backend compiled`.")
     origin = ""
     jobs, replace = _what(file, folder, output, force=force)
     # All are read before any is written: one bad file stops the command with nothing done.
@@ -79,7 +79,7 @@ def command(
     if origin:
         click.echo(f"libraries: {origin}")
     for source in left_out:
-        click.echo(f"left out: {source}, which is no model, observer or controller")
+        click.echo(f"left out: {source}, which is not a model, observer or controller")
 
 
 def open_buildable(source: str | Path) -> Buildable:
@@ -87,11 +87,11 @@ def open_buildable(source: str | Path) -> Buildable:
     if Path(source).suffix == ".npz":
         thing = load(source)
         if not hasattr(thing, "block"):
-            raise FileFormatError(f"{source}: is no model, observer or controller, so that no FMU can be made of it.")
+            raise FileFormatError(f"{source}: is not a model, observer or controller, so no FMU can be built from it.")
         return thing
     if Path(source).suffix not in ("", ".toml"):
         raise FileFormatError(
-            f"{source}: no FMU can be made of a `{Path(source).suffix}` file; give a model, controller or observer "
+            f"{source}: no FMU can be built from a `{Path(source).suffix}` file; give a model, controller or observer "
             "(.npz), a neck or loop file (.toml), or a preset (paper, lab)."
         )
     if is_loop_file(Path(source)):
@@ -104,7 +104,7 @@ def _can_be_fmu(source: str | Path) -> bool:
 
 
 def _judge(thing: Buildable, source: str | Path, data: tuple[Path, ...]) -> Validation | None:
-    """Return the scores of a model on recordings as one, each run of its own; None for what is no model."""
+    """Return the scores of a model on recordings as one, each run of its own; None for what is not a model."""
     if not isinstance(thing, Model):
         return None
     names = (Path(source).name, ", ".join(path.name for path in data))
@@ -125,7 +125,7 @@ def _what(
 
 def _jobs(folder: Path, out: Path) -> list[tuple[str | Path, Path]]:
     if not folder.is_dir():
-        raise FileFormatError(f"{folder}: is no folder.")
+        raise FileFormatError(f"{folder}: is not a folder.")
     sources = sorted(path for path in folder.iterdir() if path.suffix == ".npz" or _is_neck(path))
     if not sources:
         raise FileFormatError(f"{folder}: holds no model, observer, controller or neck file.")

@@ -58,7 +58,7 @@ def _run_log(log: Path, output: Path | None, *, force: bool, as_json: bool, layo
     from softneck.drives import read_run_log  # the drives take a while to import
 
     if layout:
-        raise SettingsError(f"{log}: is a log of ours, whose columns are known; leave --layout and --guess out.")
+        raise SettingsError(f"{log}: is a log of softneck, whose columns are known; leave out --layout and --guess.")
     path, replace = target(output, f"recordings/{log.stem}.csv", force=force)
     recording_suffix(path)
     refuse_existing(path, force=replace)

@@ -25,12 +25,14 @@ from .shared._options import force_option, json_option, output_option
 @output_option("recording", "REC", required=True)
 @click.option("--neck", default="paper", show_default=True, metavar="paper|lab|NECK.toml", help="Which neck.")
 @click.option("--duration", type=float, metavar="S", help="Length in seconds. [default: the signal's own]")
-@click.option("--seed", type=click.IntRange(0, 2**31 - 2), default=0, show_default=True, help="Of noise and signal.")
-@click.option("--payload", type=float, default=0.0, show_default=True, metavar="KG", help="On the platform.")
-@click.option("--no-noise", is_flag=True, help="A perfect inclinometer.")
+@click.option(
+    "--seed", type=click.IntRange(0, 2**31 - 2), default=0, show_default=True, help="Seed of noise and signal."
+)
+@click.option("--payload", type=float, default=0.0, show_default=True, metavar="KG", help="Payload on the platform.")
+@click.option("--no-noise", is_flag=True, help="Simulate a perfect inclinometer.")
 @click.option("--ramp", type=float, default=0.0, metavar="S", help="Ramp in from rest and out to it. [default: none]")
 @click.option("--max-position", type=float, metavar="RAD", help="Clip set-points to +-RAD. [default: the signal's own]")
-@click.option("--max-speed", type=float, metavar="RAD/S", help="Slow set-points down to it. [default: none]")
+@click.option("--max-speed", type=float, metavar="RAD/S", help="Slow set-points down to this speed. [default: none]")
 @click.option("--max-slack", type=float, metavar="RAD", help="Pay out no more than RAD below rest. [default: none]")
 @force_option
 @json_option

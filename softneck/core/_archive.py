@@ -58,14 +58,14 @@ def read_archive(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray
             contents = {name: archive[name] for name in archive.files}
         header = json.loads(contents.pop(_HEADER).tobytes().decode())
     except _DAMAGE as error:
-        raise FileFormatError(f"{source}: is no softneck file or is damaged ({_short(error)}).") from error
+        raise FileFormatError(f"{source}: is not a softneck file or is damaged ({_short(error)}).") from error
     _check_header(source, header)
     return header, contents
 
 
 def _check_header(source: Path, header: object) -> None:
     if not isinstance(header, dict) or header.get("format") != "softneck":
-        raise FileFormatError(f"{source}: is no softneck file; expected one that softneck wrote.")
+        raise FileFormatError(f"{source}: is not a softneck file; expected one that softneck wrote.")
     version = header.get("format_version")
     if version != FORMAT_VERSION:
         raise FileFormatError(

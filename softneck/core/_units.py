@@ -30,4 +30,4 @@ def to_si(unit: str) -> tuple[float, str]:
         return _TO_SI[unit]
     except KeyError:
         known = ", ".join(_TO_SI)
-        raise DataError(f"`{unit}` is no unit that softneck knows; use one of {known}.") from None
+        raise DataError(f"unknown unit `{unit}`; use one of {known}.") from None

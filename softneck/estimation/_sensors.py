@@ -54,4 +54,4 @@ def find_sensor(name: str) -> SensorNoise:
     try:
         return SENSORS[name]
     except KeyError:
-        raise SettingsError(f"`{name}` is no sensor that softneck knows; use one of {', '.join(SENSORS)}.") from None
+        raise SettingsError(f"unknown sensor `{name}`; use one of {', '.join(SENSORS)}.") from None

@@ -152,7 +152,7 @@ def place_faults(
     """Put `faults` between the parts and return the wiring with their detours.
 
     Raises:
-        SettingsError: the plant lacks what a fault acts on, or a delay is no multiple of the step.
+        SettingsError: the plant lacks what a fault acts on, or a delay is not a multiple of the step.
     """
     detours = _FaultRouting(wiring)
     sensors, plant = [], []
@@ -177,7 +177,7 @@ def sensor_outputs(fault: SensorFault, plant: Part) -> tuple[str, ...]:
     )
     for name in names:
         if name not in known:
-            raise SettingsError(f"the {with_kind(fault)} acts on `{name}`, which is no output of the plant.")
+            raise SettingsError(f"the {with_kind(fault)} acts on `{name}`, which is not an output of the plant.")
     return names
 
 
@@ -214,7 +214,7 @@ def _lag(fault: Fault, step: float) -> int:
         return 0
     lag = round(fault.delay / step)
     if lag < 1 or abs(fault.delay / step - lag) > _SAME_TIME * lag:
-        raise SettingsError(f"the sensor delay of {fault.delay:g} s is no multiple of the loop's step {step:g} s.")
+        raise SettingsError(f"the sensor delay of {fault.delay:g} s is not a multiple of the loop's step {step:g} s.")
     return lag
 
 

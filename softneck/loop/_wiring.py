@@ -198,7 +198,7 @@ def _check_constants(name: str, part: Part, constants: Mapping[str, float]) -> N
     names = [port.name for port in part.inputs]
     for constant in constants:
         if constant not in names:
-            raise SettingsError(f"`{constant}` is no input of the {name}; its inputs are {', '.join(names)}.")
+            raise SettingsError(f"`{constant}` is not an input of the {name}; its inputs are {', '.join(names)}.")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

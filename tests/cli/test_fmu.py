@@ -82,7 +82,7 @@ def test_what_cannot_become_an_fmu_is_said(call: Call, rls_file: Path, tmp_path:
         (("fmu", "empty.npz", "-o", "M.fmu"), "empty.npz"),
         (("fmu", "other.npz", "-o", "M.fmu"), "unknown kind `horse`"),
         (("fmu", "neck.txt", "-o", "M.fmu"), "neck.txt"),
-        (("fmu", "--all", "nowhere"), "is no folder"),
+        (("fmu", "--all", "nowhere"), "is not a folder"),
         (("fmu", "--all", "."), ""),
     ]
     Path("cut.npz").write_bytes(kept[: len(kept) // 2])

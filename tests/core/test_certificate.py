@@ -88,8 +88,8 @@ def test_an_edited_certificate_is_refused(tmp_path: Path) -> None:
     ("text", "match"),
     [
         ("", "no JSON"),
-        ("[1]", "is no certificate"),
-        ('{"certificate": "else"}', "is no certificate"),
+        ("[1]", "is not a certificate"),
+        ('{"certificate": "else"}', "is not a certificate"),
         ('{"certificate": "verify", "certificate_version": 99}', "version 99"),
     ],
 )

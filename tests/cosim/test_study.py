@@ -277,7 +277,7 @@ def test_other_settings_that_cannot_be(place: Path) -> None:
     with pytest.raises(SettingsError, match="not both"):
         study(place / "loop.toml", vary=vary, workers=1, dask="tcp://127.0.0.1:1")
     (place / "study.toml").write_text(f"size = 3\n{STUDY}")
-    with pytest.raises(SettingsError, match=r"`size` is no key of a study"):
+    with pytest.raises(SettingsError, match=r"unknown key `size` of a study"):
         load_study(place / "study.toml")
     with pytest.raises(SettingsError, match="cannot be sent to another process"):
         study({**{"duration_s": 0.2, "plant": "paper", "reference": StepReference()}, "controller": _Unsendable()},

@@ -117,7 +117,7 @@ def written(path: Path, *, metadata: dict[str, str] | None, messages: list[tuple
 
 def test_a_log_of_another_tool_is_no_log_of_ours(tmp_path: Path) -> None:
     path = written(tmp_path / "ros.mcap", metadata=None, messages=[("/odom", bytes(24))])
-    with pytest.raises(FileFormatError, match=r"ros\.mcap: is MCAP, but no log of `softneck drives`"):
+    with pytest.raises(FileFormatError, match=r"ros\.mcap: is MCAP, but not a log of `softneck drives`"):
         read_run_log(path)
 
 
@@ -152,7 +152,7 @@ def test_topics_of_others_in_a_log_of_ours_are_left_alone(logs: dict[str, Path],
 def test_hostile_lengths_reserve_no_memory(tmp_path: Path, record: bytes) -> None:
     path = tmp_path / "hostile.mcap"
     path.write_bytes(b"\x89MCAP0\r\n" + struct.pack("<BQII", 0x01, 8, 0, 0) + record)
-    with pytest.raises(FileFormatError, match=r"hostile\.mcap: is no log of `softneck drives`"):
+    with pytest.raises(FileFormatError, match=r"hostile\.mcap: is not a log of `softneck drives`"):
         read_run_log(path)
 
 

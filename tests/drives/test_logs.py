@@ -205,7 +205,7 @@ def test_a_damaged_log_is_one_line_or_a_cut(
 def test_what_is_no_log_is_one_line(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "run.mcap"
     path.write_bytes(content)
-    with pytest.raises(FileFormatError, match=r"run\.mcap: is no log of `softneck drives`"):
+    with pytest.raises(FileFormatError, match=r"run\.mcap: is not a log of `softneck drives`"):
         read_run_log(path)
 
 

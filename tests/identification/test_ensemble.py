@@ -78,7 +78,7 @@ def test_members_are_named_and_cannot_hold_others(models: dict[str, Model]) -> N
         combine([models["rls"], replace(models["play"], sample_time=0.01)])
     with pytest.raises(SettingsError, match="at least two members; got rls"):
         Ensemble(members=("rls",))
-    with pytest.raises(SettingsError, match="`magic` is no kind of model"):
+    with pytest.raises(SettingsError, match="unknown kind of model `magic`"):
         Ensemble(members=("rls", "magic"))
     with pytest.raises(SettingsError, match="cannot be a member"):
         Ensemble(members=("rls", "residual"))

@@ -86,9 +86,9 @@ Edit = Callable[[list[str]], list[str]]
 BAD: dict[str, tuple[Edit, str]] = {
     "missing column": (lambda s: [",".join(line.split(",")[:5]) for line in s], "missing: roll"),
     "no time": (lambda s: [line.split(",", 1)[1] for line in s], r"there is no column `time \[s\]`"),
-    "unknown column": (lambda s: changed(s, -1, 5, "yaw [deg]"), "column `yaw` is no channel of a recording"),
+    "unknown column": (lambda s: changed(s, -1, 5, "yaw [deg]"), "column `yaw` is not a channel of a recording"),
     "no unit": (lambda s: changed(s, -1, 5, "roll"), r"column `roll` names no unit; write `roll \[deg\]`"),
-    "unit that is none": (lambda s: changed(s, -1, 5, "roll [grad]"), "`grad` is no unit that softneck knows"),
+    "unit that is none": (lambda s: changed(s, -1, 5, "roll [grad]"), "unknown unit `grad`"),
     "unit of another quantity": (lambda s: changed(s, -1, 5, "roll [mm]"), "column `roll` cannot be in `mm`"),
     "twice": (lambda s: changed(s, -1, 5, "pitch [rad]"), "channel `pitch` stands in two columns"),
     "text": (lambda s: changed(s, 9, 1, "abc"), "column `motor_setpoint_1` holds `abc` at row 9"),

@@ -84,10 +84,10 @@ def test_a_gap_in_the_time_column_splits_the_run_under_any_sample_time(tmp_path:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('"p", unit = "deg"', '"p", unit = "grad"', "`grad` is no unit"),
+        ('"p", unit = "deg"', '"p", unit = "grad"', "unknown unit `grad`"),
         ('"p", unit = "deg"', '"p", unit = "mm"', r"\[channels\.pitch\] cannot be in `mm`; its SI unit is rad"),
         ('"p", unit = "deg"', '"p"', r"\[channels\.pitch\] names no unit"),
-        ('"p", unit = "deg"', '"p", unit = 5', "`5` is no unit"),
+        ('"p", unit = "deg"', '"p", unit = 5', "unknown unit `5`"),
         ('"p", unit = "deg"', '"p", unit = ["deg"]', "wrong type"),
         ('{ column = "p", unit', "{ unit", r"\[channels\.pitch\] needs `column`"),
         ('"p", unit = "deg"', '"p", unit = "deg", sing = -1', "unknown key `sing`; known: column, factor, sign"),
@@ -138,9 +138,9 @@ def test_a_layout_that_is_absent_or_no_toml(tmp_path: Path) -> None:
         read_layout(tmp_path / "none.toml")
     for content in (b"a = = 1", b"\xff\xfe\x00"):
         (tmp_path / "bad.toml").write_bytes(content)
-        with pytest.raises(FileFormatError, match="is no TOML file"):
+        with pytest.raises(FileFormatError, match="is not a TOML file"):
             read_layout(tmp_path / "bad.toml")
-    with pytest.raises(FileFormatError, match="is no TOML file"):
+    with pytest.raises(FileFormatError, match="is not a TOML file"):
         read_layout(tmp_path)
 
 

@@ -29,7 +29,7 @@ def log_options(function: Callable) -> Callable:
             "(candump) the frames. May be given several times. [default: on a bus that may move something a file under "
             "~/.local/state/softneck/log, or in $LOGS_DIRECTORY]",
         ),
-        click.option("--no-log", is_flag=True, help="No log on such a bus either."),
+        click.option("--no-log", is_flag=True, help="Write no log, not even on such a bus."),
     )  # fmt: skip
     for option in reversed(options):
         function = option(function)
@@ -39,7 +39,7 @@ def log_options(function: Callable) -> Callable:
 def require_logs(logs: Sequence[Path], *, no_log: bool, force: bool) -> None:
     """Raise where the options cannot be followed, before anybody is asked to arm anything."""
     if logs and no_log:
-        raise SettingsError("--log and --no-log: say one of them.")
+        raise SettingsError("--log and --no-log contradict each other; give one of them.")
     require_log_paths(logs, force=force)
 
 

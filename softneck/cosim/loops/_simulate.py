@@ -57,7 +57,7 @@ def simulate(
 
     Raises:
         SettingsError: parts that do not fit together.
-        DataError: a part returned what is no number.
+        DataError: a part returned what is not a number.
         FmuError: an FMU refused a call.
     """
     setup = loop if isinstance(loop, LoopSetup) else LoopSetup(loop=loop)

@@ -26,7 +26,7 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 def write_ssp(loop: Loop | LoopSetup, path: str | Path, *, force: bool = False, compiled: bool = False) -> Path:
     """Write `loop` as an SSP 1.0 archive and return its path.
 
-    Parts that are no FMUs become some; so does the reference. A master that sets all inputs first and then steps all
+    Parts that are not FMUs become some; so does the reference. A master that sets all inputs first and then steps all
     computes what `simulate` does with order "jacobi".
 
     Args:
@@ -105,7 +105,7 @@ def _component(name: str, part: Part, source: Path, loop: Loop, wiring: Wiring) 
     values = {**constants, **loop.parameters.get(name, {})}
     for key in values:
         if key not in known:
-            raise SettingsError(f"`{key}` is no parameter of the {name}; it has {', '.join(known) or 'none'}.")
+            raise SettingsError(f"`{key}` is not a parameter of the {name}; it has {', '.join(known) or 'none'}.")
     return Component(
         name=name,
         source=f"resources/{source.name}",

@@ -29,7 +29,7 @@ _MERGE_AT = 100
 class Store:
     """The folder of a study: `study.json` says what it is, Parquet files hold the runs that ended.
 
-    A run counts from the moment its file has its final name; a file that was being written is none.
+    A run counts from the moment its file has its final name; a file that was being written does not count.
 
     Attributes:
         folder: of the study.
@@ -131,14 +131,14 @@ def schema(vary: Mapping[str, Vary]) -> pa.Schema:
 
 
 def read_description(folder: Path) -> dict[str, Any]:
-    """Return what `study.json` says; raise FileFormatError if it is none."""
+    """Return what `study.json` says; raise FileFormatError if it describes no study."""
     path = folder / DESCRIPTION
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise FileFormatError(f"{path}: cannot be read ({error}).") from error
     if not isinstance(content, dict) or "study" not in content:
-        raise FileFormatError(f"{path}: describes no study.")
+        raise FileFormatError(f"{path}: does not describe a study.")
     return content
 
 

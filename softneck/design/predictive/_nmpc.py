@@ -211,7 +211,7 @@ class NmpcController:
         names = [port.name for port in self.parameters]
         for name, value in parameters.items():
             if name not in names:
-                raise SettingsError(f"`{name}` is no parameter of nmpc; it has {', '.join(names)}.")
+                raise SettingsError(f"`{name}` is not a parameter of nmpc; it has {', '.join(names)}.")
             port = self.parameters[names.index(name)]
             require_between(name, float(value), port.minimum or 0.0, port.maximum or math.inf, port.unit)
             q[names.index(name)] = value

@@ -115,7 +115,7 @@ def jog(
         report: called now and then with the done fraction.
 
     Raises:
-        SettingsError: no such motor, an amplitude that is none, or one beyond the limits of the drives file.
+        SettingsError: no such motor, an amplitude that is too small, or one beyond the limits of the drives file.
         CheckFailedError: the pre-flight failed; nothing moved.
     """
     require_whole("motor", motor, 1, 3)

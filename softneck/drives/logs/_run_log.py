@@ -82,7 +82,7 @@ def require_log_paths(paths: Sequence[Path], *, force: bool = False) -> None:
     """Raise where `RunLogger` would not write to `paths`.
 
     Raises:
-        SettingsError: an ending that is none of a log.
+        SettingsError: an ending that no log has.
         OutputFileError: a file exists.
     """
     for path in paths:
@@ -128,7 +128,7 @@ class RunLogger:
                 does not matter.
 
         Raises:
-            SettingsError: an ending that is none of a log, or two alike.
+            SettingsError: an ending that no log has, or two alike.
             OutputFileError: a file exists or cannot be written.
         """
         self.paths = tuple(paths)

@@ -31,7 +31,7 @@ class Deployment:
 
     Attributes:
         loop: with the controller that is to run.
-        neck: the virtual neck that the loop's plant is, None if it is none.
+        neck: the loop's plant if that is a virtual neck, else None.
         notes: what of the loop file does not apply on drives.
     """
 
@@ -55,7 +55,7 @@ def prepare(setup: LoopSetup, controller: Path | None = None) -> Deployment:
             part = BlockPart(load(controller, role="controller").block())
         loop = replace(loop, controller=part)
     if loop.faults:
-        notes.append(f"the loop file's {len(loop.faults)} fault(s) are not acted out on drives")
+        notes.append(f"the loop file's {len(loop.faults)} fault(s) are not applied to drives")
     return Deployment(loop, neck_of(loop), tuple(notes))
 
 
@@ -114,7 +114,7 @@ def run_simulated(
     """
     parameters = neck or deployed.neck
     if parameters is None:
-        raise SettingsError("the loop's plant is no virtual neck; say which one the drives shall turn (--neck).")
+        raise SettingsError("the loop's plant is not a virtual neck; say which one the drives are to turn (--neck).")
     loop = deployed.loop
     pilot = LoopPilot(loop)
     virtual = simulated_neck(file, parameters, sample_time=pilot.sample_time, seed=noise_seed(loop))

@@ -246,7 +246,7 @@ def _check_sensor(link: Link, file: DrivesFile, sensor: Sensor, rows: _Checks) -
         angles = [math.degrees(angle) for angle in (tilt.pitch, tilt.roll)]
         holds = tilt.valid and all(abs(angle) <= math.degrees(file.sensor.angle) for angle in angles)
         found = f"pitch {angles[0]:.2f}, roll {angles[1]:.2f} deg"
-        advice = "That is no angle of the neck: is it mounted upright, is it the right sensor?"
+        advice = "The neck cannot have that angle: is it mounted upright, is it the right sensor?"
     rows.add(node, "inclinometer", found, holds, getattr(sensor, "problem", "") or advice)
 
 
@@ -254,7 +254,7 @@ def _check_drive(objects: Objects, file: DrivesFile, entry: DriveEntry, guarding
     """Add the rows of one drive; return the guarding it got."""
     node = entry.node
     kind = objects.read(0x1000)
-    rows.add(node, "present", f"device type {kind:08X}h", kind & 0xFFFF == _DRIVE, "It is no CiA 402 drive.")
+    rows.add(node, "present", f"device type {kind:08X}h", kind & 0xFFFF == _DRIVE, "It is not a CiA 402 drive.")
     _check_identity(objects, entry, rows)
     _check_factors(objects, node, rows)
     word = objects.read(0x6041)

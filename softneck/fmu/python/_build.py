@@ -48,7 +48,7 @@ def build_fmu(block: Block, path: str | Path, *, info: FmuInfo | None = None, fo
         force: replace an existing file.
 
     Raises:
-        SettingsError: NAME is no FMI identifier, or the block cannot be packaged.
+        SettingsError: NAME is not an FMI identifier, or the block cannot be packaged.
         OutputFileError: the file exists or cannot be written.
     """
     target = Path(path)

@@ -42,7 +42,7 @@ def unpack(path: str | Path) -> Path:
     except (zipfile.BadZipFile, NotImplementedError, EOFError, RuntimeError, ValueError) as error:
         if isinstance(error, FileFormatError):
             raise
-        raise FileFormatError(f"{source}: is no FMU or is damaged ({error}).") from error
+        raise FileFormatError(f"{source}: is not an FMU or is damaged ({error}).") from error
     except OSError as error:
         raise OutputFileError(f"{source}: cannot be unpacked: {error.strerror or error}.") from error
     return folder
@@ -68,7 +68,7 @@ def _check_members(source: Path, archive: zipfile.ZipFile) -> None:
     if total > _MAX_BYTES:
         raise FileFormatError(f"{source}: unpacks to {total} bytes, over the limit of {_MAX_BYTES}.")
     if "modelDescription.xml" not in archive.namelist():
-        raise FileFormatError(f"{source}: is no FMU: it has no modelDescription.xml.")
+        raise FileFormatError(f"{source}: is not an FMU: it has no modelDescription.xml.")
 
 
 def _plain_folder() -> Path:

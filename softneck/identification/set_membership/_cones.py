@@ -34,7 +34,7 @@ class Cones:
         rule: "paper" (each sample within its own bounds) or "milanese_novara" (some function within epsilon of each).
         regions: power of two; more than 1 gives each region of the data its own gamma, see docs, "Local gamma".
         correlated: rows before and after a row that do not count when the width of the bounds between the data is
-            learned: neighbours in time are no news. 25 for a motion sampled at 20 ms, 0 for separate samples.
+            learned: neighbours in time are not news. 25 for a motion sampled at 20 ms, 0 for separate samples.
         usual: quantile of those widths above which `ConeSet.outside` calls a query unlike the data.
     """
 

@@ -35,8 +35,8 @@ def denial(who: str, rise: str, distance: float, tried: tuple[float, float], lea
             "both (the FSS is empty). Set `epsilon` higher, or leave one of the two out."
         )
     return (
-        f"gamma {gamma:.6g} with epsilon {epsilon:.6g} is denied by the data (the FSS is empty): between {who} the "
-        f"regressor moves by {distance:.6g} and {rise}. With this epsilon gamma must be at least {least:.6g}; else "
+        f"gamma {gamma:.6g} with epsilon {epsilon:.6g} is contradicted by the data (the FSS is empty): between {who} "
+        f"the regressor moves by {distance:.6g} and {rise}. With this epsilon gamma must be at least {least:.6g}; else "
         "set `epsilon` higher, or leave one of the two out."
     )
 

@@ -93,7 +93,7 @@ def read_table(source: Path, suffix: str, form: TextForm) -> pd.DataFrame:
     """Read a table as text-free columns of floats where they are numbers.
 
     Raises:
-        FileFormatError: no such file, or it is no table.
+        FileFormatError: no such file, or it is not a table.
     """
     import pandas as pd
     from pyarrow import ArrowException

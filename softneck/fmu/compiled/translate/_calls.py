@@ -42,7 +42,7 @@ def numpy_call(ex: CallContext, node: ast.AST, name: str, values: list[Value]) -
     if name in _MADE:
         return _made(ex, node, values, whole=_whole(ex, node), value=_MADE[name])
     if isinstance(node, ast.Call) and node.keywords:
-        raise ex.scope.fail(node, "keywords are not known here.")
+        raise ex.scope.fail(node, "keyword arguments are not supported here.")
     kinds = [value.type for value in values]
     numbers = all(isinstance(kind, Scalar) for kind in kinds)
     if numbers and len(values) in (1, 2):
@@ -66,7 +66,7 @@ def numpy_call(ex: CallContext, node: ast.AST, name: str, values: list[Value]) -
         if _LIKE[name] == "ones":
             ex.scope.emit(f"sn_fill1({made.code}, 1.0);")
         return made
-    raise ex.scope.fail(node, f"no C is known for `{name}` of these.")
+    raise ex.scope.fail(node, f"there is no translation to C for `{name}` of these.")
 
 
 def _of_numbers(name: str, codes: list[str], whole: bool) -> Value | None:
@@ -125,7 +125,7 @@ def _dot(ex: CallContext, node: ast.AST, values: list[Value]) -> Value:
         return ex.room(f"sn_dot_vm{codes}", VECTOR)
     if a.type == b.type == MATRIX:
         return ex.room(f"sn_dot_mm{codes}", MATRIX)
-    raise ex.scope.fail(node, "products are known of vectors and matrices.")
+    raise ex.scope.fail(node, "products are supported for vectors and matrices.")
 
 
 def array_of(ex: CallContext, node: ast.Call) -> Value:
@@ -133,7 +133,7 @@ def array_of(ex: CallContext, node: ast.Call) -> Value:
     items = node.args[0].elts if len(node.args) == 1 and isinstance(node.args[0], ast.List | ast.Tuple) else []
     values = ex.ordered(items)
     if not items or node.keywords or not all(isinstance(value.type, Scalar) for value in values):
-        raise ex.scope.fail(node, "`np.array` is known of a list of numbers.")
+        raise ex.scope.fail(node, "`np.array` is supported for a list of numbers.")
     made = ex.room(f"sn_zeros1(w, {len(values)})", VECTOR)
     for i, value in enumerate(values):
         ex.scope.emit(f"*sn_at1(w, {made.code}, {i}) = {ex.scope.cast(value, FLOAT)};")
@@ -143,7 +143,7 @@ def array_of(ex: CallContext, node: ast.Call) -> Value:
 def method(ex: CallContext, node: ast.Call, name: str, base: Value) -> Value:
     """Return the C of `base.NAME(...)`."""
     if node.keywords or not isinstance(base.type, View) or base.type.whole:
-        raise ex.scope.fail(node, "this method is not known.")
+        raise ex.scope.fail(node, "this method is not supported.")
     if name in ("max", "min", "sum") and not node.args:
         return numpy_call(ex, node, name, [base])
     if name == "copy" and not node.args and base.type.rank < 3:
@@ -159,13 +159,13 @@ def method(ex: CallContext, node: ast.Call, name: str, base: Value) -> Value:
             return ex.room(f"sn_shaped(w, {flat}, {codes[0]}, {codes[1]})", MATRIX)
         if len(codes) == 1 and base.type == MATRIX:
             return ex.room(flat, VECTOR)
-    raise ex.scope.fail(node, "this method is not known.")
+    raise ex.scope.fail(node, "this method is not supported.")
 
 
 def plain_call(ex: CallContext, node: ast.Call, name: str) -> Value:
     """Return the C of a call of one of Python's own functions."""
     if node.keywords:
-        raise ex.scope.fail(node, "keywords are not known here.")
+        raise ex.scope.fail(node, "keyword arguments are not supported here.")
     values = ex.ordered(node.args)
     kinds = [value.type for value in values]
     if len(values) == 1 and isinstance(kinds[0], Scalar):
@@ -183,7 +183,7 @@ def plain_call(ex: CallContext, node: ast.Call, name: str) -> Value:
         return Value(length(values[0].code, kinds[0], 0), INT)
     if name in ("min", "max") and len(values) > 1 and all(isinstance(kind, Scalar) for kind in kinds):
         return _extreme(ex, node, name, values)
-    raise ex.scope.fail(node, "this function is not known.")
+    raise ex.scope.fail(node, "this function is not supported.")
 
 
 def _extreme(ex: CallContext, node: ast.AST, name: str, values: list[Value]) -> Value:

@@ -199,7 +199,7 @@ class _Runtime:
         if name not in self.definitions:
             return None
         if node.keywords:
-            raise ex.scope.fail(node, "keywords are not known here.")
+            raise ex.scope.fail(node, "keyword arguments are not supported here.")
         values = ex.ordered(node.args)
         if name in _MEMBERS:
             count, kind, code = _MEMBERS[name]
