@@ -24,9 +24,12 @@ from .shared._recordings import read_together
 @click.command("fmu", epilog="Example: softneck fmu build/demo/models/rls.npz -o Rls.fmu")
 @click.argument("file", required=False)
 @output_option("FMU", "X.fmu")
-@click.option("--all", "folder", type=click.Path(path_type=Path), help="Build one FMU of every file of ours in DIR.")
+@click.option("--all", "folder", type=click.Path(path_type=Path), help="Build an FMU from every softneck file in DIR.")
 @click.option(
-    "--data", multiple=True, type=click.Path(path_type=Path), help="A recording to score a model on, inside the FMU."
+    "--data",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    help="A recording to score the model on; the scores go into the FMU.",
 )
 @click.option(
     "--backend",
@@ -35,13 +38,19 @@ from .shared._recordings import read_together
     show_default=True,
     help="What runs inside: Python and numpy of the host, or a C library that needs neither.",
 )
-@click.option("--fmi", type=click.Choice(["2", "3"]), default="2", show_default=True, help="FMI version; 3: compiled.")
+@click.option(
+    "--fmi",
+    type=click.Choice(["2", "3"]),
+    default="2",
+    show_default=True,
+    help="FMI version; 3 needs --backend compiled.",
+)
 @click.option(
     "--platform",
     "platforms",
     multiple=True,
     metavar="NAME",
-    help=f"Of a compiled FMU, only for these: {', '.join(PLATFORMS)}.  [default: all that are built]",
+    help=f"Build a compiled FMU only for these platforms: {', '.join(PLATFORMS)}.  [default: all that are built]",
 )
 @force_option
 @json_option
@@ -52,7 +61,7 @@ def command(
     """Package FILE as a Co-Simulation FMU of FMI 2.0 or 3.0.
 
     FILE is a model, observer or controller (.npz), a neck parameter file (.toml), a neck preset (paper, lab), or a
-    loop file, of whose [reference] a reference FMU is made.
+    loop file, from whose [reference] a reference FMU is built.
     """
     if backend == "python" and (fmi != "2" or platforms):
         raise SettingsError("--fmi 3 and --platform are for compiled FMUs only; add `--backend compiled`.")
@@ -83,7 +92,7 @@ def command(
 
 
 def open_buildable(source: str | Path) -> Buildable:
-    """Return what `source` names: a file of ours, a neck file or a neck preset."""
+    """Return what `source` names: a softneck file, a neck file or a neck preset."""
     if Path(source).suffix == ".npz":
         thing = load(source)
         if not hasattr(thing, "block"):

@@ -32,8 +32,8 @@ def command(file: Path, html: Path | None, force: bool, as_json: bool) -> None:
     """Say what FILE is: a recording, model, observer, controller, FMU, loop, layout, neck, study, certificate or log
     (tables, and those of `softneck drives run --log`).
 
-    Of a recording it tells the quality too: faults of its channels, and what its inputs can teach a model. Of a log it
-    tells what `softneck import --guess` would take each column for.
+    For a recording it also reports the quality: faults of its channels, and what its inputs can teach a model. For a
+    log it reports what `softneck import --guess` would take each column for.
     """
     if not file.is_file():
         raise FileFormatError(f"{file}: no such file.")

@@ -65,7 +65,7 @@ def group() -> None:
     """From a logged experiment on a tendon-driven soft robotic neck to a verified controller.
 
     \b
-    Exit codes: 0 done, 1 a check that did not hold, 2 bad input, 3 a fault of ours, 130 Ctrl-C.
+    Exit codes: 0 done, 1 a check that did not hold, 2 bad input, 3 an internal error, 130 Ctrl-C.
     """
 
 

@@ -47,7 +47,7 @@ def read_archive(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray
     """Return the header and the arrays of a file that `write_archive` wrote.
 
     Raises:
-        FileFormatError: no such file, no archive of ours, another version, damaged.
+        FileFormatError: no such file, not a softneck file, another version, damaged.
     """
     source = Path(path)
     if not source.is_file():

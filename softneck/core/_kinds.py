@@ -158,14 +158,14 @@ def resolve(path: str) -> Any:
 
 
 def load(path: str | Path, *, role: str | None = None) -> Any:
-    """Open any model, observer or controller file of ours.
+    """Open any model, observer or controller file that softneck wrote.
 
     Args:
         path: the `.npz` file.
         role: "model", "observer" or "controller" when only that will do.
 
     Raises:
-        FileFormatError: no file of ours, another version, damaged, or of another role.
+        FileFormatError: not a softneck file, another version, damaged, or of another role.
     """
     header, arrays = read_archive(path)
     kind = KINDS.get(str(header.get("kind")))

@@ -25,7 +25,7 @@ _TO_SI: dict[str, tuple[float, str]] = {
 
 
 def to_si(unit: str) -> tuple[float, str]:
-    """Return (factor, SI unit) such that SI value = factor * value; raise DataError for no unit of ours."""
+    """Return (factor, SI unit) such that SI value = factor * value; raise DataError for an unknown unit."""
     try:
         return _TO_SI[unit]
     except KeyError:

@@ -80,7 +80,7 @@ def test_a_model_under_another_ending_is_refused_before_any_work(call: Call, tmp
     (tmp_path / "a.csv").write_text("never read")
     for name in ("m.csv", "m"):
         said = call("identify", "rls", "a.csv", "-o", name, "--json")
-        refused(said, f"{name}: must end in `.npz`, by which softneck knows the file", tmp_path, {"a.csv"})
+        refused(said, f"{name}: must end in `.npz`, by which softneck recognises the file", tmp_path, {"a.csv"})
 
 
 def test_a_model_that_is_none(call: Call, tmp_path: Path, recording: Path) -> None:

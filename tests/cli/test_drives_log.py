@@ -103,7 +103,7 @@ def test_jog_and_record_replay_and_import(
     assert run("drives", *words, "--simulated", "--log", "m.txt") == 2
     lines = capsys.readouterr().err.splitlines()
     assert "exists already" in lines[0]
-    assert "say one of them" in lines[1]
+    assert "give one of them" in lines[1]
     assert "a log ends in" in lines[2]
 
 

@@ -181,4 +181,4 @@ def test_a_changed_file_makes_its_certificate_stale(call: Call, whole: Path) -> 
 def test_reports_of_nothing(call: Call, tmp_path: Path) -> None:
     assert "is not a folder" in call("report", "nowhere").error
     (tmp_path / "empty").mkdir()
-    assert "holds nothing of softneck" in call("report", "empty").error
+    assert "holds no softneck files" in call("report", "empty").error

@@ -121,7 +121,7 @@ def _description(old: bytes, new: bytes) -> Callable[[str, bytes], tuple[str, by
         (b'fmiVersion="2.0"', b'fmiVersion="1.0"', FileFormatError, "is an FMI 1.0 FMU|cannot be read"),
         (b"<CoSimulation ", b"<ModelExchange ", FileFormatError, "Model Exchange only"),
         (b"<ModelVariables>", b"<ModelVariables", FileFormatError, "cannot be read"),
-        (b' stepSize="0.02"', b"", SettingsError, "says no step size"),
+        (b' stepSize="0.02"', b"", SettingsError, "states no step size"),
         (b'Tool name="softneck"', b'Tool name="else"', SettingsError, "say its role in the loop"),
     ],
     ids=["version", "exchange", "damaged", "step", "role"],
@@ -207,7 +207,7 @@ def test_driving_with_wrong_names_lengths_or_sample_times_is_refused(fmus: Path,
     path = fmus / "Neck.fmu"
     with pytest.raises(DataError, match=r"`speed` is not an input of .*motor_setpoint_1"):
         drive_fmu(path, {"speed": np.zeros(3)})
-    with pytest.raises(DataError, match=r"one length of at least 1; got \[2, 3\]"):
+    with pytest.raises(DataError, match=r"one common length of at least 1; got \[2, 3\]"):
         drive_fmu(path, {"motor_setpoint_1": np.zeros(3), "payload": np.zeros(2)})
     with pytest.raises(DataError, match=r"`yaw` is not an output of .*it has pitch"):
         drive_fmu(path, {"payload": np.zeros(2)}, outputs=("yaw",))

@@ -190,5 +190,5 @@ def test_units_may_be_given_and_wrong_mappings_are_refused(foreign: dict[int, Pa
         plant(foreign[2], units={"yaw": "deg"})
     with pytest.raises(FileFormatError, match="u1 and u2 are both named `a`"):
         FmuPart(foreign[3], role="plant", sample_time=TS, names={"u1": "a", "u2": "a"})
-    with pytest.raises(SettingsError, match="says no step size"):
+    with pytest.raises(SettingsError, match="states no step size"):
         FmuPart(foreign[3], role="plant", names=NAMES)

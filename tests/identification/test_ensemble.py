@@ -97,7 +97,7 @@ def test_crafted_members_are_refused(models: dict[str, Model]) -> None:
     arrays = dict(combine([models["rls"], models["play"]]).arrays)
     check_arrays("ensemble", arrays)
     renamed = {name.replace("1.play", "1.ensemble"): array for name, array in arrays.items()}
-    with pytest.raises(FileFormatError, match="of no member in order"):
+    with pytest.raises(FileFormatError, match="belongs to no member in order"):
         check_arrays("ensemble", renamed)
     with pytest.raises(FileFormatError, match="cannot have 2 members"):
         check_arrays(

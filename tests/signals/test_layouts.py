@@ -101,7 +101,7 @@ def test_a_gap_in_the_time_column_splits_the_run_under_any_sample_time(tmp_path:
         ('"p", unit = "deg"', '"p", unit = "deg", sign = 0', "sign must be 1 or -1; got 0"),
         ('"p", unit = "deg"', '"p", unit = "deg", factor = 0', "a factor must be a finite number other than 0; got 0"),
         ('"p", unit = "deg"', '"p", unit = "deg", factor = "x"', "wrong type"),
-        ("pitch =", "yaw =", r"\[channels\.yaw\]: no channel of a recording"),
+        ("pitch =", "yaw =", r"\[channels\.yaw\]: not a channel of a recording"),
         ("[time]", "[times]", "the layout has the unknown key `times`"),
         ("[time]", "[time]\nsample_time_s = -1", "sample_time_s must be a positive number or `estimate`; got -1"),
         ("[time]", "[file]\nskip = -1\n[time]", "skip must be a number of lines; got -1"),

@@ -167,7 +167,7 @@ def zero_command(
 @command.command("run", epilog="Example: softneck drives run pi.npz --loop loop.toml --simulated")
 @click.argument("controller", metavar="CONTROLLER", type=click.Path(path_type=Path))
 @click.option("--loop", "loop_file", required=True, type=click.Path(path_type=Path), metavar="LOOP.toml",
-              help="Observer, reference and duration; its plant gives the virtual neck of --simulated.")  # fmt: skip
+              help="Observer, reference and duration; its plant is the virtual neck of --simulated.")  # fmt: skip
 @click.option("--certificate", "certificates", multiple=True, type=click.Path(path_type=Path),
               help="Certificate of `softneck verify` or `simulate`; several may cover the files together.")  # fmt: skip
 @drives_options

@@ -112,7 +112,7 @@ def read_run_log(path: str | Path) -> LoggedRun:
     """Read a `.mcap` log of `softneck drives`; one that is cut is read up to the cut.
 
     Raises:
-        FileFormatError: no such file, no MCAP, or none of ours.
+        FileFormatError: no such file, not MCAP, or not a log of softneck.
     """
     from mcap.records import Channel, Message, Metadata
     from mcap.stream_reader import StreamReader

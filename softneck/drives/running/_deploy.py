@@ -41,7 +41,7 @@ class Deployment:
 
 
 def prepare(setup: LoopSetup, controller: Path | None = None) -> Deployment:
-    """Return the loop of `setup` with the controller in file `controller`, an FMU or a file of ours.
+    """Return the loop of `setup` with the controller in file `controller`, an FMU or a softneck file.
 
     Raises:
         SettingsError: a controller that does not fit the loop.
