@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 from softneck.estimation import KalmanSettings, LinearNeck, consistency
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.plots import consistency_figure, faults_figure, region_figure, spectrum_figure
-from softneck.signals import Excitation, Limits, Recording, prepare, quality, redefine, signal
+from softneck.signals import Excitation, Recording, SetPointLimits, prepare, quality, redefine, signal
 
 STATIC = Path(__file__).parent / "_static"
 
@@ -67,7 +67,7 @@ def _consistency_figure(factor: float) -> Figure:
 
 def _limits_figure() -> Figure:
     """Return Eq. 22 and `steps` before and after limits and ramps."""
-    limits = Limits(position=3.5, speed=5.0, slack=1.5)
+    limits = SetPointLimits(position=3.5, speed=5.0, slack=1.5)
     pairs: list[tuple[Excitation, Excitation]] = []
     for name in ("eq22", "steps"):
         before = signal(name, duration=12.0)

@@ -14,7 +14,7 @@ from .shared._options import target
 
 if TYPE_CHECKING:
     from softneck.identification import Choice
-    from softneck.identification.selection._auto import Tried
+    from softneck.identification.selection._auto import KindTrial
     from softneck.signals import Recording
 
 
@@ -80,7 +80,7 @@ def _rows(choice: Choice) -> list[list[str]]:
     return [_row(one, one is choice.chosen) for one in choice.ranking]
 
 
-def _row(one: Tried, chosen: bool) -> list[str]:
+def _row(one: KindTrial, chosen: bool) -> list[str]:
     from softneck.identification import INFINITE
 
     if one.judged is None or one.model is None:

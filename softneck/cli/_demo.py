@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from softneck.core import CheckFailedError, OutputError
+from softneck.core import CheckFailedError, OutputFileError
 
 from .shared._console import note, print_json, print_table
 from .shared._options import force_option, json_option
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @click.command("demo", epilog="Example: softneck demo --out build/demo --quick")
-@click.option("--out", type=click.Path(path_type=Path), help="Folder for everything. [default: build/demo]")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder for all results. [default: build/demo]")
 @click.option("--quick", is_flag=True, help="A shorter experiment and less training: under 30 s.")
 @force_option
 @json_option
@@ -49,7 +49,7 @@ def _refuse_foreign(folder: Path, *, force: bool) -> None:
     """Refuse a folder that holds something, unless it lies under build/ or `force` allows it."""
     inside = folder.resolve().is_relative_to(Path("build").resolve())
     if not inside and not force and folder.is_dir() and any(folder.iterdir()):
-        raise OutputError(f"{folder}: is not empty; use --force to replace files in it or choose another folder.")
+        raise OutputFileError(f"{folder}: is not empty; use --force to replace files in it or choose another folder.")
 
 
 def _print(demo: Demo) -> None:

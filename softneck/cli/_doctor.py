@@ -1,4 +1,4 @@
-"""softneck doctor: what of this machine works."""
+"""softneck doctor: which parts of this machine work."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _EXTRAS = {
 @click.option("--compile", "compile_now", is_flag=True, help="Compile the models' code now.")
 @json_option
 def command(compile_now: bool, as_json: bool) -> None:
-    """Say what of this machine works: packages, compilers, FMU platforms, CAN, extras."""
+    """Say which parts of this machine work: packages, compilers, FMU platforms, CAN, extras."""
     if compile_now:
         _compile(quiet=as_json)
     checks = [_python(), *_packages(), _compiler(), _fmu_platform(), _compiled_fmus(), _can(), *_extras()]

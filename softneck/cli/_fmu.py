@@ -24,9 +24,12 @@ if TYPE_CHECKING:
 @click.command("fmu", epilog="Example: softneck fmu build/demo/models/rls.npz -o Rls.fmu")
 @click.argument("file", required=False)
 @output_option("FMU", "X.fmu")
-@click.option("--all", "folder", type=click.Path(path_type=Path), help="Build one FMU of every file of ours in DIR.")
+@click.option("--all", "folder", type=click.Path(path_type=Path), help="Build an FMU from every softneck file in DIR.")
 @click.option(
-    "--data", multiple=True, type=click.Path(path_type=Path), help="A recording to score a model on, inside the FMU."
+    "--data",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    help="A recording to score the model on; the scores go into the FMU.",
 )
 @click.option(
     "--backend",
@@ -35,13 +38,19 @@ if TYPE_CHECKING:
     show_default=True,
     help="What runs inside: Python and numpy of the host, or a C library that needs neither.",
 )
-@click.option("--fmi", type=click.Choice(["2", "3"]), default="2", show_default=True, help="FMI version; 3: compiled.")
+@click.option(
+    "--fmi",
+    type=click.Choice(["2", "3"]),
+    default="2",
+    show_default=True,
+    help="FMI version; 3 needs --backend compiled.",
+)
 @click.option(
     "--platform",
     "platforms",
     multiple=True,
     metavar="NAME",
-    help=f"Of a compiled FMU, only for these: {', '.join(PLATFORMS)}.  [default: all that are built]",
+    help=f"Build a compiled FMU only for these platforms: {', '.join(PLATFORMS)}.  [default: all that are built]",
 )
 @force_option
 @json_option
@@ -52,12 +61,12 @@ def command(
     """Package FILE as a Co-Simulation FMU of FMI 2.0 or 3.0.
 
     FILE is a model, observer or controller (.npz), a neck parameter file (.toml), a neck preset (paper, lab), or a
-    loop file, of whose [reference] a reference FMU is made.
+    loop file, from whose [reference] a reference FMU is built.
     """
     from softneck.fmu import build_compiled_fmu, build_fmu, fmu_info
 
     if backend == "python" and (fmi != "2" or platforms):
-        raise SettingsError("--fmi 3 and --platform are of compiled FMUs; add `--backend compiled`.")
+        raise SettingsError("--fmi 3 and --platform are for compiled FMUs only; add `--backend compiled`.")
     origin = ""
     jobs, replace = _what(file, folder, output, force=force)
     # All are read before any is written: one bad file stops the command with nothing done.
@@ -81,22 +90,22 @@ def command(
     if origin:
         click.echo(f"libraries: {origin}")
     for source in left_out:
-        click.echo(f"left out: {source}, which is no model, observer or controller")
+        click.echo(f"left out: {source}, which is not a model, observer or controller")
 
 
 def open_buildable(source: str | Path) -> Buildable:
-    """Return what `source` names: a file of ours, a neck file or a neck preset."""
+    """Return what `source` names: a softneck file, a neck file or a neck preset."""
     from softneck.cosim.loops._loop_file import is_loop_file, reference_of
     from softneck.plant import VirtualNeck
 
     if Path(source).suffix == ".npz":
         thing = load(source)
         if not hasattr(thing, "block"):
-            raise FileFormatError(f"{source}: is no model, observer or controller, so that no FMU can be made of it.")
+            raise FileFormatError(f"{source}: is not a model, observer or controller, so no FMU can be built from it.")
         return thing
     if Path(source).suffix not in ("", ".toml"):
         raise FileFormatError(
-            f"{source}: no FMU can be made of a `{Path(source).suffix}` file; give a model, controller or observer "
+            f"{source}: no FMU can be built from a `{Path(source).suffix}` file; give a model, controller or observer "
             "(.npz), a neck or loop file (.toml), or a preset (paper, lab)."
         )
     if is_loop_file(Path(source)):
@@ -109,7 +118,7 @@ def _can_be_fmu(source: str | Path) -> bool:
 
 
 def _judge(thing: Buildable, source: str | Path, data: tuple[Path, ...]) -> Validation | None:
-    """Return the scores of a model on recordings as one, each run of its own; None for what is no model."""
+    """Return the scores of a model on recordings as one, each run of its own; None for what is not a model."""
     from softneck.identification import Model, validate
 
     if not isinstance(thing, Model):
@@ -132,7 +141,7 @@ def _what(
 
 def _jobs(folder: Path, out: Path) -> list[tuple[str | Path, Path]]:
     if not folder.is_dir():
-        raise FileFormatError(f"{folder}: is no folder.")
+        raise FileFormatError(f"{folder}: is not a folder.")
     sources = sorted(path for path in folder.iterdir() if path.suffix == ".npz" or _is_neck(path))
     if not sources:
         raise FileFormatError(f"{folder}: holds no model, observer, controller or neck file.")

@@ -14,7 +14,7 @@ from .shared._console import note, print_json
 from .shared._options import force_option, json_option, output_option, target
 
 if TYPE_CHECKING:
-    from softneck.signals.importing._log import Imported
+    from softneck.signals.importing._log import ImportResult
 
 
 @click.command(
@@ -60,11 +60,11 @@ def _run_log(log: Path, output: Path | None, *, force: bool, as_json: bool, layo
     """Import the log of a run on drives."""
     from softneck.drives import read_run_log  # the drives take a while to import
     from softneck.signals import write_recording
-    from softneck.signals.importing._log import Imported
+    from softneck.signals.importing._log import ImportResult
     from softneck.signals.recording._files import recording_suffix
 
     if layout:
-        raise SettingsError(f"{log}: is a log of ours, whose columns are known; leave --layout and --guess out.")
+        raise SettingsError(f"{log}: is a log of softneck, whose columns are known; leave out --layout and --guess.")
     path, replace = target(output, f"recordings/{log.stem}.csv", force=force)
     recording_suffix(path)
     refuse_existing(path, force=replace)
@@ -72,10 +72,10 @@ def _run_log(log: Path, output: Path | None, *, force: bool, as_json: bool, layo
     recording = run.recording()
     notes = (f"{log}: {run.cut}: imported up to the cut",) if run.cut else ()
     write_recording(path, recording, force=replace)
-    _tell(path, Imported(recording, notes), {}, as_json)
+    _tell(path, ImportResult(recording, notes), {}, as_json)
 
 
-def _by_guess(log: Path, path: Path, replace: bool) -> tuple[Imported, dict[str, Any]]:
+def _by_guess(log: Path, path: Path, replace: bool) -> tuple[ImportResult, dict[str, Any]]:
     """Guess a layout, write it beside the recording, and import by it.
 
     Raises:
@@ -102,7 +102,7 @@ def _by_guess(log: Path, path: Path, replace: bool) -> tuple[Imported, dict[str,
     return imported, facts
 
 
-def _tell(path: Path, imported: Imported, more: dict[str, Any], as_json: bool) -> None:
+def _tell(path: Path, imported: ImportResult, more: dict[str, Any], as_json: bool) -> None:
     recording = imported.recording
     missed = int((recording.outputs != recording.outputs).any(axis=1).sum())
     facts = {

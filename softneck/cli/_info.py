@@ -33,8 +33,8 @@ def command(file: Path, html: Path | None, force: bool, as_json: bool) -> None:
     """Say what FILE is: a recording, model, observer, controller, FMU, loop, layout, neck, study, certificate or log
     (tables, and those of `softneck drives run --log`).
 
-    Of a recording it tells the quality too: faults of its channels, and what its inputs can teach a model. Of a log it
-    tells what `softneck import --guess` would take each column for.
+    For a recording it also reports the quality: faults of its channels, and what its inputs can teach a model. For a
+    log it reports what `softneck import --guess` would take each column for.
     """
     if not file.is_file():
         raise FileFormatError(f"{file}: no such file.")
@@ -111,7 +111,7 @@ def _recording(file: Path, html: Path | None, *, force: bool, quiet: bool) -> di
 
 
 def _log(file: Path, html: Path | None, error: DataError | FileFormatError | None) -> dict[str, Any]:
-    """Return what a foreign log seems to hold; `error` is why it is no recording, where it has a recording's ending.
+    """Return what a foreign log seems to hold; `error` is why it is not a recording, where it has a recording's ending.
 
     Raises:
         DataError, FileFormatError: it is a recording with a fault, or no log either.
@@ -122,7 +122,7 @@ def _log(file: Path, html: Path | None, error: DataError | FileFormatError | Non
         guess = guess_layout(file)
     except (DataError, FileFormatError) as reason:
         raise error or FileFormatError(
-            f"{file}: is no file of softneck by its ending, and no log either ({str(reason).removeprefix(f'{file}: ')})"
+            f"{file}: by its ending not a file of softneck, nor is it a log ({str(reason).removeprefix(f'{file}: ')})"
         ) from reason
     if error is not None and _is_titled(guess):
         raise error
@@ -151,7 +151,7 @@ def _fmu(file: Path) -> dict[str, Any]:
         description = fmpy.read_model_description(str(file), validate=False)
     except Exception as error:  # fmpy raises bare Exception
         raise FileFormatError(
-            f"{file}: is no FMU ({str(error).splitlines()[0] if str(error) else error!r})."
+            f"{file}: is not an FMU ({str(error).splitlines()[0] if str(error) else error!r})."
         ) from error
     by_causality = {
         f"{causality}s": ", ".join(v.name for v in description.modelVariables if v.causality == causality)
@@ -176,7 +176,7 @@ def _toml(file: Path) -> dict[str, Any]:
     try:
         table = tomllib.loads(file.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise FileFormatError(f"{file}: is no TOML file ({error}).") from error
+        raise FileFormatError(f"{file}: is not a TOML file ({error}).") from error
     if "plant" in table:
         return {"type": "loop", "parts": ", ".join(name for name in table if isinstance(table[name], dict))}
     if "vary" in table:
@@ -194,7 +194,7 @@ def _certificate(file: Path) -> dict[str, Any]:
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise FileFormatError(f"{file}: is no JSON file ({error}).") from error
+        raise FileFormatError(f"{file}: is not a JSON file ({error}).") from error
     if not isinstance(content, dict):
-        raise FileFormatError(f"{file}: holds no JSON object, so it is no file of softneck.")
+        raise FileFormatError(f"{file}: holds no JSON object, so it is not a softneck file.")
     return {"type": "certificate" if "limits" in content else "JSON", "keys": ", ".join(content)}

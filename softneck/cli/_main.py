@@ -17,24 +17,24 @@ from softneck.core import SoftneckError
 # `softneck --help` answers at once.
 _COMMANDS = {
     "demo": ("_demo", "Run the main job: experiment, models, FMUs, controller, closed loop, report."),
-    "doctor": ("_doctor", "Say what of this machine works."),
+    "doctor": ("_doctor", "Say which parts of this machine work."),
     "info": ("_info", "Say what a file is."),
     "record": ("_record", "Record a signal on the virtual neck."),
     "import": ("_import", "Turn any logger's table into a recording, by a layout file."),
     "identify": ("_identify", "Identify a model from recordings."),
-    "validate": ("_validate", "Judge models on rows that they were not trained on."),
-    "reproduce-paper": ("_reproduce_paper", "Run the paper on the virtual neck, ours beside its tables and figures."),
+    "validate": ("_validate", "Validate models on rows that they were not trained on."),
+    "reproduce-paper": ("_reproduce_paper", "Reproduce the paper on the virtual neck, our numbers beside its own."),
     "family": ("_family", "Fit an uncertain linear plant over inclinations and payloads."),
     "fmu": ("_fmu", "Package models, observers, controllers or the virtual neck as FMUs."),
     "observer": ("_observer", "Build a Kalman filter over a linear model."),
     "design": ("_design", "Design a controller on a linear model."),
-    "verify": ("_verify", "Prove a controller on what it claims, or fail loudly."),
+    "verify": ("_verify", "Verify a controller against requirements, or fail loudly."),
     "simulate": ("_simulate", "Close the loop that a TOML file describes and judge it."),
     "study": ("_study", "Run a loop many times over what varies: ranking, Pareto front, worst cases."),
     "ssp": ("_ssp", "Write a loop as an SSP file for other simulators."),
     "drives": ("drives._commands", "Run controllers on CANopen drives, or on simulated ones."),
     "report": ("_report", "Write one page on a whole project: data, models, certificates, loops, studies."),
-    "new": ("_new", "Begin a project whose closed-loop test passes at once."),
+    "new": ("_new", "Start a project whose closed-loop test passes at once."),
 }
 _INTERRUPTED, _BAD_INPUT, _OUR_FAULT = 130, 2, 3
 
@@ -66,7 +66,7 @@ def group() -> None:
     """From a logged experiment on a tendon-driven soft robotic neck to a verified controller.
 
     \b
-    Exit codes: 0 done, 1 a check that did not hold, 2 bad input, 3 a fault of ours, 130 Ctrl-C.
+    Exit codes: 0 done, 1 a check that did not hold, 2 bad input, 3 an internal error, 130 Ctrl-C.
     """
 
 
@@ -98,7 +98,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
         if os.environ.get("SOFTNECK_TRACEBACK"):
             traceback.print_exc()
         return _fail(
-            f"a fault of softneck, not of yours: {type(error).__name__}: {error} "
+            f"internal error in softneck: {type(error).__name__}: {error} "
             "(set SOFTNECK_TRACEBACK=1 and report what it prints)",
             _OUR_FAULT,
         )

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from softneck.core import OutputError, atomic_write
+from softneck.core import OutputFileError, atomic_write
 
 from .shared._console import print_json
 from .shared._options import force_option, json_option
@@ -23,7 +23,7 @@ def command(folder: Path, force: bool, as_json: bool) -> None:
     texts = _texts(_project_name(folder))
     taken = [name for name in texts if (folder / name).exists()]
     if taken and not force:
-        raise OutputError(
+        raise OutputFileError(
             f"{folder}: holds {', '.join(taken)} already; take an empty folder, or --force replaces them."
         )
     for name, text in texts.items():

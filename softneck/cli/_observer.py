@@ -52,7 +52,7 @@ def command(
     path, replace = target(output, "observers/kalman.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
     if gyro and any(setting.replace(" ", "").startswith("form=") for setting in settings):
-        raise SettingsError("--gyro is --set form=gyro; give one of them.")
+        raise SettingsError("--gyro is the same as --set form=gyro; give only one of them.")
     chosen = apply_settings(resolve(kind.settings), settings, sensor=sensor, form="gyro" if gyro else None)
     observer = chosen.design(load_model(model))
     told: dict[str, Any] = {}
@@ -85,7 +85,7 @@ def _fitted(observer: Any, data: tuple[Path, ...], *, fixed: tuple[str, ...]) ->
         f"log likelihood of each {before:.2f} -> {after:.2f}"
     ]
     if fit.at_bound:
-        lines.append(f"  not told by the data: {', '.join(fit.at_bound)}")
+        lines.append(f"  not determined by the data: {', '.join(fit.at_bound)}")
     for path, recording in zip(data, recordings, strict=True):
         lines += [f"  {path.name}: {line}" for line in consistency(fit.observer, recording).summary().splitlines()]
     return fit, lines

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from softneck.core import refuse_existing, require_between
-from softneck.signals import Limits, prepare, signal, signal_names, write_recording
+from softneck.signals import SetPointLimits, prepare, signal, signal_names, write_recording
 
 from .shared._console import print_json, progress
 from .shared._neck import load_neck
@@ -23,12 +23,14 @@ from .shared._options import force_option, json_option, output_option
 @output_option("recording", "REC", required=True)
 @click.option("--neck", default="paper", show_default=True, metavar="paper|lab|NECK.toml", help="Which neck.")
 @click.option("--duration", type=float, metavar="S", help="Length in seconds. [default: the signal's own]")
-@click.option("--seed", type=click.IntRange(0, 2**31 - 2), default=0, show_default=True, help="Of noise and signal.")
-@click.option("--payload", type=float, default=0.0, show_default=True, metavar="KG", help="On the platform.")
-@click.option("--no-noise", is_flag=True, help="A perfect inclinometer.")
+@click.option(
+    "--seed", type=click.IntRange(0, 2**31 - 2), default=0, show_default=True, help="Seed of noise and signal."
+)
+@click.option("--payload", type=float, default=0.0, show_default=True, metavar="KG", help="Payload on the platform.")
+@click.option("--no-noise", is_flag=True, help="Simulate a perfect inclinometer.")
 @click.option("--ramp", type=float, default=0.0, metavar="S", help="Ramp in from rest and out to it. [default: none]")
 @click.option("--max-position", type=float, metavar="RAD", help="Clip set-points to +-RAD. [default: the signal's own]")
-@click.option("--max-speed", type=float, metavar="RAD/S", help="Slow set-points down to it. [default: none]")
+@click.option("--max-speed", type=float, metavar="RAD/S", help="Slow set-points down to this speed. [default: none]")
 @click.option("--max-slack", type=float, metavar="RAD", help="Pay out no more than RAD below rest. [default: none]")
 @force_option
 @json_option
@@ -55,7 +57,7 @@ def command(
     refuse_existing(output, force=force)
     require_between("--payload", payload, 0.0, 1.0, "kg")
     bounds = {"position": max_position, "speed": max_speed, "slack": max_slack}
-    limits = Limits(**{name: value for name, value in bounds.items() if value is not None})
+    limits = SetPointLimits(**{name: value for name, value in bounds.items() if value is not None})
     excitation, changes = prepare(signal(signal_name, duration=duration, seed=seed), limits, ramp_s=ramp)
     with progress("record", quiet=as_json):
         recording = record(excitation, VirtualNeck(load_neck(neck)), seed=seed, payload=payload, noise=not no_noise)
@@ -65,5 +67,5 @@ def command(
         print_json({**facts, "signal": signal_name, "changes": changes.as_dict()})
         return
     click.echo(f"{output}: {len(recording)} rows of {signal_name} at {1e3 * recording.sample_time:g} ms")
-    if ramp > 0 or limits != Limits():
+    if ramp > 0 or limits != SetPointLimits():
         click.echo(f"set-points: {changes}")

@@ -20,15 +20,15 @@ from .shared._stages import Stages
     "--necks",
     default=3,
     show_default=True,
-    help="Other necks on which the same is identified, to tell what is the plant's.",
+    help="Number of other necks to identify on, to tell which differences come from the plant.",
 )
 @force_option
 @json_option
 def command(html: Path | None, seed: int, necks: int, force: bool, as_json: bool) -> None:
-    """Run the paper on the virtual neck: Tables 3 and 4, section 7.4 and Figures 4 to 23.
+    """Reproduce the paper on the virtual neck: Tables 3 and 4, section 7.4 and Figures 4 to 23.
 
-    Records Eq. 22 and the three tests, identifies set membership, network and RLS, and prints ours beside the
-    paper's, like with like. Takes about a minute.
+    Records Eq. 22 and the three tests, identifies set membership, network and RLS, and prints our figures
+    beside the paper's, like with like. Takes about a minute.
     """
     from softneck.plots import write_page
     from softneck.report import ReproduceSettings, paper_page, reproduce

@@ -100,7 +100,7 @@ def values_to_try(estimator: Any, searches: Sequence[str]) -> dict[str, list[Any
             try:
                 dataclasses.replace(estimator, **{name: value})
             except TypeError as error:
-                raise SettingsError(f"`{value}` is no value of `{name}` ({error}).") from error
+                raise SettingsError(f"`{value}` is not a value of `{name}` ({error}).") from error
     return vary
 
 

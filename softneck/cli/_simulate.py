@@ -20,7 +20,11 @@ if TYPE_CHECKING:
 @click.command("simulate", epilog="Example: softneck simulate build/demo/loops/pitch_step.toml --html loop.html")
 @click.argument("loop_file", metavar="LOOP.toml", type=click.Path(path_type=Path))
 @output_option("recording of the run", "REC")
-@click.option("--certificate", type=click.Path(path_type=Path), help="Write what held, with the hashes of all files.")
+@click.option(
+    "--certificate",
+    type=click.Path(path_type=Path),
+    help="Write a certificate of what held, with the hashes of all files.",
+)
 @click.option("--html", type=click.Path(path_type=Path), help="Write a page with plots, and beside it the neck in 3-D.")
 @force_option
 @json_option

@@ -22,10 +22,16 @@ if TYPE_CHECKING:
     "-o", "--output", type=click.Path(path_type=Path), metavar="DIR",
     help="Folder of runs, report and worst cases. [default: build/studies/NAME]",
 )  # fmt: skip
-@click.option("--workers", type=int, help="Local processes. [default: one for each core]")
+@click.option("--workers", type=int, help="Number of local processes. [default: one for each core]")
 @click.option("--dask", metavar="ADDRESS", help="Run on this Dask scheduler instead, such as tcp://head:8786.")
-@click.option("--resume", is_flag=True, help="Go on with the study that DIR holds.")
-@click.option("--worst", type=click.IntRange(min=0), default=3, show_default=True, help="Worst runs as loop files.")
+@click.option("--resume", is_flag=True, help="Resume the study in DIR.")
+@click.option(
+    "--worst",
+    type=click.IntRange(min=0),
+    default=3,
+    show_default=True,
+    help="Number of worst runs to write as loop files.",
+)
 @force_option
 @json_option
 def command(
@@ -44,7 +50,7 @@ def command(
     DIR gets  runs.parquet   a row for each run: what varied, seed, metrics, limits, error
               report.html    ranking, Pareto front, distributions, influences
               worst/         the worst runs as loop files for softneck simulate
-    Ctrl-C or a crash loses no finished run: --resume goes on.
+    Ctrl-C or a crash loses no finished run: --resume continues.
     """
     from softneck.cosim import load_study
     from softneck.cosim.studies._run_study import run_study

@@ -39,12 +39,12 @@ _NOTE = (
     show_default=True,
     help="Free run from set-points alone, or with logged motor positions as the paper does.",
 )
-@click.option("--include-training", is_flag=True, help="Score rows that the model was trained on as well.")
+@click.option("--include-training", is_flag=True, help="Also score rows that the model was trained on.")
 @click.option(
     "--training",
     multiple=True,
     type=click.Path(path_type=Path),
-    help="What the models were trained on, to say how novel the data is.",
+    help="What the models were trained on, to report how novel the data is.",
 )
 @click.option("--html", type=click.Path(path_type=Path), help="Write a page with plots.")
 @force_option
@@ -60,7 +60,7 @@ def command(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Judge MODELs on the rows of recordings that they were not trained on."""
+    """Validate MODELs on the rows of recordings that they were not trained on."""
     from softneck.identification import Rules, compare, load_model
     from softneck.plots import write_page
     from softneck.signals import read_recording

@@ -41,7 +41,9 @@ def _print_requirements(context: click.Context, _: click.Parameter, value: bool)
     help="Print the default requirements and exit.",
 )  # fmt: skip
 @click.option("--observer", type=_PATH, help="Observer of the loops over the virtual neck; hashed like the controller.")
-@click.option("--order", type=click.Choice(ORDERS), help="Of the loop. [default: that of the controller's design]")
+@click.option(
+    "--order", type=click.Choice(ORDERS), help="Order of the loop. [default: that of the controller's design]"
+)
 @output_option("certificate", "CERTIFICATE")
 @click.option("--html", type=_PATH, help="Write a page with the verdict, and all behind it in plots.")
 @force_option

@@ -12,7 +12,7 @@ from ._checks import require_whole as require_whole
 from ._errors import CheckFailedError as CheckFailedError
 from ._errors import DataError as DataError
 from ._errors import FileFormatError as FileFormatError
-from ._errors import OutputError as OutputError
+from ._errors import OutputFileError as OutputFileError
 from ._errors import SettingsError as SettingsError
 from ._errors import SoftneckError as SoftneckError
 from ._files import atomic_write as atomic_write

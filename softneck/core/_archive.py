@@ -35,7 +35,7 @@ def write_archive(
     """Write `header` (JSON values) and `arrays` to `path` in one piece.
 
     Raises:
-        OutputError: the file exists (and not `force`) or cannot be written.
+        OutputFileError: the file exists (and not `force`) or cannot be written.
     """
     text = json.dumps({"format": "softneck", "format_version": FORMAT_VERSION, **header})
     contents = {_HEADER: np.frombuffer(text.encode(), dtype=np.uint8), **arrays}
@@ -47,7 +47,7 @@ def read_archive(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray
     """Return the header and the arrays of a file that `write_archive` wrote.
 
     Raises:
-        FileFormatError: no such file, no archive of ours, another version, damaged.
+        FileFormatError: no such file, not a softneck file, another version, damaged.
     """
     source = Path(path)
     if not source.is_file():
@@ -58,14 +58,14 @@ def read_archive(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray
             contents = {name: archive[name] for name in archive.files}
         header = json.loads(contents.pop(_HEADER).tobytes().decode())
     except _DAMAGE as error:
-        raise FileFormatError(f"{source}: is no softneck file or is damaged ({_short(error)}).") from error
+        raise FileFormatError(f"{source}: is not a softneck file or is damaged ({_short(error)}).") from error
     _check_header(source, header)
     return header, contents
 
 
 def _check_header(source: Path, header: object) -> None:
     if not isinstance(header, dict) or header.get("format") != "softneck":
-        raise FileFormatError(f"{source}: is no softneck file; expected one that softneck wrote.")
+        raise FileFormatError(f"{source}: is not a softneck file; expected one that softneck wrote.")
     version = header.get("format_version")
     if version != FORMAT_VERSION:
         raise FileFormatError(

@@ -78,7 +78,7 @@ def write_certificate(path: str | Path, contents: Mapping[str, Any], *, force: b
     """Write what `certificate_contents` returned, in one piece.
 
     Raises:
-        OutputError: the file exists (and not `force`) or cannot be written.
+        OutputFileError: the file exists (and not `force`) or cannot be written.
     """
     with atomic_write(path, force=force) as temporary:
         temporary.write_text(json.dumps(contents, indent=2, allow_nan=False) + "\n", encoding="utf-8")
@@ -96,9 +96,9 @@ def read_certificate(path: str | Path) -> Certificate:
     except FileNotFoundError as error:
         raise FileFormatError(f"{source}: no such certificate; `softneck verify` writes one.") from error
     except (OSError, UnicodeDecodeError, ValueError, RecursionError) as error:
-        raise FileFormatError(f"{source}: is no certificate (no JSON); `softneck verify` writes one.") from error
+        raise FileFormatError(f"{source}: is not a certificate (not JSON); `softneck verify` writes one.") from error
     if not isinstance(contents, dict) or contents.get("certificate") not in CERTIFICATE_KINDS:
-        raise FileFormatError(f"{source}: is no certificate; `softneck verify` and `softneck simulate` write them.")
+        raise FileFormatError(f"{source}: is not a certificate; `softneck verify` and `softneck simulate` write them.")
     if contents.get("certificate_version") != CERTIFICATE_VERSION:
         raise FileFormatError(
             f"{source}: has certificate version {contents.get('certificate_version')}; this softneck reads "
@@ -130,7 +130,7 @@ def check_certificate(path: str | Path, files: Iterable[str | Path], *, kind: st
     found = read_certificate(path)
     if found.kind != kind:
         raise CheckFailedError(
-            f"{found.path}: is a certificate of `softneck {found.kind}`; `softneck {kind}` is asked."
+            f"{found.path}: is a certificate of `softneck {found.kind}`; one of `softneck {kind}` is needed."
         )
     if not found.holds:
         listed = ", ".join(found.failed()) or "something required"

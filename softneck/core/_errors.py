@@ -21,7 +21,7 @@ class FileFormatError(SoftneckError, ValueError):
     """A file is not what it should be: another kind, another version, damaged."""
 
 
-class OutputError(SoftneckError, OSError):
+class OutputFileError(SoftneckError, OSError):
     """A file cannot be written where it was asked for."""
 
 

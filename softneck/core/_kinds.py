@@ -133,7 +133,7 @@ def find_kind(name: str, role: str) -> Kind:
     """Return the kind of that name; raise SettingsError with the known ones if there is none."""
     kind = KINDS.get(name)
     if kind is None or kind.role != role:
-        raise SettingsError(f"`{name}` is no kind of {role}; use one of {', '.join(kinds_of(role))}.")
+        raise SettingsError(f"unknown kind of {role} `{name}`; use one of {', '.join(kinds_of(role))}.")
     return kind
 
 
@@ -160,19 +160,21 @@ def resolve(path: str) -> Any:
 
 
 def load(path: str | Path, *, role: str | None = None) -> Any:
-    """Open any model, observer or controller file of ours.
+    """Open any model, observer or controller file that softneck wrote.
 
     Args:
         path: the `.npz` file.
         role: "model", "observer" or "controller" when only that will do.
 
     Raises:
-        FileFormatError: no file of ours, another version, damaged, or of another role.
+        FileFormatError: not a softneck file, another version, damaged, or of another role.
     """
     header, arrays = read_archive(path)
     kind = KINDS.get(str(header.get("kind")))
     if kind is None:
-        raise FileFormatError(f"{path}: holds the unknown kind `{header.get('kind')}`; a newer softneck wrote it?")
+        raise FileFormatError(
+            f"{path}: holds the unknown kind `{header.get('kind')}`; was it written by a newer softneck?"
+        )
     if role is not None and kind.role != role:
         raise FileFormatError(f"{path}: is a {kind.role} ({kind.name}), not a {role}.")
     try:

@@ -25,9 +25,9 @@ _TO_SI: dict[str, tuple[float, str]] = {
 
 
 def to_si(unit: str) -> tuple[float, str]:
-    """Return (factor, SI unit) such that SI value = factor * value; raise DataError for no unit of ours."""
+    """Return (factor, SI unit) such that SI value = factor * value; raise DataError for an unknown unit."""
     try:
         return _TO_SI[unit]
     except KeyError:
         known = ", ".join(_TO_SI)
-        raise DataError(f"`{unit}` is no unit that softneck knows; use one of {known}.") from None
+        raise DataError(f"unknown unit `{unit}`; use one of {known}.") from None

@@ -3,7 +3,7 @@ from .linear._controller import LinearController as LinearController
 from .linear._custom import CustomSettings as CustomSettings
 from .linear._fopi import FopiSettings as FopiSettings
 from .linear._fractional import fopi as fopi
-from .linear._limits import Limits as Limits
+from .linear._limits import ControllerLimits as ControllerLimits
 from .linear._lqg import LqgSettings as LqgSettings
 from .linear._margins import loop_margins as loop_margins
 from .linear._pi import PiSettings as PiSettings

@@ -39,7 +39,7 @@ _START_BIAS = math.radians(5.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Form:
+class FilterMatrices:
     """Matrices of both axes together, as the runtime takes them.
 
     Attributes:
@@ -65,7 +65,7 @@ class Form:
         return (*items, sources, constants)
 
 
-def model_form(plants: Sequence[AxisPlant]) -> Form:
+def model_form(plants: Sequence[AxisPlant]) -> FilterMatrices:
     """Return model states and an output disturbance that walks, on each axis."""
     from scipy.linalg import solve_discrete_lyapunov
 
@@ -83,7 +83,7 @@ def model_form(plants: Sequence[AxisPlant]) -> Form:
     return _both(axes)
 
 
-def kinematic_form(sample_time: float) -> Form:
+def kinematic_form(sample_time: float) -> FilterMatrices:
     """Return angle and rate, driven by an acceleration constant over each sample (Bar-Shalom 2001, sec. 6.3.2)."""
     T = sample_time
     F = np.array([[1.0, T], [0.0, 1.0]])
@@ -93,7 +93,7 @@ def kinematic_form(sample_time: float) -> Form:
     return _both([axis, axis])
 
 
-def gyro_form(sample_time: float) -> Form:
+def gyro_form(sample_time: float) -> FilterMatrices:
     """Return angle and gyro bias: the angle rises by what the gyro says minus its bias (Lefferts 1982)."""
     T = sample_time
     F = np.array([[1.0, -T], [0.0, 1.0]])
@@ -104,8 +104,8 @@ def gyro_form(sample_time: float) -> Form:
     return _both([axis, axis])
 
 
-def _both(axes: Sequence[tuple[Matrix, ...]]) -> Form:
-    return Form(*(_diagonal(*(axis[i] for axis in axes)) for i in range(7)))
+def _both(axes: Sequence[tuple[Matrix, ...]]) -> FilterMatrices:
+    return FilterMatrices(*(_diagonal(*(axis[i] for axis in axes)) for i in range(7)))
 
 
 def _diagonal(*blocks: Matrix) -> Matrix:

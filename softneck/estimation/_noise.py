@@ -69,7 +69,7 @@ def fit_noise(
         fixed: names of levels that stay as they are.
 
     Raises:
-        SettingsError: a name in `fixed` that is none of the levels', or all of them.
+        SettingsError: a name in `fixed` that is not a level, or all of them.
         DataError: another sample time, missing channels, or fewer than 200 measurements.
     """
     free = _free(observer.noise_names, fixed)
@@ -101,10 +101,10 @@ def fit_noise(
 
 
 def _free(names: Sequence[str], fixed: Sequence[str]) -> np.ndarray:
-    """Return which levels are estimated (3,); refuse a name that is none, and nothing left to estimate."""
+    """Return which levels are estimated (3,); refuse an unknown name, and nothing left to estimate."""
     unknown = sorted(set(fixed) - set(names))
     if unknown or len(set(fixed)) == len(names):
-        what = f"`{unknown[0]}` is no noise level" if unknown else "no noise level is left to estimate"
+        what = f"`{unknown[0]}` is not a noise level" if unknown else "no noise level is left to estimate"
         raise SettingsError(f"{what}; this filter has {', '.join(names)}.")
     return np.array([name not in fixed for name in names])
 

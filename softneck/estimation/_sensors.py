@@ -9,7 +9,7 @@ from softneck.core import SettingsError
 
 
 @dataclass(frozen=True, slots=True)
-class Sensor:
+class SensorNoise:
     """An inclinometer.
 
     Attributes:
@@ -27,29 +27,31 @@ class Sensor:
 
 # Upper ends of what the recordings show on plateaus: a filter that trusts too little lags a little,
 # one that trusts too much rejects good samples. Rates were not recorded: data sheet class.
-SENSORS: dict[str, Sensor] = {
+SENSORS: dict[str, SensorNoise] = {
     sensor.name: sensor
     for sensor in (
-        Sensor(
+        SensorNoise(
             "mpu9250",
             math.radians(0.29),
             math.radians(0.1),
             "Arduino with MPU-9250: 0.26 to 0.29 deg on plateaus of the recordings; rates: data sheet class",
         ),
-        Sensor(
+        SensorNoise(
             "3dm-gx5-10",
             math.radians(0.04),
             math.radians(0.05),
             "3DM-GX5-10, 50 Hz: 0.02 to 0.04 deg on plateaus of the recordings; rates: data sheet class",
         ),
-        Sensor("paper", math.radians(0.05), math.radians(0.1), "the virtual neck's inclinometer in the paper preset"),
+        SensorNoise(
+            "paper", math.radians(0.05), math.radians(0.1), "the virtual neck's inclinometer in the paper preset"
+        ),
     )
 }
 
 
-def find_sensor(name: str) -> Sensor:
+def find_sensor(name: str) -> SensorNoise:
     """Return the sensor of that name; raise SettingsError with the known ones if there is none."""
     try:
         return SENSORS[name]
     except KeyError:
-        raise SettingsError(f"`{name}` is no sensor that softneck knows; use one of {', '.join(SENSORS)}.") from None
+        raise SettingsError(f"unknown sensor `{name}`; use one of {', '.join(SENSORS)}.") from None

@@ -20,7 +20,7 @@ from softneck.core import (
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
 from ._axis import AXES, AxisPlant, HasTransferFunctions, axis_plant
-from ._forms import FORMS, NOISES, RATE_STD, Form, gyro_form, kinematic_form, model_form
+from ._forms import FORMS, NOISES, RATE_STD, FilterMatrices, gyro_form, kinematic_form, model_form
 from ._kalman import KalmanObserver
 from ._sensors import find_sensor
 from ._steady import steady_gains
@@ -144,7 +144,7 @@ class KalmanSettings:
             gate_level=self.gate_level,
         )
 
-    def _form(self, plants: list[AxisPlant], period: float) -> Form:
+    def _form(self, plants: list[AxisPlant], period: float) -> FilterMatrices:
         if self.form == "model":
             return model_form(plants)
         return gyro_form(period) if self.form == "gyro" else kinematic_form(period)

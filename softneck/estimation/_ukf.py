@@ -37,7 +37,7 @@ _START_OUTPUT = math.radians(40.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Row:
+class UkfStep:
     """What one step made: numbers of the next state, outputs, and the entries of `Estimates`."""
 
     values: Vector
@@ -125,7 +125,7 @@ class UkfObserver:
         """
         return estimate_recording(self, recording)
 
-    def advance(self, values: Vector, inputs: ArrayLike) -> Row:
+    def advance(self, values: Vector, inputs: ArrayLike) -> UkfStep:
         """Do what `step` does on the numbers of a state, and tell more of it."""
         given = np.asarray(inputs, dtype=np.float64).ravel()
         if given.size != 6 or not np.isfinite(given[:3]).all():
@@ -148,7 +148,7 @@ class UkfObserver:
         healthy = healthy and not kalman_frozen(self._constants, tail, self.settings.noise[0])
         angle, rate = self._told(base, kf.x, past)
         H = self._H
-        return Row(
+        return UkfStep(
             values=np.concatenate([base, kf.x, kf.P.ravel(), past.ravel(), tail]),
             outputs=np.array([*angle, *rate, innovation, float(healthy)]),
             judged=usable,
@@ -338,7 +338,7 @@ def estimate_recording(observer: UkfObserver, recording: Recording) -> Estimates
     )
 
 
-def _run(observer: UkfObserver, run: Recording) -> list[Row]:
+def _run(observer: UkfObserver, run: Recording) -> list[UkfStep]:
     z = measured_angles(run)
     # The set-points of t_k are commanded after the measurement of t_k: the filter knows those before. In a Jacobi loop
     # the observer sees them a sample younger.

@@ -34,7 +34,7 @@ class UkfPart:
             SettingsError: any parameter: the noise levels are those of its settings.
         """
         if parameters:
-            raise SettingsError(f"`{next(iter(parameters))}` is no parameter of an unscented filter; it has none.")
+            raise SettingsError(f"`{next(iter(parameters))}` is not a parameter of an unscented filter; it has none.")
         self._state = self.observer.initial_state()
         return self._state.outputs.copy()
 

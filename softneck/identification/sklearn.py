@@ -16,7 +16,7 @@ from .set_membership._cones import Cones
 class SetMembershipRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     """`Cones` with scikit-learn's face: parameters are kept as given, and checked in `fit`.
 
-    Constant targets are no error here: with `epsilon=None` they fit with a slope and a noise of zero.
+    Constant targets are not an error here: with `epsilon=None` they fit with a slope and a noise of zero.
 
     Attributes:
         cones_: the fitted `ConeSet`, also for `outside` and `save`.

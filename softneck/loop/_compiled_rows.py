@@ -11,7 +11,7 @@ from softneck.core import Matrix, Vector
 from softneck.runtime import load_runtime
 from softneck.runtime._compile import load_linked
 
-from ._disturbed_bus import Acting, Stages
+from ._disturbed_bus import ActiveFault, FaultStages
 from ._part import BlockPart, Part
 from ._wiring import REFERENCE_PORTS, Wiring
 
@@ -44,7 +44,7 @@ class CompiledRows:
         late: tuple[str, ...],
         ratios: Mapping[str, int],
         reference: Matrix | None,
-        stages: Stages | None,
+        stages: FaultStages | None,
         rows: int,
     ) -> None:
         """Compile, or take from the cache, the rows of a loop of these parts; all of them have started."""
@@ -103,13 +103,13 @@ def _taps(names: tuple[str, ...], wiring: Wiring) -> tuple[np.ndarray, ...]:
     return _whole(begins), _whole(slots), np.concatenate(factors).astype(np.float64), np.concatenate(fragile)
 
 
-def _detours(stages: Stages | None) -> tuple[np.ndarray, ...]:
+def _detours(stages: FaultStages | None) -> tuple[np.ndarray, ...]:
     if stages is None:
         return (_EMPTY,) * 4
     return tuple(_whole(x) for x in (stages.sensor_from, stages.sensor_to, stages.plant_from, stages.plant_to))
 
 
-def _faults(stages: Stages | None, rows: int) -> tuple[Vector, tuple[Any, ...]]:
+def _faults(stages: FaultStages | None, rows: int) -> tuple[Vector, tuple[Any, ...]]:
     """Return the memory of all faults, and the arrays that `rows_fault` reads."""
     placed = [] if stages is None else [(0, a) for a in stages.sensors] + [(1, a) for a in stages.plant]
     codes, slots, values, at, held = [], [], [], 0, 0
@@ -130,7 +130,7 @@ def _faults(stages: Stages | None, rows: int) -> tuple[Vector, tuple[Any, ...]]:
     return memory, (table, _whole(slots), np.array(values, dtype=np.float64), added, memory)
 
 
-def _draw(acting: Acting, added: Matrix) -> None:
+def _draw(acting: ActiveFault, added: Matrix) -> None:
     for k in range(min(acting.first, len(added)), min(acting.last, len(added))):
         added[k] = acting.amount(k)
 

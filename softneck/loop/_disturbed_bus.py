@@ -14,13 +14,13 @@ from softneck.runtime import Port
 
 from ._faults import AXES, Fault, MotorFault, NeckFault, SensorFault, with_kind
 from ._part import Part
-from ._wiring import Named, Tap, Wiring
+from ._wiring import BusSignal, Tap, Wiring
 
 # Share of a step by which a delay or the edge of a window may miss a sample: rounding of k * step.
 _SAME_TIME = 1e-6
 
 
-class Acting:
+class ActiveFault:
     """One fault on its places of the bus.
 
     Attributes:
@@ -117,7 +117,7 @@ class Acting:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Stages:
+class FaultStages:
     """Detours and faults, in the two places of a cycle where they act.
 
     Attributes:
@@ -130,8 +130,8 @@ class Stages:
     sensor_to: np.ndarray
     plant_from: np.ndarray
     plant_to: np.ndarray
-    sensors: tuple[Acting, ...]
-    plant: tuple[Acting, ...]
+    sensors: tuple[ActiveFault, ...]
+    plant: tuple[ActiveFault, ...]
 
     def sense(self, bus: Vector, k: int) -> None:
         """Pass the plant's outputs on to their readers."""
@@ -148,24 +148,24 @@ class Stages:
 
 def place_faults(
     faults: Sequence[Fault], wiring: Wiring, parts: Mapping[str, Part], step: float
-) -> tuple[Wiring, Stages]:
+) -> tuple[Wiring, FaultStages]:
     """Put `faults` between the parts and return the wiring with their detours.
 
     Raises:
-        SettingsError: the plant lacks what a fault acts on, or a delay is no multiple of the step.
+        SettingsError: the plant lacks what a fault acts on, or a delay is not a multiple of the step.
     """
-    detours = _Detours(wiring)
+    detours = _FaultRouting(wiring)
     sensors, plant = [], []
     for fault in faults:
         if isinstance(fault, SensorFault):
             names = sensor_outputs(fault, parts["plant"])
             slots = [detours.of_output(name) for name in names]
             flags = [detours.of_output("measurement_valid")] if _drops(fault, parts["plant"]) else []
-            sensors.append(Acting(fault, slots, flags, _scales(parts["plant"].outputs, names, fault), step))
+            sensors.append(ActiveFault(fault, slots, flags, _scales(parts["plant"].outputs, names, fault), step))
         else:
             names = _plant_inputs(fault, parts["plant"])
             slots = [detours.of_input(name) for name in names]
-            plant.append(Acting(fault, slots, [], _scales(parts["plant"].inputs, names, fault), step))
+            plant.append(ActiveFault(fault, slots, [], _scales(parts["plant"].inputs, names, fault), step))
     return detours.wiring(), detours.stages(sensors, plant)
 
 
@@ -177,7 +177,7 @@ def sensor_outputs(fault: SensorFault, plant: Part) -> tuple[str, ...]:
     )
     for name in names:
         if name not in known:
-            raise SettingsError(f"the {with_kind(fault)} acts on `{name}`, which is no output of the plant.")
+            raise SettingsError(f"the {with_kind(fault)} acts on `{name}`, which is not an output of the plant.")
     return names
 
 
@@ -214,11 +214,11 @@ def _lag(fault: Fault, step: float) -> int:
         return 0
     lag = round(fault.delay / step)
     if lag < 1 or abs(fault.delay / step - lag) > _SAME_TIME * lag:
-        raise SettingsError(f"the sensor delay of {fault.delay:g} s is no multiple of the loop's step {step:g} s.")
+        raise SettingsError(f"the sensor delay of {fault.delay:g} s is not a multiple of the loop's step {step:g} s.")
     return lag
 
 
-class _Detours:
+class _FaultRouting:
     """New places on the bus for signals that faults change, and readers sent there."""
 
     def __init__(self, wiring: Wiring) -> None:
@@ -256,21 +256,21 @@ class _Detours:
 
     def _add(self, old: int, part: str, port: Port) -> int:
         self._start.append(self._start[old])
-        self._named.append(Named(len(self._start) - 1, part, port))
+        self._named.append(BusSignal(len(self._start) - 1, part, port))
         return len(self._start) - 1
 
     def wiring(self) -> Wiring:
         """Return the wiring with the detours."""
         return replace(self._wiring, start=np.array(self._start), named=tuple(self._named), taps=self._taps)
 
-    def stages(self, sensors: list[Acting], plant: list[Acting]) -> Stages:
+    def stages(self, sensors: list[ActiveFault], plant: list[ActiveFault]) -> FaultStages:
         """Return the copies and the faults."""
         places = [
             np.array([pair[i] for pair in table.values()], dtype=np.intp)
             for table in (self._outputs, self._inputs)
             for i in (0, 1)
         ]
-        return Stages(places[0], places[1], places[2], places[3], tuple(sensors), tuple(plant))
+        return FaultStages(places[0], places[1], places[2], places[3], tuple(sensors), tuple(plant))
 
 
 def _measured(name: str) -> str:

@@ -150,13 +150,13 @@ def make_fault(kind: str, values: Mapping[str, object]) -> Fault:
         SettingsError: unknown kind or key, or a value out of range.
     """
     if kind not in _FILE:
-        raise SettingsError(f"`{kind}` is no kind of fault; use one of {', '.join(FAULT_KINDS)}.")
+        raise SettingsError(f"unknown kind of fault `{kind}`; use one of {', '.join(FAULT_KINDS)}.")
     made, what, known = _FILE[kind]
     chosen: dict[str, object] = {}
     for key, value in values.items():
         name, factor = _split(key)
         if name not in (*known, "start", "duration"):
-            raise SettingsError(f"`{key}` is no key of a {kind}; it takes start_s, duration_s, {', '.join(known)}.")
+            raise SettingsError(f"unknown key `{key}` of a {kind}; it takes start_s, duration_s, {', '.join(known)}.")
         chosen[name] = _value(key, name, value, factor)
     window = {name: chosen.pop(name) for name in ("start", "duration") if name in chosen}
     try:
@@ -184,7 +184,7 @@ def fault_keys(fault: Fault) -> dict[str, object]:
         kind = next(k for k, (made, what, _) in _FILE.items() if isinstance(fault, made) and what == fault.kind)
         values = {name: getattr(fault, name) for name in _FILE[kind][2]}
     if not kind:
-        raise SettingsError(f"the {with_kind(fault)} is of no kind that a loop file has; make it of several.")
+        raise SettingsError(f"the {with_kind(fault)} is of a kind that a loop file cannot hold; make it of several.")
     values = {name: list(value) if isinstance(value, tuple) else value for name, value in values.items() if value != ()}
     times = {"start": fault.start, "duration": fault.duration}
     return {"kind": kind, **values, **{name: time for name, time in times.items() if math.isfinite(time)}}

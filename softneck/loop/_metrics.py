@@ -78,7 +78,7 @@ def check_limits(values: Mapping[str, Any], limits: Mapping[str, float]) -> list
         For each limit {"metric", "limit", "value", "holds"}; a metric that is None does not hold.
 
     Raises:
-        SettingsError: no such metric, or a limit that is no number.
+        SettingsError: no such metric, or a limit that is not a number.
     """
     known = {f"{group}.{name}": value for group, table in values.items() for name, value in table.items()}
     rows = []

@@ -34,7 +34,7 @@ class AheadReference:
     def start(self, time: float, parameters: Mapping[str, float]) -> Vector:
         """Return what holds at `time` [s]; it has no parameters."""
         if parameters:
-            raise SettingsError(f"`{next(iter(parameters))}` is no parameter of a reference ahead; it has none.")
+            raise SettingsError(f"`{next(iter(parameters))}` is not a parameter of a reference ahead; it has none.")
         return self._at(time)
 
     def advance(self, time: float, inputs: Vector) -> Vector:  # noqa: ARG002 - it has none

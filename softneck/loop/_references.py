@@ -1,4 +1,4 @@
-"""References: what pitch, roll and co-contraction shall be at a time."""
+"""References: what pitch, roll and co-contraction are to be at a time."""
 
 from __future__ import annotations
 
@@ -206,7 +206,7 @@ def make_reference(kind: str, values: Mapping[str, float]) -> Reference:
     for key, value in values.items():
         name, factor = _split(key)
         if name not in names:
-            raise SettingsError(f"`{key}` is no key of a {kind} reference; it takes {', '.join(names)} with a unit.")
+            raise SettingsError(f"unknown key `{key}` of a {kind} reference; it takes {', '.join(names)} with a unit.")
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise SettingsError(f"`{key}` must be a number; got {value!r}.")
         chosen[name] = factor * value
@@ -221,7 +221,7 @@ def reference_field(kind: str, key: str) -> str | None:
 
 
 def reference_keys(reference: Reference) -> dict[str, float | str] | None:
-    """Return the keys of a loop file that describe `reference`; None if it is no step, ramp, sine or rotation."""
+    """Return the keys of a loop file that describe `reference`; None if it is not a step, ramp, sine or rotation."""
     for kind, setting in _KINDS.items():
         if isinstance(reference, setting):
             named = {f"{item.name}{_ENDINGS[item.name]}": getattr(reference, item.name) for item in fields(setting)}

@@ -18,8 +18,8 @@ from ._loop import Loop
 from ._order import late, step_order
 from ._part import BlockPart, Part
 from ._result import LoopResult
-from ._state import LoopState, Saved
-from ._wiring import REFERENCE_PORTS, Named, Wiring, wire
+from ._state import LoopState, SaveablePart
+from ._wiring import REFERENCE_PORTS, BusSignal, Wiring, wire
 
 # Ratio of two sample times that should be whole; 1e-6 allows 0.02 / 0.01 in binary and nothing else.
 _RATIO_TOLERANCE = 1e-6
@@ -346,7 +346,7 @@ def _in_si(values: Vector, port: Port) -> tuple[Vector, str]:
     return (values.copy(), port.unit) if factor == 1.0 else (values * factor, unit)
 
 
-def _signal_name(item: Named, taken: Mapping[str, int], faulty: set[str]) -> str:
+def _signal_name(item: BusSignal, taken: Mapping[str, int], faulty: set[str]) -> str:
     name = item.port.name
     if item.part == "observer" and name not in ("innovation", "healthy"):
         return f"{name}_estimate"
@@ -355,8 +355,8 @@ def _signal_name(item: Named, taken: Mapping[str, int], faulty: set[str]) -> str
     return name if name not in taken else f"{item.part}_{name}"
 
 
-def _saved(name: str, part: Part) -> Saved:
-    if not isinstance(part, Saved):
+def _saved(name: str, part: Part) -> SaveablePart:
+    if not isinstance(part, SaveablePart):
         raise SettingsError(f"the {name} cannot save its state; give it `get_state` and `set_state`, or use an FMU.")
     return part
 

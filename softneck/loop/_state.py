@@ -16,7 +16,7 @@ _KIND = "loop_state"
 
 
 @runtime_checkable
-class Saved(Protocol):
+class SaveablePart(Protocol):
     """A part that can save its state: what it returns must be enough for a new one of its kind to go on."""
 
     def get_state(self) -> bytes:
@@ -63,10 +63,10 @@ class LoopState:
 
     @staticmethod
     def load(path: str | Path) -> LoopState:
-        """Read a state that `save` wrote; raise FileFormatError if it is none."""
+        """Read a state that `save` wrote; raise FileFormatError if it is something else."""
         header, arrays = read_archive(path)
         if header.get("kind") != _KIND:
-            raise FileFormatError(f"{path}: holds no state of a loop.")
+            raise FileFormatError(f"{path}: does not hold the state of a loop.")
         try:
             return LoopState(
                 row=int(header["row"]),

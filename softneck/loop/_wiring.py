@@ -39,7 +39,7 @@ _DEFAULTS = {"healthy": 1.0, "measurement_valid": 1.0, "enabled": 1.0}
 
 
 @dataclass(frozen=True, slots=True)
-class Named:
+class BusSignal:
     """A place on the bus that a result shows.
 
     Attributes:
@@ -104,7 +104,7 @@ class Wiring:
     """
 
     start: Vector
-    named: tuple[Named, ...]
+    named: tuple[BusSignal, ...]
     spans: Mapping[str, slice]
     taps: Mapping[str, Tap]
 
@@ -145,7 +145,7 @@ def wire(
                 places.append(len(ports) + len(extra) - 1)
         taps[name] = _tap(name, part, places, ports)
     start = np.array([port.start for _, port in ports] + extra)
-    named = tuple(Named(i, part, port) for i, (part, port) in enumerate(ports))
+    named = tuple(BusSignal(i, part, port) for i, (part, port) in enumerate(ports))
     return Wiring(start, named, _spans(parts), taps)
 
 
@@ -198,7 +198,7 @@ def _check_constants(name: str, part: Part, constants: Mapping[str, float]) -> N
     names = [port.name for port in part.inputs]
     for constant in constants:
         if constant not in names:
-            raise SettingsError(f"`{constant}` is no input of the {name}; its inputs are {', '.join(names)}.")
+            raise SettingsError(f"`{constant}` is not an input of the {name}; its inputs are {', '.join(names)}.")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

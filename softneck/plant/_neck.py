@@ -64,7 +64,7 @@ class VirtualNeck:
             internal_step: [s]; must divide the sample time. Stiff necks take more steps by themselves.
 
         Raises:
-            SettingsError: a time out of range or one that does not divide, or a seed that is no integer >= 0.
+            SettingsError: a time out of range or one that does not divide, or a seed that is not an integer >= 0.
         """
         require_between("sample_time", sample_time, 0.001, 0.1, "s")
         require_between("internal_step", internal_step, 1e-6, sample_time, "s")

@@ -158,7 +158,7 @@ class NeckParameters:
         """Return a preset with what the file overrides; `preset = "lab"` in it starts from that one.
 
         Raises:
-            FileFormatError: no such file, no TOML, or a key that is no parameter.
+            FileFormatError: no such file, no TOML, or a key that is not a parameter.
             SettingsError: a value outside its range.
         """
         source = Path(path)
@@ -169,14 +169,16 @@ class NeckParameters:
                 f"{source}: cannot be read ({error.strerror}); use paper, lab or a neck file (.toml)."
             ) from error
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise FileFormatError(f"{source}: is no valid TOML ({error}).") from error
+            raise FileFormatError(f"{source}: is not valid TOML ({error}).") from error
         preset = content.pop("preset", "paper")
         if preset not in ("paper", "lab"):
             raise FileFormatError(f'{source}: `preset` must be "paper" or "lab"; got {preset!r}.')
         names = cls.names()
         unknown = [name for name in content if name not in names]
         if unknown:
-            raise FileFormatError(f"{source}: `{unknown[0]}` is no parameter of the neck; it has {', '.join(names)}.")
+            raise FileFormatError(
+                f"{source}: `{unknown[0]}` is not a parameter of the neck; it has {', '.join(names)}."
+            )
         try:
             return dataclasses.replace(cls.preset(preset), **content)
         except SettingsError as error:
@@ -193,7 +195,7 @@ class NeckParameters:
         for item in dataclasses.fields(cls):
             if item.name == name:
                 return dict(item.metadata)
-        raise SettingsError(f"`{name}` is no parameter of the neck; it has {', '.join(cls.names())}.")
+        raise SettingsError(f"`{name}` is not a parameter of the neck; it has {', '.join(cls.names())}.")
 
     def vector(self) -> Vector:
         """Return the numbers in the runtime's order, shape (n,)."""

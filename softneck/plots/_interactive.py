@@ -45,7 +45,7 @@ _TOOLS = "box_zoom,pan,reset,save"
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
+class RenderedChart:
     """A chart as a page holds it.
 
     Attributes:
@@ -64,7 +64,7 @@ def library() -> str:
     return "\n".join([*Resources(mode="inline", components=["bokeh"], log_level="error").js_raw, _START])
 
 
-def draw(chart: Chart) -> Drawn:
+def draw(chart: Chart) -> RenderedChart:
     """Return a chart for the browser.
 
     All samples are there. Heights are kept to 7 digits (32 bit, which halves the page); x keeps all 64 bits.
@@ -90,7 +90,7 @@ def draw(chart: Chart) -> Drawn:
             grid.toolbar.active_drag = tool
     # `<` would let a label end the script; JSON may spell it otherwise.
     text = json.dumps(json_item(grid), separators=(",", ":")).replace("<", "\\u003c")
-    return Drawn(text, sum(plot.height or 0 for plot in plots[:: chart.columns]))
+    return RenderedChart(text, sum(plot.height or 0 for plot in plots[:: chart.columns]))
 
 
 class _Sources:

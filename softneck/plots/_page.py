@@ -164,7 +164,7 @@ def _plot(name: str, chart: Chart) -> _Plot:
 
 
 def write_page(path: str | Path, html: str, *, force: bool = False) -> None:
-    """Write a page in one piece; raises OutputError if it exists (and not `force`) or cannot be written."""
+    """Write a page in one piece; raises OutputFileError if it exists (and not `force`) or cannot be written."""
     with atomic_write(path, force=force) as temporary:
         temporary.write_text(html, encoding="utf-8")
 

@@ -44,7 +44,7 @@ def timeline(time: Vector, run: np.ndarray | None = None) -> Timeline:
 
     Args:
         time: (rows,) [s]; may start anew where a run does.
-        run: (rows,) number of the run or stretch of each row; a row after a step that is no sample time starts a
+        run: (rows,) number of the run or stretch of each row; a row after a step that is not a sample time starts a
             stretch as well.
 
     Raises:

@@ -46,20 +46,20 @@ at_s = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Designed:
+class DemoDesign:
     """The controller and the observer of the demo."""
 
     controller: LinearController
     observer: KalmanObserver
 
 
-def design(model: Model, fmus: Path) -> Designed:
+def design(model: Model, fmus: Path) -> DemoDesign:
     """Design both on an identified linear model and package them as FMUs in folder `fmus`."""
     controller = PiSettings().design(model)
     observer = KalmanSettings(sensor="paper").design(model)
     build_fmu(controller.block(), fmus / "Pi.fmu", info=fmu_info(controller), force=True)
     build_fmu(observer.block(), fmus / "Kalman.fmu", info=fmu_info(observer), force=True)
-    return Designed(controller, observer)
+    return DemoDesign(controller, observer)
 
 
 def close_loops(folder: Path, *, sample_time: float, tell: Tell) -> dict[str, Result]:

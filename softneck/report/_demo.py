@@ -8,17 +8,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from softneck.core import OutputError, SettingsError, atomic_write
+from softneck.core import OutputFileError, SettingsError, atomic_write
 from softneck.cosim import Result
 from softneck.identification import Model
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.plots import neck_view, page, write_page
 from softneck.signals import write_recording
 
-from ._closing import Designed, close_loops, design
+from ._closing import DemoDesign, close_loops, design
 from ._demo_page import sections
-from ._experiments import Experiments, Judged, Tell, identify, judge, record_experiments
-from ._packaging import Packaged, package
+from ._experiments import Experiments, Tell, ValidationPair, identify, judge, record_experiments
+from ._packaging import PackagedFmu, package
 from ._tables import demo_json, score_line
 
 FULL_DURATION = 200.0
@@ -59,9 +59,9 @@ class Demo:
     settings: DemoSettings
     experiments: Experiments
     models: Mapping[str, Model]
-    judged: Mapping[tuple[str, str], Judged]
-    packaged: Mapping[str, Packaged]
-    designed: Designed
+    judged: Mapping[tuple[str, str], ValidationPair]
+    packaged: Mapping[str, PackagedFmu]
+    designed: DemoDesign
     loops: Mapping[str, Result]
     seconds: float
 
@@ -88,12 +88,12 @@ def run_demo(settings: DemoSettings, *, tell: Tell) -> Demo:
         tell: announces a stage and returns its progress callback.
 
     Raises:
-        OutputError: the folder cannot be written.
+        OutputFileError: the folder cannot be written.
     """
     begin = time.monotonic()
     out = settings.out
     if out.exists() and not out.is_dir():
-        raise OutputError(f"{out}: is a file; name a folder.")
+        raise OutputFileError(f"{out}: is a file; name a folder.")
     neck = NeckParameters.paper()
     experiments = record_experiments(neck, duration=settings.duration, tell=tell)
     _write_recordings(out / "recordings", experiments)

@@ -12,9 +12,9 @@ from softneck.plots import Chart, Section, Table
 from softneck.plots._charts import delay_chart, loop_chart, recording_chart, validation_chart
 from softneck.signals import Recording
 
-from ._closing import Designed
-from ._experiments import Experiments, Judged
-from ._packaging import Packaged
+from ._closing import DemoDesign
+from ._experiments import Experiments, ValidationPair
+from ._packaging import PackagedFmu
 from ._tables import FIT_HEAD, FIT_NOTE, fit_rows, fmu_rows, loop_rows
 
 _TITLES = {
@@ -30,9 +30,9 @@ def sections(
     *,
     experiments: Experiments,
     models: Mapping[str, Model],
-    judged: Mapping[tuple[str, str], Judged],
-    packaged: Mapping[str, Packaged],
-    designed: Designed,
+    judged: Mapping[tuple[str, str], ValidationPair],
+    packaged: Mapping[str, PackagedFmu],
+    designed: DemoDesign,
     loops: Mapping[str, Result],
     shortened: bool,
 ) -> Sequence[Section]:
@@ -48,8 +48,8 @@ def sections(
 
 
 def _overview(
-    judged: Mapping[tuple[str, str], Judged],
-    packaged: Mapping[str, Packaged],
+    judged: Mapping[tuple[str, str], ValidationPair],
+    packaged: Mapping[str, PackagedFmu],
     loops: Mapping[str, Result],
     shortened: bool,
 ) -> Section:
@@ -80,7 +80,9 @@ def _model_section(models: Mapping[str, Model]) -> Section:
     return Section("Models", tables=[Table("What was identified", ["model", "finding"], rows, text=2)], charts=[curve])
 
 
-def _validation_section(data: str, judged: Mapping[tuple[str, str], Judged], models: Mapping[str, Model]) -> Section:
+def _validation_section(
+    data: str, judged: Mapping[tuple[str, str], ValidationPair], models: Mapping[str, Model]
+) -> Section:
     results = {name: judged[name, data].free for name in models}
     first = next(iter(results.values()))
     free = {name: r.free_run if r.fits[INFINITE]["pitch"] is not None else np.full_like(r.free_run, np.nan)
@@ -93,7 +95,7 @@ def _validation_section(data: str, judged: Mapping[tuple[str, str], Judged], mod
     return Section(f"Models on {data}", charts=charts)
 
 
-def _design_section(designed: Designed) -> Section:
+def _design_section(designed: DemoDesign) -> Section:
     rows = [["controller", line] for line in designed.controller.summary().splitlines()]
     rows += [["observer", line] for line in designed.observer.summary().splitlines()]
     words = ["Both were designed on the identified linear model and run below against the virtual neck, another plant."]

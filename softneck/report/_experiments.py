@@ -34,7 +34,7 @@ class Experiments:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Judged:
+class ValidationPair:
     """One model on one recording: from set-points alone, and with measured motors (paper, section 7.4)."""
 
     free: Validation
@@ -64,15 +64,17 @@ def identify(recording: Recording, *, iterations: int, seed: int, tell: Tell) ->
     return {name: estimator.fit(recording, progress=tell(f"identify {name}")) for name, estimator in estimators.items()}
 
 
-def judge(models: Mapping[str, Model], experiments: Experiments, *, tell: Tell) -> dict[tuple[str, str], Judged]:
+def judge(
+    models: Mapping[str, Model], experiments: Experiments, *, tell: Tell
+) -> dict[tuple[str, str], ValidationPair]:
     """Validate every model on every recording it has not seen."""
     report = tell("validate")
-    judged: dict[tuple[str, str], Judged] = {}
+    judged: dict[tuple[str, str], ValidationPair] = {}
     pairs = [(model, data) for model in models for data in experiments.judged]
     for number, (name, data) in enumerate(pairs):
         report(number / len(pairs), f"{name} on {data}")
         recording = experiments.judged[data]
         free = validate(models[name], recording, names=(name, data), horizons=(1, INFINITE))
         measured = validate(models[name], recording, names=(name, data), horizons=(INFINITE,), motors="measured")
-        judged[name, data] = Judged(free, measured)
+        judged[name, data] = ValidationPair(free, measured)
     return judged

@@ -22,7 +22,7 @@ TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
-class Packaged:
+class PackagedFmu:
     """An FMU and how far its free run is from the Python model's.
 
     Attributes:
@@ -43,17 +43,17 @@ class Packaged:
 
 def package(
     things: Mapping[str, Buildable], folder: Path, recording: Recording, *, scores: Mapping[str, str], tell: Tell
-) -> dict[str, Packaged]:
+) -> dict[str, PackagedFmu]:
     """Build an FMU of each plant and compare their free runs over `recording` with Python's."""
     report = tell("build FMUs and compare free runs")
-    packaged: dict[str, Packaged] = {}
+    packaged: dict[str, PackagedFmu] = {}
     for number, (name, thing) in enumerate(things.items()):
         report(number / len(things), name)
         info = fmu_info(thing, scores=scores.get(name, ""), stop_time=30.0)
         path = build_fmu(thing.block(), folder / f"{_camel(name)}.fmu", info=info, force=True)
         table = simulate_fmu_free_run(path, recording)
         difference = float(np.abs(table - python_free_run(thing.block(), recording)).max())
-        packaged[name] = Packaged(path, len(recording), difference)
+        packaged[name] = PackagedFmu(path, len(recording), difference)
     return packaged
 
 

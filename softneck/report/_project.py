@@ -67,7 +67,7 @@ def read_project(folder: str | Path, *, run_loops: bool = True, progress: Progre
     """
     root = Path(folder)
     if not root.is_dir():
-        raise FileFormatError(f"{root}: is no folder; name that of a project.")
+        raise FileFormatError(f"{root}: is not a folder; name that of a project.")
     project = Project(root)
     files = list(_files(root))
     for number, path in enumerate(files):
@@ -79,7 +79,7 @@ def read_project(folder: str | Path, *, run_loops: bool = True, progress: Progre
         except SoftneckError as error:
             project.problems[name] = str(error).removeprefix(f"{path}: ")
     if project.is_empty:
-        raise FileFormatError(f"{root}: holds nothing of softneck; `softneck new {root}` begins a project.")
+        raise FileFormatError(f"{root}: holds no softneck files; `softneck new {root}` begins a project.")
     return project
 
 
@@ -129,7 +129,7 @@ def _fmu(project: Project, path: Path, name: str) -> None:
     try:
         project.fmus[name] = fmpy.read_model_description(str(path), validate=False)
     except Exception as error:  # fmpy raises bare Exception
-        raise FileFormatError(f"{path}: is no FMU ({' '.join(str(error).split())}).") from error
+        raise FileFormatError(f"{path}: is not an FMU ({' '.join(str(error).split())}).") from error
 
 
 def _json(project: Project, path: Path, name: str) -> None:

@@ -10,8 +10,8 @@ from softneck.identification import INFINITE
 
 from . import _paper
 from ._closing import limits_of
-from ._experiments import Judged
-from ._packaging import TOLERANCE, Packaged
+from ._experiments import ValidationPair
+from ._packaging import TOLERANCE, PackagedFmu
 
 Head = list[str]
 Rows = list[list[str]]
@@ -29,7 +29,7 @@ FIT_NOTE = (
 )
 
 
-def fit_rows(judged: Mapping[tuple[str, str], Judged]) -> Rows:
+def fit_rows(judged: Mapping[tuple[str, str], ValidationPair]) -> Rows:
     """Return one row for each model and recording."""
     rows = []
     for (model, data), result in judged.items():
@@ -49,7 +49,7 @@ def fit_rows(judged: Mapping[tuple[str, str], Judged]) -> Rows:
     return rows
 
 
-def fmu_rows(packaged: Mapping[str, Packaged]) -> tuple[Head, Rows]:
+def fmu_rows(packaged: Mapping[str, PackagedFmu]) -> tuple[Head, Rows]:
     """Return one row for each FMU: how far its free run is from the Python model's."""
     rows = [
         [name, item.path.name, str(item.rows), f"{item.difference:.1e}", "holds" if item.equal else "fails"]
@@ -73,7 +73,7 @@ def loop_rows(loops: Mapping[str, Result]) -> tuple[Head, Rows]:
 
 
 def demo_json(
-    judged: Mapping[tuple[str, str], Judged], packaged: Mapping[str, Packaged], loops: Mapping[str, Result]
+    judged: Mapping[tuple[str, str], ValidationPair], packaged: Mapping[str, PackagedFmu], loops: Mapping[str, Result]
 ) -> dict[str, Any]:
     """Return the same as JSON values."""
     return {
@@ -89,7 +89,7 @@ def demo_json(
     }
 
 
-def score_line(judged: Mapping[tuple[str, str], Judged], model: str) -> str:
+def score_line(judged: Mapping[tuple[str, str], ValidationPair], model: str) -> str:
     """Return a model's free-run fits as text for its FMU."""
     lines = ["free-run fit from set-points alone [%], pitch/roll"]
     lines += [f"{data}: {_pair(r.free.fits[INFINITE])}" for (name, data), r in judged.items() if name == model]

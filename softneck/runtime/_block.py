@@ -92,7 +92,7 @@ class Block:
         names = [port.name for port in self.parameters]
         for name, value in parameters.items():
             if name not in names:
-                raise SettingsError(f"`{name}` is no parameter of {self.kind}; it has {', '.join(names) or 'none'}.")
+                raise SettingsError(f"`{name}` is not a parameter of {self.kind}; it has {', '.join(names) or 'none'}.")
             q[names.index(name)] = _in_range(self.parameters[names.index(name)], value)
         runtime = self._runtime
         x, y = np.zeros(runtime.state_size(self.arrays)), np.zeros(len(self.outputs))
@@ -145,7 +145,7 @@ class Block:
         known = {port.name for port in self.parameters}
         for name in starts:
             if name not in known:
-                raise SettingsError(f"`{name}` is no parameter of {self.kind}; it has {', '.join(sorted(known))}.")
+                raise SettingsError(f"`{name}` is not a parameter of {self.kind}; it has {', '.join(sorted(known))}.")
         ports = tuple(replace(port, start=starts.get(port.name, port.start)) for port in self.parameters)
         return replace(self, parameters=ports)
 

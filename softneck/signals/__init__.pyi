@@ -1,4 +1,4 @@
-from .excitation._limits import Limits as Limits
+from .excitation._limits import SetPointLimits as SetPointLimits
 from .excitation._limits import prepare as prepare
 from .excitation._signals import SAMPLE_TIME as SAMPLE_TIME
 from .excitation._signals import Excitation as Excitation

@@ -72,7 +72,7 @@ def _stability(part: LinearEvidence, count: int) -> Agreement:
         note = "undecided: the bound does not prove stability, and no unstable plant was found"
         agree = False
     if unstable and mu < 1.0:
-        note += "; the bound says otherwise, which is a fault of softneck's: report it"
+        note += "; the bound says otherwise, which is an internal error in softneck: report it"
     return Agreement(_at(part, "Is every plant of the box stable?"), answers, agree, note)
 
 

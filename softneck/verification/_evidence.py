@@ -14,12 +14,12 @@ from softneck.runtime import Block
 
 from ._confidence import MarginInterval, intervals
 from ._gaps import Gaps, gaps
-from ._laws import Judged
+from ._laws import ControllerUnderTest
 from ._linear import LinearLaw, judged, margins
 from ._neck_loops import STEP_AT, NeckRun, neck_changes, run_necks
 from ._plants import AXES, Plants, UncertainNeck, all_plants, join, nominal_plants
 from ._requirements import Requirements
-from ._search import Found, search
+from ._search import SearchResult, search
 from ._steps import Steps, StepTest, run_steps
 from ._structured import StructuredResult, structured
 
@@ -66,7 +66,7 @@ class LinearEvidence:
     law: LinearLaw
     plants: Plants
     margins: dict[str, Vector]
-    found: Found | None
+    found: SearchResult | None
     structured: list[list[StructuredResult]]
     gaps: list[tuple[Gaps, Gaps]]
     intervals: list[MarginInterval]
@@ -98,7 +98,7 @@ class Evidence:
 
 
 def gather(
-    controller: Judged,
+    controller: ControllerUnderTest,
     necks: Sequence[UncertainNeck],
     asked: Requirements,
     *,
@@ -169,7 +169,7 @@ def _delays(plants: Plants, law: LinearLaw, w: Vector) -> np.ndarray:
     return np.array(rows)
 
 
-def _tell(evidence: Evidence, controller: Judged, asked: Requirements, observer: bool) -> None:
+def _tell(evidence: Evidence, controller: ControllerUnderTest, asked: Requirements, observer: bool) -> None:
     """Fill metrics and what was not computed."""
     metrics, absent = evidence.metrics, evidence.not_computed
     for part in evidence.linear:
@@ -278,7 +278,7 @@ def _step_describer(evidence: Evidence, name: str) -> Describe:
     return lambda row: {**plant_facts(evidence.stepped, row), "axis": AXES[int(worse[row])]}
 
 
-def _neck_describer(evidence: Evidence, controller: Judged, asked: Requirements) -> Describe:
+def _neck_describer(evidence: Evidence, controller: ControllerUnderTest, asked: Requirements) -> Describe:
     def describe(row: int) -> dict[str, Any]:
         run = evidence.necks[row]
         size = float(asked.neck["size_deg"])

@@ -14,7 +14,7 @@ from ._linear import LinearLaw
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Judged:
+class ControllerUnderTest:
     """A controller as verification sees it.
 
     Attributes:
@@ -32,7 +32,7 @@ class Judged:
     why: str
 
 
-def judge(controller: Any, *, order: str | None, observer: bool) -> Judged:
+def judge(controller: Any, *, order: str | None, observer: bool) -> ControllerUnderTest:
     """Return what of `controller` can be judged.
 
     A linear controller has `ss()` (or `to_lti()`), from (pitch_reference, roll_reference, pitch, roll) to (theta_i,
@@ -62,7 +62,7 @@ def judge(controller: Any, *, order: str | None, observer: bool) -> Judged:
     else:
         extra = 1 + int(observer)
     laws, why = _laws(controller)
-    return Judged(block, laws, chosen, extra, why)
+    return ControllerUnderTest(block, laws, chosen, extra, why)
 
 
 def _laws(controller: Any) -> tuple[dict[str, LinearLaw], str]:

@@ -19,7 +19,7 @@ from softneck.estimation import AxisPlant, axis_plant
 
 AXES = ("pitch", "roll")
 QUANTITIES = ("static gain", "pole", "dead time")
-# A pole that is none: so fast [1/s] that a sample is over before it shows.
+# A pole that does not count: so fast [1/s] that a sample is over before it shows.
 _NO_POLE = 1e4
 
 

@@ -120,7 +120,7 @@ def _read(source: Path) -> dict[str, Any]:
     try:
         table = tomllib.loads(source.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise FileFormatError(f"{source}: is no TOML ({error}).") from error
+        raise FileFormatError(f"{source}: is not valid TOML ({error}).") from error
     except OSError as error:
         raise FileFormatError(
             f"{source}: cannot be read ({error.strerror}); name a requirements file (.toml)."
@@ -137,7 +137,7 @@ def _requirements(defaults: Mapping[str, Any], own: Mapping[str, Any]) -> Requir
     known = ("version", *_NUMBERS, "require")
     for key in own:
         if key not in known:
-            raise SettingsError(f"`{key}` is no table of a requirements file; it has {', '.join(known[1:])}.")
+            raise SettingsError(f"unknown table `{key}` of a requirements file; it has {', '.join(known[1:])}.")
     tables = {name: _table(name, defaults[name], own.get(name, {})) for name in _NUMBERS}
     bounds = _bounds(defaults["require"], own.get("require", {}))
     _refuse_contradictions(bounds)
@@ -149,7 +149,7 @@ def _table(name: str, defaults: Mapping[str, Any], own: Any) -> dict[str, Any]:
         raise SettingsError(f"`{name}` must be a table: [{name}].")
     for key, value in own.items():
         if key not in defaults:
-            raise SettingsError(f"`{key}` is no key of [{name}]; it takes {', '.join(defaults)}.")
+            raise SettingsError(f"unknown key `{key}` of [{name}]; it takes {', '.join(defaults)}.")
         if key in _NUMBERS[name]:
             _check_number(f"[{name}] {key}", value, *_NUMBERS[name][key], whole=key in _WHOLE)
         elif isinstance(defaults[key], list):
@@ -179,7 +179,7 @@ def _bounds(defaults: Mapping[str, Any], own: Any) -> tuple[Requirement, ...]:
         raise SettingsError("`require` must be a table: [require].")
     for metric in own:
         if metric not in METRIC_NAMES:
-            raise SettingsError(f"`{metric}` is no metric; [require] takes {', '.join(METRIC_NAMES)}.")
+            raise SettingsError(f"unknown metric `{metric}`; [require] takes {', '.join(METRIC_NAMES)}.")
     found = []
     for metric, entry in {**defaults, **own}.items():
         if entry is False:
@@ -193,7 +193,7 @@ def _bounds(defaults: Mapping[str, Any], own: Any) -> tuple[Requirement, ...]:
                 raise SettingsError(f"the limit of `{metric}` must be a finite number; got {limit!r}.")
             found.append(Requirement(metric, bound, float(limit), metric in own))
     if not found:
-        raise SettingsError("nothing is required; a certificate of nothing is none.")
+        raise SettingsError("nothing is required; a certificate needs at least one requirement.")
     return tuple(found)
 
 

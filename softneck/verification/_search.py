@@ -19,7 +19,7 @@ _UNSTABLE = 1e3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
+class SearchResult:
     """What a search found.
 
     Attributes:
@@ -33,7 +33,9 @@ class Found:
     evaluations: int
 
 
-def search(necks: list[UncertainNeck], law: LinearLaw, w: Vector, *, extra: int, generations: int, seed: int) -> Found:
+def search(
+    necks: list[UncertainNeck], law: LinearLaw, w: Vector, *, extra: int, generations: int, seed: int
+) -> SearchResult:
     """Return the plants inside the boxes with the smallest disk margin, unstable ones first.
 
     Differential evolution (Storn and Price 1997) over gain, pole and dead time of each axis alone, or of both where
@@ -56,7 +58,7 @@ def search(necks: list[UncertainNeck], law: LinearLaw, w: Vector, *, extra: int,
             found = _evolve(task.badness, 3 * len(axes), generations, seed)
             worst.append(task.plants(found.reshape(1, -1), f"worst that a search found ({_axes(axes)})"))
             largest, count = max(largest, task.radius), count + task.count
-    return Found(join(worst), largest, count)
+    return SearchResult(join(worst), largest, count)
 
 
 def _axes(axes: tuple[int, ...]) -> str:

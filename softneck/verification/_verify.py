@@ -16,7 +16,7 @@ from softneck.core._certificate import certificate_contents
 
 from ._agreement import Agreement, agreements
 from ._evidence import Evidence, gather, worst_row
-from ._laws import Judged, judge
+from ._laws import ControllerUnderTest, judge
 from ._neck_loops import check_blocks
 from ._plants import AXES, UncertainNeck, neck_of_family, neck_of_model
 from ._requirements import Requirement, Requirements, read_requirements
@@ -62,7 +62,7 @@ class Verification:
     verdicts: list[Verdict]
     evidence: Evidence
     agreements: list[Agreement]
-    controller: Judged
+    controller: ControllerUnderTest
     necks: list[UncertainNeck]
     requirements: Requirements
     files: Mapping[str, tuple[str, str]] = field(default_factory=dict)

@@ -21,8 +21,8 @@ from .conftest import Call, Said
 Edit = Callable[[list[str]], list[str]]
 RECORDINGS: dict[str, tuple[Edit, str]] = {
     "missing column": (lambda s: [line.rsplit(",", 1)[0] for line in s], "missing: roll"),
-    "unknown column": (lambda s: changed(s, -1, 5, "yaw [deg]"), "column `yaw` is no channel of a recording"),
-    "unit that is none": (lambda s: changed(s, -1, 5, "roll [grad]"), "`grad` is no unit that softneck knows"),
+    "unknown column": (lambda s: changed(s, -1, 5, "yaw [deg]"), "column `yaw` is not a channel of a recording"),
+    "unit that is none": (lambda s: changed(s, -1, 5, "roll [grad]"), "unknown unit `grad`"),
     "NaN": (lambda s: changed(s, 9, 1, "NaN"), "column `motor_setpoint_1` holds `NaN` at row 9"),
     "gap": (lambda s: [*s[:50], *s[80:]], "`time` jumps by 0.62 s at row 49"),
     "time backwards": (lambda s: changed(s, 9, 0, "0.01"), "`time` runs backwards or stands still at row 9"),
@@ -80,15 +80,15 @@ def test_a_model_under_another_ending_is_refused_before_any_work(call: Call, tmp
     (tmp_path / "a.csv").write_text("never read")
     for name in ("m.csv", "m"):
         said = call("identify", "rls", "a.csv", "-o", name, "--json")
-        refused(said, f"{name}: must end in `.npz`, by which softneck knows the file", tmp_path, {"a.csv"})
+        refused(said, f"{name}: must end in `.npz`, by which softneck recognises the file", tmp_path, {"a.csv"})
 
 
 def test_a_model_that_is_none(call: Call, tmp_path: Path, recording: Path) -> None:
     (tmp_path / "m.npz").write_bytes(b"PK\x03\x04 a zip that is none")
     said = call("validate", "m.npz", "--data", recording, "--json")
-    refused(said, "m.npz: is no softneck file or is damaged", tmp_path, {"m.npz"})
+    refused(said, "m.npz: is not a softneck file or is damaged", tmp_path, {"m.npz"})
     (tmp_path / "m.npz").write_text(recording.read_text())
-    refused(call("info", "m.npz"), "m.npz: is no softneck file", tmp_path, {"m.npz"})
+    refused(call("info", "m.npz"), "m.npz: is not a softneck file", tmp_path, {"m.npz"})
 
 
 def test_a_model_of_another_version(call: Call, tmp_path: Path, recording: Path, rls_file: Path) -> None:
@@ -145,8 +145,8 @@ def test_a_wrong_setting_of_a_network(call: Call, tmp_path: Path, recording: Pat
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("identify", "magic", "REC", "-o", "m.npz"), "`magic` is no kind of model; use one of rls, "),
-        (("identify", "pi", "REC", "-o", "m.npz"), "`pi` is no kind of model"),
+        (("identify", "magic", "REC", "-o", "m.npz"), "unknown kind of model `magic`; use one of rls, "),
+        (("identify", "pi", "REC", "-o", "m.npz"), "unknown kind of model `pi`"),
         (("identify", "rls", "REC", "-o", "m.npz", "--train", "0"), "the part to train on must be in (0, 1]; got 0"),
         (("identify", "rls", "REC", "-o", "m.npz", "--train", "all"), "'all' is not a valid float"),
         (("identify", "rls"), "Missing argument"),
@@ -166,7 +166,7 @@ def test_a_wrong_setting_of_a_network(call: Call, tmp_path: Path, recording: Pat
         (("record", "steps", "-o", "r.csv", "--duration", "0"), "`duration` must be between 0.02 and 86400 [s]"),
         (("record", "eq22", "-o", "r.csv", "--duration", "0.001"), "r"),
         (("record", "steps", "-o", "r.xlsx", "--duration", "1"), "a recording is a `.csv` or a `.parquet` file"),
-        (("design", "lqr", "MODEL", "-o", "c.npz"), "`lqr` is no kind of controller; use one of pi"),
+        (("design", "lqr", "MODEL", "-o", "c.npz"), "unknown kind of controller `lqr`; use one of pi"),
         (("design", "pi", "MODEL", "-o", "c.npz", "--set", "luck=1"), "there is no setting `luck`"),
         (("observer", "MODEL", "-o", "o.npz", "--sensor", "nose"), "nose"),
         (("simulate", "none.toml"), "none.toml: no such file"),

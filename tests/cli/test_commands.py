@@ -56,7 +56,7 @@ def test_help_lists_every_command_and_the_exit_codes(call: Call) -> None:
         (click.UsageError("odd"), 2, "odd"),
         (KeyboardInterrupt(), 130, "interrupted"),
         (click.Abort(), 130, "interrupted"),
-        (RuntimeError("two\nlines"), 3, "a fault of softneck, not of yours: RuntimeError: two lines"),
+        (RuntimeError("two\nlines"), 3, "internal error in softneck: RuntimeError: two lines"),
     ],
 )
 def test_every_error_is_one_line_and_its_exit_code(
@@ -178,7 +178,7 @@ def test_info_of_a_recording_with_a_fault_says_the_fault(call: Call, recording: 
     assert said.code == 2
     assert "gap.csv: `time` jumps" in said.error
     Path("note.txt").write_text("a neck of soft material")
-    assert "note.txt: is no file of softneck by its ending, and no log either" in call("info", "note.txt").error
+    assert "note.txt: by its ending not a file of softneck, nor is it a log" in call("info", "note.txt").error
 
 
 def test_the_doctor_tells_of_every_dependency(call: Call) -> None:

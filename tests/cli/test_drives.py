@@ -78,7 +78,7 @@ def test_run_writes_a_recording(call: Call, files: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("check",), "say which drives: --bus INTERFACE:CHANNEL, or --simulated"),
+        (("check",), "say which drives: --bus INTERFACE:CHANNEL or --simulated"),
         (("check", "--bus", "virtual:x"), "drives on a bus need --drives DRIVES.toml"),
         (("check", "--simulated", "--override", "luck"), "--override takes one of certificate, identity"),
         (("check", "--simulated", "--drives", "none.toml"), "none.toml: cannot be read"),

@@ -12,7 +12,7 @@ import pytest
 from softneck.cli import main
 from softneck.cli.drives._log import log_folder, opened_log
 from softneck.cli.drives._target import Target
-from softneck.core import CheckFailedError, OutputError
+from softneck.core import CheckFailedError, OutputFileError
 from softneck.drives import default_drives, read_run_log
 from softneck.drives.logs._run_log import run_facts
 from softneck.signals import read_recording
@@ -103,7 +103,7 @@ def test_jog_and_record_replay_and_import(
     assert run("drives", *words, "--simulated", "--log", "m.txt") == 2
     lines = capsys.readouterr().err.splitlines()
     assert "exists already" in lines[0]
-    assert "say one of them" in lines[1]
+    assert "give one of them" in lines[1]
     assert "a log ends in" in lines[2]
 
 
@@ -172,7 +172,7 @@ def test_a_folder_that_cannot_be_written_is_one_line_before_anything_moves(
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("LOGS_DIRECTORY", str(tmp_path / "file"))
     with (
-        pytest.raises(OutputError, match=r"cannot be written.*Or --no-log\. Nothing was sent\."),
+        pytest.raises(OutputFileError, match=r"cannot be written.*Or --no-log\. Nothing was sent\."),
         opened_log(REAL, "run", (), no_log=False, force=False),
     ):
         pass

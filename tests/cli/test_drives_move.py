@@ -46,7 +46,7 @@ def test_record_is_a_recording_for_identify(call: Call) -> None:
         (("jog", "1", "--simulated", "--pace", "-1"), "--pace"),
         (("jog", "1", "--bus", "virtual:x", "--drives", EXAMPLE), "say --arm if they may. Nothing was sent"),
         (("jog", "1", "--bus", "virtual:x", "--drives", EXAMPLE, "--pace", "2"), "--pace is for --simulated"),
-        (("jog", "1", "--bus", "socketcan:can_no", "--drives", EXAMPLE, "--arm"), "stdin is none"),
+        (("jog", "1", "--bus", "socketcan:can_no", "--drives", EXAMPLE, "--arm"), "stdin is not one"),
         (("record", "music", "--simulated", "-o", "r.csv"), "`signal` must be one of"),
         (("record", "sine", "--simulated", "-o", "r.txt"), "r.txt"),
         (("record", "sine", "--simulated", "-o", "r.csv", "--max-position", "7"), "beyond the 6 rad of [limits]"),

@@ -82,7 +82,7 @@ def test_what_cannot_become_an_fmu_is_said(call: Call, rls_file: Path, tmp_path:
         (("fmu", "empty.npz", "-o", "M.fmu"), "empty.npz"),
         (("fmu", "other.npz", "-o", "M.fmu"), "unknown kind `horse`"),
         (("fmu", "neck.txt", "-o", "M.fmu"), "neck.txt"),
-        (("fmu", "--all", "nowhere"), "is no folder"),
+        (("fmu", "--all", "nowhere"), "is not a folder"),
         (("fmu", "--all", "."), ""),
     ]
     Path("cut.npz").write_bytes(kept[: len(kept) // 2])
@@ -105,12 +105,12 @@ def test_a_model_of_another_version_is_refused(call: Call, rls_file: Path) -> No
 
 def test_what_has_no_block_is_no_fmu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("softneck.cli._fmu.load", lambda _path: object())
-    with pytest.raises(FileFormatError, match="no FMU can be made of it"):
+    with pytest.raises(FileFormatError, match="no FMU can be built from it"):
         open_buildable(tmp_path / "family.npz")
 
 
 def test_a_recording_is_no_fmu_and_what_is_one_is_said(call: Call, recording: Path) -> None:
     said = call("fmu", recording, "-o", "Recording.fmu")
     assert said.code == 2
-    assert "no FMU can be made of a `.csv` file; give a model" in said.error
+    assert "no FMU can be built from a `.csv` file; give a model" in said.error
     assert not Path("Recording.fmu").exists()

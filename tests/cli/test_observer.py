@@ -58,7 +58,7 @@ def test_a_named_sensor_keeps_its_noise(call: Call, files: tuple[Path, Path]) ->
     ("arguments", "message"),
     [
         (("--set", "sample_time=0.03"), "must divide that of the model"),
-        (("--gyro", "--set", "form=model"), "--gyro is --set form=gyro"),
+        (("--gyro", "--set", "form=model"), "--gyro is the same as --set form=gyro"),
         (("--set", "measurement_noise_std=-1"), "must be positive"),
         (("--data", "none.csv"), "none.csv"),
         (("--data", "REC", "--set", "sample_time=0.01"), "sample time"),

@@ -99,7 +99,7 @@ def test_a_study_of_failures_alone_fails(call: Call, project: Path) -> None:
         (STUDY.replace("runs = 12", "runs = 0"), "`runs` must be a whole number of at least 1"),
         (STUDY.replace("[0.85, 0.95]", "[0.95, 0.85]"), "`plant.parameters.pole`: the uniform range from 0.95 to 0.85"),
         (STUDY.replace("parameters.pole", "parameters.mass"), "no key `plant.parameters.mass`"),
-        ("loop = ", "is no TOML"),
+        ("loop = ", "is not valid TOML"),
     ],
 )
 def test_bad_studies_are_one_line(text: str, message: str, call: Call, project: Path) -> None:
@@ -179,6 +179,6 @@ def test_a_changed_file_makes_its_certificate_stale(call: Call, whole: Path) -> 
 
 
 def test_reports_of_nothing(call: Call, tmp_path: Path) -> None:
-    assert "is no folder" in call("report", "nowhere").error
+    assert "is not a folder" in call("report", "nowhere").error
     (tmp_path / "empty").mkdir()
-    assert "holds nothing of softneck" in call("report", "empty").error
+    assert "holds no softneck files" in call("report", "empty").error

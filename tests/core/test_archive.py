@@ -66,7 +66,7 @@ def test_another_version_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("header", [{"format": "other"}, {"format": None}])
 def test_an_archive_that_is_not_ours_is_refused(tmp_path: Path, header: dict[str, Any]) -> None:
-    with pytest.raises(FileFormatError, match="is no softneck file; expected one that softneck wrote"):
+    with pytest.raises(FileFormatError, match="is not a softneck file; expected one that softneck wrote"):
         read_archive(archive(tmp_path, header))
 
 
@@ -74,7 +74,7 @@ def test_numpys_own_archives_are_not_ours(tmp_path: Path) -> None:
     np.savez(tmp_path / "plain.npz", a=np.zeros(3))
     np.savez(tmp_path / "list.npz", header=np.frombuffer(b"[1, 2]", dtype=np.uint8))
     for name in ("plain", "list"):
-        with pytest.raises(FileFormatError, match="is no softneck file"):
+        with pytest.raises(FileFormatError, match="is not a softneck file"):
             read_archive(tmp_path / f"{name}.npz")
 
 
@@ -94,7 +94,7 @@ def test_no_object_array_is_written(tmp_path: Path) -> None:
 def test_a_member_that_is_no_array_is_refused(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as file:
         file.writestr("header", b"{}")
-    with pytest.raises(FileFormatError, match="is no softneck file or is damaged"):
+    with pytest.raises(FileFormatError, match="is not a softneck file or is damaged"):
         read_archive(tmp_path / "a.npz")
 
 

@@ -118,7 +118,7 @@ def test_no_row_is_no_step(block_of: Callable[[str], Block]) -> None:
         ({"noise_std": -0.1}, r"`noise_std` must be between 0 and 0\.5 \[rad\]; got -0\.1"),
         ({"pitch_start": 57.0}, "`pitch_start` must be between"),
         ({"pitch_start": np.nan}, "`pitch_start` must be between"),
-        ({"tilt": 1.0}, "`tilt` is no parameter of rls; it has pitch_start, roll_start, use_measurement"),
+        ({"tilt": 1.0}, "`tilt` is not a parameter of rls; it has pitch_start, roll_start, use_measurement"),
     ],
 )
 def test_a_wrong_parameter_is_named(block_of: Callable[[str], Block], parameters: dict, message: str) -> None:
@@ -147,7 +147,7 @@ def test_start_values_can_be_replaced(block_of: Callable[[str], Block]) -> None:
     moved = block.with_starts(pitch_start=0.2)
     assert moved.initial_state().outputs[0] == 0.2
     assert block.initial_state().outputs[0] == 0.0
-    with pytest.raises(SettingsError, match="`tilt` is no parameter of rls"):
+    with pytest.raises(SettingsError, match="`tilt` is not a parameter of rls"):
         block.with_starts(tilt=1.0)
 
 

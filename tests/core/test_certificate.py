@@ -10,7 +10,7 @@ import pytest
 from softneck.core import (
     CheckFailedError,
     FileFormatError,
-    OutputError,
+    OutputFileError,
     check_certificate,
     file_hash,
     read_certificate,
@@ -88,8 +88,8 @@ def test_an_edited_certificate_is_refused(tmp_path: Path) -> None:
     ("text", "match"),
     [
         ("", "no JSON"),
-        ("[1]", "is no certificate"),
-        ('{"certificate": "else"}', "is no certificate"),
+        ("[1]", "is not a certificate"),
+        ('{"certificate": "else"}', "is not a certificate"),
         ('{"certificate": "verify", "certificate_version": 99}', "version 99"),
     ],
 )
@@ -105,7 +105,7 @@ def test_a_certificate_without_files_is_refused(tmp_path: Path) -> None:
     write_certificate(path, certificate_contents("verify", holds=True, files={}, more={}))
     with pytest.raises(FileFormatError, match="names no files"):
         read_certificate(path)
-    with pytest.raises(OutputError, match="exists already"):
+    with pytest.raises(OutputFileError, match="exists already"):
         write_certificate(path, {})
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softneck.core import OutputError, atomic_write, file_hash, refuse_existing, write_archive
+from softneck.core import OutputFileError, atomic_write, file_hash, refuse_existing, write_archive
 from softneck.signals import Recording, write_recording
 
 from ..data import neck_recording
@@ -32,7 +32,7 @@ def test_a_failure_leaves_the_folder_as_it_was(tmp_path: Path, failure: BaseExce
     target = tmp_path / "a.txt"
     if existing:
         target.write_text("old")
-    with pytest.raises((ValueError, KeyboardInterrupt, OutputError), match=r"wrong|^$|No space left"):
+    with pytest.raises((ValueError, KeyboardInterrupt, OutputFileError), match=r"wrong|^$|No space left"):
         _fail_halfway(target, failure)
     assert [path.name for path in tmp_path.iterdir()] == (["a.txt"] if existing else [])
     assert not existing or target.read_text() == "old"
@@ -41,7 +41,7 @@ def test_a_failure_leaves_the_folder_as_it_was(tmp_path: Path, failure: BaseExce
 def test_an_existing_file_is_replaced_by_force_only(tmp_path: Path) -> None:
     target = tmp_path / "a.txt"
     target.write_text("old")
-    with pytest.raises(OutputError, match=r"a\.txt: exists already; use --force"), atomic_write(target):
+    with pytest.raises(OutputFileError, match=r"a\.txt: exists already; use --force"), atomic_write(target):
         pytest.fail("the body must not run")
     assert target.read_text() == "old"
     with atomic_write(target, force=True) as temporary:
@@ -50,19 +50,19 @@ def test_an_existing_file_is_replaced_by_force_only(tmp_path: Path) -> None:
 
 
 def test_a_folder_is_no_target_even_by_force(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="is a folder; name a file"):
+    with pytest.raises(OutputFileError, match="is a folder; name a file"):
         refuse_existing(tmp_path, force=True)
 
 
 def test_a_path_below_a_file_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match=r"x\.npz: cannot be written: .*Choose another folder"):
+    with pytest.raises(OutputFileError, match=r"x\.npz: cannot be written: .*Choose another folder"):
         write_archive(tmp_path / "file" / "x.npz", {}, {})
 
 
 def test_a_folder_that_takes_no_files_is_one_clear_error() -> None:
     # Root may write everywhere but not into /proc.
-    with pytest.raises(OutputError, match="cannot be written"):
+    with pytest.raises(OutputFileError, match="cannot be written"):
         write_archive("/proc/x.npz", {}, {})
 
 
@@ -74,7 +74,7 @@ def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.M
     # The last thing every writer does before its file is renamed.
     monkeypatch.setattr(Path, "chmod", full)
     target = tmp_path / f"a{suffix}"
-    with pytest.raises(OutputError, match=r"No space left on device\. Nothing was left behind"):
+    with pytest.raises(OutputFileError, match=r"No space left on device\. Nothing was left behind"):
         _write(target, neck_recording(120))
     assert list(tmp_path.iterdir()) == []
 

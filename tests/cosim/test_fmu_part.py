@@ -80,7 +80,7 @@ def test_an_error_carries_the_fmu_s_own_reason_and_the_part_lives_on(fmus: Path)
         np.testing.assert_array_equal(part.start(0.0, {"pitch_start": 0.5}), [0.5, 1.0])
         with pytest.raises(FmuError, match="noise_std must be between 0 and 1"):
             part.start(0.0, {"noise_std": 3.0})
-        with pytest.raises(SettingsError, match=r"`nonsense` is no parameter of .*it has pitch_start"):
+        with pytest.raises(SettingsError, match=r"`nonsense` is not a parameter of .*it has pitch_start"):
             part.start(0.0, {"nonsense": 3.0})
 
 
@@ -121,7 +121,7 @@ def _description(old: bytes, new: bytes) -> Callable[[str, bytes], tuple[str, by
         (b'fmiVersion="2.0"', b'fmiVersion="1.0"', FileFormatError, "is an FMI 1.0 FMU|cannot be read"),
         (b"<CoSimulation ", b"<ModelExchange ", FileFormatError, "Model Exchange only"),
         (b"<ModelVariables>", b"<ModelVariables", FileFormatError, "cannot be read"),
-        (b' stepSize="0.02"', b"", SettingsError, "says no step size"),
+        (b' stepSize="0.02"', b"", SettingsError, "states no step size"),
         (b'Tool name="softneck"', b'Tool name="else"', SettingsError, "say its role in the loop"),
     ],
     ids=["version", "exchange", "damaged", "step", "role"],
@@ -205,11 +205,11 @@ def test_a_free_run_starts_anew_with_each_run(fmus: Path, toys: Any, recording: 
 
 def test_driving_with_wrong_names_lengths_or_sample_times_is_refused(fmus: Path, recording: Recording) -> None:
     path = fmus / "Neck.fmu"
-    with pytest.raises(DataError, match=r"`speed` is no input of .*motor_setpoint_1"):
+    with pytest.raises(DataError, match=r"`speed` is not an input of .*motor_setpoint_1"):
         drive_fmu(path, {"speed": np.zeros(3)})
-    with pytest.raises(DataError, match=r"one length of at least 1; got \[2, 3\]"):
+    with pytest.raises(DataError, match=r"one common length of at least 1; got \[2, 3\]"):
         drive_fmu(path, {"motor_setpoint_1": np.zeros(3), "payload": np.zeros(2)})
-    with pytest.raises(DataError, match=r"`yaw` is no output of .*it has pitch"):
+    with pytest.raises(DataError, match=r"`yaw` is not an output of .*it has pitch"):
         drive_fmu(path, {"payload": np.zeros(2)}, outputs=("yaw",))
     slow = Recording(2.0 * recording.time, 0.04, recording.channels, recording.run)
     with pytest.raises(DataError, match=r"runs at 0\.02 s and the recording is at 0\.04 s"):

@@ -186,9 +186,9 @@ def test_an_instance_that_is_kept_is_reset_not_loaded_again(foreign: dict[int, P
 
 def test_units_may_be_given_and_wrong_mappings_are_refused(foreign: dict[int, Path]) -> None:
     assert plant(foreign[2], units={"motor_setpoint_1": "deg"}).inputs[0].unit == "deg"
-    with pytest.raises(FileFormatError, match="a unit is given for `yaw`, which is no variable"):
+    with pytest.raises(FileFormatError, match="a unit is given for `yaw`, which is not one of its variables"):
         plant(foreign[2], units={"yaw": "deg"})
     with pytest.raises(FileFormatError, match="u1 and u2 are both named `a`"):
         FmuPart(foreign[3], role="plant", sample_time=TS, names={"u1": "a", "u2": "a"})
-    with pytest.raises(SettingsError, match="says no step size"):
+    with pytest.raises(SettingsError, match="states no step size"):
         FmuPart(foreign[3], role="plant", names=NAMES)

@@ -184,7 +184,7 @@ def _judge(path: Path) -> list[Any]:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("duration_s = 4.0", "duration = 4.0", "`duration` is no key of the file; it takes duration_s"),
+        ("duration_s = 4.0", "duration = 4.0", "unknown key `duration` of the file; it takes duration_s"),
         ("duration_s = 4.0", "", "`duration_s` is missing"),
         ("duration_s = 4.0", 'duration_s = "4"', "`duration_s` must be a number; got '4'"),
         ("duration_s = 4.0", "duration_s = -1.0", "`duration` must be positive"),
@@ -194,20 +194,20 @@ def _judge(path: Path) -> list[Any]:
         ('fmu = "Neck.fmu"', "fmu = 3", r"\[plant\] fmu must be a text"),
         ('fmu = "Neck.fmu"', "", "needs exactly one of fmu, model, neck, python; it has none"),
         ('fmu = "Neck.fmu"', 'fmu = "Neck.fmu"\nmodel = "a.npz"', "it has fmu, model"),
-        ('fmu = "Neck.fmu"', 'model = "Neck.fmu"', "is no softneck file"),
-        ('fmu = "Neck.fmu"', 'fmu = "Neck.fmu"\nspeed = 1', r"`speed` is no key of \[plant\]"),
-        ("payload = 0.5", "mass = 0.5", "`mass` is no parameter"),
+        ('fmu = "Neck.fmu"', 'model = "Neck.fmu"', "is not a softneck file"),
+        ('fmu = "Neck.fmu"', 'fmu = "Neck.fmu"\nspeed = 1', r"unknown key `speed` of \[plant\]"),
+        ("payload = 0.5", "mass = 0.5", "`mass` is not a parameter"),
         ("payload = 0.5", 'payload = "heavy"', "must be a number; got 'heavy'"),
         ('kind = "step"', 'kind = "jump"', r"\[reference\] kind must be one of step, ramp"),
-        ('kind = "step"', 'kind = "recording"', r"`pitch_deg` is no key of \[reference\]"),
+        ('kind = "step"', 'kind = "recording"', r"unknown key `pitch_deg` of \[reference\]"),
         ("pitch_deg = 15.0", "pitch = 15.0", "degrees"),
         ('"pitch.overshoot_pct"', '"pitch.beauty"', "limit on unknown metric `pitch.beauty`"),
         (
             "[limits]",
             "[[fault]]\nkind = 'bias'\n[limits]",
-            r"\[\[fault\]\] 1: `bias` is no kind of fault; use one of sensor_dropout",
+            r"\[\[fault\]\] 1: unknown kind of fault `bias`; use one of sensor_dropout",
         ),
-        ("[limits]", "[bounds]", "`bounds` is no key of the file"),
+        ("[limits]", "[bounds]", "unknown key `bounds` of the file"),
         ("[limits]", "[[fault]]\nkind = 'push'\ny_n = 1.0\n[limits]", "needs the plant's input `push_y`"),
         ("[limits]", "[fault]\nkind = 'push'\n[limits]", r"`fault` must be a list of tables: \[\[fault\]\]"),
         ("[limits]", "[[part]]\nfmu = 'Pi.fmu'\n[limits]", r"each \[\[part\]\] needs a `name`"),
@@ -237,5 +237,5 @@ def test_a_file_that_is_no_loop_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match="no such file"):
         load_loop(tmp_path / "absent.toml")
     (tmp_path / "text.toml").write_text("no = toml =")
-    with pytest.raises(FileFormatError, match="is no TOML"):
+    with pytest.raises(FileFormatError, match="is not valid TOML"):
         load_loop(tmp_path / "text.toml")

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] - it has no stubs
 
-from softneck.core import OutputError, SettingsError
+from softneck.core import OutputFileError, SettingsError
 from softneck.cosim import load_loop, simulate, write_ssp
 from softneck.cosim.loops._loop_file import reference_of
 from softneck.cosim.loops._simulate import LoopSetup
@@ -158,7 +158,7 @@ def test_a_reference_fmu_of_a_loop_file_drives_the_loop_as_the_file_does(loop_fi
 def test_what_cannot_be_an_ssp_file_is_refused(setup: LoopSetup, archive: Path, toys: Any, tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=r"must end in `\.ssp`"):
         write_ssp(setup, tmp_path / "loop.zip")
-    with pytest.raises(OutputError, match="exists"):
+    with pytest.raises(OutputFileError, match="exists"):
         write_ssp(setup, archive)
     loop = Loop(
         plant=BlockPart(toys.neck()), controller=BlockPart(toys.pi()), reference=StepReference(pitch=0.1), duration=1.0,

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from softneck.core import FileFormatError, OutputError, SettingsError, load
+from softneck.core import FileFormatError, OutputFileError, SettingsError, load
 from softneck.cosim import (
     load_loop,
     load_study,
@@ -208,7 +208,7 @@ def test_a_folder_of_another_study(place: Path) -> None:
     made = load_study(place / "study.toml")
     study(made, workers=0, output=place / "out")
     before = {path.name: path.read_bytes() for path in (place / "out").iterdir()}
-    with pytest.raises(OutputError, match="holds a study already; --resume continues it"):
+    with pytest.raises(OutputFileError, match="holds a study already; --resume continues it"):
         study(made, workers=0, output=place / "out")
     (place / "study.toml").write_text(STUDY.replace("seed = 7", "seed = 8"))
     with pytest.raises(SettingsError, match=r"holds another study \(other seed\)"):
@@ -254,8 +254,8 @@ def test_worst_cases_are_loop_files_with_the_same_metrics(place: Path) -> None:
         ("plant.parameters.mass", "no key `plant.parameters.mass`: the plant has deadly, fails, gain"),
         ("plant.mass", "written plant.parameters.NAME"),
         ("observer.parameters.noise_std", "no observer"),
-        ("reference.yaw_deg", "`yaw_deg` is nothing of a step reference"),
-        ("fault.0.payload_kg", "`payload_kg` is nothing of a sensor_bias"),
+        ("reference.yaw_deg", "`yaw_deg` is not part of a step reference"),
+        ("fault.0.payload_kg", "`payload_kg` is not part of a sensor_bias"),
         ("fault.1.size_deg", r"of \[\[fault\]\] it has 1 \(fault.0\)"),
         ("part.filter.file", r"of \[\[part\]\] it has none"),
         ("limits", "no key `limits`"),
@@ -270,14 +270,14 @@ def test_keys_that_the_loop_does_not_have(key: str, message: str, place: Path) -
 
 def test_other_settings_that_cannot_be(place: Path) -> None:
     vary = {"reference.pitch_deg": [1.0, 2.0]}
-    with pytest.raises(SettingsError, match="no metric to be an objective"):
+    with pytest.raises(SettingsError, match="not a metric that can be an objective"):
         study(place / "loop.toml", vary=vary, objectives=["pitch.error"])
     with pytest.raises(SettingsError, match="`workers` must be a whole number"):
         study(place / "loop.toml", vary=vary, workers=-1)
     with pytest.raises(SettingsError, match="not both"):
         study(place / "loop.toml", vary=vary, workers=1, dask="tcp://127.0.0.1:1")
     (place / "study.toml").write_text(f"size = 3\n{STUDY}")
-    with pytest.raises(SettingsError, match=r"`size` is no key of a study"):
+    with pytest.raises(SettingsError, match=r"unknown key `size` of a study"):
         load_study(place / "study.toml")
     with pytest.raises(SettingsError, match="cannot be sent to another process"):
         study({**{"duration_s": 0.2, "plant": "paper", "reference": StepReference()}, "controller": _Unsendable()},
@@ -321,7 +321,7 @@ def test_ranking_puts_limits_before_objectives() -> None:
                          "m": [0.0, 2.0, 1.0, np.nan]}).astype({"holds": "boolean"})  # fmt: skip
     assert rank(runs, ["m"])["run"].tolist() == [2, 1, 0, 3]
     assert worst_runs(runs, ["m"], 2)["run"].tolist() == [3, 0]
-    with pytest.raises(SettingsError, match="no column of the runs"):
+    with pytest.raises(SettingsError, match="not a column of the runs"):
         rank(runs, ["n"])
 
 

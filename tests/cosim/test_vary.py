@@ -10,11 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softneck.core import SettingsError
-from softneck.cosim.studies._vary import Points, flattened, make_vary
+from softneck.cosim.studies._vary import StudyPoints, flattened, make_vary
 
 
-def points(vary: dict[str, Any], runs: int | None = None, seed: int = 0, sampling: str = "latin_hypercube") -> Points:
-    return Points({key: make_vary(key, given) for key, given in vary.items()}, runs, seed, sampling)
+def points(
+    vary: dict[str, Any], runs: int | None = None, seed: int = 0, sampling: str = "latin_hypercube"
+) -> StudyPoints:
+    return StudyPoints({key: make_vary(key, given) for key, given in vary.items()}, runs, seed, sampling)
 
 
 def test_grids_alone_give_each_combination_once() -> None:

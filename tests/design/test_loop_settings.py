@@ -11,10 +11,10 @@ import pytest
 from softneck.core import SettingsError
 from softneck.design import (
     AdaptiveSettings,
+    ControllerLimits,
     CustomSettings,
     FopiSettings,
     HinfSettings,
-    Limits,
     LqgSettings,
     NcfSettings,
     PidSettings,
@@ -40,7 +40,7 @@ LIMITS = {
 
 @pytest.mark.parametrize("make", KINDS.values(), ids=KINDS)
 def test_every_kind_hands_its_limits_on(make: Callable[..., Any]) -> None:
-    assert make(**LIMITS).limits() == Limits(**LIMITS)
+    assert make(**LIMITS).limits() == ControllerLimits(**LIMITS)
 
 
 @pytest.mark.parametrize("make", KINDS.values(), ids=KINDS)

@@ -273,5 +273,5 @@ def test_what_it_cannot_use_is_refused(recording: Recording, controller: NmpcCon
         NmpcSettings(horizon=10.5)  # type: ignore[arg-type]
     with pytest.raises(DataError, match="nmpc takes 10 finite inputs"):
         controller.step(controller.initial_state(), [0.1] * 7)
-    with pytest.raises(SettingsError, match="is no parameter of nmpc"):
+    with pytest.raises(SettingsError, match="is not a parameter of nmpc"):
         controller.initial_state(colour=1.0)

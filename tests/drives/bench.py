@@ -10,7 +10,7 @@ from softneck.drives import DrivesFile, default_drives, simulated_neck
 from softneck.drives.bus._link import VirtualLink
 from softneck.drives.bus._objects import Write, guarding_writes, limit_writes, mode_writes, option_writes, pdo_writes
 from softneck.drives.master import Frame, Master, MasterSettings, Phase
-from softneck.drives.master._measured import Measured
+from softneck.drives.master._measured import Measurement
 from softneck.drives.master._nmt import Command, nmt_frame
 from softneck.drives.master._settings import RampSettings
 from softneck.drives.running._virtual import VirtualRun
@@ -29,13 +29,13 @@ class Script:
 
     def __init__(self, rows: int = 100_000) -> None:
         self.wanted: tuple[float, float, float] = (0.5, -0.25, -0.25)
-        self.act: Callable[[Measured], tuple[float, float, float] | None] | None = None
+        self.act: Callable[[Measurement], tuple[float, float, float] | None] | None = None
         self.rows, self.started, self.steps = rows, 0, 0
 
     def start(self) -> None:
         self.started += 1
 
-    def step(self, measured: Measured) -> tuple[float, float, float] | None:
+    def step(self, measured: Measurement) -> tuple[float, float, float] | None:
         self.steps += 1
         return self.wanted if self.act is None else self.act(measured)
 

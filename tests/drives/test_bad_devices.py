@@ -75,7 +75,7 @@ def serial_error(number: int, name: str) -> serial.SerialException:
         (OSError(errno.ENODEV, "No such device"), r"No such device\. `ip link show`"),
         (OSError(errno.EAFNOSUPPORT, "Address family not supported"), r"This kernel has no CAN: `sudo modprobe can"),
         (can.CanOperationError("Failed to transmit: [Errno 100] Network is down"), r"`sudo ip link set can0 up`"),
-        (PermissionError(errno.EPERM, "Operation not permitted"), "This user may not"),
+        (PermissionError(errno.EPERM, "Operation not permitted"), "This user is not permitted"),
         (RuntimeError(), r"^RuntimeError\.$"),
     ],
 )  # fmt: skip

@@ -56,8 +56,8 @@ def test_the_example_states_the_defaults() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("period_s", "periode_s", r"`periode_s` is no key of \[bus\]; it takes period_s, bit_rate"),
-        ("[limits]", "[limit]", "`limit` is no key of the file"),
+        ("period_s", "periode_s", r"unknown key `periode_s` of \[bus\]; it takes period_s, bit_rate"),
+        ("[limits]", "[limit]", "unknown key `limit` of the file"),
         ("node = 2", "node = 1", "three drives need three node numbers; got 1, 1, 3"),
         ("node = 2", "node = 200", r"\[\[drive\]\] 2: `node` must be a whole number between 1 and 126"),
         ("node = 3\npeak_current_A = 10.0", "node = 3", r"\[\[drive\]\] 3: `peak_current_A` is missing"),
@@ -68,7 +68,7 @@ def test_the_example_states_the_defaults() -> None:
         ("reversed = false", "reversed = 1", r"\[\[drive\]\] 1 reversed must be true or false"),
         ('profile = "ipos2015"', 'profile = "epos"', "`profile` must be one of ipos2015, ds402"),
         ("dropout_s = 0.08", "dropout_s = 0.3", r"`dropout` must be between 0\.01 and 0\.09"),
-        ("[bus]", "[bus", "is no TOML"),
+        ("[bus]", "[bus", "is not valid TOML"),
     ],
 )
 def test_a_drives_file_with_a_typo(tmp_path: Path, old: str, new: str, message: str) -> None:
@@ -107,8 +107,8 @@ def test_our_eds_is_what_the_simulated_drives_have(profile: str) -> None:
         (lambda text: text.replace("ParameterName=Target position\nObjectType=0x7\nDataType=0x0004",
                                    "ParameterName=Target position\nObjectType=0x7\nDataType=0x0003"),
          "607Ah:0 has 2 bytes there and 4 here"),
-        (lambda _: "no eds at all", "is no EDS"),
-        (lambda _: "", "is no EDS|has no objects"),
+        (lambda _: "no eds at all", "is not an EDS"),
+        (lambda _: "", "is not an EDS|has no objects"),
     ],
     ids=["object missing", "another size", "no EDS", "empty"],
 )  # fmt: skip

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
-from softneck.core import FileFormatError, OutputError, SoftneckError
+from softneck.core import FileFormatError, OutputFileError, SoftneckError
 from softneck.drives import read_run_log, replay
 from softneck.drives.logs._cycle import LoggedPilot
 from softneck.drives.logs._frame_log import FrameLog
@@ -117,7 +117,7 @@ def written(path: Path, *, metadata: dict[str, str] | None, messages: list[tuple
 
 def test_a_log_of_another_tool_is_no_log_of_ours(tmp_path: Path) -> None:
     path = written(tmp_path / "ros.mcap", metadata=None, messages=[("/odom", bytes(24))])
-    with pytest.raises(FileFormatError, match=r"ros\.mcap: is MCAP, but no log of `softneck drives`"):
+    with pytest.raises(FileFormatError, match=r"ros\.mcap: is MCAP, but not a log of `softneck drives`"):
         read_run_log(path)
 
 
@@ -152,7 +152,7 @@ def test_topics_of_others_in_a_log_of_ours_are_left_alone(logs: dict[str, Path],
 def test_hostile_lengths_reserve_no_memory(tmp_path: Path, record: bytes) -> None:
     path = tmp_path / "hostile.mcap"
     path.write_bytes(b"\x89MCAP0\r\n" + struct.pack("<BQII", 0x01, 8, 0, 0) + record)
-    with pytest.raises(FileFormatError, match=r"hostile\.mcap: is no log of `softneck drives`"):
+    with pytest.raises(FileFormatError, match=r"hostile\.mcap: is not a log of `softneck drives`"):
         read_run_log(path)
 
 
@@ -207,7 +207,7 @@ def test_a_full_disk_costs_the_log_but_not_the_run(tmp_path: Path, ending: str) 
     bench.pass_time(3.0)
     assert (str(bench.master.supervisor.phase), bench.master.supervisor.fault) == ("running", None)
     with pytest.raises(
-        OutputError, match=r"run\.part\..*the log is not complete: No space left on device\. The run went"
+        OutputFileError, match=r"run\.part\..*the log is not complete: No space left on device\. The run went"
     ):
         log.close()
     assert not (tmp_path / f"run{ending}").exists()
@@ -217,7 +217,7 @@ def test_a_full_disk_costs_the_log_but_not_the_run(tmp_path: Path, ending: str) 
 
 def test_a_folder_that_cannot_be_written_is_told_before_anything_moves(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
-    with pytest.raises(OutputError, match=r"run\.mcap: cannot be written: .*Choose another folder"):
+    with pytest.raises(OutputFileError, match=r"run\.mcap: cannot be written: .*Choose another folder"):
         RunLogger([tmp_path / "file" / "run.mcap"])
 
 

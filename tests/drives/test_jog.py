@@ -10,7 +10,7 @@ import pytest
 from softneck.core import CheckFailedError, SettingsError
 from softneck.drives import DrivesFile, default_drives, jog, neck_drives, record_signal, simulated_neck
 from softneck.drives.bus._link import VirtualLink
-from softneck.drives.commissioning._jog import Jogged, judge
+from softneck.drives.commissioning._jog import JogResult, judge
 from softneck.drives.commissioning._record import drive_limits
 from softneck.drives.running._ask import Ask
 from softneck.drives.running._bus_loop import Session
@@ -30,7 +30,7 @@ def link_to(wired: DrivesFile, neck: NeckParameters = PAPER) -> VirtualLink:
 
 def jogged(
     motor: int, *, wired: DrivesFile | None = None, file: DrivesFile | None = None, neck: NeckParameters = PAPER
-) -> Jogged:
+) -> JogResult:
     file = file or default_drives()
     return jog(motor, Session(file=file, link=link_to(wired or file, neck)), tendon_angles=PSI)
 

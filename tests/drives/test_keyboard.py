@@ -29,7 +29,7 @@ _STALLS = ("stalled", "tpdo", "position did not come", "no drive answered", "hea
 
 
 @dataclass(frozen=True)
-class Ended:
+class ProcessEnd:
     code: int
     said: str
     states: list[int]
@@ -61,7 +61,7 @@ CLOSE = b"close"
 def played(
     tmp_path: Path, *steps: tuple[str, bytes | signal.Signals, float], simulated: bool = False,
     command: tuple[str, ...] = RECORD, pace: str = "2",
-) -> Ended:  # fmt: skip
+) -> ProcessEnd:  # fmt: skip
     """Run a command on a terminal; after each text was said, wait for a time and type, or send a signal."""
     import pty
     import termios
@@ -114,9 +114,9 @@ def played(
     return _ended(child.returncode, said, report, tmp_path, restored=before == after)
 
 
-def _ended(code: int, said: str, report: Path, folder: Path, *, restored: bool) -> Ended:
+def _ended(code: int, said: str, report: Path, folder: Path, *, restored: bool) -> ProcessEnd:
     ended = json.loads(report.read_text(encoding="utf-8")) if report.is_file() else {"states": [], "powered": False}
-    return Ended(code, said, ended["states"], ended["powered"], restored, folder / "r.csv", folder / "l.mcap")
+    return ProcessEnd(code, said, ended["states"], ended["powered"], restored, folder / "r.csv", folder / "l.mcap")
 
 
 def _paths() -> str:

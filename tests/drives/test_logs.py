@@ -18,7 +18,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from softneck.core import CheckFailedError, DataError, FileFormatError, OutputError, SettingsError
+from softneck.core import CheckFailedError, DataError, FileFormatError, OutputFileError, SettingsError
 from softneck.cosim import load_loop
 from softneck.drives import default_drives, prepare, read_run_log, replay, run_simulated
 from softneck.drives.logs._cycle import Cycle, LoggedPilot, decode_cycle, encode_cycle
@@ -205,7 +205,7 @@ def test_a_damaged_log_is_one_line_or_a_cut(
 def test_what_is_no_log_is_one_line(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "run.mcap"
     path.write_bytes(content)
-    with pytest.raises(FileFormatError, match=r"run\.mcap: is no log of `softneck drives`"):
+    with pytest.raises(FileFormatError, match=r"run\.mcap: is not a log of `softneck drives`"):
         read_run_log(path)
 
 
@@ -247,7 +247,7 @@ def test_a_killed_process_loses_less_than_the_last_second(tmp_path: Path) -> Non
     for name in ("run.part.blf", "run.part.log"):
         frames = list(FrameLog(tmp_path / name))
         assert frames[-1][0] - frames[0][0] > min(last, 1.0) - 0.1
-    with pytest.raises(OutputError, match=r"run\.part\.mcap: exists already"):
+    with pytest.raises(OutputFileError, match=r"run\.part\.mcap: exists already"):
         RunLogger([tmp_path / "run.mcap"])
 
 
@@ -261,7 +261,7 @@ def test_the_loop_does_not_wait_for_the_disk(tmp_path: Path) -> None:
         if k % 2:
             log._put(log_entry(k))
     assert log.lost > 0
-    with pytest.raises(OutputError, match=r"cycle\(s\) were dropped: the disk did not keep up"):
+    with pytest.raises(OutputFileError, match=r"cycle\(s\) were dropped: the disk did not keep up"):
         log.close()
 
 
@@ -281,7 +281,7 @@ def test_a_full_disk_is_one_line_and_the_loop_goes_on(tmp_path: Path) -> None:
     for k in range(50):
         log.frame(0.01 * k, True, Frame(0x80))
         log._put(log_entry(k))
-    with pytest.raises(OutputError, match="the log is not complete: No space left on device"):
+    with pytest.raises(OutputFileError, match="the log is not complete: No space left on device"):
         log.close()
 
 
@@ -289,7 +289,7 @@ def test_logs_have_endings_and_are_not_replaced(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=r"a log ends in \.mcap, \.log, \.blf"):
         RunLogger([tmp_path / "run.txt"])
     (tmp_path / "run.blf").write_text("kept")
-    with pytest.raises(OutputError, match="exists already"):
+    with pytest.raises(OutputFileError, match="exists already"):
         RunLogger([tmp_path / "run.blf"])
     with RunLogger([tmp_path / "empty.mcap"]) as log:
         log.describe(run_facts(Bench().master.settings, {}, simulated=True))

@@ -10,7 +10,7 @@ import pytest
 from softneck.core import CheckFailedError, SettingsError
 from softneck.drives import default_drives, neck_drives, preflight, record_signal, simulated_neck, zero
 from softneck.drives.bus._link import VirtualLink
-from softneck.drives.commissioning._record import Recorded, drive_limits
+from softneck.drives.commissioning._record import ExperimentResult, drive_limits
 from softneck.drives.master import Master, Tilt
 from softneck.drives.running._ask import Ask
 from softneck.drives.running._bus_loop import Session
@@ -32,7 +32,7 @@ def excitation(name: str, duration: float | None = None, *, seed: int = 0) -> Ex
     return prepare(signal(name, duration=duration, seed=seed), drive_limits(FILE), ramp_s=2.0)[0]
 
 
-def recorded(*excitations: Excitation, link: VirtualLink | None = None, **session: object) -> Recorded:
+def recorded(*excitations: Excitation, link: VirtualLink | None = None, **session: object) -> ExperimentResult:
     return record_signal(excitations, replace(Session(file=FILE, link=link or link_to()), **session))
 
 

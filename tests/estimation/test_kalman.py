@@ -214,7 +214,7 @@ def test_a_model_without_transfer_functions_is_refused() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"sensor": "imu"}, "`imu` is no sensor"),
+        ({"sensor": "imu"}, "unknown sensor `imu`"),
         ({"measurement_noise_std": 0.0}, "`measurement_noise_std` must be positive"),
         ({"measurement_noise_std": 5.0}, "got 5: degrees"),
         ({"model_noise_std": -1.0}, "`model_noise_std` must be positive"),

@@ -106,7 +106,7 @@ def test_a_level_that_is_known_stays() -> None:
     found = fit_noise(start, drawn(seed=7), fixed=["measurement_noise_std"])
     assert found.noise[0] == TRUE[0]
     assert found.noise[1] == pytest.approx(TRUE[1], rel=0.3)
-    with pytest.raises(SettingsError, match="`bias_noise_std` is no noise level"):
+    with pytest.raises(SettingsError, match="`bias_noise_std` is not a noise level"):
         fit_noise(start, drawn(rows=300), fixed=["bias_noise_std"])
     with pytest.raises(SettingsError, match="no noise level is left"):
         fit_noise(start, drawn(rows=300), fixed=start.noise_names)

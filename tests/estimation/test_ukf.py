@@ -166,7 +166,7 @@ def test_it_closes_the_loop_over_dropouts_and_its_part_resumes(play: Model, trai
     np.testing.assert_array_equal(part.advance(8.0, row), once)
     with pytest.raises(DataError, match="the state has 1 values"):
         part.set_state(bytes(8))
-    with pytest.raises(SettingsError, match="no parameter of an unscented filter"):
+    with pytest.raises(SettingsError, match="not a parameter of an unscented filter"):
         part.start(0.0, {"measurement_noise_std": 1e-3})
 
 

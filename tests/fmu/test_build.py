@@ -13,7 +13,7 @@ import fmpy
 import pytest
 from fmpy.validation import validate_fmu
 
-from softneck.core import OutputError, SettingsError
+from softneck.core import OutputFileError, SettingsError
 from softneck.fmu import FmuInfo, build_fmu, fmu_info
 from softneck.runtime import Block, Port
 
@@ -135,7 +135,7 @@ def test_another_ending_is_refused(toys: Any, tmp_path: Path) -> None:
 def test_an_existing_file_is_kept_unless_forced(toys: Any, tmp_path: Path) -> None:
     path = tmp_path / "Toy.fmu"
     path.write_text("mine")
-    with pytest.raises(OutputError, match="exists already"):
+    with pytest.raises(OutputFileError, match="exists already"):
         build_fmu(toys.lag(), path)
     assert path.read_text() == "mine"
     assert zipfile.is_zipfile(build_fmu(toys.lag(), path, force=True))
@@ -143,7 +143,7 @@ def test_an_existing_file_is_kept_unless_forced(toys: Any, tmp_path: Path) -> No
 
 def test_a_folder_that_cannot_be_made_is_an_output_error(toys: Any, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="cannot be written"):
+    with pytest.raises(OutputFileError, match="cannot be written"):
         build_fmu(toys.lag(), tmp_path / "file" / "Toy.fmu")
 
 

@@ -203,7 +203,7 @@ def test_a_kind_that_the_translator_refused_says_why(tmp_path: Path, monkeypatch
     from softneck.fmu.compiled import _build
 
     library = _library.find_library()
-    refused = {"softneck.identification.linear._rls_runtime": "`step`: `np.linalg.solve(A, b)`: no C is known."}
+    refused = {"softneck.identification.linear._rls_runtime": "`step`: `np.linalg.solve(A, b)`: no translation to C."}
     changed = dataclasses.replace(library, sources=dataclasses.replace(library.sources, refused=refused))
     monkeypatch.setattr(_build, "find_library", lambda: changed)
     with pytest.raises(SettingsError, match=r"_rls_runtime` cannot be in a compiled FMU: `step`: `np.linalg"):
@@ -216,7 +216,7 @@ def test_platforms_that_are_unknown_or_not_built_are_named(tmp_path: Path, monke
     library = _library.find_library()
     only = dataclasses.replace(library, binaries={"aarch64-linux": b"not run here"})
     monkeypatch.setattr(_build, "find_library", lambda: only)
-    with pytest.raises(SettingsError, match="there is no platform `amiga`"):
+    with pytest.raises(SettingsError, match="unknown platform `amiga`"):
         build_compiled_fmu(block_of("rls"), tmp_path / "X.fmu", platforms=("amiga",))
     with pytest.raises(SettingsError, match="x86_64-windows is not built, only that for aarch64-linux; run `make nat"):
         build_compiled_fmu(block_of("rls"), tmp_path / "X.fmu", platforms=("x86_64-windows",))

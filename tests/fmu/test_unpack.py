@@ -58,7 +58,7 @@ def test_what_is_no_fmu_is_said_so(lag_fmu: Path, tmp_path: Path) -> None:
         unpack(tmp_path / "absent.fmu")
     text = tmp_path / "text.fmu"
     text.write_text("no zip")
-    with pytest.raises(FileFormatError, match="is no FMU or is damaged"):
+    with pytest.raises(FileFormatError, match="is not an FMU or is damaged"):
         unpack(text)
     other = tmp_path / "other.fmu"
     with zipfile.ZipFile(other, "w") as archive:
@@ -67,12 +67,12 @@ def test_what_is_no_fmu_is_said_so(lag_fmu: Path, tmp_path: Path) -> None:
         unpack(other)
     cut = tmp_path / "cut.fmu"
     cut.write_bytes(lag_fmu.read_bytes()[:-2000])
-    with pytest.raises(FileFormatError, match="is no FMU or is damaged"):
+    with pytest.raises(FileFormatError, match="is not an FMU or is damaged"):
         unpack(cut)
     flipped = bytearray(lag_fmu.read_bytes())
     flipped[5000:5100] = bytes(100)
     cut.write_bytes(bytes(flipped))
     before = set(Path(tempfile.gettempdir()).glob("softneck-unpacked-*"))
-    with pytest.raises(FileFormatError, match="is no FMU or is damaged"):
+    with pytest.raises(FileFormatError, match="is not an FMU or is damaged"):
         unpack(cut)
     assert set(Path(tempfile.gettempdir()).glob("softneck-unpacked-*")) == before

@@ -78,7 +78,7 @@ def test_members_are_named_and_cannot_hold_others(models: dict[str, Model]) -> N
         combine([models["rls"], replace(models["play"], sample_time=0.01)])
     with pytest.raises(SettingsError, match="at least two members; got rls"):
         Ensemble(members=("rls",))
-    with pytest.raises(SettingsError, match="`magic` is no kind of model"):
+    with pytest.raises(SettingsError, match="unknown kind of model `magic`"):
         Ensemble(members=("rls", "magic"))
     with pytest.raises(SettingsError, match="cannot be a member"):
         Ensemble(members=("rls", "residual"))
@@ -97,7 +97,7 @@ def test_crafted_members_are_refused(models: dict[str, Model]) -> None:
     arrays = dict(combine([models["rls"], models["play"]]).arrays)
     check_arrays("ensemble", arrays)
     renamed = {name.replace("1.play", "1.ensemble"): array for name, array in arrays.items()}
-    with pytest.raises(FileFormatError, match="of no member in order"):
+    with pytest.raises(FileFormatError, match="belongs to no member in order"):
         check_arrays("ensemble", renamed)
     with pytest.raises(FileFormatError, match="cannot have 2 members"):
         check_arrays(

@@ -9,7 +9,7 @@ from softneck.core import DataError, SettingsError
 from softneck.identification import INFINITE, Model, Play, validate
 from softneck.identification.models._error_feedback import fit_echo
 from softneck.identification.models._loaded_drive import FUNCTIONS, NO_LOAD, LoadedDrive, fit_loaded_drive
-from softneck.identification.structured._play_terms import Data, Form, ridge
+from softneck.identification.structured._play_terms import Data, PlayStructure, ridge
 from softneck.runtime import load_functions
 from softneck.signals import Recording
 from softneck.signals.recording._channels import MOTOR_POSITIONS
@@ -126,7 +126,7 @@ def test_training_sees_what_the_free_run_computes() -> None:
     recording = short_neck()
     model = Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording)
     drive = LoadedDrive(model.arrays["drive"], model.arrays["load"])
-    terms = Data.of(recording, drive).terms(Form(15.0, 5, (0.2,), 3))
+    terms = Data.of(recording, drive).terms(PlayStructure(15.0, 5, (0.2,), 3))
     f = np.clip(terms @ model.arrays["weights"].T, *model.arrays["range"].T)
     free = model.simulate(recording, warm_up=1)[:, :2]
     # The echo of the one measured sample and its motors has died out after 200 samples.

@@ -54,7 +54,7 @@ def test_it_stands_in_a_pipeline_and_is_searched() -> None:
 
 
 def test_what_the_data_deny_is_a_value_error_that_names_the_rows() -> None:
-    with pytest.raises(ValueError, match=r"denied by the data .* rows 0 and 1"):
+    with pytest.raises(ValueError, match=r"contradicted by the data .* rows 0 and 1"):
         SetMembershipRegressor(gamma=0.5, epsilon=0.1).fit([[0.0], [1.0]], [0.0, 1.0])
 
 

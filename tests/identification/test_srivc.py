@@ -14,7 +14,7 @@ from scipy.signal import lfilter
 
 from softneck.core import DataError, Matrix, SettingsError, Vector
 from softneck.identification import OutputError, Srivc, load_model
-from softneck.identification.linear._srivc_fit import Continuous, Search
+from softneck.identification.linear._srivc_fit import Continuous, SrivcFitOptions
 from softneck.signals import SET_POINTS, Recording, motors_from, redefine, signal
 
 from ..data import TS, neck_recording, recording_from
@@ -80,7 +80,7 @@ def test_the_sampled_form_is_exact_also_between_samples(model: Continuous) -> No
 def test_a_clean_record_gives_the_system_behind_it(model: Continuous, pole: float, delay: float) -> None:
     u = steps(1500, seed=1)
     n = model.a.size
-    fit = Search(sample_time=TS, order=n, zeros=model.b.size - 1).start([(u, response(model, u))], pole, delay)
+    fit = SrivcFitOptions(sample_time=TS, order=n, zeros=model.b.size - 1).start([(u, response(model, u))], pole, delay)
     assert fit is not None
     np.testing.assert_allclose(fit.model.theta, model.theta, rtol=1e-6)  # Gauss-Newton: quadratic near its end
 
@@ -89,7 +89,7 @@ def test_it_ends_where_the_output_error_is_least() -> None:
     """With white noise the instruments are the derivatives of the output, so scipy finds no better (Young 2015)."""
     u = steps(1500, seed=2)
     y = response(NECK, u) + 10 * NOISE * np.random.default_rng(0).standard_normal(1500)
-    fit = Search(sample_time=TS).start([(u, y)], 5.0, 0.08)
+    fit = SrivcFitOptions(sample_time=TS).start([(u, y)], 5.0, 0.08)
     assert fit is not None
 
     def residual(x: Vector) -> Vector:
@@ -110,7 +110,9 @@ def test_an_offset_a_start_in_motion_and_missed_samples_do_no_harm() -> None:
     lead = 20  # rows before the window, whose outputs are not judged: they give its delayed inputs
     window = y[900 - lead : 1800].copy()
     window[:lead] = np.nan
-    fit = Search(sample_time=TS, offset=True).start([(u[900 - lead : 1800], window), (u[:800], y[:800])], 5.0, 0.08)
+    fit = SrivcFitOptions(sample_time=TS, offset=True).start(
+        [(u[900 - lead : 1800], window), (u[:800], y[:800])], 5.0, 0.08
+    )
     assert fit is not None
     np.testing.assert_allclose(fit.model.theta, NECK.theta, rtol=1e-6)
 

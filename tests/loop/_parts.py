@@ -36,7 +36,7 @@ class FunctionPart:
 
     def start(self, time: float, parameters: Mapping[str, float]) -> Vector:  # noqa: ARG002
         if parameters:
-            raise SettingsError(f"`{next(iter(parameters))}` is no parameter of {self.role}.")
+            raise SettingsError(f"`{next(iter(parameters))}` is not a parameter of {self.role}.")
         self._state, self.calls = [], []
         return np.zeros(len(self.outputs))
 

@@ -196,7 +196,7 @@ def test_an_observer_without_the_angle_is_not_bypassed() -> None:
 @pytest.mark.parametrize(
     ("constants", "message"),
     [
-        ({"payloda": 1.0}, "`payloda` is no input of the plant"),
+        ({"payloda": 1.0}, "`payloda` is not an input of the plant"),
         ({"motor_setpoint_1": 1.0}, "two writers"),
     ],
     ids=["unknown", "two_writers"],

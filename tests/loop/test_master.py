@@ -99,7 +99,7 @@ def test_two_parts_that_offer_the_same_output_are_two_writers() -> None:
             {"connections": {"controller.pitch": "plant.roll"}, "other_inputs": {"controller": {"pitch": 0.0}}},
             "input `pitch` of the controller has two writers: `plant.roll` and a constant",
         ),
-        ({"other_inputs": {"controller": {"speed": 0.0}}}, "`speed` is no input of the controller"),
+        ({"other_inputs": {"controller": {"speed": 0.0}}}, "`speed` is not an input of the controller"),
         (
             {"others": {"filter": FunctionPart("controller", ports("fog"), (), lambda *_: [])}},
             "nothing feeds input `fog` of the",

@@ -58,12 +58,12 @@ def test_a_file_overrides_a_preset(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "what"),
     [
-        ("stiffness = 1.0\n", "`stiffness` is no parameter of the neck"),
+        ("stiffness = 1.0\n", "`stiffness` is not a parameter of the neck"),
         ("winch_radius = -1\n", r"neck.toml: `winch_radius` must be between"),
         ("winch_radius = [1]\n", r"`winch_radius` must be a number \[m\]"),
         ('preset = "v3"\n', '`preset` must be "paper" or "lab"'),
-        ("winch_radius = \n", "is no valid TOML"),
-        ("\x80", "is no valid TOML"),
+        ("winch_radius = \n", "is not valid TOML"),
+        ("\x80", "is not valid TOML"),
     ],
 )
 def test_a_bad_file_is_refused_by_its_name(tmp_path: Path, text: str, what: str) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softneck.core import OutputError
+from softneck.core import OutputFileError
 from softneck.plots import (
     Section,
     Table,
@@ -64,6 +64,6 @@ def test_a_loop_is_drawn_with_what_the_plant_offers(tension: bool) -> None:
 def test_an_existing_page_is_kept_without_force(tmp_path: Path) -> None:
     target = tmp_path / "report.html"
     write(target, "first")
-    with pytest.raises(OutputError, match="exists already"):
+    with pytest.raises(OutputFileError, match="exists already"):
         write(target, "second")
     assert target.read_text(encoding="utf-8") == "first"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from softneck.core import OutputError, SettingsError, load, silent
+from softneck.core import OutputFileError, SettingsError, load, silent
 from softneck.identification import INFINITE, validate
 from softneck.report import DemoSettings, run_demo
 from softneck.report._demo import Demo
@@ -78,6 +78,6 @@ def test_a_demo_too_short_for_its_network_is_refused() -> None:
 def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path: Path) -> None:
     target = tmp_path / "taken"
     target.write_text("mine", encoding="utf-8")
-    with pytest.raises(OutputError, match="name a folder"):
+    with pytest.raises(OutputFileError, match="name a folder"):
         run_demo(DemoSettings(out=target), tell=lambda _: silent)
     assert target.read_text(encoding="utf-8") == "mine"

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from softneck.core import DataError, FileFormatError, OutputError, SoftneckError
+from softneck.core import DataError, FileFormatError, OutputFileError, SoftneckError
 from softneck.identification.models._rows import row_hashes
 from softneck.signals import SET_POINTS, Recording, concatenate, read_recording, write_recording
 from softneck.signals.recording._channels import known_channels
@@ -86,9 +86,9 @@ Edit = Callable[[list[str]], list[str]]
 BAD: dict[str, tuple[Edit, str]] = {
     "missing column": (lambda s: [",".join(line.split(",")[:5]) for line in s], "missing: roll"),
     "no time": (lambda s: [line.split(",", 1)[1] for line in s], r"there is no column `time \[s\]`"),
-    "unknown column": (lambda s: changed(s, -1, 5, "yaw [deg]"), "column `yaw` is no channel of a recording"),
+    "unknown column": (lambda s: changed(s, -1, 5, "yaw [deg]"), "column `yaw` is not a channel of a recording"),
     "no unit": (lambda s: changed(s, -1, 5, "roll"), r"column `roll` names no unit; write `roll \[deg\]`"),
-    "unit that is none": (lambda s: changed(s, -1, 5, "roll [grad]"), "`grad` is no unit that softneck knows"),
+    "unit that is none": (lambda s: changed(s, -1, 5, "roll [grad]"), "unknown unit `grad`"),
     "unit of another quantity": (lambda s: changed(s, -1, 5, "roll [mm]"), "column `roll` cannot be in `mm`"),
     "twice": (lambda s: changed(s, -1, 5, "pitch [rad]"), "channel `pitch` stands in two columns"),
     "text": (lambda s: changed(s, 9, 1, "abc"), "column `motor_setpoint_1` holds `abc` at row 9"),
@@ -163,7 +163,7 @@ def test_another_ending_is_refused(tmp_path: Path) -> None:
 def test_an_existing_recording_is_kept(tmp_path: Path) -> None:
     write_recording(tmp_path / "a.csv", neck_recording(120))
     before = (tmp_path / "a.csv").read_bytes()
-    with pytest.raises(OutputError, match="exists already; use --force"):
+    with pytest.raises(OutputFileError, match="exists already; use --force"):
         write_recording(tmp_path / "a.csv", neck_recording(130))
     assert (tmp_path / "a.csv").read_bytes() == before
 

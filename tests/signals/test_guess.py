@@ -136,7 +136,7 @@ def test_milliseconds_decimal_commas_and_columns_that_are_something_else(tmp_pat
     assert (guess.layout.delimiter, guess.layout.decimal) == (";", ",")
     assert guess.layout.time == Source((Term("timestamp"),), "ms")
     for start in ("column 'pitch_error': because 'error' is", "column 'current1': because 'current' is",
-                  "column 'yaw': because yaw is no channel", "column 'note': because it holds words",
+                  "column 'yaw': because yaw is not a channel", "column 'note': because it holds words",
                   "column 'fan': because it never changes"):  # fmt: skip
         assert any(line.startswith(f"ignored: {start}") for line in guess.lines), start
 

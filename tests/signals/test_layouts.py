@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from softneck.core import DataError, FileFormatError, SettingsError, SoftneckError
 from softneck.signals import import_log, read_layout
-from softneck.signals.importing._log import Imported
+from softneck.signals.importing._log import ImportResult
 
 from ..data import LAYOUTS
 
@@ -32,7 +32,7 @@ terms = [{ column = "a", factor = 0.5 }, { column = "b", factor = -2.0 }]
 LOG = "t, a, b, p, r\n" + "\n".join(f"{20 * k}, {k}, {2 * k}, {3 * k}, {4 * k}" for k in range(30))
 
 
-def imported(folder: Path, layout: str = LAYOUT, log: str = LOG) -> Imported:
+def imported(folder: Path, layout: str = LAYOUT, log: str = LOG) -> ImportResult:
     (folder / "layout.toml").write_text(layout)
     (folder / "log.csv").write_text(log)
     return import_log(folder / "log.csv", read_layout(folder / "layout.toml"))
@@ -84,10 +84,10 @@ def test_a_gap_in_the_time_column_splits_the_run_under_any_sample_time(tmp_path:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('"p", unit = "deg"', '"p", unit = "grad"', "`grad` is no unit"),
+        ('"p", unit = "deg"', '"p", unit = "grad"', "unknown unit `grad`"),
         ('"p", unit = "deg"', '"p", unit = "mm"', r"\[channels\.pitch\] cannot be in `mm`; its SI unit is rad"),
         ('"p", unit = "deg"', '"p"', r"\[channels\.pitch\] names no unit"),
-        ('"p", unit = "deg"', '"p", unit = 5', "`5` is no unit"),
+        ('"p", unit = "deg"', '"p", unit = 5', "unknown unit `5`"),
         ('"p", unit = "deg"', '"p", unit = ["deg"]', "wrong type"),
         ('{ column = "p", unit', "{ unit", r"\[channels\.pitch\] needs `column`"),
         ('"p", unit = "deg"', '"p", unit = "deg", sing = -1', "unknown key `sing`; known: column, factor, sign"),
@@ -101,7 +101,7 @@ def test_a_gap_in_the_time_column_splits_the_run_under_any_sample_time(tmp_path:
         ('"p", unit = "deg"', '"p", unit = "deg", sign = 0', "sign must be 1 or -1; got 0"),
         ('"p", unit = "deg"', '"p", unit = "deg", factor = 0', "a factor must be a finite number other than 0; got 0"),
         ('"p", unit = "deg"', '"p", unit = "deg", factor = "x"', "wrong type"),
-        ("pitch =", "yaw =", r"\[channels\.yaw\]: no channel of a recording"),
+        ("pitch =", "yaw =", r"\[channels\.yaw\]: not a channel of a recording"),
         ("[time]", "[times]", "the layout has the unknown key `times`"),
         ("[time]", "[time]\nsample_time_s = -1", "sample_time_s must be a positive number or `estimate`; got -1"),
         ("[time]", "[file]\nskip = -1\n[time]", "skip must be a number of lines; got -1"),
@@ -138,9 +138,9 @@ def test_a_layout_that_is_absent_or_no_toml(tmp_path: Path) -> None:
         read_layout(tmp_path / "none.toml")
     for content in (b"a = = 1", b"\xff\xfe\x00"):
         (tmp_path / "bad.toml").write_bytes(content)
-        with pytest.raises(FileFormatError, match="is no TOML file"):
+        with pytest.raises(FileFormatError, match="is not a TOML file"):
             read_layout(tmp_path / "bad.toml")
-    with pytest.raises(FileFormatError, match="is no TOML file"):
+    with pytest.raises(FileFormatError, match="is not a TOML file"):
         read_layout(tmp_path)
 
 

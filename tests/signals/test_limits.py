@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softneck.core import SettingsError
-from softneck.signals import Excitation, Limits, prepare, signal, signal_names
+from softneck.signals import Excitation, SetPointLimits, prepare, signal, signal_names
 
 TS = 0.02
 # Rounding of sums of steps up to 6 rad: 1e-12 is 1,000 ulp.
@@ -20,7 +20,7 @@ ROUNDING = 1e-12
 names = st.sampled_from(signal_names())
 seeds = st.integers(0, 5)
 limits = st.builds(
-    Limits,
+    SetPointLimits,
     position=st.floats(0.5, 6.0),
     speed=st.one_of(st.just(math.inf), st.floats(0.2, 30.0)),
     slack=st.one_of(st.just(math.inf), st.floats(0.0, 6.0)),
@@ -34,7 +34,7 @@ def played(name: str, seed: int) -> Excitation:
 
 
 @given(name=names, seed=seeds, limit=limits, ramp=ramps)
-def test_limits_hold_for_every_signal_and_seed(name: str, seed: int, limit: Limits, ramp: float) -> None:
+def test_limits_hold_for_every_signal_and_seed(name: str, seed: int, limit: SetPointLimits, ramp: float) -> None:
     P = prepare(played(name, seed), limit, ramp_s=ramp)[0].set_points
     assert P.max() <= limit.position
     assert P.min() >= -min(limit.position, limit.slack)
@@ -44,7 +44,7 @@ def test_limits_hold_for_every_signal_and_seed(name: str, seed: int, limit: Limi
 
 
 @given(name=names, seed=seeds, limit=limits, ramp=ramps)
-def test_preparing_twice_is_preparing_once(name: str, seed: int, limit: Limits, ramp: float) -> None:
+def test_preparing_twice_is_preparing_once(name: str, seed: int, limit: SetPointLimits, ramp: float) -> None:
     once = prepare(played(name, seed), limit, ramp_s=ramp)[0]
     twice, changes = prepare(once, limit, ramp_s=ramp)
     assert twice.set_points.tobytes() == once.set_points.tobytes()
@@ -54,7 +54,7 @@ def test_preparing_twice_is_preparing_once(name: str, seed: int, limit: Limits, 
 @given(name=names, seed=seeds)
 def test_without_limits_and_ramp_nothing_changes(name: str, seed: int) -> None:
     before = played(name, seed)
-    for limit in (None, Limits()):
+    for limit in (None, SetPointLimits()):
         after, changes = prepare(before, limit)
         assert after.set_points.tobytes() == before.set_points.tobytes()
         assert (after.name, after.sample_time, after.time is before.time) == (before.name, TS, True)
@@ -64,7 +64,7 @@ def test_without_limits_and_ramp_nothing_changes(name: str, seed: int) -> None:
 @given(name=names, seed=seeds, ramp=st.sampled_from([0.5, 1.0, 2.0]))
 def test_after_the_ramp_a_signal_that_obeys_is_untouched_bit_for_bit(name: str, seed: int, ramp: float) -> None:
     before = played(name, seed).set_points
-    after = prepare(played(name, seed), Limits(), ramp_s=ramp)[0].set_points
+    after = prepare(played(name, seed), SetPointLimits(), ramp_s=ramp)[0].set_points
     rows = round(ramp / TS)
     assert after[rows:-rows].tobytes() == before[rows:-rows].tobytes()
     # A signal that starts at rest has no ramp to wait for.
@@ -82,7 +82,7 @@ def test_the_ramp_is_a_raised_cosine() -> None:
 
 
 def test_a_step_becomes_a_ramp_of_the_speed_and_arrives() -> None:
-    excitation, changes = prepare(signal("steps"), Limits(speed=5.0))
+    excitation, changes = prepare(signal("steps"), SetPointLimits(speed=5.0))
     P = excitation.set_points[:, 0]
     # 3 rad at 5 rad/s: 0.6 s, 30 samples of 0.1 rad from t = 1 s on.
     np.testing.assert_allclose(P[49:80], np.arange(31) * 0.1, rtol=0, atol=1e-12)
@@ -95,7 +95,7 @@ def test_a_step_becomes_a_ramp_of_the_speed_and_arrives() -> None:
 def test_each_change_is_counted_by_its_rule() -> None:
     P = np.array([[0.0, 0.0, 0.0], [4.0, -4.0, 0.0], [4.0, -2.0, 1.0], [0.0, 0.0, 0.0]])
     excitation = Excitation("own", np.arange(4) * TS, P)
-    after, changes = prepare(excitation, Limits(position=3.0, slack=1.0))
+    after, changes = prepare(excitation, SetPointLimits(position=3.0, slack=1.0))
     np.testing.assert_array_equal(after.set_points, np.clip(P, -1.0, 3.0))
     assert (changes.position, changes.slack) == (2 / 12, 2 / 12)
     assert str(changes) == "17 % clipped in position, 17 % clipped in slack"
@@ -113,7 +113,7 @@ def test_each_change_is_counted_by_its_rule() -> None:
 )
 def test_a_wrong_limit_is_refused(bad: dict[str, float], message: str) -> None:
     with pytest.raises(SettingsError, match=message):
-        Limits(**bad)
+        SetPointLimits(**bad)
 
 
 @pytest.mark.parametrize("ramp", [-1.0, math.nan, math.inf])

@@ -126,7 +126,7 @@ def test_a_link_to_another_file_is_not_followed(tmp_path: Path) -> None:
 def test_a_small_file_that_declares_a_huge_table(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.mat", "w") as file:
         file.create_dataset("log", (2**40, 6), "f8", chunks=(1024, 6))
-    with pytest.raises(DataError, match=r"declares \d+ numbers; that is no log"):
+    with pytest.raises(DataError, match=r"declares \d+ numbers; that is not a log"):
         load(tmp_path, "a.mat", layout_text(False, '[file]\nvariable = "log"'))
 
 

@@ -87,7 +87,7 @@ def test_a_missed_sample_of_a_sensor_is_allowed() -> None:
 
 def test_an_unknown_channel_and_a_wrong_shape_are_named() -> None:
     r = neck_recording(120)
-    with pytest.raises(DataError, match="`yaw` is no channel of a recording; known: time, motor_setpoint_1"):
+    with pytest.raises(DataError, match="`yaw` is not a channel of a recording; known: time, motor_setpoint_1"):
         r.with_channels(yaw=r.time)
     with pytest.raises(DataError, match=r"channel `pitch` has shape \(119,\); time has \(120,\)"):
         r.with_channels(pitch=r.time[1:])

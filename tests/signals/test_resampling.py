@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from softneck.core import DataError
 from softneck.signals import Recording, concatenate, import_log, parse_layout, resampled
-from softneck.signals.importing._log import Imported
+from softneck.signals.importing._log import ImportResult
 
 LAYOUT = """
 [time]
@@ -31,7 +31,7 @@ def truth(t: np.ndarray) -> np.ndarray:
     return 0.1 * (np.sin(1.3 * t) + np.cos(2.7 * t + 1) + np.sin(4.0 * t + 2))
 
 
-def imported(folder: Path, time: np.ndarray, layout: str = LAYOUT, **columns: np.ndarray) -> Imported:
+def imported(folder: Path, time: np.ndarray, layout: str = LAYOUT, **columns: np.ndarray) -> ImportResult:
     pitch = columns.get("p", truth(time))
     step = columns.get("s1", np.floor(time))
     rows = zip(time, step, 0 * time, 0 * time, pitch, truth(time), strict=True)

@@ -84,8 +84,8 @@ def test_a_failure_prints_metric_limit_and_value_and_saves_the_plot(project: Pat
     plot = project / "build" / "closed_loop" / "test_too_fast.png"
     assert f"plot: {plot}" in done.stdout
     assert plot.read_bytes().startswith(b"\x89PNG")
-    assert "`speed` is no key of the file" in done.stdout
-    assert "`nonsense` is no key of the file" in done.stdout
+    assert "unknown key `speed` of the file" in done.stdout
+    assert "unknown key `nonsense` of the file" in done.stdout
 
 
 def test_the_plugin_imports_nothing_heavy() -> None:

@@ -43,7 +43,8 @@ def require_armed(bus: str, *, arm: bool) -> None:
         return
     if not sys.stdin or not sys.stdin.isatty():
         raise SettingsError(
-            f"--arm asks for `{wanted}` at a terminal, and stdin is none; a service sets {VARIABLE}. Nothing was sent."
+            f"--arm asks for `{wanted}` at a terminal, but stdin is not one; "
+            f"a service sets {VARIABLE}. Nothing was sent."
         )
     click.echo(f"The drives on {bus} will move. Is the neck free, and a hand at the Enable switch?", err=True)
     typed = click.prompt(f"Type `{wanted}` to go on", default="", show_default=False, err=True)

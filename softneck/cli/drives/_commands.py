@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 @click.group(
     "drives",
-    epilog="Example: softneck drives check --simulated. Every command takes --json, and --help tells its options.",
+    epilog="Example: softneck drives check --simulated. Every command takes --json, and --help lists its options.",
 )
 def command() -> None:
     """CANopen drives (CiA 301/402): scan, check, jog, zero, record, run, replay, stop, reset.
@@ -71,7 +71,7 @@ def scan_command(drives_file: Path | None, bus: str | None, simulated: bool, arm
         print_table(f"{len(found)} node(s)", ["node", "name", "firmware", "serial", "state"], rows)
     if not found:
         raise CheckFailedError(
-            f"{bus or 'the bus'}: no node answers. Are the drives on, is the bit rate theirs, is the line terminated "
+            f"{bus or 'the bus'}: no node answers. Are the drives on, is the bit rate right, is the line terminated "
             "(60 ohm between CAN_H and CAN_L)?"
         )
 
@@ -158,15 +158,19 @@ def zero_command(
 @command.command("run", epilog="Example: softneck drives run pi.npz --loop loop.toml --simulated")
 @click.argument("controller", metavar="CONTROLLER", type=click.Path(path_type=Path))
 @click.option("--loop", "loop_file", required=True, type=click.Path(path_type=Path), metavar="LOOP.toml",
-              help="Observer, reference and duration; its plant gives the virtual neck of --simulated.")  # fmt: skip
+              help="Observer, reference and duration; its plant is the virtual neck of --simulated.")  # fmt: skip
 @click.option("--certificate", "certificates", multiple=True, type=click.Path(path_type=Path),
-              help="Of `softneck verify` or `softneck simulate`; several may cover the files together.")  # fmt: skip
+              help="Certificate of `softneck verify` or `simulate`; several may cover the files together.")  # fmt: skip
 @drives_options
 @override_option
 @neck_option
-@click.option("--pace", type=float, help="With --simulated: this multiple of real time instead of as fast as possible.")
+@click.option(
+    "--pace", type=float, help="With --simulated: run at this multiple of real time instead of as fast as possible."
+)
 @log_options
-@click.option("--realtime", is_flag=True, help="On a bus: before all ordinary processes (SCHED_FIFO), memory locked.")
+@click.option(
+    "--realtime", is_flag=True, help="On a bus: run ahead of all ordinary processes (SCHED_FIFO), with memory locked."
+)
 @output_option("recording of the run", "REC")
 @force_option
 @json_option

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import click
 import platformdirs
 
-from softneck.core import OutputError, SettingsError
+from softneck.core import OutputFileError, SettingsError
 
 from ..shared._console import note
 from ._target import Target
@@ -31,7 +31,7 @@ def log_options(function: Callable) -> Callable:
             "(candump) the frames. May be given several times. [default: on a bus that may move something a file under "
             "~/.local/state/softneck/log, or in $LOGS_DIRECTORY]",
         ),
-        click.option("--no-log", is_flag=True, help="No log on such a bus either."),
+        click.option("--no-log", is_flag=True, help="Write no log, not even on such a bus."),
     )  # fmt: skip
     for option in reversed(options):
         function = option(function)
@@ -43,7 +43,7 @@ def require_logs(logs: Sequence[Path], *, no_log: bool, force: bool) -> None:
     from softneck.drives.logs._run_log import require_log_paths
 
     if logs and no_log:
-        raise SettingsError("--log and --no-log: say one of them.")
+        raise SettingsError("--log and --no-log contradict each other; give one of them.")
     require_log_paths(logs, force=force)
 
 
@@ -62,7 +62,7 @@ def opened_log(
         ending: of the one that was not asked for.
 
     Raises:
-        OutputError: it cannot be written (before anything moves), or is not complete.
+        OutputFileError: it cannot be written (before anything moves), or is not complete.
     """
     from softneck.drives.bus._link import HARMLESS
     from softneck.drives.logs._run_log import RunLogger
@@ -76,8 +76,8 @@ def opened_log(
     epoch = 0.0 if chosen.simulated else time.time() - time.monotonic()
     try:
         log = RunLogger(paths, force=force, wait=chosen.simulated, epoch=epoch)
-    except OutputError as error:
-        raise OutputError(f"{error} Or --no-log. Nothing was sent." if own else str(error)) from error
+    except OutputFileError as error:
+        raise OutputFileError(f"{error} Or --no-log. Nothing was sent." if own else str(error)) from error
     if own:
         note(f"log: {paths[0]}")
     try:
@@ -86,7 +86,7 @@ def opened_log(
         # What went wrong is what is to be told; that its log is not complete comes before it.
         try:
             log.close()
-        except OutputError as error:
+        except OutputFileError as error:
             note(str(error))
         _drop_empty(log, own=own)
         raise

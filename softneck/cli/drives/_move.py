@@ -31,14 +31,14 @@ from ._target import (
 if TYPE_CHECKING:
     from softneck.drives import CanLink
     from softneck.drives.bus._link import VirtualLink
-    from softneck.drives.commissioning._jog import Jogged
-    from softneck.drives.commissioning._record import Recorded
+    from softneck.drives.commissioning._jog import JogResult
+    from softneck.drives.commissioning._record import ExperimentResult
     from softneck.drives.logs._run_log import RunLogger
     from softneck.drives.running._bus_loop import Session
     from softneck.drives.running._keyboard import Keyboard
 
 
-_pace_option = click.option("--pace", type=float, help="With --simulated: this multiple of real time.")
+_pace_option = click.option("--pace", type=float, help="With --simulated: run at this multiple of real time.")
 
 
 def _session(
@@ -64,7 +64,9 @@ def _checked(chosen: Target, pace: float | None) -> None:
 
 @click.command("jog", epilog="Example: softneck drives jog 1 --drives drives.toml --bus socketcan:can0 --arm")
 @click.argument("motor", metavar="N", type=click.IntRange(1, 3))
-@click.option("--amplitude", type=float, default=0.5, show_default=True, metavar="RAD", help="Of the motor.")
+@click.option(
+    "--amplitude", type=float, default=0.5, show_default=True, metavar="RAD", help="Amplitude of the motor's move."
+)
 @drives_options
 @override_option
 @neck_option
@@ -107,7 +109,7 @@ def jog_command(
         found.require()
 
 
-def _print_jog(found: Jogged, *, as_json: bool) -> None:
+def _print_jog(found: JogResult, *, as_json: bool) -> None:
     values = found.table()
     if as_json:
         print_json(values)
@@ -129,15 +131,24 @@ def _print_jog(found: Jogged, *, as_json: bool) -> None:
 @click.argument("signal_name", metavar="SIGNAL")
 @output_option("recording", "REC", required=True)
 @click.option("--duration", type=float, metavar="S", help="Length in seconds. [default: the signal's own]")
-@click.option("--runs", type=click.IntRange(1, 100), default=1, show_default=True, help="Repeat it, seeds rising.")
-@click.option("--seed", type=click.IntRange(0, 2**31 - 200), default=0, show_default=True, help="Of the signal.")
-@click.option("--ramp", type=float, default=2.0, show_default=True, metavar="S", help="From rest, and to it.")
+@click.option(
+    "--runs", type=click.IntRange(1, 100), default=1, show_default=True, help="Repeat it, each time with the next seed."
+)
+@click.option("--seed", type=click.IntRange(0, 2**31 - 200), default=0, show_default=True, help="Seed of the signal.")
+@click.option(
+    "--ramp", type=float, default=2.0, show_default=True, metavar="S", help="Ramp in from rest and out to it."
+)
 @click.option("--max-position", type=float, metavar="RAD", help="Clip set-points to +-RAD. [default: drives file]")
 @click.option(
-    "--max-speed", type=float, metavar="RAD/S", help="Slow them down. [default: a quarter of the drives file's]"
+    "--max-speed",
+    type=float,
+    metavar="RAD/S",
+    help="Slow set-points down to this speed. [default: a quarter of the drives file's]",
 )
-@click.option("--max-slack", type=float, metavar="RAD", help="Pay out no more. [default: slack_unwind_rad, at most 3]")
-@click.option("--payload", type=float, default=0.0, metavar="KG", help="On the platform of --simulated.")
+@click.option(
+    "--max-slack", type=float, metavar="RAD", help="Pay out no more than this. [default: slack_unwind_rad, at most 3]"
+)
+@click.option("--payload", type=float, default=0.0, metavar="KG", help="Payload on the platform of --simulated.")
 @drives_options
 @override_option
 @neck_option
@@ -192,7 +203,7 @@ def record_command(
 
 
 def _print_record(
-    output: Path, recorded: Recorded, facts: dict[str, Any], changes: str, *, as_json: bool
+    output: Path, recorded: ExperimentResult, facts: dict[str, Any], changes: str, *, as_json: bool
 ) -> None:  # fmt: skip
     if as_json:
         where = None if recorded.recording is None else str(output)

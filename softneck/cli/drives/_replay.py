@@ -20,8 +20,12 @@ if TYPE_CHECKING:
 @click.command("replay", epilog="Example: softneck drives replay run.mcap")
 @click.argument("log", metavar="LOG", type=click.Path(path_type=Path))
 @click.option("--loop", "loop_file", type=click.Path(path_type=Path), metavar="LOOP.toml",
-              help="The run's loop file, where it is no longer where the log says.")  # fmt: skip
-@click.option("--controller", type=click.Path(path_type=Path), help="The run's controller, the same.")
+              help="The run's loop file, if it is no longer where the log says.")  # fmt: skip
+@click.option(
+    "--controller",
+    type=click.Path(path_type=Path),
+    help="The run's controller, if it is no longer where the log says.",
+)
 @click.option("--core-only", is_flag=True, help="Use the logged answers of the controller instead of computing them.")
 @json_option
 def replay_command(log: Path, loop_file: Path | None, controller: Path | None, core_only: bool, as_json: bool) -> None:

@@ -45,9 +45,9 @@ def drives_options(function: Callable) -> Callable:
     options = (
         click.option("--drives", "drives_file", type=click.Path(path_type=Path), metavar="DRIVES.toml",
                      help="Node ids, gear, encoder, signs, limits, sensor, guarding."),
-        click.option("--bus", metavar="INTERFACE:CHANNEL", help="Such as socketcan:can0, virtual:x."),
+        click.option("--bus", metavar="INTERFACE:CHANNEL", help="CAN bus, such as socketcan:can0 or virtual:x."),
         click.option("--simulated", is_flag=True, help="Simulated drives on the virtual neck, in this process."),
-        click.option("--arm", is_flag=True, help="Let drives on a bus move."),
+        click.option("--arm", is_flag=True, help="Allow drives on a bus to move."),
     )  # fmt: skip
     for option in reversed(options):
         function = option(function)
@@ -61,9 +61,9 @@ def target_of(
     from softneck.drives import default_drives, load_drives, neck_drives
 
     if (bus is None) == (not simulated):
-        raise SettingsError("say which drives: --bus INTERFACE:CHANNEL, or --simulated.")
+        raise SettingsError("say which drives: --bus INTERFACE:CHANNEL or --simulated.")
     if drives_file is None and not simulated:
-        raise SettingsError("drives on a bus need --drives DRIVES.toml: their limits are not for us to guess.")
+        raise SettingsError("drives on a bus need --drives DRIVES.toml: softneck does not guess their limits.")
     if drives_file is not None:
         file = load_drives(drives_file)
     else:
@@ -115,7 +115,7 @@ def open_drives(chosen: Target) -> Iterator[CanLink]:
 
     with open_link(chosen, moves=True) as link:
         if isinstance(link, VirtualLink):
-            raise SettingsError("drives on a bus are asked.")
+            raise SettingsError("this command needs drives on a bus (--bus).")
         yield link
 
 
@@ -129,7 +129,7 @@ def checked_names(names: Sequence[str]) -> tuple[str, ...]:
 
 override_option = click.option(
     "--override", "overrides", multiple=True, metavar="NAME",
-    help=f"Let a check fail, by name: {', '.join(OVERRIDES)}.",
+    help=f"Ignore a check that fails, by name: {', '.join(OVERRIDES)}.",
 )  # fmt: skip
 neck_option = click.option("--neck", metavar="paper|lab|NECK.toml", help="The virtual neck of --simulated.")
 

@@ -136,7 +136,7 @@ class LiveView:
 
 @contextlib.contextmanager
 def live_view(title: str, duration: float, *, wanted: bool) -> Iterator[tuple[Watch, ...]]:
-    """Yield the `watches` of a run; none, and nothing is drawn, if not `wanted` or stderr is no terminal."""
+    """Yield the `watches` of a run; none, and nothing is drawn, if not `wanted` or stderr is not a terminal."""
     from rich.console import Console
 
     if not (wanted and Console(stderr=True).is_terminal):

@@ -50,8 +50,7 @@ def note(message: str) -> None:
 
 @contextlib.contextmanager
 def progress(what: str, *, quiet: bool = False) -> Iterator[ProgressCallback]:
-    """Yield a callback (part done, word) that draws a bar on stderr; a line where stderr is no terminal."""
-
+    """Yield a callback (part done, word) that draws a bar on stderr; a line where stderr is not a terminal."""
     if quiet:
         yield silent
         return

@@ -40,7 +40,7 @@ def target(output: Path | None, default: str, *, force: bool, ending: str | None
         SettingsError: another ending than `ending`, by which files are known.
     """
     if output is not None and ending is not None and output.suffix.lower() != ending:
-        raise SettingsError(f"{output}: must end in `{ending}`, by which softneck knows the file.")
+        raise SettingsError(f"{output}: must end in `{ending}`, by which softneck recognises the file.")
     return (output, force) if output is not None else (Path("build") / default, True)
 
 

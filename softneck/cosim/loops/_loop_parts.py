@@ -1,4 +1,4 @@
-"""The parts that a loop's table names: files of ours, FMUs, necks, and what Python makes."""
+"""The parts that a loop's table names: softneck files, FMUs, necks, and what Python makes."""
 
 from __future__ import annotations
 

@@ -113,7 +113,7 @@ def _check_part_key(key: str, part: str, rest: str, names: Mapping[str, set[str]
 
 def _check_field(key: str, rest: str, field: str | None, where: str) -> None:
     if field is None:
-        raise SettingsError(f"the loop has no key `{key}`: `{rest}` is nothing of {where}.")
+        raise SettingsError(f"the loop has no key `{key}`: `{rest}` is not part of {where}.")
 
 
 def _entry(table: Mapping[str, Any], key: str) -> tuple[dict[str, Any], int, str]:
@@ -126,7 +126,7 @@ def _entry(table: Mapping[str, Any], key: str) -> tuple[dict[str, Any], int, str
         return entries[named.index(place)], named.index(place), rest
     if not place.isdecimal() or int(place) >= len(entries) or not rest:
         count = f"{len(entries)} ({', '.join(f'{head}.{i}' for i in range(len(entries)))})" if entries else "none"
-        raise SettingsError(f"the loop has no key `{key}`: of [[{head}]] it has {count}.")
+        raise SettingsError(f"the loop has no key `{key}`: its [[{head}]] tables: {count}.")
     return entries[int(place)], int(place), rest
 
 

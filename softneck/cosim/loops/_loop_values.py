@@ -17,7 +17,7 @@ def read_toml(source: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(source.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise FileFormatError(f"{source}: is no TOML ({error}).") from error
+        raise FileFormatError(f"{source}: is not valid TOML ({error}).") from error
     except OSError as error:
         raise FileFormatError(f"{source}: cannot be read: {error.strerror}.") from error
 
@@ -26,7 +26,7 @@ def refuse_unknown(where: str, table: Mapping[str, Any], known: tuple[str, ...])
     """Raise SettingsError if `table` has a key that is not `known`."""
     unknown = [key for key in table if key not in known]
     if unknown:
-        raise SettingsError(f"`{unknown[0]}` is no key of {where}; it takes {', '.join(known)}.")
+        raise SettingsError(f"unknown key `{unknown[0]}` of {where}; it takes {', '.join(known)}.")
 
 
 def number(name: str, value: Any) -> float:

@@ -52,12 +52,12 @@ def simulate(
         pace: run at this multiple of real time; as fast as possible if not given.
         resume: go on from this state instead of t = 0.
         keep: leave the FMUs loaded, so that the next run of the same loop resets them; `loop.close()` ends it.
-        compiled: run loops whose parts are all blocks (files of ours, the virtual neck, no FMUs) as one compiled
+        compiled: run loops whose parts are all blocks (softneck files, the virtual neck, no FMUs) as one compiled
             function: the same bits, sooner after a second of compiling, which is kept.
 
     Raises:
         SettingsError: parts that do not fit together.
-        DataError: a part returned what is no number.
+        DataError: a part returned what is not a number.
         FmuError: an FMU refused a call.
     """
     setup = loop if isinstance(loop, LoopSetup) else LoopSetup(loop=loop)

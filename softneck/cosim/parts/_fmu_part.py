@@ -195,7 +195,7 @@ class FmuPart:
         for name in parameters:
             if name not in known:
                 listed = ", ".join(known) or "none"
-                raise SettingsError(f"`{name}` is no parameter of {self.path}; it has {listed}.")
+                raise SettingsError(f"`{name}` is not a parameter of {self.path}; it has {listed}.")
         return self._bank(parameters), np.array([float(value) for value in parameters.values()])
 
     def _do(self, what: str, call: Callable[..., Any], *arguments: Any) -> Any:
@@ -236,7 +236,7 @@ def _sample_time(description: Description, given: float | None) -> float:
     experiment = description.model.defaultExperiment
     step = given if given is not None else getattr(experiment, "stepSize", None)
     if step is None:
-        raise SettingsError(f"{description.path}: says no step size; give its sample time in s.")
+        raise SettingsError(f"{description.path}: states no step size; give its sample time in s.")
     require_positive("sample_time", float(step), "s")
     return float(step)
 
@@ -246,5 +246,5 @@ def check_outputs(part: FmuPart, names: tuple[str, ...]) -> list[int]:
     known = [port.name for port in part.outputs]
     for name in names:
         if name not in known:
-            raise DataError(f"`{name}` is no output of {part.path}; it has {', '.join(known)}.")
+            raise DataError(f"`{name}` is not an output of {part.path}; it has {', '.join(known)}.")
     return [known.index(name) for name in names]

@@ -100,12 +100,12 @@ def _rows(part: FmuPart, inputs: Mapping[str, Vector]) -> Matrix:
     names = [port.name for port in part.inputs]
     sizes = {len(column) for column in inputs.values()}
     if len(sizes) != 1 or 0 in sizes:
-        raise DataError(f"the inputs must have one length of at least 1; got {sorted(sizes)}.")
+        raise DataError(f"the inputs must have one common length of at least 1; got {sorted(sizes)}.")
     # What no column gives was not measured, where that is allowed.
     held = [np.nan if port.missing else port.start for port in part.inputs]
     rows = np.tile(np.array(held), (sizes.pop(), 1))
     for name, column in inputs.items():
         if name not in names:
-            raise DataError(f"`{name}` is no input of {part.path}; it has {', '.join(names)}.")
+            raise DataError(f"`{name}` is not an input of {part.path}; it has {', '.join(names)}.")
         rows[:, names.index(name)] = column
     return rows

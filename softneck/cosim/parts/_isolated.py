@@ -20,7 +20,7 @@ import numpy as np
 from softneck.core import (
     DataError,
     FileFormatError,
-    OutputError,
+    OutputFileError,
     SettingsError,
     SoftneckError,
     Vector,
@@ -30,7 +30,7 @@ from softneck.core import (
 from ._fmu_part import FmuError, FmuPart
 
 _ERRORS: dict[str, type[SoftneckError]] = {
-    kind.__name__: kind for kind in (FmuError, DataError, FileFormatError, OutputError, SettingsError)
+    kind.__name__: kind for kind in (FmuError, DataError, FileFormatError, OutputFileError, SettingsError)
 }
 # Importing softneck in the child and loading the FMU take a second or two on a busy machine.
 _START_TIMEOUT = 60.0

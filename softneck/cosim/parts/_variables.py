@@ -143,7 +143,7 @@ def read_description(
         variables[name] = variable
     for name in units or {}:
         if name not in variables:
-            raise FileFormatError(f"{path}: a unit is given for `{name}`, which is no variable of it.")
+            raise FileFormatError(f"{path}: a unit is given for `{name}`, which is not one of its variables.")
     return Description(path, model, _annotation(folder), variables, version, units or {})
 
 

@@ -48,7 +48,7 @@ class Component:
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
+class Connection:
     """A connection from (component, output) to (component, input), times `factor` where units differ."""
 
     origin: tuple[str, str]
@@ -57,7 +57,7 @@ class Link:
 
 
 def system_description(
-    name: str, components: Sequence[Component], links: Sequence[Link], *, step: float, duration: float
+    name: str, components: Sequence[Component], links: Sequence[Connection], *, step: float, duration: float
 ) -> bytes:
     """Return the XML text of a system of `components`, stepped by `step` [s] for `duration` [s]."""
     root = Element(
@@ -122,7 +122,7 @@ def _bindings(element: Element, component: Component) -> None:
             SubElement(parameter, "ssv:Real", {"value": repr(value)})
 
 
-def _connection(connections: Element, link: Link) -> None:
+def _connection(connections: Element, link: Connection) -> None:
     (owner, output), (part, name) = link.origin, link.target
     head = {"startElement": owner, "startConnector": output, "endElement": part, "endConnector": name}
     if link.factor == 1.0:

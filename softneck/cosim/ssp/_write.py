@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from softneck.core import OutputError, SettingsError, atomic_write, refuse_existing
+from softneck.core import OutputFileError, SettingsError, atomic_write, refuse_existing
 from softneck.fmu import FmuInfo, build_compiled_fmu, build_fmu
 from softneck.loop import BlockPart, Loop, Part, ReferenceBlock
 from softneck.loop._wiring import Wiring, wire
@@ -17,7 +17,7 @@ from softneck.runtime import Port
 from ..loops._simulate import LoopSetup
 from ..parts._fmu_part import FmuPart
 from ..parts._isolated import IsolatedPart
-from ._description import Component, Link, system_description
+from ._description import Component, Connection, system_description
 
 # Fixed, so that the same loop gives the same bytes.
 _DATE = (1980, 1, 1, 0, 0, 0)
@@ -26,7 +26,7 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 def write_ssp(loop: Loop | LoopSetup, path: str | Path, *, force: bool = False, compiled: bool = False) -> Path:
     """Write `loop` as an SSP 1.0 archive and return its path.
 
-    Parts that are no FMUs become some; so does the reference. A master that sets all inputs first and then steps all
+    Parts that are not FMUs become some; so does the reference. A master that sets all inputs first and then steps all
     computes what `simulate` does with order "jacobi".
 
     Args:
@@ -37,7 +37,7 @@ def write_ssp(loop: Loop | LoopSetup, path: str | Path, *, force: bool = False, 
 
     Raises:
         SettingsError: faults, or a part that can be no FMU; the line names it.
-        OutputError: the file exists or cannot be written.
+        OutputFileError: the file exists or cannot be written.
     """
     target = Path(path)
     if target.suffix != ".ssp":
@@ -105,7 +105,7 @@ def _component(name: str, part: Part, source: Path, loop: Loop, wiring: Wiring) 
     values = {**constants, **loop.parameters.get(name, {})}
     for key in values:
         if key not in known:
-            raise SettingsError(f"`{key}` is no parameter of the {name}; it has {', '.join(known) or 'none'}.")
+            raise SettingsError(f"`{key}` is not a parameter of the {name}; it has {', '.join(known) or 'none'}.")
     return Component(
         name=name,
         source=f"resources/{source.name}",
@@ -123,7 +123,7 @@ def _renamed(port: Port, names: _Names) -> Port:
     return replace(port, name=names.of(port.name))
 
 
-def _links(loop: Loop, wiring: Wiring) -> list[Link]:
+def _links(loop: Loop, wiring: Wiring) -> list[Connection]:
     links = []
     parts = loop.parts
     for name, tap in wiring.taps.items():
@@ -132,7 +132,7 @@ def _links(loop: Loop, wiring: Wiring) -> list[Link]:
             if owner:
                 output = next(item.port.name for item in wiring.named if item.slot == slot)
                 origin = (owner, _names(parts[owner]).of(output))
-                links.append(Link(origin, (name, _names(parts[name]).of(port.name)), float(factor)))
+                links.append(Connection(origin, (name, _names(parts[name]).of(port.name)), float(factor)))
     return links
 
 
@@ -144,4 +144,4 @@ def _write(target: Path, members: Mapping[str, bytes], *, force: bool) -> None:
                 info.compress_type = zipfile.ZIP_DEFLATED
                 archive.writestr(info, data)
     except OSError as error:
-        raise OutputError(f"{target}: cannot be written: {error.strerror or error}.") from error
+        raise OutputFileError(f"{target}: cannot be written: {error.strerror or error}.") from error

@@ -123,7 +123,7 @@ def crew(workers: int | None, dask: str | None) -> Iterator[Crew]:
     """Yield the workers: a cluster's, so many local processes (as many as cores by default), or this process for 0.
 
     Raises:
-        SettingsError: a number of workers that is none, both at once, or a scheduler that cannot be reached.
+        SettingsError: an impossible number of workers, both at once, or a scheduler that cannot be reached.
     """
     if dask is not None:
         if workers is not None:

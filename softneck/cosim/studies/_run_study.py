@@ -9,7 +9,7 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from softneck.core import OutputError, Progress, SettingsError, silent
+from softneck.core import OutputFileError, Progress, SettingsError, silent
 
 from ._executors import Crew, check_sendable, crew
 from ._store import Store
@@ -63,7 +63,7 @@ def study(
 
     Raises:
         SettingsError: a key that the loop does not have, an empty range, no runs, another study's folder.
-        OutputError: `output` holds a study already.
+        OutputFileError: `output` holds a study already.
     """
     made = loop if isinstance(loop, Study) else make_study(
         loop, vary=vary or {}, runs=runs, seed=seed, sampling=sampling, objectives=objectives
@@ -158,8 +158,8 @@ class _Work:
             self._died(runs)
             self._broken()
         except CancelledError as error:
-            raise OutputError("the Dask scheduler went away; what is done is kept, --resume continues.") from error
-        except OutputError:
+            raise OutputFileError("the Dask scheduler went away; what is done is kept, --resume continues.") from error
+        except OutputFileError:
             raise
         except Exception as error:  # a worker died under Dask, or what it ran could not come back
             if len(runs) > 1:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from softneck import __version__
-from softneck.core import FileFormatError, OutputError, SettingsError, atomic_write
+from softneck.core import FileFormatError, OutputFileError, SettingsError, atomic_write
 from softneck.loop._metrics import METRICS
 
 from ._study import Study
@@ -29,7 +29,7 @@ _MERGE_AT = 100
 class Store:
     """The folder of a study: `study.json` says what it is, Parquet files hold the runs that ended.
 
-    A run counts from the moment its file has its final name; a file that was being written is none.
+    A run counts from the moment its file has its final name; a file that was being written does not count.
 
     Attributes:
         folder: of the study.
@@ -40,13 +40,13 @@ class Store:
         """Begin the study in `folder`, or go on with what is there.
 
         Raises:
-            OutputError: the folder holds a study and neither `resume` nor `force` is given.
+            OutputFileError: the folder holds a study and neither `resume` nor `force` is given.
             SettingsError: `resume` in a folder of another study, or of none.
         """
         self.folder, self._schema = folder, schema(study.vary)
         self._parts = folder / _PARTS
         if (folder / DESCRIPTION).exists() and not (resume or force):
-            raise OutputError(f"{folder}: holds a study already; --resume continues it, --force replaces it.")
+            raise OutputFileError(f"{folder}: holds a study already; --resume continues it, --force replaces it.")
         if resume:
             self._check_same(study)
         else:
@@ -57,7 +57,7 @@ class Store:
         try:
             self._parts.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise OutputError(f"{self._parts}: cannot be written: {error.strerror}.") from error
+            raise OutputFileError(f"{self._parts}: cannot be written: {error.strerror}.") from error
         self.done = set(self._table(["run"]).column("run").to_pylist())
         self._files = len(list(self._parts.glob("*.parquet")))
 
@@ -131,14 +131,14 @@ def schema(vary: Mapping[str, Vary]) -> pa.Schema:
 
 
 def read_description(folder: Path) -> dict[str, Any]:
-    """Return what `study.json` says; raise FileFormatError if it is none."""
+    """Return what `study.json` says; raise FileFormatError if it describes no study."""
     path = folder / DESCRIPTION
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise FileFormatError(f"{path}: cannot be read ({error}).") from error
     if not isinstance(content, dict) or "study" not in content:
-        raise FileFormatError(f"{path}: describes no study.")
+        raise FileFormatError(f"{path}: does not describe a study.")
     return content
 
 

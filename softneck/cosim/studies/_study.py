@@ -20,7 +20,7 @@ from ..loops._loop_parts import OBJECT
 from ..loops._loop_table import check_key, loop_table, set_sources, settable, with_values
 from ..loops._loop_values import read_toml
 from ..loops._simulate import LoopSetup
-from ._vary import Points, Vary, flattened, make_vary
+from ._vary import StudyPoints, Vary, flattened, make_vary
 
 _TOP = ("loop", "runs", "seed", "sampling", "objectives", "vary")
 Source = str | Path | Mapping[str, Any] | Loop | LoopSetup
@@ -55,19 +55,21 @@ class Study:
             raise SettingsError(f"`seed` must be a whole number that is not negative; got {self.seed!r}.")
         for metric in self.objectives:
             if metric not in METRICS:
-                raise SettingsError(f"`{metric}` is no metric to be an objective; use some of {', '.join(METRICS)}.")
+                raise SettingsError(
+                    f"`{metric}` is not a metric that can be an objective; use some of {', '.join(METRICS)}."
+                )
         if not self.objectives:
             raise SettingsError("`objectives` is empty; name at least one metric.")
 
     @cached_property
-    def points(self) -> Points:
+    def points(self) -> StudyPoints:
         """The runs: what each puts into the loop."""
-        return Points(self.vary, self.runs, self.seed, self.sampling)
+        return StudyPoints(self.vary, self.runs, self.seed, self.sampling)
 
     def table(self, run: int) -> dict[str, Any]:
         """Return the loop of one run, as the table of a loop file."""
         if not 0 <= run < len(self.points):
-            raise SettingsError(f"the study has runs 0 to {len(self.points) - 1}; there is no {run}.")
+            raise SettingsError(f"the study has runs 0 to {len(self.points) - 1}; there is no run {run}.")
         return with_values(self.loop, self.points[run].values)
 
     def setup(self, run: int, *, opened: dict[Any, Any] | None = None) -> LoopSetup:
@@ -169,7 +171,7 @@ def load_study(path: str | Path) -> Study:
 def _from_table(source: Path, table: Mapping[str, Any]) -> Study:
     for key in table:
         if key not in _TOP:
-            raise SettingsError(f"`{key}` is no key of a study; it takes {', '.join(_TOP)}.")
+            raise SettingsError(f"unknown key `{key}` of a study; it takes {', '.join(_TOP)}.")
     if "loop" not in table:
         raise SettingsError("`loop` is missing: name the loop file.")
     if not isinstance(table.get("vary", {}), dict):
@@ -215,7 +217,7 @@ def _texts(value: Any) -> list[str]:
 
 
 def _plain(value: Any) -> Any:
-    """Return `value` as JSON; of a part that is no file, a hash of what it does."""
+    """Return `value` as JSON; of a part that is not a file, a hash of what it does."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -98,14 +98,14 @@ def write_worst(study: Study, runs: pd.DataFrame, folder: str | Path, *, count: 
     Their relative paths start where those of the study's loop do, by the key `folder`.
 
     Raises:
-        SettingsError: the loop holds parts that are no files; `Study.setup(run)` gives such a loop.
+        SettingsError: the loop holds parts that are not files; `Study.setup(run)` gives such a loop.
     """
     target = Path(folder)
     paths = []
     for number, error in worst_runs(runs, study.objectives, count)[["run", "error"]].itertuples(index=False):
         table = study.table(int(number))
         if has_objects(table):
-            raise SettingsError("the loop holds parts that are no files; take its worst runs by `Study.setup(run)`.")
+            raise SettingsError("the loop holds parts that are not files; take its worst runs by `Study.setup(run)`.")
         start = os.path.relpath(study.folder / str(table.pop("folder", "")), target.resolve())
         remark = f"# Run {number} of study {study.name}" + (f"; it failed: {error}" if error else ".")
         text = f"{remark}\n" + tomli_w.dumps({"folder": Path(start).as_posix(), **table})
@@ -126,4 +126,4 @@ def has_objects(table: Any) -> bool:
 def _check(runs: pd.DataFrame, objectives: Sequence[str]) -> None:
     for metric in objectives:
         if metric not in runs:
-            raise SettingsError(f"`{metric}` is no column of the runs; they have {', '.join(runs.columns)}.")
+            raise SettingsError(f"`{metric}` is not a column of the runs; they have {', '.join(runs.columns)}.")

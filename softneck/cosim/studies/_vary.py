@@ -110,7 +110,7 @@ class Point:
     labels: Mapping[str, Any]
 
 
-class Points:
+class StudyPoints:
     """The points of a study: every sample at every point of the grid, in that order; drawn ahead, by the seed alone."""
 
     def __init__(self, vary: Mapping[str, Vary], runs: int | None, seed: int, sampling: str) -> None:

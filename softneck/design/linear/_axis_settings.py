@@ -33,7 +33,7 @@ _WORTH_IT = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
+class AxisDesign:
     """What a synthesis made of one axis.
 
     Attributes:
@@ -121,7 +121,7 @@ class AxisSettings(LoopSettings, ABC):
         )
 
     @abstractmethod
-    def _synthesise(self, axis: UncertainAxis, name: str) -> Found:
+    def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:
         """Return the controller of one axis, "pitch" or "roll"."""
 
     def _shared(self) -> bool:
@@ -229,14 +229,14 @@ class AxisSettings(LoopSettings, ABC):
         return bool(worst <= self.max_sensitivity) and not unstable_samples(controller, axis.samples, self.extra_delay)
 
     def _fastest(
-        self, build: Callable[[float], Found], axis: UncertainAxis, *, low: float, high: float, what: str
-    ) -> Found:
+        self, build: Callable[[float], AxisDesign], axis: UncertainAxis, *, low: float, high: float, what: str
+    ) -> AxisDesign:
         """Return what `build(speed)` gives at the largest speed [rad/s] whose loops all keep `max_sensitivity`.
 
         Raises:
             SettingsError: not even the lowest does.
         """
-        best: Found | None = None
+        best: AxisDesign | None = None
         tried = low
         found = _attempt(build, tried)
         if found is not None and self._keeps_all(found.controller, axis):
@@ -262,7 +262,7 @@ def _first_filter(plant: AxisPlant) -> int:
     return min(round(0.5 * slowest_time(plant) / plant.sample_time), _SLOWEST // 2)
 
 
-def _attempt(build: Callable[[float], Found], speed: float) -> Found | None:
+def _attempt(build: Callable[[float], AxisDesign], speed: float) -> AxisDesign | None:
     """Return what `build` makes, or None where the synthesis has no solution there."""
     try:
         return build(speed)

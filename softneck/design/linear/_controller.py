@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from softneck.core import FileFormatError, Matrix, Vector, atomic_write, write_archive
 from softneck.runtime import Block, State
 
-from ._limits import Limits
+from ._limits import ControllerLimits
 from ._ports import controller_inputs, controller_outputs
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ class LinearController:
     kind: str
     sample_time: float
     arrays: tuple[Matrix, ...]
-    limits: Limits
+    limits: ControllerLimits
     order: str
     design: Mapping[str, Any]
 
@@ -163,7 +163,9 @@ class LinearController:
             sample_time=float(header["sample_time"]),
             arrays=items,
             # Files of the first version do not know the rules for taut tendons.
-            limits=Limits(**{item.name: float(header[item.name]) for item in fields(Limits) if item.name in header}),
+            limits=ControllerLimits(
+                **{item.name: float(header[item.name]) for item in fields(ControllerLimits) if item.name in header}
+            ),
             order=str(header["order"]),
             design=dict(header["design"]),
         )

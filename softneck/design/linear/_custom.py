@@ -15,7 +15,7 @@ from softneck.estimation._axis import AXES
 from ..plants._uncertain import UncertainAxis
 from ._assembly import AxisController
 from ._axis_loop import conditioning_gain, error_feedback
-from ._axis_settings import AxisSettings, Found
+from ._axis_settings import AxisDesign, AxisSettings
 
 _INPUTS = {"pitch": "theta_i", "roll": "phi_i"}
 
@@ -55,7 +55,7 @@ class CustomSettings(AxisSettings):
         stored = AxisSettings._stored(self)
         return {key: value for key, value in stored.items() if key != "controller"}
 
-    def _synthesise(self, axis: UncertainAxis, name: str) -> Found:
+    def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:
         import control
 
         K = self._of(name)
@@ -65,7 +65,7 @@ class CustomSettings(AxisSettings):
                 f"{axis.sample_time:g} s, or identify the plant at {K.dt:g} s."
             )
         made = error_feedback(control.ss(K)) if K.ninputs == 1 else _of_two(K, name)
-        return Found(made, {}, {"imported": True})
+        return AxisDesign(made, {}, {"imported": True})
 
 
 def _require_system(K: Any) -> None:

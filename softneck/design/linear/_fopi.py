@@ -14,7 +14,7 @@ from softneck.estimation import AxisPlant
 
 from ..plants._uncertain import UncertainAxis
 from ._axis_loop import error_feedback
-from ._axis_settings import AxisSettings, Found, slowest_time
+from ._axis_settings import AxisDesign, AxisSettings, slowest_time
 from ._fractional import fopi
 
 
@@ -49,7 +49,7 @@ class FopiSettings(AxisSettings):
         require_between("derivative_order", self.derivative_order, 0.05, 1.0)
         require_whole("sections", self.sections, 1, 25)
 
-    def _synthesise(self, axis: UncertainAxis, name: str) -> Found:  # noqa: ARG002
+    def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:  # noqa: ARG002
         if self.crossover is not None:
             return self._built(axis, self.crossover)
         lag = slowest_time(axis.nominal) + axis.nominal.delay * axis.sample_time
@@ -57,9 +57,9 @@ class FopiSettings(AxisSettings):
             lambda speed: self._built(axis, speed), axis, low=0.2 / lag, high=5.0 / lag, what="crossover"
         )
 
-    def _built(self, axis: UncertainAxis, crossover: float) -> Found:
+    def _built(self, axis: UncertainAxis, crossover: float) -> AxisDesign:
         found = fopi(
-            _Delayed(axis.nominal, self.extra_delay),
+            _DelayedPlant(axis.nominal, self.extra_delay),
             crossover=crossover,
             phase_margin=self.phase_margin,
             derivative=self.derivative,
@@ -71,11 +71,11 @@ class FopiSettings(AxisSettings):
         }  # fmt: skip
         if self.derivative > 0.0:
             gains |= {"Kd": found.derivative, "mu": found.derivative_order}
-        return Found(error_feedback(K), gains, {"band_error": _band_error(found.response, K, crossover)})
+        return AxisDesign(error_feedback(K), gains, {"band_error": _band_error(found.response, K, crossover)})
 
 
 @dataclass(frozen=True, slots=True)
-class _Delayed:
+class _DelayedPlant:
     """A plant with the samples that the loop's order adds."""
 
     plant: AxisPlant

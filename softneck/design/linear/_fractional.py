@@ -128,8 +128,8 @@ class _FlatPhase:
     Attributes:
         w: below, at and above the crossover (3,) [rad/s].
         rest: what of C/K is without the integral (3,).
-        theta: the phase that C shall have at the crossover [rad].
-        slope: what its phase shall gain from the first to the last frequency [rad], so that the loop's is flat.
+        theta: the phase that C is to have at the crossover [rad].
+        slope: what its phase is to gain from the first to the last frequency [rad], so that the loop's is flat.
     """
 
     w: Vector

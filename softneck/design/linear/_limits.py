@@ -11,7 +11,7 @@ from ._ports import MAX_MOTOR, MAX_SLEW, limit_ports
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Limits:
+class ControllerLimits:
     """What set-points may do; the runtime shares each limit among the motors.
 
     Attributes:

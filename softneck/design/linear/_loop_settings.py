@@ -8,7 +8,7 @@ from softneck.core import require_between, require_one_of
 from softneck.estimation._settings import ORDERS
 from softneck.signals import TENDON_ANGLES
 
-from ._limits import Limits
+from ._limits import ControllerLimits
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,9 +52,9 @@ class LoopSettings:
         require_one_of("order", self.order, ORDERS)
         self.limits()
 
-    def limits(self) -> Limits:
+    def limits(self) -> ControllerLimits:
         """Return the limits of the set-points."""
-        return Limits(
+        return ControllerLimits(
             position_limit=self.position_limit,
             slew_limit=self.slew_limit,
             lead_limit=self.lead_limit,

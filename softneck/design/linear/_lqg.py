@@ -12,7 +12,7 @@ from softneck.core import Matrix, SettingsError, Vector, require_between, requir
 from ..plants._uncertain import UncertainAxis
 from ._assembly import AxisController
 from ._axis_loop import delayed_form
-from ._axis_settings import AxisSettings, Found, scaled, slowest_time
+from ._axis_settings import AxisDesign, AxisSettings, scaled, slowest_time
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,7 +45,7 @@ class LqgSettings(AxisSettings):
         require_between("control_weight", self.control_weight, 1e-4, 1e4)
         require_between("input_noise", self.input_noise, 0.0, 1e4)
 
-    def _synthesise(self, axis: UncertainAxis, name: str) -> Found:  # noqa: ARG002
+    def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:  # noqa: ARG002
         if self.load_rate is not None:
             return self._built(axis, self.load_rate)
         lag = slowest_time(axis.nominal) + axis.nominal.delay * axis.sample_time
@@ -53,7 +53,7 @@ class LqgSettings(AxisSettings):
             lambda speed: self._built(axis, speed), axis, low=0.02 / lag, high=100.0 / lag, what="load_rate"
         )
 
-    def _built(self, axis: UncertainAxis, rate: float) -> Found:
+    def _built(self, axis: UncertainAxis, rate: float) -> AxisDesign:
         from scipy.linalg import solve_discrete_are
 
         gain, dt = axis.nominal.static_gain, axis.sample_time
@@ -66,7 +66,7 @@ class LqgSettings(AxisSettings):
                 "the Riccati equations of the LQG design have no solution; raise `control_weight` or `input_noise`."
             ) from error
         F = B @ X @ A / (self.control_weight + B @ X @ B)
-        return Found(_controller(A, B, C, F, M, gain), {"load_rate_rad_s": rate}, {"feedback": F.tolist()})
+        return AxisDesign(_controller(A, B, C, F, M, gain), {"load_rate_rad_s": rate}, {"feedback": F.tolist()})
 
 
 def _filter(A: Matrix, B: Vector, C: Vector, walk: float, noise: float) -> Vector:

@@ -15,7 +15,7 @@ from softneck.estimation import AxisPlant
 from ..plants._uncertain import UncertainAxis
 from ._assembly import AxisController
 from ._axis_loop import closed_radius, coarse, conditioning_gain
-from ._axis_settings import AxisSettings, Found, slowest_time
+from ._axis_settings import AxisDesign, AxisSettings, slowest_time
 from ._sweep import Sweep
 
 TUNINGS = ("samples", "placement")
@@ -109,13 +109,13 @@ class PidSettings(AxisSettings):
         require_between("damping", self.damping, 0.1, 1.0)
         require_between("third_pole", self.third_pole, 0.0, 20.0)
 
-    def _synthesise(self, axis: UncertainAxis, name: str) -> Found:  # noqa: ARG002
+    def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:  # noqa: ARG002
         dt = axis.sample_time
         gains = self._placed(axis.nominal, dt) if self.tuning == "placement" else self._tuned(axis, dt)
         named = {
             "K": gains.gain, "Ti_s": gains.integral_time, "Td_s": gains.derivative_time, "Tf_s": gains.filter_time,
         }  # fmt: skip
-        return Found(gains.axis(dt), named, {"tuning": self.tuning})
+        return AxisDesign(gains.axis(dt), named, {"tuning": self.tuning})
 
     def _placed(self, plant: AxisPlant, dt: float) -> PidGains:
         """Return the gains with which 1 + K G is zero at the wanted poles; linear in K, K/Ti, K Td."""

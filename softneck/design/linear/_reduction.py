@@ -22,7 +22,7 @@ _BORDER = 1.0 - 1e-7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Reduced:
+class ReducedController:
     """A system of fewer states.
 
     Attributes:
@@ -36,7 +36,7 @@ class Reduced:
     bound: float
 
 
-def reduce_controller(system: Any, order: int) -> Reduced:
+def reduce_controller(system: Any, order: int) -> ReducedController:
     """Return `system`, discrete, with `order` states: balanced truncation of all but its integrators.
 
     Raises:
@@ -52,7 +52,7 @@ def reduce_controller(system: Any, order: int) -> Reduced:
     reduced = control.StateSpace(
         A, B, C, full.D, full.dt, inputs=full.input_labels, outputs=full.output_labels, name=full.name
     )
-    return Reduced(reduced, values, bound)
+    return ReducedController(reduced, values, bound)
 
 
 def reduce_axis(

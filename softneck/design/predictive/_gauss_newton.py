@@ -120,7 +120,7 @@ def _symbols(p: NonlinearProblem, step: Any) -> tuple[Any, ...]:
     return tuple(ca.MX.sym(name, size) for name, size in zip(names, sizes, strict=True))
 
 
-class Evaluated:
+class BufferedFunction:
     """A CasADi function that reads and writes numpy arrays in place: called without any allocation."""
 
     def __init__(self, function: Any) -> None:

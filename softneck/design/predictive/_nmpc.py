@@ -31,7 +31,7 @@ from softneck.signals import TENDON_ANGLES, redefinition_matrix
 from ..linear._ports import controller_inputs, controller_outputs, limit_ports
 from ._gauss_newton import NonlinearProblem
 from ._model_steps import NONLINEAR_KINDS
-from ._nonlinear_solver import NonlinearSolver, Row
+from ._nonlinear_solver import NonlinearSolver, SampleSolution
 from ._settings import spaced_starts
 from ._tuning import move_weight
 
@@ -211,7 +211,7 @@ class NmpcController:
         names = [port.name for port in self.parameters]
         for name, value in parameters.items():
             if name not in names:
-                raise SettingsError(f"`{name}` is no parameter of nmpc; it has {', '.join(names)}.")
+                raise SettingsError(f"`{name}` is not a parameter of nmpc; it has {', '.join(names)}.")
             port = self.parameters[names.index(name)]
             require_between(name, float(value), port.minimum or 0.0, port.maximum or math.inf, port.unit)
             q[names.index(name)] = value
@@ -232,7 +232,7 @@ class NmpcController:
         values, out = self.solver.step(state.values, state.parameters, u)
         return State(values, state.parameters, out), out
 
-    def info(self, state: State) -> Row:
+    def info(self, state: State) -> SampleSolution:
         """Return what the sample that led to `state` decided."""
         return self.solver.row(state.values)
 

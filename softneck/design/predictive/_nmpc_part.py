@@ -11,7 +11,7 @@ import numpy as np
 from softneck.core import DataError, Vector
 
 from ._nmpc_prepared import NonlinearController
-from ._nonlinear_solver import Row
+from ._nonlinear_solver import SampleSolution
 
 
 class NmpcPart:
@@ -41,7 +41,7 @@ class NmpcPart:
         return outputs
 
     @property
-    def info(self) -> Row:
+    def info(self) -> SampleSolution:
         """What the last sample decided; `took` is how long it took [s]."""
         return self.controller.solver.row(self._values)
 

@@ -12,7 +12,7 @@ from softneck.core import Matrix, Vector
 from softneck.runtime import load_runtime
 
 from . import _mpc_state_runtime as rt
-from ._gauss_newton import Evaluated, compiled, qp_function
+from ._gauss_newton import BufferedFunction, compiled, qp_function
 from ._nmpc_prepared import COAST, SETTLE, NonlinearController, Preparation
 
 # Places in the head of the state.
@@ -25,7 +25,7 @@ _STATUS_NAMES = ("not started", "optimal", "softened", "previous plan", "holding
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Row:
+class SampleSolution:
     """What a sample decided.
 
     Attributes:
@@ -58,7 +58,7 @@ class NonlinearSolver:
         start = self._block.initial_state(use_measurement=0.0, noise_std=0.0)
         self._rest, self._free = start.values, start.parameters
         self.nx, self.nz = start.values.size, p.variables
-        self._evaluated = Evaluated(compiled(qp_function(p)))
+        self._evaluated = BufferedFunction(compiled(qp_function(p)))
         self._rows()
         self._places()
         self._model: Any = None
@@ -94,10 +94,10 @@ class NonlinearSolver:
         self._upper = -self._lower
         self._sense = np.zeros(self._lower.size, dtype=np.int32)
 
-    def row(self, values: Vector) -> Row:
+    def row(self, values: Vector) -> SampleSolution:
         """Return what the sample that led to `values` decided."""
         head = values[self._at["head"]]
-        return Row(
+        return SampleSolution(
             status=_STATUS_NAMES[int(head[_STATUS])], iterations=int(head[_ITERATIONS]),
             residual=float(head[_RESIDUAL]), previous_plan=int(head[_SHIFTED]), softened=int(head[_SOFTENED]),
             moves=values[self._at["plan"]].reshape(-1, 3).copy(),

@@ -31,7 +31,7 @@ from ._disturbance import MeasuredDisturbance
 from ._lti import system
 from ._prediction import Problem, matrices
 from ._scenarios import chosen_scenarios, sample_pairs
-from ._tightening import Trial, tightened
+from ._tightening import LimitTrial, tightened
 from ._tuning import FULL_TRUST, Pair, keeps_bounds, move_weight, observer_trust, radius, reference_time, sensitivity
 
 # Samples of the last hold: ten moves over thirty samples, dense where they matter.
@@ -254,9 +254,9 @@ class MpcSettings:
             guard=guard_samples(bandwidth, nominal[0].sample_time),
         )
 
-    def _trial(self) -> Trial:
+    def _trial(self) -> LimitTrial:
         """Return what tightening is tried with."""
-        return Trial(
+        return LimitTrial(
             parameters=(self.position_limit, self.slew_limit, self.lead_limit, self.least_position),
             angle_limit=self.angle_limit,
             minimum_tautness=self.minimum_tautness,

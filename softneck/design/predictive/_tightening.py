@@ -35,7 +35,7 @@ _SEED = 13
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Trial:
+class LimitTrial:
     """What the limits are tried with.
 
     Attributes:
@@ -53,7 +53,7 @@ class Trial:
 
 
 def tightened(
-    arrays: tuple[Matrix, ...], plants: list[Pair], trial: Trial
+    arrays: tuple[Matrix, ...], plants: list[Pair], trial: LimitTrial
 ) -> tuple[tuple[Matrix, ...], dict[str, float]]:
     """Return the arrays with the least back-off that was found to keep the limits, and that back-off [rad].
 
@@ -78,7 +78,7 @@ def tightened(
     )
 
 
-def excess(arrays: tuple[Matrix, ...], plants: Pair, trial: Trial) -> tuple[float, float]:
+def excess(arrays: tuple[Matrix, ...], plants: Pair, trial: LimitTrial) -> tuple[float, float]:
     """Return by how much [rad] angles and tautness pass their limits in all trials with one plant; below zero is room.
 
     A motor is taken to be where its set-point was a dead time before: in drives most of the dead time is theirs.
@@ -97,7 +97,7 @@ def excess(arrays: tuple[Matrix, ...], plants: Pair, trial: Trial) -> tuple[floa
 
 
 def closed_loop(
-    arrays: tuple[Matrix, ...], plants: Pair, trial: Trial, orientation: float, rng: np.random.Generator
+    arrays: tuple[Matrix, ...], plants: Pair, trial: LimitTrial, orientation: float, rng: np.random.Generator
 ) -> tuple[Matrix, Matrix]:
     """Return the true angles (time, 2) and motors (time, 3) of one trial."""
     step = load_runtime("softneck.design.predictive._mpc_runtime").step

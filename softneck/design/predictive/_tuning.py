@@ -145,7 +145,7 @@ def observer_trust(
         return FULL_TRUST
     if not keeps(_LEAST):
         raise SettingsError(
-            "no observer keeps the asked robustness; ask for less `bandwidth` or more `max_sensitivity`."
+            "no observer keeps the requested robustness; ask for less `bandwidth` or more `max_sensitivity`."
         )
     for _ in range(_HALVINGS // 2 + 2):
         middle = 0.5 * (low + high)

@@ -10,7 +10,7 @@ import numpy as np
 from softneck.core import SettingsError, require_between, require_one_of, require_positive
 
 from ..linear._axis_loop import error_feedback
-from ..linear._axis_settings import AxisSettings, Found, slowest_time
+from ..linear._axis_settings import AxisDesign, AxisSettings, slowest_time
 from ..plants._uncertain import UncertainAxis
 from ._synthesis import METHODS, Synthesis, mixsyn
 from ._weights import makeweight, ucover
@@ -57,7 +57,7 @@ class HinfSettings(AxisSettings):
         require_between("control_weight", self.control_weight, 1e-3, 100.0)
         require_one_of("method", self.method, METHODS)
 
-    def _synthesise(self, axis: UncertainAxis, name: str) -> Found:  # noqa: ARG002
+    def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:  # noqa: ARG002
         W3 = self._uncertainty(axis)
         if self.bandwidth is not None:
             return self._built(axis, self.bandwidth, W3)
@@ -66,7 +66,7 @@ class HinfSettings(AxisSettings):
             lambda speed: self._built(axis, speed, W3), axis, low=0.05 / lag, high=5.0 / lag, what="bandwidth"
         )
 
-    def _built(self, axis: UncertainAxis, bandwidth: float, W3: Any) -> Found:
+    def _built(self, axis: UncertainAxis, bandwidth: float, W3: Any) -> AxisDesign:
         import control
 
         gain, dt = axis.nominal.static_gain, axis.sample_time
@@ -76,7 +76,7 @@ class HinfSettings(AxisSettings):
         if W3 is not None:
             self._promise(found, G, W3, dt)
         K: Any = with_integrator(found.controller)
-        return Found(
+        return AxisDesign(
             error_feedback(control.StateSpace(K.A, K.B, K.C / gain, K.D / gain, dt)),
             {"bandwidth_rad_s": bandwidth},
             {"gamma": found.gamma, "achieved": found.achieved, "method": found.method},

@@ -125,7 +125,7 @@ def mu_upper(M: Array, structure: Structure) -> tuple[Vector, Matrix, Matrix]:
     size = np.maximum(np.linalg.norm(M, 2, axis=(1, 2)), 1e-300)
     x = _balanced(M, structure)
     theta = np.concatenate([x, np.zeros((M.shape[0], reals.size))], axis=1)
-    problem = _Problem(M / size[:, None, None], structure, reals)
+    problem = _EigenvalueProblem(M / size[:, None, None], structure, reals)
     best, where = problem.exact(theta), theta.copy()
     # The last d is free: only ratios count.
     free = np.ones(theta.shape[1])
@@ -140,7 +140,7 @@ def mu_upper(M: Array, structure: Structure) -> tuple[Vector, Matrix, Matrix]:
     return size * np.sqrt(np.maximum(best, 0.0)), np.exp(where[:, :n]), where[:, n:]
 
 
-class _Problem:
+class _EigenvalueProblem:
     """Largest eigenvalue of `M_D* M_D + j (G M_D - M_D* G)`, sharp and smoothed, with its gradient."""
 
     def __init__(self, M: Array, structure: Structure, reals: Array) -> None:
@@ -179,7 +179,7 @@ class _Problem:
         return scaled, G, 0.5 * (half + np.conj(np.swapaxes(half, 1, 2)))
 
 
-def _descend(problem: _Problem, start: Matrix, sharpness: Vector, free: Vector) -> Matrix:
+def _descend(problem: _EigenvalueProblem, start: Matrix, sharpness: Vector, free: Vector) -> Matrix:
     """Minimise the smoothed eigenvalue of all matrices at once by BFGS with backtracking (Nocedal and Wright 2006)."""
     theta = start.copy()
     m, p = theta.shape
@@ -210,7 +210,7 @@ def _descend(problem: _Problem, start: Matrix, sharpness: Vector, free: Vector) 
 
 
 def _backtrack(
-    problem: _Problem, t: Matrix, step: Matrix, f: Vector, slope: Vector, sharpness: Vector, which: Array
+    problem: _EigenvalueProblem, t: Matrix, step: Matrix, f: Vector, slope: Vector, sharpness: Vector, which: Array
 ) -> tuple[Matrix, Vector, Matrix]:
     # No step of a logarithm is longer than 2: what far scalings say is noise.
     length = np.minimum(1.0, 2.0 / np.maximum(np.abs(step).max(axis=1), 1e-300))

@@ -12,7 +12,7 @@ from softneck.core import SettingsError, require_positive
 
 from ..linear._assembly import AxisController
 from ..linear._axis_loop import conditioning_gain
-from ..linear._axis_settings import AxisSettings, Found, slowest_time
+from ..linear._axis_settings import AxisDesign, AxisSettings, slowest_time
 from ..plants._uncertain import UncertainAxis
 from ._bilinear import drawn_out, to_discrete
 from ._synthesis import ncf_parts
@@ -47,7 +47,7 @@ class NcfSettings(AxisSettings):
             if value is not None:
                 require_positive(name, value, unit)
 
-    def _synthesise(self, axis: UncertainAxis, name: str) -> Found:  # noqa: ARG002
+    def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:  # noqa: ARG002
         if self.crossover is not None:
             return self._built(axis, self.crossover)
         lag = slowest_time(axis.nominal) + axis.nominal.delay * axis.sample_time
@@ -55,7 +55,7 @@ class NcfSettings(AxisSettings):
             lambda speed: self._built(axis, speed), axis, low=0.05 / lag, high=5.0 / lag, what="crossover"
         )
 
-    def _built(self, axis: UncertainAxis, crossover: float) -> Found:
+    def _built(self, axis: UncertainAxis, crossover: float) -> AxisDesign:
         import control
 
         plant, dt = axis.nominal, axis.sample_time
@@ -73,7 +73,7 @@ class NcfSettings(AxisSettings):
                 f"{_LEAST_MARGIN:g}; lower `crossover`."
             )
         controller = _two_degrees(to_discrete(found.controller, dt), to_discrete(W, dt), gain)
-        return Found(
+        return AxisDesign(
             controller,
             {"crossover_rad_s": crossover, "Ti_s": time},
             {"gamma": found.gamma, "margin": found.margin},

@@ -298,7 +298,7 @@ def grid(system: Any, frequency: Vector | None) -> Vector:
 
 
 def is_data(system: Any) -> bool:
-    """Return whether `system` is frequency response data; refuse what is no system."""
+    """Return whether `system` is frequency response data; refuse what is not a system."""
     import control
 
     if not isinstance(system, control.StateSpace | control.TransferFunction | control.FrequencyResponseData):

@@ -263,13 +263,13 @@ def _verified(closed: Any, bound: float) -> float:
     largest = float(np.max(np.linalg.eigvals(np.asarray(closed.A)).real, initial=-np.inf))
     if largest >= 0.0:
         raise SettingsError(
-            f"what came out is not stable (a pole at {largest:.3g} rad/s): the problem is near singular. Weigh the "
+            f"the result is not stable (a pole at {largest:.3g} rad/s): the problem is near singular. Weigh the "
             "control effort more (W2), or build further `above` gamma."
         )
     response = np.moveaxis(np.asarray(closed(1j * np.geomspace(1e-4, 1e5, 400), squeeze=False)), -1, 0)
     size = float(np.linalg.norm(response, 2, axis=(1, 2)).max())
     if size > (1.0 + _SLACK) * bound:
-        raise SettingsError(f"what came out has a norm of {size:.4g}, beyond {bound:.4g}: scale the weights.")
+        raise SettingsError(f"the result has a norm of {size:.4g}, beyond {bound:.4g}: scale the weights.")
     return size
 
 
@@ -279,7 +279,7 @@ def _coprime(G: Any, K: Any) -> float:
 
     closed: Any = control.feedback(G * K, 1)
     if float(np.max(np.linalg.eigvals(np.asarray(closed.A)).real, initial=-np.inf)) >= 0.0:
-        raise SettingsError("what came out is not stable: shape a slower loop, or build further `above` gamma.")
+        raise SettingsError("the result is not stable: shape a slower loop, or build further `above` gamma.")
     s = 1j * np.geomspace(1e-4, 1e5, 400)
     g, k = np.asarray(G(s)), np.asarray(K(s))
     return float(np.max(np.sqrt((1.0 + np.abs(g) ** 2) * (1.0 + np.abs(k) ** 2)) / np.abs(1.0 + g * k)))

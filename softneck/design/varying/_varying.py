@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from softneck.core import FileFormatError, Matrix, Vector, write_archive
 from softneck.runtime import Block, Port, State
 
-from ..linear._limits import Limits
+from ..linear._limits import ControllerLimits
 from ..linear._ports import controller_inputs, controller_outputs
 
 
@@ -37,7 +37,7 @@ class VaryingController:
     runtime: str
     sample_time: float
     arrays: Mapping[str, Matrix]
-    limits: Limits
+    limits: ControllerLimits
     order: str
     parameters: tuple[Port, ...] = ()
     lines: tuple[str, ...] = ()
@@ -102,7 +102,7 @@ class VaryingController:
             runtime=RUNTIMES[kind],
             sample_time=float(header["sample_time"]),
             arrays=read,
-            limits=Limits(**header["limits"]),
+            limits=ControllerLimits(**header["limits"]),
             order=str(header["order"]),
             parameters=tuple(Port(**port) for port in header["parameters"]),
             lines=tuple(str(line) for line in header["lines"]),

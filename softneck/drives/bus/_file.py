@@ -242,7 +242,7 @@ def load_drives(path: str | Path) -> DrivesFile:
     except OSError as error:
         raise FileFormatError(f"{source}: cannot be read ({error.strerror}).") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise FileFormatError(f"{source}: is no TOML ({error}).") from error
+        raise FileFormatError(f"{source}: is not valid TOML ({error}).") from error
     try:
         return make_drives(table, source.parent)
     except (SettingsError, DataError, FileFormatError) as error:
@@ -383,7 +383,7 @@ def _table(name: str, value: Any) -> Mapping[str, Any]:
 def _refuse_unknown(where: str, table: Mapping[str, Any], known: tuple[str, ...]) -> None:
     unknown = [key for key in table if key not in known]
     if unknown:
-        raise SettingsError(f"`{unknown[0]}` is no key of {where}; it takes {', '.join(known)}.")
+        raise SettingsError(f"unknown key `{unknown[0]}` of {where}; it takes {', '.join(known)}.")
 
 
 def default_drives(profile: str = "ipos2015", **changes: Any) -> DrivesFile:

@@ -46,7 +46,7 @@ def load_eds(profile: str, path: Path | None = None) -> ObjectDictionary:
         dictionary = canopen.import_od(str(source))
     except Exception as error:  # canopen raises what its parser meets: KeyError, ValueError, configparser's
         raise FileFormatError(
-            f"{source}: is no EDS ({type(error).__name__}: {' '.join(str(error).split())})."
+            f"{source}: is not an EDS ({type(error).__name__}: {' '.join(str(error).split())})."
         ) from error
     if not isinstance(dictionary, ObjectDictionary) or not len(dictionary):
         raise FileFormatError(f"{source}: has no objects; is it an EDS?")
@@ -111,7 +111,7 @@ class Objects:
                 f"node {self.node} does not answer (object {place}); is it on, is its number right?"
             ) from error
         except (struct.error, ValueError, IndexError) as error:
-            raise SdoError(f"node {self.node} sends what is no answer (object {place}: {error}).") from error
+            raise SdoError(f"node {self.node} sends an invalid answer (object {place}: {error}).") from error
         except KeyError as error:
             raise SdoError(f"the EDS has no object {place}; it does not fit the drive's profile.") from error
 

@@ -7,7 +7,7 @@ import re
 
 _ADVICE = {
     errno.EACCES: "Serial adapters belong to the group `dialout`: `sudo usermod -aG dialout $USER`, then log in again",
-    errno.EPERM: "This user may not; ask who looks after the machine",
+    errno.EPERM: "This user is not permitted; ask whoever looks after the machine",
     errno.ENOENT: "Is it plugged in, is the name right? `ls /dev/serial/by-id` lists serial ports",
     errno.ENODEV: "`ip link show` lists the interfaces of this machine",
     errno.EBUSY: "Another program has it open; end that one",

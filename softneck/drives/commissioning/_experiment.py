@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from softneck.core import FileFormatError, SettingsError
-from softneck.signals import Excitation, Limits, prepare, signal
+from softneck.signals import Excitation, SetPointLimits, prepare, signal
 from softneck.signals.excitation._limits import Changes
 
 from ..running._signal import SignalPilot
@@ -28,7 +28,7 @@ class Experiment:
     """
 
     signal: str
-    limits: Limits
+    limits: SetPointLimits
     duration: float | None = None
     seed: int = 0
     runs: int = 1
@@ -62,6 +62,6 @@ class Experiment:
             FileFormatError: they are damaged, or of another version.
         """
         try:
-            return cls(**{**facts, "limits": Limits(**facts["limits"])})
+            return cls(**{**facts, "limits": SetPointLimits(**facts["limits"])})
         except (KeyError, TypeError, SettingsError) as error:
             raise FileFormatError(f"the log's experiment does not fit this softneck ({error}).") from error

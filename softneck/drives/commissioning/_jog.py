@@ -12,7 +12,7 @@ import numpy as np
 
 from softneck.core import CheckFailedError, SettingsError, Vector, require_between, require_whole
 
-from ..running._bus_loop import Ended, Session, run_session
+from ..running._bus_loop import RunEnd, Session, run_session
 from ..running._signal import SignalLog, SignalPilot, raised_cosine
 
 SAMPLE_TIME = 0.02
@@ -29,7 +29,7 @@ _NOISE = 0.35
 
 
 @dataclass(frozen=True, slots=True)
-class Jogged:
+class JogResult:
     """What a jog showed.
 
     Attributes:
@@ -52,7 +52,7 @@ class Jogged:
     turned: float
     verdict: str
     advice: str
-    ended: Ended
+    ended: RunEnd
 
     @property
     def holds(self) -> bool:
@@ -102,7 +102,7 @@ def jog(
     tendon_angles: tuple[float, float, float],
     amplitude: float = 0.5,
     report: Callable[[float], None] | None = None,
-) -> Jogged:
+) -> JogResult:
     """Pull the tendon of one motor a little, let it out as much, and look where the neck goes.
 
     The drives must be zeroed; the same pre-flight, ramps, supervisor, limits and watches as in a run.
@@ -115,7 +115,7 @@ def jog(
         report: called now and then with the done fraction.
 
     Raises:
-        SettingsError: no such motor, an amplitude that is none, or one beyond the limits of the drives file.
+        SettingsError: no such motor, an amplitude that is too small, or one beyond the limits of the drives file.
         CheckFailedError: the pre-flight failed; nothing moved.
     """
     require_whole("motor", motor, 1, 3)
@@ -144,7 +144,7 @@ def jog(
     if log.rows < len(path):
         nothing = (math.nan, math.nan)
         verdict, advice = _stopped(ended, motor)
-        return Jogged(motor, node, amplitude, (expected.real, expected.imag), nothing, math.nan, math.nan, verdict,
+        return JogResult(motor, node, amplitude, (expected.real, expected.imag), nothing, math.nan, math.nan, verdict,
                       advice, ended)  # fmt: skip
     columns = log.columns()
     angles = columns["pitch"] + 1j * columns["roll"]
@@ -155,7 +155,7 @@ def jog(
     verdict, advice = judge(seen, noise, expected, tendon_angles, motor)
     if verdict == "no movement" and turned < amplitude:
         advice = f"The motor itself turned by {turned:.2f} of {2.0 * amplitude:g} rad: is it blocked? {advice}"
-    return Jogged(motor, node, amplitude, (expected.real, expected.imag), (seen.real, seen.imag), noise, turned,
+    return JogResult(motor, node, amplitude, (expected.real, expected.imag), (seen.real, seen.imag), noise, turned,
                   verdict, advice, ended)  # fmt: skip
 
 
@@ -167,7 +167,7 @@ def jog_pilot(motor: int, amplitude: float) -> SignalPilot:
     return SignalPilot(set_points)
 
 
-def _stopped(ended: Ended, motor: int) -> tuple[str, str]:
+def _stopped(ended: RunEnd, motor: int) -> tuple[str, str]:
     """Return verdict and advice for a jog that did not get to its end.
 
     A tendon can only pull: a motor whose current says that it is pushed has the wrong sign.

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from softneck.core import CheckFailedError, DataError, SettingsError, Vector
-from softneck.signals import SET_POINTS, Excitation, Limits, Recording
+from softneck.signals import SET_POINTS, Excitation, Recording, SetPointLimits
 
 from ..bus._file import DrivesFile
 from ..logs._rows import experiment_recording
 from ..master import Frame, Master, Tilt
-from ..running._bus_loop import Ended, Session, run_session
+from ..running._bus_loop import RunEnd, Session, run_session
 from ..running._signal import SignalLog, SignalPilot
 
 # Between two runs the motors stand at rest for this long [s]: 15 time constants of the neck.
@@ -27,7 +27,7 @@ _SLACK = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Recorded:
+class ExperimentResult:
     """An experiment that is over.
 
     Attributes:
@@ -38,7 +38,7 @@ class Recorded:
 
     recording: Recording | None
     planned: int
-    ended: Ended
+    ended: RunEnd
 
     @property
     def rows(self) -> int:
@@ -68,7 +68,7 @@ class Recorded:
 
 def drive_limits(
     file: DrivesFile, *, position: float | None = None, speed: float | None = None, slack: float | None = None
-) -> Limits:
+) -> SetPointLimits:
     """Return limits for a signal within those of the drives file; those of the file where none are given.
 
     Raises:
@@ -82,7 +82,7 @@ def drive_limits(
     ):
         if value is not None and value > most:
             raise SettingsError(f"{name} {value:g} is beyond the {most:g} {unit} of [limits] in the drives file.")
-    return Limits(
+    return SetPointLimits(
         position=own.position if position is None else position,
         # A quarter of what the drives take: with their current limit the motors follow the quickest signals up to
         # there: Eq. 22 leaves the paper's motors 1.5 rad behind for 0.28 s at a third, for 0.04 s at a quarter.
@@ -96,7 +96,7 @@ def record_signal(
     session: Session,
     *,
     report: Callable[[float], None] | None = None,
-) -> Recorded:
+) -> ExperimentResult:
     """Play `excitations` one after the other, as runs 1, 2, ...; between them the motors rest for 3 s.
 
     The same pre-flight, supervisor, limits and watches as for a controller; a fault ends the experiment, and what was
@@ -126,7 +126,7 @@ def record_signal(
     session = replace(session, watches=(log, tell, *session.watches))
     ended = run_session(session, SignalPilot(set_points), sample_time=sample_time, most=len(run) * sample_time)
     recording = experiment_recording(log.columns(), run[: log.rows], sample_time)
-    return Recorded(recording, int(np.count_nonzero(run)), ended)
+    return ExperimentResult(recording, int(np.count_nonzero(run)), ended)
 
 
 def joined(excitations: Sequence[Excitation], sample_time: float) -> tuple[np.ndarray, Vector]:

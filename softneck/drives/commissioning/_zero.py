@@ -46,7 +46,7 @@ Look = Callable[[], Tilt | None]
 
 
 @dataclass(frozen=True, slots=True)
-class Zeroed:
+class ZeroResult:
     """What zeroing found, for each motor.
 
     Attributes:
@@ -125,7 +125,7 @@ class _Motor:
                 wait(self.link, _LOOK)
 
 
-def zero(link: Link, file: DrivesFile, look: Look, *, guarding: str, operator: Operator | None = None) -> Zeroed:
+def zero(link: Link, file: DrivesFile, look: Look, *, guarding: str, operator: Operator | None = None) -> ZeroResult:
     """Tension the tendons of motors 1 to 3, set the encoders' zero there, verify, and switch the drives off.
 
     Args:
@@ -155,7 +155,7 @@ def zero(link: Link, file: DrivesFile, look: Look, *, guarding: str, operator: O
     finally:
         _off(motors, guarding)
     pulled = tuple(motor.pulled for motor in motors)
-    return Zeroed(file.nodes, pulled, tilt.pitch, tilt.roll)
+    return ZeroResult(file.nodes, pulled, tilt.pitch, tilt.roll)
 
 
 def _tension(link: Link, motor: _Motor, guard: Callable[[], None]) -> None:

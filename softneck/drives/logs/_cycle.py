@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from ..master import Frame, Master, Tilt
-from ..master._measured import Measured, Pilot
+from ..master._measured import Measurement, Pilot
 
 Triple = tuple[float, float, float]
 # What the pilot was asked and what it said: ("start", None), ("finished", bool), ("step", set-points or None), or
@@ -58,7 +58,7 @@ class LoggedPilot:
             raise
         self._answers.append(("start", None))
 
-    def step(self, measured: Measured) -> Triple | None:
+    def step(self, measured: Measurement) -> Triple | None:
         """Return what the pilot returns."""
         try:
             answer = self._pilot.step(measured)

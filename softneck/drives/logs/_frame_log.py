@@ -49,7 +49,7 @@ class BlfSink:
         from can.io.blf import BLFWriter
 
         # The writer closes its stream; flushing and renaming are ours.
-        self._writer = BLFWriter(_Kept(stream), max_container_size=_BLF_PIECE)  # pyright: ignore[reportArgumentType]
+        self._writer = BLFWriter(_UnclosableStream(stream), max_container_size=_BLF_PIECE)  # pyright: ignore[reportArgumentType]
 
     def add(self, time: float, from_master: bool, frame: Frame) -> None:
         """Write one frame."""
@@ -74,7 +74,7 @@ class BlfSink:
         self._writer.stop()
 
 
-class _Kept(io.BufferedIOBase):
+class _UnclosableStream(io.BufferedIOBase):
     """A stream that python-can may not close."""
 
     def __init__(self, stream: BinaryIO) -> None:

@@ -91,7 +91,7 @@ class LoggedRun:
             DataError: the controller did not run.
         """
         if len(self.rows) < 2:
-            raise DataError(f"{self.path}: the controller did not run, so that there is nothing to identify from.")
+            raise DataError(f"{self.path}: the controller did not run, so there is nothing to identify from.")
         times = np.array([cycle.time for cycle in self.cycles])
         positions = np.array([cycle.positions for cycle in self.cycles]).reshape(-1, 3)
         if "run" not in self.rows[0]:
@@ -104,7 +104,7 @@ class LoggedRun:
         run = np.array([row["run"] for row in self.rows])
         recording = experiment_recording(columns, run, self.sample_time)
         if recording is None:
-            raise DataError(f"{self.path}: holds no angles, so that there is nothing to identify from.")
+            raise DataError(f"{self.path}: holds no angles, so there is nothing to identify from.")
         return recording
 
 
@@ -112,7 +112,7 @@ def read_run_log(path: str | Path) -> LoggedRun:
     """Read a `.mcap` log of `softneck drives`; one that is cut is read up to the cut.
 
     Raises:
-        FileFormatError: no such file, no MCAP, or none of ours.
+        FileFormatError: no such file, not MCAP, or not a log of softneck.
     """
     from mcap.records import Channel, Message, Metadata
     from mcap.stream_reader import StreamReader
@@ -148,10 +148,10 @@ def read_run_log(path: str | Path) -> LoggedRun:
         raise
     except _damage() as error:
         if facts is None:
-            raise FileFormatError(f"{source}: is no log of `softneck drives` ({_word(error)}).") from error
+            raise FileFormatError(f"{source}: is not a log of `softneck drives` ({_word(error)}).") from error
         cut = f"ends in the middle ({_word(error)})"
     if facts is None:
-        raise FileFormatError(f"{source}: is MCAP, but no log of `softneck drives`: it has no `{METADATA}`.")
+        raise FileFormatError(f"{source}: is MCAP, but not a log of `softneck drives`: it has no `{METADATA}`.")
     return LoggedRun(source, facts, tuple(cycles), tuple(rows), tuple(events), cut, tuple(at))
 
 
@@ -170,7 +170,7 @@ def _facts(source: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
 def _table(data: bytes) -> dict[str, Any]:
     table = json.loads(data)
     if not isinstance(table, dict):
-        raise ValueError("a message that is no table")  # noqa: TRY004  (bad content, told with all other damage)
+        raise ValueError("a message that is not a table")  # noqa: TRY004  (bad content, told with all other damage)
     return table
 
 

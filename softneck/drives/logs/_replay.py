@@ -10,7 +10,7 @@ from softneck.core import CheckFailedError, DataError
 
 from ..bus._meaning import meaning
 from ..master import Master
-from ..master._measured import Measured, Pilot
+from ..master._measured import Measurement, Pilot
 from ._cycle import Answer, Cycle, LoggedPilot, Triple, cycle_of
 from ._log_file import LoggedRun
 
@@ -81,7 +81,7 @@ class Replay:
         }  # fmt: skip
 
 
-class _Recalled:
+class _ReplayPilot:
     """A pilot that answers what the log says that one answered."""
 
     def __init__(self) -> None:
@@ -90,7 +90,7 @@ class _Recalled:
     def start(self) -> None:
         self._next("start")
 
-    def step(self, measured: Measured) -> Triple | None:
+    def step(self, measured: Measurement) -> Triple | None:
         del measured
         return self._next("step")
 
@@ -100,7 +100,7 @@ class _Recalled:
 
     def _next(self, what: str) -> Any:
         if not self.answers or self.answers[0][0] != what:
-            raise _Astray(f"the core asked for `{what}`, which it did not in the logged run")
+            raise _DivergenceError(f"the core asked for `{what}`, which it did not in the logged run")
         value = self.answers.pop(0)[1]
         if isinstance(value, str):
             # The same event has the same text; the exception itself is gone.
@@ -109,7 +109,7 @@ class _Recalled:
         return value
 
 
-class _Astray(Exception):
+class _DivergenceError(Exception):
     """The replayed core asks for what the logged one did not."""
 
 
@@ -127,7 +127,7 @@ def replay(log: LoggedRun, pilot: Pilot | None = None, notes: Iterable[str] = ()
     """
     if not log.cycles:
         raise DataError(f"{log.path}: holds no cycle of the master; there is nothing to replay.")
-    recalled = _Recalled()
+    recalled = _ReplayPilot()
     listened = LoggedPilot(recalled if pilot is None else pilot)
     master = Master(log.settings(), listened)
     begin, frames, answers, found = log.cycles[0].time, 0, 0, None

@@ -59,7 +59,7 @@ def require_unstopped(fault: Event | None, *, rehome: bool = False) -> None:
         raise CheckFailedError(f"stopped at t = {fault.time:.3f} s by the operator. The drives are off.{after}")
     # Where no word reaches the drives, what they do is theirs, and nobody here can know it.
     off = (
-        "Nobody reaches the drives, whose own guarding stops them within 0.1 s"
+        "The drives cannot be reached; their own guarding stops them within 0.1 s"
         if fault.name in _UNHEARD
         else ("The drives are off")
     )

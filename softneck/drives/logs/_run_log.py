@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 from softneck import __version__
-from softneck.core import OutputError, SettingsError, file_hash, refuse_existing
+from softneck.core import OutputFileError, SettingsError, file_hash, refuse_existing
 
 from ..master import Event, Frame, Master, MasterSettings, Tilt
 from ._cycle import Cycle, LoggedPilot, cycle_of, encode_cycle
@@ -82,8 +82,8 @@ def require_log_paths(paths: Sequence[Path], *, force: bool = False) -> None:
     """Raise where `RunLogger` would not write to `paths`.
 
     Raises:
-        SettingsError: an ending that is none of a log.
-        OutputError: a file exists.
+        SettingsError: an ending that no log has.
+        OutputFileError: a file exists.
     """
     for path in paths:
         if path.suffix.lower() not in (RUN_LOG, *FRAME_LOGS):
@@ -128,8 +128,8 @@ class RunLogger:
                 does not matter.
 
         Raises:
-            SettingsError: an ending that is none of a log, or two alike.
-            OutputError: a file exists or cannot be written.
+            SettingsError: an ending that no log has, or two alike.
+            OutputFileError: a file exists or cannot be written.
         """
         self.paths = tuple(paths)
         require_log_paths(self.paths, force=force)
@@ -147,7 +147,7 @@ class RunLogger:
                 stream = partial(path).open("wb")
             except OSError as error:
                 self._close_streams()
-                raise OutputError(f"{path}: cannot be written: {error.strerror}. Choose another folder.") from error
+                raise OutputFileError(f"{path}: cannot be written: {error.strerror}. Choose another folder.") from error
             self._streams.append(stream)
             kind = {RUN_LOG: _McapSink, ".log": CandumpSink, ".blf": BlfSink}[path.suffix.lower()]
             self._sinks.append(kind(stream))
@@ -203,7 +203,7 @@ class RunLogger:
         """Write what is left and give the files their names.
 
         Raises:
-            OutputError: a log is not complete; the line says why.
+            OutputFileError: a log is not complete; the line says why.
         """
         if not self._thread.is_alive() and not self._streams:
             return
@@ -213,11 +213,11 @@ class RunLogger:
         self._close_streams()
         if self.problem:
             names = ", ".join(str(partial(path)) for path in self.paths)
-            raise OutputError(f"{names}: the log is not complete: {self.problem}. The run went on without it.")
+            raise OutputFileError(f"{names}: the log is not complete: {self.problem}. The run went on without it.")
         for path in self.paths:
             partial(path).replace(path)
         if self.lost:
-            raise OutputError(f"{self.paths[0]}: {self.lost} cycle(s) were dropped: the disk did not keep up.")
+            raise OutputFileError(f"{self.paths[0]}: {self.lost} cycle(s) were dropped: the disk did not keep up.")
 
     def _swap(self) -> list[tuple[float, bool, Frame]]:
         frames, self._frames = self._frames, []

@@ -69,7 +69,7 @@ class Gate:
         return good
 
     def _reason(self, now: float, sample: Tilt) -> str:
-        """Return why `sample` is none, "" if it may be one."""
+        """Return why `sample` is not valid, "" if it may be."""
         s = self._settings
         if not (math.isfinite(sample.pitch) and math.isfinite(sample.roll)):
             return "not finite"

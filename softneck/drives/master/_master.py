@@ -12,7 +12,7 @@ from ._fieldbus import Fieldbus
 from ._frame import Frame
 from ._gate import Gate, Tilt
 from ._limiter import Limiter
-from ._measured import Measured, Pilot, Triple
+from ._measured import Measurement, Pilot, Triple
 from ._settings import MasterSettings
 from ._supervisor import ACTIVE, FINAL, GOALS, Phase, Signal, Supervisor
 from ._watches import Leaky, Watches
@@ -314,7 +314,7 @@ class Master:
                 self._arrived_at = _NEVER
                 self._ramp(now, events)
                 return
-            answer = self.pilot.step(Measured(self._index, tilt, fresh, self.positions))
+            answer = self.pilot.step(Measurement(self._index, tilt, fresh, self.positions))
             if answer is None:
                 self._missing += 1
                 self._from = self.wanted

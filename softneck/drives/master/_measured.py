@@ -11,7 +11,7 @@ Triple = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class Measurement:
     """What the pilot gets at a sample.
 
     Attributes:
@@ -34,7 +34,7 @@ class Pilot(Protocol):
         """Begin anew."""
         ...
 
-    def step(self, measured: Measured) -> Triple | None:
+    def step(self, measured: Measurement) -> Triple | None:
         """Return the set-points [rad]; None if there are none in time."""
         ...
 

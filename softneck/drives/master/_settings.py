@@ -50,8 +50,8 @@ class SensorSettings:
     Attributes:
         dropout: without a valid sample for this long the sensor counts as lost [s].
         frozen_samples: identical raw samples in a row until it counts as frozen.
-        bad_samples: samples in a row that are no angles until it stops.
-        angle: |pitch|, |roll| beyond this are no angles of this neck [rad].
+        bad_samples: samples in a row that are not angles until it stops.
+        angle: |pitch|, |roll| beyond this are not angles of this neck [rad].
         rate: faster changes are outliers [rad/s].
         margin: change that is always allowed: noise [rad].
         on_loss: "rest" or "hold": where to ramp when the sensor is lost.

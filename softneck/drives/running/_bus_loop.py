@@ -79,7 +79,7 @@ class Session:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Ended:
+class RunEnd:
     """A run that is over; its drives are off.
 
     Attributes:
@@ -123,7 +123,7 @@ class Ended:
 
 def run_session(
     session: Session, pilot: Pilot, *, sample_time: float, most: float, begin: Callable[[Master], None] | None = None
-) -> Ended:
+) -> RunEnd:
     """Check the drives, enable them, ramp in, let `pilot` lead, ramp out, switch off.
 
     On a bus SIGTERM ends it by the ramp to rest, a second one at once. A service manager is told (sd_notify) when the
@@ -153,7 +153,7 @@ def _run_session(
     most: float,
     begin: Callable[[Master], None] | None,
     notifier: Notifier,
-) -> Ended:
+) -> RunEnd:
     file, link = session.file, session.link
     file.master_settings(sample_time)
     log = session.log
@@ -191,7 +191,7 @@ def _run_session(
         with ending.watched():
             _in_real_time(session, link, master, times, notifier, ending)
     disarm(link, file, checked.guarding)
-    return Ended(master, times, time.perf_counter() - started, ending.asked > 0, tensions[0])
+    return RunEnd(master, times, time.perf_counter() - started, ending.asked > 0, tensions[0])
 
 
 def _in_virtual_time(

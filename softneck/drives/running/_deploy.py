@@ -26,12 +26,12 @@ from ._virtual import Watch, simulated_neck
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Deployed:
+class Deployment:
     """A loop that is ready for drives.
 
     Attributes:
         loop: with the controller that is to run.
-        neck: the virtual neck that the loop's plant is, None if it is none.
+        neck: the loop's plant if that is a virtual neck, else None.
         notes: what of the loop file does not apply on drives.
     """
 
@@ -40,8 +40,8 @@ class Deployed:
     notes: tuple[str, ...] = ()
 
 
-def prepare(setup: LoopSetup, controller: Path | None = None) -> Deployed:
-    """Return the loop of `setup` with the controller in file `controller`, an FMU or a file of ours.
+def prepare(setup: LoopSetup, controller: Path | None = None) -> Deployment:
+    """Return the loop of `setup` with the controller in file `controller`, an FMU or a softneck file.
 
     Raises:
         SettingsError: a controller that does not fit the loop.
@@ -55,8 +55,8 @@ def prepare(setup: LoopSetup, controller: Path | None = None) -> Deployed:
             part = BlockPart(load(controller, role="controller").block())
         loop = replace(loop, controller=part)
     if loop.faults:
-        notes.append(f"the loop file's {len(loop.faults)} fault(s) are not acted out on drives")
-    return Deployed(loop, neck_of(loop), tuple(notes))
+        notes.append(f"the loop file's {len(loop.faults)} fault(s) are not applied to drives")
+    return Deployment(loop, neck_of(loop), tuple(notes))
 
 
 def neck_of(loop: Loop) -> NeckParameters | None:
@@ -78,7 +78,7 @@ def noise_seed(loop: Loop) -> int:
 
 
 def run_simulated(
-    deployed: Deployed,
+    deployed: Deployment,
     file: DrivesFile,
     *,
     neck: NeckParameters | None = None,
@@ -114,7 +114,7 @@ def run_simulated(
     """
     parameters = neck or deployed.neck
     if parameters is None:
-        raise SettingsError("the loop's plant is no virtual neck; say which one the drives shall turn (--neck).")
+        raise SettingsError("the loop's plant is not a virtual neck; say which one the drives are to turn (--neck).")
     loop = deployed.loop
     pilot = LoopPilot(loop)
     virtual = simulated_neck(file, parameters, sample_time=pilot.sample_time, seed=noise_seed(loop))
@@ -132,7 +132,7 @@ def run_simulated(
 
 
 def run_on_bus(
-    deployed: Deployed,
+    deployed: Deployment,
     file: DrivesFile,
     link: CanLink,
     sensor: Sensor,
@@ -175,7 +175,7 @@ def run_on_bus(
 
 
 def _run(
-    deployed: Deployed, pilot: LoopPilot, session: Session, report: Callable[[float], None] | None
+    deployed: Deployment, pilot: LoopPilot, session: Session, report: Callable[[float], None] | None
 ) -> DrivesResult:
     log = RunLog(pilot)
     rows = max(1, round(deployed.loop.duration / pilot.sample_time))

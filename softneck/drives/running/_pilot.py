@@ -12,7 +12,7 @@ from softneck.loop._order import step_order
 from softneck.loop._wiring import wire
 
 from ..master import Tilt
-from ..master._measured import Measured
+from ..master._measured import Measurement
 
 _ANGLES = ("pitch", "roll", "pitch_rate", "roll_rate")
 
@@ -71,9 +71,9 @@ class LoopPilot:
     def warm(self) -> None:
         """Step all parts once with the neck at rest: what compiles or loads at its first call does so before a run."""
         self.start()
-        self.step(Measured(0, Tilt(0.0, 0.0), True, (0.0, 0.0, 0.0)))
+        self.step(Measurement(0, Tilt(0.0, 0.0), True, (0.0, 0.0, 0.0)))
 
-    def step(self, measured: Measured) -> tuple[float, float, float] | None:
+    def step(self, measured: Measurement) -> tuple[float, float, float] | None:
         """Step observer and controller with what was measured now."""
         time = measured.index * self.sample_time
         bus = self._bus
@@ -116,7 +116,7 @@ class LoopPilot:
         """All signals of the last step, at the places that `slot` tells."""
         return self._bus
 
-    def _measure(self, measured: Measured) -> None:
+    def _measure(self, measured: Measurement) -> None:
         tilt, bus, places = measured.tilt, self._bus, self._places
         for name, place in self._tilts:
             value = getattr(tilt, name)

@@ -41,7 +41,7 @@ _NO_CSP_BIT = 0x001F0065
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class PreflightCheck:
     """One line of the report.
 
     Attributes:
@@ -69,7 +69,7 @@ class Report:
         overridden: names that were let pass by the user.
     """
 
-    rows: tuple[Row, ...]
+    rows: tuple[PreflightCheck, ...]
     guarding: str
     overridden: tuple[str, ...] = ()
 
@@ -102,11 +102,11 @@ class Report:
 
 
 @dataclass(slots=True)
-class _Rows:
-    rows: list[Row] = field(default_factory=list)
+class _Checks:
+    rows: list[PreflightCheck] = field(default_factory=list)
 
     def add(self, node: int, name: str, found: str, holds: bool, advice: str = "") -> None:
-        self.rows.append(Row(node, name, found, holds, "" if holds else advice))
+        self.rows.append(PreflightCheck(node, name, found, holds, "" if holds else advice))
 
 
 def foreign_master(frames: Sequence[Frame]) -> str:
@@ -205,7 +205,7 @@ def preflight(
     """
     dictionary = load_eds(file.profile, file.eds)
     require_eds(dictionary, file.profile, str(file.eds or f"{file.profile}.eds"))
-    rows = _Rows()
+    rows = _Checks()
     other = listen(link, file.nodes)
     rows.add(0, "second master", other or "none", not other, "Stop the other master before this one starts.")
     if other:
@@ -233,7 +233,7 @@ def preflight(
     return Report(tuple(rows.rows), guarding, tuple(override))
 
 
-def _check_sensor(link: Link, file: DrivesFile, sensor: Sensor, rows: _Rows) -> None:
+def _check_sensor(link: Link, file: DrivesFile, sensor: Sensor, rows: _Checks) -> None:
     """Look for one sample that may be an angle of the neck; a drive must not get power without."""
     on_bus = file.sensor_kind == "can"
     if on_bus:
@@ -246,15 +246,15 @@ def _check_sensor(link: Link, file: DrivesFile, sensor: Sensor, rows: _Rows) -> 
         angles = [math.degrees(angle) for angle in (tilt.pitch, tilt.roll)]
         holds = tilt.valid and all(abs(angle) <= math.degrees(file.sensor.angle) for angle in angles)
         found = f"pitch {angles[0]:.2f}, roll {angles[1]:.2f} deg"
-        advice = "That is no angle of the neck: is it mounted upright, is it the right sensor?"
+        advice = "The neck cannot have that angle: is it mounted upright, is it the right sensor?"
     rows.add(node, "inclinometer", found, holds, getattr(sensor, "problem", "") or advice)
 
 
-def _check_drive(objects: Objects, file: DrivesFile, entry: DriveEntry, guarding: str, rows: _Rows) -> str:
+def _check_drive(objects: Objects, file: DrivesFile, entry: DriveEntry, guarding: str, rows: _Checks) -> str:
     """Add the rows of one drive; return the guarding it got."""
     node = entry.node
     kind = objects.read(0x1000)
-    rows.add(node, "present", f"device type {kind:08X}h", kind & 0xFFFF == _DRIVE, "It is no CiA 402 drive.")
+    rows.add(node, "present", f"device type {kind:08X}h", kind & 0xFFFF == _DRIVE, "It is not a CiA 402 drive.")
     _check_identity(objects, entry, rows)
     _check_factors(objects, node, rows)
     word = objects.read(0x6041)
@@ -277,7 +277,7 @@ def _check_drive(objects: Objects, file: DrivesFile, entry: DriveEntry, guarding
     return guarding
 
 
-def _check_identity(objects: Objects, entry: DriveEntry, rows: _Rows) -> None:
+def _check_identity(objects: Objects, entry: DriveEntry, rows: _Checks) -> None:
     wrong, found = [], []
     for name, subindex, wanted in (("vendor", 1, entry.vendor), ("product", 2, entry.product),
                                    ("serial", 4, entry.serial)):  # fmt: skip
@@ -292,7 +292,7 @@ def _check_identity(objects: Objects, entry: DriveEntry, rows: _Rows) -> None:
     rows.add(entry.node, "firmware", firmware or "not told", holds, f"The drives file says {entry.firmware}.")
 
 
-def _check_factors(objects: Objects, node: int, rows: _Rows) -> None:
+def _check_factors(objects: Objects, node: int, rows: _Checks) -> None:
     wrong = []
     for index in (0x6093, 0x6094, 0x6097):
         pair = [_or_none(lambda i=index, s=sub: objects.read(i, s)) for sub in (1, 2)]
@@ -302,7 +302,7 @@ def _check_factors(objects: Objects, node: int, rows: _Rows) -> None:
     rows.add(node, "factor group", ", ".join(wrong) or "neutral", not wrong, advice)
 
 
-def _check_modes(objects: Objects, node: int, rows: _Rows) -> None:
+def _check_modes(objects: Objects, node: int, rows: _Checks) -> None:
     modes = objects.read(0x6502) & 0xFFFFFFFF
     said = bool(modes & 0x80) or modes == _NO_CSP_BIT
     try:
@@ -324,7 +324,7 @@ def _probe(objects: Objects) -> str:
     return "heartbeat"
 
 
-def _apply(objects: Objects, topic: str, writes: Sequence[Write], rows: _Rows) -> None:
+def _apply(objects: Objects, topic: str, writes: Sequence[Write], rows: _Checks) -> None:
     """Write all of one topic and read each back."""
     for write in writes:
         place = f"{write.index:04X}h:{write.subindex}"

@@ -14,7 +14,7 @@ from ..bus._link import VirtualLink
 from ..logs._motion import Motion
 from ..logs._rows import COLUMNS, experiment_channels
 from ..master import Frame, Master, Phase, Tilt
-from ..master._measured import Measured
+from ..master._measured import Measurement
 
 if TYPE_CHECKING:
     from ._bus_loop import Session
@@ -30,7 +30,7 @@ class SignalPilot:
     def start(self) -> None:
         """Nothing is kept between samples."""
 
-    def step(self, measured: Measured) -> tuple[float, float, float] | None:
+    def step(self, measured: Measurement) -> tuple[float, float, float] | None:
         """Return the set-points of this sample."""
         return self._rows[measured.index]
 

@@ -44,7 +44,7 @@ class PythonInclinometer:
             return None
         try:
             if not isinstance(answer, Tilt):
-                raise TypeError(f"{type(answer).__name__} {answer!r:.60} is no softneck.drives.master.Tilt")
+                raise TypeError(f"{type(answer).__name__} {answer!r:.60} is not a softneck.drives.master.Tilt")
             pitch, roll, pitch_rate, roll_rate = (float(value) for value in answer[:4])
         except (TypeError, ValueError) as error:
             self._end(f"`read` returned no sample: {error}")
@@ -74,7 +74,7 @@ class PythonInclinometer:
         return answer
 
     def _end(self, problem: str) -> None:
-        self._ended, self.problem = True, f"{problem}. It was asked no more."
+        self._ended, self.problem = True, f"{problem}. It was not asked again."
 
 
 def make_python_sensor(python: str, options: Mapping[str, Any], folder: Path) -> PythonInclinometer:

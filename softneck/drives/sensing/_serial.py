@@ -32,7 +32,7 @@ class SensorError(SoftneckError):
 
 
 def tilt_of_line(line: bytes) -> Tilt | None:
-    """Return the tilt that one line says, None if it is none; `line` without its end.
+    """Return the tilt that one line says, None if it says none; `line` without its end.
 
     At exactly no inclination the sensor's orientation is 0/0 and reads `nan`: the neck is upright then.
     """

@@ -26,7 +26,7 @@ from ._server import STATES, serve
 @click.option("--neck", default="paper", show_default=True, help="paper, lab or a neck file (.toml).")
 @click.option("--profile", type=click.Choice(list(PROFILES)), default="ipos2015", show_default=True)
 @click.option("--homed", is_flag=True, help="As if `softneck drives zero` had been run.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Of the inclinometer's noise.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Seed of the inclinometer's noise.")
 @click.option("--report", is_flag=True, help="Print one JSON line for each change of a drive's power state.")
 @click.option("--cycle", type=float, default=0.01, show_default=True, help="Bus period the drives expect [s].")
 @click.option("--sensor-socket", type=click.Path(path_type=Path),

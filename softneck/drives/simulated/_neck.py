@@ -142,7 +142,7 @@ class SimulatedNeck:
         """
         for name, value in disturbance.items():
             if name not in _DISTURBANCES:
-                raise SettingsError(f"`{name}` is no disturbance; the neck has {', '.join(_DISTURBANCES)}.")
+                raise SettingsError(f"`{name}` is not a disturbance; the neck has {', '.join(_DISTURBANCES)}.")
             self.disturbance[_DISTURBANCES.index(name)] = value
 
     def tear(self, tendon: int) -> None:

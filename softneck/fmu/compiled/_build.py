@@ -58,16 +58,16 @@ def build_compiled_fmu(
         platforms: that the FMU must run on, e.g. "x86_64-windows"; none: all whose library is here.
 
     Raises:
-        SettingsError: NAME is no FMI identifier, the kind cannot be compiled, or a platform is not built.
+        SettingsError: NAME is not an FMI identifier, the kind cannot be compiled, or a platform is not built.
         FileFormatError: a library is damaged.
-        OutputError: the file exists or cannot be written.
+        OutputFileError: the file exists or cannot be written.
     """
     target = Path(path)
     name = model_name(target)
     refuse_existing(target, force=force)
     check_block(block)
     if fmi not in FMI_VERSIONS:
-        raise SettingsError(f"FMI {fmi} is not known; take 2 or 3.")
+        raise SettingsError(f"unknown FMI version {fmi}; use 2 or 3.")
     modules = node_of(block.runtime, block.arrays).modules
     library = find_library()
     _check_kinds(modules, library.sources)
@@ -90,7 +90,7 @@ def _folders(library: Library, wanted: Sequence[str], fmi: int) -> list[tuple[st
     """Return (folder, suffix, bytes) of each library that goes into the FMU."""
     for name in wanted:
         if name not in PLATFORMS:
-            raise SettingsError(f"there is no platform `{name}`; known are {', '.join(PLATFORMS)}.")
+            raise SettingsError(f"unknown platform `{name}`; use one of {', '.join(PLATFORMS)}.")
         if name not in library.binaries:
             raise SettingsError(
                 f"the library for {name} is not built, only that for {', '.join(library.binaries)}; "

@@ -48,7 +48,7 @@ def compile_for(sources: Sources, platform: Platform) -> bytes:
         SettingsError: zig is not here, or refused the sources.
     """
     if not have_zig():
-        raise SettingsError("zig is not here; install it with `pip install ziglang`.")
+        raise SettingsError("zig is not installed; install it with `pip install ziglang`.")
     extra = [] if platform.system == "win32" else ["-fPIC"]
     # Names of what nobody calls from outside: zig's linker for macOS would keep them.
     gather = ["-Wl,-x"] if platform.system == "darwin" else ["-Wl,--gc-sections"]

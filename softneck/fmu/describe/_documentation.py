@@ -14,7 +14,7 @@ from ._response import response_figure
 MINIMUM_PYTHON = (3, 11)
 HOST_NEEDS = (
     f"The host needs Python {'.'.join(map(str, MINIMUM_PYTHON))} or newer with numpy (nothing of softneck); "
-    "a host that is no Python program finds it through LD_PRELOAD=libpython3.x.so and PYTHONPATH."
+    "a host that is not a Python program finds it through LD_PRELOAD=libpython3.x.so and PYTHONPATH."
 )
 _NUMBA = (
     "Where the host has numba too, a runtime that is slow in plain Python is compiled or taken from softneck's cache; "

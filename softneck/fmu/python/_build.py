@@ -48,8 +48,8 @@ def build_fmu(block: Block, path: str | Path, *, info: FmuInfo | None = None, fo
         force: replace an existing file.
 
     Raises:
-        SettingsError: NAME is no FMI identifier, or the block cannot be packaged.
-        OutputError: the file exists or cannot be written.
+        SettingsError: NAME is not an FMI identifier, or the block cannot be packaged.
+        OutputFileError: the file exists or cannot be written.
     """
     target = Path(path)
     name = model_name(target)

@@ -19,7 +19,7 @@ _FMU_BORDER = "# --- runtime ---\n"
 
 
 def _fmu_compiled_step(facts: dict[str, Any], folder: str, *, always: bool = False) -> Callable[..., None] | None:
-    """Return the compiled `step` of the FMU unpacked in `folder`, or None where plain Python shall run.
+    """Return the compiled `step` of the FMU unpacked in `folder`, or None where plain Python is to run.
 
     A light runtime is not worth numba's start of half a second; a middling one is where it is compiled already;
     a heavy one is compiled here, once for all FMUs of its kind on this machine.

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
-from softneck.core import FileFormatError, OutputError
+from softneck.core import FileFormatError, OutputFileError
 
 # A three-platform FMU weighs a few MB; more than this wants to fill the disk.
 _MAX_BYTES = 2 * 2**30
@@ -42,9 +42,9 @@ def unpack(path: str | Path) -> Path:
     except (zipfile.BadZipFile, NotImplementedError, EOFError, RuntimeError, ValueError) as error:
         if isinstance(error, FileFormatError):
             raise
-        raise FileFormatError(f"{source}: is no FMU or is damaged ({error}).") from error
+        raise FileFormatError(f"{source}: is not an FMU or is damaged ({error}).") from error
     except OSError as error:
-        raise OutputError(f"{source}: cannot be unpacked: {error.strerror or error}.") from error
+        raise OutputFileError(f"{source}: cannot be unpacked: {error.strerror or error}.") from error
     return folder
 
 
@@ -68,11 +68,11 @@ def _check_members(source: Path, archive: zipfile.ZipFile) -> None:
     if total > _MAX_BYTES:
         raise FileFormatError(f"{source}: unpacks to {total} bytes, over the limit of {_MAX_BYTES}.")
     if "modelDescription.xml" not in archive.namelist():
-        raise FileFormatError(f"{source}: is no FMU: it has no modelDescription.xml.")
+        raise FileFormatError(f"{source}: is not an FMU: it has no modelDescription.xml.")
 
 
 def _plain_folder() -> Path:
     for folder in (tempfile.gettempdir(), "/tmp", "/var/tmp", str(Path.home())):
         if _PLAIN.fullmatch(folder) and Path(folder).is_dir():
             return Path(folder)
-    raise OutputError("no temporary folder has a plain path (letters, digits, _ . - only); set TMPDIR to one.")
+    raise OutputFileError("no temporary folder has a plain path (letters, digits, _ . - only); set TMPDIR to one.")

@@ -75,10 +75,10 @@ class OnlineRls:
         require_positive("sample_time", self.sample_time, "s")
         if self.settings.delay is None:
             raise SettingsError(
-                "sample by sample no dead time can be searched; give `delay`, from a model identified before."
+                "a dead time cannot be searched for sample by sample; give `delay`, from a model identified before."
             )
         if self.settings.form != "ud":
-            raise SettingsError("sample by sample the form is `ud`.")
+            raise SettingsError("estimation sample by sample needs form `ud`.")
 
     @property
     def delay(self) -> int:

@@ -168,7 +168,7 @@ class Recursion:
         guards = np.array([self.forgetting, self.covariance_bound, self.dead_zone, self.poles, self.pole_radius])
         load_functions(_RUNTIME).ud_guarded(Phi, y, after.theta, after.factor, after.scale, guards, after.tally, course)
         if not np.isfinite(after.theta).all():
-            raise DataError("the recursion left the numbers; scale the regressors to the order of one.")
+            raise DataError("the recursion is no longer finite; scale the regressors to the order of one.")
         return after, RecursionHistory(error=course[:, 0], theta=course[:, 1 : 1 + n], covariance=course[:, 1 + n :])
 
     def _rows(self, regressors: Matrix, targets: Vector) -> tuple[Matrix, Vector]:

@@ -24,7 +24,7 @@ from ..models._free_run import delay_samples
 from ..models._model import Model
 from ._oe import AXES, SOURCES, axis_arrays, axis_runs
 from ._regression import arx_rows, require_excitation
-from ._srivc_fit import Runs, Search, SrivcFit, with_delay
+from ._srivc_fit import Runs, SrivcFit, SrivcFitOptions, with_delay
 from ._srivc_intervals import Intervals, bootstrap
 
 # Poles [1/s] to start from: the neck's 5, and a third and three times that.
@@ -122,7 +122,7 @@ class Srivc:
         measured = np.concatenate([y[np.isfinite(y)] for _, y in runs])
         spread = float(np.sum((measured - measured.mean()) ** 2))
         search = self.search(sample_time)
-        fixed = Search(**{**asdict(search), "free_delay": False})
+        fixed = SrivcFitOptions(**{**asdict(search), "free_delay": False})
         best, fits, curve = None, {}, []
         last: SrivcFit | None = None
         for d in delay_samples(self.delay, self.max_delay, sample_time, columns):
@@ -149,9 +149,9 @@ class Srivc:
         free = _best([*middle, *(search.improve(runs, f.model, f.starts) for f in nearby)])
         return (free if free is not None and free.cost < fits[best].cost else fits[best]), curve
 
-    def search(self, sample_time: float) -> Search:
+    def search(self, sample_time: float) -> SrivcFitOptions:
         """Return how one axis is fitted."""
-        return Search(
+        return SrivcFitOptions(
             sample_time=sample_time,
             order=self.order,
             zeros=self.zeros,

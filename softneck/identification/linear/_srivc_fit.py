@@ -84,7 +84,7 @@ class SrivcFit:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Search:
+class SrivcFitOptions:
     """How a fit is made.
 
     Attributes:
@@ -180,7 +180,7 @@ class Search:
         )
         return fit, (step, moves)
 
-    def _rows(self, u: Vector, y: Vector, model: Continuous, start: Vector) -> _Rows:
+    def _rows(self, u: Vector, y: Vector, model: Continuous, start: Vector) -> _RunColumns:
         n, functions = self.order, load_functions(_RUNTIME)
         A, e, C = model.canonical()
         big, drive = np.zeros((3 * n, 3 * n)), np.zeros(3 * n)
@@ -207,7 +207,7 @@ class Search:
         nuisance = _free_responses(A, u.size, self.sample_time)
         if self.offset:
             nuisance = np.column_stack([nuisance, np.ones(u.size)])
-        return _Rows(
+        return _RunColumns(
             simulated=simulated,
             errors=errors[there],
             instruments=np.column_stack([own, columns])[there],
@@ -216,7 +216,7 @@ class Search:
         )
 
 
-class _Rows:
+class _RunColumns:
     """One run's columns, and the same with its start projected off."""
 
     def __init__(

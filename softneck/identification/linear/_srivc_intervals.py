@@ -9,7 +9,7 @@ import numpy as np
 
 from softneck.core import Matrix, Vector
 
-from ._srivc_fit import Continuous, Runs, Search, SrivcFit
+from ._srivc_fit import Continuous, Runs, SrivcFit, SrivcFitOptions
 
 # A second of residuals stays together, so that what is correlated within a second counts as one.
 _BLOCK = 1.0
@@ -44,7 +44,7 @@ class Intervals:
 
 
 def bootstrap(
-    search: Search,
+    search: SrivcFitOptions,
     runs: Runs,
     fit: SrivcFit,
     *,

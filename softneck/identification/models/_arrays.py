@@ -77,7 +77,7 @@ def check_history(arrays: Mapping[str, Matrix]) -> float:
     expect(arrays, "history", (1,))
     history = float(arrays["history"][0])
     if history != int(history) or not 1 <= history <= _LONGEST_HISTORY:
-        raise FileFormatError(f"its history of {history:g} samples is no number from 1 to {_LONGEST_HISTORY}.")
+        raise FileFormatError(f"its history of {history:g} samples is not a number from 1 to {_LONGEST_HISTORY}.")
     if "memory" in arrays:
         expect(arrays, "memory", (1,))
         within(arrays["memory"], 1, _LONGEST_HISTORY, "its memory in samples")
@@ -102,4 +102,4 @@ def expect(arrays: Mapping[str, Matrix], name: str, shape: tuple[int, ...]) -> N
 
 def within(values: Matrix, low: float, high: float, what: str) -> None:
     if (values != np.round(values)).any() or not ((values >= low) & (values <= high)).all():
-        raise FileFormatError(f"{what} is no whole number from {low:g} to {high:g}.")
+        raise FileFormatError(f"{what} is not a whole number from {low:g} to {high:g}.")

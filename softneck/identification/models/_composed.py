@@ -46,7 +46,9 @@ def members(arrays: Mapping[str, Matrix]) -> list[tuple[str, dict[str, Matrix]]]
         if number == str(len(found)) and kind in KINDS and KINDS[kind].role == "model" and kind not in COMPOSED:
             found.append((kind, {}))
         if not found or (number, kind) != (str(len(found) - 1), found[-1][0]):
-            raise FileFormatError(f"its array `{name}` is of no member in order, or of a kind that cannot be held.")
+            raise FileFormatError(
+                f"its array `{name}` belongs to no member in order, or to a kind that cannot be held."
+            )
         found[-1][1][own] = array
     return found
 

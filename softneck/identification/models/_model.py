@@ -238,11 +238,11 @@ class Model:
 
 def _check_header(model: Model) -> None:
     if not 0.0 < model.sample_time < 10.0:
-        raise FileFormatError(f"its sample time of {model.sample_time} s is none of a neck.")
+        raise FileFormatError(f"a sample time of {model.sample_time} s is implausible for a neck.")
     if not isinstance(model.settings, dict) or not isinstance(model.findings, dict):
         raise FileFormatError("its settings and findings must be tables.")
     if model.training_rows.dtype != np.uint64 or model.training_rows.ndim != 1:
-        raise FileFormatError("its training rows are no hashes.")
+        raise FileFormatError("its training rows are not hashes.")
 
 
 def load_model(path: str | Path) -> Model:

@@ -33,7 +33,7 @@ def rmse(measured: Vector, predicted: Vector) -> float:
 def worst_error(measured: Vector, predicted: Vector) -> tuple[float, int]:
     """Return the largest absolute error, in the unit of the arguments, and its row; (NaN, -1) if nothing was measured.
 
-    A prediction that is no number is worse than any.
+    A prediction that is not a number is worse than any.
     """
     size = np.abs(measured - predicted)
     size[np.isfinite(measured) & np.isnan(predicted)] = np.inf

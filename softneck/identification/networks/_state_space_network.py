@@ -140,7 +140,7 @@ class _Job:
         settings, stop = self.settings, threading.Event()
         load_functions(FUNCTIONS)  # before the threads start: Python 3.11 cannot parse two texts at once
         total = settings.starts * (sum(_WINDOW_STEPS) + settings.iterations + 5) + 2 * settings.iterations
-        told = _Told(total)
+        told = _TrainingProgress(total)
         rows = self.records.only(~self.records.held_out) if self.same else self.records
         jobs: list[tuple[Training, np.ndarray, BestMap]] = []
         for number in range(settings.starts):
@@ -167,7 +167,7 @@ class _Job:
         return theta, found | ({"interrupted": INTERRUPTED} if interrupted else {})
 
     def _finish(
-        self, training: Training, best: BestMap, told: _Told, progress: Progress, stop: threading.Event
+        self, training: Training, best: BestMap, told: _TrainingProgress, progress: Progress, stop: threading.Event
     ) -> tuple[np.ndarray, bool]:
         """Train the best start on, at last on all rows."""
         steps = self.settings.iterations
@@ -188,7 +188,7 @@ class _Job:
         return training.weights(theta)
 
 
-class _Told:
+class _TrainingProgress:
     """What the threads say of themselves."""
 
     def __init__(self, expected: int) -> None:
@@ -206,7 +206,7 @@ def _known(best: BestMap) -> np.ndarray:
     return best.theta
 
 
-def _wait(work: Any, numbers: range, told: _Told, progress: Progress, stop: threading.Event) -> bool:
+def _wait(work: Any, numbers: range, told: _TrainingProgress, progress: Progress, stop: threading.Event) -> bool:
     """Do `work` for all numbers, two at a time; return whether Ctrl-C ended it."""
     interrupted = False
     with ThreadPoolExecutor(2) as pool:

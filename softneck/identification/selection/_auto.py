@@ -30,7 +30,7 @@ REFITTED = "trained on all rows after the choice; its scores are those of the mo
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Tried:
+class KindTrial:
     """One kind that was tried.
 
     Attributes:
@@ -67,8 +67,8 @@ class Choice:
         seed: of kinds that start at random.
     """
 
-    ranking: tuple[Tried, ...]
-    chosen: Tried
+    ranking: tuple[KindTrial, ...]
+    chosen: KindTrial
     why: str
     remarks: tuple[str, ...]
     seed: int = 0
@@ -108,7 +108,7 @@ def choose(
     unknown = [kind for kind in wanted if kind not in kinds_to_try()]
     if unknown:
         raise SettingsError(f"`{unknown[0]}` cannot be tried; known: {', '.join(kinds_to_try())}.")
-    tried: list[Tried] = []
+    tried: list[KindTrial] = []
     for number, kind in enumerate(sorted(wanted, key=_SIMPLE_FIRST.index)):
         progress(number / len(wanted), _word(kind, tried))
         tried.append(_try(kind, train, hold_out, tried, seed))
@@ -146,7 +146,7 @@ def refit(choice: Choice, recordings: Recording | list[Recording], *, progress: 
     return replace(models[-1], findings={**models[-1].findings, "refit": said})
 
 
-def _try(kind: str, train: Recording, hold_out: Recording, before: list[Tried], seed: int) -> Tried:
+def _try(kind: str, train: Recording, hold_out: Recording, before: list[KindTrial], seed: int) -> KindTrial:
     begin = time.perf_counter()
     good = sorted((one for one in before if one.fit > float("-inf")), key=lambda one: -one.fit)
     try:
@@ -154,8 +154,8 @@ def _try(kind: str, train: Recording, hold_out: Recording, before: list[Tried], 
         seconds = time.perf_counter() - begin
         judged = validate(model, hold_out, names=(kind, "hold-out"), horizons=(1, INFINITE))
     except SoftneckError as error:
-        return Tried(kind, time.perf_counter() - begin, failure=str(error))
-    return Tried(kind, seconds, model, judged)
+        return KindTrial(kind, time.perf_counter() - begin, failure=str(error))
+    return KindTrial(kind, seconds, model, judged)
 
 
 def _model(kind: str, train: Recording, best: list[Model], seed: int) -> Model:
@@ -171,12 +171,12 @@ def _model(kind: str, train: Recording, best: list[Model], seed: int) -> Model:
     return settings(**values).fit(train)
 
 
-def _word(kind: str, tried: list[Tried]) -> str:
+def _word(kind: str, tried: list[KindTrial]) -> str:
     best = max(tried, key=lambda one: one.fit, default=None)
     return kind if best is None or best.fit == float("-inf") else f"{kind} (best so far {best.kind}, {best.fit:.1f} %)"
 
 
-def _why(best: Tried, chosen: Tried, alike: list[Tried]) -> str:
+def _why(best: KindTrial, chosen: KindTrial, alike: list[KindTrial]) -> str:
     if len(alike) == 1:
         return f"{chosen.kind} has the best free run over the rows held out, {chosen.fit:.1f} %."
     others = ", ".join(f"{one.kind} {one.fit:.1f} %" for one in alike if one is not chosen)
@@ -191,7 +191,7 @@ def _why(best: Tried, chosen: Tried, alike: list[Tried]) -> str:
     )
 
 
-def _remarks(ranking: tuple[Tried, ...], other_excitation: bool) -> tuple[str, ...]:
+def _remarks(ranking: tuple[KindTrial, ...], other_excitation: bool) -> tuple[str, ...]:
     remarks = []
     if not other_excitation:
         remarks.append(

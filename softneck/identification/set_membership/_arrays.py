@@ -25,7 +25,7 @@ def check_set(arrays: Mapping[str, Matrix], n: int) -> None:
     within(np.array([rows]), 1, np.inf, "the number of points")
     frame, slopes = arrays["frame"], _slopes(arrays)
     if frame.ndim != 3 or frame.shape[::2] != (2, n) or not all(is_frame(rows) for rows in frame):
-        raise FileFormatError("its array `frame` is of no directions square to each other; identify the model again.")
+        raise FileFormatError("the directions in its array `frame` are not orthogonal; identify the model again.")
     parts = zip(frame, slopes, arrays["points"], arrays["values"], strict=True)
     nodes = np.array([slant_nodes(*axis) for axis in parts])
     # A tree of another shape would be read beyond its end, and one of other numbers would leave points out.

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from softneck.core import DataError, FileFormatError, Matrix, Vector, read_archive, write_archive
 
-from ._forest import Points, all_cores, tighten
+from ._forest import PointTree, all_cores, tighten
 from ._tree import tree_nodes
 
 _KIND = "cones"
@@ -29,7 +29,7 @@ class ConeSet:
         single: whether the outputs came as (N,), and go as (rows,).
     """
 
-    points: Points
+    points: PointTree
     gammas: Matrix
     epsilon: Vector
     scale: Vector
@@ -101,7 +101,7 @@ class ConeSet:
         nodes = tree_nodes(P, Y)
         if regions < 1 or regions & (regions - 1) or regions > len(nodes) // 2:
             raise FileFormatError(f"{path}: {regions} regions do not fit {ages.size} points.")
-        return ConeSet(Points(P, Y, nodes, ages), gammas, epsilon, scale, width, header.get("single") is True)
+        return ConeSet(PointTree(P, Y, nodes, ages), gammas, epsilon, scale, width, header.get("single") is True)
 
 
 def _floats(path: str | Path, arrays: dict[str, np.ndarray], names: tuple[str, ...]) -> list[np.ndarray]:

@@ -11,7 +11,7 @@ from softneck.core import DataError, SettingsError, Vector, require_between, req
 
 from ._cone_set import ConeSet, as_matrix, as_outputs
 from ._contradiction import require_allowed
-from ._forest import Points, all_cores, plant, region_gammas, tighten
+from ._forest import PointTree, all_cores, plant, region_gammas, tighten
 from ._gamma import RULES, curve_over, least_gammas
 from ._memory import require_memory
 
@@ -34,7 +34,7 @@ class Cones:
         rule: "paper" (each sample within its own bounds) or "milanese_novara" (some function within epsilon of each).
         regions: power of two; more than 1 gives each region of the data its own gamma, see docs, "Local gamma".
         correlated: rows before and after a row that do not count when the width of the bounds between the data is
-            learned: neighbours in time are no news. 25 for a motion sampled at 20 ms, 0 for separate samples.
+            learned: neighbours in time are not news. 25 for a motion sampled at 20 ms, 0 for separate samples.
         usual: quantile of those widths above which `ConeSet.outside` calls a query unlike the data.
     """
 
@@ -82,7 +82,7 @@ class Cones:
         widths = [usual_width(points, i, gammas[i], (self.correlated, self.usual), cores) for i in outputs]
         return ConeSet(points, gammas, epsilon, scale, epsilon + np.array(widths), single)
 
-    def _choose(self, points: Points, output: int, regions: int, workers: int) -> tuple[Vector, float]:
+    def _choose(self, points: PointTree, output: int, regions: int, workers: int) -> tuple[Vector, float]:
         """Return the gammas (regions,) and epsilon of one output."""
         P, y = points.points, points.values[output]
         gamma, epsilon = pick(self.gamma, output), pick(self.epsilon, output)
@@ -102,7 +102,7 @@ class Cones:
         return region_gammas(points, output, RULES[self.rule] * epsilon, regions), epsilon
 
 
-def usual_width(points: Points, output: int, gammas: Vector, usual: tuple[int, float], workers: int) -> float:
+def usual_width(points: PointTree, output: int, gammas: Vector, usual: tuple[int, float], workers: int) -> float:
     """Return the half-width, without epsilon, that a quantile of the data's rows stays below, themselves left out.
 
     Args:

@@ -9,11 +9,11 @@ import numpy as np
 from softneck.core import DataError, Matrix, Vector
 from softneck.signals import Recording
 
-from ._forest import Points
+from ._forest import PointTree
 from ._gamma import RULES, least_gammas
 
 
-def require_allowed(points: Points, output: int, gamma: float, epsilon: float, rule: str) -> None:
+def require_allowed(points: PointTree, output: int, gamma: float, epsilon: float, rule: str) -> None:
     """Raise DataError, naming the pair, unless the data allow (gamma, epsilon): else no function fits (FSS empty)."""
     P, y = points.points, points.values[output]
     least, pairs = least_gammas(P, y, np.array([RULES[rule] * epsilon]), nodes=points.own_nodes(output))
@@ -35,8 +35,8 @@ def denial(who: str, rise: str, distance: float, tried: tuple[float, float], lea
             "both (the FSS is empty). Set `epsilon` higher, or leave one of the two out."
         )
     return (
-        f"gamma {gamma:.6g} with epsilon {epsilon:.6g} is denied by the data (the FSS is empty): between {who} the "
-        f"regressor moves by {distance:.6g} and {rise}. With this epsilon gamma must be at least {least:.6g}; else "
+        f"gamma {gamma:.6g} with epsilon {epsilon:.6g} is contradicted by the data (the FSS is empty): between {who} "
+        f"the regressor moves by {distance:.6g} and {rise}. With this epsilon gamma must be at least {least:.6g}; else "
         "set `epsilon` higher, or leave one of the two out."
     )
 

@@ -25,7 +25,7 @@ EVERYTHING = np.zeros((1, 2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Points:
+class PointTree:
     """Points in tree order.
 
     Attributes:
@@ -60,7 +60,7 @@ class Points:
         return self.points[:, order], self.values[:, order], self.ages[order]
 
 
-def plant(points: Matrix, values: Matrix, ages: Vector) -> Points:
+def plant(points: Matrix, values: Matrix, ages: Vector) -> PointTree:
     """Return the tree over points (n, N), values (m, N) and ages (N,), which are put in its order where they lie.
 
     In place, so that memory holds the points once.
@@ -68,11 +68,11 @@ def plant(points: Matrix, values: Matrix, ages: Vector) -> Points:
     order = tree_order(points)
     for row in (*points, *values):
         row[:] = row[order]
-    return Points(points, values, tree_nodes(points, values), ages[order])
+    return PointTree(points, values, tree_nodes(points, values), ages[order])
 
 
 def tighten(
-    trees: list[Points], output: int, gammas: Vector, queries: Matrix, *, windows: Matrix = EVERYTHING, workers: int
+    trees: list[PointTree], output: int, gammas: Vector, queries: Matrix, *, windows: Matrix = EVERYTHING, workers: int
 ) -> Matrix:
     """Return max(y - gamma d) and min(y + gamma d) (rows, 2) over all trees, without epsilon.
 
@@ -93,7 +93,7 @@ def tighten(
 
 
 def needed_gamma(
-    trees: list[Points], output: int, slack: float, new: tuple[Matrix, Vector], *, windows: Matrix, gamma: float
+    trees: list[PointTree], output: int, slack: float, new: tuple[Matrix, Vector], *, windows: Matrix, gamma: float
 ) -> float:
     """Return the slope, at least `gamma`, that new points (rows, n) and values (rows,) need beside the trees'."""
     needs = load_functions(_RUNTIME).set_needs if have_numba() else plain_needs
@@ -102,7 +102,7 @@ def needed_gamma(
     return float(gamma)
 
 
-def region_gammas(tree: Points, output: int, slack: float, regions: int) -> Vector:
+def region_gammas(tree: PointTree, output: int, slack: float, regions: int) -> Vector:
     """Return the slope (regions,) that the points of each region need beside all points."""
     gammas = np.zeros(regions)
     raise_gammas = load_functions(_RUNTIME).set_regions if have_numba() else plain_regions

@@ -18,7 +18,7 @@ from softneck.core import DataError, Matrix, Vector, require_one_of, require_who
 from ._cone_set import ConeSet, as_matrix, as_outputs, as_queries
 from ._cones import pick, require_numbers, usual_width, weights
 from ._contradiction import denial
-from ._forest import EVERYTHING, Points, all_cores, needed_gamma, plant, tighten
+from ._forest import EVERYTHING, PointTree, all_cores, needed_gamma, plant, tighten
 from ._gamma import RULES, least_gammas
 from ._online_file import plain_numbers, read_online, write_online
 from ._tree import LEAF
@@ -28,7 +28,7 @@ _CHUNK = 4096
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Tracked:
+class TrackResult:
     """What `OnlineCones.track` said of each row before it learned it; shapes as the outputs'."""
 
     estimate: np.ndarray
@@ -72,7 +72,7 @@ class OnlineCones:
         self.settings = {name: plain_numbers(given) for name, given in numbers.items()}
         self.settings |= {"capacity": capacity, "rule": rule}
         self._capacity = capacity
-        self._trees: list[Points] = []
+        self._trees: list[PointTree] = []
         self._total = 0  # points ever added: the age of the next
         self._lowered = 0  # how many were forgotten when gamma was last lowered
         self._single = False
@@ -133,7 +133,7 @@ class OnlineCones:
         low, high = self.bounds(X, workers=workers)
         return 0.5 * (low + high)
 
-    def track(self, X: ArrayLike, Y: ArrayLike) -> Tracked:
+    def track(self, X: ArrayLike, Y: ArrayLike) -> TrackResult:
         """Predict each row, then learn it: the recursive mode. The set must not be empty."""
         X, targets = as_matrix("X", X), np.asarray(Y, dtype=np.float64)
         as_outputs(targets, len(X))
@@ -142,7 +142,7 @@ class OnlineCones:
             low, high = self.bounds(X[k : k + 1], workers=1)
             lower[k], upper[k] = low[0], high[0]
             self.add(X[k : k + 1], targets[k : k + 1])
-        return Tracked(0.5 * (lower + upper), lower, upper)
+        return TrackResult(0.5 * (lower + upper), lower, upper)
 
     def remembered(self) -> tuple[Matrix, Matrix]:
         """Return regressors (N, n), scaled, and outputs (N, m) of all points remembered, oldest first."""
@@ -241,7 +241,7 @@ class OnlineCones:
             least = [least_gammas(points, y, np.array([slack]))[0][0] for y, slack in zip(values, slacks, strict=True)]
             self._gamma = np.maximum(self._floor, least)
 
-    def _alive(self, trees: list[Points] | None = None) -> tuple[Matrix, Matrix, Vector]:
+    def _alive(self, trees: list[PointTree] | None = None) -> tuple[Matrix, Matrix, Vector]:
         """Return points (n, N), values (m, N) and ages (N,) that are remembered, oldest first."""
         empty = np.zeros((self._scale.size, 0)), np.zeros((self._gamma.size, 0)), np.zeros(0)
         parts = [empty, *(tree.in_time_order() for tree in (self._trees if trees is None else trees))]
@@ -249,7 +249,7 @@ class OnlineCones:
         kept = ages >= self._first
         return np.ascontiguousarray(points[:, kept]), np.ascontiguousarray(values[:, kept]), ages[kept]
 
-    def _denied(self, new: Points, output: int, slack: float) -> str:
+    def _denied(self, new: PointTree, output: int, slack: float) -> str:
         points, values, ages = self._alive([*self._trees, new])
         _, pairs = least_gammas(points, values[output], np.array([slack]))
         j, k = sorted(pairs[0])

@@ -106,7 +106,7 @@ def _largest(points: Matrix) -> float:
 def slant_nodes(frame: Matrix, slope: float, points: Matrix, values: Vector) -> Matrix:
     """Return the nodes (2^(depth+1), 2 (1 + sides) + 2) over points in tree order; see `_slant_runtime`.
 
-    Row 0, which is no node, holds the slope of the plane and the size of points and values.
+    Row 0, which is not a node, holds the slope of the plane and the size of points and values.
     """
     sides, rows = len(frame) - 1, values.size
     depth = depth_of(rows)

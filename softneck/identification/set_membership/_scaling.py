@@ -47,7 +47,7 @@ def ruled_scale(rule: str | tuple[float, ...], table: Matrix, data: Data) -> Vec
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Tried:
+class ScaleTrial:
     """One scale and epsilon (2,), and what the free run over the hold-out says of them.
 
     Attributes:
@@ -93,18 +93,18 @@ class HoldOut:
     epsilons: Sequence[Vector]
     narrow: bool = False
 
-    def choose(self, outputs: Sequence[float], motors: Sequence[float], progress: Progress) -> list[Tried]:
+    def choose(self, outputs: Sequence[float], motors: Sequence[float], progress: Progress) -> list[ScaleTrial]:
         """Return all that was tried, the best first: weights of outputs, then of motors beside the best of those."""
         tried = self._try([(weight, 1.0) for weight in outputs], progress)
         best = self.best_first(tried)[0]
         tried += self._try([(best.output_weight or 1.0, weight) for weight in motors], progress)
         return self.best_first(tried)
 
-    def fixed(self, scale: Vector) -> list[Tried]:
+    def fixed(self, scale: Vector) -> list[ScaleTrial]:
         """Return each epsilon with one scale, the best first."""
         return self.best_first(list(self._scale(scale, None, None)))
 
-    def best_first(self, tried: list[Tried]) -> list[Tried]:
+    def best_first(self, tried: list[ScaleTrial]) -> list[ScaleTrial]:
         """Return them by falling score; raises DataError where no function fits the data with any of them."""
         if not tried:
             raise DataError("equal regressors have unequal outputs beyond any epsilon tried; set `epsilon` higher.")
@@ -115,8 +115,8 @@ class HoldOut:
             ranked = [chosen, *(one for one in ranked if one is not chosen)]
         return ranked
 
-    def _try(self, weights: Sequence[tuple[float, float]], progress: Progress) -> list[Tried]:
-        tried: list[Tried] = []
+    def _try(self, weights: Sequence[tuple[float, float]], progress: Progress) -> list[ScaleTrial]:
+        tried: list[ScaleTrial] = []
         # Queries and the search for gamma are compiled and let go of Python's lock.
         with ThreadPoolExecutor(_THREADS) as pool:
             for number, part in enumerate(pool.map(self._weights, weights), start=1):
@@ -124,12 +124,14 @@ class HoldOut:
                 tried += part
         return tried
 
-    def _weights(self, weights: tuple[float, float]) -> list[Tried]:
+    def _weights(self, weights: tuple[float, float]) -> list[ScaleTrial]:
         return list(self._scale(grouped_scale(self.ground.table, *weights), *weights))
 
-    def _scale(self, scale: Vector, output: float | None, motor: float | None) -> Iterator[Tried]:
+    def _scale(self, scale: Vector, output: float | None, motor: float | None) -> Iterator[ScaleTrial]:
         for epsilon, gamma in zip(self.epsilons, gammas(self.data, scale, self.epsilons), strict=True):
             if gamma.max() > 1e100:
                 continue
             arrays = self.ground.arrays(self.data, scale, gamma, epsilon)
-            yield Tried(output, motor, scale, epsilon, *self.ground.free_run(arrays, self.tail), float(gamma.min()))
+            yield ScaleTrial(
+                output, motor, scale, epsilon, *self.ground.free_run(arrays, self.tail), float(gamma.min())
+            )

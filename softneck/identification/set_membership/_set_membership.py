@@ -30,7 +30,7 @@ from ._contradiction import require_feasible
 from ._extrapolation import usual_widths
 from ._regressor import Ground, gammas, scaled
 from ._residual_form import residual_lags
-from ._scaling import RULES, HoldOut, Tried, grouped_scale, ruled_scale
+from ._scaling import RULES, HoldOut, ScaleTrial, grouped_scale, ruled_scale
 
 FORMS = ("paper_eq21", "lags", "residual")
 _MOTORS = ("measured", "simulated")
@@ -153,7 +153,7 @@ class SetMembership:
 
     def _choose(
         self, ground: Ground, recording: Recording, noise: Vector, progress: Progress
-    ) -> tuple[Tried, list[Tried]]:
+    ) -> tuple[ScaleTrial, list[ScaleTrial]]:
         """Return scale and epsilon, and all that were tried; an empty scale is left to `ruled_scale`."""
         table = ground.table
         if self.epsilon is not None:
@@ -165,7 +165,7 @@ class SetMembership:
         weighted = self.output_weight is not None
         if len(epsilons) == 1 and (weighted or self.scale != "auto"):
             scale = np.zeros(0) if self.output_weight is None else grouped_scale(table, self.output_weight)
-            return Tried(self.output_weight, None, scale, epsilons[0], np.nan, np.nan, np.nan, np.nan), []
+            return ScaleTrial(self.output_weight, None, scale, epsilons[0], np.nan, np.nan, np.nan, np.nan), []
         head, tail = recording.split(1.0 - _HOLD_OUT)
         if len(tail) <= 2 * WARM_UP:
             raise DataError(
@@ -229,7 +229,7 @@ def noise_level(recording: Recording, axis: int) -> float:
     return max(sigma, 1e-7)  # a noise-free simulation: rounding is left
 
 
-def _findings(chosen: Tried, tried: list[Tried], scale: Vector) -> dict[str, Any]:
+def _findings(chosen: ScaleTrial, tried: list[ScaleTrial], scale: Vector) -> dict[str, Any]:
     weights = {"output_weight": chosen.output_weight, "motor_weight": chosen.motor_weight}
     return {
         "epsilon_deg": np.degrees(chosen.epsilon).tolist(),

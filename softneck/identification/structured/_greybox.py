@@ -67,12 +67,12 @@ class GreyBox:
             DataError: too short or constant.
         """
         recording = training_recording(recordings)
-        problem = _Problem.of(recording)
+        problem = _FitProblem.of(recording)
         delays = _DELAYS if self.sensor_delay is None else (self.sensor_delay,)
         best: tuple[float, int, Vector] | None = None
         start = np.array([number.encode(number.guess) for number in NUMBERS])
         interrupted = False
-        tell = _Telling(progress, len(delays) * self.evaluations * (len(NUMBERS) + 1))
+        tell = _SearchProgress(progress, len(delays) * self.evaluations * (len(NUMBERS) + 1))
         for delay in delays:
             tell.what = f"dead time {delay}"
             try:
@@ -95,7 +95,7 @@ class GreyBox:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Problem:
+class _FitProblem:
     """All runs as arrays; the drives' dead times are known beforehand."""
 
     sample_time: float
@@ -104,7 +104,7 @@ class _Problem:
     logged: bool
 
     @classmethod
-    def of(cls, recording: Recording) -> _Problem:
+    def of(cls, recording: Recording) -> _FitProblem:
         Ts = recording.sample_time
         drive = fit_loaded_drive(recording).drive.copy()
         if not recording.has_motor_positions:
@@ -140,7 +140,7 @@ class _Problem:
                 parts.append(_MOTOR_WEIGHT * (M - m)[skip::_THIN].ravel())
         return np.nan_to_num(np.concatenate(parts))
 
-    def search(self, start: Vector, delay: int, evaluations: int, tell: _Telling) -> OptimizeResult:
+    def search(self, start: Vector, delay: int, evaluations: int, tell: _SearchProgress) -> OptimizeResult:
         """Return scipy's result of a trust-region Gauss-Newton from `start`."""
         from scipy.optimize import least_squares
 
@@ -156,7 +156,7 @@ class _Problem:
         return least_squares(errors, inside, bounds=(low, high), x_scale="jac", max_nfev=evaluations, xtol=1e-5)
 
 
-class _Telling:
+class _SearchProgress:
     """Reports the search, and remembers the best for Ctrl-C."""
 
     def __init__(self, progress: Progress, expected: int) -> None:
@@ -173,7 +173,7 @@ class _Telling:
             self.progress(min(self.calls / self.expected, 0.99), f"{self.what}, loss {self.best[0]:.4g}")
 
 
-def _model(settings: GreyBox, problem: _Problem, recording: Recording, delay: int, x: Vector) -> Model:
+def _model(settings: GreyBox, problem: _FitProblem, recording: Recording, delay: int, x: Vector) -> Model:
     numbers = decode(x)
     skip = round(_SETTLED / problem.sample_time)
     errors = [y - Y for (_, Y), (_, _, _, y) in zip(problem.simulate(numbers, delay), problem.runs, strict=True)]
@@ -199,7 +199,7 @@ def _model(settings: GreyBox, problem: _Problem, recording: Recording, delay: in
     )
 
 
-def _table(problem: _Problem, x: Vector, delay: int, errors: Sequence[Matrix]) -> list[dict]:
+def _table(problem: _FitProblem, x: Vector, delay: int, errors: Sequence[Matrix]) -> list[dict]:
     """Return each number with unit, 95 % interval (linearised, the errors' colour taken into account) and range."""
     J = np.empty((problem.errors(x, delay).size, x.size))
     for i in range(x.size):

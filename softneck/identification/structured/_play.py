@@ -13,7 +13,7 @@ from ..models._error_feedback import BEYOND, fit_echo
 from ..models._fitting import SAME_EXCITATION, fitted_model, training_recording
 from ..models._loaded_drive import LoadedDrive, fit_loaded_drive
 from ..models._model import Model
-from ._play_terms import Data, Form, ridge, scores
+from ._play_terms import Data, PlayStructure, ridge, scores
 
 # What the hold-out chooses from: filters about as fast as the neck's 5 1/s and three times that; plays up to a
 # tenth of the motors' 6 rad.
@@ -107,10 +107,10 @@ class Play:
         progress(1.0, "done")
         return fitted_model("play", self, recording, arrays=arrays, findings=findings)
 
-    def _choose(self, data: Data, extra: Data | None, progress: Progress) -> tuple[Form, float, float, int]:
+    def _choose(self, data: Data, extra: Data | None, progress: Progress) -> tuple[PlayStructure, float, float, int]:
         """Return form and ridge of the best free run on the hold-out, its fit [%], and how many were tried."""
         forms = [
-            Form(rate, self.order, widths, degree)
+            PlayStructure(rate, self.order, widths, degree)
             for rate in (_RATES if self.rate is None else (self.rate,))
             for widths in (_WIDTHS if self.widths is None else (self.widths,))
             for degree in (_DEGREES if self.degree is None else (self.degree,))
@@ -122,7 +122,7 @@ class Play:
             least = min(len(form.table) for form in forms)
             raise DataError(f"{rows} settled rows are too few for {least} terms; record longer or lower `order`.")
         ridges = _RIDGES if self.ridge is None else (self.ridge,)
-        scored: list[tuple[float, Form, float]] = []
+        scored: list[tuple[float, PlayStructure, float]] = []
         for number, form in enumerate(fitting):
             best = f"best fit {max(score for score, _, _ in scored):.1f} %" if scored else "forms"
             progress(0.1 + 0.85 * number / len(fitting), best)
@@ -136,7 +136,7 @@ class Play:
         return form, weight, fit, len(scored)
 
 
-def _arrays(data: Data, drive: LoadedDrive, form: Form, weight: float, order: int) -> dict[str, Matrix]:
+def _arrays(data: Data, drive: LoadedDrive, form: PlayStructure, weight: float, order: int) -> dict[str, Matrix]:
     good = data.settled
     # Along the simulated motors, as in free run, and along the logged ones, as in a prediction: one f serves both.
     both = np.concatenate([data.terms(form)[good], data.terms(form, measured=True)[good]])

@@ -21,7 +21,7 @@ _MANY_RUNS = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Form:
+class PlayStructure:
     """Which terms there are.
 
     Attributes:
@@ -94,7 +94,7 @@ class Data:
             sample_time=recording.sample_time,
         )
 
-    def terms(self, form: Form, *, measured: bool = False) -> Matrix:
+    def terms(self, form: PlayStructure, *, measured: bool = False) -> Matrix:
         """Return the terms (time, n) of all runs, along the simulated or the logged motors."""
         run = load_functions(FUNCTIONS).bank_run
         widths, chain, table = np.array(form.widths), form.chain(self.sample_time), form.table.astype(int)
@@ -129,7 +129,7 @@ def ridge(X: Matrix, Y: Matrix, weight: float) -> Matrix:
     return W.T
 
 
-def scores(data: Data, hold_out: Data | None, form: Form, weights: tuple[float, ...]) -> list[float]:
+def scores(data: Data, hold_out: Data | None, form: PlayStructure, weights: tuple[float, ...]) -> list[float]:
     """Return, for each ridge weight, the mean free-run fit [%] of both axes on rows that were not learnt from.
 
     Without `hold_out` parts of the data are held out in turn: the end of each run (of many runs a third of them,

@@ -9,7 +9,7 @@ import numpy as np
 from softneck.core import Matrix, Vector
 from softneck.signals import Recording, redefine
 
-from ..linear._srivc_fit import Continuous, Search
+from ..linear._srivc_fit import Continuous, SrivcFitOptions
 
 _RUNS_NEEDED = 100
 
@@ -49,7 +49,7 @@ def cross_gains(recordings: Sequence[Recording], nominal: Sequence[Continuous], 
     return gains, stds
 
 
-def fit_compression(recordings: Sequence[Recording], search: Search, source: str) -> Continuous | None:
+def fit_compression(recordings: Sequence[Recording], search: SrivcFitOptions, source: str) -> Continuous | None:
     """Return G_delta from delta_i [rad] to compression [m], None where it was not logged or not excited."""
     runs: list[tuple[Vector, Vector]] = []
     for recording in recordings:

@@ -21,7 +21,7 @@ from softneck.core import (
 from softneck.signals import Recording
 
 from ..linear._oe import SOURCES
-from ..linear._srivc_fit import Search
+from ..linear._srivc_fit import SrivcFitOptions
 from ..models._checks import check_training
 from ._cross_gains import cross_gains, fit_compression
 from ._envelope import envelope_weight
@@ -90,7 +90,7 @@ class FamilySettings:
         for part in parts:
             check_training(part)
         frequency = np.geomspace(_LOWEST, np.pi / sample_time, _FREQUENCIES)
-        search = Search(sample_time=sample_time, offset=True, max_delay=self.max_delay, fastest=_FASTEST)
+        search = SrivcFitOptions(sample_time=sample_time, offset=True, max_delay=self.max_delay, fastest=_FASTEST)
         cut = [
             window
             for number, part in enumerate(parts)
@@ -105,7 +105,7 @@ class FamilySettings:
         progress(0.8, "cross gains")
         nominal = [one_pole(axes[name].nominal) for name in AXES]
         cross, cross_std = cross_gains(parts, nominal, self.source)
-        squeezed = fit_compression(parts, Search(sample_time=sample_time, offset=True), self.source)
+        squeezed = fit_compression(parts, SrivcFitOptions(sample_time=sample_time, offset=True), self.source)
         lpv, fits = self._lpv(parts, axes, sample_time) if self.lpv_knots > 0 else (None, {})
         progress(1.0, "done")
         return Family(
@@ -127,7 +127,7 @@ class FamilySettings:
         )
 
     def _local_models(
-        self, search: Search, cut: Sequence[Window], axis: int, recordings: int
+        self, search: SrivcFitOptions, cut: Sequence[Window], axis: int, recordings: int
     ) -> tuple[list[Local], int]:
         """Return the local models of an axis: windows, operating points, recordings; and how many windows gave none."""
         single = [fit_local(search, [window], axis, scope="window") for window in cut]

@@ -10,7 +10,7 @@ import numpy as np
 from softneck.core import Matrix, Vector
 from softneck.signals import Recording, redefine
 
-from ..linear._srivc_fit import Continuous, Runs, Search, SrivcFit
+from ..linear._srivc_fit import Continuous, Runs, SrivcFit, SrivcFitOptions
 
 # Below this spread of its input a window says nothing of an axis [rad]: 0.05 rad move the neck by 0.3 deg.
 _LEAST_INPUT = 0.05
@@ -123,7 +123,7 @@ def windows(recording: Recording, number: int, *, length: float, lead: float, so
 
 
 def fit_local(
-    search: Search, group: Sequence[Window], axis: int, *, scope: str, near: Continuous | None = None
+    search: SrivcFitOptions, group: Sequence[Window], axis: int, *, scope: str, near: Continuous | None = None
 ) -> Local | None:
     """Fit one model to all windows of a group, each with its own start and offset; None where they say too little.
 
@@ -168,7 +168,7 @@ def fit_local(
     )
 
 
-def _quality(search: Search, runs: Runs, fit: SrivcFit) -> tuple[Vector, float]:
+def _quality(search: SrivcFitOptions, runs: Runs, fit: SrivcFit) -> tuple[Vector, float]:
     """Return standard deviations of static gain, pole, dead time and K, and the fit [%] about each run's mean."""
     errors = [(y - s)[np.isfinite(y)] for (_, y), s in zip(runs, fit.simulated, strict=True)]
     spread = sum(float(np.sum((y[np.isfinite(y)] - np.nanmean(y)) ** 2)) for _, y in runs)

@@ -13,7 +13,7 @@ from ..models._scores import nrmse_fit
 from ._best_linear import best_linear
 from ._noise_ceiling import noise_ceiling
 from ._persistence import persistence
-from ._scored_rows import Rows, Stretch
+from ._scored_rows import Rows, ScoredStretch
 
 _AXES = ("pitch", "roll")
 
@@ -28,7 +28,7 @@ class Baselines:
 
 
 def baselines(
-    recording: Recording, stretches: Sequence[Stretch], rows: Rows, horizons: Sequence[int | str]
+    recording: Recording, stretches: Sequence[ScoredStretch], rows: Rows, horizons: Sequence[int | str]
 ) -> Baselines:
     """Return the baselines of the stretches judged; repeats are looked for in all of the recording."""
     names = [str(h) for h in horizons]

@@ -18,7 +18,7 @@ from softneck.signals import Recording
 
 from ..models._scores import nrmse_fit
 from ._persistence import held_outputs
-from ._scored_rows import Rows, Stretch
+from ._scored_rows import Rows, ScoredStretch
 
 # Dead times of a neck and its drives: the response is free, tap by tap, for so long [s].
 _FREE_SECONDS = 0.3
@@ -32,7 +32,9 @@ _PAST = 10
 _ROWS_PER_PARAMETER = 10
 
 
-def best_linear(stretches: Sequence[Stretch], rows: Rows, horizons: Sequence[int | None]) -> list[list[float | None]]:
+def best_linear(
+    stretches: Sequence[ScoredStretch], rows: Rows, horizons: Sequence[int | None]
+) -> list[list[float | None]]:
     """Return for each horizon (None: free run) the fit [%] of pitch and roll; None where rows are too few.
 
     For a finite horizon persistence and, in free run, every stable linear model of the set-points lies below.
@@ -95,7 +97,7 @@ def _filtered(numerator: list[float], denominator: list[float], x: Matrix) -> Ma
     return np.asarray(lfilter(numerator, denominator, x, axis=0, zi=z)[0])
 
 
-def _decay_columns(stretches: Sequence[Stretch]) -> Matrix:
+def _decay_columns(stretches: Sequence[ScoredStretch]) -> Matrix:
     """Return decaying exponentials (time, 7 for each stretch), each zero outside its stretch."""
     columns = np.zeros((sum(len(s.recording) for s in stretches), len(_DECAYS) * len(stretches)))
     row = 0

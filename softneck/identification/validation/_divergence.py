@@ -1,4 +1,4 @@
-"""When a free run is no prediction any more: it has left the range of the data."""
+"""When a free run is no longer a prediction: it has left the range of the data."""
 
 from __future__ import annotations
 

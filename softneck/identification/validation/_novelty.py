@@ -23,7 +23,7 @@ from ..models._model import WARM_UP, Model
 from ..models._regressors import PAPER_EQ21, motor_signals, regression
 from ..models._rows import known_rows
 from ..set_membership._residual_form import residual_rows
-from ._scored_rows import Stretch
+from ._scored_rows import ScoredStretch
 
 QUANTILES = (0.5, 0.9, 0.99, 1.0)
 _NAMES = ("p50", "p90", "p99", "max")
@@ -65,7 +65,7 @@ class Novelty:
         }
 
 
-def novelty(model: Model, stretches: Sequence[Stretch], training: Recording | None) -> Novelty | None:
+def novelty(model: Model, stretches: Sequence[ScoredStretch], training: Recording | None) -> Novelty | None:
     """Return the novelty of the judged rows; None without training data, which only some set membership models hold.
 
     Args:
@@ -150,7 +150,7 @@ def _scale(known: Matrix) -> Vector:
     return np.where(output, max(float(spread[output].max()), 1e-6), max(motors, 1e-6))
 
 
-def _set_novelty(model: Model, stretches: Sequence[Stretch]) -> Novelty:
+def _set_novelty(model: Model, stretches: Sequence[ScoredStretch]) -> Novelty:
     """Return the novelty in the space of a set's own regressor, by its weights: form `lags` or `residual`."""
     table, scale = model.arrays["table"], model.arrays["scale"]
     residual = model.kind == "residual" or model.arrays["b"].shape[1] > 0

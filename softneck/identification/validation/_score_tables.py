@@ -13,7 +13,7 @@ from ..models._model import Model
 from ..models._scores import nrmse_fit, r_squared, rmse, worst_error
 from ..set_membership._extrapolation import knows_what_it_saw, outside_seen
 from ._bootstrap import fit_intervals
-from ._scored_rows import Rows, Stretch
+from ._scored_rows import Rows, ScoredStretch
 
 INFINITE = "inf"
 AXES = ("pitch", "roll")
@@ -43,7 +43,7 @@ def score_tables(
 
 
 def run_tables(
-    stretches: Sequence[Stretch],
+    stretches: Sequence[ScoredStretch],
     rows_of_all: Rows,
     measured: dict[str, Matrix],
     predicted: dict[str, Matrix],

@@ -18,7 +18,7 @@ _MOST_STEPS = 75_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Stretch:
+class ScoredStretch:
     """Rows of one run that follow each other.
 
     Attributes:
@@ -65,13 +65,13 @@ class Rows:
         return 1 if horizon == 1 else max(-(-steps // _MOST_STEPS), 1)
 
 
-def unseen_stretches(recording: Recording, hashes: np.ndarray) -> tuple[list[Stretch], int]:
+def unseen_stretches(recording: Recording, hashes: np.ndarray) -> tuple[list[ScoredStretch], int]:
     """Return the stretches of rows whose hash is not in `hashes`, and how many rows were left out.
 
     Raises:
         DataError: nothing is left to judge.
     """
-    stretches: list[Stretch] = []
+    stretches: list[ScoredStretch] = []
     left_out = longest = 0
     for run in recording.runs():
         seen = known_rows(run, hashes) if hashes.size else np.zeros(len(run), dtype=bool)
@@ -83,13 +83,13 @@ def unseen_stretches(recording: Recording, hashes: np.ndarray) -> tuple[list[Str
             part = run.rows(start, stop)
             mask &= np.isfinite(part.outputs).any(axis=1)
             if mask.any():
-                stretches.append(Stretch(part, mask, int(run.run[0])))
+                stretches.append(ScoredStretch(part, mask, int(run.run[0])))
     if not stretches:
         raise DataError(f"nothing is left to judge: {_why(len(recording), left_out, longest)}")
     return stretches, left_out
 
 
-def pooled(stretches: list[Stretch]) -> Rows:
+def pooled(stretches: list[ScoredStretch]) -> Rows:
     """Return the rows of all stretches."""
     outputs = [np.where(s.scored[:, None], s.recording.outputs, np.nan) for s in stretches]
     return Rows(

@@ -26,7 +26,7 @@ from ._score_tables import (
     run_tables,
     score_tables,
 )
-from ._scored_rows import Rows, Stretch, pooled, unseen_stretches
+from ._scored_rows import Rows, ScoredStretch, pooled, unseen_stretches
 
 _HORIZONS = (1, 5, 25, INFINITE)
 
@@ -195,7 +195,7 @@ def check_training_data(model: Model, training: Recording | None) -> None:
 class Parts:
     """What of a recording is judged, and what stands beside any model on it."""
 
-    stretches: list[Stretch]
+    stretches: list[ScoredStretch]
     left_out: int
     rows: Rows
     baselines: Baselines

@@ -17,7 +17,7 @@ _ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Limits:
+class SetPointLimits:
     """Bounds on every motor's set-point; infinite: none.
 
     Attributes:
@@ -73,7 +73,9 @@ class Changes:
         return ", ".join(f"{100 * share:.2g} % {what}" for what, share in said.items() if share > 0) or "unchanged"
 
 
-def prepare(excitation: Excitation, limits: Limits | None = None, *, ramp_s: float = 0.0) -> tuple[Excitation, Changes]:
+def prepare(
+    excitation: Excitation, limits: SetPointLimits | None = None, *, ramp_s: float = 0.0
+) -> tuple[Excitation, Changes]:
     """Return an excitation that drives may play, and what was changed; a pure function.
 
     In this order:

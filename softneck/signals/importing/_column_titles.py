@@ -108,7 +108,7 @@ def _role(words: list[str], motor: int | None) -> tuple[str, str, int]:
         return "time", f"'{next(word for word in words if word in _TIME)}' names time", len(words)
     elif known & _COUNTER:
         return "ignored", "it counts the rows", 0
-    return "unknown", "its name says nothing that softneck knows", 0
+    return "unknown", "softneck does not recognise its name", 0
 
 
 def _angle_role(angle: str, known: set[str], target: str | None, speed: bool) -> tuple[str, str, int]:
@@ -119,5 +119,5 @@ def _angle_role(angle: str, known: set[str], target: str | None, speed: bool) ->
     if speed:
         if angle in ("pitch", "roll"):
             return f"{angle}_rate", f"it names the rate of {angle}", 0
-        return "ignored", f"the rate of {angle} is no channel of a recording", 0
+        return "ignored", f"the rate of {angle} is not a channel of a recording", 0
     return angle, f"it names the platform's {angle}", 0 if known & _SENSED else 1

@@ -13,7 +13,7 @@ from ..recording._channels import MOTOR_POSITIONS, OUTPUTS, SET_POINTS, known_ch
 from ._column_shapes import shortened
 from ._column_titles import Title, read_title
 from ._layout import Column, Term
-from ._table_format import Sniffed
+from ._table_format import SniffResult
 from ._tilt import pitch_roll
 
 
@@ -40,7 +40,7 @@ class Pick:
 class Draft:
     """The state of a guess; `picks` also holds time, run, inclination and orientation."""
 
-    sniffed: Sniffed
+    sniffed: SniffResult
     titles: dict[Column, Title] = field(default_factory=dict)
     moving: dict[Column, Vector] = field(default_factory=dict)
     picks: dict[str, Pick] = field(default_factory=dict)

@@ -65,7 +65,7 @@ def _time_and_run(draft: Draft, by_role: dict[str, list[tuple[int, Column]]]) ->
         elif rising > 0.5:
             draft.pick("time", column, f"{draft.titles[column].why}, and it rises from row to row")
         else:
-            draft.passed_over[column] = "it does not rise from row to row, so it is no time"
+            draft.passed_over[column] = "it does not rise from row to row, so it is not a time"
     for _, column in by_role["run"]:
         values = draft.sniffed.columns[column]
         if "run" not in draft.picks and np.isfinite(values).all() and np.array_equal(values, np.round(values)):
@@ -177,6 +177,6 @@ def _best(draft: Draft, entries: list[tuple[int, Column]]) -> Column | None:
 
 def _not_taken(draft: Draft, role: str) -> str:
     if role == "yaw":
-        return "yaw is no channel of a recording; where your second axis is yaw, write it as `roll` with its sign"
+        return "yaw is not a channel of a recording; where your second axis is yaw, write it as `roll` with its sign"
     taken = role if role in draft.picks else "pitch"
     return f"{say(draft.picks[taken].terms[0].column)} was taken" if taken in draft.picks else "its pair is not there"

@@ -43,7 +43,7 @@ def by_shapes(draft: Draft) -> None:
 
 
 def _answer(draft: Draft, axis: str, column: str | int, r: float) -> None:
-    why = f"it answers {_AXIS[axis]} of the motors with correlation {r:.2f}; of other columns none does so more"
+    why = f"it answers {_AXIS[axis]} of the motors with correlation {r:.2f}; no other column does so more"
     sign = -1.0 if r < 0 else 1.0
     draft.pick(axis, column, why + ("; turned round, so that it rises with it" if r < 0 else ""), sign=sign, sure=False)
 
@@ -116,7 +116,7 @@ def _motors_without_rates(draft: Draft) -> None:
         for other in triples(rest)
         if min(correlation(draft.moving[a], draft.moving[b]) for a, b in zip(first, other, strict=True)) > FOLLOWS
     ]
-    why = "of three neighbours to which two other columns answer best it is one"
+    why = "it is one of three neighbours to which two other columns answer best"
     if alike:
         other = alike[0]
         first, other = (first, other) if leads(draft.moving, first, other) else (other, first)

@@ -93,7 +93,7 @@ def read_layout(path: str | Path) -> Layout:
     except FileNotFoundError:
         raise FileFormatError(f"{source}: no such file.") from None
     except (UnicodeDecodeError, OSError, ValueError) as error:  # ValueError: a null character in the path
-        raise FileFormatError(f"{source}: is no TOML file ({error}).") from error
+        raise FileFormatError(f"{source}: is not a TOML file ({error}).") from error
     try:
         return parse_layout(text)
     except FileFormatError as error:
@@ -112,7 +112,7 @@ def parse_layout(text: str) -> Layout:
     try:
         table = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:  # int() refuses thousands of digits
-        raise FileFormatError(f"is no TOML file ({error}).") from error
+        raise FileFormatError(f"is not a TOML file ({error}).") from error
     try:
         return _layout(table)
     except SoftneckError:
@@ -171,7 +171,7 @@ def _time_source(time: dict[str, Any]) -> Source | None:
 
 def _channel_source(name: str, entry: Any) -> Source:
     if name not in known_channels() or name == "time":
-        raise SettingsError(f"[channels.{name}]: no channel of a recording; known: {', '.join(known_channels())}.")
+        raise SettingsError(f"[channels.{name}]: not a channel of a recording; known: {', '.join(known_channels())}.")
     return _source(entry, si_unit(name), f"[channels.{name}]")
 
 

@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Imported:
+class ImportResult:
     """A recording and what the importer did that a user should know."""
 
     recording: Recording
     notes: tuple[str, ...] = field(default=())
 
 
-def import_log(path: str | Path, layout: Layout) -> Imported:
+def import_log(path: str | Path, layout: Layout) -> ImportResult:
     """Read a foreign table as a recording.
 
     Raises:
@@ -79,14 +79,14 @@ def _columns(layout: Layout) -> tuple[Column, ...]:
     return (*named, layout.run) if layout.run is not None else tuple(named)
 
 
-def _imported(frame: pd.DataFrame, layout: Layout) -> Imported:
+def _imported(frame: pd.DataFrame, layout: Layout) -> ImportResult:
     channels = {name: _values(frame, source, name) for name, source in layout.channels.items()}
     if layout.inclination is not None and layout.orientation is not None:
         i = _values(frame, layout.inclination, "pitch")
         o = _values(frame, layout.orientation, "pitch")
         channels["pitch"], channels["roll"] = pitch_roll(i, o)
     samples, sample_time, notes = _clocked(frame, layout, channels)
-    return Imported(Recording(samples.time, sample_time, samples.channels, samples.run), notes)
+    return ImportResult(Recording(samples.time, sample_time, samples.channels, samples.run), notes)
 
 
 def _clocked(

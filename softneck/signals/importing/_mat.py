@@ -33,7 +33,7 @@ def read_mat(source: Path, variable: str | None, wanted: tuple[str, ...] = ()) -
 
     Raises:
         FileFormatError: no MAT file.
-        DataError: the variable is not there, is no matrix of numbers, or vectors differ in length.
+        DataError: the variable is not there, is not a matrix of numbers, or vectors differ in length.
     """
     return mat_table(source, mat_arrays(source), variable, wanted)
 
@@ -50,7 +50,7 @@ def mat_arrays(source: Path) -> dict[str, np.ndarray]:
 
     Raises:
         FileFormatError: no MAT file.
-        DataError: a variable lies in another file or declares a size that is none.
+        DataError: a variable lies in another file or declares an impossible size.
     """
     import h5py  # slow to import, and few logs need it
 
@@ -125,7 +125,7 @@ def _members(group: Any, prefix: str, depth: int) -> Iterator[tuple[str, np.ndar
             if item.external or item.is_virtual:
                 raise DataError(f"variable `{prefix}{name}` lies in another file; softneck reads what is in this one.")
             if item.size is not None and item.size > _MAX_NUMBERS:
-                raise DataError(f"variable `{prefix}{name}` declares {item.size} numbers; that is no log.")
+                raise DataError(f"variable `{prefix}{name}` declares {item.size} numbers; that is not a log.")
             # MATLAB stores columns first: the file's shape is the transpose.
             yield f"{prefix}{name}", np.asarray(item[()], dtype=np.float64).T
 

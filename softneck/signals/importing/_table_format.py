@@ -30,7 +30,7 @@ _NAMES = {"\t": "a tab", ";": "`;`", ",": "`,`", WHITESPACE: "blanks"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sniffed:
+class SniffResult:
     """A log's columns and how they were read.
 
     Attributes:
@@ -48,7 +48,7 @@ class Sniffed:
     units: dict[Column, str]
 
 
-def sniff(path: str | Path) -> Sniffed:
+def sniff(path: str | Path) -> SniffResult:
     """Read a log of unknown form.
 
     Raises:
@@ -85,7 +85,7 @@ def sniff(path: str | Path) -> Sniffed:
             "Is this a log? If so, write its delimiter into a layout and use --layout."
         )
     named = {name: unit for name, unit in zip(frame.columns, units, strict=False) if unit}
-    return Sniffed(columns, tuple(words), form, lines, named)
+    return SniffResult(columns, tuple(words), form, lines, named)
 
 
 def _numbers(column: pd.Series) -> Vector | None:
@@ -136,7 +136,7 @@ def _text_form(source: Path) -> tuple[Layout, tuple[str, ...], list[str]]:
     comma = delimiter != "," and any(map(_COMMA_NUMBER.fullmatch, body)) and not any("." in cell for cell in body)
     first = [cell.strip().replace(",", ".") if comma else cell.strip() for cell in _cells(lines[0], delimiter)]
     header = any(cell and not _NUMBER.fullmatch(cell) for cell in first)
-    why = f"file: cells are parted by {_NAMES[delimiter]}, because that cuts the lines into equally many"
+    why = f"file: cells are separated by {_NAMES[delimiter]}, because that splits all lines into equally many"
     second = "the first line holds words: names" if header else "no header line, because the first line holds numbers"
     units = _unit_row(raw[skip + 1 : skip + 3], delimiter) if header else []
     form = Layout(
@@ -147,7 +147,7 @@ def _text_form(source: Path) -> tuple[Layout, tuple[str, ...], list[str]]:
         skip=skip,
         unit_row=bool(units),
     )
-    before = (f"file: the first {skip} line(s) are no part of the table",) if skip else ()
+    before = (f"file: the first {skip} line(s) are not part of the table",) if skip else ()
     after = [
         *(["file: the line below the names holds units"] if units else []),
         *(["file: decimal commas"] if comma else []),

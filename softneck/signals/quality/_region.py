@@ -120,7 +120,7 @@ def _seconds(mask: np.ndarray, sample_time: float) -> float:
 
 
 def _still_seconds(P: Matrix, run: np.ndarray, sample_time: float) -> float:
-    """Return the time in stretches of a second or more in which no motor moves; a quantum of an encoder is no move."""
+    """Return the time in stretches of a second or more in which no motor moves; an encoder quantum is no move."""
     if len(P) < 2:
         return 0.0
     span = max(1, round(0.2 / sample_time))

@@ -85,7 +85,7 @@ def parse_column(title: str) -> tuple[str, float]:
     name, unit = match["name"], match["unit"].strip()
     if name not in _TABLE:
         raise DataError(
-            f"column `{name}` is no channel of a recording (those are {', '.join(_TABLE)}, run); "
+            f"column `{name}` is not a channel of a recording (those are {', '.join(_TABLE)}, run); "
             "rename or drop it, or use `softneck import` with a layout."
         )
     factor, unit_si = to_si(unit)

@@ -29,7 +29,7 @@ def write_recording(path: str | Path, recording: Recording, *, force: bool = Fal
     """Write a `.csv` or `.parquet` recording; a missing sample becomes an empty cell.
 
     Raises:
-        OutputError: the file exists (and not `force`) or cannot be written.
+        OutputFileError: the file exists (and not `force`) or cannot be written.
         DataError: another ending than `.csv` or `.parquet`, or a channel without a sample.
     """
     suffix = recording_suffix(path)
@@ -96,7 +96,7 @@ def read_table(source: Path, suffix: str, form: TextForm) -> pd.DataFrame:
     """Read a table as text-free columns of floats where they are numbers.
 
     Raises:
-        FileFormatError: no such file, or it is no table.
+        FileFormatError: no such file, or it is not a table.
     """
     import pandas as pd
     from pyarrow import ArrowException

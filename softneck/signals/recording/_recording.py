@@ -168,7 +168,7 @@ class Recording:
             raise DataError("the recording has no rows.")
         for name, values in self.channels.items():
             if name not in known_channels() or name == "time":
-                raise DataError(f"`{name}` is no channel of a recording; known: {', '.join(known_channels())}.")
+                raise DataError(f"`{name}` is not a channel of a recording; known: {', '.join(known_channels())}.")
             if values.shape != (len(self),):
                 raise DataError(f"channel `{name}` has shape {values.shape}; time has {(len(self),)}.")
             bad = np.isinf(values) if may_miss(name) else ~np.isfinite(values)

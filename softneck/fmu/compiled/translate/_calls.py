@@ -25,8 +25,8 @@ _LIKE = {"empty_like": "zeros", "zeros_like": "zeros", "ones_like": "ones"}
 _MADE = {"empty": 0.0, "zeros": 0.0, "ones": 1.0}
 
 
-class Expressions(Protocol):
-    """What a call needs of the expressions around it; see `_expressions.Expressions`."""
+class CallContext(Protocol):
+    """What the translation of a call needs of `_expressions.Expressions`."""
 
     scope: Scope
 
@@ -37,12 +37,12 @@ class Expressions(Protocol):
     def room(self, code: str, kind: Type) -> Value: ...
 
 
-def numpy_call(ex: Expressions, node: ast.AST, name: str, values: list[Value]) -> Value:
+def numpy_call(ex: CallContext, node: ast.AST, name: str, values: list[Value]) -> Value:
     """Return the C of `np.NAME(...)` or `math.NAME(...)`."""
     if name in _MADE:
         return _made(ex, node, values, whole=_whole(ex, node), value=_MADE[name])
     if isinstance(node, ast.Call) and node.keywords:
-        raise ex.scope.fail(node, "keywords are not known here.")
+        raise ex.scope.fail(node, "keyword arguments are not supported here.")
     kinds = [value.type for value in values]
     numbers = all(isinstance(kind, Scalar) for kind in kinds)
     if numbers and len(values) in (1, 2):
@@ -66,7 +66,7 @@ def numpy_call(ex: Expressions, node: ast.AST, name: str, values: list[Value]) -
         if _LIKE[name] == "ones":
             ex.scope.emit(f"sn_fill1({made.code}, 1.0);")
         return made
-    raise ex.scope.fail(node, f"no C is known for `{name}` of these.")
+    raise ex.scope.fail(node, f"there is no translation to C for `{name}` of these.")
 
 
 def _of_numbers(name: str, codes: list[str], whole: bool) -> Value | None:
@@ -82,7 +82,7 @@ def _of_numbers(name: str, codes: list[str], whole: bool) -> Value | None:
     return None
 
 
-def _whole(ex: Expressions, node: ast.AST) -> bool:
+def _whole(ex: CallContext, node: ast.AST) -> bool:
     whole = False
     for keyword in node.keywords if isinstance(node, ast.Call) else []:
         name = ast.unparse(keyword.value)
@@ -92,7 +92,7 @@ def _whole(ex: Expressions, node: ast.AST) -> bool:
     return whole
 
 
-def _made(ex: Expressions, node: ast.AST, values: list[Value], *, whole: bool, value: float) -> Value:
+def _made(ex: CallContext, node: ast.AST, values: list[Value], *, whole: bool, value: float) -> Value:
     """Return a new array; one that numpy leaves unset is zero here."""
     if not isinstance(node, ast.Call) or len(node.args) != 1:
         raise ex.scope.fail(node, "one shape is needed.")
@@ -114,7 +114,7 @@ def _made(ex: Expressions, node: ast.AST, values: list[Value], *, whole: bool, v
     return made
 
 
-def _dot(ex: Expressions, node: ast.AST, values: list[Value]) -> Value:
+def _dot(ex: CallContext, node: ast.AST, values: list[Value]) -> Value:
     a, b = values
     codes = f"(w, {ex.scope.given(a)}, {ex.scope.given(b)})"
     if a.type == b.type == VECTOR:
@@ -125,25 +125,25 @@ def _dot(ex: Expressions, node: ast.AST, values: list[Value]) -> Value:
         return ex.room(f"sn_dot_vm{codes}", VECTOR)
     if a.type == b.type == MATRIX:
         return ex.room(f"sn_dot_mm{codes}", MATRIX)
-    raise ex.scope.fail(node, "products are known of vectors and matrices.")
+    raise ex.scope.fail(node, "products are supported for vectors and matrices.")
 
 
-def array_of(ex: Expressions, node: ast.Call) -> Value:
+def array_of(ex: CallContext, node: ast.Call) -> Value:
     """Return `np.array([a, b, ...])` of numbers."""
     items = node.args[0].elts if len(node.args) == 1 and isinstance(node.args[0], ast.List | ast.Tuple) else []
     values = ex.ordered(items)
     if not items or node.keywords or not all(isinstance(value.type, Scalar) for value in values):
-        raise ex.scope.fail(node, "`np.array` is known of a list of numbers.")
+        raise ex.scope.fail(node, "`np.array` is supported for a list of numbers.")
     made = ex.room(f"sn_zeros1(w, {len(values)})", VECTOR)
     for i, value in enumerate(values):
         ex.scope.emit(f"*sn_at1(w, {made.code}, {i}) = {ex.scope.cast(value, FLOAT)};")
     return made
 
 
-def method(ex: Expressions, node: ast.Call, name: str, base: Value) -> Value:
+def method(ex: CallContext, node: ast.Call, name: str, base: Value) -> Value:
     """Return the C of `base.NAME(...)`."""
     if node.keywords or not isinstance(base.type, View) or base.type.whole:
-        raise ex.scope.fail(node, "this method is not known.")
+        raise ex.scope.fail(node, "this method is not supported.")
     if name in ("max", "min", "sum") and not node.args:
         return numpy_call(ex, node, name, [base])
     if name == "copy" and not node.args and base.type.rank < 3:
@@ -159,13 +159,13 @@ def method(ex: Expressions, node: ast.Call, name: str, base: Value) -> Value:
             return ex.room(f"sn_shaped(w, {flat}, {codes[0]}, {codes[1]})", MATRIX)
         if len(codes) == 1 and base.type == MATRIX:
             return ex.room(flat, VECTOR)
-    raise ex.scope.fail(node, "this method is not known.")
+    raise ex.scope.fail(node, "this method is not supported.")
 
 
-def plain_call(ex: Expressions, node: ast.Call, name: str) -> Value:
+def plain_call(ex: CallContext, node: ast.Call, name: str) -> Value:
     """Return the C of a call of one of Python's own functions."""
     if node.keywords:
-        raise ex.scope.fail(node, "keywords are not known here.")
+        raise ex.scope.fail(node, "keyword arguments are not supported here.")
     values = ex.ordered(node.args)
     kinds = [value.type for value in values]
     if len(values) == 1 and isinstance(kinds[0], Scalar):
@@ -183,10 +183,10 @@ def plain_call(ex: Expressions, node: ast.Call, name: str) -> Value:
         return Value(length(values[0].code, kinds[0], 0), INT)
     if name in ("min", "max") and len(values) > 1 and all(isinstance(kind, Scalar) for kind in kinds):
         return _extreme(ex, node, name, values)
-    raise ex.scope.fail(node, "this function is not known.")
+    raise ex.scope.fail(node, "this function is not supported.")
 
 
-def _extreme(ex: Expressions, node: ast.AST, name: str, values: list[Value]) -> Value:
+def _extreme(ex: CallContext, node: ast.AST, name: str, values: list[Value]) -> Value:
     del node
     kind = FLOAT if any(value.type == FLOAT for value in values) else INT
     code = ex.scope.cast(values[0], kind)

@@ -49,7 +49,7 @@ class Expressions:
         """Return the C of an expression; statements that it needs are written before."""
         handler: Callable[[Any], Value] | None = getattr(self, f"_{type(node).__name__.lower()}", None)
         if handler is None:
-            raise self.scope.fail(node, "no C is known for this.")
+            raise self.scope.fail(node, "there is no translation to C for this.")
         return handler(node)
 
     def ordered(self, nodes: list[ast.expr]) -> list[Value]:
@@ -85,7 +85,7 @@ class Expressions:
             return Value(f"{node.value}LL" if abs(node.value) > 2**31 - 1 else str(node.value), INT, node.value)
         if isinstance(node.value, float):
             return Value(repr(node.value), FLOAT, node.value)
-        raise self.scope.fail(node, "only numbers are known.")
+        raise self.scope.fail(node, "only numbers are supported.")
 
     def _name(self, node: ast.Name) -> Value:
         kind = self.scope.variables.get(node.id)
@@ -93,7 +93,7 @@ class Expressions:
             return Value(self.scope.lent.get(node.id, f"v_{node.id}"), kind)
         if node.id in self.constants:
             return self.value(self.constants[node.id])
-        raise self.scope.fail(node, "this name is not known, or not on every way here.")
+        raise self.scope.fail(node, "this name is not defined, or not on every path to here.")
 
     def _attribute(self, node: ast.Attribute) -> Value:
         if isinstance(node.value, ast.Name) and node.value.id in ("np", "math") and node.attr in _CONSTANTS:
@@ -103,7 +103,7 @@ class Expressions:
             return Value("(" + " * ".join(length(base.code, base.type, i) for i in range(base.type.rank)) + ")", INT)
         if node.attr == "T" and base.type in (VECTOR, MATRIX):
             return base if base.type == VECTOR else Value(f"sn_turned({self.scope.given(base)})", MATRIX)
-        raise self.scope.fail(node, "this attribute is not known.")
+        raise self.scope.fail(node, "this attribute is not supported.")
 
     def _tuple(self, node: ast.Tuple) -> Value:
         values = self.ordered(node.elts)
@@ -120,7 +120,7 @@ class Expressions:
         if isinstance(node.op, ast.USub) and value.type == VECTOR:
             return self.room(f"sn_negative_v(w, {value.code})", VECTOR)
         if not isinstance(value.type, Scalar) or isinstance(node.op, ast.Invert):
-            raise self.scope.fail(node, "this operator is not known here.")
+            raise self.scope.fail(node, "this operator is not supported here.")
         kind = INT if value.type == BOOL else value.type
         if isinstance(node.op, ast.UAdd):
             return value
@@ -139,7 +139,7 @@ class Expressions:
             return numpy_call(self, node, "dot", [left, right])
         if isinstance(left.type, View) or isinstance(right.type, View):
             if op not in _ARITHMETIC:
-                raise self.scope.fail(node, "this operator is not known between arrays.")
+                raise self.scope.fail(node, "this operator is not supported between arrays.")
             return self.elementwise(node, f"sn_{_ARITHMETIC[op]}", left, right)
         if not (isinstance(left.type, Scalar) and isinstance(right.type, Scalar)):
             raise self.scope.fail(node, f"no arithmetic with {left.type} and {right.type}.")
@@ -151,7 +151,7 @@ class Expressions:
         if op in (ast.Mod, ast.FloorDiv):
             return self._modulo(node, kind, a, b)
         if op not in _SIGNS:
-            raise self.scope.fail(node, "this operator is not known.")
+            raise self.scope.fail(node, "this operator is not supported.")
         if whole and op is ast.Mult and not any(_small(v) for v in (left, right)):
             return Value(f"sn_times(w, {a}, {b})", INT)
         known = _fold(op, left, right) if whole else None
@@ -162,7 +162,7 @@ class Expressions:
             return Value(f"sn_modulo(w, {a}, {b})" if kind == INT else f"sn_fmod({a}, {b})", kind)
         if kind == INT:
             return Value(f"sn_floor_divide(w, {a}, {b})", INT)
-        raise self.scope.fail(node, "`//` is known between whole numbers only.")
+        raise self.scope.fail(node, "`//` is supported between whole numbers only.")
 
     def elementwise(self, node: ast.AST, name: str, left: Value, right: Value) -> Value:
         """Return an operation on each entry of arrays of one shape, or of an array and a number."""
@@ -172,7 +172,7 @@ class Expressions:
                 raise self.scope.fail(node, f"no arithmetic with {value.type}.")
             letters += {VECTOR: "v", MATRIX: "m"}.get(value.type, "s")  # type: ignore[arg-type]
         if letters in ("vm", "mv"):
-            raise self.scope.fail(node, "a vector and a matrix of one shape there are not.")
+            raise self.scope.fail(node, "a vector and a matrix cannot have one shape.")
         a, b = (self.scope.cast(v, FLOAT) if isinstance(v.type, Scalar) else self.scope.given(v) for v in (left, right))
         return self.room(f"{name}_{letters}(w, {a}, {b})", MATRIX if "m" in letters else VECTOR)
 
@@ -180,14 +180,14 @@ class Expressions:
         base, exponent = self.ordered([node.left, node.right])
         n = exponent.known
         if not isinstance(base.type, Scalar) or n is None:
-            raise self.scope.fail(node, "powers are known of numbers, with a constant exponent.")
+            raise self.scope.fail(node, "powers are supported for numbers, with a constant exponent.")
         if n == 0.5:
             return Value(f"sqrt({self.scope.cast(base, FLOAT)})", FLOAT)
         if int(n) != n or abs(n) > _LARGEST_POWER or (base.type == INT and n < 0):
-            raise self.scope.fail(node, "powers are known for whole exponents up to 16, and 0.5.")
+            raise self.scope.fail(node, "powers are supported for whole exponents up to 16, and 0.5.")
         if base.type == FLOAT or exponent.type == FLOAT:
             return Value(f"sn_power_whole({self.scope.cast(base, FLOAT)}, {int(n)})", FLOAT)
-        raise self.scope.fail(node, "powers of whole numbers are not known.")
+        raise self.scope.fail(node, "powers of whole numbers are not supported.")
 
     # Truth
 
@@ -229,7 +229,7 @@ class Expressions:
     def _booleans(self, node: ast.BoolOp, part: ast.expr) -> Value:
         value = self.value(part)
         if value.type != BOOL:
-            raise self.scope.fail(node, "`and` and `or` are known between Booleans only.")
+            raise self.scope.fail(node, "`and` and `or` are supported between Booleans only.")
         return value
 
     def _ifexp(self, node: ast.IfExp) -> Value:
@@ -281,7 +281,7 @@ class Expressions:
             i = index.known % len(kind.items)
             return Value(base.code + self.scope.types.field(kind, i), kind.items[i])
         if index.type != INT or not uniform(kind) or index.known is not None:
-            raise self.scope.fail(node, "this entry of a tuple is not known.")
+            raise self.scope.fail(node, "this entry of a tuple is not supported.")
         held = self.scope.kept(base)
         place = self.scope.kept(index)
         self.scope.emit(f"if ((uint64_t){place.code} >= {len(kind.items)}u) sn_outside(w);")
@@ -304,7 +304,7 @@ class Expressions:
             if isinstance(second, ast.Slice) and not isinstance(first, ast.Slice):
                 row = Value(f"sn_row2(w, {self.scope.place(base)}, {self.place(first, base, kind, 0)})", VECTOR)
                 return row if _all(second) else self._stretch(node, self.scope.kept(row), VECTOR, second)
-        raise self.scope.fail(node, "this part of an array is not known.")
+        raise self.scope.fail(node, "this part of an array is not supported.")
 
     def _at(self, base: Value, kind: View, places: list[ast.expr]) -> Value:
         if kind.whole:
@@ -331,7 +331,7 @@ class Expressions:
 
     def _stretch(self, node: ast.AST, base: Value, kind: View, cut: ast.Slice) -> Value:
         if cut.step is not None:
-            raise self.scope.fail(node, "a slice with a step is not known.")
+            raise self.scope.fail(node, "a slice with a step is not supported.")
         if _all(cut):
             return base
         if not base.code.isidentifier():
@@ -351,7 +351,7 @@ class Expressions:
                 return numpy_call(self, node, function.attr, self.ordered(node.args))
             return method(self, node, function.attr, self.value(function.value))
         if not isinstance(function, ast.Name):
-            raise self.scope.fail(node, "this call is not known.")
+            raise self.scope.fail(node, "this call is not supported.")
         result = self._own(node, self)
         return plain_call(self, node, function.id) if result is None else result
 

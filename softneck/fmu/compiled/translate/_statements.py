@@ -27,7 +27,7 @@ class Statements:
         for node in statements:
             handler: Callable[[Any], None] | None = getattr(self, f"_{type(node).__name__.lower()}", None)
             if handler is None:
-                raise self.scope.fail(node, "no C is known for this statement.")
+                raise self.scope.fail(node, "there is no translation to C for this statement.")
             handler(node)
 
     # Simple ones
@@ -157,7 +157,7 @@ class Statements:
         names: dict[type, str] = {ast.Add: "add", ast.Sub: "sub", ast.Mult: "mul", ast.Div: "div"}
         name = names.get(type(node.op))
         if name is None or place.type not in (VECTOR, MATRIX):
-            raise self.scope.fail(node, "this is not known in place.")
+            raise self.scope.fail(node, "this is not supported in place.")
         value = self.ex.value(node.value)
         number = isinstance(value.type, Scalar)
         if not number and value.type != place.type:
@@ -182,7 +182,7 @@ class Statements:
 
     def _while(self, node: ast.While) -> None:
         if node.orelse:
-            raise self.scope.fail(node, "`else` of a loop is not known.")
+            raise self.scope.fail(node, "`else` of a loop is not supported.")
 
         def head() -> None:
             test = self.ex.value(node.test)
@@ -198,7 +198,7 @@ class Statements:
         call, target = node.iter, node.target
         plain = isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "range"
         if not plain or node.orelse or not isinstance(target, ast.Name) or not isinstance(call, ast.Call):
-            raise self.scope.fail(node, "`for NAME in range(...)` is the only loop known.")
+            raise self.scope.fail(node, "`for NAME in range(...)` is the only loop supported.")
         borders = self.ex.ordered(call.args)
         step = borders[2].known if len(borders) == 3 else 1
         if any(border.type != INT for border in borders) or not isinstance(step, int) or step == 0:

@@ -35,7 +35,7 @@ _PASSES = 20
 
 
 @dataclass(frozen=True, slots=True)
-class _Done:
+class _TranslatedFunction:
     """A function in C: its name there and what it returns."""
 
     name: str
@@ -122,9 +122,9 @@ class _Runtime:
         # C is compiled: loops over branches beat whole arrays.
         self.constants |= {"COMPILED": ast.Constant(True)} if "COMPILED" in self.constants else {}
         self.has_members = "member_step" in self.definitions
-        self._done: dict[tuple[str, tuple[Type, ...]], _Done | None] = {}
+        self._done: dict[tuple[str, tuple[Type, ...]], _TranslatedFunction | None] = {}
 
-    def function(self, name: str, arguments: tuple[Type, ...]) -> _Done:
+    def function(self, name: str, arguments: tuple[Type, ...]) -> _TranslatedFunction:
         """Return the C function for these types of arguments."""
         key = (name, arguments)
         if key not in self._done:
@@ -137,7 +137,7 @@ class _Runtime:
             raise TranslationError(f"`{name}` calls itself.")
         return done
 
-    def _written(self, node: ast.FunctionDef, arguments: tuple[Type, ...]) -> _Done:
+    def _written(self, node: ast.FunctionDef, arguments: tuple[Type, ...]) -> _TranslatedFunction:
         names = [argument.arg for argument in node.args.args]
         plain = not (node.args.kwonlyargs or node.args.vararg or node.args.kwarg or node.args.defaults)
         if not plain or len(names) != len(arguments):
@@ -160,7 +160,7 @@ class _Runtime:
         result = NONE if result is None else result
         text = self._text(node, names, arguments, scope, result)
         made = self.unit.keep(re.sub(r"\W", "_", node.name), text)
-        return _Done(made, result, tuple(name in lent for name in names))
+        return _TranslatedFunction(made, result, tuple(name in lent for name in names))
 
     def _text(
         self, node: ast.FunctionDef, names: list[str], arguments: tuple[Type, ...], scope: Scope, result: Type
@@ -199,7 +199,7 @@ class _Runtime:
         if name not in self.definitions:
             return None
         if node.keywords:
-            raise ex.scope.fail(node, "keywords are not known here.")
+            raise ex.scope.fail(node, "keyword arguments are not supported here.")
         values = ex.ordered(node.args)
         if name in _MEMBERS:
             count, kind, code = _MEMBERS[name]
