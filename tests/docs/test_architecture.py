@@ -1,0 +1,98 @@
+"""The page on the architecture: its picture and table are today's, its rules hold, and its walk-through runs."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ..data import ROOT
+
+PAGE = ROOT / "docs" / "architecture.md"
+TEXT = PAGE.read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def drawing(monkeypatch: pytest.MonkeyPatch) -> object:
+    """The script that draws the picture."""
+    pytest.importorskip("grimp", reason="grimp comes with import-linter (dependency group `lint`)")
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    import architecture  # pyright: ignore[reportMissingImports]
+
+    return architecture
+
+
+def test_picture_and_table_are_those_of_todays_imports(drawing) -> None:
+    graph = drawing.rooms_and_imports()
+    assert drawing.PICTURE.read_text(encoding="utf-8") == drawing.picture(graph), "run python docs/architecture.py"
+    assert drawing.with_table(TEXT, drawing.table(graph)) == TEXT, "run python docs/architecture.py"
+
+
+def test_the_picture_leaves_out_what_other_arrows_say_and_nothing_else(drawing) -> None:
+    graph = drawing.rooms_and_imports()
+    shown = drawing.direct(graph)
+
+    def reach(edges: dict[str, frozenset[str]], room: str) -> set[str]:
+        return {room}.union(*(reach(edges, below) for below in edges[room]))
+
+    for room in graph:
+        assert shown[room] <= graph[room]
+        assert reach(shown, room) == reach(graph, room)
+
+
+def test_every_arrow_points_down_and_no_box_is_cut(drawing) -> None:
+    graph = drawing.rooms_and_imports()
+    svg = drawing.picture(graph)
+    width, height = (float(value) for value in re.findall(r'viewBox="0 0 (\d+) (\d+)"', svg)[0])
+    boxes = [
+        tuple(map(float, box))
+        for box in re.findall(r'<rect x="(-?\d+)" y="(-?\d+)" width="(\d+)" height="(\d+)"', svg)
+    ]
+    assert len(boxes) == len(graph)
+    assert all(x >= 0 and y >= 0 and x + w <= width and y + h <= height for x, y, w, h in boxes)
+    arrows = re.findall(r'<path d="M\d+ (\d+).* (\d+)"/>', svg)
+    assert len(arrows) == sum(map(len, drawing.direct(graph).values()))
+    assert all(float(begin) < float(end) for begin, end in arrows)
+
+
+def test_every_room_of_the_source_tree_is_in_the_table(drawing) -> None:
+    rooms = {path.parent.name for path in (ROOT / "softneck").glob("*/__init__.py")}
+    assert set(re.findall(r"^\| `(\w+)` \|", TEXT, re.MULTILINE)) == rooms
+
+
+@pytest.mark.parametrize("heavy", [("loop", ("fmpy",)), ("plant", ("fmpy",)), ("drives/master", ("can", "canopen"))])
+def test_rooms_keep_off_what_their_docstrings_say_they_keep_off(heavy: tuple[str, tuple[str, ...]]) -> None:
+    room, banned = heavy
+    for path in (ROOT / "softneck" / room).rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        assert not re.search(rf"^\s*(?:import|from) ({'|'.join(banned)})\b", text, re.MULTILINE), path
+
+
+def test_the_walk_through_runs(tmp_path: Path) -> None:
+    """Blocks that begin with a file's name are written, the others run behind each other in a process of their own."""
+    script = []
+    for language, text in re.findall(r"^```(python|toml)\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL):
+        name = re.match(r"# (\w+\.(?:py|toml))\n", text)
+        if name is not None:
+            (tmp_path / name[1]).write_text(text, encoding="utf-8")
+        else:
+            assert language == "python"
+            script.append(text)
+    # Three walk-throughs: kind (table, use), sensor (check), profile (EDS, tables, check).
+    assert len(script) == 6
+    (tmp_path / "walk.py").write_text("\n".join(script), encoding="utf-8")
+    path = os.pathsep.join(filter(None, (str(tmp_path), str(ROOT), os.environ.get("PYTHONPATH", ""))))
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "walk.py"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": path},
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "Gain.fmu").is_file()
