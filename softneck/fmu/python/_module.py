@@ -88,7 +88,7 @@ def slave_module(runtime: str) -> SlaveModule:
 def _without_own_imports(source: str) -> str:
     lines = source.splitlines()
     for node in ast.parse(source).body:
-        own = isinstance(node, ast.ImportFrom) and (node.module or "").startswith("softneck.")
+        own = isinstance(node, ast.ImportFrom) and (node.level > 0 or (node.module or "").startswith("softneck."))
         docstring = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
         if own or docstring:
             for number in range(node.lineno, (node.end_lineno or node.lineno) + 1):
