@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
 
 import grimp
@@ -142,7 +143,7 @@ def _places(rows: list[list[str]], chains: list[Chain]) -> dict[str, float]:
     """Return where each stands from the left, in an order with few crossings (Sugiyama's barycentres)."""
     near: dict[str, list[str]] = {name: [] for row in rows for name in row}
     for chain in chains:
-        for (one, _), (other, _) in zip(chain, chain[1:], strict=False):
+        for (one, _), (other, _) in pairwise(chain):
             near[one].append(other)
             near[other].append(one)
     x = {name: place for row in rows for name, place in _spread(row).items()}
@@ -158,7 +159,7 @@ def _places(rows: list[list[str]], chains: list[Chain]) -> dict[str, float]:
 
 
 def _crossings(chains: list[Chain], x: Mapping[str, float]) -> int:
-    steps = [(row, x[one], x[other]) for chain in chains for (one, row), (other, _) in zip(chain, chain[1:], strict=False)]
+    steps = [(row, x[one], x[other]) for chain in chains for (one, row), (other, _) in pairwise(chain)]
     return sum(
         row == other and (a - c) * (b - d) < 0
         for i, (row, a, b) in enumerate(steps)
@@ -188,7 +189,7 @@ def _spread(row: list[str]) -> dict[str, float]:
 def _line(points: list[tuple[float, float]]) -> str:
     """Return an arrow from the lower edge of the first box to the upper edge of the last, straight through passages."""
     text = f"M{points[0][0]:.0f} {points[0][1] + BOX / 2:.0f}"
-    for i, ((x0, y0), (x1, y1)) in enumerate(zip(points, points[1:], strict=False)):
+    for i, ((x0, y0), (x1, y1)) in enumerate(pairwise(points)):
         begin, end = y0 + BOX / 2, y1 - BOX / 2 - (2.0 if i == len(points) - 2 else 0.0)
         middle = (begin + end) / 2
         text += f"C{x0:.0f} {middle:.0f} {x1:.0f} {middle:.0f} {x1:.0f} {end:.0f}"
@@ -209,7 +210,8 @@ def _box(room: str, x: float, y: float) -> str:
     first = y + 5 - 8 * len(inner)
     texts = [f'    <text x="{x:.0f}" y="{first:.0f}" font-size="16" font-weight="600">{room}</text>']
     texts += [
-        f'    <text x="{x:.0f}" y="{first + 17 + 14 * i:.0f}" font-size="11.5">{line}</text>' for i, line in enumerate(inner)
+        f'    <text x="{x:.0f}" y="{first + 17 + 14 * i:.0f}" font-size="11.5">{line}</text>'
+        for i, line in enumerate(inner)
     ]
     return "\n".join([
         '  <g text-anchor="middle" fill="#1c2530">',

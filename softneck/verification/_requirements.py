@@ -26,6 +26,7 @@ _NECK_METRICS = (
     "max_rad",
     "limit_violation_s",
 )
+#: Names of all metrics that a requirement can be about.
 METRIC_NAMES = (
     "stability.radius",
     "stability.searched_radius",

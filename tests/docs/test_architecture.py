@@ -2,41 +2,49 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 from ..data import ROOT
 
 PAGE = ROOT / "docs" / "architecture.md"
+Graph = dict[str, frozenset[str]]
 TEXT = PAGE.read_text(encoding="utf-8")
 
 
-@pytest.fixture
-def drawing(monkeypatch: pytest.MonkeyPatch) -> object:
+@pytest.fixture(scope="module")
+def drawing() -> ModuleType:
     """The script that draws the picture."""
     pytest.importorskip("grimp", reason="grimp comes with import-linter (dependency group `lint`)")
-    monkeypatch.syspath_prepend(str(ROOT / "docs"))
-    import architecture  # pyright: ignore[reportMissingImports]
+    spec = importlib.util.spec_from_file_location("architecture", ROOT / "docs" / "architecture.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
-    return architecture
+
+@pytest.fixture(scope="module")
+def graph(drawing: ModuleType) -> Graph:
+    return drawing.rooms_and_imports()
 
 
-def test_picture_and_table_are_those_of_todays_imports(drawing) -> None:
-    graph = drawing.rooms_and_imports()
+def test_picture_and_table_are_those_of_todays_imports(drawing: ModuleType, graph: Graph) -> None:
     assert drawing.PICTURE.read_text(encoding="utf-8") == drawing.picture(graph), "run python docs/architecture.py"
     assert drawing.with_table(TEXT, drawing.table(graph)) == TEXT, "run python docs/architecture.py"
 
 
-def test_the_picture_leaves_out_what_other_arrows_say_and_nothing_else(drawing) -> None:
-    graph = drawing.rooms_and_imports()
+def test_the_picture_leaves_out_what_other_arrows_say_and_nothing_else(drawing: ModuleType, graph: Graph) -> None:
     shown = drawing.direct(graph)
 
-    def reach(edges: dict[str, frozenset[str]], room: str) -> set[str]:
+    def reach(edges: Graph, room: str) -> set[str]:
         return {room}.union(*(reach(edges, below) for below in edges[room]))
 
     for room in graph:
@@ -44,13 +52,11 @@ def test_the_picture_leaves_out_what_other_arrows_say_and_nothing_else(drawing) 
         assert reach(shown, room) == reach(graph, room)
 
 
-def test_every_arrow_points_down_and_no_box_is_cut(drawing) -> None:
-    graph = drawing.rooms_and_imports()
+def test_every_arrow_points_down_and_no_box_is_cut(drawing: ModuleType, graph: Graph) -> None:
     svg = drawing.picture(graph)
     width, height = (float(value) for value in re.findall(r'viewBox="0 0 (\d+) (\d+)"', svg)[0])
     boxes = [
-        tuple(map(float, box))
-        for box in re.findall(r'<rect x="(-?\d+)" y="(-?\d+)" width="(\d+)" height="(\d+)"', svg)
+        tuple(map(float, box)) for box in re.findall(r'<rect x="(-?\d+)" y="(-?\d+)" width="(\d+)" height="(\d+)"', svg)
     ]
     assert len(boxes) == len(graph)
     assert all(x >= 0 and y >= 0 and x + w <= width and y + h <= height for x, y, w, h in boxes)
@@ -59,7 +65,7 @@ def test_every_arrow_points_down_and_no_box_is_cut(drawing) -> None:
     assert all(float(begin) < float(end) for begin, end in arrows)
 
 
-def test_every_room_of_the_source_tree_is_in_the_table(drawing) -> None:
+def test_every_room_of_the_source_tree_is_in_the_table() -> None:
     rooms = {path.parent.name for path in (ROOT / "softneck").glob("*/__init__.py")}
     assert set(re.findall(r"^\| `(\w+)` \|", TEXT, re.MULTILINE)) == rooms
 
@@ -72,6 +78,7 @@ def test_rooms_keep_off_what_their_docstrings_say_they_keep_off(heavy: tuple[str
         assert not re.search(rf"^\s*(?:import|from) ({'|'.join(banned)})\b", text, re.MULTILINE), path
 
 
+@pytest.mark.slow
 def test_the_walk_through_runs(tmp_path: Path) -> None:
     """Blocks that begin with a file's name are written, the others run behind each other in a process of their own."""
     script = []
