@@ -93,8 +93,9 @@ def setup(app: Any) -> dict[str, bool]:
         """`public-names`: the tables of all rooms."""
 
         def run(self) -> list[Any]:
+            # Docstrings change while the page with this directive does not.
+            self.env.note_reread()
             return self.parse_text_to_nodes(page(), allow_section_headings=True)
 
     app.add_directive("public-names", PublicNames)
-    # Docstrings may change while this page does not.
     return {"parallel_read_safe": True}

@@ -81,7 +81,7 @@ class Requirement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Requirements:
-    """What is asked, and how it is tried.
+    """What a verification asks of a controller, and how it is tried.
 
     Attributes:
         bounds: in the order of the file.
