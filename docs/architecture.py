@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Mapping
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,6 +19,26 @@ ROOT = Path(__file__).parents[1]
 PICTURE = ROOT / "docs" / "_static" / "architecture.svg"
 PAGE = ROOT / "docs" / "architecture.md"
 BEGIN, END = "<!-- rooms: written by docs/architecture.py -->\n", "<!-- end of rooms -->\n"
+
+# What of the world outside a room touches, told by the modules that it imports and the functions that it calls.
+WORLD = {
+    "FMI": {"fmpy", "pythonfmu"},
+    "buses and ports": {"can", "canopen", "serial"},
+    "clocks": {"time"},
+    "processes": {"subprocess", "multiprocessing", "loky", "distributed"},
+    "sockets": {"socket"},
+    "terminal": {"click", "rich", "termios", "tty"},
+    "files": {
+        "open",
+        "read_text",
+        "write_text",
+        "read_bytes",
+        "write_bytes",
+        "atomic_write",
+        "read_archive",
+        "write_archive",
+    },
+}
 
 Graph = Mapping[str, frozenset[str]]
 # Of the picture [px].
@@ -78,16 +99,32 @@ def docstring(room: str) -> tuple[str, str, str]:
     return inside, keeps, may
 
 
+@cache
+def touches(room: str) -> tuple[str, ...]:
+    """Return what of `WORLD` a room touches."""
+    used: set[str] = set()
+    for path in (ROOT / "softneck" / room).rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                used |= {alias.name.partition(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.level == 0:
+                used.add((node.module or "").partition(".")[0])
+            elif isinstance(node, ast.Call):
+                used.add(node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", ""))
+    return tuple(name for name, signs in WORLD.items() if signs & used)
+
+
 def table(graph: Graph) -> str:
     """Return the table of rooms, from the top of the house to its cellar."""
     level = levels(graph)
-    lines = ["| room | what is inside | what it may touch | imports today |", "|---|---|---|---|"]
+    lines = ["| room | what is inside | what it keeps to | touches outside | imports |", "|---|---|---|---|---|"]
     for room in sorted(graph, key=lambda name: (-level[name], name)):
         inside, keeps, may = docstring(room)
         inner = ", ".join(f"`{name}`" for name in inner_rooms(room))
         below = ", ".join(f"`{name}`" for name in sorted(graph[room], key=lambda name: (-level[name], name)))
         rooms = f" Rooms: {inner}." if inner else ""
-        lines.append(f"| `{room}` | {inside}{rooms} | {keeps} {may} | {below or 'nothing'} |")
+        outside = ", ".join(touches(room)) or "nothing"
+        lines.append(f"| `{room}` | {inside}{rooms} | {keeps} {may} | {outside} | {below or 'nothing'} |")
     return "\n".join(lines) + "\n"
 
 
