@@ -8,9 +8,10 @@ Needs grimp, which comes with import-linter (dependency group `lint`).
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Mapping
 from functools import cache
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 
 import grimp
@@ -20,7 +21,7 @@ PICTURE = ROOT / "docs" / "_static" / "architecture.svg"
 PAGE = ROOT / "docs" / "architecture.md"
 BEGIN, END = "<!-- rooms: written by docs/architecture.py -->\n", "<!-- end of rooms -->\n"
 
-# What of the world outside a room touches, told by the modules that it imports and the functions that it calls.
+# What of the world outside a room touches, told by the modules that it imports, and for files by the functions.
 WORLD = {
     "FMI": {"fmpy", "pythonfmu"},
     "buses and ports": {"can", "canopen", "serial"},
@@ -39,6 +40,9 @@ WORLD = {
         "write_archive",
     },
 }
+
+# A module that is imported, or a function that is called.
+_SIGNS = re.compile(r"^ *(?:import|from) (\w+)|\b(\w+)\(", re.MULTILINE)
 
 Graph = Mapping[str, frozenset[str]]
 # Of the picture [px].
@@ -104,13 +108,8 @@ def touches(room: str) -> tuple[str, ...]:
     """Return what of `WORLD` a room touches."""
     used: set[str] = set()
     for path in (ROOT / "softneck" / room).rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Import):
-                used |= {alias.name.partition(".")[0] for alias in node.names}
-            elif isinstance(node, ast.ImportFrom) and node.level == 0:
-                used.add((node.module or "").partition(".")[0])
-            elif isinstance(node, ast.Call):
-                used.add(node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", ""))
+        for module, function in _SIGNS.findall(path.read_text(encoding="utf-8")):
+            used.add(module or (function if function in WORLD["files"] else ""))
     return tuple(name for name, signs in WORLD.items() if signs & used)
 
 
@@ -196,12 +195,11 @@ def _places(rows: list[list[str]], chains: list[Chain]) -> dict[str, float]:
 
 
 def _crossings(chains: list[Chain], x: Mapping[str, float]) -> int:
-    steps = [(row, x[one], x[other]) for chain in chains for (one, row), (other, _) in pairwise(chain)]
-    return sum(
-        row == other and (a - c) * (b - d) < 0
-        for i, (row, a, b) in enumerate(steps)
-        for other, c, d in steps[:i]
-    )  # fmt: skip
+    steps: dict[int, list[tuple[float, float]]] = {}
+    for chain in chains:
+        for (one, row), (other, _) in pairwise(chain):
+            steps.setdefault(row, []).append((x[one], x[other]))
+    return sum((a - c) * (b - d) < 0 for row in steps.values() for (a, b), (c, d) in combinations(row, 2))
 
 
 def _box_width(room: str) -> float:
