@@ -1,6 +1,6 @@
 """What taut tendons are worth: 15 deg steps of the virtual neck with 0, 0.5 and 1 kg, three kinds of controller.
 
-Run with `python examples/taut_tendons.py`.
+Run with `python benchmarks/taut_tendons.py`.
 """
 
 from __future__ import annotations

@@ -1,11 +1,23 @@
 """Sphinx configuration."""
 
+import sys
 from importlib import metadata
+from pathlib import Path
+
+# Our own extension, `public_names`, stands beside this file.
+sys.path.insert(0, str(Path(__file__).parent))
 
 project = "softneck"
 author = "the softneck developers"
 release = metadata.version("softneck")
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_click", "sphinx-mathjax-offline"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx_click",
+    "sphinx-mathjax-offline",
+    "public_names",
+]
 myst_enable_extensions = ["dollarmath", "colon_fence"]
 myst_heading_anchors = 3
 exclude_patterns = ["_build"]

@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 from softneck.estimation import KalmanSettings, LinearNeck, consistency
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.plots import consistency_figure, faults_figure, region_figure, spectrum_figure
-from softneck.signals import Excitation, Recording, SetPointLimits, prepare, quality, redefine, signal
+from softneck.signals import Excitation, Recording, SetPointLimits, assess_quality, prepare, redefine, signal
 
 STATIC = Path(__file__).parent / "_static"
 
@@ -22,11 +22,11 @@ def main() -> None:
     """Write every picture."""
     neck = VirtualNeck(NeckParameters.preset("paper"))
     eq22, mixed = (record(signal(name), neck, seed=1) for name in ("eq22", "mixed"))
-    _save(spectrum_figure(quality(eq22), "Eq. 22"), "quality_spectrum.png")
-    _save(region_figure(eq22, quality(eq22), "Eq. 22"), "quality_region_eq22.png")
-    _save(region_figure(mixed, quality(mixed), "mixed"), "quality_region_mixed.png")
+    _save(spectrum_figure(assess_quality(eq22), "Eq. 22"), "quality_spectrum.png")
+    _save(region_figure(eq22, assess_quality(eq22), "Eq. 22"), "quality_region_eq22.png")
+    _save(region_figure(mixed, assess_quality(mixed), "mixed"), "quality_region_mixed.png")
     bad = _faulty(eq22.rows(0, 3000))
-    _save(faults_figure(bad, quality(bad), "Eq. 22 with planted faults"), "quality_faults.png")
+    _save(faults_figure(bad, assess_quality(bad), "Eq. 22 with planted faults"), "quality_faults.png")
     _save(_limits_figure(), "excitation_limits.png")
     for factor, name in ((1.0, "true"), (0.5, "too_sure")):
         _save(_consistency_figure(factor), f"kalman_{name}.png")

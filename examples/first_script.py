@@ -1,13 +1,14 @@
-"""From the paper's experiment on the virtual neck to an FMU, in ten lines."""
+"""From the paper's experiment on the virtual neck to a controller and an FMU, in ten lines."""
 
-from softneck.fmu import build_fmu, fmu_info
-from softneck.identification import Rls, validate
-from softneck.plant import NeckParameters, VirtualNeck, record
+import softneck
+from softneck.plant import NeckParameters
 from softneck.signals import signal
 
-recording = record(signal("eq22"), VirtualNeck(NeckParameters.paper()), seed=1)
+recording = softneck.record(signal("eq22"), softneck.VirtualNeck(NeckParameters.paper()), seed=1)
 train, rest = recording.split(0.7)
-model = Rls().fit(train)
+model = softneck.identify("rls", train)
 print(model.summary())
-print(validate(model, rest).fits)  # one step, 5 and 25 steps ahead, and the free run
-build_fmu(model.block(), "build/Neck.fmu", info=fmu_info(model), force=True)
+print(softneck.validate(model, rest).fits)  # one step, 5 and 25 steps ahead, and the free run
+controller = softneck.design_controller("pi", model)
+print(controller.summary())
+softneck.build_fmu(model.block(), "build/Neck.fmu", force=True)

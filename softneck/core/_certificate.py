@@ -30,7 +30,7 @@ _FOLDER = Path("build") / "certificates"
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Certificate:
-    """What a certificate says.
+    """What a certificate says: whether all held, and for which files.
 
     Attributes:
         path: of the file.

@@ -38,6 +38,7 @@ class Kind:
 
 _IDENT, _DESIGN = "softneck.identification", "softneck.design"
 _MODEL = f"{_IDENT}:Model"
+#: The table of kinds: the name that users type -> what makes it, what it becomes, what steps it.
 KINDS: dict[str, Kind] = {
     kind.name: kind
     for kind in (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+#: Called with the fraction done, 0 to 1, and a word on what is being done.
 Progress = Callable[[float, str], None]
 
 

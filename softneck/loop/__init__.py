@@ -1,6 +1,6 @@
 """The closed loop over anything that steps: wiring by name, order, references, faults, metrics.
 
-Arrays only: no FMI, no files, no clocks.
+Arrays and no FMI; a clock only paces a run, a file only keeps its state.
 May import `signals` and below.
 """
 

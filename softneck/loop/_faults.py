@@ -121,6 +121,7 @@ class NeckFault:
             require_finite(name, value, "SI")
 
 
+#: Any fault that a loop can act out.
 Fault = SensorFault | MotorFault | NeckFault
 
 # kind in a loop file -> (class, its `kind`, the keys that it takes without their unit).

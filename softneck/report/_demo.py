@@ -26,7 +26,7 @@ FULL_DURATION = 200.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DemoSettings:
-    """What the demo does.
+    """How `softneck demo` is run: length of the experiment, training, folder.
 
     Attributes:
         out: folder for recordings, models, FMUs, loops, results and the report.
@@ -81,7 +81,7 @@ class Demo:
 
 
 def run_demo(settings: DemoSettings, *, tell: Tell) -> Demo:
-    """Run the whole line and write everything to `settings.out`.
+    """Run the demo, from experiment to closed loop, and write everything to `settings.out`.
 
     Args:
         settings: what to do.

@@ -25,7 +25,7 @@ Verdicts = Mapping[tuple[str, str], ValidationPair]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReproduceSettings:
-    """What is run.
+    """How the paper is run again: training, length of the experiment, other necks.
 
     Attributes:
         iterations: of the network's training, for each axis.

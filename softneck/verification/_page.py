@@ -52,7 +52,7 @@ def _plant(verdict: Verdict) -> str:
 
 
 def verification_page(found: Verification, controller: str, certificate: str = "") -> str:
-    """Return the HTML text of the page.
+    """Return the HTML page of a verification.
 
     Args:
         found: the verification.

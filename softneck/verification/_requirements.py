@@ -26,6 +26,7 @@ _NECK_METRICS = (
     "max_rad",
     "limit_violation_s",
 )
+#: Names of all metrics that a requirement can be about.
 METRIC_NAMES = (
     "stability.radius",
     "stability.searched_radius",
@@ -80,7 +81,7 @@ class Requirement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Requirements:
-    """What is asked, and how it is tried.
+    """What a verification asks of a controller, and how it is tried.
 
     Attributes:
         bounds: in the order of the file.

@@ -45,7 +45,7 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Verification:
-    """What a verification found.
+    """What a verification found: each requirement, its worst plant, and whether all hold.
 
     Attributes:
         verdicts: one for each requirement.

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Result:
-    """One simulated loop.
+    """One simulated loop: its signals, its metrics, and whether it keeps its limits.
 
     Attributes:
         signals: all signals, named as in a recording, with their units.

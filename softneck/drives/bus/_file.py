@@ -135,7 +135,7 @@ class Neck:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DrivesFile:
-    """All of `drives.toml`.
+    """All that a drives file (`drives.toml`) says.
 
     Attributes:
         profile: "ipos2015" or "ds402".

@@ -77,7 +77,7 @@ def fault_table(fault: Event | None) -> dict[str, Any] | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrivesResult:
-    """One run on drives.
+    """What came of one run on the drives.
 
     Attributes:
         signals: one row for each sample of the controller while it ran.

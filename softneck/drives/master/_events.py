@@ -79,7 +79,7 @@ IDLE_TOO = frozenset({"second_master", "bus_off", "boot_up", "operator", "emerge
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that happened.
+    """Something that happened in a run: when, what, and at which drive.
 
     Attributes:
         time: [s] of the master's clock.

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class Frame(NamedTuple):
-    """One frame.
+    """One frame on the CAN bus.
 
     Attributes:
         identifier: COB-ID.

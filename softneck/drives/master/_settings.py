@@ -135,7 +135,7 @@ class RampSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MasterSettings:
-    """All of it.
+    """All settings of the master: bus, limits, inclinometer, watches, ramps.
 
     Attributes:
         counts_per_radian: of each winch, with sign.

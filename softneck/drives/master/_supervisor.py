@@ -10,7 +10,7 @@ from ._events import Event, Reaction
 
 
 class Phase(StrEnum):
-    """Where a run is."""
+    """The phase that a run on the drives is in, from waiting to switched off."""
 
     IDLE = "idle"
     ENABLING = "enabling"

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     import control
 
 
-# A free run starts from this many measured samples, for every kind; they are not scored.
+#: A free run starts from this many measured samples, for every kind; they are not scored.
 WARM_UP = 25
 _MOTORS = ("simulated", "measured")
 

@@ -11,7 +11,8 @@ from softneck.signals import Recording
 
 from ._drive import DriveModel
 
-# Eq. 21: y(k-1); u_i(k-2), u_i(k-3); M_i(k-3). Rows are (source, channel, lag): 0 own output, 1 u, 2 M.
+#: The regressor of Eq. 21: y(k-1); u_i(k-2), u_i(k-3); M_i(k-3).
+# Rows are (source, channel, lag): 0 own output, 1 u, 2 M.
 PAPER_EQ21 = np.array(
     [
         [0, 0, 1],

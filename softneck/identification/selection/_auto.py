@@ -57,7 +57,7 @@ class KindTrial:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Choice:
-    """The outcome of `choose`.
+    """The outcome of `choose`: all kinds by their free run, and the one that was taken.
 
     Attributes:
         ranking: all kinds, best free run first.

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """Every model on every recording.
+    """The scores of every model on every recording.
 
     Attributes:
         validations: model by model, each on all recordings.

@@ -15,6 +15,7 @@ from ..set_membership._extrapolation import knows_what_it_saw, outside_seen
 from ._bootstrap import fit_intervals
 from ._scored_rows import Rows, ScoredStretch
 
+#: The name of the free run among the horizons of a validation.
 INFINITE = "inf"
 AXES = ("pitch", "roll")
 # Bounds of set membership follow pitch, roll and three motors in its outputs.

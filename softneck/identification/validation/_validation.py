@@ -35,7 +35,7 @@ Scores = dict[str, dict[str, float | None]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Validation:
-    """One model on one recording.
+    """What one model is worth on one recording.
 
     Scores are tables horizon -> axis -> value ("1", ..., "inf"; "pitch", "roll"), None where the free run diverged or
     nothing was measured or moved; all but `per_run` are over the rows of all runs together.

@@ -10,6 +10,7 @@ from softneck.core import Matrix, SettingsError, Vector, require_between, requir
 
 from ..recording._redefinition import motors_from
 
+#: Sample time of the paper's experiments [s].
 SAMPLE_TIME = 0.02
 # Table 2: columns are motors 1, 2, 3; phi_4 of motor 3 is 0.95 as printed, not 0.095.
 _OMEGA = (1.0, 0.25, 1.5, 2.56, 1.75, 1.66, 4.0)

@@ -29,7 +29,7 @@ _NECK_LAG = 25
 
 @dataclass(frozen=True, slots=True)
 class Guess:
-    """A proposed layout.
+    """A layout that was proposed for a log, with the reason for each line.
 
     Attributes:
         layout: as far as it goes.

@@ -37,7 +37,7 @@ class Source:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
-    """How a log is read.
+    """How a foreign log is read: which column is which channel, in which unit.
 
     Attributes:
         channels: channel name -> source.

@@ -7,6 +7,7 @@ import re
 from softneck.core import DataError, to_si
 
 MOTORS = (1, 2, 3)
+#: Names of the three channels with the motors' set-points.
 SET_POINTS = tuple(f"motor_setpoint_{j}" for j in MOTORS)
 MOTOR_POSITIONS = tuple(f"motor_position_{j}" for j in MOTORS)
 OUTPUTS = ("pitch", "roll")

@@ -6,7 +6,7 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector
 
-# Eq. 6 and 8: motors at 0, 120 and 240 deg.
+#: Where the three tendons stand around the neck [rad], motors at 0, 120 and 240 deg (Eq. 6 and 8).
 TENDON_ANGLES = np.radians([0.0, 120.0, 240.0])
 
 

@@ -1,0 +1,131 @@
+"""The page on the architecture: its picture and table are today's, its rules hold, and its walk-through runs."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from ..data import ROOT
+
+PAGE = ROOT / "docs" / "architecture.md"
+Graph = dict[str, frozenset[str]]
+TEXT = PAGE.read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def drawing() -> ModuleType:
+    """The script that draws the picture."""
+    pytest.importorskip("grimp", reason="grimp comes with import-linter (dependency group `lint`)")
+    spec = importlib.util.spec_from_file_location("architecture", ROOT / "docs" / "architecture.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def graph(drawing: ModuleType) -> Graph:
+    return drawing.rooms_and_imports()
+
+
+def test_picture_and_table_are_those_of_todays_imports(drawing: ModuleType, graph: Graph) -> None:
+    assert drawing.PICTURE.read_text(encoding="utf-8") == drawing.picture(graph), "run python docs/architecture.py"
+    assert drawing.with_table(TEXT, drawing.table(graph)) == TEXT, "run python docs/architecture.py"
+
+
+def test_the_picture_leaves_out_what_other_arrows_say_and_nothing_else(drawing: ModuleType, graph: Graph) -> None:
+    shown = drawing.direct(graph)
+
+    def reach(edges: Graph, room: str) -> set[str]:
+        return {room}.union(*(reach(edges, below) for below in edges[room]))
+
+    for room in graph:
+        assert shown[room] <= graph[room]
+        assert reach(shown, room) == reach(graph, room)
+
+
+def test_every_arrow_points_down_and_no_box_is_cut(drawing: ModuleType, graph: Graph) -> None:
+    svg = drawing.picture(graph)
+    width, height = (float(value) for value in re.findall(r'viewBox="0 0 (\d+) (\d+)"', svg)[0])
+    boxes = [
+        tuple(map(float, box)) for box in re.findall(r'<rect x="(-?\d+)" y="(-?\d+)" width="(\d+)" height="(\d+)"', svg)
+    ]
+    assert len(boxes) == len(graph)
+    assert all(x >= 0 and y >= 0 and x + w <= width and y + h <= height for x, y, w, h in boxes)
+    arrows = re.findall(r'<path d="M\d+ (\d+).* (\d+)"/>', svg)
+    assert len(arrows) == sum(map(len, drawing.direct(graph).values()))
+    assert all(float(begin) < float(end) for begin, end in arrows)
+
+
+def test_every_room_of_the_source_tree_is_in_the_table() -> None:
+    rooms = {path.parent.name for path in (ROOT / "softneck").glob("*/__init__.py")}
+    assert set(re.findall(r"^\| `(\w+)` \|", TEXT, re.MULTILINE)) == rooms
+
+
+@pytest.mark.parametrize(
+    ("outside", "rooms"),
+    [
+        # The command line and the report ask fmpy what a file is.
+        ("FMI", {"fmu", "cosim", "cli", "report"}),
+        ("buses and ports", {"drives"}),
+        ("terminal", {"cli", "drives"}),
+        ("sockets", {"drives"}),
+    ],
+)
+def test_what_is_outside_is_touched_at_the_edge(
+    outside: str, rooms: set[str], drawing: ModuleType, graph: Graph
+) -> None:
+    assert {room for room in graph if outside in drawing.touches(room)} <= rooms
+
+
+def test_rooms_import_what_their_docstrings_say(drawing: ModuleType, graph: Graph) -> None:
+    """`May import a, b and below` names rooms; those below them are the lower layers of the contract."""
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"][
+        "contracts"
+    ]
+    layers = [re.findall(r"softneck\.(\w+)", layer) for layer in contracts[0]["layers"]]
+    height = {room: -row for row, names in enumerate(layers) for room in names}
+    for room, imported in graph.items():
+        said = drawing.docstring(room)[2]
+        named = set(re.findall(r"`(\w+)`", said.partition("May import")[2].partition(";")[0].lower()))
+        named |= set(re.findall(r"`(\w+)`", said.partition("may import")[2]))
+        if "everything" in said:
+            continue
+        top = max((height[name] for name in named), default=-len(layers))
+        assert all(name in named or ("below" in said and height[name] <= top) for name in imported), room
+
+
+@pytest.mark.slow
+def test_the_walk_through_runs(tmp_path: Path) -> None:
+    """Blocks that begin with a file's name are written, the others run behind each other in a process of their own."""
+    script = []
+    for language, text in re.findall(r"^```(python|toml)\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL):
+        name = re.match(r"# (\w+\.(?:py|toml))\n", text)
+        if name is not None:
+            (tmp_path / name[1]).write_text(text, encoding="utf-8")
+        else:
+            assert language == "python"
+            script.append(text)
+    # Three walk-throughs: kind (table, use), sensor (check), profile (EDS, tables, check).
+    assert len(script) == 6
+    (tmp_path / "walk.py").write_text("\n".join(script), encoding="utf-8")
+    path = os.pathsep.join(filter(None, (str(tmp_path), str(ROOT), os.environ.get("PYTHONPATH", ""))))
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "walk.py"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": path},
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "Gain.fmu").is_file()
