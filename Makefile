@@ -8,12 +8,13 @@ BIN := $(VENV)/bin
 demo: $(VENV)/.installed
 	$(BIN)/softneck demo --out build/demo
 
+# Neighbours stay with one worker: what a module makes once is made once.
 test: $(VENV)/.tested
-	$(BIN)/python -m pytest -q -n 2 -m "not slow"
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m "not slow"
 
 # What takes long: CI runs it too.
 slow: $(VENV)/.tested
-	$(BIN)/python -m pytest -q -n 2 -m slow
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m slow
 
 check: $(VENV)/.linted
 	$(BIN)/ruff check .

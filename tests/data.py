@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 
 from softneck.core import Matrix, Vector
 from softneck.signals import SET_POINTS, Recording, signal
@@ -14,6 +17,13 @@ from softneck.signals.recording._channels import MOTOR_POSITIONS
 ROOT = Path(__file__).parents[1]
 LAYOUTS = ROOT / "examples" / "layouts"
 TS = 0.02
+
+
+def slow_but(values: Iterable[str], short: Iterable[str]) -> list[Any]:
+    """Return `values` as parameters of a test, of which `make test` runs `short` and `make slow` the others."""
+    values, short = list(values), set(short)
+    assert short <= set(values), short - set(values)
+    return [value if value in short else pytest.param(value, marks=pytest.mark.slow) for value in values]
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,6 +41,7 @@ def test_taut_tendons_make_every_kind_hold(capsys: pytest.CaptureFixture[str]) -
     assert "do not hold" not in after
 
 
+@pytest.mark.slow
 def test_the_picture_of_limits_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.argv", ["mpc_limits.py", str(tmp_path)])
     runpy.run_path(str(ROOT / "examples" / "mpc_limits.py"), run_name="__main__")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib.util
 import sys
 import tempfile
@@ -91,8 +92,8 @@ def _linked(module: str, runtimes: tuple[str, ...]) -> ModuleType:
     arguments = "parameters, state, inputs, outputs"
     lines = ["from softneck.runtime import load_runtime"]
     for i, runtime in enumerate(runtimes):
-        # Its content's name is part of this text: another runtime makes another module, and another cache.
-        lines.append(f'linked_{i} = load_runtime("{runtime}").step  # {compiled_name(bundle(runtime))}')
+        # Its content's name is part of this text, and no comment: another runtime makes another module and cache.
+        lines += [f'linked_{i} = load_runtime("{runtime}").step', f'content_{i} = "{compiled_name(bundle(runtime))}"']
     lines += ["del load_runtime", "", "", f"def part_step(part, arrays, {arguments}):"]
     for i in range(len(runtimes)):
         # Constant indices: a compiler knows the type of each part's arrays then.
@@ -104,9 +105,23 @@ def _linked(module: str, runtimes: tuple[str, ...]) -> ModuleType:
 
 
 def compiled_name(text: str) -> str:
-    """Return the name under which the bundle `text` and its compiled code are kept; FMUs keep theirs there too."""
+    """Return the name under which the bundle `text` and its compiled code are kept; FMUs keep theirs there too.
+
+    Comments, docstrings and layout do not count: a text that differs in them alone is not compiled again.
+    """
     # numba's cache does not look at its options: they belong to the name.
-    return content_name(f"{text}\n# {COMPILE_OPTIONS}")
+    return content_name(f"{_without_words(text)}\n# {COMPILE_OPTIONS}")
+
+
+@cache
+def _without_words(text: str) -> str:
+    """Return `text` without what only people read."""
+    tree = ast.parse(text)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.FunctionDef | ast.ClassDef):
+            rest = node.body[1:] if ast.get_docstring(node, clean=False) is not None else node.body
+            node.body = rest or [ast.Pass()]
+    return ast.unparse(tree)
 
 
 def have_numba() -> bool:
@@ -130,7 +145,7 @@ def _compile(namespace: ModuleType) -> bool:
 def _import_text(text: str, *, compiled: bool) -> ModuleType:
     name = compiled_name(text)
     path = _cache_folder() / f"{name}.py"
-    if not path.is_file() or path.read_text(encoding="utf-8") != text:
+    if not _holds(path, text, name):
         with atomic_write(path, force=True) as temporary:
             temporary.write_text(text, encoding="utf-8")
     alias = f"{name}_compiled" if compiled else name
@@ -141,6 +156,19 @@ def _import_text(text: str, *, compiled: bool) -> ModuleType:
     sys.modules[alias] = namespace  # numba rebuilds cached functions by their module's name
     spec.loader.exec_module(namespace)
     return namespace
+
+
+def _holds(path: Path, text: str, name: str) -> bool:
+    """Return whether `path` is there with `text`, up to words; numba compiles again when a file is written again."""
+    if not path.is_file():
+        return False
+    there = path.read_text(encoding="utf-8", errors="replace")
+    if there == text:
+        return True
+    try:
+        return compiled_name(there) == name
+    except (SyntaxError, ValueError):  # a broken file, which the text replaces
+        return False
 
 
 def _cache_folder() -> Path:

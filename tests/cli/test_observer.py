@@ -37,6 +37,7 @@ def test_every_form_becomes_a_file(call: Call, files: tuple[Path, Path]) -> None
         assert load(f"{name}.npz", role="observer").form == name
 
 
+@pytest.mark.slow
 def test_noise_from_data_finds_that_of_the_sensor_by_its_gyro(call: Call, files: tuple[Path, Path]) -> None:
     said = call("observer", files[0], "-o", "g.npz", "--gyro", "--data", files[1], "--json")
     assert said.code == 0, said.err

@@ -15,6 +15,7 @@ from softneck.core import KINDS, SettingsError, resolve
 from softneck.runtime import _bundle as bundle_module
 from softneck.runtime import bundle, load_runtime
 from softneck.runtime._bundle import content_name
+from softneck.runtime._compile import _linked, _runtime, compiled_name, load_linked
 
 RUNTIMES = sorted({kind.runtime for kind in KINDS.values() if kind.runtime} | {"softneck.plant._neck_runtime"})
 
@@ -108,6 +109,52 @@ def test_a_compiled_bundle_is_kept_in_a_folder_of_the_user(
     y = np.zeros((3, 1))
     runtime.run_steps((), np.zeros(0), np.zeros(1), np.array([[1.0], [2.0], [3.0]]), y)
     assert y.ravel().tolist() == [0.0, 1.0, 2.0]
+
+
+WORDY = '"""A module."""\n' + STEP.replace(
+    "    return 1\n", '    """Return the length."""\n\n    # One delay.\n    return 1  # sample\n'
+)  # fmt: skip
+
+
+def test_words_do_not_count_in_the_name_of_compiled_code_and_all_else_does() -> None:
+    assert compiled_name(WORDY) == compiled_name(STEP) != compiled_name(STEP.replace("0.0", "1.0"))
+    # A docstring alone is still a body, and a text in a place of its own is no docstring.
+    assert compiled_name('def f():\n    """Nothing."""\n') == compiled_name("def f():\n    pass\n")
+    assert compiled_name('a = "# b"') != compiled_name('a = "# c"')
+
+
+def test_a_changed_comment_keeps_the_compiled_code_and_a_broken_file_is_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, runtime_folder: Path
+) -> None:
+    monkeypatch.setattr("platformdirs.user_cache_dir", lambda *_a, **_k: str(tmp_path / "cache"))
+    for name, text in (("wordy_a_runtime", STEP), ("wordy_b_runtime", WORDY)):
+        (runtime_folder / f"{name}.py").write_text(text)
+    load_runtime("wordy_a_runtime", compiled=False)
+    (kept,) = (tmp_path / "cache" / "runtime").glob("*.py")
+    # numba asks for the file's time and size: a file that nobody touches is not compiled again.
+    before = (kept.stat().st_mtime_ns, kept.read_text())
+    load_runtime("wordy_b_runtime", compiled=False)
+    assert list(kept.parent.glob("*.py")) == [kept]
+    assert (kept.stat().st_mtime_ns, kept.read_text()) == before
+    kept.write_text(before[1][:-9] + "(")
+    _runtime.cache_clear()
+    load_runtime("wordy_a_runtime", compiled=False)
+    assert kept.read_text() == before[1]
+
+
+def test_linked_steps_follow_what_they_link(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, runtime_folder: Path
+) -> None:
+    pytest.importorskip("numba")
+    monkeypatch.setattr("platformdirs.user_cache_dir", lambda *_a, **_k: str(tmp_path / "cache"))
+    names = []
+    for text in (STEP, WORDY, STEP.replace("= inputs[0]", "= 2.0 * inputs[0]")):
+        (runtime_folder / "linked_a_runtime.py").write_text(text)
+        for cache in (bundle, bundle_module._source, _runtime, _linked):
+            cache.cache_clear()
+        names.append(load_linked("softneck.loop._compiled_rows_runtime", ["linked_a_runtime"]).__name__)
+    # Comments change nothing; another step is another module, although its name is the same.
+    assert names[0] == names[1] != names[2]
 
 
 def test_a_cache_folder_that_cannot_be_written_is_no_hindrance(

@@ -137,11 +137,18 @@ def test_a_loop_over_our_fmus_resumes_in_another_process(loop_file: Path, tmp_pa
 @pytest.mark.parametrize(
     ("version", "mode", "message"),
     [
-        (2, 1.0, r"crashed in the step from t = 0\.2 s: its process was ended by SIGABRT"),
-        (3, 2.0, r"hung in the step from t = 0\.2 s: no answer within 0\.5 s; its process was ended"),
-        (2, 4.0, r"in the step from t = 0\.2 s: fmi2DoStep returned an error"),
+        pytest.param(2, 1.0, r"crashed in the step from t = 0\.2 s: its process was ended by SIGABRT", id="crash"),
+        pytest.param(
+            3,
+            2.0,
+            r"hung in the step from t = 0\.2 s: no answer within 0\.5 s; its process was ended",
+            id="hang",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            2, 4.0, r"in the step from t = 0\.2 s: fmi2DoStep returned an error", id="error", marks=pytest.mark.slow
+        ),
     ],
-    ids=["crash", "hang", "error"],
 )
 def test_a_bad_fmu_costs_one_run_only(
     version: int, mode: float, message: str, foreign: dict[int, Path], toys: Any

@@ -101,6 +101,7 @@ def test_workers_change_no_bit(place: Path) -> None:
         pd.testing.assert_frame_equal(here, numbers(study(made, workers=workers)), check_exact=True)
 
 
+@pytest.mark.slow
 def test_blocks_go_to_other_processes(folder: Path) -> None:
     """A loop of objects: a model, its filter and controller; compiled rows, and the bits of the ordinary loop."""
     parts: dict[str, Any] = {name: load(folder / f"{file}.npz") for name, file in
@@ -346,6 +347,7 @@ def test_the_virtual_neck_needs_no_fmu(folder: Path, tmp_path: Path) -> None:
         load_loop(tmp_path / "loop.toml")
 
 
+@pytest.mark.slow
 def test_parts_vary_by_their_files(folder: Path) -> None:
     """Plants and controllers on a grid: an identified model, the virtual neck, an FMU of it; each run is its loop."""
     loop = {"duration_s": 0.5, "plant": "rls.npz", "observer": "kalman.npz", "controller": "pi.npz",

@@ -75,6 +75,7 @@ def test_saved_and_loaded_it_is_the_same(soft: MpcController, tmp_path: Path) ->
         MpcController.from_archive(header, arrays)
 
 
+@pytest.mark.slow
 def test_the_tuning_keeps_what_it_was_asked() -> None:
     asked = MpcSettings(max_sensitivity=1.4).design(bake_off_neck())
     assert max(asked.design["sensitivity"]) <= 1.4

@@ -18,6 +18,8 @@ from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.runtime import load_runtime
 from softneck.signals import Recording, signal
 
+from ..data import slow_but
+
 
 @pytest.fixture(scope="module")
 def recording() -> Recording:
@@ -61,7 +63,7 @@ def closed_loop(
     return np.array(angles), said
 
 
-@pytest.mark.parametrize("kind", NONLINEAR_KINDS)
+@pytest.mark.parametrize("kind", slow_but(NONLINEAR_KINDS, ["play"]))
 def test_the_expression_of_a_model_is_its_runtime(kind: str, models: dict[str, Model]) -> None:
     model = models[kind]
     f, block = step_function(model), model.block()
@@ -103,7 +105,7 @@ def test_converged_it_is_what_ipopt_finds(kind: str, models: dict[str, Model]) -
 
 
 # What FMUs and loop files run has derivatives and a solver of its own: an independent method for the same numbers.
-@pytest.mark.parametrize("kind", NONLINEAR_KINDS)
+@pytest.mark.parametrize("kind", slow_but(NONLINEAR_KINDS, ["play"]))
 @pytest.mark.parametrize("others", [{}, {"angle_limit": 0.1, "preview": 0.2}, {"converged": True}], ids=str)
 def test_the_block_is_what_casadi_and_daqp_compute(
     kind: str, others: dict[str, float], models: dict[str, Model]

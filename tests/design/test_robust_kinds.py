@@ -27,6 +27,7 @@ from softneck.design import (
 from softneck.design.plants._step_and_load import StepAndLoad
 from softneck.estimation import LinearNeck
 
+from ..data import slow_but
 from ..oracles.bake_off import (
     bake_off_neck,
     bake_off_plant,
@@ -83,7 +84,7 @@ def test_the_worst_sensitivity_is_kept_and_is_what_it_says(kind: str) -> None:
     assert worst <= 1.003 * KINDS[kind].max_sensitivity
 
 
-@pytest.mark.parametrize("kind", ["pid", "fopid", "hinf", "ncf", "lqg"])
+@pytest.mark.parametrize("kind", slow_but(["pid", "fopid", "hinf", "ncf", "lqg"], ["pid", "hinf"]))
 def test_the_figures_of_the_bake_off_are_reached_from_the_file(kind: str, tmp_path: Path) -> None:
     robust(kind).save(tmp_path / "c.npz")
     row = run_bake_off(block_stepper(load(tmp_path / "c.npz", role="controller").block())).row

@@ -161,6 +161,7 @@ def test_pause_and_resume_equals_one_run() -> None:
     np.testing.assert_array_equal(np.vstack([first, block.run(state, U[25:])[1]]), whole)
 
 
+@pytest.mark.slow
 def test_a_family_gives_its_interpolation_or_its_operating_points() -> None:
     lpv = Lpv(
         knots=np.array([2.0, 20.0]) * DEG, gains=np.array([[6.0, 4.0], [5.0, 5.0]]) * DEG,

@@ -137,7 +137,7 @@ def _take(terminal: int) -> None:
     [
         (b" ", 1, "by the operator. The drives are off"),
         pytest.param(b"\x1b", 1, "by the operator. The drives are off", marks=pytest.mark.slow),
-        (b"\x03", 130, "interrupted"),
+        pytest.param(b"\x03", 130, "interrupted", marks=pytest.mark.slow),
     ],
     ids=["space", "escape", "ctrl-c"],
 )
@@ -191,7 +191,7 @@ RUN = ("record: sine", 1.0)
         pytest.param((TERM,), 143, LEFT, "ended by SIGTERM; the drives are off", id="SIGTERM", marks=pytest.mark.slow),
         pytest.param((HUP,), 130, LEFT, "interrupted", id="SIGHUP", marks=pytest.mark.slow),
         pytest.param((b"\x1a",), 130, STOPPED, "interrupted", id="ctrl-z", marks=pytest.mark.slow),
-        pytest.param((b"\x03", b"\x03"), 130, STOPPED, "interrupted", id="ctrl-c-twice"),
+        pytest.param((b"\x03", b"\x03"), 130, STOPPED, "interrupted", id="ctrl-c-twice", marks=pytest.mark.slow),
         pytest.param((TERM, TERM), 143, STOPPED, "ended by SIGTERM", id="SIGTERM-twice", marks=pytest.mark.slow),
         pytest.param((b"\x03", b" "), 130, STOPPED, "interrupted", id="space-while-ramping", marks=pytest.mark.slow),
         pytest.param((TSTP,), 130, STOPPED, "interrupted", id="SIGTSTP", marks=pytest.mark.slow),
@@ -225,6 +225,7 @@ def test_every_end_of_a_jog(
     assert ended.restored
 
 
+@pytest.mark.slow
 def test_a_closed_terminal_costs_neither_recording_nor_log(tmp_path: Path) -> None:
     """Nobody is there to read: what is printed goes nowhere, and that must not be what ends the command."""
     ended = played(tmp_path, (RUN[0], CLOSE, RUN[1]), simulated=True)

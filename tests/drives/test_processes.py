@@ -33,8 +33,6 @@ pytestmark = pytest.mark.skipif(
     sys.platform != "linux" or not allowed(*NAMESPACE),
     reason="needs unshare and ip (util-linux, iproute2) and the right to a network namespace of its own",
 )
-# What `make test` runs; the rest is marked slow, and CI runs it too.
-SHORT = ("killed",)
 
 
 def played(case: str, *options: str) -> dict[str, Any]:
@@ -46,9 +44,8 @@ def played(case: str, *options: str) -> dict[str, Any]:
     return json.loads(done.stdout)
 
 
-@pytest.mark.parametrize(
-    "case", [case if case in SHORT else pytest.param(case, marks=pytest.mark.slow) for case in CASES]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
 def test_the_end_state_is_exact(case: str) -> None:
     found = played(case)
     assert found["exact"], found

@@ -253,6 +253,13 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
 NATIVE = [kind for kind in KINDS if kind != "nmpc"]
 
 
+# Those whose runtimes take longest to compile.
+HEAVY = ("ensemble", "any", "nmpc")
+# One of each sort, for tests that take long with every kind: models, one of them with bounds, an observer, a
+# controller, the neck.
+SHORT = ("rls", "nlsm", "kalman", "pi", "neck")
+
+
 @cache
 def block_of(kind: str) -> Block:
     return KINDS[kind][0]()

@@ -18,7 +18,8 @@ from softneck.fmu.python import _build, _slave_compiled
 from softneck.runtime import _compile
 from softneck.runtime._compile import have_numba
 
-from .every_kind import KINDS, TS, block_of, inputs_of
+from ..data import slow_but
+from .every_kind import KINDS, SHORT, TS, block_of, inputs_of
 
 pytestmark = pytest.mark.skipif(not have_numba(), reason="numba is not installed")
 
@@ -38,7 +39,7 @@ def _state(fmu: Any) -> bytes:
     return bytes(fmu.fmu.serializeFMUstate(fmu.fmu.getFMUstate()))
 
 
-@pytest.mark.parametrize("kind", list(KINDS))
+@pytest.mark.parametrize("kind", slow_but(KINDS, [*SHORT, "nn"]))
 def test_compiled_and_plain_steps_agree(
     kind: str, tmp_path: Path, running: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,7 +18,8 @@ from softneck.fmu.describe._svg import line_chart
 from softneck.fmu.python import _build
 from softneck.identification import Rls, validate
 
-from .every_kind import KINDS, block_of, recording
+from ..data import slow_but
+from .every_kind import HEAVY, KINDS, block_of, recording
 
 
 def _page(path: Path) -> str:
@@ -26,7 +27,7 @@ def _page(path: Path) -> str:
         return archive.read("documentation/index.html").decode()
 
 
-@pytest.mark.parametrize("kind", list(KINDS))
+@pytest.mark.parametrize("kind", slow_but(KINDS, [kind for kind in KINDS if kind not in HEAVY]))
 def test_every_fmu_carries_page_picture_icon_and_licences(kind: str, tmp_path: Path) -> None:
     path = build_fmu(block_of(kind), tmp_path / f"{kind}.fmu", info=FmuInfo(license="CC-BY-4.0"))
     with zipfile.ZipFile(path) as archive:

@@ -12,15 +12,16 @@ import pytest
 from softneck.fmu import build_fmu
 from softneck.runtime import load_runtime
 
+from ..data import slow_but
 from ..importers import need
-from .every_kind import KINDS, TS, block_of, inputs_of
+from .every_kind import KINDS, SHORT, TS, block_of, inputs_of
 
 SCRIPTS = Path(__file__).with_name("importers")
 PACKAGES = {"libcosim": "libcosimpy", "ecos": "ecospy", "pathsim": "pathsim_fmi"}
 ROWS = 60
 
 
-@pytest.fixture(scope="module", params=list(KINDS))
+@pytest.fixture(scope="module", params=slow_but(KINDS, SHORT))
 def kind(request: pytest.FixtureRequest) -> str:
     return request.param
 

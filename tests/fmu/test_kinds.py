@@ -14,10 +14,11 @@ from softneck.cosim.parts._free_run import drive_fmu
 from softneck.fmu import build_fmu
 from softneck.runtime import Block, load_runtime
 
-from .every_kind import KINDS, MOTORS, TS, block_of, inputs_of, recording
+from ..data import slow_but
+from .every_kind import HEAVY, KINDS, MOTORS, TS, block_of, inputs_of, recording
 
 
-@pytest.fixture(scope="module", params=list(KINDS))
+@pytest.fixture(scope="module", params=slow_but(KINDS, [kind for kind in KINDS if kind not in HEAVY]))
 def kind(request: pytest.FixtureRequest) -> str:
     return request.param
 

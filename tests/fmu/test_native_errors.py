@@ -165,6 +165,7 @@ def test_the_sources_compile_without_a_warning_and_fit_the_standards_headers(own
     assert done.returncode == 0, done.stderr[-3000:]
 
 
+@pytest.mark.slow
 def test_hostile_files_and_states_break_nothing_under_the_sanitizers(tmp_path: Path) -> None:
     """Every kind, unchanged first: no memory asked for in a step; then with wrong bytes (SOFTNECK_FUZZ_ROUNDS each)."""
     _write_sources(tmp_path, c_sources())

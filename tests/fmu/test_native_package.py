@@ -62,6 +62,7 @@ def test_what_is_too_large_for_a_zip_file_of_32_bits_is_refused(tmp_path: Path) 
         write_zip(tmp_path / "huge.zip", {"resources/model.bin": Huge()})
 
 
+@pytest.mark.slow
 def test_a_wheel_knows_its_libraries_in_its_own_folders(tmp_path: Path) -> None:
     """The key of a checkout is that of its copy elsewhere: no path is part of it."""
     root = Path(__file__).parents[2]
@@ -85,7 +86,13 @@ def test_a_stream_deflated_before_gives_the_same_file(tmp_path: Path) -> None:
 
 
 @needs_cc
-@pytest.mark.parametrize(("kind", "fmi"), [("ensemble", 2), ("kalman", 3), ("mpc", 2), ("neck", 3)])
+@pytest.mark.parametrize(
+    ("kind", "fmi"),
+    [
+        ("kalman", 3),
+        *(pytest.param(kind, fmi, marks=pytest.mark.slow) for kind, fmi in (("ensemble", 2), ("mpc", 2), ("neck", 3))),
+    ],
+)
 def test_its_sources_rebuild_it_for_this_machine(kind: str, fmi: int, tmp_path: Path, running: Any) -> None:
     """By the build description where FMI 3 has one, else by the readme; another compiler, the same bits."""
     block, u = block_of(kind), inputs_of(block_of(kind), 50)
@@ -143,6 +150,7 @@ def test_the_sources_of_one_kind_hold_no_other() -> None:
     assert only_kinds(text, set(re.findall(r'\{"(softneck\.[\w.]+)"', text))) == text
 
 
+@pytest.mark.slow
 def test_fmi3_has_the_variables_of_fmi2(tmp_path: Path) -> None:
     """FMI 2 has those of the Python one: test_native_kinds.py."""
     for kind in NATIVE:

@@ -21,6 +21,7 @@ def choice() -> Choice:
     return choose(TRAIN, OTHER, kinds=("play", "rls", "nn", "residual", "ensemble"), other_excitation=True)
 
 
+@pytest.mark.slow
 def test_the_ranking_is_by_free_run_and_the_simplest_of_those_alike_is_chosen(choice: Choice) -> None:
     fits = [one.fit for one in choice.ranking]
     assert fits == sorted(fits, reverse=True)
@@ -30,6 +31,7 @@ def test_the_ranking_is_by_free_run_and_the_simplest_of_those_alike_is_chosen(ch
     assert "the simplest is taken" in choice.why or choice.ranking[0] is choice.chosen
 
 
+@pytest.mark.slow
 def test_a_kind_that_fails_is_listed_with_its_reason_and_costs_nothing_else(choice: Choice) -> None:
     failed = {one.kind: one for one in choice.ranking if one.model is None}
     assert set(failed) == {"nn"}
@@ -37,6 +39,7 @@ def test_a_kind_that_fails_is_listed_with_its_reason_and_costs_nothing_else(choi
     assert any("Not identified or diverged: nn" in remark for remark in choice.remarks)
 
 
+@pytest.mark.slow
 def test_the_residual_is_on_the_best_and_the_ensemble_of_the_others(choice: Choice) -> None:
     models = {one.kind: one.model for one in choice.ranking if one.model is not None}
     best = max((one for one in choice.ranking if one.kind in ("rls", "play")), key=lambda one: one.fit)
@@ -44,7 +47,10 @@ def test_the_residual_is_on_the_best_and_the_ensemble_of_the_others(choice: Choi
     assert sorted(models["ensemble"].settings["members"]) == ["play", "rls"]
 
 
-@pytest.mark.parametrize("kinds", [("play",), ("rls", "residual"), ("rls", "play", "ensemble")])
+@pytest.mark.parametrize(
+    "kinds",
+    [("play",), ("rls", "residual"), pytest.param(("rls", "play", "ensemble"), marks=pytest.mark.slow)],
+)
 def test_a_refit_is_the_chosen_kind_on_all_rows_and_keeps_the_scores_of_before(kinds: tuple[str, ...]) -> None:
     found = choose(TRAIN, OTHER, kinds=kinds, other_excitation=True)
     last = next(one for one in found.ranking if one.kind == kinds[-1])
@@ -57,6 +63,7 @@ def test_a_refit_is_the_chosen_kind_on_all_rows_and_keeps_the_scores_of_before(k
         assert all(again.arrays[name].tobytes() == alone.arrays[name].tobytes() for name in alone.arrays)
 
 
+@pytest.mark.slow
 def test_rows_held_out_were_never_trained_on(choice: Choice) -> None:
     assert all(one.judged.rows_left_out == 0 for one in choice.ranking if one.judged is not None)
 

@@ -30,6 +30,7 @@ def test_an_ensemble_is_the_median_of_its_members_and_its_bounds_are_their_range
     np.testing.assert_allclose(joined[:, 2:5], each[0][:, 2:5], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_two_equal_members_are_the_member(models: dict[str, Model]) -> None:
     twice = combine([models["play"], models["play"]])
     np.testing.assert_allclose(twice.predict(UNSEEN)[:, :5], models["play"].predict(UNSEEN)[:, :5], rtol=0, atol=1e-12)
@@ -44,6 +45,7 @@ def test_a_residual_on_rls_is_set_membership_of_form_residual() -> None:
     np.testing.assert_allclose(ours.simulate(UNSEEN), theirs.simulate(UNSEEN), rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_bounds_of_a_residual_hold_on_the_rows_it_was_made_of() -> None:
     recording = short_neck()
     model = Residual(base="play").fit(recording)

@@ -142,6 +142,7 @@ def test_a_design_reads_it(family: Family) -> None:
     )  # Pade of order 4
 
 
+@pytest.mark.slow
 def test_windows_and_their_uncertainty_widen_the_plant(recordings: list[Recording], family: Family) -> None:
     wide = FamilySettings(directions=1, include_windows=True, widen=2.0).fit(recordings)
     for name in ("pitch", "roll"):
@@ -180,6 +181,7 @@ def _lag(u: np.ndarray, pole: float, delay: int) -> np.ndarray:
     return y
 
 
+@pytest.mark.slow
 def test_a_gain_that_falls_with_inclination_is_interpolated() -> None:
     P = signal("aprbs", duration=80.0, seed=4).set_points.copy()
     P[:15] = 0.0

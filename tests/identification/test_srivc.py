@@ -179,6 +179,7 @@ def test_it_simulates_as_well_as_output_error() -> None:
     assert best[0] == pytest.approx(best[1], abs=0.02)
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     held = coverage(range(1000, 1008), 40, rows=1000)
     # 8 seeds at 95 %: fewer than 6 hits of 8 have a chance of 6e-3, and the seeds are fixed.

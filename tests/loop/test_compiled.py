@@ -82,6 +82,7 @@ def test_all_faults_at_once(loop: Callable[..., Loop]) -> None:
     _same(run_loop(case), run_loop(case, compiled=True))
 
 
+@pytest.mark.slow
 def test_parts_of_other_rates_and_a_reference_that_is_a_part(loop: Callable[..., Loop]) -> None:
     neck = BlockPart(VirtualNeck(NeckParameters.paper()).block(sample_time=0.005))
     wanted = BlockPart(ReferenceBlock(RotationReference(inclination=0.2), sample_time=0.01).block())
@@ -115,6 +116,7 @@ def test_progress_is_reported(loop: Callable[..., Loop]) -> None:
     assert compiled == plain
 
 
+@pytest.mark.slow
 def test_what_is_missing_is_named_as_ever(loop: Callable[..., Loop]) -> None:
     """A dropout without an observer: the line is the master's."""
     case = loop(observer=None, faults=(SensorFault(kind="dropout", start=0.4),))

@@ -14,6 +14,8 @@ from softneck.report._paper_page import grouped, linear_facts
 from softneck.report._paper_tables import paper_entries
 from softneck.report._reproduce import Reproduction
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def found() -> Reproduction:

@@ -12,6 +12,7 @@ from softneck.cli._main import run
 from .test_plugin import run_pytest
 
 
+@pytest.mark.slow
 def test_the_new_project_s_test_passes_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "my neck"
     assert run(["new", str(folder), "--json"]) == 0

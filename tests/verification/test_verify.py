@@ -79,6 +79,7 @@ def test_a_wrong_delay_fails_loudly() -> None:
     assert "fails" in verification_page(found, "pi")
 
 
+@pytest.mark.slow
 def test_the_order_adds_its_samples_and_says_so() -> None:
     early = verify(pi(), linear_neck(), make_requirements(QUICK))
     late = verify(pi(), linear_neck(), make_requirements(QUICK), order="jacobi")
@@ -179,6 +180,7 @@ def test_the_command_writes_a_certificate_that_deploys(files: dict[str, Path], c
         check_certificate(certificate, [files["controller"]])
 
 
+@pytest.mark.slow
 def test_the_worst_plant_of_the_certificate_runs_and_gives_its_value(files: dict[str, Path], capsys: Any) -> None:
     certificate = files["controller"].with_name("c.json")
     call = ["verify", str(files["controller"]), str(files["family"]), "--requirements", str(files["asked"]), "--json"]
