@@ -118,7 +118,7 @@ def test_a_folder_that_cannot_be_written(call: Call, tmp_path: Path, recording: 
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("speed=3", "there is no setting `speed`; this kind has covariance_bound, dead_zone, delay"),
+        ("speed=3", "unknown setting `speed`; this kind has covariance_bound, dead_zone, delay"),
         ("na", "--set takes KEY=VALUE; got `na`"),
         ("na=0", "`na` must be a whole number between 1 and 100; got 0"),
         ("na=1.5", "`na` must be a whole number between 1 and 100; got 1.5"),
@@ -167,7 +167,7 @@ def test_a_wrong_setting_of_a_network(call: Call, tmp_path: Path, recording: Pat
         (("record", "eq22", "-o", "r.csv", "--duration", "0.001"), "r"),
         (("record", "steps", "-o", "r.xlsx", "--duration", "1"), "a recording is a `.csv` or a `.parquet` file"),
         (("design", "lqr", "MODEL", "-o", "c.npz"), "unknown kind of controller `lqr`; use one of pi"),
-        (("design", "pi", "MODEL", "-o", "c.npz", "--set", "luck=1"), "there is no setting `luck`"),
+        (("design", "pi", "MODEL", "-o", "c.npz", "--set", "luck=1"), "unknown setting `luck`"),
         (("observer", "MODEL", "-o", "o.npz", "--sensor", "nose"), "nose"),
         (("simulate", "none.toml"), "none.toml: no such file"),
         (("fmu", "none.npz", "-o", "M.fmu"), "none.npz: no such file"),

@@ -48,7 +48,7 @@ def test_it_designs_every_kind(kind: str, models: list[str], call: Call) -> None
     ("words", "message"),
     [
         (("ncf", "m0.npz", "--set", "crossover=200.0"), "below the Nyquist frequency"),
-        (("ncf", "m0.npz", "--set", "speed=3"), "there is no setting `speed`"),
+        (("ncf", "m0.npz", "--set", "speed=3"), "unknown setting `speed`"),
         (("custom", "m0.npz"), "`controller` must be a control.StateSpace"),
         (("hinf", "m0.npz", "--mat", "c.txt"), "must end in `.mat`"),
         (("pid", "m0.npz", "--set", "tuning=placement", "--set", "frequency=3"), "take another `frequency`"),

@@ -87,7 +87,7 @@ def test_an_edited_certificate_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        ("", "no JSON"),
+        ("", "not JSON"),
         ("[1]", "is not a certificate"),
         ('{"certificate": "else"}', "is not a certificate"),
         ('{"certificate": "verify", "certificate_version": 99}', "version 99"),
