@@ -5,16 +5,18 @@ tried. Cosmic-ray's own runner starts an interpreter for each mutant, which take
 forks from a process that has numpy, scipy and numba already. Nothing of the tree that it is started in is touched: it
 works in a copy.
 
-    python tests/mutation/run.py [ROOM ...] [--count 40] [--seed 0] [--out build/mutation.json]
+    python tests/mutation/run.py [ROOM ...] [--count 40] [--seed 0] [--out build/mutation.json] [--again FILE]
 """
 
 from __future__ import annotations
 
 import argparse
+import compileall
 import difflib
 import importlib
 import json
 import os
+import py_compile
 import random
 import shutil
 import signal
@@ -153,7 +155,7 @@ def _child(root: Path, tests: tuple[str, ...], log: Path) -> None:
         # Hypothesis draws the same examples for every mutant, and looks for no smaller ones.
         options = ["-q", "-x", "-p", "no:cacheprovider", "-p", "no:randomly", "--tb=line", "-m", "not slow"]
         code = int(pytest.main([*options, "--hypothesis-seed=0", *tests]))
-    except BaseException:  # noqa: BLE001 - nothing may return into the parent's loop
+    except BaseException:  # Nothing may return into the parent's loop.
         traceback.print_exc()
     finally:
         sys.stdout.flush()
@@ -190,6 +192,9 @@ def copy_of(root: Path, folder: Path) -> Path:
             shutil.copytree(source, folder / name, ignore=shutil.ignore_patterns("__pycache__", "_build"))
         elif source.exists():
             shutil.copy2(source, folder / name)
+    # By the hash of their source: a mutant may have the size and the second of the text before it, which is all that
+    # an ordinary .pyc goes by. None is written later.
+    compileall.compile_dir(folder / "softneck", quiet=1, invalidation_mode=py_compile.PycInvalidationMode.CHECKED_HASH)
     return folder
 
 
@@ -222,17 +227,22 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=settings["count"], help="mutants a room")
     parser.add_argument("--seed", type=int, default=settings["seed"], help="of the sample")
     parser.add_argument("--out", type=Path, help="JSON of every mutant and what came of it")
+    parser.add_argument("--again", type=Path, help="try only what survived there, a file that --out wrote")
     asked = parser.parse_args()
-    # A mutant may have the size and the second of the text before it, which is all that a .pyc goes by.
+    before = json.loads(asked.again.read_text(encoding="utf-8")) if asked.again else {}
     sys.dont_write_bytecode = True
     os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
     sys.path[:] = [entry for entry in sys.path if Path(entry or ".").resolve() not in (HERE, ROOT)]
     for name in HEAVY:
         importlib.import_module(name)
     table, everything = [], {}
-    for name in asked.rooms or list(rooms):
+    for name in asked.rooms or list(before or rooms):
         possible = list(mutants_of(ROOT, rooms[name], settings))
-        found = run_room(rooms[name], settings, sample(possible, asked.count, asked.seed))
+        chosen = sample(possible, asked.count, asked.seed)
+        if asked.again:
+            lived = [item["mutant"] for item in before[name] if item["outcome"] == "survived"]
+            chosen = [mutant for mutant in chosen if asdict(mutant) in lived]
+        found = run_room(rooms[name], settings, chosen)
         counts = {kind: sum(item.outcome == kind for item in found) for kind in OUTCOMES}
         meant = len(found) - counts["equivalent"]
         table.append((name, len(possible), counts, counts["survived"] / max(meant, 1)))
