@@ -173,3 +173,42 @@ def test_a_mode_that_no_input_reaches_is_no_solution() -> None:
     P = control.StateSpace(A, B, C, [[0.0, 0.0], [0.0, 1.0], [1.0, 0.0]], 0)
     with pytest.raises(SettingsError, match="no controller exists"):
         hinfsyn(P, 1, 1, method="riccati")
+
+
+def _with_measurements(scale: np.ndarray) -> control.StateSpace:
+    """A plant with two measurements whose noise comes in by `scale` (2, 2), a generalised plant with D21 = scale."""
+    A = np.array([[-1.0, 2.0], [0.5, 0.3]])
+    B = np.hstack([[[1.0], [0.4]], np.zeros((2, 2)), [[0.0], [1.0]]])
+    C = np.array([[1.0, 0.5], [0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    D = np.zeros((4, 4))
+    D[1, 3] = 2.0
+    D[2:, 1:3] = scale
+    return control.StateSpace(A, B, C, D, 0)
+
+
+@pytest.mark.parametrize("D21", [[0.0, 3.0], [0.0, 0.2], [1.2, -0.7]], ids=["3", "0.2", "turned"])
+def test_measurement_noise_of_any_size_gives_slycots_controller(D21: list[float]) -> None:
+    pytest.importorskip("slycot")
+    P: Any = _with_measurements(np.array([D21, [0.0, 0.0]]))
+    P = control.StateSpace(P.A, P.B, P.C[:3], P.D[:3], 0)
+    ours, theirs = (hinfsyn(P, 1, 1, method=method) for method in ("riccati", "slycot"))
+    # Both searches end within 1e-4 of the least gamma.
+    assert ours.gamma == pytest.approx(theirs.gamma, rel=3e-4)
+    s = 1j * np.geomspace(1e-2, 100.0, 30)
+    # The central controllers at gammas 3e-4 apart.
+    np.testing.assert_allclose(ours.controller(s), theirs.controller(s), rtol=2e-2)
+
+
+def test_other_units_of_a_measurement_and_of_the_input_change_the_controller_by_them_alone() -> None:
+    """y' = M y and u = N u' leave the problem as it is: K' = N^-1 K M^-1, with the same gamma (D12, D21 not 1)."""
+    P: Any = _with_measurements(np.diag([0.5, 3.0]))
+    M, N = np.array([[3.0, 0.0], [0.4, 0.2]]), 5.0
+    A, B, C, D = (np.array(part) for part in (P.A, P.B, P.C, P.D))
+    C[2:], D[2:] = M @ C[2:], M @ D[2:]
+    B[:, 3:], D[:, 3:] = B[:, 3:] * N, D[:, 3:] * N
+    plain = hinfsyn(P, 2, 1, method="riccati")
+    scaled = hinfsyn(control.StateSpace(A, B, C, D, 0), 2, 1, method="riccati")
+    # The bisection passes through the same gammas; the rest is rounding of two Riccati equations.
+    assert scaled.gamma == pytest.approx(plain.gamma, rel=1e-6)
+    for s in 1j * np.geomspace(1e-2, 100.0, 10):
+        np.testing.assert_allclose(scaled.controller(s), plain.controller(s) @ np.linalg.inv(M) / N, rtol=1e-5)

@@ -14,6 +14,7 @@ from softneck.plant._inclinometer_runtime import (
     inclinometer_delayed,
     inclinometer_dropout,
     inclinometer_measure,
+    inclinometer_round,
     inclinometer_start,
     inclinometer_store,
 )
@@ -234,3 +235,23 @@ def test_encoders_and_angles_come_in_whole_steps() -> None:
         steps = Y[:, columns] / quantum
         # Rounding of a few thousand steps.
         np.testing.assert_allclose(steps, np.round(steps), atol=1e-8)
+
+
+@pytest.mark.parametrize("quantum", [1e-3, 0.25])
+def test_the_inclinometer_rounds_to_the_nearest_step_without_a_bias(quantum: float) -> None:
+    values = np.arange(-3.299, 4.7, 0.002) * quantum
+    shown = np.array([inclinometer_round(float(value), quantum) for value in values])
+    # A whole number of steps, and the nearest one: never further than half a step; rounding is eps of a few steps.
+    np.testing.assert_allclose(shown / quantum, np.round(shown / quantum), rtol=0, atol=1e-12)
+    assert np.abs(shown - values).max() <= 0.5 * quantum * (1.0 + 1e-12)
+    # Over eight whole steps, points symmetric about each, errors cancel but for rounding: floor leaves half a step.
+    assert abs((shown - values).mean()) < 1e-9 * quantum
+    assert inclinometer_round(0.123, 0.0) == 0.123
+    assert inclinometer_round(0.123, -1.0) == 0.123
+
+
+def test_what_the_inclinometer_holds_is_rounded_in_both_axes_and_rates_are_not() -> None:
+    generator, noise = np.array([1.0, 2, 3, 4, 5, 6]), np.zeros(9)
+    noise[4] = 1.0
+    inclinometer_measure((0.26, -0.14, 0.26, -0.14), noise, generator, (0.0, 0.9, 0.0, 0.9, 0.0, 0.0, 0.1))
+    np.testing.assert_allclose(noise[5:9], [0.3, -0.1, 0.26, -0.14], rtol=1e-12)  # rounding of 0.1

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
+from scipy.stats import norm
 
 from softneck.plots import convergence_figure, cover_figure, local_map_figure
 
@@ -13,7 +15,11 @@ def test_a_convergence_has_an_axis_for_each_parameter_and_one_for_the_error() ->
     figure = convergence_figure(t, theta, 0.1 * np.ones((50, 2)), ["a_1", "b_1"], "course", error=np.zeros(50))
     assert [ax.get_ylabel() for ax in figure.axes] == ["a_1", "b_1", "error [deg]"]
     np.testing.assert_array_equal(figure.axes[0].lines[0].get_ydata(), theta[:, 0])
-    assert len(figure.axes[0].collections) == 1  # the band
+    # A band of 95 % of a normal distribution, to the three digits that are drawn.
+    reach = 0.1 * norm.ppf(0.975)
+    (band,) = figure.axes[1].collections
+    heights = np.asarray(band.get_paths()[0].vertices)[:, 1]
+    assert (heights.min(), heights.max()) == pytest.approx((1.0 - reach, 1.0 + reach), rel=1e-3)
 
 
 def test_a_map_shows_degrees_and_milliseconds() -> None:
@@ -24,6 +30,11 @@ def test_a_map_shows_degrees_and_milliseconds() -> None:
         x, y = np.asarray(ax.lines[0].get_xdata(), float), np.asarray(ax.lines[0].get_ydata(), float)
         np.testing.assert_allclose(x, np.degrees([0.1, 0.3]))
         np.testing.assert_allclose(y, scale[i] * numbers[:, i])
+        # Bars of 95 % of a normal distribution, to the three digits that are drawn.
+        (bars,) = figure.axes[i].collections
+        for k, segment in enumerate(bars.get_segments()):
+            reach = scale[i] * 0.01 * norm.ppf(0.975)
+            np.testing.assert_allclose(segment[:, 1], scale[i] * numbers[k, i] + reach * np.array([-1, 1]), rtol=1e-3)
 
 
 def test_a_cover_draws_every_sample_under_the_weight() -> None:

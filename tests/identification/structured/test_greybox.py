@@ -6,9 +6,10 @@ import itertools
 
 import numpy as np
 import pytest
+import statsmodels.api as sm
 
 from softneck.identification import INFINITE, GreyBox, Model, validate
-from softneck.identification.structured._greybox import INTERRUPTED
+from softneck.identification.structured._greybox import INTERRUPTED, _table
 from softneck.identification.structured._greybox_numbers import NUMBERS
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.runtime import load_functions
@@ -111,6 +112,35 @@ def test_the_numbers_behind_its_own_equations_are_found(fitted: Model, truth: np
         assert row["high"] - row["low"] < 0.2 * max(abs(value), 0.1)
     assert all(row["low"] <= row["value"] <= row["high"] for row in found.values())
     assert {row["unit"] for row in found.values()} >= {"1/s", "rad", "rad/rad"}
+
+
+class _Line:
+    """A problem whose errors are linear in what is searched, so that least squares says all about it."""
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(0)
+        self.A = rng.standard_normal((400, len(NUMBERS)))
+        self.noise = 1e-3 * rng.standard_normal(400)
+
+    def errors(self, x: np.ndarray, delay: int) -> np.ndarray:
+        del delay
+        return self.A @ (x - np.array([number.encode(number.guess) for number in NUMBERS])) - self.noise
+
+
+def test_intervals_of_a_linear_problem_are_those_of_ordinary_least_squares() -> None:
+    problem = _Line()
+    x = np.array([number.encode(number.guess) for number in NUMBERS])
+    # At the solution, with errors that change sign from row to row: every one counts.
+    x = x + np.linalg.lstsq(problem.A, problem.noise)[0]
+    white = np.tile([[1.0], [-1.0]], (200, 2))
+    fit = sm.OLS(problem.noise, problem.A).fit()
+    expected = np.asarray(fit.conf_int(0.05)) - np.asarray(fit.params)[:, None]
+    # Student's quantile with 400 rows is 0.4 % above the normal one.
+    for row, number, value, half in zip(_table(problem, x, 0, [white]), NUMBERS, x, expected[:, 1], strict=True):  # pyright: ignore[reportArgumentType]
+        for side, sign in (("low", -1.0), ("high", 1.0)):
+            bound = number.decode(value + sign * half)
+            if number.low < bound < number.high:
+                assert number.encode(row[side]) - value == pytest.approx(sign * half, rel=0.01)
 
 
 def test_its_free_run_is_the_one_that_was_fitted(fitted: Model, truth: np.ndarray) -> None:
