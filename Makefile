@@ -69,7 +69,7 @@ $(VENV)/.installed: pyproject.toml
 	@touch $@
 
 $(VENV)/.tested: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --group test --group importers
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[all]' --group test --group importers
 	@touch $@
 
 $(VENV)/.crossed: $(VENV)/.installed
@@ -81,5 +81,5 @@ $(VENV)/.linted: $(VENV)/.tested
 	@touch $@
 
 $(VENV)/.documented: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --group docs
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[all]' --group docs
 	@touch $@

@@ -12,6 +12,7 @@ import click
 
 from softneck import __version__
 from softneck.core import SoftneckError
+from softneck.core._extras import missing_extra
 
 # Subcommand -> module and what it does; a module is imported when its command is called, so that
 # `softneck --help` answers at once.
@@ -92,17 +93,29 @@ def run(arguments: Sequence[str] | None = None) -> int:
         # The reader of a pipe went away: no error of the user's.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except ModuleNotFoundError as error:
+        return _missing(error)
     except OSError as error:
         return _fail(f"{error.filename or 'input/output'}: {error.strerror or error}", _BAD_INPUT)
     except Exception as error:  # the edge: anything unforeseen is our fault, and says so
-        if os.environ.get("SOFTNECK_TRACEBACK"):
-            traceback.print_exc()
-        return _fail(
-            f"internal error in softneck: {type(error).__name__}: {error} "
-            "(set SOFTNECK_TRACEBACK=1 and report what it prints)",
-            _OUR_FAULT,
-        )
+        return _internal(error)
     return code if isinstance(code, int) else 0
+
+
+def _missing(error: ModuleNotFoundError) -> int:
+    """Say which extra a missing package belongs to; any other missing module is our fault."""
+    line = missing_extra(error)
+    return _internal(error) if line is None else _fail(line, _BAD_INPUT)
+
+
+def _internal(error: Exception) -> int:
+    if os.environ.get("SOFTNECK_TRACEBACK"):
+        traceback.print_exception(error)
+    return _fail(
+        f"internal error in softneck: {type(error).__name__}: {error} "
+        "(set SOFTNECK_TRACEBACK=1 and report what it prints)",
+        _OUR_FAULT,
+    )
 
 
 def _fail(message: str, code: int) -> int:

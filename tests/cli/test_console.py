@@ -11,7 +11,6 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from rich.console import Console
 
-import softneck.cli.shared._console as console_module
 from softneck.cli.shared._console import note, print_table, progress
 
 # What a terminal shows in a place of its own: no controls, and no marks that join the letter before them.

@@ -15,7 +15,9 @@ from hypothesis import strategies as st
 from softneck.core import DataError, FileFormatError, OutputFileError, SoftneckError
 from softneck.identification.models._rows import row_hashes
 from softneck.signals import SET_POINTS, Recording, concatenate, read_recording, write_recording
+from softneck.signals.recording import _files
 from softneck.signals.recording._channels import known_channels
+from softneck.signals.recording._plain_csv import read_plain_csv
 
 from ..data import changed, csv_lines, neck_recording
 
@@ -46,6 +48,41 @@ def test_a_delimiter_at_the_end_of_each_line_is_no_channel(tmp_path: Path) -> No
     plain, ended = read_recording(tmp_path / "plain.csv"), read_recording(tmp_path / "ended.csv")
     assert ended.channels.keys() == plain.channels.keys()
     np.testing.assert_array_equal(ended.outputs, plain.outputs)
+
+
+# Numbers as loggers print them, and what is not a number at all, which is left to pandas.
+CELLS = st.one_of(
+    st.floats(allow_nan=False, allow_infinity=False).map(repr),
+    st.integers(-(10**20), 10**20).map(str),
+    st.decimals(-1000, 1000, places=6).map(str),
+    st.sampled_from(["", "1e5", "-.5", "+3", "5.", "nan", "1_0", " 1", "0x1", "1e999", "text", '"2"', "1e", "--1"]),
+)
+
+
+@given(rows=st.lists(st.tuples(CELLS, CELLS), min_size=1, max_size=6))
+def test_a_plain_table_is_read_as_by_pandas_or_left_to_it(tmp_path: Path, rows: list[tuple[str, str]]) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text("a,b\n" + "".join(",".join(row) + "\n" for row in rows))
+    plain = read_plain_csv(path)
+    if plain is not None:
+        by_pandas = pd.read_csv(path, keep_default_na=False, na_values=[""], skip_blank_lines=False, low_memory=False)
+        for title, column in plain.items():
+            # To the bit: rows are known by hashes of what was read.
+            np.testing.assert_array_equal(column, by_pandas[title].to_numpy(dtype=np.float64))
+
+
+def test_a_recording_written_without_arrow_holds_the_same_numbers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = neck_recording(200)
+    recording.channels["pitch"][7] = np.nan
+    write_recording(tmp_path / "arrow.csv", recording)
+    monkeypatch.setattr(_files, "find_spec", lambda _: None)
+    write_recording(tmp_path / "plain.csv", recording)
+    arrow, plain = read_recording(tmp_path / "arrow.csv"), read_recording(tmp_path / "plain.csv")
+    assert arrow.channels.keys() == plain.channels.keys()
+    for name, values in arrow.channels.items():
+        np.testing.assert_array_equal(plain.channels[name], values)
 
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])

@@ -1,0 +1,27 @@
+"""Packages that only a part of softneck needs: which extra installs them, said in one line where one is missing."""
+
+from __future__ import annotations
+
+# Package as it is imported -> (extra of `pip install`, what needs it). 500 of 1,300 MB that the main job never loads.
+EXTRAS = {
+    "casadi": ("mpc", "predictive control"),
+    "daqp": ("mpc", "predictive control solved by daqp"),
+    "pyarrow": ("files", "Parquet files and studies"),
+    "h5py": ("files", "MATLAB files of version 7.3"),
+    "can": ("drives", "a CAN bus"),
+    "canopen": ("drives", "CANopen drives, simulated ones too"),
+    "mcap": ("drives", "logs of runs on drives"),
+    "serial": ("drives", "an inclinometer on a serial port"),
+    "sklearn": ("sklearn", "the scikit-learn regressor"),
+    "slycot": ("slycot", "synthesis by SLICOT"),
+    "distributed": ("dask", "studies on a Dask cluster"),
+}
+
+
+def missing_extra(error: ModuleNotFoundError) -> str | None:
+    """Return one line on which extra to install; None where the missing module is in none of them."""
+    found = EXTRAS.get((error.name or "").partition(".")[0])
+    if found is None:
+        return None
+    extra, purpose = found
+    return f"{purpose} needs {error.name}, which is not installed; run: pip install 'softneck[{extra}]'"
