@@ -11,12 +11,10 @@ works in a copy.
 from __future__ import annotations
 
 import argparse
-import compileall
 import difflib
 import importlib
 import json
 import os
-import py_compile
 import random
 import shutil
 import signal
@@ -169,11 +167,11 @@ def try_mutant(root: Path, room: Room, mutant: Mutant, equivalent: list[dict[str
     before, after = mutated(root, mutant)
     diff = "".join(difflib.unified_diff(before.splitlines(True), after.splitlines(True), mutant.path, mutant.path, n=0))
     begin = time.monotonic()
-    path.write_text(after, encoding="utf-8")
+    _write(path, after)
     try:
         code = run_tests(root, room.tests, root / "mutation.log", patience)
     finally:
-        path.write_text(before, encoding="utf-8")
+        _write(path, before)
     if code == 5:
         raise SystemExit(f"room {room.name} has no tests")
     outcome = "hung" if code is None else "survived" if code == 0 else "killed"
@@ -181,6 +179,13 @@ def try_mutant(root: Path, room: Room, mutant: Mutant, equivalent: list[dict[str
     if outcome == "survived" and any(item["file"] == mutant.path and item["line"] in changed for item in equivalent):
         outcome = "equivalent"
     return Outcome(mutant, outcome, time.monotonic() - begin, diff)
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a text with a time of its own: a .pyc goes by second and size, which two mutants may share."""
+    later = int(path.stat().st_mtime) + 2
+    path.write_text(text, encoding="utf-8")
+    os.utime(path, (later, later))
 
 
 def copy_of(root: Path, folder: Path) -> Path:
@@ -192,9 +197,6 @@ def copy_of(root: Path, folder: Path) -> Path:
             shutil.copytree(source, folder / name, ignore=shutil.ignore_patterns("__pycache__", "_build"))
         elif source.exists():
             shutil.copy2(source, folder / name)
-    # By the hash of their source: a mutant may have the size and the second of the text before it, which is all that
-    # an ordinary .pyc goes by. None is written later.
-    compileall.compile_dir(folder / "softneck", quiet=1, invalidation_mode=py_compile.PycInvalidationMode.CHECKED_HASH)
     return folder
 
 
@@ -230,8 +232,6 @@ def main() -> None:
     parser.add_argument("--again", type=Path, help="try only what survived there, a file that --out wrote")
     asked = parser.parse_args()
     before = json.loads(asked.again.read_text(encoding="utf-8")) if asked.again else {}
-    sys.dont_write_bytecode = True
-    os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
     sys.path[:] = [entry for entry in sys.path if Path(entry or ".").resolve() not in (HERE, ROOT)]
     for name in HEAVY:
         importlib.import_module(name)
