@@ -117,6 +117,10 @@ def test_a_long_way_has_the_trapezoid_of_speed_and_acceleration() -> None:
         (-7.0, 1.0, LimitSettings(position=6.0, speed=100.0, acceleration=1e5), "position"),
         (1.0, 9.7, LimitSettings(tension=12.0), "tension"),
         (1.0, 1.0, LimitSettings(speed=2.0, acceleration=1e5), "speed"),
+        # What comes first is told: the speed is limited by the position's limit already.
+        (7.0, 1.0, LimitSettings(position=6.0, speed=2.0, acceleration=1e5), "position"),
+        (-1.0, 1.0, LimitSettings(speed=2.0, acceleration=1e5), "speed"),
+        (-0.1, 1.0, LimitSettings(acceleration=10.0), "acceleration"),
         (0.1, 1.0, LimitSettings(acceleration=10.0), "acceleration"),
         (-5.0, 0.1, LimitSettings(slack=0.2, slack_unwind=3.0, speed=100.0, acceleration=1e5), "slack"),
         (0.01, 1.0, LimitSettings(), ""),

@@ -75,20 +75,23 @@ def read_rooms(path: Path = HERE / "rooms.toml") -> tuple[dict[str, Room], dict[
     return rooms, table
 
 
+def cosmic_ray(name: str) -> Any:
+    """Return one of its modules; it is installed by `make mutate` alone."""
+    return importlib.import_module(f"cosmic_ray.{name}")
+
+
 def mutants_of(root: Path, room: Room, settings: dict[str, Any]) -> Iterator[Mutant]:
     """Yield every mutant of a room, in the order of files, operators and places."""
-    from cosmic_ray import plugins
-    from cosmic_ray.ast import ast_nodes, get_ast_from_path
-
+    plugins, ast = cosmic_ray("plugins"), cosmic_ray("ast")
     files = sorted({path for pattern in room.files for path in root.glob(pattern)})
     if not files:
         raise SystemExit(f"room {room.name}: no file fits {room.files}")
     for path in files:
-        tree = get_ast_from_path(path)
+        tree = ast.get_ast_from_path(path)
         lines = path.read_text(encoding="utf-8").splitlines()
         for name in settings["operators"]:
             operator = plugins.get_operator(f"core/{name}")()
-            places = [start for node in ast_nodes(tree) for start, _ in operator.mutation_positions(node)]
+            places = [start for node in ast.ast_nodes(tree) for start, _ in operator.mutation_positions(node)]
             for occurrence, (line, column) in enumerate(places):
                 before = lines[line - 1][:column].rstrip()
                 # A star that opens a signature or unpacks is no product, though cosmic-ray takes it for one.
@@ -111,9 +114,7 @@ def sample(mutants: list[Mutant], count: int, seed: int) -> list[Mutant]:
 
 def mutated(root: Path, mutant: Mutant) -> tuple[str, str]:
     """Return the file's text before and after."""
-    from cosmic_ray import plugins
-    from cosmic_ray.mutating import mutate_code
-
+    plugins, mutate_code = cosmic_ray("plugins"), cosmic_ray("mutating").mutate_code
     before = (root / mutant.path).read_text(encoding="utf-8")
     after = mutate_code(before, plugins.get_operator(mutant.operator)(**mutant.arguments), mutant.occurrence)
     if after is None:
