@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test slow check docs benchmark native wheel nightly nightly-fmu nightly-can nightly-systemd clean
+.PHONY: demo test slow check docs benchmark mutate native wheel nightly nightly-fmu nightly-can nightly-systemd clean
 
 demo: $(VENV)/.installed
 	$(BIN)/softneck demo --out build/demo
@@ -28,6 +28,11 @@ docs: $(VENV)/.documented
 
 benchmark: $(VENV)/.tested
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-only
+
+# Change one thing at a time in the rooms that protect people and promises, and see whether a test notices: an hour or
+# more for all; `make mutate ROOMS="master loop"` tries some. docs/howto/mutation.md has the figures.
+mutate: $(VENV)/.mutated
+	$(BIN)/python tests/mutation/run.py $(ROOMS) --out build/mutation.json
 
 # The library of compiled FMUs for all five platforms, cross-compiled by zig into softneck/fmu/compiled/binaries.
 native: $(VENV)/.crossed
@@ -70,6 +75,10 @@ $(VENV)/.installed: pyproject.toml
 
 $(VENV)/.tested: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[all]' --group test --group importers
+	@touch $@
+
+$(VENV)/.mutated: $(VENV)/.tested
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --group mutate
 	@touch $@
 
 $(VENV)/.crossed: $(VENV)/.installed

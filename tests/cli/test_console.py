@@ -7,6 +7,7 @@ import io
 import re
 
 import pytest
+import rich.console
 from hypothesis import example, given
 from hypothesis import strategies as st
 from rich.console import Console
@@ -49,7 +50,7 @@ def test_a_table_in_a_pipe_is_neither_cut_nor_folded() -> None:
 def test_progress_shows_names_of_files_as_they_are(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn = io.StringIO()
     monkeypatch.setattr(
-        console_module, "Console", lambda stderr: Console(file=drawn, force_terminal=True, width=120, stderr=stderr)
+        rich.console, "Console", lambda stderr: Console(file=drawn, force_terminal=True, width=120, stderr=stderr)
     )
     with progress(text) as tell:
         tell(0.5, text)

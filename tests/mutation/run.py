@@ -11,12 +11,10 @@ works in a copy.
 from __future__ import annotations
 
 import argparse
-import compileall
 import difflib
 import importlib
 import json
 import os
-import py_compile
 import random
 import shutil
 import signal
@@ -77,20 +75,23 @@ def read_rooms(path: Path = HERE / "rooms.toml") -> tuple[dict[str, Room], dict[
     return rooms, table
 
 
+def cosmic_ray(name: str) -> Any:
+    """Return one of its modules; it is installed by `make mutate` alone."""
+    return importlib.import_module(f"cosmic_ray.{name}")
+
+
 def mutants_of(root: Path, room: Room, settings: dict[str, Any]) -> Iterator[Mutant]:
     """Yield every mutant of a room, in the order of files, operators and places."""
-    from cosmic_ray import plugins
-    from cosmic_ray.ast import ast_nodes, get_ast_from_path
-
+    plugins, ast = cosmic_ray("plugins"), cosmic_ray("ast")
     files = sorted({path for pattern in room.files for path in root.glob(pattern)})
     if not files:
         raise SystemExit(f"room {room.name}: no file fits {room.files}")
     for path in files:
-        tree = get_ast_from_path(path)
+        tree = ast.get_ast_from_path(path)
         lines = path.read_text(encoding="utf-8").splitlines()
         for name in settings["operators"]:
             operator = plugins.get_operator(f"core/{name}")()
-            places = [start for node in ast_nodes(tree) for start, _ in operator.mutation_positions(node)]
+            places = [start for node in ast.ast_nodes(tree) for start, _ in operator.mutation_positions(node)]
             for occurrence, (line, column) in enumerate(places):
                 before = lines[line - 1][:column].rstrip()
                 # A star that opens a signature or unpacks is no product, though cosmic-ray takes it for one.
@@ -113,9 +114,7 @@ def sample(mutants: list[Mutant], count: int, seed: int) -> list[Mutant]:
 
 def mutated(root: Path, mutant: Mutant) -> tuple[str, str]:
     """Return the file's text before and after."""
-    from cosmic_ray import plugins
-    from cosmic_ray.mutating import mutate_code
-
+    plugins, mutate_code = cosmic_ray("plugins"), cosmic_ray("mutating").mutate_code
     before = (root / mutant.path).read_text(encoding="utf-8")
     after = mutate_code(before, plugins.get_operator(mutant.operator)(**mutant.arguments), mutant.occurrence)
     if after is None:
@@ -169,11 +168,11 @@ def try_mutant(root: Path, room: Room, mutant: Mutant, equivalent: list[dict[str
     before, after = mutated(root, mutant)
     diff = "".join(difflib.unified_diff(before.splitlines(True), after.splitlines(True), mutant.path, mutant.path, n=0))
     begin = time.monotonic()
-    path.write_text(after, encoding="utf-8")
+    _write(path, after)
     try:
         code = run_tests(root, room.tests, root / "mutation.log", patience)
     finally:
-        path.write_text(before, encoding="utf-8")
+        _write(path, before)
     if code == 5:
         raise SystemExit(f"room {room.name} has no tests")
     outcome = "hung" if code is None else "survived" if code == 0 else "killed"
@@ -181,6 +180,13 @@ def try_mutant(root: Path, room: Room, mutant: Mutant, equivalent: list[dict[str
     if outcome == "survived" and any(item["file"] == mutant.path and item["line"] in changed for item in equivalent):
         outcome = "equivalent"
     return Outcome(mutant, outcome, time.monotonic() - begin, diff)
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a text with a time of its own: a .pyc goes by second and size, which two mutants may share."""
+    later = int(path.stat().st_mtime) + 2
+    path.write_text(text, encoding="utf-8")
+    os.utime(path, (later, later))
 
 
 def copy_of(root: Path, folder: Path) -> Path:
@@ -192,9 +198,6 @@ def copy_of(root: Path, folder: Path) -> Path:
             shutil.copytree(source, folder / name, ignore=shutil.ignore_patterns("__pycache__", "_build"))
         elif source.exists():
             shutil.copy2(source, folder / name)
-    # By the hash of their source: a mutant may have the size and the second of the text before it, which is all that
-    # an ordinary .pyc goes by. None is written later.
-    compileall.compile_dir(folder / "softneck", quiet=1, invalidation_mode=py_compile.PycInvalidationMode.CHECKED_HASH)
     return folder
 
 
@@ -230,8 +233,6 @@ def main() -> None:
     parser.add_argument("--again", type=Path, help="try only what survived there, a file that --out wrote")
     asked = parser.parse_args()
     before = json.loads(asked.again.read_text(encoding="utf-8")) if asked.again else {}
-    sys.dont_write_bytecode = True
-    os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
     sys.path[:] = [entry for entry in sys.path if Path(entry or ".").resolve() not in (HERE, ROOT)]
     for name in HEAVY:
         importlib.import_module(name)

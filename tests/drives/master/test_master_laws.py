@@ -11,7 +11,7 @@ from softneck.drives.master._settings import LimitSettings, WatchSettings
 from softneck.drives.master._watches import Leaky, Patience, Watches
 from softneck.drives.simulated import _power as power
 
-from .bench import Bench, T
+from ..bench import Bench, T
 
 NODES = (1, 2, 3)
 

@@ -1,0 +1,269 @@
+"""Steps measured as the loop measures them, requirements at their borders, boxes and their plants counted by hand."""
+
+from __future__ import annotations
+
+import math
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+
+from softneck.core import DataError, SettingsError
+from softneck.loop import LoopResult, metrics
+from softneck.verification import make_requirements
+from softneck.verification._linear import LinearLaw, classical, judged
+from softneck.verification._plants import all_plants, join, make_plants, neck_of_family, neck_of_model, nominal_plants
+from softneck.verification._requirements import Requirement
+from softneck.verification._steps import StepTest, _metrics, run_steps
+from softneck.verification._verify import plain
+
+from .necks import TS, controller_of, family, linear_neck, pi
+
+SPREAD = {"gain": 0.2, "pole": 0.3, "delay": 0.02}
+
+
+# -- steps ------------------------------------------------------------------------------------------------------------
+
+
+def _second_order(damping: float, frequency: float, rows: int) -> np.ndarray:
+    t = np.arange(rows) * TS
+    root = frequency * math.sqrt(1.0 - damping**2)
+    return 1.0 - np.exp(-damping * frequency * t) * (np.cos(root * t) + damping * frequency / root * np.sin(root * t))
+
+
+def test_a_step_is_measured_as_the_loop_measures_it() -> None:
+    """Two programs, one definition: rise, settling, overshoot and steady error of the same rows."""
+    half, size = 200, 0.2
+    first = np.stack([size * _second_order(zeta, w, half) for zeta, w in product((0.2, 0.5, 0.9), (2.0, 5.0, 9.0))])
+    y = np.concatenate([first, first[:, -1:] + np.linspace(0.0, 0.05, half)], axis=1)
+    other = np.tile(np.linspace(-0.01, 0.005, half), (len(y), 1))
+    found = _metrics(y, other, StepTest(step=size, duration=half * TS, noise=0.0, load=0.0, seed=0), half, TS)
+    zero = np.zeros(half)
+    for row in range(len(y)):
+        signals = {"pitch": first[row], "pitch_reference": np.full(half, size), "roll": zero, "roll_reference": zero}
+        signals |= {f"motor_setpoint_{j}": zero for j in (1, 2, 3)}
+        table = metrics(LoopResult(np.arange(half) * TS, signals, {}, TS))["pitch"]
+        for name in ("rise_s", "settling_s", "overshoot_pct", "steady_rms_deg"):
+            expected = math.inf if table[name] is None else table[name]
+            # The same samples are chosen; sums and differences of times are rounded.
+            assert found[name][row] == pytest.approx(expected, rel=1e-9, abs=1e-12), (row, name)
+        load = np.degrees(np.sqrt(np.mean((y[row, half:] - size) ** 2)))
+        assert found["load_rms_deg"][row] == pytest.approx(load, rel=1e-12)
+    np.testing.assert_allclose(found["coupling_deg"], math.degrees(0.01), rtol=1e-12)
+
+
+def test_what_never_arrives_or_overflows_is_infinite() -> None:
+    half = 50
+    y = np.full((4, 2 * half), 0.05)
+    y[1] = np.inf
+    y[2, 10:] = 0.2
+    y[3] = 0.2
+    other = np.zeros((4, half))
+    found = _metrics(y, other, StepTest(step=0.2, duration=1.0, noise=0.0, load=0.0, seed=0), half, TS)
+    assert np.isinf(found["rise_s"]).tolist() == [True, True, False, False]
+    assert np.isinf(found["settling_s"]).tolist() == [True, True, False, False]
+    assert all(np.isinf(values[1]) for values in found.values())
+    # The third stands at 25 % from the start, which is beyond 10 %, and arrives in row 10.
+    assert (found["rise_s"][2], found["settling_s"][2]) == pytest.approx((10 * TS, 10 * TS))
+    assert (found["settling_s"][3], found["overshoot_pct"][3]) == (0.0, 0.0)
+
+
+def test_a_load_comes_in_the_second_half_on_the_stepped_axis_alone_and_noise_scales() -> None:
+    plants = nominal_plants([neck_of_family(family(), "f")])[0]
+    block = pi().block()
+
+    def run(**changes: float) -> Any:
+        values = {"step": 0.2, "duration": 2.0, "noise": 0.0, "load": 0.0, **changes}
+        return run_steps(plants, block, StepTest(seed=3, **values), workers=1)
+
+    calm, loaded = run(), run(load=0.05)
+    half = 100
+    assert calm.time.size == 2 * half
+    assert calm.time[1] == TS
+    delay = int(plants.delay.max())
+    for axis in (0, 1):
+        np.testing.assert_array_equal(
+            loaded.angles[axis, :, : half + 1 + delay], calm.angles[axis, :, : half + 1 + delay]
+        )
+        assert np.abs(loaded.angles[axis] - calm.angles[axis]).max() > 1e-3
+    assert loaded.metrics["overshoot_pct"] == pytest.approx(calm.metrics["overshoot_pct"])
+    one, two = (run(noise=size).angles - calm.angles for size in (1e-6, 2e-6))
+    # A linear loop inside its limits: twice the noise, twice its effect; rounding of 0.2 against 1e-6.
+    np.testing.assert_allclose(two, 2.0 * one, rtol=0.0, atol=1e-12)
+    assert run(noise=1e-3).angles.tolist() == run(noise=1e-3).angles.tolist()
+    # The worse axis stands in the table, and is named.
+    assert set(np.unique(calm.worse["rise_s"])) <= {0, 1}
+
+
+# -- requirements -----------------------------------------------------------------------------------------------------
+
+
+def test_a_bound_holds_at_its_limit_except_below() -> None:
+    for bound, values in {
+        "min": (False, True, True), "max": (True, True, False), "below": (True, False, False),
+    }.items():  # fmt: skip
+        item = Requirement("m", bound, 1.5, True)
+        assert tuple(item.holds(value) for value in (1.5 - 1e-12, 1.5, 1.5 + 1e-12)) == values
+        assert not item.holds(math.nan)
+
+
+@pytest.mark.parametrize(
+    ("table", "key", "low", "high"),
+    [
+        ("uncertainty", "gain_pct", 0.0, 95.0), ("uncertainty", "pole_pct", 0.0, 95.0),
+        ("uncertainty", "delay_ms", 0.0, 1000.0), ("sampling", "plants", 1, 100_000),
+        ("sampling", "search_generations", 0, 10_000), ("sampling", "seed", 0, 2**31 - 2),
+        ("step", "size_deg", 0.01, 45.0), ("step", "duration_s", 0.2, 600.0), ("step", "noise_deg", 0.0, 10.0),
+        ("step", "load_rad", -6.0, 6.0), ("neck", "necks", 0, 1000), ("neck", "spread_pct", 0.0, 50.0),
+        ("neck", "size_deg", 0.01, 45.0), ("neck", "duration_s", 0.5, 600.0),
+    ],
+)  # fmt: skip
+def test_numbers_of_the_tables_have_their_ranges(table: str, key: str, low: float, high: float) -> None:
+    for value in (low, high):
+        assert getattr(make_requirements({table: {key: value}}), table)[key] == value
+    step = 1 if isinstance(low, int) else 1e-6
+    for wrong in (low - step, high + step, True, "1"):
+        with pytest.raises(SettingsError):
+            make_requirements({table: {key: wrong}})
+
+
+@pytest.mark.parametrize(("key", "most"), [("payloads_kg", 5.0), ("orientations_deg", 360.0)])
+def test_lists_of_numbers_have_theirs(key: str, most: float) -> None:
+    assert make_requirements({"neck": {key: [0.0, most]}}).neck[key] == [0.0, most]
+    for wrong in ([most + 1e-6], [-1e-6], [], 1.0, [True]):
+        with pytest.raises(SettingsError):
+            make_requirements({"neck": {key: wrong}})
+
+
+@pytest.mark.parametrize(
+    ("require", "possible"),
+    [
+        ({"axes.sensitivity": {"max": 1.0}}, True),
+        ({"axes.sensitivity": {"max": 1.0 - 1e-9}}, False),
+        ({"axes.disk_margin": {"min": 2.0}, "axes.sensitivity": False}, True),
+        ({"axes.disk_margin": {"min": 2.0 + 1e-9}, "axes.sensitivity": False}, False),
+        ({"step.rise_s": {"min": 1.0, "max": 1.0}}, True),
+        ({"step.rise_s": {"min": 1.0, "max": 1.0 - 1e-9}}, False),
+        ({"roll.gain_margin": {"max": 3.0}, "axes.gain_margin": {"min": 3.0}, "axes.sensitivity": {"max": 1.5}}, True),
+        # A sensitivity of 1.5 at most is a gain margin of 1.5/0.5 = 3 at least.
+        ({"roll.gain_margin": {"max": 2.99}, "axes.gain_margin": False, "axes.sensitivity": {"max": 1.5}}, False),
+        # A sensitivity of 1.5 at least is a disk margin of 2/(3 - 1) = 1 at most.
+        ({"pitch.disk_margin": {"min": 1.0}, "axes.sensitivity": {"min": 1.5}, "axes.disk_margin": False}, True),
+        ({"pitch.disk_margin": {"min": 1.01}, "axes.sensitivity": {"min": 1.5}, "axes.disk_margin": False}, False),
+    ],
+)
+def test_what_no_loop_can_do_is_refused_at_the_border(require: dict[str, Any], possible: bool) -> None:
+    if possible:
+        assert make_requirements({"require": require}).bounds
+    else:
+        with pytest.raises(SettingsError):
+            make_requirements({"require": require})
+
+
+def test_json_values_of_everything_and_nothing_else() -> None:
+    values = {"a": np.array([1.0, math.inf]), 2: (True, np.bool_(False)), "n": np.int64(3), "x": math.nan, "t": "s"}
+    assert plain(values) == {"a": [1.0, None], "2": [True, False], "n": 3, "x": None, "t": "s"}
+    assert plain(True) is True
+    assert plain(None) is None
+    with pytest.raises(DataError):
+        plain(object())
+
+
+# -- boxes and plants -------------------------------------------------------------------------------------------------
+
+
+def test_the_box_of_a_model_is_its_spread_around_it() -> None:
+    neck = neck_of_model(linear_neck(), "m", SPREAD)
+    for box in neck.axes:
+        K, p, L = box.nominal
+        np.testing.assert_allclose(box.low, [0.8 * K, 0.7 * p, L - 0.02], rtol=1e-12)
+        np.testing.assert_allclose(box.high, [1.2 * K, 1.3 * p, L + 0.02], rtol=1e-12)
+        np.testing.assert_allclose(box.middle, box.nominal, rtol=1e-12)
+        np.testing.assert_allclose(box.widths, [0.2 * K, 0.3 * p, 0.02], rtol=1e-9)
+    # A dead time is never negative.
+    assert neck_of_model(linear_neck(delay=0), "m", SPREAD).axes[0].low[2] == 0.0
+
+
+def test_all_plants_are_the_nominal_both_sets_of_corners_the_samples_and_what_lies_inside() -> None:
+    found = family(count=6)
+    neck = neck_of_family(found, "f")
+    plants = all_plants([neck], 40, 0)
+    # 1 nominal, 8 corners twice, 6 samples, and 17 from inside the box.
+    assert [sum(word in name for name in plants.names) for word in ("nominal", "corner", "sample", "inside")] == [
+        1, 16, 6, 17,
+    ]  # fmt: skip
+    corners = plants.numbers[1:17]
+    for i, box in enumerate(neck.axes):
+        assert {tuple(row) for row in corners[:, i]} == set(product(*zip(box.low, box.high, strict=True)))
+        inside = plants.numbers[23:, i]
+        assert np.all((inside > box.low) & (inside < box.high))
+        # A Latin hypercube has one in each of 17 slices of each number.
+        slices = np.floor(17 * (inside - box.low) / (box.high - box.low)).astype(int)
+        assert all(sorted(column) == list(range(17)) for column in slices.T)
+    same = corners[::2]
+    np.testing.assert_allclose(same[:, 0], same[:, 1], rtol=0.5)
+    assert len(all_plants([neck], 1, 0)) == 23
+    both = all_plants([neck, neck], 60, 0)
+    assert np.bincount(both.source).tolist() == [30, 30]
+    assert plants.take(3).names == (plants.names[3],)
+
+
+def test_joined_plants_respond_as_each_alone() -> None:
+    w = judged(TS, 20)
+    one = nominal_plants([neck_of_model(linear_neck(), "m", SPREAD)])[0]
+    two = all_plants([neck_of_family(family(cross=0.1), "f")], 1, 0)
+    both = join([one, two])
+    np.testing.assert_allclose(both.response(w), np.concatenate([one.response(w), two.response(w)]), rtol=1e-12)
+    np.testing.assert_array_equal(both.cross, np.concatenate([one.cross, two.cross]))
+    # One sample of delay more turns the phase by w Ts and changes no size.
+    np.testing.assert_allclose(both.later(1).response(w), both.response(w) * np.exp(-1j * w * TS), rtol=1e-12)
+
+
+def test_frequencies_go_up_to_nyquist() -> None:
+    w = judged(TS)
+    assert (w[0], w[-1]) == pytest.approx((0.02, math.pi / TS))
+    assert w.size == 360
+
+
+def test_the_static_gain_of_a_plant_is_its_number() -> None:
+    neck = neck_of_model(linear_neck(), "m", SPREAD)
+    numbers = np.array([[[0.1, 5.0, 0.05], [-0.2, 3.0, 0.071]]])
+    plants = make_plants(neck, numbers, [""])
+    low = plants.response(np.array([1e-6]))[0, :, 0]
+    np.testing.assert_allclose(low, [0.1, -0.2], rtol=1e-5)
+    # Between samples the dead time counts too: the phase at low frequencies is -w (L + Ts/2 + 1/p).
+    w = 0.01
+    turned = -np.angle(plants.response(np.array([w]))[0, :, 0] / numbers[0, :, 0]) / w
+    np.testing.assert_allclose(turned, [0.05 + TS / 2 + 1 / 5.0, 0.071 + TS / 2 + 1 / 3.0], rtol=1e-3)
+
+
+# -- margins ----------------------------------------------------------------------------------------------------------
+
+
+def test_margins_of_an_integrator_with_delay_are_the_textbooks() -> None:
+    """L = k exp(-s T)/s: crosses at k, phase margin pi/2 - k T, gain margin pi/(2 k T), delay margin pm/k."""
+    w = np.geomspace(1e-2, 20.0, 4000)
+    k, T = np.array([0.5, 1.0, 2.5]), 0.5
+    L = k[:, None] * np.exp(-1j * w * T) / (1j * w)
+    found = classical(L, w)
+    crossing = math.pi / 2 - k * T
+    np.testing.assert_allclose(found["phase_margin_deg"], np.degrees(crossing), rtol=1e-4)  # straight lines between
+    np.testing.assert_allclose(found["gain_margin"], np.pi / (2 * k * T), rtol=1e-4)
+    np.testing.assert_allclose(found["delay_margin_ms"], 1e3 * crossing / k, rtol=1e-4)
+    # Upside down: where the gain may fall by so much, an unstable plant's loop for example.
+    upside = classical(1.0 / np.conj(L), w)
+    np.testing.assert_allclose(upside["gain_margin"], found["gain_margin"], rtol=1e-4)
+    # A loop that crosses neither has no margin to lose.
+    assert all(np.isinf(values).all() for values in classical(np.full((1, 4000), 0.5 + 0j), w).values())
+
+
+def test_a_controller_is_coupled_where_one_angle_moves_the_others_input() -> None:
+    law = LinearLaw.of(controller_of(np.array([1.0, -0.9]), np.array([1.0, -0.5])))
+    assert not law.coupled
+    coupled = LinearLaw(law.A, law.Br, law.By, law.C, law.Dr, law.Dy + np.array([[0.0, 1e-6], [0.0, 0.0]]), TS)
+    assert coupled.coupled
+    w = judged(TS, 15)
+    z = np.exp(1j * w * TS)
+    np.testing.assert_allclose(law.feedback(w)[:, 0, 0], -(z - 0.9) / (z - 0.5), rtol=1e-12)
+    assert np.abs(law.forward(w)).max() == 0.0
