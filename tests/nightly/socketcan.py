@@ -19,7 +19,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from machine import BUILD, END, ROOT, SOURCES, Guest, boot, has_kvm, require_tools
+from machine import BUILD, END, ROOT, Guest, boot, has_kvm, require_tools
 
 SCRIPT = ROOT / "tests" / "drives" / "processes.py"
 CASES = {
@@ -53,7 +53,7 @@ def prepare(folder: Path, period: float) -> None:
     """Write the cases' project for each profile, and compile for any processor: the guest would need minutes."""
     cache = BUILD / "cache"
     environment = {**os.environ, "XDG_CACHE_HOME": str(cache), "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
-    environment["PYTHONPATH"] = ":".join((*SOURCES, str(SCRIPT.parent)))
+    environment["PYTHONPATH"] = f"{ROOT}:{SCRIPT.parent}"
     for profile in ("ipos2015", "ds402"):
         project = folder / profile
         project.mkdir()
@@ -109,7 +109,7 @@ def main() -> None:
             for bus, names in cases.items()
         )
         script = GUEST.format(
-            path=os.environ["PATH"], sources=":".join(SOURCES), cache=BUILD / "cache", project=folder,
+            path=os.environ["PATH"], sources=ROOT, cache=BUILD / "cache", project=folder,
             python=sys.executable, script=SCRIPT, relaxed=relaxed, plays=plays,
         )  # fmt: skip
         print(f"cycle {1e3 * period:g} ms{'' if kvm else ', patience 10: an emulated machine'}", flush=True)

@@ -14,7 +14,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from machine import BUILD, END, ROOT, SOURCES, Guest, boot, has_kvm, require_tools
+from machine import BUILD, END, ROOT, Guest, boot, has_kvm, require_tools
 from socketcan import prepare
 
 UNIT = ROOT / "deploy" / "systemd" / "softneck-neck.service"
@@ -45,7 +45,7 @@ START = """export PATH=/usr/sbin:/usr/bin:/sbin:/bin
 ip link set lo up
 for device in can0 can1; do ip link set $device type can bitrate 1000000 restart-ms 0 && ip link set $device up; done
 mkdir -p /opt/softneck/bin /opt/softneck/src /opt/neck /var/cache/softneck
-cp -r {sources} /opt/softneck/src/
+cp -r {package} /opt/softneck/src/
 cp -r {project}/. /opt/neck/
 cp -a {cache}/. /var/cache/softneck/
 useradd --system --home-dir /opt/neck --groups dialout softneck
@@ -96,7 +96,7 @@ def certified(folder: Path, period: float) -> Path:
     (project / "hangs.toml").replace(project / "loop.toml")
     code = "from softneck.cli import main; main()"
     words = ["simulate", "loop.toml", "--certificate", "loop.certificate.json", "-o", "certified.csv"]
-    environment = {**os.environ, "PYTHONPATH": ":".join(SOURCES)}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     subprocess.run([sys.executable, "-c", code, *words], cwd=project, env=environment, check=True,
                    stdout=subprocess.DEVNULL)  # fmt: skip
     return project
@@ -124,15 +124,14 @@ def main() -> None:
     period, patience = (0.01, 1) if kvm else (0.02, 20)
     python = Path(sys.executable).resolve()
     homes = [str(parent) for parent in (*python.parents, *Path(sys.prefix).parents) if parent != Path("/")]
-    pythonpath = ":".join(f"/opt/softneck/src/{Path(source).name}" for source in SOURCES)
     BUILD.mkdir(parents=True, exist_ok=True)
     changed = drop_in(python, kvm=kvm)
     with tempfile.TemporaryDirectory(dir=BUILD) as name:
         project = certified(Path(name), period)
-        given = {"python": sys.executable, "pythonpath": pythonpath}
+        given = {"python": sys.executable, "pythonpath": "/opt/softneck/src"}
         files = {
             "start.sh": START.format(
-                masked=MASKED, sources=" ".join(SOURCES), project=project, cache=BUILD / "cache", homes=" ".join(homes)
+                masked=MASKED, package=ROOT / "softneck", project=project, cache=BUILD / "cache", homes=" ".join(homes)
             ),
             "guest.py": (Path(__file__).parent / "systemd_guest.py").read_text(encoding="utf-8"),
             "softneck": COMMAND.format(**given),

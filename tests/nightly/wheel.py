@@ -18,7 +18,7 @@ import venv
 import zipfile
 from pathlib import Path
 
-NATIVE = "softneck/fmu/native/binaries/"
+NATIVE = "softneck/fmu/compiled/binaries/"
 PLATFORMS = ("x86_64-linux.so", "aarch64-linux.so", "x86_64-windows.dll", "x86_64-darwin.dylib", "aarch64-darwin.dylib")
 SCRIPT = """
 import os, subprocess, sys, time, zipfile
