@@ -163,3 +163,25 @@ def test_every_phase_has_a_goal_of_its_own_for_drives_enabled_one_by_one() -> No
             seen.append(names)
     on, off = "ENABLED", "OFF"
     assert seen == [(on, off, off), (on, on, off), (on, on, on)]
+
+
+def test_waiting_before_the_start_costs_no_time_of_what_follows() -> None:
+    """Every time-out counts from the begin of its phase, not from that of the clock."""
+    bench = Bench()
+    bench.pass_time(5.0)
+    assert bench.start().phase is Phase.RUNNING
+    assert bench.master.supervisor.fault is None
+
+
+def test_a_drive_that_does_not_enable_is_given_its_second_and_no_more() -> None:
+    bench = Bench()
+    bench.pass_time(1.5)
+    bench.link.lose = lambda _, frame: frame.identifier == 0x202
+    begin = bench.now
+    bench.master.start()
+    bench.finish(6.0)
+    fault = bench.master.supervisor.fault
+    assert fault is not None
+    assert (fault.name, fault.node) == ("enable_timeout", 2)
+    # The first drive takes a few cycles, the second its second.
+    assert 1.0 < fault.time - begin < 1.15

@@ -65,15 +65,16 @@ def test_a_share_is_above_zero_and_at_most_all() -> None:
 def test_windows_begin_at_zero_and_last() -> None:
     for made in (SensorFault(kind="freeze"), MotorFault(kind="stuck"), NeckFault(values={"payload": 1.0})):
         assert (made.start, made.duration) == (0.0, math.inf)
-    for window in ({"start": -1e-9}, {"duration": 0.0}, {"duration": -1.0}, {"start": math.inf}):
+    windows: tuple[dict[str, Any], ...] = ({"start": -1e-9}, {"duration": 0.0}, {"duration": -1.0}, {"start": math.inf})
+    for window in windows:
         with pytest.raises(SettingsError):
             MotorFault(kind="stuck", **window)
-    for wrong in ({"kind": "offset"}, {"kind": "slow"}):
+    for kind in ("offset", "slow"):
         with pytest.raises(SettingsError):
-            MotorFault(**wrong)
-    for wrong in ({"kind": "bias"}, {"kind": "outlier"}, {"kind": "noise"}, {"kind": "delay"}):
+            MotorFault(kind=kind)
+    for kind in ("bias", "outlier", "noise", "delay"):
         with pytest.raises(SettingsError):
-            SensorFault(**wrong)
+            SensorFault(kind=kind)
     for values in ({}, {"payload": 0.0}, {"payload": math.nan}):
         with pytest.raises(SettingsError):
             NeckFault(values=values)
