@@ -11,6 +11,7 @@ import pytest
 
 from softneck.core import SettingsError
 from softneck.loop import (
+    Loop,
     LoopResult,
     MotorFault,
     NeckFault,
@@ -22,10 +23,14 @@ from softneck.loop import (
     StepReference,
     check_limits,
     metrics,
+    run_loop,
 )
 from softneck.loop._disturbed_bus import Acting
 from softneck.loop._faults import fault_field, fault_keys, make_fault
 from softneck.loop._references import make_reference, reference_field, reference_keys
+from softneck.runtime import Port
+
+from ._parts import SETPOINTS, FunctionPart, lag_plant, ports
 
 TS = 0.02
 
@@ -280,3 +285,20 @@ def test_slack_and_motor_limits_at_their_borders() -> None:
     assert found["slack_s"] == pytest.approx(2 * TS)
     assert found["max_rad"] == 7.0
     assert found["max_rate_rad_s"] == pytest.approx((13.0 + 1e-6) / TS)
+
+
+def test_what_nobody_feeds_holds_its_usual_value_and_what_comes_after_a_constant_is_converted() -> None:
+    """`healthy` and `enabled` are 1 where nobody says otherwise; a constant among the inputs ends nothing."""
+    seen: list[list[float]] = []
+
+    def controlled(_state: list[float], u: Any) -> list[float]:
+        seen.append([float(value) for value in u])
+        return [0.0, 0.0, 0.0]
+
+    inputs = (
+        Port(name="healthy"), Port(name="measurement_valid"), Port(name="enabled"), Port(name="pitch_reference", unit="deg"),
+        *ports("roll_reference", "pitch", "roll"),
+    )  # fmt: skip
+    controller = FunctionPart("controller", inputs, SETPOINTS, controlled)
+    run_loop(Loop(plant=lag_plant(), controller=controller, reference=StepReference(pitch=0.1), duration=0.1))
+    np.testing.assert_allclose(seen[0], [1.0, 1.0, 1.0, math.degrees(0.1), 0.0, 0.0, 0.0], rtol=1e-12)
