@@ -296,8 +296,8 @@ def test_what_nobody_feeds_holds_its_usual_value_and_what_comes_after_a_constant
         return [0.0, 0.0, 0.0]
 
     inputs = (
-        Port(name="healthy"), Port(name="measurement_valid"), Port(name="enabled"), Port(name="pitch_reference", unit="deg"),
-        *ports("roll_reference", "pitch", "roll"),
+        Port(name="healthy"), Port(name="measurement_valid"), Port(name="enabled"),
+        Port(name="pitch_reference", unit="deg"), *ports("roll_reference", "pitch", "roll"),
     )  # fmt: skip
     controller = FunctionPart("controller", inputs, SETPOINTS, controlled)
     run_loop(Loop(plant=lag_plant(), controller=controller, reference=StepReference(pitch=0.1), duration=0.1))
