@@ -11,6 +11,7 @@ import pytest
 
 from softneck.core import SettingsError
 from softneck.loop import (
+    Loop,
     LoopResult,
     MotorFault,
     NeckFault,
@@ -22,10 +23,14 @@ from softneck.loop import (
     StepReference,
     check_limits,
     metrics,
+    run_loop,
 )
 from softneck.loop._disturbed_bus import Acting
 from softneck.loop._faults import fault_field, fault_keys, make_fault
 from softneck.loop._references import make_reference, reference_field, reference_keys
+from softneck.runtime import Port
+
+from ._parts import SETPOINTS, FunctionPart, lag_plant, ports
 
 TS = 0.02
 
@@ -65,15 +70,16 @@ def test_a_share_is_above_zero_and_at_most_all() -> None:
 def test_windows_begin_at_zero_and_last() -> None:
     for made in (SensorFault(kind="freeze"), MotorFault(kind="stuck"), NeckFault(values={"payload": 1.0})):
         assert (made.start, made.duration) == (0.0, math.inf)
-    for window in ({"start": -1e-9}, {"duration": 0.0}, {"duration": -1.0}, {"start": math.inf}):
+    windows: tuple[dict[str, Any], ...] = ({"start": -1e-9}, {"duration": 0.0}, {"duration": -1.0}, {"start": math.inf})
+    for window in windows:
         with pytest.raises(SettingsError):
             MotorFault(kind="stuck", **window)
-    for wrong in ({"kind": "offset"}, {"kind": "slow"}):
+    for kind in ("offset", "slow"):
         with pytest.raises(SettingsError):
-            MotorFault(**wrong)
-    for wrong in ({"kind": "bias"}, {"kind": "outlier"}, {"kind": "noise"}, {"kind": "delay"}):
+            MotorFault(kind=kind)
+    for kind in ("bias", "outlier", "noise", "delay"):
         with pytest.raises(SettingsError):
-            SensorFault(**wrong)
+            SensorFault(kind=kind)
     for values in ({}, {"payload": 0.0}, {"payload": math.nan}):
         with pytest.raises(SettingsError):
             NeckFault(values=values)
@@ -279,3 +285,20 @@ def test_slack_and_motor_limits_at_their_borders() -> None:
     assert found["slack_s"] == pytest.approx(2 * TS)
     assert found["max_rad"] == 7.0
     assert found["max_rate_rad_s"] == pytest.approx((13.0 + 1e-6) / TS)
+
+
+def test_what_nobody_feeds_holds_its_usual_value_and_what_comes_after_a_constant_is_converted() -> None:
+    """`healthy` and `enabled` are 1 where nobody says otherwise; a constant among the inputs ends nothing."""
+    seen: list[list[float]] = []
+
+    def controlled(_state: list[float], u: Any) -> list[float]:
+        seen.append([float(value) for value in u])
+        return [0.0, 0.0, 0.0]
+
+    inputs = (
+        Port(name="healthy"), Port(name="measurement_valid"), Port(name="enabled"),
+        Port(name="pitch_reference", unit="deg"), *ports("roll_reference", "pitch", "roll"),
+    )  # fmt: skip
+    controller = FunctionPart("controller", inputs, SETPOINTS, controlled)
+    run_loop(Loop(plant=lag_plant(), controller=controller, reference=StepReference(pitch=0.1), duration=0.1))
+    np.testing.assert_allclose(seen[0], [1.0, 1.0, 1.0, math.degrees(0.1), 0.0, 0.0, 0.0], rtol=1e-12)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from matplotlib.collections import LineCollection
 from scipy.stats import norm
 
 from softneck.plots import convergence_figure, cover_figure, local_map_figure
@@ -32,6 +33,7 @@ def test_a_map_shows_degrees_and_milliseconds() -> None:
         np.testing.assert_allclose(y, scale[i] * numbers[:, i])
         # Bars of 95 % of a normal distribution, to the three digits that are drawn.
         (bars,) = figure.axes[i].collections
+        assert isinstance(bars, LineCollection)
         for k, segment in enumerate(bars.get_segments()):
             reach = scale[i] * 0.01 * norm.ppf(0.975)
             np.testing.assert_allclose(segment[:, 1], scale[i] * numbers[k, i] + reach * np.array([-1, 1]), rtol=1e-3)
