@@ -24,4 +24,4 @@ def missing_extra(error: ModuleNotFoundError) -> str | None:
     if found is None:
         return None
     extra, purpose = found
-    return f"{purpose} needs {error.name}, which is not installed; run: pip install 'softneck[{extra}]'"
+    return f"{error.name} is not installed, and it is needed for {purpose}; run: pip install 'softneck[{extra}]'"
