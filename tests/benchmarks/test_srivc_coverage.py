@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from ..identification.test_srivc import NECK, coverage
+from ..identification.linear.test_srivc import NECK, coverage
 
 SEEDS = 200
 

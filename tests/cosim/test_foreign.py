@@ -116,7 +116,8 @@ def test_its_state_resumes_in_another_instance(
 
 _RESUME = """
 import sys
-from softneck.cosim import LoopState, load_loop, simulate
+from softneck.cosim import load_loop, simulate
+from softneck.loop import LoopState
 result = simulate(load_loop(sys.argv[1]), resume=LoopState.load(sys.argv[2]))
 print([value.hex() for value in result["pitch"].tolist()])
 """

@@ -113,7 +113,7 @@ def test_our_eds_is_what_the_simulated_drives_have(profile: str) -> None:
     ids=["object missing", "another size", "no EDS", "empty"],
 )  # fmt: skip
 def test_an_eds_that_does_not_fit(tmp_path: Path, change: Callable[[str], str], message: str) -> None:
-    ours = ROOT / "deploy" / "softneck" / "drives" / "eds" / "ipos2015.eds"
+    ours = ROOT / "softneck" / "drives" / "bus" / "eds" / "ipos2015.eds"
     path = tmp_path / "mine.eds"
     path.write_text(change(ours.read_text(encoding="utf-8")), encoding="utf-8")
     file = default_drives(eds=path)

@@ -11,7 +11,7 @@ import pytest
 
 from softneck.cli._main import run
 
-UNIT = Path(__file__).parents[2] / "deploy" / "systemd" / "softneck-neck.service"
+UNIT = Path(__file__).parents[2] / "examples" / "drives" / "softneck-neck.service"
 
 
 def settings(name: str) -> list[str]:

@@ -17,7 +17,7 @@ from pathlib import Path
 from machine import BUILD, END, ROOT, Guest, boot, has_kvm, require_tools
 from socketcan import prepare
 
-UNIT = ROOT / "deploy" / "systemd" / "softneck-neck.service"
+UNIT = ROOT / "examples" / "drives" / "softneck-neck.service"
 PACKAGES = ("systemd", "udev")
 OBSERVER = """import pathlib
 from time import monotonic, sleep

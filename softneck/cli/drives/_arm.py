@@ -8,6 +8,7 @@ import sys
 import click
 
 from softneck.core import SettingsError
+from softneck.drives.bus._link import HARMLESS
 
 from ..shared._console import note
 
@@ -29,8 +30,6 @@ def require_armed(bus: str, *, arm: bool) -> None:
     Raises:
         SettingsError: no --arm, nobody to ask, or other words; nothing was sent.
     """
-    from softneck.drives.bus._link import HARMLESS
-
     if not arm:
         raise SettingsError(f"this moves the drives on {bus}; say --arm if they may. Nothing was sent.")
     if bus.partition(":")[0] in HARMLESS:

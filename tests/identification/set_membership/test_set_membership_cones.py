@@ -129,7 +129,7 @@ def test_without_the_compiler_it_is_the_same_to_the_bit(monkeypatch: pytest.Monk
 
     fast, fast_set = both()
     for module in ("_gamma", "_forest"):
-        monkeypatch.setattr(f"softneck.identification.{module}.have_numba", lambda: False)
+        monkeypatch.setattr(f"softneck.identification.set_membership.{module}.have_numba", lambda: False)
     slow, slow_set = both()
     np.testing.assert_array_equal(fast, slow)
     np.testing.assert_array_equal(fast_set.gammas, slow_set.gammas)
@@ -240,8 +240,8 @@ def test_constant_outputs_with_an_epsilon_are_a_constant() -> None:
 def test_what_the_data_deny_is_refused_by_naming_the_two_rows() -> None:
     X, y = np.array([[0.0], [1.0], [2.0], [3.0]]), np.array([0.0, 1.0, 4.0, 4.5])
     message = (
-        r"gamma 2 with epsilon 0.5 is denied .*between rows 1 and 2 of `X` and `Y` the regressor moves by 1 and "
-        r"output 0 is 3 apart. With this epsilon gamma must be at least 2.5;"
+        r"gamma 2 with epsilon 0.5 is contradicted by the data .*: between rows 1 and 2 of `X` and `Y` the regressor "
+        r"moves by 1 and output 0 is 3 apart. With this epsilon gamma must be at least 2.5;"
     )
     with pytest.raises(DataError, match=message):
         Cones(gamma=2.0, epsilon=0.5).fit(X, y)

@@ -206,7 +206,7 @@ def test_without_the_compiler_it_is_the_same_to_the_bit(monkeypatch: pytest.Monk
 
     fast = run()
     for module in ("_gamma", "_forest"):
-        monkeypatch.setattr(f"softneck.identification.{module}.have_numba", lambda: False)
+        monkeypatch.setattr(f"softneck.identification.set_membership.{module}.have_numba", lambda: False)
     slow = run()
     np.testing.assert_array_equal(fast[0], slow[0])
     np.testing.assert_array_equal(fast[1], slow[1])
