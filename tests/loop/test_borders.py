@@ -25,7 +25,7 @@ from softneck.loop import (
     metrics,
     run_loop,
 )
-from softneck.loop._disturbed_bus import Acting
+from softneck.loop._disturbed_bus import ActiveFault
 from softneck.loop._faults import fault_field, fault_keys, make_fault
 from softneck.loop._references import make_reference, reference_field, reference_keys
 from softneck.runtime import Port
@@ -98,7 +98,7 @@ def test_windows_begin_at_zero_and_last() -> None:
     ],
 )
 def test_a_window_holds_its_rows_and_no_other(start: float, duration: float, rows: range) -> None:
-    acting = Acting(NeckFault(values={"payload": 2.0}, start=start, duration=duration), [1], [], np.ones(1), TS)
+    acting = ActiveFault(NeckFault(values={"payload": 2.0}, start=start, duration=duration), [1], [], np.ones(1), TS)
     hit = []
     for k in range(12):
         bus = np.array([7.0, 1.0])

@@ -51,15 +51,17 @@ def fmu_run(build: Callable[..., Any], block: Any, case: str = "missing", **sett
     import fmpy
 
     U, names, outputs = inputs_of(block, PLAIN_ROWS, case), [p.name for p in block.inputs], block.outputs
-    table = np.zeros(len(U), [("time", float), *((p.name, bool if p.boolean else float) for p in block.inputs)])
+    table: Any = np.zeros(len(U), [("time", float), *((p.name, bool if p.boolean else float) for p in block.inputs)])
     table["time"] = np.arange(len(U)) * TS
     for name, column in zip(names, U.T, strict=True):
         table[name] = column
+    if not names:
+        table = None
     with tempfile.TemporaryDirectory(prefix="softneck-same-") as folder:
         build(block, Path(folder) / "Same.fmu", **settings)
         result: Any = fmpy.simulate_fmu(
             str(Path(folder) / "Same.fmu"), stop_time=(len(U) - 1) * TS, step_size=TS, output_interval=TS,
-            input=table if names else None, output=[p.name for p in outputs], start_values=starts_of(block, case),
+            input=table, output=[p.name for p in outputs], start_values=starts_of(block, case),
         )  # fmt: skip
     return np.column_stack([np.asarray(result[port.name], dtype=float) for port in outputs])
 
