@@ -23,6 +23,7 @@ def test_the_first_script_leaves_an_fmu(tmp_path: Path, monkeypatch: pytest.Monk
     assert (tmp_path / "build" / "Neck.fmu").is_file()
 
 
+@pytest.mark.slow
 def test_the_pictures_of_set_membership_are_those_of_the_docs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All four are drawn; what they say is tested in tests/identification."""
     monkeypatch.setattr("sys.argv", ["set_membership.py", str(tmp_path)])

@@ -41,6 +41,7 @@ def test_installing_starts_no_program(hook: str, tmp_path: Path) -> None:
     assert any(name.endswith("softneck.c") for name in names) == (hook == "build_wheel")
 
 
+@pytest.mark.slow
 def test_a_wheel_from_the_sdist_holds_every_file_once(tmp_path: Path) -> None:
     """The links at the top lead into the package: neither archive may follow them, nor lose what they lead to."""
     hook = "import sys; from hatchling import build; print(getattr(build, sys.argv[1])(sys.argv[2]))"

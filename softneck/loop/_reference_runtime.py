@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 
-def state_size(arrays: tuple[np.ndarray, ...]) -> int:  # noqa: ARG001
+def state_size(arrays: tuple[np.ndarray, ...]) -> int:
     """Return the length of the state: the number of the sample, and the row of the table."""
     return 2
 
@@ -28,7 +28,7 @@ def step(
     arrays: tuple[np.ndarray, ...],
     parameters: np.ndarray,
     state: np.ndarray,
-    inputs: np.ndarray,  # noqa: ARG001
+    inputs: np.ndarray,
     outputs: np.ndarray,
 ) -> None:
     """Go on by one sample."""

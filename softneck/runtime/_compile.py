@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import importlib.util
 import sys
 import tempfile
@@ -107,21 +106,10 @@ def _linked(module: str, runtimes: tuple[str, ...]) -> ModuleType:
 def compiled_name(text: str) -> str:
     """Return the name under which the bundle `text` and its compiled code are kept; FMUs keep theirs there too.
 
-    Comments, docstrings and layout do not count: a text that differs in them alone is not compiled again.
+    A bundle has no comments and no docstrings: where they alone change, nothing is compiled again.
     """
     # numba's cache does not look at its options: they belong to the name.
-    return content_name(f"{_without_words(text)}\n# {COMPILE_OPTIONS}")
-
-
-@cache
-def _without_words(text: str) -> str:
-    """Return `text` without what only people read."""
-    tree = ast.parse(text)
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Module | ast.FunctionDef | ast.ClassDef):
-            rest = node.body[1:] if ast.get_docstring(node, clean=False) is not None else node.body
-            node.body = rest or [ast.Pass()]
-    return ast.unparse(tree)
+    return content_name(f"{text}\n# {COMPILE_OPTIONS}")
 
 
 def have_numba() -> bool:
@@ -145,7 +133,8 @@ def _compile(namespace: ModuleType) -> bool:
 def _import_text(text: str, *, compiled: bool) -> ModuleType:
     name = compiled_name(text)
     path = _cache_folder() / f"{name}.py"
-    if not _holds(path, text, name):
+    # numba compiles again when a file is written again.
+    if not path.is_file() or path.read_text(encoding="utf-8", errors="replace") != text:
         with atomic_write(path, force=True) as temporary:
             temporary.write_text(text, encoding="utf-8")
     alias = f"{name}_compiled" if compiled else name
@@ -156,19 +145,6 @@ def _import_text(text: str, *, compiled: bool) -> ModuleType:
     sys.modules[alias] = namespace  # numba rebuilds cached functions by their module's name
     spec.loader.exec_module(namespace)
     return namespace
-
-
-def _holds(path: Path, text: str, name: str) -> bool:
-    """Return whether `path` is there with `text`, up to words; numba compiles again when a file is written again."""
-    if not path.is_file():
-        return False
-    there = path.read_text(encoding="utf-8", errors="replace")
-    if there == text:
-        return True
-    try:
-        return compiled_name(there) == name
-    except (SyntaxError, ValueError):  # a broken file, which the text replaces
-        return False
 
 
 def _cache_folder() -> Path:

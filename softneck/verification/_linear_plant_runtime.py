@@ -15,7 +15,7 @@ def state_size(arrays: tuple[np.ndarray, ...]) -> int:
 
 
 def initialise(
-    arrays: tuple[np.ndarray, ...],  # noqa: ARG001
+    arrays: tuple[np.ndarray, ...],
     parameters: np.ndarray,
     state: np.ndarray,
     outputs: np.ndarray,

@@ -125,6 +125,7 @@ def test_several_recordings_are_several_runs(call: Call, recording: Path) -> Non
     assert facts["rows_trained"] == 600
 
 
+@pytest.mark.slow
 def test_people_get_a_table_and_progress_stays_on_stderr(call: Call, recording: Path, rls_file: Path) -> None:
     said = call("identify", "rls", recording, "-o", "m.npz", "--set", "delay=0.06")
     assert said.code == 0

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 from softneck.core import load
 from softneck.signals import write_recording
 
@@ -12,6 +14,7 @@ from ..data import Truth, neck_recording
 from .conftest import Call
 
 
+@pytest.mark.slow
 def test_a_family_is_written_described_and_designed_on(call: Call, tmp_path: Path) -> None:
     for number, scale in enumerate((0.9, 1.2)):
         truth = Truth(gain=(0.011 * scale, 0.008 * scale))

@@ -34,6 +34,7 @@ def folder(tmp_path: Path, models: dict) -> Path:
     return place
 
 
+@pytest.mark.slow
 def test_all_builds_every_file_of_a_folder(call: Call, folder: Path, models: dict) -> None:
     said = call("fmu", "--all", folder, "-o", "out", "--json")
     assert said.code == 0, said.err

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from softneck.signals import read_recording, signal, write_recording
 
@@ -13,6 +14,7 @@ from ..data import neck_recording
 from .conftest import Call
 
 
+@pytest.mark.slow
 def test_info_tells_the_quality_as_text_json_and_page(call: Call, tmp_path: Path) -> None:
     recording = neck_recording(600)
     pitch = recording.channels["pitch"].copy()

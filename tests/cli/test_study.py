@@ -17,6 +17,8 @@ from .conftest import Call
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
+pytestmark = pytest.mark.slow
+
 PARTS = Path(__file__).parents[1] / "cosim" / "study_parts.py"
 LOOP = """
 duration_s = 1.0

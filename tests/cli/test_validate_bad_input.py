@@ -96,6 +96,7 @@ def test_missing_columns_are_named(call: Call, rls_file: Path) -> None:
     refused(call("validate", rls_file, "--data", "bad.csv", "--json"), "missing: roll")
 
 
+@pytest.mark.slow
 def test_what_too_few_rows_cannot_tell_is_not_told(call: Call, rls_file: Path) -> None:
     write_recording("short.csv", WHOLE.rows(0, 70))  # 45 errors; a correlation at lag 25 needs more than 50
     said = call("validate", rls_file, "--data", "short.csv", "--html", "page.html")

@@ -108,6 +108,7 @@ def test_a_file_that_is_absent_or_empty_or_a_folder(tmp_path: Path) -> None:
         read_archive(tmp_path / "empty.npz")
 
 
+@pytest.mark.slow
 @given(cut=st.floats(0, 1), flips=st.lists(st.tuples(st.floats(0, 0.9999), st.integers(1, 255)), max_size=4))
 @settings(max_examples=300)
 def test_damaged_bytes_are_a_format_error_and_nothing_else(

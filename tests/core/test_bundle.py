@@ -116,11 +116,24 @@ WORDY = '"""A module."""\n' + STEP.replace(
 )  # fmt: skip
 
 
-def test_words_do_not_count_in_the_name_of_compiled_code_and_all_else_does() -> None:
-    assert compiled_name(WORDY) == compiled_name(STEP) != compiled_name(STEP.replace("0.0", "1.0"))
-    # A docstring alone is still a body, and a text in a place of its own is no docstring.
-    assert compiled_name('def f():\n    """Nothing."""\n') == compiled_name("def f():\n    pass\n")
-    assert compiled_name('a = "# b"') != compiled_name('a = "# c"')
+def test_words_do_not_count_in_a_bundle_and_all_else_does(runtime_folder: Path) -> None:
+    texts = {"plain": STEP, "wordy": WORDY, "other": STEP.replace("0.0", "1.0")}
+    for name, text in texts.items():
+        (runtime_folder / f"{name}_words_runtime.py").write_text(text)
+    plain, wordy, other = (bundle(f"{name}_words_runtime") for name in texts)
+    assert plain == wordy != other
+    assert len({compiled_name(plain), compiled_name(wordy), compiled_name(other)}) == 2
+
+
+def test_what_a_kind_does_not_call_is_not_in_its_bundle(runtime_folder: Path) -> None:
+    # So that a line of it that changes compiles this kind no second time.
+    text = "from softneck.runtime._random_runtime import random_uniform\n" + STEP
+    (runtime_folder / "calls_part_runtime.py").write_text(text.replace("= inputs[0]", "= random_uniform(inputs)"))
+    made = bundle("calls_part_runtime")
+    assert "def random_uniform" in made
+    assert "_M1 = " in made
+    assert "random_normal" not in made
+    assert "random_seed" not in made
 
 
 def test_a_changed_comment_keeps_the_compiled_code_and_a_broken_file_is_replaced(

@@ -73,6 +73,7 @@ def run_in(master: str, path: Path, signals: list[tuple[str, str]], rows: int, f
     return np.load(out)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("master", list(PACKAGES))
 def test_other_masters_compute_our_jacobi_loop(master: str, setup: LoopSetup, archive: Path, tmp_path: Path) -> None:
     ours = simulate(setup)

@@ -195,6 +195,7 @@ def test_resume_goes_on_where_it_stood(place: Path) -> None:
     assert study(made, workers=0, output=place / "out", resume=True)["seconds"].tolist() == runs["seconds"].tolist()
 
 
+@pytest.mark.slow
 def test_many_small_files_are_joined(place: Path) -> None:
     made = make_study(place / "loop.toml", vary={"plant.parameters.pole": {"uniform": [0.8, 0.9]}}, runs=250)
     store = Store(made, place / "out")

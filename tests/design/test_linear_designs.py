@@ -127,6 +127,7 @@ def test_pid_gains_are_what_their_equation_says() -> None:
     np.testing.assert_allclose(feedback_response(gains.axis(TS), z), gains.response(z, TS), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_pid_over_the_samples_beats_placed_gains_on_them() -> None:
     """What is searched for is the worst load; a grid around the answer finds nothing better that keeps the bounds."""
     settings = PidSettings(least_delay=0.0, small_move_pole=0.0)

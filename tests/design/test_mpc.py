@@ -242,6 +242,7 @@ def test_other_inputs_that_are_not_finite_leave_what_was(plain: MpcController) -
         plain.step(neck.state, [0.1, 0, 0, math.nan, 0, 0, 0, 0, 1, 1])
 
 
+@pytest.mark.slow
 def test_what_is_known_ahead_is_followed_without_lag() -> None:
     reference = RotationReference(inclination=0.2, frequency=0.19, rise=1.0)
     errors = []

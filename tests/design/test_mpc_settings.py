@@ -29,6 +29,7 @@ def soft() -> MpcController:
     return settings.design(bake_off_neck())
 
 
+@pytest.mark.slow
 def test_equal_scenarios_are_one() -> None:
     class Same(LinearNeck):
         def samples(self, output: str) -> list[control.TransferFunction]:
@@ -46,6 +47,7 @@ def test_equal_scenarios_are_one() -> None:
         np.testing.assert_allclose(outs[1], outs[0], atol=SOLVED)
 
 
+@pytest.mark.slow
 def test_scenarios_keep_the_limit_on_all_their_plants() -> None:
     nominal = bake_off_neck()
     family = Samples(pitch=nominal.pitch, roll=nominal.roll)

@@ -52,6 +52,7 @@ def test_real_scalars_cannot_turn_an_imaginary_loop() -> None:
     assert mu_bounds(np.array([[2.0]]), [REAL]).lower[0] == pytest.approx(2.0, rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "blocks",
     [[COMPLEX] * 3, [COMPLEX] * 5, [(2, 2), COMPLEX], [REAL, COMPLEX, COMPLEX, (2, 2)], [REAL, REAL, COMPLEX]],

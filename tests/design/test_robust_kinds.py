@@ -66,6 +66,7 @@ def loop_of(controller: LinearController, plant: Any) -> Any:
     return control.feedback(control.ss(plant.tf()), back, 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_every_sample_is_stable(kind: str) -> None:
     for plant in bake_off_plants():
@@ -153,6 +154,7 @@ def test_equal_axes_are_designed_once_and_others_are_not() -> None:
     assert alone.design["pitch"]["gains"]["crossover_rad_s"] == roll
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", ["sequential", "jacobi"])
 @pytest.mark.parametrize(
     "settings", [HinfSettings, NcfSettings, LqgSettings, FopiSettings, PidSettings], ids=lambda item: item.KIND

@@ -82,6 +82,7 @@ def test_robust_stability_of_an_uncertain_pole(block: tuple[int, int]) -> None:
     assert found.lower <= found.upper * (1.0 + 1e-9)
 
 
+@pytest.mark.slow
 def test_a_real_uncertainty_is_less_than_a_complex_one() -> None:
     """s^2 + (1 + delta) s + 1 loses stability at delta = -1 for real delta."""
     M = -control.TransferFunction([1.0, 0.0], [1.0, 1.0, 1.0])

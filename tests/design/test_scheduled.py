@@ -70,6 +70,7 @@ def test_equal_operating_points_make_the_linear_controller() -> None:
     np.testing.assert_allclose(ours, same, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", [0, 1, 2])
 def test_at_an_operating_point_it_is_the_controller_of_that_point(which: int) -> None:
     models, inclinations = [neck(6.0), neck(5.0), neck(4.0, 7.0)], [4.0, 14.0, 24.0]
@@ -224,6 +225,7 @@ def test_models_of_different_sample_times_are_refused() -> None:
         scheduled([neck(), neck(sample_time=0.01)], [0.0, 20.0])
 
 
+@pytest.mark.slow
 def test_a_family_of_one_inclination_is_refused() -> None:
     with pytest.raises(SettingsError, match="where scheduling needs 2: make it with `--set lpv_knots=3`"):
         ScheduledSettings().design(replace(family(), settings={"inclination_step": 3.0}))

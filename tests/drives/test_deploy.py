@@ -191,6 +191,7 @@ def test_a_run_without_zero_is_refused() -> None:
 # -- in real time -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_run_over_a_bus_of_python_can(project: Project) -> None:
     """The same loop in real time over python-can's virtual bus; bounds are wide, for machines are shared."""
     setup = load_loop(project.write_loop("short.toml", STEP.replace("at_s = 1.0", "at_s = 0.2"), 1.2))

@@ -169,6 +169,7 @@ def test_keys_switch_drives_on_a_bus_off(tmp_path: Path, key: bytes, code: int, 
     assert 10 < len(read_recording(ended.recording).time) < 1000
 
 
+@pytest.mark.slow
 def test_other_words_move_nothing(tmp_path: Path) -> None:
     ended = played(tmp_path, ("to go on", b"yes\n", 0.0))
     assert ended.code == 2

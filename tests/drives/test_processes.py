@@ -68,6 +68,7 @@ def test_a_log_of_a_real_bus_gives_the_same_decisions(tmp_path: Path) -> None:
     assert len(list(FrameLog(tmp_path / "run.blf"))) > 6 * len(log.cycles)
 
 
+@pytest.mark.slow
 def test_a_bus_that_is_down_is_one_line_and_nothing_moves(tmp_path: Path) -> None:
     # A namespace begins with its loopback down: no multicast leaves or arrives.
     write_project(tmp_path)

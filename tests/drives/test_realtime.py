@@ -12,6 +12,7 @@ from softneck.core import SettingsError
 from softneck.drives.running._timing import steady
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="SCHED_FIFO is Linux's")
 def test_threads_beside_the_loop_come_after_it_and_before_others() -> None:
     ended = threading.Event()

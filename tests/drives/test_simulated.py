@@ -209,6 +209,7 @@ def test_tendons_pull_a_drive_without_power() -> None:
     assert all(virtual.motion[i][24] < -1000 for i in range(3))
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(
     frames=st.lists(

@@ -15,6 +15,7 @@ def script() -> dict[str, Any]:
     return runpy.run_path(str(ROOT / "examples" / "sensor_fusion.py"))
 
 
+@pytest.mark.slow
 def test_fusion_reaches_its_figures(script: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
     """Issue 10: with gyro 0.15 deg (blackout 0.15), without 0.6 (0.9). Seeds move the figures by some 10 %."""
     found = script["results"](script["scenario"]())

@@ -67,6 +67,7 @@ def test_a_filter_too_sure_of_itself_is_told() -> None:
     assert "NEES" in sure.summary()
 
 
+@pytest.mark.slow
 def test_the_noise_behind_a_recording_is_found() -> None:
     start = observer_of((TRUE[0] * 4, TRUE[1] / 5, TRUE[2] * 6))
     found = fit_noise(start, [drawn(seed=7), drawn(seed=8)])

@@ -45,6 +45,7 @@ def play(training: Recording) -> Model:
     return Play(rate=6.0, widths=(0.3,), degree=2, ridge=1e-4).fit([training])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [DISTURBED, replace(DISTURBED, sensor_delay=0.04)], ids=["in time", "40 ms late"])
 def test_over_a_linear_model_it_is_the_linear_filter(
     second_order: Model, test_run: Recording, settings: KalmanSettings
@@ -101,6 +102,7 @@ def test_over_nonlinear_models_it_bridges_what_is_missing() -> None:
         assert (np.array(found[name]) < linear).all(), name
 
 
+@pytest.mark.slow
 def test_outliers_are_refused_and_a_lasting_change_is_taken_in_by_force(play: Model, test_run: Recording) -> None:
     test_run, observer = test_run.rows(0, 480), ukf(play)
     spoilt = changed(test_run, [300], 1.5, "pitch")
@@ -145,6 +147,7 @@ def test_both_orders_of_a_loop_give_the_same_estimates(play: Model, test_run: Re
     np.testing.assert_array_equal(sequential.estimate(part).innovation, jacobi.estimate(part).innovation)
 
 
+@pytest.mark.slow
 def test_it_closes_the_loop_over_dropouts_and_its_part_resumes(play: Model, training: Recording) -> None:
     part = UkfPart(ukf(play, memory=8))
     result = run_loop(

@@ -142,6 +142,7 @@ def _host(path: Path, cache: Path, before: str = "") -> tuple[str, str]:
     return child.stdout.strip(), child.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="the cache folder is moved by XDG_CACHE_HOME")
 def test_a_heavy_fmu_compiles_once_and_says_so_and_a_middling_one_waits_for_it(
     toys: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

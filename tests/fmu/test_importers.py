@@ -31,6 +31,7 @@ def path(kind: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return build_fmu(block_of(kind), tmp_path_factory.mktemp(kind) / f"{kind}.fmu")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("importer", list(PACKAGES))
 def test_an_importer_computes_what_python_does(importer: str, kind: str, path: Path, tmp_path: Path) -> None:
     need(PACKAGES[importer])

@@ -175,6 +175,7 @@ def test_instances_in_threads_do_not_disturb_each_other(tmp_path: Path, running:
 SCRIPTS = Path(__file__).with_name("importers")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("importer", "name"),
     [("libcosim", "nlsm"), ("libcosim", "neck"), ("ecos", "ensemble"), ("ecos", "kalman"), ("pathsim", "pi")],

@@ -60,6 +60,7 @@ SETTINGS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", SETTINGS)
 def test_without_logged_positions_the_position_is_the_set_point_for_every_kind(kind: str) -> None:
     model = SETTINGS[kind].fit(neck_recording(400, positions=False))

@@ -185,6 +185,7 @@ def test_the_delay_is_the_delay() -> None:
         assert (roll, pitch_rate, roll_rate) == pytest.approx((now - delay, now - delay, 2 * (now - delay)))
 
 
+@pytest.mark.slow
 def test_noise_and_drift_have_the_spread_they_are_asked_for() -> None:
     generator, noise = np.array([1.0, 2, 3, 4, 5, 6]), np.zeros(9)
     inclinometer_start(noise, generator, 0.02, 0.0)

@@ -51,6 +51,7 @@ def test_what_cannot_be_drawn_is_refused(recording: Recording) -> None:
         neck_view(recording, link_length=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plain", [False, True], ids=["with tensions", "set-points, pitch and roll only"])
 def test_a_browser_draws_and_plays_it(recording: Recording, tmp_path: Path, chromium: str, plain: bool) -> None:
     kept = ("motor_setpoint_1", "motor_setpoint_2", "motor_setpoint_3", "pitch", "roll")

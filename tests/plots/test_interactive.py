@@ -25,6 +25,8 @@ from ..browser import Shown, own_text, shown
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
+pytestmark = pytest.mark.slow
+
 X = np.linspace(0.0, 10.0, 501)
 NASTY = "</script><script>alert(1)</script>"
 

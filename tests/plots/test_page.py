@@ -28,6 +28,7 @@ def _wave(columns: int) -> np.ndarray:
     return np.column_stack([np.sin(t + j) for j in range(columns)])
 
 
+@pytest.mark.slow
 def test_a_page_needs_nothing_from_outside_and_holds_its_pictures() -> None:
     t = np.arange(100) * 0.02
     figures = [

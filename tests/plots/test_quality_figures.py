@@ -45,6 +45,7 @@ def texts(figure: Figure) -> str:
     return " ".join(text.get_text() for ax in figure.axes for text in ax.texts)
 
 
+@pytest.mark.slow
 def test_the_page_of_any_recording_holds_five_pictures_and_every_finding(case: tuple[Recording, Quality]) -> None:
     recording, found = case
     html = quality_page(recording, found, "<Quality>")

@@ -17,6 +17,8 @@ from softneck.signals import read_recording
 
 from ..browser import own_text
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:

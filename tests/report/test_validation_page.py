@@ -21,6 +21,8 @@ from ..browser import shown
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def results(models: dict[str, Model], neck: Recording) -> list[Validation]:
@@ -75,7 +77,6 @@ def test_one_model_or_other_rows_are_not_compared(results: Sequence[Validation],
     assert "All models on neck" not in _headings(validation_page([results[1], other]))
 
 
-@pytest.mark.slow
 def test_models_of_one_file_name_keep_their_folders_apart(results: Sequence[Validation]) -> None:
     twins = [replace(results[0], model="a/rls.npz"), replace(results[1], model="b/rls.npz")]
     html = validation_page(twins)

@@ -274,6 +274,7 @@ def test_the_closed_loop_recordings_come_out_as_their_layout(shared_data: Path, 
     assert guess.layout == read_layout(LAYOUTS / "neck_closedloop.toml")
 
 
+@pytest.mark.slow
 def test_the_arm_comes_out_as_far_as_its_data_tell(shared_data: Path) -> None:
     guess, known = (
         guess_layout(shared_data / "arm_multisine/arm_multisine_400s.csv"),

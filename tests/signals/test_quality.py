@@ -63,6 +63,7 @@ def test_parseval_the_density_integrates_to_the_variance() -> None:
     np.testing.assert_allclose(found.density.sum(axis=0) * found.omega[1], variance, rtol=0.1)
 
 
+@pytest.mark.slow
 @given(omega=st.floats(0.6, 60.0))
 def test_a_sine_has_its_power_where_it_is(omega: float) -> None:
     t = np.arange(3000) * TS

@@ -42,6 +42,7 @@ def test_a_clean_recording_has_no_fault() -> None:
         assert others_are_clean(found, "none"), found.name
 
 
+@pytest.mark.slow
 @given(axis=st.sampled_from(OUTPUTS), start=st.integers(0, 2390), length=st.integers(1, 10))
 def test_missed_samples_are_found_where_they_are(axis: str, start: int, length: int) -> None:
     def drop(y: np.ndarray) -> None:
@@ -54,6 +55,7 @@ def test_missed_samples_are_found_where_they_are(axis: str, start: int, length: 
     assert others_are_clean(found, "missed")
 
 
+@pytest.mark.slow
 @given(axis=st.sampled_from(OUTPUTS), start=st.integers(5, 2200), length=st.integers(20, 150))
 def test_a_frozen_inclinometer_is_found_where_it_is(axis: str, start: int, length: int) -> None:
     def freeze(y: np.ndarray) -> None:
@@ -93,6 +95,7 @@ def test_a_drive_at_rest_while_its_set_point_rests_is_not_frozen() -> None:
         assert found.frozen == ()
 
 
+@pytest.mark.slow
 @given(axis=st.sampled_from(OUTPUTS), part=st.floats(0.4, 0.85), sign=st.sampled_from([1.0, -1.0]))
 def test_flat_tops_are_found_where_they_are(axis: str, part: float, sign: float) -> None:
     y = sign * CLEAN.channels[axis]
@@ -114,6 +117,7 @@ def test_a_smooth_quantised_peak_is_no_flat_top() -> None:
     assert found.quantum == pytest.approx(1e-3, rel=1e-9)
 
 
+@pytest.mark.slow
 @given(
     axis=st.sampled_from(OUTPUTS), row=st.integers(3, 2395), length=st.integers(1, 2),
     size=st.floats(0.15, 1.0), sign=st.sampled_from([1.0, -1.0]),
@@ -128,6 +132,7 @@ def test_spikes_are_found_where_they_are(axis: str, row: int, length: int, size:
     assert others_are_clean(found, "outliers")
 
 
+@pytest.mark.slow
 @given(row=st.integers(10, 2390), size=st.floats(-0.6, 0.6))
 def test_a_real_step_is_no_spike(row: int, size: float) -> None:
     def step(y: np.ndarray) -> None:
@@ -136,6 +141,7 @@ def test_a_real_step_is_no_spike(row: int, size: float) -> None:
     assert channel(planted("pitch", step), "pitch").outliers == ()
 
 
+@pytest.mark.slow
 @given(quantum=st.floats(1e-4, 2e-2), offset=st.floats(-1.0, 1.0))
 def test_the_step_between_levels_is_found(quantum: float, offset: float) -> None:
     y = np.round(CLEAN.channels["roll"] / quantum) * quantum + offset * quantum

@@ -65,6 +65,7 @@ def run_pytest(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
 
 
+@pytest.mark.slow
 def test_five_lines_are_a_closed_loop_test(project: Path) -> None:
     (project / "test_five.py").write_text(FIVE_LINES)
     done = run_pytest(project, "test_five.py")
@@ -72,6 +73,7 @@ def test_five_lines_are_a_closed_loop_test(project: Path) -> None:
     assert "1 passed" in done.stdout
 
 
+@pytest.mark.slow
 def test_a_failure_prints_metric_limit_and_value_and_saves_the_plot(project: Path) -> None:
     (project / "loop.toml").write_text("nonsense = 1\n")
     (project / "test_marked.py").write_text(MARKED)

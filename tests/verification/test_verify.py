@@ -69,6 +69,7 @@ def test_a_good_controller_holds(held: Verification) -> None:
     json.dumps(held.contents(), allow_nan=False)
 
 
+@pytest.mark.slow
 def test_a_wrong_delay_fails_loudly() -> None:
     """Designed without dead time, the plant has 80 ms."""
     found = verify(pi(delay=0), linear_neck(), make_requirements(QUICK))
@@ -167,6 +168,7 @@ def test_frozen_points_are_each_judged() -> None:
         assert one.value == pytest.approx(two.value, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_certificate_that_deploys(files: dict[str, Path], capsys: Any) -> None:
     certificate = files["controller"].with_name("pi.certificate.json")
     call = ["verify", str(files["controller"]), str(files["family"]), "--requirements", str(files["asked"]), "--json"]
@@ -289,6 +291,7 @@ def test_a_plant_that_is_none_is_refused(values: dict[str, Any], match: str) -> 
         linear_plant(**{"delay": [0, 0], **values})
 
 
+@pytest.mark.slow
 def test_the_page_is_drawn_in_full(browser: Any, held: Verification, tmp_path: Path) -> None:
     path = tmp_path / "v.html"
     path.write_text(verification_page(held, "pi.npz", "pi.certificate.json"), encoding="utf-8")

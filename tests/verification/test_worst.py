@@ -42,6 +42,7 @@ def test_the_worst_row_is_the_one_that_is_farthest_from_holding(
     assert worst_row(_values(*numbers), "m", "max") == largest
 
 
+@pytest.mark.slow
 def test_no_plant_of_a_verification_is_worse_than_the_one_that_it_names() -> None:
     found = verify(pi(), family(spread=0.3), make_requirements({**QUICK, "neck": {"necks": 0}}))
     computed = [verdict for verdict in found.verdicts if verdict.value is not None]
@@ -114,6 +115,7 @@ def test_intervals_at_the_worst_sample_are_those_of_the_sample_with_the_least_ma
         assert [row.value for row in found] == pytest.approx([alone.min()], rel=1e-9)  # rounding
 
 
+@pytest.mark.slow
 def test_delays_are_listed_with_the_worst_of_the_plants_that_were_tried() -> None:
     found = verify(pi(), linear_neck(), make_requirements({**QUICK, "neck": {"necks": 0}}))
     rows, law = found.evidence.linear[0].delays, _law_of(pi())

@@ -4,8 +4,8 @@ import numpy as np
 
 
 def initialise(
-    arrays: tuple[np.ndarray, ...],  # noqa: ARG001
-    parameters: np.ndarray,  # noqa: ARG001
+    arrays: tuple[np.ndarray, ...],
+    parameters: np.ndarray,
     state: np.ndarray,
     outputs: np.ndarray,
 ) -> None:

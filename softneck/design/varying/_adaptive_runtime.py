@@ -56,7 +56,7 @@ def state_size(arrays: tuple[np.ndarray, ...]) -> int:
 
 def initialise(
     arrays: tuple[np.ndarray, ...],
-    parameters: np.ndarray,  # noqa: ARG001
+    parameters: np.ndarray,
     state: np.ndarray,
     outputs: np.ndarray,
 ) -> None:

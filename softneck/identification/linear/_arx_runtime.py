@@ -1,19 +1,33 @@
-"""One linear difference equation (Eq. 23) over the histories of `_narx_runtime`."""
+"""One linear difference equation (Eq. 23) over the histories of `_histories_runtime`, and its arrays."""
 
 import numpy as np
 
+from softneck.identification.models._histories_runtime import NarxArrays, NarxState
+from softneck.runtime._layout import array
+
+
+class ArxArrays(NarxArrays):
+    """Both axes of Eq. 23."""
+
+    redefinition = array("3, 3", "T of Eq. 9-11: motors to redefined inputs")
+    a = array("2, na", "of the outputs, newest first")
+    b = array("2, nb", "of the redefined inputs, newest first")
+    delay = array("2", "dead time of each axis [samples]")
+
 
 def arx_output(
-    redefinition: np.ndarray, a: np.ndarray, b: np.ndarray, delay: int, history: int, state: np.ndarray, axis: int
+    p: NarxArrays, redefinition: np.ndarray, a: np.ndarray, b: np.ndarray, delay: int, x: NarxState, axis: int
 ) -> float:
-    """Return y(k+1) = -a y(k+1-i) + b u(k+1-delay-j) of one axis; `a` (na,) and `b` (nb,) may be empty."""
+    """Return y(k+1) = -a y(k+1-i) + b u(k+1-delay-j) of one axis; `a` (na,) and `b` (nb,) may be empty.
+
+    The positions stand H samples behind the set-points: with a delay of H more, u is where the motors were.
+    """
     y = 0.0
     for i in range(a.shape[0]):
-        y -= a[i] * state[6 * history + 2 * i + axis]
+        y -= a[i] * x.y[i, axis]
     for j in range(b.shape[0]):
-        back = 3 * (delay + j)
         redefined = 0.0
-        for m in range(3):
-            redefined += redefinition[axis, m] * state[back + m]
+        for motor in range(3):
+            redefined += redefinition[axis, motor] * x.u[delay + j, motor]
         y += b[j] * redefined
     return y

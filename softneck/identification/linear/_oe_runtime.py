@@ -1,31 +1,29 @@
-"""Two transfer functions over the redefined inputs, in free run their own outputs fed back.
-
-Arrays: H, drive, T, a (2, na), b (2, nb), delay (2,), source (1,): 1 takes motor positions for u, 0 set-points.
-"""
+"""Two transfer functions over the redefined inputs, in free run their own outputs fed back."""
 
 import numpy as np
 
-from softneck.identification.linear._arx_runtime import arx_output
-from softneck.identification.models._narx_runtime import narx_advance, narx_observe
+from softneck.identification.linear._arx_runtime import ArxArrays, arx_output
+from softneck.identification.models._histories_runtime import NarxState, narx_advance, narx_observe
+from softneck.identification.models._narx_runtime import initialise as initialise
+from softneck.runtime._layout import array
 
 
-def oe_output(arrays: tuple[np.ndarray, ...], state: np.ndarray, axis: int) -> float:
+class OeArrays(ArxArrays):
+    """Those of Eq. 23, and where u comes from."""
+
+    source = array("1", "1 takes motor positions for u, 0 set-points")
+
+
+def oe_output(p: OeArrays, x: NarxState, axis: int) -> float:
     """Return y(k+1) of one axis."""
-    h = int(arrays[0][0])
     # Motor positions stand H samples of three behind set-points: a source of 1 reads them as if that much older.
-    delay = int(arrays[5][axis]) + h * int(arrays[6][0])
-    return arx_output(arrays[2], arrays[3][axis], arrays[4][axis], delay, h, state, axis)
+    delay = int(p.delay[axis]) + p.H * int(p.source[0])
+    return arx_output(p, p.redefinition, p.a[axis], p.b[axis], delay, x, axis)
 
 
-def step(
-    arrays: tuple[np.ndarray, ...],
-    parameters: np.ndarray,
-    state: np.ndarray,
-    inputs: np.ndarray,
-    outputs: np.ndarray,
-) -> None:
+def step(p: OeArrays, parameters: np.ndarray, x: NarxState, inputs: np.ndarray, outputs: np.ndarray) -> None:
     """Advance by one sample."""
-    narx_observe(arrays, parameters, state, inputs)
-    pitch = oe_output(arrays, state, 0)
-    roll = oe_output(arrays, state, 1)
-    narx_advance(arrays, parameters, state, pitch, roll, outputs)
+    narx_observe(p, parameters, x, inputs)
+    pitch = oe_output(p, x, 0)
+    roll = oe_output(p, x, 1)
+    narx_advance(p, parameters, x, pitch, roll, outputs)

@@ -1,55 +1,48 @@
-"""A linear state space with an observer gain; arrays: H, drive, A (n, n), B (n, 3), K (n, 2), [delay, source].
+"""A linear state space with an observer gain.
 
-`x(k+1) = A x(k) + B u(k - delay) + K (y(k) - x(k)[:2])`: the first two states are pitch and roll. `source` 1 takes
-motor positions for u, 0 set-points. The state stands where `_narx_runtime` keeps its histories of outputs (n <= 2H).
+    x(k+1) = A x(k) + B u(k - delay) + K (y(k) - x(k)[:2])
+
+The first two states are pitch and roll. They stand where other kinds keep their histories of outputs (n <= 2H).
 """
 
 import numpy as np
 
-from softneck.identification.models._narx_runtime import narx_advance
+from softneck.identification.models._histories_runtime import NarxArrays, NarxState, narx_advance, narx_known, narx_push
+from softneck.identification.models._narx_runtime import initialise as initialise
+from softneck.runtime._layout import array
 
 
-def lss_observe(arrays: tuple[np.ndarray, ...], parameters: np.ndarray, state: np.ndarray, inputs: np.ndarray) -> None:
+class StateSpaceArrays(NarxArrays):
+    """Matrices over motors as they are, without redefinition."""
+
+    A = array("n, n", "")
+    B = array("n, 3", "of the three motors")
+    K = array("n, 2", "of what measurements are above the first two states")
+    delay = array("2", "dead time [samples], and source: 1 takes motor positions for u, 0 set-points")
+
+
+def lss_observe(p: StateSpaceArrays, parameters: np.ndarray, x: NarxState, inputs: np.ndarray) -> None:
     """Take in what is known at t_k: outputs and motors, measured where they are, and the histories of u and m."""
-    h = int(arrays[0][0])
-    now = 8 * h
-    measured = parameters[2] > 0.5
-    for j in range(2):
-        if measured and np.isfinite(inputs[3 + j]):
-            state[now + 3 + j] = inputs[3 + j]
-    for j in range(3):
-        if arrays[1][j, 1] == 0.0:
-            state[now + j] = inputs[j]
-        if measured and np.isfinite(inputs[5 + j]):
-            state[now + j] = inputs[5 + j]
-    state[3 : 3 * h] = state[: 3 * h - 3].copy()
-    state[3 * h + 3 : 6 * h] = state[3 * h : 6 * h - 3].copy()
-    state[:3] = inputs[:3]
-    state[3 * h : 3 * h + 3] = state[now : now + 3]
+    narx_known(p, parameters, x, inputs)
+    narx_push(x.u, inputs[:3])
+    narx_push(x.m, x.motors)
 
 
-def step(
-    arrays: tuple[np.ndarray, ...],
-    parameters: np.ndarray,
-    state: np.ndarray,
-    inputs: np.ndarray,
-    outputs: np.ndarray,
-) -> None:
+def step(p: StateSpaceArrays, parameters: np.ndarray, x: NarxState, inputs: np.ndarray, outputs: np.ndarray) -> None:
     """Advance by one sample."""
-    lss_observe(arrays, parameters, state, inputs)
-    h = int(arrays[0][0])
-    n = arrays[2].shape[0]
-    first = 6 * h
-    u = 3 * int(arrays[5][0]) + 3 * h * int(arrays[5][1])
-    e0 = state[8 * h + 3] - state[first]
-    e1 = state[8 * h + 4] - state[first + 1]
-    ahead = np.zeros(n)
-    for i in range(n):
-        value = arrays[4][i, 0] * e0 + arrays[4][i, 1] * e1
-        for j in range(n):
-            value += arrays[2][i, j] * state[first + j]
+    lss_observe(p, parameters, x, inputs)
+    states = x.y
+    # Motor positions stand H samples of three behind set-points.
+    back = int(p.delay[0]) + p.H * int(p.delay[1])
+    e0 = x.angles[0] - states[0]
+    e1 = x.angles[1] - states[1]
+    ahead = np.zeros(p.n)
+    for i in range(p.n):
+        value = p.K[i, 0] * e0 + p.K[i, 1] * e1
+        for j in range(p.n):
+            value += p.A[i, j] * states[j]
         for j in range(3):
-            value += arrays[3][i, j] * state[u + j]
+            value += p.B[i, j] * x.u[back, j]
         ahead[i] = value
-    state[first : first + n] = ahead
-    narx_advance(arrays, parameters, state, ahead[0], ahead[1], outputs)
+    states[: p.n] = ahead
+    narx_advance(p, parameters, x, ahead[0], ahead[1], outputs)

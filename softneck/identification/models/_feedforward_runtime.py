@@ -7,34 +7,29 @@ back: y(k+1) = f(k+1) + sum_i echo_i (y - f)(k+1-i). In free run the echo dies o
 import numpy as np
 
 from softneck.identification.models._bank_runtime import drive_advance, drive_limit
+from softneck.identification.models._histories_runtime import NarxArrays, NarxState
 
 
-def echo_rest(arrays: tuple[np.ndarray, ...], state: np.ndarray, axis: int, f: float) -> None:
+def echo_rest(p: NarxArrays, x: NarxState, axis: int, f: float) -> None:
     """Remember what the start is above `f` as if it had been measured for ever."""
-    h = int(arrays[0][0])
-    state[8 * h + 11 + axis] = f
-    for j in range(h):
-        state[6 * h + 2 * j + axis] -= f
+    x.added[axis] = f
+    for j in range(p.H):
+        x.y[j, axis] -= f
 
 
-def echo_added(arrays: tuple[np.ndarray, ...], echo: np.ndarray, state: np.ndarray, axis: int, f: float) -> float:
+def echo_added(p: NarxArrays, echo: np.ndarray, x: NarxState, axis: int, f: float) -> float:
     """Return y(k+1) of one axis, and note `f`; echo (2, p)."""
-    h = int(arrays[0][0])
     total = 0.0
     for i in range(echo.shape[1]):
-        total += echo[axis, i] * state[6 * h + 2 * i + axis]
-    state[8 * h + 11 + axis] = f
+        total += echo[axis, i] * x.y[i, axis]
+    x.added[axis] = f
     return f + total
 
 
-def stalling_drives(
-    arrays: tuple[np.ndarray, ...], load: np.ndarray, q: np.ndarray, state: np.ndarray, outputs: np.ndarray
-) -> None:
+def stalling_drives(p: NarxArrays, load: np.ndarray, q: np.ndarray, x: NarxState, outputs: np.ndarray) -> None:
     """Move the motors of now on from the newest of the histories, no further than their load lets them."""
-    h = int(arrays[0][0])
     for j in range(3):
-        d = int(arrays[1][j, 1])
+        d = int(p.drive[j, 1])
         if d > 0:
-            limit = drive_limit(load, q, j)
-            state[8 * h + j] = drive_advance(arrays[1][j, 0], state[3 * (d - 1) + j], state[3 * h + j], limit)
-            outputs[2 + j] = state[8 * h + j]
+            x.motors[j] = drive_advance(p.drive[j, 0], x.u[d - 1, j], x.m[0, j], drive_limit(load, q, j))
+            outputs[2 + j] = x.motors[j]

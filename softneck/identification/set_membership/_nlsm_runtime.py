@@ -1,6 +1,5 @@
 """Set membership (Eq. 18-20, Algorithm 1), alone or on a linear base.
 
-Arrays: H, drive, table, scale, W, y, (gamma, epsilon), tree nodes and frame; then the base: redefinition, a, b, delay.
 An empty base is the paper's Eq. 21, fed back what it puts out. With one, the histories hold the base's outputs: what
 the set adds to them is never fed back, and what is measured moves the base alone.
 """
@@ -8,55 +7,71 @@ the set adds to them is never fed back, and what is measured moves the base alon
 import numpy as np
 
 from softneck.identification.linear._arx_runtime import arx_output
-from softneck.identification.models._narx_runtime import narx_advance, narx_observe, narx_regressor
+from softneck.identification.models._histories_runtime import (
+    NarxArrays,
+    NarxState,
+    narx_advance,
+    narx_observe,
+    narx_regressor,
+)
+from softneck.identification.models._narx_runtime import initialise as initialise
 from softneck.identification.set_membership._principal_tree_runtime import slant_bounds
 from softneck.runtime._compiled_runtime import COMPILED
+from softneck.runtime._layout import array
+
+
+class NlsmArrays(NarxArrays):
+    """The set, then its base, which is empty where the set stands alone."""
+
+    table = array("n, 3", "regressors: source, channel and lag of each (see `narx_regressor`)")
+    scale = array("n", "what each regressor is multiplied by")
+    points = array("2, n, rows", "W: scaled regressors of the record, for each axis")
+    values = array("2, rows", "y(k+1) there, less the base [rad]")
+    bounds = array("2, 2", "gamma [rad] and epsilon [rad] of each axis (Eq. 15-17)")
+    nodes = array("2, branches, columns", "tree over the points (see `_principal_tree_runtime`)")
+    frame = array("2, directions, n", "directions of the tree")
+    redefinition = array("3, 3", "T of Eq. 9-11, for the base")
+    a = array("2, na", "of the base's outputs, newest first")
+    b = array("2, nb", "of its redefined inputs, newest first")
+    delay = array("2", "dead time of each axis [samples]")
 
 
 def nlsm_bounds(
-    points: np.ndarray, values: np.ndarray, gamma: float, epsilon: float, x: np.ndarray
+    points: np.ndarray, values: np.ndarray, gamma: float, epsilon: float, w: np.ndarray
 ) -> tuple[float, float]:
-    """Return f_l(x), f_u(x) over `points` (n, N), scaled, and their `values` (N,)."""
+    """Return f_l(w), f_u(w) (Eq. 18) over `points` (n, N), scaled, and their `values` (N,)."""
     squared = np.zeros(points.shape[1])
     for i in range(points.shape[0]):
-        gap = points[i] - x[i]
+        gap = points[i] - w[i]
         squared += gap * gap
     cone = gamma * np.sqrt(squared)
     return np.max(values - cone) - epsilon, np.min(values + cone) + epsilon
 
 
-def nlsm_query(arrays: tuple[np.ndarray, ...], axis: int, x: np.ndarray) -> tuple[float, float]:
-    """Return f_l(x), f_u(x) of one axis: by the tree where loops are fast, else over all points by numpy."""
-    gamma = arrays[6][axis, 0]
-    epsilon = arrays[6][axis, 1]
+def nlsm_query(p: NlsmArrays, axis: int, w: np.ndarray) -> tuple[float, float]:
+    """Return f_l(w), f_u(w) of one axis: by the tree where loops are fast, else over all points by numpy."""
+    gamma = p.bounds[axis, 0]
+    epsilon = p.bounds[axis, 1]
     if COMPILED:
-        low, high = slant_bounds(arrays[4][axis], arrays[5][axis], arrays[7][axis], arrays[8][axis], gamma, x)
+        low, high = slant_bounds(p.points[axis], p.values[axis], p.nodes[axis], p.frame[axis], gamma, w)
         return low - epsilon, high + epsilon
-    return nlsm_bounds(arrays[4][axis], arrays[5][axis], gamma, epsilon, x)
+    return nlsm_bounds(p.points[axis], p.values[axis], gamma, epsilon, w)
 
 
-def step(
-    arrays: tuple[np.ndarray, ...],
-    parameters: np.ndarray,
-    state: np.ndarray,
-    inputs: np.ndarray,
-    outputs: np.ndarray,
-) -> None:
+def step(p: NlsmArrays, parameters: np.ndarray, x: NarxState, inputs: np.ndarray, outputs: np.ndarray) -> None:
     """Advance by one sample; the bounds of pitch and roll follow the motor positions in `outputs`."""
-    narx_observe(arrays, parameters, state, inputs)
-    h = int(arrays[0][0])
-    table = arrays[2]
-    scale = arrays[3]
-    x = np.empty(table.shape[0])
+    narx_observe(p, parameters, x, inputs)
+    regressor = np.empty(p.n)
     angles = np.empty(2)
     for axis in range(2):
-        narx_regressor(arrays, table, state, axis, x)
-        low, high = nlsm_query(arrays, axis, x * scale)
-        base = arx_output(arrays[9], arrays[10][axis], arrays[11][axis], int(arrays[12][axis]), h, state, axis)
+        narx_regressor(p, p.table, x, axis, regressor)
+        low, high = nlsm_query(p, axis, regressor * p.scale)
+        base = arx_output(p, p.redefinition, p.a[axis], p.b[axis], int(p.delay[axis]), x, axis)
+        # The central estimate (Eq. 20).
         middle = 0.5 * (low + high)
         angles[axis] = base + middle
         outputs[5 + 2 * axis] = base + low
         outputs[6 + 2 * axis] = base + high
-        if arrays[11].shape[1] > 0:
-            state[8 * h + 11 + axis] = middle
-    narx_advance(arrays, parameters, state, angles[0], angles[1], outputs)
+        if p.nb > 0:
+            x.added[axis] = middle
+    narx_advance(p, parameters, x, angles[0], angles[1], outputs)

@@ -17,6 +17,8 @@ import math
 
 import numpy as np
 
+from softneck.runtime._layout import StateVector, cells, rest
+
 # Numbers of `neck`, in this order.
 NECK_DRIVE_RATE = 0
 NECK_PRETENSION = 1
@@ -34,21 +36,30 @@ NECK_FRICTION_ANGLE = 13
 NECK_TWIST = 14
 NECK_SENSOR_RATE = 15
 NECK_SIZE = 16
-# b (2), z (2), s, sensor (2); then the dead time's line of tilts.
 NECK_STATES = 7
 # A stalled drive gives way as the bend does: 4 ms at 20 ms follow that closely enough.
 _SUBSTEPS = 5
 _LARGEST_BEND = 1.2
 
 
-def neck_limit(neck: np.ndarray, x: np.ndarray, j: int) -> float:
+class NeckState(StateVector):
+    """What the equations remember."""
+
+    b = cells("2", "bend [rad]")
+    z = cells("2", "hysteresis [rad]")
+    s = cells("", "compression [rad]")
+    sensor = cells("2", "what the sensor says [rad]")
+    tilts = rest("the dead time's line: tilts of pitch, newest first, then those of roll [rad]")
+
+
+def neck_limit(neck: np.ndarray, x: NeckState, j: int) -> float:
     """Return the motor position at which tendon j reaches the pull limit."""
     angle = neck[NECK_TWIST] + 2.0943951023931953 * j
-    toward = math.cos(angle) * x[0] + math.sin(angle) * x[1]
-    return neck[NECK_PULL_LIMIT] - neck[NECK_PRETENSION] + neck[NECK_LEVER] * toward + x[4]
+    toward = math.cos(angle) * x.b[0] + math.sin(angle) * x.b[1]
+    return neck[NECK_PULL_LIMIT] - neck[NECK_PRETENSION] + neck[NECK_LEVER] * toward + x.s
 
 
-def neck_advance(neck: np.ndarray, sample_time: float, targets: np.ndarray, m: np.ndarray, x: np.ndarray) -> None:
+def neck_advance(neck: np.ndarray, sample_time: float, targets: np.ndarray, m: np.ndarray, x: NeckState) -> None:
     """Move the motors `m` (3,) towards `targets` (3,), and bend, hysteresis and compression in `x`, by one sample."""
     dt = sample_time / _SUBSTEPS
     keep = math.exp(-neck[NECK_DRIVE_RATE] * dt)
@@ -63,49 +74,52 @@ def neck_advance(neck: np.ndarray, sample_time: float, targets: np.ndarray, m: n
             angle = neck[NECK_TWIST] + 2.0943951023931953 * j
             c = math.cos(angle)
             s = math.sin(angle)
-            stretch = neck[NECK_PRETENSION] + m[j] - neck[NECK_LEVER] * (c * x[0] + s * x[1]) - x[4]
+            stretch = neck[NECK_PRETENSION] + m[j] - neck[NECK_LEVER] * (c * x.b[0] + s * x.b[1]) - x.s
             if stretch > 0.0:
                 pull0 += stretch * c
                 pull1 += stretch * s
                 total += stretch
                 taut += 1
-        squared = x[0] * x[0] + x[1] * x[1]
+        squared = x.b[0] * x.b[0] + x.b[1] * x.b[1]
         loss = neck[NECK_STIFFENING] * squared
         k0 = neck[NECK_STIFFNESS] * (1.0 + neck[NECK_ASYMMETRY])
         k1 = neck[NECK_STIFFNESS] * (1.0 - neck[NECK_ASYMMETRY])
-        f0 = neck[NECK_GAIN] * pull0 - k0 * (x[0] - neck[NECK_REST]) - loss * x[0] - neck[NECK_FRICTION] * x[2]
-        f1 = neck[NECK_GAIN] * pull1 - k1 * (x[1] - neck[NECK_REST + 1]) - loss * x[1] - neck[NECK_FRICTION] * x[3]
+        f0 = neck[NECK_GAIN] * pull0 - k0 * (x.b[0] - neck[NECK_REST]) - loss * x.b[0] - neck[NECK_FRICTION] * x.z[0]
+        f1 = (
+            neck[NECK_GAIN] * pull1 - k1 * (x.b[1] - neck[NECK_REST + 1]) - loss * x.b[1] - neck[NECK_FRICTION] * x.z[1]
+        )
         rate = neck[NECK_STIFFNESS] + 3.0 * loss + 0.5 * taut * neck[NECK_GAIN] * neck[NECK_LEVER] + neck[NECK_FRICTION]
         d0 = dt * f0 / (1.0 + dt * rate)
         d1 = dt * f1 / (1.0 + dt * rate)
-        x[0] += d0
-        x[1] += d1
-        size = math.sqrt(x[0] * x[0] + x[1] * x[1])
+        x.b[0] += d0
+        x.b[1] += d1
+        size = math.sqrt(x.b[0] * x.b[0] + x.b[1] * x.b[1])
         if size > _LARGEST_BEND:
-            x[0] *= _LARGEST_BEND / size
-            x[1] *= _LARGEST_BEND / size
+            x.b[0] *= _LARGEST_BEND / size
+            x.b[1] *= _LARGEST_BEND / size
         # Implicit in z: it cannot leave |z| <= friction_angle.
         forget = 1.0 + math.sqrt(d0 * d0 + d1 * d1) / neck[NECK_FRICTION_ANGLE]
-        x[2] = (x[2] + d0) / forget
-        x[3] = (x[3] + d1) / forget
+        x.z[0] = (x.z[0] + d0) / forget
+        x.z[1] = (x.z[1] + d1) / forget
         axial = neck[NECK_AXIAL_RATE]
-        rise = axial * (neck[NECK_COMPLIANCE] * (total - 3.0 * neck[NECK_PRETENSION]) - x[4])
-        x[4] += dt * rise / (1.0 + dt * axial * (1.0 + neck[NECK_COMPLIANCE] * taut))
+        rise = axial * (neck[NECK_COMPLIANCE] * (total - 3.0 * neck[NECK_PRETENSION]) - x.s)
+        x.s += dt * rise / (1.0 + dt * axial * (1.0 + neck[NECK_COMPLIANCE] * taut))
 
 
-def neck_sense(neck: np.ndarray, sample_time: float, x: np.ndarray) -> None:
+def neck_sense(neck: np.ndarray, sample_time: float, x: NeckState) -> None:
     """Push the tilt of now into the dead time's line behind the states, and move the sensor on."""
-    size = math.sqrt(x[0] * x[0] + x[1] * x[1])
+    size = math.sqrt(x.b[0] * x.b[0] + x.b[1] * x.b[1])
     part = math.sin(size) / size if size > 1e-9 else 1.0
-    lines = (x.shape[0] - NECK_STATES) // 2
+    line = x.tilts
+    lines = line.shape[0] // 2
     keep = math.exp(-neck[NECK_SENSOR_RATE] * sample_time)
     for axis in range(2):
-        tilt = math.atan2(part * x[axis], math.cos(size))
-        first = NECK_STATES + axis * lines
+        tilt = math.atan2(part * x.b[axis], math.cos(size))
+        first = axis * lines
         seen = tilt
         if lines > 0:
-            seen = x[first + lines - 1]
+            seen = line[first + lines - 1]
             for i in range(lines - 1, 0, -1):
-                x[first + i] = x[first + i - 1]
-            x[first] = tilt
-        x[5 + axis] = keep * x[5 + axis] + (1.0 - keep) * seen
+                line[first + i] = line[first + i - 1]
+            line[first] = tilt
+        x.sensor[axis] = keep * x.sensor[axis] + (1.0 - keep) * seen

@@ -1,7 +1,5 @@
 """Play operators and low-pass filters, polynomials of them, and a linear echo of what was measured.
 
-Arrays: H, drive, load, redefinition, widths, chain, table (n, 3), weights (2, n), range (2, 2), echo (2, p),
-memory (samples after which a held start has settled). State: that of `_histories_runtime`, then q (3), plays, bank.
 The histories hold the measured output less the feed-forward part f, else the echo itself: y(k+1) = f(k+1) +
 sum_i echo_i (y - f)(k+1-i). f has no feedback at all and is kept within `range`; the echo is a stable filter that
 dies out when nothing is measured. So no free run can diverge.
@@ -11,49 +9,61 @@ import numpy as np
 
 from softneck.identification.models._bank_runtime import bank_advance, load_advance, monomial
 from softneck.identification.models._feedforward_runtime import echo_added, echo_rest, stalling_drives
-from softneck.identification.models._histories_runtime import narx_advance, narx_observe, narx_rest, narx_size
+from softneck.identification.models._histories_runtime import (
+    NarxArrays,
+    NarxState,
+    narx_advance,
+    narx_observe,
+    narx_rest,
+)
+from softneck.runtime._layout import array, cells, value
 
 
-def state_size(arrays: tuple[np.ndarray, ...]) -> int:
-    """Return the length of the state vector."""
-    count = arrays[4].shape[0]
-    return narx_size(arrays) + 3 + 3 * count + 3 * (count + 1) * int(arrays[5][1])
+class PlayArrays(NarxArrays):
+    """The bank of operators and filters, and the polynomial over it."""
+
+    load = array("4", "where a drive stalls: pole, c, c1, c2 (see `_bank_runtime`)")
+    redefinition = array("3, 3", "T of Eq. 9-11: motors to redefined inputs")
+    widths = array("w", "widths of the play operators behind each redefined input [rad]")
+    chain = array("2", "pole and number of the equal low-pass filters behind each operator")
+    table = array("terms, 3", "signals of the bank that each term multiplies; -1 stands for 1")
+    weights = array("2, terms", "of the terms, for each axis")
+    range = array("2, 2", "least and largest f of each axis [rad]")
+    echo = array("2, p", "of what was measured above f, newest first")
+    memory = array("1", "samples after which a held start has settled")
+    order = value("chain", 1)
 
 
-def play_output(arrays: tuple[np.ndarray, ...], bank: np.ndarray, axis: int) -> float:
+class PlayState(NarxState):
+    """Histories, load, operators and filters."""
+
+    q = cells("3", "motor positions behind a low-pass: the load of now [rad]")
+    plays = cells("3 * w", "play operators [rad]")
+    bank = cells("3 * (w + 1) * order", "filters [rad]")
+
+
+def play_output(p: PlayArrays, bank: np.ndarray, axis: int) -> float:
     """Return the feed-forward part f of one axis."""
     y = 0.0
-    for i in range(arrays[6].shape[0]):
-        y += arrays[7][axis, i] * monomial(arrays[6], i, bank)
-    return min(max(y, arrays[8][axis, 0]), arrays[8][axis, 1])
+    for i in range(p.terms):
+        y += p.weights[axis, i] * monomial(p.table, i, bank)
+    return min(max(y, p.range[axis, 0]), p.range[axis, 1])
 
 
-def initialise(arrays: tuple[np.ndarray, ...], parameters: np.ndarray, state: np.ndarray, outputs: np.ndarray) -> None:
+def initialise(p: PlayArrays, parameters: np.ndarray, x: PlayState, outputs: np.ndarray) -> None:
     """Rest: motors at zero, the output at its start value; what that is above f is remembered as measured."""
-    narx_rest(arrays, parameters, state, outputs)
-    bank = state[narx_size(arrays) + 3 + 3 * arrays[4].shape[0] :]
+    narx_rest(p, parameters, x, outputs)
     for axis in range(2):
-        echo_rest(arrays, state, axis, play_output(arrays, bank, axis))
+        echo_rest(p, x, axis, play_output(p, x.bank, axis))
 
 
-def step(
-    arrays: tuple[np.ndarray, ...],
-    parameters: np.ndarray,
-    state: np.ndarray,
-    inputs: np.ndarray,
-    outputs: np.ndarray,
-) -> None:
+def step(p: PlayArrays, parameters: np.ndarray, x: PlayState, inputs: np.ndarray, outputs: np.ndarray) -> None:
     """Advance by one sample."""
-    narx_observe(arrays, parameters, state, inputs)
-    h = int(arrays[0][0])
-    q = state[narx_size(arrays) : narx_size(arrays) + 3]
-    plays = state[narx_size(arrays) + 3 : narx_size(arrays) + 3 + 3 * arrays[4].shape[0]]
-    bank = state[narx_size(arrays) + 3 + 3 * arrays[4].shape[0] :]
-    m = state[3 * h : 3 * h + 3]
-    load_advance(arrays[2], m, q)
-    bank_advance(arrays[3], arrays[4], arrays[5], m, plays, bank)
+    narx_observe(p, parameters, x, inputs)
+    load_advance(p.load, x.m[0], x.q)
+    bank_advance(p.redefinition, p.widths, p.chain, x.m[0], x.plays, x.bank)
     angles = np.empty(2)
     for axis in range(2):
-        angles[axis] = echo_added(arrays, arrays[9], state, axis, play_output(arrays, bank, axis))
-    narx_advance(arrays, parameters, state, angles[0], angles[1], outputs)
-    stalling_drives(arrays, arrays[2], q, state, outputs)
+        angles[axis] = echo_added(p, p.echo, x, axis, play_output(p, x.bank, axis))
+    narx_advance(p, parameters, x, angles[0], angles[1], outputs)
+    stalling_drives(p, p.load, x.q, x, outputs)

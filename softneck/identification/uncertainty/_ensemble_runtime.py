@@ -1,57 +1,62 @@
 """The median of several plants, with the least and the largest of them as bounds.
 
-Arrays: H (1), memory (1); then those of the members. State: random generator (6); then the members' states.
 Each member runs free on its own outputs; a median of bounded numbers is bounded.
 """
 
 import numpy as np
 
+from softneck.runtime._layout import Arrays, StateVector, array, cells, rest
 from softneck.runtime._members_runtime import member_count, member_initialise, member_size, member_step
 from softneck.runtime._random_runtime import random_normal, random_seed
 
-OWN_ARRAYS = 2
-OWN_STATES = 6
+
+class EnsembleArrays(Arrays):
+    """Those of the members follow."""
+
+    history = array("1", "H: how many samples of each signal are kept")
+    memory = array("1", "samples after which a held start has settled")
 
 
-def state_size(arrays: tuple[np.ndarray, ...]) -> int:
+class EnsembleState(StateVector):
+    """The members' states follow, in their order."""
+
+    random = cells("6", "generator of the output noise")
+    members = rest("states of the members")
+
+
+def state_size(p: EnsembleArrays) -> int:
     """Return the length of the state vector."""
-    size = OWN_STATES
+    size = EnsembleState.size(p)
     for i in range(member_count()):
-        size += member_size(arrays, i)
+        size += member_size(p, i)
     return size
 
 
-def initialise(arrays: tuple[np.ndarray, ...], parameters: np.ndarray, state: np.ndarray, outputs: np.ndarray) -> None:
+def initialise(p: EnsembleArrays, parameters: np.ndarray, x: EnsembleState, outputs: np.ndarray) -> None:
     """Rest: as the members rest."""
     own = np.zeros(9)
-    at = OWN_STATES
-    random_seed(state[:OWN_STATES], parameters[4])
+    at, members = 0, x.members
+    random_seed(x.random, parameters[4])
     for i in range(member_count()):
-        size = member_size(arrays, i)
-        member_initialise(arrays, i, parameters, state[at : at + size], own)
+        size = member_size(p, i)
+        member_initialise(p, i, parameters, members[at : at + size], own)
         at += size
     outputs[:5] = own[:5]
     outputs[5:7] = own[0]
     outputs[7:9] = own[1]
 
 
-def step(
-    arrays: tuple[np.ndarray, ...],
-    parameters: np.ndarray,
-    state: np.ndarray,
-    inputs: np.ndarray,
-    outputs: np.ndarray,
-) -> None:
+def step(p: EnsembleArrays, parameters: np.ndarray, x: EnsembleState, inputs: np.ndarray, outputs: np.ndarray) -> None:
     """Advance by one sample; the bounds of pitch and roll follow the motor positions in `outputs`."""
     quiet = parameters.copy()
     quiet[3] = 0.0
     count = member_count()
     angles = np.empty((2, count))
     own = np.zeros(9)
-    at = OWN_STATES
+    at, members = 0, x.members
     for i in range(count):
-        size = member_size(arrays, i)
-        member_step(arrays, i, quiet, state[at : at + size], inputs, own)
+        size = member_size(p, i)
+        member_step(p, i, quiet, members[at : at + size], inputs, own)
         angles[0, i] = own[0]
         angles[1, i] = own[1]
         if i == 0:
@@ -63,5 +68,5 @@ def step(
         outputs[5 + 2 * axis] = inorder[0]
         outputs[6 + 2 * axis] = inorder[count - 1]
     if parameters[3] > 0.0:
-        outputs[0] += parameters[3] * random_normal(state[:OWN_STATES])
-        outputs[1] += parameters[3] * random_normal(state[:OWN_STATES])
+        outputs[0] += parameters[3] * random_normal(x.random)
+        outputs[1] += parameters[3] * random_normal(x.random)

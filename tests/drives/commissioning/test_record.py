@@ -104,6 +104,7 @@ def test_motors_that_do_not_follow_say_what_to_do() -> None:
         record_signal([played], Session(file=file, link=link)).require()
 
 
+@pytest.mark.slow
 def test_it_is_usable_by_identify_and_the_model_is_that_of_the_virtual_neck() -> None:
     played = excitation("eq22", 40.0)
     ours = recorded(played).recording
@@ -191,6 +192,7 @@ def test_what_the_drives_file_does_not_allow_is_refused() -> None:
         recorded()
 
 
+@pytest.mark.slow
 def test_the_first_experiment_after_zeroing_ends_as_planned() -> None:
     """The tendons keep the tension of `zero`; the motors have what is left of their current."""
     link = VirtualLink(simulated_neck(FILE, NECK, sample_time=0.02, homed=False))

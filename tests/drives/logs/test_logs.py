@@ -168,6 +168,7 @@ def test_other_limits_are_found(run: Path) -> None:
 # -- a cut log, a killed process --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_log_is_read_up_to_its_cut(run: Path, tmp_path: Path) -> None:
     whole, cycles = run.read_bytes(), read_run_log(run).cycles
     path = tmp_path / "cut.mcap"
@@ -316,6 +317,7 @@ def test_mcap_opens_with_the_index_of_its_own_reader(run: Path) -> None:
     np.testing.assert_array_equal([row["pitch_measured"] for row in rows], expected["pitch_measured"])
 
 
+@pytest.mark.slow
 def test_wireshark_reads_both_frame_logs_with_its_canopen_dissector(run: Path) -> None:
     tool = shutil.which("tshark")
     if tool is None:

@@ -89,6 +89,7 @@ PAIRS = st.tuples(st.sampled_from(sorted(FAULTS)), st.sampled_from(sorted(FAULTS
 TIMES = st.tuples(st.floats(0.0, 0.4), st.floats(0.0, 0.4))
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(names=PAIRS, times=TIMES)
 def test_pairs(names: tuple[str, str], times: tuple[float, float]) -> None:

@@ -105,6 +105,7 @@ def test_runs_have_starts_of_their_own() -> None:
         OutputError().fit([first, Recording(first.time * 2, 2 * TS, first.channels)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("source", ["set_points", "positions"])
 def test_what_drives_it_is_what_was_asked(source: str) -> None:
     r = neck_recording(1500, noise=0.0)
@@ -117,6 +118,7 @@ def test_what_drives_it_is_what_was_asked(source: str) -> None:
     np.testing.assert_allclose(free[:, 0], y, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [OutputError(), OutputError(nf=2, nb=2, max_delay=0.12)], ids=["one", "two"])
 def test_tf_ss_free_run_and_file_are_one_system(settings: OutputError, tmp_path: Path) -> None:
     model = settings.fit(neck_recording(1500, noise=1e-3))
@@ -180,6 +182,7 @@ def _real(shared_data: Path, name: str) -> Recording:
     return import_log(shared_data / folder / log, read_layout(LAYOUTS / f"{folder}.toml")).recording
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "source", "least"), [("open", "set_points", (93.0, 89.5)), ("closed", "positions", (85.0, 0.0))]
 )

@@ -126,6 +126,7 @@ def _recording(rows: int, noise: float) -> Recording:
     return Recording(np.arange(rows) * TS, TS, channels)
 
 
+@pytest.mark.slow
 def test_the_kind_finds_gain_pole_and_dead_time_with_their_intervals(tmp_path: Path) -> None:
     model = Srivc(resamples=60).fit(_recording(2000, NOISE))
     truth = {"K": NECK.b[0], "pole": NECK.a[0], "delay_s": NECK.delay}
@@ -171,6 +172,7 @@ def test_tf_ss_and_free_run_are_one_system(order: int) -> None:
         np.testing.assert_allclose(joint[axis], free[:, axis], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_it_simulates_as_well_as_output_error() -> None:
     r = neck_recording(1500, noise=1e-3)
     sampled, continuous = OutputError().fit(r), Srivc(resamples=0).fit(r)
@@ -186,6 +188,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     assert min(held.values()) >= 6 / 8
 
 
+@pytest.mark.slow
 def test_what_cannot_be_fitted_is_named() -> None:
     with pytest.raises(SettingsError, match="`zeros` must be below `order` 1; got 1"):
         Srivc(zeros=1)

@@ -221,6 +221,7 @@ def test_ctrl_c_keeps_the_best_so_far_and_says_so() -> None:
     assert np.isfinite(model.simulate(neck_recording(100))).all()
 
 
+@pytest.mark.slow
 def test_the_hold_out_given_decides_and_without_one_the_model_says_so() -> None:
     assert "excitation it was trained on" in SMALL.fit(short_neck()).findings["remark"]
     assert "remark" not in SMALL.fit(short_neck(), hold_out=neck_recording(400, seed=8)).findings

@@ -264,6 +264,7 @@ def test_a_residual_cannot_drift(models: dict) -> None:
     np.testing.assert_allclose(runs[0][-10:], runs[1][-10:], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_residual_form_is_reached_by_its_name_and_says_so(models: dict) -> None:
     assert models["residual"].kind == "nlsm"
     assert models["residual"].settings["form"] == "residual"

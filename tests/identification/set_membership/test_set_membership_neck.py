@@ -62,6 +62,7 @@ def test_one_step_ahead_the_bounds_of_eq21_hold(paper: Model, eq22: tuple[Record
     assert coverage(eq22[1], paper.predict(eq22[1])) >= 0.97  # the issue's; 99.9 % measured
 
 
+@pytest.mark.slow
 def test_dividing_by_the_standard_deviation_is_a_trap(
     paper: Model, eq22: tuple[Recording, Recording], tests: dict[str, Recording]
 ) -> None:

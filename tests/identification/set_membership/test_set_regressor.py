@@ -66,6 +66,7 @@ def test_without_outputs_in_the_regressor_a_free_run_forgets_its_start() -> None
     assert runs[0][:, [0, 1, 5, 6, 7, 8]].tobytes() == runs[1][:, [0, 1, 5, 6, 7, 8]].tobytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["lags", "residual"])
 def test_the_drive_model_supplies_motors_where_that_is_asked_for(form: str) -> None:
     """Made of simulated motors, a set does not look at logged ones beyond the drive model they give."""

@@ -21,6 +21,8 @@ from softneck.signals import Recording, signal
 
 from ...data import TRUTH, TS, Truth, neck_recording, recording_from
 
+pytestmark = pytest.mark.slow
+
 # Gains of three payloads on one pole and dead time each.
 PAYLOADS = [Truth(gain=(0.011 * k, 0.008 * k)) for k in (0.8, 1.0, 1.25)]
 
@@ -142,7 +144,6 @@ def test_a_design_reads_it(family: Family) -> None:
     )  # Pade of order 4
 
 
-@pytest.mark.slow
 def test_windows_and_their_uncertainty_widen_the_plant(recordings: list[Recording], family: Family) -> None:
     wide = FamilySettings(directions=1, include_windows=True, widen=2.0).fit(recordings)
     for name in ("pitch", "roll"):
@@ -151,7 +152,6 @@ def test_windows_and_their_uncertainty_widen_the_plant(recordings: list[Recordin
         assert wide.covered(name) <= 1.0 + 1e-9
 
 
-@pytest.mark.slow
 def test_gains_across_the_axes_are_told() -> None:
     P = signal("mixed", duration=60.0, seed=3).set_points.copy()
     P[:15] = 0.0
@@ -181,7 +181,6 @@ def _lag(u: np.ndarray, pole: float, delay: int) -> np.ndarray:
     return y
 
 
-@pytest.mark.slow
 def test_a_gain_that_falls_with_inclination_is_interpolated() -> None:
     P = signal("aprbs", duration=80.0, seed=4).set_points.copy()
     P[:15] = 0.0

@@ -13,6 +13,7 @@ from ...data import neck_recording
 DATA = {"short": neck_recording(300, seed=21, noise=1e-3), "long": neck_recording(1300, seed=22, noise=1e-3)}
 
 
+@pytest.mark.slow
 def test_every_pair_is_as_validated_alone(models: dict[str, Model]) -> None:
     chosen = {name: models[name] for name in ("rls", "nn")}
     told: list[float] = []

@@ -21,6 +21,7 @@ def ar1(pole: float, rows: int, rng: np.random.Generator) -> np.ndarray:
     return x * np.sqrt(1 - pole**2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("motion", "error", "rows", "least"),
     # Nominal 95 %. On 1,200 records it printed 0.92, 0.93 and 0.84; three deviations of 300 lie below.

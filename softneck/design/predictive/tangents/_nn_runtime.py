@@ -25,7 +25,7 @@ def tangent_network(arrays: tuple[np.ndarray, ...], axis: int, x: np.ndarray) ->
 def tangent(
     arrays: tuple[np.ndarray, ...],
     k: int,
-    before: np.ndarray,  # noqa: ARG001
+    before: np.ndarray,
     state: np.ndarray,
     line: np.ndarray,
     rows: np.ndarray,

@@ -1,0 +1,187 @@
+"""Names for what a runtime reads and remembers: each kind declares its arrays and its state once, beside its equations.
+
+    class LagArrays(Arrays):
+        poles = array("n", "a of y+ = a y + (1 - a) u")
+
+    class LagState(StateVector):
+        y = cells("n", "outputs of now")
+
+    def step(p: LagArrays, parameters, x: LagState, inputs, outputs):
+        for i in range(p.n):
+            x.y[i] = p.poles[i] * x.y[i] + (1.0 - p.poles[i]) * inputs[i]
+
+From this follow the order in the file, the checks of shapes, the ranks in C, the length of the state and the reference
+page. The arrays stay a tuple and the state one vector: a bundle writes places for names (see `_names`), so that numba
+and C read what they would of numbers. A subclass adds behind what its base has.
+
+Shapes are written in symbols: `n` is whatever length the array has there, `2 * n + 1` must fit, and `value` makes
+a symbol of an entry that holds a whole number.
+"""
+
+from __future__ import annotations
+
+import ast
+import operator
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from softneck.core import FileFormatError, Matrix, SettingsError
+
+_OPERATORS: dict[type, Callable[[int, int], int]] = {
+    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.FloorDiv: operator.floordiv,
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One array, or one part of a state.
+
+    Attributes:
+        shape: the length along each dimension, in symbols; empty for a single number of a state.
+        meaning: one line with the unit, for the reference page.
+        open: the rest of the state, however long.
+    """
+
+    shape: tuple[str, ...]
+    meaning: str
+    open: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Symbol:
+    """A length that an array's entry holds, or that a function of the runtime makes of arrays."""
+
+    array: str
+    places: tuple[int, ...] = ()
+    function: Callable[..., int] | None = None
+
+
+def array(shape: str, meaning: str) -> Any:
+    """Declare an array of `shape`, such as `"2, hidden, n"`."""
+    return Field(_split(shape), meaning)
+
+
+def cells(shape: str, meaning: str) -> Any:
+    """Declare a part of a state of `shape`: `"H, 3"`, or `""` for a number."""
+    return Field(_split(shape), meaning)
+
+
+def rest(meaning: str) -> Any:
+    """Declare the last part of a state, which others fill: a composed kind's members."""
+    return Field((), meaning, open=True)
+
+
+def value(array_name: str, *places: int, function: Callable[..., int] | None = None) -> Any:
+    """Declare a symbol: the whole number at `places` of an array, or `function` of that array."""
+    return Symbol(array_name, places, function)
+
+
+class _Layout:
+    fields: ClassVar[dict[str, Field]] = {}
+    symbols: ClassVar[dict[str, Symbol]] = {}
+
+    def __init_subclass__(cls) -> None:
+        own = {name: item for name, item in vars(cls).items() if isinstance(item, Field)}
+        cls.fields = cls.fields | own
+        cls.symbols = cls.symbols | {name: item for name, item in vars(cls).items() if isinstance(item, Symbol)}
+
+    if TYPE_CHECKING:  # symbols of shapes are names as well; a bundle refuses one that is not declared
+
+        def __getattr__(self, name: str) -> Any: ...
+
+
+class Arrays(_Layout):
+    """A kind's arrays with names: `NnArrays(model.arrays.values()).W1`; inside a runtime, a parameter's annotation."""
+
+    def __init__(self, arrays: Sequence[Matrix]) -> None:
+        """Name `arrays`, which come in the order of the declaration; members of a composed kind may follow."""
+        for name, item in zip(self.fields, arrays, strict=False):
+            setattr(self, name, item)
+
+    @classmethod
+    def names(cls) -> tuple[str, ...]:
+        """Return the names in the order of file and runtime."""
+        return tuple(cls.fields)
+
+    @classmethod
+    def ranks(cls) -> tuple[int, ...]:
+        """Return the number of dimensions of each array."""
+        return tuple(len(item.shape) for item in cls.fields.values())
+
+    @classmethod
+    def place(cls, name: str) -> int:
+        """Return the place of an array among all."""
+        return cls.names().index(name)
+
+    @classmethod
+    def lengths(cls, arrays: Mapping[str, Matrix]) -> dict[str, int]:
+        """Return the symbols of the shapes of `arrays`.
+
+        Raises:
+            FileFormatError: an array whose shape does not fit the others.
+        """
+        named = Arrays.__new__(cls)
+        known: dict[str, int] = {}
+        for name, item in cls.fields.items():
+            found = arrays[name].shape
+            setattr(named, name, arrays[name])
+            if len(found) == len(item.shape):
+                for text, length in zip(item.shape, found, strict=True):
+                    if text.isidentifier():
+                        known.setdefault(text, length)
+                wanted = tuple(evaluate(text, known) for text in item.shape)
+            else:
+                wanted = tuple(known.get(text, text) for text in item.shape)
+            if found != wanted:
+                shown = str(wanted).replace("'", "")
+                raise FileFormatError(f"its array `{name}` has shape {found}; {shown} is needed.")
+            for symbol, source in cls.symbols.items():
+                if source.array == name:
+                    known[symbol] = _found(source, arrays[name])
+        return known
+
+
+class StateVector(_Layout):
+    """What a kind remembers, with names; inside a runtime, the annotation of the state vector."""
+
+    if TYPE_CHECKING:  # it is a vector
+
+        def __getitem__(self, at: Any) -> Any: ...
+        def __setitem__(self, at: Any, value: Any) -> None: ...
+
+    @classmethod
+    def parts(cls, arrays: Arrays) -> dict[str, slice]:
+        """Return where each part is in the state vector of a model with `arrays`."""
+        known = type(arrays).lengths(vars(arrays))
+        at, found = 0, {}
+        for name, item in cls.fields.items():
+            size = 1
+            for text in item.shape:
+                size *= evaluate(text, known)
+            found[name] = slice(at, None if item.open else at + size)
+            at += size
+        return found
+
+
+def evaluate(text: str, known: Mapping[str, int]) -> int:
+    """Return the value of a length such as `3 * (1 + widths)`."""
+
+    def term(node: ast.expr) -> int:
+        if isinstance(node, ast.Constant) and isinstance(node.value, int):
+            return node.value
+        if isinstance(node, ast.Name) and node.id in known:
+            return known[node.id]
+        if isinstance(node, ast.BinOp) and type(node.op) in _OPERATORS:
+            return _OPERATORS[type(node.op)](term(node.left), term(node.right))
+        raise SettingsError(f"the length `{text}` of a layout is not made of {', '.join(known) or 'numbers'}.")
+
+    return term(ast.parse(text, mode="eval").body)
+
+
+def _found(symbol: Symbol, source: Matrix) -> int:
+    return symbol.function(source) if symbol.function is not None else int(source[symbol.places])
+
+
+def _split(shape: str) -> tuple[str, ...]:
+    return tuple(text.strip() for text in shape.split(",") if text.strip())

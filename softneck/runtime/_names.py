@@ -1,0 +1,223 @@
+"""Places for names: `p.W1` becomes `p[3]` and `x.y[i]` a place in the state vector, before anybody compiles them.
+
+A function's parameters say by their annotation which names they have (see `_layout`). Lengths that a shape's symbols
+stand for are read from the arrays once, where the function begins.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from softneck.core import SettingsError
+
+from ._layout import Arrays, StateVector, Symbol
+
+
+def lowered(function: ast.FunctionDef, find: Callable[[str], Any], where: str) -> ast.FunctionDef:
+    """Return `function` with places for names, without docstring and annotations.
+
+    Args:
+        function: as it is written.
+        find: returns what a name in the function's module stands for.
+        where: the module, for messages.
+
+    Raises:
+        SettingsError: a name that the declaration does not have, or a part of a state used in a way that has no place.
+    """
+    layouts = {}
+    for argument in function.args.args:
+        if isinstance(argument.annotation, ast.Name):
+            found = find(argument.annotation.id)
+            if isinstance(found, type) and issubclass(found, Arrays | StateVector):
+                layouts[argument.arg] = found
+        argument.annotation = None
+    function.returns = None
+    names = _Names(layouts, find, f"{where}: `{function.name}`")
+    body = function.body[1:] if ast.get_docstring(function, clean=False) is not None else function.body
+    body = [names.visit(statement) for statement in body] or [ast.Pass()]
+    function.body = [*names.begin(), *body]
+    return ast.fix_missing_locations(function)
+
+
+def state_size(arrays: type[Arrays], state: type[StateVector]) -> ast.FunctionDef:
+    """Return the function that tells the length of a state, for a kind that does not write it itself."""
+    text = f"def state_size(p):\n    return {state.__name__}.size(p)\n"
+    function = next(node for node in ast.parse(text).body if isinstance(node, ast.FunctionDef))
+    function.args.args[0].annotation = ast.Name(arrays.__name__)
+    return lowered(function, {arrays.__name__: arrays, state.__name__: state}.get, "state_size")
+
+
+class _Names(ast.NodeTransformer):
+    """Rewrites one function."""
+
+    def __init__(self, layouts: Mapping[str, type], find: Callable[[str], Any], where: str) -> None:
+        self._layouts, self._find, self._where = layouts, find, where
+        self._used: dict[str, ast.expr] = {}
+
+    def begin(self) -> list[ast.stmt]:
+        """Return the statements that read the lengths in use."""
+        return [ast.Assign([ast.Name(f"_{name}", ast.Store())], source) for name, source in self._used.items()]
+
+    def visit_Attribute(self, node: ast.Attribute) -> ast.expr:
+        """Return the place of `p.name` or `x.name`."""
+        layout = self._layout_of(node)
+        if layout is None:
+            return self.generic_visit(node)  # pyright: ignore[reportReturnType]
+        owner: str = node.value.id  # type: ignore[attr-defined]
+        if issubclass(layout, StateVector):
+            return self._part(owner, layout, node.attr, None, node.ctx)
+        if node.attr in layout.fields:
+            return ast.Subscript(ast.Name(owner, ast.Load()), ast.Constant(layout.place(node.attr)), node.ctx)
+        return self._symbol(node.attr)
+
+    def visit_Subscript(self, node: ast.Subscript) -> ast.expr:
+        """Return the place of `x.name[...]`."""
+        layout = self._layout_of(node.value)
+        if layout is None or not issubclass(layout, StateVector):
+            return self.generic_visit(node)  # pyright: ignore[reportReturnType]
+        index = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
+        owner, name = node.value.value.id, node.value.attr  # type: ignore[attr-defined]
+        return self._part(owner, layout, name, [self.visit(item) for item in index], node.ctx)
+
+    def visit_Call(self, node: ast.Call) -> ast.expr:
+        """Return the length that `NnState.size(p)` stands for."""
+        owner = node.func.value if isinstance(node.func, ast.Attribute) else None
+        if isinstance(owner, ast.Name) and node.func.attr == "size":  # type: ignore[attr-defined]
+            layout = self._find(owner.id)
+            if isinstance(layout, type) and issubclass(layout, StateVector):
+                return self._offset(layout, None)
+        return self.generic_visit(node)  # pyright: ignore[reportReturnType]
+
+    def _layout_of(self, node: ast.expr) -> type | None:
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            return self._layouts.get(node.value.id)
+        return None
+
+    def _part(
+        self, owner: str, layout: type[StateVector], name: str, index: list[ast.expr] | None, ctx: ast.expr_context
+    ) -> ast.expr:
+        """Return a number of the state, a row, or a stretch of numbers."""
+        if name not in layout.fields:
+            raise self._fail(f"{layout.__name__} declares no `{name}`")
+        item, begin = layout.fields[name], self._begin(owner, layout, name)
+        place: ast.expr
+        if item.open:
+            place = ast.Slice(begin if index is None else _sum(begin, self._border(index[0])), None)
+        elif not item.shape:
+            place = begin
+        elif index is None:
+            place = ast.Slice(begin, _sum(begin, self._product(item.shape)))
+        elif len(index) == len(item.shape) and not any(isinstance(i, ast.Slice) for i in index):
+            place = begin
+            for dimension, i in enumerate(index):
+                place = _sum(place, _times(i, self._product(item.shape[dimension + 1 :])))
+        elif len(index) == 1:
+            first, last = self._rows(index[0], item.shape)
+            row = self._product(item.shape[1:])
+            place = ast.Slice(_sum(begin, _times(first, row)), _sum(begin, _times(last, row)))
+        else:
+            raise self._fail(f"`{name}[...]` of these indices is no stretch of the state")
+        return ast.Subscript(ast.Name(owner, ast.Load()), place, ctx)
+
+    def _rows(self, index: ast.expr, shape: tuple[str, ...]) -> tuple[ast.expr, ast.expr]:
+        if not isinstance(index, ast.Slice):
+            return index, _sum(index, ast.Constant(1))
+        if index.step is not None:
+            raise self._fail("a stretch of the state has no step")
+        first = ast.Constant(0) if index.lower is None else index.lower
+        return first, self._length(shape[0]) if index.upper is None else index.upper
+
+    def _border(self, index: ast.expr) -> ast.expr:
+        if isinstance(index, ast.Slice) and index.upper is None and index.lower is not None:
+            return index.lower
+        raise self._fail("of the rest of a state only `[begin:]` can be taken")
+
+    def _begin(self, owner: str, layout: type[StateVector], name: str) -> ast.expr:
+        """Return where a part begins: a number, or a variable that the function fills at its begin."""
+        begin = self._offset(layout, name)
+        if isinstance(begin, ast.Constant):
+            return begin
+        variable = f"{owner}_{name}"
+        self._used[variable] = begin
+        return ast.Name(f"_{variable}", ast.Load())
+
+    def _offset(self, layout: type[StateVector], name: str | None) -> ast.expr:
+        """Return where `name` begins in the state, or the length of all that is not open."""
+        terms: dict[str, int] = {}
+        for other, item in layout.fields.items():
+            if other == name or item.open:
+                break
+            factor, lengths = 1, []
+            for text in item.shape:
+                factor, lengths = (factor * int(text), lengths) if text.isdigit() else (factor, [*lengths, text])
+            term = ast.unparse(self._product(tuple(lengths))) if lengths else ""
+            terms[term] = terms.get(term, 0) + factor
+        total: ast.expr = ast.Constant(0)
+        for term, factor in terms.items():
+            total = _sum(total, _times(ast.Constant(factor), _expression(f"({term})" if term else "1")))
+        return total
+
+    def _product(self, shape: tuple[str, ...]) -> ast.expr:
+        total: ast.expr = ast.Constant(1)
+        for text in shape:
+            total = _times(total, self._length(text))
+        return total
+
+    def _length(self, text: str) -> ast.expr:
+        """Return a length of a shape, in the symbols that the function reads."""
+        names = self
+
+        class Symbols(ast.NodeTransformer):
+            def visit_Name(self, node: ast.Name) -> ast.expr:
+                return names._symbol(node.id)
+
+        return Symbols().visit(ast.parse(text, mode="eval").body)
+
+    def _symbol(self, name: str) -> ast.expr:
+        """Return the variable that holds a symbol, which the function reads at its begin."""
+        if name not in self._used:
+            owner = next((key for key, layout in self._layouts.items() if issubclass(layout, Arrays)), None)
+            if owner is None:
+                raise self._fail(f"it needs the length `{name}` and has no arrays to read it from")
+            self._used[name] = self._source(owner, self._layouts[owner], name)
+        return ast.Name(f"_{name}", ast.Load())
+
+    def _source(self, owner: str, layout: type[Arrays], name: str) -> ast.expr:
+        if name in layout.symbols:
+            symbol: Symbol = layout.symbols[name]
+            array = f"{owner}[{layout.place(symbol.array)}]"
+            if symbol.function is not None:
+                return _expression(f"{symbol.function.__name__}({array})")
+            return _expression(f"int({array}[{', '.join(map(str, symbol.places))}])")
+        for place, item in enumerate(layout.fields.values()):
+            if name in item.shape:
+                return _expression(f"{owner}[{place}].shape[{item.shape.index(name)}]")
+        raise self._fail(f"{layout.__name__} declares neither an array nor a length `{name}`")
+
+    def _fail(self, problem: str) -> SettingsError:
+        return SettingsError(f"{self._where}: {problem}.")
+
+
+def _expression(text: str) -> ast.expr:
+    return ast.parse(text, mode="eval").body
+
+
+def _sum(left: ast.expr, right: ast.expr) -> ast.expr:
+    if isinstance(left, ast.Constant) and isinstance(right, ast.Constant):
+        return ast.Constant(left.value + right.value)  # type: ignore[operator]
+    if isinstance(left, ast.Constant) and left.value == 0:
+        return right
+    if isinstance(right, ast.Constant) and right.value == 0:
+        return left
+    return ast.BinOp(left, ast.Add(), right)
+
+
+def _times(left: ast.expr, right: ast.expr) -> ast.expr:
+    for one, other in ((left, right), (right, left)):
+        if isinstance(one, ast.Constant) and one.value == 1:
+            return other
+        if isinstance(one, ast.Constant) and one.value == 0:
+            return ast.Constant(0)
+    return ast.BinOp(left, ast.Mult(), right)
