@@ -24,7 +24,7 @@ class Kind:
         result: dotted path of the class that a file becomes, by its `from_archive`.
         runtime: dotted name of the runtime module (see `core.bundle`); "" for what no loop steps.
         summary: one line for `--help` and the docs.
-        arrays: dotted path of a model's array layout: names in the runtime's order, and their checks.
+        check: dotted path of what checks the numbers in a model's arrays; names and shapes its runtime declares.
     """
 
     name: str
@@ -33,7 +33,7 @@ class Kind:
     result: str
     runtime: str
     summary: str
-    arrays: str = ""
+    check: str = ""
 
 
 _IDENT, _DESIGN = "softneck.identification", "softneck.design"
@@ -44,39 +44,39 @@ KINDS: dict[str, Kind] = {
     for kind in (
         Kind("rls", "model", "softneck.identification:Rls", _MODEL, f"{_IDENT}.linear._rls_runtime",
              "recursive least squares over the redefined inputs, with dead time (Eq. 23-30)",
-             f"{_IDENT}.linear._arrays:RLS"),
+             f"{_IDENT}.linear._arrays:check_rls"),
         Kind("oe", "model", "softneck.identification:OutputError", _MODEL, f"{_IDENT}.linear._oe_runtime",
              "output error: transfer functions with dead time that simulate best (Gauss-Newton)",
-             f"{_IDENT}.linear._arrays:OE"),
+             f"{_IDENT}.linear._arrays:check_oe"),
         Kind("srivc", "model", "softneck.identification:Srivc", _MODEL, f"{_IDENT}.linear._oe_runtime",
              "continuous-time K exp(-L s)/(s + p) by refined instrumental variables, with confidence intervals",
-             f"{_IDENT}.linear._arrays:OE"),
+             f"{_IDENT}.linear._arrays:check_oe"),
         Kind("subspace", "model", "softneck.identification:Subspace", _MODEL, f"{_IDENT}.linear._state_space_runtime",
              "state space from the three motors to both angles (N4SID), without redefinition",
-             f"{_IDENT}.linear._arrays:STATE_SPACE"),
+             f"{_IDENT}.linear._arrays:check_state_space"),
         Kind("nlsm", "model", "softneck.identification:SetMembership", _MODEL, f"{_IDENT}.set_membership._nlsm_runtime",
              "nonlinear set membership (Eq. 12-21, Algorithm 1)",
-             f"{_IDENT}.set_membership._arrays:NLSM"),
+             f"{_IDENT}.set_membership._arrays:check_nlsm"),
         Kind("nn", "model", "softneck.identification:Network", _MODEL, f"{_IDENT}.networks._nn_runtime",
              "NLARX neural network, two hidden layers of 25 (section 6.2)",
-             f"{_IDENT}.networks._arrays:NN"),
+             f"{_IDENT}.networks._arrays:check_nn"),
         Kind("play", "model", "softneck.identification:Play", _MODEL, f"{_IDENT}.structured._play_runtime",
              "play operators and low-pass filters, ridge on their polynomial; no feedback, strong in free run",
-             f"{_IDENT}.structured._arrays:PLAY"),
+             f"{_IDENT}.structured._arrays:check_play"),
         Kind("nss", "model", "softneck.identification:NeuralStateSpace", _MODEL, f"{_IDENT}.networks._nss_runtime",
              "neural state space over play operators, contracting; trained over its whole free run",
-             f"{_IDENT}.networks._arrays:NSS"),
+             f"{_IDENT}.networks._arrays:check_nss"),
         Kind("greybox", "model", "softneck.identification:GreyBox", _MODEL, f"{_IDENT}.structured._greybox_runtime",
              "equations of a tendon-driven neck, their 16 numbers fitted by the error of its free run",
-             f"{_IDENT}.structured._arrays:GREYBOX"),
+             f"{_IDENT}.structured._arrays:check_greybox"),
         Kind("residual", "model", "softneck.identification:Residual", _MODEL,
              f"{_IDENT}.uncertainty._residual_runtime",
              "any other kind, and set membership on what its free run leaves over, with bounds",
-             f"{_IDENT}.uncertainty._arrays:RESIDUAL"),
+             f"{_IDENT}.uncertainty._arrays:check_residual"),
         Kind("ensemble", "model", "softneck.identification:Ensemble", _MODEL,
              f"{_IDENT}.uncertainty._ensemble_runtime",
              "the median of several kinds, with their spread as bounds",
-             f"{_IDENT}.uncertainty._arrays:ENSEMBLE"),
+             f"{_IDENT}.uncertainty._arrays:check_ensemble"),
         Kind("rls_state", "state", "softneck.identification:Recursion",
              f"{_IDENT}.linear._recursion:RecursionState",
              "", "what a recursive least squares remembers"),

@@ -15,6 +15,7 @@ from __future__ import annotations
 import ast
 import builtins
 import hashlib
+from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -31,6 +32,15 @@ _LOOPS = "softneck.runtime._loops_runtime"
 _MEMBERS = "softneck.runtime._members_runtime"
 _DECLARATIONS = "softneck.runtime._layout"
 _ALLOWED = {"numpy", "math", "__future__", _DECLARATIONS}
+
+
+@dataclass(frozen=True, slots=True)
+class _Piece:
+    """A function or a constant: what it defines, what it reads, and its text."""
+
+    names: frozenset[str]
+    reads: frozenset[str]
+    text: str
 
 
 @cache
@@ -53,16 +63,16 @@ def bundle(runtime: str, *, loops: bool = True, skip: tuple[str, ...] = ()) -> s
         order.remove(_MEMBERS)
         tangents = all(_has_tangent(member) for member, _ in members)
         texts.append(member_calls([count for _, count in members], own_arrays(outer), tangents=tangents))
-    found = {module: [node for node in _statements(module) if not set(skip) & set(_defined(node))] for module in order}
+    found = {module: [piece for piece in _pieces(module) if not set(skip) & piece.names] for module in order}
     home = next((module for module in order if _defines(found[module], "step")), None)
-    if home is not None and not any(_defines(nodes, "state_size") for nodes in found.values()):
-        found[home].append(state_size(declared(home, Arrays), declared(home, StateVector)))
+    if home is not None and not any(_defines(pieces, "state_size") for pieces in found.values()):
+        found[home].append(_piece(state_size(declared(home, Arrays), declared(home, StateVector))))
     if loops:
-        found[_LOOPS] = [node for node in _statements(_LOOPS) if "step" not in _defined(node)]
+        found[_LOOPS] = [piece for piece in _pieces(_LOOPS) if "step" not in piece.names]
     _check_names(found)
-    kept = _needed(found, outer, [node for text in texts for node in ast.parse(text).body])
+    kept = _needed(found, outer, {name for text in texts for name in _read(ast.parse(text))})
     parts = ["# A softneck runtime: generated, do not edit.", "import math", "", "import numpy as np", "", *texts]
-    parts += [ast.unparse(node) + "\n" for nodes in found.values() for node in nodes if kept & set(_defined(node))]
+    parts += [piece.text for pieces in found.values() for piece in pieces if kept & piece.names]
     return "\n".join(parts)
 
 
@@ -101,7 +111,7 @@ def _members(runtime: str) -> tuple[str, list[tuple[str, int]]]:
 
 def _has_tangent(member: str) -> bool:
     """Return whether the module of a member says how its outputs answer to planned inputs."""
-    return any(_defined(node) == ["tangent"] for node in _tree(member.partition("(")[0]).body)
+    return _defines(list(_pieces(member.partition("(")[0])), "tangent")
 
 
 def _collect(module: str, order: list[str]) -> None:
@@ -112,62 +122,67 @@ def _collect(module: str, order: list[str]) -> None:
         order.append(module)
 
 
-def _statements(module: str) -> list[ast.stmt]:
+@cache
+def _pieces(module: str) -> tuple[_Piece, ...]:
     """Return the functions and constants of a module, with places for names."""
 
     def find(name: str) -> Any:
         return None if hasattr(builtins, name) else getattr(import_module(module), name, None)
 
-    kept: list[ast.stmt] = []
-    for node in _tree(module).body:
+    kept: list[_Piece] = []
+    for node in ast.parse(_source(module)).body:  # its own tree, as names become places in it
         if isinstance(node, ast.Import | ast.ImportFrom):
             _check_import(module, node)
         elif isinstance(node, ast.FunctionDef):
-            kept.append(lowered(node, find, module))
+            kept.append(_piece(lowered(node, find, module)))
         elif isinstance(node, ast.Assign):
-            kept.append(node)
+            kept.append(_piece(node))
         elif not isinstance(node, ast.ClassDef | ast.Expr):
             raise SettingsError(f"runtime module {module} has a statement of another kind in line {node.lineno}.")
-    return kept
+    return tuple(kept)
 
 
-def _check_names(found: dict[str, list[ast.stmt]]) -> None:
+def _piece(node: ast.FunctionDef | ast.Assign) -> _Piece:
+    if isinstance(node, ast.FunctionDef):
+        names = {node.name}
+    else:
+        names = {part.id for target in node.targets for part in ast.walk(target) if isinstance(part, ast.Name)}
+    return _Piece(frozenset(names), frozenset(_read(node)), ast.unparse(node) + "\n")
+
+
+def _read(node: ast.AST) -> set[str]:
+    return {part.id for part in ast.walk(node) if isinstance(part, ast.Name)}
+
+
+def _defines(pieces: list[_Piece], name: str) -> bool:
+    return any(name in piece.names for piece in pieces)
+
+
+def _check_names(found: dict[str, list[_Piece]]) -> None:
     names: dict[str, str] = {}
-    for module, nodes in found.items():
-        for defined in (name for node in nodes for name in _defined(node)):
+    for module, pieces in found.items():
+        for defined in sorted(name for piece in pieces for name in piece.names):
             if defined in names:
                 raise SettingsError(f"runtime modules {names[defined]} and {module} both define `{defined}`.")
             names[defined] = module
 
 
-def _needed(found: dict[str, list[ast.stmt]], outer: str, others: list[ast.stmt]) -> set[str]:
+def _needed(found: dict[str, list[_Piece]], outer: str, others: set[str]) -> set[str]:
     """Return the names that the outer module offers, and all that these, the loops and `others` read."""
-    by_name = {name: node for nodes in found.values() for node in nodes for name in _defined(node)}
-    waiting = ["state_size", *(name for node in (*found[outer], *found.get(_LOOPS, ())) for name in _defined(node))]
-    waiting += [item.asname or item.name for node in _tree(outer).body for item in getattr(node, "names", ())]
-    waiting += [name for node in others for name in _read(node)]
+    reads = {name: piece.reads for pieces in found.values() for piece in pieces for name in piece.names}
+    waiting = ["state_size", *others, *(item for node in _tree(outer).body for item in _imported(node))]
+    waiting += [name for module in (outer, _LOOPS) for piece in found.get(module, ()) for name in piece.names]
     kept: set[str] = set()
     while waiting:
         name = waiting.pop()
-        if name in by_name and name not in kept:
+        if name in reads and name not in kept:
             kept.add(name)
-            waiting += _read(by_name[name])
+            waiting += reads[name]
     return kept
 
 
-def _defines(nodes: list[ast.stmt], name: str) -> bool:
-    return any(name in _defined(node) for node in nodes)
-
-
-def _read(node: ast.stmt) -> list[str]:
-    return [part.id for part in ast.walk(node) if isinstance(part, ast.Name)]
-
-
-def _defined(node: ast.stmt) -> list[str]:
-    if isinstance(node, ast.FunctionDef | ast.ClassDef):
-        return [node.name]
-    targets = node.targets if isinstance(node, ast.Assign) else []
-    return [part.id for target in targets for part in ast.walk(target) if isinstance(part, ast.Name)]
+def _imported(node: ast.stmt) -> list[str]:
+    return [item.asname or item.name for item in node.names] if isinstance(node, ast.ImportFrom) else []
 
 
 def _check_import(module: str, node: ast.Import | ast.ImportFrom) -> None:
@@ -186,5 +201,6 @@ def _source(module: str) -> str:
     return Path(spec.origin).read_text(encoding="utf-8")
 
 
+@cache
 def _tree(module: str) -> ast.Module:
     return ast.parse(_source(module))

@@ -21,6 +21,7 @@ a symbol of an entry that holds a whole number.
 from __future__ import annotations
 
 import ast
+import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -156,12 +157,15 @@ class StateVector(_Layout):
         known = type(arrays).lengths(vars(arrays))
         at, found = 0, {}
         for name, item in cls.fields.items():
-            size = 1
-            for text in item.shape:
-                size *= evaluate(text, known)
+            size = math.prod(evaluate(text, known) for text in item.shape)
             found[name] = slice(at, None if item.open else at + size)
             at += size
         return found
+
+    @classmethod
+    def size(cls, arrays: Arrays) -> int:
+        """Return the length of all parts but an open one; in a runtime's text too."""
+        return max(part.start if part.stop is None else part.stop for part in cls.parts(arrays).values())
 
 
 def evaluate(text: str, known: Mapping[str, int]) -> int:

@@ -1,6 +1,6 @@
 """The members of a runtime that holds others; a bundle replaces these functions (see `_bundle`).
 
-The outer module defines OWN_ARRAYS, the number of arrays before those of its members.
+Theirs come behind the arrays that the outer module declares.
 """
 
 import numpy as np
@@ -11,20 +11,20 @@ def member_count() -> int:
     raise NotImplementedError
 
 
-def member_size(arrays: tuple[np.ndarray, ...], member: int) -> int:
+def member_size(arrays: object, member: int) -> int:
     """Return the length of a member's state."""
     raise NotImplementedError
 
 
 def member_initialise(
-    arrays: tuple[np.ndarray, ...], member: int, parameters: np.ndarray, state: np.ndarray, outputs: np.ndarray
+    arrays: object, member: int, parameters: np.ndarray, state: np.ndarray, outputs: np.ndarray
 ) -> None:
     """Fill a member's state and outputs at t_0."""
     raise NotImplementedError
 
 
 def member_step(
-    arrays: tuple[np.ndarray, ...],
+    arrays: object,
     member: int,
     parameters: np.ndarray,
     state: np.ndarray,
@@ -36,7 +36,7 @@ def member_step(
 
 
 def member_tangent(
-    arrays: tuple[np.ndarray, ...],
+    arrays: object,
     member: int,
     k: int,
     before: np.ndarray,

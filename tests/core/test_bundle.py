@@ -24,9 +24,13 @@ RUNTIMES = sorted({kind.runtime for kind in KINDS.values() if kind.runtime} | {"
 def runtime_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder on the path, whose modules no cache remembers."""
     monkeypatch.syspath_prepend(tmp_path)
-    bundle.cache_clear()
-    bundle_module._source.cache_clear()
+    _forget()
     return tmp_path
+
+
+def _forget() -> None:
+    for cache in (bundle, bundle_module._source, bundle_module._tree, bundle_module._pieces, _runtime, _linked):
+        cache.cache_clear()
 
 
 STEP = """
@@ -163,8 +167,7 @@ def test_linked_steps_follow_what_they_link(
     names = []
     for text in (STEP, WORDY, STEP.replace("= inputs[0]", "= 2.0 * inputs[0]")):
         (runtime_folder / "linked_a_runtime.py").write_text(text)
-        for cache in (bundle, bundle_module._source, _runtime, _linked):
-            cache.cache_clear()
+        _forget()
         names.append(load_linked("softneck.loop._compiled_rows_runtime", ["linked_a_runtime"]).__name__)
     # Comments change nothing; another step is another module, although its name is the same.
     assert names[0] == names[1] != names[2]

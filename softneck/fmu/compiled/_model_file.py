@@ -14,7 +14,7 @@ import numpy as np
 from softneck.core import Matrix, SettingsError
 from softneck.runtime import Block, Port
 
-from .translate._kinds import RANKS
+from .translate._kinds import RUNTIMES, ranks_of
 
 _MAGIC = b"SNMODEL\0"
 FORMAT = 1
@@ -45,17 +45,17 @@ def node_of(runtime: str, arrays: tuple[Matrix, ...]) -> Node:
     """
     outer, _, inner = runtime.partition("(")
     pairs = [part.rpartition(":") for part in _split(inner[:-1])] if inner else []
-    if outer not in RANKS:
+    if outer not in RUNTIMES:
         raise SettingsError(
             f"`{outer}` cannot be in a compiled FMU: it is not in the table of softneck.fmu.compiled; "
             "use `--backend python`."
         )
     own = len(arrays) - sum(int(count) for _, _, count in pairs)
     ranks = tuple(array.ndim for array in arrays[: max(own, 0)])
-    if ranks != RANKS[outer]:
+    if ranks != ranks_of(outer):
         raise SettingsError(
-            f"`{outer}` has arrays of ranks {ranks} and the compiled library expects {RANKS[outer]}; "
-            "use `--backend python`, or correct the table of softneck.fmu.compiled."
+            f"`{outer}` has arrays of ranks {ranks} and the compiled library expects {ranks_of(outer)}; "
+            "use `--backend python`, or correct its declaration."
         )
     members, first = [], own
     for name, _, count in pairs:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import ast
 import hashlib
 from dataclasses import dataclass
 from functools import cache
-from importlib.util import find_spec
 from pathlib import Path
 
-from .translate._kinds import RANKS
+from softneck.runtime import bundle
+
+from .translate._kinds import RUNTIMES, ranks_of
 from .translate._translate import Unit
 from .translate._types import TranslationError
 
@@ -40,12 +40,9 @@ class Sources:
 def c_sources() -> Sources:
     """Return the C sources of the library, translated now."""
     unit, refused = Unit(), {}
-    for module, ranks in RANKS.items():
-        if find_spec(module.rpartition(".")[0]) is None or find_spec(module) is None:
-            refused[module] = "this softneck does not have it"
-            continue
+    for module in RUNTIMES:
         try:
-            unit.add(module, ranks)
+            unit.add(module, ranks_of(module))
         except TranslationError as error:
             refused[module] = str(error)
     files = {path.name: path.read_text(encoding="utf-8") for path in sorted((HERE / "c").glob("*.[ch]"))}
@@ -59,32 +56,10 @@ def sources_key() -> str:
 
     Far faster than translating: it tells whether a library that is there is still the right one.
     """
-    digest = hashlib.sha256(repr((FLAGS, sorted(RANKS.items()))).encode())
+    texts = [bundle(module, loops=False) for module in RUNTIMES]
+    digest = hashlib.sha256(repr((FLAGS, [ranks_of(module) for module in RUNTIMES], texts)).encode())
     # By name: a wheel has the packages in other folders than a checkout.
-    files = {*HERE.rglob("*.py"), *(HERE / "c").glob("*.[ch]"), *_runtime_files()}
+    files = {*HERE.rglob("*.py"), *(HERE / "c").glob("*.[ch]")}
     for path in sorted(files, key=lambda path: path.name):
         digest.update(path.name.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:32]
-
-
-def _runtime_files() -> set[Path]:
-    """Return the files of all runtimes in the table, with the runtime modules that they import."""
-    found: set[Path] = set()
-    waiting = list(RANKS)
-    while waiting:
-        path = _file_of(waiting.pop())
-        if path is None or path in found:
-            continue
-        found.add(path)
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom) and node.module and node.module.endswith("_runtime"):
-                waiting.append(node.module)
-    return found
-
-
-def _file_of(module: str) -> Path | None:
-    try:
-        spec = find_spec(module)
-    except ModuleNotFoundError:
-        return None
-    return None if spec is None or spec.origin is None else Path(spec.origin)

@@ -1,4 +1,4 @@
-"""The arrays of the linear kinds, in their runtimes' order, and what they must be."""
+"""What the numbers in the arrays of the linear kinds must be."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from softneck.core import Matrix
 
-from ..models._arrays import ArrayLayout, expect, within
+from ..models._arrays import within
 
 
 def no_base() -> dict[str, Matrix]:
@@ -17,36 +17,22 @@ def no_base() -> dict[str, Matrix]:
     return {"redefinition": np.zeros((3, 3)), "a": empty, "b": empty, "delay": np.zeros(2)}
 
 
-def _check_rls(arrays: Mapping[str, Matrix], history: float) -> None:
-    check_linear(arrays, history)
-    within(np.array([arrays["a"].shape[-1]]), 1, history, "the order")
+def check_rls(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
+    check_linear(arrays, sizes)
+    within(np.array([sizes["na"]]), 1, sizes["H"], "the order")
 
 
-def _check_oe(arrays: Mapping[str, Matrix], history: float) -> None:
-    _check_rls(arrays, history)
-    expect(arrays, "source", (1,))
+def check_oe(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
+    check_rls(arrays, sizes)
     within(arrays["source"], 0, 1, "the source")
 
 
-def _check_state_space(arrays: Mapping[str, Matrix], history: float) -> None:
-    n = arrays["A"].shape[-1]
-    for name, shape in {"A": (n, n), "B": (n, 3), "K": (n, 2), "delay": (2,)}.items():
-        expect(arrays, name, shape)
-    within(np.array([n]), 2, 2 * history, "the order")
-    within(arrays["delay"][:1], 0, history - 1, "a dead time")
+def check_state_space(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
+    within(np.array([sizes["n"]]), 2, 2 * sizes["H"], "the order")
+    within(arrays["delay"][:1], 0, sizes["H"] - 1, "a dead time")
     within(arrays["delay"][1:], 0, 1, "the source")
 
 
-def check_linear(arrays: Mapping[str, Matrix], history: float) -> None:
-    na, nb = arrays["a"].shape[-1], arrays["b"].shape[-1]
-    for name, shape in {"redefinition": (3, 3), "a": (2, na), "b": (2, nb), "delay": (2,)}.items():
-        expect(arrays, name, shape)
-    within(arrays["delay"], 0, history - nb, "a dead time")
-    within(np.array([na]), 0, history, "the order")
-
-
-RLS = ArrayLayout(("history", "drive", "redefinition", "a", "b", "delay"), _check_rls)
-# `oe` and `srivc`.
-OE = ArrayLayout(("history", "drive", "redefinition", "a", "b", "delay", "source"), _check_oe)
-# `subspace`, and what is linear over the motors or of more than one pole.
-STATE_SPACE = ArrayLayout(("history", "drive", "A", "B", "K", "delay"), _check_state_space)
+def check_linear(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
+    within(arrays["delay"], 0, sizes["H"] - sizes["nb"], "a dead time")
+    within(np.array([sizes["na"]]), 0, sizes["H"], "the order")

@@ -11,12 +11,12 @@ import numpy as np
 
 from softneck.core import KINDS, FileFormatError, Matrix, SettingsError, Vector
 from softneck.runtime import load_runtime
+from softneck.runtime._bundle import declared
+from softneck.runtime._layout import Arrays, StateVector
 
 from ._linear_systems import STATE_SPACE
 
 COMPOSED = ("residual", "ensemble")
-# As in `_histories_runtime`: u, m, y behind each other, then those of now.
-_PER_SAMPLE = 8
 
 
 def prefixed_arrays(members: list[tuple[str, Mapping[str, Matrix]]]) -> dict[str, Matrix]:
@@ -69,17 +69,15 @@ def memory_of(arrays: Mapping[str, Matrix]) -> int:
 
 def set_now(kind: str, arrays: Mapping[str, Matrix], values: Vector, m: Vector, y: Vector) -> None:
     """Write motors `m` (3,) and outputs `y` (2,) of now into a state, which a `step` has moved on."""
-    if kind not in COMPOSED:
-        now = _PER_SAMPLE * int(arrays["history"][0])
-        values[now : now + 5] = np.concatenate([m, y])
-        return
-    at = 6
-    if kind == "residual":
-        now = 5 * int(arrays["history"][0])
+    runtime = runtime_of(kind, arrays).partition("(")[0]
+    named = declared(runtime, Arrays)(list(arrays.values()))
+    parts = declared(runtime, StateVector).parts(named)
+    if "added" in parts and kind in COMPOSED:
         # The base stands where the neck does less what the set adds.
-        y = y - values[now + 5 : now + 7]
-        values[now : now + 5] = np.concatenate([m, y])
-        at = now + 13
+        y = y - values[parts["added"]]
+    if "motors" in parts:
+        values[parts["motors"]], values[parts["angles"]] = m, y
+    at = parts[list(parts)[-1]].start
     for member, part in members(arrays):
         size = load_runtime(runtime_of(member, part)).state_size(tuple(part.values()))
         set_now(member, part, values[at : at + size], m, y)

@@ -1,4 +1,4 @@
-"""The arrays of set membership, in its runtime's order, and what they must be."""
+"""What the numbers in the arrays of set membership must be."""
 
 from __future__ import annotations
 
@@ -9,22 +9,20 @@ import numpy as np
 from softneck.core import FileFormatError, Matrix, Vector
 
 from ..linear._arrays import check_linear
-from ..models._arrays import ArrayLayout, check_table, expect, within
+from ..models._arrays import check_table, within
 from ._principal_tree import is_frame, slant_nodes
 
 
-def _check_nlsm(arrays: Mapping[str, Matrix], history: float) -> None:
-    check_set(arrays, check_table(arrays["table"], history))
-    check_linear(arrays, history)
+def check_nlsm(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
+    check_set(arrays, sizes)
+    check_linear(arrays, sizes)
 
 
-def check_set(arrays: Mapping[str, Matrix], n: int) -> None:
-    rows = arrays["values"].shape[-1]
-    for name, shape in {"scale": (n,), "points": (2, n, rows), "values": (2, rows), "bounds": (2, 2)}.items():
-        expect(arrays, name, shape)
-    within(np.array([rows]), 1, np.inf, "the number of points")
+def check_set(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
+    check_table(arrays["table"], sizes["H"])
+    within(np.array([sizes["rows"]]), 1, np.inf, "the number of points")
     frame, slopes = arrays["frame"], _slopes(arrays)
-    if frame.ndim != 3 or frame.shape[::2] != (2, n) or not all(is_frame(rows) for rows in frame):
+    if not all(is_frame(rows) for rows in frame):
         raise FileFormatError("the directions in its array `frame` are not orthogonal; identify the model again.")
     parts = zip(frame, slopes, arrays["points"], arrays["values"], strict=True)
     nodes = np.array([slant_nodes(*axis) for axis in parts])
@@ -40,23 +38,3 @@ def _slopes(arrays: Mapping[str, Matrix]) -> Vector:
     if not ((slopes >= 0.0) & ((slopes < arrays["bounds"][:, 0]) | (slopes == 0.0))).all():
         raise FileFormatError("its array `nodes` is not the tree over its points; identify the model again.")
     return slopes
-
-
-NLSM = ArrayLayout(
-    (
-        "history",
-        "drive",
-        "table",
-        "scale",
-        "points",
-        "values",
-        "bounds",
-        "nodes",
-        "frame",
-        "redefinition",
-        "a",
-        "b",
-        "delay",
-    ),
-    _check_nlsm,
-)

@@ -24,15 +24,15 @@ def neck_run(
     m = start.copy()
     held = np.empty(3)
     for _ in range(settle):
-        neck_advance(neck, sample_time, start, m, x)
-        neck_sense(neck, sample_time, x)
+        neck_advance(neck, sample_time, start, m, x)  # pyright: ignore[reportArgumentType]
+        neck_sense(neck, sample_time, x)  # pyright: ignore[reportArgumentType]
     motors[0] = m
     outputs[0] = x[5:7]
     for k in range(targets.shape[0] - 1):
         for j in range(3):
             back = k + 1 - int(delay[j])
             held[j] = targets[back, j] if back >= 0 else start[j]
-        neck_advance(neck, sample_time, held, m, x)
-        neck_sense(neck, sample_time, x)
+        neck_advance(neck, sample_time, held, m, x)  # pyright: ignore[reportArgumentType]
+        neck_sense(neck, sample_time, x)  # pyright: ignore[reportArgumentType]
         motors[k + 1] = m
         outputs[k + 1] = x[5:7]

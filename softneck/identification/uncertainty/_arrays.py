@@ -1,4 +1,4 @@
-"""The own arrays of models that hold others, and what they must be."""
+"""What the numbers in the own arrays of models that hold others must be."""
 
 from __future__ import annotations
 
@@ -6,22 +6,15 @@ from collections.abc import Mapping
 
 from softneck.core import Matrix
 
-from ..models._arrays import ArrayLayout, check_table, within
+from ..models._arrays import within
 from ..set_membership._arrays import check_set
 
 
-def _check_residual(arrays: Mapping[str, Matrix], history: float) -> None:
-    n = check_table(arrays["table"], history)
+def check_residual(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
     within(arrays["table"][:, 0], 2, 3, "a regressor's source")
-    check_set(arrays, n)
+    check_set(arrays, sizes)
 
 
-def _check_ensemble(arrays: Mapping[str, Matrix], history: float) -> None:
+def check_ensemble(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
     """Nothing beyond what every composed model is checked for."""
-    del arrays, history
-
-
-RESIDUAL = ArrayLayout(
-    ("history", "memory", "table", "scale", "points", "values", "bounds", "nodes", "frame"), _check_residual
-)
-ENSEMBLE = ArrayLayout(("history", "memory"), _check_ensemble)
+    del arrays, sizes
