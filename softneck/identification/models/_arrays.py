@@ -26,9 +26,7 @@ def check_arrays(kind: str, arrays: Mapping[str, Matrix]) -> None:
     names = declared(KINDS[form].runtime, Arrays).names()
     if tuple(arrays) != names:
         raise FileFormatError(f"a model of kind {kind} has the arrays {', '.join(names)}; got {', '.join(arrays)}.")
-    sizes = _check_shapes(form, arrays)
-    within(arrays["drive"][:, 1], 0, sizes["H"], "a drive's delay")
-    resolve(KINDS[form].check)(arrays, sizes)
+    _check_numbers(form, arrays)
 
 
 def _check_composed(kind: str, arrays: Mapping[str, Matrix]) -> None:
@@ -38,20 +36,24 @@ def _check_composed(kind: str, arrays: Mapping[str, Matrix]) -> None:
         raise FileFormatError(f"a model of kind {kind} starts with the arrays {', '.join(names)}.")
     if len(parts) < 1 or (kind == "residual" and len(parts) != 1):
         raise FileFormatError(f"a model of kind {kind} cannot have {len(parts)} members.")
-    resolve(KINDS[kind].check)(own, _check_shapes(kind, own))
+    _check_numbers(kind, own)
     for member, part in parts:
         check_arrays(member, part)
 
 
-def _check_shapes(kind: str, arrays: Mapping[str, Matrix]) -> dict[str, int]:
-    """Check what the declaration of a kind says of its arrays, and return the lengths in it."""
+def _check_numbers(kind: str, arrays: Mapping[str, Matrix]) -> None:
+    """Check what the declaration of a kind says of its arrays, and what the kind's own check does."""
     for name, array in arrays.items():
         if array.dtype != np.float64 or not np.isfinite(array).all():
             raise FileFormatError(f"its array `{name}` is not of finite floats.")
     for name, what in {"history": "its history in samples", "memory": "its memory in samples"}.items():
         if name in arrays:  # before its number is a length of others
             within(arrays[name], 1, _LONGEST_HISTORY, what)
-    return declared(KINDS[kind].runtime, Arrays).lengths(arrays)
+    sizes = declared(KINDS[kind].runtime, Arrays).lengths(arrays)
+    if "drive" in arrays:
+        within(arrays["drive"][:, 1], 0, sizes["H"], "a drive's delay")
+    if KINDS[kind].check:
+        resolve(KINDS[kind].check)(arrays, sizes)
 
 
 def check_table(table: Matrix, history: int) -> None:

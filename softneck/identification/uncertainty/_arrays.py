@@ -13,8 +13,3 @@ from ..set_membership._arrays import check_set
 def check_residual(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
     within(arrays["table"][:, 0], 2, 3, "a regressor's source")
     check_set(arrays, sizes)
-
-
-def check_ensemble(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
-    """Nothing beyond what every composed model is checked for."""
-    del arrays, sizes
