@@ -197,9 +197,7 @@ def adaptive_redesign(p: AdaptiveArrays, x: AdaptiveState, axis: int, adapt: boo
     x.used[axis, 1] = math.copysign(size, gain) * lag
 
 
-def adaptive_asked(
-    p: AdaptiveArrays, parameters: np.ndarray, x: AdaptiveState, axis: int, inputs: np.ndarray
-) -> float:
+def adaptive_asked(p: AdaptiveArrays, parameters: np.ndarray, x: AdaptiveState, axis: int, inputs: np.ndarray) -> float:
     """Return what the gains in use ask for, without the integral."""
     rf = linear_reference(p, parameters, x.xf, inputs)[axis]
     ym = x.x[axis, 1 + int(p.delays[axis])]
@@ -237,7 +235,7 @@ def adaptive_push(p: AdaptiveArrays, x: AdaptiveState, axis: int, u: float, goin
     x.line[axis, 0] = x.input[axis, 2]
 
 
-def adaptive_arrays(p: AdaptiveArrays, x: AdaptiveState) -> tuple[np.ndarray, ...]:
+def adaptive_arrays(p: AdaptiveArrays, x: AdaptiveState) -> LinearArrays:
     """Return the arrays of the linear controller for a and b in use."""
     n = p.d + 2
     A, Br, By = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2)), np.zeros((2 * n, 2))
@@ -261,7 +259,9 @@ def adaptive_arrays(p: AdaptiveArrays, x: AdaptiveState) -> tuple[np.ndarray, ..
         L[o + 1, axis] = b
     # `adaptive_align` aligns: no matrix of y and v can, as it would move with the gains.
     align = np.zeros((2 * n, 4))
-    return (p.Af, p.Bf, p.Cf, p.Df, A, Br, By, C, Dr, Dy, L, align, p.rest, p.T, p.T_inverse, p.constants)
+    return (  # pyright: ignore[reportReturnType]  # a tuple is what arrays are in the bundle
+        p.Af, p.Bf, p.Cf, p.Df, A, Br, By, C, Dr, Dy, L, align, p.rest, p.T, p.T_inverse, p.constants,
+    )  # fmt: skip
 
 
 def adaptive_align(p: AdaptiveArrays, now: LinearArrays, x: AdaptiveState, y: np.ndarray) -> None:

@@ -85,7 +85,7 @@ def scheduled_blend(stacked: np.ndarray, knots: int, low: int, part: float) -> n
     return (1.0 - part) * stacked[low * rows : (low + 1) * rows] + part * stacked[high * rows : (high + 1) * rows]
 
 
-def scheduled_arrays(p: ScheduledArrays, tilt: float) -> tuple[np.ndarray, ...]:
+def scheduled_arrays(p: ScheduledArrays, tilt: float) -> LinearArrays:
     """Return the arrays of the linear controller at inclination `tilt` [rad]."""
     low, part = p.k - 1, 0.0
     for i in range(1, p.k):
@@ -93,7 +93,7 @@ def scheduled_arrays(p: ScheduledArrays, tilt: float) -> tuple[np.ndarray, ...]:
             low = i - 1
             part = max(0.0, (tilt - p.knots[low]) / (p.knots[i] - p.knots[low]))
             break
-    return (
+    return (  # pyright: ignore[reportReturnType]  # a tuple is what arrays are in the bundle
         p.Af,
         p.Bf,
         p.Cf,
