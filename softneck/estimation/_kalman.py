@@ -18,16 +18,18 @@ from softneck.signals import Recording
 
 from ._forms import NOISES, STATES
 from ._kalman_parts_runtime import (
-    KALMAN_CONSTANTS,
     KALMAN_DIVIDER,
     KALMAN_FROZEN,
     KALMAN_GATE,
+    KALMAN_LAG,
     KALMAN_LEAD,
     KALMAN_REJECTIONS,
     KALMAN_TIMEOUT,
+    KalmanArrays,
 )
 from ._offline import Estimates, filter_recording, smooth_recording
 from ._steady import steady_gains, system
+from ._steady_kalman_runtime import SteadyKalmanArrays
 
 if TYPE_CHECKING:
     from filterpy.kalman import KalmanFilter
@@ -35,8 +37,6 @@ if TYPE_CHECKING:
 
 _RUNTIME = "softneck.estimation._kalman_runtime"
 _STEADY = "softneck.estimation._steady_kalman_runtime"
-_ARRAYS = ("F", "B", "H", "first_noise", "second_noise", "P0", "PF", "sources", "constants")
-_GAINS = ("gain", "inverse_spread", "start_gain", "start_inverse_spread", "forced_gain", "forced_inverse_spread")
 _MEASURED = ("pitch", "roll")
 
 
@@ -47,8 +47,7 @@ class KalmanObserver:
     Attributes:
         form: "model", "gyro" or "kinematic".
         sample_time: [s].
-        arrays: F (n, n), B (n, 2), H (2, n), unit covariances of the two process noises (n, n), P0 (n, n) at the
-            start, PF (n, n) of a forced acceptance, sources (2, 3 or 2) and constants; with steady gains six more.
+        arrays: those of `KalmanArrays`; with steady gains those of `SteadyKalmanArrays`.
         noise: standard deviations, named and in the units of `noise_names`.
         sensor: name of the preset, "none" where the noise was given, "data" where it was estimated.
         order: of the loop it is for.
@@ -64,13 +63,18 @@ class KalmanObserver:
     gate_level: float
 
     def __post_init__(self) -> None:
-        for i, name in ((3, "first_noise"), (4, "second_noise"), (5, "P0"), (6, "PF")):
-            _require_covariance(name, self.arrays[i])
+        for name in ("first_noise", "second_noise", "P0", "PF"):
+            _require_covariance(name, getattr(self._named, name))
+
+    @property
+    def _named(self) -> KalmanArrays:
+        return KalmanArrays(self.arrays)
 
     @property
     def delays(self) -> tuple[int, int]:
         """Samples that set-points need to act on pitch and roll, beyond the first; 0 where they do not act."""
-        return (int(self.arrays[8][0]), int(self.arrays[8][1])) if self.form == "model" else (0, 0)
+        pitch, roll = self._named.constants[KALMAN_LAG : KALMAN_LAG + 2]
+        return (int(pitch), int(roll)) if self.form == "model" else (0, 0)
 
     @property
     def noise_names(self) -> tuple[str, ...]:
@@ -80,12 +84,12 @@ class KalmanObserver:
     @property
     def is_steady(self) -> bool:
         """Whether gains are constant."""
-        return len(self.arrays) > len(_ARRAYS)
+        return len(self.arrays) > len(KalmanArrays.names())
 
     @property
     def lead(self) -> float:
         """How far the estimate runs ahead of the measurement [s]: the sensor's delay."""
-        return float(self.arrays[8][KALMAN_LEAD]) * self.sample_time
+        return float(self._named.constants[KALMAN_LEAD]) * self.sample_time
 
     def with_noise(self, noise: Sequence[float], *, sensor: str = "none") -> KalmanObserver:
         """Return the same filter with other noise levels, steady gains made anew."""
@@ -93,12 +97,12 @@ class KalmanObserver:
         for (name, unit), value in zip(NOISES[self.form], levels, strict=True):
             if not (math.isfinite(value) and value > 0.0):
                 raise SettingsError(f"`{name}` must be positive [{unit}]; got {value}.")
-        bare = dataclasses.replace(self, noise=levels, sensor=sensor, arrays=self.arrays[: len(_ARRAYS)])
+        bare = dataclasses.replace(self, noise=levels, sensor=sensor, arrays=self.arrays[: len(KalmanArrays.names())])
         return bare.steady() if self.is_steady else bare
 
     def steady(self) -> KalmanObserver:
         """Return the filter with the gains that it converges to while measurements come regularly."""
-        arrays = self.arrays[: len(_ARRAYS)]
+        arrays = self.arrays[: len(KalmanArrays.names())]
         return dataclasses.replace(self, arrays=(*arrays, *steady_gains(arrays, self.noise)))
 
     def block(self) -> Block:
@@ -137,10 +141,10 @@ class KalmanObserver:
         """
         from filterpy.kalman import KalmanFilter
 
-        F, _, Q, R = system(self.arrays, self.noise)
+        F, H, Q, R = system(self.arrays, self.noise)
         kf: Any = KalmanFilter(dim_x=F.shape[0], dim_z=2, dim_u=2)
-        kf.F, kf.B, kf.H = F.copy(), self.arrays[1].copy(), self.arrays[2].copy()
-        kf.P, kf.Q, kf.R = self.arrays[5].copy(), Q, R
+        kf.F, kf.B, kf.H = F.copy(), self._named.B.copy(), H.copy()
+        kf.P, kf.Q, kf.R = self._named.P0.copy(), Q, R
         return kf
 
     def estimate(self, recording: Recording) -> Estimates:
@@ -160,7 +164,7 @@ class KalmanObserver:
 
     def summary(self) -> str:
         """Return some lines for people."""
-        n, c, d = self.arrays[0].shape[0], self.arrays[8], self.delays
+        n, c, d = len(self._named.F), self._named.constants, self.delays
         acts = f"; set-points act after {d[0] + 1} and {d[1] + 1} samples" if self.form == "model" else ""
         levels = [
             f"{name.removesuffix('_noise_std')} {math.degrees(value):.3g} {unit.replace('rad', 'deg')}"
@@ -197,29 +201,22 @@ class KalmanObserver:
             "outputs": [port.name for port in block.outputs],
             "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
         }
-        names = (*_ARRAYS, *(_GAINS if self.is_steady else ()))
-        write_archive(path, header, dict(zip(names, self.arrays, strict=True)), force=force)
+        names = SteadyKalmanArrays.names()  # of a filter without steady gains the first
+        write_archive(path, header, dict(zip(names, self.arrays, strict=False)), force=force)
 
     @classmethod
     def from_archive(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> KalmanObserver:
         """Return the observer that `save` wrote; `softneck.core.load` calls this."""
         form = str(header["form"])
-        names = (*_ARRAYS, *(_GAINS if _GAINS[0] in arrays else ()))
-        items = tuple(np.ascontiguousarray(arrays[name], dtype=np.float64) for name in names)
-        n = items[0].shape[0]
-        source = (2, 2) if form == "gyro" else (2, 3)
-        shapes = ((n, n), (n, 2), (2, n), *([(n, n)] * 4), source, (KALMAN_CONSTANTS,), *([(n, 2), (2, 2)] * 3))
-        if any(
-            item.shape != shape or not np.isfinite(item).all()
-            for item, shape in zip(items, shapes[: len(items)], strict=True)
-        ):
-            raise FileFormatError("the observer's arrays have wrong shapes or are not finite; design it again.")
+        items = (SteadyKalmanArrays if "gain" in arrays else KalmanArrays).read(arrays)
+        if items["sources"].shape[1] != (2 if form == "gyro" else 3):
+            raise FileFormatError(f"its array `sources` is not of form {form}; design the observer again.")
         levels = [float(header["noise"][name]) for name, _ in NOISES[form]]
         try:
             return cls(
                 form=form,
                 sample_time=float(header["sample_time"]),
-                arrays=items,
+                arrays=tuple(items.values()),
                 noise=(levels[0], levels[1], levels[2]),
                 sensor=str(header["sensor"]),
                 order=str(header["order"]),

@@ -1,21 +1,13 @@
-"""What both Kalman runtimes share: which measurements count, lines of past inputs, the step from filter time to now.
-
-`arrays`: F (n, n), B (n, 2), H (2, n), unit covariances of the two process noises (n, n), P0 (n, n) of the start,
-PF (n, n) added before a measurement is taken in by force, T (2, 3 or 2) from the sources to the two inputs, and the
-constants whose places stand below.
-
-The tail of the state, from its end: samples seen; rejections in a row; samples since an accepted measurement; samples
-since a new measurement; the last measured pitch and roll; repetitions of them (-1: none came yet); running mean
-square of what changes from one measurement to the next [rad^2]; log det of the last innovation covariance; the last
-gyro rates.
-"""
+"""What both Kalman runtimes share: which measurements count, lines of past inputs, the step from filter time to now."""
 
 import math
 
 import numpy as np
 
 from softneck.runtime._compiled_runtime import COMPILED
+from softneck.runtime._layout import Arrays, StateVector, array, cells, value
 
+# Places in `constants`.
 KALMAN_LAG = 0  # and 1: samples that the inputs of the two axes need to act; parts of a sample are interpolated
 KALMAN_GATE = 2  # largest normalised innovation squared
 KALMAN_REJECTIONS = 3  # in a row, then the next measurement is taken in by force
@@ -26,8 +18,6 @@ KALMAN_DIVIDER = 7  # samples of the filter per sample of the sensor
 KALMAN_FROZEN = 8  # identical measurements that mean a frozen sensor; 0: never
 KALMAN_GYRO = 9  # 1: the sources are the gyro's rates, 0: the set-points
 KALMAN_GAP = 10  # what the angle may do unseen in a sample without gyro [rad]
-KALMAN_CONSTANTS = 11
-KALMAN_TAIL = 11
 # Memory of the mean square: some 20 samples, as many as a frozen sensor needs to be told.
 KALMAN_KEEP = 0.95
 # A sensor that scatters by less than a tenth of its stated noise is a simulated one, and may well stand still.
@@ -39,119 +29,161 @@ def kalman_line_length(c: np.ndarray) -> int:
     return math.ceil(max(c[KALMAN_LAG], c[KALMAN_LAG + 1])) + 1
 
 
-def kalman_clear(c: np.ndarray, state: np.ndarray) -> None:
-    """Set the tail of a state that is zero: nothing came yet."""
-    state[-3] = c[KALMAN_TIMEOUT]
-    state[-7] = -1.0
+class KalmanArrays(Arrays):
+    """x+ = F x + B u + w, y = H x + e, where w has the covariance q1^2 first_noise + q2^2 second_noise."""
+
+    F = array("n, n", "state over one sample")
+    B = array("n, 2", "of the inputs of both axes")
+    H = array("2, n", "from state to pitch and roll")
+    first_noise = array("n, n", "unit covariance of the first process noise")
+    second_noise = array("n, n", "unit covariance of the second")
+    P0 = array("n, n", "covariance at the start")
+    PF = array("n, n", "added before a measurement is taken in by force")
+    sources = array("2, sources_in", "T: from three set-points, or two rates of the gyro, to the inputs")
+    constants = array("11", "see KALMAN_*")
+    length = value("constants", function=kalman_line_length)
 
 
-def kalman_usable(c: np.ndarray, state: np.ndarray, inputs: np.ndarray, noise: float) -> bool:
+class KalmanCounters(StateVector):
+    """What a filter remembers of its sensor, whatever it knows of the neck."""
+
+    samples = cells("", "seen so far")
+    rejected = cells("", "measurements refused in a row")
+    unheard = cells("", "samples since an accepted measurement, up to the timeout")
+    age = cells("", "samples since a new measurement")
+    pitch = cells("", "last measured [rad]")
+    roll = cells("", "last measured [rad]")
+    repeats = cells("", "of the last measurement in a row; -1: none came yet")
+    scatter = cells("", "mean square of what changes from one measurement to the next [rad^2]")
+    log_det = cells("", "of the last innovation's covariance")
+    rates = cells("2", "last of the gyro [rad/s]")
+
+
+class KalmanState(KalmanCounters):
+    """Counters, the estimate, and what the sources said."""
+
+    x = cells("n", "estimate at the filter's time")
+    lines = cells("2, length", "past inputs of each axis, in a ring: `samples` tells which is newest")
+
+
+def kalman_clear(c: np.ndarray, x: KalmanCounters) -> None:
+    """Set the counters of a state that is zero: nothing came yet."""
+    x.unheard = c[KALMAN_TIMEOUT]
+    x.repeats = -1.0
+
+
+def kalman_usable(c: np.ndarray, x: KalmanCounters, inputs: np.ndarray, noise: float) -> bool:
     """Return whether `inputs` holds a new measurement of a sensor that lives.
 
     A slower sensor's sample is often held: within its period an unchanged value is the old one.
     """
-    state[-4] += 1.0
+    x.age += 1.0
     pitch, roll = inputs[3], inputs[4]
     if not (inputs[5] > 0.5 and math.isfinite(pitch) and math.isfinite(roll)):
         return False
-    came = state[-7] >= 0.0
-    same = came and pitch == state[-5] and roll == state[-6]
-    if same and state[-4] < c[KALMAN_DIVIDER]:
+    came = x.repeats >= 0.0
+    same = came and pitch == x.pitch and roll == x.roll
+    if same and x.age < c[KALMAN_DIVIDER]:
         return False
-    state[-4] = 0.0
+    x.age = 0.0
     if same:
-        state[-7] += 1.0
+        x.repeats += 1.0
     else:
         if came:
-            change = 0.5 * ((pitch - state[-5]) ** 2 + (roll - state[-6]) ** 2)
-            state[-8] = KALMAN_KEEP * state[-8] + (1.0 - KALMAN_KEEP) * change
-        state[-7] = 0.0
-        state[-5] = pitch
-        state[-6] = roll
-    return not kalman_frozen(c, state, noise)
+            change = 0.5 * ((pitch - x.pitch) ** 2 + (roll - x.roll) ** 2)
+            x.scatter = KALMAN_KEEP * x.scatter + (1.0 - KALMAN_KEEP) * change
+        x.repeats = 0.0
+        x.pitch = pitch
+        x.roll = roll
+    return not kalman_frozen(c, x, noise)
 
 
-def kalman_frozen(c: np.ndarray, state: np.ndarray, noise: float) -> bool:
+def kalman_frozen(c: np.ndarray, x: KalmanCounters, noise: float) -> bool:
     """Return whether a sensor that used to scatter repeats itself to the last bit."""
     still = KALMAN_STILL * noise
-    return bool(c[KALMAN_FROZEN] > 0.0 and state[-7] >= c[KALMAN_FROZEN] - 1.0 and state[-8] > still * still)
+    return bool(c[KALMAN_FROZEN] > 0.0 and x.repeats >= c[KALMAN_FROZEN] - 1.0 and x.scatter > still * still)
 
 
-def kalman_push(
-    arrays: tuple[np.ndarray, ...], state: np.ndarray, inputs: np.ndarray, length: int, u: np.ndarray
-) -> bool:
+def kalman_forced(c: np.ndarray, x: KalmanCounters) -> bool:
+    """Return whether so many measurements were refused that the next is taken in whatever it says."""
+    return bool(x.rejected >= c[KALMAN_REJECTIONS])
+
+
+def kalman_count(c: np.ndarray, x: KalmanCounters, judged: bool, accepted: bool) -> None:
+    """Count rejections in a row and samples without an accepted measurement."""
+    if judged:
+        x.rejected = 0.0 if accepted else x.rejected + 1.0
+    x.unheard = 0.0 if accepted else min(x.unheard + 1.0, c[KALMAN_TIMEOUT])
+
+
+def kalman_healthy(c: np.ndarray, x: KalmanCounters, noise: float) -> bool:
+    """Return whether a measurement was accepted in time, of a sensor that lives."""
+    return bool(x.unheard < c[KALMAN_TIMEOUT] and not kalman_frozen(c, x, noise))
+
+
+def kalman_push(p: KalmanArrays, x: KalmanState, inputs: np.ndarray, u: np.ndarray) -> bool:
     """Put what the sources say now into the lines, fill `u` (2,) with what acts; return whether a gyro said nothing."""
-    T, c = arrays[7], arrays[8]
+    T, c = p.sources, p.constants
     lost = False
     if c[KALMAN_GYRO] > 0.5:
-        p, r = inputs[6], inputs[7]
+        pitch, roll = inputs[6], inputs[7]
         # Behind an invalid measurement an unchanged rate is one that the plant holds.
-        lost = not (math.isfinite(p) and math.isfinite(r))
-        lost = lost or (inputs[5] < 0.5 and state[-1] > 0.0 and p == state[-10] and r == state[-11])
+        lost = not (math.isfinite(pitch) and math.isfinite(roll))
+        lost = lost or (inputs[5] < 0.5 and x.samples > 0.0 and pitch == x.rates[0] and roll == x.rates[1])
         if not lost:
-            state[-10] = p
-            state[-11] = r
-        u[0] = T[0, 0] * state[-10] + T[0, 1] * state[-11]
-        u[1] = T[1, 0] * state[-10] + T[1, 1] * state[-11]
+            x.rates[0] = pitch
+            x.rates[1] = roll
+        u[0] = T[0, 0] * x.rates[0] + T[0, 1] * x.rates[1]
+        u[1] = T[1, 0] * x.rates[0] + T[1, 1] * x.rates[1]
     else:
         u[0] = T[0, 0] * inputs[0] + T[0, 1] * inputs[1] + T[0, 2] * inputs[2]
         u[1] = T[1, 0] * inputs[0] + T[1, 1] * inputs[1] + T[1, 2] * inputs[2]
-    first = state.shape[0] - KALMAN_TAIL - 2 * length
-    head = int(state[-1]) % length
+    newest = int(x.samples) % p.length
     for axis in range(2):
-        if state[-1] == 0.0:
+        if x.samples == 0.0:
             # Nothing is known of the past: the sources stood still.
-            state[first + axis * length : first + (axis + 1) * length] = u[axis]
-        state[first + axis * length + head] = u[axis]
-        u[axis] = kalman_lagged(state, first + axis * length, length, head, c[KALMAN_LAG + axis])
+            x.lines[axis] = u[axis]
+        x.lines[axis, newest] = u[axis]
+        u[axis] = kalman_lagged(x.lines[axis], newest, c[KALMAN_LAG + axis])
     return lost
 
 
-def kalman_lagged(state: np.ndarray, first: int, length: int, head: int, lag: float) -> float:
+def kalman_lagged(line: np.ndarray, newest: int, lag: float) -> float:
     """Return the input `lag` samples ago, between samples by a straight line; of the future the newest known."""
     if lag <= 0.0:
-        return float(state[first + head])
+        return float(line[newest])
+    length = line.shape[0]
     whole = int(lag)
     part = lag - whole
-    value = state[first + (head - whole) % length]
+    value = line[(newest - whole) % length]
     if part > 0.0:
-        value = (1.0 - part) * value + part * state[first + (head - whole - 1) % length]
+        value = (1.0 - part) * value + part * line[(newest - whole - 1) % length]
     return float(value)
 
 
-def kalman_tell(
-    arrays: tuple[np.ndarray, ...], state: np.ndarray, frozen: bool, length: int, outputs: np.ndarray
-) -> None:
+def kalman_tell(p: KalmanArrays, x: KalmanState, noise: float, outputs: np.ndarray) -> None:
     """Carry the estimate from the filter's time to now; fill all outputs but the innovation."""
-    F, B, H, c = arrays[0], arrays[1], arrays[2], arrays[8]
-    first = state.shape[0] - KALMAN_TAIL - 2 * length
-    head = int(state[-1]) % length
+    c = p.constants
+    newest = int(x.samples) % p.length
     whole = int(c[KALMAN_LEAD])
     part = c[KALMAN_LEAD] - whole
-    n = F.shape[0]
-    x = state[:n]
+    now = x.x
     u = np.empty(2)
     y0, y1 = 0.0, 0.0
     for i in range(whole + 1):
-        u[0] = kalman_lagged(state, first, length, head, c[KALMAN_LAG] - 1.0 - i)
-        u[1] = kalman_lagged(state, first + length, length, head, c[KALMAN_LAG + 1] - 1.0 - i)
+        for axis in range(2):
+            u[axis] = kalman_lagged(x.lines[axis], newest, c[KALMAN_LAG + axis] - 1.0 - i)
         if i == whole:
-            y = kalman_dot(H, x)
+            y = kalman_dot(p.H, now)
             y0, y1 = y[0], y[1]
-        x = kalman_ahead(F, x, B, u)
-    y = kalman_dot(H, x)
+        now = kalman_ahead(p.F, now, p.B, u)
+    y = kalman_dot(p.H, now)
+    # Between samples by a straight line, whose slope is the rate.
     outputs[0] = y0 + part * (y[0] - y0)
     outputs[1] = y1 + part * (y[1] - y1)
     outputs[2] = (y[0] - y0) / c[KALMAN_PERIOD]
     outputs[3] = (y[1] - y1) / c[KALMAN_PERIOD]
-    outputs[5] = 1.0 if state[-3] < c[KALMAN_TIMEOUT] and not frozen else 0.0
-
-
-def kalman_count(c: np.ndarray, state: np.ndarray, judged: bool, accepted: bool) -> None:
-    """Count rejections in a row and samples without an accepted measurement."""
-    if judged:
-        state[-2] = 0.0 if accepted else state[-2] + 1.0
-    state[-3] = 0.0 if accepted else min(state[-3] + 1.0, c[KALMAN_TIMEOUT])
+    outputs[5] = 1.0 if kalman_healthy(c, x, noise) else 0.0
 
 
 def kalman_dot(A: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -1,7 +1,6 @@
 """Kalman filter with its covariance; equations of Kalman 1960, update in the form of Joseph (Bucy and Joseph 1968).
 
-State vector: x (n,), P (n, n), lines of past inputs (2, length), tail (see `_kalman_parts_runtime`, which also tells
-what the arrays hold). The noise levels are parameters, so Q and R are built in every step.
+The noise levels are parameters, so Q and R are built in every step.
 """
 
 import math
@@ -11,48 +10,36 @@ import numpy as np
 from softneck.estimation._kalman_parts_runtime import (
     KALMAN_GAP,
     KALMAN_GATE,
-    KALMAN_REJECTIONS,
-    KALMAN_TAIL,
+    KalmanArrays,
+    KalmanState,
     kalman_ahead,
     kalman_clear,
     kalman_count,
     kalman_dot,
-    kalman_frozen,
-    kalman_line_length,
+    kalman_forced,
     kalman_push,
     kalman_tell,
     kalman_usable,
 )
 from softneck.runtime._compiled_runtime import COMPILED
+from softneck.runtime._layout import cells
 
 
-def state_size(arrays: tuple[np.ndarray, ...]) -> int:
-    """Return the length of the state vector."""
-    n = arrays[0].shape[0]
-    return n + n * n + 2 * kalman_line_length(arrays[8]) + KALMAN_TAIL
+class KalmanFullState(KalmanState):
+    """The estimate and how uncertain it is."""
+
+    P = cells("n, n", "covariance of x")
 
 
-def initialise(
-    arrays: tuple[np.ndarray, ...],
-    parameters: np.ndarray,
-    state: np.ndarray,
-    outputs: np.ndarray,
-) -> None:
+def initialise(p: KalmanArrays, parameters: np.ndarray, x: KalmanFullState, outputs: np.ndarray) -> None:
     """Start at rest, uncertain by P0, with no measurement accepted yet."""
-    n = arrays[0].shape[0]
-    state[:] = 0.0
-    state[n : n + n * n] = arrays[5].reshape(n * n)
-    kalman_clear(arrays[8], state)
+    x[:] = 0.0
+    x.P[:] = p.P0.reshape(p.n * p.n)
+    kalman_clear(p.constants, x)
     outputs[:] = 0.0
 
 
-def step(
-    arrays: tuple[np.ndarray, ...],
-    parameters: np.ndarray,
-    state: np.ndarray,
-    inputs: np.ndarray,
-    outputs: np.ndarray,
-) -> None:
+def step(p: KalmanArrays, parameters: np.ndarray, x: KalmanFullState, inputs: np.ndarray, outputs: np.ndarray) -> None:
     """Predict with the inputs that acted until now, then take in the measurement where there is a credible one.
 
     inputs: motor_setpoint_1..3, pitch_measured, roll_measured, measurement_valid; with gyro pitch_rate_measured,
@@ -60,77 +47,65 @@ def step(
     outputs: pitch, roll, pitch_rate, roll_rate, innovation, healthy.
     parameters: measurement noise and two process noises (standard deviations).
     """
-    c = arrays[8]
-    n = arrays[0].shape[0]
-    length = kalman_line_length(c)
+    c = p.constants
     u = np.empty(2)
-    lost = kalman_push(arrays, state, inputs, length, u)
-    usable = kalman_usable(c, state, inputs, parameters[0])
-    forced = state[-2] >= c[KALMAN_REJECTIONS]
-    P = state[n : n + n * n].reshape((n, n))
-    kalman_predict(arrays, parameters, state[:n], P, u)
+    lost = kalman_push(p, x, inputs, u)
+    usable = kalman_usable(c, x, inputs, parameters[0])
+    forced = kalman_forced(c, x)
+    P = x.P.reshape((p.n, p.n))
+    kalman_predict(p, parameters, x.x, P, u)
     if lost:
-        P += c[KALMAN_GAP] * c[KALMAN_GAP] * arrays[3] / arrays[3].max()
-    if state[-1] < length:
+        P += c[KALMAN_GAP] * c[KALMAN_GAP] * p.first_noise / p.first_noise.max()
+    if x.samples < p.length:
         # Inputs from before the start are still on their way: the model has no say.
-        P += arrays[5]
+        P += p.P0
     elif forced:
-        P += arrays[6]
+        P += p.PF
     innovation, accepted = 0.0, False
     if usable:
-        innovation, accepted = kalman_correct(arrays, parameters[0], state, P, inputs, forced)
-    kalman_count(c, state, usable, accepted)
-    kalman_tell(arrays, state, kalman_frozen(c, state, parameters[0]), length, outputs)
+        innovation, accepted = kalman_correct(p, parameters[0], x, P, inputs, forced)
+    kalman_count(c, x, usable, accepted)
+    kalman_tell(p, x, parameters[0], outputs)
     outputs[4] = innovation
-    state[-1] += 1.0
+    x.samples += 1.0
 
 
-def kalman_predict(
-    arrays: tuple[np.ndarray, ...], parameters: np.ndarray, x: np.ndarray, P: np.ndarray, u: np.ndarray
-) -> None:
+def kalman_predict(p: KalmanArrays, parameters: np.ndarray, x: np.ndarray, P: np.ndarray, u: np.ndarray) -> None:
     """Replace `x` by F x + B u and `P` by F P F' + Q."""
-    F, QM, QW = arrays[0], arrays[3], arrays[4]
     q1, q2 = parameters[1] * parameters[1], parameters[2] * parameters[2]
-    x[:] = kalman_ahead(F, x, arrays[1], u)
+    x[:] = kalman_ahead(p.F, x, p.B, u)
     if not COMPILED:
-        np.dot(np.dot(F, P), F.T, P)
-        P += q1 * QM
-        P += q2 * QW
+        np.dot(np.dot(p.F, P), p.F.T, P)
+        P += q1 * p.first_noise
+        P += q2 * p.second_noise
         return
-    kalman_sandwich(F, P)
-    for i in range(F.shape[0]):
-        for j in range(F.shape[0]):
-            P[i, j] += q1 * QM[i, j] + q2 * QW[i, j]
+    kalman_sandwich(p.F, P)
+    for i in range(p.n):
+        for j in range(p.n):
+            P[i, j] += q1 * p.first_noise[i, j] + q2 * p.second_noise[i, j]
 
 
 def kalman_correct(
-    arrays: tuple[np.ndarray, ...],
-    noise: float,
-    state: np.ndarray,
-    P: np.ndarray,
-    inputs: np.ndarray,
-    forced: bool,
+    p: KalmanArrays, noise: float, x: KalmanFullState, P: np.ndarray, inputs: np.ndarray, forced: bool
 ) -> tuple[float, bool]:
     """Take the measurement into x and P unless the gate refuses; return e' S^-1 e and whether it was taken in."""
-    H, c = arrays[2], arrays[8]
-    n = H.shape[1]
-    x = state[:n]
-    e = inputs[3:5] - kalman_dot(H, x)
+    e = inputs[3:5] - kalman_dot(p.H, x.x)
     e0, e1, r = float(e[0]), float(e[1]), float(noise * noise)
-    PH = kalman_columns(P, H)
-    S = kalman_columns(H, PH.T)
+    # S = H P H' + R of two outputs: written out, made symmetric, its inverse by the determinant.
+    PH = kalman_columns(P, p.H)
+    S = kalman_columns(p.H, PH.T)
     s00, s01, s11 = float(S[0, 0]) + r, 0.5 * float(S[0, 1] + S[1, 0]), float(S[1, 1]) + r
     determinant = s00 * s11 - s01 * s01
     innovation = (s11 * e0 * e0 - 2.0 * s01 * e0 * e1 + s00 * e1 * e1) / determinant
-    state[-9] = math.log(determinant)
-    if not (forced or innovation <= c[KALMAN_GATE]):
+    x.log_det = math.log(determinant)
+    if not (forced or innovation <= p.constants[KALMAN_GATE]):
         return innovation, False
     S[0, 0] = s11 / determinant
     S[1, 1] = s00 / determinant
     S[0, 1] = S[1, 0] = -s01 / determinant
     K = kalman_columns(PH, S)
-    x += kalman_dot(K, e)
-    kalman_joseph(P, K, H, r)
+    x.x[:] += kalman_dot(K, e)
+    kalman_joseph(P, K, p.H, r)
     return innovation, True
 
 

@@ -4,11 +4,13 @@ import math
 
 import numpy as np
 
-from softneck.estimation._kalman_runtime import step
+from softneck.estimation._kalman_parts_runtime import KalmanArrays
+from softneck.estimation._kalman_runtime import KalmanFullState, step
+from softneck.estimation._kalman_runtime import initialise as initialise
 
 
 def kalman_cost(
-    arrays: tuple[np.ndarray, ...], parameters: np.ndarray, state: np.ndarray, inputs: np.ndarray, start: int
+    p: KalmanArrays, parameters: np.ndarray, x: KalmanFullState, inputs: np.ndarray, start: int
 ) -> tuple[float, int]:
     """Return sum of log det S + e' S^-1 e over the measurements from row `start` on, and their number.
 
@@ -17,9 +19,10 @@ def kalman_cost(
     outputs = np.zeros(6)
     total, count = 0.0, 0
     for k in range(inputs.shape[0]):
-        state[-9] = np.nan
-        step(arrays, parameters, state, inputs[k], outputs)
-        if k >= start and not math.isnan(state[-9]):
-            total += state[-9] + outputs[4]
+        # A step that judges no measurement leaves it.
+        x.log_det = np.nan
+        step(p, parameters, x, inputs[k], outputs)
+        if k >= start and not math.isnan(x.log_det):
+            total += x.log_det + outputs[4]
             count += 1
     return total, count

@@ -12,7 +12,7 @@ from softneck.runtime import load_functions
 from softneck.signals import Recording
 
 from ._kalman import KalmanObserver
-from ._kalman_parts_runtime import KALMAN_FROZEN, KALMAN_GATE, KALMAN_REJECTIONS
+from ._kalman_parts_runtime import KALMAN_FROZEN, KALMAN_GATE, KALMAN_REJECTIONS, KalmanArrays
 from ._offline import check_recording, measured_angles, source_rows
 
 # Levels are searched within two powers of ten of where the search starts: smooth data would like none at all, and a
@@ -133,11 +133,12 @@ class _Cost:
 
     def __init__(self, observer: KalmanObserver, runs: Sequence[Recording]) -> None:
         self._functions = load_functions("softneck.estimation._likelihood_runtime")
-        constants = observer.arrays[8].copy()
+        arrays = dict(zip(KalmanArrays.names(), observer.arrays, strict=False))  # without steady gains
+        arrays["constants"] = constants = arrays["constants"].copy()
         # No gate, no force, no frozen sensor: the likelihood is of all that was measured.
         constants[KALMAN_GATE] = constants[KALMAN_REJECTIONS] = np.inf
         constants[KALMAN_FROZEN] = 0.0
-        self._arrays = (*observer.arrays[:8], constants)
+        self._arrays = tuple(arrays.values())
         self._size = int(self._functions.state_size(self._arrays))
         self._tables: list[Matrix] = []
         self.outliers = 0

@@ -17,10 +17,12 @@ from ._kalman_parts_runtime import (
     KALMAN_GAP,
     KALMAN_GATE,
     KALMAN_KEEP,
+    KALMAN_LAG,
     KALMAN_LEAD,
     KALMAN_REJECTIONS,
     KALMAN_STILL,
     KALMAN_TIMEOUT,
+    KalmanArrays,
 )
 
 _AXES = ("pitch", "roll")
@@ -162,20 +164,21 @@ def _over_runs(observer: LinearFilter, recording: Recording, *, smooth: bool) ->
 
 def _forward(observer: LinearFilter, run: Recording) -> _Pass:
     """Filter one run with filterpy."""
-    H, P0, PF, T, c = (observer.arrays[i] for i in (2, 5, 6, 7, 8))
+    p = KalmanArrays(observer.arrays)
+    H, c = p.H, p.constants
     kf: Any = observer.filterpy()
     kf.x = np.zeros((H.shape[1], 1))
     raw, lost = source_rows(observer, run)
-    passed = _Pass(sources=raw @ T.T)
+    passed = _Pass(sources=raw @ p.sources.T)
     z = measured_angles(run)
     usable, frozen = _usable(z, c, observer.noise[0])
-    gap = c[KALMAN_GAP] ** 2 * observer.arrays[3] / observer.arrays[3].max()
+    gap = c[KALMAN_GAP] ** 2 * p.first_noise / p.first_noise.max()
     length = math.ceil(max(_lags(observer))) + 1
     misses, rejections = c[KALMAN_TIMEOUT], 0
     for k in range(len(run)):
         kf.predict(_input(observer, passed.sources, k)[:, None])
         forced = rejections >= c[KALMAN_REJECTIONS]
-        kf.P = kf.P + (gap if lost[k] else 0.0) + (P0 if k < length else PF if forced else 0.0)
+        kf.P = kf.P + (gap if lost[k] else 0.0) + (p.P0 if k < length else p.PF if forced else 0.0)
         passed.prior.append(kf.x[:, 0].copy())
         passed.prior_P.append(kf.P.copy())
         nis, log_det, accepted = 0.0, 0.0, False
@@ -195,7 +198,7 @@ def _forward(observer: LinearFilter, run: Recording) -> _Pass:
 
 def _backward(observer: LinearFilter, passed: _Pass) -> tuple[Matrix, np.ndarray]:
     """Return the smoothed states (time, n) and covariances; filterpy's own smoother knows no inputs."""
-    F = observer.arrays[0]
+    F = KalmanArrays(observer.arrays).F
     x, P = np.array(passed.x), np.array(passed.P)
     for k in range(len(x) - 2, -1, -1):
         G = np.linalg.solve(passed.prior_P[k + 1], F @ P[k]).T
@@ -206,7 +209,8 @@ def _backward(observer: LinearFilter, passed: _Pass) -> tuple[Matrix, np.ndarray
 
 def _told(observer: LinearFilter, passed: _Pass, x: Matrix, P: np.ndarray, *, smooth: bool) -> tuple[np.ndarray, ...]:
     """Return angles and rates (time, 2) carried ahead by the sensor's delay, flags, aligned angles, covariances."""
-    H, c = observer.arrays[2], observer.arrays[8]
+    p = KalmanArrays(observer.arrays)
+    H, c = p.H, p.constants
     whole = int(c[KALMAN_LEAD])
     part = c[KALMAN_LEAD] - whole
     size = len(x)
@@ -221,7 +225,7 @@ def _told(observer: LinearFilter, passed: _Pass, x: Matrix, P: np.ndarray, *, sm
             ahead[0, k] = H @ x[k]
         state = x[k + kept]
         for i in range(kept + 1, whole + 2):
-            state = observer.arrays[0] @ state + observer.arrays[1] @ _input(observer, passed.sources, k, i)
+            state = p.F @ state + p.B @ _input(observer, passed.sources, k, i)
             ahead[i, k] = H @ state
     angle = ahead[whole] + part * (ahead[whole + 1] - ahead[whole])
     rate = (ahead[whole + 1] - ahead[whole]) / observer.sample_time
@@ -231,7 +235,8 @@ def _told(observer: LinearFilter, passed: _Pass, x: Matrix, P: np.ndarray, *, sm
 def _lags(observer: LinearFilter) -> tuple[float, float]:
     """Return the lags of the inputs; what a Jacobi loop adds, a recording does not have."""
     late = float(observer.order == "jacobi" and observer.form == "model")
-    return float(observer.arrays[8][0]) - late, float(observer.arrays[8][1]) - late
+    pitch, roll = KalmanArrays(observer.arrays).constants[KALMAN_LAG : KALMAN_LAG + 2]
+    return float(pitch) - late, float(roll) - late
 
 
 def _input(observer: LinearFilter, sources: Matrix, k: int, ahead: int = 0) -> Vector:

@@ -6,7 +6,7 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError
 
-from ._kalman_parts_runtime import KALMAN_DIVIDER
+from ._kalman_parts_runtime import KALMAN_DIVIDER, KalmanArrays
 
 
 def steady_covariance(arrays: tuple[Matrix, ...], noise: tuple[float, float, float]) -> Matrix:
@@ -18,7 +18,7 @@ def steady_covariance(arrays: tuple[Matrix, ...], noise: tuple[float, float, flo
 
     F, H, Q, R = system(arrays, noise)
     Fm, Qm = np.eye(F.shape[0]), np.zeros_like(Q)
-    for _ in range(int(arrays[8][KALMAN_DIVIDER])):
+    for _ in range(int(KalmanArrays(arrays).constants[KALMAN_DIVIDER])):
         Fm, Qm = F @ Fm, F @ Qm @ F.T + Q
     try:
         P = np.asarray(solve_discrete_are(Fm.T, H.T, Qm, R))
@@ -34,8 +34,8 @@ def steady_covariance(arrays: tuple[Matrix, ...], noise: tuple[float, float, flo
 
 def steady_gains(arrays: tuple[Matrix, ...], noise: tuple[float, float, float]) -> tuple[Matrix, ...]:
     """Return gain and inverse innovation covariance in steady state, at the start and by force: six matrices."""
-    P, H, R = steady_covariance(arrays, noise), arrays[2], noise[0] ** 2 * np.eye(2)
-    pairs = (gain(P, H, R), gain(P + arrays[5], H, R), gain(P + arrays[6], H, R))
+    P, p, R = steady_covariance(arrays, noise), KalmanArrays(arrays), noise[0] ** 2 * np.eye(2)
+    pairs = (gain(P, p.H, R), gain(P + p.P0, p.H, R), gain(P + p.PF, p.H, R))
     return tuple(np.ascontiguousarray(matrix) for pair in pairs for matrix in pair)
 
 
@@ -47,5 +47,6 @@ def gain(P: Matrix, H: Matrix, R: Matrix) -> tuple[Matrix, Matrix]:
 
 def system(arrays: tuple[Matrix, ...], noise: tuple[float, float, float]) -> tuple[Matrix, Matrix, Matrix, Matrix]:
     """Return F, H, Q and R of one sample."""
+    p = KalmanArrays(arrays)
     measurement, first, second = noise
-    return arrays[0], arrays[2], first**2 * arrays[3] + second**2 * arrays[4], measurement**2 * np.eye(2)
+    return p.F, p.H, first**2 * p.first_noise + second**2 * p.second_noise, measurement**2 * np.eye(2)

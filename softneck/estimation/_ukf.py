@@ -12,20 +12,11 @@ from numpy.typing import ArrayLike
 
 from softneck.core import DataError, Matrix, SettingsError, Vector, require_whole
 from softneck.identification import WARM_UP, Model
-from softneck.runtime import Block, State
+from softneck.runtime import Block, State, load_functions
+from softneck.runtime._layout import Arrays
 from softneck.signals import Recording
 
-from ._kalman_parts_runtime import (
-    KALMAN_GATE,
-    KALMAN_LEAD,
-    KALMAN_REJECTIONS,
-    KALMAN_TAIL,
-    KALMAN_TIMEOUT,
-    kalman_clear,
-    kalman_count,
-    kalman_frozen,
-    kalman_usable,
-)
+from ._kalman_parts_runtime import KALMAN_GATE, KALMAN_LEAD, KalmanCounters
 from ._offline import Estimates, measured_angles
 from ._settings import KalmanSettings
 from ._ukf_memory import LONGEST, angle_memory
@@ -34,6 +25,7 @@ from ._ukf_memory import LONGEST, angle_memory
 # it may be large without sending sigma points to where no neck ever was.
 _START_MODEL = math.radians(5.0)
 _START_OUTPUT = math.radians(40.0)
+_COUNTERS = KalmanCounters.parts(Arrays(()))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,7 +90,7 @@ class UkfObserver:
     def initial_state(self) -> State:
         """Return the state before the first row, when nothing is known."""
         values = np.zeros(self._places[-1])
-        kalman_clear(self._constants, values)
+        self._rules.kalman_clear(self._constants, values)
         return State(values, np.zeros(0), np.zeros(6))
 
     def step(self, state: State, inputs: ArrayLike) -> tuple[State, Vector]:
@@ -133,23 +125,25 @@ class UkfObserver:
                 "an unscented filter takes 6 inputs (three set-points [rad], which must be finite, pitch_measured, "
                 f"roll_measured, measurement_valid); got {given.tolist()}."
             )
-        base, x, P, past, tail = self._parts(values)
-        if tail[-1] == 0.0:
+        rules, c, noise = self._rules, self._constants, self.settings.noise[0]
+        counters, base, x, P, past = self._parts(values)
+        samples = counters[_COUNTERS["samples"]]
+        if samples == 0.0:
             base, x, P, past = self._first(given)
         past = np.vstack([past[1:], given[:3]])
-        usable = kalman_usable(self._constants, tail, given, self.settings.noise[0])
-        kf = self._predicted(base, x, P, past, widen=tail[-1] < WARM_UP or self._forced(tail))
+        usable = rules.kalman_usable(c, counters, given, noise)
+        forced = rules.kalman_forced(c, counters)
+        kf = self._predicted(base, x, P, past, widen=bool(samples < WARM_UP or forced))
         # The oldest angle leaves the states: with the last estimate of it the model moves on.
         base, _ = self._moved(base, past[:1], x[None, -4:-2])
-        innovation, accepted, log_det = self._corrected(kf, given[3:5], usable, forced=self._forced(tail))
-        kalman_count(self._constants, tail, usable, accepted)
-        tail[-1] += 1.0
-        healthy = tail[-3] < self._constants[KALMAN_TIMEOUT]
-        healthy = healthy and not kalman_frozen(self._constants, tail, self.settings.noise[0])
+        innovation, accepted, log_det = self._corrected(kf, given[3:5], usable, forced=forced)
+        rules.kalman_count(c, counters, usable, accepted)
+        samples += 1.0
+        healthy = rules.kalman_healthy(c, counters, noise)
         angle, rate = self._told(base, kf.x, past)
         H = self._H
         return UkfStep(
-            values=np.concatenate([base, kf.x, kf.P.ravel(), past.ravel(), tail]),
+            values=np.concatenate([counters, base, kf.x, kf.P.ravel(), past.ravel()]),
             outputs=np.array([*angle, *rate, innovation, float(healthy)]),
             judged=usable,
             accepted=accepted,
@@ -223,15 +217,17 @@ class UkfObserver:
         state, outputs = self._plant.run(State(base, self._parameters, np.zeros(0)), rows)
         return state.values, outputs
 
-    def _forced(self, tail: Vector) -> bool:
-        return bool(tail[-2] >= self._constants[KALMAN_REJECTIONS])
-
-    def _parts(self, values: Vector) -> tuple[Vector, Vector, Matrix, Matrix, Vector]:
-        """Return copies of the model's numbers, states, covariance, past set-points and the tail of counters."""
+    def _parts(self, values: Vector) -> tuple[Vector, Vector, Vector, Matrix, Matrix]:
+        """Return copies of the counters, the model's numbers, states, covariance and past set-points."""
         if values.size != self._places[-1]:
             raise DataError(f"the state has {values.size} numbers, this filter's {self._places[-1]}; start it anew.")
-        base, x, P, past, tail = np.split(values.copy(), self._places[:-1])
-        return base, x, P.reshape(x.size, x.size), past.reshape(-1, 3), tail
+        counters, base, x, P, past = np.split(values.copy(), self._places[:-1])
+        return counters, base, x, P.reshape(x.size, x.size), past.reshape(-1, 3)
+
+    @cached_property
+    def _rules(self) -> Any:
+        """The functions of the counters, which are those of the Kalman runtimes."""
+        return load_functions("softneck.estimation._kalman_parts_runtime", compiled=False)
 
     @cached_property
     def _plant(self) -> Block:
@@ -269,7 +265,8 @@ class UkfObserver:
     def _places(self) -> list[int]:
         """Where the parts of a state end."""
         n = 2 * self.memory + 2
-        sizes = [self._plant.initial_state().values.size, n, n * n, 3 * self._kept, KALMAN_TAIL]
+        counters = max(part.stop for part in _COUNTERS.values())
+        sizes = [counters, self._plant.initial_state().values.size, n, n * n, 3 * self._kept]
         return [int(end) for end in np.cumsum(sizes)]
 
 

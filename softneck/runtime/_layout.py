@@ -27,6 +27,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
+
 from softneck.core import FileFormatError, Matrix, SettingsError
 
 _OPERATORS: dict[type, Callable[[int, int], int]] = {
@@ -116,21 +118,35 @@ class Arrays(_Layout):
         return cls.names().index(name)
 
     @classmethod
+    def read(cls, arrays: Mapping[str, np.ndarray]) -> dict[str, Matrix]:
+        """Return a file's arrays in the order of the declaration.
+
+        Raises:
+            FileFormatError: an array whose shape does not fit the others, or whose numbers are not finite.
+        """
+        found: dict[str, Matrix] = {name: np.ascontiguousarray(arrays[name], dtype=np.float64) for name in cls.fields}
+        for name, item in found.items():
+            if not np.isfinite(item).all():
+                raise FileFormatError(f"its array `{name}` holds numbers that are not finite.")
+        cls.lengths(found)
+        return found
+
+    @classmethod
     def lengths(cls, arrays: Mapping[str, Matrix]) -> dict[str, int]:
         """Return the symbols of the shapes of `arrays`.
 
         Raises:
             FileFormatError: an array whose shape does not fit the others.
         """
-        named = Arrays.__new__(cls)
         known: dict[str, int] = {}
+        # All first: `k * n` may stand before the array that tells k.
+        for name, item in cls.fields.items():
+            for text, length in zip(item.shape, arrays[name].shape, strict=False):
+                if text.isidentifier():
+                    known.setdefault(text, length)
         for name, item in cls.fields.items():
             found = arrays[name].shape
-            setattr(named, name, arrays[name])
             if len(found) == len(item.shape):
-                for text, length in zip(item.shape, found, strict=True):
-                    if text.isidentifier():
-                        known.setdefault(text, length)
                 wanted = tuple(evaluate(text, known) for text in item.shape)
             else:
                 wanted = tuple(known.get(text, text) for text in item.shape)

@@ -1,61 +1,64 @@
-"""Two axes with cross gains, each a transfer function behind its delay, motors where they were told to be.
-
-Arrays: numerator (2, q), denominator (2, q), delay (2,), cross (2,), T (3, 3) of Eq. 9-11.
-State: random generator (6), observable form (2 q), inputs so far (2 (longest delay + 1)).
-"""
+"""Two axes with cross gains, each a transfer function behind its delay, motors where they were told to be."""
 
 import numpy as np
 
+from softneck.runtime._layout import Arrays, StateVector, array, cells, value
 from softneck.runtime._random_runtime import random_normal, random_seed
 
 
-def state_size(arrays: tuple[np.ndarray, ...]) -> int:
-    """Return the length of the state vector."""
-    return 6 + 2 * arrays[0].shape[1] + 2 * (int(arrays[2].max()) + 1)
+def linear_plant_line(delay: np.ndarray) -> int:
+    """Return how many inputs each axis keeps: those of its delay, and the one of now."""
+    return int(delay.max()) + 1
 
 
-def initialise(
-    arrays: tuple[np.ndarray, ...],
-    parameters: np.ndarray,
-    state: np.ndarray,
-    outputs: np.ndarray,
-) -> None:
+class LinearPlantArrays(Arrays):
+    """Transfer functions of pitch and roll from redefined inputs."""
+
+    numerator = array("2, q", "b of each axis, highest power first; begins with 0")
+    denominator = array("2, q", "a of each axis; begins with 1")
+    delay = array("2", "samples beyond the first until an input acts")
+    cross = array("2", "what of the other axis' input is added to an axis' own")
+    T = array("3, 3", "of Eq. 9-11: motors to redefined inputs")
+    line = value("delay", function=linear_plant_line)
+
+
+class LinearPlantState(StateVector):
+    """What each axis remembers."""
+
+    random = cells("6", "generator of the measurement noise")
+    x = cells("2, q", "observable form of each axis, its angle first [rad]; the last entry stays zero")
+    u = cells("2, line", "inputs of each axis, newest first [rad]")
+
+
+def initialise(p: LinearPlantArrays, parameters: np.ndarray, x: LinearPlantState, outputs: np.ndarray) -> None:
     """Rest: motors and angles at zero."""
-    state[:] = 0.0
-    random_seed(state[:6], parameters[1])
+    x[:] = 0.0
+    random_seed(x.random, parameters[1])
     outputs[:] = 0.0
     if parameters[0] > 0.0:
         for axis in range(2):
-            outputs[2 + axis] = parameters[0] * random_normal(state[:6])
+            outputs[2 + axis] = parameters[0] * random_normal(x.random)
 
 
 def step(
-    arrays: tuple[np.ndarray, ...],
-    parameters: np.ndarray,
-    state: np.ndarray,
-    inputs: np.ndarray,
-    outputs: np.ndarray,
+    p: LinearPlantArrays, parameters: np.ndarray, x: LinearPlantState, inputs: np.ndarray, outputs: np.ndarray
 ) -> None:
     """Advance by one sample.
 
     inputs: motor_setpoint_1..3, load_pitch, load_roll. parameters: noise_std [rad], noise_seed.
     outputs: pitch, roll, pitch_measured, roll_measured, motor_position_1..3.
     """
-    q = arrays[0].shape[1]
-    line = int(arrays[2].max()) + 1
-    tilt = np.dot(arrays[4], inputs[:3])
+    tilt = np.dot(p.T, inputs[:3])
     for axis in range(2):
-        held = state[6 + 2 * q + axis * line : 6 + 2 * q + (axis + 1) * line]
-        for j in range(line - 1, 0, -1):
-            held[j] = held[j - 1]
-        held[0] = tilt[axis] + arrays[3][axis] * tilt[1 - axis] + inputs[3 + axis]
-        x = state[6 + axis * q : 6 + (axis + 1) * q]
-        y = x[0]
-        u = held[int(arrays[2][axis])]
-        for j in range(q - 1):
-            x[j] = x[j + 1] - arrays[1][axis, j + 1] * y + arrays[0][axis, j + 1] * u
-        outputs[axis] = x[0]
-        outputs[2 + axis] = x[0]
+        for j in range(p.line - 1, 0, -1):
+            x.u[axis, j] = x.u[axis, j - 1]
+        x.u[axis, 0] = tilt[axis] + p.cross[axis] * tilt[1 - axis] + inputs[3 + axis]
+        y = x.x[axis, 0]
+        u = x.u[axis, int(p.delay[axis])]
+        for j in range(p.q - 1):
+            x.x[axis, j] = x.x[axis, j + 1] - p.denominator[axis, j + 1] * y + p.numerator[axis, j + 1] * u
+        outputs[axis] = x.x[axis, 0]
+        outputs[2 + axis] = x.x[axis, 0]
         if parameters[0] > 0.0:
-            outputs[2 + axis] += parameters[0] * random_normal(state[:6])
+            outputs[2 + axis] += parameters[0] * random_normal(x.random)
     outputs[4:7] = inputs[:3]

@@ -1,18 +1,23 @@
 """A controller's own runtime against many linear plants, one after the other, as in a loop of sequential order.
 
-Arrays: T (3, 3) of Eq. 9-11; then those of the controller. Set-points act on the plant's input one sample later than
-the angle that they were computed from was read, plus its delay; motors are where they were told to be.
+Set-points act on the plant's input one sample later than the angle that they were computed from was read, plus its
+delay; motors are where they were told to be.
 """
 
 import numpy as np
 
+from softneck.runtime._layout import Arrays, array
 from softneck.runtime._members_runtime import member_initialise, member_size, member_step
 
-OWN_ARRAYS = 1
+
+class SweepArrays(Arrays):
+    """What stands between controller and plants; the arrays of the controller follow."""
+
+    T = array("3, 3", "of Eq. 9-11: motors to redefined inputs")
 
 
 def sweep_run(
-    arrays: tuple[np.ndarray, ...],
+    p: SweepArrays,
     parameters: np.ndarray,
     start: np.ndarray,
     places: np.ndarray,
@@ -34,13 +39,13 @@ def sweep_run(
     signals: (time, 7) pitch, roll and co-contraction reference, noise of both angles, load on both plants' inputs.
     """
     n, rows, q = numerator.shape[0], signals.shape[0], numerator.shape[2]
-    state = np.empty(member_size(arrays, 0))
+    state = np.empty(member_size(p, 0))
     inputs = start.copy()
     outputs = np.zeros(outputs_at[3])
     values = np.empty(10)
     held = np.zeros(3)
     for i in range(n):
-        member_initialise(arrays, 0, parameters, state, outputs)
+        member_initialise(p, 0, parameters, state, outputs)
         x = np.zeros((2, q))
         u = np.zeros((rows, 2))
         held[:] = 0.0
@@ -54,11 +59,11 @@ def sweep_run(
             for j in range(10):
                 if places[j] >= 0:
                     inputs[places[j]] = values[j]
-            member_step(arrays, 0, parameters, state, inputs, outputs)
+            member_step(p, 0, parameters, state, inputs, outputs)
             for j in range(3):
                 held[j] = outputs[outputs_at[j]]
                 motors[i, k, j] = held[j]
-            tilt = np.dot(arrays[0], held)
+            tilt = np.dot(p.T, held)
             u[k, 0] = tilt[0] + cross[i, 0] * tilt[1] + signals[k, 5]
             u[k, 1] = tilt[1] + cross[i, 1] * tilt[0] + signals[k, 6]
             for axis in range(2):

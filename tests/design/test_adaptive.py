@@ -17,6 +17,7 @@ from softneck.core import SettingsError, load
 from softneck.design import AdaptiveSettings, LinearController, VaryingController
 from softneck.design.linear._assembly import assemble
 from softneck.design.linear._tuning import Gains
+from softneck.design.varying._adaptive_runtime import AdaptiveArrays, AdaptiveState
 from softneck.design.varying._model_following import following_axis
 from softneck.estimation import AxisPlant, LinearNeck
 from softneck.identification import Recursion
@@ -28,8 +29,7 @@ from .test_pi import POLE, TS, B, DelayedNeck, neck
 
 DEG = math.radians(1.0)
 NOMINAL = B / (1.0 - POLE)
-# Where a memory of an axis keeps what: see the runtime.
-THETA, USED = slice(0, 2), slice(12, 14)
+LEARNT = ("theta", "U", "D", "tally")
 
 
 @cache
@@ -37,16 +37,19 @@ def controller(**settings: float) -> VaryingController:
     return AdaptiveSettings(**{"lead_limit": 12.0, "start_covariance": 50.0, **settings}).design(neck())  # pyright: ignore
 
 
-def memory(block: Block, values: np.ndarray, axis: int) -> np.ndarray:
-    """The memory of an axis: the last part of the state but for the flag."""
-    size = 20 + int(block.arrays[10].max()) + 1 + 4
-    return values[values.size - 1 - (2 - axis) * size :][:size]
+def memory(block: Block, values: np.ndarray, name: str, axis: int) -> np.ndarray:
+    """What an axis remembers under `name`."""
+    return values[AdaptiveState.parts(AdaptiveArrays(block.arrays))[name]].reshape(2, -1)[axis]
+
+
+def estimated(block: Block, values: np.ndarray, axis: int) -> tuple[float, float]:
+    """Pole a and static gain that were learnt."""
+    theta = memory(block, values, "theta", axis)
+    return -theta[0], theta[1] / (1.0 + theta[0])
 
 
 def estimate(part: BlockPart, axis: int) -> tuple[float, float]:
-    """Pole a and static gain that were learnt."""
-    theta = memory(part.block, part._state, axis)[THETA]
-    return -theta[0], theta[1] / (1.0 + theta[0])
+    return estimated(part.block, part._state, axis)
 
 
 class Square:
@@ -123,7 +126,7 @@ def test_what_it_learns_is_what_the_kit_s_recursion_learns() -> None:
         dead_zone=settings.dead_zone, poles=1, pole_radius=1.0, start_covariance=1.0,
     )  # fmt: skip
     found = recursion.run(recursion.initial_state([-POLE, B]), Phi, bands[0][rows])[0].theta
-    theta = memory(part.block, part._state, 0)[THETA]
+    theta = memory(part.block, part._state, "theta", 0)
     # The same rows in the same order, filtered twice: rounding, unless a guard acted that the recursion has not.
     np.testing.assert_allclose(theta, found, rtol=1e-6)
 
@@ -165,19 +168,18 @@ def fuzz(rows: int, seed: int) -> np.ndarray:
 @given(seed=st.integers(0, 1000))
 def test_whatever_comes_the_estimate_is_in_its_box_and_gains_move_slowly(seed: int) -> None:
     block = controller(gain_rate=0.5).block()
-    box = block.arrays[9]
+    box = AdaptiveArrays(block.arrays).box
     state = block.initial_state()
-    before = [memory(block, state.values, axis)[USED].copy() for axis in range(2)]
+    before = [memory(block, state.values, "used", axis).copy() for axis in range(2)]
     for u in fuzz(120, seed):
         state, P = block.step(state, u)
         assert np.isfinite(P).all()
         for axis in range(2):
-            a, gain = -memory(block, state.values, axis)[0], 0.0
-            gain = memory(block, state.values, axis)[1] / (1.0 - a)
+            a, gain = estimated(block, state.values, axis)
             # One division and one product of rounding.
             assert box[axis, 0] * (1 - 1e-9) <= a <= box[axis, 1] * (1 + 1e-9)
             assert box[axis, 2] * (1 - 1e-9) <= gain <= box[axis, 3] * (1 + 1e-9)
-            used = memory(block, state.values, axis)[USED].copy()
+            used = memory(block, state.values, "used", axis).copy()
             lags, gains = (1.0 - used[0], 1.0 - before[axis][0]), (used[1], before[axis][1])
             assert abs(lags[0] / lags[1] - 1.0) <= 0.5 * TS * (1 + 1e-9)
             # b = gain (1 - a): both may move at once.
@@ -186,7 +188,7 @@ def test_whatever_comes_the_estimate_is_in_its_box_and_gains_move_slowly(seed: i
 
 
 def learnt(block: Block, state: State) -> np.ndarray:
-    return np.concatenate([memory(block, state.values, axis)[:12] for axis in range(2)])
+    return np.concatenate([memory(block, state.values, name, axis) for name in LEARNT for axis in range(2)])
 
 
 def test_nothing_is_learnt_at_rest_within_the_dead_zone_or_while_stopped() -> None:
@@ -206,7 +208,7 @@ def test_nothing_is_learnt_at_rest_within_the_dead_zone_or_while_stopped() -> No
 def test_an_estimate_that_predicts_worse_than_the_nominal_plant_is_dropped() -> None:
     part = BlockPart(controller(gain_range=0.8).block())
     squares(part, gain=1.7, duration=12.0)
-    a, static = estimate(part, 0)
+    _, static = estimate(part, 0)
     assert static > 1.5 * NOMINAL
     values = part._state.copy()
     # The payload is taken off: the plant is the nominal one again, and what was learnt is wrong at once.
@@ -220,8 +222,7 @@ def test_an_estimate_that_predicts_worse_than_the_nominal_plant_is_dropped() -> 
         state, P = block.step(state, np.array([*reference, *angles, *motors, 1.0, 1.0]))
         answer = plant.advance(k * TS, P)
         angles, motors = answer[:2], P
-        a, static = -memory(block, state.values, 0)[0], 0.0
-        static = memory(block, state.values, 0)[1] / (1.0 - a)
+        _, static = estimated(block, state.values, 0)
         dropped = dropped or abs(static / NOMINAL - 1.0) < 1e-9
     assert dropped
     assert static == pytest.approx(NOMINAL, rel=0.1)

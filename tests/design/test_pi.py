@@ -215,7 +215,7 @@ def test_a_damaged_controller_file_is_refused(tmp_path: Path) -> None:
     header, arrays = read_archive(tmp_path / "c.npz")
     header = {key: value for key, value in header.items() if not key.startswith("format")}
     write_archive(tmp_path / "bad.npz", header, {**arrays, "C": arrays["C"] * math.nan})
-    with pytest.raises(FileFormatError, match="wrong shapes or are not finite"):
+    with pytest.raises(FileFormatError, match="its array `C` holds numbers that are not finite"):
         load(tmp_path / "bad.npz")
 
 

@@ -69,7 +69,7 @@ def assemble(
     sample_time: float,
     tendon_angles: tuple[float, float, float],
 ) -> tuple[Matrix, ...]:
-    """Return the arrays that `_linear_parts_runtime` reads.
+    """Return the arrays of `LinearArrays`.
 
     Args:
         axes: controllers of pitch and roll.

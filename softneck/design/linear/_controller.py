@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import FileFormatError, Matrix, Vector, atomic_write, write_archive
+from softneck.core import Matrix, Vector, atomic_write, write_archive
 from softneck.runtime import Block, State
 
 from ._limits import ControllerLimits
+from ._linear_parts_runtime import LinearArrays
 from ._ports import controller_inputs, controller_outputs
 
 if TYPE_CHECKING:
@@ -22,24 +23,6 @@ if TYPE_CHECKING:
 
 
 _RUNTIME = "softneck.design.linear._linear_controller_runtime"
-_ARRAYS = (
-    "Af",
-    "Bf",
-    "Cf",
-    "Df",
-    "A",
-    "Br",
-    "By",
-    "C",
-    "Dr",
-    "Dy",
-    "L",
-    "align",
-    "rest",
-    "T",
-    "T_inverse",
-    "constants",
-)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -49,7 +32,7 @@ class LinearController:
     Attributes:
         kind: name in the table of kinds.
         sample_time: [s].
-        arrays: what the runtime reads, see `_linear_parts_runtime`.
+        arrays: those of `LinearArrays`.
         limits: of the set-points.
         order: of the loop it is for.
         design: JSON values: the settings, gains and margins by axis, for `summary` and the header.
@@ -87,15 +70,15 @@ class LinearController:
         """Return it without limits, from (pitch_reference, roll_reference, pitch, roll) to (theta_i, phi_i)."""
         import control
 
-        Af, Bf, Cf, Df, A, Br, By, C, Dr, Dy = self.arrays[:10]
-        Af, Bf, Cf, Df = Af[:2, :2], Bf[:2, :2], Cf[:2, :2], Df[:2, :2]
-        states = np.block([[Af, np.zeros((2, A.shape[0]))], [Br @ Cf, A]])
-        inputs = np.block([[Bf, np.zeros((2, 2))], [Br @ Df, By]])
+        p = LinearArrays(self.arrays)
+        Af, Bf, Cf, Df = p.Af[:2, :2], p.Bf[:2, :2], p.Cf[:2, :2], p.Df[:2, :2]
+        states = np.block([[Af, np.zeros((2, len(p.A)))], [p.Br @ Cf, p.A]])
+        inputs = np.block([[Bf, np.zeros((2, 2))], [p.Br @ Df, p.By]])
         return control.StateSpace(
             states,
             inputs,
-            np.hstack([Dr @ Cf, C]),
-            np.hstack([Dr @ Df, Dy]),
+            np.hstack([p.Dr @ Cf, p.C]),
+            np.hstack([p.Dr @ Df, p.Dy]),
             self.sample_time,
             inputs=["pitch_reference", "roll_reference", "pitch", "roll"],
             outputs=["theta_i", "phi_i"],
@@ -145,23 +128,15 @@ class LinearController:
             "outputs": [port.name for port in block.outputs],
             "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
         }
-        write_archive(path, header, dict(zip(_ARRAYS, self.arrays, strict=True)), force=force)
+        write_archive(path, header, dict(zip(LinearArrays.names(), self.arrays, strict=True)), force=force)
 
     @classmethod
     def from_archive(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> LinearController:
         """Return the controller that `save` wrote; `softneck.core.load` calls this."""
-        items = tuple(np.ascontiguousarray(arrays[name], dtype=np.float64) for name in _ARRAYS)
-        m, n = items[0].shape[0], items[4].shape[0]
-        shapes = (
-            (m, m), (m, 3), (3, m), (3, 3), (n, n), (n, 2), (n, 2), (2, n), (2, 2), (2, 2), (n, 2),
-            (n, 4), (m, 3), (3, 3), (3, 3), (1,),
-        )  # fmt: skip
-        if any(item.shape != shape or not np.isfinite(item).all() for item, shape in zip(items, shapes, strict=True)):
-            raise FileFormatError("the controller's arrays have wrong shapes or are not finite; design it again.")
         return cls(
             kind=str(header["kind"]),
             sample_time=float(header["sample_time"]),
-            arrays=items,
+            arrays=tuple(LinearArrays.read(arrays).values()),
             # Files of the first version do not know the rules for taut tendons.
             limits=ControllerLimits(
                 **{item.name: float(header[item.name]) for item in fields(ControllerLimits) if item.name in header}

@@ -5,53 +5,79 @@
 
 L = Br Dr^-1 is the conditioning technique: the state is what it would be had the reference asked for no more
 than the motors can do (Hanus, Kinnaert and Henrotte 1987, Automatica 23:729).
-
-The state vector begins with xf (m,), x (n,), set-points held (3,). Arrays: Af, Bf, Cf, Df, A, Br, By, C, Dr, Dy, L,
-align, rest, T, T_inverse, constants (sample time [s]).
 """
 
 import numpy as np
 
 from softneck.design.linear._allocation_runtime import allocate
+from softneck.runtime._layout import Arrays, StateVector, array, cells
 
 LINEAR_REFERENCE_LIMIT = 0.8
 LINEAR_MOTOR_LIMIT = 6.0
 
 
-def linear_align(arrays: tuple[np.ndarray, ...], state: np.ndarray, y: np.ndarray) -> None:
+class FilterArrays(Arrays):
+    """The reference filter, from r = (pitch, roll, co-contraction) to rf."""
+
+    Af = array("m, m", "rf = Cf xf + Df r, xf+ = Af xf + Bf r")
+    Bf = array("m, 3", "")
+    Cf = array("3, m", "")
+    Df = array("3, 3", "")
+
+
+class LinearArrays(FilterArrays):
+    """A controller from rf and y = (pitch, roll) to v = (theta_i, phi_i)."""
+
+    A = array("n, n", "v = C x + Dr rf + Dy y, x+ = A x + Br rf + By y + L (v_limited - v)")
+    Br = array("n, 2", "")
+    By = array("n, 2", "")
+    C = array("2, n", "")
+    Dr = array("2, 2", "")
+    Dy = array("2, 2", "")
+    L = array("n, 2", "conditioning")
+    align = array("n, 4", "from y and v to the state nearest to rest that asks for v")
+    rest = array("m, 3", "from r to the filter's state at rest")
+    T = array("3, 3", "of Eq. 9-11: motors to (theta_i, phi_i, delta_i)")
+    T_inverse = array("3, 3", "")
+    constants = array("1", "sample time [s]")
+
+
+class LinearState(StateVector):
+    """What every linear controller remembers; kinds add what else they do."""
+
+    xf = cells("m", "state of the reference filter")
+    x = cells("n", "state of the controller")
+    held = cells("3", "set-points held [rad]")
+    started = cells("", "1 from the first step on")
+
+
+def linear_align(p: LinearArrays, x: LinearState, y: np.ndarray) -> None:
     """Choose the state that asks for the held set-points while the reference is where the neck is: no bump."""
-    m, n = arrays[0].shape[0], arrays[4].shape[0]
-    v = np.dot(arrays[13], state[m + n : m + n + 3])
+    v = np.dot(p.T, x.held)
     known = np.empty(4)
     known[:2] = y
     known[2:] = v[:2]
     rest = np.empty(3)
     rest[:2] = y
     rest[2] = v[2]
-    state[:m] = np.dot(arrays[12], rest)
-    state[m : m + n] = np.dot(arrays[11], known)
+    x.xf[:] = np.dot(p.rest, rest)
+    x.x[:] = np.dot(p.align, known)
 
 
-def linear_control(
-    arrays: tuple[np.ndarray, ...], parameters: np.ndarray, state: np.ndarray, inputs: np.ndarray
-) -> None:
+def linear_control(p: LinearArrays, parameters: np.ndarray, x: LinearState, inputs: np.ndarray) -> None:
     """One sample of filter, controller, limits and conditioning."""
-    m, n = arrays[0].shape[0], arrays[4].shape[0]
-    xf, x, held = state[:m].copy(), state[m : m + n].copy(), state[m + n : m + n + 3]
     y = inputs[3:5]
-
     r = linear_asked(parameters, inputs)
-    rf = linear_reference(arrays, parameters, xf, inputs)
+    rf = linear_reference(p, parameters, x.xf, inputs)
     wanted = np.empty(3)
-    wanted[:2] = np.dot(arrays[7], x) + np.dot(arrays[8], rf[:2]) + np.dot(arrays[9], y)
+    wanted[:2] = np.dot(p.C, x.x) + np.dot(p.Dr, rf[:2]) + np.dot(p.Dy, y)
     wanted[2] = rf[2]
-    limits = np.array([parameters[0], parameters[2], parameters[1] * arrays[15][0], parameters[3]])
-    allocate(arrays[14], wanted, limits, inputs[5:8], held)
-
-    excess = np.dot(arrays[13], held)[:2] - wanted[:2]
-    state[:m] = np.dot(arrays[0], xf) + np.dot(arrays[1], r)
-    x = np.dot(arrays[4], x) + np.dot(arrays[5], rf[:2]) + np.dot(arrays[6], y) + np.dot(arrays[10], excess)
-    state[m : m + n] = x
+    limits = np.array([parameters[0], parameters[2], parameters[1] * p.constants[0], parameters[3]])
+    allocate(p.T_inverse, wanted, limits, inputs[5:8], x.held)
+    # What the limits took away: the controller's state moves as if it had never been asked for.
+    excess = np.dot(p.T, x.held)[:2] - wanted[:2]
+    x.xf[:] = np.dot(p.Af, x.xf) + np.dot(p.Bf, r)
+    x.x[:] = np.dot(p.A, x.x) + np.dot(p.Br, rf[:2]) + np.dot(p.By, y) + np.dot(p.L, excess)
 
 
 def linear_asked(parameters: np.ndarray, inputs: np.ndarray) -> np.ndarray:
@@ -64,8 +90,6 @@ def linear_asked(parameters: np.ndarray, inputs: np.ndarray) -> np.ndarray:
     return r
 
 
-def linear_reference(
-    arrays: tuple[np.ndarray, ...], parameters: np.ndarray, xf: np.ndarray, inputs: np.ndarray
-) -> np.ndarray:
+def linear_reference(p: FilterArrays, parameters: np.ndarray, xf: np.ndarray, inputs: np.ndarray) -> np.ndarray:
     """Return the filtered references (3,) of now."""
-    return np.dot(arrays[2], xf) + np.dot(arrays[3], linear_asked(parameters, inputs))
+    return np.dot(p.Cf, xf) + np.dot(p.Df, linear_asked(parameters, inputs))

@@ -14,8 +14,10 @@ from softneck.estimation._axis import HasTransferFunctions
 from softneck.runtime import Port
 
 from ..linear._assembly import assemble, pi_axis
+from ..linear._linear_parts_runtime import LinearArrays
 from ..linear._loop_settings import LoopSettings
 from ..linear._margins import frequencies
+from ._adaptive_runtime import AdaptiveArrays
 from ._operating_points import AXES
 from ._varying import RUNTIMES, VaryingController
 
@@ -192,20 +194,20 @@ class AdaptiveSettings(LoopSettings):
             sample_time=Ts,
             tendon_angles=self.tendon_angles,
         )
-        names = ("Af", "Bf", "Cf", "Df", "rest", "T", "T_inverse", "constants")
         guards = [
             self.forgetting, self.covariance_bound, self.dead_zone,
             max(-float(plant.denominator[1]) for plant in plants) ** (1.0 / (2.0 * self.pole_range)), self.excitation,
             math.exp(-self.band * Ts), self.distrust, min(self.gain_rate * Ts, 0.5), Ts / self.leak_time,
             min(self.start_covariance, 0.5 * self.covariance_bound),
         ]  # fmt: skip
-        return dict(zip(names, (*common[:4], *common[12:16]), strict=True)) | {
+        arrays = dict(zip(LinearArrays.names(), common, strict=True)) | {
             "nominal": np.array([[-plant.denominator[1], plant.numerator[0]] for plant in plants]),
             "box": np.array([self._box(plant) for plant in plants]),
             "delays": np.array(delays, dtype=np.float64),
             "loop": np.array(kappas),
             "guards": np.array(guards),
         }
+        return {name: arrays[name] for name in AdaptiveArrays.names()}
 
 
 def _pole(plant: AxisPlant) -> float:

@@ -13,7 +13,8 @@ from softneck.estimation import AxisPlant
 from softneck.estimation._axis import HasTransferFunctions
 from softneck.identification import Family
 
-from ..linear._assembly import assemble
+from ..linear._assembly import AxisController, assemble
+from ..linear._linear_parts_runtime import LinearArrays
 from ..linear._loop_settings import LoopSettings
 from ..linear._margins import frequencies
 from ..linear._tuning import Gains, tune_pi
@@ -21,10 +22,7 @@ from ._model_following import following_axis
 from ._operating_points import AXES, OperatingPoint, family_points, model_points
 from ._varying import RUNTIMES, VaryingController
 
-# The arrays of `assemble`, in its order, and those that follow the inclination.
-_NAMES = (
-    "Af", "Bf", "Cf", "Df", "A", "Br", "By", "C", "Dr", "Dy", "L", "align", "rest", "T", "T_inverse", "constants"
-)  # fmt: skip
+# The arrays that follow the inclination.
 _VARYING = ("A", "Br", "By", "C", "Dr", "Dy", "L", "align")
 # Between two operating points the loop is judged at so many places.
 _BETWEEN = 4
@@ -140,18 +138,21 @@ class ScheduledSettings(LoopSettings):
             for axis in range(2)
         ]
         each = [
-            assemble(
-                (pitch, roll),
-                reference_times=(self.reference_time, self.reference_time, self.reference_time),
-                sample_time=sample_time,
-                tendon_angles=self.tendon_angles,
-            )
+            dict(zip(LinearArrays.names(), self._assembled(pitch, roll, sample_time), strict=True))
             for pitch, roll in zip(*axes, strict=True)
         ]
         return {
-            name: np.vstack([arrays[i] for arrays in each]) if name in _VARYING else each[0][i]
-            for i, name in enumerate(_NAMES)
+            name: np.vstack([arrays[name] for arrays in each]) if name in _VARYING else each[0][name]
+            for name in LinearArrays.names()
         }
+
+    def _assembled(self, pitch: AxisController, roll: AxisController, sample_time: float) -> tuple[Matrix, ...]:
+        return assemble(
+            (pitch, roll),
+            reference_times=(self.reference_time, self.reference_time, self.reference_time),
+            sample_time=sample_time,
+            tendon_angles=self.tendon_angles,
+        )
 
     def _between(self, points: Sequence[OperatingPoint], gains: Sequence[Sequence[Gains]]) -> float:
         """Return the largest Ms of all frozen loops at and between the points; refuse an unstable one.

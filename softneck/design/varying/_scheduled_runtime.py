@@ -6,53 +6,71 @@ integral adds to the tilt - so a change of the inclination alone moves no motor 
 
 The inclination is that of the angles, `atan |(tan pitch, tan roll)|`, through a first-order lag: it must not change
 faster than the loop it schedules (Shamma and Athans 1990, IEEE TAC 35:898).
-
-Arrays: 0 to 3 Af, Bf, Cf, Df; 4 to 11 A, Br, By, C, Dr, Dy, L, align of all inclinations below each other; 12 to 15
-rest, T, T_inverse, constants; 16 inclinations (m,); 17 the lag's memory (1,).
-State vector: that of the linear controller without its flag, inclination, whether started.
 """
 
 import math
 
 import numpy as np
 
-from softneck.design.linear._linear_parts_runtime import linear_align, linear_control
+from softneck.design.linear._linear_parts_runtime import (
+    FilterArrays,
+    LinearArrays,
+    LinearState,
+    linear_align,
+    linear_control,
+)
 from softneck.design.linear._rest_runtime import initialise as initialise
+from softneck.runtime._layout import array, cells
 
 
-def state_size(arrays: tuple[np.ndarray, ...]) -> int:
-    """Return the length of the state vector."""
-    return arrays[0].shape[0] + arrays[4].shape[1] + 5
+class ScheduledArrays(FilterArrays):
+    """The linear controller's arrays; those that follow the inclination hold one below the other."""
+
+    A = array("k * n, n", "as of the linear controller, of every inclination")
+    Br = array("k * n, 2", "")
+    By = array("k * n, 2", "")
+    C = array("k * 2, n", "")
+    Dr = array("k * 2, 2", "")
+    Dy = array("k * 2, 2", "")
+    L = array("k * n, 2", "")
+    align = array("k * n, 4", "")
+    rest = array("m, 3", "from r to the filter's state at rest")
+    T = array("3, 3", "of Eq. 9-11: motors to (theta_i, phi_i, delta_i)")
+    T_inverse = array("3, 3", "")
+    constants = array("1", "sample time [s]")
+    knots = array("k", "inclinations, rising [rad]")
+    memory = array("1", "pole of the inclination's lag")
+
+
+class ScheduledState(LinearState):
+    """That of the linear controller, and where between the inclinations it is."""
+
+    inclination = cells("", "behind the lag [rad]")
 
 
 def step(
-    arrays: tuple[np.ndarray, ...],
-    parameters: np.ndarray,
-    state: np.ndarray,
-    inputs: np.ndarray,
-    outputs: np.ndarray,
+    p: ScheduledArrays, parameters: np.ndarray, x: ScheduledState, inputs: np.ndarray, outputs: np.ndarray
 ) -> None:
     """Compute the set-points for now, and the state for the next sample; ports as of the linear controller."""
-    m, n = arrays[0].shape[0], arrays[4].shape[1]
     active = inputs[8] > 0.5 and inputs[9] > 0.5
-    started = state[-1] > 0.5
+    started = x.started > 0.5
     if not started:
-        state[m + n : m + n + 3] = inputs[5:8]
+        x.held[:] = inputs[5:8]
     tilt = scheduled_inclination(inputs[3], inputs[4])
     if not started or not active:
         # Nothing moves: the lag has nothing to protect.
-        state[-2] = tilt
+        x.inclination = tilt
     else:
-        memory = arrays[17][0]
-        state[-2] = memory * state[-2] + (1.0 - memory) * tilt
-    now = scheduled_arrays(arrays, state[-2])
+        memory = p.memory[0]
+        x.inclination = memory * x.inclination + (1.0 - memory) * tilt
+    now = scheduled_arrays(p, x.inclination)
     if not started or not active:
-        linear_align(now, state, inputs[3:5])
-        scheduled_exactly(now, state, inputs[3:5])
-    state[-1] = 1.0
+        linear_align(now, x, inputs[3:5])
+        scheduled_exactly(now, x, inputs[3:5])
+    x.started = 1.0
     if active:
-        linear_control(now, parameters, state, inputs)
-    outputs[:] = state[m + n : m + n + 3]
+        linear_control(now, parameters, x, inputs)
+    outputs[:] = x.held
 
 
 def scheduled_inclination(pitch: float, roll: float) -> float:
@@ -67,45 +85,41 @@ def scheduled_blend(stacked: np.ndarray, knots: int, low: int, part: float) -> n
     return (1.0 - part) * stacked[low * rows : (low + 1) * rows] + part * stacked[high * rows : (high + 1) * rows]
 
 
-def scheduled_arrays(arrays: tuple[np.ndarray, ...], tilt: float) -> tuple[np.ndarray, ...]:
+def scheduled_arrays(p: ScheduledArrays, tilt: float) -> LinearArrays:
     """Return the arrays of the linear controller at inclination `tilt` [rad]."""
-    knots = arrays[16]
-    m = knots.shape[0]
-    low, part = m - 1, 0.0
-    for i in range(1, m):
-        if tilt < knots[i]:
+    low, part = p.k - 1, 0.0
+    for i in range(1, p.k):
+        if tilt < p.knots[i]:
             low = i - 1
-            part = max(0.0, (tilt - knots[low]) / (knots[i] - knots[low]))
+            part = max(0.0, (tilt - p.knots[low]) / (p.knots[i] - p.knots[low]))
             break
-    return (
-        arrays[0],
-        arrays[1],
-        arrays[2],
-        arrays[3],
-        scheduled_blend(arrays[4], m, low, part),
-        scheduled_blend(arrays[5], m, low, part),
-        scheduled_blend(arrays[6], m, low, part),
-        scheduled_blend(arrays[7], m, low, part),
-        scheduled_blend(arrays[8], m, low, part),
-        scheduled_blend(arrays[9], m, low, part),
-        scheduled_blend(arrays[10], m, low, part),
-        scheduled_blend(arrays[11], m, low, part),
-        arrays[12],
-        arrays[13],
-        arrays[14],
-        arrays[15],
+    return (  # pyright: ignore[reportReturnType]  # a tuple is what arrays are in the bundle
+        p.Af,
+        p.Bf,
+        p.Cf,
+        p.Df,
+        scheduled_blend(p.A, p.k, low, part),
+        scheduled_blend(p.Br, p.k, low, part),
+        scheduled_blend(p.By, p.k, low, part),
+        scheduled_blend(p.C, p.k, low, part),
+        scheduled_blend(p.Dr, p.k, low, part),
+        scheduled_blend(p.Dy, p.k, low, part),
+        scheduled_blend(p.L, p.k, low, part),
+        scheduled_blend(p.align, p.k, low, part),
+        p.rest,
+        p.T,
+        p.T_inverse,
+        p.constants,
     )
 
 
-def scheduled_exactly(arrays: tuple[np.ndarray, ...], state: np.ndarray, y: np.ndarray) -> None:
+def scheduled_exactly(p: LinearArrays, x: LinearState, y: np.ndarray) -> None:
     """Correct the aligned state until it asks for exactly the held set-points: a blend of alignments does not."""
-    m, n = arrays[0].shape[0], arrays[4].shape[0]
-    x = state[m : m + n]
-    v = np.dot(arrays[13], state[m + n : m + n + 3])
-    asked = np.dot(arrays[7], x) + np.dot(arrays[8], y) + np.dot(arrays[9], y)
+    v = np.dot(p.T, x.held)
+    asked = np.dot(p.C, x.x) + np.dot(p.Dr, y) + np.dot(p.Dy, y)
     for i in range(2):
-        row = arrays[7][i]
+        row = p.C[i]
         size = np.dot(row, row)
         if size > 0.0:
             # Rows of C belong to one axis each, so the other axis' answer stays.
-            x += row * ((v[i] - asked[i]) / size)
+            x.x[:] += row * ((v[i] - asked[i]) / size)

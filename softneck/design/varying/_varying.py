@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import FileFormatError, Matrix, Vector, write_archive
+from softneck.core import Matrix, Vector, write_archive
 from softneck.runtime import Block, Port, State
+from softneck.runtime._bundle import declared
+from softneck.runtime._layout import Arrays
 
 from ..linear._limits import ControllerLimits
 from ..linear._ports import controller_inputs, controller_outputs
@@ -23,7 +25,7 @@ class VaryingController:
 
     Attributes:
         kind: "scheduled" or "adaptive".
-        runtime: dotted name of the runtime module, which says what `arrays` are.
+        runtime: dotted name of the runtime module, which declares `arrays`.
         sample_time: [s].
         arrays: by name, in the runtime's order.
         limits: of the set-points.
@@ -94,14 +96,11 @@ class VaryingController:
     def from_archive(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> VaryingController:
         """Return the controller that `save` wrote; `softneck.core.load` calls this."""
         kind = str(header["kind"])
-        read = {str(name): np.ascontiguousarray(arrays[name], dtype=np.float64) for name in header["names"]}
-        if not all(np.isfinite(array).all() for array in read.values()) or not _fits(kind, read):
-            raise FileFormatError("the controller's arrays have wrong shapes or are not finite; design it again.")
         return cls(
             kind=kind,
             runtime=RUNTIMES[kind],
             sample_time=float(header["sample_time"]),
-            arrays=read,
+            arrays=declared(RUNTIMES[kind], Arrays).read(arrays),
             limits=ControllerLimits(**header["limits"]),
             order=str(header["order"]),
             parameters=tuple(Port(**port) for port in header["parameters"]),
@@ -114,30 +113,3 @@ RUNTIMES = {
     "scheduled": "softneck.design.varying._scheduled_runtime",
     "adaptive": "softneck.design.varying._adaptive_runtime",
 }
-
-
-def _fits(kind: str, arrays: Mapping[str, np.ndarray]) -> bool:
-    """Return whether the arrays fit each other as the runtime of `kind` reads them."""
-    expected = _scheduled_shapes(arrays) if kind == "scheduled" else _adaptive_shapes(arrays)
-    return {name: array.shape for name, array in arrays.items()} == expected
-
-
-def _filter_shapes(f: int) -> dict[str, tuple[int, ...]]:
-    return {"Af": (f, f), "Bf": (f, 3), "Cf": (3, f), "Df": (3, 3)}
-
-
-def _scheduled_shapes(arrays: Mapping[str, np.ndarray]) -> dict[str, tuple[int, ...]]:
-    f, n, m = arrays["Af"].shape[0], arrays["A"].shape[1], arrays["knots"].size
-    return _filter_shapes(f) | {
-        "A": (m * n, n), "Br": (m * n, 2), "By": (m * n, 2), "C": (m * 2, n), "Dr": (m * 2, 2), "Dy": (m * 2, 2),
-        "L": (m * n, 2), "align": (m * n, 4), "rest": (f, 3), "T": (3, 3), "T_inverse": (3, 3), "constants": (1,),
-        "knots": (m,), "memory": (1,),
-    }  # fmt: skip
-
-
-def _adaptive_shapes(arrays: Mapping[str, np.ndarray]) -> dict[str, tuple[int, ...]]:
-    f = arrays["Af"].shape[0]
-    return _filter_shapes(f) | {
-        "rest": (f, 3), "T": (3, 3), "T_inverse": (3, 3), "constants": (1,), "nominal": (2, 2), "box": (2, 4),
-        "delays": (2,), "loop": (2,), "guards": arrays["guards"].shape,
-    }  # fmt: skip
