@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from ._types import BOOL, FLOAT, INT, Bundle, CTypes, Scalar, TranslationError, Type, Value, lends, unified
 
 # A variable, an array of the model, or what a parameter points to; and an entry of a tuple in one.
-_PLACE = re.compile(r"(?:[a-z]\w*|\(\*\w+\)|v_arrays->arrays\[\d+\]\.v\d)(?:\.f\d+|\.f\[\d+\])*")
+_PLACE = re.compile(r"(?:[a-z]\w*|\(\*\w+\)|v_\w+->arrays\[\d+\]\.v\d)(?:\.f\d+|\.f\[\d+\])*")
 
 
 class Scope:

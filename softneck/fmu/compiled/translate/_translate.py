@@ -195,7 +195,8 @@ class _Runtime:
         """Return the C of a call of a function of this runtime; None for what is none of its own."""
         name = node.func.id if isinstance(node.func, ast.Name) else ""
         if name == "member_count" and self.has_members:
-            return Value("(int64_t)v_arrays->member_count", INT)
+            arrays = next(key for key, kind in ex.scope.variables.items() if isinstance(kind, Arrays))
+            return Value(f"(int64_t)v_{arrays}->member_count", INT)
         if name not in self.definitions:
             return None
         if node.keywords:
