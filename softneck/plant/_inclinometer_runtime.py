@@ -22,6 +22,12 @@ class InclinometerSample(StateVector):
     rates = cells("2", "pitch rate and roll rate [rad/s]")
 
 
+class InclinometerHistory(StateVector):
+    """Past samples."""
+
+    samples = cells("n, 6", "each an `InclinometerSample`, newest first")
+
+
 class InclinometerNoise(StateVector):
     """What is wrong with the sensor, and what it says."""
 
@@ -40,14 +46,15 @@ def inclinometer_store(history: np.ndarray, sample: tuple[float, float, float, f
         history[i] = sample[i]
 
 
-def inclinometer_delayed(history: np.ndarray, delay: float, sample_time: float) -> tuple[float, float, float, float]:
-    """Return (pitch, roll, pitch rate, roll rate) `delay` before the newest sample of `history` (6 n,)."""
+def inclinometer_delayed(
+    history: InclinometerHistory, delay: float, sample_time: float
+) -> tuple[float, float, float, float]:
+    """Return (pitch, roll, pitch rate, roll rate) `delay` before the newest sample."""
     steps = delay / sample_time
+    # A delay of so many samples may be off by rounding.
     whole = math.floor(steps + 1e-9)
-    new = INCLINOMETER_SAMPLE_SIZE * whole
-    old = new + INCLINOMETER_SAMPLE_SIZE
     part = max(steps - whole, 0.0)
-    return inclinometer_between(history[new:old], history[old:], part, sample_time)
+    return inclinometer_between(history.samples[whole], history.samples[whole + 1], part, sample_time)
 
 
 def inclinometer_between(

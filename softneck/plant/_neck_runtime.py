@@ -44,14 +44,20 @@ from softneck.plant._mechanics_runtime import (
 from softneck.runtime._layout import Arrays, array, cells, value
 from softneck.runtime._random_runtime import random_seed
 
+# Numbers of `setup`, in this order.
+NECK_TS = 0
+NECK_SUBSTEPS = 1
+NECK_SENT = 2
+NECK_SAMPLES = 3
+
 
 class VirtualNeckArrays(Arrays):
     """How the neck is sampled; what it is made of are its parameters."""
 
     setup = array("1, 4", "sample time [s], substeps per sample, set-points kept, sensor samples kept")
-    substeps = value("setup", 0, 1)
-    sent = value("setup", 0, 2)
-    samples = value("setup", 0, 3)
+    substeps = value("setup", 0, NECK_SUBSTEPS)
+    sent = value("setup", 0, NECK_SENT)
+    samples = value("setup", 0, NECK_SAMPLES)
 
 
 class VirtualNeckState(NeckBody):
@@ -60,7 +66,7 @@ class VirtualNeckState(NeckBody):
     random = cells("6", "generator of the sensor's noise")
     noise = cells("9", "see `InclinometerNoise`")
     queue = cells("sent, 3", "set-points, newest first [rad]")
-    history = cells("samples, 6", "see `InclinometerSample`, newest first")
+    history = cells("samples, 6", "see `InclinometerHistory`")
 
 
 def initialise(p: VirtualNeckArrays, parameters: np.ndarray, x: VirtualNeckState, outputs: np.ndarray) -> None:
@@ -87,7 +93,7 @@ def step(
     p: VirtualNeckArrays, parameters: np.ndarray, x: VirtualNeckState, inputs: np.ndarray, outputs: np.ndarray
 ) -> None:
     """Hold `inputs` for one sample time, integrate, measure."""
-    sample_time = float(p.setup[0, 0])
+    sample_time = float(p.setup[0, NECK_TS])
     neck_enqueue(x.queue, inputs, float(parameters[NECK_POSITION_LIMIT]))
     c = neck_constants(parameters)
     load = neck_load(
@@ -129,7 +135,7 @@ def neck_enqueue(queue: np.ndarray, inputs: np.ndarray, limit: float) -> None:
 
 def neck_measure(p: VirtualNeckArrays, parameters: np.ndarray, x: VirtualNeckState) -> None:
     """Take one sensor sample: delay, noise, drift, quantisation, dropout."""
-    sample_time = float(p.setup[0, 0])
+    sample_time = float(p.setup[0, NECK_TS])
     begins = 1.0 - math.exp(-sample_time * parameters[NECK_DROPOUT_RATE])
     ends = min(1.0, sample_time / parameters[NECK_DROPOUT_TIME])
     inclinometer_dropout(x.noise, x.random, begins, ends)

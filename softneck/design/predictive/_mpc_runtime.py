@@ -57,7 +57,7 @@ def mpc_bounds(
     """Fill the bounds of all rows."""
     q = p.constants
     held = theta.held
-    free = np.dot(p.E, theta)
+    free = np.dot(p.E, theta)  # pyright: ignore[reportArgumentType]  (a vector)
     move = parameters[1] * q[MPC_TS]
     for i in range(p.m):
         kind = p.kinds[i, 0]
@@ -88,9 +88,9 @@ def mpc_bounds(
 def mpc_decide(p: MpcArrays, parameters: np.ndarray, x: MpcState, inputs: np.ndarray) -> None:
     """Solve the QP, check its answer and move `held` by its first moves, or by those of the plan before."""
     theta = np.empty(MpcTheta.size(p))
-    mpc_parameter(p, x, theta)
+    mpc_parameter(p, x, theta)  # pyright: ignore[reportArgumentType]
     lower, upper, lam = np.empty(p.m), np.empty(p.m), np.zeros(p.m)
-    mpc_bounds(p, parameters, inputs[5:8], theta, lower, upper)
+    mpc_bounds(p, parameters, inputs[5:8], theta, lower, upper)  # pyright: ignore[reportArgumentType]
     z0 = np.dot(p.K, theta)
     sign = x.active.copy()
     budget = int(p.constants[MPC_BUDGET])
