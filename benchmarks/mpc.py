@@ -18,6 +18,7 @@ from scipy import sparse
 
 from softneck.core import load
 from softneck.design import MpcController, MpcSettings, NmpcSettings
+from softneck.design.predictive._mpc_state_runtime import MpcArrays
 from softneck.identification import Network
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.runtime import load_functions, load_runtime
@@ -39,7 +40,8 @@ def main() -> None:
     controller = MpcSettings(bandwidth=8.0, lead_limit=12.0).design(bake_off_neck())
     problems, whole = closed_loop(controller, options.samples)
     active = [int((row != 0.0).sum()) for *_, row in problems]
-    print(f"linear: {controller.arrays[16].shape[0]} unknowns, {controller.arrays[14].shape[0]} rows, "
+    rows, unknowns = MpcArrays(controller.arrays).A.shape
+    print(f"linear: {unknowns} unknowns, {rows} rows, "
           f"{len(problems)} samples, {np.mean(active):.1f} active limits on average")  # fmt: skip
     print(f"| {'solver':34} | median [us] | p99 [us] | largest error of z [rad] |")
     show("the controller's step, all of it", whole, math.nan)
@@ -67,25 +69,26 @@ def closed_loop(controller: MpcController, samples: int) -> tuple[QPS, list[floa
     f = load_functions(block.runtime)
     start = block.initial_state()
     x, parameters, out = start.values.copy(), start.parameters, np.zeros(3)
-    u, rng, m = np.array([port.start for port in block.inputs]), np.random.default_rng(0), len(controller.arrays[14])
+    u, rng, a = np.array([port.start for port in block.inputs]), np.random.default_rng(0), MpcArrays(controller.arrays)
+    m = len(a.kinds)
     y, line = np.zeros(2), [np.zeros(2)] * 5
     problems, times = [], []
     for k in range(samples + 100):
         if k % 25 == 0:
             u[:2], u[2] = rng.uniform(-0.55, 0.55, 2), rng.uniform(-2.0, 2.0)
         u[3:5], u[5:8] = y, out
-        shadow, held = x.copy(), out.copy()
+        shadow = x.copy()
         begin = time.perf_counter()
         step(controller.arrays, parameters, x, u, out)
         took = time.perf_counter() - begin
-        theta, low, high = np.zeros(controller.arrays[10].shape[1]), np.zeros(m), np.zeros(m)
+        theta, low, high = np.zeros(a.K.shape[1]), np.zeros(m), np.zeros(m)
         if f.mpc_begin(controller.arrays, shadow, u):
             f.mpc_parameter(controller.arrays, shadow, theta)
-            f.mpc_bounds(controller.arrays, parameters, held, u[5:8], theta, low, high)
+            f.mpc_bounds(controller.arrays, parameters, u[5:8], theta, low, high)
         if k >= 100:
             times.append(took)
             problems.append((theta, low, high, x[-m:].copy()))
-        line = [*line[1:], (controller.arrays[8] @ out)[:2]]
+        line = [*line[1:], (a.T @ out)[:2]]
         y = _POLE * y + (1.0 - _POLE) * _GAIN * line[0]
     return problems, times
 
@@ -103,19 +106,19 @@ def timed(solve: Callable[..., np.ndarray], problems: QPS) -> tuple[list[float],
 
 def cold(c: MpcController, theta: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Return daqp's answer from scratch, as the reference."""
-    sense = np.zeros(low.size, dtype=np.int32)
-    return daqp.solve(c.arrays[16], c.arrays[17] @ theta, c.arrays[11], high, low, sense, primal_tol=1e-12)[0]
+    a, sense = MpcArrays(c.arrays), np.zeros(low.size, dtype=np.int32)
+    return daqp.solve(a.H, a.F @ theta, a.A, high, low, sense, primal_tol=1e-12)[0]
 
 
 def own(c: MpcController) -> Callable[..., np.ndarray]:
     """Return the block's solver, warm."""
-    a, f = c.arrays, load_functions("softneck.design.predictive._dual_runtime")
-    sign, lam = np.zeros(len(a[14])), np.zeros(len(a[14]))
+    a, f = MpcArrays(c.arrays), load_functions("softneck.design.predictive._dual_runtime")
+    sign, lam = np.zeros(len(a.kinds)), np.zeros(len(a.kinds))
 
     def solve(theta: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        z0 = a[10] @ theta
-        f.qp_solve(a[12], a[11] @ z0, low, high, sign, lam, 1000, 1e-10, z0.size)
-        return z0 - lam @ a[15]
+        z0 = a.K @ theta
+        f.qp_solve(a.G, a.A @ z0, low, high, sign, lam, 1000, 1e-10, z0.size)
+        return z0 - lam @ a.AH
 
     return solve
 
@@ -128,12 +131,12 @@ def program(c: MpcController) -> Callable[..., np.ndarray]:
 
 def bare(c: MpcController) -> Callable[..., np.ndarray]:
     """Return daqp's persistent model alone."""
-    a, made = c.arrays, daqp.Model()
-    nz = a[16].shape[0]
-    made.setup(a[16], np.zeros(nz), a[11][nz:], np.full(len(a[14]), 1e30), np.full(len(a[14]), -1e30))
+    a, made = MpcArrays(c.arrays), daqp.Model()
+    nz = a.H.shape[0]
+    made.setup(a.H, np.zeros(nz), a.A[nz:], np.full(len(a.kinds), 1e30), np.full(len(a.kinds), -1e30))
 
     def solve(theta: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        made.update(f=a[17] @ theta, bupper=high, blower=low)
+        made.update(f=a.F @ theta, bupper=high, blower=low)
         return made.solve()[0]
 
     return solve
@@ -143,13 +146,13 @@ def osqp_solver(c: MpcController) -> Callable[..., np.ndarray]:
     """Return OSQP, warm, at its usual accuracy."""
     import osqp
 
-    a, made = c.arrays, osqp.OSQP()
-    wide = np.full(len(a[14]), 1e3)
-    made.setup(sparse.csc_matrix(np.triu(a[16])), np.zeros(a[16].shape[0]), sparse.csc_matrix(a[11]), -wide, wide,
+    a, made = MpcArrays(c.arrays), osqp.OSQP()
+    wide = np.full(len(a.kinds), 1e3)
+    made.setup(sparse.csc_matrix(np.triu(a.H)), np.zeros(a.H.shape[0]), sparse.csc_matrix(a.A), -wide, wide,
                verbose=False, eps_abs=1e-5, eps_rel=1e-5)  # fmt: skip
 
     def solve(theta: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        made.update(q=a[17] @ theta, l=low, u=high)
+        made.update(q=a.F @ theta, l=low, u=high)
         return made.solve().x
 
     return solve
@@ -157,10 +160,10 @@ def osqp_solver(c: MpcController) -> Callable[..., np.ndarray]:
 
 def casadi_daqp(c: MpcController) -> Callable[..., np.ndarray]:
     """Return CasADi's interface to daqp."""
-    a = c.arrays
-    H, A = ca.DM(a[16]), ca.DM(a[11])
+    a = MpcArrays(c.arrays)
+    H, A = ca.DM(a.H), ca.DM(a.A)
     made = ca.conic("qp", "daqp", {"h": H.sparsity(), "a": A.sparsity()})
-    return lambda theta, low, high: np.array(made(h=H, g=a[17] @ theta, a=A, lba=low, uba=high)["x"])[:, 0]
+    return lambda theta, low, high: np.array(made(h=H, g=a.F @ theta, a=A, lba=low, uba=high)["x"])[:, 0]
 
 
 SOLVERS: dict[str, Callable[[MpcController], Callable[..., np.ndarray]]] = {
@@ -174,7 +177,7 @@ SOLVERS: dict[str, Callable[[MpcController], Callable[..., np.ndarray]]] = {
 
 def lqr(c: MpcController, problems: QPS) -> list[float]:
     """Return what the unconstrained law alone takes."""
-    K = np.ascontiguousarray(c.arrays[10][:3])
+    K = np.ascontiguousarray(MpcArrays(c.arrays).K[:3])
     return timed(lambda theta, *_: K @ theta, problems)[0]
 
 
@@ -220,20 +223,20 @@ def do_mpc_times(samples: int) -> list[float]:
 
 def optimality(c: MpcController, states: int) -> None:
     """Check answers at random states, limits anywhere, against daqp from scratch at 1e-12."""
-    a, f = c.arrays, load_functions("softneck.design.predictive._mpc_runtime")
+    a, f = MpcArrays(c.arrays), load_functions("softneck.design.predictive._mpc_runtime")
     solve, parameters, rng = own(c), c.initial_state().parameters, np.random.default_rng(1)
     worst, worst_cost, active = 0.0, 0.0, []
     for _ in range(states):
-        theta = 0.15 * rng.standard_normal(a[10].shape[1])
+        theta = 0.15 * rng.standard_normal(a.K.shape[1])
         theta[-5:-2], theta[-2], theta[-1] = rng.uniform(-6.0, 6.0, 3), rng.uniform(-2.0, 2.0), 1.0
-        low, high = np.zeros(len(a[14])), np.zeros(len(a[14]))
-        f.mpc_bounds(a, parameters, theta[-5:-2].copy(), theta[-5:-2].copy(), theta, low, high)
+        low, high = np.zeros(len(a.kinds)), np.zeros(len(a.kinds))
+        f.mpc_bounds(c.arrays, parameters, theta[-5:-2].copy(), theta, low, high)
         mine, its = solve(theta, low, high), cold(c, theta, low, high)
         worst = max(worst, float(np.abs(mine - its).max()))
-        g = a[17] @ theta
-        costs = [0.5 * z @ a[16] @ z + g @ z for z in (mine, its)]
+        g = a.F @ theta
+        costs = [0.5 * z @ a.H @ z + g @ z for z in (mine, its)]
         worst_cost = max(worst_cost, (costs[0] - costs[1]) / max(1.0, abs(costs[1])))
-        values = a[11] @ mine
+        values = a.A @ mine
         active.append(int(((values > high - 1e-9) | (values < low + 1e-9)).sum()))
     print(f"optimality: {states} random states, {np.mean(active):.1f} active limits on average: moves within "
           f"{worst:.1e} rad of daqp from scratch, cost at most {worst_cost:.1e} above (relative)")  # fmt: skip

@@ -14,7 +14,9 @@ from numpy.typing import ArrayLike
 
 from softneck.core import Vector
 from softneck.runtime import State
+from softneck.runtime._layout import Arrays
 
+from ._mechanics_runtime import NeckBody
 from ._parameters import NeckParameters
 
 _GRAVITY = 9.80665
@@ -55,16 +57,17 @@ def neck_energy(state: State, *, payload: float = 0.0) -> NeckEnergy:
     """
     names = NeckParameters.names()
     p = dict(zip(names, state.parameters.tolist(), strict=False))
-    x = state.values
+    x = body(state)
     length, radius = p["link_length"], p["platform_radius"]
     carried = ((p["platform_mass"], p["platform_height"]), (payload, p["payload_height"]), (0.25 * p["link_mass"], 0.0))
     inertia = sum(m * (0.5 * length + c) ** 2 for m, c in carried) + 0.25 * p["platform_mass"] * radius**2
     mass = sum(m for m, _ in carried)
-    parts = _potentials(p, x[:3], x[8:11], x[19:22], payload)
+    parts = _potentials(p, np.append(x["b"], x["s"]), x["position"], x["free"], payload)
+    (w1, w2), (v,), (z1, z2) = x["w"], x["v"], x["z"]
     return NeckEnergy(
-        kinetic=float(0.5 * inertia * (x[3] ** 2 + x[4] ** 2) + 0.5 * mass * x[5] ** 2),
+        kinetic=float(0.5 * inertia * (w1**2 + w2**2) + 0.5 * mass * v**2),
         elastic=parts[0],
-        hysteresis=float(0.5 * p["hysteresis_torque"] / p["hysteresis_angle"] * (x[6] ** 2 + x[7] ** 2)),
+        hysteresis=float(0.5 * p["hysteresis_torque"] / p["hysteresis_angle"] * (z1**2 + z2**2)),
         tendons=parts[1],
         gravity=parts[2],
     )
@@ -94,7 +97,13 @@ def potential_energy(
 
 def free_lengths(state: State) -> Vector:
     """Return the tendons' unstretched lengths [m] at winch position zero, (3,)."""
-    return state.values[19:22].copy()
+    return body(state)["free"].copy()
+
+
+def body(state: State) -> dict[str, Vector]:
+    """Return the parts of `NeckBody`, by name."""
+    # Their lengths do not depend on any array.
+    return {name: state.values[place] for name, place in NeckBody.parts(Arrays(())).items()}
 
 
 def _potentials(p: dict[str, float], q: Vector, P: Vector, free: Vector, payload: float) -> tuple[float, float, float]:

@@ -1,8 +1,8 @@
 """The neck's differential equation: link, three tendons, three drives, attitude filter.
 
-x is (b1, b2, s, their rates w1, w2, v, hysteresis z1, z2, positions, speeds and integrals of the drives,
-filtered pitch, filtered roll), 19 numbers. Inertia is constant: that of a platform on a link bent by
-small angles, M (L0/2 + c)^2 + J; how it changes with the bend is left out, as the neck is overdamped.
+Its 19 states are the parts of `NeckBody` before the free lengths; for speed they go from function to function as a
+tuple in that order. Inertia is constant: that of a platform on a link bent by small angles, M (L0/2 + c)^2 + J; how it
+changes with the bend is left out, as the neck is overdamped.
 """
 
 import math
@@ -56,14 +56,29 @@ from softneck.plant._index_runtime import (
 )
 from softneck.plant._link_runtime import LINK_WALL_RATIO, link_elastic, link_hysteresis, link_weight
 from softneck.plant._tendon_runtime import tendon_chord, tendon_tension
+from softneck.runtime._layout import StateVector, cells
 
-NECK_ODE_SIZE = 19
 NECK_GRAVITY = 9.80665
 # Winch speed over which the gear's Coulomb friction is smoothed [rad/s]; numerical.
 NECK_GEAR_EDGE = 0.2
 # Runge-Kutta 4 is stable to 2.78 along both axes; half of that keeps the fastest modes accurate enough.
 NECK_STABLE = 1.4
 NECK_MOST_SUBSTEPS = 2000
+
+
+class NeckBody(StateVector):
+    """The 19 continuous states, in the order of `neck_rates`, and the tendons' lengths, which stay."""
+
+    b = cells("2", "bending vector, towards where the neck leans [rad]")
+    s = cells("", "compression of the link [m]")
+    w = cells("2", "rates of b [rad/s]")
+    v = cells("", "rate of s [m/s]")
+    z = cells("2", "hysteresis [rad]")
+    position = cells("3", "of the winches [rad]")
+    speed = cells("3", "of the winches [rad/s]")
+    integral = cells("3", "of the drives' speed loops: torque at the winch [N m]")
+    filtered = cells("2", "pitch and roll behind the attitude filter [rad]")
+    free = cells("3", "unstretched lengths of the tendons at winch position zero [m]")
 
 
 def neck_constants(q: np.ndarray) -> tuple:
@@ -150,7 +165,7 @@ def neck_rates(
     c: tuple,
     load: tuple,
 ) -> tuple:
-    """Return the time derivatives of the 19 continuous states."""
+    """Return the time derivatives of the 19 states."""
     b1, b2, s, w1, w2, v, z1, z2, p1, p2, p3, o1, o2, o3, i1, i2, i3, f1, f2 = x
     link, hysteresis, _, geometry, directions, drive, rest = c
     winch = rest[0]
@@ -207,14 +222,19 @@ def neck_pull(
     return at_winch, -at_platform * g1, -at_platform * g2, -at_platform * gs
 
 
-def neck_tensions(x: tuple, free: tuple[float, float, float], c: tuple) -> tuple[float, float, float]:
+def neck_tensions(x: NeckBody, c: tuple) -> tuple[float, float, float]:
     """Return the three tensions at the winches [N]."""
-    body = (x[0], x[1], x[2], x[3], x[4], x[5])
-    f = bend_functions(x[0] * x[0] + x[1] * x[1])
-    t1, _, _, _ = neck_pull(body, f, c[4][0], x[8], x[11], free[0], c)
-    t2, _, _, _ = neck_pull(body, f, c[4][1], x[9], x[12], free[1], c)
-    t3, _, _, _ = neck_pull(body, f, c[4][2], x[10], x[13], free[2], c)
+    body = (x.b[0], x.b[1], x.s, x.w[0], x.w[1], x.v)
+    f = bend_functions(x.b[0] * x.b[0] + x.b[1] * x.b[1])
+    t1, _, _, _ = neck_pull(body, f, c[4][0], x.position[0], x.speed[0], x.free[0], c)
+    t2, _, _, _ = neck_pull(body, f, c[4][1], x.position[1], x.speed[1], x.free[1], c)
+    t3, _, _, _ = neck_pull(body, f, c[4][2], x.position[2], x.speed[2], x.free[2], c)
     return t1, t2, t3
+
+
+def neck_lean(x: NeckBody, load: tuple) -> tuple[float, float, float, float]:
+    """Return (pitch, roll, pitch rate, roll rate) against the vertical."""
+    return lean_angles((x.b[0], x.b[1], x.w[0], x.w[1]), bend_functions(x.b[0] * x.b[0] + x.b[1] * x.b[1]), load[2])
 
 
 def neck_rest(q: np.ndarray, c: tuple) -> tuple[float, float, float, float, float, float]:

@@ -1,23 +1,15 @@
-"""The virtual neck as a runtime: state vector, equilibrium at rest, one sample by classical Runge-Kutta.
-
-State: 19 continuous numbers (bending and compression, their rates, hysteresis, positions, speeds and
-integrals of the drives, attitude filter), the tendons' free lengths at rest, the random generator, the
-sensor's noise, past set-points and past sensor samples.
-`arrays[0]` is (sample time [s], substeps per sample, set-points kept, sensor samples kept).
-"""
+"""The virtual neck as a runtime: equilibrium at rest, one sample by classical Runge-Kutta."""
 
 import math
 
 import numpy as np
 
-from softneck.plant._geometry_runtime import bend_functions, lean_angles
 from softneck.plant._inclinometer_runtime import (
-    INCLINOMETER_NOISE_SIZE,
-    INCLINOMETER_SAMPLE_SIZE,
     inclinometer_delayed,
     inclinometer_dropout,
     inclinometer_measure,
     inclinometer_round,
+    inclinometer_shown,
     inclinometer_start,
     inclinometer_store,
 )
@@ -40,90 +32,97 @@ from softneck.plant._index_runtime import (
     NECK_WINCH_RADIUS,
 )
 from softneck.plant._mechanics_runtime import (
-    NECK_ODE_SIZE,
+    NeckBody,
     neck_constants,
+    neck_lean,
     neck_load,
     neck_rates,
     neck_rest,
     neck_substeps,
     neck_tensions,
 )
-from softneck.runtime._random_runtime import RANDOM_SIZE, random_seed
+from softneck.runtime._layout import Arrays, array, cells, value
+from softneck.runtime._random_runtime import random_seed
 
-NECK_FREE = 19
-NECK_RANDOM = 22
-NECK_NOISE = 28
-NECK_QUEUE = 37
-
-
-def state_size(arrays: tuple[np.ndarray, ...]) -> int:
-    """Return the length of the state vector."""
-    return NECK_QUEUE + 3 * int(arrays[0][0, 2]) + INCLINOMETER_SAMPLE_SIZE * int(arrays[0][0, 3])
+# Numbers of `setup`, in this order.
+NECK_TS = 0
+NECK_SUBSTEPS = 1
+NECK_SENT = 2
+NECK_SAMPLES = 3
 
 
-def initialise(arrays: tuple[np.ndarray, ...], parameters: np.ndarray, state: np.ndarray, outputs: np.ndarray) -> None:
-    """Fill `state` and `outputs` with the neck at rest: set-points zero, tendons at their pretension."""
-    setup = arrays[0][0]
-    state[:] = 0.0
+class VirtualNeckArrays(Arrays):
+    """How the neck is sampled; what it is made of are its parameters."""
+
+    setup = array("1, 4", "sample time [s], substeps per sample, set-points kept, sensor samples kept")
+    substeps = value("setup", 0, NECK_SUBSTEPS)
+    sent = value("setup", 0, NECK_SENT)
+    samples = value("setup", 0, NECK_SAMPLES)
+
+
+class VirtualNeckState(NeckBody):
+    """The body, and what drives and inclinometer keep of the past."""
+
+    random = cells("6", "generator of the sensor's noise")
+    noise = cells("9", "see `InclinometerNoise`")
+    queue = cells("sent, 3", "set-points, newest first [rad]")
+    history = cells("samples, 6", "see `InclinometerHistory`")
+
+
+def initialise(p: VirtualNeckArrays, parameters: np.ndarray, x: VirtualNeckState, outputs: np.ndarray) -> None:
+    """Fill `x` and `outputs` with the neck at rest: set-points zero, tendons at their pretension."""
+    x[:] = 0.0
     c = neck_constants(parameters)
-    b1, b2, s, free1, free2, free3 = neck_rest(parameters, c)
-    state[0] = b1
-    state[1] = b2
-    state[2] = s
+    x.b[0], x.b[1], x.s, x.free[0], x.free[1], x.free[2] = neck_rest(parameters, c)
     for i in range(3):
-        state[14 + i] = parameters[NECK_WINCH_RADIUS] * parameters[NECK_PRETENSION]
-    state[NECK_FREE] = free1
-    state[NECK_FREE + 1] = free2
-    state[NECK_FREE + 2] = free3
+        # What a drive needs to hold its tendon's pretension.
+        x.integral[i] = parameters[NECK_WINCH_RADIUS] * parameters[NECK_PRETENSION]
     load = neck_load(parameters, 0.0, 0.0, 0.0, 0.0, 0.0)
-    lean = lean_angles((b1, b2, 0.0, 0.0), bend_functions(b1 * b1 + b2 * b2), load[2])
-    state[17] = lean[0]
-    state[18] = lean[1]
-    history = state[NECK_QUEUE + 3 * int(setup[2]) :]
-    for _ in range(int(setup[3])):
-        inclinometer_store(history, (lean[0], lean[1], 0.0, 0.0, 0.0, 0.0))
-    generator = state[NECK_RANDOM : NECK_RANDOM + RANDOM_SIZE]
-    random_seed(generator, parameters[NECK_NOISE_SEED])
-    noise = state[NECK_NOISE : NECK_NOISE + INCLINOMETER_NOISE_SIZE]
-    inclinometer_start(noise, generator, parameters[NECK_DRIFT_STD], parameters[NECK_RATE_BIAS_STD])
-    neck_measure(setup, parameters, state)
-    neck_outputs(parameters, state, c, load, outputs)
+    lean = neck_lean(x, load)
+    x.filtered[0] = lean[0]
+    x.filtered[1] = lean[1]
+    for _ in range(p.samples):
+        inclinometer_store(x.history, (lean[0], lean[1], 0.0, 0.0, 0.0, 0.0))
+    random_seed(x.random, parameters[NECK_NOISE_SEED])
+    inclinometer_start(x.noise, x.random, parameters[NECK_DRIFT_STD], parameters[NECK_RATE_BIAS_STD])
+    neck_measure(p, parameters, x)
+    neck_outputs(parameters, x, c, load, outputs)
 
 
 def step(
-    arrays: tuple[np.ndarray, ...],
-    parameters: np.ndarray,
-    state: np.ndarray,
-    inputs: np.ndarray,
-    outputs: np.ndarray,
+    p: VirtualNeckArrays, parameters: np.ndarray, x: VirtualNeckState, inputs: np.ndarray, outputs: np.ndarray
 ) -> None:
     """Hold `inputs` for one sample time, integrate, measure."""
-    setup = arrays[0][0]
-    sample_time = float(setup[0])
-    queue = state[NECK_QUEUE : NECK_QUEUE + 3 * int(setup[2])]
-    neck_enqueue(queue, inputs, float(parameters[NECK_POSITION_LIMIT]))
+    sample_time = float(p.setup[0, NECK_TS])
+    neck_enqueue(x.queue, inputs, float(parameters[NECK_POSITION_LIMIT]))
     c = neck_constants(parameters)
     load = neck_load(
         parameters, float(inputs[3]), float(inputs[4]), float(inputs[5]), float(inputs[6]), float(inputs[7])
     )
-    free = (float(state[NECK_FREE]), float(state[NECK_FREE + 1]), float(state[NECK_FREE + 2]))
-    count = neck_substeps(c, load, sample_time, int(setup[1]))
+    free = (float(x.free[0]), float(x.free[1]), float(x.free[2]))
+    count = neck_substeps(c, load, sample_time, p.substeps)
     h = sample_time / count
     latency = float(parameters[NECK_DRIVE_LATENCY])
-    x = neck_read(state)
+    moving = neck_read(x)
     for i in range(count):
-        age = 3 * max(0, math.ceil((latency - i * h) / sample_time - 1e-9))
-        command = (float(queue[age]), float(queue[age + 1]), float(queue[age + 2]))
-        x = neck_runge_kutta(x, h, command, free, c, load)
-    neck_write(state, x)
-    lean = lean_angles((x[0], x[1], x[3], x[4]), bend_functions(x[0] * x[0] + x[1] * x[1]), load[2])
+        age = max(0, math.ceil((latency - i * h) / sample_time - 1e-9))
+        command = (float(x.queue[age, 0]), float(x.queue[age, 1]), float(x.queue[age, 2]))
+        moving = neck_runge_kutta(moving, h, command, free, c, load)
+    neck_write(x, moving)
+    neck_sense(p, parameters, x, c, load, outputs)
+
+
+def neck_sense(
+    p: VirtualNeckArrays, parameters: np.ndarray, x: VirtualNeckState, c: tuple, load: tuple, outputs: np.ndarray
+) -> None:
+    """Let the inclinometer see where the neck is now, and fill `outputs`."""
+    lean = neck_lean(x, load)
     lag = float(parameters[NECK_SENSOR_LAG])
-    history = state[NECK_QUEUE + 3 * int(setup[2]) :]
-    slope1 = (lean[0] - x[17]) / lag
-    slope2 = (lean[1] - x[18]) / lag
-    inclinometer_store(history, (x[17], x[18], slope1, slope2, lean[2], lean[3]))
-    neck_measure(setup, parameters, state)
-    neck_outputs(parameters, state, c, load, outputs)
+    slope1 = (lean[0] - x.filtered[0]) / lag
+    slope2 = (lean[1] - x.filtered[1]) / lag
+    inclinometer_store(x.history, (x.filtered[0], x.filtered[1], slope1, slope2, lean[2], lean[3]))
+    neck_measure(p, parameters, x)
+    neck_outputs(parameters, x, c, load, outputs)
 
 
 def neck_enqueue(queue: np.ndarray, inputs: np.ndarray, limit: float) -> None:
@@ -134,15 +133,12 @@ def neck_enqueue(queue: np.ndarray, inputs: np.ndarray, limit: float) -> None:
         queue[i] = min(max(float(inputs[i]), -limit), limit)
 
 
-def neck_measure(setup: np.ndarray, parameters: np.ndarray, state: np.ndarray) -> None:
+def neck_measure(p: VirtualNeckArrays, parameters: np.ndarray, x: VirtualNeckState) -> None:
     """Take one sensor sample: delay, noise, drift, quantisation, dropout."""
-    sample_time = float(setup[0])
-    generator = state[NECK_RANDOM : NECK_RANDOM + RANDOM_SIZE]
-    noise = state[NECK_NOISE : NECK_NOISE + INCLINOMETER_NOISE_SIZE]
-    history = state[NECK_QUEUE + 3 * int(setup[2]) :]
+    sample_time = float(p.setup[0, NECK_TS])
     begins = 1.0 - math.exp(-sample_time * parameters[NECK_DROPOUT_RATE])
     ends = min(1.0, sample_time / parameters[NECK_DROPOUT_TIME])
-    inclinometer_dropout(noise, generator, begins, ends)
+    inclinometer_dropout(x.noise, x.random, begins, ends)
     keep = math.exp(-sample_time / parameters[NECK_DRIFT_TIME])
     settings = (
         float(parameters[NECK_DRIFT_STD]),
@@ -153,51 +149,40 @@ def neck_measure(setup: np.ndarray, parameters: np.ndarray, state: np.ndarray) -
         float(parameters[NECK_RATE_NOISE_STD]),
         float(parameters[NECK_NOISE_QUANTUM]),
     )
-    arrived = inclinometer_delayed(history, float(parameters[NECK_SENSOR_DELAY]), sample_time)
-    inclinometer_measure(arrived, noise, generator, settings)
+    arrived = inclinometer_delayed(x.history, float(parameters[NECK_SENSOR_DELAY]), sample_time)
+    inclinometer_measure(arrived, x.noise, x.random, settings)
 
 
-def neck_outputs(
-    parameters: np.ndarray,
-    state: np.ndarray,
-    c: tuple,
-    load: tuple,
-    outputs: np.ndarray,
-) -> None:
+def neck_outputs(parameters: np.ndarray, x: VirtualNeckState, c: tuple, load: tuple, outputs: np.ndarray) -> None:
     """Fill `outputs` from the state: truth, measurement, encoders, tensions, compression."""
-    x = neck_read(state)
-    lean = lean_angles((x[0], x[1], x[3], x[4]), bend_functions(x[0] * x[0] + x[1] * x[1]), load[2])
+    lean = neck_lean(x, load)
     outputs[0] = lean[0]
     outputs[1] = lean[1]
-    for i in range(4):
-        outputs[2 + i] = state[NECK_NOISE + 5 + i]
-    outputs[6] = state[NECK_NOISE + 4]
+    outputs[2], outputs[3], outputs[4], outputs[5], outputs[6] = inclinometer_shown(x.noise)
     counts = float(parameters[NECK_ENCODER_COUNTS])
     quantum = 2.0 * math.pi / counts if counts > 0.0 else 0.0
     for i in range(3):
-        outputs[7 + i] = inclinometer_round(float(state[8 + i]), quantum)
-    free = (float(state[NECK_FREE]), float(state[NECK_FREE + 1]), float(state[NECK_FREE + 2]))
-    tension1, tension2, tension3 = neck_tensions(x, free, c)
-    outputs[10] = tension1
-    outputs[11] = tension2
-    outputs[12] = tension3
-    outputs[13] = x[2]
+        outputs[7 + i] = inclinometer_round(float(x.position[i]), quantum)
+    outputs[10], outputs[11], outputs[12] = neck_tensions(x, c)
+    outputs[13] = x.s
 
 
-def neck_read(state: np.ndarray) -> tuple:
+def neck_read(x: NeckBody) -> tuple:
     """Return the 19 continuous states as a tuple of floats."""
     return (
-        float(state[0]), float(state[1]), float(state[2]), float(state[3]), float(state[4]), float(state[5]),
-        float(state[6]), float(state[7]), float(state[8]), float(state[9]), float(state[10]),
-        float(state[11]), float(state[12]), float(state[13]), float(state[14]), float(state[15]),
-        float(state[16]), float(state[17]), float(state[18]),
+        float(x.b[0]), float(x.b[1]), float(x.s), float(x.w[0]), float(x.w[1]), float(x.v), float(x.z[0]),
+        float(x.z[1]), float(x.position[0]), float(x.position[1]), float(x.position[2]), float(x.speed[0]),
+        float(x.speed[1]), float(x.speed[2]), float(x.integral[0]), float(x.integral[1]), float(x.integral[2]),
+        float(x.filtered[0]), float(x.filtered[1]),
     )  # fmt: skip
 
 
-def neck_write(state: np.ndarray, x: tuple) -> None:
+def neck_write(x: NeckBody, moving: tuple) -> None:
     """Write the 19 continuous states back."""
-    for i in range(NECK_ODE_SIZE):
-        state[i] = x[i]
+    (
+        x.b[0], x.b[1], x.s, x.w[0], x.w[1], x.v, x.z[0], x.z[1], x.position[0], x.position[1], x.position[2],
+        x.speed[0], x.speed[1], x.speed[2], x.integral[0], x.integral[1], x.integral[2], x.filtered[0], x.filtered[1],
+    ) = moving  # fmt: skip
 
 
 def neck_along(x: tuple, k: tuple, h: float) -> tuple:

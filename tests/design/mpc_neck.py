@@ -8,6 +8,7 @@ import control
 import numpy as np
 
 from softneck.design import MpcController
+from softneck.design.predictive._mpc_state_runtime import MpcArrays
 from softneck.estimation import LinearNeck
 from softneck.runtime import load_runtime
 
@@ -46,7 +47,7 @@ class Neck:
         values, out = self.state.values.copy(), np.zeros(3)
         load_runtime(self.block.runtime).step(self.block.arrays, self.state.parameters, values, self.inputs, out)
         self.state = type(self.state)(values, self.state.parameters, out)
-        v = (self.controller.arrays[8] @ out)[:2] + self.load
+        v = (MpcArrays(self.controller.arrays).T @ out)[:2] + self.load
         self.line = [*self.line[1:], v]
         self.y = POLE * self.y + (1.0 - POLE) * self.gain * GAIN * self.line[0]
         self.motors = out

@@ -36,10 +36,19 @@ def soft() -> MpcController:
 def thetas(controller: MpcController, count: int, size: float = 0.15) -> np.ndarray:
     """Return (count, n_theta) random parameters, motors anywhere within their limits."""
     rng = np.random.default_rng(5)
-    values = size * rng.standard_normal((count, controller.arrays[10].shape[1]))
+    values = size * rng.standard_normal((count, named(controller).K.shape[1]))
     values[:, -5:-2] = rng.uniform(-5.9, 5.9, (count, 3))
     values[:, -2], values[:, -1] = rng.uniform(-1.0, 1.0, count), 1.0
     return values
+
+
+def named(controller: MpcController) -> rt.MpcArrays:
+    return rt.MpcArrays(controller.arrays)
+
+
+def remembered(neck: Neck, name: str) -> float:
+    """Return one number of what the controller remembers."""
+    return neck.state.values[rt.MpcState.parts(named(neck.controller))[name]].item()
 
 
 def bounds(controller: MpcController, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -51,15 +60,15 @@ def bounds(controller: MpcController, theta: np.ndarray) -> tuple[np.ndarray, np
 def test_the_runtimes_solver_equals_daqp(kind: str, request: pytest.FixtureRequest) -> None:
     controller: MpcController = request.getfixturevalue(kind)
     f = load_functions("softneck.design.predictive._dual_runtime")
-    a = controller.arrays
-    m = len(a[14])
+    a = named(controller)
+    m = len(a.kinds)
     sign, lam, most = np.zeros(m), np.zeros(m), 0
     for theta in thetas(controller, 150):
         low, high = bounds(controller, theta)
-        z0 = a[10] @ theta
-        assert f.qp_solve(a[12], a[11] @ z0, low, high, sign, lam, 500, 1e-10, z0.size) >= 0
-        z = z0 - lam @ a[15]
-        expected, _, flag, _ = daqp.solve(a[16], a[17] @ theta, a[11], high, low, np.zeros(m, dtype=np.int32))
+        z0 = a.K @ theta
+        assert f.qp_solve(a.G, a.A @ z0, low, high, sign, lam, 500, 1e-10, z0.size) >= 0
+        z = z0 - lam @ a.AH
+        expected, _, flag, _ = daqp.solve(a.H, a.F @ theta, a.A, high, low, np.zeros(m, dtype=np.int32))
         assert flag > 0
         # daqp's own tolerance is 1e-6 on rows of size 1e-3 to 1; both are far better at their vertices.
         np.testing.assert_allclose(z, expected, atol=1e-8)
@@ -72,14 +81,14 @@ def test_casadi_says_the_same_of_the_same_expression(soft: MpcController) -> Non
     solver = ca.conic("oracle", "osqp", {"h": qp.sparsity_out(0), "a": qp.sparsity_out(2)}, {
         "osqp": {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 200_000, "verbose": False, "polish": True},
     })  # fmt: skip
-    program, a = soft.program(), soft.arrays
+    program = soft.program()
     for theta in thetas(soft, 5):
         H, g, A, low, high = qp(theta, [6.0, 12.5 * TS, 0.3, -0.25])
         lower, upper = bounds(soft, theta)
         # Rounding of the same sums in another order.
         np.testing.assert_allclose(np.array(low)[:, 0], lower, atol=1e-12)
         np.testing.assert_allclose(np.array(high)[:, 0], upper, atol=1e-12)
-        np.testing.assert_allclose(np.array(g)[:, 0], a[17] @ theta, atol=1e-10)
+        np.testing.assert_allclose(np.array(g)[:, 0], named(soft).F @ theta, atol=1e-10)
         z, flag, _ = program.solve(theta, lower, upper)
         oracle = np.array(solver(h=H, g=g, a=A, lba=low, uba=high)["x"])[:, 0]
         assert flag > 0
@@ -102,11 +111,12 @@ def test_without_limits_and_blocking_it_is_the_lqr(plain: MpcController) -> None
     Q[:2, :2], Q[2:, 2:] = np.diag(problem.output_weight), problem.cocontraction_weight * np.outer(T[2], T[2])
     P = solve_discrete_are(A, B, Q, w * np.eye(3))
     K = np.linalg.solve(w * np.eye(3) + B.T @ P @ B, B.T @ P @ A)
-    theta = np.zeros(controller.arrays[10].shape[1])
+    gain = named(controller).K
+    theta = np.zeros(gain.shape[1])
     theta[:2], theta[-5:-2] = (0.1, -0.2), (0.3, -0.1, 0.5)
     state = np.concatenate([theta[:2], theta[-5:-2]])
     # Thirty steps of a Riccati recursion from its own solution, and a 90 x 90 inverse.
-    np.testing.assert_allclose((controller.arrays[10] @ theta)[:3], -K @ state, atol=1e-9)
+    np.testing.assert_allclose((gain @ theta)[:3], -K @ state, atol=1e-9)
 
 
 def test_to_lti_is_the_block_while_no_limit_is_active(plain: MpcController) -> None:
@@ -122,7 +132,7 @@ def test_to_lti_is_the_block_while_no_limit_is_active(plain: MpcController) -> N
     for k in range(60):
         state, motors = plain.step(state, [u[k, 0], u[k, 1], 0.0, u[k, 2], u[k, 3], *motors, 1.0, 1.0])
         # Unit vectors of 1e-3 through sums of 100: 1e-13 relative.
-        np.testing.assert_allclose((plain.arrays[8] @ motors)[:2], expected[:, k], atol=1e-12)
+        np.testing.assert_allclose((named(plain).T @ motors)[:2], expected[:, k], atol=1e-12)
 
 
 @pytest.mark.parametrize(("gain", "load"), [(0.7, 0.0), (1.3, 0.4), (1.0, -0.8)])
@@ -131,7 +141,7 @@ def test_no_offset_is_left_by_another_gain_or_a_load(plain: MpcController, gain:
     for _ in range(500):
         neck.step(0.15, -0.1)
     np.testing.assert_allclose(neck.y, [0.15, -0.1], atol=1e-5)  # ten seconds at more than 1 rad/s
-    assert neck.state.values[rt.MPC_STATUS] == rt.MPC_OPTIMAL
+    assert remembered(neck, "status") == rt.MPC_OPTIMAL
 
 
 def test_it_takes_over_without_a_bump(plain: MpcController) -> None:
@@ -158,7 +168,7 @@ def test_limits_are_kept_and_reported(soft: MpcController) -> None:
     # Soft, and looked at one time constant of the loop ahead: before that the neck may pass it by a degree.
     assert highest <= 0.3 + 0.02
     assert highest < 0.5 * 0.8
-    assert neck.state.values[rt.MPC_RESIDUAL] < 1e-8
+    assert remembered(neck, "residual") < 1e-8
 
 
 def test_a_limit_that_cannot_be_kept_is_softened_and_counted(soft: MpcController) -> None:
@@ -166,7 +176,7 @@ def test_a_limit_that_cannot_be_kept_is_softened_and_counted(soft: MpcController
     neck.y = np.array([0.6, 0.0])  # beyond the limit of 0.3 rad already
     neck.step(0.0)
     assert soft.info(neck.state).status == "softened"
-    assert neck.state.values[rt.MPC_SOFTENED] == 1.0
+    assert remembered(neck, "softened") == 1.0
     assert np.isfinite(neck.motors).all()
 
 
@@ -174,7 +184,7 @@ def test_tendons_stay_taut(soft: MpcController) -> None:
     least = []
     for controller in (soft, MpcSettings(bandwidth=8.0, lead_limit=12.0).design(bake_off_neck())):
         neck = Neck(controller)
-        lever = 6.93 * controller.arrays[8][:2].T
+        lever = 6.93 * named(controller).T[:2].T
         for _ in range(150):
             neck.step(0.28, 0.0, cocontraction_reference=-0.5)
         least.append((neck.motors - lever @ neck.y).min())
@@ -191,22 +201,21 @@ def test_out_of_iterations_the_previous_plan_goes_on_and_is_counted() -> None:
         out = neck.step(0.3 if k % 50 < 25 else -0.3)
         assert np.abs(out - before).max() <= 12.5 * TS + 1e-12
         before = out
-    assert neck.state.values[rt.MPC_SHIFTED] > 0
-    assert Neck(full).state.values[rt.MPC_SHIFTED] == 0
+    assert remembered(neck, "shifted") > 0
+    assert remembered(Neck(full), "shifted") == 0
     # Age counts up the plan: without answers its moves come one after another.
     state = full.initial_state()
     state, _ = full.step(state, [0.05, 0, 0, 0, 0, 0, 0, 0, 1, 1])
     plan = full.info(state).set_points
-    starved = list(full.arrays)
-    starved[0] = starved[0].copy()
-    starved[0][rt.MPC_BUDGET], starved[0][rt.MPC_TOLERANCE] = 0, -1.0
+    starved = tuple(array.copy() for array in full.arrays)
+    rt.MpcArrays(starved).constants[[rt.MPC_BUDGET, rt.MPC_TOLERANCE]] = 0, -1.0
     out = np.zeros(3)
     step, values = load_runtime(full.block().runtime).step, state.values.copy()
     for i in range(3):
         inputs = np.array([0.05, 0, 0, 0, 0, *out, 1, 1])
-        step(tuple(starved), np.array([6.0, 12.5, 12.0, -6.0]), values, inputs, out)
+        step(starved, np.array([6.0, 12.5, 12.0, -6.0]), values, inputs, out)
         np.testing.assert_allclose(out, plan[i], atol=1e-12)
-    assert values[rt.MPC_SHIFTED] == 3
+    assert values[rt.MpcState.parts(named(full))["shifted"]] == 3
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 57.0])

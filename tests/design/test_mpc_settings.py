@@ -40,7 +40,7 @@ def test_equal_scenarios_are_one() -> None:
     settings = {"bandwidth": 8.0, "angle_limit": 0.3}
     one = MpcSettings(**settings).design(nominal)  # type: ignore[arg-type]
     three = MpcSettings(**settings, scenarios=2).design(same)  # type: ignore[arg-type]
-    assert three.arrays[0][rt.MPC_SCENARIOS] == 3
+    assert rt.MpcArrays(three.arrays).constants[rt.MPC_SCENARIOS] == 3
     necks = [Neck(one), Neck(three)]
     for k in range(60):
         outs = [neck.step(0.4 if k < 30 else -0.1) for neck in necks]

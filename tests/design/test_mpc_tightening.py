@@ -44,7 +44,7 @@ def worst(controller: MpcController, gain: float, seed: int) -> tuple[float, flo
     """Return by how much angles and tautness pass their limits [rad], steps and errors being random."""
     rng = np.random.default_rng(seed)
     neck = Neck(controller, gain=gain)
-    lever = 6.93 * controller.arrays[8][:2].T
+    lever = 6.93 * rt.MpcArrays(controller.arrays).T[:2].T
     bias, beyond, slack = 0.5 * BOUND * rng.choice([-1.0, 1.0], 2), -math.inf, -math.inf
     wanted, behind = np.zeros(2), [np.zeros(3)] * 5
     for k in range(300):
@@ -85,11 +85,11 @@ def test_the_back_off_is_what_the_bounds_lose(pair: tuple[MpcController, MpcCont
     loose, tight = pair
     back = tight.design["back_off_rad"]
     assert back["angle"] > 0.0
-    theta, motors = np.zeros(loose.arrays[10].shape[1]), np.zeros(3)
+    theta, motors = np.zeros(rt.MpcArrays(loose.arrays).K.shape[1]), np.zeros(3)
     theta[-1] = 1.0
     parameters = loose.initial_state().parameters
     bounds = [c.program().bounds(theta, parameters, motors) for c in (loose, tight)]
-    kinds = loose.arrays[14][:, 0]
+    kinds = rt.MpcArrays(loose.arrays).kinds[:, 0]
     rows = {
         rt.MPC_ROW_ANGLE_HIGH: (1, -back["angle"]), rt.MPC_ROW_ANGLE_LOW: (0, back["angle"]),
         rt.MPC_ROW_TAUT: (0, back["tautness"]), rt.MPC_ROW_MOVE: (1, 0.0),
@@ -102,14 +102,14 @@ def test_the_back_off_is_what_the_bounds_lose(pair: tuple[MpcController, MpcCont
 
 def test_the_casadi_function_knows_the_back_off(pair: tuple[MpcController, MpcController]) -> None:
     tight = pair[1]
-    theta = np.zeros(tight.arrays[10].shape[1])
+    theta = np.zeros(rt.MpcArrays(tight.arrays).K.shape[1])
     theta[-1] = 1.0
     limits = [6.0, 12.5 * 0.02, LIMIT, TAUT]
     *_, lower, upper = (np.array(item.full()).ravel() for item in tight.program().function()(theta, limits))
     parameters = tight.initial_state().parameters
     own = tight.program().bounds(theta, parameters, np.zeros(3))
     # The block's position rows come back as fast as moves allow; soft rows are the same sums.
-    of = tight.arrays[14][:, 0] >= rt.MPC_ROW_ANGLE_HIGH
+    of = rt.MpcArrays(tight.arrays).kinds[:, 0] >= rt.MPC_ROW_ANGLE_HIGH
     np.testing.assert_allclose(lower[of], own[0][of], rtol=1e-12)
     np.testing.assert_allclose(upper[of], own[1][of], rtol=1e-12)
 
@@ -117,7 +117,8 @@ def test_the_casadi_function_knows_the_back_off(pair: tuple[MpcController, MpcCo
 def test_tightening_survives_a_file(pair: tuple[MpcController, MpcController], tmp_path: Path) -> None:
     pair[1].save(tmp_path / "mpc.npz")
     again = load(tmp_path / "mpc.npz")
-    np.testing.assert_array_equal(again.arrays[0], pair[1].arrays[0])
+    for mine, its in zip(again.arrays, pair[1].arrays, strict=True):
+        np.testing.assert_array_equal(mine, its)
 
 
 def test_tightening_without_a_soft_limit_is_refused() -> None:

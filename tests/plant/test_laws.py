@@ -8,12 +8,16 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 
 from softneck.plant import NeckParameters, VirtualNeck, neck_energy
-from softneck.plant._energy import free_lengths, potential_energy
-from softneck.plant._mechanics_runtime import neck_constants, neck_load, neck_rates, neck_substeps
+from softneck.plant._energy import body, free_lengths, potential_energy
+from softneck.plant._mechanics_runtime import NeckBody, neck_constants, neck_load, neck_rates, neck_substeps
 from softneck.runtime import Block, State
+from softneck.runtime._layout import Arrays
 
 # Where the plant's outputs are in its port order.
 TENSIONS = slice(10, 13)
+# And the parts of its state.
+AT = NeckBody.parts(Arrays(()))
+MOVING = slice(0, AT["free"].start)
 
 
 def quiet(**changes: float) -> NeckParameters:
@@ -52,20 +56,20 @@ def test_energy_never_rises_with_locked_winches(payload: float) -> None:
     block = VirtualNeck(quiet()).block()
     start, _ = block.run(block.initial_state(), inputs(200, (1.5, -0.5, 0.4)))
     c, load = neck_constants(start.parameters), neck_load(start.parameters, payload, 0.0, 0.0, 0.0, 0.0)
-    free = tuple(start.values[19:22].tolist())
-    drives = slice(8, 17)
+    free = tuple(free_lengths(start).tolist())
+    drives = slice(AT["position"].start, AT["integral"].stop)
 
     def locked(_: float, x: np.ndarray) -> np.ndarray:
         dx = np.array(neck_rates(tuple(x.tolist()), (0.0, 0.0, 0.0), free, c, load))
         dx[drives] = 0.0
         return dx
 
-    x0 = start.values[:19].copy()
+    x0 = start.values[MOVING].copy()
     x0[0:2] += 0.15
     x0[5] = 0.3
     x0[11:14] = 0.0
     solution = solve_ivp(locked, (0.0, 0.4), x0, method="LSODA", rtol=1e-9, atol=1e-12, max_step=1e-3)
-    values = [np.concatenate([x, start.values[19:]]) for x in solution.y.T]
+    values = [np.concatenate([x, start.values[MOVING.stop :]]) for x in solution.y.T]
     E = [neck_energy(State(v, start.parameters, start.outputs), payload=payload).total for v in values]
     # The integrator's tolerance, 1e-9 of about 1 J per step.
     assert np.diff(E).max() < 2e-9
@@ -84,7 +88,8 @@ def test_statics_are_the_minimum_of_potential_energy(motors: tuple[float, float,
     )
     block = VirtualNeck(parameters).block()
     state, Y = block.run(block.initial_state(), inputs(1000, motors, payload))
-    positions, free = state.values[8:11], free_lengths(state)
+    x = body(state)
+    positions, free = x["position"], x["free"]
     found = minimize(
         lambda q: potential_energy(parameters, q * [1, 1, 0.01], positions, free, payload=payload),
         np.zeros(3),
@@ -92,8 +97,8 @@ def test_statics_are_the_minimum_of_potential_energy(motors: tuple[float, float,
         options={"gtol": 1e-9, "xrtol": 1e-12},
     )
     # BFGS by differences finds the minimum to about sqrt(eps) of 0.3 rad, and 20 s settle to 1e-7.
-    np.testing.assert_allclose(state.values[:3], found.x * [1, 1, 0.01], atol=3e-6)
-    assert Y[-1, 13] == state.values[2]
+    np.testing.assert_allclose([*x["b"], *x["s"]], found.x * [1, 1, 0.01], atol=3e-6)
+    assert Y[-1, 13] == x["s"]
 
 
 def test_a_third_of_a_turn_turns_the_answer() -> None:
@@ -120,7 +125,7 @@ def _normals(angles: np.ndarray) -> np.ndarray:
 def smooth_run(substeps: int) -> np.ndarray:
     """End state of a manoeuvre without slack, wall or limits, at 20 ms / `substeps`."""
     block = smooth_block(0.02 / substeps)
-    return block.run(block.initial_state(), smooth_inputs())[0].values[:19]
+    return block.run(block.initial_state(), smooth_inputs())[0].values[MOVING]
 
 
 def smooth_block(step: float) -> Block:
@@ -147,8 +152,8 @@ def test_the_integrator_agrees_with_scipy_on_a_smooth_manoeuvre() -> None:
     state = block.initial_state()
     c = neck_constants(state.parameters)
     load = neck_load(state.parameters, 0.0, 0.0, 0.0, 0.0, 0.0)
-    free = tuple(state.values[19:22].tolist())
-    x = state.values[:19].copy()
+    free = tuple(free_lengths(state).tolist())
+    x = state.values[MOVING].copy()
     for u in smooth_inputs():
         command = tuple(u[:3].tolist())
         solution = solve_ivp(
@@ -158,7 +163,8 @@ def test_the_integrator_agrees_with_scipy_on_a_smooth_manoeuvre() -> None:
         x = solution.y[:, -1]
     mine = smooth_run(20)
     # Angles to 1e-8 rad, a hundred-thousandth of the smallest noise; the fastest states are speeds.
-    np.testing.assert_allclose(mine[[0, 1, 2, 8, 9, 10, 17, 18]], x[[0, 1, 2, 8, 9, 10, 17, 18]], atol=1e-8)
+    for name in ("b", "s", "position", "filtered"):
+        np.testing.assert_allclose(mine[AT[name]], x[AT[name]], atol=1e-8)
     np.testing.assert_allclose(mine, x, atol=1e-5)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,19 +11,21 @@ import pytest
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.plant._drive_runtime import drive_rates
 from softneck.plant._geometry_runtime import bend_functions, lean_angles, tilt_rotation
-from softneck.plant._inclinometer_runtime import (
-    inclinometer_delayed,
-    inclinometer_dropout,
-    inclinometer_measure,
-    inclinometer_round,
-    inclinometer_start,
-    inclinometer_store,
-)
+from softneck.plant._inclinometer_runtime import InclinometerNoise
 from softneck.plant._link_runtime import link_hysteresis, link_weight
 from softneck.plant._mechanics_runtime import neck_drive
 from softneck.plant._tendon_runtime import tendon_chord, tendon_tension
+from softneck.runtime import load_functions
+from softneck.runtime._layout import Arrays
 
 L0, RADIUS = 0.107, 0.052
+NOISE = InclinometerNoise.parts(Arrays(()))
+
+
+@pytest.fixture(scope="module")
+def sensor() -> Any:
+    """The functions of the inclinometer."""
+    return load_functions("softneck.plant._inclinometer_runtime")
 
 
 @pytest.mark.parametrize("beta", [1e-9, 1e-3, 0.0999, 0.1001, 0.5, 1.5])
@@ -172,27 +175,27 @@ def test_a_tendon_that_pulls_harder_than_the_current_limit_drives_the_winch_back
     assert drive_run(0.3, 0.0, 0.7 * torque)[-1, 0] > -0.05
 
 
-def test_the_delay_is_the_delay() -> None:
+def test_the_delay_is_the_delay(sensor: Any) -> None:
     history, Ts = np.zeros(6 * 12), 0.02
     for k in range(40):
         t = k * Ts
-        inclinometer_store(history, (math.sin(3 * t), t, 3 * math.cos(3 * t), 1.0, t, 2 * t))
+        sensor.inclinometer_store(history, (math.sin(3 * t), t, 3 * math.cos(3 * t), 1.0, t, 2 * t))
     now = 39 * Ts
     for delay in (0.0, 0.02, 0.033, 0.1, 0.2):
-        pitch, roll, pitch_rate, roll_rate = inclinometer_delayed(history, delay, Ts)
+        pitch, roll, pitch_rate, roll_rate = sensor.inclinometer_delayed(history, delay, Ts)
         # Hermite: Ts^4 / 384 of a fourth derivative of 81.
         assert pitch == pytest.approx(math.sin(3 * (now - delay)), abs=4e-8)
         assert (roll, pitch_rate, roll_rate) == pytest.approx((now - delay, now - delay, 2 * (now - delay)))
 
 
 @pytest.mark.slow
-def test_noise_and_drift_have_the_spread_they_are_asked_for() -> None:
+def test_noise_and_drift_have_the_spread_they_are_asked_for(sensor: Any) -> None:
     generator, noise = np.array([1.0, 2, 3, 4, 5, 6]), np.zeros(9)
-    inclinometer_start(noise, generator, 0.02, 0.0)
+    sensor.inclinometer_start(noise, generator, 0.02, 0.0)
     rows = []
     for _ in range(60_000):
-        inclinometer_measure((0.0, 0.0, 0.0, 0.0), noise, generator, (0.02, 0.9, 0.0, 0.9, 0.01, 0.05, 0.0))
-        rows.append(noise[[0, 5, 7]].copy())
+        sensor.inclinometer_measure((0.0, 0.0, 0.0, 0.0), noise, generator, (0.02, 0.9, 0.0, 0.9, 0.01, 0.05, 0.0))
+        rows.append([noise[NOISE[name]][0] for name in ("bias", "angles", "rates")])
     drift, angle, rate = np.array(rows).T
     # 60,000 samples, the drift's correlated over 20: 3 standard errors are 4 % there and 1 % elsewhere.
     assert drift.std() == pytest.approx(0.02, rel=0.04)
@@ -201,13 +204,13 @@ def test_noise_and_drift_have_the_spread_they_are_asked_for() -> None:
     assert np.corrcoef(drift[1:], drift[:-1])[0, 1] == pytest.approx(0.9, abs=0.01)
 
 
-def test_dropouts_come_as_often_and_last_as_long_as_asked() -> None:
+def test_dropouts_come_as_often_and_last_as_long_as_asked(sensor: Any) -> None:
     generator, noise = np.array([6.0, 5, 4, 3, 2, 1]), np.zeros(9)
-    noise[4] = 1.0
+    noise[NOISE["arrives"]] = 1.0
     valid = []
     for _ in range(100_000):
-        inclinometer_dropout(noise, generator, 0.01, 0.2)
-        valid.append(noise[4])
+        sensor.inclinometer_dropout(noise, generator, 0.01, 0.2)
+        valid.append(noise[NOISE["arrives"]].item())
     lost = 1.0 - np.array(valid)
     starts = int((np.diff(lost) > 0).sum())
     # Mean length 1 / 0.2 = 5 samples; about 950 dropouts, so 3 standard errors are 9 %.
@@ -239,20 +242,21 @@ def test_encoders_and_angles_come_in_whole_steps() -> None:
 
 
 @pytest.mark.parametrize("quantum", [1e-3, 0.25])
-def test_the_inclinometer_rounds_to_the_nearest_step_without_a_bias(quantum: float) -> None:
+def test_the_inclinometer_rounds_to_the_nearest_step_without_a_bias(sensor: Any, quantum: float) -> None:
     values = np.arange(-3.299, 4.7, 0.002) * quantum
-    shown = np.array([inclinometer_round(float(value), quantum) for value in values])
+    shown = np.array([sensor.inclinometer_round(float(value), quantum) for value in values])
     # A whole number of steps, and the nearest one: never further than half a step; rounding is eps of a few steps.
     np.testing.assert_allclose(shown / quantum, np.round(shown / quantum), rtol=0, atol=1e-12)
     assert np.abs(shown - values).max() <= 0.5 * quantum * (1.0 + 1e-12)
     # Over eight whole steps, points symmetric about each, errors cancel but for rounding: floor leaves half a step.
     assert abs((shown - values).mean()) < 1e-9 * quantum
-    assert inclinometer_round(0.123, 0.0) == 0.123
-    assert inclinometer_round(0.123, -1.0) == 0.123
+    assert sensor.inclinometer_round(0.123, 0.0) == 0.123
+    assert sensor.inclinometer_round(0.123, -1.0) == 0.123
 
 
-def test_what_the_inclinometer_holds_is_rounded_in_both_axes_and_rates_are_not() -> None:
+def test_what_the_inclinometer_holds_is_rounded_in_both_axes_and_rates_are_not(sensor: Any) -> None:
     generator, noise = np.array([1.0, 2, 3, 4, 5, 6]), np.zeros(9)
-    noise[4] = 1.0
-    inclinometer_measure((0.26, -0.14, 0.26, -0.14), noise, generator, (0.0, 0.9, 0.0, 0.9, 0.0, 0.0, 0.1))
-    np.testing.assert_allclose(noise[5:9], [0.3, -0.1, 0.26, -0.14], rtol=1e-12)  # rounding of 0.1
+    noise[NOISE["arrives"]] = 1.0
+    sensor.inclinometer_measure((0.26, -0.14, 0.26, -0.14), noise, generator, (0.0, 0.9, 0.0, 0.9, 0.0, 0.0, 0.1))
+    np.testing.assert_allclose(noise[NOISE["angles"]], [0.3, -0.1], rtol=1e-12)  # rounding of 0.1
+    np.testing.assert_allclose(noise[NOISE["rates"]], [0.26, -0.14], rtol=1e-12)

@@ -9,13 +9,10 @@ import numpy as np
 
 from softneck.core import Matrix, Vector
 
+from . import _mpc_state_runtime as rt
 from ._disturbance import MeasuredDisturbance
 from ._prediction import Matrices, Problem, disturbance_pole, padded, rest_states
 
-NAMES = (
-    "constants", "model_A", "model_B", "observer", "rest", "delays", "disturbances", "filters", "T", "starts", "K",
-    "A", "G", "E", "kinds", "AH", "H", "F", "scale",
-)  # fmt: skip
 # Radians: a motor resolves 1.3e-4 rad, a soft limit is judged at 1e-6.
 _TOLERANCE = 1e-10
 
@@ -42,13 +39,13 @@ class Tuning:
 
 
 def assemble(problem: Problem, found: Matrices, tuning: Tuning) -> tuple[Matrix, ...]:
-    """Return the arrays in the order of `NAMES`."""
+    """Return the arrays in the order of `MpcArrays`."""
     p, n = problem, problem.order
     plants = [scenario.axis(i) for scenario in p.scenarios for i in range(2)]
     Ts = plants[0].sample_time
     AH = np.linalg.solve(found.H, found.A.T).T
     angle_at = 4.0
-    constants = np.array([
+    constants = np.array([  # in the order of MPC_TS to MPC_TAUT_BACK
         Ts, p.rows, len(p.scenarios), n, p.dead_time, len(p.starts), p.slacks, tuning.preview,
         min(round(tuning.reference_time / Ts), tuning.preview), len(tuning.disturbances), tuning.budget, _TOLERANCE,
         tuning.coast, angle_at, angle_at + float(p.angles), 0.0, 0.0,
@@ -57,27 +54,25 @@ def assemble(problem: Problem, found: Matrices, tuning: Tuning) -> tuple[Matrix,
     disturbances = np.zeros((max(1, len(tuning.disturbances)), 3))
     for row, item in zip(disturbances, tuning.disturbances, strict=False):
         row[:] = item.pitch, item.roll, math.exp(-Ts / item.time) if item.time > 0.0 else 0.0
-    return (
-        constants,
-        np.vstack([padded(plant, n)[0] for plant in plants]),
-        np.array([padded(plant, n)[1] for plant in plants]),
-        observer_gains(np.array([disturbance_pole(plant, p.disturbance_time) for plant in plants]), tuning.trust),
-        np.array([rest_states(plant, n) for plant in plants]),
-        np.array([float(plant.delay) for plant in plants]),
-        disturbances,
-        np.full(3, keep),
-        p.T,
-        np.array(p.starts, dtype=np.float64),
-        -np.linalg.solve(found.H, found.F),
-        found.A,
-        found.A @ AH.T,
-        found.E,
-        found.kinds,
-        AH,
-        found.H,
-        found.F,
-        np.array([max(1.0, float(np.abs(found.H).max()))]),
-    )
+    poles = np.array([disturbance_pole(plant, p.disturbance_time) for plant in plants])
+    made = {
+        "constants": constants,
+        "model_A": np.vstack([padded(plant, n)[0] for plant in plants]),
+        "model_B": np.array([padded(plant, n)[1] for plant in plants]),
+        "observer": observer_gains(poles, tuning.trust),
+        "rest": np.array([rest_states(plant, n) for plant in plants]),
+        "delays": np.array([float(plant.delay) for plant in plants]),
+        "disturbances": disturbances,
+        "filters": np.full(3, keep),
+        "T": p.T,
+        "starts": np.array(p.starts, dtype=np.float64),
+        "K": -np.linalg.solve(found.H, found.F),
+        "G": found.A @ AH.T,
+        "AH": AH,
+        "scale": np.array([max(1.0, float(np.abs(found.H).max()))]),
+        **{name: getattr(found, name) for name in ("A", "E", "kinds", "H", "F")},
+    }
+    return tuple(made[name] for name in rt.MpcArrays.names())
 
 
 def observer_gains(poles: Vector, trust: float) -> Matrix:
@@ -112,26 +107,25 @@ def observer_bandwidth(gains: Vector, sample_time: float) -> float:
 
 def with_gains(arrays: tuple[Matrix, ...], trust: float) -> tuple[Matrix, ...]:
     """Return the arrays with another trust of the observer in what is measured."""
-    items = list(arrays)
-    items[3] = observer_gains(items[3][:, 2], trust)
-    return tuple(items)
+    poles = rt.MpcArrays(arrays).observer[:, 2]
+    return _with(arrays, observer=observer_gains(poles, trust))
 
 
 def with_back_off(arrays: tuple[Matrix, ...], angle: float, tautness: float) -> tuple[Matrix, ...]:
     """Return the arrays with soft limits that are tighter by so much [rad]."""
-    items = list(arrays)
-    constants: Vector = items[0].copy()
-    constants[15:17] = angle, tautness
-    items[0] = constants
-    return tuple(items)
+    constants = rt.MpcArrays(arrays).constants.copy()
+    constants[[rt.MPC_ANGLE_BACK, rt.MPC_TAUT_BACK]] = angle, tautness
+    return _with(arrays, constants=constants)
 
 
 def with_filter(arrays: tuple[Matrix, ...], reference_time: float) -> tuple[Matrix, ...]:
     """Return the arrays with other reference filters."""
-    items = list(arrays)
-    Ts = float(items[0][0])
+    constants = rt.MpcArrays(arrays).constants.copy()
+    Ts = float(constants[rt.MPC_TS])
     keep = math.exp(-Ts / reference_time) if reference_time > 0.0 else 0.0
-    constants: Vector = items[0].copy()
-    constants[8] = min(round(reference_time / Ts), constants[7])
-    items[0], items[7] = constants, np.full(3, keep)
-    return tuple(items)
+    constants[rt.MPC_LEAD] = min(round(reference_time / Ts), constants[rt.MPC_AHEAD])
+    return _with(arrays, constants=constants, filters=np.full(3, keep))
+
+
+def _with(arrays: tuple[Matrix, ...], **changed: Matrix) -> tuple[Matrix, ...]:
+    return tuple(changed.get(name, item) for name, item in zip(rt.MpcArrays.names(), arrays, strict=True))

@@ -16,7 +16,6 @@ from softneck.runtime import Block, Port, State
 
 from ..linear._ports import MAX_MOTOR, controller_inputs, controller_outputs, limit_ports
 from . import _mpc_state_runtime as rt
-from ._arrays import NAMES
 from ._disturbance import MeasuredDisturbance
 from ._lti import lti
 from ._part import MpcPart
@@ -41,7 +40,7 @@ class MpcController:
 
     Attributes:
         sample_time: [s].
-        arrays: what the runtime reads, by `_arrays.NAMES`.
+        arrays: what the runtime reads, in the order of `MpcArrays`.
         position_limit, slew_limit, lead_limit, least_position: of each motor [rad], [rad/s], [rad], [rad].
         angle_limit: soft, of pitch and roll [rad], or None.
         minimum_tautness: soft, of each tendon [rad], or None.
@@ -98,7 +97,7 @@ class MpcController:
     @property
     def preview(self) -> float:
         """How far ahead the reference is known [s]."""
-        return float(self.arrays[0][rt.MPC_AHEAD]) * self.sample_time
+        return float(rt.MpcArrays(self.arrays).constants[rt.MPC_AHEAD]) * self.sample_time
 
     def initial_state(self, **parameters: float) -> State:
         """Return the state at the start; parameters are the limits by name."""
@@ -138,13 +137,14 @@ class MpcController:
 
     def summary(self) -> str:
         """Return some lines for people."""
-        q, d = self.arrays[0], self.design
+        a, d = rt.MpcArrays(self.arrays), self.design
+        q = a.constants
         settings = d.get("settings", {})
         lines = [
             f"mpc controller, {self.sample_time * 1e3:g} ms, {self.order} order, {d.get('extra_delay', 0)} samples of "
             "delay added to the plant for it",
-            f"  {self.arrays[16].shape[0]} unknowns ({int(q[rt.MPC_MOVES])} moves of 3 motors, {int(q[rt.MPC_SLACKS])} "
-            f"slacks), {self.arrays[14].shape[0]} rows, horizon {settings.get('horizon')} samples after the dead time, "
+            f"  {a.H.shape[0]} unknowns ({int(q[rt.MPC_MOVES])} moves of 3 motors, {int(q[rt.MPC_SLACKS])} "
+            f"slacks), {a.kinds.shape[0]} rows, horizon {settings.get('horizon')} samples after the dead time, "
             f"{int(q[rt.MPC_SCENARIOS])} scenario(s)",
             f"  limits: |P| <= {self.position_limit:g} rad, slew {self.slew_limit:g} rad/s, "
             f"lead {self.lead_limit:g} rad"
@@ -174,16 +174,18 @@ class MpcController:
             "outputs": [port.name for port in block.outputs],
             "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
         }
-        write_archive(path, header, dict(zip(NAMES, self.arrays, strict=True)), force=force)
+        write_archive(path, header, dict(zip(rt.MpcArrays.names(), self.arrays, strict=True)), force=force)
 
     @classmethod
     def from_archive(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> MpcController:
         """Return the controller that `save` wrote; `softneck.core.load` calls this."""
-        items = tuple(np.ascontiguousarray(arrays[name], dtype=np.float64) for name in NAMES)
-        _check_shapes(items)
+        items = {name: np.ascontiguousarray(arrays[name], dtype=np.float64) for name in rt.MpcArrays.names()}
+        if not all(np.isfinite(item).all() for item in items.values()):
+            raise FileFormatError("the controller's arrays are not finite; design it again.")
+        rt.MpcArrays.lengths(items)
         return cls(
             sample_time=float(header["sample_time"]),
-            arrays=items,
+            arrays=tuple(items.values()),
             **{name: None if header[name] is None else float(header[name]) for name in _LIMITS},  # type: ignore[arg-type]
             disturbances=tuple(MeasuredDisturbance(**item) for item in header["disturbances"]),
             order=str(header["order"]),
@@ -194,28 +196,13 @@ class MpcController:
 _LIMITS = ("position_limit", "slew_limit", "lead_limit", "least_position", "angle_limit", "minimum_tautness")
 
 
-def _check_shapes(items: tuple[Matrix, ...]) -> None:
-    q = items[0]
-    if q.shape != (17,) or not np.isfinite(q).all():
-        raise FileFormatError("the controller's constants are damaged; design it again.")
-    S, n, L = int(q[rt.MPC_SCENARIOS]), int(q[rt.MPC_ORDER]), int(q[rt.MPC_ROWS])
-    b = int(q[rt.MPC_MOVES])
-    nz, m, p = 3 * b + int(q[rt.MPC_SLACKS]), items[14].shape[0], 2 * S * (n + 2) + 2 * L + 5
-    disturbances = max(1, int(q[rt.MPC_DISTURBANCES]))
-    shapes = (
-        (17,), (2 * S * n, n), (2 * S, n), (2 * S, 3), (2 * S, n), (2 * S,), (disturbances, 3), (3,), (3, 3), (b,),
-        (nz, p), (m, nz), (m, m), (m, p), (m, 2), (m, nz), (nz, nz), (nz, p), (1,),
-    )  # fmt: skip
-    if any(item.shape != shape or not np.isfinite(item).all() for item, shape in zip(items, shapes, strict=True)):
-        raise FileFormatError("the controller's arrays have wrong shapes or are not finite; design it again.")
-
-
 def _review(controller: MpcController) -> list[str]:
     """Return one line for each finding."""
-    c, q = controller, controller.arrays[0]
+    c, a = controller, rt.MpcArrays(controller.arrays)
+    q = a.constants
     lines = []
     settings = c.design.get("settings", {})
-    condition = float(np.linalg.cond(c.arrays[16]))
+    condition = float(np.linalg.cond(a.H))
     if condition > _ILL_CONDITIONED:
         lines.append(f"the QP is ill-conditioned ({condition:.1g}): bring the weights closer together.")
     horizon = int(settings.get("horizon", 0))
@@ -228,7 +215,7 @@ def _review(controller: MpcController) -> list[str]:
     lines += _limits(c)
     n = int(q[rt.MPC_ORDER])
     for axis, name in enumerate(("pitch", "roll")):
-        A = c.arrays[1][axis * n : (axis + 1) * n]
+        A = a.model_A[axis * n : (axis + 1) * n]
         radius = float(np.abs(np.linalg.eigvals(A)).max())
         if 0.0 < radius < 1.0 and 1.0 - radius**horizon < _SEEN:
             lines.append(f"{name}: the horizon ends before half of a move's effect is seen; lengthen it.")
@@ -250,10 +237,10 @@ def _limits(c: MpcController) -> list[str]:
             f"lead_limit {c.lead_limit:g} rad is less than one sample's slew "
             f"({c.slew_limit * c.sample_time:g} rad): the slew limit is never reached."
         )
-    n = int(c.arrays[0][rt.MPC_ORDER])
-    gains = [float(c.arrays[4][axis, 0]) for axis in range(2)]
+    a = rt.MpcArrays(c.arrays)
+    gains = [float(a.rest[axis, 0]) for axis in range(2)]
     if c.angle_limit is not None:
-        T_inverse = np.linalg.inv(c.arrays[8])
+        T_inverse = np.linalg.inv(a.T)
         for axis, name in enumerate(("pitch", "roll")):
             needed = float(np.abs(T_inverse[:, axis]).max()) * c.angle_limit / abs(gains[axis])
             if needed > c.position_limit:
@@ -267,6 +254,6 @@ def _limits(c: MpcController) -> list[str]:
             f"minimum_tautness {c.minimum_tautness:g} rad is above rest: the neck is compressed all the time, and a "
             "co-contraction reference below that is never reached."
         )
-    if not np.isfinite(c.arrays[10]).all() or n < 1:
+    if not np.isfinite(a.K).all():
         lines.append("the arrays are damaged; design it again.")
     return lines

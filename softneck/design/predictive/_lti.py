@@ -31,7 +31,7 @@ def lti(arrays: tuple[Matrix, ...], *, name: str = "mpc") -> control.StateSpace:
 
     A, B, C, D = system(arrays)
     return control.StateSpace(
-        A, B, C, D, float(arrays[0][0]),
+        A, B, C, D, float(rt.MpcArrays(arrays).constants[rt.MPC_TS]),
         inputs=["pitch_reference", "roll_reference", "pitch", "roll"], outputs=["theta_i", "phi_i"], name=name,
     )  # fmt: skip
 
@@ -39,19 +39,19 @@ def lti(arrays: tuple[Matrix, ...], *, name: str = "mpc") -> control.StateSpace:
 def system(arrays: tuple[Matrix, ...]) -> tuple[Matrix, Matrix, Matrix, Matrix]:
     """Return A, B, C, D of `lti`."""
     step = load_runtime("softneck.design.predictive._mpc_runtime").step
-    places = rt.mpc_places(arrays)
-    head = rt.MPC_COUNTERS
-    # Held set-points, filtered references, then models, disturbances, past inputs and references to come.
-    kept = np.concatenate([np.arange(head, head + 6), np.arange(places[1], places[5])])
+    a = rt.MpcArrays(arrays)
+    at, q = rt.MpcState.parts(a), a.constants
+    numbers = np.arange(at["active"].stop)
+    kept = np.concatenate([numbers[at[name]] for name in ("held", "filtered", "models", "offsets", "past", "coming")])
     # Tautness is the fifth where angles have no limit, else the sixth.
-    soft = [_FREE] * (int(arrays[0][rt.MPC_TAUT_AT]) - int(arrays[0][rt.MPC_ANGLE_AT]))
+    soft = [_FREE] * int(q[rt.MPC_TAUT_AT] - q[rt.MPC_ANGLE_AT])
     parameters = np.array([_FREE, _FREE, _FREE, -_FREE, *soft, -_FREE])
-    ahead = 2 if arrays[0][rt.MPC_AHEAD] > 0 else 0
-    ports = 10 + ahead + int(arrays[0][rt.MPC_DISTURBANCES])
+    ahead = 2 if q[rt.MPC_AHEAD] > 0 else 0
+    ports = 10 + ahead + int(q[rt.MPC_DISTURBANCES])
 
     def image(state_at: int, input_at: int) -> tuple[Vector, Vector]:
-        state, u = np.zeros(places[7]), np.zeros(ports)
-        state[rt.MPC_STARTED] = 1.0
+        state, u = np.zeros(numbers.size), np.zeros(ports)
+        state[at["started"]] = 1.0
         u[8:10] = 1.0
         if state_at >= 0:
             state[state_at] = _UNIT
@@ -61,7 +61,7 @@ def system(arrays: tuple[Matrix, ...]) -> tuple[Matrix, Matrix, Matrix, Matrix]:
                 u[10 + input_at] = _UNIT
         out = np.zeros(3)
         step(arrays, parameters, state, u, out)
-        return state[kept] / _UNIT, (arrays[8] @ out)[:2] / _UNIT
+        return state[kept] / _UNIT, (a.T @ out)[:2] / _UNIT
 
     columns = [image(int(at), -1) for at in kept] + [image(-1, i) for i in range(4)]
     states = np.array([state for state, _ in columns]).T

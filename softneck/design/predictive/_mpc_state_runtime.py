@@ -1,11 +1,15 @@
-"""What a predictive controller remembers, and how it moves on: models, disturbances, references, past inputs.
+"""What a predictive controller knows and remembers, and how it moves on: models, disturbances, references, past inputs.
 
-See `_mpc_runtime` for the state and theta.
+Each scenario s has, for each axis, a model `x+ = A x + B v(k - d)`, `y = x[0] + o` that runs on the inputs alone; the
+models stand behind each other, i = 2 s + axis. Its output disturbance o follows what was measured: `o+ = o + r`,
+`r+ = a r` with a the plant's slowest pole, which is what a load makes of the angle that comes on at the plant's input.
 """
 
 import math
 
 import numpy as np
+
+from softneck.runtime._layout import Arrays, StateVector, array, cells, value
 
 MPC_REFERENCE_LIMIT = 0.8
 MPC_MOTOR_LIMIT = 6.0
@@ -13,36 +17,26 @@ MPC_MOTOR_LIMIT = 6.0
 MPC_PLAUSIBLE = 1.3
 MPC_NO_BOUND = 1e30
 
-# Counters at the head of the state.
-MPC_STARTED = 0
-MPC_ITERATIONS = 1
-MPC_STATUS = 2  # of the last sample: one of the MPC_* below
-MPC_SHIFTED = 3  # samples on which the shifted previous plan was used
-MPC_SOFTENED = 4  # samples on which a soft limit could not be kept
-MPC_MISSED = 5  # samples in a row without a measurement
-MPC_AGE = 6  # of the plan
-MPC_RESIDUAL = 7  # of the KKT conditions, last answer
-MPC_SLACK = 8  # largest, last answer
-MPC_COUNTERS = 9
+# Status of a sample.
 MPC_OPTIMAL = 1.0
 MPC_SOFT = 2.0
 MPC_PLAN = 3.0
 MPC_HOLDING = 4.0
 
-# arrays[0], by place.
+# Numbers of `constants`, in this order.
 MPC_TS = 0
-MPC_ROWS = 1  # L
+MPC_ROWS = 1
 MPC_SCENARIOS = 2
 MPC_ORDER = 3
-MPC_PAST = 4  # D
+MPC_PAST = 4
 MPC_MOVES = 5
 MPC_SLACKS = 6
-MPC_AHEAD = 7  # H
-MPC_LEAD = 8
+MPC_AHEAD = 7
+MPC_LEAD = 8  # samples by which references are taken early, to make up for their filters
 MPC_DISTURBANCES = 9
 MPC_BUDGET = 10
 MPC_TOLERANCE = 11
-MPC_COAST = 12
+MPC_COAST = 12  # samples without measurement until the motors are held
 MPC_ANGLE_AT = 13  # places of two parameters; those whose limit is not set are not there
 MPC_TAUT_AT = 14
 MPC_ANGLE_BACK = 15  # how much soft limits are tightened
@@ -57,18 +51,79 @@ MPC_ROW_ANGLE_LOW = 4.0
 MPC_ROW_TAUT = 5.0
 
 
-def mpc_places(arrays: tuple[np.ndarray, ...]) -> tuple[int, int, int, int, int, int, int, int]:
-    """Return where disturbances, x, o, past inputs, references to come, plan and active rows begin, and the end."""
-    q = arrays[0]
-    S, n = int(q[MPC_SCENARIOS]), int(q[MPC_ORDER])
-    disturbances = MPC_COUNTERS + 9
-    x = disturbances + 2 * int(q[MPC_DISTURBANCES])
-    o = x + 2 * S * n
-    past = o + 4 * S
-    ahead = past + 2 * int(q[MPC_PAST])
-    plan = ahead + 2 * int(q[MPC_AHEAD])
-    active = plan + 3 * int(q[MPC_MOVES]) + int(q[MPC_SLACKS])
-    return disturbances, x, o, past, ahead, plan, active, active + arrays[14].shape[0]
+def mpc_disturbance_rows(constants: np.ndarray) -> int:
+    """Return the rows of `disturbances`: no array is empty."""
+    return max(1, int(constants[MPC_DISTURBANCES]))
+
+
+class MpcArrays(Arrays):
+    """The models of S scenarios, and the QP `min 1/2 z'Hz + (F theta)'z, lower <= A z + E theta <= upper`."""
+
+    _z, _theta = "3 * moves + slacks", "2 * S * (n + 2) + 2 * L + 5"
+    constants = array("17", "see MPC_TS to MPC_TAUT_BACK")
+    model_A = array("2 * S * n, n", "A of each model, below each other")
+    model_B = array("2 * S, n", "B of each model")
+    observer = array("2 * S, 3", "gains on o and r, and the pole a")
+    rest = array("2 * S, n", "x at rest under an input of one")
+    delays = array("2 * S", "d, dead times [samples]")
+    disturbances = array("channels, 3", "of each measured one: its gains on pitch and roll, and the pole of its filter")
+    filters = array("3", "poles of the reference filters")
+    T = array("3, 3", "of Eq. 9-11: motors to redefined inputs")
+    starts = array("moves", "samples of the horizon at which the motors move")
+    K = array(f"{_z}, {_theta}", "-H^-1 F: the answer without limits")
+    A = array(f"m, {_z}", "the rows that are limited")
+    G = array("m, m", "A H^-1 A'")
+    E = array(f"m, {_theta}", "what theta adds to the rows")
+    kinds = array("m, 2", "of each row: its MPC_ROW_*, and the motor or axis that it is of")
+    AH = array(f"m, {_z}", "A H^-1")
+    H = array(f"{_z}, {_z}", "")
+    F = array(f"{_z}, {_theta}", "")
+    scale = array("1", "the largest entry of H, at least one")
+    L = value("constants", MPC_ROWS)  # samples of which the reference is needed
+    S = value("constants", MPC_SCENARIOS)
+    n = value("constants", MPC_ORDER)
+    D = value("constants", MPC_PAST)  # the longest dead time
+    moves = value("constants", MPC_MOVES)
+    slacks = value("constants", MPC_SLACKS)
+    ahead = value("constants", MPC_AHEAD)  # samples that the reference is known ahead
+    lead = value("constants", MPC_LEAD)
+    measured = value("constants", MPC_DISTURBANCES)  # disturbances
+    channels = value("constants", function=mpc_disturbance_rows)
+
+
+class MpcState(StateVector):
+    """What is remembered from sample to sample."""
+
+    started = cells("", "1 after the first sample")
+    iterations = cells("", "of the last answer")
+    status = cells("", "of the last sample: MPC_OPTIMAL to MPC_HOLDING")
+    shifted = cells("", "samples on which the shifted previous plan was used")
+    softened = cells("", "samples on which a soft limit could not be kept")
+    missed = cells("", "samples in a row without a measurement")
+    age = cells("", "of the plan [samples]")
+    residual = cells("", "of the KKT conditions, last answer")
+    slack = cells("", "the largest, last answer")
+    held = cells("3", "set-points of now [rad]")
+    filtered = cells("3", "references behind their filters [rad]")
+    seen = cells("3", "references last seen [rad]")
+    disturbances = cells("measured, 2", "of each measured one: its value, and that behind its filter")
+    models = cells("2 * S, n", "x of each model")
+    offsets = cells("2 * S, 2", "o [rad] and r [rad/sample] of each model")
+    past = cells("D, 2", "inputs v, newest first [rad]")
+    coming = cells("2, ahead", "references to come [rad]")
+    plan = cells("3 * moves + slacks", "z: moves of the motors [rad], then slacks")
+    active = cells("m", "1 for rows at their upper, -1 at their lower bound")
+
+
+class MpcTheta(StateVector):
+    """The parameter of the QP."""
+
+    models = cells("2 * S, n", "x(k + d) of each model")
+    offsets = cells("2 * S, 2", "o and r of each model")
+    wanted = cells("2, L", "pitch and roll at k + 1 .. k + L, less what measured disturbances will add [rad]")
+    held = cells("3", "set-points of now [rad]")
+    cocontraction = cells("", "wanted [rad]")
+    one = cells("", "1")
 
 
 def mpc_plausible(angle: float) -> bool:
@@ -76,180 +131,157 @@ def mpc_plausible(angle: float) -> bool:
     return math.isfinite(angle) and abs(angle) < MPC_PLAUSIBLE
 
 
-def mpc_begin(arrays: tuple[np.ndarray, ...], state: np.ndarray, inputs: np.ndarray) -> bool:
+def mpc_begin(p: MpcArrays, x: MpcState, inputs: np.ndarray) -> bool:
     """Take in what is known now; return whether the motors may move."""
-    held = state[MPC_COUNTERS : MPC_COUNTERS + 3]
-    if state[MPC_STARTED] == 0.0:
+    if x.started == 0.0:
         for j in range(3):
-            held[j] = inputs[5 + j] if math.isfinite(inputs[5 + j]) else 0.0
-    mpc_listen(arrays, state, inputs)
+            x.held[j] = inputs[5 + j] if math.isfinite(inputs[5 + j]) else 0.0
+    mpc_listen(p, x, inputs)
     measured = mpc_plausible(inputs[3]) and mpc_plausible(inputs[4])
-    state[MPC_MISSED] = 0.0 if measured else state[MPC_MISSED] + 1.0
-    active = inputs[8] > 0.5 and inputs[9] > 0.5 and state[MPC_MISSED] <= arrays[0][MPC_COAST]
-    if state[MPC_STARTED] == 0.0 or not active:
-        mpc_align(arrays, state, inputs, measured)
+    x.missed = 0.0 if measured else x.missed + 1.0
+    active = inputs[8] > 0.5 and inputs[9] > 0.5 and x.missed <= p.constants[MPC_COAST]
+    if x.started == 0.0 or not active:
+        mpc_align(p, x, inputs, measured)
     elif measured:
-        mpc_correct(arrays, state, inputs)
-    state[MPC_STARTED] = 1.0
+        mpc_correct(p, x, inputs)
+    x.started = 1.0
     if active:
-        mpc_filter(arrays, state)
+        mpc_filter(p, x)
+    else:
+        x.status = MPC_HOLDING
     return active
 
 
-def mpc_listen(arrays: tuple[np.ndarray, ...], state: np.ndarray, inputs: np.ndarray) -> None:
+def mpc_listen(p: MpcArrays, x: MpcState, inputs: np.ndarray) -> None:
     """Take in references and measured disturbances; one that is not finite leaves what was."""
-    seen = state[MPC_COUNTERS + 6 : MPC_COUNTERS + 9]
     for i in range(3):
         if math.isfinite(inputs[i]):
             limit = MPC_REFERENCE_LIMIT if i < 2 else MPC_MOTOR_LIMIT
-            seen[i] = min(max(inputs[i], -limit), limit)
-    places = mpc_places(arrays)
-    H = int(arrays[0][MPC_AHEAD])
+            x.seen[i] = min(max(inputs[i], -limit), limit)
     first = 10
-    if H > 0:
+    if p.ahead > 0:
         first = 12
-        ahead = state[places[4] : places[4] + 2 * H]
         for axis in range(2):
-            row = ahead[axis * H : (axis + 1) * H]
-            if state[MPC_STARTED] == 0.0:
-                row[:] = seen[axis]
-            for i in range(H - 1):
+            row = x.coming[axis]
+            if x.started == 0.0:
+                row[:] = x.seen[axis]
+            for i in range(p.ahead - 1):
                 row[i] = row[i + 1]
             value = inputs[10 + axis]
             if math.isfinite(value):
-                row[H - 1] = min(max(value, -MPC_REFERENCE_LIMIT), MPC_REFERENCE_LIMIT)
-    count = int(arrays[0][MPC_DISTURBANCES])
-    for i in range(count):
+                row[p.ahead - 1] = min(max(value, -MPC_REFERENCE_LIMIT), MPC_REFERENCE_LIMIT)
+    for i in range(p.measured):
         value = inputs[first + i]
-        now = state[places[0] + 2 * i]
-        state[places[0] + 2 * i] = value if math.isfinite(value) else now
-        if state[MPC_STARTED] == 0.0:
-            state[places[0] + 2 * i + 1] = state[places[0] + 2 * i]
+        x.disturbances[i, 0] = value if math.isfinite(value) else x.disturbances[i, 0]
+        if x.started == 0.0:
+            x.disturbances[i, 1] = x.disturbances[i, 0]
 
 
-def mpc_added(arrays: tuple[np.ndarray, ...], state: np.ndarray, axis: int) -> float:
+def mpc_added(p: MpcArrays, x: MpcState, axis: int) -> float:
     """Return what the measured disturbances add to an angle now."""
-    first = mpc_places(arrays)[0]
     total = 0.0
-    for i in range(int(arrays[0][MPC_DISTURBANCES])):
-        total += arrays[6][i, axis] * state[first + 2 * i + 1]
+    for i in range(p.measured):
+        total += p.disturbances[i, axis] * x.disturbances[i, 1]
     return total
 
 
-def mpc_align(arrays: tuple[np.ndarray, ...], state: np.ndarray, inputs: np.ndarray, measured: bool) -> None:
+def mpc_align(p: MpcArrays, x: MpcState, inputs: np.ndarray, measured: bool) -> None:
     """Start as if the neck had always stood where it is under the held set-points: no bump."""
-    q = arrays[0]
-    S, n, D = int(q[MPC_SCENARIOS]), int(q[MPC_ORDER]), int(q[MPC_PAST])
-    _, first, o, past, _, plan, _, end = mpc_places(arrays)
-    held = state[MPC_COUNTERS : MPC_COUNTERS + 3]
-    v = np.dot(arrays[8], held)
-    for s in range(S):
+    v = np.dot(p.T, x.held)
+    for s in range(p.S):
         for axis in range(2):
             i = 2 * s + axis
-            for j in range(n):
-                state[first + i * n + j] = arrays[4][i, j] * v[axis]
-            state[o + 2 * i] = 0.0
-            state[o + 2 * i + 1] = 0.0
+            for j in range(p.n):
+                x.models[i, j] = p.rest[i, j] * v[axis]
+            x.offsets[i, 0] = 0.0
+            x.offsets[i, 1] = 0.0
             if measured:
-                state[o + 2 * i] = inputs[3 + axis] - state[first + i * n] - mpc_added(arrays, state, axis)
-            state[MPC_COUNTERS + 3 + axis] = state[first + i * n] + state[o + 2 * i]
-    state[MPC_COUNTERS + 5] = v[2]
-    for i in range(D):
-        state[past + 2 * i] = v[0]
-        state[past + 2 * i + 1] = v[1]
-    state[plan:end] = 0.0
-    state[MPC_AGE] = 0.0
+                x.offsets[i, 0] = inputs[3 + axis] - x.models[i, 0] - mpc_added(p, x, axis)
+            x.filtered[axis] = x.models[i, 0] + x.offsets[i, 0]
+    x.filtered[2] = v[2]
+    for i in range(p.D):
+        x.past[i, 0] = v[0]
+        x.past[i, 1] = v[1]
+    x.plan[:] = 0.0
+    x.active[:] = 0.0
+    x.age = 0.0
 
 
-def mpc_correct(arrays: tuple[np.ndarray, ...], state: np.ndarray, inputs: np.ndarray) -> None:
+def mpc_correct(p: MpcArrays, x: MpcState, inputs: np.ndarray) -> None:
     """Take the measured angles in."""
-    q = arrays[0]
-    n = int(q[MPC_ORDER])
-    _, first, o, _, _, _, _, _ = mpc_places(arrays)
-    for i in range(2 * int(q[MPC_SCENARIOS])):
-        error = inputs[3 + i % 2] - mpc_added(arrays, state, i % 2) - state[first + i * n] - state[o + 2 * i]
-        state[o + 2 * i] += arrays[3][i, 0] * error
-        state[o + 2 * i + 1] += arrays[3][i, 1] * error
+    for i in range(2 * p.S):
+        error = inputs[3 + i % 2] - mpc_added(p, x, i % 2) - x.models[i, 0] - x.offsets[i, 0]
+        x.offsets[i, 0] += p.observer[i, 0] * error
+        x.offsets[i, 1] += p.observer[i, 1] * error
 
 
-def mpc_filter(arrays: tuple[np.ndarray, ...], state: np.ndarray) -> None:
+def mpc_filter(p: MpcArrays, x: MpcState) -> None:
     """Move the reference filters on: what is asked now acts now."""
-    H, lead = int(arrays[0][MPC_AHEAD]), int(arrays[0][MPC_LEAD])
-    ahead = mpc_places(arrays)[4]
     for i in range(3):
-        a = arrays[7][i]
-        asked = state[MPC_COUNTERS + 6 + i]
-        if i < 2 and H > 0 and lead > 0:
-            asked = state[ahead + i * H + min(lead, H) - 1]
-        state[MPC_COUNTERS + 3 + i] = a * state[MPC_COUNTERS + 3 + i] + (1.0 - a) * asked
+        a = p.filters[i]
+        asked = x.seen[i]
+        if i < 2 and p.ahead > 0 and p.lead > 0:
+            asked = x.coming[i, min(p.lead, p.ahead) - 1]
+        x.filtered[i] = a * x.filtered[i] + (1.0 - a) * asked
 
 
-def mpc_parameter(arrays: tuple[np.ndarray, ...], state: np.ndarray, theta: np.ndarray) -> None:
+def mpc_model(p: MpcArrays, i: int, u: float, now: np.ndarray, after: np.ndarray) -> None:
+    """Fill `after` with A x + B u of model i at x = `now`."""
+    for j in range(p.n):
+        total = p.model_B[i, j] * u
+        for k in range(p.n):
+            total += p.model_A[i * p.n + j, k] * now[k]
+        after[j] = total
+
+
+def mpc_parameter(p: MpcArrays, x: MpcState, theta: MpcTheta) -> None:
     """Fill theta."""
-    q = arrays[0]
-    S, n, L = int(q[MPC_SCENARIOS]), int(q[MPC_ORDER]), int(q[MPC_ROWS])
-    H, lead = int(q[MPC_AHEAD]), int(q[MPC_LEAD])
-    d0, first, o, past, ahead, _, _, _ = mpc_places(arrays)
-    x = np.empty(n)
-    y = np.empty(n)
-    for i in range(2 * S):
-        x[:] = state[first + i * n : first + (i + 1) * n]
-        for back in range(int(arrays[5][i]), 0, -1):
-            v = state[past + 2 * (back - 1) + i % 2]
-            for j in range(n):
-                total = arrays[2][i, j] * v
-                for m in range(n):
-                    total += arrays[1][i * n + j, m] * x[m]
-                y[j] = total
-            x[:] = y
-        theta[i * n : (i + 1) * n] = x
-        theta[2 * S * n + 2 * i] = state[o + 2 * i]
-        theta[2 * S * n + 2 * i + 1] = state[o + 2 * i + 1]
-    at = 2 * S * (n + 2)
+    now, after = np.empty(p.n), np.empty(p.n)
+    for i in range(2 * p.S):
+        now[:] = x.models[i]
+        # The inputs of the dead time are given, oldest first.
+        for back in range(int(p.delays[i]), 0, -1):
+            mpc_model(p, i, x.past[back - 1, i % 2], now, after)
+            now[:] = after
+        theta.models[i] = now
+        theta.offsets[i, 0] = x.offsets[i, 0]
+        theta.offsets[i, 1] = x.offsets[i, 1]
     for axis in range(2):
-        a = arrays[7][axis]
-        value = state[MPC_COUNTERS + 3 + axis]
-        for i in range(1, L + 1):
-            asked = state[MPC_COUNTERS + 6 + axis]
-            if H > 0:
-                asked = state[ahead + axis * H + min(i + lead, H) - 1]
+        a = p.filters[axis]
+        value = x.filtered[axis]
+        for i in range(1, p.L + 1):
+            asked = x.seen[axis]
+            if p.ahead > 0:
+                asked = x.coming[axis, min(i + p.lead, p.ahead) - 1]
             value = a * value + (1.0 - a) * asked
-            theta[at + axis * L + i - 1] = value
-        for j in range(int(q[MPC_DISTURBANCES])):
-            w, z = state[d0 + 2 * j], state[d0 + 2 * j + 1]
-            for i in range(L):
-                z = arrays[6][j, 2] * z + (1.0 - arrays[6][j, 2]) * w
-                theta[at + axis * L + i] -= arrays[6][j, axis] * z
-    at += 2 * L
-    theta[at : at + 3] = state[MPC_COUNTERS : MPC_COUNTERS + 3]
-    theta[at + 3] = state[MPC_COUNTERS + 5]
-    theta[at + 4] = 1.0
+            theta.wanted[axis, i - 1] = value
+        for j in range(p.measured):
+            w, z, keep = x.disturbances[j, 0], x.disturbances[j, 1], p.disturbances[j, 2]
+            for i in range(p.L):
+                z = keep * z + (1.0 - keep) * w
+                theta.wanted[axis, i] -= p.disturbances[j, axis] * z
+    theta.held[:] = x.held
+    theta.cocontraction = x.filtered[2]
+    theta.one = 1.0
 
 
-def mpc_predict(arrays: tuple[np.ndarray, ...], state: np.ndarray) -> None:
+def mpc_predict(p: MpcArrays, x: MpcState) -> None:
     """Move models, past inputs and disturbances on to the next sample."""
-    q = arrays[0]
-    n, D = int(q[MPC_ORDER]), int(q[MPC_PAST])
-    d0, first, o, past, _, _, _, _ = mpc_places(arrays)
-    v = np.dot(arrays[8], state[MPC_COUNTERS : MPC_COUNTERS + 3])
-    x = np.empty(n)
-    for i in range(2 * int(q[MPC_SCENARIOS])):
-        back = int(arrays[5][i])
-        u = state[past + 2 * (back - 1) + i % 2] if back > 0 else v[i % 2]
-        x[:] = state[first + i * n : first + (i + 1) * n]
-        for j in range(n):
-            total = arrays[2][i, j] * u
-            for m in range(n):
-                total += arrays[1][i * n + j, m] * x[m]
-            state[first + i * n + j] = total
-        state[o + 2 * i] += state[o + 2 * i + 1]
-        state[o + 2 * i + 1] *= arrays[3][i, 2]
-    for i in range(D - 1, 0, -1):
-        state[past + 2 * i] = state[past + 2 * i - 2]
-        state[past + 2 * i + 1] = state[past + 2 * i - 1]
-    if D > 0:
-        state[past] = v[0]
-        state[past + 1] = v[1]
-    for i in range(int(q[MPC_DISTURBANCES])):
-        keep = arrays[6][i, 2]
-        state[d0 + 2 * i + 1] = keep * state[d0 + 2 * i + 1] + (1.0 - keep) * state[d0 + 2 * i]
+    v = np.dot(p.T, x.held)
+    now = np.empty(p.n)
+    for i in range(2 * p.S):
+        back = int(p.delays[i])
+        u = x.past[back - 1, i % 2] if back > 0 else v[i % 2]
+        now[:] = x.models[i]
+        mpc_model(p, i, u, now, x.models[i])
+        x.offsets[i, 0] += x.offsets[i, 1]
+        x.offsets[i, 1] *= p.observer[i, 2]
+    for i in range(p.D - 1, 0, -1):
+        x.past[i, 0] = x.past[i - 1, 0]
+        x.past[i, 1] = x.past[i - 1, 1]
+    if p.D > 0:
+        x.past[0, 0] = v[0]
+        x.past[0, 1] = v[1]
+    for i in range(p.measured):
+        keep = p.disturbances[i, 2]
+        x.disturbances[i, 1] = keep * x.disturbances[i, 1] + (1.0 - keep) * x.disturbances[i, 0]

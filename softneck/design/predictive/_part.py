@@ -26,6 +26,7 @@ class MpcPart(BlockPart):
         super().__init__(controller)
         self._program = MpcProgram(controller.arrays) if solver == "daqp" else None
         self._functions = load_functions("softneck.design.predictive._mpc_runtime")
+        self._at = rt.MpcState.parts(rt.MpcArrays(controller.arrays))
         self._took = math.nan
 
     def advance(self, time: float, inputs: Vector) -> Vector:
@@ -44,27 +45,24 @@ class MpcPart(BlockPart):
     def counts(self) -> dict[str, int]:
         """Samples since the start on which the previous plan went on, and on which a soft limit was not kept."""
         return {
-            "previous_plan": int(self._state[rt.MPC_SHIFTED]),
-            "softened": int(self._state[rt.MPC_SOFTENED]),
+            "previous_plan": int(self._state[self._at["shifted"]].item()),
+            "softened": int(self._state[self._at["softened"]].item()),
         }
 
     def _with_daqp(self, program: MpcProgram, inputs: Vector) -> Vector:
         """Do what the runtime's `step` does, with another solver in its middle."""
         f, arrays, state, parameters = self._functions, self.block.arrays, self._state, self._parameters
-        if not f.mpc_begin(arrays, state, inputs):
-            state[rt.MPC_STATUS] = rt.MPC_HOLDING
-        else:
-            m = arrays[14].shape[0]
-            theta, lower, upper = np.empty(arrays[10].shape[1]), np.empty(m), np.empty(m)
-            held = state[rt.MPC_COUNTERS : rt.MPC_COUNTERS + 3]
+        if f.mpc_begin(arrays, state, inputs):
+            m, count = program.E.shape
+            theta, lower, upper = np.empty(count), np.empty(m), np.empty(m)
             f.mpc_parameter(arrays, state, theta)
-            f.mpc_bounds(arrays, parameters, held, inputs[5:8], theta, lower, upper)
+            f.mpc_bounds(arrays, parameters, inputs[5:8], theta, lower, upper)
             z, flag, lam = program.solve(theta, lower, upper)
             f.mpc_take(arrays, state, theta, z, lam, lower, upper, flag > 0)
-            state[rt.MPC_ITERATIONS] = program.iterations
+            state[self._at["iterations"]] = program.iterations
             f.mpc_move(arrays, state, lower, upper, parameters[0])
         f.mpc_predict(arrays, state)
-        self._outputs[:] = state[rt.MPC_COUNTERS : rt.MPC_COUNTERS + 3]
+        self._outputs[:] = state[self._at["held"]]
         return self._outputs.copy()
 
     def start(self, time: float, parameters: Mapping[str, float]) -> Vector:

@@ -11,14 +11,12 @@ from softneck.core import Matrix, SettingsError, Vector
 from softneck.runtime import load_functions
 
 from . import _mpc_state_runtime as rt
-from ._arrays import NAMES
 
 # daqp's own default is 1e-6; the block's solver ends at 1e-10.
 _TOLERANCE = 1e-10
 ROW_NAMES = ("slew", "position", "slack", "angle", "angle", "tautness")
 STATUS_NAMES = ("not started", "optimal", "softened", "previous plan", "holding")
 _OF_MOTORS = (rt.MPC_ROW_MOVE, rt.MPC_ROW_POSITION, rt.MPC_ROW_TAUT)
-_FIELDS = {name: place for place, name in enumerate(NAMES)}
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -62,8 +60,8 @@ class MpcProgram:
         import daqp
 
         self.iterations = 0
-        self.arrays = arrays
-        self.H, self.F, self.A = (arrays[_FIELDS[name]] for name in ("H", "F", "A"))
+        self.arrays, a = arrays, rt.MpcArrays(arrays)
+        self.constants, self.kinds, self.H, self.F, self.A, self.E = a.constants, a.kinds, a.H, a.F, a.A, a.E
         m = self.A.shape[0]
         self._functions = load_functions("softneck.design.predictive._mpc_runtime")
         self._rest, self._order = self._rows()
@@ -74,7 +72,7 @@ class MpcProgram:
         )
         if flag < 0:
             raise SettingsError(f"daqp refuses the controller's QP (flag {flag}); review its weights.")
-        limit = int(arrays[0][rt.MPC_BUDGET]) if budget is None else budget
+        limit = int(self.constants[rt.MPC_BUDGET]) if budget is None else budget
         self._model.settings = {"primal_tol": _TOLERANCE, "dual_tol": _TOLERANCE, "iter_limit": max(limit, 1)}
 
     def _rows(self) -> tuple[np.ndarray, np.ndarray]:
@@ -93,8 +91,7 @@ class MpcProgram:
         """Return the bounds (m,) of all rows under those limits, motors (3,) being where they are [rad]."""
         m = self.A.shape[0]
         lower, upper = np.empty(m), np.empty(m)
-        held = np.ascontiguousarray(theta[-5:-2])
-        self._functions.mpc_bounds(self.arrays, parameters, held, np.asarray(motors, float), theta, lower, upper)
+        self._functions.mpc_bounds(self.arrays, parameters, np.asarray(motors, float), theta, lower, upper)
         return lower, upper
 
     def solve(self, theta: Vector, lower: Vector, upper: Vector) -> tuple[Vector, int, Vector]:
@@ -115,16 +112,16 @@ class MpcProgram:
         import casadi as ca
 
         theta, limits = ca.SX.sym("theta", self.F.shape[1]), ca.SX.sym("limits", 4)
-        q = self.arrays[0]
+        q = self.constants
         position, move = limits[0], limits[1]
         angle, taut = limits[2] - float(q[rt.MPC_ANGLE_BACK]), limits[3] + float(q[rt.MPC_TAUT_BACK])
-        free = ca.mtimes(ca.DM(self.arrays[_FIELDS["E"]]), theta)
+        free = ca.mtimes(ca.DM(self.E), theta)
         inf = rt.MPC_NO_BOUND
         ends = {
             rt.MPC_ROW_MOVE: (-move, move), rt.MPC_ROW_POSITION: (-position, position), rt.MPC_ROW_SLACK: (0.0, inf),
             rt.MPC_ROW_ANGLE_HIGH: (-inf, angle), rt.MPC_ROW_ANGLE_LOW: (-angle, inf), rt.MPC_ROW_TAUT: (taut, inf),
         }  # fmt: skip
-        rows = [ends[kind] for kind in self.arrays[_FIELDS["kinds"]][:, 0]]
+        rows = [ends[kind] for kind in self.kinds[:, 0]]
         lower = ca.vertcat(*(row[0] for row in rows)) - free
         upper = ca.vertcat(*(row[1] for row in rows)) - free
         return ca.Function(
@@ -144,35 +141,30 @@ def residual(
 
 def explain(arrays: tuple[Matrix, ...], state: Vector) -> MpcInfo:
     """Return what the sample that led to `state` decided."""
-    places = rt.mpc_places(arrays)
+    a = rt.MpcArrays(arrays)
+    now = {name: state[place] for name, place in rt.MpcState.parts(a).items()}
     functions = load_functions("softneck.design.predictive._mpc_runtime")
-    q = arrays[0]
-    plan, signs = state[places[5] : places[6]], state[places[6] : places[7]]
-    starts = arrays[_FIELDS["starts"]].astype(int)
-    N = int(q[rt.MPC_ROWS]) - int(q[rt.MPC_PAST])
-    head = rt.MPC_COUNTERS
-    age = int(state[rt.MPC_AGE])
-    moves = np.zeros((N, 3))
-    for i, start in enumerate(starts):
+    age = int(now["age"].item())
+    moves = np.zeros((int(a.constants[rt.MPC_ROWS] - a.constants[rt.MPC_PAST]), 3))
+    for i, start in enumerate(a.starts.astype(int)):
         if start > age:
-            moves[start - age - 1] = plan[3 * i : 3 * i + 3]
-    theta = np.zeros(arrays[_FIELDS["K"]].shape[1])
+            moves[start - age - 1] = now["plan"][3 * i : 3 * i + 3]
+    theta = np.zeros(a.K.shape[1])
     functions.mpc_parameter(arrays, state, theta)
     # The state stands one sample on: what is held now was the plan's first move.
-    set_points = state[head : head + 3] + np.cumsum(moves, axis=0)
-    angles, reference = _predicted(arrays, theta, set_points)
-    kinds = arrays[_FIELDS["kinds"]]
+    set_points = now["held"] + np.cumsum(moves, axis=0)
+    angles, reference = _predicted(a, theta, set_points)
     active = tuple(
         f"{ROW_NAMES[int(kind)]} {('upper', 'lower')[int(sign < 0)]} "
         + (("motor " + str(int(which) + 1)) if kind in _OF_MOTORS else ("pitch", "roll")[int(which) % 2])
-        for (kind, which), sign in zip(kinds, signs, strict=True)
+        for (kind, which), sign in zip(a.kinds, now["active"], strict=True)
         if sign != 0.0 and kind != rt.MPC_ROW_SLACK
     )
     return MpcInfo(
-        status=STATUS_NAMES[int(state[rt.MPC_STATUS])],
-        iterations=int(state[rt.MPC_ITERATIONS]),
-        residual=float(state[rt.MPC_RESIDUAL]),
-        slack=float(state[rt.MPC_SLACK]),
+        status=STATUS_NAMES[int(now["status"].item())],
+        iterations=int(now["iterations"].item()),
+        residual=now["residual"].item(),
+        slack=now["slack"].item(),
         active=active,
         set_points=set_points,
         angles=angles,
@@ -180,21 +172,19 @@ def explain(arrays: tuple[Matrix, ...], state: Vector) -> MpcInfo:
     )
 
 
-def _predicted(arrays: tuple[Matrix, ...], theta: Vector, set_points: Matrix) -> tuple[Matrix, Matrix]:
+def _predicted(a: rt.MpcArrays, theta: Vector, set_points: Matrix) -> tuple[Matrix, Matrix]:
     """Return predicted angles and references (N, 2) of the nominal plant from theta on."""
-    q = arrays[0]
-    n, S, L = int(q[rt.MPC_ORDER]), int(q[rt.MPC_SCENARIOS]), int(q[rt.MPC_ROWS])
-    N = set_points.shape[0]
-    inputs = set_points @ arrays[_FIELDS["T"]].T
+    n, N = a.model_B.shape[1], set_points.shape[0]
+    now = {name: theta[place] for name, place in rt.MpcTheta.parts(a).items()}
+    inputs = set_points @ a.T.T
     angles, reference = np.zeros((N, 2)), np.zeros((N, 2))
-    first = 2 * S * (n + 2)
     for axis in range(2):
-        A, B = arrays[1][axis * n : (axis + 1) * n], arrays[2][axis]
-        a, delay = arrays[3][axis, 2], int(arrays[5][axis])
-        level, rate = theta[2 * S * n + 2 * axis : 2 * S * n + 2 * axis + 2]
-        x = theta[axis * n : (axis + 1) * n]
+        A, B = a.model_A[axis * n : (axis + 1) * n], a.model_B[axis]
+        pole, delay = a.observer[axis, 2], int(a.delays[axis])
+        level, rate = now["offsets"].reshape(-1, 2)[axis]
+        x = now["models"].reshape(-1, n)[axis]
+        reference[:, axis] = now["wanted"].reshape(2, -1)[axis, delay : delay + N]
         for i in range(N):
             x = A @ x + B * inputs[i, axis]
-            angles[i, axis] = x[0] + level + rate * (1.0 - a ** (delay + 1 + i)) / (1.0 - a)
-            reference[i, axis] = theta[first + axis * L + delay + i]
+            angles[i, axis] = x[0] + level + rate * (1.0 - pole ** (delay + 1 + i)) / (1.0 - pole)
     return angles, reference

@@ -29,6 +29,7 @@ from ._arrays import Tuning, assemble, observer_bandwidth, with_filter, with_gai
 from ._controller import MpcController
 from ._disturbance import MeasuredDisturbance
 from ._lti import system
+from ._mpc_state_runtime import MpcArrays
 from ._prediction import Problem, matrices
 from ._scenarios import chosen_scenarios, sample_pairs
 from ._tightening import LimitTrial, tightened
@@ -306,7 +307,7 @@ class MpcSettings:
         arrays = with_filter(arrays, time)
         parts = system(arrays)
         found = {
-            "observer_bandwidth_rad_s": observer_bandwidth(arrays[3][0], nominal[0].sample_time),
+            "observer_bandwidth_rad_s": observer_bandwidth(MpcArrays(arrays).observer[0], nominal[0].sample_time),
             "reference_time_s": time,
             "sensitivity": [sensitivity(parts, pair, self.extra_delay, w) for pair in families],
             "worst_sensitivity": max(

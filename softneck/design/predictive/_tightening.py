@@ -87,7 +87,7 @@ def excess(arrays: tuple[Matrix, ...], plants: Pair, trial: LimitTrial) -> tuple
     worst = (-math.inf, -math.inf)
     for orientation in _ORIENTATIONS:
         angles, motors = closed_loop(arrays, plants, trial, orientation, rng)
-        lever = trial.tautness_lever * arrays[8][:2].T
+        lever = trial.tautness_lever * rt.MpcArrays(arrays).T[:2].T
         beyond = -math.inf if trial.angle_limit is None else float(np.abs(angles).max()) - trial.angle_limit
         slack = -math.inf
         if trial.minimum_tautness is not None:
@@ -100,8 +100,8 @@ def closed_loop(
     arrays: tuple[Matrix, ...], plants: Pair, trial: LimitTrial, orientation: float, rng: np.random.Generator
 ) -> tuple[Matrix, Matrix]:
     """Return the true angles (time, 2) and motors (time, 3) of one trial."""
-    step = load_runtime("softneck.design.predictive._mpc_runtime").step
-    Ts, H = plants[0].sample_time, int(arrays[0][rt.MPC_AHEAD])
+    runtime, a = load_runtime("softneck.design.predictive._mpc_runtime"), rt.MpcArrays(arrays)
+    Ts, H = plants[0].sample_time, int(a.constants[rt.MPC_AHEAD])
     rows = round(_HOLD / Ts)
     tilt = _TILT if trial.angle_limit is None else trial.angle_limit
     levels = tilt * np.repeat(_LEVELS, rows)
@@ -115,8 +115,8 @@ def closed_loop(
     parameters = np.array(
         [*trial.parameters, *(v for v in (trial.angle_limit, trial.minimum_tautness) if v is not None)]
     )
-    state, out = np.zeros(rt.mpc_places(arrays)[7]), np.zeros(3)
-    inputs = np.zeros(10 + (2 if H > 0 else 0) + int(arrays[0][rt.MPC_DISTURBANCES]))
+    state, out = np.zeros(runtime.state_size(arrays)), np.zeros(3)
+    inputs = np.zeros(10 + (2 if H > 0 else 0) + int(a.constants[rt.MPC_DISTURBANCES]))
     inputs[8:10] = 1.0
     necks = [_Axis(plant) for plant in plants]
     dead = max(plant.delay for plant in plants)
@@ -126,10 +126,10 @@ def closed_loop(
         inputs[:2], inputs[3:5], inputs[5:8] = wanted[k], angles[k] + errors[k], motors[k]
         if H > 0:
             inputs[10:12] = wanted[k + H]
-        step(arrays, parameters, state, inputs, out)
+        runtime.step(arrays, parameters, state, inputs, out)
         line = np.vstack([out, line[:-1]])
         for axis, neck in enumerate(necks):
-            neck.advance(float((arrays[8] @ out)[axis]))
+            neck.advance(float((a.T @ out)[axis]))
     return angles, motors
 
 

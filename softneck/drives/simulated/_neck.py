@@ -12,6 +12,7 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, require_between, require_one_of
 from softneck.plant import NeckParameters, VirtualNeck
+from softneck.plant._neck_runtime import VirtualNeckArrays, VirtualNeckState
 from softneck.runtime import load_functions
 
 from ._axis import Axis
@@ -100,6 +101,7 @@ class SimulatedNeck:
         block = VirtualNeck(parameters).block(noise_seed=settings.seed, sample_time=settings.sample_time)
         start = block.initial_state()
         self._arrays, self._q, self._x = block.arrays, start.parameters, start.values.copy()
+        self._free = VirtualNeckState.parts(VirtualNeckArrays(block.arrays))["free"]
         self.outputs: Vector = start.outputs.copy()
         self.disturbance: Vector = np.zeros(len(_DISTURBANCES))
         self.motion: Matrix = np.zeros((3, SERVO_SIZE))
@@ -147,7 +149,7 @@ class SimulatedNeck:
 
     def tear(self, tendon: int) -> None:
         """Let tendon 1, 2 or 3 hang: it is a metre too long."""
-        self._x[18 + tendon] += 1.0
+        self._x[self._free][tendon - 1] += 1.0
 
     def block(self, motor: int) -> None:
         """Hold winch 1, 2 or 3 where it is, whatever its motor does."""

@@ -13,9 +13,10 @@ from softneck.plant._index_runtime import (
     NECK_GEAR_RATIO,
     NECK_TORQUE_CONSTANT,
 )
-from softneck.plant._mechanics_runtime import neck_constants, neck_load, neck_substeps
-from softneck.plant._neck_runtime import NECK_FREE, neck_read, neck_write
-from softneck.plant._winch_runtime import winch_advance, winch_constants
+from softneck.plant._mechanics_runtime import NeckBody, neck_constants, neck_load, neck_substeps
+from softneck.plant._neck_runtime import neck_read, neck_write
+from softneck.plant._winch_runtime import winch_advance, winch_constants, winch_motion
+from softneck.plant._winch_runtime import winch_sense as winch_sense
 
 SERVO_POWER = 0  # 1.0: the loops are closed; 0.0: no current
 SERVO_MODE = 1  # 0 stop with SERVO_DECELERATION, 1 profile position, 3 profile velocity, 8 cyclic position
@@ -50,7 +51,7 @@ SERVO_SIZE = 28
 
 def servo_ticks(
     parameters: np.ndarray,
-    state: np.ndarray,
+    x: NeckBody,
     disturbance: np.ndarray,
     motion: np.ndarray,
     ring: np.ndarray,
@@ -67,21 +68,22 @@ def servo_ticks(
         float(disturbance[3]),
         float(disturbance[4]),
     )
-    free = (float(state[NECK_FREE]), float(state[NECK_FREE + 1]), float(state[NECK_FREE + 2]))
+    free = (float(x.free[0]), float(x.free[1]), float(x.free[2]))
     passive = winch_constants(c)
     count = neck_substeps(c, load, h, 1)
     per_ampere = float(
         parameters[NECK_TORQUE_CONSTANT] * parameters[NECK_GEAR_RATIO] * parameters[NECK_GEAR_EFFICIENCY]
     )
-    x = neck_read(state)
+    moving = neck_read(x)
     for _ in range(ticks):
-        t1 = servo_tick(motion[0], ring[0], x[8], x[11], c[5], per_ampere, h)
-        t2 = servo_tick(motion[1], ring[1], x[9], x[12], c[5], per_ampere, h)
-        t3 = servo_tick(motion[2], ring[2], x[10], x[13], c[5], per_ampere, h)
-        x = winch_advance(x, (t1, t2, t3), free, passive, load, h, count)
-    neck_write(state, x)
+        position, speed = winch_motion(moving)
+        t1 = servo_tick(motion[0], ring[0], position[0], speed[0], c[5], per_ampere, h)
+        t2 = servo_tick(motion[1], ring[1], position[1], speed[1], c[5], per_ampere, h)
+        t3 = servo_tick(motion[2], ring[2], position[2], speed[2], c[5], per_ampere, h)
+        moving = winch_advance(moving, (t1, t2, t3), free, passive, load, h, count)
+    neck_write(x, moving)
     for i in range(3):
-        servo_read(motion[i], x[8 + i], x[11 + i])
+        servo_read(motion[i], x.position[i], x.speed[i])
 
 
 def servo_read(m: np.ndarray, position: float, speed: float) -> None:
