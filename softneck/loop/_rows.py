@@ -54,7 +54,7 @@ class Rows:
             checked: stop where an output becomes NaN or infinite.
         """
         self.names, self._parts = tuple(parts), tuple(parts.values())
-        self._cycle, self._faults = cycle, faults
+        self._cycle, self._faults = tuple(zip(*cycle, strict=True)), faults
         self.bus = wiring.start.copy()
         for name, outputs in starts.items():
             self.bus[wiring.spans[name]] = outputs
@@ -64,11 +64,13 @@ class Rows:
             part.memory[2] if isinstance(part, BlockPart) and name in starts else places.copy()
             for name, part, places in zip((*self.names, "reference"), (*self._parts, None), shown, strict=True)
         )
-        self._signals = (self.bus, self.held, tuple(shown))
+        self._following = np.zeros(1, dtype=np.int64)
+        self._signals = (self.bus, self.held, tuple(shown), self._following)
         taps = [wiring.taps[name] for name in self.names]
         missing = [[port.missing for port in part.outputs] if checked else [] for part in self._parts]
         table = np.zeros((0, len(REFERENCE_PORTS))) if reference is None else reference
-        self._rest = (
+        self._plan = (
+            self._cycle,
             step,
             (
                 tuple(tap.slots for tap in taps),
@@ -78,23 +80,32 @@ class Rows:
             ),
             table,
         )
+        # A block is stepped in place; whoever else calls it gets a copy of its outputs.
+        self._steps = tuple(part.step if isinstance(part, BlockPart) else part.advance for part in self._parts)
 
-    def run(self, first: int, stop: int, table: Matrix, *, compiled: bool = False) -> tuple[int, int, int]:
-        """Run rows `first` to `stop`, noted in `table`; return (next row, 0 or what went wrong, part)."""
+    def run(self, first: int, stop: int, table: Matrix, *, compiled: bool = False) -> tuple[int, int]:
+        """Run rows `first` to `stop`, noted in `table`; return 0 or what went wrong, and the part."""
         faults = self._faults
+        self._following[0] = first
         faults.draw(first, stop)
         if compiled:
-            function, actions, parts = self._linked
-            return function(first, stop, (actions, *self._rest), self._signals, faults.arrays, parts, table)
-        return run_rows(first, stop, (self._cycle, *self._rest), self._signals, faults.lists, self._parts, table)
+            function, plan, parts = self._linked
+            return function(first, stop, plan, self._signals, faults.arrays, parts, table)
+        return run_rows(first, stop, self._plan, self._signals, faults.lists, self._steps, table)
+
+    @property
+    def row(self) -> int:
+        """The next row, also where a part broke off with an error."""
+        return int(self._following[0])
 
     @cached_property
-    def _linked(self) -> tuple[Callable[..., tuple[int, int, int]], np.ndarray, tuple]:
-        """The compiled rows, their actions, and what they step."""
+    def _linked(self) -> tuple[Callable[..., tuple[int, int]], tuple, tuple]:
+        """The compiled rows, and their plan and parts."""
         parts = [part for part in self._parts if isinstance(part, BlockPart)]
         function = load_linked(_MODULE, [part.block.runtime for part in parts]).run_rows
         memories = tuple(zip(*(part.memory[:2] for part in parts), strict=True))
-        return function, np.array(self._cycle, dtype=np.int64), (tuple(part.block.arrays for part in parts), *memories)
+        actions = tuple(np.array(column, dtype=np.int64) for column in self._cycle)
+        return function, (actions, *self._plan[1:]), (tuple(part.block.arrays for part in parts), *memories)
 
 
 def can_compile(parts: Mapping[str, Part]) -> bool:

@@ -24,29 +24,34 @@ ROWS_DISTURB = 3
 ROWS_RECORD = 4
 
 
-def part_step(part: int, time: float, parts: tuple, inputs: np.ndarray, outputs: np.ndarray) -> None:
-    """Step one part; `load_linked` writes this function anew for parts that are compiled."""
-    outputs[:] = parts[part].advance(time, inputs)
+def part_step(part: int, time: float, parts: tuple, inputs: np.ndarray, outputs: np.ndarray) -> bool:
+    """Step one part and return whether all its outputs are known to be finite.
+
+    For parts that are compiled `load_linked` writes this function anew.
+    """
+    values = parts[part](time, inputs)
+    if values is not outputs:
+        outputs[:] = values
+    # One sum tells whether a closer look is needed; in Python, which warns of no inf - inf.
+    return math.isfinite(sum(values.tolist()))
 
 
 def run_rows(first: int, stop: int, plan: tuple, signals: tuple, faults: tuple, parts: tuple, table: np.ndarray) -> tuple:
-    """Run rows `first` to `stop`; return (next row, what stopped it, part).
+    """Run rows `first` to `stop`; return (what stopped them, part).
 
     plan: (actions, step [s], taps, reference (rows, 4)). signals: (bus, what each part holds, the places on the bus
-    where it is shown), the reference behind the parts. parts: for `part_step`.
+    where it is shown, the next row), the reference behind the parts. parts: for `part_step`.
     """
     cycle, step, taps, reference = plan
-    bus, held, shown = signals
+    bus, held, shown, following = signals
     for k in range(first, stop):
-        for i in range(len(cycle)):
-            action = cycle[i]
-            what, part = action[0], action[1]
-            if k % action[2] != 0:
+        for what, part, every in zip(cycle[0], cycle[1], cycle[2]):
+            if k % every != 0:
                 continue
             if what == ROWS_STEP:
                 problem = rows_step(part, k * step, taps, bus, held[part], parts)
                 if problem != ROWS_DONE:
-                    return k, problem, part
+                    return problem, part
             elif what == ROWS_SHOW:
                 shown[part][:] = held[part]
             elif what == ROWS_REFER:
@@ -55,7 +60,8 @@ def run_rows(first: int, stop: int, plan: tuple, signals: tuple, faults: tuple, 
                 faults_act(k, part, faults, bus)
             else:
                 table[k] = bus
-    return stop, ROWS_DONE, 0
+        following[0] = k + 1
+    return ROWS_DONE, 0
 
 
 def rows_step(part: int, time: float, taps: tuple, bus: np.ndarray, outputs: np.ndarray, parts: tuple) -> int:
@@ -66,14 +72,16 @@ def rows_step(part: int, time: float, taps: tuple, bus: np.ndarray, outputs: np.
     """
     slots, factors, fragile, missing = taps
     inputs = bus[slots[part]]
-    if factors[part].shape[0] > 0:
+    if factors[part].size:
         inputs *= factors[part]
-    for i in fragile[part]:
-        if not math.isfinite(inputs[i]):
-            return ROWS_MISSING_INPUT
-    part_step(part, time, parts, inputs, outputs)
+    if fragile[part].size:
+        for i in fragile[part]:
+            if not math.isfinite(inputs[i]):
+                return ROWS_MISSING_INPUT
+    if part_step(part, time, parts, inputs, outputs):
+        return ROWS_DONE
     may_miss = missing[part]
-    for i in range(may_miss.shape[0]):
+    for i in range(may_miss.size):
         if not math.isfinite(outputs[i]) and not (may_miss[i] and math.isnan(outputs[i])):
             return ROWS_BAD_OUTPUT
     return ROWS_DONE

@@ -145,12 +145,17 @@ class LoopRun:
         stride = max(1, self.rows // 100)
         if pace is not None and not pace > 0.0:
             raise SettingsError(f"`pace` must be positive (1 is real time); got {pace}.")
-        compiled = self._compile and on_step is None and pace is None
+        watched = on_step is not None or pace is not None
         begin, first = clock.perf_counter(), self.row
         while self.row < stop:
-            # Compiled rows run until somebody wants to know of them.
-            end = self.row + 1 if not compiled else stop if report is None else (self.row // stride + 1) * stride
-            self.row, problem, part = running.run(self.row, min(stop, end), self._table, compiled=compiled)
+            # Rows run until somebody wants to know of them.
+            end = self.row + 1 if watched else stop if report is None else (self.row // stride + 1) * stride
+            try:
+                problem, part = running.run(
+                    self.row, min(stop, end), self._table, compiled=self._compile and not watched
+                )
+            finally:
+                self.row = running.row
             if problem:
                 self._explain(running, part)
             if report is not None and self.row % stride == 0:
