@@ -100,11 +100,10 @@ class FaultStages:
         self._acting = (*sensors, *plant)
         codes, slots, spans, held = [], [], [], 0
         for i, acting in enumerate(self._acting):
-            begin, end = len(slots), len(slots) + len(acting.slots)
+            place, begin, end = int(i >= len(sensors)), len(slots), len(slots) + len(acting.slots)
             slots += [*acting.slots, *acting.flags]
-            codes.append(
-                [int(i >= len(sensors)), acting.what, acting.first, acting.last, begin, end, len(slots), held, acting.lag]
-            )
+            window = (acting.first, acting.last)
+            codes.append([place, acting.what, *window, begin, end, len(slots), held, acting.lag])
             spans.append(slice(begin, end))
             held += acting.lag * (end - begin)
         memory, most = np.zeros(held), np.zeros(len(slots))

@@ -54,7 +54,9 @@ def cycle(
     leave = [*at_plant, (ROWS_RECORD, 0, 1)]
     if order == "jacobi":
         return [*arrive, *leave, *each(ROWS_STEP, parts), *each(ROWS_SHOW, [n for n in parts if n not in waiting])]
-    ordered = [(what, numbers[name], ratios[name]) for name in step_order(parts, taps) for what in (ROWS_STEP, ROWS_SHOW)]
+    ordered = [
+        (what, numbers[name], ratios[name]) for name in step_order(parts, taps) for what in (ROWS_STEP, ROWS_SHOW)
+    ]
     return [*arrive, *ordered, *leave, *each(ROWS_STEP, waiting)]
 
 

@@ -37,7 +37,7 @@ class Rows:
         *,
         step: float,
         starts: Mapping[str, Vector],
-        faults: FaultStages,
+        faults: FaultStages | None = None,
         reference: Matrix | None = None,
         checked: bool = True,
     ) -> None:
@@ -54,7 +54,7 @@ class Rows:
             checked: stop where an output becomes NaN or infinite.
         """
         self.names, self._parts = tuple(parts), tuple(parts.values())
-        self._cycle, self._faults = tuple(zip(*cycle, strict=True)), faults
+        self._cycle, self._faults = tuple(zip(*cycle, strict=True)), faults or FaultStages([[]] * 4, [], [], 0)
         self.bus = wiring.start.copy()
         for name, outputs in starts.items():
             self.bus[wiring.spans[name]] = outputs

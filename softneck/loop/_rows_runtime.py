@@ -36,7 +36,9 @@ def part_step(part: int, time: float, parts: tuple, inputs: np.ndarray, outputs:
     return math.isfinite(sum(values.tolist()))
 
 
-def run_rows(first: int, stop: int, plan: tuple, signals: tuple, faults: tuple, parts: tuple, table: np.ndarray) -> tuple:
+def run_rows(
+    first: int, stop: int, plan: tuple, signals: tuple, faults: tuple, parts: tuple, table: np.ndarray
+) -> tuple:
     """Run rows `first` to `stop`; return (what stopped them, part).
 
     plan: (actions, step [s], taps, reference (rows, 4)). signals: (bus, what each part holds, the places on the bus
@@ -45,7 +47,7 @@ def run_rows(first: int, stop: int, plan: tuple, signals: tuple, faults: tuple, 
     cycle, step, taps, reference = plan
     bus, held, shown, following = signals
     for k in range(first, stop):
-        for what, part, every in zip(cycle[0], cycle[1], cycle[2]):
+        for what, part, every in zip(cycle[0], cycle[1], cycle[2]):  # noqa: B905 - numba knows no `strict`
             if k % every != 0:
                 continue
             if what == ROWS_STEP:

@@ -205,9 +205,7 @@ class LoopRun:
             DataError: the state is of another loop.
         """
         running, memories = self._start(), self._faults.memories
-        state.check(
-            order=self.loop.order, step=self.step, bus=running.bus, memories=memories, parts=set(self._parts)
-        )
+        state.check(order=self.loop.order, step=self.step, bus=running.bus, memories=memories, parts=set(self._parts))
         if state.row > self.rows:
             raise DataError(f"the state is at row {state.row}; this loop ends at row {self.rows}: make it longer.")
         for name, part in self._parts.items():
