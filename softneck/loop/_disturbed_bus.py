@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from statistics import NormalDist
 
 import numpy as np
@@ -13,9 +13,14 @@ from softneck.core import DataError, SettingsError, Vector, to_si
 from softneck.runtime import Port
 
 from ._faults import AXES, Fault, MotorFault, NeckFault, SensorFault, with_kind
+from ._faults_runtime import FAULT_ADD, FAULT_DELAY, FAULT_DROPOUT, FAULT_FREEZE, FAULT_SLOW
 from ._part import Part
 from ._wiring import BusSignal, Tap, Wiring
 
+# What each kind does but those that add something.
+_WHAT = {
+    "dropout": FAULT_DROPOUT, "freeze": FAULT_FREEZE, "stuck": FAULT_FREEZE, "delay": FAULT_DELAY, "slow": FAULT_SLOW,
+}  # fmt: skip
 # Share of a step by which a delay or the edge of a window may miss a sample: rounding of k * step.
 _SAME_TIME = 1e-6
 
@@ -24,10 +29,10 @@ class ActiveFault:
     """One fault on its places of the bus.
 
     Attributes:
-        memory: what it remembers between steps, for `LoopState`.
-        what: it does: the fault's kind, "add" for a disturbance.
+        what: it does, see `_faults_runtime`.
         slots, flags: positions of its signals, and of those of validity.
         first, last: rows of its window.
+        lag: rows that it remembers.
     """
 
     def __init__(self, fault: Fault, slots: list[int], flags: list[int], scale: Vector, step: float) -> None:
@@ -40,71 +45,28 @@ class ActiveFault:
             scale: (n,) SI to the unit of each signal.
             step: of the loop [s].
         """
-        self.fault, self.slots, self.flags = fault, np.array(slots, dtype=np.intp), np.array(flags, dtype=np.intp)
+        self.fault, self.slots, self.flags = fault, slots, flags
         self.first = math.ceil(fault.start / step - _SAME_TIME)
         end = fault.start + fault.duration
         self.last = math.ceil(end / step - _SAME_TIME) if math.isfinite(end) else 2**62
         self._scale, self._step = scale, step
-        self.what = "add" if isinstance(fault, NeckFault) else fault.kind
-        self._act = getattr(self, f"_{self.what}")
-        self._lag = _lag(fault, step)
-        self.memory = np.zeros(((self._lag or 1), len(slots)))
+        kind = "add" if isinstance(fault, NeckFault) else fault.kind
+        self.what, self.drawn = _WHAT.get(kind, FAULT_ADD), kind in ("noise", "outlier")
+        self.lag = _lag(fault, step) or 1
         # The two tails of a normal variable: a share of the samples, of either sign.
-        self._far = NormalDist().inv_cdf(1.0 - 0.5 * getattr(fault, "share", 0.0)) if self.what == "outlier" else 0.0
-
-    def apply(self, bus: Vector, k: int) -> None:
-        """Change the bus at row `k` if the fault is on; remember what it needs in any case."""
-        self._act(bus, k, self.first <= k < self.last)
-
-    def _dropout(self, bus: Vector, k: int, on: bool) -> None:  # noqa: ARG002
-        if on:
-            bus[self.slots] = np.nan
-            bus[self.flags] = 0.0
-
-    def _freeze(self, bus: Vector, k: int, on: bool) -> None:
-        # At the very first row there is nothing before: that row's own value stays.
-        if on and k > 0:
-            bus[self.slots] = self.memory[0]
-        else:
-            self.memory[0] = bus[self.slots]
-
-    _stuck = _freeze
-
-    def _bias(self, bus: Vector, k: int, on: bool) -> None:
-        if on:
-            bus[self.slots] += self.amount(k)
-
-    _offset = _noise = _outlier = _add = _bias
-
-    def _delay(self, bus: Vector, k: int, on: bool) -> None:
-        now = bus[self.slots]
-        if k == 0:
-            self.memory[:] = now
-        old = self.memory[k % self._lag].copy()
-        self.memory[k % self._lag] = now
-        if on:
-            bus[self.slots] = old
-
-    def _slow(self, bus: Vector, k: int, on: bool) -> None:
-        wanted = bus[self.slots]
-        if on and k > 0:
-            wanted = self.memory[0] + np.clip(wanted - self.memory[0], -self.most, self.most)
-            bus[self.slots] = wanted
-        self.memory[0] = wanted
+        self._far = NormalDist().inv_cdf(1.0 - 0.5 * getattr(fault, "share", 0.0)) if kind == "outlier" else 0.0
 
     def amount(self, k: int) -> Vector:
-        """Return what is added at row `k` (n,): bias, offset and disturbance, noise, outliers; zero for the others."""
+        """Return what is added at row `k` (n,): bias, offset and disturbance, noise, outliers."""
         fault = self.fault
         if isinstance(fault, NeckFault):
             return self._scale * np.array(list(fault.values.values()))
-        if fault.kind in ("bias", "offset"):
-            return self._scale * fault.size
         if fault.kind == "noise" and isinstance(fault, SensorFault):
             return self._scale * fault.std * self._draws(k)
         if fault.kind == "outlier":
             draw = self._draws(k)
             return np.where(np.abs(draw) > self._far, self._scale * fault.size * np.sign(draw), 0.0)
-        return np.zeros(self.slots.size)
+        return self._scale * fault.size
 
     @property
     def most(self) -> Vector:
@@ -113,43 +75,67 @@ class ActiveFault:
 
     def _draws(self, k: int) -> Vector:
         """Return the normal draws (n,) of row `k`: a function of seed and row, so that nothing must be remembered."""
-        return np.random.default_rng([getattr(self.fault, "seed"), k]).standard_normal(self.slots.size)  # noqa: B009
+        return np.random.default_rng([getattr(self.fault, "seed"), k]).standard_normal(len(self.slots))  # noqa: B009
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class FaultStages:
-    """Detours and faults, in the two places of a cycle where they act.
+    """All faults of a loop, as `_faults_runtime` reads them.
 
     Attributes:
-        sensor_from, sensor_to: positions of the plant's outputs and of their faulty copies.
-        plant_from, plant_to: the same of what the plant reads.
-        sensors, plant: the faults there, in the file's order.
+        lists, arrays: the same, for interpreted and for compiled rows.
+        memories: (rows, signals) what each fault remembers between rows, for `LoopState`.
     """
 
-    sensor_from: np.ndarray
-    sensor_to: np.ndarray
-    plant_from: np.ndarray
-    plant_to: np.ndarray
-    sensors: tuple[ActiveFault, ...]
-    plant: tuple[ActiveFault, ...]
+    def __init__(
+        self, detours: Sequence[list[int]], sensors: Sequence[ActiveFault], plant: Sequence[ActiveFault], rows: int
+    ) -> None:
+        """Lay out faults of a run of `rows` rows.
 
-    def sense(self, bus: Vector, k: int) -> None:
-        """Pass the plant's outputs on to their readers."""
-        bus[self.sensor_to] = bus[self.sensor_from]
-        for acting in self.sensors:
-            acting.apply(bus, k)
+        Args:
+            detours: positions of the plant's outputs, of their faulty copies, and both of what the plant reads.
+            sensors: the faults there, in the file's order.
+            plant: those of what the plant reads.
+            rows: of the run.
+        """
+        self._acting = (*sensors, *plant)
+        codes, slots, spans, held = [], [], [], 0
+        for i, acting in enumerate(self._acting):
+            place, begin, end = int(i >= len(sensors)), len(slots), len(slots) + len(acting.slots)
+            slots += [*acting.slots, *acting.flags]
+            window = (acting.first, acting.last)
+            codes.append([place, acting.what, *window, begin, end, len(slots), held, acting.lag])
+            spans.append(slice(begin, end))
+            held += acting.lag * (end - begin)
+        memory, most = np.zeros(held), np.zeros(len(slots))
+        adding = [pair for pair in zip(self._acting, spans, strict=True) if pair[0].what == FAULT_ADD]
+        self._added = np.zeros((rows if adding else 0, len(slots)))
+        self._drawn = [pair for pair in adding if pair[0].drawn]
+        for acting, span in zip(self._acting, spans, strict=True):
+            most[span] = acting.most
+        for acting, span in adding:
+            if not acting.drawn:
+                self._added[acting.first : acting.last, span] = acting.amount(0)
+        self.memories = tuple(
+            memory[code[7] : code[7] + acting.lag * len(acting.slots)].reshape(acting.lag, -1)
+            for acting, code in zip(self._acting, codes, strict=True)
+        )
+        numbers = (most, self._added, memory)
+        self.lists = (tuple(detours), codes, slots, *numbers)
+        table = np.array(codes, dtype=np.int64).reshape(-1, 9)
+        whole = tuple(np.array(places, dtype=np.int64) for places in (*detours, slots))
+        self.arrays = (whole[:4], table, whole[4], *numbers)
 
-    def actuate(self, bus: Vector, k: int) -> None:
-        """Pass on to the plant what drives and disturbs it."""
-        bus[self.plant_to] = bus[self.plant_from]
-        for acting in self.plant:
-            acting.apply(bus, k)
+    def draw(self, first: int, stop: int) -> None:
+        """Draw what is random in rows `first` to `stop`."""
+        for acting, span in self._drawn:
+            for k in range(max(first, acting.first), min(stop, acting.last)):
+                self._added[k, span] = acting.amount(k)
 
 
 def place_faults(
-    faults: Sequence[Fault], wiring: Wiring, parts: Mapping[str, Part], step: float
+    faults: Sequence[Fault], wiring: Wiring, parts: Mapping[str, Part], *, step: float, rows: int
 ) -> tuple[Wiring, FaultStages]:
-    """Put `faults` between the parts and return the wiring with their detours.
+    """Put `faults` between the parts for `rows` rows of `step` [s] and return the wiring with their detours.
 
     Raises:
         SettingsError: the plant lacks what a fault acts on, or a delay is not a multiple of the step.
@@ -166,7 +152,7 @@ def place_faults(
             names = _plant_inputs(fault, parts["plant"])
             slots = [detours.of_input(name) for name in names]
             plant.append(ActiveFault(fault, slots, [], _scales(parts["plant"].inputs, names, fault), step))
-    return detours.wiring(), detours.stages(sensors, plant)
+    return detours.wiring(), FaultStages(detours.places(), sensors, plant, rows)
 
 
 def sensor_outputs(fault: SensorFault, plant: Part) -> tuple[str, ...]:
@@ -263,14 +249,9 @@ class _FaultRouting:
         """Return the wiring with the detours."""
         return replace(self._wiring, start=np.array(self._start), named=tuple(self._named), taps=self._taps)
 
-    def stages(self, sensors: list[ActiveFault], plant: list[ActiveFault]) -> FaultStages:
-        """Return the copies and the faults."""
-        places = [
-            np.array([pair[i] for pair in table.values()], dtype=np.intp)
-            for table in (self._outputs, self._inputs)
-            for i in (0, 1)
-        ]
-        return FaultStages(places[0], places[1], places[2], places[3], tuple(sensors), tuple(plant))
+    def places(self) -> list[list[int]]:
+        """Return from where to where the plant's outputs are copied, and what it reads."""
+        return [[pair[i] for pair in table.values()] for table in (self._outputs, self._inputs) for i in (0, 1)]
 
 
 def _measured(name: str) -> str:

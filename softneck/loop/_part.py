@@ -65,10 +65,14 @@ class BlockPart:
         self._outputs = state.outputs.copy()
         return self._outputs.copy()
 
-    def advance(self, time: float, inputs: Vector) -> Vector:  # noqa: ARG002
+    def advance(self, time: float, inputs: Vector) -> Vector:
         """Step once and return the outputs."""
+        return self.step(time, inputs).copy()
+
+    def step(self, time: float, inputs: Vector) -> Vector:  # noqa: ARG002
+        """Step once and return the outputs where the next step changes them."""
         self._step(self.block.arrays, self._parameters, self._state, inputs, self._outputs)
-        return self._outputs.copy()
+        return self._outputs
 
     def close(self) -> None:
         """Do nothing: a block holds nothing but memory."""

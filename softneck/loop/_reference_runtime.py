@@ -1,74 +1,106 @@
-"""A reference as a runtime: what `_references.py` computes, sample by sample, for the reference FMU.
+"""References: what pitch, roll and co-contraction are to be, for loops (`_references.py`) and the reference FMU.
 
-Arrays: (settings) = [kind, sample time], and a table (N, 4) of time, pitch, roll, co-contraction for a recorded one.
-Kinds: 0 step, 1 ramp, 2 sine, 3 rotation, 4 recording. `step` from sample k returns the reference at sample k + 1,
-which is where a master reads it.
+`step` from sample k returns the reference at sample k + 1, which is where a master reads it.
 """
-
-from __future__ import annotations
 
 import math
 
 import numpy as np
 
-
-def state_size(arrays: tuple[np.ndarray, ...]) -> int:
-    """Return the length of the state: the number of the sample, and the row of the table."""
-    return 2
+from softneck.runtime._layout import Arrays, StateVector, array, cells
 
 
-def initialise(arrays: tuple[np.ndarray, ...], parameters: np.ndarray, state: np.ndarray, outputs: np.ndarray) -> None:
+class ReferenceArrays(Arrays):
+    """Which reference, and the rows of a recorded one."""
+
+    setup = array("2", "kind: 0 step, 1 ramp, 2 sine, 3 rotation, 4 recording; sample time [s]")
+    table = array("rows, 4", "time [s], pitch, roll, co-contraction [rad] of a recording")
+
+
+class ReferenceState(StateVector):
+    """Where in time it is."""
+
+    sample = cells("", "number of the sample")
+    row = cells("", "row of the table")
+
+
+def initialise(p: ReferenceArrays, parameters: np.ndarray, x: ReferenceState, outputs: np.ndarray) -> None:
     """Fill the state and the outputs at t_0."""
-    state[0] = 0.0
-    state[1] = 0.0
-    reference_at(arrays, parameters, state, outputs)
+    x.sample = 0.0
+    x.row = 0.0
+    reference_at(p, parameters, x, outputs)
 
 
 def step(
-    arrays: tuple[np.ndarray, ...],
-    parameters: np.ndarray,
-    state: np.ndarray,
-    inputs: np.ndarray,
-    outputs: np.ndarray,
+    p: ReferenceArrays, parameters: np.ndarray, x: ReferenceState, inputs: np.ndarray, outputs: np.ndarray
 ) -> None:
     """Go on by one sample."""
-    state[0] += 1.0
-    reference_at(arrays, parameters, state, outputs)
+    x.sample += 1.0
+    reference_at(p, parameters, x, outputs)
 
 
-def reference_at(
-    arrays: tuple[np.ndarray, ...], parameters: np.ndarray, state: np.ndarray, outputs: np.ndarray
-) -> None:
+def reference_at(p: ReferenceArrays, parameters: np.ndarray, x: ReferenceState, outputs: np.ndarray) -> None:
     """Write pitch, roll, co-contraction and enabled at the state's sample.
 
     Parameters: pitch, roll, cocontraction, inclination [rad], frequency [Hz], at, rise [s], enabled.
     """
-    kind = int(arrays[0][0])
-    time = state[0] * arrays[0][1]
+    kind = int(p.setup[0])
+    time = x.sample * p.setup[1]
     pitch, roll, cocontraction = parameters[0], parameters[1], parameters[2]
-    elapsed = time - parameters[5]
-    outputs[3] = parameters[7]
-    if kind == 4:
-        table = arrays[1]
-        k = int(state[1])
-        # Half a nanosecond, as everywhere: times are multiples of a sample time.
-        while k + 1 < table.shape[0] and table[k + 1, 0] <= time + 5e-10:
-            k += 1
-        state[1] = float(k)
-        outputs[0], outputs[1], outputs[2] = table[k, 1], table[k, 2], table[k, 3]
+    frequency, at, rise = parameters[4], parameters[5], parameters[6]
+    if kind == 0:
+        pitch, roll, cocontraction = reference_step(time, pitch, roll, cocontraction, at)
+    elif kind == 1:
+        pitch, roll, cocontraction = reference_ramp(time, pitch, roll, cocontraction, at, rise)
+    elif kind == 2:
+        pitch, roll, cocontraction = reference_sine(time, pitch, roll, cocontraction, frequency, at)
     elif kind == 3:
-        elapsed = max(0.0, elapsed)
-        a = parameters[3] * min(1.0, elapsed / parameters[6])
-        angle = 2.0 * math.pi * parameters[4] * elapsed
-        outputs[0], outputs[1], outputs[2] = a * math.cos(angle), a * math.sin(angle), cocontraction
+        pitch, roll, cocontraction = reference_rotation(time, parameters[3], cocontraction, frequency, at, rise)
     else:
-        third = 1.0
-        if kind == 0:
-            part = 1.0 if time >= parameters[5] - 5e-10 else 0.0
-            third = part
-        elif kind == 1:
-            part = min(1.0, max(0.0, elapsed / parameters[6]))
-            third = part
-        else:
-            part = math.sin(2.0 * math.pi * parameters[4] * max(0.0, elapsed))
-        outputs[0], outputs[1], outputs[2] = pitch * part, roll * part, cocontraction * third
+        k = reference_row(time, p.table, int(x.row))
+        x.row = float(k)
+        pitch, roll, cocontraction = p.table[k, 1], p.table[k, 2], p.table[k, 3]
+    outputs[0], outputs[1], outputs[2], outputs[3] = pitch, roll, cocontraction, parameters[7]
+
+
+def reference_step(
+    time: float, pitch: float, roll: float, cocontraction: float, at: float
+) -> tuple[float, float, float]:  # fmt: skip
+    """Jump from zero at `at`."""
+    # Times are multiples of a sample time; half a nanosecond covers their rounding.
+    if time >= at - 5e-10:
+        return pitch, roll, cocontraction
+    return 0.0, 0.0, 0.0
+
+
+def reference_ramp(
+    time: float, pitch: float, roll: float, cocontraction: float, at: float, rise: float
+) -> tuple[float, float, float]:
+    """Rise linearly from zero over `rise`."""
+    part = min(1.0, max(0.0, (time - at) / rise))
+    return pitch * part, roll * part, cocontraction * part
+
+
+def reference_sine(
+    time: float, pitch: float, roll: float, cocontraction: float, frequency: float, at: float
+) -> tuple[float, float, float]:
+    """Swing in phase from `at` on."""
+    wave = math.sin(2.0 * math.pi * frequency * max(0.0, time - at))
+    return pitch * wave, roll * wave, cocontraction
+
+
+def reference_rotation(
+    time: float, inclination: float, cocontraction: float, frequency: float, at: float, rise: float
+) -> tuple[float, float, float]:
+    """Go around: pitch = A cos(w t), roll = A sin(w t), A rising from zero over `rise`."""
+    elapsed = max(0.0, time - at)
+    a = inclination * min(1.0, elapsed / rise)
+    angle = 2.0 * math.pi * frequency * elapsed
+    return a * math.cos(angle), a * math.sin(angle), cocontraction
+
+
+def reference_row(time: float, table: np.ndarray, k: int) -> int:
+    """Return the row of a recording that holds at `time`, from row `k` on."""
+    while k + 1 < table.shape[0] and table[k + 1, 0] <= time + 5e-10:
+        k += 1
+    return k

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Protocol
@@ -19,6 +18,8 @@ from softneck.core import (
     require_positive,
     to_si,
 )
+
+from ._reference_runtime import reference_ramp, reference_rotation, reference_row, reference_sine, reference_step
 
 Triple = tuple[float, float, float]
 # The neck bends by at most 40 deg = 0.7 rad (paper, section 5); more is a value in degrees.
@@ -54,9 +55,7 @@ class StepReference:
 
     def __call__(self, time: float, /) -> Triple:
         """Return the reference at `time`."""
-        # Times are multiples of a sample time; half a nanosecond covers their rounding.
-        on = time >= self.at - 5e-10
-        return (self.pitch, self.roll, self.cocontraction) if on else (0.0, 0.0, 0.0)
+        return reference_step(time, self.pitch, self.roll, self.cocontraction, self.at)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,8 +82,7 @@ class RampReference:
 
     def __call__(self, time: float, /) -> Triple:
         """Return the reference at `time`."""
-        part = min(1.0, max(0.0, (time - self.at) / self.rise))
-        return self.pitch * part, self.roll * part, self.cocontraction * part
+        return reference_ramp(time, self.pitch, self.roll, self.cocontraction, self.at, self.rise)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,8 +109,7 @@ class SineReference:
 
     def __call__(self, time: float, /) -> Triple:
         """Return the reference at `time`."""
-        wave = math.sin(2.0 * math.pi * self.frequency * max(0.0, time - self.at))
-        return self.pitch * wave, self.roll * wave, self.cocontraction
+        return reference_sine(time, self.pitch, self.roll, self.cocontraction, self.frequency, self.at)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -141,10 +138,9 @@ class RotationReference:
 
     def __call__(self, time: float, /) -> Triple:
         """Return the reference at `time`."""
-        elapsed = max(0.0, time - self.at)
-        A = self.inclination * min(1.0, elapsed / self.rise)
-        angle = 2.0 * math.pi * self.frequency * elapsed
-        return A * math.cos(angle), A * math.sin(angle), self.cocontraction
+        return reference_rotation(
+            time, self.inclination, self.cocontraction, self.frequency, self.at, self.rise
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -172,7 +168,9 @@ class RecordingReference:
 
     def __call__(self, time: float, /) -> Triple:
         """Return the reference at `time`."""
-        k = max(0, int(np.searchsorted(self.time, time + 5e-10, side="right")) - 1)
+        # The search only comes near, in few steps; the row itself is the runtime's to say.
+        near = max(0, int(np.searchsorted(self.time, time, side="right")) - 1)
+        k = reference_row(time, self.time[:, None], near)
         third = 0.0 if self.cocontraction is None else float(self.cocontraction[k])
         return float(self.pitch[k]), float(self.roll[k]), third
 

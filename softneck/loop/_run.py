@@ -12,12 +12,12 @@ import numpy as np
 from softneck.core import DataError, Matrix, SettingsError, Vector, to_si
 from softneck.runtime import Port
 
-from ._compiled_rows import CompiledRows, can_compile
 from ._disturbed_bus import place_faults
 from ._loop import Loop
-from ._order import late, step_order
-from ._part import BlockPart, Part
+from ._order import cycle, late
+from ._part import Part
 from ._result import LoopResult
+from ._rows import Rows, can_compile
 from ._state import LoopState, SaveablePart
 from ._wiring import REFERENCE_PORTS, BusSignal, Wiring, wire
 
@@ -100,23 +100,19 @@ class LoopRun:
         `compiled` takes compiled rows where all parts are blocks.
         """
         self.loop, self._parts = loop, loop.parts
-        self.step, self._ratios = _schedule(self._parts)
+        self.step, ratios = _schedule(self._parts)
         wiring = wire(self._parts, loop.constants, loop.connections)
-        sequential = loop.order == "sequential"
-        self._order = step_order(self._parts, wiring.taps) if sequential else ()
-        self._wiring, stages = place_faults(loop.faults, wiring, self._parts, self.step)
-        self._stages = stages if loop.faults else None
-        self._memories = tuple(acting.memory for acting in (*stages.sensors, *stages.plant))
+        self._cycle = cycle(
+            self._parts, wiring.taps, ratios, order=loop.order, disturbed=bool(loop.faults)
+        )  # fmt: skip
         self.row, self.rows = 0, max(1, round(loop.duration / self.step))
-        self._late = tuple(name for name, part in self._parts.items() if late(part))
-        self._bus, self._pending = self._wiring.start.copy(), {}
-        self._started = False
-        self._cycle = self._sequential if sequential else self._jacobi
+        self._wiring, self._faults = place_faults(loop.faults, wiring, self._parts, step=self.step, rows=self.rows)
         self._columns = _columns(self._wiring)
-        self._table = np.empty((self.rows, self._bus.size))
+        self._table = np.empty((self.rows, self._wiring.start.size))
         self._reference = _reference_table(loop, self.step, self.rows)
-        self._compiled: CompiledRows | None = None
+        self._late = [i for i, part in enumerate(self._parts.values()) if late(part)]
         self._compile = compiled and can_compile(self._parts)
+        self._begun: Rows | None = None
 
     def __enter__(self) -> LoopRun:
         """Return the run itself."""
@@ -128,7 +124,7 @@ class LoopRun:
 
     def close(self) -> None:
         """Release the parts."""
-        self._started = False
+        self._begun = None
         self.loop.close()
 
     def advance(
@@ -144,52 +140,40 @@ class LoopRun:
         Raises:
             DataError: a part returned NaN or infinity; the message names part, variable and time.
         """
-        self._start()
+        running = self._start()
         stop = self.rows if rows is None else min(self.rows, self.row + rows)
         stride = max(1, self.rows // 100)
         if pace is not None and not pace > 0.0:
             raise SettingsError(f"`pace` must be positive (1 is real time); got {pace}.")
-        if self._compile and on_step is None and pace is None:
-            self._advance_compiled(stop, stride, report)
-            return self.row == self.rows
+        watched = on_step is not None or pace is not None
         begin, first = clock.perf_counter(), self.row
-        cycle = self._cycle
-        for k in range(self.row, stop):
-            cycle(k)
-            self.row = k + 1
-            if report is not None and (k + 1) % stride == 0:
-                report((k + 1) / self.rows)
+        while self.row < stop:
+            # Rows run until somebody wants to know of them.
+            end = self.row + 1 if watched else stop if report is None else (self.row // stride + 1) * stride
+            try:
+                problem, part = running.run(
+                    self.row, min(stop, end), self._table, compiled=self._compile and not watched
+                )
+            finally:
+                self.row = running.row
+            if problem:
+                self._explain(running, part)
+            if report is not None and self.row % stride == 0:
+                report(self.row / self.rows)
             if pace is not None:
-                _wait_until(begin + (k + 1 - first) * self.step / pace)
+                _wait_until(begin + (self.row - first) * self.step / pace)
+            k = self.row - 1
             if on_step is not None and on_step(LoopStep(k, k * self.step, self._table[k], self._columns)):
                 self._table = self._table[: self.row]
                 self.rows = self.row
                 break
         return self.row == self.rows
 
-    def _advance_compiled(self, stop: int, stride: int, report: Callable[[float], None] | None) -> None:
-        rows = self._compiled = self._compiled or self._compiled_rows()
-        while self.row < stop:
-            end = stop if report is None else min(stop, (self.row // stride + 1) * stride)
-            self.row, problem, part = rows.run(self.row, end, self._pending, self._bus, self._table)
-            if problem:
-                self._explain(rows.names[part], self.row * self.step)
-            if report is not None:
-                report(self.row / self.rows)
-
-    def _compiled_rows(self) -> CompiledRows:
-        blocks = {name: part for name, part in self._parts.items() if isinstance(part, BlockPart)}
-        return CompiledRows(
-            blocks, self._wiring, sequential=self.loop.order == "sequential", order=self._order, late=self._late,
-            ratios=self._ratios, reference=self._reference, stages=self._stages, rows=self.rows,
-        )  # fmt: skip
-
-    def _explain(self, name: str, time: float) -> None:
-        """Raise what the Python rows would raise of part `name`, whose inputs or outputs the compiled ones refused."""
-        self._wiring.taps[name].read(self._bus, time)
-        part = self._parts[name]
-        if isinstance(part, BlockPart):
-            self._checked(name, part.memory[2], time)
+    def _explain(self, running: Rows, part: int) -> None:
+        """Raise what is wrong with the inputs or outputs of a part that stopped the rows."""
+        name, time = running.names[part], self.row * self.step
+        self._wiring.taps[name].read(running.bus, time)
+        self._require_finite(name, running.held[part], time)
 
     def result(self) -> LoopResult:
         """Return the signals of all rows so far."""
@@ -205,12 +189,12 @@ class LoopRun:
         Raises:
             SettingsError: a part that cannot save its state.
         """
-        self._start()
+        running = self._start()
         parts = {name: _saved(name, part).get_state() for name, part in self._parts.items()}
         return LoopState(
-            row=self.row, order=self.loop.order, step=self.step, bus=self._bus.copy(),
-            pending={name: values.copy() for name, values in self._pending.items()},
-            memories=tuple(memory.copy() for memory in self._memories), table=self._table[: self.row].copy(),
+            row=self.row, order=self.loop.order, step=self.step, bus=running.bus.copy(),
+            pending={running.names[i]: running.held[i].copy() for i in self._late},
+            memories=tuple(memory.copy() for memory in self._faults.memories), table=self._table[: self.row].copy(),
             parts=parts,
         )  # fmt: skip
 
@@ -220,83 +204,36 @@ class LoopRun:
         Raises:
             DataError: the state is of another loop.
         """
-        self._start()
-        state.check(
-            order=self.loop.order, step=self.step, bus=self._bus, memories=self._memories, parts=set(self._parts)
-        )
+        running, memories = self._start(), self._faults.memories
+        state.check(order=self.loop.order, step=self.step, bus=running.bus, memories=memories, parts=set(self._parts))
         if state.row > self.rows:
             raise DataError(f"the state is at row {state.row}; this loop ends at row {self.rows}: make it longer.")
         for name, part in self._parts.items():
             _saved(name, part).set_state(state.parts[name])
         self.row = state.row
-        self._bus[:] = state.bus
-        self._pending = {name: values.copy() for name, values in state.pending.items()}
-        for memory, saved in zip(self._memories, state.memories, strict=True):
+        running.bus[:] = state.bus
+        for i in self._late:
+            running.held[i][:] = state.pending[running.names[i]]
+        for memory, saved in zip(memories, state.memories, strict=True):
             memory[:] = saved
         self._table[: self.row] = state.table
 
-    def _start(self) -> None:
-        if self._started:
-            return
-        self._started = True
-        parameters = self.loop.parameters
-        for name, part in self._parts.items():
-            outputs = self._checked(name, part.start(0.0, parameters.get(name, {})), 0.0)
-            self._bus[self._wiring.spans[name]] = outputs
-            if name in self._late:
-                self._pending[name] = outputs.copy()
+    def _start(self) -> Rows:
+        if self._begun is None:
+            outputs = {}
+            for name, part in self._parts.items():
+                outputs[name] = part.start(0.0, self.loop.parameters.get(name, {}))
+                self._require_finite(name, outputs[name], 0.0)
+            self._begun = Rows(
+                self._parts, self._wiring, self._cycle, step=self.step, starts=outputs, reference=self._reference,
+                faults=self._faults,
+            )  # fmt: skip
+        return self._begun
 
-    def _sequential(self, k: int) -> None:
-        """Read the plant at t_k, step observer, then controller, then plant."""
-        time, bus = self._arrive(k), self._bus
-        for name in self._order:
-            if k % self._ratios[name] == 0:
-                bus[self._wiring.spans[name]] = self._advance(name, time)
-        if self._stages is not None:
-            self._stages.actuate(bus, k)
-        self._table[k] = bus
-        for name in self._late:
-            if k % self._ratios[name] == 0:
-                self._pending[name] = self._advance(name, time)
-
-    def _jacobi(self, k: int) -> None:
-        """Set the inputs of all from what is on the bus at t_k, step all; the outputs are seen at t_k+1."""
-        time, bus = self._arrive(k), self._bus
-        if self._stages is not None:
-            self._stages.actuate(bus, k)
-        self._table[k] = bus
-        due = [name for name in self._parts if k % self._ratios[name] == 0]
-        outputs = {name: self._advance(name, time) for name in due}
-        for name, values in outputs.items():
-            if name in self._late:
-                self._pending[name] = values
-            else:
-                bus[self._wiring.spans[name]] = values
-
-    def _arrive(self, k: int) -> float:
-        """Put on the bus what becomes valid at t_k: the plant's outputs and the reference."""
-        bus, spans = self._bus, self._wiring.spans
-        for name in self._late:
-            if k % self._ratios[name] == 0:
-                bus[spans[name]] = self._pending[name]
-        if self._reference is not None:
-            bus[spans["reference"]] = self._reference[k]
-        if self._stages is not None:
-            self._stages.sense(bus, k)
-        return k * self.step
-
-    def _advance(self, name: str, time: float) -> Vector:
-        inputs = self._wiring.taps[name].read(self._bus, time)
-        return self._checked(name, self._parts[name].advance(time, inputs), time)
-
-    def _checked(self, name: str, outputs: Vector, time: float) -> Vector:
-        # One sum tells whether a closer look is needed; in Python, which warns of no inf - inf.
-        if math.isfinite(sum(outputs.tolist())):
-            return outputs
+    def _require_finite(self, name: str, outputs: Vector, time: float) -> None:
         for port, value in zip(self._parts[name].outputs, outputs, strict=True):
             if not math.isfinite(value) and not (port.missing and math.isnan(value)):
                 raise DataError(f"output `{port.name}` of the {name} became {value} in the step at t = {time:g} s.")
-        return outputs
 
 
 def _schedule(parts: Mapping[str, Part]) -> tuple[float, dict[str, int]]:

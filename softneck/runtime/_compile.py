@@ -81,6 +81,7 @@ def load_linked(module: str, runtimes: Sequence[str]) -> ModuleType:
     """Return the functions of runtime module `module`, whose `part_step(part, ...)` calls the step of `runtimes[part]`.
 
     The steps are those that `load_runtime` compiled: they are linked, not compiled again, and give the same bits.
+    What they step comes as `parts` = (arrays, parameters, states), each with an entry for each part.
     """
     with _LOADING:
         return _linked(module, tuple(runtimes))
@@ -88,15 +89,16 @@ def load_linked(module: str, runtimes: Sequence[str]) -> ModuleType:
 
 @cache
 def _linked(module: str, runtimes: tuple[str, ...]) -> ModuleType:
-    arguments = "parameters, state, inputs, outputs"
     lines = ["from softneck.runtime import load_runtime"]
     for i, runtime in enumerate(runtimes):
         # Its content's name is part of this text, and no comment: another runtime makes another module and cache.
         lines += [f'linked_{i} = load_runtime("{runtime}").step', f'content_{i} = "{compiled_name(bundle(runtime))}"']
-    lines += ["del load_runtime", "", "", f"def part_step(part, arrays, {arguments}):"]
+    lines += ["del load_runtime", "", "", "def part_step(part, time, parts, inputs, outputs):"]
     for i in range(len(runtimes)):
         # Constant indices: a compiler knows the type of each part's arrays then.
-        lines += [f"    if part == {i}:", f"        linked_{i}(arrays[{i}], {arguments})"]
+        step = f"linked_{i}(parts[0][{i}], parts[1][{i}], parts[2][{i}], inputs, outputs)"
+        lines += [f"    if part == {i}:", f"        {step}"]
+    lines.append("    return False")  # nobody looked at the outputs
     text = bundle(module, loops=False, skip=("part_step",)) + "\n".join(lines) + "\n"
     namespace = _import_text(text, compiled=True)
     _compile(namespace)

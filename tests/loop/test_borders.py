@@ -25,8 +25,9 @@ from softneck.loop import (
     metrics,
     run_loop,
 )
-from softneck.loop._disturbed_bus import ActiveFault
+from softneck.loop._disturbed_bus import ActiveFault, FaultStages
 from softneck.loop._faults import fault_field, fault_keys, make_fault
+from softneck.loop._faults_runtime import faults_act
 from softneck.loop._references import make_reference, reference_field, reference_keys
 from softneck.runtime import Port
 
@@ -99,10 +100,11 @@ def test_windows_begin_at_zero_and_last() -> None:
 )
 def test_a_window_holds_its_rows_and_no_other(start: float, duration: float, rows: range) -> None:
     acting = ActiveFault(NeckFault(values={"payload": 2.0}, start=start, duration=duration), [1], [], np.ones(1), TS)
+    stages = FaultStages([[]] * 4, [], [acting], 12)
     hit = []
     for k in range(12):
         bus = np.array([7.0, 1.0])
-        acting.apply(bus, k)
+        faults_act(k, 1, stages.lists, bus)
         assert bus[0] == 7.0
         hit += [k] if bus[1] == 3.0 else []
     assert hit == list(rows)

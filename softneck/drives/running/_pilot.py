@@ -1,19 +1,24 @@
-"""Observer, controller and reference of a loop as the master's pilot: the same parts, wired and ordered the same."""
+"""Observer, controller and reference of a loop as the master's pilot: the same parts, wiring, and cycle."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
 from softneck.core import SettingsError, Vector
 from softneck.loop import Loop
-from softneck.loop._order import step_order
+from softneck.loop._order import cycle
+from softneck.loop._rows import Rows
+from softneck.loop._rows_runtime import ROWS_RECORD, ROWS_REFER, ROWS_SHOW, ROWS_STEP
 from softneck.loop._wiring import wire
 
 from ..master import Tilt
 from ..master._measured import Measurement
 
+# Nothing is recorded here: the master's log does that.
+_NO_TABLE = np.zeros((0, 0))
 _ANGLES = ("pitch", "roll", "pitch_rate", "roll_rate")
 
 
@@ -39,34 +44,37 @@ class LoopPilot:
             raise SettingsError(f"on drives all parts of a loop need one sample time; it has {listed}.")
         self.sample_time = loop.controller.sample_time
         wiring = wire(self._parts, loop.constants, loop.connections)
-        self._wiring, self._order = wiring, step_order(self._parts, wiring.taps)
-        self._late_reference = "reference" in self._parts
-        span = wiring.spans["plant"]
-        self._places = {port.name: span.start + i for i, port in enumerate(loop.plant.outputs)}
-        self._setpoints = wiring.spans["controller"]
+        self._wiring = wiring
+        # As in a simulation, but that the plant is hardware, and nobody knows the reference's rows ahead.
+        actions = cycle(self._parts, wiring.taps, dict.fromkeys(self._parts, 1), order=loop.order, disturbed=False)
+        self._plant = tuple(self._parts).index("plant")
+        self._cycle = [
+            (ROWS_SHOW if what == ROWS_REFER else what, part, every)
+            for what, part, every in actions
+            if what != ROWS_RECORD and (what, part) != (ROWS_STEP, self._plant)
+        ]
+        self._places = {port.name: i for i, port in enumerate(loop.plant.outputs)}
         names = [port.name for port in loop.controller.outputs]
         try:
-            self._chosen = np.array([self._setpoints.start + names.index(f"motor_setpoint_{j}") for j in (1, 2, 3)])
+            first = wiring.spans["controller"].start
+            self._chosen = np.array([first + names.index(f"motor_setpoint_{j}") for j in (1, 2, 3)])
         except ValueError as error:
             raise SettingsError(f"the controller does not give three motor set-points: {', '.join(names)}.") from error
         self._tilts = [(name, self._places[f"{name}{end}"]) for name in _ANGLES for end in ("_measured", "")
                        if f"{name}{end}" in self._places]  # fmt: skip
         self._rows = round(loop.duration / self.sample_time)
-        self._bus: Vector = wiring.start.copy()
-        self._next_reference: Vector | None = None
-        self._started = False
+        self._running = self._begun({})
         self.columns = tuple(dict.fromkeys(f"{item.part}.{item.port.name}" for item in wiring.named))
 
     def start(self) -> None:
         """Start all parts but the plant."""
-        self._bus = self._wiring.start.copy()
-        for name, part in self._parts.items():
-            if name != "plant":
-                outputs = part.start(0.0, self._loop.parameters.get(name, {}))
-                self._bus[self._wiring.spans[name]] = outputs
-                if name == "reference":
-                    self._next_reference = outputs
-        self._started = True
+        parameters = self._loop.parameters
+        others = {name: part for name, part in self._parts.items() if name != "plant"}
+        self._running = self._begun({n: part.start(0.0, parameters.get(n, {})) for n, part in others.items()})
+
+    def _begun(self, starts: Mapping[str, Vector]) -> Rows:
+        # What is no number is the master's to judge: it stops the drives where set-points become so.
+        return Rows(self._parts, self._wiring, self._cycle, step=self.sample_time, starts=starts, checked=False)
 
     def warm(self) -> None:
         """Step all parts once with the neck at rest: what compiles or loads at its first call does so before a run."""
@@ -75,16 +83,14 @@ class LoopPilot:
 
     def step(self, measured: Measurement) -> tuple[float, float, float] | None:
         """Step observer and controller with what was measured now."""
-        time = measured.index * self.sample_time
-        bus = self._bus
-        self._measure(measured)
-        self._refer(time)
-        for name in self._order:
-            bus[self._wiring.spans[name]] = self._parts[name].advance(time, self._wiring.taps[name].read(bus, time))
-        if self._late_reference:
-            tap = self._wiring.taps["reference"]
-            self._next_reference = self._parts["reference"].advance(time, tap.read(bus, time))
-        a, b, c = bus[self._chosen].tolist()
+        running, index = self._running, measured.index
+        self._measure(measured, running.held[self._plant])
+        if "reference" not in self._parts:
+            running.held[-1][:3] = self._loop.reference(index * self.sample_time)  # pyright: ignore[reportCallIssue]
+        problem, part = running.run(index, index + 1, _NO_TABLE)
+        if problem:
+            self._wiring.taps[running.names[part]].read(running.bus, index * self.sample_time)
+        a, b, c = running.bus[self._chosen].tolist()
         return a, b, c
 
     def finished(self, index: int) -> bool:
@@ -93,7 +99,6 @@ class LoopPilot:
 
     def close(self) -> None:
         """Release the parts."""
-        self._started = False
         self._loop.close()
 
     def value(self, name: str) -> float:
@@ -101,7 +106,7 @@ class LoopPilot:
         part, _, port = name.partition(".")
         for item in self._wiring.named:
             if item.part == part and item.port.name == port:
-                return float(self._bus[item.slot])
+                return float(self._running.bus[item.slot])
         return math.nan
 
     def slot(self, part: str, port: str) -> int | None:
@@ -114,26 +119,18 @@ class LoopPilot:
     @property
     def signals(self) -> Vector:
         """All signals of the last step, at the places that `slot` tells."""
-        return self._bus
+        return self._running.bus
 
-    def _measure(self, measured: Measurement) -> None:
-        tilt, bus, places = measured.tilt, self._bus, self._places
+    def _measure(self, measured: Measurement, outputs: Vector) -> None:
+        """Write to the plant's `outputs` what hardware says."""
+        tilt, places = measured.tilt, self._places
         for name, place in self._tilts:
             value = getattr(tilt, name)
-            bus[place] = value if math.isfinite(value) else 0.0
+            outputs[place] = value if math.isfinite(value) else 0.0
         for j in (1, 2, 3):
             place = places.get(f"motor_position_{j}")
             if place is not None:
-                bus[place] = measured.positions[j - 1]
+                outputs[place] = measured.positions[j - 1]
         place = places.get("measurement_valid")
         if place is not None:
-            bus[place] = 1.0 if measured.fresh else 0.0
-
-    def _refer(self, time: float) -> None:
-        span = self._wiring.spans["reference"]
-        if self._next_reference is not None:
-            self._bus[span] = self._next_reference
-            return
-        reference = self._loop.reference
-        pitch, roll, common = reference(time)  # pyright: ignore[reportCallIssue]
-        self._bus[span] = (pitch, roll, common, 1.0)
+            outputs[place] = 1.0 if measured.fresh else 0.0

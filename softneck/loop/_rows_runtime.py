@@ -1,0 +1,89 @@
+"""The rows of a loop: one cycle, interpreted or compiled, that simulations, studies, verification and drives share.
+
+What happens in a row is a list of actions (see `_order.py`). All that changes is changed in place: the bus, what each
+part holds, the memory of faults.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from softneck.loop._faults_runtime import faults_act
+
+ROWS_DONE = 0
+ROWS_MISSING_INPUT = 1
+ROWS_BAD_OUTPUT = 2
+
+# The actions of a cycle: what, which part or place of faults, every how many rows.
+ROWS_STEP = 0
+ROWS_SHOW = 1
+ROWS_REFER = 2
+ROWS_DISTURB = 3
+ROWS_RECORD = 4
+
+
+def part_step(part: int, time: float, parts: tuple, inputs: np.ndarray, outputs: np.ndarray) -> bool:
+    """Step one part and return whether all its outputs are known to be finite.
+
+    For parts that are compiled `load_linked` writes this function anew.
+    """
+    values = parts[part](time, inputs)
+    if values is not outputs:
+        outputs[:] = values
+    # One sum tells whether a closer look is needed; in Python, which warns of no inf - inf.
+    return math.isfinite(sum(values.tolist()))
+
+
+def run_rows(
+    first: int, stop: int, plan: tuple, signals: tuple, faults: tuple, parts: tuple, table: np.ndarray
+) -> tuple:
+    """Run rows `first` to `stop`; return (what stopped them, part).
+
+    plan: (actions, step [s], taps, reference (rows, 4)). signals: (bus, what each part holds, the places on the bus
+    where it is shown, the next row), the reference behind the parts. parts: for `part_step`.
+    """
+    cycle, step, taps, reference = plan
+    bus, held, shown, following = signals
+    for k in range(first, stop):
+        for what, part, every in zip(cycle[0], cycle[1], cycle[2]):  # noqa: B905 - numba knows no `strict`
+            if k % every != 0:
+                continue
+            if what == ROWS_STEP:
+                problem = rows_step(part, k * step, taps, bus, held[part], parts)
+                if problem != ROWS_DONE:
+                    return problem, part
+            elif what == ROWS_SHOW:
+                shown[part][:] = held[part]
+            elif what == ROWS_REFER:
+                shown[part][:] = reference[k]
+            elif what == ROWS_DISTURB:
+                faults_act(k, part, faults, bus)
+            else:
+                table[k] = bus
+        following[0] = k + 1
+    return ROWS_DONE, 0
+
+
+def rows_step(part: int, time: float, taps: tuple, bus: np.ndarray, outputs: np.ndarray, parts: tuple) -> int:
+    """Gather the inputs of a part, step it, look at its outputs.
+
+    taps: of each part, the inputs' places on the bus, their factors (none if all are one), which of them must not be
+    missing, and which of its outputs may be (none if nobody looks).
+    """
+    slots, factors, fragile, missing = taps
+    inputs = bus[slots[part]]
+    if factors[part].size:
+        inputs *= factors[part]
+    if fragile[part].size:
+        for i in fragile[part]:
+            if not math.isfinite(inputs[i]):
+                return ROWS_MISSING_INPUT
+    if part_step(part, time, parts, inputs, outputs):
+        return ROWS_DONE
+    may_miss = missing[part]
+    for i in range(may_miss.size):
+        if not math.isfinite(outputs[i]) and not (may_miss[i] and math.isnan(outputs[i])):
+            return ROWS_BAD_OUTPUT
+    return ROWS_DONE
