@@ -102,7 +102,7 @@ def test_the_branch_not_taken_leaves_no_trace_in_derivatives() -> None:
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("def f(a, b):\n    return np.zeros(3)[int(a)]", r"`f` .* `a` depends on state or inputs .*\(line 2 "),
+        ("def f(a, b):\n    return np.zeros(3)[int(a)]", r"`f` .* `a` depends on state or inputs, .*\(line 2 "),
         ("def f(a, b):\n    while a > 0.0:\n        a -= 1.0\n    return a", r"`a > 0.0` depends on .*\(line 2 "),
         ("def f(a, b):\n    if a > 0.0:\n        return a\n    return b", r"a test on symbols decides where"),
         ("def f(a, b):\n    if a > 0.0:\n        c = a\n    return c", r"`c` is not defined, or not on every path"),
