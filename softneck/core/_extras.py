@@ -4,7 +4,7 @@ from __future__ import annotations
 
 # Package as it is imported -> (extra of `pip install`, what needs it). 500 of 1,300 MB that the main job never loads.
 EXTRAS = {
-    "casadi": ("mpc", "predictive control"),
+    "casadi": ("mpc", "predictive control, plans and `model.casadi()`"),
     "daqp": ("mpc", "predictive control solved by daqp"),
     "pyarrow": ("files", "Parquet files and studies"),
     "h5py": ("files", "MATLAB files of version 7.3"),

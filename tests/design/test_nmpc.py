@@ -3,17 +3,17 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import casadi as ca
 import numpy as np
 import pytest
 
 from softneck.core import DataError, SettingsError, load
 from softneck.design import NmpcController, NmpcSettings
-from softneck.design.predictive._gauss_newton import cost_function
-from softneck.design.predictive._model_steps import NONLINEAR_KINDS, step_function
+from softneck.design.predictive._nmpc import NONLINEAR_KINDS
 from softneck.design.predictive._nmpc_prepared import disturbance_ahead, estimate_gains
+from softneck.design.predictive._nmpc_state_runtime import nmpc_places, nmpc_shift
 from softneck.estimation import LinearNeck
 from softneck.identification import GreyBox, Model, Network, NeuralStateSpace, Play, Rls
+from softneck.loop import BlockPart
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.runtime import load_runtime
 from softneck.signals import Recording, signal
@@ -63,44 +63,30 @@ def closed_loop(
     return np.array(angles), said
 
 
-@pytest.mark.parametrize("kind", slow_but(NONLINEAR_KINDS, ["play"]))
-def test_the_expression_of_a_model_is_its_runtime(kind: str, models: dict[str, Model]) -> None:
-    model = models[kind]
-    f, block = step_function(model), model.block()
-    state = block.initial_state(pitch_start=0.1, use_measurement=0.0)
-    x, u = state.values.copy(), np.zeros(3)
-    rng = np.random.default_rng(0)
-    for _ in range(150):
-        u = np.clip(u + rng.normal(0.0, 0.4, 3), -6.0, 6.0)
-        state, y = block.step(state, [*u, *[math.nan] * 5])
-        ahead, angles = f(x, u)
-        x = np.array(ahead)[:, 0]
-        # Rounding, and in the grey box roots of 1e-24 where the runtime has a case of its own.
-        np.testing.assert_allclose(np.array(angles)[:, 0], y[:2], atol=1e-10)
-        np.testing.assert_allclose(x, state.values, atol=1e-10)
-
-
-@pytest.mark.parametrize("kind", ["nn", "play"])
-def test_converged_it_is_what_ipopt_finds(kind: str, models: dict[str, Model]) -> None:
-    settings = NmpcSettings(horizon=12, moves=4, converged=True, slew_limit=4.0, lead_limit=12.0)
+@pytest.mark.parametrize("kind", slow_but(NONLINEAR_KINDS, ["nn", "play"]))
+@pytest.mark.parametrize("limit", [None, 0.1])
+def test_converged_it_is_what_ipopt_finds(kind: str, limit: float | None, models: dict[str, Model]) -> None:
+    settings = NmpcSettings(
+        horizon=12, moves=4, converged=True, slew_limit=4.0, lead_limit=12.0, angle_limit=limit
+    )  # fmt: skip
     controller = settings.design(models[kind])
-    solver, p = controller.solver, controller.problem()
-    state, motors = controller.initial_state(), np.zeros(3)
+    own, best = BlockPart(controller.block()), controller.part(solver="casadi")
+    places = nmpc_places(own.block.arrays, models[kind].block().initial_state().values.size)
+    motors = own.start(0.0, {})
+    best.start(0.0, {})
     for k in range(30):
-        state, motors = controller.step(state, [0.3 if k < 15 else -0.2, 0.1, 0.2, 0.05, 0.0, *state.outputs, 1.0, 1.0])
-    # The last sample's problem is still in the buffers: its parameters, and its solution as the point it stands at.
-    found, x, held, target, asked, common = (item.copy() for item in solver._evaluated.inputs)
-    z = ca.MX.sym("z", p.variables)
-    cost = cost_function(p)(z, x, held, target, asked, common)[0]
-    sums = ca.mtimes(ca.DM(solver._A[: solver.nz, : solver.nz]), z)
-    oracle = ca.nlpsol("oracle", "ipopt", {"x": z, "f": cost, "g": sums}, {
-        "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-10}, "print_time": False,
-    })  # fmt: skip
-    n = solver._n
-    low, high = solver._lower, solver._upper
-    best = oracle(x0=np.zeros(solver.nz), lbx=low[: solver.nz], ubx=high[: solver.nz], lbg=low[n:], ubg=high[n:])
-    # The bound; ipopt itself stops its barrier at 1e-10 of the scaled problem.
-    np.testing.assert_allclose(found, np.array(best["x"])[:, 0], atol=1e-5)
+        asked = [0.3, 0.1, 0.2] if k < 15 else [-0.2, 0.1, 0.2]
+        u = np.array([*asked, 0.05, 0.0, *motors, 1.0, 1.0])
+        best.set_state(own.get_state())
+        motors = own.advance(0.0, u)
+        best.advance(0.0, u)
+        if k == 0:
+            continue
+        found = best.moves.ravel().copy()
+        nmpc_shift(own.block.arrays[1], found)
+        assert best.status == "Solve_Succeeded"
+        # The bound; ipopt itself stops its barrier at 1e-10 of the scaled problem.
+        np.testing.assert_allclose(own.memory[1][places[4] : places[5]], found, atol=1e-5)
     assert np.abs(motors).max() > 0.1
 
 

@@ -12,7 +12,6 @@ import hashlib
 import shutil
 import subprocess
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,61 +19,10 @@ import numpy as np
 import platformdirs
 
 from softneck.core import Matrix, Vector, atomic_write
-from softneck.identification import Model
 
-from ._model_steps import step_function
+from ._nmpc_prepared import NonlinearProblem
 
 _COMPILE_SECONDS = 300.0
-
-
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class NonlinearProblem:
-    """What is asked, in numbers.
-
-    Attributes:
-        model: that is predicted.
-        horizon: N, samples from now.
-        starts: samples at which the motors may move.
-        T: (3, 3) of Eq. 9-11.
-        weights: (N, 2) on angle errors [1/rad^2].
-        move_weight: lambda.
-        cocontraction_weight: rho.
-    """
-
-    model: Model
-    horizon: int
-    starts: tuple[int, ...]
-    T: Matrix
-    weights: Matrix
-    move_weight: float
-    cocontraction_weight: float
-
-    @property
-    def variables(self) -> int:
-        """Number of moves of all motors."""
-        return 3 * len(self.starts)
-
-    def spread(self) -> Matrix:
-        """Return (3 N, nz): which moves make the set-points of each sample."""
-        rows = np.array([[float(start <= i) for start in self.starts] for i in range(self.horizon)])
-        return np.kron(rows, np.eye(3))
-
-
-def cost_function(problem: NonlinearProblem) -> Any:
-    """Return `casadi.Function` (z, x, held, target, asked, common) -> (cost, angles): what ipopt as an oracle takes."""
-    import casadi as ca
-
-    p, step = problem, step_function(problem.model)
-    z, x, held, target, asked, common = _symbols(p, step)
-    U = ca.reshape(ca.mtimes(ca.DM(p.spread()), z), 3, p.horizon) + ca.repmat(held, 1, p.horizon)
-    state, angles = x, []
-    for i in range(p.horizon):
-        state, y = step(state, U[:, i])
-        angles.append(y)
-    Y = ca.vertcat(*angles)
-    cost = ca.dot(ca.DM(p.weights.ravel()), (Y - target) ** 2) + p.move_weight * ca.sumsqr(z - asked)
-    cost += p.cocontraction_weight * ca.sumsqr(ca.mtimes(ca.DM(p.T[2:]), U) - common)
-    return ca.Function("cost", [z, x, held, target, asked, common], [cost, Y])
 
 
 def qp_function(problem: NonlinearProblem) -> Any:
@@ -84,9 +32,10 @@ def qp_function(problem: NonlinearProblem) -> Any:
     """
     import casadi as ca
 
-    p, step = problem, step_function(problem.model)
+    p, step = problem, problem.model.casadi()
     a, b = step.sx_in()
     ahead, y = step(a, b)
+    y = y[:2]
     both = [ahead, y, *(ca.jacobian(value, by) for value in (ahead, y) for by in (a, b))]
     linear = ca.Function("model_linear", [a, b], both)
     z, x, held, target, asked, common = _symbols(p, step)

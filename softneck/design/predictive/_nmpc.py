@@ -29,12 +29,13 @@ from softneck.runtime import Block, Port, State
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
 from ..linear._ports import controller_inputs, controller_outputs, limit_ports
-from ._gauss_newton import NonlinearProblem
-from ._model_steps import NONLINEAR_KINDS
+from ._nmpc_prepared import NonlinearProblem
 from ._nonlinear_solver import NonlinearSolver, SampleSolution
 from ._settings import spaced_starts
 from ._tuning import move_weight
 
+# Kinds of model whose derivatives the runtime has.
+NONLINEAR_KINDS = ("nn", "play", "greybox", "nss")
 # The model is moved by this much of a redefined input to learn its gain and its time constant [rad].
 _PROBE = 1.0
 _PROBE_SECONDS = 6.0
@@ -236,11 +237,17 @@ class NmpcController:
         """Return what the sample that led to `state` decided."""
         return self.solver.row(state.values)
 
-    def part(self) -> Any:
-        """Return the controller as a part of a loop."""
-        from ._nmpc_part import NmpcPart
+    def part(self, *, solver: str = "own") -> Any:
+        """Return the controller as a part of a loop.
 
-        return NmpcPart(self)
+        Args:
+            solver: "own", or "casadi" for each sample's optimum by ipopt: slow, a reference to compare with.
+        """
+        from ._nmpc_part import NmpcPart
+        from ._optimal import OptimalPart
+
+        require_one_of("solver", solver, ("own", "casadi"))
+        return NmpcPart(self) if solver == "own" else OptimalPart(self)
 
     def block(self) -> Block:
         """Return the controller as a block of role "controller", for FMUs: numpy alone, no CasADi and no daqp."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -10,13 +11,48 @@ import numpy as np
 from softneck.core import Matrix
 from softneck.estimation import AxisPlant
 from softneck.identification import Model
-from softneck.runtime import State
-
-from ._gauss_newton import NonlinearProblem
+from softneck.runtime import Block, State
 
 # Samples without measurement until the motors hold, and samples after which a model has settled.
 COAST = 25
 SETTLE = 200
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class NonlinearProblem:
+    """What is asked, in numbers, condensed to the moves z of the motors (Bock 1983; Diehl et al. 2005, sec. 3).
+
+        min  sum_i w_i |y_i(z) - t_i|^2 + lambda |z - a|^2 + rho sum_i (delta_i(z) - c)^2
+
+    with y_i the model's free run and t_i the reference less the estimated disturbance.
+
+    Attributes:
+        model: that is predicted.
+        horizon: N, samples from now.
+        starts: samples at which the motors may move.
+        T: (3, 3) of Eq. 9-11.
+        weights: (N, 2) on angle errors [1/rad^2].
+        move_weight: lambda.
+        cocontraction_weight: rho.
+    """
+
+    model: Model
+    horizon: int
+    starts: tuple[int, ...]
+    T: Matrix
+    weights: Matrix
+    move_weight: float
+    cocontraction_weight: float
+
+    @property
+    def variables(self) -> int:
+        """Number of moves of all motors."""
+        return 3 * len(self.starts)
+
+    def spread(self) -> Matrix:
+        """Return (3 N, nz): which moves make the set-points of each sample."""
+        rows = np.array([[float(start <= i) for start in self.starts] for i in range(self.horizon)])
+        return np.kron(rows, np.eye(3))
 
 
 class NonlinearController(Protocol):
@@ -36,6 +72,7 @@ class NonlinearController(Protocol):
     def solver(self) -> Any: ...
     def plants(self) -> tuple[AxisPlant, AxisPlant]: ...
     def problem(self) -> NonlinearProblem: ...
+    def block(self) -> Block: ...
     def initial_state(self, **parameters: float) -> State: ...
 
 

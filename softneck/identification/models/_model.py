@@ -28,15 +28,18 @@ from softneck.signals import Recording
 from . import _linear_systems as _linear
 from . import _ports
 from ._arrays import check_arrays
-from ._composed import memory_of, runtime_of, set_now
+from ._composed import members, memory_of, runtime_of, set_now
 
 if TYPE_CHECKING:
+    import casadi
     import control
 
 
 #: A free run starts from this many measured samples, for every kind; they are not scored.
 WARM_UP = 25
 _MOTORS = ("simulated", "measured")
+# Kinds whose next output is looked up among the points of a set: which of them decide depends on the state.
+_SEARCHING = ("nlsm", "residual")
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -178,6 +181,24 @@ class Model:
     def ss(self) -> control.StateSpace:
         """Return the state space to (pitch, roll) [rad] from (theta_i, phi_i), or from the motors where it has them."""
         return _linear.state_space(self)
+
+    def casadi(self) -> casadi.Function:
+        """Return one step in free run as a function of symbols, (x, u) -> (x_next, y), from the runtime's own text.
+
+        x is `State.values`, u (3,) the set-points [rad], y the outputs one sample later. At kinks derivatives are those
+        of one side.
+
+        Raises:
+            SettingsError: a kind that searches a set (`nlsm`, `residual`, an ensemble with one of them).
+        """
+        from softneck.runtime._casadi import step_function
+
+        held = [self.kind, *(kind for kind, _ in members(self.arrays))]
+        for kind in held:
+            if kind in _SEARCHING:
+                raise SettingsError(f"a model of kind `{kind}` searches its set; it cannot become a CasADi function.")
+        start = self.block().initial_state(use_measurement=0.0, noise_std=0.0)
+        return step_function(self.block(), start.parameters, inputs=3)
 
     def summary(self) -> str:
         """Return a few lines on what the model is, in degrees."""

@@ -1,0 +1,2 @@
+from ._plan import PlanSettings as PlanSettings
+from ._plan import plan as plan
