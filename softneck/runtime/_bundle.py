@@ -6,7 +6,8 @@ kit and what runs in the host is the same text, under a name that its content de
 
 A runtime may hold others: `outer(inner:11,other:13)` is module `outer` over member `inner`, which reads the first
 11 arrays behind those of `outer`, and `other`, which reads the next 13. Each member's names get a prefix, and the
-calls `member_*` of `_members_runtime` become calls of the members.
+calls `member_*` of `_members_runtime` become calls of the members; one that calls `member_tangent` gets their
+derivatives with them.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from pathlib import Path
 from softneck.core import SettingsError
 
 from ._composition import member_calls, prefixed
+from ._tangent import with_tangent
 
 _LOOPS = "softneck.runtime._loops_runtime"
 _MEMBERS = "softneck.runtime._members_runtime"
@@ -43,10 +45,11 @@ def bundle(runtime: str, *, loops: bool = True, skip: tuple[str, ...] = ()) -> s
     _collect(outer, order)
     names: dict[str, str] = {}
     parts = ["# A softneck runtime: generated, do not edit.", "import math", "", "import numpy as np", ""]
-    parts += [prefixed(bundle(member, loops=False), f"m{i}_") for i, (member, _) in enumerate(members)]
+    tangents = bool(members) and any(_asks_for_tangents(module) for module in order)
+    texts = [bundle(member, loops=False) for member, _ in members]
+    parts += [prefixed(with_tangent(text) if tangents else text, f"m{i}_") for i, text in enumerate(texts)]
     for module in order:
         if module == _MEMBERS and members:
-            tangents = all(_has_tangent(member) for member, _ in members)
             parts.append(member_calls([count for _, count in members], _own_arrays(outer), tangents=tangents))
         else:
             parts.append(_stripped(module, names, skip=set(skip)))
@@ -75,9 +78,10 @@ def _own_arrays(outer: str) -> int:
     raise SettingsError(f"runtime module {outer} takes no members: it does not say OWN_ARRAYS.")
 
 
-def _has_tangent(member: str) -> bool:
-    """Return whether the module of a member says how its outputs answer to planned inputs."""
-    return any(_defined(node) == ["tangent"] for node in _tree(member.partition("(")[0]).body)
+def _asks_for_tangents(module: str) -> bool:
+    """Return whether a module reads how the outputs of its members answer to their inputs."""
+    imports = [node for node in _tree(module).body if isinstance(node, ast.ImportFrom) and node.module == _MEMBERS]
+    return any(alias.name == "member_tangent" for node in imports for alias in node.names)
 
 
 def _collect(module: str, order: list[str]) -> None:

@@ -3,9 +3,9 @@
     step_tangent(arrays, parameters, state, inputs, outputs, state_rows, inputs_rows, outputs_rows, moved)
 
 advances `state` and `outputs` as `step` does, to the bit, and moves `state_rows` (n_state, m) on and fills
-`outputs_rows` (n_out, m) along the first `moved` of m directions, of which `inputs_rows` (n_in, m) holds what the inputs
-are moved by. Numbers are differentiated in rows, one for each direction (forward); functions that make one number out
-of loops or arrays in reverse, so that a network costs one more sweep and not one for each direction.
+`outputs_rows` (n_out, m) along the first `moved` of m directions; `inputs_rows` (n_in, m) holds what the inputs are
+moved by. Numbers are differentiated in rows, one for each direction (forward); functions that make one number out of
+loops or arrays in reverse, so that a network costs one more sweep and not one for each direction.
 
 At a kink the derivative to the right counts: with `max` and `min` of equal numbers, `abs` of zero and a length of zero
 each direction is followed on its own, `lim (f(x + h d) - f(x)) / h` from above; in a function that is differentiated in
@@ -22,7 +22,7 @@ from ._tangent_back import Back, worth_it
 from ._tangent_rows import Rows
 
 _STEP: Pattern = (("state", 1), ("inputs", 1), ("outputs", 1))
-_SHIFTED = '''
+_SHIFTED = """
 def tangent_shifted(rows, to, start, count, moved):
     if to > start:
         for i in range(count - 1, -1, -1):
@@ -32,7 +32,7 @@ def tangent_shifted(rows, to, start, count, moved):
         for i in range(count):
             for r in range(moved):
                 rows[to + i, r] = rows[start + i, r]
-'''
+"""
 
 
 @cache

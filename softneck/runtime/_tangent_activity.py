@@ -18,10 +18,8 @@ RANDOM = re.compile(r"(m\d+_)*random_\w+")
 # Of arrays: what makes a new one. Of numbers: what is a step in any case, and has no derivative.
 MAKERS = ("empty", "zeros", "ones", "empty_like", "zeros_like")
 STEPS = ("int", "bool", "len", "floor", "ceil", "round", "isfinite", "isnan", "isinf")
-_REFUSED = {
-    "slant_bounds": "set membership searches its data, which has no derivative",
-    "nlsm_bounds": "set membership searches its data, which has no derivative",
-}
+# What searches data for its nearest points: set membership.
+SEARCHES = ("slant_bounds", "nlsm_bounds")
 
 # Argument -> number of its dimensions, for those that depend on state or inputs.
 Pattern = tuple[tuple[str, int], ...]
@@ -49,9 +47,10 @@ class Program:
     def activity(self, name: str, pattern: Pattern) -> Activity:
         """Return the activity of a function whose arguments of `pattern` depend on state or inputs."""
         key = (name, pattern)
-        plain = re.sub(r"^(m\d+_)*", "", name)
-        if plain in _REFUSED and pattern:
-            raise TangentError(f"{name}: {_REFUSED[plain]}.")
+        if pattern and name.endswith(SEARCHES):
+            raise TangentError(
+                f"set membership (kinds `nlsm` and `residual`) searches its data and has no derivative (`{name}`)."
+            )
         if key in self._open:
             raise TangentError(f"{name}: a function that calls itself has no known derivative.")
         if key not in self._done:
@@ -103,6 +102,21 @@ class Activity:
     def written(self) -> dict[str, int]:
         """The arguments that depend on state or inputs, those that the function makes so among them."""
         return {name: self.ranks.get(name, 1) for name in self.parameters if name in self.active}
+
+    @property
+    def stores(self) -> set[str]:
+        """The arguments that the function writes into."""
+        found = set()
+        for part in ast.walk(self.node):
+            base = viewed(part) if isinstance(part, ast.Subscript) and isinstance(part.ctx, ast.Store) else None
+            found |= {self.root(base.id)} if base is not None else set()
+            name = self.program.called(part)
+            if name is not None and isinstance(part, ast.Call):
+                callee = self.program.activity(name, self.pattern(part, name))
+                for parameter, value in zip(callee.parameters, part.args, strict=True):
+                    base = viewed(value)
+                    found |= {self.root(base.id)} if base is not None and parameter in callee.stores else set()
+        return found & set(self.parameters)
 
     def root(self, name: str) -> str:
         """Return the array that a name shows."""
@@ -160,6 +174,8 @@ class Activity:
         for parameter, value in zip(names, call.args, strict=True):
             if self.is_active(value):
                 rank = self.rank(value)
+                if rank is None and isinstance(value, ast.Name) and value.id in self.parameters:
+                    rank = 1  # one that is written into: whoever calls knows better and comes again
                 if rank is None:
                     raise self.fail(call, f"how many dimensions `{ast.unparse(value)}` has cannot be told.")
                 found[parameter] = rank
@@ -209,6 +225,9 @@ class Activity:
                     self._bind(one, value)
         elif isinstance(statement, ast.AugAssign):
             self._mark(statement.target, self.is_active(statement.value))
+            rank = self.rank(statement.value)
+            if isinstance(statement.target, ast.Name) and rank is not None:  # a number is never spread over an array
+                self.ranks.setdefault(statement.target.id, rank)
         for call in calls(statement):
             name = self.program.called(call)
             pattern = self.pattern(call, name) if name else ()
@@ -228,7 +247,7 @@ class Activity:
             if rank is not None:
                 self.ranks[target.id] = max(rank, self.ranks.get(target.id, 0))
             base = viewed(value)
-            if base is not None and rank != 0 and base.id != target.id and self.root(base.id) != target.id:
+            if base is not None and rank and base.id != target.id and self.root(base.id) != target.id:
                 self.roots[target.id] = base.id
         self._mark(target, self.is_active(value))
 

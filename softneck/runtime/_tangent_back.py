@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import ast
 import copy
-import re
 from collections.abc import Callable
 
-from ._tangent_activity import Activity, Pattern, TangentError, is_numpy, statements
+from ._tangent_activity import Activity, Pattern, is_numpy, statements
 from ._tangent_lowering import Lowering, Terms, inner, undefined
 from ._tangent_rows import Derived, names, without_unused
 
@@ -143,19 +142,21 @@ class Back(Lowering):
 
     def _sums_of(self, node: ast.For) -> set[str]:
         """Return what a loop adds up and reads nowhere else; raise TangentError if it carries on anything more."""
-        found = [s for s in statements(node.body) if isinstance(s, ast.AugAssign) and isinstance(s.target, ast.Name)]
-        added = {s.target.id for s in found if isinstance(s.op, ast.Add | ast.Sub) and isinstance(s.target, ast.Name)}
-        reads = [n.id for s in node.body for n in ast.walk(s) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Load)]
+        used = [part for statement in node.body for part in ast.walk(statement) if isinstance(part, ast.Name)]
+        reads = {name.id for name in used if isinstance(name.ctx, ast.Load)}
+        written = {name.id for name in used if isinstance(name.ctx, ast.Store)}
+        added: set[str] = set()
+        loops: set[str] = set()
+        for part in statements(node.body):
+            if isinstance(part, ast.AugAssign | ast.For) and isinstance(part.target, ast.Name):
+                adds = isinstance(part, ast.AugAssign) and isinstance(part.op, ast.Add | ast.Sub)
+                (added if adds else loops).update([part.target.id] if adds or isinstance(part, ast.For) else [])
         fresh: set[str] = set()
         for statement in node.body:
             if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name):
                 if statement.targets[0].id not in {n.id for n in names(statement.value)} | added:
                     fresh.add(statement.targets[0].id)
                 added -= fresh
-        written = {
-            n.id for s in node.body for n in ast.walk(s) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)
-        }
-        loops = {s.target.id for s in statements(node.body) if isinstance(s, ast.For) and isinstance(s.target, ast.Name)}
         sums = {name for name in added if name not in reads}
         if written - sums - fresh - loops:
             raise self.fail(node, "what this loop carries on is not reversed.")

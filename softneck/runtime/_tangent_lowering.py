@@ -97,7 +97,7 @@ class Lowering:
 
     def sum(self, first: Terms, second: Terms) -> Terms:
         """Return the sum of both, each place once."""
-        found = dict((place, partial) for partial, place in first)
+        found = {place: partial for partial, place in first}
         for partial, place in second:
             found[place] = self.kept(f"{found[place]} + {partial}", "p") if place in found else partial
         return [(partial, place) for place, partial in found.items()]

@@ -10,7 +10,7 @@ import ast
 import re
 from typing import Protocol
 
-from ._tangent_activity import MAKERS, Activity, Pattern, is_numpy, pairs, statements, viewed
+from ._tangent_activity import MAKERS, Activity, Pattern, is_numpy, pairs, viewed
 from ._tangent_lowering import Lowering, Terms, inner
 
 _PLACE = re.compile(r"«(\w+)»")
@@ -39,6 +39,7 @@ class Rows(Lowering):
         self._waiting: list[str] = []
         self._loops: list[list[str]] = []
         self._stored: set[str] = set()
+        self._whole: ast.expr | None = None
         assigned = {n.id for n in ast.walk(activity.node) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
         self._given = {name for name, rank in activity.written.items() if rank == 0 and name not in assigned}
         self._taken = {name for name, rank in activity.written.items() if rank == 0 and name in assigned}
@@ -111,12 +112,14 @@ class Rows(Lowering):
             return
         name = self.activity.program.called(node.value)
         if name is not None and isinstance(node.value, ast.Call) and self.activity.pattern(node.value, name):
+            self._whole = node.value
             self.call(node.value, name)
         else:
             self.lines.append(ast.unparse(node))
 
     def _return(self, node: ast.Return) -> None:
         if self.activity.result and node.value is not None:
+            self._whole = node.value
             text, terms = self.value(node.value)
             text = self.kept(text)
             self._waiting.append(f"result_rows[_r] = {linear(terms)}")
@@ -145,6 +148,7 @@ class Rows(Lowering):
         target, value = one[0]
         if value is None:
             raise self.fail(node, "the derivative of several results of a call is not known.")
+        self._whole = value
         if act.rank(target) == 0:
             self._number(target, *self.value(value))
         else:
@@ -214,6 +218,8 @@ class Rows(Lowering):
         back = self._derived.back(name, pattern)
         if back is not None:
             return self._gradient(node, callee, back)
+        if node is not self._whole and callee.stores:
+            raise self.fail(node, "a call that writes into its arguments stands alone, or alone behind `=`.")
         given, rows = [], []
         for parameter, value in zip(callee.parameters, node.args, strict=True):
             if parameter not in callee.written:
@@ -272,6 +278,8 @@ class Rows(Lowering):
             self.lines.append(ast.unparse(node))
             if is_numpy(value, *MAKERS) and isinstance(value, ast.Call):
                 self.lines.append(f"{target.id}_rows = {made_rows(value)}")
+            elif is_numpy(value, "sort") and isinstance(value, ast.Call):
+                self._sorted(target.id, value.args[0])
             elif viewed(value) is not None or is_copy(value):
                 copied = is_copy(value) and isinstance(value, ast.Call)
                 base = value.func.value if copied and isinstance(value.func, ast.Attribute) else value  # type: ignore[union-attr]
@@ -302,6 +310,13 @@ class Rows(Lowering):
         else:
             self._fill(node, rows, first, count, value)
         self.lines.append(ast.unparse(node))
+
+    def _sorted(self, name: str, value: ast.expr) -> None:
+        """Write the rows of a sorted vector: those of its entries, in their new order."""
+        order = self.name("o")
+        self.lines += [f"{order} = np.argsort({ast.unparse(value)})"]
+        self.lines += [f"{name}_rows = np.empty(({name}.shape[0], moved))"]
+        self.lines += loops(f"{name}.shape[0]", f"{name}_rows[_i, _r] = {self._rows(value)}[{order}[_i], _r]")
 
     def _fill(self, node: ast.stmt, rows: str, first: str, count: str, value: ast.expr) -> None:
         """Write the loops that fill rows with what a vector is moved by."""
