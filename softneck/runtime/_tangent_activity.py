@@ -187,7 +187,7 @@ class Activity:
             if isinstance(function.value, ast.Name) and function.value.id in ("np", "math"):
                 quiet = function.attr in (*STEPS, *MAKERS)
                 return not quiet and any(self.is_active(value) for value in node.args)
-            return self.is_active(function.value)
+            return self.is_active(function.value) or any(self.is_active(value) for value in node.args)
         name = self.program.called(node)
         if name is not None:
             pattern = self.pattern(node, name)
