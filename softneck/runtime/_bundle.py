@@ -7,7 +7,8 @@ A line that changes reaches the kinds that need it and no other.
 
 A runtime may hold others: `outer(inner:11,other:13)` is module `outer` over member `inner`, which reads the first
 11 arrays behind those of `outer`, and `other`, which reads the next 13. Each member's names get a prefix, and the
-calls `member_*` of `_members_runtime` become calls of the members.
+calls `member_*` of `_members_runtime` become calls of the members; one that calls `member_tangent` gets their
+derivatives with them.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from softneck.core import SettingsError
 from ._composition import member_calls, prefixed
 from ._layout import Arrays, StateVector
 from ._names import lowered, state_size
+from ._tangent import with_tangent
 
 _LOOPS = "softneck.runtime._loops_runtime"
 _MEMBERS = "softneck.runtime._members_runtime"
@@ -58,10 +60,11 @@ def bundle(runtime: str, *, loops: bool = True, skip: tuple[str, ...] = ()) -> s
     outer, members = _members(runtime)
     order: list[str] = []
     _collect(outer, order)
-    texts = [prefixed(bundle(member, loops=False), f"m{i}_") for i, (member, _) in enumerate(members)]
+    texts = [bundle(member, loops=False) for member, _ in members]
+    tangents = any(_asks_for_tangents(module) for module in order)
+    texts = [prefixed(with_tangent(text) if tangents else text, f"m{i}_") for i, text in enumerate(texts)]
     if members and _MEMBERS in order:
         order.remove(_MEMBERS)
-        tangents = all(_has_tangent(member) for member, _ in members)
         texts.append(member_calls([count for _, count in members], own_arrays(outer), tangents=tangents))
     found = {module: [piece for piece in _pieces(module) if not set(skip) & piece.names] for module in order}
     home = next((module for module in order if _defines(found[module], "step")), None)
@@ -109,9 +112,10 @@ def _members(runtime: str) -> tuple[str, list[tuple[str, int]]]:
     return outer, [(name, int(count)) for name, _, count in pairs]
 
 
-def _has_tangent(member: str) -> bool:
-    """Return whether the module of a member says how its outputs answer to planned inputs."""
-    return _defines(list(_pieces(member.partition("(")[0])), "tangent")
+def _asks_for_tangents(module: str) -> bool:
+    """Return whether a module reads how the outputs of its members answer to their inputs."""
+    imports = [node for node in _tree(module).body if isinstance(node, ast.ImportFrom) and node.module == _MEMBERS]
+    return any(alias.name == "member_tangent" for node in imports for alias in node.names)
 
 
 def _collect(module: str, order: list[str]) -> None:

@@ -18,6 +18,7 @@ import platformdirs
 from softneck.core import atomic_write
 
 from ._bundle import bundle, content_name
+from ._tangent import with_tangent
 
 # No fast-math: compiled and plain Python must agree to rounding. No GIL: batches run on all cores.
 COMPILE_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
@@ -61,6 +62,16 @@ def load_functions(module: str, *, compiled: bool = True) -> ModuleType:
         return _functions(module, compiled)
 
 
+def load_tangent(module: str, *, compiled: bool = True) -> Callable[..., None]:
+    """Return `step_tangent` of runtime module `module`; see `_tangent`.
+
+    Raises:
+        TangentError: its step has no derivative.
+    """
+    with _LOADING:
+        return _tangent(module, compiled).step_tangent
+
+
 @cache
 def _runtime(module: str, compiled: bool) -> Runtime:
     namespace = _import_text(bundle(module), compiled=compiled)
@@ -71,7 +82,16 @@ def _runtime(module: str, compiled: bool) -> Runtime:
 
 @cache
 def _functions(module: str, compiled: bool) -> ModuleType:
-    namespace = _import_text(bundle(module, loops=False), compiled=compiled)
+    return _namespace(bundle(module, loops=False), compiled)
+
+
+@cache
+def _tangent(module: str, compiled: bool) -> ModuleType:
+    return _namespace(with_tangent(bundle(module, loops=False)), compiled)
+
+
+def _namespace(text: str, compiled: bool) -> ModuleType:
+    namespace = _import_text(text, compiled=compiled)
     if compiled:
         _compile(namespace)
     return namespace

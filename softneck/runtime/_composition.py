@@ -11,8 +11,8 @@ _CALLS = {
     "member_initialise": (", parameters, state, outputs", "initialise", False),
     "member_step": (", parameters, state, inputs, outputs", "step", False),
 }
-# Of members that have derivatives.
-_TANGENT = {"member_tangent": (", k, before, state, line, rows, slopes", "tangent", False)}
+_ROWS = "state_rows, inputs_rows, outputs_rows, moved"
+_TANGENT = {"member_tangent": (f", parameters, state, inputs, outputs, {_ROWS}", "step_tangent", False)}
 
 
 def prefixed(text: str, prefix: str) -> str:
@@ -33,7 +33,7 @@ def member_calls(counts: list[int], own: int, *, tangents: bool = False) -> str:
     Args:
         counts: arrays of each member.
         own: arrays before them.
-        tangents: the members have a function `tangent`.
+        tangents: the members have a function `step_tangent`.
     """
     lines = ["", "def member_count():", f"    return {len(counts)}", ""]
     for call, (arguments, name, returns) in (_CALLS | (_TANGENT if tangents else {})).items():
@@ -60,13 +60,11 @@ class _Prefix(ast.NodeTransformer):
     def visit_arg(self, node: ast.arg) -> ast.arg:
         """Rename a parameter that is called like a function."""
         node.arg = self._new(node.arg)
-        node.annotation = None
         return node
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.FunctionDef:
-        """Rename a function; its docstring and annotations are left out."""
+        """Rename a function; its docstring is left out."""
         node.name = self._new(node.name)
-        node.returns = None
         if ast.get_docstring(node) is not None and len(node.body) > 1:
             node.body = node.body[1:]
         self.generic_visit(node)

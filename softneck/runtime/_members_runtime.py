@@ -38,12 +38,14 @@ def member_step(
 def member_tangent(
     arrays: object,
     member: int,
-    k: int,
-    before: np.ndarray,
+    parameters: np.ndarray,
     state: np.ndarray,
-    line: np.ndarray,
-    rows: np.ndarray,
-    slopes: np.ndarray,
+    inputs: np.ndarray,
+    outputs: np.ndarray,
+    state_rows: np.ndarray,
+    inputs_rows: np.ndarray,
+    outputs_rows: np.ndarray,
+    moved: int,
 ) -> None:
-    """Move a member's derivatives on by one sample; only of members that have a function `tangent`."""
+    """Advance a member by one sample, and what its state is moved by along the first `moved` directions."""
     raise NotImplementedError

@@ -16,7 +16,7 @@ from ._layout import Arrays, StateVector, Symbol
 
 
 def lowered(function: ast.FunctionDef, find: Callable[[str], Any], where: str) -> ast.FunctionDef:
-    """Return `function` with places for names, without docstring and annotations.
+    """Return `function` with places for names, without its docstring and the names of layouts.
 
     Args:
         function: as it is written.
@@ -32,8 +32,7 @@ def lowered(function: ast.FunctionDef, find: Callable[[str], Any], where: str) -
             found = find(argument.annotation.id)
             if isinstance(found, type) and issubclass(found, Arrays | StateVector):
                 layouts[argument.arg] = found
-        argument.annotation = None
-    function.returns = None
+                argument.annotation = None
     names = _Names(layouts, find, f"{where}: `{function.name}`")
     body = function.body[1:] if ast.get_docstring(function, clean=False) is not None else function.body
     body = [names.visit(statement) for statement in body] or [ast.Pass()]

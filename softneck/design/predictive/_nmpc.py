@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import (
-    DataError,
     SettingsError,
     Vector,
     require_between,
@@ -29,8 +28,9 @@ from softneck.runtime import Block, Port, State
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
 from ..linear._ports import controller_inputs, controller_outputs, limit_ports
+from ._nmpc_arrays import controller_arrays
+from ._nmpc_part import NmpcPart, SampleSolution, explain
 from ._nmpc_prepared import NonlinearProblem
-from ._nonlinear_solver import NonlinearSolver, SampleSolution
 from ._settings import spaced_starts
 from ._tuning import move_weight
 
@@ -135,8 +135,6 @@ class NmpcSettings:
 class NmpcController:
     """A nonlinear predictive controller of pitch and roll; `NmpcSettings.design` makes it.
 
-    `block` is for FMUs and loop files and needs numpy alone; `step` and `part` solve the same with CasADi and daqp.
-
     Attributes:
         settings: what was asked.
         model: that it predicts with.
@@ -201,22 +199,9 @@ class NmpcController:
             cocontraction_weight=s.cocontraction_weight,
         )
 
-    @cached_property
-    def solver(self) -> NonlinearSolver:
-        """The compiled problem with its solver; made at first use."""
-        return NonlinearSolver(self)
-
     def initial_state(self, **parameters: float) -> State:
         """Return the state at the start; parameters are the limits by name."""
-        q = np.array([port.start for port in self.parameters])
-        names = [port.name for port in self.parameters]
-        for name, value in parameters.items():
-            if name not in names:
-                raise SettingsError(f"`{name}` is not a parameter of nmpc; it has {', '.join(names)}.")
-            port = self.parameters[names.index(name)]
-            require_between(name, float(value), port.minimum or 0.0, port.maximum or math.inf, port.unit)
-            q[names.index(name)] = value
-        return State(np.zeros(self.solver.size), q, np.zeros(3))
+        return self._block.initial_state(**parameters)
 
     def step(self, state: State, inputs: ArrayLike) -> tuple[State, Vector]:
         """Return the next state and the set-points valid now; inputs as `inputs`.
@@ -224,42 +209,36 @@ class NmpcController:
         Raises:
             DataError: wrong number of inputs, or one that is not finite.
         """
-        u = np.asarray(inputs, dtype=np.float64).ravel()
-        if u.size != len(self.inputs) or not np.isfinite(u).all():
-            raise DataError(
-                f"nmpc takes {len(self.inputs)} finite inputs ({', '.join(port.name for port in self.inputs)}); "
-                f"got {u.tolist()}."
-            )
-        values, out = self.solver.step(state.values, state.parameters, u)
-        return State(values, state.parameters, out), out
+        return self._block.step(state, inputs)
 
     def info(self, state: State) -> SampleSolution:
         """Return what the sample that led to `state` decided."""
-        return self.solver.row(state.values)
+        return explain(self._block, state.values)
 
     def part(self, *, solver: str = "own") -> Any:
-        """Return the controller as a part of a loop.
+        """Return the controller as a part of a loop that tells what each sample decided.
 
         Args:
             solver: "own", or "casadi" for each sample's optimum by ipopt: slow, a reference to compare with.
         """
-        from ._nmpc_part import NmpcPart
         from ._optimal import OptimalPart
 
         require_one_of("solver", solver, ("own", "casadi"))
-        return NmpcPart(self) if solver == "own" else OptimalPart(self)
+        return NmpcPart(self._block) if solver == "own" else OptimalPart(self)
 
     def block(self) -> Block:
-        """Return the controller as a block of role "controller", for FMUs: numpy alone, no CasADi and no daqp."""
-        from ._nmpc_arrays import controller_arrays
+        """Return the controller as a block of role "controller"."""
+        return self._block
 
-        runtime = f"softneck.design.predictive.tangents._{self.model.kind}_runtime:{len(self.model.arrays)}"
+    @cached_property
+    def _block(self) -> Block:
+        plant = self.model.block()
         return Block(
             kind="nmpc",
             role="controller",
-            runtime=f"softneck.design.predictive._nmpc_runtime({runtime})",
+            runtime=f"softneck.design.predictive._nmpc_runtime({plant.runtime}:{len(plant.arrays)})",
             sample_time=self.sample_time,
-            arrays=(*controller_arrays(self), *self.model.block().arrays),
+            arrays=(*controller_arrays(self), *plant.arrays),
             inputs=self.inputs,
             outputs=self.outputs,
             parameters=self.parameters,

@@ -15,12 +15,10 @@ def controller_arrays(controller: NonlinearController) -> tuple[Matrix, ...]:
     p, block = prepared.problem, controller.model.block()
     start = block.initial_state(use_measurement=0.0, noise_std=0.0)
     slack = 0.0 if s.angle_limit is None else s.slack_weight * float(p.weights[0].max())
-    # What a model remembers behind its histories, see `softneck.identification.models._histories_runtime`.
-    rows = start.values.size - 8 * int(block.arrays[0][0]) - 13
     constants = np.array([
         controller.sample_time, p.horizon, s.window, prepared.ahead, prepared.lead, prepared.keep, p.move_weight,
         p.cocontraction_weight, slack, s.angle_limit or 0.0, s.budget, float(s.converged), COAST, SETTLE,
-        len(block.outputs), rows,
+        len(block.outputs),
     ])  # fmt: skip
     return (
         constants, np.array(p.starts, dtype=np.float64), p.T, p.weights, prepared.gains, prepared.future,

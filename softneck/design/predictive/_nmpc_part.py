@@ -1,60 +1,82 @@
-"""The nonlinear predictive controller as a part of a loop."""
+"""The nonlinear predictive controller as a part of a loop, and what each of its samples decided."""
 
 from __future__ import annotations
 
 import math
 import time as clock
 from collections.abc import Mapping
+from dataclasses import dataclass
 
-import numpy as np
+from softneck.core import Matrix, Vector
+from softneck.loop import BlockPart
+from softneck.runtime import Block, load_runtime
 
-from softneck.core import DataError, Vector
+from . import _nmpc_state_runtime as rt
 
-from ._nmpc_prepared import NonlinearController
-from ._nonlinear_solver import SampleSolution
+_STATUS_NAMES = ("not started", "optimal", "softened", "previous plan", "holding")
 
 
-class NmpcPart:
-    """A nonlinear predictive controller that a loop steps; a `softneck.loop.Part`."""
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class SampleSolution:
+    """What a sample decided.
 
-    role = "controller"
+    Attributes:
+        status: "optimal", "softened", "previous plan", "holding" or "not started".
+        iterations: of the QP solver, all Gauss-Newton steps together.
+        residual: of the QP's KKT conditions.
+        previous_plan, softened: samples so far on which those happened.
+        moves: (moves, 3) that are planned next [rad].
+    """
 
-    def __init__(self, controller: NonlinearController) -> None:
-        """Adapt `controller`; the state comes with `start`."""
-        self.controller = controller
-        self.inputs, self.outputs = controller.inputs, controller.outputs
-        self.sample_time = controller.sample_time
+    status: str
+    iterations: int
+    residual: float
+    previous_plan: int
+    softened: int
+    moves: Matrix
+
+
+def explain(block: Block, values: Vector) -> SampleSolution:
+    """Return what the sample decided that led a controller's `block` to the state `values`."""
+    # The plan and the active rows, two for each of its numbers and those of soft limits, stand at the state's end.
+    starts = block.arrays[1].size
+    soft = 1 + 4 * starts if block.arrays[0][rt.NMPC_SLACK] > 0.0 else 0
+    end = load_runtime(block.runtime).state_size(block.arrays) - 6 * starts - soft
+    return SampleSolution(
+        status=_STATUS_NAMES[int(values[rt.NMPC_STATUS])],
+        iterations=int(values[rt.NMPC_ITERATIONS]),
+        residual=float(values[rt.NMPC_RESIDUAL]),
+        previous_plan=int(values[rt.NMPC_SHIFTED]),
+        softened=int(values[rt.NMPC_SOFTENED]),
+        moves=values[end - 3 * starts : end].reshape(-1, 3).copy(),
+    )
+
+
+class NmpcPart(BlockPart):
+    """A nonlinear predictive controller that a loop steps; a `softneck.loop.Part` with `info` of its last sample.
+
+    Attributes:
+        took: how long the last sample took [s].
+    """
+
+    def __init__(self, controller: Block) -> None:
+        """Adapt a controller's block; the state comes with `start`."""
+        super().__init__(controller)
         self.took = math.nan
-        self._values = self._parameters = np.zeros(0)
 
-    def start(self, time: float, parameters: Mapping[str, float]) -> Vector:  # noqa: ARG002 - it knows no absolute time
+    def start(self, time: float, parameters: Mapping[str, float]) -> Vector:
         """Return the outputs at the start; unknown parameters raise SettingsError."""
-        state = self.controller.initial_state(**parameters)
-        self._values, self._parameters = state.values, state.parameters
-        return np.zeros(3)
+        self.took = math.nan
+        return super().start(time, parameters)
 
-    def advance(self, time: float, inputs: Vector) -> Vector:  # noqa: ARG002
+    def advance(self, time: float, inputs: Vector) -> Vector:
         """Step once and return the set-points."""
         begin = clock.perf_counter()
-        self._values, outputs = self.controller.solver.step(self._values, self._parameters, inputs)
+        outputs = super().advance(time, inputs)
         self.took = clock.perf_counter() - begin
         return outputs
 
     @property
     def info(self) -> SampleSolution:
-        """What the last sample decided; `took` is how long it took [s]."""
-        return self.controller.solver.row(self._values)
-
-    def close(self) -> None:
-        """Do nothing: it holds nothing but memory."""
-
-    def get_state(self) -> bytes:
-        """Return the numbers of the state, to the bit."""
-        return self._values.astype("<f8").tobytes()
-
-    def set_state(self, state: bytes) -> None:
-        """Go on from what `get_state` returned; raise DataError if it is of another controller."""
-        values = np.frombuffer(state, dtype="<f8")
-        if values.size != self._values.size:
-            raise DataError(f"the state has {values.size} values, this controller's {self._values.size}.")
-        self._values = values.copy()
+        """What the last sample decided."""
+        return explain(self.block, self._state)

@@ -11,7 +11,7 @@ import numpy as np
 from softneck.core import Matrix
 from softneck.estimation import AxisPlant
 from softneck.identification import Model
-from softneck.runtime import Block, State
+from softneck.runtime import Block
 
 # Samples without measurement until the motors hold, and samples after which a model has settled.
 COAST = 25
@@ -56,7 +56,7 @@ class NonlinearProblem:
 
 
 class NonlinearController(Protocol):
-    """What preparation, solver, arrays and part need of an `NmpcController`."""
+    """What preparation and arrays need of an `NmpcController`."""
 
     @property
     def settings(self) -> Any: ...
@@ -64,16 +64,9 @@ class NonlinearController(Protocol):
     def model(self) -> Model: ...
     @property
     def sample_time(self) -> float: ...
-    @property
-    def inputs(self) -> Any: ...
-    @property
-    def outputs(self) -> Any: ...
-    @property
-    def solver(self) -> Any: ...
     def plants(self) -> tuple[AxisPlant, AxisPlant]: ...
     def problem(self) -> NonlinearProblem: ...
     def block(self) -> Block: ...
-    def initial_state(self, **parameters: float) -> State: ...
 
 
 class Preparation:
@@ -96,9 +89,6 @@ class Preparation:
         delay = max(plant.delay for plant in plants)
         L = p.horizon + delay + 1
         i = np.arange(1, L + 1)
-        self.decay = self.keep**i
-        lag = i[:, None] - i[None, :]
-        self.filter = np.where(lag >= 0, (1.0 - self.keep) * self.keep ** np.maximum(lag, 0), 0.0)
         self.asked_at = np.minimum(i + self.lead, max(self.ahead, 1)) - 1
         ends = (*p.starts[1:], p.horizon)
         middles = np.array([-0.5, *(0.5 * (a + b) for a, b in zip(p.starts, ends, strict=True))]) + delay

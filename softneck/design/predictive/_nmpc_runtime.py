@@ -1,7 +1,7 @@
 """Nonlinear predictive control: estimate, linearise along the plan, condense, solve, check, shift.
 
-The same sample as `_nonlinear_solver` (CasADi and daqp), with the derivatives of the `_tangent_*` runtimes and the
-solver of `_dual_runtime`; both agree to rounding. Member 0 is the model, whose free run it predicts with.
+Member 0 is the model, whose free run it predicts with and whose derivatives are those of its step's text (see
+`softneck.runtime._tangent`); the solver is that of `_dual_runtime`.
 
 State: head (NMPC_HEAD), held (3), filtered references (3), references last seen (3), references to come (2, H),
 the model's state, its angles of now (2), what it missed (window, 2) newest first, plan (nz), active rows (m).
@@ -30,7 +30,6 @@ from softneck.design.predictive._nmpc_state_runtime import (
     NMPC_OUTPUTS,
     NMPC_PLAN,
     NMPC_RESIDUAL,
-    NMPC_ROWS,
     NMPC_SETTLE,
     NMPC_SHIFTED,
     NMPC_SLACK,
@@ -46,14 +45,28 @@ from softneck.design.predictive._nmpc_state_runtime import (
     nmpc_plausible,
     nmpc_shift,
 )
+from softneck.runtime._layout import Arrays, array
 from softneck.runtime._members_runtime import member_initialise, member_size, member_step, member_tangent
 
-# constants, starts, T, weights, gains, future, slopes, inverse, asked_at, free
-OWN_ARRAYS = 10
 _MOST_ITERATIONS = 50
 _CONVERGED = 1e-10
 _TOLERANCE = 1e-10
 _LARGEST_RESIDUAL = 1e-7
+
+
+class NmpcArrays(Arrays):
+    """Those of the model follow."""
+
+    setup = array("15", "constants, see NMPC_TS and those below it")
+    starts = array("b", "samples at which the motors may move")
+    T = array("3, 3", "of Eq. 9-11: motors to redefined inputs")
+    weights = array("N, 2", "on angle errors [1/rad^2]")
+    gains = array("2, window", "what was missed to its level and rate")
+    future = array("N, 2", "what level and rate of it make of each sample to come")
+    slopes = array("b, path", "references to come to moves of the redefined inputs")
+    inverse = array("3, 2", "of T, by the static gains")
+    asked_at = array("path", "which of the references to come each sample asks for")
+    free = array("parameters", "of the model in free run")
 
 
 def state_size(arrays: tuple[np.ndarray, ...]) -> int:
@@ -62,7 +75,7 @@ def state_size(arrays: tuple[np.ndarray, ...]) -> int:
 
 
 def step(
-    arrays: tuple[np.ndarray, ...],
+    arrays: NmpcArrays,
     parameters: np.ndarray,
     state: np.ndarray,
     inputs: np.ndarray,
@@ -131,21 +144,24 @@ def nmpc_linear(
     arrays: tuple[np.ndarray, ...], x: np.ndarray, motors: np.ndarray, z: np.ndarray, Y: np.ndarray, S: np.ndarray
 ) -> None:
     """Fill the angles Y (2 N,) that the plan `z` leads to from `x`, and their derivative S (2 N, nz)."""
-    N, starts = int(arrays[0][NMPC_N]), arrays[1]
-    line = np.zeros((8 * (N + 1), z.shape[0]))
-    rows = np.zeros((int(arrays[0][NMPC_ROWS]), z.shape[0]))
-    now, before, held = x.copy(), x.copy(), motors.copy()
+    N, starts, nz = int(arrays[0][NMPC_N]), arrays[1], z.shape[0]
+    now, held = x.copy(), motors.copy()
+    u, out = np.empty(8), np.zeros(int(arrays[0][NMPC_OUTPUTS]))
+    u[3:] = np.nan
+    X, U, D = np.zeros((x.shape[0], nz)), np.zeros((8, nz)), np.zeros((out.shape[0], nz))
     block = 0
     for k in range(N):
         if block < starts.shape[0] and starts[block] == k:
-            held += z[3 * block : 3 * block + 3]
+            for j in range(3):
+                held[j] += z[3 * block + j]
+                U[j, 3 * block + j] = 1.0
             block += 1
-        for j in range(3):
-            for b in range(block):
-                line[8 * k + j, 3 * b + j] = 1.0
-        before[:] = now
-        nmpc_model(arrays, now, held, Y[2 * k : 2 * k + 2])
-        member_tangent(arrays, 0, k, before, now, line, rows, S[2 * k : 2 * k + 2])
+        u[:3] = held
+        # Moves that are still to come have moved nothing.
+        moved = 3 * block
+        member_tangent(arrays, 0, arrays[9], now, u, out, X, U, D, moved)
+        Y[2 * k : 2 * k + 2] = out[:2]
+        S[2 * k : 2 * k + 2, :moved] = D[:2, :moved]
 
 
 def nmpc_quadratic(

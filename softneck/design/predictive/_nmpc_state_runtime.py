@@ -40,7 +40,6 @@ NMPC_CONVERGED = 11
 NMPC_COAST = 12
 NMPC_SETTLE = 13
 NMPC_OUTPUTS = 14  # of the model
-NMPC_ROWS = 15  # of the model's state behind its histories
 
 
 def nmpc_places(arrays: tuple[np.ndarray, ...], size: int) -> tuple[int, int, int, int, int, int, int]:

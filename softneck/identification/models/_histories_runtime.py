@@ -76,7 +76,8 @@ def narx_observe(p: NarxArrays, parameters: np.ndarray, x: NarxState, inputs: np
     narx_known(p, parameters, x, inputs)
     narx_push(x.u, inputs[:3])
     narx_push(x.m, x.motors)
-    narx_push(x.y, x.angles - x.added)
+    base = x.angles - x.added
+    narx_push(x.y, base)
 
 
 def narx_advance(

@@ -26,7 +26,7 @@ from softneck.runtime import Block, State
 from softneck.signals import Recording
 
 from . import _linear_systems as _linear
-from . import _ports
+from . import _linearisation, _ports
 from ._arrays import check_arrays
 from ._composed import members, memory_of, runtime_of, set_now
 
@@ -122,6 +122,35 @@ class Model:
                 raise DataError(f"`measured` must have 2 or 5 entries (pitch, roll, motors); got {values.size}.")
             u[3 : 3 + values.size] = values
         return self.block().step(state, u)
+
+    def jacobian(self, state: State, inputs: ArrayLike) -> _linearisation.Jacobian:
+        """Return the derivatives A (n, n), B (n, 3), C (n_out, n), D (n_out, 3) of `step(state, inputs)`.
+
+        They are exact, from the text of the step itself. Rows and columns of the state are in the order of
+        `state.values`, those of the outputs in that of `step`. At a kink the derivative to the right counts.
+
+        Args:
+            state: at t_k.
+            inputs: (3,) motor set-points [rad].
+
+        Raises:
+            SettingsError: a kind that searches its data (set membership), and so has no derivative.
+        """
+        return _linearisation.jacobian(self, state, inputs)
+
+    def linearize(self, at: State | Mapping[str, float] | ArrayLike | None = None) -> control.StateSpace:
+        """Return the linear system from the motors' set-points to the outputs that the model is near a state.
+
+        States that no input moves, or that no output shows, are left out. It has `dt` and the signals' names.
+
+        Args:
+            at: the state, whose motors are told to stay where they are; or set-points [rad], (3,) or by name
+                (`motor_setpoint_1`, ..), under which the model has come to rest; None for zero.
+
+        Raises:
+            SettingsError: a kind without derivative, or a model that does not come to rest.
+        """
+        return _linearisation.linearised(self, at)
 
     def simulate(self, recording: Recording, *, motors: str = "simulated", warm_up: int = WARM_UP) -> Matrix:
         """Free run: return the outputs (time, n_out) [rad] from set-points alone; row 0 is the start.

@@ -121,5 +121,5 @@ def test_names_of_a_member_get_a_prefix_and_nothing_else_changes() -> None:
 
 def test_a_module_without_members_takes_none() -> None:
     plain = "softneck.identification.linear._rls_runtime"
-    with pytest.raises(SettingsError, match="takes no members: it does not say OWN_ARRAYS"):
+    with pytest.raises(SettingsError, match="does not declare its Arrays"):
         bundle(f"softneck.runtime._members_runtime({plain}:6)")

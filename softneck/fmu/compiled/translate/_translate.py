@@ -11,6 +11,7 @@ import re
 from dataclasses import dataclass, field
 
 from softneck.runtime import bundle
+from softneck.runtime._tangent import with_tangent
 
 from ._chunks import defined, nested_loops, reached
 from ._expressions import Expressions
@@ -61,7 +62,7 @@ class Unit:
             TranslationError: it uses what is not known in C; the unit is as it was before.
         """
         before = (list(self.types.declarations), list(self.functions), dict(self._bodies))
-        runtime = _Runtime(self, module)
+        runtime = _Runtime(self, bundle(module, loops=False))
         arrays = Arrays(ranks)
         try:
             size = runtime.function("state_size", (arrays,))
@@ -81,6 +82,18 @@ class Unit:
             f'    {{"{module}", sn_ranks{number}, {len(ranks)}, {int(runtime.has_members)}, '
             f"{size.name}, {start.name}, {step.name}}},"
         )
+
+    def tangent(self, module: str, ranks: tuple[int, ...]) -> str:
+        """Add the derivative of a runtime's step (see `softneck.runtime._tangent`), and return its name in C.
+
+        Raises:
+            TranslationError: it uses what is not known in C.
+        """
+        runtime = _Runtime(self, with_tangent(bundle(module, loops=False)))
+        if runtime.has_members:
+            raise TranslationError(f"{module}: derivatives of members are not translated.")
+        rows = (MATRIX, MATRIX, MATRIX)
+        return runtime.function("step_tangent", (Arrays(ranks), VECTOR, VECTOR, VECTOR, VECTOR, *rows, INT)).name
 
     def text(self) -> str:
         """Return the C file."""
@@ -114,8 +127,8 @@ class Unit:
 class _Runtime:
     """One runtime module on its way to C."""
 
-    def __init__(self, unit: Unit, module: str) -> None:
-        tree = ast.parse(bundle(module, loops=False))
+    def __init__(self, unit: Unit, text: str) -> None:
+        tree = ast.parse(text)
         self.unit = unit
         self.definitions = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
         self.constants = _constants(tree)

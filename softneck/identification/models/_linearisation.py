@@ -1,0 +1,135 @@
+"""The derivatives of one step of an identified plant, and the linear system that it is near a state."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from softneck.core import Matrix, SettingsError, Vector
+from softneck.core._checks import finite_vector
+from softneck.runtime import Block, State
+from softneck.runtime._compile import load_tangent
+
+if TYPE_CHECKING:
+    import control
+
+# The set-points stand first among a plant's inputs; what is measured is given to no step here.
+_MOTORS = 3
+# Some 4 s at a time; what has not come to rest after 200 s never does.
+_SETTLE, _TIMES = 200, 50
+_REST = 1e-12
+
+
+class Jacobian(NamedTuple):
+    """What one step makes of small changes: `dx(k+1) = A dx(k) + B du(k)`, `dy(k+1) = C dx(k) + D du(k)`.
+
+    Attributes:
+        A: (n, n), in the order of the state's `values`.
+        B: (n, 3), from the motors' set-points [rad].
+        C: (n_out, n), to the outputs that the step returns, in the order of the block's.
+        D: (n_out, 3).
+    """
+
+    A: Matrix
+    B: Matrix
+    C: Matrix
+    D: Matrix
+
+
+class Stepped(Protocol):
+    """What is asked of a model here."""
+
+    @property
+    def kind(self) -> str:
+        """Its name in the table of kinds."""
+        ...
+
+    def block(self) -> Block:
+        """Its block."""
+        ...
+
+    def initial_state(self, **parameters: float) -> State:
+        """The state at rest."""
+        ...
+
+
+def jacobian(model: Stepped, state: State, inputs: ArrayLike) -> Jacobian:
+    """Return the derivatives of `model.step(state, inputs)`; see `Model.jacobian`."""
+    block = model.block()
+    n, n_out = state.values.size, len(block.outputs)
+    u = np.full(len(block.inputs), np.nan)
+    u[:_MOTORS] = finite_vector("inputs", inputs, _MOTORS)
+    X, U = np.zeros((n, n + _MOTORS)), np.zeros((u.size, n + _MOTORS))
+    X[:, :n] = np.eye(n)
+    U[:_MOTORS, n:] = np.eye(_MOTORS)
+    Y = np.zeros((n_out, n + _MOTORS))
+    tangent = load_tangent(block.runtime)
+    tangent(block.arrays, state.parameters, state.values.copy(), u, np.zeros(n_out), X, U, Y, n + _MOTORS)
+    return Jacobian(X[:, :n], X[:, n:], Y[:, :n], Y[:, n:])
+
+
+def linearised(model: Stepped, at: State | Mapping[str, float] | ArrayLike | None) -> control.StateSpace:
+    """Return the linear system that `model` is near a state; see `Model.linearize`."""
+    import control
+
+    block = model.block()
+    if isinstance(at, State):
+        # The motors are told to stay where they are.
+        state, u = at, at.outputs[2 : 2 + _MOTORS]
+    else:
+        u = _set_points(block, at)
+        state = _rest(model, block, u)
+    J = jacobian(model, state, u)
+    n, n_out = J.A.shape[0], J.C.shape[0]
+    # A step returns the outputs of the next sample; as states of their own they are those of the state's.
+    A = np.block([[J.A, np.zeros((n, n_out))], [J.C, np.zeros((n_out, n_out))]])
+    B, C = np.vstack([J.B, J.D]), np.hstack([np.zeros((n_out, n)), np.eye(n_out)])
+    kept = _reached(A, B.any(axis=1)) & _reached(A.T, C.any(axis=0))
+    return control.StateSpace(
+        A[np.ix_(kept, kept)], B[kept], C[:, kept], np.zeros((n_out, _MOTORS)), block.sample_time,
+        inputs=[port.name for port in block.inputs[:_MOTORS]], outputs=[port.name for port in block.outputs],
+        name=model.kind,
+    )  # fmt: skip
+
+
+def _set_points(block: Block, at: Mapping[str, float] | ArrayLike | None) -> Vector:
+    """Return the motors' set-points (3,) that are asked for."""
+    names = [port.name for port in block.inputs[:_MOTORS]]
+    if at is None:
+        return np.zeros(_MOTORS)
+    if isinstance(at, Mapping):
+        given: Mapping[str, Any] = at
+        unknown = sorted(set(given) - set(names))
+        if unknown:
+            raise SettingsError(f"`{unknown[0]}` is not a set-point; `at` takes {', '.join(names)}.")
+        return finite_vector("at", [given.get(name, 0.0) for name in names], _MOTORS)
+    return finite_vector("at", at, _MOTORS)
+
+
+def _rest(model: Stepped, block: Block, u: Vector) -> State:
+    """Return the state in which the model stands under the set-points `u`, run free until it does."""
+    state = model.initial_state(use_measurement=0.0)
+    rows = np.full((_SETTLE, len(block.inputs)), np.nan)
+    rows[:, :_MOTORS] = u
+    for _ in range(_TIMES):
+        state, outputs = block.run(state, rows)
+        if np.isfinite(outputs).all() and np.ptp(outputs[-_SETTLE // 4 :], axis=0).max() <= _REST:
+            return state
+    raise SettingsError(
+        f"the model of kind {model.kind} does not come to rest under the set-points {u.tolist()} rad within "
+        f"{_SETTLE * _TIMES * block.sample_time:g} s; give `at` a state."
+    )
+
+
+def _reached(A: Matrix, first: np.ndarray) -> np.ndarray:
+    """Return which states (n,) follow from those of `first`, one sample after the other."""
+    leads = A != 0.0
+    reached = first
+    while True:
+        more = reached | leads[:, reached].any(axis=1)
+        if (more == reached).all():
+            return reached
+        reached = more

@@ -1,0 +1,289 @@
+"""Derivatives in reverse: the gradient of a function that makes one number out of loops or whole arrays.
+
+`f_back(..., seed, x_bar)` returns f and adds seed * df/dx to `x_bar`. Values are computed forward; then the statements
+come in reverse, each passing on what the result makes of its variable. A loop is run once more from its start, so it
+may carry on sums only; a short one of fixed length is written out.
+"""
+
+from __future__ import annotations
+
+import ast
+import copy
+from collections.abc import Callable
+
+from ._tangent_activity import Activity, Pattern, is_numpy, statements
+from ._tangent_lowering import Lowering, Terms, inner, undefined
+from ._tangent_rows import Derived, names, without_unused
+
+_LONGEST_WRITTEN_OUT = 4
+# tanh and the like of whole arrays: what they pass on, with v for their value and x for their argument.
+_EACH = {"tanh": "(1.0 - {v} * {v})", "exp": "{v}", "sin": "np.cos({x})", "cos": "-np.sin({x})", "sqrt": "0.5 / {v}"}
+
+
+def worth_it(activity: Activity, pattern: Pattern) -> bool:
+    """Return whether a function is better differentiated in reverse."""
+    node = activity.node
+    returns = ast.unparse(node.returns) if node.returns else ""
+    stores = any(isinstance(part, ast.Subscript) and isinstance(part.ctx, ast.Store) for part in ast.walk(node))
+    plain = returns == "float" and activity.result and not stores
+    vectors = all(rank == 1 for _, rank in pattern) and dict(pattern) == activity.written
+    many = any(isinstance(part, ast.For) or is_numpy(part, "dot") for part in ast.walk(node))
+    return plain and vectors and many
+
+
+class Back(Lowering):
+    """Writes the derivative in reverse of one function."""
+
+    def __init__(self, activity: Activity, derived: Derived) -> None:
+        """Begin."""
+        super().__init__(activity)
+        self._derived = derived
+        # What to do behind the statement at hand, once its own terms are passed on.
+        self._after: list[str] = []
+        self._sums: set[str] = set()
+
+    def text(self, name: str) -> str:
+        """Return the derived function, called `name`; raise TangentError where it cannot be reversed."""
+        act = self.activity
+        body = _written_out(act.node.body)
+        if not isinstance(body[-1], ast.Return) or any(isinstance(s, ast.Return) for s in statements(body[:-1])):
+            raise self.fail(act.node, "it returns in its middle.")
+        forward, back = self._block(body)
+        arguments = [*act.parameters, "seed", *(f"{parameter}_bar" for parameter in act.written)]
+        stored = {n.id for n in ast.walk(act.node) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+        bars = [f"{n}_bar = 0.0" for n in sorted(stored) if act.root(n) in act.active and act.ranks.get(n) == 0]
+        lines = without_unused([*forward, *bars, *back, "return _result"])
+        return "\n".join([f"def {name}({', '.join(arguments)}):", *inner(lines)]) + "\n"
+
+    def _block(self, body: list[ast.stmt]) -> tuple[list[str], list[str]]:
+        """Return the lines forward, and those in reverse."""
+        forward: list[str] = []
+        back: list[str] = []
+        for node in body:
+            outside, self.lines = self.lines, []
+            handler: Callable[[ast.stmt], list[str]] | None = {
+                ast.Assign: self._assign, ast.AugAssign: self._assign, ast.If: self._if, ast.For: self._for,
+                ast.Return: self._return, ast.Expr: self._nothing, ast.Pass: self._nothing,
+            }.get(type(node))  # type: ignore[assignment]  # fmt: skip
+            if handler is None:
+                raise self.fail(node, "this statement is not reversed.")
+            reverse = handler(node)
+            forward, back = forward + self.lines, reverse + back
+            self.lines = outside
+        return forward, back
+
+    def _nothing(self, node: ast.stmt) -> list[str]:
+        if isinstance(node, ast.Expr) and not isinstance(node.value, ast.Constant):
+            raise self.fail(node, "a call without a result is not reversed.")
+        return []
+
+    def _assign(self, node: ast.stmt) -> list[str]:
+        act = self.activity
+        target = node.targets[0] if isinstance(node, ast.Assign) else node.target  # type: ignore[attr-defined]
+        value: ast.expr = node.value  # type: ignore[attr-defined]
+        if isinstance(node, ast.AugAssign):
+            value = ast.BinOp(ast.parse(ast.unparse(target), mode="eval").body, node.op, value)
+        if not isinstance(target, ast.Name) or (isinstance(node, ast.Assign) and len(node.targets) > 1):
+            raise self.fail(node, "this assignment is not reversed.")
+        if not act.is_active(target):
+            self.lines.append(ast.unparse(node))
+            return []
+        if act.rank(target) != 0:
+            return self._vector(node, target, value)
+        self._after = []
+        text, terms = self.value(value)
+        if target.id not in self._sums:
+            self.lines.append(f"{target.id} = {text}")
+        own = [partial for partial, place in terms if place == f"{target.id}_bar"]
+        passed = self._passed([term for term in terms if term[1] != f"{target.id}_bar"], f"{target.id}_bar")
+        kept = [f"{target.id}_bar = {own[0]} * {target.id}_bar"] if own and own[0] != "1.0" else []
+        return [*passed, *(kept if own else [f"{target.id}_bar = 0.0"]), *self._after]
+
+    def _return(self, node: ast.stmt) -> list[str]:
+        assert_value = node.value if isinstance(node, ast.Return) else None
+        if assert_value is None:
+            raise self.fail(node, "it returns nothing.")
+        self._after = []
+        text, terms = self.value(assert_value)
+        self.lines.append(f"_result = {text}")
+        return [*self._passed(terms, "seed"), *self._after]
+
+    def _passed(self, terms: Terms, bar: str) -> list[str]:
+        """Return the lines that pass `bar` on to the places of `terms`."""
+        lines = []
+        for partial, place in terms:
+            passed = {"1.0": bar, "-1.0": f"-{bar}"}.get(partial, f"{partial} * {bar}")
+            lines.append(f"{place} {'=' if place.startswith('_') else '+='} {passed}")
+        return lines
+
+    def _if(self, node: ast.stmt) -> list[str]:
+        if not isinstance(node, ast.If):
+            return []
+        test = self.kept(f"1.0 if {ast.unparse(node.test)} else 0.0", "c")
+        branches = [self._block(part) for part in (node.body, node.orelse)]
+        self.lines += undefined([forward for forward, _ in branches])
+        back = []
+        for number, (forward, reverse) in enumerate(branches):
+            head = f"if {test} {'>' if number == 0 else '<'} 0.5:"
+            self.lines += [head, *inner(forward)] if forward else []
+            back += [head, *inner(reverse)] if reverse else []
+        return back
+
+    def _for(self, node: ast.stmt) -> list[str]:
+        if not isinstance(node, ast.For):
+            return []
+        head = ast.unparse(node).splitlines()[0]
+        self.lines += ast.unparse(node).splitlines()
+        before, self._sums = self._sums, self._sums | self._sums_of(node)
+        outside, self.lines = self.lines, []
+        forward, back = self._block(node.body)
+        self.lines, self._sums = outside, before
+        return [head, *inner([*forward, *back] or ["pass"])]
+
+    def _sums_of(self, node: ast.For) -> set[str]:
+        """Return what a loop adds up and reads nowhere else; raise TangentError if it carries on anything more."""
+        used = [part for statement in node.body for part in ast.walk(statement) if isinstance(part, ast.Name)]
+        reads = {name.id for name in used if isinstance(name.ctx, ast.Load)}
+        written = {name.id for name in used if isinstance(name.ctx, ast.Store)}
+        added: set[str] = set()
+        loops: set[str] = set()
+        for part in statements(node.body):
+            if isinstance(part, ast.AugAssign | ast.For) and isinstance(part.target, ast.Name):
+                adds = isinstance(part, ast.AugAssign) and isinstance(part.op, ast.Add | ast.Sub)
+                (added if adds else loops).update([part.target.id] if adds or isinstance(part, ast.For) else [])
+        fresh: set[str] = set()
+        for statement in node.body:
+            if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name):
+                if statement.targets[0].id not in {n.id for n in names(statement.value)} | added:
+                    fresh.add(statement.targets[0].id)
+                added -= fresh
+        sums = {name for name in added if name not in reads}
+        if written - sums - fresh - loops:
+            raise self.fail(node, "what this loop carries on is not reversed.")
+        return sums
+
+    # Places
+
+    def place(self, node: ast.Name | ast.Subscript) -> str:
+        """Return where what is passed on to a number is added up."""
+        if isinstance(node, ast.Name):
+            return f"{node.id}_bar"
+        if not isinstance(node.value, ast.Name) or node.value.id not in self.activity.parameters:
+            raise self.fail(node, "an entry of this is not reversed.")
+        return f"{node.value.id}_bar[{self.index(node)}]"
+
+    def chosen(self, sign: int, a: tuple[str, Terms], b: tuple[str, Terms]) -> Terms:
+        """Return the derivative of the larger or smaller of two; of equal ones that of growing numbers."""
+        # max(x, c) moves with a growing x = c, min(x, c) does not.
+        first = self.kept(f"1.0 if {a[0]} {'>=' if (sign > 0) == bool(a[1]) else '>'} {b[0]} else 0.0", "p")
+        if sign < 0:
+            first = self.kept(f"1.0 if {a[0]} {'<' if a[1] and not b[1] else '<='} {b[0]} else 0.0", "p")
+        return self.sum(self.times(a[1], first), self.times(b[1], f"1.0 - {first}"))
+
+    def length(self, value: str, parts: list[tuple[str, Terms]]) -> Terms:
+        """Return the derivative of a length."""
+        return self.along(value, parts)
+
+    def call(self, node: ast.Call, name: str) -> tuple[str, Terms]:
+        """Write a call forward; its own reverse comes behind the statement's."""
+        act = self.activity
+        pattern = act.pattern(node, name)
+        back = self._derived.back(name, pattern)
+        if back is None:
+            raise self.fail(node, "this call is not reversed.")
+        callee = act.program.activity(name, pattern)
+        arguments = list(map(ast.unparse, node.args))
+        value = self.kept(f"{name}({', '.join(arguments)})")
+        bars = [f"{a}_bar" for p, a in zip(callee.parameters, arguments, strict=True) if p in callee.written]
+        if not all(bar.removesuffix("_bar") in act.parameters for bar in bars):
+            raise self.fail(node, "this call is not reversed.")
+        self._after.append(f"{back}({', '.join([*arguments, f'{value}_bar', *bars])})")
+        return value, [("1.0", f"{value}_bar")]
+
+    # Vectors
+
+    def product(self, node: ast.Call) -> tuple[str, Terms]:
+        """Write a product of vectors."""
+        active = [act for act in node.args if self.activity.is_active(act)]
+        if len(active) != 1 or self.activity.rank(node) != 0:
+            raise self.fail(node, "this product is not reversed.")
+        other = next(value for value in node.args if value is not active[0])
+        held, push = self._taken_apart(active[0])
+        texts = [held if value is active[0] else ast.unparse(value) for value in node.args]
+        value = self.kept(f"np.dot({', '.join(texts)})")
+        self._after += push(f"({ast.unparse(other)} * {value}_bar)")
+        return value, [("1.0", f"{value}_bar")]
+
+    def _vector(self, node: ast.stmt, target: ast.Name, value: ast.expr) -> list[str]:
+        stores = [n for n in ast.walk(self.activity.node) if isinstance(n, ast.Name) and n.id == target.id]
+        if isinstance(node, ast.AugAssign) or [isinstance(n.ctx, ast.Store) for n in stores].count(True) != 1:
+            raise self.fail(node, "a vector that is overwritten is not reversed.")
+        if sum(isinstance(n.ctx, ast.Load) for n in stores) > 1:
+            raise self.fail(node, "a vector that is read twice is not reversed.")
+        held, push = self._taken_apart(value)
+        self.lines.append(f"{target.id} = {held}")
+        return push(f"{target.id}_bar")
+
+    def _taken_apart(self, node: ast.expr) -> tuple[str, Callable[[str], list[str]]]:
+        """Return a vector's text, and what passes on what it is given."""
+        act = self.activity
+        if not act.is_active(node):
+            return f"({ast.unparse(node)})", lambda _: []
+        if isinstance(node, ast.Name):
+            sign = "+=" if node.id in act.parameters else "="
+            return node.id, lambda bar: [f"{node.id}_bar {sign} {bar}"]
+        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add | ast.Sub | ast.Mult | ast.Div):
+            return self._pair_apart(node)
+        if is_numpy(node, *_EACH) and isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            text, push = self._taken_apart(node.args[0])
+            argument = self.kept(text, "x")
+            value = self.kept(f"np.{node.func.attr}({argument})", "x")
+            slope = _EACH[node.func.attr].format(v=value, x=argument)
+            return value, lambda bar: push(f"({bar} * {slope})")
+        if is_numpy(node, "dot") and isinstance(node, ast.Call) and not act.is_active(node.args[0]):
+            matrix = ast.unparse(node.args[0])
+            text, push = self._taken_apart(node.args[1])
+            return f"np.dot({matrix}, {text})", lambda bar: push(f"np.dot({bar}, {matrix})")
+        raise self.fail(node, "this array is not reversed.")
+
+    def _pair_apart(self, node: ast.BinOp) -> tuple[str, Callable[[str], list[str]]]:
+        (a, first), (b, second) = self._taken_apart(node.left), self._taken_apart(node.right)
+        both = self.activity.is_active(node.left) and self.activity.is_active(node.right)
+        if isinstance(node.op, ast.Add | ast.Sub):
+            sign = "+" if isinstance(node.op, ast.Add) else "-"
+            return f"({a} {sign} {b})", lambda bar: first(bar) + second(bar if sign == "+" else f"(-{bar})")
+        if both or (isinstance(node.op, ast.Div) and self.activity.is_active(node.right)):
+            raise self.fail(node, "this array is not reversed.")
+        if isinstance(node.op, ast.Div):
+            return f"({a} / {b})", lambda bar: first(f"({bar} / {b})")
+        return f"({a} * {b})", lambda bar: first(f"({bar} * {b})") + second(f"({bar} * {a})")
+
+
+def _written_out(body: list[ast.stmt]) -> list[ast.stmt]:
+    """Return statements with short loops of fixed length written out."""
+    out: list[ast.stmt] = []
+    for node in body:
+        size = None
+        if isinstance(node, ast.For) and isinstance(node.iter, ast.Call) and len(node.iter.args) == 1:
+            size = node.iter.args[0].value if isinstance(node.iter.args[0], ast.Constant) else None
+        if isinstance(size, int) and size <= _LONGEST_WRITTEN_OUT and isinstance(node, ast.For):
+            counter = ast.unparse(node.target)
+            for i in range(size):
+                text = [ast.unparse(_Replaced(counter, i).visit(copy.deepcopy(s))) for s in _written_out(node.body)]
+                out += ast.parse("\n".join(text)).body
+            continue
+        new = copy.copy(node)
+        for part in ("body", "orelse"):
+            if getattr(new, part, None):
+                setattr(new, part, _written_out(getattr(new, part)))
+        out.append(new)
+    return out
+
+
+class _Replaced(ast.NodeTransformer):
+    def __init__(self, name: str, value: int) -> None:
+        self._name, self._value = name, value
+
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        """Put the number where the counter stood."""
+        return ast.Constant(self._value) if node.id == self._name else node
