@@ -10,10 +10,9 @@ import pytest
 
 from softneck.core import DataError, SettingsError, load
 from softneck.design import NmpcController, NmpcSettings
-from softneck.design.predictive import _nmpc_state_runtime as rt
 from softneck.design.predictive._nmpc import NONLINEAR_KINDS
 from softneck.design.predictive._nmpc_prepared import disturbance_ahead, estimate_gains
-from softneck.design.predictive._nmpc_state_runtime import nmpc_places, nmpc_shift
+from softneck.design.predictive._nmpc_state_runtime import NmpcArrays, NmpcState
 from softneck.estimation import LinearNeck
 from softneck.identification import GreyBox, Model, Network, NeuralStateSpace, Play, Rls
 from softneck.loop import BlockPart
@@ -66,6 +65,12 @@ def closed_loop(
     return np.array(angles), said
 
 
+def named(controller: NmpcController, values: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the parts of a controller's state by their names."""
+    parts = NmpcState.parts(NmpcArrays(controller.block().arrays))
+    return {name: values[place] for name, place in parts.items()}
+
+
 @dataclass(frozen=True)
 class Asked:
     """What a sample is asked, where it decides: the problem's numbers, and the bounds of moves and positions."""
@@ -91,21 +96,19 @@ def asked(controller: NmpcController, state: State, u: list[float]) -> Asked:
     f.step(block.arrays, q, state.values.copy(), np.array(u), np.zeros(3))
     f.nmpc_decide = decide
     values = found[0]
-    _, x, y, missed, plan, active, _ = f.nmpc_places(block.arrays, f.member_size(block.arrays, 0))
+    x = named(controller, values)
     target, moves = np.empty(2 * s.horizon), np.empty(p.variables)
     f.nmpc_asked(block.arrays, values, target, moves)
-    level, rate = block.arrays[4] @ values[missed:plan].reshape(-1, 2)
-    future = block.arrays[5]
-    target -= (np.outer(future[:, 0], level) + np.outer(future[:, 1], rate)).ravel()
-    held, b = values[rt.NMPC_HELD : rt.NMPC_HELD + 3], len(p.starts)
+    target -= missing(controller, values)
+    held, b = x["held"], len(p.starts)
     step = q[1] * controller.sample_time
     low, high = np.full(p.variables, -step), np.full(p.variables, step)
     low[:3] = np.clip(np.array(u[5:8]) - q[2] - held, -step, step)
     high[:3] = np.clip(np.array(u[5:8]) + q[2] - held, low[:3], step)
     least = np.minimum(max(-q[0], q[3]), held + high[:3]) - held
     most = np.maximum(q[0], held + low[:3]) - held
-    common = float(values[rt.NMPC_HELD + 5])
-    return Asked(values[x:y], held, values[plan:active], target, moves, common, low, high, np.tile(least, b),
+    common = float(x["filtered"][2])
+    return Asked(x["model"], held, x["plan"], target, moves, common, low, high, np.tile(least, b),
                  np.tile(most, b))  # fmt: skip
 
 
@@ -122,7 +125,7 @@ def test_converged_it_is_what_ipopt_finds(kind: str, limit: float | None, models
     )  # fmt: skip
     controller = settings.design(models[kind])
     own, best = BlockPart(controller.block()), controller.part(solver="casadi")
-    places = nmpc_places(own.block.arrays, models[kind].block().initial_state().values.size)
+    f = load_functions(own.block.runtime, compiled=False)
     motors = own.start(0.0, {})
     best.start(0.0, {})
     for k in range(30):
@@ -134,10 +137,10 @@ def test_converged_it_is_what_ipopt_finds(kind: str, limit: float | None, models
         if k == 0:
             continue
         found = best.moves.ravel().copy()
-        nmpc_shift(own.block.arrays[1], found)
+        f.nmpc_shift(NmpcArrays(own.block.arrays).starts, found)
         assert best.status == "Solve_Succeeded"
         # The issue's bound; ipopt itself stops its barrier at 1e-10 of the scaled problem.
-        np.testing.assert_allclose(own.memory[1][places[4] : places[5]], found, atol=1e-5)
+        np.testing.assert_allclose(named(controller, own.memory[1])["plan"], found, atol=1e-5)
     assert np.abs(motors).max() > 0.1
 
 
@@ -187,7 +190,7 @@ def test_each_sample_is_the_quadratic_program_of_differences(
                 at = np.array([*p.starts[1:], p.horizon]) - 1
                 at = np.concatenate([2 * at, 2 * at + 1])
                 # What the model misses is in the target; the angles themselves are limited.
-                free = (Y - S @ a.plan + missing(controller, state, a))[at]
+                free = (Y - S @ a.plan + missing(controller, state.values))[at]
                 upper, lower = np.hstack([S[at], -np.ones((at.size, 1))]), np.hstack([S[at], np.ones((at.size, 1))])
                 rows = np.vstack([rows, upper, lower])
                 far = np.full(at.size, 1e30)
@@ -202,14 +205,11 @@ def test_each_sample_is_the_quadratic_program_of_differences(
     assert statuses == ({"optimal", "softened"} if soft else {"optimal"})
 
 
-def missing(controller: NmpcController, after: State, a: Asked) -> np.ndarray:
+def missing(controller: NmpcController, values: np.ndarray) -> np.ndarray:
     """Return what the model is expected to miss (2 N,), from what it missed so far."""
-    block = controller.block()
-    places = load_functions(block.runtime, compiled=False)
-    _, _, _, missed, plan, _, _ = places.nmpc_places(block.arrays, a.x.size)
-    level, rate = block.arrays[4] @ after.values[missed:plan].reshape(-1, 2)
-    future = block.arrays[5]
-    return (np.outer(future[:, 0], level) + np.outer(future[:, 1], rate)).ravel()
+    arrays = NmpcArrays(controller.block().arrays)
+    level, rate = arrays.gains @ named(controller, values)["missed"].reshape(-1, 2)
+    return (np.outer(arrays.future[:, 0], level) + np.outer(arrays.future[:, 1], rate)).ravel()
 
 
 def test_the_block_that_numba_has_not_compiled_is_the_same(network: Model) -> None:
@@ -318,7 +318,7 @@ def test_disabled_it_holds_and_takes_over_without_a_bump(controller: NmpcControl
         state, out = controller.step(state, [0.3, 0.0, 0.0, 0.05, 0.0, *motors, 1.0, 0.0])
         np.testing.assert_array_equal(out, motors)
     before = out
-    filtered = state.values[rt.NMPC_HELD + 3 : rt.NMPC_HELD + 6]
+    filtered = named(controller, state.values)["filtered"]
     state, out = controller.step(state, [*filtered, 0.05, 0.0, *motors, 1.0, 1.0])
     # Asked for what is there: 1e-3 rad is what a model that was not quite at rest moves on by.
     np.testing.assert_allclose(out, before, atol=1e-3)

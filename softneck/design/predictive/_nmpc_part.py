@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 from softneck.core import Matrix, Vector
 from softneck.loop import BlockPart
-from softneck.runtime import Block, load_runtime
+from softneck.runtime import Block
 
-from . import _nmpc_state_runtime as rt
+from ._nmpc_state_runtime import NmpcArrays, NmpcState
 
 _STATUS_NAMES = ("not started", "optimal", "softened", "previous plan", "holding")
 
@@ -38,17 +38,15 @@ class SampleSolution:
 
 def explain(block: Block, values: Vector) -> SampleSolution:
     """Return what the sample decided that led a controller's `block` to the state `values`."""
-    # The plan and the active rows, two for each of its numbers and those of soft limits, stand at the state's end.
-    starts = block.arrays[1].size
-    soft = 1 + 4 * starts if block.arrays[0][rt.NMPC_SLACK] > 0.0 else 0
-    end = load_runtime(block.runtime).state_size(block.arrays) - 6 * starts - soft
+    parts = NmpcState.parts(NmpcArrays(block.arrays))
+    number = {name: float(values[place.start]) for name, place in parts.items()}
     return SampleSolution(
-        status=_STATUS_NAMES[int(values[rt.NMPC_STATUS])],
-        iterations=int(values[rt.NMPC_ITERATIONS]),
-        residual=float(values[rt.NMPC_RESIDUAL]),
-        previous_plan=int(values[rt.NMPC_SHIFTED]),
-        softened=int(values[rt.NMPC_SOFTENED]),
-        moves=values[end - 3 * starts : end].reshape(-1, 3).copy(),
+        status=_STATUS_NAMES[int(number["status"])],
+        iterations=int(number["iterations"]),
+        residual=number["residual"],
+        previous_plan=int(number["shifted"]),
+        softened=int(number["softened"]),
+        moves=values[parts["plan"]].reshape(-1, 3).copy(),
     )
 
 

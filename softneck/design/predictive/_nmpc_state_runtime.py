@@ -4,27 +4,21 @@ import math
 
 import numpy as np
 
+from softneck.runtime._layout import Arrays, StateVector, array, cells, rest, value
+
 NMPC_REFERENCE_LIMIT = 0.8
 NMPC_MOTOR_LIMIT = 6.0
 # No neck leans this far; whoever says so measures nothing.
 NMPC_PLAUSIBLE = 1.3
 NMPC_NO_BOUND = 1e30
 
-# Head of the state.
-NMPC_STARTED = 0
-NMPC_ITERATIONS = 1
-NMPC_STATUS = 2  # of the last sample: one of the numbers below
-NMPC_SHIFTED = 3  # samples on which the shifted previous plan was used
-NMPC_SOFTENED = 4  # samples on which a soft limit could not be kept
-NMPC_MISSED = 5  # samples in a row without a measurement
-NMPC_RESIDUAL = 6  # of the KKT conditions, last answer
-NMPC_HELD = 7
+# Status of the last sample.
 NMPC_OPTIMAL = 1.0
 NMPC_SOFT = 2.0
 NMPC_PLAN = 3.0
 NMPC_HOLDING = 4.0
 
-# arrays[0], by place.
+# Places in `setup`.
 NMPC_TS = 0
 NMPC_N = 1
 NMPC_WINDOW = 2
@@ -42,24 +36,49 @@ NMPC_SETTLE = 13
 NMPC_OUTPUTS = 14  # of the model
 
 
-def nmpc_places(arrays: tuple[np.ndarray, ...], size: int) -> tuple[int, int, int, int, int, int, int]:
-    """Return where references to come, model, angles, misses, plan and active rows begin, and the end.
+def nmpc_slacks(setup: np.ndarray) -> int:
+    """Return 1 if the angles have a soft limit, else 0."""
+    return 1 if setup[NMPC_SLACK] > 0.0 else 0
 
-    Args:
-        arrays: of the controller.
-        size: of the model's state.
-    """
-    nz = 3 * arrays[1].shape[0]
-    ahead = NMPC_HELD + 9
-    x = ahead + 2 * int(arrays[0][NMPC_AHEAD])
-    y = x + size
-    missed = y + 2
-    plan = missed + 2 * int(arrays[0][NMPC_WINDOW])
-    active = plan + nz
-    rows = 2 * nz
-    if arrays[0][NMPC_SLACK] > 0.0:
-        rows += 1 + 4 * arrays[1].shape[0]
-    return ahead, x, y, missed, plan, active, active + rows
+
+class NmpcArrays(Arrays):
+    """Those of the model follow."""
+
+    setup = array("15", "numbers of the problem, at the places NMPC_TS to NMPC_OUTPUTS")
+    starts = array("moves", "samples at which the motors may move")
+    T = array("3, 3", "of Eq. 9-11: motors to redefined inputs")
+    weights = array("N, 2", "on angle errors [1/rad^2]")
+    gains = array("2, window", "what was missed to its level and rate")
+    future = array("N, 2", "what level and rate of it make of each sample to come")
+    slopes = array("moves, path", "references to come to moves of the redefined inputs")
+    inverse = array("3, 2", "of T, by the static gains")
+    asked_at = array("path", "which of the references to come each sample asks for")
+    free = array("parameters", "of the model in free run")
+    N = value("setup", NMPC_N)
+    H = value("setup", NMPC_AHEAD)
+    lead = value("setup", NMPC_LEAD)
+    slacks = value("setup", function=nmpc_slacks)
+
+
+class NmpcState(StateVector):
+    """What is held, asked, missed and planned; the model's own state follows."""
+
+    started = cells("", "whether a sample came yet")
+    iterations = cells("", "of the QP solver in the last sample")
+    status = cells("", "of the last sample: NMPC_OPTIMAL to NMPC_HOLDING, 0 before the first")
+    shifted = cells("", "samples on which the previous plan went on")
+    softened = cells("", "samples on which a soft limit could not be kept")
+    lost = cells("", "samples in a row without a measurement")
+    residual = cells("", "of the KKT conditions, last answer")
+    held = cells("3", "set-points [rad]")
+    filtered = cells("3", "references behind their filter [rad]")
+    seen = cells("3", "references last seen [rad]")
+    ahead = cells("2, H", "references to come [rad]")
+    angles = cells("2", "of the model now [rad]")
+    missed = cells("window, 2", "what measurements were above the model, newest first [rad]")
+    plan = cells("3 * moves", "moves of the motors [rad]")
+    active = cells("6 * moves + slacks * (1 + 4 * moves)", "sign of each row of the QP that is active")
+    model = rest("state of the model")
 
 
 def nmpc_plausible(angle: float) -> bool:
@@ -67,67 +86,58 @@ def nmpc_plausible(angle: float) -> bool:
     return math.isfinite(angle) and abs(angle) < NMPC_PLAUSIBLE
 
 
-def nmpc_listen(arrays: tuple[np.ndarray, ...], state: np.ndarray, inputs: np.ndarray, first: bool) -> None:
+def nmpc_listen(p: NmpcArrays, x: NmpcState, inputs: np.ndarray, first: bool) -> None:
     """Take in the references; one that is not finite leaves what was."""
-    seen = state[NMPC_HELD + 6 : NMPC_HELD + 9]
     for i in range(3):
         if math.isfinite(inputs[i]):
             limit = NMPC_REFERENCE_LIMIT if i < 2 else NMPC_MOTOR_LIMIT
-            seen[i] = min(max(inputs[i], -limit), limit)
-    H = int(arrays[0][NMPC_AHEAD])
+            x.seen[i] = min(max(inputs[i], -limit), limit)
     for axis in range(2):
-        if H > 0:
-            start = NMPC_HELD + 9 + axis * H
-            row = state[start : start + H]
+        if p.H > 0:
+            row = x.ahead[axis]
             if first:
-                row[:] = seen[axis]
-            for i in range(H - 1):
+                row[:] = x.seen[axis]
+            for i in range(p.H - 1):
                 row[i] = row[i + 1]
-            value = inputs[10 + axis]
-            if math.isfinite(value):
-                row[H - 1] = min(max(value, -NMPC_REFERENCE_LIMIT), NMPC_REFERENCE_LIMIT)
+            newest = inputs[10 + axis]
+            if math.isfinite(newest):
+                row[p.H - 1] = min(max(newest, -NMPC_REFERENCE_LIMIT), NMPC_REFERENCE_LIMIT)
 
 
-def nmpc_asked(arrays: tuple[np.ndarray, ...], state: np.ndarray, target: np.ndarray, asked: np.ndarray) -> None:
+def nmpc_asked(p: NmpcArrays, x: NmpcState, target: np.ndarray, asked: np.ndarray) -> None:
     """Move the reference filters on; fill the filtered references to come (2 N,) and the moves they ask for (nz,)."""
-    q, slopes, inverse = arrays[0], arrays[6], arrays[7]
-    H, lead, keep = int(q[NMPC_AHEAD]), int(q[NMPC_LEAD]), q[NMPC_KEEP]
-    filtered = state[NMPC_HELD + 3 : NMPC_HELD + 6]
-    seen = state[NMPC_HELD + 6 : NMPC_HELD + 9]
-    first = NMPC_HELD + 9
-    rows = slopes.shape[1]
-    path = np.empty(rows)
+    keep = p.setup[NMPC_KEEP]
+    path = np.empty(p.path)
     asked[:] = 0.0
     for i in range(3):
-        now = seen[i]
-        if i < 2 and H > 0 and lead > 0:
-            now = state[first + i * H + lead - 1]
-        filtered[i] = keep * filtered[i] + (1.0 - keep) * now
+        now = x.seen[i]
+        if i < 2 and p.H > 0 and p.lead > 0:
+            now = x.ahead[i, p.lead - 1]
+        x.filtered[i] = keep * x.filtered[i] + (1.0 - keep) * now
     for axis in range(2):
-        value = filtered[axis]
-        for i in range(rows):
-            wanted = state[first + axis * H + int(arrays[8][i])] if H > 0 else seen[axis]
-            value = keep * value + (1.0 - keep) * wanted
-            path[i] = value
+        filtered = x.filtered[axis]
+        for i in range(p.path):
+            wanted = x.ahead[axis, int(p.asked_at[i])] if p.H > 0 else x.seen[axis]
+            filtered = keep * filtered + (1.0 - keep) * wanted
+            path[i] = filtered
             if 2 * i + axis < target.shape[0]:
-                target[2 * i + axis] = value
-        for b in range(slopes.shape[0]):
-            move = np.dot(slopes[b], path)
+                target[2 * i + axis] = filtered
+        for b in range(p.moves):
+            move = np.dot(p.slopes[b], path)
             for j in range(3):
-                asked[3 * b + j] += inverse[j, axis] * move
+                asked[3 * b + j] += p.inverse[j, axis] * move
 
 
-def nmpc_ahead(arrays: tuple[np.ndarray, ...], missed: np.ndarray, ahead: np.ndarray) -> None:
-    """Fill what the model will miss (2 N,), from what it missed (window, 2)."""
-    gains, future = arrays[4], arrays[5]
+def nmpc_ahead(p: NmpcArrays, x: NmpcState, ahead: np.ndarray) -> None:
+    """Fill what the model will miss (2 N,), from what it missed."""
     for axis in range(2):
         level = 0.0
         rate = 0.0
-        for i in range(gains.shape[1]):
-            level += gains[0, i] * missed[2 * i + axis]
-            rate += gains[1, i] * missed[2 * i + axis]
-        for i in range(future.shape[0]):
-            ahead[2 * i + axis] = future[i, 0] * level + future[i, 1] * rate
+        for i in range(p.gains.shape[1]):
+            level += p.gains[0, i] * x.missed[i, axis]
+            rate += p.gains[1, i] * x.missed[i, axis]
+        for i in range(p.future.shape[0]):
+            ahead[2 * i + axis] = p.future[i, 0] * level + p.future[i, 1] * rate
 
 
 def nmpc_shift(starts: np.ndarray, plan: np.ndarray) -> None:

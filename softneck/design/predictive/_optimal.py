@@ -18,8 +18,8 @@ from softneck.identification import Model
 from softneck.loop import BlockPart
 from softneck.runtime import load_functions
 
-from . import _nmpc_state_runtime as rt
 from ._nmpc_prepared import NonlinearController
+from ._nmpc_state_runtime import NmpcArrays, NmpcState
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -143,7 +143,7 @@ class OptimalPart(BlockPart):
         p, s = controller.problem(), controller.settings
         self._problem, self._limit = p, s.angle_limit
         self._runtime: Any = load_functions(self.block.runtime, compiled=False)
-        self._places = rt.nmpc_places(self.block.arrays, controller.model.block().initial_state().values.size)
+        self._parts = NmpcState.parts(NmpcArrays(self.block.arrays))
         nz, slacks = p.variables, int(s.angle_limit is not None)
         spread = np.hstack([p.spread(), np.zeros((3 * p.horizon, slacks))])
         sums = np.kron(np.tril(np.ones((nz // 3, nz // 3))), np.eye(3))
@@ -166,35 +166,33 @@ class OptimalPart(BlockPart):
 
     def advance(self, time: float, inputs: Vector) -> Vector:
         """Step once and return the set-points."""
-        if self._state[rt.NMPC_STARTED] != 0.0:
-            plan, active = self._places[4:6]
+        if self._state[self._parts["started"]] != 0.0:
             z, self.status = self._solver.solve(self._task(inputs))
-            self.moves = z[: active - plan].reshape(-1, 3)
-            self._state[plan:active] = self.moves.ravel()
+            self.moves = z[: self._problem.variables].reshape(-1, 3)
+            self._state[self._parts["plan"]] = self.moves.ravel()
         return super().advance(time, inputs)
 
     def _task(self, u: Vector) -> Task:
         """Return what the sample asks for, by the runtime's own functions up to its solver."""
-        _, x, y, missed, plan, active, end = self._places
-        f, arrays, p, state = self._runtime, self.block.arrays, self._problem, self._state.copy()
-        nz, N, slacks = p.variables, p.horizon, len(self._slack)
-        held = state[rt.NMPC_HELD : rt.NMPC_HELD + 3]
+        f, arrays, problem, state = self._runtime, self.block.arrays, self._problem, self._state.copy()
+        x = {name: state[place] for name, place in self._parts.items()}
+        nz, N, slacks = problem.variables, problem.horizon, len(self._slack)
         f.nmpc_listen(arrays, state, u, False)
         if f.nmpc_plausible(u[3]) and f.nmpc_plausible(u[4]):
-            state[missed:plan] = np.concatenate([u[3:5] - state[y:missed], state[missed : plan - 2]])
+            f.nmpc_compare(arrays, state, u, False)
         target, asked, ahead = np.empty(2 * N), np.empty(nz), np.empty(2 * N)
         f.nmpc_asked(arrays, state, target, asked)
-        f.nmpc_ahead(arrays, state[missed:plan], ahead)
-        lower, upper = np.empty(end - active), np.empty(end - active)
-        f.nmpc_bounds(arrays, self._parameters, held, u[5:8], lower, upper, slacks)
+        f.nmpc_ahead(arrays, state, ahead)
+        lower, upper = np.empty(x["active"].size), np.empty(x["active"].size)
+        f.nmpc_bounds(arrays, self._parameters, x["held"], u[5:8], lower, upper)
         least, most = lower[: nz + slacks], upper[: nz + slacks]
-        level = np.full(N, np.sqrt(p.cocontraction_weight) * (state[rt.NMPC_HELD + 5] - p.T[2] @ held))
+        level = np.full(N, np.sqrt(problem.cocontraction_weight) * (x["filtered"][2] - problem.T[2] @ x["held"]))
         free, none = self._seen @ ahead, np.full(len(self._seen), np.inf)
         limit = self._limit or 0.0
         return Task(
-            start=state[x:y], offset=np.tile(held, N), target=target - ahead,
-            asked=np.concatenate([np.sqrt(p.move_weight) * asked, level, -0.05 * self._slack.sum(axis=1)]),
+            start=x["model"], offset=np.tile(x["held"], N), target=target - ahead,
+            asked=np.concatenate([np.sqrt(problem.move_weight) * asked, level, -0.05 * self._slack.sum(axis=1)]),
             low=np.concatenate([lower[nz + slacks :][:nz], -none, -limit - free]),
             high=np.concatenate([upper[nz + slacks :][:nz], limit - free, none]),
-            least=least, most=most, guess=np.clip(np.append(state[plan:active], np.zeros(slacks)), least, most),
+            least=least, most=most, guess=np.clip(np.append(x["plan"], np.zeros(slacks)), least, most),
         )  # fmt: skip
