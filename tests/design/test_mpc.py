@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from softneck.core import DataError
+from softneck.core import DataError, FileFormatError
 from softneck.design import MeasuredDisturbance, MpcController, MpcSettings
 from softneck.design.predictive import _mpc_state_runtime as rt
 from softneck.loop import BlockPart, Loop, RotationReference, run_loop
@@ -350,3 +350,11 @@ def test_its_state_is_whole(plain: MpcController) -> None:
     two.set_state(one.get_state())
     for u in rows[20:]:
         np.testing.assert_array_equal(one.advance(0.0, u), two.advance(0.0, u))
+
+
+def test_a_damaged_file_says_which_array_is_wrong(plain: MpcController) -> None:
+    arrays = dict(zip(rt.MpcArrays.names(), plain.arrays, strict=True))
+    with pytest.raises(FileFormatError, match=r"`K` has shape \(30, \d+\); \(30, \d+\) is needed"):
+        MpcController.from_archive({}, arrays | {"K": arrays["K"][:, 1:]})
+    with pytest.raises(FileFormatError, match="not finite"):
+        MpcController.from_archive({}, arrays | {"constants": np.full(17, np.nan)})
