@@ -144,20 +144,21 @@ def kalman_push(p: KalmanArrays, x: KalmanState, inputs: np.ndarray, u: np.ndarr
             # Nothing is known of the past: the sources stood still.
             x.lines[axis] = u[axis]
         x.lines[axis, newest] = u[axis]
-        u[axis] = kalman_lagged(x.lines[axis], newest, c[KALMAN_LAG + axis])
+        u[axis] = kalman_lagged(x.lines, axis, newest, c[KALMAN_LAG + axis])
     return lost
 
 
-def kalman_lagged(line: np.ndarray, newest: int, lag: float) -> float:
+def kalman_lagged(lines: np.ndarray, axis: int, newest: int, lag: float) -> float:
     """Return the input `lag` samples ago, between samples by a straight line; of the future the newest known."""
+    length = lines.shape[0] // 2
+    first = axis * length
     if lag <= 0.0:
-        return float(line[newest])
-    length = line.shape[0]
+        return float(lines[first + newest])
     whole = int(lag)
     part = lag - whole
-    value = line[(newest - whole) % length]
+    value = lines[first + (newest - whole) % length]
     if part > 0.0:
-        value = (1.0 - part) * value + part * line[(newest - whole - 1) % length]
+        value = (1.0 - part) * value + part * lines[first + (newest - whole - 1) % length]
     return float(value)
 
 
@@ -167,12 +168,12 @@ def kalman_tell(p: KalmanArrays, x: KalmanState, noise: float, outputs: np.ndarr
     newest = int(x.samples) % p.length
     whole = int(c[KALMAN_LEAD])
     part = c[KALMAN_LEAD] - whole
-    now = x.x
+    now, lines = x.x, x.lines
     u = np.empty(2)
     y0, y1 = 0.0, 0.0
     for i in range(whole + 1):
         for axis in range(2):
-            u[axis] = kalman_lagged(x.lines[axis], newest, c[KALMAN_LAG + axis] - 1.0 - i)
+            u[axis] = kalman_lagged(lines, axis, newest, c[KALMAN_LAG + axis] - 1.0 - i)
         if i == whole:
             y = kalman_dot(p.H, now)
             y0, y1 = y[0], y[1]

@@ -104,7 +104,8 @@ def kalman_correct(
     S[1, 1] = s00 / determinant
     S[0, 1] = S[1, 0] = -s01 / determinant
     K = kalman_columns(PH, S)
-    x.x[:] += kalman_dot(K, e)
+    estimate = x.x  # numba would copy the stretch for `x.x[:] +=`
+    estimate += kalman_dot(K, e)
     kalman_joseph(P, K, p.H, r)
     return innovation, True
 

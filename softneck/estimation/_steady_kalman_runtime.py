@@ -53,15 +53,16 @@ def step(
         K, SI = p.start_gain, p.start_inverse_spread
     elif forced:
         K, SI = p.forced_gain, p.forced_inverse_spread
-    x.x[:] = kalman_ahead(p.F, x.x, p.B, u)
+    estimate = kalman_ahead(p.F, x.x, p.B, u)
     innovation, accepted = 0.0, False
     if usable:
-        y = kalman_dot(p.H, x.x)
+        y = kalman_dot(p.H, estimate)
         e0, e1 = inputs[3] - y[0], inputs[4] - y[1]
         innovation = SI[0, 0] * e0 * e0 + (SI[0, 1] + SI[1, 0]) * e0 * e1 + SI[1, 1] * e1 * e1
         accepted = forced or innovation <= c[KALMAN_GATE]
         if accepted:
-            x.x[:] += e0 * K[:, 0] + e1 * K[:, 1]
+            estimate += e0 * K[:, 0] + e1 * K[:, 1]
+    x.x[:] = estimate
     kalman_count(c, x, usable, accepted)
     kalman_tell(p, x, parameters[0], outputs)
     outputs[4] = innovation

@@ -13,7 +13,7 @@ from softneck.estimation import AxisPlant
 from softneck.estimation._axis import HasTransferFunctions
 from softneck.identification import Family
 
-from ..linear._assembly import AxisController, assemble
+from ..linear._assembly import assemble
 from ..linear._linear_parts_runtime import LinearArrays
 from ..linear._loop_settings import LoopSettings
 from ..linear._margins import frequencies
@@ -138,21 +138,18 @@ class ScheduledSettings(LoopSettings):
             for axis in range(2)
         ]
         each = [
-            dict(zip(LinearArrays.names(), self._assembled(pitch, roll, sample_time), strict=True))
+            assemble(
+                (pitch, roll),
+                reference_times=(self.reference_time, self.reference_time, self.reference_time),
+                sample_time=sample_time,
+                tendon_angles=self.tendon_angles,
+            )
             for pitch, roll in zip(*axes, strict=True)
         ]
         return {
-            name: np.vstack([arrays[name] for arrays in each]) if name in _VARYING else each[0][name]
-            for name in LinearArrays.names()
+            name: np.vstack([arrays[i] for arrays in each]) if name in _VARYING else each[0][i]
+            for i, name in enumerate(LinearArrays.names())
         }
-
-    def _assembled(self, pitch: AxisController, roll: AxisController, sample_time: float) -> tuple[Matrix, ...]:
-        return assemble(
-            (pitch, roll),
-            reference_times=(self.reference_time, self.reference_time, self.reference_time),
-            sample_time=sample_time,
-            tendon_angles=self.tendon_angles,
-        )
 
     def _between(self, points: Sequence[OperatingPoint], gains: Sequence[Sequence[Gains]]) -> float:
         """Return the largest Ms of all frozen loops at and between the points; refuse an unstable one.

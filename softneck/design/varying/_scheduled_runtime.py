@@ -116,10 +116,11 @@ def scheduled_arrays(p: ScheduledArrays, tilt: float) -> LinearArrays:
 def scheduled_exactly(p: LinearArrays, x: LinearState, y: np.ndarray) -> None:
     """Correct the aligned state until it asks for exactly the held set-points: a blend of alignments does not."""
     v = np.dot(p.T, x.held)
-    asked = np.dot(p.C, x.x) + np.dot(p.Dr, y) + np.dot(p.Dy, y)
+    inside = x.x
+    asked = np.dot(p.C, inside) + np.dot(p.Dr, y) + np.dot(p.Dy, y)
     for i in range(2):
         row = p.C[i]
         size = np.dot(row, row)
         if size > 0.0:
             # Rows of C belong to one axis each, so the other axis' answer stays.
-            x.x[:] += row * ((v[i] - asked[i]) / size)
+            inside += row * ((v[i] - asked[i]) / size)
