@@ -140,25 +140,24 @@ def kalman_push(p: KalmanArrays, x: KalmanState, inputs: np.ndarray, u: np.ndarr
         u[1] = T[1, 0] * inputs[0] + T[1, 1] * inputs[1] + T[1, 2] * inputs[2]
     newest = int(x.samples) % p.length
     for axis in range(2):
+        line = x.lines[axis]
         if x.samples == 0.0:
             # Nothing is known of the past: the sources stood still.
-            x.lines[axis] = u[axis]
-        x.lines[axis, newest] = u[axis]
-        u[axis] = kalman_lagged(x.lines, axis, newest, c[KALMAN_LAG + axis])
+            line[:] = u[axis]
+        line[newest] = u[axis]
+        u[axis] = kalman_lagged(line, newest, c[KALMAN_LAG + axis])
     return lost
 
 
-def kalman_lagged(lines: np.ndarray, axis: int, newest: int, lag: float) -> float:
+def kalman_lagged(line: np.ndarray, newest: int, lag: float) -> float:
     """Return the input `lag` samples ago, between samples by a straight line; of the future the newest known."""
-    length = lines.shape[0] // 2
-    first = axis * length
     if lag <= 0.0:
-        return float(lines[first + newest])
+        return float(line[newest])
     whole = int(lag)
     part = lag - whole
-    value = lines[first + (newest - whole) % length]
+    value = line[(newest - whole) % line.shape[0]]
     if part > 0.0:
-        value = (1.0 - part) * value + part * lines[first + (newest - whole - 1) % length]
+        value = (1.0 - part) * value + part * line[(newest - whole - 1) % line.shape[0]]
     return float(value)
 
 
@@ -168,12 +167,12 @@ def kalman_tell(p: KalmanArrays, x: KalmanState, noise: float, outputs: np.ndarr
     newest = int(x.samples) % p.length
     whole = int(c[KALMAN_LEAD])
     part = c[KALMAN_LEAD] - whole
-    now, lines = x.x, x.lines
+    now, first, second = x.x, x.lines[0], x.lines[1]
     u = np.empty(2)
     y0, y1 = 0.0, 0.0
     for i in range(whole + 1):
-        for axis in range(2):
-            u[axis] = kalman_lagged(lines, axis, newest, c[KALMAN_LAG + axis] - 1.0 - i)
+        u[0] = kalman_lagged(first, newest, c[KALMAN_LAG] - 1.0 - i)
+        u[1] = kalman_lagged(second, newest, c[KALMAN_LAG + 1] - 1.0 - i)
         if i == whole:
             y = kalman_dot(p.H, now)
             y0, y1 = y[0], y[1]
