@@ -14,7 +14,7 @@ from softneck.signals import Recording
 
 KINDS = ("rls", "mimo", "oe", "srivc", "subspace", "play", "nss", "nn", "greybox", "ensemble")
 # Sums in another order and another libm's tanh, sine and root: some ulp of numbers of order one. Most kinds are equal
-# to the bit, and the largest difference of all was 2e-16.
+# to the bit; over 1,000 samples the largest difference of all was 9e-16.
 ROUNDING = 1e-12
 
 
