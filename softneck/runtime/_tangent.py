@@ -7,10 +7,10 @@ advances `state` and `outputs` as `step` does, to the bit, and moves `state_rows
 moved by. Numbers are differentiated in rows, one for each direction (forward); functions that make one number out of
 loops or arrays in reverse, so that a network costs one more sweep and not one for each direction.
 
-At a kink the derivative to the right counts: with `max` and `min` of equal numbers, `abs` of zero and a length of zero
-each direction is followed on its own, `lim (f(x + h d) - f(x)) / h` from above; in a function that is differentiated in
-reverse it is that of the growing argument. An `if` follows the branch that the step takes. Whole numbers, tests and
-draws of random numbers are moved by nothing.
+At a kink the derivative to the right counts: `max` and `min` of equal numbers are those of a first one that grows a
+little, so is `abs` of zero, and so is a length of zero by its first part. A play operator on its edge thus moves with a
+growing input and stays with a falling one, whatever the direction: the derivative stays linear. An `if` follows the
+branch that the step takes. Whole numbers, tests and draws of random numbers are moved by nothing.
 """
 
 from __future__ import annotations

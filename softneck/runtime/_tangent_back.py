@@ -172,18 +172,6 @@ class Back(Lowering):
             raise self.fail(node, "an entry of this is not reversed.")
         return f"{node.value.id}_bar[{self.index(node)}]"
 
-    def chosen(self, sign: int, a: tuple[str, Terms], b: tuple[str, Terms]) -> Terms:
-        """Return the derivative of the larger or smaller of two; of equal ones that of growing numbers."""
-        # max(x, c) moves with a growing x = c, min(x, c) does not.
-        first = self.kept(f"1.0 if {a[0]} {'>=' if (sign > 0) == bool(a[1]) else '>'} {b[0]} else 0.0", "p")
-        if sign < 0:
-            first = self.kept(f"1.0 if {a[0]} {'<' if a[1] and not b[1] else '<='} {b[0]} else 0.0", "p")
-        return self.sum(self.times(a[1], first), self.times(b[1], f"1.0 - {first}"))
-
-    def length(self, value: str, parts: list[tuple[str, Terms]]) -> Terms:
-        """Return the derivative of a length."""
-        return self.along(value, parts)
-
     def call(self, node: ast.Call, name: str) -> tuple[str, Terms]:
         """Write a call forward; its own reverse comes behind the statement's."""
         act = self.activity

@@ -29,7 +29,7 @@ _NO_LENGTH = 1e-24
 class Lowering:
     """Writes the lines of one derived function; `lines` are without their indentation.
 
-    A derivative in rows and one in reverse differ in what they make of places, choices and calls.
+    A derivative in rows and one in reverse differ in what they make of places and calls.
     """
 
     def __init__(self, activity: Activity) -> None:
@@ -40,14 +40,6 @@ class Lowering:
 
     def place(self, node: ast.Name | ast.Subscript) -> str:
         """Return where what a number is moved by stands."""
-        raise NotImplementedError
-
-    def chosen(self, sign: int, a: tuple[str, Terms], b: tuple[str, Terms]) -> Terms:
-        """Return the derivative of the larger (sign 1) or smaller (-1) of two numbers."""
-        raise NotImplementedError
-
-    def length(self, value: str, parts: list[tuple[str, Terms]]) -> Terms:
-        """Return the derivative of the length `value` of a vector."""
         raise NotImplementedError
 
     def call(self, node: ast.Call, name: str) -> tuple[str, Terms]:
@@ -185,7 +177,7 @@ class Lowering:
             return self._extreme(node, 1 if name.startswith("max") else -1)
         if name in ("atan2", "arctan2", "hypot") and len(node.args) == 2:
             return self._pair(node, name)
-        if len(node.args) != 1:
+        if len(node.args) != 1 or name not in (*_SLOPES, "float", "abs", "fabs"):
             raise self.fail(node, "the derivative of this function is not known.")
         if name == "sqrt" and (parts := squares(node.args[0])):
             return self._root(node, parts)
@@ -194,9 +186,7 @@ class Lowering:
             return f"float({text})", terms
         text = self.kept(text)
         if name in ("abs", "fabs"):
-            return f"abs({text})", self.chosen(1, (text, terms), (f"-{text}", self.times(terms, "-1.0")))
-        if name not in _SLOPES:
-            raise self.fail(node, "the derivative of this function is not known.")
+            return f"abs({text})", self._chosen(1, (text, terms), (f"-{text}", self.times(terms, "-1.0")))
         value = self.kept(f"{ast.unparse(function)}({text})")
         return value, self.times(terms, _SLOPES[name].format(x=text, v=value))
 
@@ -206,7 +196,7 @@ class Lowering:
         for other in node.args[1:]:
             text, more = self.value(other)
             value, text = self.kept(value), self.kept(text)
-            terms = self.chosen(sign, (value, terms), (text, more))
+            terms = self._chosen(sign, (value, terms), (text, more))
             value = f"{function}({value}, {text})"
         return value, terms
 
@@ -215,7 +205,7 @@ class Lowering:
         (a, first), (b, second) = ((self.kept(text), terms) for text, terms in parts)
         value = self.kept(f"{ast.unparse(node.func)}({a}, {b})")
         if name == "hypot":
-            return value, self.length(value, [(a, first), (b, second)])
+            return value, self._length(value, [(a, first), (b, second)])
         square = self.kept(f"{a} * {a} + {b} * {b}")
         return value, self.sum(self.times(first, f"{b} / {square}"), self.times(second, f"-{a} / {square}"))
 
@@ -224,14 +214,20 @@ class Lowering:
         parts = [(self.kept(text), terms) for text, terms in parts]
         total = " + ".join(f"{text} * {text}" for text, _ in parts)
         value = self.kept(f"{ast.unparse(node.func)}({total})")
-        return value, self.length(value, parts)
+        return value, self._length(value, parts)
 
-    def along(self, value: str, parts: list[tuple[str, Terms]]) -> Terms:
-        """Return the derivative of the length of a vector that is not zero."""
+    def _chosen(self, sign: int, a: tuple[str, Terms], b: tuple[str, Terms]) -> Terms:
+        """Return the derivative of the larger (sign 1) or smaller (-1) of two; of equal ones the first grows."""
+        first = self.kept(f"1.0 if {a[0]} {'>=' if sign > 0 else '<'} {b[0]} else 0.0", "p")
+        return self.sum(self.times(a[1], first), self.times(b[1], f"1.0 - {first}"))
+
+    def _length(self, value: str, parts: list[tuple[str, Terms]]) -> Terms:
+        """Return the derivative of the length `value` of a vector; of zero length its first part grows."""
         over = self.kept(f"1.0 / math.sqrt({value} * {value} + {_NO_LENGTH})", "p")
         terms: Terms = []
-        for text, more in parts:
-            terms = self.sum(terms, self.times(more, f"{text} * {over}"))
+        for number, (text, more) in enumerate(parts):
+            slope = f"{text} * {over}"
+            terms = self.sum(terms, self.times(more, slope if number else f"{slope} if {value} > 0.0 else 1.0"))
         return terms
 
 

@@ -182,32 +182,6 @@ class Rows(Lowering):
             raise self.fail(node, "an entry of this has no known derivative.")
         return f"{node.value.id}_rows[{self.index(node)}, _r]"
 
-    def chosen(self, sign: int, a: tuple[str, Terms], b: tuple[str, Terms]) -> Terms:
-        """Return the derivative of the larger or smaller of two; of equal ones each direction goes its own way."""
-        larger = self.name("k")
-        self.lines.append(f"{larger} = 1.0 if {a[0]} > {b[0]} else (-1.0 if {a[0]} < {b[0]} else 0.0)")
-        first, second, one = self.name("d"), self.name("d"), self.name("d")
-        yes, no = (">", "<") if sign > 0 else ("<", ">")
-        self._waiting += [
-            f"«{first}» = {linear(a[1])}",
-            f"«{second}» = {linear(b[1])}",
-            f"«{one}» = «{first}» if {larger} {yes} 0.0 else («{second}» if {larger} {no} 0.0 "
-            f"else {'max' if sign > 0 else 'min'}(«{first}», «{second}»))",
-        ]
-        return [("1.0", f"«{one}»")]
-
-    def length(self, value: str, parts: list[tuple[str, Terms]]) -> Terms:
-        """Return the derivative of a length; that of zero length grows in every direction."""
-        if not any(terms for _, terms in parts):
-            return []
-        terms = self.along(value, parts)
-        names = [self.name("d") for _ in parts]
-        self._waiting += [f"«{name}» = {linear(more)}" for name, (_, more) in zip(names, parts, strict=True)]
-        one = self.name("d")
-        square = " + ".join(f"«{name}» * «{name}»" for name in names)
-        self._waiting.append(f"«{one}» = {linear(terms)} if {value} > 0.0 else math.sqrt({square})")
-        return [("1.0", f"«{one}»")]
-
     # Calls
 
     def call(self, node: ast.Call, name: str) -> tuple[str, Terms]:

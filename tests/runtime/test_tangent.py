@@ -128,43 +128,46 @@ def functions(body: str, before: str = "") -> SimpleNamespace:
     return SimpleNamespace(step=names["step"], tangent=names["step_tangent"])
 
 
-def both(f: SimpleNamespace, point: list[float], d: Matrix, h: float, *, one_sided: bool) -> tuple[Matrix, Matrix]:
-    """Return the derivatives of state and outputs along the columns of `d` (5, m), and differences."""
-    x, u = np.array(point[:3]), np.array(point[3:])
-    X, Y, m = d[:3].copy(), np.zeros((2, d.shape[1])), d.shape[1]
-    f.tangent((), np.zeros(0), x.copy(), u, np.zeros(2), X, d[3:], Y, m)
+def derivative(f: SimpleNamespace, z: Vector, d: Matrix) -> Matrix:
+    """Return what state and outputs are moved by along the columns of `d` (5, m) at `z`, state and inputs."""
+    X, Y = d[:3].copy(), np.zeros((2, d.shape[1]))
+    f.tangent((), np.zeros(0), z[:3].copy(), z[3:].copy(), np.zeros(2), X, d[3:], Y, d.shape[1])
+    return np.vstack([X, Y])
+
+
+def differences(f: SimpleNamespace, z: Vector, d: Matrix, h: float) -> Matrix:
+    """Return the same by central differences."""
 
     def run(z: Vector) -> Vector:
         state, out = z[:3].copy(), np.zeros(2)
         f.step((), np.zeros(0), state, z[3:].copy(), out)
         return np.concatenate([state, out])
 
-    z = np.array(point)
-    low = 0.0 if one_sided else -h
-    slopes = [(run(z + h * d[:, i]) - run(z + low * d[:, i])) / (h - low) for i in range(m)]
-    return np.vstack([X, Y]), np.array(slopes).T
+    return np.array([(run(z + h * column) - run(z - h * column)) / (2.0 * h) for column in d.T]).T
 
 
+_PLAY = "state[0] = max(inputs[0] - 0.5, min(inputs[0] + 0.5, state[0]))"
 CORNERS = {
-    "play": ("state[0] = max(inputs[0] - 0.5, min(inputs[0] + 0.5, state[0]))", [0.25, 0.0, 0.0, 0.75, 0.0]),
-    "play at the other side": (
-        "state[0] = max(inputs[0] - 0.5, min(inputs[0] + 0.5, state[0]))", [0.25, 0.0, 0.0, -0.25, 0.0],
-    ),
+    "play that is drawn along": (_PLAY, [0.25, 0.0, 0.0, 0.75, 0.0]),
+    "play that stays": (_PLAY, [0.25, 0.0, 0.0, -0.25, 0.0]),
     "stalling drive": (
-        "state[0] = min(0.5 * state[0] + 0.5 * inputs[0], max(state[1], state[0]))", [1.0, 1.0, 0.0, 1.0, 0.0],
+        "state[0] = min(0.5 * state[0] + 0.5 * inputs[0], max(state[1], state[0]))", [1.0, 0.5, 0.0, 1.0, 0.0],
     ),
-    "absolute value": ("outputs[0] = abs(inputs[0]) + math.fabs(state[1] - inputs[1])", [0.0, 1.0, 0.0, 0.0, 1.0]),
-    "friction": ("outputs[0] = math.sqrt(inputs[0] * inputs[0] + state[0] * state[0])", [0.0, 0.0, 0.0, 0.0, 0.0]),
-    "length": ("outputs[1] = 2.0 * math.hypot(inputs[0], inputs[1])", [0.0, 0.0, 0.0, 0.0, 0.0]),
+    "absolute value": ("outputs[0] = abs(inputs[0]) + math.fabs(inputs[0] - inputs[1])", [0.0] * 5),
+    "range": ("outputs[0] = min(max(inputs[0], 0.0), 1.0)", [0.0] * 5),
+    "end of a range": ("outputs[0] = min(max(inputs[0], -1.0), 0.0)", [0.0] * 5),
+    "friction": ("outputs[0] = math.sqrt(inputs[0] * inputs[0])", [0.0] * 5),
+    "length": ("outputs[1] = 2.0 * math.hypot(inputs[0], inputs[1])", [0.0] * 5),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize(("body", "point"), CORNERS.values(), ids=CORNERS)
 def test_at_a_corner_the_derivative_to_the_right_counts(body: str, point: list[float]) -> None:
-    d = np.hstack([np.eye(5), -np.eye(5), np.random.default_rng(0).standard_normal((5, 8))])
-    # Straight on either side of the corner: only rounding is left of differences, 1e-16 / 2^-10.
-    found, slopes = both(functions(body), point, d, 2.0**-10, one_sided=True)
-    np.testing.assert_allclose(found, slopes, atol=1e-12)
+    f, z, d = functions(body), np.array(point), np.eye(5)
+    right = z + 2.0**-10 * d[3]
+    # A 2^-20 on either side of there: lines, but for the length, which is round by 2^-20.
+    slopes = differences(f, right, d, 2.0**-20)
+    np.testing.assert_allclose(derivative(f, z, d), slopes, atol=1e-9)
 
 
 SMOOTH = {
@@ -244,9 +247,9 @@ def test_everything_a_step_is_written_in_is_differentiated(body: str, seed: int)
     rng = np.random.default_rng(seed)
     f = functions(body, HELPERS)
     d = np.hstack([np.eye(5), rng.standard_normal((5, 4))])
-    found, slopes = both(f, rng.uniform(0.2, 1.0, 5).tolist(), d, 1e-5, one_sided=False)
+    z = rng.uniform(0.2, 1.0, 5)
     # h^2 of the third derivative, below 30 here, and rounding of 1e-16 / h.
-    np.testing.assert_allclose(found, slopes, rtol=1e-7, atol=1e-8)
+    np.testing.assert_allclose(derivative(f, z, d), differences(f, z, d, 1e-5), rtol=1e-7, atol=1e-8)
 
 
 def test_sums_and_whole_layers_are_differentiated_in_reverse() -> None:

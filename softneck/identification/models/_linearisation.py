@@ -76,6 +76,7 @@ def linearised(model: Stepped, at: State | Mapping[str, float] | ArrayLike | Non
     import control
 
     block = model.block()
+    load_tangent(block.runtime)  # a kind without derivatives need not come to rest first
     if isinstance(at, State):
         # The motors are told to stay where they are.
         state, u = at, at.outputs[2 : 2 + _MOTORS]
