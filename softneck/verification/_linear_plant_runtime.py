@@ -7,6 +7,7 @@ State: random generator (6), observable form (2 q), inputs so far (2 (longest de
 import numpy as np
 
 from softneck.runtime._random_runtime import random_normal, random_seed
+from softneck.verification._axis_runtime import axis_advance
 
 
 def state_size(arrays: tuple[np.ndarray, ...]) -> int:
@@ -50,10 +51,7 @@ def step(
             held[j] = held[j - 1]
         held[0] = tilt[axis] + arrays[3][axis] * tilt[1 - axis] + inputs[3 + axis]
         x = state[6 + axis * q : 6 + (axis + 1) * q]
-        y = x[0]
-        u = held[int(arrays[2][axis])]
-        for j in range(q - 1):
-            x[j] = x[j + 1] - arrays[1][axis, j + 1] * y + arrays[0][axis, j + 1] * u
+        axis_advance(x, arrays[0][axis], arrays[1][axis], held[int(arrays[2][axis])])
         outputs[axis] = x[0]
         outputs[2 + axis] = x[0]
         if parameters[0] > 0.0:
