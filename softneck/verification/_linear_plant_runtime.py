@@ -4,6 +4,7 @@ import numpy as np
 
 from softneck.runtime._layout import Arrays, StateVector, array, cells, value
 from softneck.runtime._random_runtime import random_normal, random_seed
+from softneck.verification._axis_runtime import axis_advance
 
 
 def linear_plant_line(delay: np.ndarray) -> int:
@@ -50,15 +51,13 @@ def step(
     """
     tilt = np.dot(p.T, inputs[:3])
     for axis in range(2):
+        held, own = x.u[axis], x.x[axis]
         for j in range(p.line - 1, 0, -1):
-            x.u[axis, j] = x.u[axis, j - 1]
-        x.u[axis, 0] = tilt[axis] + p.cross[axis] * tilt[1 - axis] + inputs[3 + axis]
-        y = x.x[axis, 0]
-        u = x.u[axis, int(p.delay[axis])]
-        for j in range(p.q - 1):
-            x.x[axis, j] = x.x[axis, j + 1] - p.denominator[axis, j + 1] * y + p.numerator[axis, j + 1] * u
-        outputs[axis] = x.x[axis, 0]
-        outputs[2 + axis] = x.x[axis, 0]
+            held[j] = held[j - 1]
+        held[0] = tilt[axis] + p.cross[axis] * tilt[1 - axis] + inputs[3 + axis]
+        axis_advance(own, p.numerator[axis], p.denominator[axis], held[int(p.delay[axis])])
+        outputs[axis] = own[0]
+        outputs[2 + axis] = own[0]
         if parameters[0] > 0.0:
             outputs[2 + axis] += parameters[0] * random_normal(x.random)
     outputs[4:7] = inputs[:3]

@@ -8,6 +8,7 @@ import numpy as np
 
 from softneck.runtime._layout import Arrays, array
 from softneck.runtime._members_runtime import member_initialise, member_size, member_step
+from softneck.verification._axis_runtime import axis_advance
 
 
 class SweepArrays(Arrays):
@@ -67,12 +68,5 @@ def sweep_run(
             u[k, 0] = tilt[0] + cross[i, 0] * tilt[1] + signals[k, 5]
             u[k, 1] = tilt[1] + cross[i, 1] * tilt[0] + signals[k, 6]
             for axis in range(2):
-                sweep_advance(x[axis], numerator[i, axis], denominator[i, axis], u[:, axis], k - delay[i, axis])
-
-
-def sweep_advance(x: np.ndarray, numerator: np.ndarray, denominator: np.ndarray, u: np.ndarray, row: int) -> None:
-    """Advance the observable form of one axis by one sample; its last entry stays zero."""
-    y = x[0]
-    held = u[row] if row >= 0 else 0.0
-    for j in range(x.shape[0] - 1):
-        x[j] = x[j + 1] - denominator[j + 1] * y + numerator[j + 1] * held
+                row = k - delay[i, axis]
+                axis_advance(x[axis], numerator[i, axis], denominator[i, axis], u[row, axis] if row >= 0 else 0.0)

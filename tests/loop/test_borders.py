@@ -13,6 +13,7 @@ from softneck.core import SettingsError
 from softneck.loop import (
     Loop,
     LoopResult,
+    LoopRun,
     MotorFault,
     NeckFault,
     RampReference,
@@ -108,6 +109,32 @@ def test_a_window_holds_its_rows_and_no_other(start: float, duration: float, row
         assert bus[0] == 7.0
         hit += [k] if bus[1] == 3.0 else []
     assert hit == list(rows)
+
+
+@pytest.mark.parametrize(("fault", "second"), [
+    (MotorFault(kind="stuck"), 7.0), (MotorFault(kind="slow", rate=5.0), 7.0 + 5.0 * TS),
+])  # fmt: skip
+def test_what_sticks_from_the_first_row_on_has_that_rows_own_value(fault: MotorFault, second: float) -> None:
+    stages = FaultStages([[]] * 4, [], [ActiveFault(fault, [0], [], np.ones(1), TS)], 2)
+    for k, (wanted, shown) in enumerate([(7.0, 7.0), (9.0, second)]):
+        bus = np.array([wanted])
+        faults_act(k, 1, stages.lists, bus)
+        assert bus[0] == shown
+
+
+def test_a_part_that_breaks_off_leaves_the_rows_before_it() -> None:
+    def breaks(state: list[float], _: np.ndarray) -> list[float]:
+        state.append(0.0)
+        if len(state) > 5:
+            raise RuntimeError("no more")
+        return [0.0, 0.0, 0.0]
+
+    controller = FunctionPart("controller", ports("pitch", "roll"), SETPOINTS, breaks)
+    loop = Loop(plant=lag_plant(), controller=controller, reference=StepReference(pitch=0.1), duration=1.0)
+    with LoopRun(loop) as run:
+        with pytest.raises(RuntimeError, match="no more"):
+            run.advance()
+        assert run.row == run.result().time.size == 5
 
 
 # -- keys of files ----------------------------------------------------------------------------------------------------
