@@ -24,9 +24,9 @@ class SteadyKalmanArrays(KalmanArrays):
     gain = array("n, 2", "K in steady state")
     inverse_spread = array("2, 2", "S^-1 in steady state")
     start_gain = array("n, 2", "while inputs from before the start are on their way")
-    start_inverse_spread = array("2, 2", "")
+    start_inverse_spread = array("2, 2", "S^-1 then")
     forced_gain = array("n, 2", "by force")
-    forced_inverse_spread = array("2, 2", "")
+    forced_inverse_spread = array("2, 2", "S^-1 then")
 
 
 def initialise(p: SteadyKalmanArrays, parameters: np.ndarray, x: KalmanState, outputs: np.ndarray) -> None:

@@ -133,6 +133,6 @@ def test_every_kind_says_what_each_array_and_part_is(runtime: str) -> None:
         assert layout.fields
         assert layout.__doc__
         named = [name for name, item in layout.fields.items() if item.meaning]
-        # A matrix of a textbook's equation, such as A, may say all by its letter.
-        assert all(name in named or len(name) == 1 for name in layout.fields)
+        # A matrix of the equation in the docstring, such as A or Br, says all by its letters.
+        assert all(name in named or len(name) <= 2 for name in layout.fields)
     assert load_runtime(runtime.partition("(")[0], compiled=False) if "predictive._nmpc" not in runtime else True

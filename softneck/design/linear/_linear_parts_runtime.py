@@ -38,7 +38,7 @@ class LinearArrays(FilterArrays):
     align = array("n, 4", "from y and v to the state nearest to rest that asks for v")
     rest = array("m, 3", "from r to the filter's state at rest")
     T = array("3, 3", "of Eq. 9-11: motors to (theta_i, phi_i, delta_i)")
-    T_inverse = array("3, 3", "")
+    T_inverse = array("3, 3", "redefined inputs to motors")
     constants = array("1", "sample time [s]")
 
 

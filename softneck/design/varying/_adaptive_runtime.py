@@ -55,7 +55,7 @@ class AdaptiveArrays(FilterArrays):
 
     rest = array("m, 3", "from r to the filter's state at rest")
     T = array("3, 3", "of Eq. 9-11: motors to (theta_i, phi_i, delta_i)")
-    T_inverse = array("3, 3", "")
+    T_inverse = array("3, 3", "redefined inputs to motors")
     constants = array("1", "sample time [s]")
     nominal = array("2, 2", "a and b of each axis")
     box = array("2, 4", "least and largest a, least and largest static gain of each axis")
