@@ -236,8 +236,9 @@ def squares(node: ast.expr) -> list[ast.expr]:
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
         first, second = squares(node.left), squares(node.right)
         return first + second if first and second else []
-    product = isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mult)
-    return [node.left] if product and ast.dump(node.left) == ast.dump(node.right) else []
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mult) and ast.dump(node.left) == ast.dump(node.right):
+        return [node.left]
+    return []
 
 
 def inner(lines: list[str]) -> list[str]:

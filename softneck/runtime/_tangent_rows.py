@@ -131,6 +131,7 @@ class Rows(Lowering):
 
     def _assign(self, node: ast.Assign | ast.AugAssign) -> None:
         act = self.activity
+        one: list[tuple[ast.expr, ast.expr | None]]
         if isinstance(node, ast.AugAssign):
             before = ast.parse(ast.unparse(node.target), mode="eval").body
             one = [(node.target, ast.BinOp(before, node.op, node.value))]

@@ -92,9 +92,10 @@ def asked(controller: NmpcController, state: State, u: list[float]) -> Asked:
     block, s, p = controller.block(), controller.settings, controller.problem()
     f, q = load_functions(block.runtime, compiled=False), state.parameters
     found: list[np.ndarray] = []
-    decide, f.nmpc_decide = f.nmpc_decide, lambda _, __, values, ___: found.append(values.copy())
+    decide = f.nmpc_decide
+    vars(f)["nmpc_decide"] = lambda _, __, values, ___: found.append(values.copy())
     f.step(block.arrays, q, state.values.copy(), np.array(u), np.zeros(3))
-    f.nmpc_decide = decide
+    vars(f)["nmpc_decide"] = decide
     values = found[0]
     x = named(controller, values)
     target, moves = np.empty(2 * s.horizon), np.empty(p.variables)

@@ -51,10 +51,6 @@ class Stepped(Protocol):
         """Its block."""
         ...
 
-    def initial_state(self, **parameters: float) -> State:
-        """The state at rest."""
-        ...
-
 
 def jacobian(model: Stepped, state: State, inputs: ArrayLike) -> Jacobian:
     """Return the derivatives of `model.step(state, inputs)`; see `Model.jacobian`."""
@@ -88,7 +84,7 @@ def linearised(model: Stepped, at: State | Mapping[str, float] | ArrayLike | Non
     # A step returns the outputs of the next sample; as states of their own they are those of the state's.
     A = np.block([[J.A, np.zeros((n, n_out))], [J.C, np.zeros((n_out, n_out))]])
     B, C = np.vstack([J.B, J.D]), np.hstack([np.zeros((n_out, n)), np.eye(n_out)])
-    kept = _reached(A, B.any(axis=1)) & _reached(A.T, C.any(axis=0))
+    kept = _reached(A, B) & _reached(A.T, C.T)
     return control.StateSpace(
         A[np.ix_(kept, kept)], B[kept], C[:, kept], np.zeros((n_out, _MOTORS)), block.sample_time,
         inputs=[port.name for port in block.inputs[:_MOTORS]], outputs=[port.name for port in block.outputs],
@@ -112,7 +108,7 @@ def _set_points(block: Block, at: Mapping[str, float] | ArrayLike | None) -> Vec
 
 def _rest(model: Stepped, block: Block, u: Vector) -> State:
     """Return the state in which the model stands under the set-points `u`, run free until it does."""
-    state = model.initial_state(use_measurement=0.0)
+    state = block.initial_state(use_measurement=0.0)
     rows = np.full((_SETTLE, len(block.inputs)), np.nan)
     rows[:, :_MOTORS] = u
     for _ in range(_TIMES):
@@ -125,12 +121,11 @@ def _rest(model: Stepped, block: Block, u: Vector) -> State:
     )
 
 
-def _reached(A: Matrix, first: np.ndarray) -> np.ndarray:
-    """Return which states (n,) follow from those of `first`, one sample after the other."""
-    leads = A != 0.0
-    reached = first
+def _reached(A: Matrix, B: Matrix) -> np.ndarray:
+    """Return which states (n,) follow from those that `B` (n, m) moves, one sample after the other."""
+    leads, reached = A != 0.0, np.count_nonzero(B, axis=1) > 0
     while True:
-        more = reached | leads[:, reached].any(axis=1)
-        if (more == reached).all():
+        more = reached | (np.count_nonzero(leads[:, reached], axis=1) > 0)
+        if np.array_equal(more, reached):
             return reached
         reached = more
