@@ -26,13 +26,16 @@ def lowered(function: ast.FunctionDef, find: Callable[[str], Any], where: str) -
     Raises:
         SettingsError: a name that the declaration does not have, or a part of a state used in a way that has no place.
     """
-    layouts = {}
+
+    def layout(annotation: ast.expr | None) -> Any:
+        found = find(annotation.id) if isinstance(annotation, ast.Name) else None
+        return found if isinstance(found, type) and issubclass(found, Arrays | StateVector) else None
+
+    layouts = {argument.arg: layout(argument.annotation) for argument in function.args.args}
+    layouts = {name: found for name, found in layouts.items() if found is not None}
     for argument in function.args.args:
-        if isinstance(argument.annotation, ast.Name):
-            found = find(argument.annotation.id)
-            if isinstance(found, type) and issubclass(found, Arrays | StateVector):
-                layouts[argument.arg] = found
-                argument.annotation = None
+        argument.annotation = None if argument.arg in layouts else argument.annotation
+    function.returns = None if layout(function.returns) else function.returns
     names = _Names(layouts, find, f"{where}: `{function.name}`")
     body = function.body[1:] if ast.get_docstring(function, clean=False) is not None else function.body
     body = [names.visit(statement) for statement in body] or [ast.Pass()]
