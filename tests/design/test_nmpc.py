@@ -12,7 +12,7 @@ import pytest
 from softneck.core import DataError, SettingsError, load
 from softneck.design import NmpcController, NmpcSettings
 from softneck.design.predictive import _nmpc_state_runtime as rt
-from softneck.design.predictive._gauss_newton import cost_function
+from softneck.design.predictive._gauss_newton import NonlinearProblem, cost_function
 from softneck.design.predictive._model_steps import NONLINEAR_KINDS, step_function
 from softneck.design.predictive._nmpc_prepared import disturbance_ahead, estimate_gains
 from softneck.estimation import LinearNeck
@@ -99,9 +99,9 @@ class Asked:
     most: np.ndarray
 
 
-def asked(controller: NmpcController, state: State, u: list[float]) -> Asked:
+def asked(controller: NmpcController, p: NonlinearProblem, state: State, u: list[float]) -> Asked:
     """Return what `controller.step(state, u)` is asked; bounds and what is missed are worked out here once more."""
-    block, s, p = controller.block(), controller.settings, controller.problem()
+    block, s = controller.block(), controller.settings
     f, q = load_functions(block.runtime, compiled=False), state.parameters
     found: list[np.ndarray] = []
     decide = f.nmpc_decide
@@ -140,7 +140,7 @@ def test_converged_it_is_what_ipopt_finds(kind: str, models: dict[str, Model]) -
     a = None
     for k in range(30):
         u = [0.3 if k < 15 else -0.2, 0.1, 0.2, 0.05, 0.0, *state.outputs, 1.0, 1.0]
-        a = asked(controller, state, u) if k == 29 else None
+        a = asked(controller, p, state, u) if k == 29 else None
         state, motors = controller.step(state, u)
     assert a is not None
     z = ca.MX.sym("z", p.variables)
@@ -154,9 +154,9 @@ def test_converged_it_is_what_ipopt_finds(kind: str, models: dict[str, Model]) -
     assert np.abs(motors).max() > 0.1
 
 
-def answers(controller: NmpcController, a: Asked, z: np.ndarray) -> np.ndarray:
+def answers(controller: NmpcController, p: NonlinearProblem, a: Asked, z: np.ndarray) -> np.ndarray:
     """Return the angles (2 N,) that the model itself makes of the plan `z`."""
-    plant, p = controller.model.block(), controller.problem()
+    plant = controller.model.block()
     rows = np.full((p.horizon, 8), np.nan)
     rows[:, :3] = a.held + (p.spread() @ z).reshape(-1, 3)
     start = plant.initial_state(use_measurement=0.0)
@@ -171,20 +171,21 @@ def test_each_sample_is_the_quadratic_program_of_differences(
 ) -> None:
     settings = NmpcSettings(horizon=12, moves=4, slew_limit=6.0, angle_limit=angle_limit)
     controller, plant = settings.design(models[kind]), models[kind].block()
-    p, nz, soft = controller.problem(), controller.problem().variables, int(angle_limit is not None)
+    p, soft = controller.problem(), int(angle_limit is not None)
+    nz = p.variables
     state, motors = controller.initial_state(), np.zeros(3)
     x, y = plant.initial_state(use_measurement=0.0), np.zeros(2)
     rng, statuses = np.random.default_rng(0), set()
     for k in range(40):
         u = [*([0.3, -0.1, 0.3] if k < 20 else [-0.3, 0.2, 0.0]), *(y + 0.002 * rng.standard_normal(2)), *motors, 1, 1]
-        a = asked(controller, state, u) if k > 0 else None
+        a = asked(controller, p, state, u) if k > 0 else None
         state, motors = controller.step(state, u)
         statuses.add(controller.info(state).status)
         if a is not None:
             h = 1e-5
-            columns = [(answers(controller, a, a.plan + d) - answers(controller, a, a.plan - d)) / (2.0 * h)
-                       for d in h * np.eye(nz)]  # fmt: skip
-            S, Y = np.array(columns).T, answers(controller, a, a.plan)
+            moved = h * np.eye(nz)
+            ends = [[answers(controller, p, a, a.plan + s * d) for d in moved] for s in (1.0, -1.0)]
+            S, Y = (np.array(ends[0]) - np.array(ends[1])).T / (2.0 * h), answers(controller, p, a, a.plan)
             w = p.weights.ravel()
             common = p.T[2] @ p.spread().reshape(p.horizon, 3, nz)
             H, f = np.zeros((nz + soft, nz + soft)), np.zeros(nz + soft)
