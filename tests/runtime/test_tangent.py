@@ -18,7 +18,7 @@ import pytest
 
 from softneck.core import Matrix, SettingsError, Vector, load
 from softneck.fmu.compiled import _sources
-from softneck.fmu.compiled.translate._kinds import RANKS
+from softneck.fmu.compiled.translate._kinds import ranks_of
 from softneck.fmu.compiled.translate._translate import Unit
 from softneck.identification import Model
 from softneck.runtime import Block, load_runtime
@@ -309,7 +309,7 @@ SN_EXPORT int run(int count, double **data, const int32_t *ranks, const int32_t 
 @pytest.mark.parametrize("name", ["nn", "greybox", "play", "nss", "oe"])
 def test_in_c_it_is_the_same(name: str, tmp_path: Path) -> None:
     block, unit = block_of(name), Unit()
-    c_name = unit.tangent(block.runtime, RANKS[block.runtime])
+    c_name = unit.tangent(block.runtime, ranks_of(block.runtime))
     for path in (_sources.HERE / "c").glob("*.h"):
         shutil.copy(path, tmp_path)
     (tmp_path / "sn_kinds.h").write_text(unit.text().replace("sn_kinds[] = {\n", "sn_kinds[] = {{0}\n"))

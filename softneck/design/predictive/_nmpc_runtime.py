@@ -327,7 +327,7 @@ def nmpc_decide(p: NmpcArrays, parameters: np.ndarray, x: NmpcState, inputs: np.
             sign[i] = 1.0 if lam[i] > 0.0 else (-1.0 if lam[i] < 0.0 else 0.0)
         change = np.max(np.abs(z[:nz] - at))
         at[:] = z[:nz]
-        slack = z[nz] if p.slacks > 0 else 0.0
+        slack = float(z[nz]) if p.slacks > 0 else 0.0
         if change < _CONVERGED:
             break
     x.iterations = total

@@ -86,7 +86,7 @@ def linearised(model: Stepped, at: State | Mapping[str, float] | ArrayLike | Non
     B, C = np.vstack([J.B, J.D]), np.hstack([np.zeros((n_out, n)), np.eye(n_out)])
     kept = _reached(A, B) & _reached(A.T, C.T)
     return control.StateSpace(
-        A[np.ix_(kept, kept)], B[kept], C[:, kept], np.zeros((n_out, _MOTORS)), block.sample_time,
+        A[kept][:, kept], B[kept], C[:, kept], np.zeros((n_out, _MOTORS)), block.sample_time,
         inputs=[port.name for port in block.inputs[:_MOTORS]], outputs=[port.name for port in block.outputs],
         name=model.kind,
     )  # fmt: skip
