@@ -26,7 +26,9 @@ KALMAN_STILL = 0.1
 
 def kalman_line_length(c: np.ndarray) -> int:
     """Return how many past inputs each axis keeps."""
-    return math.ceil(max(c[KALMAN_LAG], c[KALMAN_LAG + 1])) + 1
+    longest = max(c[KALMAN_LAG], c[KALMAN_LAG + 1])
+    whole = int(longest)
+    return whole + 2 if longest > whole else whole + 1
 
 
 class KalmanArrays(Arrays):

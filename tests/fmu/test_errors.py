@@ -126,6 +126,7 @@ def test_a_runtime_that_takes_the_slave_s_names_is_refused(tmp_path: Path, monke
     from softneck.fmu.python._module import slave_module
 
     text = "import numpy as np\n\n\ndef _fmu_print(a):\n    return a\n\n\ndef step(a, b, c, d, e):\n    return None\n"
+    text += "\n\ndef state_size(a):\n    return 0\n"
     (tmp_path / "toy_clash_runtime.py").write_text(text)
     monkeypatch.syspath_prepend(str(tmp_path))
     with pytest.raises(SettingsError, match="defines _fmu_print"):

@@ -42,9 +42,14 @@ class Layers:
         W1, b1, W2, b2, w3 = (p.reshape(s) for p, s in zip(np.split(weights[:-1], edges[:-1]), shapes, strict=True))
         return Layers(W1, b1, W2, b2, w3, float(weights[-1]))
 
+    def hidden(self, Z: Matrix) -> tuple[Matrix, Matrix]:
+        """Return the values of both layers (rows, hidden) for inputs (rows, n)."""
+        first = np.tanh(Z @ self.W1.T + self.b1)
+        return first, np.tanh(first @ self.W2.T + self.b2)
+
     def output(self, Z: Matrix) -> Vector:
         """Return the outputs (rows,) for inputs (rows, n)."""
-        return np.tanh(np.tanh(Z @ self.W1.T + self.b1) @ self.W2.T + self.b2) @ self.w3 + self.b3
+        return self.hidden(Z)[1] @ self.w3 + self.b3
 
 
 def random_layers(n: int, hidden: tuple[int, int], rng: np.random.Generator) -> Layers:
@@ -62,8 +67,7 @@ def random_layers(n: int, hidden: tuple[int, int], rng: np.random.Generator) -> 
 
 def jacobian(layers: Layers, Z: Matrix) -> tuple[Vector, Matrix]:
     """Return the outputs (rows,) and their derivatives by all weights (rows, weights)."""
-    H1 = np.tanh(Z @ layers.W1.T + layers.b1)
-    H2 = np.tanh(H1 @ layers.W2.T + layers.b2)
+    H1, H2 = layers.hidden(Z)
     D2 = (1.0 - H2**2) * layers.w3
     D1 = (D2 @ layers.W2) * (1.0 - H1**2)
     rows = Z.shape[0]

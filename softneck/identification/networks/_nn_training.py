@@ -197,8 +197,7 @@ def train_axis(
 
 def _solved(layers: Layers, Z: Matrix, target: Vector) -> Layers:
     """Return the layers with the output layer of least squares: Levenberg-Marquardt starts far closer then."""
-    H = np.tanh(np.tanh(Z @ layers.W1.T + layers.b1) @ layers.W2.T + layers.b2)
-    H = np.column_stack([H, np.ones(len(H))])
+    H = np.column_stack([layers.hidden(Z)[1], np.ones(len(Z))])
     # Neurons are much alike at random: a thousandth of the rows keeps the weights of order one.
     w = np.linalg.solve(H.T @ H + 1e-3 * len(H) * np.eye(H.shape[1]), H.T @ target)
     return replace(layers, w3=w[:-1], b3=float(w[-1]))

@@ -35,7 +35,8 @@ def state_size(p: EnsembleArrays) -> int:
 def initialise(p: EnsembleArrays, parameters: np.ndarray, x: EnsembleState, outputs: np.ndarray) -> None:
     """Rest: as the members rest."""
     own = np.zeros(9)
-    at, members = 0, x.members
+    at = 0
+    members = x.members
     random_seed(x.random, parameters[4])
     for i in range(member_count()):
         size = member_size(p, i)
@@ -53,7 +54,8 @@ def step(p: EnsembleArrays, parameters: np.ndarray, x: EnsembleState, inputs: np
     count = member_count()
     angles = np.empty((2, count))
     own = np.zeros(9)
-    at, members = 0, x.members
+    at = 0
+    members = x.members
     for i in range(count):
         size = member_size(p, i)
         member_step(p, i, quiet, members[at : at + size], inputs, own)
