@@ -17,6 +17,7 @@ def test_the_readmes_script_is_the_example() -> None:
     assert shown.strip() in SCRIPT.read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_the_first_script_leaves_an_fmu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     runpy.run_path(str(SCRIPT), run_name="__main__")
@@ -33,6 +34,7 @@ def test_the_pictures_of_set_membership_are_those_of_the_docs(tmp_path: Path, mo
     assert names == {path.name for path in (ROOT / "docs" / "_static").glob("set_membership_*.svg")}
 
 
+@pytest.mark.slow
 def test_the_planned_trajectory_prints_what_the_docs_show(capsys: pytest.CaptureFixture[str]) -> None:
     runpy.run_path(str(ROOT / "examples" / "planned_trajectory.py"), run_name="__main__")
     page = (ROOT / "docs" / "howto" / "optimal_control.md").read_text(encoding="utf-8")

@@ -42,6 +42,7 @@ def files(tmp_path_factory: pytest.TempPathFactory, models: dict) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_scan_check_zero_stop_and_reset_answer_in_json(call: Call) -> None:
     nodes = json.loads(call("drives", "scan", "--simulated", "--json").out)["nodes"]
     assert [node["node"] for node in nodes] == [1, 2, 3]

@@ -47,6 +47,7 @@ def test_noise_from_data_finds_that_of_the_sensor_by_its_gyro(call: Call, files:
     assert told["fit"]["rows"] > 900
 
 
+@pytest.mark.slow
 def test_a_named_sensor_keeps_its_noise(call: Call, files: tuple[Path, Path]) -> None:
     said = call("observer", files[0], "-o", "o.npz", "--sensor", "mpu9250", "--data", files[1])
     assert said.code == 0, said.err

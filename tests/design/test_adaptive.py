@@ -165,6 +165,7 @@ def fuzz(rows: int, seed: int) -> np.ndarray:
     return U
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 1000))
 def test_whatever_comes_the_estimate_is_in_its_box_and_gains_move_slowly(seed: int) -> None:
     block = controller(gain_rate=0.5).block()

@@ -56,6 +56,7 @@ def bounds(controller: MpcController, theta: np.ndarray) -> tuple[np.ndarray, np
     return controller.program().bounds(theta, parameters, theta[-5:-2])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["plain", "soft"])
 def test_the_runtimes_solver_equals_daqp(kind: str, request: pytest.FixtureRequest) -> None:
     controller: MpcController = request.getfixturevalue(kind)
@@ -307,6 +308,7 @@ def test_a_measured_disturbance_is_met_before_it_shows() -> None:
     assert worst[1] < 0.7 * worst[0]
 
 
+@pytest.mark.slow
 def test_daqp_in_the_loop_is_the_blocks_own_solver(soft: MpcController) -> None:
     parts = [soft.part(), soft.part(solver="daqp")]
     assert all(np.array_equal(part.start(0.0, {}), np.zeros(3)) for part in parts)

@@ -45,6 +45,7 @@ def test_the_function_is_the_runtime(kind: str, models: dict[str, Model]) -> Non
         np.testing.assert_allclose(np.array(y)[:, 0], outputs[k], rtol=ROUNDING, atol=ROUNDING)
 
 
+@pytest.mark.slow
 def test_a_network_of_the_papers_size_too(neck: Recording) -> None:
     model = Network(iterations=2).fit(neck)
     f = model.casadi()

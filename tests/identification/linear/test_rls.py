@@ -18,6 +18,7 @@ from softneck.signals import concatenate, redefine, signal
 from ...data import TRUTH, TS, Truth, neck_recording, recording_from
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [1, 2, 5])
 def test_the_standard_form_ends_where_least_squares_does(n: int) -> None:
     rng = np.random.default_rng(n)

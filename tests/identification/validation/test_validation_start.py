@@ -57,6 +57,7 @@ def memoriser(recording: Recording) -> Model:
     )
 
 
+@pytest.mark.slow
 def test_a_model_that_memorises_is_not_scored_on_what_it_has_seen() -> None:
     seen = neck_recording(500, seed=3, noise=2e-3)
     others = [neck_recording(700, seed=s, noise=2e-3) for s in (41, 42)]
