@@ -19,9 +19,12 @@ import pytest
 
 from softneck.core import SettingsError
 from softneck.fmu import build_compiled_fmu
+from softneck.fmu.compiled import _sources
 from softneck.fmu.compiled._library import packaged_library
+from softneck.fmu.compiled._model_file import node_of
 from softneck.fmu.compiled._sources import FLAGS, c_sources, sources_key
 from softneck.fmu.compiled.translate._chunks import only_kinds
+from softneck.fmu.compiled.translate._kinds import ranks_of
 from softneck.fmu.python._pack import deflated, write_zip
 
 from .every_kind import NATIVE, TS, block_of, inputs_of
@@ -160,3 +163,25 @@ def test_fmi3_has_the_variables_of_fmi2(tmp_path: Path) -> None:
             variables = fmpy.read_model_description(str(tmp_path / "Model.fmu")).modelVariables
             facts.append([(v.name, v.valueReference, v.causality, v.unit) for v in variables if v.name != "time"])
         assert facts[0] == facts[1], kind
+
+
+def test_any_source_that_changes_makes_another_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    copy = tmp_path / "compiled"
+    shutil.copytree(_sources.HERE, copy, ignore=shutil.ignore_patterns("__pycache__", "binaries"))
+    monkeypatch.setattr(_sources, "HERE", copy)
+    keys = [sources_key.__wrapped__()]
+    assert keys[0] == sources_key()
+    for name in ("c/sn_vector.h", "translate/_calls.py", "_build.py"):
+        path = copy / name
+        path.write_text(path.read_text(encoding="utf-8") + "\n", encoding="utf-8")
+        keys.append(sources_key.__wrapped__())
+    assert len(set(keys)) == len(keys)
+
+
+def test_arrays_of_other_ranks_than_declared_are_refused() -> None:
+    runtime = "softneck.identification.linear._rls_runtime"
+    arrays = tuple(np.zeros((1,) * rank) for rank in ranks_of(runtime))
+    assert node_of(runtime, arrays).module == runtime
+    for wrong in (arrays[:-1], (*arrays[:-1], np.zeros((1, 1)))):
+        with pytest.raises(SettingsError, match=r"arrays of ranks .* and the compiled library expects"):
+            node_of(runtime, wrong)
