@@ -13,6 +13,8 @@ import numpy as np
 from softneck.core import DataError, FileFormatError, Matrix, Vector, read_archive, write_archive
 
 _KIND = "loop_state"
+# Raised whenever what a part saves stands in another order: lengths alone would not tell.
+_PARTS_VERSION = 2
 
 
 @runtime_checkable
@@ -52,8 +54,8 @@ class LoopState:
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write the state to an `.npz` file."""
         header = {
-            "kind": _KIND, "row": self.row, "order": self.order, "step": self.step.hex(),
-            "faults": len(self.memories), "pending": list(self.pending),
+            "kind": _KIND, "parts_version": _PARTS_VERSION, "row": self.row, "order": self.order,
+            "step": self.step.hex(), "faults": len(self.memories), "pending": list(self.pending),
             "parts": {name: base64.b64encode(state).decode() for name, state in self.parts.items()},
         }  # fmt: skip
         arrays = {"bus": self.bus, "table": self.table}
@@ -67,6 +69,11 @@ class LoopState:
         header, arrays = read_archive(path)
         if header.get("kind") != _KIND:
             raise FileFormatError(f"{path}: does not hold the state of a loop.")
+        if header.get("parts_version") != _PARTS_VERSION:
+            raise FileFormatError(
+                f"{path}: was saved by another version of softneck, whose parts keep their numbers in another order; "
+                "run the loop from its start."
+            )
         try:
             return LoopState(
                 row=int(header["row"]),

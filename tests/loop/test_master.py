@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softneck.core import DataError, FileFormatError, SettingsError
+from softneck.core import DataError, FileFormatError, SettingsError, read_archive, write_archive
 from softneck.loop import BlockPart, Loop, LoopRun, LoopState, StepReference, run_loop
 from softneck.loop._run import LoopStep
 from softneck.runtime import Block, Port
@@ -184,3 +184,16 @@ def test_ports_with_units_of_the_same_kind_connect_and_others_do_not() -> None:
     speed = FunctionPart("controller", (Port(name="pitch_reference", unit="m"),), ports("half"), lambda *_: [0.0])
     with pytest.raises(SettingsError, match=r"is in \[rad\] but `pitch_reference` of the filter in \[m\]"):
         run_loop(loop_with(others={"filter": speed}))
+
+
+def test_a_saved_state_whose_parts_have_another_order_is_refused(blocks: Loop, tmp_path: Path) -> None:
+    with LoopRun(blocks) as run:
+        run.advance(3)
+        run.state().save(tmp_path / "s.npz")
+    header, arrays = read_archive(tmp_path / "s.npz")
+    assert LoopState.load(tmp_path / "s.npz").row == 3
+    # An earlier version's has no such number; its arrays have the same lengths.
+    earlier = {name: value for name, value in header.items() if name != "parts_version"}
+    write_archive(tmp_path / "old.npz", earlier, arrays)
+    with pytest.raises(FileFormatError, match=r"another version of softneck.*run the loop from its start"):
+        LoopState.load(tmp_path / "old.npz")
