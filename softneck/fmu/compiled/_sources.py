@@ -58,8 +58,8 @@ def sources_key() -> str:
     """
     texts = [bundle(module, loops=False) for module in RUNTIMES]
     digest = hashlib.sha256(repr((FLAGS, [ranks_of(module) for module in RUNTIMES], texts)).encode())
-    # By name: a wheel has the packages in other folders than a checkout.
-    files = {*HERE.rglob("*.py"), *(HERE / "c").glob("*.[ch]")}
-    for path in sorted(files, key=lambda path: path.name):
-        digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    # By name: a wheel has the packages in other folders than a checkout. By content where a name is there twice.
+    paths = [*HERE.rglob("*.py"), *(HERE / "c").glob("*.[ch]")]
+    for name, content in sorted((path.name.encode(), path.read_bytes()) for path in paths):
+        digest.update(name + b"\0" + content)
     return digest.hexdigest()[:32]
