@@ -25,6 +25,7 @@ print(getattr(build, sys.argv[1])(sys.argv[2]))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hook", ["build_wheel", "build_editable"])
 def test_installing_starts_no_program(hook: str, tmp_path: Path) -> None:
     done = subprocess.run(

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
+from ._errors import SettingsError
+
 # Package as it is imported -> (extra of `pip install`, what needs it). 500 of 1,300 MB that the main job never loads.
 EXTRAS = {
     "casadi": ("mpc", "predictive control, plans and `model.casadi()`"),
@@ -25,3 +29,9 @@ def missing_extra(error: ModuleNotFoundError) -> str | None:
         return None
     extra, purpose = found
     return f"{error.name} is not installed, and it is needed for {purpose}; run: pip install 'softneck[{extra}]'"
+
+
+def require_package(package: str) -> None:
+    """Raise `SettingsError` with that line unless `package`, of one of the extras, is installed."""
+    if find_spec(package) is None:
+        raise SettingsError(f"{missing_extra(ModuleNotFoundError(name=package))}.")

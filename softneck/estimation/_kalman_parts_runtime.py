@@ -165,7 +165,7 @@ def kalman_lagged(line: np.ndarray, newest: int, lag: float) -> float:
 
 def kalman_tell(p: KalmanArrays, x: KalmanState, noise: float, outputs: np.ndarray) -> None:
     """Carry the estimate from the filter's time to now; fill all outputs but the innovation."""
-    c = p.constants
+    F, B, H, c = p.F, p.B, p.H, p.constants
     newest = int(x.samples) % p.length
     whole = int(c[KALMAN_LEAD])
     part = c[KALMAN_LEAD] - whole
@@ -176,10 +176,10 @@ def kalman_tell(p: KalmanArrays, x: KalmanState, noise: float, outputs: np.ndarr
         u[0] = kalman_lagged(first, newest, c[KALMAN_LAG] - 1.0 - i)
         u[1] = kalman_lagged(second, newest, c[KALMAN_LAG + 1] - 1.0 - i)
         if i == whole:
-            y = kalman_dot(p.H, now)
+            y = kalman_dot(H, now)
             y0, y1 = y[0], y[1]
-        now = kalman_ahead(p.F, now, p.B, u)
-    y = kalman_dot(p.H, now)
+        now = kalman_ahead(F, now, B, u)
+    y = kalman_dot(H, now)
     # Between samples by a straight line, whose slope is the rate.
     outputs[0] = y0 + part * (y[0] - y0)
     outputs[1] = y1 + part * (y[1] - y1)
@@ -194,9 +194,10 @@ def kalman_dot(A: np.ndarray, x: np.ndarray) -> np.ndarray:
         return np.dot(A, x)
     y = np.empty(A.shape[0])
     for i in range(A.shape[0]):
-        y[i] = 0.0
+        total = 0.0
         for j in range(A.shape[1]):
-            y[i] += A[i, j] * x[j]
+            total += A[i, j] * x[j]
+        y[i] = total
     return y
 
 
@@ -206,7 +207,8 @@ def kalman_ahead(F: np.ndarray, x: np.ndarray, B: np.ndarray, u: np.ndarray) -> 
         return np.dot(F, x) + np.dot(B, u)
     y = np.empty(F.shape[0])
     for i in range(F.shape[0]):
-        y[i] = B[i, 0] * u[0] + B[i, 1] * u[1]
+        total = B[i, 0] * u[0] + B[i, 1] * u[1]
         for j in range(F.shape[1]):
-            y[i] += F[i, j] * x[j]
+            total += F[i, j] * x[j]
+        y[i] = total
     return y

@@ -73,16 +73,17 @@ def step(p: KalmanArrays, parameters: np.ndarray, x: KalmanFullState, inputs: np
 def kalman_predict(p: KalmanArrays, parameters: np.ndarray, x: np.ndarray, P: np.ndarray, u: np.ndarray) -> None:
     """Replace `x` by F x + B u and `P` by F P F' + Q."""
     q1, q2 = parameters[1] * parameters[1], parameters[2] * parameters[2]
+    QM, QW = p.first_noise, p.second_noise  # numba counts references where a loop takes them from `p`
     x[:] = kalman_ahead(p.F, x, p.B, u)
     if not COMPILED:
         np.dot(np.dot(p.F, P), p.F.T, P)
-        P += q1 * p.first_noise
-        P += q2 * p.second_noise
+        P += q1 * QM
+        P += q2 * QW
         return
     kalman_sandwich(p.F, P)
     for i in range(p.n):
         for j in range(p.n):
-            P[i, j] += q1 * p.first_noise[i, j] + q2 * p.second_noise[i, j]
+            P[i, j] += q1 * QM[i, j] + q2 * QW[i, j]
 
 
 def kalman_correct(

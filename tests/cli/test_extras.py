@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from softneck import load
 from softneck.cli._main import run
+from softneck.core import SettingsError, _extras
 from softneck.core._extras import EXTRAS, missing_extra
 from softneck.signals import write_recording
 
@@ -32,6 +34,13 @@ def test_a_command_names_the_extra_that_it_lacks(
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert "pip install 'softneck[files]'" in said
+
+
+def test_a_model_without_casadi_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = load(Path(__file__).parents[1] / "golden" / "rls.npz")
+    monkeypatch.setattr(_extras, "find_spec", lambda _: None)
+    with pytest.raises(SettingsError, match=r"casadi is not installed.*pip install 'softneck\[mpc\]'"):
+        model.casadi()
 
 
 def test_any_other_missing_module_is_an_error_of_ours() -> None:

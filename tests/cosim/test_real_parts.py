@@ -42,6 +42,7 @@ def _loop(folder: Path, plant: str, ending: str) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", ["sequential", "jacobi"])
 def test_files_and_fmus_make_the_same_loop(order: str, folder: Path) -> None:
     paths = [_loop(folder, "rls.npz", "npz"), _loop(folder, "rls.fmu", "fmu")]

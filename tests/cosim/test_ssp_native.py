@@ -28,6 +28,7 @@ pytestmark = pytest.mark.skipif(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("master", list(PACKAGES))
 def test_other_masters_compute_our_jacobi_loop_without_python(master: str, tmp_path: Path) -> None:
     linear = _linear()

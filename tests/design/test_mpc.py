@@ -100,6 +100,7 @@ def test_casadi_says_the_same_of_the_same_expression(soft: MpcController) -> Non
         np.testing.assert_allclose(z, oracle, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_without_limits_and_blocking_it_is_the_lqr(plain: MpcController) -> None:
     settings = MpcSettings(bandwidth=8.0, moves=30)
     problem = settings.problem(bake_off_neck(), 8.0)

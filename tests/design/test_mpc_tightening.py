@@ -67,6 +67,7 @@ def neck_measured(neck: Neck) -> np.ndarray:
     return neck.inputs[3:5]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", GAINS)
 def test_tightened_limits_hold_on_every_sample(pair: tuple[MpcController, MpcController], gain: float) -> None:
     for seed in range(4):

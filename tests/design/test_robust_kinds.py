@@ -85,6 +85,7 @@ def test_the_worst_sensitivity_is_kept_and_is_what_it_says(kind: str) -> None:
     assert worst <= 1.003 * KINDS[kind].max_sensitivity
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", slow_but(["pid", "fopid", "hinf", "ncf", "lqg"], ["pid", "hinf"]))
 def test_the_figures_of_the_bake_off_are_reached_from_the_file(kind: str, tmp_path: Path) -> None:
     robust(kind).save(tmp_path / "c.npz")

@@ -66,6 +66,7 @@ def test_a_run_on_simulated_drives_equals_the_co_simulation(
         assert gap[-50:].max() < 0.1
 
 
+@pytest.mark.slow
 def test_the_same_run_twice_is_the_same_to_the_bit(project: Project) -> None:
     setup = load_loop(project.loop)
     first, second = (run_simulated(prepare(setup, project.controller), default_drives()) for _ in range(2))
@@ -73,6 +74,7 @@ def test_the_same_run_twice_is_the_same_to_the_bit(project: Project) -> None:
         np.testing.assert_array_equal(values, second.signals[name])
 
 
+@pytest.mark.slow
 def test_reversed_drives_other_nodes_and_200_hz_give_the_same_motion(project: Project) -> None:
     scale = DriveScale(peak_current=20.0, slow_loop=0.8e-3, reversed=True)
     one, two, three = (DriveEntry(node=node, scale=scale) for node in (5, 77, 12))
@@ -134,6 +136,7 @@ def look(link: VirtualLink) -> Tilt:
     return Tilt(sample.pitch, sample.roll, valid=sample.valid)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("profile", ["ipos2015", "ds402"])
 def test_zero_tensions_every_tendon_and_marks_the_drives(profile: str) -> None:
     file = default_drives(profile)
@@ -154,6 +157,7 @@ def test_zero_tensions_every_tendon_and_marks_the_drives(profile: str) -> None:
     assert preflight(link, file, homed=True).holds
 
 
+@pytest.mark.slow
 def test_a_torn_tendon_is_found_while_zeroing() -> None:
     file, link = default_drives(), virtual()
     link.neck.tear(2)
@@ -163,6 +167,7 @@ def test_a_torn_tendon_is_found_while_zeroing() -> None:
     assert all(drive.axis.state == 0x40 for drive in link.neck.drives)
 
 
+@pytest.mark.slow
 def test_a_neck_that_leans_is_not_zeroed() -> None:
     file, link = default_drives(), virtual()
     link.neck.set(base_tilt_pitch=0.3)

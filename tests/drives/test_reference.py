@@ -38,6 +38,7 @@ def test_json_has_the_keys_of_the_reference(
     assert set(json.loads(capsys.readouterr().out)) == keys_of(words.split()[0])
 
 
+@pytest.mark.slow
 def test_run_and_replay_have_the_keys_of_the_reference(
     project: Project, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

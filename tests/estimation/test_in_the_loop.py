@@ -36,6 +36,7 @@ def closed(model: Model, settings: KalmanSettings) -> LoopResult:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
     [KalmanSettings(), KalmanSettings(steady=True), KalmanSettings(form="gyro"), KalmanSettings(form="kinematic")],
@@ -49,6 +50,7 @@ def test_every_form_closes_the_loop_over_dropouts(model: Model, settings: Kalman
     assert np.isfinite(result["pitch_estimate"]).all()
 
 
+@pytest.mark.slow
 def test_a_model_as_plant_without_noise_does_not_lock_the_loop(model: Model) -> None:
     """At rest its measurement repeats to the last bit; a filter that called it frozen would stop the controller."""
     result = run_loop(

@@ -61,6 +61,7 @@ def test_a_right_model_filters_noise() -> None:
     assert np.std(error[100:]) < 0.3 * np.std(raw[100:])
 
 
+@pytest.mark.slow
 def test_the_innovation_is_chi_square_when_the_model_is_right() -> None:
     rng = np.random.default_rng(5)
     record = recording(noise_deg=0.1, rows=3000)

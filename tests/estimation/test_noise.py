@@ -42,6 +42,7 @@ def drawn(rows: int = 4000, *, seed: int = 3, noise: tuple[float, float, float] 
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, 4, 5])
 def test_nis_and_nees_keep_their_bands_when_the_model_is_right(seed: int) -> None:
     found = consistency(observer_of(), drawn(seed=seed))
@@ -57,6 +58,7 @@ def test_nis_and_nees_keep_their_bands_when_the_model_is_right(seed: int) -> Non
     assert np.count_nonzero(outside) <= 4
 
 
+@pytest.mark.slow
 def test_a_filter_too_sure_of_itself_is_told() -> None:
     record = drawn()
     sure = consistency(observer_of((TRUE[0] / 2, TRUE[1] / 2, TRUE[2] / 2)), record)
@@ -102,6 +104,7 @@ def test_the_likelihood_is_that_of_filterpy() -> None:
     assert ours == pytest.approx(expected / (400 - _SETTLE), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_level_that_is_known_stays() -> None:
     start = observer_of((TRUE[0], TRUE[1] / 5, TRUE[2] * 6))
     found = fit_noise(start, drawn(seed=7), fixed=["measurement_noise_std"])
@@ -113,6 +116,7 @@ def test_a_level_that_is_known_stays() -> None:
         fit_noise(start, drawn(rows=300), fixed=start.noise_names)
 
 
+@pytest.mark.slow
 def test_outliers_do_not_move_the_noise() -> None:
     record = drawn(rows=2500)
     clean = fit_noise(observer_of(), record)

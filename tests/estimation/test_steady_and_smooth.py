@@ -17,6 +17,7 @@ from softneck.estimation._steady import steady_covariance, steady_gains
 from .necks import changed, neck, recording, rows_of, run_block, run_plain, smooth_motion
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("divider", [1, 2])
 def test_constant_gains_are_those_that_filterpy_converges_to(form: str, divider: int) -> None:

@@ -67,6 +67,7 @@ def test_over_a_linear_model_it_is_the_linear_filter(
     np.testing.assert_array_equal(told.healthy, linear.healthy)
 
 
+@pytest.mark.slow
 def test_its_nis_and_nees_are_those_of_the_linear_filter(training: Recording) -> None:
     model, part = Rls().fit([training]), training.rows(0, 600)
     noise = math.radians(0.05) * np.random.default_rng(2).standard_normal((2, 600))
@@ -82,6 +83,7 @@ def test_its_nis_and_nees_are_those_of_the_linear_filter(training: Recording) ->
     assert "over rls, 20 ms" in ukf(model, settings).summary()
 
 
+@pytest.mark.slow
 def test_a_first_order_model_needs_one_angle_and_gains_nothing_from_more(training: Recording) -> None:
     model, part = Rls().fit([training]), training.rows(0, 400)
     one, three = ukf(model, DISTURBED), ukf(model, DISTURBED, memory=3)

@@ -31,6 +31,7 @@ def result_of(pitch: np.ndarray, reference: np.ndarray, motor: np.ndarray | None
     return LoopResult(np.arange(pitch.size) * TS, signals, {}, TS)
 
 
+@pytest.mark.slow
 @given(
     damping=st.floats(0.2, 1.5),
     frequency=st.floats(2.0, 12.0),

@@ -32,6 +32,7 @@ def inputs(rows: int, motors: np.ndarray | tuple[float, float, float], payload: 
     return U
 
 
+@pytest.mark.slow
 def test_energy_never_rises_when_the_neck_is_let_go() -> None:
     block = VirtualNeck(quiet()).block(sample_time=0.001)
     # Tendons paid out: nothing actuates. A push leans the neck, and lets go.

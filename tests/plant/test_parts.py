@@ -161,6 +161,7 @@ def drive_run(seconds: float, command: float, pull: float, **changes: float) -> 
     return np.array(rows)
 
 
+@pytest.mark.slow
 def test_a_drive_keeps_its_speed_limit_and_holds_its_position_under_load() -> None:
     limit = 8.0
     run = drive_run(2.0, 4.0, 0.02, speed_limit=limit)
@@ -169,6 +170,7 @@ def test_a_drive_keeps_its_speed_limit_and_holds_its_position_under_load() -> No
     assert run[-1, 0] == pytest.approx(4.0, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_a_tendon_that_pulls_harder_than_the_current_limit_drives_the_winch_back() -> None:
     torque = neck_drive(np.append(NeckParameters.paper().vector(), 0.0))[4]
     assert drive_run(0.3, 0.0, 1.5 * torque)[-1, 0] < -0.5

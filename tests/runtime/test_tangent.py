@@ -305,6 +305,7 @@ SN_EXPORT int run(int count, double **data, const int32_t *ranks, const int32_t 
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
 @pytest.mark.parametrize("name", ["nn", "greybox", "play", "nss", "oe"])
 def test_in_c_it_is_the_same(name: str, tmp_path: Path) -> None:

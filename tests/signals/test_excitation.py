@@ -28,6 +28,7 @@ def digest(set_points: np.ndarray) -> str:
     return hashlib.sha256(np.round(set_points * 1e6).astype("<i4").tobytes()).hexdigest()[:16]
 
 
+@pytest.mark.slow
 def test_every_signal_is_frozen() -> None:
     assert {name: digest(signal(name).set_points) for name in signal_names()} == FROZEN
 
@@ -94,6 +95,7 @@ def test_a_seed_decides_a_random_signal(name: str) -> None:
     assert np.abs(first - other).max() > 0.1
 
 
+@pytest.mark.slow
 def test_the_multisine_has_no_power_beyond_4_rad_per_s_and_a_low_crest_factor() -> None:
     P = signal("multisine").set_points
     power = np.abs(np.fft.rfft(P, axis=0)) ** 2
@@ -103,6 +105,7 @@ def test_the_multisine_has_no_power_beyond_4_rad_per_s_and_a_low_crest_factor() 
     assert (np.abs(P).max(axis=0) / P.std(axis=0)).max() < 3.0  # 32 tones in phase would reach 8
 
 
+@pytest.mark.slow
 def test_the_multisine_excites_all_of_the_band_alike() -> None:
     P = signal("multisine").set_points
     power = np.abs(np.fft.rfft(P, axis=0)) ** 2

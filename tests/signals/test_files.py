@@ -205,6 +205,7 @@ def test_an_existing_recording_is_kept(tmp_path: Path) -> None:
     assert (tmp_path / "a.csv").read_bytes() == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
 @given(data=st.data())
 @settings(max_examples=120)

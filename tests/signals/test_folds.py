@@ -55,6 +55,7 @@ def test_what_cannot_be_split_by_runs() -> None:
         numbered([5]).split_runs(0.5)
 
 
+@pytest.mark.slow
 @given(rows=st.lists(st.integers(2, 40), min_size=1, max_size=7), data=st.data())
 def test_folds_hold_out_each_row_once_and_join_nothing(rows: list[int], data: st.DataObject) -> None:
     whole = numbered(rows)

@@ -68,6 +68,7 @@ def layouts(draw: st.DrawFn) -> Layout:
     )
 
 
+@pytest.mark.slow
 @given(layout=layouts(), remark=st.text(max_size=20))
 @settings(max_examples=60)
 def test_a_layout_survives_its_file(tmp_path: Path, layout: Layout, remark: str) -> None:

@@ -53,6 +53,7 @@ def recordings(draw: st.DrawFn) -> Recording:
     return Recording(time, Ts, channels, run if len(runs) > 1 else np.zeros(n, dtype=np.int64))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
 @given(recording=recordings())
 @settings(max_examples=30)
@@ -145,6 +146,7 @@ def mangled(data: st.DataObject, whole: bytes) -> bytes:
     return bytes(content[: data.draw(st.integers(0, len(content)))] if data.draw(st.booleans()) else content)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["log.csv", "bare.csv", "log.parquet", "v5.mat", "v73.mat"])
 @given(data=st.data())
 @settings(max_examples=60)
@@ -163,6 +165,7 @@ def test_mangled_logs_are_a_result_or_a_clear_error(tmp_path: Path, name: str, d
         import_log(damaged, guess.layout)
 
 
+@pytest.mark.slow
 @given(data=st.data())
 @settings(max_examples=100)
 def test_a_mangled_layout_is_a_result_or_a_clear_error(tmp_path: Path, data: st.DataObject) -> None:

@@ -166,6 +166,7 @@ def test_a_layout_without_time_is_refused(tmp_path: Path) -> None:
         imported(tmp_path, LAYOUT.split("[channels]")[1].join(["[channels]", ""]))
 
 
+@pytest.mark.slow
 @given(data=st.data())
 @settings(max_examples=150)
 def test_damaged_layouts_are_a_clear_error_and_nothing_else(tmp_path: Path, data: st.DataObject) -> None:

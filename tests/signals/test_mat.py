@@ -150,6 +150,7 @@ def test_a_run_column_numbers_the_runs(tmp_path: Path) -> None:
         load(tmp_path, "a.csv", layout.replace('"n"', "[1]"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("version", ["v5", "v7.3"])
 @given(data=st.data())
 @settings(max_examples=100)

@@ -40,6 +40,7 @@ def topics(recording: Recording, severity: str) -> set[str]:
     return {finding.topic for finding in assess_quality(recording).findings if finding.severity == severity}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["paper", "lab"])
 @pytest.mark.parametrize("name", ["eq22", "mixed", "aprbs", "multisine"])
 def test_a_clean_recording_of_the_virtual_neck_gives_no_warning(preset: str, name: str) -> None:
@@ -144,6 +145,7 @@ def test_each_behaviour_is_seen_when_it_happens_and_missed_when_not() -> None:
     assert assess_quality(recording_from(together)).region.behaviours["holding still"] == pytest.approx(4.0)
 
 
+@pytest.mark.slow
 def test_the_papers_signal_misses_what_the_paper_says_and_mixed_does_not() -> None:
     neck = VirtualNeck(NeckParameters.preset("paper"))
     missing = ("tendon 1 alone", "tendon 2 alone", "tendon 3 alone", "co-contraction", "holding still")
@@ -151,6 +153,7 @@ def test_the_papers_signal_misses_what_the_paper_says_and_mixed_does_not() -> No
     assert assess_quality(record(signal("mixed"), neck)).region.never == ()
 
 
+@pytest.mark.slow
 def test_coverage_is_whole_where_the_motors_went_everywhere() -> None:
     # A grid of motor positions a third of a cell apart reaches every cell of the hexagon.
     axis = np.arange(-2.0, 2.01, 1 / 6)
@@ -171,6 +174,7 @@ def test_runs_with_the_same_set_points_show_the_noise() -> None:
     np.testing.assert_allclose(found[0].rms, 2e-3, rtol=0.08)
 
 
+@pytest.mark.slow
 def test_nothing_reaches_across_runs() -> None:
     """Runs in another order have the same spectrum, condition, correlation and region."""
     parts = [recording_from(signal("multisine", duration=30.0, seed=s).set_points, noise=1e-3) for s in (1, 2, 3)]
@@ -182,6 +186,7 @@ def test_nothing_reaches_across_runs() -> None:
     assert one.region.behaviours == pytest.approx(other.region.behaviours)
 
 
+@pytest.mark.slow
 @given(
     rows=st.integers(1, 40), runs=st.integers(1, 4),
     scale=st.sampled_from([0.0, 1e-12, 1.0]), missing=st.floats(0.0, 1.0),

@@ -40,6 +40,7 @@ def imported(folder: Path, time: np.ndarray, layout: str = LAYOUT, **columns: np
     return import_log(folder / "log.csv", parse_layout(layout))
 
 
+@pytest.mark.slow
 @given(jitter=st.floats(0.05, 0.2), seed=st.integers(0, 99))
 def test_a_band_limited_signal_is_recovered_from_jittered_samples(tmp_path: Path, jitter: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -82,6 +83,7 @@ def test_set_points_hold_their_last_value(tmp_path: Path) -> None:
     np.testing.assert_array_equal(r.set_points[:, 0], expected)
 
 
+@pytest.mark.slow
 @given(data=st.data())
 def test_a_missed_sample_is_never_invented(tmp_path: Path, data: st.DataObject) -> None:
     rng = np.random.default_rng(data.draw(st.integers(0, 9)))

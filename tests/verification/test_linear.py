@@ -76,6 +76,7 @@ def test_radii_are_those_of_the_closed_loops_poles(cross: float) -> None:
         assert found[row] == pytest.approx(np.abs(closed.poles()).max(), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_margins_are_those_of_python_control() -> None:
     pytest.importorskip("slycot")
     plants = all_plants([neck_of_model(linear_neck(), "m", SPREAD)], 30, 0)
@@ -106,6 +107,7 @@ def test_two_complex_scalars_have_a_closed_form() -> None:
     np.testing.assert_allclose(two_scalars(M), mu_bounds(M, [(1, 0), (1, 0)]).upper, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_margin_of_both_channels_is_that_of_the_system_of_two() -> None:
     plants = nominal_plants([neck_of_family(family(cross=0.3), "f")])[0]
     controller: Any = pi().ss()
@@ -157,6 +159,7 @@ def _hidden() -> tuple[UncertainNeck, LinearLaw]:
     return neck, law
 
 
+@pytest.mark.slow
 def test_a_loop_that_is_stable_at_all_corners_but_not_inside_is_caught_by_the_search() -> None:
     neck, law = _hidden()
     corners = all_plants([neck], 1, 0)
@@ -173,6 +176,7 @@ def test_where_the_search_finds_an_unstable_plant_the_bound_proves_nothing() -> 
         assert row.mu > 1.0
 
 
+@pytest.mark.slow
 def test_bounds_enclose_what_was_sampled() -> None:
     """The box of a neck with a PI: sampled instability, lower and upper bound stand in this order."""
     neck = neck_of_model(linear_neck(), "m", {"gain": 0.4, "pole": 0.4, "delay": 0.02})

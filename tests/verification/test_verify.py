@@ -60,6 +60,7 @@ def files(tmp_path: Path) -> dict[str, Path]:
     return paths
 
 
+@pytest.mark.slow
 def test_a_good_controller_holds(held: Verification) -> None:
     assert held.holds, [(v.requirement.metric, v.value) for v in held.failed]
     values = {v.requirement.metric: v.value for v in held.verdicts}
@@ -147,6 +148,7 @@ class _Frozen(_Nonlinear):
         return self._inner.ss()
 
 
+@pytest.mark.slow
 def test_what_cannot_be_computed_is_said_and_not_passed_off() -> None:
     found = verify(_Nonlinear(pi()), linear_neck(), make_requirements(QUICK))
     words = {v.requirement.metric: v.holds for v in found.verdicts}
@@ -198,6 +200,7 @@ def test_the_worst_plant_of_the_certificate_runs_and_gives_its_value(files: dict
     assert step.metrics[axis]["overshoot_pct"] == pytest.approx(worst["value"], abs=1.0)
 
 
+@pytest.mark.slow
 def test_a_requirement_that_fails_gives_exit_code_1(files: dict[str, Path], capsys: Any) -> None:
     files["asked"].write_text(QUICK_TOML.format(sensitivity=1.01), encoding="utf-8")
     path = files["controller"].with_name("c.json")

@@ -10,8 +10,9 @@ import numpy as np
 
 from softneck.core import Vector
 
-_WIDTH, _HEIGHT = 640.0, 240.0
-_LEFT, _RIGHT, _TOP, _BOTTOM = 56.0, 12.0, 28.0, 34.0
+_WIDTH, _HEIGHT = 640.0, 256.0
+_LEFT, _RIGHT, _TOP, _BOTTOM = 56.0, 12.0, 44.0, 34.0
+_LETTER = 7.0  # width of one, on the safe side
 # Distinguishable in grey and with any colour vision (Okabe and Ito 2008).
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
 # A curve has no more points than the picture has pixels.
@@ -38,13 +39,14 @@ def line_chart(time: Vector, curves: Mapping[str, Vector], *, title: str, unit: 
         x = _LEFT + (value - float(t[0])) * across
         parts.append(f'<text x="{x:.1f}" y="{_HEIGHT - 16:g}" text-anchor="middle">{value:g}</text>')
     parts.append(f'<text x="{_WIDTH - _RIGHT:g}" y="{_HEIGHT - 3:g}" text-anchor="end">time [s]</text>')
+    place = _LEFT  # of the next name, in a line of their own below the title
     for number, (name, values) in enumerate(curves.items()):
         colour = _COLOURS[number % len(_COLOURS)]
         x = _LEFT + (t - t[0]) * across
         y = _HEIGHT - _BOTTOM - (np.asarray(values)[::step] - low) * up
         parts.append(f'<path d="{_path(x, y)}" fill="none" stroke="{colour}" stroke-width="1.5"/>')
-        place = _WIDTH - _RIGHT - 90.0 * (len(curves) - number - 1)
-        parts.append(f'<text x="{place:g}" y="16" text-anchor="end" fill="{colour}">{escape(name)}</text>')
+        parts.append(f'<text x="{place:g}" y="34" fill="{colour}">{escape(name)}</text>')
+        place += _LETTER * (len(name) + 2)
     return "".join([*parts, "</svg>"])
 
 

@@ -120,6 +120,7 @@ def test_a_slack_tendon_does_not_move_the_neck() -> None:
         found.require()
 
 
+@pytest.mark.slow
 def test_noise_of_the_lab_does_not_matter() -> None:
     """0.3 deg is the noise of the lab's worse inclinometer; at 1 deg the way is still seen."""
     for noise in (0.3, 1.0):

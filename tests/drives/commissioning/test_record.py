@@ -127,6 +127,7 @@ def test_runs_are_numbered_and_never_joined() -> None:
     assert two.time[0] - one.time[-1] == pytest.approx(3.02)
 
 
+@pytest.mark.slow
 def test_a_fault_in_the_middle_keeps_what_was_recorded() -> None:
     link, played = link_to(), excitation("rotation")
     whole = recorded(played)
@@ -148,6 +149,7 @@ def test_a_fault_in_the_middle_keeps_what_was_recorded() -> None:
     assert all(drive.axis.state != 0x27 for drive in link.neck.drives)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ask", "fault", "phase"), [(Ask.LEAVE, None, "done"), (Ask.STOP, "operator", "stopped")])
 def test_an_operator_ends_it_with_the_drives_off(ask: Ask, fault: str | None, phase: str) -> None:
     link = link_to()

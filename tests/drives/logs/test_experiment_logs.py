@@ -58,6 +58,7 @@ def equal(one: Recording, other: Recording) -> None:
         np.testing.assert_array_equal(other.channels[name], values, err_msg=name)
 
 
+@pytest.mark.slow
 def test_an_experiment_is_computed_again_and_imported_as_it_was(tmp_path: Path) -> None:
     path = tmp_path / "r.mcap"
     recording = recorded(path)
@@ -73,6 +74,7 @@ def test_an_experiment_is_computed_again_and_imported_as_it_was(tmp_path: Path) 
     assert other.difference.what == "the controller's answer"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ask", list(Ask))
 def test_an_interrupted_experiment_keeps_its_log(tmp_path: Path, ask: Ask) -> None:
     path, link = tmp_path / "r.mcap", virtual()
@@ -93,6 +95,7 @@ def test_leaving_before_anything_moved_replays(tmp_path: Path) -> None:
     replay(read_run_log(path)).require()
 
 
+@pytest.mark.slow
 def test_a_jog_replays(tmp_path: Path) -> None:
     path = tmp_path / "j.mcap"
     with RunLogger([path], wait=True) as log:

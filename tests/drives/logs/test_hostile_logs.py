@@ -156,6 +156,7 @@ def test_hostile_lengths_reserve_no_memory(tmp_path: Path, record: bytes) -> Non
         read_run_log(path)
 
 
+@pytest.mark.slow
 @settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     facts=JSON | st.fixed_dictionaries({"files": JSON}) | st.none(),

@@ -120,6 +120,7 @@ def run(project: Project, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_the_controller_computed_again_gives_the_same_run(run: Path, project: Project) -> None:
     log = read_run_log(run)
     assert changed_files(log) == []
@@ -349,6 +350,7 @@ def test_python_can_converts_one_frame_log_into_the_other(run: Path, tmp_path: P
     assert [frame for _, _, frame in FrameLog(path)] == [frame for _, _, frame in FrameLog(run.with_suffix(".log"))]
 
 
+@pytest.mark.slow
 def test_the_frame_logs_hold_what_the_master_saw_and_sent(run: Path) -> None:
     frames = [(from_master, frame) for _, from_master, frame in FrameLog(run.with_suffix(".blf"))]
     sent = [frame for from_master, frame in frames if from_master]

@@ -103,6 +103,7 @@ def test_thousands_of_pairs(names: tuple[str, str], times: tuple[float, float], 
     safe(play(names, times, seed))
 
 
+@pytest.mark.slow
 @settings(max_examples=8, deadline=None)
 @given(names=PAIRS, times=TIMES, seed=st.integers(0, 1000))
 def test_the_same_seed_gives_the_same_trace(names: tuple[str, str], times: tuple[float, float], seed: int) -> None:
@@ -162,6 +163,7 @@ class Abuse(RuleBasedStateMachine):
                 assert not any(drive.axis.state == ENABLED and drive.alive for drive in bench.neck.drives)
 
 
+@pytest.mark.slow
 def test_abuse() -> None:
     run_state_machine_as_test(Abuse, settings=settings(max_examples=25, stateful_step_count=12, deadline=None))
 

@@ -237,6 +237,7 @@ def running() -> Bench:
     return Bench(off=frozenset(RULES)).start()
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(
     frames=FRAMES, tilt=st.none() | st.builds(Tilt, st.floats(), st.floats(), st.floats(), st.floats(), st.booleans())

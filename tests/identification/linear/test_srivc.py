@@ -157,6 +157,7 @@ def test_a_given_dead_time_is_kept() -> None:
     assert len(model.findings["delay_curve"]["pitch"]) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2])
 def test_tf_ss_and_free_run_are_one_system(order: int) -> None:
     model = Srivc(order=order, zeros=order - 1, resamples=0, max_delay=0.12).fit(neck_recording(1200, noise=2e-3))

@@ -48,6 +48,7 @@ def coverage(recording: Recording, outputs: Matrix) -> float:
     return float(((Y[:, [5, 7]] <= y) & (y <= Y[:, [6, 8]])).mean())
 
 
+@pytest.mark.slow
 def test_eq21_with_a_chosen_scale_runs_free(
     paper: Model, eq22: tuple[Recording, Recording], tests: dict[str, Recording]
 ) -> None:

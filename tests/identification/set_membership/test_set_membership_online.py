@@ -36,6 +36,7 @@ def fed(X: np.ndarray, Y: np.ndarray, pieces: list[int], online: OnlineCones) ->
     return online
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(stream=streams(), floor=st.sampled_from([None, 0.5]))
 def test_after_any_adding_and_forgetting_it_is_the_set_of_the_points_left(
@@ -76,6 +77,7 @@ def test_many_at_once_are_as_one_by_one(stream: tuple[np.ndarray, np.ndarray, li
     np.testing.assert_array_equal(together.bounds(X[:5] + 0.1), singly.bounds(X[:5] + 0.1))
 
 
+@pytest.mark.slow
 def test_trees_are_few_and_a_point_is_rebuilt_a_logarithmic_number_of_times(monkeypatch: pytest.MonkeyPatch) -> None:
     import softneck.identification.set_membership._online as module
 
@@ -97,6 +99,7 @@ def test_trees_are_few_and_a_point_is_rebuilt_a_logarithmic_number_of_times(monk
     assert sum(planted) < rows * (1 + 8.5 + 7 + 2)
 
 
+@pytest.mark.slow
 def test_a_drifting_plant_is_tracked_by_the_online_set_and_lost_by_the_frozen_one() -> None:
     """y' = 0.6 y + g u with g from 1 down to 0.5: a neck whose tendons slacken."""
     rng = np.random.default_rng(2)

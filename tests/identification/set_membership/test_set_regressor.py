@@ -107,6 +107,7 @@ def test_a_regressor_of_nothing_and_a_scale_of_another_length_are_refused() -> N
         SetMembership(epsilon=0.01, scale=(1.0, 2.0, 3.0)).fit(recording)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["lags", "residual"])
 def test_novelty_is_measured_in_a_sets_own_regressor(form: str) -> None:
     settings = SetMembership(form=form, epsilon=0.02, output_weight=5.0, output_lags=(1, 2), motor_lags=(1, 5))

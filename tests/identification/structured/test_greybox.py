@@ -103,6 +103,7 @@ def fitted(truth: np.ndarray) -> Model:
     return GreyBox(sensor_delay=2).fit(neck_of(truth))
 
 
+@pytest.mark.slow
 def test_the_numbers_behind_its_own_equations_are_found(fitted: Model, truth: np.ndarray) -> None:
     found = {row["name"]: row for row in fitted.findings["numbers"]}
     for name in ("lever", "asymmetry", "rest_pitch"):

@@ -179,6 +179,7 @@ def model(recordings: dict[str, Recording]) -> Model:
     return Play().fit(recordings["train"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LEAST)
 def test_the_figures_of_the_issue_on_the_virtual_neck(
     recordings: dict[str, Recording], model: Model, name: str

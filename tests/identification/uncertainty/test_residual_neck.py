@@ -17,6 +17,7 @@ def model(recordings: dict[str, Recording]) -> Model:
     return SetMembership(form="residual").fit(recordings["train"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LEAST)
 def test_the_free_run_fits_and_stays_within_its_bounds(
     recordings: dict[str, Recording], model: Model, name: str

@@ -59,6 +59,7 @@ def test_each_run_is_scored_as_if_it_were_alone() -> None:
         assert entry["worst_deg"] == alone.worst_deg
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["rls", "nlsm", "residual", "nn"])
 def test_rows_shared_out_to_threads_are_predicted_as_by_one(
     models: dict[str, Model], kind: str, monkeypatch: pytest.MonkeyPatch
@@ -87,6 +88,7 @@ def test_of_a_long_record_every_nth_row_is_predicted_as_before(
         assert np.isnan(np.delete(some, rows, axis=0)).all()
 
 
+@pytest.mark.slow
 def test_rows_of_a_long_record_are_judged_alike_for_model_and_baselines(monkeypatch: pytest.MonkeyPatch) -> None:
     recording, model = neck_recording(1500, seed=8, noise=2e-3), perfect()
     whole = validate(model, recording)

@@ -42,6 +42,7 @@ def test_any_lag_and_dead_time_of_a_neck_is_met(pole: float, delay: int) -> None
     assert number(result.best_linear["inf"]["pitch"]) > 99.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_no_rls_model_lies_above(seed: int) -> None:
     """Trained on other rows, on these rows, and with any dead time; free run, and each horizon."""
@@ -59,6 +60,7 @@ def test_no_rls_model_lies_above(seed: int) -> None:
                 assert number(fit) <= number(result.best_linear[horizon][axis]) + 1e-6
 
 
+@pytest.mark.slow
 def test_it_is_what_a_long_impulse_response_by_another_method_finds() -> None:
     recording = neck_recording(4000, seed=2, noise=1e-2)
     ours = validate(some_model().fit(neck_recording(600)), recording, horizons=("inf",)).best_linear["inf"]
@@ -73,6 +75,7 @@ def test_it_is_what_a_long_impulse_response_by_another_method_finds() -> None:
         assert 100 - number(ours[name]) == pytest.approx(left * 1.023, rel=0.01)
 
 
+@pytest.mark.slow
 def test_persistence_lies_below_and_more_knowledge_never_harms() -> None:
     result = validate(some_model().fit(neck_recording(600)), neck_recording(ROWS, seed=9, noise=2e-3))
     bound = result.best_linear

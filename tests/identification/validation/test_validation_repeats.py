@@ -27,6 +27,7 @@ def test_the_noise_of_repeated_runs_is_found(count: int) -> None:
     assert noise_deviation(recording) == pytest.approx([SIGMA, SIGMA], rel=0.09)
 
 
+@pytest.mark.slow
 def test_the_ceiling_is_the_fit_of_the_truth() -> None:
     truth, runs = played(0, noise=0.0), [played(seed) for seed in (1, 2, 3)]
     model = Rls(delay=None, max_delay=0.1).fit(recording_from(signal("aprbs", duration=30.0, seed=2).set_points))

@@ -82,6 +82,7 @@ def test_a_gap_keeps_the_distance_of_what_is_around_it() -> None:
     assert (np.argmax(np.abs(peak), axis=1) == 9).all()
 
 
+@pytest.mark.slow
 def test_false_alarms_come_as_often_as_said() -> None:
     tests = [resid(*noise(600, seed)) for seed in range(150)]
     p_values = np.concatenate([t.p_value for t in tests])
