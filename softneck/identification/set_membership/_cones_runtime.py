@@ -25,6 +25,7 @@ def least_gammas(points: np.ndarray, values: np.ndarray, slacks: np.ndarray, wor
         distance = np.sqrt(squared)
         rise = np.abs(values[i + 1 :] - values[i])
         for m in range(slacks.shape[0]):
+            # 1e-300 and 1e300 keep equal regressors from making 0/0 or infinity; `argmax` would stumble over a NaN.
             needed = np.minimum(np.maximum(rise - slacks[m], 0.0) / np.maximum(distance, 1e-300), 1e300)
             j = int(np.argmax(needed))
             if needed[j] > gammas[m]:

@@ -9,6 +9,7 @@ def gamma_gap(nodes: np.ndarray, a: int, b: int, n: int) -> float:
     """Return the distance between the boxes of two nodes of a kd-tree over n sides, 0 where they meet."""
     squared = 0.0
     for i in range(n):
+        # Negative where the boxes overlap along this side: then it adds nothing to the distance.
         gap = max(nodes[a, 2 * i] - nodes[b, 2 * i + 1], nodes[b, 2 * i] - nodes[a, 2 * i + 1])
         if gap > 0.0:
             squared += gap * gap
@@ -50,22 +51,26 @@ def gamma_leaves(
     """Raise the gammas to what the pairs between two nodes of the last level need."""
     rows = values.shape[0]
     n = points.shape[0]
+    # The second half of `nodes` is the last level; its leaves share the columns evenly (see `borders` in `_tree`).
     count = nodes.shape[0] // 2
     a = leaves[0] - count
     b = leaves[1]
     first = (b - count) * rows // count
     last = (b + 1 - count) * rows // count
     for j in range(a * rows // count, (a + 1) * rows // count):
+        # The point against the whole leaf first: one distance may do for all of its points.
         squared = 0.0
         for i in range(n):
             gap = max(max(nodes[b, 2 * i] - points[i, j], points[i, j] - nodes[b, 2 * i + 1]), 0.0)
             squared += gap * gap
         # Gammas only rise, so what this says stays on the safe side.
         allowed = gamma_allowed(math.sqrt(squared), slacks, gammas)
+        # The furthest that any value of the leaf may be from this one.
         if max(nodes[b, 2 * n + 1] - values[j], values[j] - nodes[b, 2 * n]) <= allowed:
             continue
         for k in range(first, last):
             rise = abs(values[j] - values[k])
+            # `allowed` is that of the nearest the leaf comes to the point: a pair within it needs no root.
             if rise <= allowed:
                 continue
             squared = 0.0
@@ -110,17 +115,20 @@ def gamma_search(
         top -= 1
         a = waiting[top, 0]
         b = waiting[top, 1]
+        # The most that outputs of two nodes differ by, at the least that their points are apart: no pair asks for more.
         rise = max(nodes[a, 2 * n + 1] - nodes[b, 2 * n], nodes[b, 2 * n + 1] - nodes[a, 2 * n])
         nearest = gamma_gap(nodes, a, b, n)
         if rise <= gamma_allowed(nearest, slacks, gammas):
             continue
         if a >= leaves:
+            # Leaves with themselves were done above.
             if a != b:
                 gamma_leaves(points, values, nodes, (a, b), slacks, gammas, pairs)
             continue
         # The last pushed is the first taken: a node with itself first.
         for p in range(2):
             for q in range(2):
+                # A node with itself has its two children as a pair once only.
                 if a != b or p < q:
                     waiting[top, 0] = 2 * a + p
                     waiting[top, 1] = 2 * b + q

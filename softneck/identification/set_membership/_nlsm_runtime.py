@@ -41,10 +41,12 @@ def nlsm_bounds(
 ) -> tuple[float, float]:
     """Return f_l(w), f_u(w) (Eq. 18) over `points` (n, N), scaled, and their `values` (N,)."""
     squared = np.zeros(points.shape[1])
+    # One regressor after the other: what is allocated is one row long, not the whole table.
     for i in range(points.shape[0]):
         gap = points[i] - w[i]
         squared += gap * gap
-    cone = gamma * np.sqrt(squared)
+    cone = gamma * np.sqrt(squared)  # gamma |x - w(k)| of Eq. 19 and 20
+    # Eq. 20 and Eq. 19; epsilon is the same in all cones, so that it is added once.
     return np.max(values - cone) - epsilon, np.min(values + cone) + epsilon
 
 
@@ -54,7 +56,7 @@ def nlsm_query(p: NlsmArrays, axis: int, w: np.ndarray) -> tuple[float, float]:
     epsilon = p.bounds[axis, 1]
     if COMPILED:
         low, high = slant_bounds(p.points[axis], p.values[axis], p.nodes[axis], p.frame[axis], gamma, w)
-        return low - epsilon, high + epsilon
+        return low - epsilon, high + epsilon  # epsilon moves all cones alike: the tree does without
     return nlsm_bounds(p.points[axis], p.values[axis], gamma, epsilon, w)
 
 
@@ -64,14 +66,16 @@ def step(p: NlsmArrays, parameters: np.ndarray, x: NarxState, inputs: np.ndarray
     regressor = np.empty(p.n)
     angles = np.empty(2)
     for axis in range(2):
-        narx_regressor(p, p.table, x, axis, regressor)
+        narx_regressor(p, p.table, x, axis, regressor)  # Eq. 21, or the lags asked for
         low, high = nlsm_query(p, axis, regressor * p.scale)
+        # Without a base a and b are empty and this is zero.
         base = arx_output(p, p.redefinition, p.a[axis], p.b[axis], int(p.delay[axis]), x, axis)
-        # The central estimate (Eq. 20).
+        # The central estimate (Eq. 18).
         middle = 0.5 * (low + high)
         angles[axis] = base + middle
         outputs[5 + 2 * axis] = base + low
         outputs[6 + 2 * axis] = base + high
+        # `narx_observe` takes this off again: with a base the histories hold the base alone.
         if p.nb > 0:
             x.added[axis] = middle
     narx_advance(p, parameters, x, angles[0], angles[1], outputs)

@@ -49,12 +49,16 @@ def slant_child(nodes: np.ndarray, node: int, squared: float, along: float, plan
     """Return `slant_children` of one child, whose box is at the root of `squared` across the plane's slope."""
     m = plane[1]
     gamma = plane[3]
+    # The box along e, seen from x: d runs from start to stop.
     start = nodes[node, 0] - along
     stop = nodes[node, 1] - along
+    # m s / sqrt(gamma^2 - m^2): upper cones are least at d = -best, lower ones largest at +best.
     best = plane[2] * math.sqrt(squared)
+    # Convex in d: where the bottom lies outside of the box, the box's nearer end is least.
     d = min(max(-best, start), stop)
     high = nodes[node, 2] + plane[0] + (m * d + gamma * math.sqrt(d * d + squared)) - plane[4]
     d = min(max(best, start), stop)
+    # The same upside down, with rmax; rounding is added, which again keeps the node rather than leaves it out.
     low = nodes[node, 3] + plane[0] + (m * d - gamma * math.sqrt(d * d + squared)) + plane[4]
     return high, low
 
@@ -91,11 +95,13 @@ def slant_bounds(
     # The slope m and the size of points and values stand in the row that is no node.
     m = nodes[0, 0]
     size = nodes[0, 1]
+    # Sums of magnitudes: no distance and no product with e is larger, so this is the size of what gets rounded.
     for i in range(x.shape[0]):
         size += abs(x[i])
     plane = np.empty(5)
     plane[0] = m * at[0]
     plane[1] = m
+    # m < gamma, for whoever makes the tree keeps m at 0.98 gamma at most (`_STEEPEST`); m = 0 has no plane to follow.
     plane[2] = m / math.sqrt(gamma * gamma - m * m) if m > 0.0 else 0.0
     plane[3] = gamma
     plane[4] = (x.shape[0] + 8) * SLANT_ROUNDING * (gamma * size + nodes[0, 2])
@@ -115,6 +121,7 @@ def slant_bounds(
         node = waiting[top]
         high = later[top, 0]
         low = later[top, 1]
+        # As long as a cone of this node may still tighten one of the bounds.
         while high < best[1] or low > best[0]:
             if node >= leaves:
                 first = (node - leaves) * rows // leaves
@@ -129,6 +136,7 @@ def slant_bounds(
                 node, other = other, node
                 high, other_high = other_high, high
                 low, other_low = other_low, low
+            # Bounds only get tighter: what cannot help now never will.
             if other_high < best[1] or other_low > best[0]:
                 waiting[top] = other
                 later[top, 0] = other_high

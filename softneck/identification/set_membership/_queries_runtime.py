@@ -27,6 +27,7 @@ def set_bounds(
     """Return `bounds` tightened by the cones of all regions, each with its own slope; see `tree_tighten`."""
     regions = gammas.shape[0]
     home = set_home(tree[2], regions, x)
+    # The region that x lies in comes first: with its bounds the others are soon left out.
     bounds = tree_tighten(tree, (home, column), float(gammas[home - regions]), x, bounds, hidden)
     for region in range(regions):
         if regions + region != home:
@@ -54,6 +55,7 @@ def set_batch(
     """
     points, values, nodes, ages = tree
     for k in range(queries.shape[0]):
+        # One window for each query, or one for all.
         w = min(k, windows.shape[0] - 1)
         known = (bounds[k, 0], bounds[k, 1])
         hidden = (ages, windows[w, 0], windows[w, 1])
@@ -92,6 +94,7 @@ def set_need(
                     for i in range(x.shape[0]):
                         gap = points[i, k] - x[i]
                         squared += gap * gap
+                    # As `gamma_need`: equal points ask for a huge but finite gamma.
                     needed = min((abs(values[k] - y) - slack) / max(math.sqrt(squared), 1e-300), 1e300)
                     if needed > gamma:
                         gamma = needed
@@ -100,6 +103,7 @@ def set_need(
             left, right = tree_children(nodes, node, x)
             node = 2 * node if left <= right else 2 * node + 1
             distance = min(left, right)
+            # The sibling: 2j and 2j + 1 differ in the last bit.
             waiting[top] = node ^ 1
             top += 1
     return gamma, worst
@@ -135,6 +139,7 @@ def set_regions(
         for j in range(region * rows // regions, (region + 1) * rows // regions):
             for i in range(points.shape[0]):
                 x[i] = points[i, j]
+            # All points count, j itself too: its own rise of 0 asks for nothing.
             gammas[region], _ = set_need(
                 (points, values, nodes), column, gammas[region], slack, x, values[j], (ages, 0.0, 0.0)
             )

@@ -14,6 +14,7 @@ def tree_distance(nodes: np.ndarray, node: int, x: np.ndarray) -> float:
     """Return the distance of x (n,) from a node's box, 0 within."""
     squared = 0.0
     for i in range(x.shape[0]):
+        # x can be beyond one end of the box only.
         gap = max(nodes[node, 2 * i] - x[i], x[i] - nodes[node, 2 * i + 1])
         if gap > 0.0:
             squared += gap * gap
@@ -83,14 +84,16 @@ def tree_tighten(
     # Left for later: one node a level at most, and 2^64 nodes are more than any memory holds.
     waiting = np.empty(64, dtype=np.int64)
     later = np.empty(64)
+    # Leaves share the points evenly: none has more than one above the mean.
     cones = np.empty(rows // leaves + 1)
     waiting[0] = node
-    later[0] = 0.0 if node == 1 else gamma * tree_distance(nodes, node, x)
+    later[0] = 0.0 if node == 1 else gamma * tree_distance(nodes, node, x)  # of all points: at least 0, and free
     top = 1
     while top > 0:
         top -= 1
         node = waiting[top]
         cone = later[top]
+        # Eq. 19 and 20 with the best value and the nearest place that the box allows: no cone in it does better.
         while nodes[node, column] + cone < high or nodes[node, column + 1] - cone > low:
             if node >= leaves:
                 first = (node - leaves) * rows // leaves
@@ -115,6 +118,7 @@ def tree_tighten(
                 node = other + 1
                 cone = gamma * right
                 far = gamma * left
+            # Bounds only get tighter: what cannot help now never will.
             if nodes[other, column] + far < high or nodes[other, column + 1] - far > low:
                 waiting[top] = other
                 later[top] = far
