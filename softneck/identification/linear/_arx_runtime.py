@@ -24,8 +24,9 @@ def arx_output(
     """
     y = 0.0
     for i in range(a.shape[0]):
-        y -= a[i] * x.y[i, axis]
+        y -= a[i] * x.y[i, axis]  # Eq. 23 has its a with a minus
     for j in range(b.shape[0]):
+        # Eq. 9 or 10 of u(k+1-delay-j).
         redefined = 0.0
         for motor in range(3):
             redefined += redefinition[axis, motor] * x.u[delay + j, motor]

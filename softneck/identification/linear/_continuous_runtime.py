@@ -22,8 +22,9 @@ def ct_simulate(
     """
     m = start.shape[0]
     states[0] = start
+    # With a delay between two samples the input changes within the step: `old` acts before, `new` after the change.
     for k in range(states.shape[0] - 1):
-        first = inputs[max(k - delay - 1, 0)]
+        first = inputs[max(k - delay - 1, 0)]  # before the record the first input was held
         second = inputs[max(k - delay, 0)]
         for i in range(m):
             value = old[i] * first + new[i] * second
@@ -40,6 +41,7 @@ def ct_filter(
     states[0] = 0.0
     for k in range(states.shape[0] - 1):
         for i in range(n):
+            # Exact for errors that run straight from one sample to the next.
             value = now[i] * errors[k] + ahead[i] * errors[k + 1]
             for j in range(n):
                 value += transition[i, j] * states[k, j]

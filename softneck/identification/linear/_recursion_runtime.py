@@ -13,9 +13,9 @@ def rls_recursion(
     for t in range(regressors.shape[0]):
         phi = regressors[t]
         F_phi = np.dot(covariance, phi)
-        denominator = forgetting + np.dot(phi, F_phi)
+        denominator = forgetting + np.dot(phi, F_phi)  # Eq. 29 has 1 for lambda
         error = targets[t] - np.dot(theta, phi)  # Eq. 30
         gain = F_phi / denominator  # = F(t+1) phi
         theta += gain * error  # Eq. 28
         covariance -= np.outer(gain, F_phi)  # Eq. 29
-        covariance /= forgetting
+        covariance /= forgetting  # F grows by what is forgotten; lambda = 1 leaves Eq. 29

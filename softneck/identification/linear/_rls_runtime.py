@@ -10,6 +10,7 @@ from softneck.identification.models._narx_runtime import initialise as initialis
 def step(p: ArxArrays, parameters: np.ndarray, x: NarxState, inputs: np.ndarray, outputs: np.ndarray) -> None:
     """Advance by one sample."""
     narx_observe(p, parameters, x, inputs)
+    # Two SISO models: Eq. 9-11 leave each axis its own input.
     pitch = arx_output(p, p.redefinition, p.a[0], p.b[0], int(p.delay[0]), x, 0)
     roll = arx_output(p, p.redefinition, p.a[1], p.b[1], int(p.delay[1]), x, 1)
     narx_advance(p, parameters, x, pitch, roll, outputs)

@@ -30,12 +30,15 @@ def lss_observe(p: StateSpaceArrays, parameters: np.ndarray, x: NarxState, input
 
 def step(p: StateSpaceArrays, parameters: np.ndarray, x: NarxState, inputs: np.ndarray, outputs: np.ndarray) -> None:
     """Advance by one sample."""
+    # Not `narx_observe`: `x.y` holds the states here, and no output is pushed into it.
     lss_observe(p, parameters, x, inputs)
     states = x.y
     # Motor positions stand H samples of three behind set-points.
     back = int(p.delay[0]) + p.H * int(p.delay[1])
+    # Zero in free run: then the angles of now are the first two states.
     e0 = x.angles[0] - states[0]
     e1 = x.angles[1] - states[1]
+    # Beside the states, as every row needs all the old ones.
     ahead = np.zeros(p.n)
     for i in range(p.n):
         value = p.K[i, 0] * e0 + p.K[i, 1] * e1

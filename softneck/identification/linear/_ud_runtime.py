@@ -16,27 +16,32 @@ def ud_update(
 
     `factor` (n, n) is U transposed, whose diagonal of ones is not stored; `scale` (n,) is D; `gain` (n,) is scratch.
     """
-    error = target
+    error = target  # Eq. 30
     for i in range(theta.shape[0]):
         error -= theta[i] * phi[i]
+    # alpha grows from lambda to lambda + phi' F phi, the denominator of Eq. 29, column by column.
     alpha = forgetting
     inverse = 1.0 / forgetting
     age = inverse
     for j in range(theta.shape[0]):
+        # f = U' phi and g = D f, so that phi' F phi is the sum of f g.
         f = phi[j]
         for i in range(j):
             f += factor[j, i] * phi[i]
         g = scale[j] * f
-        mu = -f * inverse
+        mu = -f * inverse  # by alpha of the columns before
         before = alpha
         alpha += f * g
         inverse = 1.0 / alpha
+        # D changes by positive factors alone: no rounding turns its sign. 1 / lambda is the forgetting.
         scale[j] *= before * inverse * age
         for i in range(j):
+            # Either needs the other's old value: U that of the gain, the gain that of U.
             u = factor[j, i]
             factor[j, i] = u + mu * gain[i]
             gain[i] += u * g
         gain[j] = g
+    # gain / alpha is F(t+1) phi (Eq. 28).
     for i in range(theta.shape[0]):
         theta[i] += gain[i] * (error * inverse)
     return error
@@ -60,7 +65,7 @@ def ud_trace(factor: np.ndarray, scale: np.ndarray) -> float:
     """Return the trace of U D U'."""
     total = 0.0
     for j in range(scale.shape[0]):
-        column = 1.0
+        column = 1.0  # U's one
         for i in range(j):
             column += factor[j, i] * factor[j, i]
         total += scale[j] * column
@@ -72,12 +77,14 @@ def is_stable(a: np.ndarray, radius: float, work: np.ndarray) -> bool:
     n = a.shape[0]
     power = 1.0
     for i in range(n):
+        # Roots within `radius` are those of a(radius z) within the unit circle.
         power *= radius
         work[i] = a[i] / power
     for m in range(n, 0, -1):
         k = work[m - 1]
-        if not abs(k) < 1.0:
+        if not abs(k) < 1.0:  # and not `>= 1`: NaN must not pass for stable
             return False
+        # Down by one order, with all roots still within.
         for i in range(m - 1):
             work[n + i] = (work[i] - k * work[m - 2 - i]) / (1.0 - k * k)
         for i in range(m - 1):
@@ -111,6 +118,7 @@ def ud_guarded(
         error = targets[t]
         for i in range(n):
             error -= theta[i] * phi[i]
+        # Before anything moves: a row that teaches nothing leaves F alone too.
         if abs(error) > dead_zone or dead_zone == 0.0:
             before[:] = theta
             ud_update(factor, scale, theta, phi, targets[t], forgetting, gain)
@@ -122,10 +130,12 @@ def ud_guarded(
             tally[1] = forgetting * tally[1] + error * after
             if na > 0 and not is_stable(theta[:na], radius, work):
                 tally[3] += 1.0
+                # theta alone goes back; what F has learnt of the directions stays.
                 ud_retreat(theta, before, na, radius, work)
             if bound > 0.0:
                 trace = ud_trace(factor, scale)
                 if trace > bound:
+                    # All directions shrink alike, so that the shape of F stays.
                     scale *= bound / trace
         else:
             tally[2] += 1.0
@@ -148,7 +158,7 @@ def ud_note(row: np.ndarray, error: float, theta: np.ndarray, factor: np.ndarray
     row[0] = error
     for i in range(n):
         row[1 + i] = theta[i]
-        diagonal = scale[i]
+        diagonal = scale[i]  # F_ii, with the one of U
         for j in range(i + 1, n):
             diagonal += scale[j] * factor[j, i] * factor[j, i]
         row[1 + n + i] = diagonal
