@@ -11,9 +11,10 @@ def drive_run(drive: np.ndarray, load: np.ndarray, targets: np.ndarray, start: n
     q = start.copy()
     motors[0] = m
     for k in range(targets.shape[0] - 1):
+        # In the order of the kinds' `step`: the load follows m(k), then the drive moves on to k+1 against it.
         load_advance(load, m, q)
         for j in range(3):
-            back = k + 1 - int(drive[j, 1])
+            back = k + 1 - int(drive[j, 1])  # m(k+1) answers to u(k+1-d)
             target = targets[back, j] if back >= 0 else start[j]
             m[j] = drive_advance(drive[j, 0], target, m[j], drive_limit(load, q, j))
         motors[k + 1] = m
@@ -35,6 +36,7 @@ def bank_run(
         for i in range(count + 1):
             x = v
             if i > 0:
+                # Filters that have settled hold what they are given.
                 x = max(v - widths[i - 1], min(v + widths[i - 1], 0.0))
                 plays[c * count + i - 1] = x
             for o in range(n):

@@ -17,6 +17,7 @@ import numpy as np
 def drive_limit(load: np.ndarray, q: np.ndarray, j: int) -> float:
     """Return how far motor j gets under the load of now."""
     mean = (q[0] + q[1] + q[2]) / 3.0
+    # What one motor pulls beyond the others bends the neck, what all pull presses it together: two slopes of tension.
     return load[1] + load[2] * (q[j] - mean) + load[3] * mean
 
 
@@ -39,15 +40,18 @@ def bank_advance(
     count = widths.shape[0]
     for c in range(3):
         v = 0.0
+        # Eq. 9-11: theta, phi, delta.
         for j in range(3):
             v += redefinition[c, j] * m[j]
         for i in range(count + 1):
             x = v
             if i > 0:
                 at = c * count + i - 1
+                # The play follows v at its width and stands still within.
                 plays[at] = max(v - widths[i - 1], min(v + widths[i - 1], plays[at]))
                 x = plays[at]
             first = (c * (count + 1) + i) * n
+            # Last filter first: each takes what the one before it held a sample ago.
             for o in range(n - 1, 0, -1):
                 bank[first + o] = chain[0] * bank[first + o] + (1.0 - chain[0]) * bank[first + o - 1]
             bank[first] = chain[0] * bank[first] + (1.0 - chain[0]) * x
@@ -56,6 +60,7 @@ def bank_advance(
 def monomial(table: np.ndarray, row: int, bank: np.ndarray) -> float:
     """Return the product of the signals that a row of `table` (n, 3) names; -1 stands for 1."""
     value = 1.0
+    # Up to three factors: terms of degree three at most.
     for i in range(3):
         at = int(table[row, i])
         if at >= 0:

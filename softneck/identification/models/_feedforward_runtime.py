@@ -21,7 +21,7 @@ def echo_added(p: NarxArrays, echo: np.ndarray, x: NarxState, axis: int, f: floa
     """Return y(k+1) of one axis, and note `f`; echo (2, p)."""
     total = 0.0
     for i in range(echo.shape[1]):
-        total += echo[axis, i] * x.y[i, axis]
+        total += echo[axis, i] * x.y[i, axis]  # y - f of i + 1 samples before, as `narx_observe` left it
     x.added[axis] = f
     return f + total
 
@@ -31,5 +31,6 @@ def stalling_drives(p: NarxArrays, load: np.ndarray, q: np.ndarray, x: NarxState
     for j in range(3):
         d = int(p.drive[j, 1])
         if d > 0:
+            # In place of the lag of `narx_advance`, which knows no load and has moved `x.motors` on already.
             x.motors[j] = drive_advance(p.drive[j, 0], x.u[d - 1, j], x.m[0, j], drive_limit(load, q, j))
             outputs[2 + j] = x.motors[j]

@@ -59,9 +59,9 @@ def narx_push(history: np.ndarray, newest: np.ndarray) -> None:
 
 def narx_known(p: NarxArrays, parameters: np.ndarray, x: NarxState, inputs: np.ndarray) -> None:
     """Take in where angles and motors are at t_k: as measured, where they are."""
-    measured = parameters[NARX_USE_MEASUREMENT] > 0.5
+    measured = parameters[NARX_USE_MEASUREMENT] > 0.5  # a Boolean parameter as a number
     for axis in range(2):
-        if measured and np.isfinite(inputs[3 + axis]):
+        if measured and np.isfinite(inputs[3 + axis]):  # NaN: not measured now
             x.angles[axis] = inputs[3 + axis]
     for j in range(3):
         # A drive without delay is where it is sent, unless an encoder says otherwise.
@@ -76,6 +76,7 @@ def narx_observe(p: NarxArrays, parameters: np.ndarray, x: NarxState, inputs: np
     narx_known(p, parameters, x, inputs)
     narx_push(x.u, inputs[:3])
     narx_push(x.m, x.motors)
+    # What a kind adds is never fed back: its history holds the outputs without it.
     base = x.angles - x.added
     narx_push(x.y, base)
 
@@ -88,6 +89,7 @@ def narx_advance(
         d = int(p.drive[j, 1])
         if d > 0:
             a = p.drive[j, 0]
+            # Row 0 of the history is u(k), so that u(k+1-d) is row d - 1; m is measured where it is.
             x.motors[j] = a * x.motors[j] + (1.0 - a) * x.u[d - 1, j]
         outputs[2 + j] = x.motors[j]
     x.angles[0] = pitch
@@ -102,10 +104,11 @@ def narx_advance(
 
 def narx_regressor(p: NarxArrays, table: np.ndarray, x: NarxState, axis: int, regressor: np.ndarray) -> None:
     """Fill the regressor of y(k+1); row (source, channel, lag) of `table`: source 0 own output, 1 u, 2 m, 3 outputs."""
+    # Eq. 13 in the order of the table.
     for i in range(table.shape[0]):
         source = int(table[i, 0])
         channel = int(table[i, 1])
-        back = int(table[i, 2]) - 1
+        back = int(table[i, 2]) - 1  # lag 1 of y(k+1) is sample k, the newest
         if source == 0:
             regressor[i] = x.y[back, axis]
         elif source == 1:
