@@ -14,7 +14,7 @@ def nn_scalar(w: np.ndarray, h1: int, h2: int, z: np.ndarray, first: np.ndarray,
     n = z.shape[0]
     at = 0
     for i in range(h1):
-        total = w[h1 * n + i]
+        total = w[h1 * n + i]  # offsets stand behind all weights of their layer
         for j in range(n):
             total += w[at] * z[j]
             at += 1
@@ -49,10 +49,12 @@ def nn_gradient(
     W2 = b1 + h1
     b2 = W2 + h2 * h1
     w3 = b2 + h2
+    # Reverse, layer by layer: `back` gathers what each neuron of the first layer does to y by way of the second.
     back[:] = 0.0
     g[w3 + h2] = 1.0
     for i in range(h2):
         g[w3 + i] = second[i]
+        # tanh' = 1 - tanh^2, from the value that is known.
         d = (1.0 - second[i] * second[i]) * w[w3 + i]
         g[b2 + i] = d
         for j in range(h1):
@@ -62,6 +64,7 @@ def nn_gradient(
     for i in range(h1):
         d = (1.0 - first[i] * first[i]) * back[i]
         g[b1 + i] = d
+        # Column 0 of W1 belongs to the last output: this is what free runs feed back.
         by_first += d * w[i * n]
         for j in range(n):
             g[i * n + j] = d * z[j]
@@ -77,6 +80,7 @@ def nn_free(
     z = np.empty(Z.shape[1])
     last = 0.0
     for k in range(Z.shape[0]):
+        # NaN: the free run goes on from its own output.
         if np.isfinite(starts[k]):
             last = starts[k]
         z[:] = Z[k]
@@ -108,10 +112,11 @@ def nn_sensitivities(
     for k in range(Z.shape[0]):
         if np.isfinite(starts[k]):
             last = starts[k]
-            s[:] = 0.0
+            s[:] = 0.0  # a measurement depends on no weight
         z[:] = Z[k]
         z[0] = shift + gain * last
         last = nn_scalar(w, h1, h2, z, first, second)
+        # dy_k = df/dw + df/dy dy_(k-1), with z_0 = shift + gain y.
         slope = gain * nn_gradient(w, h1, h2, z, first, second, back, g)
         for i in range(w.shape[0]):
             s[i] = g[i] + slope * s[i]

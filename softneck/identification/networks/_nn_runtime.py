@@ -49,12 +49,14 @@ class NnState(NarxState):
 def initialise(p: NnArrays, parameters: np.ndarray, x: NnState, outputs: np.ndarray) -> None:
     """Rest: motors at zero, outputs at their start values for ever."""
     narx_rest(p, parameters, x, outputs)
+    # At the start the network has said what the output is: it misses nothing (d = 0).
     x.own[0] = parameters[0]
     x.own[1] = parameters[1]
 
 
 def nn_output(p: NnArrays, axis: int, regressor: np.ndarray) -> float:
     """Return the network's y(k+1) of one axis."""
+    # Angles are a tenth of motor positions: scaled, all of them count.
     z = (regressor - p.input_scale[axis, 0]) / p.input_scale[axis, 1]
     first = np.tanh(np.dot(p.W1[axis], z) + p.b1[axis])
     second = np.tanh(np.dot(p.W2[axis], first) + p.b2[axis])
@@ -66,6 +68,7 @@ def step(p: NnArrays, parameters: np.ndarray, x: NnState, inputs: np.ndarray, ou
     """Advance by one sample."""
     narx_observe(p, parameters, x, inputs)
     q = x.q
+    # q(k+1) from m(k): the drives below stall at the load that they have by then.
     load_advance(p.load, x.m[0], q)
     regressor = np.empty(p.n)
     angles = np.empty(2)
@@ -77,4 +80,5 @@ def step(p: NnArrays, parameters: np.ndarray, x: NnState, inputs: np.ndarray, ou
         x.own[axis] = nn_output(p, axis, regressor)
         angles[axis] = x.own[axis] + x.disturbance[axis]
     narx_advance(p, parameters, x, angles[0], angles[1], outputs)
+    # The lag of `narx_advance` knows no load: these positions replace its own.
     stalling_drives(p, p.load, q, x, outputs)

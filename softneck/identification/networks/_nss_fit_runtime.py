@@ -34,7 +34,7 @@ def nss_free(
     (time, 2) is a number, and `seen` holds what it was corrected to.
     """
     p = V.shape[1]
-    edge = np.cumsum(np.array([n * n, n * p, n * q, q * n, q * p, q, q * q, 2 * n]))
+    edge = np.cumsum(np.array([n * n, n * p, n * q, q * n, q * p, q, q * q, 2 * n]))  # where the matrices end in w
     A = w[: edge[0]].copy().reshape(n, n)
     B = w[edge[0] : edge[1]].copy().reshape(n, p)
     E = w[edge[1] : edge[2]].copy().reshape(n, q)
@@ -52,13 +52,14 @@ def nss_free(
             x[:] = 0.0
         elif begin[k] == 2:
             x[:] = states[k]
+        # Before it is corrected: the error of Y is that of a prediction.
         for a in range(2):
             total = c[a]
             for i in range(n):
                 total += C[a, i] * x[i]
             Y[k, a] = total
         for a in range(2):
-            if np.isfinite(measured[k, a]):
+            if np.isfinite(measured[k, a]):  # NaN: nothing measured, the state runs free
                 for i in range(n):
                     x[i] += gain[i, a] * (measured[k, a] - Y[k, a])
         seen[k] = x
@@ -100,7 +101,7 @@ def nss_sensitivities(
     for k in range(V.shape[0]):
         if begin[k] == 1:
             x[:] = 0.0
-            S[:] = 0.0
+            S[:] = 0.0  # a state that is set depends on no weight
         elif begin[k] == 2:
             x[:] = states[k]
             S[:] = 0.0
@@ -110,9 +111,11 @@ def nss_sensitivities(
             for i in range(n):
                 total += C[a, i] * x[i]
             Y[k, a] = total
+            # Rows that nobody asked for move S all the same, below.
             if r >= 0:
                 line = J[2 * r + a]
                 line[:] = 0.0
+                # dy/dw = C dx/dw, and C and c by themselves.
                 for i in range(n):
                     weight = C[a, i]
                     for l in range(inner):
@@ -122,11 +125,13 @@ def nss_sensitivities(
         nss_next(A, B, E, F, G, h, D, x, V[k], t, ahead)
         # R: how the sums into the neurons, those behind each of them included, move the state.
         for i in range(n):
+            # The last neuron first: an earlier one moves the state also by way of all behind it (D is triangular).
             for j in range(q - 1, -1, -1):
                 total = E[i, j]
                 for l in range(j + 1, q):
                     total += R[i, l] * D[l, j]
-                R[i, j] = total * (1.0 - t[j] * t[j])
+                R[i, j] = total * (1.0 - t[j] * t[j])  # tanh' = 1 - tanh^2
+        # dx(k+1)/dx(k) = A + R F.
         for i in range(n):
             for j in range(n):
                 slope[i, j] = A[i, j]
@@ -134,6 +139,7 @@ def nss_sensitivities(
                     slope[i, j] += R[i, l] * F[l, j]
         for i in range(n):
             row = moved[i]
+            # dx(k+1)/dw: by way of x(k), then each weight by itself, in the order of w.
             row[:] = 0.0
             for j in range(n):
                 weight = slope[i, j]

@@ -15,6 +15,7 @@ def nss_inputs(redefinition: np.ndarray, widths: np.ndarray, m: np.ndarray, play
     """Move `plays` (3 widths,) to the motors `m` (3,), and fill `v` (3 (1 + widths),)."""
     count = widths.shape[0]
     for c in range(3):
+        # Eq. 9-11.
         value = 0.0
         for j in range(3):
             value += redefinition[c, j] * m[j]
@@ -45,6 +46,7 @@ def nss_next(
             total += F[i, j] * x[j]
         for j in range(v.shape[0]):
             total += G[i, j] * v[j]
+        # Neurons before this one alone: their values are of this sample already.
         for j in range(i):
             total += D[i, j] * t[j]
         t[i] = math.tanh(total)

@@ -53,13 +53,14 @@ def nss_output(p: NssArrays, x: np.ndarray, axis: int) -> float:
     y = p.c[axis]
     for i in range(p.n):
         y += p.C[axis, i] * x[i]
-    return min(max(y, p.range[axis, 0]), p.range[axis, 1])
+    return min(max(y, p.range[axis, 0]), p.range[axis, 1])  # training's range, widened
 
 
 def initialise(p: NssArrays, parameters: np.ndarray, x: NssState, outputs: np.ndarray) -> None:
     """Rest: motors at zero, the neck settled; what the start is above that is remembered as measured."""
     narx_rest(p, parameters, x, outputs)
     v = np.zeros(p.B.shape[1])
+    # Long enough: the map contracts, so that what it began with is forgotten.
     for _ in range(int(p.memory[0])):
         nss_advance(p, x.x, v)
     for axis in range(2):
@@ -79,6 +80,7 @@ def step(p: NssArrays, parameters: np.ndarray, x: NssState, inputs: np.ndarray, 
     narx_observe(p, parameters, x, inputs)
     load_advance(p.load, x.m[0], x.q)
     v = np.empty(p.B.shape[1])
+    # v comes from simulated or measured motors, not set-points: the drives are outside of the map.
     nss_inputs(p.redefinition, p.widths, x.m[int(p.delay[0])], x.plays, v)
     nss_advance(p, x.x, v)
     angles = np.empty(2)
