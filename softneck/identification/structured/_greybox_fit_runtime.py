@@ -23,6 +23,7 @@ def neck_run(
     x = np.zeros(7 + 2 * lines)
     m = start.copy()
     held = np.empty(3)
+    # Under set-points that stay: a run begins at rest, as its recording is taken to.
     for _ in range(settle):
         neck_advance(neck, sample_time, start, m, x)  # pyright: ignore[reportArgumentType]
         neck_sense(neck, sample_time, x)  # pyright: ignore[reportArgumentType]

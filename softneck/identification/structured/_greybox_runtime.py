@@ -40,6 +40,7 @@ def initialise(p: GreyBoxArrays, parameters: np.ndarray, x: GreyBoxState, output
     m = np.zeros(3)
     for _ in range(int(p.memory[0])):
         neck_advance(p.neck, p.sensor[1], np.zeros(3), m, x.neck)
+        # The sensor settles with the neck: its dead time holds the tilt at rest.
         neck_sense(p.neck, p.sensor[1], x.neck)
     for axis in range(2):
         echo_rest(p, x, axis, greybox_angle(x.neck, axis))
@@ -53,10 +54,11 @@ def greybox_angle(neck: NeckState, axis: int) -> float:
 def step(p: GreyBoxArrays, parameters: np.ndarray, x: GreyBoxState, inputs: np.ndarray, outputs: np.ndarray) -> None:
     """Advance by one sample."""
     narx_observe(p, parameters, x, inputs)
+    # From measured positions where there are any; a copy, as histories do not change.
     m = x.m[0].copy()
     targets = np.empty(3)
     for j in range(3):
-        targets[j] = x.u[int(p.drive[j, 1]) - 1, j]
+        targets[j] = x.u[int(p.drive[j, 1]) - 1, j]  # u(k+1-d); d >= 1 for this kind
     neck_advance(p.neck, p.sensor[1], targets, m, x.neck)
     neck_sense(p.neck, p.sensor[1], x.neck)
     angles = np.empty(2)

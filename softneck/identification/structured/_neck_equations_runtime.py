@@ -54,17 +54,19 @@ class NeckState(StateVector):
 
 def neck_limit(neck: np.ndarray, x: NeckState, j: int) -> float:
     """Return the motor position at which tendon j reaches the pull limit."""
-    angle = neck[NECK_TWIST] + 2.0943951023931953 * j
+    angle = neck[NECK_TWIST] + 2.0943951023931953 * j  # 120 deg apart (Eq. 5), as mounted
     toward = math.cos(angle) * x.b[0] + math.sin(angle) * x.b[1]
+    # x_j = pull_limit, solved for m_j.
     return neck[NECK_PULL_LIMIT] - neck[NECK_PRETENSION] + neck[NECK_LEVER] * toward + x.s
 
 
 def neck_advance(neck: np.ndarray, sample_time: float, targets: np.ndarray, m: np.ndarray, x: NeckState) -> None:
     """Move the motors `m` (3,) towards `targets` (3,), and bend, hysteresis and compression in `x`, by one sample."""
     dt = sample_time / _SUBSTEPS
-    keep = math.exp(-neck[NECK_DRIVE_RATE] * dt)
+    keep = math.exp(-neck[NECK_DRIVE_RATE] * dt)  # exact for a target that is held
     for _ in range(_SUBSTEPS):
         for j in range(3):
+            # Where the neck moves away a stalled drive gives way: the limit may fall below m.
             m[j] = min(keep * m[j] + (1.0 - keep) * targets[j], neck_limit(neck, x, j))
         pull0 = 0.0
         pull1 = 0.0
@@ -75,7 +77,7 @@ def neck_advance(neck: np.ndarray, sample_time: float, targets: np.ndarray, m: n
             c = math.cos(angle)
             s = math.sin(angle)
             stretch = neck[NECK_PRETENSION] + m[j] - neck[NECK_LEVER] * (c * x.b[0] + s * x.b[1]) - x.s
-            if stretch > 0.0:
+            if stretch > 0.0:  # a slack tendon neither pulls nor adds to `rate`
                 pull0 += stretch * c
                 pull1 += stretch * s
                 total += stretch
@@ -88,12 +90,15 @@ def neck_advance(neck: np.ndarray, sample_time: float, targets: np.ndarray, m: n
         f1 = (
             neck[NECK_GAIN] * pull1 - k1 * (x.b[1] - neck[NECK_REST + 1]) - loss * x.b[1] - neck[NECK_FRICTION] * x.z[1]
         )
+        # Minus the slope of f over b, one number for both directions: the cube's at its steepest, and half of each taut
+        # tendon, as e e' of all three add up to 3/2.
         rate = neck[NECK_STIFFNESS] + 3.0 * loss + 0.5 * taut * neck[NECK_GAIN] * neck[NECK_LEVER] + neck[NECK_FRICTION]
-        d0 = dt * f0 / (1.0 + dt * rate)
+        d0 = dt * f0 / (1.0 + dt * rate)  # one stage: (1 + dt rate) d = dt f
         d1 = dt * f1 / (1.0 + dt * rate)
         x.b[0] += d0
         x.b[1] += d1
         size = math.sqrt(x.b[0] * x.b[0] + x.b[1] * x.b[1])
+        # Both by one factor: the neck keeps leaning where it leant.
         if size > _LARGEST_BEND:
             x.b[0] *= _LARGEST_BEND / size
             x.b[1] *= _LARGEST_BEND / size
@@ -103,23 +108,25 @@ def neck_advance(neck: np.ndarray, sample_time: float, targets: np.ndarray, m: n
         x.z[1] = (x.z[1] + d1) / forget
         axial = neck[NECK_AXIAL_RATE]
         rise = axial * (neck[NECK_COMPLIANCE] * (total - 3.0 * neck[NECK_PRETENSION]) - x.s)
+        # Its slope again: s itself, and each taut tendon, which gets looser as the link gives way.
         x.s += dt * rise / (1.0 + dt * axial * (1.0 + neck[NECK_COMPLIANCE] * taut))
 
 
 def neck_sense(neck: np.ndarray, sample_time: float, x: NeckState) -> None:
     """Push the tilt of now into the dead time's line behind the states, and move the sensor on."""
     size = math.sqrt(x.b[0] * x.b[0] + x.b[1] * x.b[1])
-    part = math.sin(size) / size if size > 1e-9 else 1.0
+    part = math.sin(size) / size if size > 1e-9 else 1.0  # sin x / x: the straight neck divides by nothing
     line = x.tilts
     lines = line.shape[0] // 2
     keep = math.exp(-neck[NECK_SENSOR_RATE] * sample_time)
     for axis in range(2):
         tilt = math.atan2(part * x.b[axis], math.cos(size))
         first = axis * lines
+        # Out comes the tilt of `lines` samples ago, before that of now goes in.
         seen = tilt
         if lines > 0:
             seen = line[first + lines - 1]
             for i in range(lines - 1, 0, -1):
                 line[first + i] = line[first + i - 1]
             line[first] = tilt
-        x.sensor[axis] = keep * x.sensor[axis] + (1.0 - keep) * seen
+        x.sensor[axis] = keep * x.sensor[axis] + (1.0 - keep) * seen  # exact for what is held over the sample

@@ -47,7 +47,7 @@ def play_output(p: PlayArrays, bank: np.ndarray, axis: int) -> float:
     y = 0.0
     for i in range(p.terms):
         y += p.weights[axis, i] * monomial(p.table, i, bank)
-    return min(max(y, p.range[axis, 0]), p.range[axis, 1])
+    return min(max(y, p.range[axis, 0]), p.range[axis, 1])  # a polynomial knows no bound outside of its data
 
 
 def initialise(p: PlayArrays, parameters: np.ndarray, x: PlayState, outputs: np.ndarray) -> None:
@@ -60,10 +60,12 @@ def initialise(p: PlayArrays, parameters: np.ndarray, x: PlayState, outputs: np.
 def step(p: PlayArrays, parameters: np.ndarray, x: PlayState, inputs: np.ndarray, outputs: np.ndarray) -> None:
     """Advance by one sample."""
     narx_observe(p, parameters, x, inputs)
+    # q, plays and filters take m(k) in and stand at k+1: what is read from them is y(k+1).
     load_advance(p.load, x.m[0], x.q)
     bank_advance(p.redefinition, p.widths, p.chain, x.m[0], x.plays, x.bank)
     angles = np.empty(2)
     for axis in range(2):
         angles[axis] = echo_added(p, p.echo, x, axis, play_output(p, x.bank, axis))
     narx_advance(p, parameters, x, angles[0], angles[1], outputs)
+    # The lag of `narx_advance` knows no load: these positions replace its own.
     stalling_drives(p, p.load, x.q, x, outputs)

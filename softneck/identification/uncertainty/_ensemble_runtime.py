@@ -42,6 +42,7 @@ def initialise(p: EnsembleArrays, parameters: np.ndarray, x: EnsembleState, outp
         size = member_size(p, i)
         member_initialise(p, i, parameters, members[at : at + size], own)
         at += size
+    # Members start alike: what the last one says holds for all.
     outputs[:5] = own[:5]
     outputs[5:7] = own[0]
     outputs[7:9] = own[1]
@@ -49,6 +50,7 @@ def initialise(p: EnsembleArrays, parameters: np.ndarray, x: EnsembleState, outp
 
 def step(p: EnsembleArrays, parameters: np.ndarray, x: EnsembleState, inputs: np.ndarray, outputs: np.ndarray) -> None:
     """Advance by one sample; the bounds of pitch and roll follow the motor positions in `outputs`."""
+    # Parameter 3 is `noise_std`: noise comes once, on the median, and from this kind's generator.
     quiet = parameters.copy()
     quiet[3] = 0.0
     count = member_count()
@@ -61,11 +63,13 @@ def step(p: EnsembleArrays, parameters: np.ndarray, x: EnsembleState, inputs: np
         member_step(p, i, quiet, members[at : at + size], inputs, own)
         angles[0, i] = own[0]
         angles[1, i] = own[1]
+        # Motors are not averaged: the first member's drives stand for all.
         if i == 0:
             outputs[2:5] = own[2:5]
         at += size
     for axis in range(2):
         inorder = np.sort(angles[axis])
+        # Of an even number the mean of the middle two.
         outputs[axis] = 0.5 * (inorder[(count - 1) // 2] + inorder[count // 2])
         outputs[5 + 2 * axis] = inorder[0]
         outputs[6 + 2 * axis] = inorder[count - 1]

@@ -53,6 +53,7 @@ def initialise(p: ResidualArrays, parameters: np.ndarray, x: ResidualState, outp
     base = np.zeros(9)
     x[:] = 0.0
     member_initialise(p, 0, parameters, x.base, base)
+    # The histories hold the base's outputs, not what the set adds.
     for j in range(p.H):
         for axis in range(2):
             x.y[j, axis] = base[axis]
@@ -70,13 +71,13 @@ def residual_query(p: ResidualArrays, axis: int, regressor: np.ndarray) -> tuple
     epsilon = p.bounds[axis, 1]
     if COMPILED:
         low, high = slant_bounds(p.points[axis], p.values[axis], p.nodes[axis], p.frame[axis], gamma, regressor)
-        return low - epsilon, high + epsilon
+        return low - epsilon, high + epsilon  # epsilon moves all cones alike: the tree does without
     squared = np.zeros(p.rows)
     for i in range(p.points.shape[1]):
         gap = p.points[axis, i] - regressor[i]
         squared += gap * gap
-    cone = gamma * np.sqrt(squared)
-    return np.max(p.values[axis] - cone) - epsilon, np.min(p.values[axis] + cone) + epsilon
+    cone = gamma * np.sqrt(squared)  # gamma |x - w(k)| of Eq. 19 and 20
+    return np.max(p.values[axis] - cone) - epsilon, np.min(p.values[axis] + cone) + epsilon  # Eq. 20, Eq. 19
 
 
 def residual_observe(p: ResidualArrays, x: ResidualState, given: np.ndarray, measured: bool) -> None:
@@ -106,10 +107,11 @@ def step(p: ResidualArrays, parameters: np.ndarray, x: ResidualState, inputs: np
     # The noise is added once, at the end, by this kind's own generator.
     quiet = parameters.copy()
     quiet[3] = 0.0
+    # Base and set together are to meet the measurement: the base is told the rest of it. NaN stays NaN.
     given = inputs.copy()
     for axis in range(2):
         given[3 + axis] -= x.added[axis]
-    residual_observe(p, x, given, parameters[2] > 0.5)
+    residual_observe(p, x, given, parameters[2] > 0.5)  # parameter 2 is `use_measurement`
     base = np.zeros(9)
     member_step(p, 0, quiet, x.base, given, base)
     for axis in range(2):
@@ -117,11 +119,12 @@ def step(p: ResidualArrays, parameters: np.ndarray, x: ResidualState, inputs: np
     for j in range(3):
         x.motors[j] = base[2 + j]
         outputs[2 + j] = base[2 + j]
+    # From histories that end at t_k: y(k+1) of the base, which is known by now, is not among them.
     regressor = np.empty(p.n)
     residual_regressor(p, x, regressor)
     for axis in range(2):
         low, high = residual_query(p, axis, regressor)
-        x.added[axis] = 0.5 * (low + high)
+        x.added[axis] = 0.5 * (low + high)  # Eq. 18
         outputs[axis] = base[axis] + 0.5 * (low + high)
         outputs[5 + 2 * axis] = base[axis] + low
         outputs[6 + 2 * axis] = base[axis] + high
