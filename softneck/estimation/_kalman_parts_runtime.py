@@ -26,6 +26,7 @@ KALMAN_STILL = 0.1
 
 def kalman_line_length(c: np.ndarray) -> int:
     """Return how many past inputs each axis keeps."""
+    # One sample more where a lag lies between two: a straight line needs both ends.
     longest = max(c[KALMAN_LAG], c[KALMAN_LAG + 1])
     whole = int(longest)
     return whole + 2 if longest > whole else whole + 1
@@ -81,6 +82,7 @@ def kalman_usable(c: np.ndarray, x: KalmanCounters, inputs: np.ndarray, noise: f
     """
     x.age += 1.0
     pitch, roll = inputs[3], inputs[4]
+    # A measurement is of both axes; a sensor that says NaN is as good as one that says invalid.
     if not (inputs[5] > 0.5 and math.isfinite(pitch) and math.isfinite(roll)):
         return False
     came = x.repeats >= 0.0
@@ -92,6 +94,7 @@ def kalman_usable(c: np.ndarray, x: KalmanCounters, inputs: np.ndarray, noise: f
         x.repeats += 1.0
     else:
         if came:
+            # Mean of both axes; of a neck that stands still it is twice the noise's variance.
             change = 0.5 * ((pitch - x.pitch) ** 2 + (roll - x.roll) ** 2)
             x.scatter = KALMAN_KEEP * x.scatter + (1.0 - KALMAN_KEEP) * change
         x.repeats = 0.0
@@ -103,6 +106,7 @@ def kalman_usable(c: np.ndarray, x: KalmanCounters, inputs: np.ndarray, noise: f
 def kalman_frozen(c: np.ndarray, x: KalmanCounters, noise: float) -> bool:
     """Return whether a sensor that used to scatter repeats itself to the last bit."""
     still = KALMAN_STILL * noise
+    # `repeats` does not count the first of equal ones, hence the - 1.
     return bool(c[KALMAN_FROZEN] > 0.0 and x.repeats >= c[KALMAN_FROZEN] - 1.0 and x.scatter > still * still)
 
 
@@ -113,6 +117,7 @@ def kalman_forced(c: np.ndarray, x: KalmanCounters) -> bool:
 
 def kalman_count(c: np.ndarray, x: KalmanCounters, judged: bool, accepted: bool) -> None:
     """Count rejections in a row and samples without an accepted measurement."""
+    # No measurement is no refusal: a gap in the data forces nothing.
     if judged:
         x.rejected = 0.0 if accepted else x.rejected + 1.0
     x.unheard = 0.0 if accepted else min(x.unheard + 1.0, c[KALMAN_TIMEOUT])
@@ -135,9 +140,11 @@ def kalman_push(p: KalmanArrays, x: KalmanState, inputs: np.ndarray, u: np.ndarr
         if not lost:
             x.rates[0] = pitch
             x.rates[1] = roll
+        # Lost rates leave the last ones; `step` widens P by what the angle may do meanwhile.
         u[0] = T[0, 0] * x.rates[0] + T[0, 1] * x.rates[1]
         u[1] = T[1, 0] * x.rates[0] + T[1, 1] * x.rates[1]
     else:
+        # Eq. 9 and 10; the kinematic form has zeros here.
         u[0] = T[0, 0] * inputs[0] + T[0, 1] * inputs[1] + T[0, 2] * inputs[2]
         u[1] = T[1, 0] * inputs[0] + T[1, 1] * inputs[1] + T[1, 2] * inputs[2]
     newest = int(x.samples) % p.length
@@ -157,6 +164,7 @@ def kalman_lagged(line: np.ndarray, newest: int, lag: float) -> float:
         return float(line[newest])
     whole = int(lag)
     part = lag - whole
+    # A ring: what is older than the newest stands before it, round the end.
     value = line[(newest - whole) % line.shape[0]]
     if part > 0.0:
         value = (1.0 - part) * value + part * line[(newest - whole - 1) % line.shape[0]]
@@ -173,6 +181,7 @@ def kalman_tell(p: KalmanArrays, x: KalmanState, noise: float, outputs: np.ndarr
     u = np.empty(2)
     y0, y1 = 0.0, 0.0
     for i in range(whole + 1):
+        # What carries the estimate from i samples after its time to i + 1: newer by i + 1 than the last that acted.
         u[0] = kalman_lagged(first, newest, c[KALMAN_LAG] - 1.0 - i)
         u[1] = kalman_lagged(second, newest, c[KALMAN_LAG + 1] - 1.0 - i)
         if i == whole:
@@ -183,6 +192,7 @@ def kalman_tell(p: KalmanArrays, x: KalmanState, noise: float, outputs: np.ndarr
     # Between samples by a straight line, whose slope is the rate.
     outputs[0] = y0 + part * (y[0] - y0)
     outputs[1] = y1 + part * (y[1] - y1)
+    # The model's own rate over that sample, not a difference of noisy estimates.
     outputs[2] = (y[0] - y0) / c[KALMAN_PERIOD]
     outputs[3] = (y[1] - y1) / c[KALMAN_PERIOD]
     outputs[5] = 1.0 if kalman_healthy(c, x, noise) else 0.0

@@ -55,11 +55,13 @@ def step(p: KalmanArrays, parameters: np.ndarray, x: KalmanFullState, inputs: np
     P = x.P.reshape((p.n, p.n))
     kalman_predict(p, parameters, x.x, P, u)
     if lost:
+        # In the gyro form `first_noise` is diag(T^2, 0): by its largest entry it is 1 on the angles.
         P += c[KALMAN_GAP] * c[KALMAN_GAP] * p.first_noise / p.first_noise.max()
     if x.samples < p.length:
         # Inputs from before the start are still on their way: the model has no say.
         P += p.P0
     elif forced:
+        # Wide enough for the measurement to have its way.
         P += p.PF
     innovation, accepted = 0.0, False
     if usable:
@@ -97,14 +99,17 @@ def kalman_correct(
     S = kalman_columns(p.H, PH.T)
     s00, s01, s11 = float(S[0, 0]) + r, 0.5 * float(S[0, 1] + S[1, 0]), float(S[1, 1]) + r
     determinant = s00 * s11 - s01 * s01
+    # e' S^-1 e, the NIS: chi-square with 2 degrees of freedom if the filter is true.
     innovation = (s11 * e0 * e0 - 2.0 * s01 * e0 * e1 + s00 * e1 * e1) / determinant
     x.log_det = math.log(determinant)
+    # The gate; x and P stay as predicted where it refuses.
     if not (forced or innovation <= p.constants[KALMAN_GATE]):
         return innovation, False
+    # S becomes its inverse; the gain needs no more of it.
     S[0, 0] = s11 / determinant
     S[1, 1] = s00 / determinant
     S[0, 1] = S[1, 0] = -s01 / determinant
-    K = kalman_columns(PH, S)
+    K = kalman_columns(PH, S)  # P H' S^-1, which is its own transpose
     estimate = x.x  # numba would copy the stretch for `x.x[:] +=`
     estimate += kalman_dot(K, e)
     kalman_joseph(P, K, p.H, r)
@@ -117,6 +122,7 @@ def kalman_joseph(P: np.ndarray, K: np.ndarray, H: np.ndarray, r: float) -> None
     if not COMPILED:
         J = np.dot(K, H)
         J *= -1.0
+        # The diagonal of J = I - K H, as a view.
         J.ravel()[:: n + 1] += 1.0
         np.dot(np.dot(J, P), J.T, P)
         P += np.dot(r * K, K.T)
@@ -151,10 +157,12 @@ def kalman_sandwich(A: np.ndarray, P: np.ndarray) -> None:
     W = np.zeros((n, n))
     for i in range(n):
         for k in range(n):
+            # Axes do not meet but in the gate: half of F and of I - K H is zero.
             if A[i, k] != 0.0:
                 for j in range(n):
                     W[i, j] += A[i, k] * P[k, j]
     for i in range(n):
+        # Half is computed and mirrored: P stays symmetric to the last bit.
         for j in range(i + 1):
             total = 0.0
             for k in range(n):

@@ -23,6 +23,7 @@ def kalman_cost(
         x.log_det = np.nan
         step(p, parameters, x, inputs[k], outputs)
         if k >= start and not math.isnan(x.log_det):
+            # -2 log L but for a constant: e' S^-1 e is the output `innovation`.
             total += x.log_det + outputs[4]
             count += 1
     return total, count

@@ -48,6 +48,7 @@ def step(
     kalman_push(p, x, inputs, u)
     usable = kalman_usable(c, x, inputs, parameters[0])
     forced = kalman_forced(c, x)
+    # Two gains more stand for what the full filter adds to P.
     K, SI = p.gain, p.inverse_spread
     if x.samples < p.length:
         K, SI = p.start_gain, p.start_inverse_spread
@@ -58,10 +59,11 @@ def step(
     if usable:
         y = kalman_dot(p.H, estimate)
         e0, e1 = inputs[3] - y[0], inputs[4] - y[1]
+        # e' S^-1 e, S of these noise levels: the gate is that of the full filter.
         innovation = SI[0, 0] * e0 * e0 + (SI[0, 1] + SI[1, 0]) * e0 * e1 + SI[1, 1] * e1 * e1
         accepted = forced or innovation <= c[KALMAN_GATE]
         if accepted:
-            estimate += e0 * K[:, 0] + e1 * K[:, 1]
+            estimate += e0 * K[:, 0] + e1 * K[:, 1]  # x = x- + K e
     x.x[:] = estimate
     kalman_count(c, x, usable, accepted)
     kalman_tell(p, x, parameters[0], outputs)
