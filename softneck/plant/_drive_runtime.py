@@ -22,9 +22,11 @@ def drive_rates(
     """
     position, speed, integral = x
     gain, speed_limit, bandwidth, reset, torque_limit, supply, back_emf, inertia, friction, edge = c
-    wanted = min(max(gain * (command - position), -speed_limit), speed_limit)
+    wanted = min(max(gain * (command - position), -speed_limit), speed_limit)  # P controller of position
+    # By the inertia, so that `bandwidth` is that of the closed speed loop.
     error = inertia * bandwidth * (wanted - speed)
     asked = error + integral
+    # What the supply leaves over the back-EMF; turned backwards the winch has more.
     high = min(torque_limit, supply - back_emf * speed)
     low = max(-torque_limit, -supply - back_emf * speed)
     torque = min(max(asked, low), high)
@@ -32,4 +34,4 @@ def drive_rates(
     waits = (asked > high and error > 0.0) or (asked < low and error < 0.0)
     growth = 0.0 if waits else reset * error
     drag = friction * math.tanh(speed / edge)
-    return (torque - pull - drag) / inertia, growth
+    return (torque - pull - drag) / inertia, growth  # a tendon that pulls turns the winch back, towards negative

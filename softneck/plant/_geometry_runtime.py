@@ -34,6 +34,7 @@ def bend_functions(square: float) -> tuple[float, float, float, float, float, fl
     A = (1.0 - cosine) / square
     B = sine / beta
     S = 2.0 * half / beta
+    # Derivatives of the definitions above; divided by beta they are even, as A, B and S are.
     dA = (B - 2.0 * A) / square
     dB = (cosine - B) / square
     dS = (math.cos(0.5 * beta) - S) / square
@@ -42,6 +43,7 @@ def bend_functions(square: float) -> tuple[float, float, float, float, float, fl
 
 def tilt_rotation(pitch: float, roll: float) -> tuple[float, float, float, float, float, float, float, float, float]:
     """Return the rotation, row by row, that leans the vertical by the tilt vector (pitch, roll) [rad]."""
+    # Rodrigues' formula about the horizontal axis (-roll, pitch): no yaw.
     square = pitch * pitch + roll * roll
     A, B, _, _, _, _ = bend_functions(square)
     cosine = math.cos(math.sqrt(square))
@@ -71,12 +73,15 @@ def lean_angles(
     b1, b2, w1, w2 = bend
     A, B, _, _, dB, _ = f
     along = b1 * w1 + b2 * w2
+    # n as the base sees it; 1 - A beta^2 is cos(beta).
     m1 = B * b1
     m2 = B * b2
     m3 = 1.0 - A * (b1 * b1 + b2 * b2)
+    # Its rate: d beta/dt = b.w / beta, and the primes come divided by beta.
     k1 = B * w1 + dB * along * b1
     k2 = B * w2 + dB * along * b2
     k3 = -B * along
+    # n and its rate in the world.
     n1 = R[0] * m1 + R[1] * m2 + R[2] * m3
     n2 = R[3] * m1 + R[4] * m2 + R[5] * m3
     n3 = R[6] * m1 + R[7] * m2 + R[8] * m3

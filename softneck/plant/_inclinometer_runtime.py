@@ -81,6 +81,7 @@ def inclinometer_between(
 def inclinometer_start(noise: InclinometerNoise, generator: np.ndarray, drift: float, rate_bias: float) -> None:
     """Draw the biases at t_0 from their stationary distribution."""
     for axis in range(2):
+        # Stationary from t_0 on: no start is better known than the rest.
         noise.bias[axis] = drift * random_normal(generator)
     for axis in range(2):
         noise.rate_bias[axis] = rate_bias * random_normal(generator)
@@ -100,6 +101,7 @@ def inclinometer_measure(
     numbers as one that arrives, so dropouts do not change the noise of the others.
     """
     drift, keep, rate_bias, rate_keep, std, rate_std, quantum = c
+    # keep^2 + fresh^2 = 1: the variance stays what it is, whatever the sample time.
     fresh = math.sqrt(max(0.0, 1.0 - keep * keep))
     rate_fresh = math.sqrt(max(0.0, 1.0 - rate_keep * rate_keep))
     for axis in range(2):
@@ -112,6 +114,7 @@ def inclinometer_measure(
     white4 = rate_std * random_normal(generator)
     if noise.arrives < 0.5:
         return
+    # Noise before rounding, as in a converter.
     noise.angles[0] = inclinometer_round(truth[0] + noise.bias[0] + white1, quantum)
     noise.angles[1] = inclinometer_round(truth[1] + noise.bias[1] + white2, quantum)
     noise.rates[0] = truth[2] + noise.rate_bias[0] + white3
@@ -120,6 +123,7 @@ def inclinometer_measure(
 
 def inclinometer_dropout(noise: InclinometerNoise, generator: np.ndarray, begins: float, ends: float) -> None:
     """Advance the dropout's two-state chain; `begins` and `ends` are chances per sample."""
+    # One draw in either state, so that the stream does not depend on it.
     draw = random_uniform(generator)
     if noise.arrives > 0.5:
         noise.arrives = 0.0 if draw < begins else 1.0
@@ -136,4 +140,5 @@ def inclinometer_round(value: float, quantum: float) -> float:
     """Return `value` at the resolution `quantum`; 0 leaves it alone."""
     if quantum <= 0.0:
         return value
+    # Halves go up in plain Python, numba and C alike; `round` differs between them.
     return quantum * math.floor(value / quantum + 0.5)

@@ -23,7 +23,7 @@ def link_elastic(
     k1, k2, k3, damping, r1, r2, axial, axial3, axial_damping, limit = c
     stiffening = k3 * (b1 * b1 + b2 * b2)
     force = -axial * s - axial3 * s * s * s - axial_damping * v
-    if s > limit:
+    if s > limit:  # zero at the limit: the force has no jump
         force -= LINK_WALL_RATIO * axial * (s - limit)
     return (
         -k1 * (b1 - r1) - stiffening * b1 - damping * w1,
@@ -38,6 +38,7 @@ def link_hysteresis(z1: float, z2: float, w1: float, w2: float, reach: float) ->
     The torque is -H z / reach. |z| never leaves `reach`; the element only stores and dissipates
     (Dahl 1968; it is Bouc-Wen with n = 1, beta = 1, gamma = 0, here isotropic in two directions).
     """
+    # One rate for both directions, by the length of w: that is what makes it isotropic.
     rate = math.sqrt(w1 * w1 + w2 * w2) / reach
     return w1 - rate * z1, w2 - rate * z2
 
@@ -58,13 +59,16 @@ def link_weight(
     b1, b2, length = b
     A, B, _, dA, dB, _ = f
     weight, moment, push1, push2 = load
+    # Minus the gradient of up . ((L A + c B) b, L B + c cos beta), summed over the weights.
     side = weight * length * A + moment * B
     turn = weight * length * dA + moment * dB
-    sink = up[2] * (weight * length * dB - moment * B)
+    sink = up[2] * (weight * length * dB - moment * B)  # d cos(beta) / db = -B b
     # Gravity acts against `up`; its horizontal part leans the platform like a push does.
     lean = turn * (up[0] * b1 + up[1] * b2) + sink
+    # The push acts on the link's end: no c, and B has no part in it.
     pushed = length * dA * (push1 * b1 + push2 * b2)
     force1 = -side * up[0] - lean * b1 + length * A * push1 + pushed * b1
     force2 = -side * up[1] - lean * b2 + length * A * push2 + pushed * b2
+    # Along s the arc gets shorter, dL = -ds: weight presses the link together.
     along = weight * (A * (up[0] * b1 + up[1] * b2) + up[2] * B) - A * (push1 * b1 + push2 * b2)
     return force1, force2, along

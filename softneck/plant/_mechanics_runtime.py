@@ -86,7 +86,7 @@ def neck_constants(q: np.ndarray) -> tuple:
     k = float(q[NECK_BENDING_STIFFNESS])
     asymmetry = float(q[NECK_STIFFNESS_ASYMMETRY])
     link = (
-        k * (1.0 + asymmetry),
+        k * (1.0 + asymmetry),  # K = k diag(1 + alpha, 1 - alpha)
         k * (1.0 - asymmetry),
         float(q[NECK_BENDING_STIFFENING]),
         float(q[NECK_BENDING_DAMPING]),
@@ -118,7 +118,7 @@ def neck_drive(q: np.ndarray) -> tuple[float, float, float, float, float, float,
     """Return the constants of `drive_rates` at the winch."""
     ratio = float(q[NECK_GEAR_RATIO])
     constant = float(q[NECK_TORQUE_CONSTANT])
-    per_ampere = constant * ratio * float(q[NECK_GEAR_EFFICIENCY])
+    per_ampere = constant * ratio * float(q[NECK_GEAR_EFFICIENCY])  # torque at the winch [N m/A]
     resistance = float(q[NECK_MOTOR_RESISTANCE])
     return (
         float(q[NECK_POSITION_GAIN]),
@@ -126,9 +126,9 @@ def neck_drive(q: np.ndarray) -> tuple[float, float, float, float, float, float,
         float(q[NECK_SPEED_BANDWIDTH]),
         1.0 / float(q[NECK_SPEED_INTEGRAL_TIME]),
         float(q[NECK_CURRENT_LIMIT]) * per_ampere,
-        float(q[NECK_SUPPLY_VOLTAGE]) / resistance * per_ampere,
-        constant * ratio / resistance * per_ampere,
-        float(q[NECK_ROTOR_INERTIA]) * ratio * ratio,
+        float(q[NECK_SUPPLY_VOLTAGE]) / resistance * per_ampere,  # stall torque at full supply
+        constant * ratio / resistance * per_ampere,  # back-EMF: torque that each rad/s takes of it
+        float(q[NECK_ROTOR_INERTIA]) * ratio * ratio,  # the rotor's, seen through the gear
         float(q[NECK_GEAR_FRICTION]),
         NECK_GEAR_EDGE,
     )
@@ -142,6 +142,7 @@ def neck_load(
     platform = float(q[NECK_PLATFORM_MASS])
     link = 0.25 * float(q[NECK_LINK_MASS])
     carried = max(payload, 0.0)
+    # A negative payload could make mass or inertia negative.
     height = float(q[NECK_PLATFORM_HEIGHT])
     above = float(q[NECK_PAYLOAD_HEIGHT])
     half = 0.5 * float(q[NECK_LINK_LENGTH])
@@ -153,8 +154,11 @@ def neck_load(
         push_y,
     )
     R = tilt_rotation(base_pitch, base_roll)
+    # A thin disc about its diameter.
     disc = 0.25 * platform * float(q[NECK_PLATFORM_RADIUS]) ** 2
+    # Straight up, the platform moves by L0/2 + c for each rad of b: A = 1/2 and B = 1.
     inertia = platform * (half + height) ** 2 + link * half**2 + carried * (half + above) ** 2 + disc
+    # Third row of R: the vertical, as the base sees it.
     return weight, (R[6], R[7], R[8]), R, inertia, mass
 
 
@@ -172,13 +176,15 @@ def neck_rates(
     body = (b1, b2, s, w1, w2, v)
     f = bend_functions(b1 * b1 + b2 * b2)
     q1, q2, qs = link_elastic(body, link)
+    # The arc is L0 - s long.
     g1, g2, gs = link_weight((b1, b2, geometry[0] - s), f, load[1], load[0])
     t1, a1, c1, cs1 = neck_pull(body, f, directions[0], p1, o1, free[0], c)
     t2, a2, c2, cs2 = neck_pull(body, f, directions[1], p2, o2, free[1], c)
     t3, a3, c3, cs3 = neck_pull(body, f, directions[2], p3, o3, free[2], c)
-    stuck = hysteresis[0] / hysteresis[1]
+    stuck = hysteresis[0] / hysteresis[1]  # H / z_r
     dz1, dz2 = link_hysteresis(z1, z2, w1, w2, hysteresis[1])
     inertia = load[3]
+    # The tendon's torque r T stands against the drive's.
     u1, d1 = drive_rates((p1, o1, i1), command[0], winch * t1, drive)
     u2, d2 = drive_rates((p2, o2, i2), command[1], winch * t2, drive)
     u3, d3 = drive_rates((p3, o3, i3), command[2], winch * t3, drive)
@@ -218,7 +224,9 @@ def neck_pull(
     """Return (tension at the winch [N], its forces on b1, b2 and s) of one tendon."""
     winch = c[6][0]
     length, slide, g1, g2, gs = tendon_chord(body, f, direction, c[3])
+    # Stretch l - l0 + r P and its rate; the guide feels the tendon slide past it, the winch's turning not included.
     at_winch, at_platform = tendon_tension(length - free + winch * position, slide + winch * speed, slide, c[2])
+    # A tendon shortens if it can: forces are minus its tension along the length's gradient.
     return at_winch, -at_platform * g1, -at_platform * g2, -at_platform * gs
 
 
@@ -262,6 +270,7 @@ def neck_rest(q: np.ndarray, c: tuple) -> tuple[float, float, float, float, floa
             q1 -= pretension * t1
             q2 -= pretension * t2
             qs -= pretension * ts
+        # Newton along s. Along b the link's own stiffness does: weights and tendons only weaken it, below buckling.
         slope = link[6] + 3.0 * link[7] * s * s
         if s > link[9]:
             slope += LINK_WALL_RATIO * link[6]
@@ -270,6 +279,7 @@ def neck_rest(q: np.ndarray, c: tuple) -> tuple[float, float, float, float, floa
         s += qs / slope
     f = bend_functions(b1 * b1 + b2 * b2)
     body = (b1, b2, s, 0.0, 0.0, 0.0)
+    # So long that the pretension alone stretches them.
     stretch = pretension / c[2][0]
     l1, _, _, _, _ = tendon_chord(body, f, c[4][0], c[3])
     l2, _, _, _, _ = tendon_chord(body, f, c[4][1], c[3])
@@ -281,16 +291,23 @@ def neck_substeps(c: tuple, load: tuple, sample_time: float, wanted: int) -> int
     """Return substeps per sample: `wanted`, or more where the stiffest mode asks for it."""
     link, hysteresis, tendon, geometry, _, drive, rest = c
     winch = rest[0]
+    # The highest tension to reckon with: what a drive can pull at its current limit, and half of it again.
     pull = 1.5 * max(drive[4] / winch, rest[2])
+    # Guides at their steepest, where tanh has slope 1, are dampers too; three tendons pull.
     loss = 3.0 * (tendon[1] + tendon[2] * pull / tendon[3])
     arm = geometry[1] ** 2
+    # Bounds, not values: 3 k3 is the cube's slope at 1 rad, H / z_r the hysteresis' at a turn.
     stiffness = max(link[0], link[1]) + 3.0 * link[2] + hysteresis[0] / hysteresis[1] + 3.0 * tendon[0] * arm
+    # d / J bounds an overdamped mode, the root of k / J an undamped one, their sum both.
     bending = (link[3] + loss * arm) / load[3] + math.sqrt(stiffness / load[3])
+    # As if the link rested on its wall.
     wall = link[6] * (1.0 + LINK_WALL_RATIO) + 3.0 * link[7] * link[9] ** 2 + 3.0 * tendon[0]
     axial = (link[8] + loss) / load[4] + math.sqrt(wall / load[4])
     inertia = drive[7]
+    # The gear's friction at its steepest, as the guides' above.
     damped = tendon[1] * winch * winch / inertia + drive[8] / (drive[9] * inertia)
     driven = drive[2] + damped + math.sqrt(tendon[0] * winch * winch / inertia)
     fastest = max(max(bending, axial), max(driven, 1.0 / rest[1]))
     needed = math.ceil(sample_time * fastest / NECK_STABLE)
+    # Capped: a neck that asks for more is simulated no finer.
     return min(max(wanted, needed), NECK_MOST_SUBSTEPS)

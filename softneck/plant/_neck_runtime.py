@@ -77,10 +77,12 @@ def initialise(p: VirtualNeckArrays, parameters: np.ndarray, x: VirtualNeckState
     for i in range(3):
         # What a drive needs to hold its tendon's pretension.
         x.integral[i] = parameters[NECK_WINCH_RADIUS] * parameters[NECK_PRETENSION]
+    # Payload, pushes and a tilted base are inputs: at t_0 there are none.
     load = neck_load(parameters, 0.0, 0.0, 0.0, 0.0, 0.0)
     lean = neck_lean(x, load)
     x.filtered[0] = lean[0]
     x.filtered[1] = lean[1]
+    # As if the neck had always stood there: no delay shows an angle that never was.
     for _ in range(p.samples):
         inclinometer_store(x.history, (lean[0], lean[1], 0.0, 0.0, 0.0, 0.0))
     random_seed(x.random, parameters[NECK_NOISE_SEED])
@@ -100,11 +102,13 @@ def step(
         parameters, float(inputs[3]), float(inputs[4]), float(inputs[5]), float(inputs[6]), float(inputs[7])
     )
     free = (float(x.free[0]), float(x.free[1]), float(x.free[2]))
+    # In every step: the payload is an input, and moves the modes.
     count = neck_substeps(c, load, sample_time, p.substeps)
     h = sample_time / count
     latency = float(parameters[NECK_DRIVE_LATENCY])
     moving = neck_read(x)
     for i in range(count):
+        # How many samples old the set-points are that have arrived by now; 1e-9 for delays of whole samples.
         age = max(0, math.ceil((latency - i * h) / sample_time - 1e-9))
         command = (float(x.queue[age, 0]), float(x.queue[age, 1]), float(x.queue[age, 2]))
         moving = neck_runge_kutta(moving, h, command, free, c, load)
@@ -118,6 +122,7 @@ def neck_sense(
     """Let the inclinometer see where the neck is now, and fill `outputs`."""
     lean = neck_lean(x, load)
     lag = float(parameters[NECK_SENSOR_LAG])
+    # The filter's own equation: with slopes, a delay between two samples is read off a cubic.
     slope1 = (lean[0] - x.filtered[0]) / lag
     slope2 = (lean[1] - x.filtered[1]) / lag
     inclinometer_store(x.history, (x.filtered[0], x.filtered[1], slope1, slope2, lean[2], lean[3]))
@@ -127,7 +132,7 @@ def neck_sense(
 
 def neck_enqueue(queue: np.ndarray, inputs: np.ndarray, limit: float) -> None:
     """Put the newest set-points, clamped to +-`limit`, in front of the queue."""
-    for i in range(queue.shape[0] - 1, 2, -1):
+    for i in range(queue.shape[0] - 1, 2, -1):  # triples: [i - 3] is the same motor's
         queue[i] = queue[i - 3]
     for i in range(3):
         queue[i] = min(max(float(inputs[i]), -limit), limit)
@@ -136,9 +141,11 @@ def neck_enqueue(queue: np.ndarray, inputs: np.ndarray, limit: float) -> None:
 def neck_measure(p: VirtualNeckArrays, parameters: np.ndarray, x: VirtualNeckState) -> None:
     """Take one sensor sample: delay, noise, drift, quantisation, dropout."""
     sample_time = float(p.setup[0, NECK_TS])
+    # A chain of two states: onsets at a rate, and mean length T of a dropout (geometric, so that ends = Ts / T).
     begins = 1.0 - math.exp(-sample_time * parameters[NECK_DROPOUT_RATE])
     ends = min(1.0, sample_time / parameters[NECK_DROPOUT_TIME])
     inclinometer_dropout(x.noise, x.random, begins, ends)
+    # Exact for an Ornstein-Uhlenbeck process over one sample.
     keep = math.exp(-sample_time / parameters[NECK_DRIFT_TIME])
     settings = (
         float(parameters[NECK_DRIFT_STD]),
@@ -160,6 +167,7 @@ def neck_outputs(parameters: np.ndarray, x: VirtualNeckState, c: tuple, load: tu
     outputs[1] = lean[1]
     outputs[2], outputs[3], outputs[4], outputs[5], outputs[6] = inclinometer_shown(x.noise)
     counts = float(parameters[NECK_ENCODER_COUNTS])
+    # Only what is logged is in counts: the drives' loops see the position itself.
     quantum = 2.0 * math.pi / counts if counts > 0.0 else 0.0
     for i in range(3):
         outputs[7 + i] = inclinometer_round(float(x.position[i]), quantum)
@@ -208,5 +216,6 @@ def neck_runge_kutta(
     k2 = neck_rates(neck_along(x, k1, 0.5 * h), command, free, c, load)
     k3 = neck_rates(neck_along(x, k2, 0.5 * h), command, free, c, load)
     k4 = neck_rates(neck_along(x, k3, h), command, free, c, load)
+    # x + h/6 (k1 + k4) + h/3 (k2 + k3).
     middle = neck_along(k2, k3, 1.0)
     return neck_along(neck_along(x, neck_along(k1, k4, 1.0), h / 6.0), middle, h / 3.0)

@@ -19,6 +19,7 @@ def tendon_chord(
     dS = f[5]
     a = geometry[1]
     inner = geometry[0] - s - a * (b1 * e[0] + b2 * e[1])
+    # Gradient of S (L0 - s - a b.e), where dS/db = (S'/beta) b.
     g1 = dS * b1 * inner - S * a * e[0]
     g2 = dS * b2 * inner - S * a * e[1]
     return S * inner, g1 * w1 + g2 * w2 - S * v, g1, g2, -S
@@ -37,6 +38,7 @@ def tendon_tension(
     if stretch <= 0.0:
         return 0.0, 0.0
     tension = stiffness * stretch + damping * rate
+    # A damper may not push either: a tendon let go fast enough is slack before its stretch is gone.
     if tension <= 0.0:
         return 0.0, 0.0
     return tension, tension * (1.0 + friction * math.tanh(slide / speed))

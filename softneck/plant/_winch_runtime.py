@@ -16,6 +16,7 @@ WINCH_NO_LIMIT = 1e3
 def winch_constants(c: tuple) -> tuple:
     """Return the neck's constants `c` with drives that pass on the torque they are given."""
     d = c[5]
+    # Neither bandwidth nor reset: a drive then asks for its integral, which never changes. Back-EMF and supply stay.
     passive = (d[0], d[1], 0.0, 0.0, WINCH_NO_LIMIT, d[5], d[6], d[7], d[8], d[9])
     return c[0], c[1], c[2], c[3], c[4], passive, c[6]
 
@@ -40,10 +41,12 @@ def winch_advance(
     `c` is of `winch_constants`, `load` of `neck_load`; `count` Runge-Kutta steps are taken.
     """
     b1, b2, s, w1, w2, v, z1, z2, p1, p2, p3, o1, o2, o3, _, _, _, f1, f2 = x
+    # Torques in the place of the integrals.
     x = (
         b1, b2, s, w1, w2, v, z1, z2, p1, p2, p3, o1, o2, o3, torques[0], torques[1], torques[2], f1, f2
     )  # fmt: skip
     for _ in range(count):
+        # The command has no say without a bandwidth.
         x = neck_runge_kutta(x, h / count, (0.0, 0.0, 0.0), free, c, load)
     return x
 
