@@ -40,33 +40,40 @@ def allocate_tendons(
     tilt = np.empty(3)
     # All of the last column are positive where the tendons surround the link.
     most = position / np.max(inverse[:, 2])
+    # Co-contraction first: what it leaves is for the tilt.
     common = min(max(wanted[2], -most), most)
+    # What the least pulled of unequal tendons has when the most pulled is at its limit: more cannot be kept at rest.
     least = min(least, most * np.min(inverse[:, 2]))
     for j in range(3):
         tilt[j] = inverse[j, 0] * wanted[0] + inverse[j, 1] * wanted[1]
+    # At -position the rule asks for nothing: tendons may be let out to the limit.
     taut = least > -position
     if taut:
         for j in range(3):
             common = max(common, least / inverse[j, 2])
     scale = 1.0
     for j in range(3):
-        rest = inverse[j, 2] * common
+        rest = inverse[j, 2] * common  # motor j by co-contraction alone
         if tilt[j] > 0.0:
+            # |s p_j + c_j delta| <= P_max, solved for s.
             scale = min(scale, (position - rest) / tilt[j])
-        elif tilt[j] < 0.0 and not taut:
+        elif tilt[j] < 0.0 and not taut:  # with the rule, `least` is the nearer bound
             scale = min(scale, (position + rest) / -tilt[j])
         if taut:
             for i in range(3):
                 # Motor j at `position` while co-contraction keeps motor i at `least`.
                 ratio = inverse[j, 2] / inverse[i, 2]
                 spread = tilt[j] - ratio * tilt[i]
+                # Then `scale * spread + ratio * least` is where motor j is.
                 if spread > 0.0:
                     scale = min(scale, (position - ratio * least) / spread)
-    scale = max(scale, 0.0)
+    scale = max(scale, 0.0)  # never the other way round
     if taut:
+        # delta = max(delta_ref, max_j (P_least - s p_j) / c_j).
         for j in range(3):
             common = max(common, (least - scale * tilt[j]) / inverse[j, 2])
     for j in range(3):
+        # The limits are kept already, but for rounding.
         target[j] = min(max(inverse[j, 2] * common + scale * tilt[j], -position), position)
 
 
@@ -76,6 +83,7 @@ def allocate_lead(target: np.ndarray, motors: np.ndarray, lead: float) -> None:
     for j in range(3):
         largest = max(largest, abs(target[j] - motors[j]))
     if largest > lead:
+        # Towards the motors, so that the integral waits for a drive at its current limit.
         share = lead / largest
         for j in range(3):
             target[j] = motors[j] + share * (target[j] - motors[j])

@@ -14,9 +14,11 @@ def step(p: LinearArrays, parameters: np.ndarray, x: LinearState, inputs: np.nda
     parameters: position limit [rad], slew limit [rad/s], lead limit [rad], least position of a motor [rad], least
     co-contraction [rad].
     """
+    # Whoever had the motors before: this controller takes over where they are.
     if x.started == 0.0:
         x.held[:] = inputs[5:8]
     active = inputs[8] > 0.5 and inputs[9] > 0.5
+    # Held set-points and an aligned state for as long as it may not act, so that it begins without a bump.
     if x.started == 0.0 or not active:
         linear_align(p, x, inputs[3:5])
     x.started = 1.0

@@ -12,8 +12,8 @@ import numpy as np
 from softneck.design.linear._allocation_runtime import allocate
 from softneck.runtime._layout import Arrays, StateVector, array, cells
 
-LINEAR_REFERENCE_LIMIT = 0.8
-LINEAR_MOTOR_LIMIT = 6.0
+LINEAR_REFERENCE_LIMIT = 0.8  # [rad], as the ports' min and max
+LINEAR_MOTOR_LIMIT = 6.0  # [rad], the paper's largest rotation (section 3.1)
 
 
 class FilterArrays(Arrays):
@@ -57,6 +57,7 @@ def linear_align(p: LinearArrays, x: LinearState, y: np.ndarray) -> None:
     known = np.empty(4)
     known[:2] = y
     known[2:] = v[:2]
+    # As if the references had been y and the co-contraction of now for ever.
     rest = np.empty(3)
     rest[:2] = y
     rest[2] = v[2]
@@ -68,14 +69,17 @@ def linear_control(p: LinearArrays, parameters: np.ndarray, x: LinearState, inpu
     """One sample of filter, controller, limits and conditioning."""
     y = inputs[3:5]
     r = linear_asked(parameters, inputs)
+    # Of now, before the filter moves on: r acts at once where Df lets it.
     rf = linear_reference(p, parameters, x.xf, inputs)
     wanted = np.empty(3)
     wanted[:2] = np.dot(p.C, x.x) + np.dot(p.Dr, rf[:2]) + np.dot(p.Dy, y)
     wanted[2] = rf[2]
+    # Position, lead, move in one sample, least position.
     limits = np.array([parameters[0], parameters[2], parameters[1] * p.constants[0], parameters[3]])
     allocate(p.T_inverse, wanted, limits, inputs[5:8], x.held)
     # What the limits took away: the controller's state moves as if it had never been asked for.
     excess = np.dot(p.T, x.held)[:2] - wanted[:2]
+    # Last, as v is of the states of now.
     x.xf[:] = np.dot(p.Af, x.xf) + np.dot(p.Bf, r)
     x.x[:] = np.dot(p.A, x.x) + np.dot(p.Br, rf[:2]) + np.dot(p.By, y) + np.dot(p.L, excess)
 

@@ -36,19 +36,24 @@ def sweep_run(
         for k in range(rows):
             y = state[0]
             angles[i, k] = y
+            # The reference acts at once, as in the runtime's filter (Df).
             rf = test[1] * rf + (1.0 - test[1]) * test[0]
             v = D[0] * rf + D[1] * y
             for j in range(n):
                 v += C[j] * x[j]
+            # Position, then move in one sample: one motor's part of `allocate`.
             u = min(max(v, -test[2]), test[2])
             held = min(max(u, held - test[3]), held + test[3])
             for j in range(n):
+                # Conditioning: L times what the limits took away.
                 total = B[j, 0] * rf + B[j, 1] * y + L[j] * (held - v)
                 for m in range(n):
                     total += A[j, m] * x[m]
                 following[j] = total
             x[:] = following
+            # Written where it will be at the front once its dead time is over.
             line[delay] = held + (test[4] if k >= test[5] else 0.0)
+            # Observable form; `y` keeps the angle of now, as state[0] changes first.
             for j in range(order):
                 tail = state[j + 1] if j + 1 < order else 0.0
                 state[j] = tail - plants[i, 1, j] * y + plants[i, 0, j] * line[0]

@@ -100,6 +100,7 @@ def step(p: AdaptiveArrays, parameters: np.ndarray, x: AdaptiveState, inputs: np
     if x.started == 0.0:
         x.held[:] = inputs[5:8]
     active = inputs[8] > 0.5 and inputs[9] > 0.5
+    # A regression needs the sample before.
     going = active and x.started > 0.5
     for axis in range(2):
         if going:
@@ -110,6 +111,7 @@ def step(p: AdaptiveArrays, parameters: np.ndarray, x: AdaptiveState, inputs: np
             # New gains move no motor: the integral takes up what they would have changed.
             change = adaptive_asked(p, parameters, x, axis, inputs) - before
             x.x[axis, 0] -= change
+        # Behind the learning, which needs the band-pass of before.
         adaptive_see(p, x, axis, inputs[3 + axis], going)
     now = adaptive_arrays(p, x)
     if x.started == 0.0 or not active:
@@ -125,9 +127,9 @@ def step(p: AdaptiveArrays, parameters: np.ndarray, x: AdaptiveState, inputs: np
 
 def adaptive_forget(p: AdaptiveArrays, x: AdaptiveState, axis: int) -> None:
     """Set the estimate back to the nominal plant."""
-    x.theta[axis, 0] = -p.nominal[axis, 0]
+    x.theta[axis, 0] = -p.nominal[axis, 0]  # Eq. 23 has a_1 = -a
     x.theta[axis, 1] = p.nominal[axis, 1]
-    x.U[axis] = 0.0
+    x.U[axis] = 0.0  # U = I: its ones are not kept
     x.D[axis] = p.guards[ADAPTIVE_START]
     x.tally[axis] = 0.0
 
@@ -139,25 +141,29 @@ def adaptive_learn(p: AdaptiveArrays, x: AdaptiveState, axis: int, y: float) -> 
     first = f * x.angle[axis, 1] + (y - x.angle[axis, 0])
     target = f * x.angle[axis, 2] + first
     newest = x.angle[axis, 2]
-    past = x.line[axis, int(p.delays[axis])]
+    past = x.line[axis, int(p.delays[axis])]  # u_f(k - 1 - d): the input of now is pushed last
     # The band-passed input of the last second, and whether all of the line has been filled since the last stop.
     x.power[axis] = ADAPTIVE_AVERAGE * x.power[axis] + (1.0 - ADAPTIVE_AVERAGE) * past * past
+    # d samples for the line, and two time constants, 2 / (1 - f) samples, for the band-pass to forget the stop.
     filled = x.samples[axis] > p.d + 2.0 / (1.0 - f)
     excited = math.sqrt(x.power[axis]) > p.guards[ADAPTIVE_EXCITED]
     if not (filled and excited):
         return
     a, b = p.nominal[axis, 0], p.nominal[axis, 1]
+    # Both errors before the row is learnt: afterwards the estimate would judge itself.
     error = target + x.theta[axis, 0] * newest - x.theta[axis, 1] * past
     nominal = target - a * newest - b * past
     x.missed[axis] = ADAPTIVE_AVERAGE * x.missed[axis] + (1.0 - ADAPTIVE_AVERAGE) * error * error
     x.nominal_missed[axis] = ADAPTIVE_AVERAGE * x.nominal_missed[axis] + (1.0 - ADAPTIVE_AVERAGE) * nominal * nominal
     adaptive_update(p, x, axis, -newest, past, target)
     adaptive_confine(p, x, axis)
+    # Within the dead zone one is as good as the other.
     floor = p.guards[ADAPTIVE_DEAD_ZONE] * p.guards[ADAPTIVE_DEAD_ZONE]
     worse = x.missed[axis] > p.guards[ADAPTIVE_DISTRUST] * x.nominal_missed[axis] + floor
     sound = math.isfinite(x.theta[axis, 0]) and math.isfinite(x.theta[axis, 1])
     if worse or not (sound and math.isfinite(x.D[axis, 0] + x.D[axis, 1])):
         adaptive_forget(p, x, axis)
+        # Even at first, or the new estimate would be distrusted for the old one's errors.
         x.missed[axis] = x.nominal_missed[axis]
 
 
@@ -169,6 +175,7 @@ def adaptive_update(
     row[0, 0] = past_angle
     row[0, 1] = past_input
     g = p.guards
+    # One a, whose pole is kept stable.
     rules = np.array([g[ADAPTIVE_FORGETTING], g[ADAPTIVE_BOUND], g[ADAPTIVE_DEAD_ZONE], 1.0, g[ADAPTIVE_RADIUS]])
     factor = x.U[axis].reshape((2, 2))
     ud_guarded(row, np.array([target]), x.theta[axis], factor, x.D[axis], rules, x.tally[axis], np.empty((0, 5)))
@@ -178,6 +185,7 @@ def adaptive_confine(p: AdaptiveArrays, x: AdaptiveState, axis: int) -> None:
     """Put the estimate back into the box of pole and static gain."""
     a = min(max(-x.theta[axis, 0], p.box[axis, 0]), p.box[axis, 1])
     x.theta[axis, 0] = -a
+    # The box is of the static gain b / (1 - a), whatever sign it has.
     x.theta[axis, 1] = min(max(x.theta[axis, 1], p.box[axis, 2] * (1.0 - a)), p.box[axis, 3] * (1.0 - a))
 
 
@@ -187,6 +195,7 @@ def adaptive_redesign(p: AdaptiveArrays, x: AdaptiveState, axis: int, adapt: boo
     a, b = p.nominal[axis, 0], p.nominal[axis, 1]
     if adapt:
         a, b = -x.theta[axis, 0], x.theta[axis, 1]
+    # 1 - a and the static gain move, as the controller's time and gain do; relative, so that neither gets to zero.
     lag = 1.0 - x.used[axis, 0]
     gain = x.used[axis, 1] / lag
     lag = min(max(1.0 - a, lag * (1.0 - rate)), lag * (1.0 + rate))
@@ -211,7 +220,7 @@ def adaptive_see(p: AdaptiveArrays, x: AdaptiveState, axis: int, y: float, going
     if going:
         x.angle[axis, 1] = f * x.angle[axis, 1] + (y - x.angle[axis, 0])
         x.angle[axis, 2] = f * x.angle[axis, 2] + x.angle[axis, 1]
-    else:
+    else:  # behind a zero at z = 1 what rests is zero
         x.angle[axis, 1] = 0.0
         x.angle[axis, 2] = 0.0
     x.angle[axis, 0] = y
@@ -220,6 +229,7 @@ def adaptive_see(p: AdaptiveArrays, x: AdaptiveState, axis: int, y: float, going
 def adaptive_push(p: AdaptiveArrays, x: AdaptiveState, axis: int, u: float, going: bool) -> None:
     """Put the band-passed input of now into the line."""
     f = p.guards[ADAPTIVE_FILTER]
+    # What was held or moved by others is no experiment: the line begins anew.
     if not going or x.samples[axis] == 0.0:
         x.input[axis, 1] = 0.0
         x.input[axis, 2] = 0.0
@@ -237,6 +247,7 @@ def adaptive_push(p: AdaptiveArrays, x: AdaptiveState, axis: int, u: float, goin
 
 def adaptive_arrays(p: AdaptiveArrays, x: AdaptiveState) -> LinearArrays:
     """Return the arrays of the linear controller for a and b in use."""
+    # s, ym and its past of d samples, for each axis.
     n = p.d + 2
     A, Br, By = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2)), np.zeros((2 * n, 2))
     C, Dr, Dy, L = np.zeros((2, 2 * n)), np.zeros((2, 2)), np.zeros((2, 2)), np.zeros((2 * n, 2))
@@ -245,18 +256,18 @@ def adaptive_arrays(p: AdaptiveArrays, x: AdaptiveState) -> LinearArrays:
         o = axis * n
         seen = o + 1 + int(p.delays[axis])
         A[o, o] = 1.0
-        A[o, seen] = kappa * (1.0 - a) / b
-        A[o + 1, o + 1] += a
+        A[o, seen] = kappa * (1.0 - a) / b  # s+ = s + kappa (1 - a) / b (ym - y)
+        A[o + 1, o + 1] += a  # ym+ = a ym + (1 - a) rf
         for i in range(2, n):
-            A[o + i, o + i - 1] = 1.0
+            A[o + i, o + i - 1] = 1.0  # a line of delay
         Br[o + 1, axis] = 1.0 - a
         By[o, axis] = -kappa * (1.0 - a) / b
         C[axis, o] = 1.0
         C[axis, seen] += kappa / b
         Dr[axis, axis] = (1.0 - a) / b
         Dy[axis, axis] = -kappa / b
-        L[o, axis] = p.guards[ADAPTIVE_LEAK]
-        L[o + 1, axis] = b
+        L[o, axis] = p.guards[ADAPTIVE_LEAK]  # gives up what is beyond a limit over `leak_time`
+        L[o + 1, axis] = b  # the model gets what the motors could do, and waits
     # `adaptive_align` aligns: no matrix of y and v can, as it would move with the gains.
     align = np.zeros((2 * n, 4))
     return (  # pyright: ignore[reportReturnType]  # a tuple is what arrays are in the bundle
@@ -273,4 +284,5 @@ def adaptive_align(p: AdaptiveArrays, now: LinearArrays, x: AdaptiveState, y: np
     x.xf[:] = np.dot(p.rest, rest)
     for axis in range(2):
         x.x[axis] = y[axis]
+        # v = rf / G_0 + s where ym = y: Dr is 1 / G_0.
         x.x[axis, 0] = v[axis] - now.Dr[axis, axis] * y[axis]

@@ -75,12 +75,14 @@ def step(
 
 def scheduled_inclination(pitch: float, roll: float) -> float:
     """Return the inclination [rad]."""
+    # Pitch and roll are atan2(n1, n3) and atan2(n2, n3) of the normal n: the squares of their tangents add up.
     return math.atan(math.hypot(math.tan(pitch), math.tan(roll)))
 
 
 def scheduled_blend(stacked: np.ndarray, knots: int, low: int, part: float) -> np.ndarray:
     """Return the matrix that lies `part` of the way from inclination `low` to the next."""
     rows = stacked.shape[0] // knots
+    # Beyond the last knot `part` is zero: it blends with itself.
     high = min(low + 1, knots - 1)
     return (1.0 - part) * stacked[low * rows : (low + 1) * rows] + part * stacked[high * rows : (high + 1) * rows]
 
@@ -117,6 +119,7 @@ def scheduled_exactly(p: LinearArrays, x: LinearState, y: np.ndarray) -> None:
     """Correct the aligned state until it asks for exactly the held set-points: a blend of alignments does not."""
     v = np.dot(p.T, x.held)
     inside = x.x
+    # With r at the angle, as `linear_align` has it.
     asked = np.dot(p.C, inside) + np.dot(p.Dr, y) + np.dot(p.Dy, y)
     for i in range(2):
         row = p.C[i]
