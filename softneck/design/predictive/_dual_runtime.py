@@ -19,6 +19,7 @@ QP_INFEASIBLE = -2
 
 def qp_append(G: np.ndarray, rows: np.ndarray, L: np.ndarray, k: int, p: int) -> bool:
     """Append row p to the `k` active ones and their factor; return false if it depends on them."""
+    # Row p of the factor: L l = G_Wp; `square` is left of G_pp, what of row p the active rows do not span.
     square = G[p, p]
     for i in range(k):
         value = G[p, rows[i]]
@@ -38,6 +39,7 @@ def qp_remove(G: np.ndarray, rows: np.ndarray, L: np.ndarray, lam: np.ndarray, k
     for i in range(at, k - 1):
         rows[i] = rows[i + 1]
         lam[i] = lam[i + 1]
+    # The factor above `at` stands; the rows behind are appended to it anew.
     left = at
     for i in range(at, k - 1):
         lam[left] = lam[i]
@@ -79,6 +81,7 @@ def qp_start(
     k = 0
     for p in range(sign.shape[0]):
         if sign[p] != 0.0:
+            # At most as many rows as variables; and a side without a bound is none to stand on.
             bound = upper[p] if sign[p] > 0.0 else lower[p]
             if k < rows.shape[0] and abs(bound) < 1e20 and qp_append(G, rows, L, k, p):
                 k += 1
@@ -86,6 +89,7 @@ def qp_start(
                 sign[p] = 0.0
     while k > 0:
         qp_multipliers(c, lower, upper, sign, rows, L, k, lam)
+        # The most wrong multiplier's row goes, one at a time: the others change when it does.
         worst = 0.0
         at = -1
         for i in range(k):
@@ -109,7 +113,7 @@ def qp_worst(
     far = tolerance
     side = 0.0
     for p in range(r.shape[0]):
-        if sign[p] == 0.0:
+        if sign[p] == 0.0:  # active rows stand on their bounds
             if r[p] - upper[p] > far:
                 far = r[p] - upper[p]
                 at = p
@@ -146,6 +150,7 @@ def qp_solve(
     k = qp_start(G, c, lower, upper, sign, rows, L, lam)
     iterations = 0
     while True:
+        # r = c - G w.
         r[:] = c
         for i in range(k):
             for p in range(m):
@@ -160,13 +165,17 @@ def qp_solve(
             iterations += 1
             if iterations > budget:
                 return QP_FAILED
+            # G_WW w = G_Wp: as row p's multiplier grows by s t, those of the active rows fall by s t w.
             for i in range(k):
                 w[i] = G[rows[i], p]
             qp_backward(L, k, w)
+            # How fast row p comes back by it: the Schur complement of G_WW.
             curve = G[p, p]
             for i in range(k):
                 curve -= G[rows[i], p] * w[i]
+            # The step at which row p is on its bound; never, if it depends on the active rows.
             full = far / curve if curve > QP_DEPENDENT * G[p, p] else 1e300
+            # The step at which the first multiplier of an active row would change sign.
             part = 1e300
             at = -1
             for i in range(k):
@@ -175,6 +184,7 @@ def qp_solve(
                     part = abs(lam[i]) / falls
                     at = i
             t = min(full, part)
+            # Neither: the active rows contradict row p.
             if t >= 1e300:
                 return QP_INFEASIBLE
             for i in range(k):
@@ -188,6 +198,7 @@ def qp_solve(
                 sign[p] = s
                 k += 1
                 break
+            # The row that blocks goes; row p keeps what its multiplier has gained.
             sign[rows[at]] = 0.0
             k = qp_remove(G, rows, L, lam, k, at)
     # From the bounds anew: what the steps have added up to is off by their rounding.

@@ -47,6 +47,7 @@ def step(p: MpcArrays, parameters: np.ndarray, x: MpcState, inputs: np.ndarray, 
     """
     if mpc_begin(p, x, inputs):
         mpc_decide(p, parameters, x, inputs)
+    # Held or moved: models and past inputs go on with what the motors were told.
     mpc_predict(p, x)
     outputs[:] = x.held
 
@@ -66,6 +67,7 @@ def mpc_bounds(
             low, high = -move, move
             # The first three rows are the moves of now, whose motors have been seen.
             if i < 3 and math.isfinite(motors[i]):
+                # Within the slew at any rate: a motor far off must not leave the problem without a solution.
                 low = min(max(low, motors[i] - parameters[2] - held[i]), high)
                 high = max(min(high, motors[i] + parameters[2] - held[i]), low)
         elif kind == MPC_ROW_POSITION:
@@ -76,6 +78,7 @@ def mpc_bounds(
         elif kind == MPC_ROW_SLACK:
             low = 0.0
         elif kind == MPC_ROW_ANGLE_HIGH:
+            # Soft limits, tightened by their back-off; the slack is a variable of the row.
             high = parameters[int(q[MPC_ANGLE_AT])] - q[MPC_ANGLE_BACK] - free[i]
         elif kind == MPC_ROW_ANGLE_LOW:
             low = q[MPC_ANGLE_BACK] - parameters[int(q[MPC_ANGLE_AT])] - free[i]
@@ -92,12 +95,14 @@ def mpc_decide(p: MpcArrays, parameters: np.ndarray, x: MpcState, inputs: np.nda
     lower, upper, lam = np.empty(p.m), np.empty(p.m), np.zeros(p.m)
     mpc_bounds(p, parameters, inputs[5:8], theta, lower, upper)  # pyright: ignore[reportArgumentType]
     z0 = np.dot(p.K, theta)
+    # A warm start, from the rows that the last sample ended with.
     sign = x.active.copy()
     budget = int(p.constants[MPC_BUDGET])
     # The rows' multipliers depend on G and the rows at z0 alone.
     c = np.dot(p.A, z0)
     iterations = qp_solve(p.G, c, lower, upper, sign, lam, budget, p.constants[MPC_TOLERANCE], z0.shape[0])
     x.iterations = iterations if iterations >= 0 else budget
+    # z = z0 - H^-1 A' lambda; H is symmetric.
     z = z0 - np.dot(lam, p.AH)
     mpc_take(p, x, theta, z, lam, lower, upper, iterations >= 0)
     mpc_move(p, x, lower, upper, parameters[0])
@@ -119,6 +124,7 @@ def mpc_take(
         x.age = 0.0
         mpc_judge(p, x, z)
     else:
+        # Rows of an answer that was none are no start.
         x.active[:] = 0.0
         x.age += 1.0
         x.status = MPC_PLAN
@@ -141,12 +147,14 @@ def mpc_residual(
     p: MpcArrays, theta: np.ndarray, z: np.ndarray, lam: np.ndarray, lower: np.ndarray, upper: np.ndarray
 ) -> float:
     """Return the largest residual of the KKT conditions: stationarity, by the size of H, bounds, multipliers' signs."""
+    # H z + F theta + A' lambda = 0.
     gradient = np.dot(p.H, z) + np.dot(p.F, theta) + np.dot(lam, p.A)
     worst = np.max(np.abs(gradient)) / p.scale[0]
     r = np.dot(p.A, z)
     for i in range(p.m):
         worst = max(worst, r[i] - upper[i], lower[i] - r[i])
         if lam[i] > 0.0:
+            # Complementarity: a multiplier or a distance to its bound, not both.
             worst = max(worst, min(abs(r[i] - upper[i]), lam[i]))
         elif lam[i] < 0.0:
             worst = max(worst, min(abs(r[i] - lower[i]), -lam[i]))
@@ -158,8 +166,9 @@ def mpc_move(p: MpcArrays, x: MpcState, lower: np.ndarray, upper: np.ndarray, po
     for j in range(3):
         move = 0.0
         for b in range(p.moves):
-            if p.starts[b] == x.age:
+            if p.starts[b] == x.age:  # whole numbers: equality is safe
                 move = x.plan[3 * b + j]
+        # Bounds of now: a plan of an earlier sample knew others.
         move = min(max(move, lower[j]), upper[j])
         low, high = min(-position, x.held[j]), max(position, x.held[j])
         x.held[j] = min(max(x.held[j] + move, low), high)

@@ -11,8 +11,8 @@ import numpy as np
 
 from softneck.runtime._layout import Arrays, StateVector, array, cells, value
 
-MPC_REFERENCE_LIMIT = 0.8
-MPC_MOTOR_LIMIT = 6.0
+MPC_REFERENCE_LIMIT = 0.8  # [rad], as the ports' min and max
+MPC_MOTOR_LIMIT = 6.0  # [rad], the paper's largest rotation (section 3.1)
 # No neck leans this far; whoever says so measures nothing.
 MPC_PLAUSIBLE = 1.3
 MPC_NO_BOUND = 1e30
@@ -158,11 +158,12 @@ def mpc_listen(p: MpcArrays, x: MpcState, inputs: np.ndarray) -> None:
         if math.isfinite(inputs[i]):
             limit = MPC_REFERENCE_LIMIT if i < 2 else MPC_MOTOR_LIMIT
             x.seen[i] = min(max(inputs[i], -limit), limit)
-    first = 10
+    first = 10  # of the measured disturbances in `inputs`: behind the preview, where there is one
     if p.ahead > 0:
         first = 12
         for axis in range(2):
             row = x.coming[axis]
+            # What is to come is not known yet: as now.
             if x.started == 0.0:
                 row[:] = x.seen[axis]
             for i in range(p.ahead - 1):
@@ -196,6 +197,7 @@ def mpc_align(p: MpcArrays, x: MpcState, inputs: np.ndarray, measured: bool) -> 
             x.offsets[i, 0] = 0.0
             x.offsets[i, 1] = 0.0
             if measured:
+                # What the angle is beyond that is a disturbance, there to stay.
                 x.offsets[i, 0] = inputs[3 + axis] - x.models[i, 0] - mpc_added(p, x, axis)
             x.filtered[axis] = x.models[i, 0] + x.offsets[i, 0]
     x.filtered[2] = v[2]
@@ -210,6 +212,7 @@ def mpc_align(p: MpcArrays, x: MpcState, inputs: np.ndarray, measured: bool) -> 
 def mpc_correct(p: MpcArrays, x: MpcState, inputs: np.ndarray) -> None:
     """Take the measured angles in."""
     for i in range(2 * p.S):
+        # x runs on its inputs alone: only o and r answer to what was measured.
         error = inputs[3 + i % 2] - mpc_added(p, x, i % 2) - x.models[i, 0] - x.offsets[i, 0]
         x.offsets[i, 0] += p.observer[i, 0] * error
         x.offsets[i, 1] += p.observer[i, 1] * error
@@ -220,6 +223,7 @@ def mpc_filter(p: MpcArrays, x: MpcState) -> None:
     for i in range(3):
         a = p.filters[i]
         asked = x.seen[i]
+        # As many samples early as the filter makes late.
         if i < 2 and p.ahead > 0 and p.lead > 0:
             asked = x.coming[i, min(p.lead, p.ahead) - 1]
         x.filtered[i] = a * x.filtered[i] + (1.0 - a) * asked
@@ -250,15 +254,18 @@ def mpc_parameter(p: MpcArrays, x: MpcState, theta: MpcTheta) -> None:
         a = p.filters[axis]
         value = x.filtered[axis]
         for i in range(1, p.L + 1):
+            # No preview: the reference of now is taken to stay.
             asked = x.seen[axis]
             if p.ahead > 0:
                 asked = x.coming[axis, min(i + p.lead, p.ahead) - 1]
             value = a * value + (1.0 - a) * asked
             theta.wanted[axis, i - 1] = value
         for j in range(p.measured):
+            # A measured disturbance is taken to stay as well; its effect comes through its filter.
             w, z, keep = x.disturbances[j, 0], x.disturbances[j, 1], p.disturbances[j, 2]
             for i in range(p.L):
                 z = keep * z + (1.0 - keep) * w
+                # Off the target instead of onto every model's angle: the same error.
                 theta.wanted[axis, i] -= p.disturbances[j, axis] * z
     theta.held[:] = x.held
     theta.cocontraction = x.filtered[2]
@@ -271,9 +278,10 @@ def mpc_predict(p: MpcArrays, x: MpcState) -> None:
     now = np.empty(p.n)
     for i in range(2 * p.S):
         back = int(p.delays[i])
-        u = x.past[back - 1, i % 2] if back > 0 else v[i % 2]
+        u = x.past[back - 1, i % 2] if back > 0 else v[i % 2]  # v(k - d); without dead time v of now
         now[:] = x.models[i]
         mpc_model(p, i, u, now, x.models[i])
+        # o first: r of now moves it (o+ = o + r, r+ = a r).
         x.offsets[i, 0] += x.offsets[i, 1]
         x.offsets[i, 1] *= p.observer[i, 2]
     for i in range(p.D - 1, 0, -1):

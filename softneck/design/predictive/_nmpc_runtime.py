@@ -36,10 +36,10 @@ from softneck.design.predictive._nmpc_state_runtime import (
 )
 from softneck.runtime._members_runtime import member_initialise, member_size, member_step, member_tangent
 
-_MOST_ITERATIONS = 50
-_CONVERGED = 1e-10
-_TOLERANCE = 1e-10
-_LARGEST_RESIDUAL = 1e-7
+_MOST_ITERATIONS = 50  # of the iterated form; a real-time iteration takes one
+_CONVERGED = 1e-10  # [rad] in any move
+_TOLERANCE = 1e-10  # [rad] by which the QP's rows may be beyond their bounds
+_LARGEST_RESIDUAL = 1e-7  # 1000 times `_TOLERANCE`: beyond it the answer is none
 
 
 def state_size(p: NmpcArrays) -> int:
@@ -78,6 +78,7 @@ def step(p: NmpcArrays, parameters: np.ndarray, x: NmpcState, inputs: np.ndarray
     x.status = NMPC_HOLDING
     if acts:
         nmpc_decide(p, parameters, x, inputs)
+    # In free run, measured or not: what it misses is in `missed`, not in its state.
     nmpc_model(p, x.model, x.held, x.angles)
     outputs[:] = x.held
 
@@ -99,7 +100,7 @@ def nmpc_model(p: NmpcArrays, model: np.ndarray, motors: np.ndarray, angles: np.
     """Move the model on in free run under `motors` and fill its `angles`."""
     u = np.empty(8)
     u[:3] = motors
-    u[3:] = np.nan
+    u[3:] = np.nan  # NaN: nothing is measured
     out = np.zeros(int(p.setup[NMPC_OUTPUTS]))
     member_step(p, 0, p.free, model, u, out)
     angles[:] = out[:2]
@@ -116,16 +117,18 @@ def nmpc_settle(p: NmpcArrays, x: NmpcState) -> None:
 def nmpc_linear(p: NmpcArrays, x: NmpcState, z: np.ndarray, Y: np.ndarray, S: np.ndarray) -> None:
     """Fill the angles Y (2 N,) that the plan `z` leads to from now on, and their derivative S (2 N, nz)."""
     nz = z.shape[0]
+    # A copy: the controller's own model stays at t_k.
     now, held = x.model.copy(), x.held.copy()
     u, out = np.empty(8), np.zeros(int(p.setup[NMPC_OUTPUTS]))
     u[3:] = np.nan
+    # dx/dz, du/dz, dy/dz: the state of now answers to no move.
     X, U, D = np.zeros((now.shape[0], nz)), np.zeros((8, nz)), np.zeros((out.shape[0], nz))
     block = 0
     for k in range(p.N):
         if block < p.moves and p.starts[block] == k:
             for j in range(3):
                 held[j] += z[3 * block + j]
-                U[j, 3 * block + j] = 1.0
+                U[j, 3 * block + j] = 1.0  # from here on, as `held` keeps the move
             block += 1
         u[:3] = held
         # Moves that are still to come have moved nothing.
@@ -142,24 +145,28 @@ def nmpc_quadratic(
     """Fill the QP's H and f for absolute moves; `missing` (2 N,) is what angles are above their targets."""
     q, nz, N, starts, T = p.setup, z.shape[0], p.N, p.starts, p.T
     weights = p.weights.reshape(2 * N)
+    # Gauss-Newton: H = 2 S' Q S, without the second derivative of the free run.
     weighted = np.empty((nz, 2 * N))
     for i in range(2 * N):
         weighted[:, i] = 2.0 * weights[i] * S[i]
     H[:, :] = 0.0
     f[:] = 0.0
     H[:nz, :nz] = np.dot(weighted, S)
+    # S z taken off, so that z are moves and not changes of the plan; `asked` are those that the reference needs.
     f[:nz] = np.dot(weighted, missing - np.dot(S, z)) - 2.0 * q[NMPC_MOVE] * asked
-    level = np.dot(T[2], x.held) - x.filtered[2]
+    level = np.dot(T[2], x.held) - x.filtered[2]  # delta of now above what is wanted
     for b in range(starts.shape[0]):
         for j in range(3):
             i = 3 * b + j
             H[i, i] += 2.0 * q[NMPC_MOVE]
+            # A move counts in all samples from its own on.
             f[i] += 2.0 * q[NMPC_COCONTRACTION] * T[2, j] * (N - starts[b]) * level
             for c in range(starts.shape[0]):
                 # Samples on which both moves are in what is held.
                 both = N - max(starts[b], starts[c])
                 for m in range(3):
                     H[i, 3 * c + m] += 2.0 * q[NMPC_COCONTRACTION] * both * T[2, j] * T[2, m]
+    # sigma (eps^2 + 0.1 eps): the linear part makes slack zero wherever it can be.
     if q[NMPC_SLACK] > 0.0:
         H[nz, nz] = 2.0 * q[NMPC_SLACK]
         f[nz] = 0.1 * q[NMPC_SLACK]
@@ -175,7 +182,8 @@ def nmpc_bounds(
         lower[i] = -move
         upper[i] = move
     for j in range(3):
-        known = motors[j] if math.isfinite(motors[j]) else held[j]
+        known = motors[j] if math.isfinite(motors[j]) else held[j]  # an encoder that says nothing: no lead to keep
+        # Within the slew at any rate, as in `mpc_bounds`.
         lower[j] = min(max(-move, known - parameters[2] - held[j]), move)
         upper[j] = max(min(move, known + parameters[2] - held[j]), lower[j])
     if slacks > 0:
@@ -206,14 +214,15 @@ def nmpc_rows(
     for i in range(n):
         A[i, i] = 1.0
     for i in range(nz):
-        for c in range(i // 3 + 1):
+        for c in range(i // 3 + 1):  # a position is the sum of the moves so far
             A[n + i, 3 * c + i % 3] = 1.0
     if n > nz:
         for axis in range(2):
             for c in range(b):
                 end = int(starts[c + 1]) if c + 1 < b else p.N
-                at = 2 * (end - 1) + axis
+                at = 2 * (end - 1) + axis  # y of sample k + 1 stands in rows 2 k and 2 k + 1
                 row = n + nz + axis * b + c
+                # The angle without any move: y(z) - S z, on its tangent.
                 free = reached[at] - np.dot(S[at], z)
                 for side in range(2):
                     A[row + 2 * b * side, :nz] = S[at]
@@ -237,7 +246,7 @@ def nmpc_factor(H: np.ndarray, L: np.ndarray) -> bool:
                 L[i, j] = value / L[j, j]
             elif value > 0.0:
                 L[i, i] = math.sqrt(value)
-            else:
+            else:  # not positive, or NaN
                 return False
     return True
 
@@ -259,12 +268,14 @@ def nmpc_solve(
             for j in range(i):
                 value -= L[i, j] * X[row, j]
             X[row, i] = value / L[i, i]
+    # z0 = -H^-1 f.
     z[:] = -f
     qp_backward(L, n, z)
     across = np.empty((n, m))
     for row in range(m):
         across[:, row] = X[row]
     iterations = qp_solve(np.dot(X, across), np.dot(A, z), lower, upper, sign, lam, budget, _TOLERANCE, n)
+    # H^-1 A' lambda = L'^-1 (X' lambda): half of a solve, as X has the other.
     change = np.dot(across, lam)
     for i in range(n - 1, -1, -1):
         value = change[i]
@@ -310,6 +321,7 @@ def nmpc_decide(p: NmpcArrays, parameters: np.ndarray, x: NmpcState, inputs: np.
     total = 0
     answered = False
     slack = 0.0
+    # Once (real-time iteration, Diehl, Bock and Schloeder 2005), or until nothing changes.
     for _ in range(_MOST_ITERATIONS if q[NMPC_CONVERGED] > 0.5 else 1):
         nmpc_linear(p, x, at, Y, S)
         Y += ahead
@@ -323,9 +335,11 @@ def nmpc_decide(p: NmpcArrays, parameters: np.ndarray, x: NmpcState, inputs: np.
             answered = x.residual <= _LARGEST_RESIDUAL
         if not answered:
             break
+        # A start for the next iteration's and the next sample's QP.
         for i in range(m):
             sign[i] = 1.0 if lam[i] > 0.0 else (-1.0 if lam[i] < 0.0 else 0.0)
         change = np.max(np.abs(z[:nz] - at))
+        # Full steps, without a line search.
         at[:] = z[:nz]
         slack = float(z[nz]) if p.slacks > 0 else 0.0
         if change < _CONVERGED:
@@ -334,6 +348,7 @@ def nmpc_decide(p: NmpcArrays, parameters: np.ndarray, x: NmpcState, inputs: np.
     nmpc_take(p, x, at, sign, answered, slack)
     plan, held = x.plan, x.held
     for j in range(3):
+        # Bounds of now: a plan of an earlier sample knew others.
         move = min(max(plan[j], lower[j]), upper[j])
         low, high = min(-parameters[0], held[j]), max(parameters[0], held[j])
         held[j] = min(max(held[j] + move, low), high)

@@ -6,8 +6,8 @@ import numpy as np
 
 from softneck.runtime._layout import Arrays, StateVector, array, cells, rest, value
 
-NMPC_REFERENCE_LIMIT = 0.8
-NMPC_MOTOR_LIMIT = 6.0
+NMPC_REFERENCE_LIMIT = 0.8  # [rad], as the ports' min and max
+NMPC_MOTOR_LIMIT = 6.0  # [rad], the paper's largest rotation (section 3.1)
 # No neck leans this far; whoever says so measures nothing.
 NMPC_PLAUSIBLE = 1.3
 NMPC_NO_BOUND = 1e30
@@ -112,12 +112,12 @@ def nmpc_asked(p: NmpcArrays, x: NmpcState, target: np.ndarray, asked: np.ndarra
     for i in range(3):
         now = x.seen[i]
         if i < 2 and p.H > 0 and p.lead > 0:
-            now = x.ahead[i, p.lead - 1]
+            now = x.ahead[i, p.lead - 1]  # as many samples early as the filter makes late
         x.filtered[i] = keep * x.filtered[i] + (1.0 - keep) * now
     for axis in range(2):
         filtered = x.filtered[axis]
         for i in range(p.path):
-            wanted = x.ahead[axis, int(p.asked_at[i])] if p.H > 0 else x.seen[axis]
+            wanted = x.ahead[axis, int(p.asked_at[i])] if p.H > 0 else x.seen[axis]  # no preview: it stays
             filtered = keep * filtered + (1.0 - keep) * wanted
             path[i] = filtered
             if 2 * i + axis < target.shape[0]:
@@ -125,18 +125,20 @@ def nmpc_asked(p: NmpcArrays, x: NmpcState, target: np.ndarray, asked: np.ndarra
         for b in range(p.moves):
             move = np.dot(p.slopes[b], path)
             for j in range(3):
-                asked[3 * b + j] += p.inverse[j, axis] * move
+                asked[3 * b + j] += p.inverse[j, axis] * move  # T^-1 over the static gains
 
 
 def nmpc_ahead(p: NmpcArrays, x: NmpcState, ahead: np.ndarray) -> None:
     """Fill what the model will miss (2 N,), from what it missed."""
     for axis in range(2):
+        # o and r of now, by least squares over the window (see `estimate_gains`).
         level = 0.0
         rate = 0.0
         for i in range(p.gains.shape[1]):
             level += p.gains[0, i] * x.missed[i, axis]
             rate += p.gains[1, i] * x.missed[i, axis]
         for i in range(p.future.shape[0]):
+            # o_i = o + r (1 + a + ...): the same disturbance as the linear controller's.
             ahead[2 * i + axis] = p.future[i, 0] * level + p.future[i, 1] * rate
 
 
@@ -149,6 +151,7 @@ def nmpc_shift(starts: np.ndarray, plan: np.ndarray) -> None:
         for i in range(b):
             # Position one sample after this start, relative to what is held now.
             now = 0.0
+            # The first move is in `held` already: the sum begins at 1.
             for c in range(1, b):
                 if starts[c] <= starts[i] + 1.0:
                     now += before[3 * c + j]
