@@ -25,6 +25,7 @@ def faults_act(k: int, place: int, faults: tuple, bus: np.ndarray) -> None:
     """
     detours, codes = faults[0], faults[1]
     origins, targets = detours[2 * place], detours[2 * place + 1]
+    # What a fault may change has a place of its own; the signal itself stays true for whoever reads it elsewhere.
     for i in range(len(origins)):
         bus[targets[i]] = bus[origins[i]]
     for i in range(len(codes)):
@@ -40,6 +41,7 @@ def fault_act(k: int, code: np.ndarray, faults: tuple, bus: np.ndarray) -> None:
     for i in range(begin, end):
         slot, at = slots[i], code[7] + i - begin
         now = bus[slot]
+        # Bias, outliers, noise, offsets and what acts on the neck: all drawn before the run, a row each.
         if kind == FAULT_ADD:
             if on:
                 bus[slot] = now + added[k, i]
@@ -47,18 +49,21 @@ def fault_act(k: int, code: np.ndarray, faults: tuple, bus: np.ndarray) -> None:
             if on:
                 bus[slot] = math.nan
         elif kind == FAULT_FREEZE:
+            # The memory follows while nothing is wrong.
             # At the very first row there is nothing before: that row's own value stays.
             if on and k > 0:
                 bus[slot] = memory[at]
             else:
                 memory[at] = now
         elif kind == FAULT_SLOW:
+            # From what was shown on the last row, in the window or before it: a slow motor begins without a jump.
             if on and k > 0:
                 bus[slot] = memory[at] + min(max(now - memory[at], -most[i]), most[i])
             memory[at] = bus[slot]
         else:
             fault_delay(k, i, code, memory, bus, slot, on)
     if kind == FAULT_DROPOUT and on:
+        # The flags of validity stand behind the signals in `slots`.
         for i in range(end, code[6]):
             bus[slots[i]] = 0.0
 
@@ -72,6 +77,7 @@ def fault_delay(
     if k == 0:
         for row in range(lag):
             memory[first + row * width] = now
+    # What is read here was written `lag` rows ago, in the place that now is written anew.
     at = first + (k % lag) * width
     if on:
         bus[slot] = memory[at]

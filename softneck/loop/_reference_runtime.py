@@ -45,7 +45,7 @@ def reference_at(p: ReferenceArrays, parameters: np.ndarray, x: ReferenceState, 
     Parameters: pitch, roll, cocontraction, inclination [rad], frequency [Hz], at, rise [s], enabled.
     """
     kind = int(p.setup[0])
-    time = x.sample * p.setup[1]
+    time = x.sample * p.setup[1]  # from a count: sums of sample times would drift
     pitch, roll, cocontraction = parameters[0], parameters[1], parameters[2]
     frequency, at, rise = parameters[4], parameters[5], parameters[6]
     if kind == 0:
@@ -57,6 +57,7 @@ def reference_at(p: ReferenceArrays, parameters: np.ndarray, x: ReferenceState, 
     elif kind == 3:
         pitch, roll, cocontraction = reference_rotation(time, parameters[3], cocontraction, frequency, at, rise)
     else:
+        # Time only goes forward: the search goes on where it was.
         k = reference_row(time, p.table, int(x.row))
         x.row = float(k)
         pitch, roll, cocontraction = p.table[k, 1], p.table[k, 2], p.table[k, 3]
@@ -94,6 +95,7 @@ def reference_rotation(
 ) -> tuple[float, float, float]:
     """Go around: pitch = A cos(w t), roll = A sin(w t), A rising from zero over `rise`."""
     elapsed = max(0.0, time - at)
+    # Out of the upright on a spiral: a circle begun at once would be a step.
     a = inclination * min(1.0, elapsed / rise)
     angle = 2.0 * math.pi * frequency * elapsed
     return a * math.cos(angle), a * math.sin(angle), cocontraction
@@ -101,6 +103,6 @@ def reference_rotation(
 
 def reference_row(time: float, table: np.ndarray, k: int) -> int:
     """Return the row of a recording that holds at `time`, from row `k` on."""
-    while k + 1 < table.shape[0] and table[k + 1, 0] <= time + 5e-10:
+    while k + 1 < table.shape[0] and table[k + 1, 0] <= time + 5e-10:  # rounding of the times, as in `reference_step`
         k += 1
     return k

@@ -30,6 +30,7 @@ def part_step(part: int, time: float, parts: tuple, inputs: np.ndarray, outputs:
     For parts that are compiled `load_linked` writes this function anew.
     """
     values = parts[part](time, inputs)
+    # A part may have written into `outputs` itself.
     if values is not outputs:
         outputs[:] = values
     # One sum tells whether a closer look is needed; in Python, which warns of no inf - inf.
@@ -62,6 +63,7 @@ def run_rows(
                 faults_act(k, part, faults, bus)
             else:
                 table[k] = bus
+        # A run that stops or is saved goes on from here.
         following[0] = k + 1
     return ROWS_DONE, 0
 
@@ -73,10 +75,12 @@ def rows_step(part: int, time: float, taps: tuple, bus: np.ndarray, outputs: np.
     missing, and which of its outputs may be (none if nobody looks).
     """
     slots, factors, fragile, missing = taps
+    # A copy: no part can change the bus by its inputs.
     inputs = bus[slots[part]]
     if factors[part].size:
         inputs *= factors[part]
     if fragile[part].size:
+        # Parts that cannot use a missing value say so; all others get the NaN.
         for i in fragile[part]:
             if not math.isfinite(inputs[i]):
                 return ROWS_MISSING_INPUT
@@ -84,6 +88,7 @@ def rows_step(part: int, time: float, taps: tuple, bus: np.ndarray, outputs: np.
         return ROWS_DONE
     may_miss = missing[part]
     for i in range(may_miss.size):
+        # NaN says "missing" where that may be; infinity is never an answer.
         if not math.isfinite(outputs[i]) and not (may_miss[i] and math.isnan(outputs[i])):
             return ROWS_BAD_OUTPUT
     return ROWS_DONE

@@ -49,10 +49,11 @@ def run_horizon(
         if horizon == 1:
             outputs[k] = scratch
             continue
+        # Known to t_k: from here on a copy runs free, and the row `horizon` ahead is noted.
         branch[:] = state
         if k == 0:
             outputs[0] = scratch
         for j in range(k + 1, min(k + horizon, last)):
             step(arrays, parameters, branch, free[j], scratch)
-            if k == 0 or j == k + horizon - 1:
+            if k == 0 or j == k + horizon - 1:  # from the first row those nearer too, which nobody else foresees
                 outputs[j] = scratch

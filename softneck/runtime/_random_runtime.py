@@ -20,12 +20,14 @@ def random_seed(s: np.ndarray, seed: float) -> None:
         # Park-Miller minimal standard generator: exact in float64, never 0.
         z = (16807.0 * z) % 2147483647.0
         s[i] = z
+    # Streams of neighbouring seeds begin alike: let them part.
     for _ in range(12):
         random_uniform(s)
 
 
 def random_uniform(s: np.ndarray) -> float:
     """Return a number in (0, 1) and advance the state `s` (6,)."""
+    # Products stay below 2^53, so that nothing is rounded; `%` of Python and numba is never negative.
     a = (1403580.0 * s[1] - 810728.0 * s[0]) % _M1
     s[0] = s[1]
     s[1] = s[2]
@@ -35,6 +37,7 @@ def random_uniform(s: np.ndarray) -> float:
     s[4] = s[5]
     s[5] = b
     d = a - b
+    # The two components, modulo m1, from 1 to m1: neither 0 nor 1 comes out, and the logarithm exists.
     if d <= 0.0:
         d += _M1
     return d / (_M1 + 1.0)
@@ -46,5 +49,6 @@ def random_normal(s: np.ndarray) -> float:
         v = 2.0 * random_uniform(s) - 1.0
         w = 2.0 * random_uniform(s) - 1.0
         r = v * v + w * w
+        # The second number that the method has to give is let go: it would be one more to keep in the state.
         if 0.0 < r < 1.0:
             return v * math.sqrt(-2.0 * math.log(r) / r)

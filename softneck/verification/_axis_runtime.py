@@ -9,5 +9,6 @@ def axis_advance(x: np.ndarray, numerator: np.ndarray, denominator: np.ndarray, 
     numerator, denominator: as long as x, highest power of z first; they begin with 0 and 1.
     """
     y = x[0]
+    # Observable form: x[j] is what past inputs and outputs still do to the angle j samples from now.
     for j in range(x.shape[0] - 1):
         x[j] = x[j + 1] - denominator[j + 1] * y + numerator[j + 1] * u

@@ -49,15 +49,17 @@ def step(
     inputs: motor_setpoint_1..3, load_pitch, load_roll. parameters: noise_std [rad], noise_seed.
     outputs: pitch, roll, pitch_measured, roll_measured, motor_position_1..3.
     """
-    tilt = np.dot(p.T, inputs[:3])
+    tilt = np.dot(p.T, inputs[:3])  # Eq. 9-11
     for axis in range(2):
         held, own = x.u[axis], x.x[axis]
         for j in range(p.line - 1, 0, -1):
             held[j] = held[j - 1]
+        # The other axis' input leaks in; a load acts as an input does, before the dead time.
         held[0] = tilt[axis] + p.cross[axis] * tilt[1 - axis] + inputs[3 + axis]
         axis_advance(own, p.numerator[axis], p.denominator[axis], held[int(p.delay[axis])])
         outputs[axis] = own[0]
         outputs[2 + axis] = own[0]
         if parameters[0] > 0.0:
             outputs[2 + axis] += parameters[0] * random_normal(x.random)
+    # No drives between: set-points are reached at once.
     outputs[4:7] = inputs[:3]

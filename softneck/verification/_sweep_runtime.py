@@ -48,14 +48,16 @@ def sweep_run(
     for i in range(n):
         member_initialise(p, 0, parameters, state, outputs)
         x = np.zeros((2, q))
-        u = np.zeros((rows, 2))
+        u = np.zeros((rows, 2))  # inputs v of all rows: a delay is an index back
         held[:] = 0.0
         for k in range(rows):
             values[:3] = signals[k, :3]
             for axis in range(2):
+                # Sequential: the controller sees the angle of t_k before its set-points move the plant on to t_k+1.
                 angles[i, k, axis] = x[axis, 0]
                 values[3 + axis] = x[axis, 0] + signals[k, 3 + axis]
             values[5:8] = held
+            # Healthy and enabled.
             values[8:] = 1.0
             for j in range(10):
                 if places[j] >= 0:
@@ -68,5 +70,5 @@ def sweep_run(
             u[k, 0] = tilt[0] + cross[i, 0] * tilt[1] + signals[k, 5]
             u[k, 1] = tilt[1] + cross[i, 1] * tilt[0] + signals[k, 6]
             for axis in range(2):
-                row = k - delay[i, axis]
+                row = k - delay[i, axis]  # before the run the plant was at rest
                 axis_advance(x[axis], numerator[i, axis], denominator[i, axis], u[row, axis] if row >= 0 else 0.0)

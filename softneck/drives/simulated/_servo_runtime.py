@@ -70,6 +70,7 @@ def servo_ticks(
     )
     free = (float(x.free[0]), float(x.free[1]), float(x.free[2]))
     passive = winch_constants(c)
+    # As many Runge-Kutta steps as the neck needs within a tick.
     count = neck_substeps(c, load, h, 1)
     per_ampere = float(
         parameters[NECK_TORQUE_CONSTANT] * parameters[NECK_GEAR_RATIO] * parameters[NECK_GEAR_EFFICIENCY]
@@ -103,6 +104,7 @@ def servo_tick(
 ) -> float:
     """Return the torque at the winch [N m] over the next tick; `position` [rad] and `speed` [rad/s] are the winch's."""
     counts = m[SERVO_SCALE] * position + m[SERVO_ZERO]
+    # Without power the demand follows the winch: whoever switches on starts where it stands.
     if m[SERVO_POWER] < 0.5:
         m[SERVO_DEMAND] = counts
         m[SERVO_DEMAND_SPEED] = 0.0
@@ -111,7 +113,7 @@ def servo_tick(
         m[SERVO_LATE] = 0.0
         m[SERVO_LEFT] = 0.0
         m[SERVO_AT_LIMIT] = 0.0
-        ring[:] = counts
+        ring[:] = counts  # nor is an old demand still on its way
         return 0.0
     servo_generate(m, h)
     servo_limit(m)
@@ -120,23 +122,28 @@ def servo_tick(
         place = 0
     m[SERVO_PLACE] = place
     ring[place] = m[SERVO_DEMAND]
+    # Latency is the bus's: profiles are generated in the drive itself.
     demand = ring[place - int(m[SERVO_LAG])] if m[SERVO_MODE] == 8.0 else m[SERVO_DEMAND]
     servo_follow(m, demand - counts, h)
     gain, speed_limit, bandwidth, reset, _, supply, back_emf, inertia, _, _ = drive
+    # Counts have the drive's sign, the neck radians: the scale takes both over.
     wanted = min(max(gain * (demand - counts) / m[SERVO_SCALE], -speed_limit), speed_limit)
     error = inertia * bandwidth * (wanted - speed)
     asked = error + m[SERVO_INTEGRAL]
-    most = m[SERVO_CURRENT_LIMIT] * per_ampere
+    most = m[SERVO_CURRENT_LIMIT] * per_ampere  # what the drive is set to, not the neck's own limit
     if m[SERVO_STUCK] > 0.5:
         # A blocked winch is held where it is by something stronger than the motor, which pushes in vain.
         m[SERVO_CURRENT] = math.copysign(m[SERVO_CURRENT_LIMIT], demand - counts)
+        # That something: a PI controller of zero speed, without limit.
         m[SERVO_INTEGRAL] += -h * reset * inertia * bandwidth * speed
         return m[SERVO_INTEGRAL] - inertia * bandwidth * speed
     high = min(most, supply - back_emf * speed)
     low = max(-most, -supply - back_emf * speed)
+    # Anti-windup, as in `drive_rates`.
     if not ((asked > high and error > 0.0) or (asked < low and error < 0.0)):
         m[SERVO_INTEGRAL] += h * reset * error
     torque = min(max(asked, low), high)
+    # Positive in the drive's own sense, as its counts are.
     m[SERVO_CURRENT] = torque / per_ampere * (1.0 if m[SERVO_SCALE] > 0.0 else -1.0)
     return torque
 
@@ -149,6 +156,7 @@ def servo_generate(m: np.ndarray, h: float) -> None:
             m[SERVO_LEFT] -= 1.0
             m[SERVO_DEMAND] += m[SERVO_SLOPE]
             m[SERVO_DEMAND_SPEED] = m[SERVO_SLOPE] / h
+            # Slopes add up with rounding: the last tick lands on the target itself.
             if m[SERVO_LEFT] < 0.5:
                 m[SERVO_DEMAND] = m[SERVO_TARGET]
         else:
@@ -159,6 +167,7 @@ def servo_generate(m: np.ndarray, h: float) -> None:
         way = m[SERVO_TARGET] - m[SERVO_DEMAND]
         # The speed from which the profile still stops at the target, one tick ahead.
         stop = math.sqrt(2.0 * m[SERVO_DECELERATION] * abs(way))
+        # No faster than the way that is left within one tick either.
         aim = math.copysign(min(min(m[SERVO_SPEED], stop), abs(way) / h), way)
         v = servo_ramp(v, aim, m[SERVO_ACCELERATION], m[SERVO_DECELERATION], h)
     elif mode == 3.0:
@@ -171,7 +180,7 @@ def servo_generate(m: np.ndarray, h: float) -> None:
 
 def servo_ramp(v: float, aim: float, acceleration: float, deceleration: float, h: float) -> float:
     """Return the speed one tick later on the way to `aim`."""
-    faster = abs(aim) > abs(v) and aim * v >= 0.0
+    faster = abs(aim) > abs(v) and aim * v >= 0.0  # towards the other side it brakes first
     most = (acceleration if faster else deceleration) * h
     return min(max(aim, v - most), v + most)
 
@@ -184,7 +193,7 @@ def servo_limit(m: np.ndarray) -> None:
     if m[SERVO_DEMAND] > m[SERVO_HIGH]:
         m[SERVO_DEMAND] = m[SERVO_HIGH]
         m[SERVO_AT_LIMIT] = 1.0
-        m[SERVO_DEMAND_SPEED] = min(m[SERVO_DEMAND_SPEED], 0.0)
+        m[SERVO_DEMAND_SPEED] = min(m[SERVO_DEMAND_SPEED], 0.0)  # only back inside
     elif m[SERVO_DEMAND] < m[SERVO_LOW]:
         m[SERVO_DEMAND] = m[SERVO_LOW]
         m[SERVO_AT_LIMIT] = -1.0
