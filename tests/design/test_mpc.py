@@ -289,6 +289,17 @@ def test_a_loop_gives_the_reference_ahead() -> None:
     )
 
 
+def test_a_disturbance_that_is_there_from_the_start_moves_nothing() -> None:
+    known = MeasuredDisturbance(name="base_tilt_pitch", unit="rad", pitch=1.0, time=0.3)
+    controller = MpcSettings(bandwidth=8.0, disturbances=(known,), lead_limit=12.0).design(bake_off_neck())
+    # It leans by 0.2 rad for its base does, and shall.
+    inputs = [0.2, 0.0, 0.0, 0.2, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.2]
+    state = controller.initial_state()
+    for _ in range(5):
+        state, out = controller.step(state, inputs)
+        np.testing.assert_allclose(out, 0.0, atol=1e-9)  # rounding of the QP
+
+
 def test_a_measured_disturbance_is_met_before_it_shows() -> None:
     known = MeasuredDisturbance(name="base_tilt_pitch", unit="rad", pitch=1.0, time=0.3)
     controller = MpcSettings(bandwidth=8.0, disturbances=(known,), lead_limit=12.0).design(bake_off_neck())

@@ -2,7 +2,13 @@
 
 import numpy as np
 
-from softneck.design.linear._linear_parts_runtime import LinearArrays, LinearState, linear_align, linear_control
+from softneck.design.linear._linear_parts_runtime import (
+    LinearArrays,
+    LinearState,
+    linear_align,
+    linear_control,
+    linear_sound,
+)
 from softneck.design.linear._rest_runtime import initialise as initialise
 
 
@@ -14,6 +20,10 @@ def step(p: LinearArrays, parameters: np.ndarray, x: LinearState, inputs: np.nda
     parameters: position limit [rad], slew limit [rad/s], lead limit [rad], least position of a motor [rad], least
     co-contraction [rad].
     """
+    # One that is none would stay in the state for good: the motors hold until all are there again.
+    if not linear_sound(inputs):
+        outputs[:] = x.held
+        return
     # Whoever had the motors before: this controller takes over where they are.
     if x.started == 0.0:
         x.held[:] = inputs[5:8]

@@ -7,6 +7,8 @@ L = Br Dr^-1 is the conditioning technique: the state is what it would be had th
 than the motors can do (Hanus, Kinnaert and Henrotte 1987, Automatica 23:729).
 """
 
+import math
+
 import numpy as np
 
 from softneck.design.linear._allocation_runtime import allocate
@@ -63,6 +65,14 @@ def linear_align(p: LinearArrays, x: LinearState, y: np.ndarray) -> None:
     rest[2] = v[2]
     x.xf[:] = np.dot(p.rest, rest)
     x.x[:] = np.dot(p.align, known)
+
+
+def linear_sound(inputs: np.ndarray) -> bool:
+    """Return whether references, angles and motor positions are numbers."""
+    for i in range(8):
+        if not math.isfinite(inputs[i]):
+            return False
+    return True
 
 
 def linear_control(p: LinearArrays, parameters: np.ndarray, x: LinearState, inputs: np.ndarray) -> None:

@@ -199,7 +199,7 @@ def mpc_align(p: MpcArrays, x: MpcState, inputs: np.ndarray, measured: bool) -> 
             if measured:
                 # What the angle is beyond that is a disturbance, there to stay.
                 x.offsets[i, 0] = inputs[3 + axis] - x.models[i, 0] - mpc_added(p, x, axis)
-            x.filtered[axis] = x.models[i, 0] + x.offsets[i, 0]
+            x.filtered[axis] = x.models[i, 0] + x.offsets[i, 0] + mpc_added(p, x, axis)
     x.filtered[2] = v[2]
     for i in range(p.D):
         x.past[i, 0] = v[0]

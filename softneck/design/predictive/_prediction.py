@@ -88,7 +88,7 @@ class Problem:
 
     @property
     def parameters(self) -> int:
-        """Length of theta, see `_mpc_runtime`."""
+        """Length of theta, see `_mpc_state_runtime`."""
         return 2 * len(self.scenarios) * (self.order + 2) + 2 * self.rows + 5
 
     @property

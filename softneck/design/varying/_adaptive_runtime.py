@@ -26,6 +26,7 @@ from softneck.design.linear._linear_parts_runtime import (
     LinearState,
     linear_control,
     linear_reference,
+    linear_sound,
 )
 from softneck.identification.linear._ud_runtime import ud_guarded
 from softneck.runtime._layout import array, cells, value
@@ -97,6 +98,11 @@ def step(p: AdaptiveArrays, parameters: np.ndarray, x: AdaptiveState, inputs: np
 
     parameters: those of the linear controller, and whether to adapt at all (0 or 1).
     """
+    # As in the linear controller; the line of inputs has a gap now, and begins anew.
+    if not linear_sound(inputs):
+        x.samples[:] = 0.0
+        outputs[:] = x.held
+        return
     if x.started == 0.0:
         x.held[:] = inputs[5:8]
     active = inputs[8] > 0.5 and inputs[9] > 0.5

@@ -18,6 +18,7 @@ from softneck.design.linear._linear_parts_runtime import (
     LinearState,
     linear_align,
     linear_control,
+    linear_sound,
 )
 from softneck.design.linear._rest_runtime import initialise as initialise
 from softneck.runtime._layout import array, cells
@@ -52,6 +53,10 @@ def step(
     p: ScheduledArrays, parameters: np.ndarray, x: ScheduledState, inputs: np.ndarray, outputs: np.ndarray
 ) -> None:
     """Compute the set-points for now, and the state for the next sample; ports as of the linear controller."""
+    # As in the linear controller: what is not a number would stay in the state.
+    if not linear_sound(inputs):
+        outputs[:] = x.held
+        return
     active = inputs[8] > 0.5 and inputs[9] > 0.5
     started = x.started > 0.5
     if not started:

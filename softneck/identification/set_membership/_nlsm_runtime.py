@@ -39,7 +39,7 @@ class NlsmArrays(NarxArrays):
 def nlsm_bounds(
     points: np.ndarray, values: np.ndarray, gamma: float, epsilon: float, w: np.ndarray
 ) -> tuple[float, float]:
-    """Return f_l(w), f_u(w) (Eq. 18) over `points` (n, N), scaled, and their `values` (N,)."""
+    """Return f_l(w), f_u(w) (Eq. 19-20) over `points` (n, N), scaled, and their `values` (N,)."""
     squared = np.zeros(points.shape[1])
     # One regressor after the other: what is allocated is one row long, not the whole table.
     for i in range(points.shape[0]):

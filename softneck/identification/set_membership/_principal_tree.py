@@ -104,7 +104,7 @@ def _largest(points: Matrix) -> float:
 
 
 def slant_nodes(frame: Matrix, slope: float, points: Matrix, values: Vector) -> Matrix:
-    """Return the nodes (2^(depth+1), 2 (1 + sides) + 2) over points in tree order; see `_slant_runtime`.
+    """Return the nodes (2^(depth+1), 2 (1 + sides) + 2) over points in tree order; see `_principal_tree_runtime`.
 
     Row 0, which is not a node, holds the slope of the plane and the size of points and values.
     """

@@ -41,7 +41,7 @@ INTERRUPTED = "the fit was interrupted; these are the best numbers until then"
 class GreyBox:
     """Tendon kinematics, slack, hysteresis, stalling drives, lag and dead time; 16 numbers, by output error.
 
-    The equations are in `_neck_model_runtime`; findings hold each number with its unit and 95 % confidence.
+    The equations are in `_neck_equations_runtime`; findings hold each number with its unit and 95 % confidence.
 
     Attributes:
         evaluations: at most so many steps of Gauss-Newton for each dead time.

@@ -14,7 +14,7 @@ class Number:
     """One number of the neck's equations.
 
     Attributes:
-        name: as in `_neck_model_runtime`.
+        name: as in `_neck_equations_runtime`.
         unit: SI; lengths of tendon and tensions are in radians of motor.
         guess: where the search starts: the order of magnitude of a neck of 0.1 m with winches of 7.5 mm.
         low, high: its range.

@@ -66,7 +66,7 @@ def initialise(p: ResidualArrays, parameters: np.ndarray, x: ResidualState, outp
 
 
 def residual_query(p: ResidualArrays, axis: int, regressor: np.ndarray) -> tuple[float, float]:
-    """Return the bounds of one axis (Eq. 18-19): by the tree where loops are fast, else over all points by numpy."""
+    """Return the bounds of one axis (Eq. 19-20): by the tree where loops are fast, else over all points by numpy."""
     gamma = p.bounds[axis, 0]
     epsilon = p.bounds[axis, 1]
     if COMPILED:
