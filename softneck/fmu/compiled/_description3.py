@@ -80,11 +80,10 @@ def _variable(table: Element, port: Port, causality: str, reference: int) -> Non
 def _structure(root: Element, block: Block) -> None:
     structure = SubElement(root, "ModelStructure")
     n_in, n_out = len(block.inputs), len(block.outputs)
-    # A plant answers one sample later; all others with what they read at the same instant.
-    inputs = " ".join(map(str, range(n_in))) if block.role != "plant" else ""
     first = n_in + n_out
     parameters = " ".join(str(first + i) for i in range(len(block.parameters)))
-    for tag, known in (("Output", inputs), ("InitialUnknown", parameters)):
+    # As in FMI 2.0: an input shows in no output before the next communication step.
+    for tag, known in (("Output", ""), ("InitialUnknown", parameters)):
         for i in range(n_out):
             SubElement(structure, tag, valueReference=str(n_in + i), dependencies=known)
 
