@@ -67,15 +67,12 @@ def system_description(
         root, "ssd:System", {"name": "loop", "description": "closed loop, all inputs set before all steps"}
     )
     elements = SubElement(system, "ssd:Elements")
-    corners = [_corner(component.name, number) for number, component in enumerate(components)]
-    for component, corner in zip(components, corners, strict=True):
-        _component(elements, component, corner)
+    for number, component in enumerate(components):
+        _component(elements, component, _corner(component.name, number))
     connections = SubElement(system, "ssd:Connections")
     for link in links:
         _connection(connections, link)
-    width = max(x for x, _ in corners) + _WIDTH + _GAP
-    height = max(y for _, y in corners) + _HEIGHT + _GAP
-    SubElement(system, "ssd:SystemGeometry", {"x1": "0", "y1": "0", "x2": f"{width:g}", "y2": f"{height:g}"})
+    # No SystemGeometry: OMSimulator refuses a file that has one, and the boxes of the components say as much.
     _omsimulator(system, step)
     _units(root, components)
     SubElement(root, "ssd:DefaultExperiment", {"startTime": "0", "stopTime": repr(duration)})
