@@ -117,6 +117,7 @@ def _facts(block: Block, name: str) -> dict[str, Any]:
         "role": block.role,
         "sample_time": float(block.sample_time),
         "cost": plain_cost(block),
+        "module_of_runtime": block.runtime,  # nothing the slave reads: a compiled FMU can be made of this one
         "shapes": [list(array.shape) for array in block.arrays],
         "inputs": [_port_facts(port) for port in block.inputs],
         "outputs": [_port_facts(port) for port in block.outputs],
