@@ -35,8 +35,12 @@ class Running3(Running):
 
     def set(self, **values: float) -> None:
         for name, value in values.items():
-            call = self.fmu.setBoolean if name in self.booleans else self.fmu.setFloat64
-            call([self.references[name]], [bool(value) if name in self.booleans else value])
+            if name == "noise_seed":
+                self.fmu.setInt64([self.references[name]], [int(value)])
+            elif name in self.booleans:
+                self.fmu.setBoolean([self.references[name]], [bool(value)])
+            else:
+                self.fmu.setFloat64([self.references[name]], [value])
 
     def get(self, *names: str) -> list[float]:
         take = {name: self.fmu.getBoolean if name in self.booleans else self.fmu.getFloat64 for name in names}

@@ -100,8 +100,8 @@ def _component(elements: Element, component: Component, corner: tuple[float, flo
 
 
 def _type(parent: Element, port: Port) -> None:
-    if port.boolean:
-        SubElement(parent, "ssc:Boolean")
+    if port.boolean or port.integer:
+        SubElement(parent, "ssc:Boolean" if port.boolean else "ssc:Integer")
     else:
         SubElement(parent, "ssc:Real", {} if port.unit in ("", "1") else {"unit": port.unit})
 
@@ -115,6 +115,8 @@ def _bindings(element: Element, component: Component) -> None:
         parameter = SubElement(parameters, "ssv:Parameter", {"name": port.name})
         if port.boolean:
             SubElement(parameter, "ssv:Boolean", {"value": "true" if value else "false"})
+        elif port.integer:
+            SubElement(parameter, "ssv:Integer", {"value": str(int(value))})
         else:
             SubElement(parameter, "ssv:Real", {"value": repr(value)})
 

@@ -121,7 +121,9 @@ def _component(name: str, part: Part, source: Path, loop: Loop, wiring: Wiring) 
 
 
 def _parameters(part: Part) -> tuple[Port, ...]:
-    return part.block.parameters if isinstance(part, BlockPart) else getattr(part, "parameters", ())
+    if isinstance(part, BlockPart):  # becomes an FMU of FMI 2.0, where our whole numbers are Real
+        return tuple(replace(port, integer=False) for port in part.block.parameters)
+    return getattr(part, "parameters", ())
 
 
 def _renamed(port: Port, names: _Names) -> Port:
