@@ -18,14 +18,17 @@ from softneck.loop import ReferenceBlock, StepReference
 from softneck.runtime import Block
 
 from .conftest import Running
-from .every_kind import KINDS, NATIVE, SHORT, TS, block_of, inputs_of
+from .every_kind import KINDS, NATIVE, TS, block_of, inputs_of
 
 needs_cc = pytest.mark.skipif(shutil.which("cc") is None and not os.environ.get("CI"), reason="no C compiler here")
 
 
+QUICK = ("rls", "kalman", "pi", "reference")
+
+
 def _some_slow(kinds: list[str]) -> list[Any]:
     """One of each sort at once, all others at night: models take their time to be fitted."""
-    return [*SHORT, "reference", *(pytest.param(kind, marks=pytest.mark.slow) for kind in kinds if kind not in SHORT)]
+    return [*QUICK, *(pytest.param(kind, marks=pytest.mark.slow) for kind in kinds if kind not in QUICK)]
 
 
 class Running3(Running):
