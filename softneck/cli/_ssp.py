@@ -17,10 +17,10 @@ from .shared._options import force_option, json_option, output_option, target
 @output_option("SSP archive", "X.ssp")
 @click.option(
     "--backend",
-    type=click.Choice(["python", "compiled"]),
-    default="python",
+    type=click.Choice(["compiled", "python"]),
+    default="compiled",
     show_default=True,
-    help="What runs in the FMUs that are made here: Python and numpy, or a C library that needs neither.",
+    help="What runs in its FMUs: a C library that needs nothing, or Python and numpy of the host.",
 )
 @force_option
 @json_option

@@ -79,7 +79,10 @@ class VirtualNeck:
             raise SettingsError(f"`noise_seed` must be an integer from 0 to 2147483646; got {noise_seed}.")
         queue = math.ceil(_LONGEST_LATENCY / sample_time) + 1
         history = math.ceil(_LONGEST_DELAY / sample_time) + 2
-        seed = Port(name="noise_seed", description="seed of the sensor's noise", start=float(noise_seed), minimum=0.0)
+        seed = Port(
+            name="noise_seed", description="seed of the sensor's noise", start=float(noise_seed), minimum=0.0,
+            integer=True,
+        )  # fmt: skip
         return Block(
             kind="virtual_neck",
             role="plant",

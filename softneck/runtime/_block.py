@@ -24,6 +24,7 @@ class Port:
         start: value before anything is set.
         minimum, maximum, nominal: as in FMI; None where there is none.
         boolean: a Boolean, carried as 0.0 or 1.0.
+        integer: a whole number; Int64 in FMI 3.0, Real in FMI 2.0.
         missing: NaN is allowed and means "not measured".
     """
 
@@ -35,6 +36,7 @@ class Port:
     maximum: float | None = None
     nominal: float | None = None
     boolean: bool = False
+    integer: bool = False
     missing: bool = False
 
 

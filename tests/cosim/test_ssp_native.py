@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import shutil
 import subprocess
 import sys
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from softneck.cosim import load_loop, simulate, write_ssp
+from softneck.core import SettingsError
+from softneck.cosim import FmuPart, load_loop, simulate, write_ssp
+from softneck.cosim.ssp._rebuild import block_without_python
 from softneck.design import PiSettings
 from softneck.estimation import KalmanSettings
-from softneck.fmu import build_compiled_fmu
+from softneck.fmu import build_compiled_fmu, build_fmu
+from softneck.fmu.describe._description import described_block
+from softneck.fmu.python._pack import read_zip, write_zip
 from softneck.plant import NeckParameters, VirtualNeck
+from softneck.runtime import Block, Port
 
-from ..fmu.every_kind import _linear
+from ..fmu.every_kind import _linear, block_of
+from ._foreign import build_foreign
 from .test_ssp import LOOP, MASTERS, PACKAGES, run_in
 
 pytestmark = pytest.mark.skipif(
@@ -32,12 +40,12 @@ pytestmark = pytest.mark.skipif(
 @pytest.mark.parametrize("master", list(PACKAGES))
 def test_other_masters_compute_our_jacobi_loop_without_python(master: str, tmp_path: Path) -> None:
     linear = _linear()
-    build_compiled_fmu(VirtualNeck(NeckParameters.paper()).block(), tmp_path / "VirtualNeck.fmu")
+    build_fmu(VirtualNeck(NeckParameters.paper()).block(), tmp_path / "VirtualNeck.fmu")  # becomes a compiled one
     build_compiled_fmu(KalmanSettings().design(linear).block(), tmp_path / "kalman.fmu")
     PiSettings().design(linear).save(tmp_path / "pi.npz")
     (tmp_path / "loop.toml").write_text(LOOP)
     setup = load_loop(tmp_path / "loop.toml")
-    archive = write_ssp(setup, tmp_path / "Loop.ssp", compiled=True)
+    archive = write_ssp(setup, tmp_path / "Loop.ssp")
     with zipfile.ZipFile(archive) as members:
         for name in members.namelist():
             if name.endswith(".fmu"):
@@ -58,9 +66,71 @@ def test_other_masters_compute_our_jacobi_loop_without_python(master: str, tmp_p
     assert np.abs(ours["pitch"]).max() > 0.02  # the loop does move
 
 
+@pytest.mark.parametrize("kind", ["kalman", "pi", pytest.param("ensemble", marks=pytest.mark.slow)])
+def test_a_python_fmu_gives_its_block_back(kind: str, tmp_path: Path) -> None:
+    """What becomes a compiled FMU is what the Python one was made of: the same arrays, ports and starts."""
+    block = described_block(block_of(kind))
+    again = block_without_python(build_fmu(block, tmp_path / "Model.fmu"))
+    assert again is not None
+    for name in ("kind", "role", "runtime", "sample_time"):
+        assert getattr(again, name) == getattr(block, name)
+    for ours, theirs in zip(block.arrays, again.arrays, strict=True):
+        np.testing.assert_array_equal(theirs, ours)
+    for ours, theirs in zip(_ports(block), _ports(again), strict=True):
+        # XML has no range of a Boolean; NaN as a start value is not equal to itself.
+        kept = replace(ours, minimum=None, maximum=None) if ours.boolean else ours
+        assert repr(theirs) == repr(replace(kept, integer=False))  # FMI 2.0 has our whole numbers as Real
+
+
+def test_an_fmi3_fmu_of_ours_says_what_may_be_missing(tmp_path: Path) -> None:
+    for fmi in (2, 3):
+        build_compiled_fmu(block_of("kalman"), tmp_path / f"Kalman{fmi}.fmu", fmi=fmi)
+    two, three = (FmuPart(tmp_path / f"Kalman{fmi}.fmu") for fmi in (2, 3))
+    assert three.role == two.role == "observer"
+    assert [port.missing for port in three.inputs] == [port.missing for port in two.inputs]
+    assert any(port.missing for port in three.inputs)
+
+
+def test_a_compiled_fmu_stays_what_it_is(tmp_path: Path) -> None:
+    build_compiled_fmu(block_of("pi"), tmp_path / "pi.fmu")
+    assert block_without_python(tmp_path / "pi.fmu") is None
+
+
+def _ports(block: Block) -> tuple[Port, ...]:
+    return (*block.inputs, *block.outputs, *block.parameters)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda facts: facts.pop("module_of_runtime"), "made by another version of softneck"),
+        (lambda facts: facts.update(runtime="softneck_0"), "made by another version of softneck"),
+        (lambda facts: facts.update(module_of_runtime="this"), "not in the table"),
+    ],
+)
+def test_a_python_fmu_that_cannot_be_made_again_is_refused(change: Any, message: str, tmp_path: Path) -> None:
+    members = read_zip(build_fmu(block_of("pi"), tmp_path / "pi.fmu"))
+    facts = json.loads(members["resources/block.json"])
+    change(facts)
+    write_zip(tmp_path / "pi.fmu", members | {"resources/block.json": json.dumps(facts).encode()})
+    with pytest.raises(SettingsError, match=message):
+        block_without_python(tmp_path / "pi.fmu")
+    assert "this" not in sys.modules
+
+
+def test_a_foreign_fmu_that_needs_its_tool_is_refused(tmp_path: Path) -> None:
+    members = read_zip(build_foreign(tmp_path, 2))
+    text = members["modelDescription.xml"].decode()
+    tool = text.replace("<CoSimulation ", '<CoSimulation needsExecutionTool="true" ')
+    write_zip(tmp_path / "Tool.fmu", members | {"modelDescription.xml": tool.encode()})
+    assert block_without_python(tmp_path / "Foreign2.fmu") is None
+    with pytest.raises(SettingsError, match=r"Tool\.fmu: needs another program .* `--backend python`"):
+        block_without_python(tmp_path / "Tool.fmu")
+
+
 def _assert_equal(how: str, signals: dict[tuple[str, str], str], theirs: np.ndarray, ours: Any) -> None:
     for (part, name), column in zip(signals, theirs.T, strict=True):
-        # The issue's limit; the controller runs in Python in ours, all else in the same library.
+        # The issue's limit; the neck and the controller run in Python in ours, all else in the same library.
         expected = ours[signals[part, name]]
         np.testing.assert_allclose(column[1:], expected[1:], rtol=0, atol=1e-12, err_msg=f"{part}.{name} {how}")
 

@@ -71,16 +71,6 @@ def test_variables_carry_what_the_ports_say(lag_fmu: Path) -> None:
     assert model.coSimulation.canHandleVariableCommunicationStepSize
 
 
-def test_only_a_plant_has_no_direct_feedthrough(lag_fmu: Path, controller_fmu: Path) -> None:
-    plant = fmpy.read_model_description(str(lag_fmu))
-    assert [unknown.dependencies for unknown in plant.outputs] == [[], []]
-    controller = fmpy.read_model_description(str(controller_fmu))
-    names = [[v.name for v in unknown.dependencies or []] for unknown in controller.outputs]
-    assert names == [["pitch_reference", "pitch"]]
-    initial = [[v.name for v in unknown.dependencies or []] for unknown in plant.initialUnknowns]
-    assert initial == [["pitch_start", "noise_std", "noise_seed", "biased"]] * 2
-
-
 def test_references_get_the_range_of_the_neck_unless_they_have_their_own(toys: Any, tmp_path: Path) -> None:
     path = build_fmu(toys.pi(), tmp_path / "Pi.fmu")
     ranges = {v.name: (v.min, v.max) for v in fmpy.read_model_description(str(path)).modelVariables}

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softneck.fmu import build_fmu
+from softneck.fmu import build_compiled_fmu, build_fmu
 
 from .every_kind import block_of
 from .test_importers import need
@@ -38,6 +38,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
+@pytest.fixture(scope="module")
+def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder as the pages of other simulators want it: nothing there needs Python."""
+    place = tmp_path_factory.mktemp("elsewhere")
+    build_compiled_fmu(block_of("rls"), place / "Neck.fmu")
+    return place
+
+
 def test_fmpy_s_commands_run(folder: Path) -> None:
     commands = [line.removeprefix("$ ") for part in _parts("fmu_fmpy.md", "console") for line in part.splitlines()]
     assert len(commands) == 3
@@ -49,8 +57,9 @@ def test_fmpy_s_commands_run(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(("page", "package"), [("fmu_fmpy.md", "fmpy"), ("fmu_libcosim.md", "libcosimpy")])
-def test_the_scripts_compute_the_same_pitch(page: str, package: str, folder: Path) -> None:
+def test_the_scripts_compute_the_same_pitch(page: str, package: str, request: pytest.FixtureRequest) -> None:
     need(package)
+    folder = request.getfixturevalue("folder" if package == "fmpy" else "elsewhere")
     (script,) = _parts(page, "python")
     printed = _run([sys.executable, "-c", script], folder)
     block = block_of("rls")
@@ -67,4 +76,5 @@ def test_the_scripts_compute_the_same_pitch(page: str, package: str, folder: Pat
 def test_every_page_says_what_was_run(page: str) -> None:
     text = (PAGES / page).read_text(encoding="utf-8")
     assert "**Run here**" in text or "**Not run here:**" in text
+    assert page == "fmu_fmpy.md" or "--backend compiled" in text.split("LD_PRELOAD")[0]
     assert page.removesuffix(".md") in (PAGES.parent / "index.md").read_text(encoding="utf-8")

@@ -16,6 +16,7 @@ from typing import Any
 import fmpy
 import numpy as np
 import pytest
+from fmpy.fmi1 import FMICallException
 from fmpy.fmi3 import FMU3Slave
 from fmpy.validation import validate_fmu
 
@@ -140,6 +141,36 @@ def _run3(folder: Path, block: Block, u: np.ndarray) -> np.ndarray:
     fmu.terminate()
     fmu.freeInstance()
     return seen
+
+
+def test_a_seed_is_an_integer_in_fmi3(tmp_path: Path, running: Any) -> None:
+    """Int64 there, Real in FMI 2.0 as it always was; the same noise out of both."""
+    block, noise = block_of("rls"), [port.name for port in block_of("rls").parameters].index("noise_std")
+    first = len(block.inputs) + len(block.outputs)
+    for fmi in (2, 3):
+        build_compiled_fmu(block, tmp_path / f"Rls{fmi}.fmu", fmi=fmi)
+    with running(tmp_path / "Rls2.fmu") as fmu:
+        fmu.begin(noise_std=0.1, noise_seed=7.0)
+        fmu.fmu.doStep(0.0, TS)
+        expected = fmu.get("pitch", "roll")
+    with unpacked(tmp_path / "Rls3.fmu") as folder:
+        model = fmpy.read_model_description(str(folder))
+        seed = next(v for v in model.modelVariables if v.name == "noise_seed")
+        assert (seed.type, seed.start, seed.min, seed.max) == ("Int64", "0", "0", "2147483647")
+        fmu = FMU3Slave(guid=model.guid, unzipDirectory=str(folder), modelIdentifier="Rls3", instanceName="three")
+        fmu.instantiate()
+        fmu.setFloat64([first + noise], [0.1])
+        fmu.setInt64([seed.valueReference], [7])
+        fmu.enterInitializationMode(startTime=0.0)
+        fmu.exitInitializationMode()
+        fmu.doStep(currentCommunicationPoint=0.0, communicationStepSize=TS)
+        assert list(fmu.getInt64([seed.valueReference])) == [7]
+        assert list(fmu.getFloat64([len(block.inputs), len(block.inputs) + 1])) == expected
+        for wrong in (first + noise, seed.valueReference + 100):  # a Float64, and no variable at all
+            with pytest.raises(FMICallException):
+                fmu.getInt64([wrong])
+        fmu.freeInstance()
+    assert 0.0 not in expected
 
 
 def test_the_same_block_gives_the_same_bytes(kind: str, path: Path, tmp_path: Path) -> None:

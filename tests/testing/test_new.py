@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -23,6 +25,20 @@ def test_the_new_project_s_test_passes_at_once(tmp_path: Path, capsys: pytest.Ca
     assert "2 passed" in done.stdout
     assert run(["simulate", str(folder / "loop.toml"), "-o", str(tmp_path / "run.csv")]) == 0
     assert run(["ssp", str(folder / "loop.toml"), "-o", str(tmp_path / "loop.ssp")]) == 0
+    if shutil.which("cc"):
+        for name in ("Pi", "Kalman", "VirtualNeck"):
+            assert _runs_python(folder / "fmus" / f"{name}.fmu")
+            assert not _runs_python(folder / "fmus" / "compiled" / f"{name}.fmu")
+        with zipfile.ZipFile(tmp_path / "loop.ssp") as archive:
+            archive.extractall(tmp_path / "ssp")
+        parts = list((tmp_path / "ssp" / "resources").glob("*.fmu"))
+        assert [path.stem for path in parts if _runs_python(path)] == []
+        assert len(parts) == 4
+
+
+def _runs_python(fmu: Path) -> bool:
+    with zipfile.ZipFile(fmu) as archive:
+        return any(name.endswith(".py") for name in archive.namelist())
 
 
 def test_what_stands_there_is_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

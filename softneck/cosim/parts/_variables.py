@@ -100,6 +100,7 @@ class Description:
             maximum=_number(variable.max if variable.max is not None else getattr(declared, "max", None), None),
             nominal=_number(variable.nominal, None),
             boolean=variable.type == "Boolean",
+            integer="Int" in variable.type,
             missing=variable.name in self.annotation.missing,
         )
 
@@ -149,7 +150,8 @@ def read_description(
 
 def _annotation(folder: Path) -> Annotation:
     root = ET.parse(folder / "modelDescription.xml").getroot()
-    block = root.find("VendorAnnotations/Tool[@name='softneck']/Block")
+    places = ("VendorAnnotations/Tool[@name='softneck']/Block", "Annotations/Annotation[@type='softneck']/Block")
+    block = next((found for found in map(root.find, places) if found is not None), None)  # FMI 2.0, FMI 3.0
     if block is None:
         return Annotation()
     return Annotation(block.get("kind", ""), block.get("role", ""), frozenset(block.get("missing", "").split()))

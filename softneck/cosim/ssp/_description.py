@@ -67,15 +67,12 @@ def system_description(
         root, "ssd:System", {"name": "loop", "description": "closed loop, all inputs set before all steps"}
     )
     elements = SubElement(system, "ssd:Elements")
-    corners = [_corner(component.name, number) for number, component in enumerate(components)]
-    for component, corner in zip(components, corners, strict=True):
-        _component(elements, component, corner)
+    for number, component in enumerate(components):
+        _component(elements, component, _corner(component.name, number))
     connections = SubElement(system, "ssd:Connections")
     for link in links:
         _connection(connections, link)
-    width = max(x for x, _ in corners) + _WIDTH + _GAP
-    height = max(y for _, y in corners) + _HEIGHT + _GAP
-    SubElement(system, "ssd:SystemGeometry", {"x1": "0", "y1": "0", "x2": f"{width:g}", "y2": f"{height:g}"})
+    # No SystemGeometry: OMSimulator refuses a file that has one, and the boxes of the components say as much.
     _omsimulator(system, step)
     _units(root, components)
     SubElement(root, "ssd:DefaultExperiment", {"startTime": "0", "stopTime": repr(duration)})
@@ -103,8 +100,8 @@ def _component(elements: Element, component: Component, corner: tuple[float, flo
 
 
 def _type(parent: Element, port: Port) -> None:
-    if port.boolean:
-        SubElement(parent, "ssc:Boolean")
+    if port.boolean or port.integer:
+        SubElement(parent, "ssc:Boolean" if port.boolean else "ssc:Integer")
     else:
         SubElement(parent, "ssc:Real", {} if port.unit in ("", "1") else {"unit": port.unit})
 
@@ -118,6 +115,8 @@ def _bindings(element: Element, component: Component) -> None:
         parameter = SubElement(parameters, "ssv:Parameter", {"name": port.name})
         if port.boolean:
             SubElement(parameter, "ssv:Boolean", {"value": "true" if value else "false"})
+        elif port.integer:
+            SubElement(parameter, "ssv:Integer", {"value": str(int(value))})
         else:
             SubElement(parameter, "ssv:Real", {"value": repr(value)})
 

@@ -1,4 +1,4 @@
-"""A loop as an SSP 1.0 archive: its FMUs, who feeds whom, parameters, geometry, in one file for other masters."""
+"""A loop as an SSP 1.0 archive: its FMUs, who feeds whom, parameters, places, in one file for other masters."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ from ..loops._simulate import LoopSetup
 from ..parts._fmu_part import FmuPart
 from ..parts._isolated import IsolatedPart
 from ._description import Component, Connection, system_description
+from ._rebuild import block_without_python
 
 # Fixed, so that the same loop gives the same bytes.
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 
-def write_ssp(loop: Loop | LoopSetup, path: str | Path, *, force: bool = False, compiled: bool = False) -> Path:
+def write_ssp(loop: Loop | LoopSetup, path: str | Path, *, force: bool = False, compiled: bool = True) -> Path:
     """Write `loop` as an SSP 1.0 archive and return its path.
 
     Parts that are not FMUs become some; so does the reference. A master that sets all inputs first and then steps all
@@ -33,10 +34,11 @@ def write_ssp(loop: Loop | LoopSetup, path: str | Path, *, force: bool = False, 
         loop: a loop or what `load_loop` returned.
         path: `NAME.ssp`.
         force: replace an existing file.
-        compiled: what is made here needs no Python; FMUs that the loop names stay what they are.
+        compiled: nothing in the file needs Python: Python FMUs of ours that the loop names are made again as compiled
+            ones, all others stay what they are. False: what is made here runs Python.
 
     Raises:
-        SettingsError: faults, or a part that can be no FMU; the line names it.
+        SettingsError: faults, a part that can be no FMU, or one that needs Python; the line names it.
         OutputFileError: the file exists or cannot be written.
     """
     target = Path(path)
@@ -63,19 +65,22 @@ def write_ssp(loop: Loop | LoopSetup, path: str | Path, *, force: bool = False, 
 
 def _fmu_of(name: str, part: Part, folder: Path, compiled: bool) -> Path:
     """Return an FMU of `part`, in `folder` if it must be made or renamed."""
+    block = part.block if isinstance(part, BlockPart) else None
     if isinstance(part, FmuPart | IsolatedPart):
-        renamed = folder / f"{name}_{part.path.name}"
-        renamed.write_bytes(part.path.read_bytes())
-        return renamed
-    if not isinstance(part, BlockPart):
+        block = block_without_python(part.path) if compiled else None
+        if block is None:
+            renamed = folder / f"{name}_{part.path.name}"
+            renamed.write_bytes(part.path.read_bytes())
+            return renamed
+    if block is None:
         raise SettingsError(
             f"the {name} is a {type(part).__name__}, of which no FMU can be built; give an FMU or a file."
         )
-    target, info = folder / f"{name}.fmu", FmuInfo(description=f"{part.block.kind} of a loop")
+    target, info = folder / f"{name}.fmu", FmuInfo(description=f"{block.kind} of a loop")
     if compiled:
-        build_compiled_fmu(part.block, target, info=info)
+        build_compiled_fmu(block, target, info=info)
         return target
-    return build_fmu(part.block, target, info=info)
+    return build_fmu(block, target, info=info)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +121,9 @@ def _component(name: str, part: Part, source: Path, loop: Loop, wiring: Wiring) 
 
 
 def _parameters(part: Part) -> tuple[Port, ...]:
-    return part.block.parameters if isinstance(part, BlockPart) else getattr(part, "parameters", ())
+    if isinstance(part, BlockPart):  # becomes an FMU of FMI 2.0, where our whole numbers are Real
+        return tuple(replace(port, integer=False) for port in part.block.parameters)
+    return getattr(part, "parameters", ())
 
 
 def _renamed(port: Port, names: _Names) -> Port:

@@ -16,6 +16,7 @@ from ..describe._description import Identity, described_block, model_description
 from ..describe._documentation import documentation_page
 from ..describe._icon import icon_png
 from ..describe._info import FmuInfo
+from ..describe._terminals import terminals_file
 from ..python._build import check_block, generation_date, license_text, model_name
 from ..python._pack import write_zip
 from ._description3 import model_description3
@@ -133,6 +134,7 @@ def _members(block: Block, info: FmuInfo, name: str, fmi: int, sources: Sources)
     }
     if fmi == 3:
         members["sources/buildDescription.xml"] = _build_description(name)
+    members |= terminals_file(block)
     files = _needed_sources(sources, node_of(block.runtime, block.arrays).modules, fmi)
     return members | {f"sources/{file}": text.encode() for file, text in files.items()}
 
@@ -151,7 +153,9 @@ def _build_description(name: str) -> bytes:
     root = Element("fmiBuildDescription", fmiVersion="3.0")
     options = " ".join(flag for flag in FLAGS if flag.startswith("-f"))
     configuration = SubElement(root, "BuildConfiguration", modelIdentifier=name)
-    files = SubElement(configuration, "SourceFileSet", language="C99", compilerOptions=options)
+    # Options of a compiler stand beside its name alone (table of SourceFileSet); clang takes those of gcc.
+    head = {"language": "C99", "compiler": "gcc", "compilerOptions": options}
+    files = SubElement(configuration, "SourceFileSet", head)
     SubElement(files, "SourceFile", name=MAIN)
     SubElement(configuration, "Library", name="m", external="true")
     indent(root)

@@ -37,7 +37,8 @@ def model_description3(block: Block, info: FmuInfo, identity: Identity) -> bytes
     }
     root = Element("fmiModelDescription", head | head_texts(block, info))
     yes = ("canHandleVariableCommunicationStepSize", "canGetAndSetFMUState", "canSerializeFMUState")
-    SubElement(root, "CoSimulation", {"modelIdentifier": identity.name} | dict.fromkeys(yes, "true"))
+    fixed = {"modelIdentifier": identity.name, "fixedInternalStepSize": repr(float(block.sample_time))}
+    SubElement(root, "CoSimulation", fixed | dict.fromkeys(yes, "true"))
     add_unit_definitions(root, block)
     categories = SubElement(root, "LogCategories")
     for name, text in (("logStatusWarning", "Warnings"), ("logStatusError", "Errors")):
@@ -73,6 +74,9 @@ def _variable(table: Element, port: Port, causality: str, reference: int) -> Non
     start = {} if causality == "output" else {"start": start_attribute(port)}
     if port.boolean:
         SubElement(table, "Boolean", head | start)
+    elif port.integer:
+        numbers = {name: str(int(float(text))) for name, text in (range_attributes(port) | start).items()}
+        SubElement(table, "Int64", head | numbers)
     else:
         SubElement(table, "Float64", head | unit_attributes(port) | range_attributes(port) | start)
 
@@ -80,11 +84,10 @@ def _variable(table: Element, port: Port, causality: str, reference: int) -> Non
 def _structure(root: Element, block: Block) -> None:
     structure = SubElement(root, "ModelStructure")
     n_in, n_out = len(block.inputs), len(block.outputs)
-    # A plant answers one sample later; all others with what they read at the same instant.
-    inputs = " ".join(map(str, range(n_in))) if block.role != "plant" else ""
     first = n_in + n_out
     parameters = " ".join(str(first + i) for i in range(len(block.parameters)))
-    for tag, known in (("Output", inputs), ("InitialUnknown", parameters)):
+    # As in FMI 2.0: an input shows in no output before the next communication step.
+    for tag, known in (("Output", ""), ("InitialUnknown", parameters)):
         for i in range(n_out):
             SubElement(structure, tag, valueReference=str(n_in + i), dependencies=known)
 

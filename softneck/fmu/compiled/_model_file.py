@@ -20,7 +20,7 @@ _MAGIC = b"SNMODEL\0"
 FORMAT = 1
 _MARK = 0x01020304
 _HEAD = 32
-_BOOLEAN, _MISSING = 1, 2
+_BOOLEAN, _MISSING, _INTEGER = 1, 2, 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +122,7 @@ class _Writer:
         self.text("1" if port.boolean else port.unit)
         low = -np.inf if port.minimum is None else float(port.minimum)
         high = np.inf if port.maximum is None else float(port.maximum)
-        flags = _BOOLEAN * port.boolean | _MISSING * port.missing
+        flags = _BOOLEAN * port.boolean | _MISSING * port.missing | _INTEGER * port.integer
         self.plain("<3dI", float(port.start), low, high, flags)
 
     def node(self, node: Node) -> None:

@@ -185,11 +185,11 @@ def _variable(table: Element, port: Port, causality: str, reference: int) -> Non
 def _structure(root: Element, block: Block) -> None:
     structure = SubElement(root, "ModelStructure")
     n_in, n_out = len(block.inputs), len(block.outputs)
-    # A plant answers one sample later; all others with what they read at the same instant.
-    inputs = " ".join(str(i + 1) for i in range(n_in)) if block.role != "plant" else ""
     first = n_in + n_out
     parameters = " ".join(str(first + i + 1) for i in range(len(block.parameters)))
-    for tag, known in (("Outputs", inputs), ("InitialUnknowns", parameters)):
+    # Outputs change in a communication step alone: an input that is set shows in none before. A master that were told
+    # otherwise would find an algebraic loop between observer and controller. At the start they follow the parameters.
+    for tag, known in (("Outputs", ""), ("InitialUnknowns", parameters)):
         if n_out:
             group = SubElement(structure, tag)
             for i in range(n_out):

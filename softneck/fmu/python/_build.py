@@ -28,6 +28,7 @@ from ..describe._description import Identity, described_block, generation_tool, 
 from ..describe._documentation import HOST_NEEDS, documentation_page
 from ..describe._icon import icon_png
 from ..describe._info import FmuInfo
+from ..describe._terminals import terminals_file
 from ._module import slave_module
 from ._pack import read_zip, write_zip
 
@@ -106,7 +107,7 @@ def _members(block: Block, info: FmuInfo, name: str) -> dict[str, bytes]:
     members["documentation/licenses/license.txt"] = license_text("softneck", info.license).encode()
     members["documentation/licenses/pythonfmu.txt"] = license_text("pythonfmu", "MIT").encode()
     members["model.png"] = icon_png(block.kind, block.role)
-    return members
+    return members | terminals_file(block)
 
 
 def _facts(block: Block, name: str) -> dict[str, Any]:
@@ -117,6 +118,7 @@ def _facts(block: Block, name: str) -> dict[str, Any]:
         "role": block.role,
         "sample_time": float(block.sample_time),
         "cost": plain_cost(block),
+        "module_of_runtime": block.runtime,  # nothing the slave reads: a compiled FMU can be made of this one
         "shapes": [list(array.shape) for array in block.arrays],
         "inputs": [_port_facts(port) for port in block.inputs],
         "outputs": [_port_facts(port) for port in block.outputs],

@@ -56,7 +56,7 @@ PARAMETERS = (
         minimum=0.0,
         maximum=0.5,
     ),
-    Port(name="noise_seed", description="Seed of that noise", minimum=0.0, maximum=2147483647.0),
+    Port(name="noise_seed", description="Seed of that noise", minimum=0.0, maximum=2147483647.0, integer=True),
 )
 
 
