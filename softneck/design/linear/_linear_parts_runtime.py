@@ -69,10 +69,10 @@ def linear_align(p: LinearArrays, x: LinearState, y: np.ndarray) -> None:
 
 def linear_sound(inputs: np.ndarray) -> bool:
     """Return whether references, angles and motor positions are numbers."""
+    total = 0.0  # one that is none makes the sum none
     for i in range(8):
-        if not math.isfinite(inputs[i]):
-            return False
-    return True
+        total += inputs[i]
+    return math.isfinite(total)
 
 
 def linear_control(p: LinearArrays, parameters: np.ndarray, x: LinearState, inputs: np.ndarray) -> None:

@@ -1,4 +1,6 @@
-"""Exact bounds by branch and bound over a slanted tree (see `_principal_tree`): node j of level l is row 2^l + j of `nodes`.
+"""Exact bounds by branch and bound over a slanted tree (see `_principal_tree`).
+
+Node j of level l is row 2^l + j of `nodes`.
 
 A node's points lie in a box along the rows of `frame`, the first of which, e, runs up the plane that all values follow:
 y = m e p + r with r from rmin to rmax of the node. At the distance s from the box across e, and d along it, no cone
