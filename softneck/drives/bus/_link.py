@@ -26,13 +26,12 @@ class BusError(SoftneckError):
 
 
 class Link(Protocol):
-    """Sends and receives frames; its clock is monotonic.
+    """Sends and receives frames; its clock is monotonic."""
 
-    Attributes:
-        problem: why frames no longer pass, "" while they do.
-    """
-
-    problem: str
+    @property
+    def problem(self) -> str:
+        """Why frames no longer pass, "" while they do."""
+        ...
 
     @property
     def now(self) -> float:

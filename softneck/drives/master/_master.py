@@ -6,7 +6,7 @@ import math
 from collections import Counter, deque
 from collections.abc import Sequence
 
-from ._cia402 import DriveState, Goal
+from ._cia402 import OFF, DriveState, Goal
 from ._events import IDLE_TOO, Event, Reaction
 from ._fieldbus import Fieldbus
 from ._frame import Frame
@@ -226,8 +226,10 @@ class Master:
             self._ramp(now, events)
         elif phase is Phase.RETREAT:
             self._retreat(now, events)
-        elif phase in (Phase.DISABLING, Phase.STOPPING):
-            self._switch_off(now)
+        elif phase is Phase.DISABLING:
+            self._switch_off(now, events)
+        elif phase is Phase.STOPPING:
+            self._stop_all(now)
         if self.supervisor.phase not in _MOVED:
             self._track()
 
@@ -355,7 +357,15 @@ class Master:
         if now - self.supervisor.since >= self.settings.sensor.hold:
             self._change(now, Signal.ARRIVED)
 
-    def _switch_off(self, now: float) -> None:
+    def _switch_off(self, now: float, events: list[Event]) -> None:
+        """A run is done when each drive has said in this cycle that it is off; silence says nothing."""
+        powered = [view for view in self.bus.drives if view.state not in OFF or not view.fresh]
+        if not powered:
+            self._change(now, Signal.OFF)
+        elif now - self.supervisor.since > _STOP_TIME:
+            events.append(Event(now, "not_off", powered[0].node, f"it is {powered[0].state.name}"))
+
+    def _stop_all(self, now: float) -> None:
         powered = any(view.state in _POWERED and not view.silent > 5 for view in self.bus.drives)
         if not powered or now - self.supervisor.since > _STOP_TIME:
             self._change(now, Signal.OFF)
@@ -368,6 +378,16 @@ class Master:
         if phase is not Phase.STOPPED:
             return False
         return any(view.heard and (view.silent or view.state in _POWERED) for view in self.bus.drives)
+
+    def signs_of_life(self) -> Sequence[Frame]:
+        """Return what keeps the drives' guarding quiet after the last step; nothing where silence has to stop one."""
+        return () if self._starved(self._now or 0.0) else self.bus.signs_of_life()
+
+    def not_off(self, node: int, detail: str) -> None:
+        """Take in that a drive did not confirm, after the last step, that it is off: then the run is not done."""
+        event = Event(self._now or 0.0, "not_off", node, detail)
+        self._told(event, judged=True)
+        self.supervisor.revoke(event)
 
     def _change(self, now: float, signal: Signal) -> None:
         if self.supervisor.signal(now, signal):
