@@ -13,7 +13,9 @@ from .test_plugin import run_pytest
 
 
 @pytest.mark.slow
-def test_the_new_project_s_test_passes_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_new_project_s_test_passes_at_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = tmp_path / "my neck"
     assert run(["new", str(folder), "--json"]) == 0
     files = json.loads(capsys.readouterr().out)["files"]
@@ -23,6 +25,13 @@ def test_the_new_project_s_test_passes_at_once(tmp_path: Path, capsys: pytest.Ca
     assert "2 passed" in done.stdout
     assert run(["simulate", str(folder / "loop.toml"), "-o", str(tmp_path / "run.csv")]) == 0
     assert run(["ssp", str(folder / "loop.toml"), "-o", str(tmp_path / "loop.ssp")]) == 0
+    # And to simulated drives, by the commands that its README lists.
+    monkeypatch.chdir(folder)
+    listed = [line[2:].split() for line in Path("README.md").read_text().splitlines() if line.startswith("$ softneck ")]
+    to_drives = [words[1:] for words in listed if words[1] == "verify" or "drives_loop.toml" in words]
+    assert [words[0] for words in to_drives] == ["verify", "simulate", "drives"]
+    for words in to_drives:
+        assert run(words) == 0, words
 
 
 def test_what_stands_there_is_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -160,7 +160,8 @@ def zero_command(
 @click.option("--loop", "loop_file", required=True, type=click.Path(path_type=Path), metavar="LOOP.toml",
               help="Observer, reference and duration; its plant is the virtual neck of --simulated.")  # fmt: skip
 @click.option("--certificate", "certificates", multiple=True, type=click.Path(path_type=Path),
-              help="Certificate of `softneck verify` or `simulate`; several may cover the files together.")  # fmt: skip
+              help="Certificate of `softneck verify`, or of `simulate`: both are needed. [default: CONTROLLER and LOOP "
+              "with .certificate.json]")  # fmt: skip
 @drives_options
 @override_option
 @neck_option
@@ -181,13 +182,15 @@ def run_command(
 ) -> None:  # fmt: skip
     """Run CONTROLLER in the loop of LOOP.toml on the drives: enable, ramp in, control, ramp out, switch off.
 
-    Refused unless certificates cover controller, observer and loop file and hold. Exit code 1 if anything stopped it,
-    143 if SIGTERM ended it (to rest, then off).
+    Refused unless a certificate of `softneck verify` shows what drives need of the controller, one of `softneck
+    simulate` covers controller, observer, loop and drives file for the whole run, and the loop, run again on its own
+    plant, does the same. Exit code 1 if anything stopped it, or a drive did not confirm that it is off; 143 if SIGTERM
+    ended it (to rest, then off).
     On a terminal (stderr) a live view shows the run, on a bus and with --pace; not with --json.
     """
     from softneck.cosim import load_loop
     from softneck.drives import prepare, run_on_bus, run_simulated
-    from softneck.drives.running._certified import require_certified
+    from softneck.drives.running._certified import require_certified, require_same_again
     from softneck.drives.running._deploy import neck_of
     from softneck.drives.running._keyboard import Keyboard
     from softneck.signals import write_recording
@@ -199,14 +202,19 @@ def run_command(
     require_logs(logs, no_log=no_log, force=force)
     names = checked_names(overrides)
     setup = load_loop(loop_file)
+    if drives_file is None and "drives" in setup.files:
+        drives_file = Path(setup.files["drives"][0])
     virtual = load_neck(neck) if neck else neck_of(setup.loop)
     chosen = target_of(drives_file, bus, simulated, arm, neck=virtual)
     if not controller.is_file():
         raise SettingsError(f"{controller}: no such file.")
-    require_certified(setup, controller, certificates, names)
+    certified = require_certified(setup, controller, certificates, names, drives=drives_file)
     deployed = prepare(setup, controller)
     for text in deployed.notes:
         note(text)
+    if certified is not None:
+        again = require_same_again(deployed.loop, certified[1])
+        note(f"{certified[1].path}: {again:g} of {deployed.loop.duration:g} s run again on the loop's plant: the same")
     files = acting_files(setup, loop_file, controller, drives_file)
     live = not as_json and (not chosen.simulated or pace is not None)
     sensor: Any = None if chosen.simulated else sensor_of(chosen.file, str(chosen.bus))
