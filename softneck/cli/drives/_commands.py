@@ -54,19 +54,20 @@ def command() -> None:
 @drives_options
 @json_option
 def scan_command(drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, as_json: bool) -> None:
-    """List the nodes on the bus; sends reads only. Exit code 1 if none answers."""
+    """List the nodes on the bus; sends reads only. Exit code 1 if none answers, or several devices at one number."""
     from softneck.drives import default_drives, scan
+    from softneck.drives.running._scan import several_devices
 
     if bus is not None and drives_file is None:
         chosen = Target(default_drives(), bus, False, arm)
     else:
         chosen = target_of(drives_file, bus, simulated, arm)
     with open_link(chosen, moves=False) as link:
-        found = scan(link)
+        found = scan(link, bit_rate=chosen.file.bit_rate)
     if as_json:
         print_json({"nodes": found})
     else:
-        rows = [[str(item["node"]), str(item["name"] or "-"), str(item["firmware"] or "-"), str(item["serial"] or "-"),
+        rows = [[str(item["node"]), str(item["name"] or "-"), str(item["firmware"] or "-"), _serials(item["serials"]),
                  str(item["state"] or "-")] for item in found]  # fmt: skip
         print_table(f"{len(found)} node(s)", ["node", "name", "firmware", "serial", "state"], rows)
     if not found:
@@ -74,6 +75,14 @@ def scan_command(drives_file: Path | None, bus: str | None, simulated: bool, arm
             f"{bus or 'the bus'}: no node answers. Are the drives on, is the bit rate right, is the line terminated "
             "(60 ohm between CAN_H and CAN_L)?"
         )
+    shared = [(item["node"], several_devices(item["serials"])) for item in found]
+    listed = "; ".join(f"node {node}: {told}" for node, told in shared if told)
+    if listed:
+        raise CheckFailedError(f"{listed}. Give each device a node number of its own.")
+
+
+def _serials(serials: list[int | None]) -> str:
+    return ", ".join(str(serial or "-") for serial in serials) or "-"
 
 
 @command.command("check", epilog="Example: softneck drives check --simulated")

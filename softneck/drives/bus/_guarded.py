@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from ..master import Frame
 from ._link import Link
@@ -14,8 +14,8 @@ class GuardedLink:
     It has no thread: an owner that hangs waits on nothing, and the drives notice.
     """
 
-    def __init__(self, link: Link, signs: Callable[[], Sequence[Frame]], period: float) -> None:
-        """Send what `signs` returns over `link` every `period` [s], beginning with the first wait."""
+    def __init__(self, link: Link, signs: Sequence[Frame], period: float) -> None:
+        """Send `signs` over `link` every `period` [s], beginning with the first wait."""
         self._link, self._signs, self._period = link, signs, period
         self._due = link.now
 
@@ -39,8 +39,8 @@ class GuardedLink:
         while True:
             now = self.now
             if now >= self._due - 1e-9:
-                self._link.send(self._signs())
+                self._link.send(self._signs)
                 self._due = max(self._due, now) + self._period
             frames = self._link.receive(max(0.0, min(until, self._due) - now))
-            if frames or self.now >= until - 1e-9:
+            if frames or self.now >= until:
                 return frames

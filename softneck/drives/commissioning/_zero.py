@@ -141,7 +141,7 @@ def zero(link: Link, file: DrivesFile, look: Look, *, guarding: str, operator: O
     dictionary = load_eds(file.profile, file.eds)
     signs = _signs_of_life(file, guarding)
     # Fed from every wait of this thread, those for answers too: a master that hangs stops feeding.
-    guarded = GuardedLink(link, lambda: signs, file.guard_cycles * file.cycle)
+    guarded = GuardedLink(link, signs, file.guard_cycles * file.cycle)
     motors = [_Motor(guarded, entry, file, dictionary) for entry in file.drives]
     left: dict[int, str] = {}
     try:
@@ -157,7 +157,7 @@ def zero(link: Link, file: DrivesFile, look: Look, *, guarding: str, operator: O
             _set_zero(guarded, motor)
     finally:
         _off(motors)
-        left = disarm(link, file, guarding, lambda: signs)
+        left = disarm(link, file, guarding, signs)
     for node, why in left.items():
         raise CheckFailedError(
             f"node {node}: did not confirm that it is switched off: {why}. Press the hardware stop (Enable input)."

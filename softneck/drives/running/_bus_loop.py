@@ -20,7 +20,7 @@ from ..logs._cycle import LoggedPilot
 from ..logs._result import fault_table, require_unstopped
 from ..logs._run_log import RunLogger, run_facts
 from ..logs._times import CycleTimes
-from ..master import Frame, Master, MasterSettings, Tilt
+from ..master import Event, Frame, Master, MasterSettings, Tilt
 from ..master._measured import Pilot
 from ..master._nmt import Command as NmtCommand
 from ..master._nmt import nmt_frame
@@ -188,11 +188,18 @@ def _run_session(
         notifier.ready()
         with ending.watched():
             _in_real_time(session, link, master, times, notifier, ending)
-    left = disarm(link, file, checked.guarding, master.signs_of_life)
+    left = disarm(link, file, checked.guarding, () if master.starved else master.bus.signs_of_life())
     if master.supervisor.fault is None:
         for node, why in left.items():
-            master.not_off(node, why)
+            _take_back(master, Event(link.now, "not_off", node, why))
     return RunEnd(master, times, time.perf_counter() - started, ending.asked > 0, tensions[0])
+
+
+def _take_back(master: Master, event: Event) -> None:
+    """Let `event` end a run that looked done."""
+    master.supervisor.revoke(event)
+    master.counts[event.name] += 1
+    master.events.append(event)
 
 
 def _in_virtual_time(

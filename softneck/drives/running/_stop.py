@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from softneck.core import CheckFailedError
 
@@ -13,7 +13,7 @@ from ..bus._objects import disarm_writes
 from ..bus._sdo import Objects, SdoError, load_eds
 from ..master import Frame
 from ..master._cia402 import OFF, DriveState, state_of
-from ._preflight import require_bus
+from ._scan import require_bus
 
 # Between two looks at a drive [s].
 _LOOK = 0.02
@@ -70,14 +70,14 @@ def reset(link: Link, file: DrivesFile) -> dict[int, str]:
     return states
 
 
-def disarm(link: Link, file: DrivesFile, guarding: str, signs: Callable[[], Sequence[Frame]]) -> dict[int, str]:
+def disarm(link: Link, file: DrivesFile, guarding: str, signs: Sequence[Frame]) -> dict[int, str]:
     """End the guarding of drives that are off, feeding it until the last one is disarmed.
 
     Args:
         link: to the bus.
         file: of the drives.
         guarding: "life" or "heartbeat", as the pre-flight set it up.
-        signs: returns the signs of life to send meanwhile.
+        signs: of life, to send meanwhile.
 
     Returns:
         node -> why it is not known to be off; empty where all confirmed it.
