@@ -11,7 +11,7 @@ from markupsafe import Markup
 from softneck.core import CheckFailedError, SettingsError, refuse_existing, write_certificate
 
 from .shared._console import print_json, print_table, progress
-from .shared._options import force_option, json_option, output_option, target
+from .shared._options import force_option, json_option, output_option, target, trust_option
 
 if TYPE_CHECKING:
     from softneck.cosim import Result
@@ -26,13 +26,16 @@ if TYPE_CHECKING:
     help="Write a certificate of the limits that held, with the hashes of all files; `drives run` asks for it.",
 )
 @click.option("--html", type=click.Path(path_type=Path), help="Write a page with plots, and beside it the neck in 3-D.")
+@trust_option
 @force_option
 @json_option
 def command(
-    loop_file: Path, output: Path | None, certificate: Path | None, html: Path | None, force: bool, as_json: bool
-) -> None:
+    loop_file: Path, output: Path | None, certificate: Path | None, html: Path | None, trust: bool, force: bool,
+    as_json: bool,
+) -> None:  # fmt: skip
     """Close the loop that LOOP.toml describes; exit code 1 if one of its limits does not hold."""
     from softneck.cosim import load_loop, simulate
+    from softneck.cosim.loops._trust import require_trusted
     from softneck.plots import neck_view, write_page
     from softneck.signals import write_recording
     from softneck.signals.recording._files import recording_suffix
@@ -44,6 +47,7 @@ def command(
     for extra in (certificate, html, view):
         if extra is not None:
             refuse_existing(extra, force=force)
+    require_trusted(loop_file, trust=trust)
     setup = load_loop(loop_file)
     if certificate is not None and not setup.limits:
         raise SettingsError(

@@ -37,7 +37,15 @@ def test_the_new_project_s_test_passes_at_once(
 def test_what_stands_there_is_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "loop.toml").write_text("mine")
     assert run(["new", str(tmp_path)]) == 2
-    assert "holds loop.toml already" in capsys.readouterr().err
+    assert "is not empty (it holds loop.toml); take a new folder" in capsys.readouterr().err
     assert (tmp_path / "loop.toml").read_text() == "mine"
     assert [path.name for path in tmp_path.iterdir()] == ["loop.toml"]
     assert run(["new", str(tmp_path), "--force"]) == 0
+
+
+def test_a_folder_with_anything_in_it_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("etc", "home", "usr", "var"):
+        (tmp_path / name).mkdir()
+    assert run(["new", str(tmp_path)]) == 2
+    assert "is not empty (it holds etc, home, usr, ...)" in capsys.readouterr().err
+    assert len(list(tmp_path.iterdir())) == 4

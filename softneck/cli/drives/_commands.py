@@ -12,7 +12,7 @@ from softneck.core import CheckFailedError, SettingsError, refuse_existing
 
 from ..shared._console import note, print_json, print_table, progress
 from ..shared._neck import load_neck
-from ..shared._options import force_option, json_option, output_option, target
+from ..shared._options import force_option, json_option, output_option, target, trust_option
 from ._log import acting_files, log_options, opened_log, require_logs
 from ._move import jog_command, record_command
 from ._replay import replay_command
@@ -182,12 +182,13 @@ def zero_command(
     "--realtime", is_flag=True, help="On a bus: run ahead of all ordinary processes (SCHED_FIFO), with memory locked."
 )
 @output_option("recording of the run", "REC")
+@trust_option
 @force_option
 @json_option
 def run_command(
     controller: Path, loop_file: Path, certificates: tuple[Path, ...], drives_file: Path | None, bus: str | None,
     simulated: bool, arm: bool, overrides: tuple[str, ...], neck: str | None, pace: float | None, realtime: bool,
-    logs: tuple[Path, ...], no_log: bool, output: Path | None, force: bool, as_json: bool,
+    logs: tuple[Path, ...], no_log: bool, output: Path | None, trust: bool, force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Run CONTROLLER in the loop of LOOP.toml on the drives: enable, ramp in, control, ramp out, switch off.
 
@@ -198,6 +199,7 @@ def run_command(
     On a terminal (stderr) a live view shows the run, on a bus and with --pace; not with --json.
     """
     from softneck.cosim import load_loop
+    from softneck.cosim.loops._trust import require_trusted
     from softneck.drives import prepare, run_on_bus, run_simulated
     from softneck.drives.running._certified import require_certified, require_same_again
     from softneck.drives.running._deploy import neck_of
@@ -210,6 +212,7 @@ def run_command(
     refuse_existing(path, force=replace)
     require_logs(logs, no_log=no_log, force=force)
     names = checked_names(overrides)
+    require_trusted(loop_file, trust=trust)
     setup = load_loop(loop_file)
     if drives_file is None and "drives" in setup.files:
         drives_file = Path(setup.files["drives"][0])
