@@ -47,7 +47,7 @@ def foreign_python(source: Path) -> str:
     table = read_toml(source)
     loop, named = table.get("loop"), list(python_of(table))
     project = source.resolve().parent
-    if isinstance(loop, str):
+    if isinstance(loop, str) and (source.parent / loop).is_file():
         project = (source.parent / loop).resolve().parent
         loop = read_toml(source.parent / loop)
         named += python_of(loop)
