@@ -13,18 +13,23 @@ from softneck.core import OutputFileError, atomic_write
 from .shared._console import print_json
 from .shared._options import force_option, json_option
 
+# Of a folder that is not empty, in the line that refuses it.
+_MOST_NAMES = 3
+
 
 @click.command("new", epilog="Example: softneck new my_neck && cd my_neck && pytest")
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
 @force_option
 @json_option
 def command(folder: Path, force: bool, as_json: bool) -> None:
-    """Write a project into DIR: identification, design, loop, study and a closed-loop test."""
+    """Write a project into DIR, new or empty: identification, design, loop, study, closed-loop test, drives."""
     texts = _texts(_project_name(folder))
-    taken = [name for name in texts if (folder / name).exists()]
-    if taken and not force:
+    held = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
+    if held and not force:
+        more = ", ..." if len(held) > _MOST_NAMES else ""
         raise OutputFileError(
-            f"{folder}: holds {', '.join(taken)} already; take an empty folder, or --force replaces them."
+            f"{folder}: is not empty (it holds {', '.join(held[:_MOST_NAMES])}{more}); take a new folder, or --force "
+            "writes the project into this one and replaces files of the same names."
         )
     for name, text in texts.items():
         with atomic_write(folder / name, force=force) as temporary:

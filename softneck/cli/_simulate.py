@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import click
 from markupsafe import Markup
 
-from softneck.core import CheckFailedError, refuse_existing, write_certificate
+from softneck.core import CheckFailedError, SettingsError, refuse_existing, write_certificate
 
 from .shared._console import print_json, print_table, progress
-from .shared._options import force_option, json_option, output_option, target
+from .shared._options import force_option, json_option, output_option, target, trust_option
 
 if TYPE_CHECKING:
     from softneck.cosim import Result
@@ -23,16 +23,19 @@ if TYPE_CHECKING:
 @click.option(
     "--certificate",
     type=click.Path(path_type=Path),
-    help="Write a certificate of what held, with the hashes of all files.",
+    help="Write a certificate of the limits that held, with the hashes of all files; `drives run` asks for it.",
 )
 @click.option("--html", type=click.Path(path_type=Path), help="Write a page with plots, and beside it the neck in 3-D.")
+@trust_option
 @force_option
 @json_option
 def command(
-    loop_file: Path, output: Path | None, certificate: Path | None, html: Path | None, force: bool, as_json: bool
-) -> None:
+    loop_file: Path, output: Path | None, certificate: Path | None, html: Path | None, trust: bool, force: bool,
+    as_json: bool,
+) -> None:  # fmt: skip
     """Close the loop that LOOP.toml describes; exit code 1 if one of its limits does not hold."""
     from softneck.cosim import load_loop, simulate
+    from softneck.cosim.loops._trust import require_trusted
     from softneck.plots import neck_view, write_page
     from softneck.signals import write_recording
     from softneck.signals.recording._files import recording_suffix
@@ -44,8 +47,15 @@ def command(
     for extra in (certificate, html, view):
         if extra is not None:
             refuse_existing(extra, force=force)
+    require_trusted(loop_file, trust=trust)
+    setup = load_loop(loop_file)
+    if certificate is not None and not setup.limits:
+        raise SettingsError(
+            f"{loop_file}: has no [limits], so a certificate would show nothing; state some, such as "
+            '"pitch.overshoot_pct" = 10.0.'
+        )
     with progress("simulate", quiet=as_json) as report:
-        result = simulate(load_loop(loop_file), report=lambda done: report(done, loop_file.name))
+        result = simulate(setup, report=lambda done: report(done, loop_file.name))
     write_recording(path, result.recording(), force=replace)
     if certificate is not None:
         write_certificate(certificate, result.certificate(), force=force)

@@ -10,7 +10,7 @@ import click
 from softneck.core import CheckFailedError
 
 from .shared._console import note, print_json, print_table, progress
-from .shared._options import force_option, json_option
+from .shared._options import force_option, json_option, trust_option
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="Number of worst runs to write as loop files.",
 )
+@trust_option
 @force_option
 @json_option
 def command(
@@ -41,6 +42,7 @@ def command(
     dask: str | None,
     resume: bool,
     worst: int,
+    trust: bool,
     force: bool,
     as_json: bool,
 ) -> None:
@@ -53,6 +55,7 @@ def command(
     Ctrl-C or a crash loses no finished run: --resume continues.
     """
     from softneck.cosim import load_study
+    from softneck.cosim.loops._trust import require_trusted
     from softneck.cosim.studies._run_study import run_study
     from softneck.cosim.studies._store import read_description
     from softneck.cosim.studies._study_results import write_worst
@@ -60,6 +63,7 @@ def command(
     from softneck.report import study_page
     from softneck.report._study_page import failures
 
+    require_trusted(study_file, trust=trust)
     study = load_study(study_file)
     folder = output if output is not None else Path("build") / "studies" / study_file.stem
     replace = force or (output is None and not resume)

@@ -1,8 +1,8 @@
 """Certificates: JSON files that say what held, on which files, and whether those are still the same.
 
 A certificate is bound to the content of each file that it was made from, by SHA-256, and to itself: `seal` is the
-SHA-256 of all else that stands in it. That guards against accidents and edits by hand, not against forgers: whoever
-can write the file can seal it again.
+SHA-256 of all else that stands in it. The seal is a checksum and no signature: it guards against accidents and edits by
+hand, not against forgers, for whoever can write the file can seal it again.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Certificate:
     Attributes:
         path: of the file.
         kind: "verify" or "simulate".
-        holds: whether all that was required held.
+        holds: whether something was required, and all of it held.
         files: role -> (path, SHA-256) of every file that was read for it.
         contents: all of the JSON.
     """
@@ -46,10 +46,20 @@ class Certificate:
     files: Mapping[str, tuple[str, str]]
     contents: Mapping[str, Any]
 
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """The requirements or limits, each with "metric", "limit", "value" and "holds"."""
+        return required_rows(self.contents)
+
     def failed(self) -> list[str]:
         """Return the names of the requirements or limits that did not hold."""
-        rows = self.contents.get("requirements", self.contents.get("limits", []))
-        return [str(row.get("metric")) for row in rows if isinstance(row, dict) and not row.get("holds")]
+        return [str(row.get("metric")) for row in self.rows if not row.get("holds")]
+
+
+def required_rows(contents: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the requirements or limits in a certificate's JSON values; one without any certifies nothing."""
+    rows = contents.get("requirements", contents.get("limits"))
+    return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
 
 
 def certificate_contents(
@@ -109,7 +119,7 @@ def read_certificate(path: str | Path) -> Certificate:
     return Certificate(
         path=source,
         kind=contents["certificate"],
-        holds=contents.get("holds") is True,
+        holds=contents.get("holds") is True and bool(required_rows(contents)),
         files=_files(source, contents.get("files")),
         contents=contents,
     )
@@ -132,6 +142,8 @@ def check_certificate(path: str | Path, files: Iterable[str | Path], *, kind: st
         raise CheckFailedError(
             f"{found.path}: is a certificate of `softneck {found.kind}`; one of `softneck {kind}` is needed."
         )
+    if not found.rows:
+        raise CheckFailedError(f"{found.path}: requires nothing, so it shows nothing; state limits and make it again.")
     if not found.holds:
         listed = ", ".join(found.failed()) or "something required"
         raise CheckFailedError(f"{found.path}: says that {listed} did not hold; mend the design and verify again.")
@@ -142,7 +154,7 @@ def check_certificate(path: str | Path, files: Iterable[str | Path], *, kind: st
         if file_hash(item) not in digests:
             changed = any(Path(name).name == item.name for name, _ in found.files.values())
             what = "was changed after it was certified" if changed else "is not what was certified"
-            raise CheckFailedError(f"{item}: {what} (certificate {found.path}); run `softneck verify` on it.")
+            raise CheckFailedError(f"{item}: {what} (certificate {found.path}); run `softneck {kind}` on it.")
     return found
 
 

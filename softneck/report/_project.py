@@ -8,9 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from softneck.core import KINDS, FileFormatError, Progress, SoftneckError, load, read_archive, silent
+from softneck.core import KINDS, FileFormatError, Progress, SettingsError, SoftneckError, load, read_archive, silent
 from softneck.cosim import load_loop, read_runs, simulate
 from softneck.cosim.loops._loop_file import is_loop_file
+from softneck.cosim.loops._loop_values import read_toml
+from softneck.cosim.loops._trust import python_of
 from softneck.cosim.studies._store import read_description
 from softneck.signals import assess_quality, read_recording
 
@@ -59,7 +61,7 @@ def read_project(folder: str | Path, *, run_loops: bool = True, progress: Progre
 
     Args:
         folder: of the project.
-        run_loops: whether to run the loop files, Python parts of the user's own included.
+        run_loops: whether to run the loop files; one that names Python is never run.
         progress: called with the part done and a word.
 
     Raises:
@@ -100,6 +102,10 @@ def _files(root: Path) -> Iterator[Path]:
 
 def _loop(project: Project, path: Path, name: str) -> None:
     if is_loop_file(path):
+        # Whoever asks for a page on a folder that somebody sent does not ask for what stands in it to run.
+        named = next(python_of(read_toml(path)), "")
+        if named:
+            raise SettingsError(f"names Python (`{named}`), which a report never runs; `softneck simulate` does.")
         project.loops[name] = simulate(load_loop(path), compiled=True)
 
 

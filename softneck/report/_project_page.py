@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import SoftneckError, file_hash
+from softneck.core._certificate import required_rows
 from softneck.cosim import Result
 from softneck.identification import INFINITE, validate
 from softneck.plots import Chart, Section, Table, page
@@ -38,7 +39,7 @@ def project_page(project: Project) -> str:
 def _overview(project: Project) -> Section:
     loops = [result for result in project.loops.values() if result.limits]
     held = sum(result.holds for result in loops)
-    certified = sum(bool(content.get("holds")) for content in project.certificates.values())
+    certified = sum(_certifies(content) for content in project.certificates.values())
     lines = [
         ("recordings", len(project.recordings), "-"),
         ("models", len(project.models), "-"),
@@ -155,10 +156,10 @@ def _certificates(project: Project) -> Section | None:
     rows, details = [], []
     for name, content in project.certificates.items():
         stale = _changed(project.folder, name, content)
-        asked = content.get("requirements") or content.get("limits") or []
-        verdict = "holds" if content.get("holds") else "fails"
+        asked = required_rows(content)
+        verdict = "holds" if _certifies(content) else "fails"
         rows.append([name, str(content["certificate"]), str(len(asked)), ", ".join(stale) or "none", verdict])
-        details += [_requirement(name, row) for row in asked if isinstance(row, Mapping)]
+        details += [_requirement(name, row) for row in asked]
     head = ["certificate", "of", "requirements", "files changed since", "verdict"]
     tables = [Table("Certificates", head, rows, text=2)]
     if details:
@@ -166,6 +167,11 @@ def _certificates(project: Project) -> Section | None:
             Table("What was required", ["certificate", "metric", "value", "limit", "verdict"], details, text=2)
         )
     return Section("Verification", tables=tables)
+
+
+def _certifies(content: Mapping[str, Any]) -> bool:
+    """Return whether a certificate asks for something and says that all of it held."""
+    return bool(content.get("holds")) and bool(required_rows(content))
 
 
 def _requirement(name: str, row: Mapping[str, Any]) -> list[str]:

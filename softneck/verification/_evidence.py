@@ -194,9 +194,18 @@ def _tell(evidence: Evidence, controller: ControllerUnderTest, asked: Requiremen
     if not evidence.necks:
         absent["neck"] = "no loops over the virtual neck were asked for (necks = 0)"
         return
+    describe = _neck_describer(evidence, controller, asked)
     for name in evidence.necks[0].metrics:
         values = np.array([run.metrics[name] for run in evidence.necks])
-        metrics[f"neck.{name}"] = Values(values, _neck_describer(evidence, controller, asked))
+        metrics[f"neck.{name}"] = Values(values, describe)
+    # What a heavier payload leaves of the pretension is no matter of the controller's.
+    light = [k for k, run in enumerate(evidence.necks) if run.payload <= asked.neck["taut_up_to_kg"]]
+    if light:
+        values = metrics["neck.slack_s"].values[light]
+        metrics["neck.slack_s"] = Values(values, lambda row: describe(light[row]))
+    else:
+        del metrics["neck.slack_s"]
+        absent["neck.slack_s"] = "all of `payloads_kg` are above `taut_up_to_kg`"
 
 
 def _tell_linear(evidence: Evidence, part: LinearEvidence) -> None:

@@ -18,6 +18,7 @@ from softneck.runtime import Block
 # When the step comes [s]: after the controller took over the motors.
 STEP_AT = 0.5
 _AXIS = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg")
+_MOTORS = ("max_rad", "limit_violation_s", "slack_s")
 # An axis that moves less than this part of the step is not judged as stepped.
 _SMALL = 0.05
 
@@ -112,7 +113,7 @@ def _judge(loop: Loop) -> tuple[dict[str, float], LoopResult | None]:
         result = run_loop(loop)
     except DataError:
         # Numbers overflowed: the loop is not stable, whatever its margins say.
-        return dict.fromkeys((*_AXIS, "max_rad", "limit_violation_s"), math.inf), None
+        return dict.fromkeys((*_AXIS, *_MOTORS), math.inf), None
     table = metrics(result)
     sizes = {axis: float(np.abs(result[f"{axis}_reference"]).max()) for axis in ("pitch", "roll")}
     stepped = [axis for axis, size in sizes.items() if size > _SMALL * max(sizes.values())]
@@ -122,7 +123,7 @@ def _judge(loop: Loop) -> tuple[dict[str, float], LoopResult | None]:
         values[name] = (
             math.inf if any(value is None for value in found) else max(float(value or 0.0) for value in found)
         )
-    values |= {name: float(table["motors"][name] or 0.0) for name in ("max_rad", "limit_violation_s")}
+    values |= {name: float(table["motors"][name] or 0.0) for name in _MOTORS}
     return values, result
 
 

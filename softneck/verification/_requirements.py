@@ -25,6 +25,7 @@ _NECK_METRICS = (
     "rms_error_deg",
     "max_rad",
     "limit_violation_s",
+    "slack_s",
 )
 #: Names of all metrics that a requirement can be about.
 METRIC_NAMES = (
@@ -50,7 +51,7 @@ _NUMBERS: dict[str, dict[str, tuple[float, float, str]]] = {
     },
     "neck": {
         "necks": (0, 1000, ""), "spread_pct": (0.0, 50.0, "%"), "size_deg": (0.01, 45.0, "deg"),
-        "duration_s": (0.5, 600.0, "s"),
+        "duration_s": (0.5, 600.0, "s"), "taut_up_to_kg": (0.0, 5.0, "kg"),
     },
 }  # fmt: skip
 _WHOLE = ("plants", "search_generations", "seed", "necks")

@@ -12,6 +12,7 @@ from softneck.cosim import load_loop, simulate
 from softneck.design import PiSettings
 from softneck.signals import read_recording
 
+from ..drives.certified import write_verified
 from .conftest import Call
 
 LOOP = """duration_s = 1.5
@@ -23,6 +24,8 @@ file = "pi.npz"
 kind = "step"
 pitch_deg = 5.0
 at_s = 0.2
+[limits]
+"pitch.overshoot_pct" = 30.0
 """
 NECK = """from softneck.plant import NeckParameters, VirtualNeck
 
@@ -38,6 +41,7 @@ def files(tmp_path_factory: pytest.TempPathFactory, models: dict) -> Path:
     PiSettings().design(models["rls"]).save(folder / "pi.npz")
     (folder / "loop.toml").write_text(LOOP, encoding="utf-8")
     (folder / "neck_for_drives_cli.py").write_text(NECK, encoding="utf-8")
+    write_verified(folder / "pi.npz")
     write_certificate(folder / "loop.json", simulate(load_loop(folder / "loop.toml")).certificate())
     return folder
 
@@ -85,7 +89,7 @@ def test_run_writes_a_recording(call: Call, files: Path) -> None:
         (("check", "--simulated", "--drives", "none.toml"), "none.toml: cannot be read"),
         (("zero", "--bus", "virtual:x", "--drives", "{example}"), "say --arm if they may. Nothing was sent"),
         (("scan", "--bus", "socketcan:can_that_is_not"), "bus socketcan:can_that_is_not cannot be opened"),
-        (("run", "{pi}", "--loop", "{loop}", "--simulated"), "has no certificate"),
+        (("run", "{pi}", "--loop", "{loop}", "--simulated"), "loop.toml: has no certificate of `softneck simulate`"),
         (("run", "none.npz", "--loop", "{loop}", "--simulated"), "none.npz: no such file"),
         (("run", "{pi}", "--loop", "none.toml", "--simulated"), "none.toml"),
         (("run", "{pi}", "--loop", "{loop}", "--bus", "virtual:x", "--drives", "{example}", "--override",

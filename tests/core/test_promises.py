@@ -26,7 +26,8 @@ def sealed(contents: dict[str, Any]) -> str:
 
 def certificate(**changes: Any) -> dict[str, Any]:
     return {
-        "certificate": "verify", "certificate_version": 1, "softneck": "0.1", "holds": True, "requirements": [],
+        "certificate": "verify", "certificate_version": 1, "softneck": "0.1", "holds": True,
+        "requirements": [{"metric": "a", "holds": True}],
         "files": {"controller": {"path": "somewhere/pi.npz", "sha256": DIGEST}}, **changes,
     }  # fmt: skip
 

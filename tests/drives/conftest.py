@@ -16,6 +16,8 @@ from softneck.identification import Rls
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import signal
 
+from .certified import write_verified
+
 LOOP = """duration_s = {duration}
 sample_time_s = 0.02
 [plant]
@@ -73,6 +75,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     (folder / "neck_for_drives.py").write_text(NECK, encoding="utf-8")
     made = Project(folder)
     made.write_loop("loop.toml", STEP, 4.0)
+    write_verified(made.controller)
     result = simulate(load_loop(made.loop))
     write_certificate(made.certificate, result.certificate())
     assert json.loads(made.certificate.read_text())["holds"]

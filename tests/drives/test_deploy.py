@@ -1,4 +1,4 @@
-"""Whole runs on simulated drives: equal to the co-simulation, certified, and over a real python-can bus."""
+"""Whole runs on simulated drives: equal to the co-simulation, and over a real python-can bus."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import threading
 import time
 import tracemalloc
 from dataclasses import replace
-from pathlib import Path
 
 import can
 import numpy as np
@@ -30,7 +29,6 @@ from softneck.drives.bus._link import VirtualLink
 from softneck.drives.bus._units import DriveScale
 from softneck.drives.master import Tilt
 from softneck.drives.master._settings import RampSettings
-from softneck.drives.running._certified import require_certified
 from softneck.drives.simulated import SimulatedNeck, SimulatedSettings, serve
 from softneck.plant import NeckParameters
 
@@ -104,24 +102,6 @@ def test_a_fault_ends_the_run_and_its_log_is_kept(project: Project) -> None:
     assert len(result.signals.time) > 20
     with pytest.raises(CheckFailedError, match=r"the inclinometer is frozen.*softneck drives reset"):
         result.require()
-
-
-# -- certificates -----------------------------------------------------------------------------------------------------
-
-
-def test_only_certified_files_run(project: Project, tmp_path: Path) -> None:
-    setup = load_loop(project.loop)
-    assert require_certified(setup, project.controller, [project.certificate]) == (project.certificate,)
-    with pytest.raises(CheckFailedError, match="has no certificate"):
-        require_certified(setup, project.controller, [])
-    assert require_certified(setup, project.controller, [], ["certificate"]) == ()
-    changed = load_loop(project.write_loop("other.toml", STEP, 3.0))
-    with pytest.raises(CheckFailedError, match=r"other\.toml: is not what was certified"):
-        require_certified(changed, project.controller, [project.certificate])
-    other = tmp_path / "pi.npz"
-    other.write_bytes(project.controller.read_bytes() + b"\0")
-    with pytest.raises(CheckFailedError, match=r"pi\.npz: is not what was certified"):
-        require_certified(setup, other, [project.certificate])
 
 
 # -- zero -------------------------------------------------------------------------------------------------------------

@@ -71,6 +71,23 @@ def test_a_good_controller_holds(held: Verification) -> None:
 
 
 @pytest.mark.slow
+def test_taut_tendons_are_asked_for_up_to_the_payload_that_leaves_a_pretension() -> None:
+    """Of the runs over the virtual neck those with light payloads count; without any the metric is not computed."""
+    few = {"sampling": {"plants": 1, "search_generations": 0}, "step": {"duration_s": 0.4}}
+    asked = {"payloads_kg": [0.0, 1.0], "taut_up_to_kg": 0.5, "duration_s": 1.0}
+    found = verify(pi(), linear_neck(), make_requirements({**few, "neck": {**QUICK["neck"], **asked}}))
+    slack = [run.metrics["slack_s"] for run in found.evidence.necks]
+    # The paper's neck under 1 kg: 3.3 N of pretension less 3 N, and the step takes the rest.
+    assert slack[0] == 0.0 < slack[1]
+    row = next(row for row in found.contents()["requirements"] if row["metric"] == "neck.slack_s")
+    assert (row["value"], row["holds"], row["worst"]["payload_kg"]) == (0.0, True, 0.0)
+    heavy = {**QUICK["neck"], **asked, "payloads_kg": [1.0]}
+    found = verify(pi(), linear_neck(), make_requirements({**few, "neck": heavy}))
+    row = next(row for row in found.contents()["requirements"] if row["metric"] == "neck.slack_s")
+    assert (row["holds"], row["note"]) == (None, "not computed: all of `payloads_kg` are above `taut_up_to_kg`")
+
+
+@pytest.mark.slow
 def test_a_wrong_delay_fails_loudly() -> None:
     """Designed without dead time, the plant has 80 ms."""
     found = verify(pi(delay=0), linear_neck(), make_requirements(QUICK))

@@ -12,7 +12,7 @@ from softneck.core import CheckFailedError, SettingsError, refuse_existing
 
 from ..shared._console import note, print_json, print_table, progress
 from ..shared._neck import load_neck
-from ..shared._options import force_option, json_option, output_option, target
+from ..shared._options import force_option, json_option, output_option, target, trust_option
 from ._log import acting_files, log_options, opened_log, require_logs
 from ._move import jog_command, record_command
 from ._replay import replay_command
@@ -54,19 +54,20 @@ def command() -> None:
 @drives_options
 @json_option
 def scan_command(drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, as_json: bool) -> None:
-    """List the nodes on the bus; sends reads only. Exit code 1 if none answers."""
+    """List the nodes on the bus; sends reads only. Exit code 1 if none answers, or several devices at one number."""
     from softneck.drives import default_drives, scan
+    from softneck.drives.running._scan import several_devices
 
     if bus is not None and drives_file is None:
         chosen = Target(default_drives(), bus, False, arm)
     else:
         chosen = target_of(drives_file, bus, simulated, arm)
     with open_link(chosen, moves=False) as link:
-        found = scan(link)
+        found = scan(link, bit_rate=chosen.file.bit_rate)
     if as_json:
         print_json({"nodes": found})
     else:
-        rows = [[str(item["node"]), str(item["name"] or "-"), str(item["firmware"] or "-"), str(item["serial"] or "-"),
+        rows = [[str(item["node"]), str(item["name"] or "-"), str(item["firmware"] or "-"), _serials(item["serials"]),
                  str(item["state"] or "-")] for item in found]  # fmt: skip
         print_table(f"{len(found)} node(s)", ["node", "name", "firmware", "serial", "state"], rows)
     if not found:
@@ -74,6 +75,14 @@ def scan_command(drives_file: Path | None, bus: str | None, simulated: bool, arm
             f"{bus or 'the bus'}: no node answers. Are the drives on, is the bit rate right, is the line terminated "
             "(60 ohm between CAN_H and CAN_L)?"
         )
+    shared = [(item["node"], several_devices(item["serials"])) for item in found]
+    listed = "; ".join(f"node {node}: {told}" for node, told in shared if told)
+    if listed:
+        raise CheckFailedError(f"{listed}. Give each device a node number of its own.")
+
+
+def _serials(serials: list[int | None]) -> str:
+    return ", ".join(str(serial or "-") for serial in serials) or "-"
 
 
 @command.command("check", epilog="Example: softneck drives check --simulated")
@@ -160,7 +169,8 @@ def zero_command(
 @click.option("--loop", "loop_file", required=True, type=click.Path(path_type=Path), metavar="LOOP.toml",
               help="Observer, reference and duration; its plant is the virtual neck of --simulated.")  # fmt: skip
 @click.option("--certificate", "certificates", multiple=True, type=click.Path(path_type=Path),
-              help="Certificate of `softneck verify` or `simulate`; several may cover the files together.")  # fmt: skip
+              help="Certificate of `softneck verify`, or of `simulate`: both are needed. [default: CONTROLLER and LOOP "
+              "with .certificate.json]")  # fmt: skip
 @drives_options
 @override_option
 @neck_option
@@ -172,22 +182,26 @@ def zero_command(
     "--realtime", is_flag=True, help="On a bus: run ahead of all ordinary processes (SCHED_FIFO), with memory locked."
 )
 @output_option("recording of the run", "REC")
+@trust_option
 @force_option
 @json_option
 def run_command(
     controller: Path, loop_file: Path, certificates: tuple[Path, ...], drives_file: Path | None, bus: str | None,
     simulated: bool, arm: bool, overrides: tuple[str, ...], neck: str | None, pace: float | None, realtime: bool,
-    logs: tuple[Path, ...], no_log: bool, output: Path | None, force: bool, as_json: bool,
+    logs: tuple[Path, ...], no_log: bool, output: Path | None, trust: bool, force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Run CONTROLLER in the loop of LOOP.toml on the drives: enable, ramp in, control, ramp out, switch off.
 
-    Refused unless certificates cover controller, observer and loop file and hold. Exit code 1 if anything stopped it,
-    143 if SIGTERM ended it (to rest, then off).
+    Refused unless a certificate of `softneck verify` shows what drives need of the controller, one of `softneck
+    simulate` covers controller, observer, loop and drives file for the whole run, and the loop, run again on its own
+    plant, does the same. Exit code 1 if anything stopped it, or a drive did not confirm that it is off; 143 if SIGTERM
+    ended it (to rest, then off).
     On a terminal (stderr) a live view shows the run, on a bus and with --pace; not with --json.
     """
     from softneck.cosim import load_loop
+    from softneck.cosim.loops._trust import require_trusted
     from softneck.drives import prepare, run_on_bus, run_simulated
-    from softneck.drives.running._certified import require_certified
+    from softneck.drives.running._certified import require_certified, require_same_again
     from softneck.drives.running._deploy import neck_of
     from softneck.drives.running._keyboard import Keyboard
     from softneck.signals import write_recording
@@ -198,15 +212,21 @@ def run_command(
     refuse_existing(path, force=replace)
     require_logs(logs, no_log=no_log, force=force)
     names = checked_names(overrides)
+    require_trusted(loop_file, trust=trust)
     setup = load_loop(loop_file)
+    if drives_file is None and "drives" in setup.files:
+        drives_file = Path(setup.files["drives"][0])
     virtual = load_neck(neck) if neck else neck_of(setup.loop)
     chosen = target_of(drives_file, bus, simulated, arm, neck=virtual)
     if not controller.is_file():
         raise SettingsError(f"{controller}: no such file.")
-    require_certified(setup, controller, certificates, names)
+    certified = require_certified(setup, controller, certificates, names, drives=drives_file)
     deployed = prepare(setup, controller)
     for text in deployed.notes:
         note(text)
+    if certified is not None:
+        again = require_same_again(deployed.loop, certified[1])
+        note(f"{certified[1].path}: {again:g} of {deployed.loop.duration:g} s run again on the loop's plant: the same")
     files = acting_files(setup, loop_file, controller, drives_file)
     live = not as_json and (not chosen.simulated or pace is not None)
     sensor: Any = None if chosen.simulated else sensor_of(chosen.file, str(chosen.bus))

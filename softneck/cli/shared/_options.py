@@ -16,6 +16,9 @@ from softneck.core._kinds import make_settings
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout and nothing else.")
 force_option = click.option("--force", is_flag=True, help="Replace an existing file.")
+trust_option = click.option(
+    "--trust", is_flag=True, help="Run Python that the file names and that lies outside of the loop's folder."
+)
 set_option = click.option(
     "--set",
     "settings",

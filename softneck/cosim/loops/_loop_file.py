@@ -19,7 +19,7 @@ from ._simulate import LoopSetup
 
 _TOP = (
     "duration_s", "sample_time_s", "order", "plant", "observer", "controller", "reference", "part", "connections",
-    "fault", "limits", "angle", "folder",
+    "fault", "limits", "angle", "folder", "drives",
 )  # fmt: skip
 _SAME_SAMPLE_TIME = 1e-6
 
@@ -101,6 +101,8 @@ def _setup(table: Mapping[str, Any], source: Path, opened: dict[Any, Any] | None
     parts = {name: opener.part(name, part) for name, part in described.items()}
     parts |= {name: opener.other(name, part) for name, part in others.items()}
     described |= others
+    if "drives" in table:
+        opener.drives(table["drives"])
     reference = opener.reference(table["reference"], parts["controller"].sample_time)
     if isinstance(reference, FmuPart | IsolatedPart):
         parts["reference"], described["reference"] = reference, table["reference"]

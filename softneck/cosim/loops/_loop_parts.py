@@ -85,6 +85,12 @@ class PartOpener:
             time=time, pitch=pitch, roll=roll, cocontraction=channels.get("cocontraction_reference")
         )
 
+    def drives(self, name: Any) -> None:
+        """Remember the drives file that the loop is meant for; nothing here reads it, certificates are bound to it."""
+        if not isinstance(name, str):
+            raise SettingsError(f"`drives` must be the name of a drives file; got {name!r}.")
+        self._file("drives", name)
+
     def _made(self, name: str, table: Any, keys: tuple[str, ...], role: str | None, *, as_role: str) -> Part:
         if not isinstance(table, dict):
             raise SettingsError(f"`{name}` must be a table: [{name}].")

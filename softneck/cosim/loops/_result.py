@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from softneck.core import DataError, Vector, to_si
+import numpy as np
+
+from softneck.core import DataError, SettingsError, Vector, to_si
 from softneck.core._certificate import certificate_contents
 from softneck.loop import LoopResult, check_limits, metrics
 from softneck.signals import Recording
@@ -14,6 +16,9 @@ from softneck.signals.recording._channels import file_unit, known_channels
 
 if TYPE_CHECKING:
     import pandas as pd
+
+# Rows of a run that its certificate keeps, spread over all of it: what goes another way is elsewhere in one of them.
+_TRACE_ROWS = 50
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -52,8 +57,8 @@ class Result:
 
     @property
     def holds(self) -> bool:
-        """Whether all limits hold."""
-        return all(row["holds"] for row in self.limits)
+        """Whether there are limits, and all of them hold."""
+        return bool(self.bounds) and all(row["holds"] for row in self.limits)
 
     @property
     def real_time_factor(self) -> float:
@@ -83,9 +88,28 @@ class Result:
         """Return the JSON of `softneck simulate`."""
         return {"metrics": self.metrics, "limits": self.limits, "real_time_factor": self.real_time_factor}
 
+    def trace(self) -> dict[str, list[Any]]:
+        """Return some rows of the run, by which it is known again: their numbers, set-points and angles.
+
+        The keys are "row", "motor_setpoint_1" to 3, "pitch", "roll"; the values have shape (rows,), in rad;
+        an angle that was not measured there is None.
+        """
+        rows = np.unique(np.linspace(0, len(self.signals.time) - 1, _TRACE_ROWS).astype(int))
+        kept = {f"motor_setpoint_{j}": self.signals[f"motor_setpoint_{j}"] for j in (1, 2, 3)}
+        kept |= {axis: self.signals.angle(axis) for axis in ("pitch", "roll")}
+        cells = {name: [x if np.isfinite(x) else None for x in values[rows].tolist()] for name, values in kept.items()}
+        return {"row": rows.tolist(), **cells}
+
     def certificate(self) -> dict[str, Any]:
-        """Return what held, with the hash of every file that was read."""
+        """Return what held, with the hash of every file that was read.
+
+        Raises:
+            SettingsError: the loop has no limits, so nothing can hold.
+        """
+        if not self.bounds:
+            raise SettingsError("the loop has no [limits]: a certificate of it would show nothing; state some.")
         more = {
+            "trace": self.trace(),
             "limits": self.limits,
             "metrics": self.metrics,
             "order": self.order,

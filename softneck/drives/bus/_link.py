@@ -26,13 +26,12 @@ class BusError(SoftneckError):
 
 
 class Link(Protocol):
-    """Sends and receives frames; its clock is monotonic.
+    """Sends and receives frames; its clock is monotonic."""
 
-    Attributes:
-        problem: why frames no longer pass, "" while they do.
-    """
-
-    problem: str
+    @property
+    def problem(self) -> str:
+        """Why frames no longer pass, "" while they do."""
+        ...
 
     @property
     def now(self) -> float:
@@ -103,7 +102,8 @@ class VirtualLink:
     def receive(self, timeout: float) -> list[Frame]:
         """Return what is there; else let time pass until something comes or `timeout` [s] is over."""
         passed = 0.0
-        while not self._inbox and passed < timeout - 1e-9:
+        # What rounding leaves of a time-out is a cycle too: whoever waits until it is over would wait for ever.
+        while not self._inbox and (passed < timeout - 1e-9 or passed == 0.0 < timeout):
             self.pass_time()
             passed += self.cycle
             self.send(())

@@ -58,9 +58,17 @@ class Write:
     topic: str
 
 
+# What a drive needs to be guarded: a heartbeat consumer and producer, or life guarding.
+GUARDED_BY = {"heartbeat": (0x1016, 0x1017), "life": (0x100C, 0x100D)}
+GUARDING_OBJECTS = ((0x1016, 1), (0x1017, 0), (0x100C, 0), (0x100D, 0))
+_ANY_GUARDING = frozenset(index for index, _ in GUARDING_OBJECTS)
+
+
 def require_eds(dictionary: ObjectDictionary, profile: str, name: str) -> None:
     """Raise FileFormatError unless the EDS has what a run needs, in the right sizes."""
     for (index, subindex), size in {**SIZES, **_PROFILE_SIZES[profile]}.items():
+        if index in GUARDED_BY["life"] and index not in dictionary and 0x1016 in dictionary:
+            continue  # guarded by heartbeat alone, as CiA 301 recommends
         integer, found = is_integer(dictionary, index, subindex)
         place = f"{index:04X}h:{subindex}"
         if not integer:
@@ -124,18 +132,17 @@ def limit_writes(file: DrivesFile, entry: DriveEntry) -> list[Write]:
     ]
 
 
-def guarding_writes(file: DrivesFile, kind: str, master: int) -> list[Write]:
-    """Life guarding, or heartbeat both ways."""
+def guarding_writes(file: DrivesFile, kind: str, master: int, has: frozenset[int] = _ANY_GUARDING) -> list[Write]:
+    """Life guarding, or heartbeat both ways; the other is switched off in a drive that `has` its objects."""
     if kind == "life":
         period = max(1, round(1000.0 * file.guarding.time / 5.0))
-        return [Write(0x1017, 0, 0, "guarding"), Write(0x100C, 0, period, "guarding"), Write(0x100D, 0, 5, "guarding")]
-    milliseconds = round(1000.0 * file.guarding.time)
-    return [
-        Write(0x100C, 0, 0, "guarding"),
-        Write(0x100D, 0, 0, "guarding"),
-        Write(0x1017, 0, max(10, milliseconds // 2), "guarding"),
-        Write(0x1016, 1, (master << 16) | milliseconds, "guarding"),
-    ]
+        off, on = [(0x1017, 0)], [(0x100C, 0, period), (0x100D, 0, 5)]
+    else:
+        milliseconds = round(1000.0 * file.guarding.time)
+        off, on = [(0x100C, 0), (0x100D, 0)], [(0x1017, 0, max(10, milliseconds // 2))]
+        on.append((0x1016, 1, (master << 16) | milliseconds))
+    values = [(index, subindex, 0) for index, subindex in off if index in has] + on
+    return [Write(index, subindex, value, "guarding") for index, subindex, value in values]
 
 
 def disarm_writes(kind: str) -> list[Write]:

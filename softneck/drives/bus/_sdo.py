@@ -75,6 +75,22 @@ class Objects:
         """
         return int(self._call(index, subindex, lambda item: item.raw))
 
+    def has(self, index: int, subindex: int = 0) -> bool:
+        """Return whether the drive, and its EDS, have a number there.
+
+        Raises:
+            SdoError: the drive does not answer.
+        """
+        if index not in self._dictionary:
+            return False
+        try:
+            self.read(index, subindex)
+        except SdoError as error:
+            if error.aborted:
+                return False
+            raise
+        return True
+
     def read_text(self, index: int, subindex: int = 0) -> str:
         """Return a text."""
         return str(self._call(index, subindex, lambda item: item.raw)).strip("\0 ")

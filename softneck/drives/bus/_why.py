@@ -13,6 +13,7 @@ _ADVICE = {
     errno.EBUSY: "Another program has it open; end that one",
     errno.EAFNOSUPPORT: "This kernel has no CAN: `sudo modprobe can-raw`, and `vcan` to practise",
     errno.ENETDOWN: "`sudo ip link set can0 up`, with the bit rate set before",
+    errno.ENOBUFS: "Nobody acknowledges them: is a drive on, the bit rate right, the line terminated",
     errno.EIO: "Was it unplugged?",
 }
 # How operating system and libraries number an error within its text.

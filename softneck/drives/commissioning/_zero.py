@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 from softneck.core import CheckFailedError, SoftneckError
 
 from ..bus._file import DriveEntry, DrivesFile
+from ..bus._guarded import GuardedLink
 from ..bus._link import Link
 from ..bus._objects import (
     HOMED_MARK,
     MASTER_NODE,
     Write,
     current_write,
-    disarm_writes,
     option_writes,
     speed_of_units,
     speed_units,
@@ -26,7 +26,7 @@ from ..bus._units import counts_to_position
 from ..master import Frame, Tilt
 from ..master._cia402 import DriveState, state_of
 from ..running._ask import Operator
-from ..running._stop import wait
+from ..running._stop import disarm, wait
 
 if TYPE_CHECKING:
     from canopen.objectdictionary import ObjectDictionary
@@ -139,33 +139,41 @@ def zero(link: Link, file: DrivesFile, look: Look, *, guarding: str, operator: O
         CheckFailedError: a tendon does not get tight in time, the neck is not upright, or the slow loop is another.
     """
     dictionary = load_eds(file.profile, file.eds)
-    motors = [_Motor(link, entry, file, dictionary) for entry in file.drives]
-    guard = _feeder(link, file, guarding, operator)
+    signs = _signs_of_life(file, guarding)
+    # Fed from every wait of this thread, those for answers too: a master that hangs stops feeding.
+    guarded = GuardedLink(link, signs, file.guard_cycles * file.cycle)
+    motors = [_Motor(guarded, entry, file, dictionary) for entry in file.drives]
+    left: dict[int, str] = {}
     try:
         for motor in motors:
             motor.prepare()
             motor.start = motor.position()
             motor.enable()
-            _tension(link, motor, guard)
+            _tension(guarded, motor, operator)
         # What the later ones pulled may have loosened the first: all pull on with their small current.
-        _rest(link, _SETTLE, guard)
+        _rest(guarded, _SETTLE, operator)
         tilt = _upright(file, look)
         for motor in motors:
-            _set_zero(link, motor)
+            _set_zero(guarded, motor)
     finally:
-        _off(motors, guarding)
+        _off(motors)
+        left = disarm(link, file, guarding, signs)
+    for node, why in left.items():
+        raise CheckFailedError(
+            f"node {node}: did not confirm that it is switched off: {why}. Press the hardware stop (Enable input)."
+        )
     pulled = tuple(motor.pulled for motor in motors)
     return ZeroResult(file.nodes, pulled, tilt.pitch, tilt.roll)
 
 
-def _tension(link: Link, motor: _Motor, guard: Callable[[], None]) -> None:
+def _tension(link: Link, motor: _Motor, operator: Operator | None) -> None:
     zero, node = motor.file.zero, motor.entry.node
     motor.objects.write(0x60FF, 0, speed_units(zero.speed, motor.entry, motor.file.profile))
     begin = link.now
     still_since: float | None = None
     before, before_at, ratios = motor.position(), link.now, []
     while True:
-        _rest(link, _LOOK, guard)
+        _rest(link, _LOOK, operator)
         now, position, speed = link.now, motor.position(), motor.speed()
         moved = (position - before) / max(now - before_at, 1e-6)
         if abs(moved) > _FAST_ENOUGH and abs(speed) > 0.01:
@@ -224,40 +232,27 @@ def _set_zero(link: Link, motor: _Motor) -> None:
         raise CheckFailedError(f"node {motor.entry.node}: homing did not end (status {word:04X}h, position {counts}).")
 
 
-def _feeder(link: Link, file: DrivesFile, guarding: str, operator: Operator | None) -> Callable[[], None]:
+def _signs_of_life(file: DrivesFile, guarding: str) -> list[Frame]:
     """Return what tells the drives that we live: guarding requests, or our heartbeat."""
     if guarding == "life":
-        frames = [Frame(0x700 + node, b"\0", remote=True) for node in file.nodes]
-    else:
-        frames = [Frame(0x700 + MASTER_NODE, b"\x05")]
-
-    def feed() -> None:
-        if operator is not None and operator() is not None:
-            raise CheckFailedError("stopped by the operator. The drives are off; zero them again.")
-        link.send(frames)
-
-    return feed
+        return [Frame(0x700 + node, b"\0", remote=True) for node in file.nodes]
+    return [Frame(0x700 + MASTER_NODE, b"\x05")]
 
 
-def _off(motors: list[_Motor], guarding: str) -> None:
-    """Switch all off and end their guarding; one that does not answer must not keep the others on."""
+def _off(motors: list[_Motor]) -> None:
+    """Switch all off; one that does not answer must not keep the others on."""
     for motor in motors:
         try:
             motor.word(0x06)
             motor.word(0x00)
         except SoftneckError:
             continue
-    for motor in motors:
-        try:
-            for write in disarm_writes(guarding):
-                motor.objects.write(write.index, write.subindex, write.value)
-        except SoftneckError:
-            continue
 
 
-def _rest(link: Link, seconds: float, guard: Callable[[], None]) -> None:
-    """Wait, feeding the drives' guarding from here: a master that hangs stops feeding."""
+def _rest(link: Link, seconds: float, operator: Operator | None) -> None:
+    """Wait, and end it all if somebody asks for it."""
     until = link.now + seconds
     while link.now < until - 1e-9:
-        guard()
+        if operator is not None and operator() is not None:
+            raise CheckFailedError("stopped by the operator. The drives are off; zero them again.")
         wait(link, min(_LOOK, until - link.now))

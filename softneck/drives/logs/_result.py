@@ -47,7 +47,13 @@ def recording_of(signals: LoopResult, speeds: Matrix) -> Recording:
     return Recording(signals.time, signals.sample_time, channels)
 
 
-_UNHEARD = ("bus_off", "bus_silent")
+_UNHEARD = "The drives cannot be reached; their own guarding stops them within 0.1 s"
+# What is known of the drives' power after these; after all others they are off.
+_POWER = {
+    "bus_off": _UNHEARD,
+    "bus_silent": _UNHEARD,
+    "not_off": "If it may still have power, press the hardware stop (Enable input)",
+}
 
 
 def require_unstopped(fault: Event | None, *, rehome: bool = False) -> None:
@@ -58,11 +64,7 @@ def require_unstopped(fault: Event | None, *, rehome: bool = False) -> None:
     if fault.name == "operator":
         raise CheckFailedError(f"stopped at t = {fault.time:.3f} s by the operator. The drives are off.{after}")
     # Where no word reaches the drives, what they do is theirs, and nobody here can know it.
-    off = (
-        "The drives cannot be reached; their own guarding stops them within 0.1 s"
-        if fault.name in _UNHEARD
-        else ("The drives are off")
-    )
+    off = _POWER.get(fault.name, "The drives are off")
     raise CheckFailedError(
         f"stopped at t = {fault.time:.3f} s: {fault}. {off}; look for the cause, then `softneck drives reset`.{after}"
     )

@@ -22,6 +22,12 @@ class DriveState(IntEnum):
     UNKNOWN = 0xFF
 
 
+# Without power, and not by a fault: what a drive has to say before a run counts as done.
+OFF = frozenset({DriveState.NOT_READY, DriveState.DISABLED, DriveState.READY, DriveState.SWITCHED_ON})
+# With power: a drive that quick-stops or reacts to a fault still brakes.
+POWERED = frozenset({DriveState.ENABLED, DriveState.QUICK_STOP, DriveState.REACTION})
+
+
 class Goal(IntEnum):
     """What the master wants of a drive."""
 

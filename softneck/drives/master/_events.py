@@ -68,6 +68,7 @@ RULES: dict[str, Rule] = {
     "clock": Rule(_R.STOP, 1, 0.0, "the clock went backwards"),
     "enable_timeout": Rule(_R.STOP, 0, 2.0, "a drive did not reach Operation Enabled"),
     "ramp_timeout": Rule(_R.STOP, 0, 60.0, "a ramp did not end"),
+    "not_off": Rule(_R.STOP, 0, 1.0, "a drive did not confirm that it is switched off"),
     "left": Rule(_R.COUNT, 1, 0.0, "the operator asked for the ramp to rest"),
     "operator": Rule(_R.STOP, 1, 0.0, "stopped by the operator"),
 }

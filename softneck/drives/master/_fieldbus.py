@@ -197,9 +197,13 @@ class Fieldbus:
             frames.append(Frame(0x200 + view.node, _RPDO.pack(word, target)))
         frames.append(SYNC)
         if guard and self._cycle % self.settings.guard_cycles == 0:
-            frames.extend(self._guards if self.settings.guarding == "life" else (self._beat,))
+            frames.extend(self.signs_of_life())
         self._cycle += 1
         return frames
+
+    def signs_of_life(self) -> tuple[Frame, ...]:
+        """Return what the drives' guarding waits for: a request to each, or our heartbeat."""
+        return self._guards if self.settings.guarding == "life" else (self._beat,)
 
     def start(self) -> list[Frame]:
         """Return the frames that start the nodes."""

@@ -6,7 +6,7 @@ import math
 from collections import Counter, deque
 from collections.abc import Sequence
 
-from ._cia402 import DriveState, Goal
+from ._cia402 import OFF, POWERED, DriveState, Goal
 from ._events import IDLE_TOO, Event, Reaction
 from ._fieldbus import Fieldbus
 from ._frame import Frame
@@ -23,8 +23,6 @@ _LOST = 5
 _STOP_TIME = 1.0
 # A drive that has not stopped this long after it was told to gets no more sign of life [s].
 _OBEY_TIME = 0.25
-_POWERED = (DriveState.ENABLED, DriveState.QUICK_STOP, DriveState.REACTION)
-_MOST_EVENTS = 1000
 _NEVER = -math.inf
 _MOVED = frozenset({Phase.RAMP_IN, Phase.RUNNING, Phase.RAMP_OUT, Phase.RETREAT})
 
@@ -61,11 +59,10 @@ class Master:
         self.wanted: Triple = (0.0, 0.0, 0.0)
         self._from: Triple = (0.0, 0.0, 0.0)
         self.counts: Counter[str] = Counter()
-        self.events: deque[Event] = deque(maxlen=_MOST_EVENTS)
+        self.events: deque[Event] = deque(maxlen=1000)
         self.cycle = 0
         self._now: float | None = None
-        self._missing = 0
-        self._index = -1
+        self._missing, self._index = 0, -1
         self._part, self._arrived_at = 0, _NEVER
         self._enabling, self._enabling_since = 0, _NEVER
         self._hold_at: Triple | None = None
@@ -127,7 +124,7 @@ class Master:
         self._watch(now, due, fresh, events)
         self._act(now, due, fresh, events)
         self._judge(now, events)
-        frames_out = self.bus.send(self._goals(), self._targets(), guard=not self._starved(now))
+        frames_out = self.bus.send(self._goals(), self._targets(), guard=not self.starved)
         self.cycle += 1
         return frames_out
 
@@ -227,7 +224,7 @@ class Master:
         elif phase is Phase.RETREAT:
             self._retreat(now, events)
         elif phase in (Phase.DISABLING, Phase.STOPPING):
-            self._switch_off(now)
+            self._switch_off(now, events)
         if self.supervisor.phase not in _MOVED:
             self._track()
 
@@ -355,19 +352,25 @@ class Master:
         if now - self.supervisor.since >= self.settings.sensor.hold:
             self._change(now, Signal.ARRIVED)
 
-    def _switch_off(self, now: float) -> None:
-        powered = any(view.state in _POWERED and not view.silent > 5 for view in self.bus.drives)
-        if not powered or now - self.supervisor.since > _STOP_TIME:
+    def _switch_off(self, now: float, events: list[Event]) -> None:
+        """A run is done when each drive has said in this cycle that it is off; after a stop silence is enough."""
+        stopping, late = self.supervisor.phase is Phase.STOPPING, now - self.supervisor.since > _STOP_TIME
+        powered = [view for view in self.bus.drives if view.state not in OFF or not view.fresh]
+        if stopping:
+            powered = [view for view in self.bus.drives if view.state in POWERED and not view.silent > 5]
+        if not powered or (late and stopping):
             self._change(now, Signal.OFF)
+        elif late:
+            events.append(Event(now, "not_off", powered[0].node, f"it is {powered[0].state.name}"))
 
-    def _starved(self, now: float) -> bool:
+    @property
+    def starved(self) -> bool:
         """Whether guarding ends because a drive does not stop: one that hears no PDO still notices our silence."""
         phase = self.supervisor.phase
         if phase is Phase.STOPPING:
-            return now - self.supervisor.since > _OBEY_TIME
-        if phase is not Phase.STOPPED:
-            return False
-        return any(view.heard and (view.silent or view.state in _POWERED) for view in self.bus.drives)
+            return (self._now or 0.0) - self.supervisor.since > _OBEY_TIME
+        unsure = (view.heard and (view.silent or view.state in POWERED) for view in self.bus.drives)
+        return phase is Phase.STOPPED and any(unsure)
 
     def _change(self, now: float, signal: Signal) -> None:
         if self.supervisor.signal(now, signal):

@@ -105,6 +105,11 @@ class Supervisor:
         self.phase, self.since = following, now
         return True
 
+    def revoke(self, event: Event) -> None:
+        """Take a good end back: what showed after it says that it was none."""
+        self.phase = Phase.STOPPED
+        self.fault = self.fault or event
+
     def react(self, now: float, events: Sequence[Event]) -> list[Event]:
         """Take `events` of this cycle in their order; return those that count."""
         kept = [event for event in events if event.name not in self.off] if self.off else list(events)

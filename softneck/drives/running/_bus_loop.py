@@ -16,13 +16,11 @@ from softneck.core import SettingsError, SoftneckError
 
 from ..bus._file import DrivesFile
 from ..bus._link import CanLink, VirtualLink
-from ..bus._objects import disarm_writes
-from ..bus._sdo import Objects, SdoError, load_eds
 from ..logs._cycle import LoggedPilot
 from ..logs._result import fault_table, require_unstopped
 from ..logs._run_log import RunLogger, run_facts
 from ..logs._times import CycleTimes
-from ..master import Frame, Master, MasterSettings, Tilt
+from ..master import Event, Frame, Master, MasterSettings, Tilt
 from ..master._measured import Pilot
 from ..master._nmt import Command as NmtCommand
 from ..master._nmt import nmt_frame
@@ -31,7 +29,7 @@ from ..sensing._sensor import Sensor
 from ._ask import Ask, Operator
 from ._notify import Notifier
 from ._preflight import preflight
-from ._stop import stop
+from ._stop import disarm, stop
 from ._timing import Ending, steady
 from ._virtual import VirtualRun, Watch
 
@@ -190,8 +188,18 @@ def _run_session(
         notifier.ready()
         with ending.watched():
             _in_real_time(session, link, master, times, notifier, ending)
-    disarm(link, file, checked.guarding)
+    left = disarm(link, file, checked.guarding, () if master.starved else master.bus.signs_of_life())
+    if master.supervisor.fault is None:
+        for node, why in left.items():
+            _take_back(master, Event(link.now, "not_off", node, why))
     return RunEnd(master, times, time.perf_counter() - started, ending.asked > 0, tensions[0])
+
+
+def _take_back(master: Master, event: Event) -> None:
+    """Let `event` end a run that looked done."""
+    master.supervisor.revoke(event)
+    master.counts[event.name] += 1
+    master.events.append(event)
 
 
 def _in_virtual_time(
@@ -256,18 +264,6 @@ def _ask(master: Master, ask: Ask | None) -> None:
         master.stop("asked to")
     elif ask is Ask.LEAVE:
         master.leave("asked to")
-
-
-def disarm(link: CanLink | VirtualLink, file: DrivesFile, guarding: str) -> None:
-    """End the guarding of drives that are off; one that does not answer keeps it, and faults: so be it."""
-    dictionary = load_eds(file.profile, file.eds)
-    for node in file.nodes:
-        objects = Objects(link, node, dictionary)
-        try:
-            for write in disarm_writes(guarding):
-                objects.write(write.index, write.subindex, write.value)
-        except (SdoError, SoftneckError):
-            continue
 
 
 def _emergency_stop(link: CanLink, file: DrivesFile) -> None:

@@ -1,57 +1,160 @@
-"""What may run on drives: files whose certificates, by hash, are for exactly them and hold."""
+"""What may run on drives: files that `verify` and `simulate` certified, in a loop that does the same again."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
-from softneck.core import CheckFailedError, check_certificate, file_hash, read_certificate
-from softneck.core._certificate import certificate_path
+from softneck.core import CheckFailedError, check_certificate, read_certificate
+from softneck.core._certificate import Certificate, certificate_path
 from softneck.cosim.loops._simulate import LoopSetup
+from softneck.loop import Loop, LoopResult, LoopRun
+from softneck.verification import read_requirements
+
+# What `softneck verify` must have shown before a controller gets to drives, each at least as strictly as its defaults
+# ask. What arming asks for later is a line here.
+ARMING = {
+    "stability.radius": "the loop is stable with every plant",
+    "axes.disk_margin": "disk margin",
+    "axes.gain_margin": "gain margin",
+    "axes.delay_margin_ms": "delay margin",
+    "step.overshoot_pct": "overshoot of a step",
+    "step.load_rms_deg": "error under a load",
+    "neck.slack_s": "tendons stay taut",
+}
+# Two machines round differently, which a stable loop keeps at 1e-9 rad and less; a drive cannot tell 1e-4 rad apart:
+# its encoder has 1.3e-4 rad of the winch to a count.
+SAME = 1e-4
+# A run again takes no longer than this [s], beside loading and compiling; what it has reached by then is compared.
+_REPLAY_TIME = 1.8
+# Rows between two looks at the clock; of the slowest controllers they take 0.2 s.
+_REPLAY_ROWS = 10
+_OVERRIDE = "or let it pass by name with --override certificate."
 
 
-def files_that_act(setup: LoopSetup, controller: Path) -> list[Path]:
-    """Return the files of a run that a certificate must cover: all but the plant, which is hardware now."""
+def files_that_act(setup: LoopSetup, controller: Path, drives: Path | None = None) -> list[Path]:
+    """Return the files of a run that its certificates must cover: all but the plant, which is hardware now."""
     roles = {role: Path(path) for role, (path, _) in setup.files.items() if role not in ("plant", "controller")}
-    return [controller, *roles.values()]
+    return [controller, *roles.values(), *([] if drives is None else [drives])]
 
 
 def require_certified(
-    setup: LoopSetup, controller: Path, certificates: Sequence[Path], override: Collection[str] = ()
-) -> tuple[Path, ...]:
-    """Return the certificates that cover controller, observer and loop file; all that are given must hold.
+    setup: LoopSetup,
+    controller: Path,
+    certificates: Sequence[Path] = (),
+    override: Collection[str] = (),
+    *,
+    drives: Path | None = None,
+) -> tuple[Certificate, Certificate] | None:
+    """Return the certificates of `verify` and of `simulate` that let a run begin; None where they are overridden.
 
     Args:
-        setup: the loop.
+        setup: the loop, as its file describes it.
         controller: the file that is to run.
-        certificates: of `softneck verify` and `softneck simulate --certificate`; where none is given, the one beside
-            the controller.
+        certificates: that were given; one that is not is looked for beside the controller, or beside the loop file.
         override: "certificate" in it lets everything pass.
+        drives: the drives file, where one is used.
 
     Raises:
         FileFormatError: no certificate, damaged or edited.
-        CheckFailedError: one does not hold, or a file is not covered by any.
+        CheckFailedError: one is missing, does not hold, asks for too little, or a file is not covered by it.
     """
     if "certificate" in override:
-        return ()
-    given = list(certificates)
-    beside = certificate_path(controller)
-    if not given and beside.is_file():
-        given = [beside]
-    if not given:
+        return None
+    loop = Path(setup.files["loop"][0]) if "loop" in setup.files else controller
+    if drives is not None and "drives" not in setup.files:
         raise CheckFailedError(
-            f"{controller}: has no certificate; `softneck simulate LOOP.toml --certificate FILE` writes one for loop, "
-            "observer and controller. Give it with --certificate, or let it pass by name with --override certificate."
+            f'{loop}: names no drives file; write `drives = "{drives.name}"` into it, so that its certificate covers '
+            f"{drives}, simulate it again, {_OVERRIDE}"
         )
-    covered: set[str] = set()
-    for path in given:
-        found = check_certificate(path, [], kind=read_certificate(path).kind)
-        covered |= {digest for _, digest in found.files.values()}
-    for item in files_that_act(setup, controller):
-        if file_hash(item) not in covered:
-            names = ", ".join(str(path) for path in given)
-            raise CheckFailedError(
-                f"{item}: is not what was certified ({names}), or was changed since; simulate and verify it again, or "
-                "let it pass by name with --override certificate."
-            )
-    return tuple(given)
+    verified = _covering("verify", certificates, controller, [controller])
+    _require_minimum(verified)
+    simulated = _covering("simulate", certificates, loop, files_that_act(setup, controller, drives))
+    covered = float(simulated.contents.get("duration_s") or 0.0)
+    # Half a sample: a duration is a whole number of them.
+    if covered < setup.loop.duration - 0.5 * setup.loop.controller.sample_time:
+        raise CheckFailedError(
+            f"{simulated.path}: is for {covered:g} s, the run takes {setup.loop.duration:g} s; simulate it again."
+        )
+    return verified, simulated
+
+
+def _covering(kind: str, given: Sequence[Path], item: Path, files: Sequence[Path]) -> Certificate:
+    """Return the one certificate of this kind that covers all `files`: of those given, else the one beside `item`."""
+    found = [path for path in given if read_certificate(path).kind == kind]
+    beside = certificate_path(item)
+    if not found and beside.is_file() and read_certificate(beside).kind == kind:
+        found = [beside]
+    if not found:
+        command = "verify CONTROLLER MODEL -o FILE" if kind == "verify" else "simulate LOOP.toml --certificate FILE"
+        raise CheckFailedError(
+            f"{item}: has no certificate of `softneck {kind}`; `softneck {command}` writes one. Give it with "
+            f"--certificate, {_OVERRIDE}"
+        )
+    refused: CheckFailedError | None = None
+    for path in found:
+        try:
+            return check_certificate(path, files, kind=kind)
+        except CheckFailedError as error:
+            refused = refused or error
+    raise CheckFailedError(str(refused))
+
+
+def _require_minimum(found: Certificate) -> None:
+    """Raise CheckFailedError unless the certificate shows all of `ARMING`, at least as strictly as the defaults ask."""
+    defaults = {item.metric: item for item in read_requirements().bounds}
+    for metric, what in ARMING.items():
+        least = defaults[metric]
+        rows = [row for row in found.rows if row.get("metric") == metric]
+        if not rows:
+            why = "it was not asked for"
+        elif all(row.get("holds") is not True for row in rows):
+            why = str(rows[0].get("note") or "it does not hold")
+        elif not any(_as_strict(row, least.bound, least.limit) for row in rows):
+            why = f"it asks for {float(rows[0].get('limit') or 0.0):g}, the default is {least.limit:g}"
+        else:
+            continue
+        raise CheckFailedError(f"{found.path}: does not show `{metric}` ({what}): {why}. Verify again, {_OVERRIDE}")
+
+
+def _as_strict(row: dict, bound: str, limit: float) -> bool:
+    found = row.get("limit")
+    if row.get("holds") is not True or not isinstance(found, int | float):
+        return False
+    if bound == "min":
+        return row.get("bound") == "min" and found >= limit
+    return row.get("bound") in ("max", "below") and found <= limit
+
+
+def require_same_again(loop: Loop, certificate: Certificate) -> float:
+    """Run `loop` on its own plant and compare it with its certificate; return how much of it was compared [s].
+
+    Raises:
+        CheckFailedError: set-points or angles part by more than 1e-4 rad, or the certificate keeps none.
+    """
+    trace = certificate.contents.get("trace")
+    if not isinstance(trace, dict) or not trace.get("row"):
+        raise CheckFailedError(f"{certificate.path}: is of an earlier softneck and keeps no rows; simulate it again.")
+    again = _run_for(loop, _REPLAY_TIME)
+    for name, expected in trace.items():
+        if name == "row":
+            continue
+        values = again.angle(name) if name in ("pitch", "roll") else again[name]
+        for row, value in zip(trace["row"], expected, strict=True):
+            if value is not None and row < len(values) and not abs(values[row] - value) <= SAME:
+                raise CheckFailedError(
+                    f"{certificate.path}: the loop does not do again what was certified: `{name}` is {values[row]:.6g} "
+                    f"instead of {value:.6g} rad at t = {again.time[row]:.2f} s. Simulate it again, {_OVERRIDE}"
+                )
+    return float(again.time[-1] + again.sample_time)
+
+
+def _run_for(loop: Loop, seconds: float) -> LoopResult:
+    """Return the rows of `loop` that `seconds` of this machine's time are enough for, from its begin."""
+    with LoopRun(loop) as run:
+        ended = run.advance(1)
+        until = time.perf_counter() + seconds
+        while not ended and time.perf_counter() < until:
+            ended = run.advance(_REPLAY_ROWS)
+        return run.result()

@@ -7,12 +7,14 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from softneck.core import CheckFailedError, SoftneckError
+from softneck.core import CheckFailedError
 
 from ..bus._file import DriveEntry, DrivesFile
-from ..bus._link import BusError, Link
+from ..bus._link import Link
 from ..bus._objects import (
     CSP,
+    GUARDED_BY,
+    GUARDING_OBJECTS,
     HOMED_MARK,
     MASTER_NODE,
     Write,
@@ -28,14 +30,12 @@ from ..master import Frame
 from ..master._cia402 import DriveState, state_of
 from ..master._nmt import Command, nmt_frame
 from ..sensing._sensor import LOOK, Sensor, look_at
+from ._scan import DRIVE, devices_at, or_none, require_bus, several_devices
 
 # Another master shows within this time [s]: heartbeats and SYNCs come faster.
 LISTEN = 1.0
-# All nodes answer within this time [s] after the last request.
-_SCAN_TIME = 0.2
 # What a row may be overridden by; a missing drive or a second master never.
 OVERRIDES = ("certificate", "identity", "firmware", "modes", "homed")
-_DRIVE = 0x192  # device profile in 1000h
 # Default of 6502h in the manual: no bit for the cyclic mode though the drive has it.
 _NO_CSP_BIT = 0x001F0065
 
@@ -146,47 +146,6 @@ def listen(link: Link, nodes: Collection[int], seconds: float = LISTEN) -> str:
     return ""
 
 
-def require_bus(link: Link) -> None:
-    """Raise BusError if the bus refused a frame: whoever sends nothing hears nothing, which is no drive's fault."""
-    if link.problem:
-        raise BusError(f"the bus takes no frames: {link.problem} Nothing was moved.")
-
-
-def scan(link: Link) -> list[dict[str, Any]]:
-    """Ask every node number for its device type; return what answers, with identity where it tells."""
-    link.receive(0.0)
-    for node in range(1, 127):
-        link.send([Frame(0x600 + node, bytes([0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0]))])
-    require_bus(link)
-    answers: dict[int, int] = {}
-    until = link.now + _SCAN_TIME
-    while link.now < until:
-        for frame in link.receive(until - link.now):
-            node = frame.identifier - 0x580
-            if 1 <= node <= 126 and len(frame.data) == 8 and not frame.error and frame.data[1:4] == b"\x00\x10\x00":
-                answers[node] = int.from_bytes(frame.data[4:8], "little")
-    dictionary = load_eds("ipos2015")
-    return [_identity(Objects(link, node, dictionary), kind) for node, kind in sorted(answers.items())]
-
-
-def _identity(objects: Objects, kind: int) -> dict[str, Any]:
-    found: dict[str, Any] = {"node": objects.node, "device_type": kind, "drive": kind & 0xFFFF == _DRIVE}
-    for name, subindex in (("vendor", 1), ("product", 2), ("revision", 3), ("serial", 4)):
-        found[name] = _or_none(lambda sub=subindex: objects.read(0x1018, sub))
-    found["name"] = _or_none(lambda: objects.read_text(0x1008))
-    found["firmware"] = _or_none(lambda: objects.read_text(0x100A))
-    word = _or_none(lambda: objects.read(0x6041))
-    found["state"] = None if word is None else state_of(int(word)).name
-    return found
-
-
-def _or_none(read: Any) -> Any:
-    try:
-        return read()
-    except SdoError:
-        return None
-
-
 def preflight(
     link: Link, file: DrivesFile, *, override: Collection[str] = (), homed: bool = False, sensor: Sensor | None = None
 ) -> Report:
@@ -213,6 +172,11 @@ def preflight(
     link.send([nmt_frame(Command.PRE_OPERATIONAL, node) for node in file.nodes])
     require_bus(link)
     guarding = file.guarding.kind
+    devices = {node: several_devices(serials) for node, serials in devices_at(link, file.nodes).items()}
+    for node, found in devices.items():
+        rows.add(node, "node number", found or "one device", not found, "Give one of them another node number.")
+    if any(devices.values()):
+        return Report(tuple(rows.rows), "none")
     for entry in file.drives:
         objects = Objects(link, entry.node, dictionary)
         try:
@@ -254,7 +218,7 @@ def _check_drive(objects: Objects, file: DrivesFile, entry: DriveEntry, guarding
     """Add the rows of one drive; return the guarding it got."""
     node = entry.node
     kind = objects.read(0x1000)
-    rows.add(node, "present", f"device type {kind:08X}h", kind & 0xFFFF == _DRIVE, "It is not a CiA 402 drive.")
+    rows.add(node, "present", f"device type {kind:08X}h", kind & 0xFFFF == DRIVE, "It is not a CiA 402 drive.")
     _check_identity(objects, entry, rows)
     _check_factors(objects, node, rows)
     word = objects.read(0x6041)
@@ -264,13 +228,14 @@ def _check_drive(objects: Objects, file: DrivesFile, entry: DriveEntry, guarding
              if state is DriveState.FAULT else "Run `softneck drives stop`.")  # fmt: skip
     _check_modes(objects, node, rows)
     rows.add(node, "slow loop", f"{entry.scale.slow_loop * 1e3:g} ms by the drives file; `zero` measures it", True)
-    if guarding == "auto":
-        guarding = _probe(objects)
+    guarding, has = _guarding(objects, guarding, rows)
+    if not guarding:
+        return "auto"
     for topic, writes in (
         ("modes", mode_writes(file)),
         ("options", option_writes()),
         ("limits", limit_writes(file, entry)),
-        ("guarding", guarding_writes(file, guarding, MASTER_NODE)),
+        ("guarding", guarding_writes(file, guarding, MASTER_NODE, has)),
         ("mapping", pdo_writes(entry, file.profile)),
     ):
         _apply(objects, topic, writes, rows)
@@ -287,7 +252,7 @@ def _check_identity(objects: Objects, entry: DriveEntry, rows: _Checks) -> None:
             wrong.append(f"{name} {value} instead of {wanted}")
     text = ", ".join(wrong or found)
     rows.add(entry.node, "identity", text, not wrong, "Is this the motor that the drives file means?")
-    firmware = _or_none(lambda: objects.read_text(0x100A))
+    firmware = or_none(lambda: objects.read_text(0x100A))
     holds = entry.firmware is None or firmware == entry.firmware
     rows.add(entry.node, "firmware", firmware or "not told", holds, f"The drives file says {entry.firmware}.")
 
@@ -295,7 +260,7 @@ def _check_identity(objects: Objects, entry: DriveEntry, rows: _Checks) -> None:
 def _check_factors(objects: Objects, node: int, rows: _Checks) -> None:
     wrong = []
     for index in (0x6093, 0x6094, 0x6097):
-        pair = [_or_none(lambda i=index, s=sub: objects.read(i, s)) for sub in (1, 2)]
+        pair = [or_none(lambda i=index, s=sub: objects.read(i, s)) for sub in (1, 2)]
         if None not in pair and pair[0] != pair[1]:
             wrong.append(f"{index:04X}h is {pair[0]}/{pair[1]}")
     advice = "Set the factor group to 1/1 and save it: positions are in encoder counts here."
@@ -315,13 +280,24 @@ def _check_modes(objects: Objects, node: int, rows: _Checks) -> None:
     rows.add(node, "modes", found, said and taken, "The cyclic synchronous position mode is needed.")
 
 
-def _probe(objects: Objects) -> str:
-    """Return "heartbeat" where the drive has a consumer (1016h), else "life"."""
-    try:
-        objects.read(0x1016, 1)
-    except (SdoError, SoftneckError):
-        return "life"
-    return "heartbeat"
+def _guarding(objects: Objects, wanted: str, rows: _Checks) -> tuple[str, frozenset[int]]:
+    """Return how the drive is guarded and which of the objects for it the drive has; "" after a row that says why not.
+
+    With "auto" by heartbeat where the drive can send and watch one, else by life guarding.
+    """
+    has = frozenset(index for index, subindex in GUARDING_OBJECTS if objects.has(index, subindex))
+    lacks = {kind: [index for index in needed if index not in has] for kind, needed in GUARDED_BY.items()}
+    possible = [kind for kind in ("heartbeat", "life") if not lacks[kind] and wanted in (kind, "auto")]
+    if possible:
+        return possible[0], has
+    kinds = GUARDED_BY if wanted == "auto" else (wanted,)
+    told = " and ".join(f"no {kind} guarding: it lacks {_listed(lacks[kind])}" for kind in kinds)
+    rows.add(objects.node, "guarding", told, False, "A drive must notice by itself that its master is gone.")
+    return "", has
+
+
+def _listed(indices: Sequence[int]) -> str:
+    return ", ".join(f"{index:04X}h" for index in indices)
 
 
 def _apply(objects: Objects, topic: str, writes: Sequence[Write], rows: _Checks) -> None:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from softneck.core import CheckFailedError
 
 from ..bus._file import DrivesFile
+from ..bus._guarded import GuardedLink
 from ..bus._link import Link
+from ..bus._objects import disarm_writes
 from ..bus._sdo import Objects, SdoError, load_eds
 from ..master import Frame
-from ..master._cia402 import DriveState, state_of
-from ._preflight import require_bus
+from ..master._cia402 import OFF, DriveState, state_of
+from ._scan import require_bus
 
 # Between two looks at a drive [s].
 _LOOK = 0.02
@@ -68,8 +70,41 @@ def reset(link: Link, file: DrivesFile) -> dict[int, str]:
     return states
 
 
+def disarm(link: Link, file: DrivesFile, guarding: str, signs: Sequence[Frame]) -> dict[int, str]:
+    """End the guarding of drives that are off, feeding it until the last one is disarmed.
+
+    Args:
+        link: to the bus.
+        file: of the drives.
+        guarding: "life" or "heartbeat", as the pre-flight set it up.
+        signs: of life, to send meanwhile.
+
+    Returns:
+        node -> why it is not known to be off; empty where all confirmed it.
+    """
+    guarded = GuardedLink(link, signs, file.guard_cycles * file.cycle)
+    dictionary = load_eds(file.profile, file.eds)
+    left = {}
+    for node in file.nodes:
+        objects = Objects(guarded, node, dictionary)
+        try:
+            for write in disarm_writes(guarding):
+                objects.write(write.index, write.subindex, write.value)
+        except SdoError as error:
+            left[node] = str(error).rstrip(".")
+    for node in [node for node in file.nodes if node not in left]:
+        try:
+            state = state_of(Objects(guarded, node, dictionary).read(0x6041))
+        except SdoError as error:
+            left[node] = str(error).rstrip(".")
+            continue
+        if state not in OFF:
+            left[node] = f"it is in {state.name}"
+    return left
+
+
 # Where the motor surely has no current. A drive in REACTION or QUICK_STOP still brakes.
-_OFF = (DriveState.NOT_READY, DriveState.DISABLED, DriveState.READY, DriveState.SWITCHED_ON, DriveState.FAULT)
+_OFF = {*OFF, DriveState.FAULT}
 
 
 def require_stopped(states: Mapping[int, str]) -> None:

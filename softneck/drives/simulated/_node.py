@@ -103,7 +103,7 @@ class SimulatedDrive:
             self._boot(now)
 
     def _guard(self, now: float) -> None:
-        if self.axis.values[(0x1017, 0)]:
+        if self.axis.values.get((0x1017, 0)) or (0x100C, 0) not in self.axis.values:
             return  # heartbeat and guarding exclude each other (CiA 301, 7.2.8.3.2)
         self._out.append(CanFrame(self._ids[1], bytes([self._toggle | self.nmt])))
         self._toggle ^= 0x80
@@ -174,8 +174,8 @@ class SimulatedDrive:
 
     def _watch_times(self) -> None:
         v = self.axis.values
-        self._life = v[(0x100C, 0)] * v[(0x100D, 0)] / 1000.0
-        self._beat = v[(0x1017, 0)] / 1000.0
+        self._life = v.get((0x100C, 0), 0) * v.get((0x100D, 0), 0) / 1000.0
+        self._beat = v.get((0x1017, 0), 0) / 1000.0
         entry = v.get((0x1016, 1), 0)
         self._consumed = ((entry >> 16) & 0x7F, (entry & 0xFFFF) / 1000.0) if entry & 0xFFFF else None
         if not self._life and not self._consumed:

@@ -35,8 +35,9 @@ def test_guards_are_needed(name: str) -> None:
 def test_every_guard_that_stops_has_a_scenario_that_needs_it() -> None:
     needed = {guard for scenario in SCENARIOS.values() for guard in scenario.guards}
     acting = {name for name, rule in RULES.items() if rule.reaction in (Reaction.STOP, Reaction.RETREAT)}
-    # Tests of their own: `pushed` in test_jog.py, for it acts before a run begins; the others in test_master.py.
-    assert acting - needed == {"clock", "enable_timeout", "ramp_timeout", "operator", "pushed"}
+    # Tests of their own: `pushed` in test_jog.py, for it acts before a run begins, `not_off` in test_switched_off.py,
+    # for it acts after; the others in test_master.py.
+    assert acting - needed == {"clock", "enable_timeout", "ramp_timeout", "operator", "pushed", "not_off"}
 
 
 def test_a_short_dropout_is_bridged() -> None:

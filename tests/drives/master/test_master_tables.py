@@ -98,7 +98,7 @@ def test_the_rules_are_those_of_the_fault_table() -> None:
         "clamp_persistent": (stop, 0, 1.0), "drive_limit": (count, 1, 0.0), "following": (stop, 0, 0.2),
         "diverged": (stop, 0, 0.2), "tension": (stop, 0, 0.2), "pushed": (stop, 0, 0.2), "stalled": (stop, 1, 0.0),
         "late_cycle": (count, 1, 0.0), "clock": (stop, 1, 0.0), "enable_timeout": (stop, 0, 2.0),
-        "ramp_timeout": (stop, 0, 60.0), "left": (count, 1, 0.0), "operator": (stop, 1, 0.0),
+        "ramp_timeout": (stop, 0, 60.0), "not_off": (stop, 0, 1.0), "left": (count, 1, 0.0), "operator": (stop, 1, 0.0),
     }  # fmt: skip
     assert {name: (rule.reaction, rule.cycles, rule.seconds) for name, rule in RULES.items()} == expected
     # A drive that booted has lost its encoder's zero; nothing else loses it.

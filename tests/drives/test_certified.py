@@ -1,0 +1,153 @@
+"""What arms the drives: a verification, a loop certificate that covers the run, and the same loop again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softneck.core import CheckFailedError, SettingsError, file_hash, read_certificate, write_certificate
+from softneck.core._certificate import certificate_contents
+from softneck.cosim import load_loop, simulate
+from softneck.drives import prepare
+from softneck.drives.running._certified import ARMING, SAME, require_certified, require_same_again
+from softneck.verification import read_requirements
+
+from .certified import verified_rows, write_verified
+from .conftest import STEP, Project
+
+DRIVES = 'profile = "ipos2015"\n' + "".join(f"[[drive]]\nnode = {n}\npeak_current_A = 10.0\n" for n in (1, 2, 3))
+
+
+def edited(source: Path, path: Path, **changes: object) -> Path:
+    """Write a certificate with other contents and a seal that fits: the seal is a checksum, anybody can make it."""
+    contents = json.loads(source.read_text(encoding="utf-8")) | changes
+    more = {
+        key: contents[key] for key in contents
+        if key not in ("certificate", "certificate_version", "softneck", "holds", "files", "seal")
+    }  # fmt: skip
+    files = {role: (entry["path"], entry["sha256"]) for role, entry in contents["files"].items()}
+    write_certificate(path, certificate_contents("simulate", holds=contents["holds"], files=files, more=more))
+    return path
+
+
+def test_both_certificates_let_a_run_begin(project: Project) -> None:
+    found = require_certified(load_loop(project.loop), project.controller, [project.certificate])
+    assert found is not None
+    assert [item.kind for item in found] == ["verify", "simulate"]
+    # Both lie beside controller and loop file.
+    assert require_certified(load_loop(project.loop), project.controller) is not None
+    assert require_certified(load_loop(project.loop), project.controller, [], ["certificate"]) is None
+
+
+def test_an_empty_certificate_arms_nothing(project: Project, tmp_path: Path) -> None:
+    empty = edited(project.certificate, tmp_path / "empty.json", limits=[])
+    assert not read_certificate(empty).holds
+    with pytest.raises(CheckFailedError, match=r"empty\.json: requires nothing, so it shows nothing"):
+        require_certified(load_loop(project.loop), project.controller, [empty])
+
+
+def test_a_loop_without_limits_holds_nothing_and_gets_no_certificate(project: Project) -> None:
+    path = project.write_loop("free.toml", STEP, 0.04)
+    path.write_text(path.read_text(encoding="utf-8").partition("[limits]")[0], encoding="utf-8")
+    result = simulate(load_loop(path))
+    assert not result.holds
+    with pytest.raises(SettingsError, match=r"no \[limits\]"):
+        result.certificate()
+
+
+def test_a_verification_is_needed_as_well(project: Project, tmp_path: Path) -> None:
+    alone = tmp_path / "pi.npz"
+    alone.write_bytes(project.controller.read_bytes())
+    with pytest.raises(CheckFailedError, match=r"pi\.npz: has no certificate of `softneck verify`"):
+        require_certified(load_loop(project.loop), alone, [project.certificate])
+    with pytest.raises(CheckFailedError, match=r"other\.toml: has no certificate of `softneck simulate`"):
+        require_certified(load_loop(project.write_loop("other.toml", STEP, 3.0)), project.controller)
+
+
+@pytest.mark.parametrize("metric", ARMING)
+def test_each_metric_of_the_minimum_is_needed_as_strictly_as_by_default(
+    project: Project, tmp_path: Path, metric: str
+) -> None:
+    setup, default = load_loop(project.loop), {item.metric: item for item in read_requirements().bounds}[metric]
+    looser = default.limit * (0.5 if default.bound == "min" else 2.0)
+    stricter = default.limit * (2.0 if default.bound == "min" else 0.5)
+    for change, refused in (
+        (None, "was not asked for"),
+        ({"holds": None, "note": "not computed: no linear form"}, "not computed: no linear form"),
+        ({"limit": looser}, f"it asks for {looser:g}, the default is {default.limit:g}"),
+        ({"bound": "max" if default.bound == "min" else "min"}, "the default is"),
+        ({"limit": stricter}, ""),
+    ):
+        rows = verified_rows()
+        if change is None:
+            del rows[metric]
+        else:
+            rows[metric] |= change
+        path = write_verified(project.controller, rows, tmp_path / "verified.json")
+        if not refused:
+            assert require_certified(setup, project.controller, [path]) is not None
+            continue
+        with pytest.raises(CheckFailedError, match=rf"does not show `{metric}` .*{refused}"):
+            require_certified(setup, project.controller, [path])
+
+
+def test_a_loop_certificate_covers_each_file_for_the_whole_run(project: Project, tmp_path: Path) -> None:
+    setup = load_loop(project.loop)
+    changed = load_loop(project.write_loop("other.toml", STEP, 3.0))
+    with pytest.raises(CheckFailedError, match=r"other\.toml: is not what was certified"):
+        require_certified(changed, project.controller, [project.certificate])
+    other = tmp_path / "pi.npz"
+    other.write_bytes(project.controller.read_bytes() + b"\0")
+    write_verified(other)
+    with pytest.raises(CheckFailedError, match=r"pi\.npz: was changed after it was certified"):
+        require_certified(setup, other, [project.certificate])
+    short = edited(project.certificate, tmp_path / "short.json", duration_s=3.9)
+    with pytest.raises(CheckFailedError, match=r"short\.json: is for 3\.9 s, the run takes 4 s"):
+        require_certified(setup, project.controller, [short])
+
+
+def test_a_loop_certificate_covers_the_drives_file(project: Project) -> None:
+    drives = project.folder / "my_drives.toml"
+    drives.write_text(DRIVES, encoding="utf-8")
+    with pytest.raises(CheckFailedError, match=r"loop\.toml: names no drives file; write `drives = "):
+        require_certified(load_loop(project.loop), project.controller, [project.certificate], drives=drives)
+    path = project.write_loop("with_drives.toml", STEP, 0.5)
+    path.write_text('drives = "my_drives.toml"\n' + path.read_text(encoding="utf-8"), encoding="utf-8")
+    setup = load_loop(path)
+    certificate = path.with_name("with_drives.certificate.json")
+    write_certificate(certificate, simulate(setup).certificate())
+    assert read_certificate(certificate).files["drives"] == (str(drives), file_hash(drives))
+    require_certified(setup, project.controller, drives=drives)
+    drives.write_text(DRIVES.replace("10.0", "20.0"), encoding="utf-8")
+    with pytest.raises(CheckFailedError, match=r"my_drives\.toml: was changed after it was certified"):
+        require_certified(setup, project.controller, drives=drives)
+
+
+def test_the_loop_has_to_do_again_what_was_certified(project: Project, tmp_path: Path) -> None:
+    deployed = prepare(load_loop(project.loop), project.controller)
+    certificate = read_certificate(project.certificate)
+    assert require_same_again(deployed.loop, certificate) == pytest.approx(4.0, abs=1e-9)
+    trace = dict(certificate.contents["trace"])
+    assert (trace["row"][0], trace["row"][-1], len(trace["row"])) == (0, 199, 50)
+    shifted = np.array(trace["motor_setpoint_2"])
+    shifted[30] += 1.5 * SAME
+    other = edited(project.certificate, tmp_path / "c.json", trace=trace | {"motor_setpoint_2": shifted.tolist()})
+    with pytest.raises(CheckFailedError, match=r"does not do again what was certified: `motor_setpoint_2` is"):
+        require_same_again(deployed.loop, read_certificate(other))
+    shifted[30] -= SAME
+    other = edited(project.certificate, tmp_path / "d.json", trace=trace | {"motor_setpoint_2": shifted.tolist()})
+    require_same_again(deployed.loop, read_certificate(other))
+    old = edited(project.certificate, tmp_path / "old.json", trace=None)
+    with pytest.raises(CheckFailedError, match=r"old\.json: is of an earlier softneck"):
+        require_same_again(deployed.loop, read_certificate(old))
+
+
+def test_a_slow_loop_is_compared_for_as_far_as_two_seconds_get(
+    project: Project, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("softneck.drives.running._certified._REPLAY_TIME", 0.0)
+    deployed = prepare(load_loop(project.loop), project.controller)
+    assert require_same_again(deployed.loop, read_certificate(project.certificate)) < 4.0
