@@ -7,7 +7,7 @@ from pathlib import Path
 
 from softneck.core import CheckFailedError, check_certificate, file_hash, read_certificate
 from softneck.core._certificate import certificate_path
-from softneck.cosim.loops._simulate import LoopSetup
+from softneck.cosim.loops._setup import LoopSetup
 
 
 def files_that_act(setup: LoopSetup, controller: Path) -> list[Path]:
