@@ -194,6 +194,8 @@ def _opened(loop: Source) -> tuple[Mapping[str, Any], Path]:
         return read_toml(path), path.parent.resolve()
     if isinstance(loop, Loop | LoopSetup):
         return loop_table(loop), Path.cwd()
+    if not isinstance(loop, Mapping):
+        raise SettingsError(f"`loop` must be a loop file or a table of its keys; got {loop!r}.")
     return normal_table(loop), Path.cwd()
 
 
