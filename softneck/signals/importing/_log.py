@@ -88,9 +88,9 @@ def _imported(frame: pd.DataFrame, layout: Layout) -> ImportResult:
         i = _values(frame, layout.inclination, "pitch")
         o = _values(frame, layout.orientation, "pitch")
         channels["pitch"], channels["roll"] = pitch_roll(i, o)
-    _refuse_turns(layout, channels)
     samples, sample_time, notes = _clocked(frame, layout, channels)
     recording = Recording(samples.time, sample_time, samples.channels, samples.run)
+    _refuse_turns(layout, recording.channels)
     if not np.ptp(recording.set_points, axis=0).any():
         notes += ("warning: no set-point ever changes: nothing can be identified from this log",)
     return ImportResult(recording, notes)
