@@ -219,7 +219,7 @@ def test_damaged_headers_of_arrays_are_a_format_error_and_nothing_else(tmp_path:
     def damaged(content: bytes) -> bytes:
         changed = bytearray(content)
         for at in rng.integers(128, size=rng.integers(1, 6)):
-            changed[at] = rng.choice([*b"(){}[]'\\,:0x9-+\x00\xff\n#", rng.integers(256)])
+            changed[at] = int(rng.choice(np.frombuffer(b"(){}[]'\\,:0x9-+\x00\xff\n#", dtype=np.uint8)))
         return bytes(changed)
 
     with contextlib.suppress(FileFormatError):
