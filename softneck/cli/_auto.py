@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,14 +12,17 @@ from softneck.core import SettingsError, refuse_existing
 
 from .shared._console import note, percent, print_json, print_table, progress
 from .shared._options import target
+from .shared._validate_table import with_fit
 
 if TYPE_CHECKING:
-    from softneck.identification import Choice
+    from softneck.identification import Choice, Model
     from softneck.identification.selection._auto import KindTrial
     from softneck.signals import Recording
 
 
 _HEAD = ["kind", "free run", "one step", "persistence", "trained in", "size", ""]
+
+_LINEAR = "`design` and `observer` take linear models: the best of them, {kind}, is in {path}"
 
 
 def identify_auto(
@@ -38,30 +42,54 @@ def identify_auto(
     from softneck.plots import write_page
     from softneck.signals import read_recording
 
-    path, replace = target(output, "models/auto.npz", force=force)
-    refuse_existing(path, force=replace)
+    path, overwrite = target(output, "models/auto.npz", force=force)
+    # Linear kinds are what `design` and `observer` take.
+    linear_path = path.with_name(f"{path.stem}_linear.npz")
+    for file in (path, linear_path):
+        refuse_existing(file, force=overwrite)
     if html is not None:
         refuse_existing(html, force=force)
     parts = [read_recording(source) for source in recordings]
     head, tail, other = _split(parts, train)
     with progress("identify auto", quiet=as_json) as report:
         choice = choose(head, tail, other_excitation=other, seed=seed or 0, progress=report)
-    model = choice.chosen.model
-    if model is None:
-        raise SettingsError("the chosen kind has no model.")
-    if refit_all:
-        with progress(f"identify {choice.chosen.kind} on all rows", quiet=as_json) as report:
-            model = refit(choice, parts, progress=report)
-    model.save(path, force=replace)
+    linear = _best_linear(choice)
+    saved = {path: choice} if linear is None else {path: choice, linear_path: linear}
+    models: list[Model] = []
+    for file, taken in saved.items():
+        model = _model(taken)
+        if refit_all:
+            with progress(f"identify {taken.chosen.kind} on all rows", quiet=as_json) as report:
+                model = refit(taken, parts, progress=report)
+        models.append(with_fit(model, taken.chosen.judged))
+        models[-1].save(file, force=overwrite)
+    said = [] if linear is None else [_LINEAR.format(kind=linear.chosen.kind, path=linear_path)]
     if html is not None:
         write_page(html, _page(choice), force=force)
     if as_json:
-        print_json({**_facts(choice, path), "refit": refit_all})
+        facts = _facts(choice, path)
+        print_json({**facts, "linear_model": None if linear is None else str(linear_path), "refit": refit_all})
         return
     print_table("Fit [%] on the rows held out, pitch/roll", _HEAD, _rows(choice))
-    click.echo(f"{choice.why}\n{path}\n{model.summary()}")
-    for remark in [*choice.remarks, *([REFITTED] if refit_all else [])]:
+    click.echo(f"{choice.why}\n{path}\n{models[0].summary()}")
+    for remark in [*said, *choice.remarks, *([REFITTED] if refit_all else [])]:
         note(remark)
+
+
+def _model(choice: Choice) -> Model:
+    if choice.chosen.model is None:
+        raise SettingsError("the chosen kind has no model.")
+    return choice.chosen.model
+
+
+def _best_linear(choice: Choice) -> Choice | None:
+    """Return the choice of the best linear kind where the chosen one is not linear; None where none ran free."""
+    from softneck.identification.models._linear_systems import KINDS
+
+    linear = [one for one in choice.ranking if one.kind in KINDS and one.fit > float("-inf")]
+    if choice.chosen.kind in KINDS or not linear:
+        return None
+    return replace(choice, chosen=linear[0])
 
 
 def _split(parts: list[Recording], train: float) -> tuple[Recording, Recording, bool]:

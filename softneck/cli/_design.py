@@ -8,12 +8,15 @@ from typing import Any
 import click
 
 from softneck.core import KINDS, SettingsError, find_kind, load, refuse_existing, resolve
-from softneck.core._kinds import kinds_of
+from softneck.core._kinds import fitting, kinds_of
 
-from .shared._console import print_json, progress
+from .shared._console import percent, print_json, progress
 from .shared._options import apply_settings, force_option, json_option, output_option, set_option, target
 
 _KINDS = "\n".join(f"  {name:9} {KINDS[name].summary}" for name in kinds_of("controller"))
+
+# [%] Free run over the rows held out: below it R2 is below 1/2, so more of the motion is unexplained than explained.
+_LEAST_FIT = 30.0
 
 
 @click.command(
@@ -26,6 +29,7 @@ _KINDS = "\n".join(f"  {name:9} {KINDS[name].summary}" for name in kinds_of("con
 @click.argument("kind")
 @click.argument("models", nargs=-1, required=True, metavar="MODEL|FAMILY...", type=click.Path(path_type=Path))
 @output_option("controller", "CONTROLLER")
+@click.option("--any-fit", is_flag=True, help=f"Also on a model whose free run has a fit below {_LEAST_FIT:g} %.")
 @click.option("--mat", type=click.Path(path_type=Path), metavar="FILE.mat", help="Write it for MATLAB as well.")
 @set_option
 @force_option
@@ -34,6 +38,7 @@ def command(
     kind: str,
     models: tuple[Path, ...],
     output: Path | None,
+    any_fit: bool,
     mat: Path | None,
     settings: tuple[str, ...],
     force: bool,
@@ -46,7 +51,7 @@ def command(
     if mat is not None:
         target(mat, "", force=force, ending=".mat")
         refuse_existing(mat, force=force)
-    plants = [_linear(model) for model in models]
+    plants = [_linear(model, any_fit=any_fit) for model in models]
     with progress(f"design {kind}", quiet=as_json):
         controller = apply_settings(resolve(entry.settings), settings).design(plants[0] if len(plants) == 1 else plants)
     controller.save(path, force=replace)
@@ -60,7 +65,21 @@ def command(
     click.echo(f"{path}\n{controller.summary()}")
 
 
-def _linear(path: Path) -> Any:
+def _linear(path: Path, *, any_fit: bool) -> Any:
     """Open a model or a family."""
     thing = load(path)
-    return thing if hasattr(thing, "tf") else load(path, role="model")  # which says what it is
+    if not hasattr(thing, "tf"):
+        return load(path, role="model")  # which says what it is
+    with fitting(path):
+        held_out = getattr(thing, "findings", {}).get("hold_out", {})
+        diverged = held_out.get("diverged") is not None
+        least = min((fit for fit in held_out.get("fit", {}).values() if fit is not None), default=100.0)
+        poor = diverged or least < _LEAST_FIT
+    if poor and not any_fit:
+        what = "diverges" if diverged else f"has a fit of {percent(least)} %"
+        raise SettingsError(
+            f"{path}: over the rows held out its free run {what}; below {_LEAST_FIT:g} % more of the motion is "
+            "unexplained than explained, and no margin is to be believed. Identify a better model, or go on by "
+            "--any-fit."
+        )
+    return thing

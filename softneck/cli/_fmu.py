@@ -162,7 +162,7 @@ def _is_neck(path: Path) -> bool:
         return False
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError):
+    except (ValueError, RecursionError):
         return False
     return not set(content).isdisjoint({"preset", *NeckParameters.names()})
 

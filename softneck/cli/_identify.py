@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from softneck.core import KINDS, SettingsError, find_kind, refuse_existing, resolve
+from softneck.core import KINDS, CheckFailedError, SettingsError, find_kind, refuse_existing, resolve
 from softneck.core._kinds import kinds_of
 
 from ._auto import identify_auto
@@ -24,6 +24,7 @@ from ._search import (
 from .shared._console import note, percent, print_json, progress
 from .shared._options import apply_settings, force_option, json_option, output_option, set_option, target
 from .shared._recordings import read_together
+from .shared._validate_table import useless, with_fit
 
 if TYPE_CHECKING:
     from softneck.identification import Model, Search, Validation
@@ -95,6 +96,7 @@ def command(
         model = found.model if found is not None else estimator.fit(head, progress=report)
     with progress("hold-out", quiet=as_json):
         held_out = _hold_out(model, tail)
+    model = with_fit(model, held_out)
     model.save(path, force=replace)
     if found is not None and plot is not None:
         write_plot(found, plot, force=force)
@@ -104,6 +106,12 @@ def command(
         _print(path, model, held_out, found)
     if found is not None and found.interrupted:
         raise KeyboardInterrupt  # what was done is kept, and the exit code says that it is not all
+    why = None if held_out is None else useless(held_out)
+    if why is not None:
+        raise CheckFailedError(
+            f"{path}: no model of the rows held out: {why}. Try another kind or settings, or record longer; "
+            "`softneck identify auto` compares kinds."
+        )
 
 
 def _refuse_options_of_auto(kind: str, *, html: bool, refit: bool) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from softneck.core import DataError, FileFormatError, SettingsError, file_hash, load, read_archive, refuse_existing
+from softneck.core._kinds import fitting
 
 from ._info_log import describe_log, is_candump
 from .shared._console import print_json, progress
@@ -68,7 +69,9 @@ def _describe(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dic
         case ".npz":
             header, _ = read_archive(file)
             thing = load(file)
-            return {"type": type(thing).__name__.lower(), "kind": header["kind"], "summary": thing.summary()}
+            with fitting(file):
+                summary = thing.summary()
+            return {"type": type(thing).__name__.lower(), "kind": header["kind"], "summary": summary}
         case ".fmu":
             return _fmu(file)
         case ".toml":
@@ -175,7 +178,7 @@ def _toml(file: Path) -> dict[str, Any]:
 
     try:
         table = tomllib.loads(file.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # no TOML, no UTF-8, thousands of digits or brackets
         raise FileFormatError(f"{file}: is not a TOML file ({error}).") from error
     if "plant" in table:
         return {"type": "loop", "parts": ", ".join(name for name in table if isinstance(table[name], dict))}
@@ -193,7 +196,7 @@ def _toml(file: Path) -> dict[str, Any]:
 def _certificate(file: Path) -> dict[str, Any]:
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise FileFormatError(f"{file}: is not a JSON file ({error}).") from error
     if not isinstance(content, dict):
         raise FileFormatError(f"{file}: holds no JSON object, so it is not a softneck file.")

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 from importlib import import_module
 
 import click
@@ -79,7 +81,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code; an error is one line on stderr."""
     try:
-        code = group.main(args=arguments, prog_name="softneck", standalone_mode=False)
+        with _without_remarks():
+            code = group.main(args=arguments, prog_name="softneck", standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message(), err=True)
         return _BAD_INPUT
@@ -100,6 +103,15 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:  # the edge: anything unforeseen is our fault, and says so
         return _internal(error)
     return code if isinstance(code, int) else 0
+
+
+@contextlib.contextmanager
+def _without_remarks() -> Iterator[None]:
+    """Leave out what libraries warn of by lines of their source: what a user must know is said in our own words."""
+    with warnings.catch_warnings():
+        if not os.environ.get("SOFTNECK_TRACEBACK"):
+            warnings.showwarning = lambda *_, **__: None
+        yield
 
 
 def _missing(error: ModuleNotFoundError) -> int:

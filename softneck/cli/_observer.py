@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,9 @@ from .shared._options import apply_settings, force_option, json_option, output_o
 
 if TYPE_CHECKING:
     from softneck.estimation._noise import NoiseFit
+
+# Part of each run to fit the levels to; the rest checks them.
+_FITTED = 0.7
 
 
 @click.command("observer", epilog="Example: softneck observer rls.npz -o observer.npz --sensor paper")
@@ -58,10 +62,10 @@ def command(
     told: dict[str, Any] = {}
     lines: list[str] = []
     if data:
-        fit, lines = _fitted(observer, data, fixed=() if sensor is None else (observer.noise_names[0],))
-        observer = fit.observer
+        fit, kept, lines = _fitted(observer, data, fixed=() if sensor is None else (observer.noise_names[0],))
+        observer = fit.observer if kept else observer
         told = {"fit": {"rows": fit.rows, "outliers": fit.outliers, "log_likelihood": list(fit.log_likelihood),
-                        "at_bound": list(fit.at_bound)}}  # fmt: skip
+                        "at_bound": list(fit.at_bound), "kept": kept}}  # fmt: skip
     observer.save(path, force=replace)
     if as_json:
         noise = dict(zip(observer.noise_names, observer.noise, strict=True))
@@ -71,14 +75,19 @@ def command(
     click.echo("\n".join([str(path), observer.summary(), *lines]))
 
 
-def _fitted(observer: Any, data: tuple[Path, ...], *, fixed: tuple[str, ...]) -> tuple[NoiseFit, list[str]]:
-    """Return the noise levels that the recordings support, and what to say about them."""
+def _fitted(observer: Any, data: tuple[Path, ...], *, fixed: tuple[str, ...]) -> tuple[NoiseFit, bool, list[str]]:
+    """Return noise levels fitted to the first part of each run, whether the rest speaks for them, and what to say."""
     # Imported here: `softneck --help` must not wait for scipy's optimisers.
     from softneck.estimation import consistency, fit_noise
-    from softneck.signals import read_recording
+    from softneck.estimation._bridging import bridging_error
+    from softneck.signals import concatenate, read_recording
 
     recordings = [read_recording(path) for path in data]
-    fit = fit_noise(observer, recordings, fixed=fixed)
+    parts = [recording.split(_FITTED) for recording in recordings]
+    fit = fit_noise(observer, [head for head, _ in parts], fixed=fixed)
+    held_out = concatenate([tail for _, tail in parts])
+    default, fitted = (math.degrees(bridging_error(item, held_out)) for item in (observer, fit.observer))
+    kept = fitted < default
     before, after = fit.log_likelihood
     lines = [
         f"  noise from {fit.rows} measurements, {fit.outliers} outliers left out; "
@@ -86,6 +95,10 @@ def _fitted(observer: Any, data: tuple[Path, ...], *, fixed: tuple[str, ...]) ->
     ]
     if fit.at_bound:
         lines.append(f"  not determined by the data: {', '.join(fit.at_bound)}")
+    verdict = "kept" if kept else "not better, so the default levels are kept"
+    lines.append(f"  gaps of 5 samples over {len(held_out)} rows held out: {default:.3f} deg RMS by the default "
+                 f"{fitted:.3f} by the fitted levels: {verdict}")  # fmt: skip
     for path, recording in zip(data, recordings, strict=True):
-        lines += [f"  {path.name}: {line}" for line in consistency(fit.observer, recording).summary().splitlines()]
-    return fit, lines
+        taken = fit.observer if kept else observer
+        lines += [f"  {path.name}: {line}" for line in consistency(taken, recording).summary().splitlines()]
+    return fit, kept, lines

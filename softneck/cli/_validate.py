@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from softneck.core import SettingsError, refuse_existing
+from softneck.core import CheckFailedError, SettingsError, refuse_existing
 
 from .shared._console import print_json, print_table, progress
 from .shared._options import force_option, json_option
 from .shared._recordings import read_together
-from .shared._validate_table import fit_table, remarks
+from .shared._validate_table import fit_table, remarks, useless
 
 if TYPE_CHECKING:
     from softneck.identification import Validation
@@ -60,7 +60,10 @@ def command(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Validate MODELs on the rows of recordings that they were not trained on."""
+    """Validate MODELs on the rows of recordings that they were not trained on.
+
+    Exit code 1 if a free run diverges or a fit is below -100 %.
+    """
     from softneck.identification import Rules, compare, load_model
     from softneck.plots import write_page
     from softneck.signals import read_recording
@@ -79,7 +82,14 @@ def command(
         write_page(html, _page(results), force=force)
     if as_json:
         print_json(comparison.as_dict())
-        return
+    else:
+        _print(results)
+    found = [f"{Path(r.model).name} on {Path(r.data).name}: {why}" for r in results if (why := useless(r))]
+    if found:
+        raise CheckFailedError(f"no model of this data: {'; '.join(found)}.")
+
+
+def _print(results: list[Validation]) -> None:
     print_table("Fit in %, errors in deg, pitch/roll", *fit_table(results))
     for result in results:
         for line in remarks(result):

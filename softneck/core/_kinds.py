@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -177,9 +178,18 @@ def load(path: str | Path, *, role: str | None = None) -> Any:
         )
     if role is not None and kind.role != role:
         raise FileFormatError(f"{path}: is a {kind.role} ({kind.name}), not a {role}.")
-    try:
+    with fitting(path):
         return resolve(kind.result).from_archive(header, arrays)
+
+
+@contextmanager
+def fitting(path: str | Path) -> Iterator[None]:
+    """Raise FileFormatError for whatever a header and arrays that do not fit together lead to."""
+    try:
+        yield
     except FileFormatError as error:
         raise FileFormatError(f"{path}: {error}") from error
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except ImportError:  # an extra that is not installed
+        raise
+    except Exception as error:
         raise FileFormatError(f"{path}: its header and arrays do not fit together ({error}).") from error

@@ -32,7 +32,7 @@ def simulate_batch(
         inputs: (time, 8) for all necks, or (necks, time, 8), in the block's port order.
         seeds: of the sensors' noise, one each; 0, 1, 2, ... where None.
         sample_time: [s].
-        internal_step: [s].
+        internal_step: longest [s]; a sample takes equal steps.
         workers: threads; all cores where None.
 
     Raises:

@@ -11,7 +11,7 @@ from softneck.runtime import Block, Port
 from ._parameters import NeckParameters
 
 RUNTIME = "softneck.plant._neck_runtime"
-# Internal step [s]: the fastest mode of the presets is then 0.5 to 0.9 of the inverse step.
+# Longest internal step [s]: the fastest mode of the presets is then 0.5 to 0.9 of the inverse step.
 INTERNAL_STEP = 0.001
 # What the queues must hold: the upper ends of `drive_latency` and `sensor_delay` [s].
 _LONGEST_LATENCY = 0.1
@@ -61,20 +61,15 @@ class VirtualNeck:
         Args:
             noise_seed: seed of the sensor's noise; equal seeds give equal bits.
             sample_time: [s], 0.001 to 0.1.
-            internal_step: [s]; must divide the sample time. Stiff necks take more steps by themselves.
+            internal_step: longest [s]; a sample takes as few equal steps as keep within it. Stiff necks take more.
 
         Raises:
-            SettingsError: a time out of range or one that does not divide, or a seed that is not an integer >= 0.
+            SettingsError: a time out of range, or a seed that is not an integer >= 0.
         """
         require_between("sample_time", sample_time, 0.001, 0.1, "s")
         require_between("internal_step", internal_step, 1e-6, sample_time, "s")
-        substeps = round(sample_time / internal_step)
-        # 1e-9: times such as 0.02 / 0.001 are off by rounding only.
-        if not math.isclose(substeps * internal_step, sample_time, rel_tol=1e-9):
-            raise SettingsError(
-                f"`internal_step` {internal_step:g} s must divide `sample_time` {sample_time:g} s; "
-                f"use for example {sample_time / max(substeps, 1):g} s."
-            )
+        # 1e-9: 0.003 / 0.001 is a little more than 3, by rounding only.
+        substeps = math.ceil(sample_time / internal_step * (1.0 - 1e-9))
         if isinstance(noise_seed, bool) or noise_seed != int(noise_seed) or not 0 <= noise_seed < 2**31 - 1:
             raise SettingsError(f"`noise_seed` must be an integer from 0 to 2147483646; got {noise_seed}.")
         queue = math.ceil(_LONGEST_LATENCY / sample_time) + 1

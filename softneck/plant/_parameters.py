@@ -168,7 +168,7 @@ class NeckParameters:
             raise FileFormatError(
                 f"{source}: cannot be read ({error.strerror}); use paper, lab or a neck file (.toml)."
             ) from error
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        except (ValueError, RecursionError) as error:
             raise FileFormatError(f"{source}: is not valid TOML ({error}).") from error
         preset = content.pop("preset", "paper")
         if preset not in ("paper", "lab"):

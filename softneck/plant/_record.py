@@ -45,11 +45,11 @@ def record(
         seed: of the sensor's noise.
         payload: mass on the platform [kg], 0 to 5.
         noise: False gives a perfect sensor that keeps its lag and delay.
-        internal_step: [s]; must divide the sample time.
+        internal_step: longest [s]; a sample takes equal steps.
 
     Raises:
         DataError: set-points that are not finite or beyond the neck's position limit.
-        SettingsError: a payload or a seed out of range, a step that does not divide.
+        SettingsError: a payload, a seed or a step out of range.
     """
     require_between("payload", payload, 0.0, 5.0, "kg")
     P = np.asarray(excitation.set_points, dtype=np.float64)

@@ -121,7 +121,7 @@ def make_requirements(table: Mapping[str, Any]) -> Requirements:
 def _read(source: Path) -> dict[str, Any]:
     try:
         table = tomllib.loads(source.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise FileFormatError(f"{source}: is not valid TOML ({error}).") from error
     except OSError as error:
         raise FileFormatError(

@@ -37,11 +37,11 @@ def plant():
 _LOOP = """# Written by `softneck verify`: {title}.
 # Run it with `softneck simulate {name}`.
 duration_s = {duration:g}
-sample_time_s = {sample_time:g}
+sample_time_s = {sample_time!r}
 order = "{order}"
 
 [plant]
-python = "{python}"
+{plant}
 parameters = {{ {parameters} }}
 {observer}
 [controller]
@@ -105,7 +105,7 @@ def linear_plant(
 
 
 def virtual_neck() -> Block:
-    """Return the virtual neck `paper` as a plant; a loop file sets its parameters."""
+    """Return the virtual neck `paper` as a plant at 20 ms; loop files that earlier versions wrote name it."""
     return VirtualNeck(NeckParameters.paper()).block()
 
 
@@ -130,7 +130,7 @@ def write_linear(
     angles = (size, 0.0) if worst["axis"] == 0 else (0.0, size)
     noise = f"noise_std = {math.radians(step['noise_deg'])!r}"
     text = _loop(
-        folder, f"{name}.toml", title=f"{name} on {worst['name']}, with a step", python=f"{module}:plant",
+        folder, f"{name}.toml", title=f"{name} on {worst['name']}, with a step", plant=f'python = "{module}:plant"',
         parameters=noise, controller=controller, observer=None, angles=angles, at=0.0,
         duration=float(step["duration_s"]), sample_time=float(worst["sample_time"]), order="sequential",
     )  # fmt: skip
@@ -144,7 +144,7 @@ def write_neck(
     """Write `name.toml`, a loop over the virtual neck; `worst` is what the certificate says of that run."""
     values = {**worst["parameters"], "payload": worst["payload_kg"], "noise_seed": float(worst["seed"])}
     text = _loop(
-        folder, f"{name}.toml", title=f"{name} on {worst['name']}", python="softneck.verification:virtual_neck",
+        folder, f"{name}.toml", title=f"{name} on {worst['name']}", plant='neck = "paper"',
         parameters=", ".join(f"{key} = {float(value)!r}" for key, value in values.items()), controller=controller,
         observer=observer, angles=(worst["pitch_deg"], worst["roll_deg"]), at=worst["at_s"],
         duration=worst["duration_s"], sample_time=worst["sample_time_s"], order=worst["order"],

@@ -32,6 +32,28 @@ def test_auto_ranks_explains_and_saves(call: Call, recording: Path) -> None:
     assert call("identify", "auto", recording, "-o", "best.npz").code == 2
 
 
+def test_auto_saves_the_best_linear_model_beside_one_that_design_would_refuse(
+    call: Call, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_auto, "ALIKE", 1e-9)  # the better one is taken, however little better
+    monkeypatch.setattr(_auto.KindTrial, "fit", property(lambda one: {"play": 90.0, "rls": 80.0}[one.kind]))
+    said = call("identify", "auto", recording, "-o", "best.npz", "--refit", "--json")
+    assert said.code == 0, said.err
+    facts = json.loads(said.out)
+    assert (facts["chosen"], facts["linear_model"]) == ("play", "best_linear.npz")
+    assert load("best_linear.npz").kind == "rls"
+    assert call("design", "pi", "best.npz", "-o", "a.npz").code == 2
+    assert call("design", "pi", "best_linear.npz", "-o", "pi.npz").code == 0
+    assert call("observer", "best_linear.npz", "-o", "obs.npz").code == 0
+    # Nothing is replaced, and a chosen linear model needs no other.
+    Path("best.npz").unlink()
+    assert "best_linear.npz: exists already" in call("identify", "auto", recording, "-o", "best.npz").error
+    monkeypatch.setattr(_auto.KindTrial, "fit", property(lambda one: {"play": 80.0, "rls": 90.0}[one.kind]))
+    said = call("identify", "auto", recording, "-o", "other.npz", "--json")
+    assert json.loads(said.out)["linear_model"] is None
+    assert not Path("other_linear.npz").exists()
+
+
 def test_auto_prints_one_json_object_and_holds_out_the_last_of_several(call: Call, recording: Path) -> None:
     write_recording(Path("other.csv"), neck_recording(300, seed=44))
     said = call("identify", "auto", recording, "other.csv", "--json")

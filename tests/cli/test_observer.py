@@ -42,9 +42,24 @@ def test_noise_from_data_finds_that_of_the_sensor_by_its_gyro(call: Call, files:
     said = call("observer", files[0], "-o", "g.npz", "--gyro", "--data", files[1], "--json")
     assert said.code == 0, said.err
     told = json.loads(said.out)
-    # The paper preset has 0.05 deg; 950 pairs know it to 3 %, and what the gyro misses of the motion takes some.
+    # The paper preset has 0.05 deg; 650 pairs know it to 3 %, and what the gyro misses of the motion takes some.
     assert told["noise"]["measurement_noise_std"] == pytest.approx(0.05 * 3.14159265 / 180.0, rel=0.25)
-    assert told["fit"]["rows"] > 900
+    # The first 70 % of 1,000 rows, less the 50 in which the filter settles; the rest judges, and speaks for them.
+    assert told["fit"]["rows"] > 600
+    assert told["fit"]["kept"]
+
+
+@pytest.mark.slow
+def test_levels_that_rows_held_out_do_not_speak_for_are_not_kept(call: Call) -> None:
+    recording = record(signal("eq22", duration=60.0), VirtualNeck(NeckParameters.paper()), seed=5)
+    Rls().fit([recording.split(0.7)[0]]).save("rls.npz")
+    write_recording("rec.csv", recording)
+    assert call("observer", "rls.npz", "-o", "default.npz").code == 0
+    said = call("observer", "rls.npz", "-o", "o.npz", "--data", "rec.csv")
+    assert said.code == 0, said.err
+    # The model is wrong, and the likeliest levels have no sensor noise: they follow it, and go astray in gaps.
+    assert "not better, so the default levels are kept" in said.out
+    assert load("o.npz").noise == load("default.npz").noise
 
 
 @pytest.mark.slow

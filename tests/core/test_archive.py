@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import json
+import struct
+import sys
 import zipfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -161,3 +164,88 @@ def test_a_file_of_another_role_or_kind_is_refused(tmp_path: Path, models: dict)
         load(tmp_path / "m.npz", role="controller")
     with pytest.raises(FileFormatError, match="holds the unknown kind `magic`"):
         load(archive(tmp_path, {"kind": "magic"}))
+
+
+def with_member(folder: Path, name: str, change: Callable[[bytes], bytes]) -> Path:
+    """The archive with one member changed and all sums of the zip file right."""
+    source = archive(folder)
+    with zipfile.ZipFile(source) as file:
+        members = {item: file.read(item) for item in file.namelist()}
+    with zipfile.ZipFile(source, "w") as file:
+        for item, content in members.items():
+            file.writestr(item, change(content) if item == name else content)
+    return source
+
+
+def with_header(text: str) -> Callable[[bytes], bytes]:
+    """Replace the text in which numpy says what follows."""
+    head = text.encode("latin1")
+    return lambda content: content[:8] + struct.pack("<H", len(head)) + head + content[128:]
+
+
+# What fuzzing found that numpy's reader raises, beside ValueError.
+@pytest.mark.parametrize(
+    "text",
+    ["{'descr': (", "'''", "{'a'", "1+1", "(" * 3000, "-" * 3000 + "1", "\\", "\x00", "  x\n y", "{'descr': zz}",
+     "{'descr': '<f8', 'fortran_order': False, 'shape': (-1,)}",
+     "{'descr': '<f8', 'fortran_order': False, 'shape': (10**30,)}",
+     "{'descr': '<f8', 'fortran_order': False, 'shape': (99999999999999999999,)}",
+     "{'descr': '<f8', 'fortran_order': False, 'shape': (9000000000000000000, 9000000000000000000)}",
+     "{'descr': '|O', 'fortran_order': False, 'shape': (300,)}",
+     "{'descr': 3, 'fortran_order': False, 'shape': (300,)}"],
+)  # fmt: skip
+def test_any_text_in_an_array_s_header_is_a_format_error(tmp_path: Path, text: str) -> None:
+    with pytest.raises(FileFormatError, match=r"a\.npz: is not a softneck file or is damaged"):
+        read_archive(with_member(tmp_path, "a.npy", with_header(text)))
+
+
+@pytest.mark.parametrize("descr", ["<c16", "<U2", "|S8", "<M8[ns]", "|V8"])
+def test_an_array_of_anything_but_numbers_is_a_format_error(tmp_path: Path, descr: str) -> None:
+    text = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': (100,)}}"
+    with pytest.raises(FileFormatError, match="its member `a` is not an array of numbers"):
+        read_archive(with_member(tmp_path, "a.npy", with_header(text)))
+
+
+def test_a_member_without_numpy_s_magic_is_a_format_error(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match="its member `a` is not an array of numbers"):
+        read_archive(with_member(tmp_path, "a.npy", lambda content: b"\x00" + content[1:]))
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=150)
+def test_damaged_headers_of_arrays_are_a_format_error_and_nothing_else(tmp_path: Path, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+
+    def damaged(content: bytes) -> bytes:
+        changed = bytearray(content)
+        for at in rng.integers(128, size=rng.integers(1, 6)):
+            changed[at] = int(rng.choice(np.frombuffer(b"(){}[]'\\,:0x9-+\x00\xff\n#", dtype=np.uint8)))
+        return bytes(changed)
+
+    with contextlib.suppress(FileFormatError):
+        read_archive(with_member(tmp_path, str(rng.choice(["a.npy", "header.npy"])), damaged))
+
+
+@pytest.mark.parametrize("value", [None, 10**400, "x", [], {}, [[]], True, -1, 1e300])
+@pytest.mark.parametrize("key", ["kind", "sample_time", "settings", "findings"])
+def test_a_header_of_any_values_is_a_model_or_a_format_error(
+    tmp_path: Path, models: dict, key: str, value: object
+) -> None:
+    models["rls"].save(tmp_path / "m.npz")
+    header, contents = read_archive(tmp_path / "m.npz")
+    header.update({key: value})
+    with unlimited_digits():
+        write_archive(tmp_path / "m.npz", header, contents, force=True)
+    with contextlib.suppress(FileFormatError):
+        load(tmp_path / "m.npz")
+
+
+@contextlib.contextmanager
+def unlimited_digits() -> Iterator[None]:
+    """Write integers that Python refuses to read."""
+    limit = sys.get_int_max_str_digits()
+    sys.set_int_max_str_digits(0)
+    try:
+        yield
+    finally:
+        sys.set_int_max_str_digits(limit)

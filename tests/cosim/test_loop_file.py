@@ -117,6 +117,22 @@ def test_a_plant_written_in_python_stands_beside_the_file(loop_file: Path, toys:
             load_loop(loop_file)
 
 
+def test_simulate_takes_a_table_a_file_or_a_loop(loop_file: Path, toys: Any) -> None:
+    known = simulate(_python_loop(toys))
+    table = {
+        "duration_s": 4.0, "plant": {"object": toys.neck(), "parameters": {"payload": 0.5, "pitch_start": 0.01}},
+        "controller": toys.pi(), "reference": {"kind": "step", "pitch_deg": 15.0, "at_s": 1.0},
+    }  # fmt: skip
+    for loop in (table, loop_file, str(loop_file), load_loop(loop_file)):
+        np.testing.assert_array_equal(simulate(loop)["pitch"], known["pitch"])
+    with pytest.raises(SettingsError, match="`duration_s` is missing"):
+        simulate({})
+    with pytest.raises(FileFormatError, match=r"none\.toml: no such file"):
+        simulate("none.toml")
+    with pytest.raises(SettingsError, match="`loop` must be a Loop, a loop file or a table of its keys; got a int"):
+        simulate(3)  # pyright: ignore[reportArgumentType]
+
+
 def test_parts_of_one_loop_may_be_mixed(loop_file: Path, toys: Any) -> None:
     mixed = _python_loop(toys)
     mixed = Loop(

@@ -106,6 +106,24 @@ def test_lost_samples_are_missing_in_a_recording() -> None:
     assert np.isfinite(recording.motor_positions).all()
 
 
+@pytest.mark.parametrize(
+    ("sample_time", "steps"), [(0.001, 1), (0.003, 3), (0.02, 20), (0.1, 100), (0.0015, 2), (0.0208954, 21)]
+)
+def test_internal_steps_fit_any_sample_time_and_stay_within_a_millisecond(sample_time: float, steps: int) -> None:
+    # Column 1 of the setup is the number of steps; of times that 1 ms divides it is their quotient.
+    assert NECK.block(sample_time=sample_time).arrays[0][0][1] == steps
+
+
+def test_a_sample_time_estimated_from_a_log_simulates_as_finely_as_any_other() -> None:
+    U = np.zeros((50, 8))
+    U[:, 0] = 1.5
+    blocks = [NECK.block(sample_time=0.0208954, internal_step=step) for step in (0.001, 0.0001)]
+    Y, fine = (block.run(block.initial_state(), U)[1][:, :2] for block in blocks)
+    # rad: set-points arrive at a whole internal step, up to 1 ms late, while the neck moves at 1 rad/s.
+    np.testing.assert_allclose(Y, fine, atol=1e-3)
+    assert np.abs(fine).max() > 0.1
+
+
 def test_a_batch_is_each_neck_by_itself() -> None:
     necks = [NeckParameters.paper().sample(np.random.default_rng(seed)) for seed in range(4)]
     U = np.zeros((60, 8))

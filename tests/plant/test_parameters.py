@@ -104,7 +104,6 @@ def test_the_labs_sensors_differ_and_leave_the_neck_alone() -> None:
 @pytest.mark.parametrize(
     ("settings", "what"),
     [
-        ({"sample_time": 0.0207, "internal_step": 0.001}, "`internal_step` 0.001 s must divide `sample_time` 0.0207 s"),
         ({"sample_time": 0.0}, r"`sample_time` must be between 0.001 and 0.1 \[s\]; got 0"),
         ({"internal_step": 0.05}, r"`internal_step` must be between .* got 0.05"),
         ({"noise_seed": -1}, "`noise_seed` must be an integer from 0"),

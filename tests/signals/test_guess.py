@@ -205,6 +205,67 @@ def test_a_table_without_names_is_told_by_its_data(tmp_path: Path, kind: str, po
     assert any(line.startswith("not sure: pitch from column") for line in guess.lines)
 
 
+def held(*, set_points: str, positions: str, sign: float = 1.0) -> dict[str, np.ndarray]:
+    """A log of one held target, [0, 115.189, 0] deg, that motor 2 reaches and the platform answers."""
+    arrived = 1.0 - np.exp(-NECK.time / 0.3)
+    target, unit = np.array([0.0, sign * 115.189, 0.0]), {"deg": 1.0, "rad": np.pi / 180.0}
+    rng = np.random.default_rng(0)
+    found = {"time": NECK.time}
+    found |= {f"motor_target{j}": np.full(NECK.time.size, unit[set_points] * target[j - 1]) for j in (1, 2, 3)}
+    moved = arrived[:, None] * target + 0.05 * rng.standard_normal((NECK.time.size, 3))
+    found |= {f"encoder{j}": unit[positions] * moved[:, j - 1] for j in (1, 2, 3)}
+    return found | {"pitch": -10.0 * arrived, "roll": 17.0 * arrived}
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(("set_points", "positions"), [("deg", "deg"), ("rad", "rad"), ("deg", "rad"), ("rad", "deg")])
+def test_set_points_that_stand_still_are_in_the_unit_of_their_positions(
+    tmp_path: Path, set_points: str, positions: str, sign: float
+) -> None:
+    pd.DataFrame(held(set_points=set_points, positions=positions, sign=sign)).to_csv(tmp_path / "log.csv", index=False)
+    guess = guess_layout(tmp_path / "log.csv")
+    done = import_log(tmp_path / "log.csv", guess.layout)
+    np.testing.assert_allclose(done.recording.set_points[:, 1], sign * np.radians(115.189), rtol=1e-12)
+    # Within the noise of the encoder, 0.05 deg, four standard deviations.
+    np.testing.assert_allclose(done.recording.motor_positions[-50:, 1], sign * np.radians(115.189), atol=0.0035)
+    assert "no set-point ever changes" in done.notes[-1]
+    # One reaching 57 times the other is a clue, but not a proof.
+    unsure = [line for line in guess.lines if line.startswith("not sure: motor_")]
+    assert len(unsure) == (0 if set_points == positions else 6)
+
+
+@pytest.mark.parametrize("titled", ["motor_target", "encoder"])
+def test_a_unit_in_the_title_of_one_motor_s_column_is_that_of_all(tmp_path: Path, titled: str) -> None:
+    # 10 deg are within reach in rad too: only the title tells.
+    columns = {
+        name: 0.08 * c if name[-1] in "123" else c for name, c in held(set_points="deg", positions="deg").items()
+    }
+    frame = pd.DataFrame(columns).rename(columns={f"{titled}{j}": f"{titled}{j} [deg]" for j in (1, 2, 3)})
+    frame.to_csv(tmp_path / "log.csv", index=False)
+    layout = guess_layout(tmp_path / "log.csv").layout
+    assert {layout.channels[name].unit for name in (*SET_POINTS, *MOTOR_POSITIONS)} == {"deg"}
+
+
+@pytest.mark.parametrize("channel", ["motor_setpoint_2", "motor_position_2"])
+def test_motors_beyond_two_turns_are_refused_with_the_fix(tmp_path: Path, channel: str) -> None:
+    pd.DataFrame(held(set_points="deg", positions="deg")).to_csv(tmp_path / "log.csv", index=False)
+    text = guess_layout(tmp_path / "log.csv").text
+    lines = [line.replace('"deg"', '"rad"') if line.startswith(channel) else line for line in text.splitlines()]
+    with pytest.raises(DataError, match=rf"log.csv: `{channel}` reaches 115.* rad, which is 18 turns.*in degrees"):
+        import_log(tmp_path / "log.csv", parse_layout("\n".join(lines)))
+
+
+def test_a_glitch_of_an_encoder_is_not_a_unit(tmp_path: Path) -> None:
+    columns = held(set_points="rad", positions="rad")
+    columns["encoder2"][100] = 4096.0
+    pd.DataFrame(columns).to_csv(tmp_path / "log.csv", index=False)
+    source = {name: Source((Term(f"encoder{name[-1]}"),), "rad") for name in MOTOR_POSITIONS}
+    source |= {name: Source((Term(f"motor_target{name[-1]}"),), "rad") for name in SET_POINTS}
+    source |= {name: Source((Term(name),), "deg") for name in ("pitch", "roll")}
+    layout = Layout(channels=source, sample_time=TS)
+    assert import_log(tmp_path / "log.csv", layout).recording.motor_positions[100, 1] == 4096.0
+
+
 def test_restarts_runs_and_duplicates_are_seen(tmp_path: Path) -> None:
     columns = table()
     columns["t"] = np.tile(NECK.time[:400], 3)

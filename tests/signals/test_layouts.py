@@ -21,13 +21,13 @@ LAYOUT = """
 column = "t"
 unit = "ms"
 [channels]
-motor_setpoint_1 = { column = "a", unit = "rad" }
+motor_setpoint_1 = { column = "a", unit = "rad", factor = 0.25 }
 motor_setpoint_2 = { column = "b", unit = "deg", sign = -1 }
 pitch = { column = "p", unit = "deg" }
 roll = { column = "r", unit = "deg" }
 [channels.motor_setpoint_3]
 unit = "rad"
-terms = [{ column = "a", factor = 0.5 }, { column = "b", factor = -2.0 }]
+terms = [{ column = "a", factor = 0.125 }, { column = "b", factor = -0.25 }]
 """
 LOG = "t, a, b, p, r\n" + "\n".join(f"{20 * k}, {k}, {2 * k}, {3 * k}, {4 * k}" for k in range(30))
 
@@ -42,7 +42,8 @@ def test_units_signs_and_sums_of_columns(tmp_path: Path) -> None:
     r = imported(tmp_path).recording
     k = np.arange(30.0)
     assert r.sample_time == 0.02
-    np.testing.assert_allclose(r.set_points, np.column_stack([k, -np.radians(2 * k), 0.5 * k - 4 * k]), rtol=1e-15)
+    expected = np.column_stack([k / 4, -np.radians(2 * k), 0.125 * k - 0.5 * k])
+    np.testing.assert_allclose(r.set_points, expected, rtol=1e-15)
     np.testing.assert_allclose(r.outputs, np.radians(np.column_stack([3 * k, 4 * k])), rtol=1e-15)
 
 
@@ -117,7 +118,7 @@ def test_a_gap_in_the_time_column_splits_the_run_under_any_sample_time(tmp_path:
             "needs both `inclination` and `orientation`",
         ),
         ("[time]", "file = 5\n[time]", r"\[file\] must be a table"),
-        ('{ column = "a", factor = 0.5 }', "5", "needs `column`"),
+        ('{ column = "a", factor = 0.125 }', "5", "needs `column`"),
     ],
 )
 def test_a_wrong_layout_is_one_clear_line(tmp_path: Path, old: str, new: str, message: str) -> None:

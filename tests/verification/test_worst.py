@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.stats import norm
 
 from softneck.core import Vector
+from softneck.cosim import load_loop
 from softneck.design import LinearController
 from softneck.verification import make_requirements, verify
 from softneck.verification._confidence import intervals
 from softneck.verification._evidence import Values, worst_row
 from softneck.verification._linear import LinearLaw, judged, margins
 from softneck.verification._plants import all_plants, make_plants, neck_of_family, neck_of_model
+from softneck.verification._worst import write_neck
 
 from .necks import QUICK, TS, family, linear_neck, pi
 
@@ -129,3 +133,17 @@ def test_delays_are_listed_with_the_worst_of_the_plants_that_were_tried() -> Non
         assert peak >= max(alone["pitch.sensitivity"][0], alone["roll.sensitivity"][0])
         assert radius >= alone["stability.radius"][0]
     assert np.all(np.diff(rows[:3, 2]) < 0.0)
+
+
+def test_the_loop_of_a_worst_neck_runs_at_a_sample_time_estimated_from_a_log(tmp_path: Path) -> None:
+    sample_time = 0.020895371  # a file that rounds it to six digits names another one
+    replace(pi(), sample_time=sample_time).save(tmp_path / "pi.npz")
+    worst = {
+        "name": "paper, 1 kg", "parameters": {}, "payload_kg": 1.0, "seed": 7, "pitch_deg": 15.0, "roll_deg": 0.0,
+        "at_s": 0.5, "duration_s": 2.5, "sample_time_s": sample_time, "order": "sequential",
+    }  # fmt: skip
+    file = write_neck(tmp_path, "neck", worst, controller=tmp_path / "pi.npz", observer=None, force=False)
+    parts = load_loop(file).loop.parts
+    assert {name: part.sample_time for name, part in parts.items()} == {
+        "plant": sample_time, "controller": sample_time
+    }  # fmt: skip

@@ -71,6 +71,8 @@ def progress(what: str, *, quiet: bool = False) -> Iterator[ProgressCallback]:
 
 def percent(value: float | None) -> str:
     """Return a fit for a table cell; `-` where there is none: it diverged, or nothing was measured or moved."""
+    if value is not None and value < -1000.0:
+        return "<-1000"
     return "-" if value is None else f"{value:.1f}"
 
 

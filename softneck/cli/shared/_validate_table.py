@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,13 +12,15 @@ import numpy as np
 from ._console import percent
 
 if TYPE_CHECKING:
-    from softneck.identification import Validation
+    from softneck.identification import Model, Validation
 
 
 Head = list[str]
 Cells = list[list[str]]
 # What is left of 120 columns beside the numbers.
 _NAME = 18
+# [%] What the motion's mirror image scores: its error is twice the motion.
+_USELESS = -100.0
 
 
 def fit_table(results: Sequence[Validation]) -> tuple[Head, Cells]:
@@ -65,6 +68,24 @@ def remarks(r: Validation) -> list[str]:
             f"{who}: novelty {p50} (median), {p90} (90 %), {p99} (99 %), {most} (largest) times the training's spacing"
         )
     return lines
+
+
+def with_fit(model: Model, held_out: Validation | None) -> Model:
+    """Return the model with what it was worth on the rows held out, which `softneck design` asks for."""
+    if held_out is None:
+        return model
+    said = {"fit": held_out.fits["inf"], "diverged": held_out.diverged, "rows": held_out.rows_scored}
+    return replace(model, findings={**model.findings, "hold_out": said})
+
+
+def useless(r: Validation) -> str | None:
+    """Return why a model is no model of the rows that it was judged on, or None."""
+    if r.diverged is not None:
+        return f"its free run diverges at {r.diverged:.2f} s"
+    fits = [(fit, "in free run" if h == "inf" else f"{h} sample(s) ahead", axis)
+            for h, table in r.fits.items() for axis, fit in table.items() if fit is not None]  # fmt: skip
+    worst, horizon, axis = min(fits, default=(0.0, "", ""))
+    return f"its fit {horizon} is {percent(worst)} % in {axis}" if worst < _USELESS else None
 
 
 def _residuals(r: Validation) -> str:

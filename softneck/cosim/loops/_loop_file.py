@@ -15,7 +15,7 @@ from ..parts._fmu_part import FmuPart
 from ..parts._isolated import IsolatedPart
 from ._loop_parts import OBJECT, PRESETS, SOURCES, PartOpener
 from ._loop_values import number, numbers, read_toml, refuse_unknown, tables, texts
-from ._simulate import LoopSetup
+from ._setup import LoopSetup
 
 _TOP = (
     "duration_s", "sample_time_s", "order", "plant", "observer", "controller", "reference", "part", "connections",

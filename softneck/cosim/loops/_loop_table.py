@@ -15,7 +15,7 @@ from ..parts._fmu_part import FmuPart
 from ..parts._isolated import IsolatedPart
 from ._loop_file import normal_table
 from ._loop_parts import OBJECT
-from ._simulate import LoopSetup
+from ._setup import LoopSetup
 
 _PARTS = ("plant", "observer", "controller")
 _SOURCES = ("fmu", "model", "file", "neck", "python", OBJECT)

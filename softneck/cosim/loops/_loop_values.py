@@ -16,7 +16,7 @@ def read_toml(source: Path) -> dict[str, Any]:
         raise FileFormatError(f"{source}: no such file.")
     try:
         return tomllib.loads(source.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise FileFormatError(f"{source}: is not valid TOML ({error}).") from error
     except OSError as error:
         raise FileFormatError(f"{source}: cannot be read: {error.strerror}.") from error

@@ -4,37 +4,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
-from softneck.core import require_one_of
+from softneck.core import SettingsError
 from softneck.loop import Loop, LoopState, run_loop
 from softneck.loop._run import StepCallback
 
+from ._loop_file import load_loop, make_loop
 from ._result import Result
-
-
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class LoopSetup:
-    """A loop with what is asked of it; a loop file describes one.
-
-    Attributes:
-        loop: the parts, the reference, the order.
-        limits: metric -> upper limit, such as "pitch.overshoot_pct": 5.0.
-        files: what was read for it: role -> (path, SHA-256).
-        angle: which angle the metrics judge: "true" (where the plant offers it) or "measured".
-    """
-
-    loop: Loop
-    limits: Mapping[str, float] = field(default_factory=dict)
-    files: Mapping[str, tuple[str, str]] = field(default_factory=dict)
-    angle: str = "true"
-
-    def __post_init__(self) -> None:
-        require_one_of("angle", self.angle, ("true", "measured"))
+from ._setup import LoopSetup
 
 
 def simulate(
-    loop: Loop | LoopSetup,
+    loop: Loop | LoopSetup | Mapping[str, Any] | str | Path,
     *,
     report: Callable[[float], None] | None = None,
     on_step: StepCallback | None = None,
@@ -46,7 +29,8 @@ def simulate(
     """Run a loop from t = 0 to its end.
 
     Args:
-        loop: a plain loop, or one with limits as `load_loop` returns it.
+        loop: a plain loop, one with limits as `load_loop` returns it, a loop file, or a table of its keys, whose
+            relative paths start at the working folder and which may hold objects (see `make_loop`).
         report: called now and then with the done fraction.
         on_step: called after each row with a `LoopStep`; it stops the run by returning True.
         pace: run at this multiple of real time; as fast as possible if not given.
@@ -56,11 +40,11 @@ def simulate(
             function: the same bits, sooner after a second of compiling, which is kept.
 
     Raises:
-        SettingsError: parts that do not fit together.
+        SettingsError: parts that do not fit together, or what `make_loop` refuses.
         DataError: a part returned what is not a number.
         FmuError: an FMU refused a call.
     """
-    setup = loop if isinstance(loop, LoopSetup) else LoopSetup(loop=loop)
+    setup = _opened(loop)
     begin = time.perf_counter()
     signals = run_loop(setup.loop, report, on_step=on_step, pace=pace, resume=resume, keep=keep, compiled=compiled)
     wall = time.perf_counter() - begin
@@ -72,3 +56,15 @@ def simulate(
         order=setup.loop.order,
         angle=setup.angle,
     )
+
+
+def _opened(loop: Any) -> LoopSetup:
+    if isinstance(loop, LoopSetup):
+        return loop
+    if isinstance(loop, Loop):
+        return LoopSetup(loop=loop)
+    if isinstance(loop, Mapping):
+        return make_loop(loop)
+    if isinstance(loop, str | Path):
+        return load_loop(loop)
+    raise SettingsError(f"`loop` must be a Loop, a loop file or a table of its keys; got a {type(loop).__name__}.")

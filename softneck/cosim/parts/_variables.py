@@ -163,4 +163,7 @@ def _number(text: Any, default: Any) -> Any:
         return default
     if str(text) in ("true", "false"):
         return 1.0 if str(text) == "true" else 0.0
-    return float(text)
+    try:
+        return float(text)
+    except ValueError:
+        raise FileFormatError(f"modelDescription.xml has the attribute `{text}` where a number is needed.") from None

@@ -14,7 +14,7 @@ from softneck.loop import BlockPart, Loop, Part, ReferenceBlock
 from softneck.loop._wiring import Wiring, wire
 from softneck.runtime import Port
 
-from ..loops._simulate import LoopSetup
+from ..loops._setup import LoopSetup
 from ..parts._fmu_part import FmuPart
 from ..parts._isolated import IsolatedPart
 from ._description import Component, Connection, system_description

@@ -19,7 +19,7 @@ from ..loops._loop_file import make_loop, normal_table
 from ..loops._loop_parts import OBJECT
 from ..loops._loop_table import check_key, loop_table, set_sources, settable, with_values
 from ..loops._loop_values import read_toml
-from ..loops._simulate import LoopSetup
+from ..loops._setup import LoopSetup
 from ._vary import StudyPoints, Vary, flattened, make_vary
 
 _TOP = ("loop", "runs", "seed", "sampling", "objectives", "vary")
@@ -194,6 +194,8 @@ def _opened(loop: Source) -> tuple[Mapping[str, Any], Path]:
         return read_toml(path), path.parent.resolve()
     if isinstance(loop, Loop | LoopSetup):
         return loop_table(loop), Path.cwd()
+    if not isinstance(loop, Mapping):
+        raise SettingsError(f"`loop` must be a loop file or a table of its keys; got {loop!r}.")
     return normal_table(loop), Path.cwd()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -56,7 +57,10 @@ def loop_margins(loop: control.TransferFunction) -> Margins:
     radius = float(np.abs(poles).max(initial=0.0))
     if radius >= 1.0:
         raise SettingsError(f"the closed loop is not stable (spectral radius {radius:.4f}); ask for less.")
-    gain, phase, _, _, crossover, _ = control.stability_margins(loop)
+    with warnings.catch_warnings():
+        # It says that polynomials of this order are inaccurate and that it takes the frequency response instead.
+        warnings.filterwarnings("ignore", "stability_margins: Falling back", UserWarning)
+        gain, phase, _, _, crossover, _ = control.stability_margins(loop)
     response = np.asarray(loop(np.exp(1j * frequencies(dt) * dt)))
     sensitivity = float(np.abs(1.0 / (1.0 + response)).max())
     angle = math.radians(float(phase))

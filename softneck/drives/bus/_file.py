@@ -241,7 +241,7 @@ def load_drives(path: str | Path) -> DrivesFile:
         table = tomllib.loads(source.read_text(encoding="utf-8"))
     except OSError as error:
         raise FileFormatError(f"{source}: cannot be read ({error.strerror}).") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise FileFormatError(f"{source}: is not valid TOML ({error}).") from error
     try:
         return make_drives(table, source.parent)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from softneck.core import SettingsError, load
 from softneck.cosim import FmuPart
-from softneck.cosim.loops._simulate import LoopSetup
+from softneck.cosim.loops._setup import LoopSetup
 from softneck.loop import BlockPart, Loop, Part
 from softneck.plant import NeckParameters
 

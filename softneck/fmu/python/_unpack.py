@@ -39,12 +39,12 @@ def unpack(path: str | Path) -> Path:
             except BaseException:
                 shutil.rmtree(folder, ignore_errors=True)
                 raise
-    except (zipfile.BadZipFile, NotImplementedError, EOFError, RuntimeError, ValueError) as error:
-        if isinstance(error, FileFormatError):
-            raise
-        raise FileFormatError(f"{source}: is not an FMU or is damaged ({error}).") from error
+    except FileFormatError:
+        raise
     except OSError as error:
         raise OutputFileError(f"{source}: cannot be unpacked: {error.strerror or error}.") from error
+    except Exception as error:  # zipfile and its decompressors raise whatever damaged bytes lead to
+        raise FileFormatError(f"{source}: is not an FMU or is damaged ({error}).") from error
     return folder
 
 

@@ -13,14 +13,14 @@ def nrmse_fit(measured: Vector, predicted: Vector) -> float:
     100 is perfect, 0 is as good as the mean; NaN where nothing was measured or nothing moved.
     """
     y, yhat = _paired(measured, predicted)
-    spread = float(np.linalg.norm(y - y.mean())) if y.size else 0.0
+    spread = float(np.linalg.norm(y - y.mean())) if _moves(y) else 0.0
     return 100.0 * (1.0 - float(np.linalg.norm(y - yhat)) / spread) if spread > 0 else float("nan")
 
 
 def r_squared(measured: Vector, predicted: Vector) -> float:
     """Return `R2 = 1 - SSE/SST = 1 - (1 - fit/100)^2`; NaN where nothing was measured or nothing moved."""
     y, yhat = _paired(measured, predicted)
-    total = float(np.sum((y - y.mean()) ** 2)) if y.size else 0.0
+    total = float(np.sum((y - y.mean()) ** 2)) if _moves(y) else 0.0
     return 1.0 - float(np.sum((y - yhat) ** 2)) / total if total > 0 else float("nan")
 
 
@@ -41,6 +41,11 @@ def worst_error(measured: Vector, predicted: Vector) -> tuple[float, int]:
         return float("nan"), -1
     row = int(np.nanargmax(size))
     return float(size[row]), row
+
+
+def _moves(y: Vector) -> bool:
+    # The mean of equal numbers is off by rounding: to divide by that distance made fits of -1e16 %.
+    return y.size > 0 and float(np.ptp(y)) > 1e-12 * float(np.abs(y).max())
 
 
 def _paired(measured: Vector, predicted: Vector) -> tuple[Vector, Vector]:

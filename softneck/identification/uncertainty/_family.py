@@ -235,6 +235,10 @@ def _cross_line(cross: Matrix) -> str:
     )
 
 
+# What no neck reaches, and a damaged file does: gains [rad/rad], poles [1/s]; dead times [s].
+_LARGEST, _LONGEST = 1e4, 10.0
+
+
 def _check(name: str, axis: AxisFamily, frequencies: int) -> None:
     n = axis.samples.shape[0]
     shapes = {
@@ -247,3 +251,10 @@ def _check(name: str, axis: AxisFamily, frequencies: int) -> None:
     for key in ("samples", "nominal", "box", "weight"):
         if not np.isfinite(getattr(axis, key)).all():
             raise FileFormatError(f"its array `{name}_{key}` is not finite.")
+    for key in ("samples", "nominal", "box"):
+        table = np.atleast_2d(getattr(axis, key))
+        if (np.abs(table) > _LARGEST).any() or (table[:, 2] < 0.0).any() or (table[:, 2] > _LONGEST).any():
+            raise FileFormatError(
+                f"its array `{name}_{key}` is not of gains and poles up to {_LARGEST:g} and dead times from 0 to "
+                f"{_LONGEST:g} s."
+            )

@@ -42,6 +42,8 @@ def fit_intervals(
         return [[None, None] for _ in measured]
     table = np.column_stack([_terms(y, e) for y, e in zip(measured, errors, strict=True)])
     sums = _block_sums(table, stretch, length)
+    if not len(sums):  # no error is a number: the predictions are beyond all bounds
+        return [[None, None] for _ in measured]
     # The same blocks for every horizon and axis, and the same every time.
     drawn = np.random.default_rng(0).integers(len(sums), size=(RESAMPLES, -(-len(sums) // length)))
     picks = csr_array((np.ones(drawn.size), drawn.ravel(), np.arange(RESAMPLES + 1) * drawn.shape[1]),
@@ -101,7 +103,7 @@ def _block_sums(table: Matrix, stretch: np.ndarray, length: int) -> Matrix:
         wrapped = np.resize(rows, (len(rows) + length - 1, rows.shape[1]))
         total = np.vstack([np.zeros(rows.shape[1]), np.cumsum(wrapped, axis=0)])
         parts.append(total[length:] - total[:-length])
-    return np.concatenate(parts)
+    return np.concatenate([np.zeros((0, table.shape[1])), *parts])
 
 
 def _interval(totals: Matrix) -> list[float] | None:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from ..recording._channels import MOTOR_POSITIONS, MOTORS, SET_POINTS, file_unit
+from ..recording._channels import MOTOR_POSITIONS, MOTOR_TURNS, MOTORS, SET_POINTS, file_unit
 from ._draft import Draft
 from ._sample_time import velocity_period
 
 _VELOCITIES = tuple(f"motor_velocity_{j}" for j in MOTORS)
-# The neck's motors stay within 6 rad; two turns are 12.6 rad, and in degrees hardly a move.
-_MOTOR_TURNS = 4.0 * np.pi
+# Set-points in degrees and positions in rad, or the reverse; at rest a position is within a quarter of its set-point.
+_DEGREES, _ALIKE = 180.0 / np.pi, 1.25
 # The neck tilts by 0.8 rad at most: as radians, a quarter turn is out of reach.
 _TILT = np.pi / 2.0
 # The paper's sample time [s], which decides where the data leave it open.
@@ -38,9 +40,10 @@ def units(draft: Draft) -> dict[str, Unit]:
 
 
 def largest(draft: Draft, channel: str) -> float:
-    """Return the largest size of a channel as logged."""
-    values = np.abs(draft.values(channel))
-    return float(values.max()) if values.size else 0.0
+    """Return the largest size of a channel as logged, of one that stands still too."""
+    columns = draft.sniffed.columns
+    values = np.abs(sum(term.factor * columns[term.column] for term in draft.picks[channel].terms))
+    return float(values[np.isfinite(values)].max(initial=0.0))
 
 
 def _time(draft: Draft, found: dict[str, Unit]) -> None:
@@ -58,17 +61,37 @@ def _time(draft: Draft, found: dict[str, Unit]) -> None:
 
 
 def _motors(draft: Draft, found: dict[str, Unit]) -> None:
+    """Positions follow their set-points: both have one unit, of which either may tell, unless they are 57 apart."""
     groups = [group for group in (SET_POINTS, MOTOR_POSITIONS) if draft.has(group)]
+    names = [name for group in groups for name in group]
     sizes = {group: max(largest(draft, name) for name in group) for group in groups}
-    # Positions follow their set-points: where both are of one size they have one unit.
-    if len(groups) == 2 and 0.5 < (sizes[groups[0]] + 1e-12) / (sizes[groups[1]] + 1e-12) < 2.0:
-        sizes = dict.fromkeys(groups, max(sizes.values()))
-    for group in groups:
-        beyond = sizes[group] > _MOTOR_TURNS
-        unit = "deg" if beyond else "rad"
-        why = f"they reach {sizes[group]:.4g}, " + ("beyond two turns" if beyond else "within the motors' reach")
-        for name in group:
-            found.setdefault(name, (unit, 1.0, why))
+    if (
+        len(groups) == 2
+        and _DEGREES / _ALIKE < max(sizes.values()) / max(min(sizes.values()), 1e-12) < _DEGREES * _ALIKE
+    ):
+        for group in groups:
+            unit = "deg" if sizes[group] == max(sizes.values()) else "rad"
+            _unsure(draft, found, group, (unit, 1.0, "of set-points and positions one reaches 57 times the other"))
+        return
+    titled = {found[name][0] for name in names if name in found}
+    reach = max(sizes.values(), default=0.0)
+    beyond = reach > MOTOR_TURNS
+    unit = "deg" if beyond else "rad"
+    why = (
+        f"the motors' set-points and positions reach {reach:.4g}, " if len(groups) == 2 else f"they reach {reach:.4g}, "
+    )
+    why += "beyond two turns" if beyond else "within the motors' reach"
+    if len(titled) == 1:
+        unit, why = titled.pop(), "the title of another of the motors' columns says so"
+    for name in names:
+        found.setdefault(name, (unit, 1.0, why))
+
+
+def _unsure(draft: Draft, found: dict[str, Unit], group: tuple[str, ...], unit: Unit) -> None:
+    for name in group:
+        if name not in found:
+            found[name] = unit
+            draft.picks[name] = replace(draft.picks[name], sure=False)
 
 
 def _platform(draft: Draft, found: dict[str, Unit]) -> None:

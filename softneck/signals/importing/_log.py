@@ -11,7 +11,7 @@ import numpy as np
 
 from softneck.core import DataError, FileFormatError, SoftneckError, Vector, to_si
 
-from ..recording._channels import may_miss
+from ..recording._channels import MOTOR_POSITIONS, MOTOR_TURNS, SET_POINTS, may_miss
 from ..recording._files import integers, numbers, read_table
 from ..recording._recording import Recording
 from ..recording._resampling import Samples, mean_step, resample, split_at_gaps, without_duplicates
@@ -23,6 +23,9 @@ from ._tilt import pitch_roll
 
 if TYPE_CHECKING:
     import pandas as pd
+
+# Part of the samples of a channel that may be anything.
+_GLITCHES = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,7 +89,24 @@ def _imported(frame: pd.DataFrame, layout: Layout) -> ImportResult:
         o = _values(frame, layout.orientation, "pitch")
         channels["pitch"], channels["roll"] = pitch_roll(i, o)
     samples, sample_time, notes = _clocked(frame, layout, channels)
-    return ImportResult(Recording(samples.time, sample_time, samples.channels, samples.run), notes)
+    recording = Recording(samples.time, sample_time, samples.channels, samples.run)
+    _refuse_turns(layout, recording.channels)
+    if not np.ptp(recording.set_points, axis=0).any():
+        notes += ("warning: no set-point ever changes: nothing can be identified from this log",)
+    return ImportResult(recording, notes)
+
+
+def _refuse_turns(layout: Layout, channels: Mapping[str, Vector]) -> None:
+    """Raise DataError where motors turn further than they can for more than some glitches of an encoder."""
+    for name in (*SET_POINTS, *MOTOR_POSITIONS):
+        reached = np.abs(channels.get(name, np.zeros(1)))
+        if (reached > MOTOR_TURNS).mean() > _GLITCHES:
+            reach = np.nanmax(reached)
+            hint = 'is it in degrees (`unit = "deg"`)?' if layout.channels[name].unit == "rad" else "is `factor` right?"
+            raise DataError(
+                f"`{name}` reaches {reach:.4g} rad, which is {reach / (2.0 * np.pi):.0f} turns; the motors' range is "
+                f"6 rad. Mend its line in the layout: {hint}"
+            )
 
 
 def _clocked(

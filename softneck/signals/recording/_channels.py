@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 
 from softneck.core import DataError, to_si
@@ -10,6 +11,8 @@ MOTORS = (1, 2, 3)
 #: Names of the three channels with the motors' set-points.
 SET_POINTS = tuple(f"motor_setpoint_{j}" for j in MOTORS)
 MOTOR_POSITIONS = tuple(f"motor_position_{j}" for j in MOTORS)
+# [rad] The motors stay within 6 rad: two turns are another unit, and in degrees hardly a move.
+MOTOR_TURNS = 4.0 * math.pi
 OUTPUTS = ("pitch", "roll")
 REQUIRED = (*SET_POINTS, *OUTPUTS)
 
