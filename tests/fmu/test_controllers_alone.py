@@ -51,13 +51,6 @@ def _block(kind: str) -> Block:
     return NmpcSettings(horizon=8, moves=3).design(model).block()
 
 
-@pytest.fixture(autouse=True)
-def numba_for_nmpc(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A sample of nonlinear predictive control takes plain Python 0.1 s."""
-    if "kind" in request.fixturenames and request.getfixturevalue("kind") == "nmpc":
-        monkeypatch.setenv("SOFTNECK_FMU_NUMBA", "1")
-
-
 @pytest.fixture(scope="module")
 def neck(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("neck") / "Neck.fmu"
