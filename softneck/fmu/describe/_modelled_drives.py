@@ -31,6 +31,8 @@ def with_modelled_drives(block: Block) -> Block:
     inputs = [port.name for port in block.inputs]
     if block.role != "controller" or inputs[5:8] != _POSITIONS or len(block.outputs) != len(_POSITIONS):
         return block
+    if _PARAMETER.name in {port.name for port in block.parameters}:  # out of an FMU, which has them
+        return block
     neck, Ts = NeckParameters.paper(), block.sample_time
     # A set-point that is `drive_latency` late acts from the first sample on that is no earlier, and shows one later.
     delay = 1 + math.ceil(neck.drive_latency / Ts - 1e-9)
