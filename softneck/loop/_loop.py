@@ -13,6 +13,8 @@ from ._references import Reference
 
 ORDERS = ("sequential", "jacobi")
 _NAMES = ("plant", "observer", "controller", "reference")
+# Parameter of a controller's FMU: take motor positions as they come, instead of a model of the drives inside it.
+USE_MOTOR_POSITIONS = "use_motor_positions"
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -68,13 +70,18 @@ class Loop:
 
     @property
     def parameters(self) -> dict[str, Mapping[str, float]]:
-        """Return part -> its parameters."""
+        """Return part -> its parameters; an FMU's `use_motor_positions` is true where nobody says otherwise."""
         named = {
             "plant": self.plant_parameters,
             "observer": self.observer_parameters,
             "controller": self.controller_parameters,
         }
-        return named | dict(self.other_parameters)
+        named |= dict(self.other_parameters)
+        for name, part in self.parts.items():
+            # A loop connects the positions; blocks take them always, FMUs when told to.
+            if USE_MOTOR_POSITIONS in {port.name for port in getattr(part, "parameters", ())}:
+                named[name] = {USE_MOTOR_POSITIONS: 1.0, **named.get(name, {})}
+        return named
 
     @property
     def constants(self) -> dict[str, Mapping[str, float]]:

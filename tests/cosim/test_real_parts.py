@@ -56,6 +56,19 @@ def test_files_and_fmus_make_the_same_loop(order: str, folder: Path) -> None:
         np.testing.assert_allclose(results[0][name], results[1][name], rtol=0, atol=1e-12, err_msg=name)
 
 
+@pytest.mark.parametrize(("said", "differs"), [("", False), (", use_motor_positions = false", True)])
+def test_a_loop_gives_a_controller_s_fmu_its_motors_unless_told_not_to(said: str, differs: bool, folder: Path) -> None:
+    results = []
+    for ending, more in (("npz", ""), ("fmu", said)):
+        path = _loop(folder, f"rls.{ending}", ending)
+        path.write_text(
+            path.read_text().replace(f'pi.{ending}"', f'pi.{ending}"\nparameters = {{ lead_limit = 0.05{more} }}')
+        )
+        results.append(simulate(load_loop(path))["motor_setpoint_1"])
+    # This model's motors are where they are sent at once; the drives inside are behind, and lead less.
+    assert (np.abs(results[1] - results[0]).max() > 0.01) == differs
+
+
 def test_the_loop_closes_over_the_virtual_neck_s_fmu(folder: Path) -> None:
     result = simulate(load_loop(_loop(folder, "VirtualNeck.fmu", "fmu")))
     assert np.isfinite(result.frame.to_numpy()).all()
@@ -78,6 +91,9 @@ for folder in sys.argv[1:]:
     fmu = FMU2Slave(guid=model.guid, unzipDirectory=folder, modelIdentifier=name, instanceName=name)
     fmu.instantiate(loggingOn=True)
     fmu.setupExperiment(startTime=0.0)
+    for v in model.modelVariables:
+        if v.name == "use_motor_positions":
+            fmu.setBoolean([v.valueReference], [1])
     fmu.enterInitializationMode()
     fmu.exitInitializationMode()
     drives = [v.valueReference for v in model.modelVariables if v.causality == "input" and v.type == "Real"]

@@ -129,6 +129,8 @@ def test_it_names_parts_units_values_experiment_and_places(archive: Path) -> Non
         assert {item.get("source") for item in components.values()} <= set(members.namelist())
     text = etree.tostring(root).decode()
     assert 'name="payload"><ssv:Real value="0.2"/>' in text.replace("\n", "").replace("  ", "").replace("> <", "><")
+    flat = "".join(line.strip() for line in text.splitlines())
+    assert 'name="use_motor_positions"><ssv:Boolean value="true"/>' in flat  # the controller was a file
     assert root.find(f"{_SPACE}DefaultExperiment").attrib == {"startTime": "0", "stopTime": "2.0"}
     assert 'FixedStepMaster description="oms-ma" stepSize="0.02"' in text
     boxes = [item.find(f"{_SPACE}ElementGeometry").attrib for item in components.values()]

@@ -11,7 +11,7 @@ import can
 import numpy as np
 import pytest
 
-from softneck.core import CheckFailedError, SettingsError
+from softneck.core import CheckFailedError, SettingsError, load
 from softneck.cosim import load_loop, simulate
 from softneck.drives import (
     CanInclinometer,
@@ -28,8 +28,11 @@ from softneck.drives.bus._file import DriveEntry
 from softneck.drives.bus._link import VirtualLink
 from softneck.drives.bus._units import DriveScale
 from softneck.drives.master import Tilt
+from softneck.drives.master._measured import Measurement
 from softneck.drives.master._settings import RampSettings
+from softneck.drives.running._pilot import LoopPilot
 from softneck.drives.simulated import SimulatedNeck, SimulatedSettings, serve
+from softneck.fmu import build_fmu
 from softneck.plant import NeckParameters
 
 from .bench import Bench
@@ -62,6 +65,22 @@ def test_a_run_on_simulated_drives_equals_the_co_simulation(
         assert gap.max() < bound_deg
         # The end of the run agrees whatever happened before: drives and neck have come to rest or to their circle.
         assert gap[-50:].max() < 0.1
+
+
+def test_a_controller_s_fmu_answers_drives_as_its_file_does(project: Project, tmp_path: Path) -> None:
+    fmu = build_fmu(load(project.controller, role="controller").block(), tmp_path / "Pi.fmu")
+    pilots = [LoopPilot(prepare(load_loop(project.loop), path).loop) for path in (project.controller, fmu)]
+    for pilot in pilots:
+        pilot.start()
+    answers = [
+        [pilot.step(Measurement(k, Tilt(0.0, 0.0), True, (0.1, 0.0, -0.1))) for k in range(100)] for pilot in pilots
+    ]
+    for pilot in pilots:
+        pilot.close()
+    first, second = (np.array(answer, dtype=float) for answer in answers)
+    # Compiled and plain Python; from 1 s on the step wants more than these motors, which do not move, let it lead.
+    np.testing.assert_allclose(second, first, rtol=0, atol=1e-12)
+    assert first[-1, 0] > 0.2
 
 
 @pytest.mark.slow

@@ -23,6 +23,7 @@ from softneck.design import (
     ScheduledSettings,
 )
 from softneck.estimation import KalmanSettings, LinearNeck
+from softneck.fmu.describe._modelled_drives import with_modelled_drives
 from softneck.identification import (
     GreyBox,
     Network,
@@ -37,7 +38,7 @@ from softneck.identification import (
     combine,
 )
 from softneck.plant import NeckParameters, VirtualNeck
-from softneck.runtime import Block
+from softneck.runtime import Block, load_runtime
 from softneck.signals import Recording, redefine, signal
 
 TS = 0.02
@@ -263,6 +264,22 @@ SHORT = ("rls", "nlsm", "kalman", "pi", "neck")
 @cache
 def block_of(kind: str) -> Block:
     return KINDS[kind][0]()
+
+
+def as_block(block: Block) -> dict[str, float]:
+    """Return the parameters with which the block's FMU does what the block does: positions as they come."""
+    return {"use_motor_positions": 1.0} if block.role == "controller" else {}
+
+
+def plain_run(block: Block, rows: np.ndarray, **parameters: float) -> np.ndarray:
+    """Return the outputs (time, n_out) of the plain text, where compiling would take a minute, as FMUs hold it."""
+    whole = with_modelled_drives(block)
+    runtime = load_runtime(whole.runtime, compiled=False)
+    values = np.array([parameters.get(port.name, port.start) for port in whole.parameters])
+    state, outputs = np.zeros(runtime.state_size(whole.arrays)), np.zeros((len(rows), len(whole.outputs)))
+    runtime.initialise(whole.arrays, values, state, np.zeros(len(whole.outputs)))
+    runtime.run_steps(whole.arrays, values, state, rows, outputs)
+    return outputs
 
 
 def inputs_of(block: Block, rows: int, *, missing: bool = True) -> np.ndarray:

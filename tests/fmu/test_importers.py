@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from softneck.fmu import build_fmu
-from softneck.runtime import load_runtime
 
 from ..data import slow_but
 from ..importers import need
-from .every_kind import KINDS, SHORT, TS, block_of, inputs_of
+from .every_kind import KINDS, SHORT, TS, block_of, inputs_of, plain_run
 
 SCRIPTS = Path(__file__).with_name("importers")
 PACKAGES = {"libcosim": "libcosimpy", "ecos": "ecospy", "pathsim": "pathsim_fmi"}
@@ -49,10 +48,7 @@ def test_an_importer_computes_what_python_does(importer: str, kind: str, path: P
     done = subprocess.run(script, capture_output=True, text=True, timeout=120, check=False)
     assert out.is_file(), done.stderr[-2000:]
     seen = np.load(out)
-    state = block.initial_state()
-    expected = np.zeros((ROWS, len(outputs)))
-    runtime = load_runtime(block.runtime, compiled=False)
-    runtime.run_steps(block.arrays, state.parameters, state.values.copy(), u, expected)
+    expected = plain_run(block, u)
     if importer == "pathsim":
         expected = expected[:, [i for i, port in enumerate(block.outputs) if not port.boolean]]
     # The same text on the same numbers, in another process: only a BLAS that sums in another order may differ.

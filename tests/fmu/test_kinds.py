@@ -15,7 +15,7 @@ from softneck.fmu import build_fmu
 from softneck.runtime import Block, load_runtime
 
 from ..data import slow_but
-from .every_kind import HEAVY, KINDS, MOTORS, TS, block_of, inputs_of, recording
+from .every_kind import HEAVY, KINDS, MOTORS, TS, as_block, block_of, inputs_of, recording
 
 
 @pytest.fixture(scope="module", params=slow_but(KINDS, [kind for kind in KINDS if kind not in HEAVY]))
@@ -57,7 +57,7 @@ def test_the_fmu_equals_theblock_of(kind: str, path: Path, running: Any) -> None
     plain = np.zeros_like(compiled)
     load_runtime(block.runtime, compiled=False).run_steps(block.arrays, state.parameters, state.values.copy(), u, plain)
     with running(path) as fmu:
-        fmu.begin()
+        fmu.begin(**as_block(block))
         np.testing.assert_array_equal(fmu.get(*[p.name for p in block.outputs]), state.outputs)
         seen = _run(fmu, block, u)
     np.testing.assert_array_equal(seen, plain)  # the same text on the same numbers

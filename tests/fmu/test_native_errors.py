@@ -26,6 +26,7 @@ from softneck.fmu import build_compiled_fmu, build_fmu
 from softneck.fmu.compiled import _library
 from softneck.fmu.compiled._model_file import model_bytes
 from softneck.fmu.compiled._sources import Sources, c_sources
+from softneck.fmu.describe._modelled_drives import with_modelled_drives
 
 from .every_kind import NATIVE, block_of
 
@@ -179,7 +180,9 @@ def test_hostile_files_and_states_break_nothing_under_the_sanitizers(tmp_path: P
     files = []
     for kind in NATIVE:
         files.append(tmp_path / f"{kind}.bin")
-        files[-1].write_bytes(model_bytes(block_of(kind), kind, "00000000-0000-0000-0000-000000000000"))
+        files[-1].write_bytes(
+            model_bytes(with_modelled_drives(block_of(kind)), kind, "00000000-0000-0000-0000-000000000000")
+        )
     done = subprocess.run(
         ["./fuzz", str(ROUNDS), "1", *map(str, files)], cwd=tmp_path, capture_output=True, text=True, check=False,
         timeout=3000,

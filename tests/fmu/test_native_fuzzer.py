@@ -11,6 +11,7 @@ import pytest
 
 from softneck.fmu.compiled._model_file import model_bytes
 from softneck.fmu.compiled._sources import c_sources
+from softneck.fmu.describe._modelled_drives import with_modelled_drives
 
 from .every_kind import NATIVE, block_of
 
@@ -22,7 +23,7 @@ pytestmark = pytest.mark.skipif(not SECONDS, reason="takes SOFTNECK_FUZZ_SECONDS
 def _seeds(corpus: Path, models: Path) -> None:
     """One seed of each sort for every kind; found again in a moment, so nothing of it is kept in git."""
     for number, kind in enumerate(NATIVE):
-        data = model_bytes(block_of(kind), kind, "00000000-0000-0000-0000-000000000000")
+        data = model_bytes(with_modelled_drives(block_of(kind)), kind, "00000000-0000-0000-0000-000000000000")
         (models / f"{number}.bin").write_bytes(data)
         (corpus / f"model_{kind}").write_bytes(b"\0" + data)
         (corpus / f"state_{kind}").write_bytes(bytes([1, number]) + bytes(64))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -130,6 +131,18 @@ def test_plant_constants_reach_the_plant_by_name() -> None:
     plant = lag_plant(extra=(Port(name="payload", unit="kg"), Port(name="push_x", unit="N", start=0.25)))
     run_loop(Loop(plant=plant, controller=p_controller(), reference=STEP, duration=0.1, plant_inputs={"payload": 0.5}))
     np.testing.assert_array_equal(plant.calls[0][1][3:], [0.5, 0.25])
+
+
+def test_a_part_with_the_parameter_takes_motor_positions_unless_told_otherwise() -> None:
+    controller = p_controller()
+    loop = Loop(plant=lag_plant(), controller=controller, reference=STEP, duration=1.0)
+    assert not loop.parameters["controller"]
+    controller.parameters = (Port(name="use_motor_positions", boolean=True),)  # type: ignore[attr-defined]
+    assert loop.parameters["controller"] == {"use_motor_positions": 1.0}
+    told = replace(loop, controller_parameters={"use_motor_positions": 0.0, "lead_limit": 1.0})
+    assert told.parameters["controller"] == {"use_motor_positions": 0.0, "lead_limit": 1.0}
+    further = replace(loop, controller=p_controller(), others={"filter": controller})
+    assert further.parameters["filter"] == {"use_motor_positions": 1.0}
 
 
 def test_progress_ends_at_one_and_parts_are_closed() -> None:

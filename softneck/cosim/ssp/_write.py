@@ -10,7 +10,9 @@ from pathlib import Path
 
 from softneck.core import OutputFileError, SettingsError, atomic_write, refuse_existing
 from softneck.fmu import FmuInfo, build_compiled_fmu, build_fmu
+from softneck.fmu.describe._modelled_drives import with_modelled_drives
 from softneck.loop import BlockPart, Loop, Part, ReferenceBlock
+from softneck.loop._loop import USE_MOTOR_POSITIONS
 from softneck.loop._wiring import Wiring, wire
 from softneck.runtime import Port
 
@@ -107,7 +109,9 @@ def _component(name: str, part: Part, source: Path, loop: Loop, wiring: Wiring) 
         if not owner and wiring.start[slot] == wiring.start[slot]
     }
     known = {port.name: port for port in (*part.inputs, *_parameters(part))}
-    values = {**constants, **loop.parameters.get(name, {})}
+    # What is an FMU only here has this parameter only here; see `Loop.parameters`.
+    defaults = {USE_MOTOR_POSITIONS: 1.0} if USE_MOTOR_POSITIONS in known else {}
+    values = {**constants, **defaults, **loop.parameters.get(name, {})}
     for key in values:
         if key not in known:
             raise SettingsError(f"`{key}` is not a parameter of the {name}; it has {', '.join(known) or 'none'}.")
@@ -122,7 +126,7 @@ def _component(name: str, part: Part, source: Path, loop: Loop, wiring: Wiring) 
 
 def _parameters(part: Part) -> tuple[Port, ...]:
     if isinstance(part, BlockPart):  # becomes an FMU of FMI 2.0, where our whole numbers are Real
-        return tuple(replace(port, integer=False) for port in part.block.parameters)
+        return tuple(replace(port, integer=False) for port in with_modelled_drives(part.block).parameters)
     return getattr(part, "parameters", ())
 
 

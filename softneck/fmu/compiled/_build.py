@@ -69,11 +69,12 @@ def build_compiled_fmu(
     check_block(block)
     if fmi not in FMI_VERSIONS:
         raise SettingsError(f"unknown FMI version {fmi}; use 2 or 3.")
+    block = described_block(block)
     modules = node_of(block.runtime, block.arrays).modules
     library = find_library()
     _check_kinds(modules, library.sources)
     folders = _folders(library, platforms, fmi)
-    members = _members(described_block(block), info or FmuInfo(), name, fmi, library.sources)
+    members = _members(block, info or FmuInfo(), name, fmi, library.sources)
     members |= {f"binaries/{folder}/{name}{suffix}": data for folder, suffix, data in folders}
     with atomic_write(target, force=force) as temporary:
         write_zip(temporary, members, library.streams)

@@ -15,6 +15,7 @@ from softneck.core import SettingsError
 from softneck.runtime import Block, Port
 
 from ._info import FmuInfo
+from ._modelled_drives import with_modelled_drives
 
 # Paper, section 3: the neck tilts up to 0.7 rad or so; more in a reference is nearly always degrees.
 REFERENCE_LIMIT = 0.8
@@ -48,8 +49,9 @@ class Identity:
 
 
 def described_block(block: Block) -> Block:
-    """Return `block` with the range of references filled in where it gives none."""
-    return replace(block, inputs=tuple(_with_reference_range(port) for port in block.inputs))
+    """Return `block` as its FMU holds it: a controller with the drives inside, references with a range."""
+    whole = with_modelled_drives(block)
+    return replace(whole, inputs=tuple(_with_reference_range(port) for port in whole.inputs))
 
 
 def generation_tool() -> str:

@@ -28,6 +28,7 @@ RUNTIMES = (
     "softneck.design.varying._scheduled_runtime",
     "softneck.design.varying._adaptive_runtime",
     "softneck.design.predictive._mpc_runtime",
+    "softneck.fmu.describe._modelled_drives_runtime",
     "softneck.loop._reference_runtime",
 )
 
