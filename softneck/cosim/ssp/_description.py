@@ -73,9 +73,14 @@ def system_description(
     for link in links:
         _connection(connections, link)
     # No SystemGeometry: OMSimulator refuses a file that has one, and the boxes of the components say as much.
-    _omsimulator(system, step)
+    master = {"description": "oms-ma", "stepSize": repr(step)}
+    settings = {**master, "absoluteTolerance": "1e-4", "relativeTolerance": "1e-4"}
+    SubElement(SubElement(_omsimulator(system), "oms:SimulationInformation"), "oms:FixedStepMaster", settings)
     _units(root, components)
-    SubElement(root, "ssd:DefaultExperiment", {"startTime": "0", "stopTime": repr(duration)})
+    experiment = SubElement(root, "ssd:DefaultExperiment", {"startTime": "0", "stopTime": repr(duration)})
+    # Where this is missing OMSimulator says that the file is deprecated.
+    results = {"resultFile": f"{name}_res.mat", "bufferSize": "1"}
+    SubElement(_omsimulator(experiment), "oms:SimulationInformation", results)
     indent(root)
     return tostring(root, encoding="utf-8", xml_declaration=True)
 
@@ -132,16 +137,9 @@ def _connection(connections: Element, link: Connection) -> None:
     SubElement(connection, "ssc:LinearTransformation", {"factor": repr(link.factor)})
 
 
-def _omsimulator(system: Element, step: float) -> None:
-    annotation = SubElement(SubElement(system, "ssd:Annotations"), "ssc:Annotation", {"type": "org.openmodelica"})
-    information = SubElement(SubElement(annotation, "oms:Annotations"), "oms:SimulationInformation")
-    settings = {
-        "description": "oms-ma",
-        "stepSize": repr(step),
-        "absoluteTolerance": "1e-4",
-        "relativeTolerance": "1e-4",
-    }
-    SubElement(information, "oms:FixedStepMaster", settings)
+def _omsimulator(parent: Element) -> Element:
+    annotation = SubElement(SubElement(parent, "ssd:Annotations"), "ssc:Annotation", {"type": "org.openmodelica"})
+    return SubElement(annotation, "oms:Annotations")
 
 
 def _units(root: Element, components: Sequence[Component]) -> None:
