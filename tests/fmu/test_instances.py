@@ -139,7 +139,8 @@ int main(int argc, char **argv)
     void (*end)(void *) = dlsym(library, "fmi2FreeInstance");
     atexit(look); /* runs before what the library registered when it was loaded, and after what the FMU does now */
     fmu = make("host", 1, argv[3], argv[2], calls, 0, 0);
-    printf("%d %d\\n", leave(fmu), advance(fmu, 0.0, 0.1, 1));
+    printf("%d", leave(fmu));
+    printf(" %d\\n", advance(fmu, 0.0, 0.1, 1));
     end(fmu);
     return 0;
 }
