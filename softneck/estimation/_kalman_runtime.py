@@ -23,6 +23,7 @@ from softneck.estimation._kalman_parts_runtime import (
 )
 from softneck.runtime._compiled_runtime import COMPILED
 from softneck.runtime._layout import cells
+from softneck.runtime._rest_runtime import REST
 
 
 class KalmanFullState(KalmanState):
@@ -73,7 +74,7 @@ def step(p: KalmanArrays, parameters: np.ndarray, x: KalmanFullState, inputs: np
 def kalman_predict(p: KalmanArrays, parameters: np.ndarray, x: np.ndarray, P: np.ndarray, u: np.ndarray) -> None:
     """Replace `x` by F x + B u and `P` by F P F' + Q."""
     q1, q2 = parameters[1] * parameters[1], parameters[2] * parameters[2]
-    x[:] = kalman_ahead(p.F, x, p.B, u)
+    x[:] = (kalman_ahead(p.F, x, p.B, u) + REST) - REST
     if not COMPILED:
         np.dot(np.dot(p.F, P), p.F.T, P)
         P += q1 * p.first_noise

@@ -74,7 +74,7 @@ def trained_set_points(*sources: Recording | Mapping[str, Any]) -> dict[str, Any
     Args:
         sources: recordings, and findings of models that are part of it.
     """
-    seen = [np.zeros((1, 3))]
+    seen: list[np.ndarray] = [np.zeros((1, 3))]
     for source in sources:
         seen.append(source.set_points if isinstance(source, Recording) else np.array(_range(source)))
     rows = np.vstack(seen)
