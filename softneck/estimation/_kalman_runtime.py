@@ -23,6 +23,7 @@ from softneck.estimation._kalman_parts_runtime import (
 )
 from softneck.runtime._compiled_runtime import COMPILED
 from softneck.runtime._layout import cells
+from softneck.runtime._rest_runtime import REST
 
 
 class KalmanFullState(KalmanState):
@@ -76,7 +77,7 @@ def kalman_predict(p: KalmanArrays, parameters: np.ndarray, x: np.ndarray, P: np
     """Replace `x` by F x + B u and `P` by F P F' + Q."""
     q1, q2 = parameters[1] * parameters[1], parameters[2] * parameters[2]
     QM, QW = p.first_noise, p.second_noise  # numba counts references where a loop takes them from `p`
-    x[:] = kalman_ahead(p.F, x, p.B, u)
+    x[:] = (kalman_ahead(p.F, x, p.B, u) + REST) - REST
     if not COMPILED:
         np.dot(np.dot(p.F, P), p.F.T, P)
         P += q1 * QM

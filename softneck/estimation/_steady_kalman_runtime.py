@@ -16,6 +16,7 @@ from softneck.estimation._kalman_parts_runtime import (
     kalman_usable,
 )
 from softneck.runtime._layout import array
+from softneck.runtime._rest_runtime import REST
 
 
 class SteadyKalmanArrays(KalmanArrays):
@@ -64,7 +65,7 @@ def step(
         accepted = forced or innovation <= c[KALMAN_GATE]
         if accepted:
             estimate += e0 * K[:, 0] + e1 * K[:, 1]  # x = x- + K e
-    x.x[:] = estimate
+    x.x[:] = (estimate + REST) - REST
     kalman_count(c, x, usable, accepted)
     kalman_tell(p, x, parameters[0], outputs)
     outputs[4] = innovation

@@ -115,7 +115,7 @@ static int one(const unsigned char *file, size_t size, int honest)
     s->tell = quiet;
     if (sn_parse_model(&s->model, bytes, length, "fuzz", error) && sn_make_room(s)) {
         sn_restart(s);
-        if (sn_begin(s, 0.0) && sn_run(s)) {
+        if (sn_begin(s, 0.0, SN_NEVER) && sn_run(s)) {
             before = taken;
             works = steps(s, 20, !honest);
             if (honest && taken != before) {

@@ -60,7 +60,7 @@ static void model(const uint8_t *data, size_t size)
     s->tell = quiet;
     if (sn_parse_model(&s->model, bytes, size, "fuzz", error) && sn_make_room(s)) {
         sn_restart(s);
-        if (sn_begin(s, 0.0) && sn_run(s))
+        if (sn_begin(s, 0.0, SN_NEVER) && sn_run(s))
             steps(s, 4, data, data + size);
     }
     sn_free_instance(s);
@@ -161,7 +161,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     sn_restart(s);
     if (data[0] % KINDS == CALLS)
         calls(s, data + 2, size - 2);
-    else if (sn_begin(s, 0.0) && sn_run(s))
+    else if (sn_begin(s, 0.0, SN_NEVER) && sn_run(s))
         state(s, data + 2, size - 2);
     return 0;
 }

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import subprocess
 import sys
+import sysconfig
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import fmpy
 import numpy as np
 import pytest
 
@@ -88,8 +92,6 @@ def test_a_process_of_many_instances_and_errors_ends_cleanly(lag_fmu: Path, cont
 
 @pytest.mark.parametrize("kind", ["lag", "controller"])
 def test_fmpy_s_own_simulation_runs_them(kind: str, toys: Any, tmp_path: Path) -> None:
-    import fmpy
-
     path = build_fmu(getattr(toys, kind)(), tmp_path / "Toy.fmu")
     starts = {"extra": 0.0, "pitch_start": 0.25} if kind == "lag" else {"pitch_reference": 0.1}
     result = fmpy.simulate_fmu(str(path), stop_time=1.0, start_values=starts)
@@ -120,3 +122,45 @@ def test_the_binary_is_let_go_before_python_ends(lag_fmu: Path) -> None:
         command = [sys.executable, "-c", _ENDING, str(folder)]
         child = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     assert (child.returncode, child.stdout.strip()) == (0, "1"), child.stderr
+
+
+_HOST_IN_C = """
+#include <dlfcn.h>
+#include <stdio.h>
+#include <stdlib.h>
+static void look(void) { printf("Python runs: %d\\n", ((int (*)(void))dlsym(RTLD_DEFAULT, "Py_IsInitialized"))()); }
+static void report(void) {}
+int main(int argc, char **argv)
+{
+    void *calls[5] = {(void *)report}, *library = dlopen(argv[1], RTLD_NOW), *fmu;
+    void *(*make)(const char *, int, const char *, const char *, void *, int, int) = dlsym(library, "fmi2Instantiate");
+    int (*leave)(void *) = dlsym(library, "fmi2ExitInitializationMode");
+    int (*advance)(void *, double, double, int) = dlsym(library, "fmi2DoStep");
+    void (*end)(void *) = dlsym(library, "fmi2FreeInstance");
+    atexit(look); /* runs before what the library registered when it was loaded, and after what the FMU does now */
+    fmu = make("host", 1, argv[3], argv[2], calls, 0, 0);
+    printf("%d", leave(fmu));
+    printf(" %d\\n", advance(fmu, 0.0, 0.1, 1));
+    end(fmu);
+    return 0;
+}
+"""
+_LIBPYTHON = Path(sysconfig.get_config_var("LIBDIR") or "", sysconfig.get_config_var("INSTSONAME") or "")
+
+
+@pytest.mark.skipif(
+    sys.platform != "linux" or shutil.which("cc") is None or ".so" not in _LIBPYTHON.name or not _LIBPYTHON.is_file(),
+    reason="a host in C needs a C compiler and a shared libpython, on Linux",
+)
+def test_python_ends_before_the_destructors_of_a_host_in_c(lag_fmu: Path, tmp_path: Path) -> None:
+    """Else they free what pythonfmu's binary shares between instances twice, and most of our FMUs end by SIGABRT."""
+    host = tmp_path / "host"
+    command = ["cc", "-std=gnu99", "-w", "-xc", "-o", str(host), "-", "-ldl"]
+    subprocess.run(command, input=_HOST_IN_C, text=True, check=True)
+    python = {"LD_PRELOAD": _LIBPYTHON, "PYTHONHOME": sys.base_prefix, "PYTHONPATH": os.pathsep.join(sys.path)}
+    with unpacked(lag_fmu) as folder:
+        guid = fmpy.read_model_description(str(folder)).guid
+        command = [str(host), str(folder / "binaries/linux64/Lag.so"), (folder / "resources").as_uri(), guid]
+        environment = os.environ | {name: str(value) for name, value in python.items()}
+        child = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=120)
+    assert (child.returncode, child.stdout) == (0, "0 0\nPython runs: 0\n"), child.stderr

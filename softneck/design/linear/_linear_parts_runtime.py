@@ -13,6 +13,7 @@ import numpy as np
 
 from softneck.design.linear._allocation_runtime import allocate
 from softneck.runtime._layout import Arrays, StateVector, array, cells
+from softneck.runtime._rest_runtime import REST
 
 LINEAR_REFERENCE_LIMIT = 0.8  # [rad], as the ports' min and max
 LINEAR_MOTOR_LIMIT = 6.0  # [rad], the paper's largest rotation (section 3.1)
@@ -90,8 +91,9 @@ def linear_control(p: LinearArrays, parameters: np.ndarray, x: LinearState, inpu
     # What the limits took away: the controller's state moves as if it had never been asked for.
     excess = np.dot(p.T, x.held)[:2] - wanted[:2]
     # Last, as v is of the states of now.
-    x.xf[:] = np.dot(p.Af, x.xf) + np.dot(p.Bf, r)
-    x.x[:] = np.dot(p.A, x.x) + np.dot(p.Br, rf[:2]) + np.dot(p.By, y) + np.dot(p.L, excess)
+    x.xf[:] = (np.dot(p.Af, x.xf) + np.dot(p.Bf, r) + REST) - REST
+    ahead = np.dot(p.A, x.x) + np.dot(p.Br, rf[:2]) + np.dot(p.By, y) + np.dot(p.L, excess)
+    x.x[:] = (ahead + REST) - REST
 
 
 def linear_asked(parameters: np.ndarray, inputs: np.ndarray) -> np.ndarray:

@@ -24,6 +24,7 @@ from ._sources import GENERATED, HERE, Sources, c_sources, sources_key
 
 BINARIES = HERE / "binaries"
 _MANIFEST = "manifest.json"
+_BEGUN = "begun.json"  # of a `make native` that has not ended
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +63,10 @@ def packaged_library(folder: Path = BINARIES) -> Library | None:
     manifest = _manifest(folder)
     if manifest is None or manifest["key"] != sources_key():
         return None
+    return _read(folder, manifest)
+
+
+def _read(folder: Path, manifest: dict) -> Library:
     content: dict[str, bytes] = {}
     for name, digest in manifest["files"].items():
         path = folder / name
@@ -94,23 +99,40 @@ def platforms_built() -> tuple[list[str], str]:
 
 
 def build_all(folder: Path = BINARIES) -> Library:
-    """Cross-compile for all platforms with zig and write them to `folder`: `make native`."""
-    sources = c_sources()
-    binaries = {name: compile_for(sources, platform) for name, platform in PLATFORMS.items()}
-    files = {_file_name(name): _packed(data) for name, data in binaries.items()}
-    files[GENERATED] = sources.files[GENERATED].encode()
+    """Cross-compile for all platforms with zig and write them to `folder`: `make native`.
+
+    Each library is kept as it comes: a call after one that was interrupted or failed takes up what is there.
+    """
+    sources, key = c_sources(), sources_key()
     folder.mkdir(parents=True, exist_ok=True)
-    for name, data in files.items():
-        (folder / name).write_bytes(data)
-    digests = {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}
-    manifest = {
-        "key": sources_key(), "platforms": list(binaries), "files": digests, "refused": sources.refused,
-    }  # fmt: skip
+    digests = _begun(folder, key)
+    for name, platform in PLATFORMS.items():
+        if _file_name(name) not in digests:
+            _keep(folder, _file_name(name), _packed(compile_for(sources, platform)), digests)
+            (folder / _BEGUN).write_text(json.dumps({"key": key, "files": digests}), encoding="utf-8")
+    _keep(folder, GENERATED, sources.files[GENERATED].encode(), digests)
+    manifest = {"key": key, "platforms": list(PLATFORMS), "files": digests, "refused": sources.refused}
     for path in folder.iterdir():  # of another version
-        if path.name not in files:
+        if path.name not in digests:
             path.unlink()
     (folder / _MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
-    return Library(binaries, sources, "built with this softneck")
+    return _read(folder, manifest)
+
+
+def _keep(folder: Path, name: str, data: bytes, digests: dict[str, str]) -> None:
+    with atomic_write(folder / name, force=True) as temporary:
+        temporary.write_bytes(data)
+    digests[name] = hashlib.sha256(data).hexdigest()
+
+
+def _begun(folder: Path, key: str) -> dict[str, str]:
+    """Return the files, with their digests, that an earlier call left behind whole and for the same sources."""
+    try:
+        begun = json.loads((folder / _BEGUN).read_text(encoding="utf-8"))
+        files = begun["files"] if begun["key"] == key else {}
+        return {n: d for n, d in files.items() if hashlib.sha256((folder / n).read_bytes()).hexdigest() == d}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return {}
 
 
 def _packed(data: bytes) -> bytes:

@@ -29,6 +29,7 @@ from ._slave_exit import _fmu_release_at_exit
 
 # Share of a sample time: hosts add up their time, and 1e6 steps of 2 ms are off by 1e-7 s at most.
 _FMU_SAME_TIME = 1e-4
+_FMU_MOST_SAMPLES = 1e9
 _FMU_WARNING = 1
 _FMU_ERROR = 3
 _FMU_CATEGORY = {_FMU_WARNING: "logStatusWarning", _FMU_ERROR: "logStatusError"}
@@ -110,6 +111,7 @@ class SoftneckSlave(Fmi2Slave):
         self.plant = self.facts["role"] in ("plant", "reference")
         self.sample_time = self.facts["sample_time"]
         self.start, self.count, self.running, self.stale = 0.0, 0, False, True
+        self.stop = math.inf
         self.variables = np.array([port["start"] for port in self.ports], dtype=np.float64)
         # What nobody connects or sets was not measured.
         self.variables[:n_in][[port["missing"] for port in self.facts["inputs"]]] = np.nan
@@ -142,9 +144,12 @@ class SoftneckSlave(Fmi2Slave):
     # Life cycle
 
     @_fmu_guarded
-    def setup_experiment(self, start_time: float, *_: Any) -> None:
-        """Take the start time."""
+    def setup_experiment(self, start_time: float, stop_time: float | None = None, *_: Any) -> None:
+        """Take the start time, and the stop time where the host defines one."""
+        if not math.isfinite(start_time):
+            raise ValueError(f"the start time is {start_time}; it must be finite.")
         self.start, self.count = float(start_time), 0
+        self.stop = math.inf if stop_time is None else float(stop_time)
         if self.folder in sys.path:  # the binary put it there to find this module, once for each instance
             sys.path.remove(self.folder)
 
@@ -175,11 +180,15 @@ class SoftneckSlave(Fmi2Slave):
             found(self.arrays, self.parameters, self.memory.copy(), np.zeros(self.n_in), self.pending.copy())
 
     def do_step(self, current_time: float, step_size: float) -> bool:
-        """Take all samples in [current_time, current_time + step_size)."""
+        """Take all samples in [current_time, current_time + step_size); False refuses the step and changes nothing."""
         try:
+            end = current_time + step_size
+            refusal = self._refusal(current_time, step_size, end)
+            if refusal:
+                self.tell(_FMU_ERROR, f"{self.facts['name']}: {refusal}")
+                return False
             if self.stale:
                 self._initialise()
-            end = current_time + step_size
             slack = _FMU_SAME_TIME * self.sample_time
             while self.start + self.count * self.sample_time < end - slack:
                 self._take_sample()
@@ -187,9 +196,22 @@ class SoftneckSlave(Fmi2Slave):
             if self.plant and self.start + self.count * self.sample_time <= end + slack:
                 self.outputs[:] = self.pending
         except BaseException as error:
+            # Not False: that is "discard", the only status of pythonfmu's binary besides "fatal", and hosts cut the
+            # result off there without a word. What was half done must not pass for a step refused.
             self._fail(error)
             raise
-        return True  # False would be "discard", on which hosts cut the result off without a word
+        return True
+
+    def _refusal(self, time: float, size: float, end: float) -> str:
+        """Return why a step to `end` cannot be taken, "" for one that can."""
+        if not self.running:
+            return "a step before the initialisation has ended."
+        samples = (end - self.start) / self.sample_time - self.count
+        if not (size >= 0.0 and samples <= _FMU_MOST_SAMPLES):
+            return f"a step from {time:g} s over {size:g} s cannot be taken."
+        if end - self.stop > _FMU_SAME_TIME * self.sample_time + 1e-9 * abs(self.stop):  # hosts round their times
+            return f"a step from {time:g} s over {size:g} s goes past the stop time of {self.stop:g} s."
+        return ""
 
     def _take_sample(self) -> None:
         if self.plant:

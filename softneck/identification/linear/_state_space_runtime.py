@@ -10,6 +10,7 @@ import numpy as np
 from softneck.identification.models._histories_runtime import NarxArrays, NarxState, narx_advance, narx_known, narx_push
 from softneck.identification.models._narx_runtime import initialise as initialise
 from softneck.runtime._layout import array
+from softneck.runtime._rest_runtime import REST
 
 
 class StateSpaceArrays(NarxArrays):
@@ -46,6 +47,6 @@ def step(p: StateSpaceArrays, parameters: np.ndarray, x: NarxState, inputs: np.n
             value += p.A[i, j] * states[j]
         for j in range(3):
             value += p.B[i, j] * x.u[back, j]
-        ahead[i] = value
+        ahead[i] = (value + REST) - REST
     states[: p.n] = ahead
     narx_advance(p, parameters, x, ahead[0], ahead[1], outputs)

@@ -13,6 +13,8 @@ least and the largest input ever given.
 
 import numpy as np
 
+from softneck.runtime._rest_runtime import REST
+
 
 def drive_limit(load: np.ndarray, q: np.ndarray, j: int) -> float:
     """Return how far motor j gets under the load of now."""
@@ -29,7 +31,7 @@ def drive_advance(pole: float, target: float, m: float, limit: float) -> float:
 def load_advance(load: np.ndarray, m: np.ndarray, q: np.ndarray) -> None:
     """Let q follow m (3,)."""
     for j in range(3):
-        q[j] = load[0] * q[j] + (1.0 - load[0]) * m[j]
+        q[j] = (load[0] * q[j] + (1.0 - load[0]) * m[j] + REST) - REST
 
 
 def bank_advance(
@@ -53,8 +55,9 @@ def bank_advance(
             first = (c * (count + 1) + i) * n
             # Last filter first: each takes what the one before it held a sample ago.
             for o in range(n - 1, 0, -1):
-                bank[first + o] = chain[0] * bank[first + o] + (1.0 - chain[0]) * bank[first + o - 1]
-            bank[first] = chain[0] * bank[first] + (1.0 - chain[0]) * x
+                before = bank[first + o - 1]
+                bank[first + o] = (chain[0] * bank[first + o] + (1.0 - chain[0]) * before + REST) - REST
+            bank[first] = (chain[0] * bank[first] + (1.0 - chain[0]) * x + REST) - REST
 
 
 def monomial(table: np.ndarray, row: int, bank: np.ndarray) -> float:

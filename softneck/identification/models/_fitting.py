@@ -11,6 +11,7 @@ from softneck.signals import Recording, concatenate
 
 from ._checks import check_training
 from ._model import Model
+from ._ports import trained_set_points
 from ._rows import row_hashes
 
 if TYPE_CHECKING:
@@ -49,6 +50,6 @@ def fitted_model(
         sample_time=recording.sample_time,
         arrays=arrays,
         settings=asdict(settings),
-        findings=findings,
+        findings={**findings, **trained_set_points(recording)},
         training_rows=row_hashes(recording),
     )

@@ -4,6 +4,7 @@ import numpy as np
 
 from softneck.runtime._layout import Arrays, StateVector, array, cells, value
 from softneck.runtime._random_runtime import random_normal, random_seed
+from softneck.runtime._rest_runtime import REST
 
 # Parameters, in this order.
 NARX_START = 0  # pitch_start, roll_start
@@ -90,12 +91,12 @@ def narx_advance(
         if d > 0:
             a = p.drive[j, 0]
             # Row 0 of the history is u(k), so that u(k+1-d) is row d - 1; m is measured where it is.
-            x.motors[j] = a * x.motors[j] + (1.0 - a) * x.u[d - 1, j]
+            x.motors[j] = (a * x.motors[j] + (1.0 - a) * x.u[d - 1, j] + REST) - REST
         outputs[2 + j] = x.motors[j]
-    x.angles[0] = pitch
-    x.angles[1] = roll
-    outputs[0] = pitch
-    outputs[1] = roll
+    x.angles[0] = (pitch + REST) - REST
+    x.angles[1] = (roll + REST) - REST
+    outputs[0] = x.angles[0]
+    outputs[1] = x.angles[1]
     # What a sensor would add is seen outside and never fed back.
     if parameters[NARX_NOISE_STD] > 0.0:
         outputs[0] += parameters[NARX_NOISE_STD] * random_normal(x.random)

@@ -70,7 +70,7 @@ class Model:
             runtime=runtime_of(self.kind, self.arrays),
             sample_time=self.sample_time,
             arrays=tuple(self.arrays.values()),
-            inputs=_ports.INPUTS,
+            inputs=_ports.inputs(self.findings),
             outputs=_ports.outputs(self.kind),
             parameters=_ports.PARAMETERS,
         )
@@ -291,6 +291,10 @@ def _check_header(model: Model) -> None:
         raise FileFormatError(f"a sample time of {model.sample_time} s is implausible for a neck.")
     if not isinstance(model.settings, dict) or not isinstance(model.findings, dict):
         raise FileFormatError("its settings and findings must be tables.")
+    try:
+        _ports.inputs(model.findings)
+    except (KeyError, TypeError, ValueError) as error:
+        raise FileFormatError("its range of set-points must be three minima and three maxima.") from error
     if model.training_rows.dtype != np.uint64 or model.training_rows.ndim != 1:
         raise FileFormatError("its training rows are not hashes.")
 

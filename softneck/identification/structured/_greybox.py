@@ -16,6 +16,7 @@ from ..models._error_feedback import fit_echo
 from ..models._fitting import training_recording
 from ..models._loaded_drive import drive_start, fit_loaded_drive
 from ..models._model import Model
+from ..models._ports import trained_set_points
 from ..models._rows import row_hashes
 from ._greybox_numbers import NUMBERS, decode
 
@@ -194,7 +195,11 @@ def _model(settings: GreyBox, problem: _FitProblem, recording: Recording, delay:
         sample_time=problem.sample_time,
         arrays=arrays,
         settings={"evaluations": settings.evaluations, "sensor_delay": settings.sensor_delay},
-        findings={"sensor_delay": delay, "numbers": _table(problem, x, delay, errors)},
+        findings={
+            "sensor_delay": delay,
+            "numbers": _table(problem, x, delay, errors),
+            **trained_set_points(recording),
+        },
         training_rows=row_hashes(recording),
     )
 

@@ -13,6 +13,7 @@ from softneck.signals import Recording
 from ..models._composed import COMPOSED, memory_of, prefixed_arrays
 from ..models._fitting import one_recording
 from ..models._model import Model
+from ..models._ports import trained_set_points
 from ..models._rows import row_hashes
 
 
@@ -75,7 +76,10 @@ def combine(models: Sequence[Model]) -> Model:
         sample_time=models[0].sample_time,
         arrays=arrays,
         settings={"members": [model.kind for model in models]},
-        findings={"members": ", ".join(model.kind for model in models)},
+        findings={
+            "members": ", ".join(model.kind for model in models),
+            **trained_set_points(*(model.findings for model in models)),
+        },
         training_rows=np.unique(np.concatenate([model.training_rows for model in models])),
     )
 

@@ -22,6 +22,7 @@ from softneck.signals import Recording
 from ..models._composed import COMPOSED, memory_of, prefixed_arrays
 from ..models._fitting import training_recording
 from ..models._model import WARM_UP, Model
+from ..models._ports import trained_set_points
 from ..models._regressors import lag_table
 from ..models._rows import row_hashes
 from ..models._scores import nrmse_fit
@@ -91,6 +92,7 @@ class Residual:
             "gamma": gamma.tolist(),
             "points": int(arrays["values"].shape[1]),
             **{key: value for key, value in base.findings.items() if key in ("remark", "interrupted")},
+            **trained_set_points(recording, base.findings),
         }
         return Model(
             kind="residual",

@@ -95,8 +95,8 @@ SN_EXPORT fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean with_toler
                                          fmi2Boolean with_stop, fmi2Real stop)
 {
     sn_instance *s = (sn_instance *)c;
-    (void)with_tolerance, (void)tolerance, (void)with_stop, (void)stop;
-    if (s == NULL || !sn_begin(s, start))
+    (void)with_tolerance, (void)tolerance;
+    if (s == NULL || !sn_begin(s, start, with_stop ? stop : SN_NEVER))
         return fmi2Error;
     return fmi2OK;
 }

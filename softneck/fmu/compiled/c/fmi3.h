@@ -104,8 +104,8 @@ SN_EXPORT void fmi3FreeInstance(fmi3Instance c) { sn_free_instance((sn_instance 
 SN_EXPORT fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean with_tolerance, fmi3Float64 tolerance,
                                                  fmi3Float64 start, fmi3Boolean with_stop, fmi3Float64 stop)
 {
-    (void)with_tolerance, (void)tolerance, (void)with_stop, (void)stop;
-    return c != NULL && sn_begin((sn_instance *)c, start) ? fmi3OK : fmi3Error;
+    (void)with_tolerance, (void)tolerance;
+    return c != NULL && sn_begin((sn_instance *)c, start, with_stop ? stop : SN_NEVER) ? fmi3OK : fmi3Error;
 }
 
 SN_EXPORT fmi3Status fmi3ExitInitializationMode(fmi3Instance c)

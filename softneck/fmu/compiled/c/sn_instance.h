@@ -11,13 +11,14 @@ enum { SN_WARN = 1, SN_FAIL = 3 };
 /* Share of a sample time: hosts add up their time, and 1e6 steps of 2 ms are off by 1e-7 s at most. */
 #define SN_SAME_TIME 1e-4
 #define SN_MOST_SAMPLES 1e9
+#define SN_NEVER DBL_MAX /* the stop time of a host that defines none */
 
 typedef struct {
     sn_model model;
     sn_work work;
     sn_v1 values, inputs, outputs, parameters, pending, state;
     unsigned char *warned;
-    double start, time;
+    double start, time, stop;
     int64_t count, states;
     int running, stale, stepping;
     char *instance_name;
@@ -139,6 +140,7 @@ static void sn_restart(sn_instance *s)
     memset(s->pending.p, 0, (size_t)(s->pending.n + s->state.n) * sizeof(double));
     memset(s->warned, 0, m->n_in);
     s->start = s->time = 0.0;
+    s->stop = SN_NEVER;
     s->count = 0;
     s->running = 0;
     s->stale = 1;
@@ -183,13 +185,14 @@ static int sn_initialise(sn_instance *s)
     return 1;
 }
 
-static int sn_begin(sn_instance *s, double start)
+static int sn_begin(sn_instance *s, double start, double stop)
 {
     if (!sn_finite(start)) {
         sn_say(s, SN_FAIL, "the start time is %f; it must be finite.", start);
         return 0;
     }
     s->start = s->time = start;
+    s->stop = stop;
     s->count = 0;
     return 1;
 }
@@ -225,6 +228,10 @@ static int sn_do_step(sn_instance *s, double time, double size)
     }
     if (!sn_finite(end) || size < 0.0 || (end - s->start) / period - (double)s->count > SN_MOST_SAMPLES) {
         sn_say(s, SN_FAIL, "a step from %g s over %g s cannot be taken.", time, size);
+        return 0;
+    }
+    if (end > s->stop && end - s->stop > slack + 1e-9 * fabs(s->stop)) { /* hosts round their times */
+        sn_say(s, SN_FAIL, "a step from %g s over %g s goes past the stop time of %g s.", time, size, s->stop);
         return 0;
     }
     if (!sn_initialise(s))

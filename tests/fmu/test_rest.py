@@ -1,0 +1,34 @@
+"""What decays to rest does not linger among the subnormal numbers, with which processors are slow."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from softneck.runtime._rest_runtime import REST
+
+from .every_kind import block_of
+
+_LEAST_NORMAL = np.finfo(float).tiny
+
+
+@pytest.mark.parametrize("kind", ["rls", "srivc", "play", "pi", "ncf", "kalman_steady"])
+def test_a_state_at_rest_holds_no_subnormal_number(kind: str) -> None:
+    block = block_of(kind)
+    rng = np.random.default_rng(0)
+    at_rest = [port.start for port in block.inputs]
+    moved = np.tile(at_rest, (50, 1))
+    moved[:, [i for i, port in enumerate(block.inputs) if not port.boolean]] += 0.1 * rng.standard_normal(
+        (50, sum(not port.boolean for port in block.inputs))
+    )
+    state, _ = block.run(block.initial_state(), moved)
+    # The slowest pole here, 0.98, needs 35,000 samples from 0.1 to the subnormal numbers.
+    state, outputs = block.run(state, np.tile(at_rest, (40_000, 1)))
+    for values in (state.values, outputs[-1]):
+        size = np.abs(values)
+        assert not ((size > 0.0) & (size < _LEAST_NORMAL)).any()
+
+
+def test_numbers_of_normal_size_are_left_alone_to_the_bit() -> None:
+    x = np.random.default_rng(0).standard_normal(10_000) * 10.0 ** np.linspace(-63.0, 300.0, 10_000)
+    assert ((x + REST) - REST == x).all()
