@@ -14,8 +14,8 @@ from ._response import response_figure
 MINIMUM_PYTHON = (3, 11)
 HOST_NEEDS = (
     f"The host needs Python {'.'.join(map(str, MINIMUM_PYTHON))} or newer with numpy (nothing of softneck); "
-    "a host that is not a Python program finds it through LD_PRELOAD=libpython3.x.so and PYTHONPATH, and is better served "
-    "by an FMU of `softneck fmu --backend compiled`, which needs no Python."
+    "a host that is not a Python program finds it through LD_PRELOAD=libpython3.x.so and PYTHONPATH, and is better "
+    "served by an FMU of `softneck fmu --backend compiled`, which needs no Python."
 )
 _NUMBA = (
     "Where the host has numba too, a runtime that is slow in plain Python is compiled or taken from softneck's cache; "
