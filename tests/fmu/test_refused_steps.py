@@ -97,7 +97,9 @@ def test_a_set_point_that_the_model_never_saw_is_said_once(
 ) -> None:
     build(block_of("rls"), tmp_path / "Neck.fmu")
     description = fmpy.read_model_description(str(tmp_path / "Neck.fmu"))
-    stated = {v.name: (float(v.min), float(v.max)) for v in description.modelVariables if v.name in MOTORS}
+    stated = {
+        v.name: (float(v.min or "nan"), float(v.max or "nan")) for v in description.modelVariables if v.name in MOTORS
+    }
     seen = recording().set_points
     assert stated == dict(zip(MOTORS, zip(seen.min(axis=0), seen.max(axis=0), strict=True), strict=True))
     low, high = stated["motor_setpoint_1"]

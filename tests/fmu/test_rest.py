@@ -12,7 +12,10 @@ from .every_kind import block_of
 _LEAST_NORMAL = np.finfo(float).tiny
 
 
-@pytest.mark.parametrize("kind", ["rls", "srivc", "play", "pi", "ncf", "kalman_steady"])
+_LONG = [pytest.param(kind, marks=pytest.mark.slow) for kind in ("srivc", "subspace", "kalman_steady", "adaptive")]
+
+
+@pytest.mark.parametrize("kind", ["rls", "play", "pi", "ncf", *_LONG])
 def test_a_state_at_rest_holds_no_subnormal_number(kind: str) -> None:
     block = block_of(kind)
     rng = np.random.default_rng(0)

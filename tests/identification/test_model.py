@@ -182,3 +182,13 @@ def test_noise_has_its_size_and_leaves_the_state_alone(models: dict[str, Model])
     # Standard error of a standard deviation of 8,000 numbers: 0.8 %; five of those.
     assert error.std() == pytest.approx(0.01, rel=0.04)
     assert abs(np.corrcoef(error[1:, 0], error[:-1, 0])[0, 1]) < 5 / np.sqrt(4000)
+
+
+@pytest.mark.parametrize(
+    "seen", [{"min": [0.0] * 3}, {"min": [0.0] * 2, "max": [1.0] * 2}, [0.0], {"min": 0, "max": 1}]
+)
+def test_a_file_with_half_a_range_of_set_points_is_refused(seen: object) -> None:
+    from softneck.identification.models._model import _check_header
+
+    with pytest.raises(FileFormatError, match="three minima and three maxima"):
+        _check_header(Model(kind="rls", sample_time=0.02, arrays={}, findings={"set_points_rad": seen}))

@@ -30,6 +30,7 @@ from softneck.design.linear._linear_parts_runtime import (
 )
 from softneck.identification.linear._ud_runtime import ud_guarded
 from softneck.runtime._layout import array, cells, value
+from softneck.runtime._rest_runtime import REST
 
 # Places in `guards`.
 ADAPTIVE_FORGETTING = 0
@@ -224,8 +225,8 @@ def adaptive_see(p: AdaptiveArrays, x: AdaptiveState, axis: int, y: float, going
     """Advance the band-pass of the angle; after a stop it begins at rest where the neck is."""
     f = p.guards[ADAPTIVE_FILTER]
     if going:
-        x.angle[axis, 1] = f * x.angle[axis, 1] + (y - x.angle[axis, 0])
-        x.angle[axis, 2] = f * x.angle[axis, 2] + x.angle[axis, 1]
+        x.angle[axis, 1] = (f * x.angle[axis, 1] + (y - x.angle[axis, 0]) + REST) - REST
+        x.angle[axis, 2] = (f * x.angle[axis, 2] + x.angle[axis, 1] + REST) - REST
     else:  # behind a zero at z = 1 what rests is zero
         x.angle[axis, 1] = 0.0
         x.angle[axis, 2] = 0.0
@@ -242,8 +243,8 @@ def adaptive_push(p: AdaptiveArrays, x: AdaptiveState, axis: int, u: float, goin
         x.line[axis] = 0.0
         x.samples[axis] = 1.0 if going else 0.0
     else:
-        x.input[axis, 1] = f * x.input[axis, 1] + (u - x.input[axis, 0])
-        x.input[axis, 2] = f * x.input[axis, 2] + x.input[axis, 1]
+        x.input[axis, 1] = (f * x.input[axis, 1] + (u - x.input[axis, 0]) + REST) - REST
+        x.input[axis, 2] = (f * x.input[axis, 2] + x.input[axis, 1] + REST) - REST
         x.samples[axis] += 1.0
     x.input[axis, 0] = u
     for i in range(p.d, 0, -1):
