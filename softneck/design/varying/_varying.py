@@ -83,7 +83,8 @@ class VaryingController:
             "limits": asdict(self.limits),
             "order": self.order,
             "names": list(self.arrays),
-            "parameters": [asdict(port) for port in self.parameters],
+            # None of them is an integer, and files of format 1 do not say so.
+            "parameters": [{k: v for k, v in asdict(port).items() if k != "integer"} for port in self.parameters],
             "lines": list(self.lines),
             "design": dict(self.design),
             "inputs": [port.name for port in block.inputs],
