@@ -38,6 +38,32 @@ def test_a_second_call_takes_up_what_the_first_left_behind(tmp_path: Path, monke
     assert len(list(tmp_path.iterdir())) == len(names) + 2  # the generated source and the manifest
 
 
+@pytest.mark.parametrize("name", list(PLATFORMS))
+def test_zig_is_asked_for_the_platform_and_named_where_it_is_missing(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    commands: list[list[str]] = []
+
+    def compiled(_sources: Sources, command: list[str], suffix: str) -> bytes:
+        commands.append(command)
+        return suffix.encode()
+
+    monkeypatch.setattr(_compilers, "_compiled", compiled)
+    platform = PLATFORMS[name]
+    monkeypatch.setattr(_compilers, "have_zig", lambda: False)
+    with pytest.raises(SettingsError, match="zig is not installed; install it with `pip install ziglang`"):
+        _compilers.compile_for(SOURCES, platform)
+    assert not commands
+    monkeypatch.setattr(_compilers, "have_zig", lambda: True)
+    assert _compilers.compile_for(SOURCES, platform) == platform.suffix.encode()
+    (command,) = commands
+    assert command[command.index("-target") + 1] == platform.target
+    assert ("-fPIC" in command) == (platform.system != "win32")
+    # Bits must not depend on the processor: no fused multiply-add anywhere.
+    assert "-ffp-contract=off" in command
+    assert ("-DSN_OWN_PROBE" in command) == (platform.system == "win32")
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows knows no limit on processor time")
 @pytest.mark.parametrize(("does", "ends"), [("time.sleep(1.5)", True), ("while True: pass", False)])
 def test_a_compiler_may_wait_but_not_work_for_ever(does: str, ends: bool, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,7 @@ _VERSION, _UNIX, _UTF8, _STORED, _DEFLATED = 20, 3 << 8, 1 << 11, 0, 8
 _TIME, _DATE, _RIGHTS = 0, 33, 0o100644 << 16
 # Measured numbers hardly deflate: a tree of 1,000,000 points loses 11 % in 20 s. Beyond this many bytes they stay as
 # they are; what is beyond the other one needs the 64-bit headers that not every host reads.
-_LARGE, _MOST = 1 << 24, (1 << 32) - 1
+_LARGE, _MOST = 1 << 24, (1 << 32) - 2  # a size of 2^32 - 1 says: see the 64-bit header
 
 
 def deflated(data: bytes) -> bytes:
