@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test slow check docs benchmark mutate native wheel nightly nightly-fmu nightly-can nightly-systemd clean
+.PHONY: demo test slow check docs benchmark mutate native wheel nightly nightly-tests nightly-fmu nightly-can nightly-systemd clean
 
 demo: $(VENV)/.installed
 	$(BIN)/softneck demo --out build/demo
@@ -14,7 +14,7 @@ test: $(VENV)/.tested
 
 # What takes long: CI runs it too.
 slow: $(VENV)/.tested
-	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m slow
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m "slow and not nightly"
 
 check: $(VENV)/.linted
 	$(BIN)/ruff check .
@@ -38,7 +38,11 @@ mutate: $(VENV)/.mutated
 native: $(VENV)/.crossed
 	$(BIN)/python -m softneck.fmu.compiled
 
-nightly: nightly-fmu nightly-can nightly-systemd
+nightly: nightly-tests nightly-fmu nightly-can nightly-systemd
+
+# With `make test` and `make slow` that is all: every kind in every importer, predictive control over every kind.
+nightly-tests: $(VENV)/.tested
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m nightly
 
 # The library on other platforms, bit for bit; wrong bytes under the sanitizers; libFuzzer for two minutes.
 # Debian: wine64 qemu-user libc6-arm64-cross gcc clang.

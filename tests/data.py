@@ -19,11 +19,15 @@ LAYOUTS = ROOT / "examples" / "layouts"
 TS = 0.02
 
 
-def slow_but(values: Iterable[str], short: Iterable[str]) -> list[Any]:
-    """Return `values` as parameters of a test, of which `make test` runs `short` and `make slow` the others."""
-    values, short = list(values), set(short)
-    assert short <= set(values), short - set(values)
-    return [value if value in short else pytest.param(value, marks=pytest.mark.slow) for value in values]
+def slow_but(values: Iterable[str], short: Iterable[str], nightly: Iterable[str] = ()) -> list[Any]:
+    """Return `values` as parameters of a test.
+
+    `make test` runs `short`, `make slow` the others, but for those of `nightly`, for which CI has no time.
+    """
+    values, short, nightly = list(values), set(short), set(nightly)
+    assert short | nightly <= set(values), (short | nightly) - set(values)
+    marks = {value: (pytest.mark.slow, *([pytest.mark.nightly] if value in nightly else [])) for value in values}
+    return [value if value in short else pytest.param(value, marks=marks[value]) for value in values]
 
 
 @dataclass(frozen=True, slots=True)

@@ -119,7 +119,7 @@ def sums_of(starts: tuple[int, ...]) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", slow_but(NONLINEAR_KINDS, ["nn", "play"]))
+@pytest.mark.parametrize("kind", slow_but(NONLINEAR_KINDS, ["nn", "play"], ["nss", "greybox"]))
 @pytest.mark.parametrize("limit", [None, 0.1])
 def test_converged_it_is_what_ipopt_finds(kind: str, limit: float | None, models: dict[str, Model]) -> None:
     settings = NmpcSettings(

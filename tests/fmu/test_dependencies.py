@@ -17,6 +17,7 @@ from softneck.fmu import build_compiled_fmu, build_fmu, unpacked
 from softneck.loop import ReferenceBlock, StepReference
 from softneck.runtime import Block
 
+from ..data import slow_but
 from .conftest import Running
 from .every_kind import KINDS, NATIVE, TS, block_of, inputs_of
 
@@ -26,9 +27,9 @@ needs_cc = pytest.mark.skipif(shutil.which("cc") is None and not os.environ.get(
 QUICK = ("rls", "kalman", "pi", "reference")
 
 
-def _some_slow(kinds: list[str]) -> list[Any]:
-    """One of each sort at once, all others at night: models take their time to be fitted."""
-    return [*QUICK, *(pytest.param(kind, marks=pytest.mark.slow) for kind in kinds if kind not in QUICK)]
+def _others_at_night(kinds: list[str]) -> list[Any]:
+    """One of each sort at once: models take their time to be fitted."""
+    return slow_but([*kinds, "reference"], QUICK, set(kinds) - set(QUICK))
 
 
 class Running3(Running):
@@ -107,7 +108,7 @@ def _assert_starts(fmu: Running, model: ModelDescription, block: Block) -> None:
         fmu.set(**{port.name: port.start})
 
 
-@pytest.mark.parametrize("kind", _some_slow(list(KINDS)))
+@pytest.mark.parametrize("kind", _others_at_night(list(KINDS)))
 def test_dependencies_of_python_fmus(kind: str, tmp_path: Path, running: Any) -> None:
     block = _of(kind)
     path = build_fmu(block, tmp_path / "Model.fmu")
@@ -121,7 +122,7 @@ def test_dependencies_of_python_fmus(kind: str, tmp_path: Path, running: Any) ->
 
 
 @needs_cc
-@pytest.mark.parametrize("kind", _some_slow(NATIVE))
+@pytest.mark.parametrize("kind", _others_at_night(NATIVE))
 def test_dependencies_of_compiled_fmus(kind: str, tmp_path: Path, running: Any) -> None:
     block = _of(kind)
     build_compiled_fmu(block, tmp_path / "Model.fmu")
@@ -135,7 +136,7 @@ def test_dependencies_of_compiled_fmus(kind: str, tmp_path: Path, running: Any) 
 
 
 @needs_cc
-@pytest.mark.parametrize("kind", _some_slow(NATIVE))
+@pytest.mark.parametrize("kind", _others_at_night(NATIVE))
 def test_dependencies_of_fmi3(kind: str, tmp_path: Path) -> None:
     block = _of(kind)
     build_compiled_fmu(block, tmp_path / "Model.fmu", fmi=3)

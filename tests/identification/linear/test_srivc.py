@@ -182,6 +182,7 @@ def test_it_simulates_as_well_as_output_error() -> None:
     assert best[0] == pytest.approx(best[1], abs=0.02)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     held = coverage(range(1000, 1008), 40, rows=1000)

@@ -144,6 +144,7 @@ def test_a_design_reads_it(family: Family) -> None:
     )  # Pade of order 4
 
 
+@pytest.mark.nightly
 def test_windows_and_their_uncertainty_widen_the_plant(recordings: list[Recording], family: Family) -> None:
     wide = FamilySettings(directions=1, include_windows=True, widen=2.0).fit(recordings)
     for name in ("pitch", "roll"):
@@ -152,6 +153,7 @@ def test_windows_and_their_uncertainty_widen_the_plant(recordings: list[Recordin
         assert wide.covered(name) <= 1.0 + 1e-9
 
 
+@pytest.mark.nightly
 def test_gains_across_the_axes_are_told() -> None:
     P = signal("mixed", duration=60.0, seed=3).set_points.copy()
     P[:15] = 0.0
@@ -181,6 +183,7 @@ def _lag(u: np.ndarray, pole: float, delay: int) -> np.ndarray:
     return y
 
 
+@pytest.mark.nightly
 def test_a_gain_that_falls_with_inclination_is_interpolated() -> None:
     P = signal("aprbs", duration=80.0, seed=4).set_points.copy()
     P[:15] = 0.0
@@ -201,6 +204,7 @@ def test_a_gain_that_falls_with_inclination_is_interpolated() -> None:
     assert (np.diff(family.lpv.gains, axis=1) < 0).all()
 
 
+@pytest.mark.nightly
 def test_the_virtual_neck_and_the_real_one(shared_data: Path) -> None:
     from softneck.signals import import_log, read_layout
 
