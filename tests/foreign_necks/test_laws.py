@@ -1,0 +1,195 @@
+"""Every foreign neck obeys mechanics: it rests, energy falls, slack tendons pull nothing, payloads stay finite."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import softneck
+from softneck.plant import NeckParameters, VirtualNeck
+from softneck.runtime import load_functions, load_runtime
+from softneck.signals import SAMPLE_TIME, Excitation, signal
+
+from .necks import NECKS, ForeignNeck, record
+
+PITCH, TENSIONS, COMPRESSION = slice(0, 2), slice(10, 13), 13
+# Wear and running in change a neck by the way its motors go; here they are off.
+UNWORN = {
+    "chain": {"running_in": (0.0, 1.0)}, "beam": {"wear": (0.0, 1.0)}, "twisted": {"running_in": (0.0, 1.0)},
+    "spring": {"dead_zone": (0.03, 0.0, 1.0)}, "foam": {"grease": (0.0, 1.0)},
+}  # fmt: skip
+# Relays and sheaths hold energy that `energy` does not count.
+COUNTED = {"beam": {"preisach": (0.0, 0.4, 0.2)}, "foam": {"sheath": (0.0, 0.001)}}
+
+
+def quiet(name: str, *, seed: int = 0, **changes: tuple[float, ...]) -> ForeignNeck:
+    return ForeignNeck(name=name, seed=seed, noise=False, changes=tuple(changes.items()))
+
+
+def inputs(rows: int, motors: tuple[float, float, float], payload: float = 0.0) -> np.ndarray:
+    U = np.zeros((rows, 8))
+    U[:, :3], U[:, 3] = motors, payload
+    return U
+
+
+@pytest.mark.parametrize("name", NECKS)
+def test_a_neck_that_nobody_moves_rests(name: str) -> None:
+    block = quiet(name).block()
+    state = block.initial_state()
+    _, Y = block.run(state, inputs(250, (0.0, 0.0, 0.0)))
+    # Homing ends where the springs balance; what the relays of `beam` hold there moves it by 0.02 deg.
+    assert np.degrees(np.abs(Y[:, PITCH] - state.outputs[PITCH])).max() < 0.05
+    np.testing.assert_allclose(Y[:, TENSIONS], quiet(name).numbers()["pretension"][0], atol=0.1)
+
+
+@pytest.mark.parametrize("payload", [0.0, 1.0])
+@pytest.mark.parametrize("name", NECKS)
+def test_energy_falls_with_locked_winches(name: str, payload: float) -> None:
+    drive = quiet(name).numbers()["drive"].copy()
+    drive[1] = 0.0  # the speed limit
+    block = quiet(name, drive=tuple(drive), **COUNTED.get(name, {})).block()
+    U = inputs(40, (0.0, 0.0, 0.0), payload)
+    U[:, 4], U[:, 5] = 3.0, -1.0
+    state, Y = block.run(block.initial_state(), U)
+    assert np.ptp(Y[:, 0]) > 0.01
+    measure, let_go = load_functions(quiet(name).runtime, compiled=False).energy, inputs(1, (0.0, 0.0, 0.0), payload)[0]
+    E = [measure(block.arrays, state.values, let_go)]
+    for _ in range(60):
+        state, _ = block.step(state, let_go)
+        E.append(measure(block.arrays, state.values, let_go))
+    # Semi-implicit Euler swings about the true energy by its step times the fastest speed: a thousandth of what is lost.
+    assert np.diff(E).max() < 1e-3 * (E[0] - E[-1])
+    assert E[0] - E[-1] > 1e-4
+
+
+@pytest.mark.parametrize("name", NECKS)
+def test_slack_tendons_pull_nothing(name: str) -> None:
+    block = quiet(name, **UNWORN.get(name, {})).block()
+    slack, Y = block.run(block.initial_state(), inputs(100, (-5.0, -5.0, -5.0)))
+    assert not Y[-1, TENSIONS].any()
+    _, still = block.run(slack, inputs(50, (-5.0, -5.0, -5.0)))
+    _, moved = block.run(slack, inputs(50, (-4.0, -5.5, -5.0)))
+    assert not moved[:, TENSIONS].any()
+    assert (moved[:, 7] != still[:, 7]).any()
+    # To the bit: nothing but tension couples a winch to the body.
+    np.testing.assert_array_equal(moved[:, [0, 1, COMPRESSION]], still[:, [0, 1, COMPRESSION]])
+
+
+@pytest.mark.parametrize("payload", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("name", NECKS)
+def test_payloads_to_1_kg_stay_finite_and_tendons_never_push(name: str, payload: float) -> None:
+    U = np.zeros((250, 8))
+    U[:, :3], U[:, 3] = signal("eq22", duration=5.0).set_points * 1.5, payload
+    for seed in (0, 1):
+        block = quiet(name, seed=seed).block()
+        _, Y = block.run(block.initial_state(), U)
+        assert np.isfinite(Y).all()
+        assert Y[:, TENSIONS].min() >= 0.0
+        assert np.degrees(np.abs(Y[:, PITCH])).max() < 70.0
+        assert Y[:, COMPRESSION].max() < 0.06
+
+
+def moves() -> np.ndarray:
+    t = np.arange(150) * SAMPLE_TIME
+    return np.column_stack([1.5 * np.sin(w * t + f) for w, f in ((1.1, 0.0), (2.3, 1.0), (3.1, 2.0))])
+
+
+@pytest.mark.parametrize("name", ["chain", "foam"])
+def test_a_third_of_a_turn_turns_the_answer(name: str) -> None:
+    block = quiet(name).block()
+    U = np.zeros((150, 8))
+    U[:, :3] = moves()
+    _, here = block.run(block.initial_state(), U)
+    U[:, :3] = np.roll(moves(), 1, axis=1)
+    _, there = block.run(block.initial_state(), U)
+    turn = np.array([[np.cos(a := 2 * np.pi / 3), -np.sin(a)], [np.sin(a), np.cos(a)]])
+    # Tangents are the normal over its third part. Rounding, grown where tendons fall slack.
+    np.testing.assert_allclose(np.tan(here[:, PITCH]) @ turn.T, np.tan(there[:, PITCH]), atol=1e-8)
+    np.testing.assert_allclose(np.roll(here[:, TENSIONS], 1, axis=1), there[:, TENSIONS], atol=1e-6)
+
+
+def test_the_column_in_a_mirror() -> None:
+    block = quiet("column").block()
+    U = np.zeros((150, 8))
+    U[:, :3] = moves()
+    _, here = block.run(block.initial_state(), U)
+    U[:, :3] = moves()[:, [0, 2, 1]]
+    _, there = block.run(block.initial_state(), U)
+    # Rounding, grown where tendons fall slack.
+    np.testing.assert_allclose(here[:, PITCH] * [1, -1], there[:, PITCH], atol=1e-8)
+
+
+@pytest.mark.parametrize("name", sorted({*NECKS} - {"chain", "foam"}))
+def test_the_others_have_no_symmetry_of_a_third_of_a_turn(name: str) -> None:
+    block = quiet(name).block()
+    bends = []
+    for motor in range(3):
+        _, Y = block.run(block.initial_state(), inputs(150, tuple(np.eye(3)[motor] * 3.0)))
+        bends.append(float(np.hypot(*np.degrees(Y[-1, PITCH]))))
+    assert np.ptp(bends) > 0.1
+
+
+@pytest.mark.parametrize("name", NECKS)
+def test_seeds_give_the_same_bits_and_others_do_not(name: str) -> None:
+    U = inputs(80, (1.5, 0.0, -1.0))
+
+    def run(seed: int, noise: int) -> np.ndarray:
+        block = ForeignNeck(name=name, seed=seed).block(noise_seed=noise)
+        return block.run(block.initial_state(), U)[1]
+
+    first, again, specimen, noisy = run(0, 5), run(0, 5), run(1, 5), run(0, 6)
+    np.testing.assert_array_equal(first, again)
+    np.testing.assert_array_equal(first[:, PITCH], noisy[:, PITCH])
+    assert (first[:, 2] != noisy[:, 2]).mean() > 0.5
+    assert np.degrees(np.abs(first[-1, PITCH] - specimen[-1, PITCH])).max() > 0.05
+
+
+@pytest.mark.parametrize("name", NECKS)
+def test_plain_python_steps_as_the_compiled_one(name: str) -> None:
+    block = ForeignNeck(name=name).block()
+    state, _ = block.run(block.initial_state(), inputs(30, (2.0, -1.0, 0.5)))
+    plain, x, y = load_runtime(block.runtime, compiled=False), state.values.copy(), np.zeros(14)
+    u = inputs(1, (-1.0, 2.0, 0.5))[0]
+    for _ in range(3):
+        plain.step(block.arrays, state.parameters, x, u, y)
+        state, compiled = block.step(state, u)
+        # Compilers order sums and contract products as they like.
+        np.testing.assert_allclose(y, compiled, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", NECKS)
+def test_a_held_neck_creeps(name: str) -> None:
+    block = quiet(name).block()
+    _, Y = block.run(block.initial_state(), inputs(1500, (3.0, 0.0, 0.0)))
+    lean = np.degrees(np.hypot(Y[:, 0] - Y[0, 0], Y[:, 1] - Y[0, 1]))
+    # From the third second, when all drives have arrived, to the thirtieth.
+    assert 0.05 < lean[-1] - lean[150] < 3.0
+
+
+@pytest.mark.parametrize("name", NECKS)
+def test_a_warm_neck_is_another(name: str) -> None:
+    t = np.arange(200) * SAMPLE_TIME
+    excitation = Excitation("steps", t, np.where(t < 2.0, 0.3, 1.0)[:, None] * np.array([1.0, -0.5, 0.2]))
+    cold, warm = (record(excitation, quiet(name), warm=seconds) for seconds in (0.0, 60.0))
+    assert np.degrees(np.abs(cold.outputs - warm.outputs)).max() > 0.05
+
+
+@pytest.mark.parametrize("name", NECKS)
+def test_ports_and_recordings_are_those_of_the_virtual_neck(name: str) -> None:
+    ours, excitation = VirtualNeck(NeckParameters.paper()), signal("eq22", duration=1.0)
+    block, like = ForeignNeck(name=name).block(), ours.block()
+    assert [port.name for port in block.inputs] == [port.name for port in like.inputs]
+    assert [port.name for port in block.outputs] == [port.name for port in like.outputs]
+    recording, other = record(excitation, ForeignNeck(name=name), payload=0.5), softneck.record(excitation, ours)
+    assert set(recording.channels) == set(other.channels)
+    assert all(np.isfinite(channel).all() for channel in recording.channels.values())
+
+
+@pytest.mark.parametrize("name", NECKS)
+def test_a_plant_names_its_numbers_in_the_runtimes_order(name: str) -> None:
+    from softneck.runtime._bundle import declared
+    from softneck.runtime._layout import Arrays
+
+    layout = declared(ForeignNeck(name=name).runtime, Arrays)
+    assert layout.names() == ("setup", *quiet(name).numbers())
+    layout.read(dict(zip(layout.names(), quiet(name).block().arrays, strict=True)))
