@@ -1,4 +1,4 @@
-"""`beam`: a finite beam element with displacement and slope of its own, Preisach hysteresis, drives that run out of power.
+"""`beam`: a finite beam element with displacement and slope of its own, Preisach hysteresis, drives short of power.
 
 The tip's displacement d and slope t are independent (Euler-Bernoulli, cubic shape functions), in both planes:
 
@@ -6,12 +6,13 @@ The tip's displacement d and slope t are independent (Euler-Bernoulli, cubic sha
     [M] = -- [-6 L 4 L^2] [t] ,
           L^3
 
-with u how far the bend lowers the tip: weight and tendons act through it (geometric stiffness: Przemieniecki 1968, sec.
-15.2). Tendons run straight from base to platform. The slope carries a torque H m, with m from -1 to 1 the mean of 136
-relays per plane that switch up at alpha and down at beta <= alpha, more of them where alpha - beta is small (Preisach
-1935; Mayergoyz 1991, ch. 1): it remembers every reversal that was not wiped out. Two Maxwell branches creep. The
-dashpot of each plane is in proportion to its stiffness. Motors have a speed loop of second order and less speed the
-more they pull; rubbing falls as the printed layers wear in. The sensor's filter is of second order.
+with u how far the bend lowers the tip: weight and tendons act through it (geometric stiffness: Przemieniecki 1968,
+ch. 15). Tendons run straight from base to platform. The slope meets a torque H (t / t_s - m), with m from -1 to 1 the
+mean of 136 relays per plane that switch up at alpha and down at beta <= alpha, more of them where alpha - beta is
+small (Preisach 1935; Mayergoyz 1991, ch. 1): fibres that follow the bend late. They remember every reversal that was
+not wiped out, and a closed loop of t costs energy, as m lags. Two Maxwell branches creep. The dashpot of each plane
+is in proportion to its stiffness. Motors have a speed loop of second order and less speed the more they pull; rubbing
+falls as the printed layers wear in. The sensor's filter is of second order.
 """
 
 import math
@@ -47,7 +48,7 @@ class BeamArrays(ForeignArrays):
     bending = array("2", "EI of both planes [N m^2]")
     loss = array("1", "dashpots, per stiffness [s]")
     creep = array("4", "Maxwell branches: parts of the stiffness [1], time constants [s]")
-    preisach = array("3", "H [N m], largest threshold [rad], breadth of the density over alpha - beta [rad]")
+    preisach = array("3", "H [N m], largest threshold t_s [rad], breadth of the density over alpha - beta [rad]")
     wear = array("2", "additional part of the hysteresis while new [1], way over which it goes [rad]")
     axial = array("2", "stiffness [N/m] and damping [N s/m] against compression")
     mass = array("3", "platform [kg], its centre above the tip [m], its own inertia [kg m^2]")
@@ -249,7 +250,7 @@ def beam_body(p: BeamArrays, x: BeamState, load: tuple, h: float, homing: bool) 
             x.et[m, j] += part * (x.t[j] - x.et[m, j])
         if not homing:
             beam_switch(p, x, j)
-            x.force[2 + j] -= rubbing * x.m[j]
+            x.force[2 + j] -= rubbing * (x.t[j] / p.preisach[1] - x.m[j])
         c1 = mass * x.dd[j] + h * (x.force[j] - k * (12.0 * d - 6.0 * L * t))
         c2 = inertia * x.dt[j] + h * (x.force[2 + j] - k * (4.0 * L * L * t - 6.0 * L * d))
         # Dashpots implicit: (M + h eta K) v = c, two by two.

@@ -4,12 +4,12 @@ The foam has the elastic energy
 
     U = K b^2/2 + k3 (b_1^3 - 3 b_1 b_2^2)/3 - k4 |b|^4/4 + k6 |b|^6/6 + k_s s^2/2
 
-of the bend b [rad] and compression s [m]: cells that buckle soften it, full ones stiffen it (Gibson and Ashby 1997, ch. 5), and
-the lobes make it stiffer towards a tendon than away from one; it is symmetric under a third of a turn. Its loss is that
-of a fluid which thins under shear, d |b'|^p, p < 1 (Ostwald and de Waele). Tendon i spans (L - s)(1 - |b|^2/6) - a b.e_i,
-a straight line between plates that an arc carries. Motors are far away: each tendon runs in a sheath whose friction F z
-is a part of the tension and builds up over a way before it slides (Dahl 1976, AIAA J. 14:1675; Bowden cables: Agrawal et
-al. 2010, IEEE T-RO 26:1023),
+of the bend b [rad] and compression s [m]: cells that buckle soften it, full ones stiffen it (Gibson and Ashby 1997,
+ch. 5), and the lobes make it stiffer towards a tendon than away from one; it is symmetric under a third of a turn.
+Its loss is that of a fluid which thins under shear, d |b'|^p, p < 1 (Ostwald and de Waele). Tendon i spans (L - s)(1
+- |b|^2/6) - a b.e_i, a straight line between plates that an arc carries. Motors are far away: each tendon runs in a
+sheath whose friction F z is a part of the tension and builds up over a way before it slides (Dahl 1976, AIAA J.
+14:1675; Bowden cables: Agrawal et al. 2010, IEEE T-RO 26:914),
 
     z' = (y' - |y'| z) / x_s,   T_platform = T_winch (1 + F z),
 

@@ -126,7 +126,7 @@ def foreign_sense(p: ForeignArrays, x: ForeignState, pitch: float, roll: float) 
 def foreign_measure(p: ForeignArrays, x: ForeignState) -> None:
     """Delay, spoil and round what the sensor sees."""
     steps = p.sensor_delay[0] / p.setup[0]
-    whole = int(math.floor(steps + 1e-9))
+    whole = math.floor(steps + 1e-9)
     part = max(steps - whole, 0.0)
     for j in range(4):
         late = x.history[whole, j] + part * (x.history[whole + 1, j] - x.history[whole, j])

@@ -1,11 +1,11 @@
-"""`twisted`: a helical print that twists as it is pressed, tendons out of place, an Iwan chain of sliders, a turned sensor.
+"""`twisted`: a helical print that twists as it is pressed, tendons out of place, Iwan's sliders, a turned sensor.
 
-A gimbal at height h_p turns by theta and phi, and above it the platform by the twist psi about its own axis; it sinks by
-s. The elastic energy couples all: K12 theta phi between the axes, K_s s psi between compression and twist (a helix
-unwinds: Love 1927, sec. 271). Tendons, at angles and radii of their own, pull at holes that turn with psi, so that each
-also twists; the centre of mass is beside the axis. Each axis carries four sliders in parallel, springs k_m that slip at
-+-f_m = k_m y_m (Iwan 1966, J. Appl. Mech. 33:893): stiffness falls in steps, and each reversal takes twice as far. Two
-Maxwell branches creep. Worm gears sag under load and stand still in a dead zone; sliders weaken as they run in.
+A gimbal at height h_p turns by theta and phi, and above it the platform by the twist psi about its own axis; it sinks
+by s. The elastic energy couples all: K12 theta phi between the axes, K_s s psi between compression and twist (a helix
+unwinds: Love 1927, ch. 19). Tendons, at angles and radii of their own, pull at holes that turn with psi, so that each
+also twists; the centre of mass is beside the axis. Each axis carries four sliders in parallel, springs k_m that slip
+at +-f_m = k_m y_m (Iwan 1966, J. Appl. Mech. 33:893): stiffness falls in steps, and each reversal takes twice as far.
+Two Maxwell branches creep. Worm gears sag under load and stand still in a dead zone; sliders weaken as they run in.
 The sensor's axes turn with psi and its filter lags 60 ms: it gives Euler angles of a platform that has yawed.
 """
 

@@ -27,9 +27,14 @@ def reaches(text: str) -> list[str]:
     found = [name for name in HELD_OUT if re.search(rf"\b{name}\b", text, re.IGNORECASE)]
     if "foreign_necks" not in text:
         return found
-    names = {node.id for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Name)}
-    names |= {item.name for node in ast.walk(ast.parse(text)) if isinstance(node, ast.ImportFrom) for item in node.names}
-    names |= {node.attr for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Attribute)}
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.ImportFrom):
+            names |= {item.name for item in node.names}
+        elif isinstance(node, ast.Name):
+            names.add(node.id)
+        elif isinstance(node, ast.Attribute):
+            names.add(node.attr)
     return found + sorted(names & {"NECKS", "HELD_OUT", "held_out"})
 
 
