@@ -19,10 +19,11 @@ import math
 
 import numpy as np
 
-from softneck.runtime._layout import array, cells
+from softneck.runtime._layout import cells
 from tests.foreign_necks._shared_runtime import (
     FOREIGN_GRAVITY,
     ForeignArrays,
+    ForeignNumbers,
     ForeignState,
     foreign_age,
     foreign_enqueue,
@@ -39,22 +40,22 @@ from tests.foreign_necks._shared_runtime import (
 BEAM_GRID = 16
 
 
-class BeamArrays(ForeignArrays):
+class BeamNumbers(ForeignNumbers):
     """Numbers of the beam."""
 
-    length = array("1", "of the beam [m]")
-    angle = array("3", "of the tendons [rad]")
-    radius = array("1", "of the tendons' holes [m]")
-    bending = array("2", "EI of both planes [N m^2]")
-    loss = array("1", "dashpots, per stiffness [s]")
-    creep = array("4", "Maxwell branches: parts of the stiffness [1], time constants [s]")
-    preisach = array("3", "H [N m], largest threshold t_s [rad], breadth of the density over alpha - beta [rad]")
-    wear = array("2", "additional part of the hysteresis while new [1], way over which it goes [rad]")
-    axial = array("2", "stiffness [N/m] and damping [N s/m] against compression")
-    mass = array("3", "platform [kg], its centre above the tip [m], its own inertia [kg m^2]")
-    tendon = array("2", "stiffness [N/m] and damping [N s/m]")
-    drive = array("4", "gain [1/s], speed limit [rad/s], bandwidth of the speed loop [1/s], load that stops it [N]")
-    sensor = array("2", "bandwidth [rad/s] and damping [1] of the attitude filter")
+    length = cells("1", "of the beam [m]")
+    angle = cells("3", "of the tendons [rad]")
+    radius = cells("1", "of the tendons' holes [m]")
+    bending = cells("2", "EI of both planes [N m^2]")
+    loss = cells("1", "dashpots, per stiffness [s]")
+    creep = cells("4", "Maxwell branches: parts of the stiffness [1], time constants [s]")
+    preisach = cells("3", "H [N m], largest threshold t_s [rad], breadth of the density over alpha - beta [rad]")
+    wear = cells("2", "additional part of the hysteresis while new [1], way over which it goes [rad]")
+    axial = cells("2", "stiffness [N/m] and damping [N s/m] against compression")
+    mass = cells("3", "platform [kg], its centre above the tip [m], its own inertia [kg m^2]")
+    tendon = cells("2", "stiffness [N/m] and damping [N s/m]")
+    drive = cells("4", "gain [1/s], speed limit [rad/s], bandwidth of the speed loop [1/s], load that stops it [N]")
+    sensor = cells("2", "bandwidth [rad/s] and damping [1] of the attitude filter")
 
 
 BEAM = {
@@ -99,7 +100,12 @@ class BeamState(ForeignState):
     force = cells("5", "on d [N], on t [N m], on s [N]")
 
 
-def initialise(p: BeamArrays, parameters: np.ndarray, x: BeamState, outputs: np.ndarray) -> None:
+def state_size(a: ForeignArrays) -> int:
+    """Return the length of the state: the first vector that `step` names is that of its numbers."""
+    return BeamState.size(a)
+
+
+def initialise(a: ForeignArrays, p: BeamNumbers, x: BeamState, outputs: np.ndarray) -> None:
     """Home the tendons at their pretension and let the beam come to rest."""
     x[:] = 0.0
     beam_relays(p, x)
@@ -109,26 +115,26 @@ def initialise(p: BeamArrays, parameters: np.ndarray, x: BeamState, outputs: np.
     for i in range(3):
         x.free[i] = beam_tendon(p, x, i)[0] - p.pretension[0] / p.tendon[0]
     pitch, roll = beam_lean(x, load)
-    foreign_start(p, x, parameters[0], pitch, roll)
+    foreign_start(a, p, x, pitch, roll)
     foreign_outputs(x, x.s, outputs)
 
 
-def step(p: BeamArrays, parameters: np.ndarray, x: BeamState, inputs: np.ndarray, outputs: np.ndarray) -> None:
+def step(a: ForeignArrays, p: BeamNumbers, x: BeamState, inputs: np.ndarray, outputs: np.ndarray) -> None:
     """Hold `inputs` for one sample time, integrate, measure."""
     foreign_enqueue(p, x, inputs)
     load = foreign_load(inputs)
-    h = p.setup[0] / p.substeps
-    for i in range(p.substeps):
-        beam_drives(p, x, foreign_age(p, i), h)
+    h = a.setup[0] / a.substeps
+    for i in range(a.substeps):
+        beam_drives(p, x, foreign_age(a, p, i), h)
         beam_body(p, x, load, h, False)
         pitch, roll = beam_lean(x, load)
         foreign_resonant(x, pitch, roll, p.sensor[0], p.sensor[1], h)
     pitch, roll = beam_lean(x, load)
-    foreign_sense(p, x, pitch, roll)
+    foreign_sense(a, p, x, pitch, roll)
     foreign_outputs(x, x.s, outputs)
 
 
-def beam_relays(p: BeamArrays, x: BeamState) -> None:
+def beam_relays(p: BeamNumbers, x: BeamState) -> None:
     """Share the torque out and demagnetise: up below the line alpha = -beta, down above it."""
     total = 0.0
     at = 0
@@ -149,7 +155,7 @@ def beam_relays(p: BeamArrays, x: BeamState) -> None:
             x.m[axis] += x.share[k] * x.relay[axis, k]
 
 
-def beam_switch(p: BeamArrays, x: BeamState, axis: int) -> None:
+def beam_switch(p: BeamNumbers, x: BeamState, axis: int) -> None:
     """Switch the relays of one plane."""
     cell = 2.0 * p.preisach[1] / (BEAM_GRID - 1)
     m = 0.0
@@ -167,7 +173,7 @@ def beam_switch(p: BeamArrays, x: BeamState, axis: int) -> None:
     x.m[axis] = m
 
 
-def beam_drives(p: BeamArrays, x: BeamState, age: int, h: float) -> None:
+def beam_drives(p: BeamNumbers, x: BeamState, age: int, h: float) -> None:
     """Move the motors."""
     for i in range(3):
         fast = p.drive[1] * max(0.0, 1.0 - x.tension[i] / p.drive[3])
@@ -177,7 +183,7 @@ def beam_drives(p: BeamArrays, x: BeamState, age: int, h: float) -> None:
         x.travel += h * abs(x.speed[i])
 
 
-def beam_lowered(p: BeamArrays, x: BeamState) -> float:
+def beam_lowered(p: BeamNumbers, x: BeamState) -> float:
     """Return how far bending lowers the tip [m]."""
     L = p.length[0]
     u = 0.0
@@ -186,7 +192,7 @@ def beam_lowered(p: BeamArrays, x: BeamState) -> float:
     return u
 
 
-def beam_tendon(p: BeamArrays, x: BeamState, i: int) -> tuple[float, float, float, float, float, float]:
+def beam_tendon(p: BeamNumbers, x: BeamState, i: int) -> tuple[float, float, float, float, float, float]:
     """Return the length of tendon `i` [m] and its gradient to d1, d2, t1, t2 and s."""
     L = p.length[0]
     a1 = p.radius[0] * math.cos(p.angle[i])
@@ -207,7 +213,7 @@ def beam_tendon(p: BeamArrays, x: BeamState, i: int) -> tuple[float, float, floa
     )
 
 
-def beam_body(p: BeamArrays, x: BeamState, load: tuple, h: float, homing: bool) -> None:
+def beam_body(p: BeamNumbers, x: BeamState, load: tuple, h: float, homing: bool) -> None:
     """Advance the element by one substep."""
     payload, up, push1, push2, _ = load
     L = p.length[0]
@@ -273,7 +279,7 @@ def beam_lean(x: BeamState, load: tuple) -> tuple[float, float]:
     return foreign_tilt(g[0], g[1], g[2], load[4])
 
 
-def energy(p: BeamArrays, x: BeamState, inputs: np.ndarray) -> float:
+def energy(p: BeamNumbers, x: BeamState, inputs: np.ndarray) -> float:
     """Return kinetic and stored energy [J]; what the relays hold is left out."""
     payload, up, _, _, _ = foreign_load(inputs)
     L = p.length[0]

@@ -19,10 +19,11 @@ import math
 import numpy as np
 
 from softneck.plant._geometry_runtime import bend_functions, tilt_rotation
-from softneck.runtime._layout import array, cells
+from softneck.runtime._layout import cells
 from tests.foreign_necks._shared_runtime import (
     FOREIGN_GRAVITY,
     ForeignArrays,
+    ForeignNumbers,
     ForeignState,
     foreign_age,
     foreign_enqueue,
@@ -37,21 +38,21 @@ from tests.foreign_necks._shared_runtime import (
 CHAIN_LINKS = 6
 
 
-class ChainArrays(ForeignArrays):
+class ChainNumbers(ForeignNumbers):
     """Numbers of the chain."""
 
-    length = array("1", "of the chain [m]")
-    radius = array("1", "of the tendons' holes [m]")
-    stiffness = array("1", "of the whole chain against bending [N m/rad]")
-    damping = array("1", "of the whole chain [N m s/rad]")
-    creep = array("2", "Maxwell branch: part of the stiffness [1], time constant [s]")
-    axial = array("2", "stiffness [N/m] and damping [N s/m] against compression")
-    mass = array("3", "platform [kg], its height above the last disc [m], inertia of a link [kg m^2]")
-    tendon = array("2", "stiffness [N/m] and damping [N s/m]")
-    friction = array("3", "mu [1], wrap at the base [rad], speed over which it is smoothed [m/s]")
-    running_in = array("2", "additional part of the friction while new [1], way over which it goes [rad]")
-    drive = array("3", "position gain [1/s], speed limit [rad/s], acceleration limit [rad/s^2]")
-    sensor_lag = array("1", "time constant of the attitude filter [s]")
+    length = cells("1", "of the chain [m]")
+    radius = cells("1", "of the tendons' holes [m]")
+    stiffness = cells("1", "of the whole chain against bending [N m/rad]")
+    damping = cells("1", "of the whole chain [N m s/rad]")
+    creep = cells("2", "Maxwell branch: part of the stiffness [1], time constant [s]")
+    axial = cells("2", "stiffness [N/m] and damping [N s/m] against compression")
+    mass = cells("3", "platform [kg], its height above the last disc [m], inertia of a link [kg m^2]")
+    tendon = cells("2", "stiffness [N/m] and damping [N s/m]")
+    friction = cells("3", "mu [1], wrap at the base [rad], speed over which it is smoothed [m/s]")
+    running_in = cells("2", "additional part of the friction while new [1], way over which it goes [rad]")
+    drive = cells("3", "position gain [1/s], speed limit [rad/s], acceleration limit [rad/s^2]")
+    sensor_lag = cells("1", "time constant of the attitude filter [s]")
 
 
 # Value, and relative spread between necks of different seeds.
@@ -92,7 +93,12 @@ class ChainState(ForeignState):
     tip = cells("7, 12", "of the discs: where, and how turned")
 
 
-def initialise(p: ChainArrays, parameters: np.ndarray, x: ChainState, outputs: np.ndarray) -> None:
+def state_size(a: ForeignArrays) -> int:
+    """Return the length of the state: the first vector that `step` names is that of its numbers."""
+    return ChainState.size(a)
+
+
+def initialise(a: ForeignArrays, p: ChainNumbers, x: ChainState, outputs: np.ndarray) -> None:
     """Home the tendons at their pretension and let the chain come to rest."""
     x[:] = 0.0
     load = foreign_load(np.zeros(8))
@@ -101,26 +107,26 @@ def initialise(p: ChainArrays, parameters: np.ndarray, x: ChainState, outputs: n
     for i in range(3):
         x.free[i] = chain_length(p, x, i) - p.pretension[0] / p.tendon[0]
     pitch, roll = chain_lean(x, load)
-    foreign_start(p, x, parameters[0], pitch, roll)
+    foreign_start(a, p, x, pitch, roll)
     foreign_outputs(x, x.s, outputs)
 
 
-def step(p: ChainArrays, parameters: np.ndarray, x: ChainState, inputs: np.ndarray, outputs: np.ndarray) -> None:
+def step(a: ForeignArrays, p: ChainNumbers, x: ChainState, inputs: np.ndarray, outputs: np.ndarray) -> None:
     """Hold `inputs` for one sample time, integrate, measure."""
     foreign_enqueue(p, x, inputs)
     load = foreign_load(inputs)
-    h = p.setup[0] / p.substeps
-    for i in range(p.substeps):
-        chain_drives(p, x, foreign_age(p, i), h)
+    h = a.setup[0] / a.substeps
+    for i in range(a.substeps):
+        chain_drives(p, x, foreign_age(a, p, i), h)
         chain_body(p, x, load, h, False)
         pitch, roll = chain_lean(x, load)
         foreign_lag(x, pitch, roll, p.sensor_lag[0], h)
     pitch, roll = chain_lean(x, load)
-    foreign_sense(p, x, pitch, roll)
+    foreign_sense(a, p, x, pitch, roll)
     foreign_outputs(x, x.s, outputs)
 
 
-def chain_drives(p: ChainArrays, x: ChainState, age: int, h: float) -> None:
+def chain_drives(p: ChainNumbers, x: ChainState, age: int, h: float) -> None:
     """Move the motors along ramps of limited speed and acceleration."""
     for i in range(3):
         wanted = p.drive[0] * (x.queue[age, i] - x.position[i])
@@ -131,7 +137,7 @@ def chain_drives(p: ChainArrays, x: ChainState, age: int, h: float) -> None:
         x.travel += h * abs(x.speed[i])
 
 
-def chain_spans(p: ChainArrays, x: ChainState) -> None:
+def chain_spans(p: ChainNumbers, x: ChainState) -> None:
     """Find length and gradient of each tendon at each joint."""
     h = (p.length[0] - x.s) / CHAIN_LINKS
     for k in range(CHAIN_LINKS):
@@ -152,7 +158,7 @@ def chain_spans(p: ChainArrays, x: ChainState) -> None:
             x.spans[k, i, 3] = -C / CHAIN_LINKS
 
 
-def chain_length(p: ChainArrays, x: ChainState, i: int) -> float:
+def chain_length(p: ChainNumbers, x: ChainState, i: int) -> float:
     """Return the length of tendon `i` [m]."""
     chain_spans(p, x)
     total = 0.0
@@ -161,7 +167,7 @@ def chain_length(p: ChainArrays, x: ChainState, i: int) -> float:
     return total
 
 
-def chain_kinematics(p: ChainArrays, x: ChainState) -> None:
+def chain_kinematics(p: ChainNumbers, x: ChainState) -> None:
     """Find where the discs are and how they are turned, from the base to the platform."""
     h = (p.length[0] - x.s) / CHAIN_LINKS
     for j in range(12):
@@ -178,7 +184,7 @@ def chain_kinematics(p: ChainArrays, x: ChainState) -> None:
             x.tip[k + 1, row] = x.tip[k, row] + 0.5 * h * (c + x.tip[k + 1, 5 + 3 * row])
 
 
-def chain_weight(p: ChainArrays, x: ChainState, load: tuple) -> float:
+def chain_weight(p: ChainNumbers, x: ChainState, load: tuple) -> float:
     """Add the torques of weight and push to the joints; return their force along the compression."""
     payload, up, push1, push2, _ = load
     weight = FOREIGN_GRAVITY * (p.mass[0] + payload)
@@ -222,7 +228,7 @@ def chain_weight(p: ChainArrays, x: ChainState, load: tuple) -> float:
     return 0.5 * along / CHAIN_LINKS
 
 
-def chain_tendon(p: ChainArrays, x: ChainState, i: int, homing: bool) -> float:
+def chain_tendon(p: ChainNumbers, x: ChainState, i: int, homing: bool) -> float:
     """Add the torques of tendon `i` to the joints; return its force along the compression."""
     length = 0.0
     slide = 0.0
@@ -255,7 +261,7 @@ def chain_tendon(p: ChainArrays, x: ChainState, i: int, homing: bool) -> float:
     return along
 
 
-def chain_body(p: ChainArrays, x: ChainState, load: tuple, h: float, homing: bool) -> None:
+def chain_body(p: ChainNumbers, x: ChainState, load: tuple, h: float, homing: bool) -> None:
     """Advance the joints by one substep."""
     for k in range(CHAIN_LINKS):
         for j in range(2):
@@ -298,7 +304,7 @@ def chain_lean(x: ChainState, load: tuple) -> tuple[float, float]:
     return foreign_tilt(x.tip[last, 5], x.tip[last, 8], x.tip[last, 11], load[4])
 
 
-def energy(p: ChainArrays, x: ChainState, inputs: np.ndarray) -> float:
+def energy(p: ChainNumbers, x: ChainState, inputs: np.ndarray) -> float:
     """Return kinetic and stored energy [J]."""
     payload, up, _, _, _ = foreign_load(inputs)
     chain_kinematics(p, x)

@@ -17,10 +17,11 @@ import math
 
 import numpy as np
 
-from softneck.runtime._layout import array, cells
+from softneck.runtime._layout import cells
 from tests.foreign_necks._shared_runtime import (
     FOREIGN_GRAVITY,
     ForeignArrays,
+    ForeignNumbers,
     ForeignState,
     foreign_age,
     foreign_enqueue,
@@ -34,21 +35,21 @@ from tests.foreign_necks._shared_runtime import (
 )
 
 
-class ColumnArrays(ForeignArrays):
+class ColumnNumbers(ForeignNumbers):
     """Numbers of the column."""
 
-    height = array("2", "of the gimbal above the base, of the platform above the gimbal [m]")
-    radius = array("1", "of the tendons' holes [m]")
-    stiffness = array("1", "of the column against bending [N m/rad]")
-    damping = array("1", "viscous loss [N m s/rad]")
-    branch = array("4", "stiffness of the Maxwell branches, parts of the column's [1]")
-    branch_time = array("4", "their time constants [s]")
-    softening = array("2", "largest softening [1], bend over which it comes [rad]")
-    axial = array("2", "stiffness [N/m] and damping [N s/m] against compression")
-    mass = array("3", "platform [kg], its centre above the gimbal [m], its own inertia [kg m^2]")
-    tendon = array("3", "stiffness [N/m], toe [m], damping [N s/m]")
-    drive = array("4", "gain [1/s], speed limit [rad/s], sag [rad/s/N], load that stops it [N]")
-    sensor_lag = array("1", "time constant of the attitude filter [s]")
+    height = cells("2", "of the gimbal above the base, of the platform above the gimbal [m]")
+    radius = cells("1", "of the tendons' holes [m]")
+    stiffness = cells("1", "of the column against bending [N m/rad]")
+    damping = cells("1", "viscous loss [N m s/rad]")
+    branch = cells("4", "stiffness of the Maxwell branches, parts of the column's [1]")
+    branch_time = cells("4", "their time constants [s]")
+    softening = cells("2", "largest softening [1], bend over which it comes [rad]")
+    axial = cells("2", "stiffness [N/m] and damping [N s/m] against compression")
+    mass = cells("3", "platform [kg], its centre above the gimbal [m], its own inertia [kg m^2]")
+    tendon = cells("3", "stiffness [N/m], toe [m], damping [N s/m]")
+    drive = cells("4", "gain [1/s], speed limit [rad/s], sag [rad/s/N], load that stops it [N]")
+    sensor_lag = cells("1", "time constant of the attitude filter [s]")
 
 
 COLUMN = {
@@ -87,7 +88,12 @@ class ColumnState(ForeignState):
     force = cells("3", "on theta and phi [N m], on s [N]")
 
 
-def initialise(p: ColumnArrays, parameters: np.ndarray, x: ColumnState, outputs: np.ndarray) -> None:
+def state_size(a: ForeignArrays) -> int:
+    """Return the length of the state: the first vector that `step` names is that of its numbers."""
+    return ColumnState.size(a)
+
+
+def initialise(a: ForeignArrays, p: ColumnNumbers, x: ColumnState, outputs: np.ndarray) -> None:
     """Home the tendons at their pretension and let the column come to rest."""
     x[:] = 0.0
     load = foreign_load(np.zeros(8))
@@ -99,26 +105,26 @@ def initialise(p: ColumnArrays, parameters: np.ndarray, x: ColumnState, outputs:
     for i in range(3):
         x.free[i] = column_tendon(p, x, i)[0] - stretch
     pitch, roll = column_lean(x, load)
-    foreign_start(p, x, parameters[0], pitch, roll)
+    foreign_start(a, p, x, pitch, roll)
     foreign_outputs(x, x.s, outputs)
 
 
-def step(p: ColumnArrays, parameters: np.ndarray, x: ColumnState, inputs: np.ndarray, outputs: np.ndarray) -> None:
+def step(a: ForeignArrays, p: ColumnNumbers, x: ColumnState, inputs: np.ndarray, outputs: np.ndarray) -> None:
     """Hold `inputs` for one sample time, integrate, measure."""
     foreign_enqueue(p, x, inputs)
     load = foreign_load(inputs)
-    h = p.setup[0] / p.substeps
-    for i in range(p.substeps):
-        column_drives(p, x, foreign_age(p, i), h)
+    h = a.setup[0] / a.substeps
+    for i in range(a.substeps):
+        column_drives(p, x, foreign_age(a, p, i), h)
         column_body(p, x, load, h, False)
         pitch, roll = column_lean(x, load)
         foreign_lag(x, pitch, roll, p.sensor_lag[0], h)
     pitch, roll = column_lean(x, load)
-    foreign_sense(p, x, pitch, roll)
+    foreign_sense(a, p, x, pitch, roll)
     foreign_outputs(x, x.s, outputs)
 
 
-def column_drives(p: ColumnArrays, x: ColumnState, age: int, h: float) -> None:
+def column_drives(p: ColumnNumbers, x: ColumnState, age: int, h: float) -> None:
     """Move the motors, which sag under the tendons' tension above that of homing."""
     for i in range(3):
         load = x.tension[i] - p.pretension[0]
@@ -130,7 +136,7 @@ def column_drives(p: ColumnArrays, x: ColumnState, age: int, h: float) -> None:
         x.travel += h * abs(x.speed[i])
 
 
-def column_tendon(p: ColumnArrays, x: ColumnState, i: int) -> tuple[float, float, float, float]:
+def column_tendon(p: ColumnNumbers, x: ColumnState, i: int) -> tuple[float, float, float, float]:
     """Return the length of tendon `i` [m] and its gradient to theta, phi and s."""
     c = p.radius[0] * math.cos(2.0 * math.pi / 3.0 * i)
     d = p.radius[0] * math.sin(2.0 * math.pi / 3.0 * i)
@@ -147,12 +153,12 @@ def column_tendon(p: ColumnArrays, x: ColumnState, i: int) -> tuple[float, float
     )
 
 
-def column_soft(p: ColumnArrays, x: ColumnState) -> float:
+def column_soft(p: ColumnNumbers, x: ColumnState) -> float:
     """Return what is left of the stiffness after the largest bend so far."""
     return 1.0 - p.softening[0] * (1.0 - math.exp(-x.worst / p.softening[1]))
 
 
-def column_body(p: ColumnArrays, x: ColumnState, load: tuple, h: float, homing: bool) -> None:
+def column_body(p: ColumnNumbers, x: ColumnState, load: tuple, h: float, homing: bool) -> None:
     """Advance the gimbal by one substep."""
     payload, up, push1, push2, _ = load
     mass = p.mass[0] + payload
@@ -199,7 +205,7 @@ def column_lean(x: ColumnState, load: tuple) -> tuple[float, float]:
     return foreign_tilt(g[0], g[1], g[2], load[4])
 
 
-def energy(p: ColumnArrays, x: ColumnState, inputs: np.ndarray) -> float:
+def energy(p: ColumnNumbers, x: ColumnState, inputs: np.ndarray) -> float:
     """Return kinetic and stored energy [J]."""
     payload, up, _, _, _ = foreign_load(inputs)
     mass = p.mass[0] + payload

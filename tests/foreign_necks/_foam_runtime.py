@@ -21,10 +21,11 @@ import math
 
 import numpy as np
 
-from softneck.runtime._layout import array, cells
+from softneck.runtime._layout import cells
 from tests.foreign_necks._shared_runtime import (
     FOREIGN_GRAVITY,
     ForeignArrays,
+    ForeignNumbers,
     ForeignState,
     foreign_age,
     foreign_enqueue,
@@ -37,23 +38,23 @@ from tests.foreign_necks._shared_runtime import (
 )
 
 
-class FoamArrays(ForeignArrays):
+class FoamNumbers(ForeignNumbers):
     """Numbers of the foam."""
 
-    length = array("1", "of the foam [m]")
-    radius = array("1", "of the tendons' holes [m]")
-    stiffness = array("4", "K [N m/rad], k3 [N m/rad^2], k4 [N m/rad^3], k6 [N m/rad^5]")
-    loss = array("3", "torque at 1 rad/s [N m], p [1], rate below which it is linear [rad/s]")
-    branch = array("3", "stiffness of the Maxwell branches, parts of K [1]")
-    branch_time = array("3", "their time constants [s]")
-    axial = array("2", "stiffness [N/m] and damping [N s/m] against compression")
-    mass = array("3", "platform [kg], its centre above the end [m], its own inertia [kg m^2]")
-    tendon = array("2", "stiffness with its sheath [N/m] and damping [N s/m]")
-    sheath = array("2", "largest part of the tension that friction takes [1], way over which it builds up [m]")
-    grease = array("2", "additional part of the friction while cold [1], way over which it goes [rad]")
-    drum = array("1", "r_1, what a turn by 1 rad adds to the radius [m/rad]")
-    drive = array("3", "gain [1/s], speed limit [rad/s], bandwidth of the speed loop [1/s]")
-    sensor_lag = array("1", "time constant of the attitude filter [s]")
+    length = cells("1", "of the foam [m]")
+    radius = cells("1", "of the tendons' holes [m]")
+    stiffness = cells("4", "K [N m/rad], k3 [N m/rad^2], k4 [N m/rad^3], k6 [N m/rad^5]")
+    loss = cells("3", "torque at 1 rad/s [N m], p [1], rate below which it is linear [rad/s]")
+    branch = cells("3", "stiffness of the Maxwell branches, parts of K [1]")
+    branch_time = cells("3", "their time constants [s]")
+    axial = cells("2", "stiffness [N/m] and damping [N s/m] against compression")
+    mass = cells("3", "platform [kg], its centre above the end [m], its own inertia [kg m^2]")
+    tendon = cells("2", "stiffness with its sheath [N/m] and damping [N s/m]")
+    sheath = cells("2", "largest part of the tension that friction takes [1], way over which it builds up [m]")
+    grease = cells("2", "additional part of the friction while cold [1], way over which it goes [rad]")
+    drum = cells("1", "r_1, what a turn by 1 rad adds to the radius [m/rad]")
+    drive = cells("3", "gain [1/s], speed limit [rad/s], bandwidth of the speed loop [1/s]")
+    sensor_lag = cells("1", "time constant of the attitude filter [s]")
 
 
 FOAM = {
@@ -94,7 +95,12 @@ class FoamState(ForeignState):
     force = cells("3", "on the bend [N m], on s [N]")
 
 
-def initialise(p: FoamArrays, parameters: np.ndarray, x: FoamState, outputs: np.ndarray) -> None:
+def state_size(a: ForeignArrays) -> int:
+    """Return the length of the state: the first vector that `step` names is that of its numbers."""
+    return FoamState.size(a)
+
+
+def initialise(a: ForeignArrays, p: FoamNumbers, x: FoamState, outputs: np.ndarray) -> None:
     """Home the tendons at their pretension and let the foam come to rest."""
     x[:] = 0.0
     load = foreign_load(np.zeros(8))
@@ -103,26 +109,26 @@ def initialise(p: FoamArrays, parameters: np.ndarray, x: FoamState, outputs: np.
     for i in range(3):
         x.free[i] = foam_tendon(p, x, i)[0] - p.pretension[0] / p.tendon[0]
     pitch, roll = foam_lean(x, load)
-    foreign_start(p, x, parameters[0], pitch, roll)
+    foreign_start(a, p, x, pitch, roll)
     foreign_outputs(x, x.s, outputs)
 
 
-def step(p: FoamArrays, parameters: np.ndarray, x: FoamState, inputs: np.ndarray, outputs: np.ndarray) -> None:
+def step(a: ForeignArrays, p: FoamNumbers, x: FoamState, inputs: np.ndarray, outputs: np.ndarray) -> None:
     """Hold `inputs` for one sample time, integrate, measure."""
     foreign_enqueue(p, x, inputs)
     load = foreign_load(inputs)
-    h = p.setup[0] / p.substeps
-    for i in range(p.substeps):
-        foam_drives(p, x, foreign_age(p, i), h)
+    h = a.setup[0] / a.substeps
+    for i in range(a.substeps):
+        foam_drives(p, x, foreign_age(a, p, i), h)
         foam_body(p, x, load, h, False)
         pitch, roll = foam_lean(x, load)
         foreign_lag(x, pitch, roll, p.sensor_lag[0], h)
     pitch, roll = foam_lean(x, load)
-    foreign_sense(p, x, pitch, roll)
+    foreign_sense(a, p, x, pitch, roll)
     foreign_outputs(x, x.s, outputs)
 
 
-def foam_drives(p: FoamArrays, x: FoamState, age: int, h: float) -> None:
+def foam_drives(p: FoamNumbers, x: FoamState, age: int, h: float) -> None:
     """Move the motors."""
     for i in range(3):
         wanted = min(max(p.drive[0] * (x.queue[age, i] - x.position[i]), -p.drive[1]), p.drive[1])
@@ -131,7 +137,7 @@ def foam_drives(p: FoamArrays, x: FoamState, age: int, h: float) -> None:
         x.travel += h * abs(x.speed[i])
 
 
-def foam_tendon(p: FoamArrays, x: FoamState, i: int) -> tuple[float, float, float, float]:
+def foam_tendon(p: FoamNumbers, x: FoamState, i: int) -> tuple[float, float, float, float]:
     """Return the span of tendon `i` [m] and its gradient to b1, b2 and s."""
     e1 = p.radius[0] * math.cos(2.0 * math.pi / 3.0 * i)
     e2 = p.radius[0] * math.sin(2.0 * math.pi / 3.0 * i)
@@ -145,12 +151,12 @@ def foam_tendon(p: FoamArrays, x: FoamState, i: int) -> tuple[float, float, floa
     )
 
 
-def foam_wound(p: FoamArrays, position: float) -> float:
+def foam_wound(p: FoamNumbers, position: float) -> float:
     """Return how much rope a drum has taken in [m]."""
     return position * (p.winch_radius[0] + 0.5 * p.drum[0] * position)
 
 
-def foam_body(p: FoamArrays, x: FoamState, load: tuple, h: float, homing: bool) -> None:
+def foam_body(p: FoamNumbers, x: FoamState, load: tuple, h: float, homing: bool) -> None:
     """Advance the foam by one substep."""
     payload, up, push1, push2, _ = load
     mass = p.mass[0] + payload
@@ -203,7 +209,7 @@ def foam_lean(x: FoamState, load: tuple) -> tuple[float, float]:
     return foreign_tilt(part * x.b[0], part * x.b[1], math.cos(beta), load[4])
 
 
-def energy(p: FoamArrays, x: FoamState, inputs: np.ndarray) -> float:
+def energy(p: FoamNumbers, x: FoamState, inputs: np.ndarray) -> float:
     """Return kinetic and stored energy [J]; what a sheath's friction holds is left out."""
     payload, up, _, _, _ = foreign_load(inputs)
     mass = p.mass[0] + payload

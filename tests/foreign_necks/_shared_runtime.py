@@ -19,18 +19,24 @@ FOREIGN_SEEN = 42
 
 
 class ForeignArrays(Arrays):
-    """How a foreign neck is sampled, and its sensor; its own numbers follow."""
+    """How a foreign neck is sampled."""
 
     setup = array("2", "sample time [s], substeps per sample")
     substeps = value("setup", 1)
-    position_limit = array("1", "set-points are clamped to this [rad]")
-    latency = array("1", "from set-point to drive [s]")
-    sensor_delay = array("1", "transport delay of the sensor [s]")
-    noise_std = array("1", "white noise of the angles [rad]")
-    rate_noise_std = array("1", "white noise of the rates [rad/s]")
-    noise_quantum = array("1", "resolution of the angles, 0: exact [rad]")
-    pretension = array("1", "tension of each tendon after homing [N]")
-    winch_radius = array("1", "radius of the empty winch [m]")
+
+
+class ForeignNumbers(StateVector):
+    """A neck's parameters: those that all have; its own follow."""
+
+    noise_seed = cells("1", "seed of the sensor's noise")
+    position_limit = cells("1", "set-points are clamped to this [rad]")
+    latency = cells("1", "from set-point to drive [s]")
+    sensor_delay = cells("1", "transport delay of the sensor [s]")
+    noise_std = cells("1", "white noise of the angles [rad]")
+    rate_noise_std = cells("1", "white noise of the rates [rad/s]")
+    noise_quantum = cells("1", "resolution of the angles, 0: exact [rad]")
+    pretension = cells("1", "tension of each tendon after homing [N]")
+    winch_radius = cells("1", "radius of the empty winch [m]")
 
 
 class ForeignState(StateVector):
@@ -63,9 +69,9 @@ def foreign_tilt(n1: float, n2: float, n3: float, R: tuple) -> tuple[float, floa
     return math.atan2(u, w), math.atan2(v, w)
 
 
-def foreign_start(p: ForeignArrays, x: ForeignState, seed: float, pitch: float, roll: float) -> None:
+def foreign_start(a: ForeignArrays, p: ForeignNumbers, x: ForeignState, pitch: float, roll: float) -> None:
     """Let the sensor have seen (`pitch`, `roll`) for ever."""
-    random_seed(x.random, seed)
+    random_seed(x.random, p.noise_seed[0])
     x.lean[0] = pitch
     x.lean[1] = roll
     x.filtered[0] = pitch
@@ -73,10 +79,10 @@ def foreign_start(p: ForeignArrays, x: ForeignState, seed: float, pitch: float, 
     for i in range(FOREIGN_SEEN):
         x.history[i, 0] = pitch
         x.history[i, 1] = roll
-    foreign_measure(p, x)
+    foreign_measure(a, p, x)
 
 
-def foreign_enqueue(p: ForeignArrays, x: ForeignState, inputs: np.ndarray) -> None:
+def foreign_enqueue(p: ForeignNumbers, x: ForeignState, inputs: np.ndarray) -> None:
     """Put the newest set-points in front of the queue."""
     for i in range(FOREIGN_SENT - 1, 0, -1):
         for j in range(3):
@@ -85,11 +91,11 @@ def foreign_enqueue(p: ForeignArrays, x: ForeignState, inputs: np.ndarray) -> No
         x.queue[0, j] = min(max(float(inputs[j]), -p.position_limit[0]), p.position_limit[0])
 
 
-def foreign_age(p: ForeignArrays, substep: int) -> int:
+def foreign_age(a: ForeignArrays, p: ForeignNumbers, substep: int) -> int:
     """Return how many samples old the set-points are that have reached the drives by this substep."""
-    late = p.latency[0] - substep * p.setup[0] / p.substeps
+    late = p.latency[0] - substep * a.setup[0] / a.substeps
     # 1e-9: delays of whole samples are off by rounding only.
-    return max(0, math.ceil(late / p.setup[0] - 1e-9))
+    return max(0, math.ceil(late / a.setup[0] - 1e-9))
 
 
 def foreign_lag(x: ForeignState, pitch: float, roll: float, lag: float, h: float) -> None:
@@ -108,7 +114,7 @@ def foreign_resonant(x: ForeignState, pitch: float, roll: float, band: float, da
         x.filtered[j] += h * x.filtered[2 + j]
 
 
-def foreign_sense(p: ForeignArrays, x: ForeignState, pitch: float, roll: float) -> None:
+def foreign_sense(a: ForeignArrays, p: ForeignNumbers, x: ForeignState, pitch: float, roll: float) -> None:
     """Note where the platform leans at the end of a sample, and measure."""
     for i in range(FOREIGN_SEEN - 1, 0, -1):
         for j in range(4):
@@ -116,16 +122,16 @@ def foreign_sense(p: ForeignArrays, x: ForeignState, pitch: float, roll: float) 
     x.history[0, 0] = x.filtered[0]
     x.history[0, 1] = x.filtered[1]
     # A gyro that integrates over its sample.
-    x.history[0, 2] = (pitch - x.lean[0]) / p.setup[0]
-    x.history[0, 3] = (roll - x.lean[1]) / p.setup[0]
+    x.history[0, 2] = (pitch - x.lean[0]) / a.setup[0]
+    x.history[0, 3] = (roll - x.lean[1]) / a.setup[0]
     x.lean[0] = pitch
     x.lean[1] = roll
-    foreign_measure(p, x)
+    foreign_measure(a, p, x)
 
 
-def foreign_measure(p: ForeignArrays, x: ForeignState) -> None:
+def foreign_measure(a: ForeignArrays, p: ForeignNumbers, x: ForeignState) -> None:
     """Delay, spoil and round what the sensor sees."""
-    steps = p.sensor_delay[0] / p.setup[0]
+    steps = p.sensor_delay[0] / a.setup[0]
     whole = math.floor(steps + 1e-9)
     part = max(steps - whole, 0.0)
     for j in range(4):

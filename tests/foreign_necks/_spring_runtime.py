@@ -18,10 +18,11 @@ import math
 
 import numpy as np
 
-from softneck.runtime._layout import array, cells
+from softneck.runtime._layout import cells
 from tests.foreign_necks._shared_runtime import (
     FOREIGN_GRAVITY,
     ForeignArrays,
+    ForeignNumbers,
     ForeignState,
     foreign_age,
     foreign_enqueue,
@@ -35,25 +36,25 @@ from tests.foreign_necks._shared_runtime import (
 )
 
 
-class SpringArrays(ForeignArrays):
+class SpringNumbers(ForeignNumbers):
     """Numbers of the spring."""
 
-    length = array("2", "of the spring [m]; kappa, how a bend brings the ends together [1/rad^2]")
-    angle = array("3", "of the tendons [rad]")
-    radius = array("3", "of the tendons' holes [m]")
-    stiffness = array("3", "K11, K22 and K12 [N m/rad]")
-    damping = array("1", "viscous loss [N m s/rad]")
-    creep = array("2", "Maxwell branch: part of the stiffness [1], time constant [s]")
-    hysteresis = array("2", "H of both axes [N m]")
-    yielding = array("2", "r of both axes [rad]")
-    wen = array("3", "beta, gamma, n [1]")
-    axial = array("4", "stiffness [N/m], damping [N s/m], compression at which coils touch [m], stiffness then [N/m]")
-    mass = array("3", "platform [kg], its lever [m], its own inertia [kg m^2]")
-    tendon = array("2", "stiffness [N/m] and damping [N s/m]")
-    drive = array("3", "gain [1/s], speed limit [rad/s], bandwidth of the speed loop [1/s]")
-    dead_zone = array("3", "half width [rad], additional part while cold [1], way over which it goes [rad]")
-    backlash = array("3", "play [rad], pull that moves the winch in it [N], its speed per pull above that [rad/s/N]")
-    sensor = array("2", "bandwidth [rad/s] and damping [1] of the attitude filter")
+    length = cells("2", "of the spring [m]; kappa, how a bend brings the ends together [1/rad^2]")
+    angle = cells("3", "of the tendons [rad]")
+    radius = cells("3", "of the tendons' holes [m]")
+    stiffness = cells("3", "K11, K22 and K12 [N m/rad]")
+    damping = cells("1", "viscous loss [N m s/rad]")
+    creep = cells("2", "Maxwell branch: part of the stiffness [1], time constant [s]")
+    hysteresis = cells("2", "H of both axes [N m]")
+    yielding = cells("2", "r of both axes [rad]")
+    wen = cells("3", "beta, gamma, n [1]")
+    axial = cells("4", "stiffness [N/m], damping [N s/m], compression at which coils touch [m], stiffness then [N/m]")
+    mass = cells("3", "platform [kg], its lever [m], its own inertia [kg m^2]")
+    tendon = cells("2", "stiffness [N/m] and damping [N s/m]")
+    drive = cells("3", "gain [1/s], speed limit [rad/s], bandwidth of the speed loop [1/s]")
+    dead_zone = cells("3", "half width [rad], additional part while cold [1], way over which it goes [rad]")
+    backlash = cells("3", "play [rad], pull that moves the winch in it [N], its speed per pull above that [rad/s/N]")
+    sensor = cells("2", "bandwidth [rad/s] and damping [1] of the attitude filter")
 
 
 SPRING = {
@@ -98,7 +99,12 @@ class SpringState(ForeignState):
     force = cells("3", "on the bend [N m], on s [N]")
 
 
-def initialise(p: SpringArrays, parameters: np.ndarray, x: SpringState, outputs: np.ndarray) -> None:
+def state_size(a: ForeignArrays) -> int:
+    """Return the length of the state: the first vector that `step` names is that of its numbers."""
+    return SpringState.size(a)
+
+
+def initialise(a: ForeignArrays, p: SpringNumbers, x: SpringState, outputs: np.ndarray) -> None:
     """Home the tendons at their pretension and let the spring come to rest."""
     x[:] = 0.0
     load = foreign_load(np.zeros(8))
@@ -110,28 +116,28 @@ def initialise(p: SpringArrays, parameters: np.ndarray, x: SpringState, outputs:
     for i in range(3):
         x.free[i] = spring_tendon(p, x, i)[0] + p.winch_radius[0] * x.winch[i] - p.pretension[0] / p.tendon[0]
     pitch, roll = spring_lean(x, load)
-    foreign_start(p, x, parameters[0], pitch, roll)
+    foreign_start(a, p, x, pitch, roll)
     foreign_outputs(x, x.s, outputs)
 
 
-def step(p: SpringArrays, parameters: np.ndarray, x: SpringState, inputs: np.ndarray, outputs: np.ndarray) -> None:
+def step(a: ForeignArrays, p: SpringNumbers, x: SpringState, inputs: np.ndarray, outputs: np.ndarray) -> None:
     """Hold `inputs` for one sample time, integrate, measure."""
     foreign_enqueue(p, x, inputs)
     load = foreign_load(inputs)
-    h = p.setup[0] / p.substeps
-    for i in range(p.substeps):
-        spring_drives(p, x, foreign_age(p, i), h)
+    h = a.setup[0] / a.substeps
+    for i in range(a.substeps):
+        spring_drives(p, x, foreign_age(a, p, i), h)
         spring_body(p, x, load, h, False)
         pitch, roll = spring_lean(x, load)
         # asin(n_2) of a normal whose inclinations are pitch and roll.
         euler = math.atan(math.tan(roll) * math.cos(pitch))
         foreign_resonant(x, pitch, euler, p.sensor[0], p.sensor[1], h)
     pitch, roll = spring_lean(x, load)
-    foreign_sense(p, x, pitch, roll)
+    foreign_sense(a, p, x, pitch, roll)
     foreign_outputs(x, x.s, outputs)
 
 
-def spring_drives(p: SpringArrays, x: SpringState, age: int, h: float) -> None:
+def spring_drives(p: SpringNumbers, x: SpringState, age: int, h: float) -> None:
     """Move motors with a dead zone, and winches within their play."""
     dead = p.dead_zone[0] * (1.0 + p.dead_zone[1] * math.exp(-x.travel / p.dead_zone[2]))
     half = 0.5 * p.backlash[0]
@@ -150,7 +156,7 @@ def spring_drives(p: SpringArrays, x: SpringState, age: int, h: float) -> None:
         x.turning[i] = (x.winch[i] - before) / h
 
 
-def spring_tendon(p: SpringArrays, x: SpringState, i: int) -> tuple[float, float, float, float]:
+def spring_tendon(p: SpringNumbers, x: SpringState, i: int) -> tuple[float, float, float, float]:
     """Return the length of tendon `i` [m] and its gradient to b1, b2 and s."""
     e1 = p.radius[i] * math.cos(p.angle[i])
     e2 = p.radius[i] * math.sin(p.angle[i])
@@ -165,7 +171,7 @@ def spring_tendon(p: SpringArrays, x: SpringState, i: int) -> tuple[float, float
     )
 
 
-def spring_body(p: SpringArrays, x: SpringState, load: tuple, h: float, homing: bool) -> None:
+def spring_body(p: SpringNumbers, x: SpringState, load: tuple, h: float, homing: bool) -> None:
     """Advance the spring by one substep."""
     payload, up, push1, push2, _ = load
     mass = p.mass[0] + payload
@@ -211,7 +217,7 @@ def spring_lean(x: SpringState, load: tuple) -> tuple[float, float]:
     return foreign_tilt(g[0], g[1], g[2], load[4])
 
 
-def energy(p: SpringArrays, x: SpringState, inputs: np.ndarray) -> float:
+def energy(p: SpringNumbers, x: SpringState, inputs: np.ndarray) -> float:
     """Return kinetic and stored energy [J]."""
     payload, up, _, _, _ = foreign_load(inputs)
     mass = p.mass[0] + payload

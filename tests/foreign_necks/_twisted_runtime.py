@@ -13,10 +13,11 @@ import math
 
 import numpy as np
 
-from softneck.runtime._layout import array, cells
+from softneck.runtime._layout import cells
 from tests.foreign_necks._shared_runtime import (
     FOREIGN_GRAVITY,
     ForeignArrays,
+    ForeignNumbers,
     ForeignState,
     foreign_age,
     foreign_enqueue,
@@ -30,24 +31,24 @@ from tests.foreign_necks._shared_runtime import (
 )
 
 
-class TwistedArrays(ForeignArrays):
+class TwistedNumbers(ForeignNumbers):
     """Numbers of the helix."""
 
-    height = array("2", "of the gimbal above the base, of the platform above the gimbal [m]")
-    angle = array("3", "of the tendons [rad]")
-    radius = array("3", "of the tendons' holes [m]")
-    stiffness = array("3", "of theta, of phi, between them [N m/rad]")
-    twist = array("3", "stiffness [N m/rad], damping [N m s/rad], coupling to the compression [N]")
-    damping = array("1", "viscous loss of theta and phi [N m s/rad]")
-    creep = array("4", "Maxwell branches: parts of the stiffness [1], time constants [s]")
-    slider = array("4", "stiffness of the sliders [N m/rad]")
-    slip = array("4", "angle at which they slip [rad]")
-    running_in = array("2", "additional part of the sliders while new [1], way over which it goes [rad]")
-    axial = array("2", "stiffness [N/m] and damping [N s/m] against compression")
-    mass = array("5", "platform [kg], its centre from the gimbal (x, y, z) [m], its own inertia [kg m^2]")
-    tendon = array("2", "stiffness [N/m] and damping [N s/m]")
-    drive = array("4", "gain [1/s], speed limit [rad/s], sag [rad/s/N], dead zone [rad]")
-    sensor_lag = array("1", "time constant of the attitude filter [s]")
+    height = cells("2", "of the gimbal above the base, of the platform above the gimbal [m]")
+    angle = cells("3", "of the tendons [rad]")
+    radius = cells("3", "of the tendons' holes [m]")
+    stiffness = cells("3", "of theta, of phi, between them [N m/rad]")
+    twist = cells("3", "stiffness [N m/rad], damping [N m s/rad], coupling to the compression [N]")
+    damping = cells("1", "viscous loss of theta and phi [N m s/rad]")
+    creep = cells("4", "Maxwell branches: parts of the stiffness [1], time constants [s]")
+    slider = cells("4", "stiffness of the sliders [N m/rad]")
+    slip = cells("4", "angle at which they slip [rad]")
+    running_in = cells("2", "additional part of the sliders while new [1], way over which it goes [rad]")
+    axial = cells("2", "stiffness [N/m] and damping [N s/m] against compression")
+    mass = cells("5", "platform [kg], its centre from the gimbal (x, y, z) [m], its own inertia [kg m^2]")
+    tendon = cells("2", "stiffness [N/m] and damping [N s/m]")
+    drive = cells("4", "gain [1/s], speed limit [rad/s], sag [rad/s/N], dead zone [rad]")
+    sensor_lag = cells("1", "time constant of the attitude filter [s]")
 
 
 TWISTED = {
@@ -89,7 +90,12 @@ class TwistedState(ForeignState):
     force = cells("4", "on theta, phi and psi [N m], on s [N]")
 
 
-def initialise(p: TwistedArrays, parameters: np.ndarray, x: TwistedState, outputs: np.ndarray) -> None:
+def state_size(a: ForeignArrays) -> int:
+    """Return the length of the state: the first vector that `step` names is that of its numbers."""
+    return TwistedState.size(a)
+
+
+def initialise(a: ForeignArrays, p: TwistedNumbers, x: TwistedState, outputs: np.ndarray) -> None:
     """Home the tendons at their pretension and let the helix come to rest."""
     x[:] = 0.0
     load = foreign_load(np.zeros(8))
@@ -99,29 +105,29 @@ def initialise(p: TwistedArrays, parameters: np.ndarray, x: TwistedState, output
         x.free[i] = twisted_tendon(p, x, i)[0] - p.pretension[0] / p.tendon[0]
     pitch, roll = twisted_lean(x, load)
     seen1, seen2 = twisted_seen(x, pitch, roll)
-    foreign_start(p, x, parameters[0], seen1, seen2)
+    foreign_start(a, p, x, seen1, seen2)
     x.lean[0] = pitch
     x.lean[1] = roll
     foreign_outputs(x, x.s, outputs)
 
 
-def step(p: TwistedArrays, parameters: np.ndarray, x: TwistedState, inputs: np.ndarray, outputs: np.ndarray) -> None:
+def step(a: ForeignArrays, p: TwistedNumbers, x: TwistedState, inputs: np.ndarray, outputs: np.ndarray) -> None:
     """Hold `inputs` for one sample time, integrate, measure."""
     foreign_enqueue(p, x, inputs)
     load = foreign_load(inputs)
-    h = p.setup[0] / p.substeps
-    for i in range(p.substeps):
-        twisted_drives(p, x, foreign_age(p, i), h)
+    h = a.setup[0] / a.substeps
+    for i in range(a.substeps):
+        twisted_drives(p, x, foreign_age(a, p, i), h)
         twisted_body(p, x, load, h, False)
         pitch, roll = twisted_lean(x, load)
         seen1, seen2 = twisted_seen(x, pitch, roll)
         foreign_lag(x, seen1, seen2, p.sensor_lag[0], h)
     pitch, roll = twisted_lean(x, load)
-    foreign_sense(p, x, pitch, roll)
+    foreign_sense(a, p, x, pitch, roll)
     foreign_outputs(x, x.s, outputs)
 
 
-def twisted_drives(p: TwistedArrays, x: TwistedState, age: int, h: float) -> None:
+def twisted_drives(p: TwistedNumbers, x: TwistedState, age: int, h: float) -> None:
     """Move the motors: dead zone, and sag under the tension above that of homing."""
     for i in range(3):
         error = x.queue[age, i] - x.position[i]
@@ -133,12 +139,12 @@ def twisted_drives(p: TwistedArrays, x: TwistedState, age: int, h: float) -> Non
         x.travel += h * abs(x.speed[i])
 
 
-def twisted_hole(p: TwistedArrays, x: TwistedState, i: int) -> tuple[float, float]:
+def twisted_hole(p: TwistedNumbers, x: TwistedState, i: int) -> tuple[float, float]:
     """Return where the hole of tendon `i` is on the platform after the twist [m]."""
     return p.radius[i] * math.cos(p.angle[i] + x.b[2]), p.radius[i] * math.sin(p.angle[i] + x.b[2])
 
 
-def twisted_tendon(p: TwistedArrays, x: TwistedState, i: int) -> tuple[float, float, float, float, float]:
+def twisted_tendon(p: TwistedNumbers, x: TwistedState, i: int) -> tuple[float, float, float, float, float]:
     """Return the length of tendon `i` [m] and its gradient to theta, phi, psi and s."""
     h1, h2 = twisted_hole(p, x, i)
     g = foreign_gimbal(x.b[0], x.b[1], (h1, h2, p.height[1]))
@@ -157,14 +163,14 @@ def twisted_tendon(p: TwistedArrays, x: TwistedState, i: int) -> tuple[float, fl
     )
 
 
-def twisted_centre(p: TwistedArrays, x: TwistedState) -> tuple[float, float]:
+def twisted_centre(p: TwistedNumbers, x: TwistedState) -> tuple[float, float]:
     """Return where the centre of mass is beside the platform's axis after the twist [m]."""
     c = math.cos(x.b[2])
     s = math.sin(x.b[2])
     return p.mass[1] * c - p.mass[2] * s, p.mass[1] * s + p.mass[2] * c
 
 
-def twisted_body(p: TwistedArrays, x: TwistedState, load: tuple, h: float, homing: bool) -> None:
+def twisted_body(p: TwistedNumbers, x: TwistedState, load: tuple, h: float, homing: bool) -> None:
     """Advance the platform by one substep."""
     payload, up, push1, push2, _ = load
     mass = p.mass[0] + payload
@@ -229,7 +235,7 @@ def twisted_seen(x: TwistedState, pitch: float, roll: float) -> tuple[float, flo
     return math.atan(c * n1 + s * n2), math.asin((c * n2 - s * n1) / size)
 
 
-def energy(p: TwistedArrays, x: TwistedState, inputs: np.ndarray) -> float:
+def energy(p: TwistedNumbers, x: TwistedState, inputs: np.ndarray) -> float:
     """Return kinetic and stored energy [J]."""
     payload, up, _, _, _ = foreign_load(inputs)
     mass = p.mass[0] + payload

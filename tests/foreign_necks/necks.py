@@ -69,10 +69,15 @@ class ForeignNeck:
         """Return the neck as a plant with the virtual neck's ports."""
         like = VirtualNeck(NeckParameters.paper()).block()
         setup = np.array([sample_time, round(sample_time / SUBSTEP)])
-        port = Port(name="noise_seed", description="seed of the sensor's noise", start=float(noise_seed), integer=True)
+        ports = [
+            Port(name="noise_seed", description="seed of the sensor's noise", start=float(noise_seed), integer=True)
+        ]
+        for name, values in self.numbers().items():
+            names = [name] if values.size == 1 else [f"{name}_{i}" for i in range(1, values.size + 1)]
+            ports += [Port(name=part, start=float(value)) for part, value in zip(names, values, strict=True)]
         return Block(
-            kind=self.name, role="plant", runtime=self.runtime, sample_time=sample_time,
-            arrays=(setup, *self.numbers().values()), inputs=like.inputs, outputs=like.outputs, parameters=(port,),
+            kind=self.name, role="plant", runtime=self.runtime, sample_time=sample_time, arrays=(setup,),  # pyright: ignore[reportArgumentType]
+            inputs=like.inputs, outputs=like.outputs, parameters=tuple(ports),
         )  # fmt: skip
 
 

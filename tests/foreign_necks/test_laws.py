@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from itertools import pairwise
 
 import numpy as np
@@ -12,7 +13,8 @@ from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import load_functions, load_runtime
 from softneck.signals import SAMPLE_TIME, Excitation, signal
 
-from ._beam_runtime import BeamArrays, BeamState
+from ._beam_runtime import BeamState
+from ._shared_runtime import ForeignArrays
 from .necks import NECKS, ForeignNeck, record
 
 PITCH, TENSIONS, COMPRESSION = slice(0, 2), slice(10, 13), 13
@@ -56,10 +58,10 @@ def test_energy_falls_with_locked_winches(name: str, payload: float) -> None:
     state, Y = block.run(block.initial_state(), U)
     assert np.ptp(Y[:, 0]) > 0.01
     measure, let_go = load_functions(quiet(name).runtime, compiled=False).energy, inputs(1, (0.0, 0.0, 0.0), payload)[0]
-    E = [measure(block.arrays, state.values, let_go)]
+    E = [measure(state.parameters, state.values, let_go)]
     for _ in range(60):
         state, _ = block.step(state, let_go)
-        E.append(measure(block.arrays, state.values, let_go))
+        E.append(measure(state.parameters, state.values, let_go))
     # Semi-implicit Euler swings about the true energy by its step times the fastest speed.
     assert np.diff(E).max() < 1e-3 * (E[0] - E[-1])
     assert E[0] - E[-1] > 1e-4
@@ -190,25 +192,25 @@ def test_ports_and_recordings_are_those_of_the_virtual_neck(name: str) -> None:
 
 @pytest.mark.parametrize("name", NECKS)
 def test_a_plant_names_its_numbers_in_the_runtimes_order(name: str) -> None:
-    from softneck.runtime._bundle import declared
-    from softneck.runtime._layout import Arrays
-
-    layout = declared(ForeignNeck(name=name).runtime, Arrays)
-    assert layout.names() == ("setup", *quiet(name).numbers())
-    layout.read(dict(zip(layout.names(), quiet(name).block().arrays, strict=True)))
+    neck = quiet(name)
+    layout = getattr(import_module(neck.runtime), f"{name.capitalize()}Numbers")
+    lengths = {part: at.stop - at.start for part, at in layout.parts(ForeignArrays(neck.block().arrays)).items()}
+    assert lengths == {"noise_seed": 1, **{number: values.size for number, values in neck.numbers().items()}}
+    assert list(lengths) == ["noise_seed", *neck.numbers()]
 
 
 def preisach_means(turns: list[float]) -> np.ndarray:
     """The relays' mean along a slope that goes from turn to turn in steps of 0.005 rad, with its slope (rows, 2)."""
     runtime, block = load_functions(quiet("beam").runtime, compiled=False), quiet("beam").block()
-    x = np.zeros(block.initial_state().values.size)
-    at = BeamState.parts(BeamArrays(block.arrays))
-    runtime.beam_relays(block.arrays, x)
+    start = block.initial_state()
+    p, x = start.parameters, np.zeros(start.values.size)
+    at = BeamState.parts(ForeignArrays(block.arrays))
+    runtime.beam_relays(p, x)
     rows = []
     for here, there in pairwise(turns):
         for slope in np.linspace(here, there, 1 + round(abs(there - here) / 0.005)):
             x[at["t"].start] = slope
-            runtime.beam_switch(block.arrays, x, 0)
+            runtime.beam_switch(p, x, 0)
             rows.append((slope, x[at["m"].start]))
     return np.array(rows)
 
