@@ -67,6 +67,28 @@ def test_energy_falls_with_locked_winches(name: str, payload: float) -> None:
     assert E[0] - E[-1] > 1e-4
 
 
+# What makes each neck lag, whatever the speed; nothing of it.
+WITHOUT_HYSTERESIS = {
+    "chain": {"friction": (0.0, 1.6, 0.006)}, "spring": {"hysteresis": (0.0, 0.0)}, "foam": {"sheath": (0.0, 0.001)},
+    "beam": {"preisach": (0.0, 0.4, 0.2)}, "twisted": {"slider": (0.0, 0.0, 0.0, 0.0)},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", sorted(WITHOUT_HYSTERESIS))
+def test_hysteresis_lags_and_never_leads(name: str) -> None:
+    def gap(neck: ForeignNeck) -> float:
+        U = np.zeros((2000, 8))
+        theta = 2.0 * np.sin(2 * np.pi * np.arange(2000) / 1000)
+        U[:, :3] = theta[:, None] * np.array([2.0, -1.0, -1.0]) / 3.0
+        block = neck.block()
+        Y = np.degrees(block.run(block.initial_state(), U)[1])
+        return float(Y[1499, 0] - Y[1999, 0])  # theta is 0, on the way down and up
+
+    with_it, without = gap(quiet(name)), gap(quiet(name, **WITHOUT_HYSTERESIS[name]))
+    # Viscosity and creep lag too; a torque of the wrong sign would take from that.
+    assert with_it > without + 0.1 > 0.1
+
+
 @pytest.mark.parametrize("name", NECKS)
 def test_slack_tendons_pull_nothing(name: str) -> None:
     block = quiet(name, **UNWORN.get(name, {})).block()
