@@ -72,6 +72,72 @@ WITHOUT_HYSTERESIS = {
     "chain": {"friction": (0.0, 1.6, 0.006)}, "spring": {"hysteresis": (0.0, 0.0)}, "foam": {"sheath": (0.0, 0.001)},
     "beam": {"preisach": (0.0, 0.4, 0.2)}, "twisted": {"slider": (0.0, 0.0, 0.0, 0.0)},
 }  # fmt: skip
+# Coordinates of the bodies, and how far they are moved [rad, m].
+MOVED = {name: {"b": 0.15} for name in NECKS} | {"chain": {"b": 0.04}, "beam": {"d": 0.006, "t": 0.15}}
+
+
+@pytest.mark.parametrize("name", NECKS)
+def test_energy_falls_from_wherever_a_neck_is_let_go(name: str) -> None:
+    neck = quiet(name)
+    drive = neck.numbers()["drive"].copy()
+    drive[1] = 0.0  # the speed limit
+    block = quiet(name, drive=tuple(drive), **COUNTED.get(name, {})).block()
+    measure, u = load_functions(neck.runtime, compiled=False).energy, inputs(1, (0.0, 0.0, 0.0))[0]
+    at = getattr(import_module(neck.runtime), f"{name.capitalize()}State").parts(ForeignArrays(block.arrays))
+    for seed in range(3):
+        rng, state = np.random.default_rng(seed), block.initial_state()
+        for part, size in MOVED[name].items():
+            state.values[at[part]] += size * rng.uniform(-1.0, 1.0, state.values[at[part]].size)
+        E = [measure(state.parameters, state.values, u)]
+        for _ in range(25):
+            state, _ = block.step(state, u)
+            E.append(measure(state.parameters, state.values, u))
+        # As above.
+        assert np.diff(E).max() < 1e-3 * (E[0] - E[-1])
+
+
+@pytest.mark.parametrize("name", NECKS)
+def test_energy_is_stationary_where_a_neck_stands(name: str) -> None:
+    neck = quiet(name)
+    drive = neck.numbers()["drive"].copy()
+    drive[1] = 0.0  # the speed limit
+    block = quiet(name, drive=tuple(drive), **WITHOUT_HYSTERESIS.get(name, {})).block()
+    u = inputs(1, (0.0, 0.0, 0.0), 0.3)[0]
+    u[6:] = 0.2, -0.1  # the base leans
+    state, _ = block.run(block.initial_state(), np.tile(u, (500, 1)))
+    measure = load_functions(neck.runtime, compiled=False).energy
+    at = getattr(import_module(neck.runtime), f"{name.capitalize()}State").parts(ForeignArrays(block.arrays))
+    places = [i for part in (*MOVED[name], "s") for i in range(at[part].start, at[part].stop)]
+    for place in places:
+        energies = []
+        for sign in (1.0, -1.0):
+            moved = state.values.copy()
+            moved[place] += sign * 1e-5
+            energies.append(measure(state.parameters, moved, u))
+        # It still creeps by some 1e-4 rad/s against its dashpots; the weight alone turns it by some 0.05 N m.
+        assert abs(energies[0] - energies[1]) / 2e-5 < 5e-4
+
+
+@pytest.mark.parametrize("name", sorted({*NECKS} - {"chain"}))  # whose turns and energy tell
+def test_tendons_pull_along_the_gradient_of_their_length(name: str) -> None:
+    neck = quiet(name)
+    block, runtime = neck.block(), load_functions(neck.runtime, compiled=False)
+    tendon = getattr(runtime, f"{name}_tendon")
+    state = block.initial_state()
+    at = getattr(import_module(neck.runtime), f"{name.capitalize()}State").parts(ForeignArrays(block.arrays))
+    places = [i for part in (*MOVED[name], "s") for i in range(at[part].start, at[part].stop)]
+    x = state.values
+    x[places] += np.random.default_rng(0).uniform(-0.1, 0.1, len(places)) * [*[1.0] * (len(places) - 1), 0.1]
+    for i in range(3):
+        gradient = tendon(state.parameters, x, i)[1:]
+        for place, slope in zip(places, gradient, strict=True):
+            lengths = []
+            for sign in (1.0, -1.0):
+                moved = x.copy()
+                moved[place] += sign * 1e-6
+                lengths.append(tendon(state.parameters, moved, i)[0])
+            # Rounding of 0.1 m over 2e-6.
+            assert abs((lengths[0] - lengths[1]) / 2e-6 - slope) < 1e-9
 
 
 @pytest.mark.parametrize("name", sorted(WITHOUT_HYSTERESIS))
