@@ -57,6 +57,13 @@ def test_a_foreign_import_is_refused(runtime_folder: Path, imported: str) -> Non
         bundle("foreign_a_runtime")
 
 
+def test_runtimes_of_ones_own_share_text(runtime_folder: Path) -> None:
+    (runtime_folder / "shared_a_runtime.py").write_text("def twice(value):\n    return 2.0 * value\n")
+    text = f"from shared_a_runtime import twice\n{STEP}    outputs[0] += twice(inputs[0])\n"
+    (runtime_folder / "sharing_a_runtime.py").write_text(text)
+    assert "def twice" in bundle("sharing_a_runtime")
+
+
 def test_two_definitions_of_one_name_are_refused(runtime_folder: Path) -> None:
     text = "from softneck.runtime._random_runtime import random_normal\n\n\ndef random_seed(s):\n    return 0\n" + STEP
     (runtime_folder / "twice_a_runtime.py").write_text(text)
