@@ -13,10 +13,14 @@ from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import load_functions, load_runtime
 from softneck.signals import SAMPLE_TIME, Excitation, signal
 
+from ..data import slow_but
 from ._beam_runtime import BeamState
 from ._shared_runtime import ForeignArrays
 from .necks import NECKS, ForeignNeck, record
 
+# The others take a minute to compile.
+QUICK = ("column",)
+SOME = slow_but(NECKS, QUICK)
 PITCH, TENSIONS, COMPRESSION = slice(0, 2), slice(10, 13), 13
 # Wear and running in change a neck by the way its motors go; here they are off.
 UNWORN = {
@@ -37,7 +41,7 @@ def inputs(rows: int, motors: tuple[float, float, float], payload: float = 0.0) 
     return U
 
 
-@pytest.mark.parametrize("name", NECKS)
+@pytest.mark.parametrize("name", SOME)
 def test_a_neck_that_nobody_moves_rests(name: str) -> None:
     block = quiet(name).block()
     state = block.initial_state()
@@ -48,7 +52,7 @@ def test_a_neck_that_nobody_moves_rests(name: str) -> None:
 
 
 @pytest.mark.parametrize("payload", [0.0, 1.0])
-@pytest.mark.parametrize("name", NECKS)
+@pytest.mark.parametrize("name", SOME)
 def test_energy_falls_with_locked_winches(name: str, payload: float) -> None:
     drive = quiet(name).numbers()["drive"].copy()
     drive[1] = 0.0  # the speed limit
@@ -76,7 +80,7 @@ WITHOUT_HYSTERESIS = {
 MOVED = {name: {"b": 0.15} for name in NECKS} | {"chain": {"b": 0.04}, "beam": {"d": 0.006, "t": 0.15}}
 
 
-@pytest.mark.parametrize("name", NECKS)
+@pytest.mark.parametrize("name", SOME)
 def test_energy_falls_from_wherever_a_neck_is_let_go(name: str) -> None:
     neck = quiet(name)
     drive = neck.numbers()["drive"].copy()
@@ -96,7 +100,7 @@ def test_energy_falls_from_wherever_a_neck_is_let_go(name: str) -> None:
         assert np.diff(E).max() < 1e-3 * (E[0] - E[-1])
 
 
-@pytest.mark.parametrize("name", NECKS)
+@pytest.mark.parametrize("name", SOME)
 def test_energy_is_stationary_where_a_neck_stands(name: str) -> None:
     neck = quiet(name)
     drive = neck.numbers()["drive"].copy()
@@ -118,7 +122,7 @@ def test_energy_is_stationary_where_a_neck_stands(name: str) -> None:
         assert abs(energies[0] - energies[1]) / 2e-5 < 5e-4
 
 
-@pytest.mark.parametrize("name", sorted({*NECKS} - {"chain"}))  # whose turns and energy tell
+@pytest.mark.parametrize("name", slow_but(sorted({*NECKS} - {"chain"}), QUICK))  # whose turns and energy tell
 def test_tendons_pull_along_the_gradient_of_their_length(name: str) -> None:
     neck = quiet(name)
     block, runtime = neck.block(), load_functions(neck.runtime, compiled=False)
@@ -155,7 +159,7 @@ def test_hysteresis_lags_and_never_leads(name: str) -> None:
     assert with_it > without + 0.1 > 0.1
 
 
-@pytest.mark.parametrize("name", NECKS)
+@pytest.mark.parametrize("name", SOME)
 def test_slack_tendons_pull_nothing(name: str) -> None:
     block = quiet(name, **UNWORN.get(name, {})).block()
     slack, Y = block.run(block.initial_state(), inputs(100, (-5.0, -5.0, -5.0)))
@@ -169,7 +173,7 @@ def test_slack_tendons_pull_nothing(name: str) -> None:
 
 
 @pytest.mark.parametrize("payload", [0.0, 0.3, 1.0])
-@pytest.mark.parametrize("name", NECKS)
+@pytest.mark.parametrize("name", SOME)
 def test_payloads_to_1_kg_stay_finite_and_tendons_never_push(name: str, payload: float) -> None:
     U = np.zeros((250, 8))
     U[:, :3], U[:, 3] = signal("eq22", duration=5.0).set_points * 1.5, payload
@@ -212,7 +216,7 @@ def test_the_column_in_a_mirror() -> None:
     np.testing.assert_allclose(here[:, PITCH] * [1, -1], there[:, PITCH], atol=1e-8)
 
 
-@pytest.mark.parametrize("name", sorted({*NECKS} - {"chain", "foam"}))
+@pytest.mark.parametrize("name", slow_but(sorted({*NECKS} - {"chain", "foam"}), QUICK))
 def test_the_others_have_no_symmetry_of_a_third_of_a_turn(name: str) -> None:
     block = quiet(name).block()
     bends = []
@@ -222,7 +226,7 @@ def test_the_others_have_no_symmetry_of_a_third_of_a_turn(name: str) -> None:
     assert np.ptp(bends) > 0.1
 
 
-@pytest.mark.parametrize("name", NECKS)
+@pytest.mark.parametrize("name", SOME)
 def test_seeds_give_the_same_bits_and_others_do_not(name: str) -> None:
     U = inputs(80, (1.5, 0.0, -1.0))
 
@@ -237,7 +241,7 @@ def test_seeds_give_the_same_bits_and_others_do_not(name: str) -> None:
     assert np.degrees(np.abs(first[-1, PITCH] - specimen[-1, PITCH])).max() > 0.05
 
 
-@pytest.mark.parametrize("name", NECKS)
+@pytest.mark.parametrize("name", SOME)
 def test_plain_python_steps_as_the_compiled_one(name: str) -> None:
     block = ForeignNeck(name=name).block()
     state, _ = block.run(block.initial_state(), inputs(30, (2.0, -1.0, 0.5)))
@@ -250,7 +254,7 @@ def test_plain_python_steps_as_the_compiled_one(name: str) -> None:
         np.testing.assert_allclose(y, compiled, rtol=1e-7, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", NECKS)
+@pytest.mark.parametrize("name", SOME)
 def test_a_held_neck_creeps(name: str) -> None:
     block = quiet(name).block()
     _, Y = block.run(block.initial_state(), inputs(1500, (3.0, 0.0, 0.0)))
@@ -259,7 +263,7 @@ def test_a_held_neck_creeps(name: str) -> None:
     assert 0.05 < lean[-1] - lean[150] < 3.0
 
 
-@pytest.mark.parametrize("name", NECKS)
+@pytest.mark.parametrize("name", SOME)
 def test_a_warm_neck_is_another(name: str) -> None:
     t = np.arange(200) * SAMPLE_TIME
     excitation = Excitation("steps", t, np.where(t < 2.0, 0.3, 1.0)[:, None] * np.array([1.0, -0.5, 0.2]))
@@ -267,7 +271,7 @@ def test_a_warm_neck_is_another(name: str) -> None:
     assert np.degrees(np.abs(cold.outputs - warm.outputs)).max() > 0.05
 
 
-@pytest.mark.parametrize("name", NECKS)
+@pytest.mark.parametrize("name", SOME)
 def test_ports_and_recordings_are_those_of_the_virtual_neck(name: str) -> None:
     ours, excitation = VirtualNeck(NeckParameters.paper()), signal("eq22", duration=1.0)
     block, like = ForeignNeck(name=name).block(), ours.block()
@@ -278,7 +282,7 @@ def test_ports_and_recordings_are_those_of_the_virtual_neck(name: str) -> None:
     assert all(np.isfinite(channel).all() for channel in recording.channels.values())
 
 
-@pytest.mark.parametrize("name", NECKS)
+@pytest.mark.parametrize("name", SOME)
 def test_a_plant_names_its_numbers_in_the_runtimes_order(name: str) -> None:
     neck = quiet(name)
     layout = getattr(import_module(neck.runtime), f"{name.capitalize()}Numbers")
