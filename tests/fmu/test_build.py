@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 import zipfile
 from dataclasses import replace
@@ -13,10 +14,12 @@ import fmpy
 import pytest
 from fmpy.validation import validate_fmu
 
+from softneck import load
 from softneck.core import OutputFileError, SettingsError
 from softneck.fmu import FmuInfo, build_fmu, fmu_info
 from softneck.runtime import Block, Port
 
+GOLDEN = Path(__file__).parents[1] / "golden"
 KINDS = ["lag", "controller", "neck", "pi"]
 
 
@@ -108,6 +111,26 @@ def test_building_leaves_the_interpreter_as_it_was(toys: Any, tmp_path: Path) ->
     build_fmu(toys.controller(), tmp_path / "Second.fmu")
     assert (list(sys.path), set(sys.modules), Path.cwd(), dict(os.environ), sys.dont_write_bytecode) == before
     assert sorted(item.name for item in tmp_path.iterdir()) == ["First.fmu", "Second.fmu"]
+
+
+def test_an_fmu_that_ran_before_changes_nothing(tmp_path: Path) -> None:
+    """It leaves its own pythonfmu in `sys.modules`, which has no binaries."""
+    here = build_fmu(load(GOLDEN / "pi.npz").block(), tmp_path / "Pi.fmu")
+    script = """
+import sys
+import fmpy
+from softneck import load
+from softneck.fmu import build_fmu
+golden, here, there = sys.argv[1:]
+fmpy.simulate_fmu(here, stop_time=0.1)
+build_fmu(load(golden).block(), there)
+"""
+    there = tmp_path / "there" / "Pi.fmu"
+    there.parent.mkdir()
+    command = [sys.executable, "-c", script, str(GOLDEN / "pi.npz"), str(here), str(there)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert there.is_file(), done.stderr
+    assert there.read_bytes() == here.read_bytes()
 
 
 @pytest.mark.parametrize("name", ["1st", "my model", "a-b", "neck.v2", "lambda", "é", ""])

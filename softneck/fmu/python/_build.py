@@ -147,8 +147,6 @@ def _flat(arrays: tuple[np.ndarray, ...]) -> bytes:
 
 def _through_pythonfmu(module: str, source: str, resources: Mapping[str, bytes]) -> dict[str, bytes]:
     """Return the members of the FMU that pythonfmu builds from the slave and its resources."""
-    from pythonfmu import FmuBuilder
-
     with tempfile.TemporaryDirectory(prefix="softneck-fmu-") as folder:
         script = Path(folder) / f"{module}.py"
         script.write_text(source, encoding="utf-8")
@@ -158,6 +156,8 @@ def _through_pythonfmu(module: str, source: str, resources: Mapping[str, bytes])
         # pythonfmu imports the slave's class and makes it a name in sys.modules; an instance then reads its
         # resources from pythonfmu's own folder.
         with _imports_restored():
+            from pythonfmu import FmuBuilder
+
             built = FmuBuilder.build_FMU(
                 script, dest=Path(folder) / "built.fmu", project_files=files,
                 canGetAndSetFMUstate=True, canSerializeFMUstate=True,
@@ -169,13 +169,20 @@ def _through_pythonfmu(module: str, source: str, resources: Mapping[str, bytes])
 def _imports_restored() -> Iterator[None]:
     path, bytecode, modules = list(sys.path), sys.dont_write_bytecode, set(sys.modules)
     sys.dont_write_bytecode = True
+    # An FMU that ran in this process brought its own pythonfmu, without binaries, and modules that stand on it.
+    installed, loaded, from_fmus = str(distribution("pythonfmu").locate_file("")), sys.modules.get("pythonfmu"), {}
+    if loaded is not None and not str(loaded.__file__).startswith(installed):
+        from_fmus = {name: sys.modules.pop(name) for name in modules if name.startswith(("pythonfmu", "softneck_"))}
+        sys.path.insert(0, installed)
     try:
         yield
     finally:
         sys.path[:] = path
         sys.dont_write_bytecode = bytecode
-        for name in [name for name in sys.modules if name.startswith("softneck_") and name not in modules]:
+        new = ("pythonfmu", "softneck_") if from_fmus else "softneck_"
+        for name in [name for name in sys.modules if name.startswith(new) and (from_fmus or name not in modules)]:
             sys.modules.pop(name)
+        sys.modules.update(from_fmus)
         for entry in [key for key in sys.path_importer_cache if "softneck-fmu-" in key or "pythonfmu_" in key]:
             sys.path_importer_cache.pop(entry, None)
 

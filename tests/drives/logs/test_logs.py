@@ -215,7 +215,7 @@ KILLED = """
 import os, signal, sys, time
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
-from softneck.drives import RunLogger, run_facts
+from softneck.drives.logs._run_log import RunLogger, run_facts
 from softneck.drives.logs._cycle import LoggedPilot
 from tests.drives.bench import Bench
 bench = Bench()
