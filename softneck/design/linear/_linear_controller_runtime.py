@@ -7,7 +7,7 @@ from softneck.design.linear._linear_parts_runtime import (
     LinearState,
     linear_align,
     linear_control,
-    linear_sound,
+    linear_finite,
 )
 from softneck.design.linear._rest_runtime import initialise as initialise
 
@@ -21,7 +21,7 @@ def step(p: LinearArrays, parameters: np.ndarray, x: LinearState, inputs: np.nda
     co-contraction [rad].
     """
     # One that is none would stay in the state for good: the motors hold until all are there again.
-    if not linear_sound(inputs):
+    if not linear_finite(inputs):
         outputs[:] = x.held
         return
     # Whoever had the motors before: this controller takes over where they are.

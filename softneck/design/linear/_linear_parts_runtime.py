@@ -68,7 +68,7 @@ def linear_align(p: LinearArrays, x: LinearState, y: np.ndarray) -> None:
     x.x[:] = np.dot(p.align, known)
 
 
-def linear_sound(inputs: np.ndarray) -> bool:
+def linear_finite(inputs: np.ndarray) -> bool:
     """Return whether references, angles and motor positions are numbers."""
     total = 0.0  # one that is none makes the sum none
     for i in range(8):

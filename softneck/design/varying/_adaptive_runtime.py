@@ -25,8 +25,8 @@ from softneck.design.linear._linear_parts_runtime import (
     LinearArrays,
     LinearState,
     linear_control,
+    linear_finite,
     linear_reference,
-    linear_sound,
 )
 from softneck.identification.linear._ud_runtime import ud_guarded
 from softneck.runtime._layout import array, cells, value
@@ -100,7 +100,7 @@ def step(p: AdaptiveArrays, parameters: np.ndarray, x: AdaptiveState, inputs: np
     parameters: those of the linear controller, and whether to adapt at all (0 or 1).
     """
     # As in the linear controller; the line of inputs has a gap now, and begins anew.
-    if not linear_sound(inputs):
+    if not linear_finite(inputs):
         x.samples[:] = 0.0
         outputs[:] = x.held
         return

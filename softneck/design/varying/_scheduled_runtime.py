@@ -18,7 +18,7 @@ from softneck.design.linear._linear_parts_runtime import (
     LinearState,
     linear_align,
     linear_control,
-    linear_sound,
+    linear_finite,
 )
 from softneck.design.linear._rest_runtime import initialise as initialise
 from softneck.runtime._layout import array, cells
@@ -54,7 +54,7 @@ def step(
 ) -> None:
     """Compute the set-points for now, and the state for the next sample; ports as of the linear controller."""
     # As in the linear controller: what is not a number would stay in the state.
-    if not linear_sound(inputs):
+    if not linear_finite(inputs):
         outputs[:] = x.held
         return
     active = inputs[8] > 0.5 and inputs[9] > 0.5
