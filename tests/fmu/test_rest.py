@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from softneck.fmu.describe._description import described_block
 from softneck.runtime._rest_runtime import REST
 
 from .every_kind import block_of
@@ -17,7 +18,7 @@ _LONG = [pytest.param(kind, marks=pytest.mark.slow) for kind in ("srivc", "subsp
 
 @pytest.mark.parametrize("kind", ["rls", "play", "pi", "ncf", *_LONG])
 def test_a_state_at_rest_holds_no_subnormal_number(kind: str) -> None:
-    block = block_of(kind)
+    block = described_block(block_of(kind))  # as its FMU holds it: a controller with the drives inside
     rng = np.random.default_rng(0)
     at_rest = [port.start for port in block.inputs]
     moved = np.tile(at_rest, (50, 1))
@@ -30,6 +31,20 @@ def test_a_state_at_rest_holds_no_subnormal_number(kind: str) -> None:
     for values in (state.values, outputs[-1]):
         size = np.abs(values)
         assert not ((size > 0.0) & (size < _LEAST_NORMAL)).any()
+
+
+def test_modelled_drives_end_at_a_set_point_of_zero() -> None:
+    block = described_block(block_of("pi"))
+    names = [port.name for port in block.inputs]
+    rows = np.zeros((10_000, len(names)))
+    rows[:, [names.index("healthy"), names.index("enabled")]] = 1.0
+    # There and back: a tendon that may not go below 0 is sent to exactly 0.
+    rows[:50, 0], rows[50:, 0] = 0.3, -0.3
+    state, outputs = block.run(block.initial_state(least_position=0.0), rows)
+    assert outputs[49].max() > 0.1
+    assert (outputs[-1] == 0.0).any()
+    size = np.abs(state.values)
+    assert not ((size > 0.0) & (size < _LEAST_NORMAL)).any()
 
 
 def test_numbers_of_normal_size_are_left_alone_to_the_bit() -> None:

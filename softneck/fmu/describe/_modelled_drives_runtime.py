@@ -14,6 +14,7 @@ import numpy as np
 from softneck.identification.models._histories_runtime import narx_push
 from softneck.runtime._layout import Arrays, StateVector, array, cells, rest, value
 from softneck.runtime._members_runtime import member_initialise, member_size, member_step
+from softneck.runtime._rest_runtime import REST
 
 
 class DrivesArrays(Arrays):
@@ -62,4 +63,4 @@ def step(p: DrivesArrays, parameters: np.ndarray, x: DrivesState, inputs: np.nda
     member_step(p, 0, parameters[:own], x.controller, given, outputs)
     narx_push(x.u, outputs)
     for j in range(3):
-        x.motors[j] = p.drive[0] * x.motors[j] + (1.0 - p.drive[0]) * x.u[p.d - 1, j]
+        x.motors[j] = (p.drive[0] * x.motors[j] + (1.0 - p.drive[0]) * x.u[p.d - 1, j] + REST) - REST
