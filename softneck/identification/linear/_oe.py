@@ -21,8 +21,7 @@ from softneck.core import (
 from softneck.signals import TENDON_ANGLES, Recording, redefine, redefinition_matrix
 
 from ..models._drive import fit_drive
-from ..models._fitting import fitted_model, training_recording
-from ..models._free_run import delay_samples, free_run_fit
+from ..models._fitting import delay_samples, fitted_model, free_run_fit, training_recording
 from ..models._model import Model
 from ..models._state_space import axes_system, lss_arrays
 from ._oe_fit import OutputErrorFit, default_starts, fit_output_error, largest_radius, pole_radius

@@ -27,8 +27,7 @@ from softneck.signals import Recording
 
 from . import _linear_systems as _linear
 from . import _linearisation, _ports
-from ._arrays import check_arrays
-from ._composed import members, memory_of, runtime_of, set_now
+from ._arrays import check_arrays, members, memory_of, runtime_of, set_now
 
 if TYPE_CHECKING:
     import casadi
