@@ -138,7 +138,12 @@ def test_review_tells_what_is_doubtful() -> None:
 
 
 @pytest.mark.parametrize(
-    "limits", [{"minimum_tautness": -0.2}, {"angle_limit": 0.3}, {"angle_limit": 0.3, "minimum_tautness": -0.2}]
+    "limits",
+    [
+        pytest.param({"minimum_tautness": -0.2}, marks=pytest.mark.slow),
+        pytest.param({"angle_limit": 0.3}, marks=pytest.mark.slow),
+        {"angle_limit": 0.3, "minimum_tautness": -0.2},
+    ],
 )
 def test_limits_that_are_not_active_change_no_gain(limits: dict[str, float], plain: MpcController) -> None:
     limited = MpcSettings(bandwidth=8.0, **limits).design(bake_off_neck())  # type: ignore[arg-type]
