@@ -12,8 +12,8 @@ from softneck.drives import default_drives, neck_drives, preflight, record_signa
 from softneck.drives.bus._link import VirtualLink
 from softneck.drives.commissioning._record import ExperimentResult, drive_limits
 from softneck.drives.master import Master, Tilt
-from softneck.drives.running._ask import Ask
 from softneck.drives.running._bus_loop import Session
+from softneck.drives.running._timing import Ask
 from softneck.identification import Rls
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import Excitation, prepare, signal
