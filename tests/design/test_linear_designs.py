@@ -219,6 +219,7 @@ def test_reduction_keeps_its_bound_and_its_integrator(order: int) -> None:
     assert np.all(np.diff(found.singular_values) <= 0.0)
 
 
+@pytest.mark.slow
 def test_a_reduced_design_says_what_it_lost() -> None:
     full = NcfSettings().design(bake_off_neck())
     small = NcfSettings(controller_order=4).design(bake_off_neck())

@@ -126,6 +126,7 @@ def test_models_it_cannot_use_are_refused() -> None:
         MpcSettings(scenarios=2, bandwidth=8.0).design(bake_off_neck())
 
 
+@pytest.mark.slow
 def test_review_tells_what_is_doubtful() -> None:
     assert MpcSettings(bandwidth=8.0).design(bake_off_neck()).review() == []
     short = MpcSettings(bandwidth=8.0, horizon=4, moves=2, lead_limit=0.1, angle_limit=0.8, position_limit=2.0).design(

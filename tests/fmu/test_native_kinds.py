@@ -234,6 +234,7 @@ def test_an_importer_computes_what_python_does(importer: str, name: str, tmp_pat
     _assert_equal(np.load(out), expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fmi", [2, 3])
 def test_fmutool_finds_it_compliant(fmi: int, tmp_path: Path) -> None:
     tool = Path(sys.executable).with_name("fmutool")

@@ -132,6 +132,7 @@ def test_the_controller_computed_again_gives_the_same_run(run: Path, project: Pr
     assert result.answers == len(log.rows)
 
 
+@pytest.mark.slow
 def test_another_controller_is_found_at_its_first_answer(run: Path, project: Project) -> None:
     other = project.write_loop("other_reference.toml", 'kind = "step"\npitch_deg = 15.5\nat_s = 1.0', 4.0)
     log = read_run_log(run)

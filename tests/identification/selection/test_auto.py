@@ -47,6 +47,7 @@ def test_the_residual_is_on_the_best_and_the_ensemble_of_the_others(choice: Choi
     assert sorted(models["ensemble"].settings["members"]) == ["play", "rls"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kinds",
     slow_but([("play",), ("rls", "residual"), ("rls", "play", "ensemble")], [("play",)]),
