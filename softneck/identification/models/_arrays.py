@@ -10,7 +10,7 @@ from softneck.core import KINDS, FileFormatError, Matrix, resolve
 from softneck.runtime._bundle import declared
 from softneck.runtime._layout import Arrays
 
-from ._composed import COMPOSED, members, own_arrays
+from ._composed import COMPOSED, members, own_arrays, runtime_of
 
 # A minute at 1 ms: far beyond any lag of a neck, far below what memory holds.
 _LONGEST_HISTORY = 60_000
@@ -23,10 +23,10 @@ def check_arrays(kind: str, arrays: Mapping[str, Matrix]) -> None:
         return
     # `rls` over the motors and more than one pole are state spaces as well.
     form = "subspace" if kind in ("rls", "oe", "srivc") and "A" in arrays else kind
-    names = declared(KINDS[form].runtime, Arrays).names()
+    names = declared(runtime_of(kind, arrays), Arrays).names()
     if tuple(arrays) != names:
         raise FileFormatError(f"a model of kind {kind} has the arrays {', '.join(names)}; got {', '.join(arrays)}.")
-    _check_numbers(form, arrays)
+    _check_numbers(form, arrays, runtime_of(kind, arrays))
 
 
 def _check_composed(kind: str, arrays: Mapping[str, Matrix]) -> None:
@@ -36,12 +36,12 @@ def _check_composed(kind: str, arrays: Mapping[str, Matrix]) -> None:
         raise FileFormatError(f"a model of kind {kind} starts with the arrays {', '.join(names)}.")
     if len(parts) < 1 or (kind == "residual" and len(parts) != 1):
         raise FileFormatError(f"a model of kind {kind} cannot have {len(parts)} members.")
-    _check_numbers(kind, own)
+    _check_numbers(kind, own, KINDS[kind].runtime)
     for member, part in parts:
         check_arrays(member, part)
 
 
-def _check_numbers(kind: str, arrays: Mapping[str, Matrix]) -> None:
+def _check_numbers(kind: str, arrays: Mapping[str, Matrix], runtime: str) -> None:
     """Check what the declaration of a kind says of its arrays, and what the kind's own check does."""
     for name, array in arrays.items():
         if array.dtype != np.float64 or not np.isfinite(array).all():
@@ -49,7 +49,7 @@ def _check_numbers(kind: str, arrays: Mapping[str, Matrix]) -> None:
     for name, what in {"history": "its history in samples", "memory": "its memory in samples"}.items():
         if name in arrays:  # before its number is a length of others
             within(arrays[name], 1, _LONGEST_HISTORY, what)
-    sizes = declared(KINDS[kind].runtime, Arrays).lengths(arrays)
+    sizes = declared(runtime, Arrays).lengths(arrays)
     if "drive" in arrays:
         within(arrays["drive"][:, 1], 0, sizes["H"], "a drive's delay")
     if KINDS[kind].check:

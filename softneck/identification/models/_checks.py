@@ -23,7 +23,7 @@ def check_training(recording: Recording) -> None:
             "the motor set-points are constant; nothing can be identified. Record with an excitation such as `eq22`."
         )
     outputs = recording.outputs
-    for axis, name in enumerate(("pitch", "roll")):
+    for axis, name in enumerate(recording.robot.outputs.names):
         values = outputs[np.isfinite(outputs[:, axis]), axis]
         if values.size < MIN_ROWS:
             raise DataError(f"`{name}` has only {values.size} samples that were not missed; {MIN_ROWS} are needed.")

@@ -14,7 +14,7 @@ from softneck.runtime import load_runtime
 from softneck.runtime._bundle import declared
 from softneck.runtime._layout import Arrays, StateVector
 
-from ._linear_systems import STATE_SPACE
+from ._linear_systems import AFFINE, STATE_SPACE
 
 COMPOSED = ("residual", "ensemble")
 
@@ -56,7 +56,9 @@ def members(arrays: Mapping[str, Matrix]) -> list[tuple[str, dict[str, Matrix]]]
 def runtime_of(kind: str, arrays: Mapping[str, Matrix]) -> str:
     """Return the name of the runtime, with those of the members (see `softneck.runtime.bundle`)."""
     if kind not in COMPOSED:
-        return STATE_SPACE if "A" in arrays and kind != "nss" else KINDS[kind].runtime
+        if "A" in arrays and kind != "nss":
+            return AFFINE if "offset" in arrays else STATE_SPACE
+        return KINDS[kind].runtime
     inner = ",".join(f"{runtime_of(member, part)}:{len(part)}" for member, part in members(arrays))
     return f"{KINDS[kind].runtime}({inner})"
 

@@ -18,8 +18,8 @@ class DriveModel:
     """`m(k+1) = a m(k) + (1 - a) u(k+1-d)` per motor.
 
     Attributes:
-        pole: (3,) a.
-        delay: (3,) d in samples; 0 says that the position is the set-point (no positions were logged).
+        pole: (motors,) a.
+        delay: (motors,) d in samples; 0 says that the position is the set-point (no positions were logged).
     """
 
     pole: Vector
@@ -27,20 +27,21 @@ class DriveModel:
 
     @property
     def array(self) -> Matrix:
-        """(3, 2): pole and delay, as the runtime reads them."""
+        """(motors, 2): pole and delay, as the runtime reads them."""
         return np.column_stack([self.pole, self.delay])
 
     def simulate(self, set_points: Matrix, start: Vector) -> Matrix:
-        """Return motor positions (time, 3) [rad] for set-points (time, 3), from `start` (3,)."""
+        """Return motor positions (time, motors) [rad] for set-points (time, motors), from `start` (motors,)."""
         columns = zip(set_points.T, start, self.pole, self.delay, strict=True)
         return np.column_stack([_simulate(u, m0, a, int(d)) for u, m0, a, d in columns])
 
 
 def fit_drive(recording: Recording) -> DriveModel:
     """Identify the drives from logged positions; the identity where none were logged."""
+    motors = recording.set_points.shape[1]
     if not recording.has_motor_positions:
-        return DriveModel(np.zeros(3), np.zeros(3))
-    fits = [_fit_motor(recording, motor) for motor in range(3)]
+        return DriveModel(np.zeros(motors), np.zeros(motors))
+    fits = [_fit_motor(recording, motor) for motor in range(motors)]
     return DriveModel(np.array([a for a, _ in fits]), np.array([float(d) for _, d in fits]))
 
 

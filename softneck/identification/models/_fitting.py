@@ -17,6 +17,8 @@ from ._rows import row_hashes
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
+# Kinds that take any robot.
+ANY_ROBOT = ("rls", "oe", "srivc", "subspace", "play")
 SAME_EXCITATION = "chosen on rows of the excitation it was trained on; a hold-out of another one chooses better"
 
 
@@ -25,13 +27,23 @@ def one_recording(recordings: Recording | list[Recording]) -> Recording:
     return concatenate(recordings if isinstance(recordings, list) else [recordings])
 
 
-def training_recording(recordings: Recording | list[Recording]) -> Recording:
+def training_recording(recordings: Recording | list[Recording], *, any_robot: bool = False) -> Recording:
     """Return all runs as one recording to identify from.
 
+    Args:
+        recordings: of one robot and sample time.
+        any_robot: whether the kind takes other robots than the neck.
+
     Raises:
-        DataError: too short, without excitation, or with an output that never moves.
+        DataError: too short, without excitation, with an output that never moves, or of a robot that the kind cannot
+            take.
     """
     recording = one_recording(recordings)
+    if not any_robot and not recording.robot.is_neck:
+        raise DataError(
+            f"this kind of model is for necks only so far, and the recording is of robot {recording.robot.label()}; "
+            f"identify {', '.join(ANY_ROBOT)}."
+        )
     check_training(recording)
     return recording
 
@@ -52,4 +64,5 @@ def fitted_model(
         settings=asdict(settings),
         findings={**findings, **trained_set_points(recording)},
         training_rows=row_hashes(recording),
+        robot=recording.robot,
     )

@@ -24,6 +24,8 @@ def read_plain_csv(source: Path) -> dict[str, Vector] | None:
         if source.stat().st_size > _LARGEST:
             return None
         head, _, body = source.read_text(encoding="utf-8").replace("\r\n", "\n").partition("\n")
+        if head.startswith("# "):  # whose recording it is
+            head, _, body = body.partition("\n")
     except (OSError, UnicodeDecodeError):
         return None
     titles = head.split(",")
