@@ -33,7 +33,7 @@ from softneck.core import Matrix, Vector
 from softneck.design import MpcSettings, NmpcSettings, PiSettings
 from softneck.identification import Network
 from softneck.loop import BlockPart, Loop, LoopResult, RecordingReference, run_loop
-from softneck.loop._preview import AheadReference
+from softneck.loop._reference_parts import AheadReference
 from softneck.plant import VirtualNeck, record
 from softneck.signals import TENDON_ANGLES, redefinition_matrix, signal
 from tests.oracles.neck_table import NeckSteps

@@ -22,7 +22,7 @@ import numpy as np
 from five_seeds import TESTS, recordings
 
 from softneck.identification import WARM_UP, nrmse_fit
-from softneck.identification.models._loaded_drive import LoadedDrive, drive_start, fit_loaded_drive
+from softneck.identification.models._drive import LoadedDrive, drive_start, fit_loaded_drive
 from softneck.signals import Recording
 
 PEERS = ("frols", "mlp", "jax_sysid_nss")

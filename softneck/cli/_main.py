@@ -14,7 +14,7 @@ import click
 
 from softneck import __version__
 from softneck.core import SoftneckError
-from softneck.core._extras import missing_extra
+from softneck.core._errors import missing_extra
 
 # Subcommand -> module and what it does; a module is imported when its command is called, so that
 # `softneck --help` answers at once.

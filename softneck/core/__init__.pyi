@@ -23,8 +23,8 @@ from ._kinds import Kind as Kind
 from ._kinds import find_kind as find_kind
 from ._kinds import load as load
 from ._kinds import resolve as resolve
-from ._progress import Progress as Progress
-from ._progress import silent as silent
 from ._types import Matrix as Matrix
+from ._types import Progress as Progress
 from ._types import Vector as Vector
+from ._types import silent as silent
 from ._units import to_si as to_si

@@ -1,6 +1,8 @@
-"""The errors users meet: one clear line each, and one exit code each."""
+"""The errors users meet: one clear line each, one exit code each; and which extra installs what is missing."""
 
 from __future__ import annotations
+
+from importlib.util import find_spec
 
 
 class SoftneckError(Exception):
@@ -29,3 +31,34 @@ class CheckFailedError(SoftneckError):
     """A check that the user asked for did not hold; exit code 1."""
 
     exit_code = 1
+
+
+# Package as it is imported -> (extra of `pip install`, what needs it). 500 of 1,300 MB that the main job never loads.
+EXTRAS = {
+    "casadi": ("mpc", "predictive control, plans and `model.casadi()`"),
+    "daqp": ("mpc", "predictive control solved by daqp"),
+    "pyarrow": ("files", "Parquet files and studies"),
+    "h5py": ("files", "MATLAB files of version 7.3"),
+    "can": ("drives", "a CAN bus"),
+    "canopen": ("drives", "CANopen drives, simulated ones too"),
+    "mcap": ("drives", "logs of runs on drives"),
+    "serial": ("drives", "an inclinometer on a serial port"),
+    "sklearn": ("sklearn", "the scikit-learn regressor"),
+    "slycot": ("slycot", "synthesis by SLICOT"),
+    "distributed": ("dask", "studies on a Dask cluster"),
+}
+
+
+def missing_extra(error: ModuleNotFoundError) -> str | None:
+    """Return one line on which extra to install; None where the missing module is in none of them."""
+    found = EXTRAS.get((error.name or "").partition(".")[0])
+    if found is None:
+        return None
+    extra, purpose = found
+    return f"{error.name} is not installed, and it is needed for {purpose}; run: pip install 'softneck[{extra}]'"
+
+
+def require_package(package: str) -> None:
+    """Raise `SettingsError` with that line unless `package`, of one of the extras, is installed."""
+    if find_spec(package) is None:
+        raise SettingsError(f"{missing_extra(ModuleNotFoundError(name=package))}.")

@@ -1,7 +1,8 @@
-"""Array types; shapes stand in the docstrings of those who use them."""
+"""Types for signatures: arrays, whose shapes stand in docstrings, and how long work reports itself."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,3 +13,12 @@ from numpy.typing import NDArray
 Vector = NDArray[np.floating[Any]]
 #: An array of floats with two axes, as a type.
 Matrix = NDArray[np.floating[Any]]
+
+
+#: Called with the fraction done, 0 to 1, and a word on what is being done.
+Progress = Callable[[float, str], None]
+
+
+def silent(done: float, what: str) -> None:
+    """Report nothing."""
+    del done, what

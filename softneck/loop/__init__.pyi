@@ -3,11 +3,9 @@ from ._faults import MotorFault as MotorFault
 from ._faults import NeckFault as NeckFault
 from ._faults import SensorFault as SensorFault
 from ._loop import Loop as Loop
-from ._metrics import check_limits as check_limits
-from ._metrics import metrics as metrics
 from ._part import BlockPart as BlockPart
 from ._part import Part as Part
-from ._reference_block import ReferenceBlock as ReferenceBlock
+from ._reference_parts import ReferenceBlock as ReferenceBlock
 from ._references import RampReference as RampReference
 from ._references import RecordingReference as RecordingReference
 from ._references import Reference as Reference
@@ -15,6 +13,8 @@ from ._references import RotationReference as RotationReference
 from ._references import SineReference as SineReference
 from ._references import StepReference as StepReference
 from ._result import LoopResult as LoopResult
+from ._result import check_limits as check_limits
+from ._result import metrics as metrics
 from ._run import LoopRun as LoopRun
 from ._run import run_loop as run_loop
 from ._state import LoopState as LoopState

@@ -1,11 +1,15 @@
-"""What a run of a loop leaves: one table of signals with their units."""
+"""What a run of a loop leaves: one table of signals with their units, and how well the loop did, in numbers."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
-from softneck.core import DataError, Vector
+import numpy as np
+
+from softneck.core import DataError, SettingsError, Vector, require_one_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,3 +47,152 @@ class LoopResult:
         """
         names = (axis, f"{axis}_measured") if which == "true" else (f"{axis}_measured", axis)
         return self.signals[names[0]] if names[0] in self.signals else self[names[1]]
+
+
+# Settling is to 5 % of the step, as in the lab's reports and the bake-off of `softneck.design`.
+SETTLING_BAND = 0.05
+# Positions that motors may take [rad] (the public conventions: |P| <= 6 rad).
+MAX_POSITION = 6.0
+# A tendon that pulls less than this hangs [N]: 0.1 g, far below any pretension.
+_SLACK = 1e-3
+_RISE = (0.1, 0.9)
+# The steady state is judged on the last quarter of what follows the step.
+_STEADY_PART = 0.25
+
+_AXIS = ("rise_s", "settling_s", "overshoot_pct", "rms_error_deg", "iae", "ise", "itae", "steady_rms_deg")
+_MOTORS = ("max_rad", "max_rate_rad_s", "effort", "total_variation_rad", "limit_violation_s", "slack_s")
+# All metrics, named as in [limits].
+METRICS = (*(f"{axis}.{name}" for axis in ("pitch", "roll") for name in _AXIS), *(f"motors.{name}" for name in _MOTORS))
+
+Metrics = dict[str, dict[str, float | None]]
+
+
+def metrics(result: LoopResult, *, angle: str = "true") -> Metrics:
+    """Return the metrics of a run: a table each for `pitch`, `roll` and `motors`.
+
+    For an axis:
+
+    - `rise_s`: from 10 to 90 % of the step [s], first samples at or beyond; `settling_s`: from the step to the
+      first sample from which the error stays below 5 % of it [s]; `overshoot_pct`: of the step, zero if none.
+      All three are None where the reference makes no single step, and where the level is never reached.
+    - `rms_error_deg`, `iae` [rad s], `ise` [rad^2 s]: of reference minus angle, over the whole run.
+    - `itae` [rad s^2]: the error's size times the time since the step (since the start without one).
+    - `steady_rms_deg`: rms error over the last quarter of the time after the step (of the run without one).
+
+    For the motors, of the set-points: `max_rad`, `max_rate_rad_s` between samples, `effort` = integral of
+    P1^2 + P2^2 + P3^2 [rad^2 s], `total_variation_rad` = sum of all moves, `limit_violation_s` = time with a
+    set-point beyond 6 rad [s]; `slack_s` = time with a tendon without tension [s], None where no tension is known.
+
+    Args:
+        result: of a run.
+        angle: "true" (where the plant offers it, else measured) or "measured"; missing samples are left out.
+
+    Raises:
+        SettingsError: another `angle`.
+    """
+    require_one_of("angle", angle, ("true", "measured"))
+    P = np.column_stack([result[f"motor_setpoint_{j}"] for j in (1, 2, 3)])
+    moves = np.abs(np.diff(P, axis=0))
+    beyond = np.any(np.abs(P) > MAX_POSITION * (1.0 + 1e-9), axis=1)
+    return {
+        "pitch": _axis(result, "pitch", angle),
+        "roll": _axis(result, "roll", angle),
+        "motors": {
+            "max_rad": float(np.abs(P).max()),
+            "max_rate_rad_s": float(moves.max(initial=0.0)) / result.sample_time,
+            "effort": float(np.sum(P**2) * result.sample_time),
+            "total_variation_rad": float(moves.sum()),
+            "limit_violation_s": float(beyond.sum() * result.sample_time),
+            "slack_s": _slack(result),
+        },
+    }
+
+
+def check_limits(values: Mapping[str, Any], limits: Mapping[str, float]) -> list[dict[str, Any]]:
+    """Compare metrics with upper limits named as in a loop file, such as "pitch.overshoot_pct".
+
+    Returns:
+        For each limit {"metric", "limit", "value", "holds"}; a metric that is None does not hold.
+
+    Raises:
+        SettingsError: no such metric, or a limit that is not a number.
+    """
+    known = {f"{group}.{name}": value for group, table in values.items() for name, value in table.items()}
+    rows = []
+    for name, limit in limits.items():
+        if name not in known:
+            raise SettingsError(f"limit on unknown metric `{name}`; use one of {', '.join(known)}.")
+        if isinstance(limit, bool) or not isinstance(limit, int | float) or math.isnan(limit):
+            raise SettingsError(f"the limit of `{name}` must be a number; got {limit!r}.")
+        value = known[name]
+        holds = value is not None and value <= limit
+        rows.append({"metric": name, "limit": float(limit), "value": value, "holds": bool(holds)})
+    return rows
+
+
+def _axis(result: LoopResult, axis: str, angle: str) -> dict[str, float | None]:
+    r, y = result[f"{axis}_reference"], result.angle(axis, angle)
+    step = _find_step(r)
+    first = 0 if step is None else step[0]
+    error = r - y
+    known = np.isfinite(error)
+    tail = error[first + math.floor((1.0 - _STEADY_PART) * (r.size - first)) :]
+    shape: dict[str, float | None] = {"rise_s": None, "settling_s": None, "overshoot_pct": None}
+    if step is not None and known[step[0] :].any():
+        k, low, high = step
+        response = (y[k:] - low) / (high - low)
+        shape = _step_shape(_held(response), result.sample_time)
+    size, since = np.abs(error[known]), result.time[known] - result.time[first]
+    return {
+        **shape,
+        "rms_error_deg": _rms_deg(error),
+        "iae": float(np.sum(size) * result.sample_time),
+        "ise": float(np.sum(size**2) * result.sample_time),
+        "itae": float(np.sum(size * np.maximum(since, 0.0)) * result.sample_time),
+        "steady_rms_deg": _rms_deg(tail),
+    }
+
+
+def _held(y: Vector) -> Vector:
+    """Return `y` (n,) with each missing sample as the one before it; the first ones as the first that is known."""
+    known = np.flatnonzero(np.isfinite(y))
+    return y[known[np.maximum(np.searchsorted(known, np.arange(y.size), side="right") - 1, 0)]]
+
+
+def _slack(result: LoopResult) -> float | None:
+    names = [f"tension_{j}" for j in (1, 2, 3) if f"tension_{j}" in result.signals]
+    if not names:
+        return None
+    slack = np.any([result[name] <= _SLACK for name in names], axis=0)
+    return float(slack.sum() * result.sample_time)
+
+
+def _find_step(r: Vector) -> tuple[int, float, float] | None:
+    """Return (row, level before, level after) if the reference makes exactly one step, else None.
+
+    A constant reference other than zero is a step from zero at the first row.
+    """
+    jumps = np.flatnonzero(np.diff(r))
+    if jumps.size == 0:
+        return (0, 0.0, float(r[0])) if r[0] != 0.0 else None
+    if jumps.size == 1 and jumps[0] + 2 < r.size:
+        k = int(jumps[0]) + 1
+        return k, float(r[0]), float(r[k])
+    return None
+
+
+def _step_shape(y: Vector, sample_time: float) -> dict[str, float | None]:
+    """Return rise, settling and overshoot of a response `y` (n,) that should go from 0 to 1."""
+    low, high = (np.flatnonzero(y >= level) for level in _RISE)
+    outside = np.flatnonzero(np.abs(y - 1.0) >= SETTLING_BAND)
+    settled = 0 if outside.size == 0 else int(outside[-1]) + 1
+    return {
+        "rise_s": float(high[0] - low[0]) * sample_time if high.size else None,
+        "settling_s": settled * sample_time if settled < y.size else None,
+        "overshoot_pct": max(0.0, 100.0 * (float(y.max()) - 1.0)),
+    }
+
+
+def _rms_deg(error: Vector) -> float | None:
+    known = error[np.isfinite(error)]
+    return math.degrees(math.sqrt(float(np.mean(known**2)))) if known.size else None

@@ -1,6 +1,6 @@
 """The rows of a loop: one cycle, interpreted or compiled, that simulations, studies, verification and drives share.
 
-What happens in a row is a list of actions (see `_order.py`). All that changes is changed in place: the bus, what each
+What happens in a row is a list of actions (see `_rows.py`). All that changes is changed in place: the bus, what each
 part holds, the memory of faults.
 """
 

@@ -14,10 +14,9 @@ from softneck.runtime import Port
 
 from ._disturbed_bus import place_faults
 from ._loop import Loop
-from ._order import cycle, late
 from ._part import Part
 from ._result import LoopResult
-from ._rows import Rows, can_compile
+from ._rows import Rows, can_compile, cycle, late
 from ._state import LoopState, SaveablePart
 from ._wiring import REFERENCE_PORTS, BusSignal, Wiring, wire
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Vector
-from softneck.core._extras import require_package
+from softneck.core._errors import require_package
 
 from ._block import Block
 from ._bundle import bundle

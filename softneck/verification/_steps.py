@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector
-from softneck.loop._metrics import SETTLING_BAND
+from softneck.loop._result import SETTLING_BAND
 from softneck.runtime import Block, load_functions
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 

@@ -10,8 +10,8 @@ import pytest
 
 from softneck import load
 from softneck.cli._main import run
-from softneck.core import SettingsError, _extras
-from softneck.core._extras import EXTRAS, missing_extra
+from softneck.core import SettingsError, _errors
+from softneck.core._errors import EXTRAS, missing_extra
 from softneck.signals import write_recording
 
 from ..data import ROOT, neck_recording
@@ -38,7 +38,7 @@ def test_a_command_names_the_extra_that_it_lacks(
 
 def test_a_model_without_casadi_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     model = load(Path(__file__).parents[1] / "golden" / "rls.npz")
-    monkeypatch.setattr(_extras, "find_spec", lambda _: None)
+    monkeypatch.setattr(_errors, "find_spec", lambda _: None)
     with pytest.raises(SettingsError, match=r"casadi is not installed.*pip install 'softneck\[mpc\]'"):
         model.casadi()
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from softneck.core import load
-from softneck.identification.models._rows import row_hashes
+from softneck.identification.models._fitting import row_hashes
 from softneck.signals import read_recording, write_recording
 
 from ..data import neck_recording

@@ -23,7 +23,7 @@ from softneck.design import PiSettings
 from softneck.estimation import KalmanSettings
 from softneck.fmu import build_compiled_fmu, build_fmu
 from softneck.fmu.describe._description import described_block
-from softneck.fmu.python._pack import read_zip, write_zip
+from softneck.fmu.python._zip import read_zip, write_zip
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import Block, Port
 

@@ -32,7 +32,7 @@ from softneck.cosim.studies._study_results import write_worst
 from softneck.cosim.studies._study_run import failed_row
 from softneck.loop import StepReference
 from softneck.loop._faults import make_fault
-from softneck.loop._metrics import METRICS
+from softneck.loop._result import METRICS
 
 LOOP = """
 duration_s = 1.0

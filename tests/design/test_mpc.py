@@ -15,7 +15,7 @@ from softneck.core import DataError, FileFormatError
 from softneck.design import MeasuredDisturbance, MpcController, MpcSettings
 from softneck.design.predictive import _mpc_state_runtime as rt
 from softneck.loop import BlockPart, Loop, RotationReference, run_loop
-from softneck.loop._preview import AheadReference
+from softneck.loop._reference_parts import AheadReference
 from softneck.runtime import load_functions, load_runtime
 
 from ..oracles.bake_off import bake_off_neck

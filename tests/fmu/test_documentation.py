@@ -14,7 +14,7 @@ from PIL import Image
 
 from softneck.core import SettingsError
 from softneck.fmu import FmuInfo, build_fmu, fmu_info
-from softneck.fmu.describe._svg import line_chart
+from softneck.fmu.describe._figures import line_chart
 from softneck.fmu.python import _build
 from softneck.identification import Rls, validate
 

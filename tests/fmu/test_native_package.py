@@ -25,7 +25,7 @@ from softneck.fmu.compiled._model_file import node_of
 from softneck.fmu.compiled._sources import FLAGS, c_sources, sources_key
 from softneck.fmu.compiled.translate._chunks import only_kinds
 from softneck.fmu.compiled.translate._kinds import ranks_of
-from softneck.fmu.python._pack import deflated, write_zip
+from softneck.fmu.python._zip import deflated, write_zip
 
 from .every_kind import NATIVE, TS, block_of, inputs_of
 

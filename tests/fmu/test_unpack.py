@@ -48,7 +48,7 @@ def test_members_that_reach_out_are_refused(name: str, tmp_path: Path) -> None:
 
 
 def test_an_archive_that_would_fill_the_disk_is_refused(lag_fmu: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("softneck.fmu.python._unpack._MAX_BYTES", 1000)
+    monkeypatch.setattr("softneck.fmu.python._zip._MAX_BYTES", 1000)
     with pytest.raises(FileFormatError, match="over the limit of 1000"):
         unpack(lag_fmu)
 

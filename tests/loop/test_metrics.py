@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from softneck.core import SettingsError
 from softneck.loop import LoopResult, check_limits, metrics
-from softneck.loop._metrics import SETTLING_BAND
+from softneck.loop._result import SETTLING_BAND
 
 TS = 0.02
 

@@ -13,11 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from softneck.core import DataError, FileFormatError, OutputFileError, SoftneckError
-from softneck.identification.models._rows import row_hashes
+from softneck.identification.models._fitting import row_hashes
 from softneck.signals import SET_POINTS, Recording, concatenate, read_recording, write_recording
 from softneck.signals.recording import _files
 from softneck.signals.recording._channels import known_channels
-from softneck.signals.recording._plain_csv import read_plain_csv
+from softneck.signals.recording._files import read_plain_csv
 
 from ..data import changed, csv_lines, neck_recording
 

@@ -9,7 +9,7 @@ from typing import Any
 from softneck.core import FileFormatError, SettingsError, SoftneckError, file_hash
 from softneck.loop import Fault, Loop, Part, ReferenceBlock
 from softneck.loop._faults import make_fault
-from softneck.loop._preview import AheadReference
+from softneck.loop._reference_parts import AheadReference
 
 from ..parts._fmu_part import FmuPart
 from ..parts._isolated import IsolatedPart

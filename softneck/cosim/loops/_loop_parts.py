@@ -11,7 +11,7 @@ from typing import Any
 
 from softneck.core import DataError, FileFormatError, SettingsError, file_hash, load
 from softneck.loop import BlockPart, Part, RecordingReference, Reference
-from softneck.loop._preview import AheadReference
+from softneck.loop._reference_parts import AheadReference
 from softneck.loop._references import make_reference
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import Block

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from softneck import __version__
 from softneck.core import FileFormatError, OutputFileError, SettingsError, atomic_write
-from softneck.loop._metrics import METRICS
+from softneck.loop._result import METRICS
 
 from ._study import Study
 from ._vary import Vary

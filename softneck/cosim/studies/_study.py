@@ -12,7 +12,7 @@ from typing import Any
 
 from softneck.core import FileFormatError, SettingsError, SoftneckError, file_hash
 from softneck.loop import Loop, LoopRun
-from softneck.loop._metrics import METRICS
+from softneck.loop._result import METRICS
 from softneck.runtime import Block
 
 from ..loops._loop_file import make_loop, normal_table

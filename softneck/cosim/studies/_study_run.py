@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import SoftneckError
-from softneck.loop._metrics import METRICS
+from softneck.loop._result import METRICS
 
 from ..loops._loop_file import make_loop
 from ..loops._loop_table import with_values

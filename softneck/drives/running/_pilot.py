@@ -9,8 +9,7 @@ import numpy as np
 
 from softneck.core import SettingsError, Vector
 from softneck.loop import Loop
-from softneck.loop._order import cycle
-from softneck.loop._rows import Rows
+from softneck.loop._rows import Rows, cycle
 from softneck.loop._rows_runtime import ROWS_RECORD, ROWS_REFER, ROWS_SHOW, ROWS_STEP
 from softneck.loop._wiring import wire
 

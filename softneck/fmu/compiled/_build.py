@@ -13,12 +13,10 @@ from softneck.core import SettingsError, atomic_write, refuse_existing
 from softneck.runtime import Block
 
 from ..describe._description import Identity, described_block, model_description
-from ..describe._documentation import documentation_page
-from ..describe._icon import icon_png
-from ..describe._info import FmuInfo
-from ..describe._terminals import terminals_file
+from ..describe._documentation import FmuInfo, documentation_page
+from ..describe._terminals_and_icons import icon_png, terminals_file
 from ..python._build import check_block, generation_date, license_text, model_name
-from ..python._pack import write_zip
+from ..python._zip import write_zip
 from ._description3 import model_description3
 from ._library import Library, find_library
 from ._model_file import model_bytes, node_of

@@ -15,7 +15,7 @@ from ..describe._description import (
     start_attribute,
     unit_attributes,
 )
-from ..describe._info import FmuInfo
+from ..describe._documentation import FmuInfo
 
 _TIME = "time"
 

@@ -17,7 +17,7 @@ import platformdirs
 
 from softneck.core import FileFormatError, SettingsError, atomic_write
 
-from ..python._pack import deflated
+from ..python._zip import deflated
 from ._compilers import compile_for, compile_here, local_compiler
 from ._platforms import PLATFORMS, here
 from ._sources import GENERATED, HERE, Sources, c_sources, sources_key

@@ -12,8 +12,8 @@ import numpy as np
 from softneck.identification import Validation
 from softneck.runtime import Block
 
-from ._info import FmuInfo
-from ._svg import line_chart
+from ._documentation import FmuInfo
+from ._figures import line_chart
 
 _AXES = ("pitch", "roll")
 # Of a free run, in the picture [s].

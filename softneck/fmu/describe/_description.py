@@ -14,7 +14,7 @@ from softneck import __version__
 from softneck.core import SettingsError
 from softneck.runtime import Block, Port
 
-from ._info import FmuInfo
+from ._documentation import FmuInfo
 from ._modelled_drives import with_modelled_drives
 
 # Paper, section 3: the neck tilts up to 0.7 rad or so; more in a reference is nearly always degrees.

@@ -1,14 +1,42 @@
-"""`documentation/index.html` of an FMU: what it is, its variables, its timing, what the host must have."""
+"""What an FMU says about itself beyond its variables: its texts, and `documentation/index.html`.
+
+The page says what the model is, its variables, its timing, and what the host must have.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from html import escape
 
 from softneck.runtime import Block, Port
 
-from ._info import FmuInfo
-from ._response import response_figure
+from ._figures import response_figure
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FmuInfo:
+    """Texts for people, and the length of the default experiment.
+
+    Attributes:
+        description: one line.
+        author: who made the model, "" for none.
+        license: SPDX name, "" for none.
+        version: of the model, "" for none.
+        copyright: one line, "" for none.
+        documentation: HTML that goes into the body of `documentation/index.html`: how the model was
+            identified, its scores, what it is not good for.
+        stop_time: of the default experiment [s].
+    """
+
+    description: str = ""
+    author: str = ""
+    license: str = ""
+    version: str = ""
+    copyright: str = ""
+    documentation: str = ""
+    stop_time: float = 10.0
+
 
 # What the slave's syntax needs.
 MINIMUM_PYTHON = (3, 11)

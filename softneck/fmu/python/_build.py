@@ -25,12 +25,10 @@ from softneck.runtime import Block, Port
 
 from ..describe._cost import plain_cost
 from ..describe._description import Identity, described_block, generation_tool, model_description
-from ..describe._documentation import HOST_NEEDS, documentation_page
-from ..describe._icon import icon_png
-from ..describe._info import FmuInfo
-from ..describe._terminals import terminals_file
+from ..describe._documentation import HOST_NEEDS, FmuInfo, documentation_page
+from ..describe._terminals_and_icons import icon_png, terminals_file
 from ._module import slave_module
-from ._pack import read_zip, write_zip
+from ._zip import read_zip, write_zip
 
 _BINARIES = ("binaries/linux64/", "binaries/win64/")
 _ROLES = ("plant", "observer", "controller", "reference")

@@ -22,8 +22,7 @@ from softneck.signals import TENDON_ANGLES, Recording, redefine, redefinition_ma
 
 from ..models._directions import Directions, directions_of
 from ..models._drive import fit_drive
-from ..models._fitting import fitted_model, training_recording
-from ..models._free_run import delay_samples, free_run_fit
+from ..models._fitting import delay_samples, fitted_model, free_run_fit, training_recording
 from ..models._model import Model
 from ..models._state_space import axes_system, lss_arrays
 from ._operating_point import about, operating_point, with_offset

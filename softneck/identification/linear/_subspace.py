@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +12,7 @@ from softneck.core import (
     DataError,
     Matrix,
     Progress,
+    Vector,
     require_between,
     require_one_of,
     require_positive,
@@ -21,14 +23,169 @@ from softneck.signals import Recording
 
 from ..models._directions import directions_of
 from ..models._drive import fit_drive
-from ..models._fitting import fitted_model, training_recording
-from ..models._free_run import delay_samples
+from ..models._fitting import delay_samples, fitted_model, training_recording
 from ..models._model import Model
 from ..models._state_space import lss_arrays
 from ._oe import SOURCES
 from ._operating_point import about, operating_point, with_offset
 from ._regression import condition
-from ._subspace_fit import SubspaceFit, fit_subspace
+
+# A mode slower than the record cannot be told from a drift: it is drawn in to this radius.
+_LARGEST_RADIUS = 0.9995
+
+Runs = Sequence[tuple[Matrix, Matrix]]
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class SubspaceFit:
+    """A state space and how it fits.
+
+    Attributes:
+        A, B, C, K: of the innovation form.
+        singular_values: of the projected future: their drop says the order.
+        cost: (ny,) sums of squared errors of the free run, over the outputs.
+    """
+
+    A: Matrix
+    B: Matrix
+    C: Matrix
+    K: Matrix
+    singular_values: Vector
+    cost: Vector
+
+
+def fit_subspace(runs: Runs, order: int, horizon: int) -> SubspaceFit:
+    """Identify from inputs (time, nu) and outputs (time, ny) of each run.
+
+    Args:
+        runs: never joined; a window with a missed output is left out.
+        order: n.
+        horizon: block rows of past and of future.
+
+    Raises:
+        DataError: every run too short, or too few windows.
+    """
+    windows = _Windows(runs, horizon)
+    gamma, sequence, values = windows.observability(order)
+    ny = runs[0][1].shape[1]
+    C = gamma[:ny]
+    A = _settled(np.linalg.lstsq(gamma[:-ny], gamma[ny:])[0])
+    B, cost = _input_matrix(runs, A, C)
+    K = _gain(windows, sequence, A, B, C)
+    return SubspaceFit(A=A, B=B, C=C, K=K, singular_values=values, cost=cost)
+
+
+class _Windows:
+    """All windows of past and future of all runs."""
+
+    def __init__(self, runs: Runs, horizon: int) -> None:
+        self.nu, self.ny, self.horizon = runs[0][0].shape[1], runs[0][1].shape[1], horizon
+        parts, self.follows, self.inputs, self.outputs = [], [], [], []
+        for U, Y in runs:
+            count = len(U) - 2 * horizon
+            if count < 2:
+                continue
+            both = np.column_stack([U, Y])
+            rows = np.lib.stride_tricks.sliding_window_view(both, 2 * horizon, axis=0)[:count]  # (count, nu+ny, 2h)
+            good = np.isfinite(rows).all(axis=(1, 2))
+            parts.append(rows[good])
+            at = np.flatnonzero(good)
+            follows = np.zeros(at.size, dtype=bool)
+            follows[:-1] = np.diff(at) == 1
+            self.follows.append(follows)
+            self.inputs.append(U[at + horizon])
+            self.outputs.append(Y[at + horizon])
+        total = sum(len(part) for part in parts)
+        need = 2 * horizon * (self.nu + self.ny)
+        if total < need:
+            raise DataError(
+                f"{total} windows of {2 * horizon} samples without a missed one are too few for {need} rows; "
+                "record longer runs or lower `horizon`."
+            )
+        self.data = np.concatenate(parts)
+
+    def observability(self, order: int) -> tuple[Matrix, Matrix, Vector]:
+        """Return Gamma (h ny, n), the states (windows, n) at the first sample of each future, and singular values."""
+        h, nu = self.horizon, self.nu
+        flat = self.data.transpose(0, 2, 1)  # (windows, time, channel)
+        count = len(flat)
+        past = flat[:, :h].reshape(count, -1)
+        future_u = flat[:, h:, :nu].reshape(count, -1)
+        future_y = flat[:, h:, nu:].reshape(count, -1)
+        R = np.asarray(np.linalg.qr(np.column_stack([future_u, past, future_y]), mode="r"))
+        n1, n2 = future_u.shape[1], past.shape[1]
+        R22, R23 = R[n1 : n1 + n2, n1 : n1 + n2], R[n1 : n1 + n2, n1 + n2 :]
+        U, s, _ = np.linalg.svd(R23.T, full_matrices=False)
+        if order > s.size or s[order - 1] <= 1e-12 * s[0]:
+            raise DataError(f"the data holds fewer than {order} states; lower `order`.")
+        gamma = U[:, :order] * np.sqrt(s[:order])
+        # Y_f = Gamma X + ..., and X is what the past says of it with the future inputs taken out.
+        states = past @ np.linalg.lstsq(R22, R23, rcond=1e-10)[0] @ np.linalg.pinv(gamma).T
+        return gamma, states, s[: 3 * order + 4]
+
+
+def _input_matrix(runs: Runs, A: Matrix, C: Matrix) -> tuple[Matrix, Vector]:
+    """Return B (n, nu) and the cost by least squares of the free run, each run with a start of its own."""
+    from scipy.signal import lfilter
+
+    n, ny = A.shape[0], C.shape[0]
+    nu = runs[0][0].shape[1]
+    modes, V = np.linalg.eig(A)
+    left, right = C @ V, np.linalg.inv(V)
+    weights = np.einsum("im,mj->ijm", left, right)  # (ny, n, modes)
+    parts, targets = [], []
+    for U, Y in runs:
+        forced = np.zeros((len(U), ny, n * nu))
+        for j in range(nu):
+            s = np.column_stack([lfilter([0.0, 1.0], [1.0, -m], U[:, j]) for m in modes])
+            forced[:, :, j * n : (j + 1) * n] = np.real(np.einsum("tm,ijm->tij", s, weights))
+        free = np.real(np.einsum("tm,ijm->tij", modes ** np.arange(len(U))[:, None], weights))
+        X, F, y = forced.reshape(-1, n * nu), free.reshape(-1, n), Y.reshape(-1)
+        there = np.isfinite(y)
+        Q, _ = np.linalg.qr(F[there])
+        parts.append(X[there] - Q @ (Q.T @ X[there]))
+        targets.append((y[there] - Q @ (Q.T @ y[there]), np.flatnonzero(there) % ny))
+    X = np.concatenate(parts)
+    y = np.concatenate([t for t, _ in targets])
+    channel = np.concatenate([c for _, c in targets])
+    theta = np.linalg.lstsq(X, y)[0]
+    e = y - X @ theta
+    return theta.reshape(nu, n).T, np.array([float(e[channel == i] @ e[channel == i]) for i in range(ny)])
+
+
+def _gain(windows: _Windows, states: Matrix, A: Matrix, B: Matrix, C: Matrix) -> Matrix:
+    """Return the Kalman gain of the noise that the state sequence leaves over."""
+    from scipy.linalg import solve_discrete_are
+
+    follows = np.concatenate(windows.follows)
+    at = np.flatnonzero(follows)
+    U, Y = np.concatenate(windows.inputs), np.concatenate(windows.outputs)
+    w = states[at + 1] - states[at] @ A.T - U[at] @ B.T
+    v = Y[at] - states[at] @ C.T
+    joint = np.cov(np.column_stack([w, v]).T)
+    n, ny = A.shape[0], C.shape[0]
+    # A clean simulation leaves nothing; an observer needs some noise to trade.
+    floor = 1e-10 * max(float(np.trace(np.atleast_2d(np.cov(Y.T)))), 1e-12)
+    R = joint[n:, n:] + floor * np.eye(ny)
+    Q = joint[:n, :n] + floor * np.eye(n)
+    S = joint[:n, n:]
+    try:
+        P = np.asarray(solve_discrete_are(A.T, C.T, Q, R, s=S))
+    except (np.linalg.LinAlgError, ValueError):
+        return np.zeros((n, ny))  # no stabilising gain: the model starts from where it would stand
+    K = (A @ P @ C.T + S) @ np.linalg.inv(C @ P @ C.T + R)
+    return K if np.abs(np.linalg.eigvals(A - K @ C)).max() < 1.0 else np.zeros((n, ny))
+
+
+def _settled(A: Matrix) -> Matrix:
+    """Return `A` with its modes drawn into the unit disc."""
+    modes, V = np.linalg.eig(A)
+    size = np.abs(modes)
+    if size.max() <= _LARGEST_RADIUS:
+        return A
+    inside = np.where(size > _LARGEST_RADIUS, modes * _LARGEST_RADIUS / np.maximum(size, 1e-300), modes)
+    return np.real(V @ np.diag(inside) @ np.linalg.inv(V))
+
 
 # Motors that repeat each other to one part in a million: no method tells their effects apart.
 _WORST_CONDITION = 1e6

@@ -8,6 +8,7 @@ by 0.2 s is what those seconds are stretched by.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,7 +82,8 @@ def directions_of(recording: Recording, motors: list[Matrix]) -> Directions:
     return Directions(names, np.array(found), np.array(seconds), given is None)
 
 
-def _first_order(inputs: list[Matrix], outputs: list[Vector], sample_time: float) -> tuple[float, Vector]:
+def _first_order(
+    inputs: Sequence[Matrix], outputs: Sequence[Vector], sample_time: float) -> tuple[float, Vector]:
     """Return time constant [s] and weights (motors,) of the low-pass filter over all inputs that fits an output best."""
     longest = max(len(U) for U in inputs) * sample_time
     y = np.concatenate(outputs)

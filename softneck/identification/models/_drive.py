@@ -1,4 +1,7 @@
-"""The drive model: from motor set-point to measured position, first order plus delay, one per motor."""
+"""The drive model: from motor set-point to measured position, first order plus delay, one per motor.
+
+And the same with a limit: what a motor that pulls against its current limit does (see `_bank_runtime`).
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softneck.core import Matrix, Vector
+from softneck.runtime import load_functions
 from softneck.signals import Recording
 
 # 0.2 s at 20 ms: a drive that answers later than that is not the paper's.
@@ -83,3 +87,125 @@ def _simulate(u: Vector, start: float, a: float, d: int) -> Vector:
     # Before the record began the drive had reached its position.
     delayed = np.concatenate([np.full(min(d, u.size), start), u[: max(u.size - d, 0)]])
     return lfilter([1.0 - a], [1.0, -a], delayed, zi=[a * start])[0]
+
+
+FUNCTIONS = "softneck.identification.models._bank_fit_runtime"
+# A limit that no set-point reaches.
+NO_LOAD = np.array([0.0, 1e9, 0.0, 0.0])
+# The simplex starts here: a drive that follows a fast lag closely, and one that stops at a fixed tension.
+# (logit of the pole of q, c, c1, c2)
+_STARTS = ((2.0, 0.2, 0.9, 1.0), (4.0, 2.0, 0.3, 0.3), (2.0, 0.5, 0.8, 0.5))
+_EVALUATIONS = 500
+# A plain lag this close [rad^2] leaves nothing to explain: an encoder's step is 1e-4 rad.
+_EXACT = 1e-7
+# A limit that explains less of the error than this is noise.
+_WORTH = 0.95
+# A minute or two of motion say all there is to say about five numbers.
+_MOST_ROWS = 10_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadedDrive:
+    """A lag with dead time for each motor, and the limit they share.
+
+    Attributes:
+        drive: (3, 2) pole and delay, as in `DriveModel`.
+        load: (4,) pole of q, c, c1, c2 of `_bank_runtime`; `NO_LOAD` for none.
+    """
+
+    drive: Matrix
+    load: Vector
+
+    def simulate(self, set_points: Matrix, start: Vector) -> Matrix:
+        """Return motor positions (time, 3) [rad] for set-points (time, 3), from `start` (3,)."""
+        motors = np.empty(set_points.shape)
+        load_functions(FUNCTIONS).drive_run(
+            self.drive, self.load, np.ascontiguousarray(set_points), np.ascontiguousarray(start), motors
+        )
+        return motors
+
+
+def fit_loaded_drive(recording: Recording) -> LoadedDrive:
+    """Identify drives with a common limit from logged positions; no limit where it explains nothing."""
+    from scipy.optimize import minimize
+
+    plain = LoadedDrive(fit_drive(recording).array, NO_LOAD)
+    if not recording.has_motor_positions:
+        return plain
+    runs = _longest(recording)
+    error = _loaded_error(runs, plain)
+    if error < _EXACT:
+        return plain
+    released = _released(runs, plain.drive)
+    best, least = plain, _WORTH * error
+    for start in _STARTS:
+        found = minimize(
+            lambda x: _loaded_error(runs, _from(x, released)),
+            np.concatenate([[0.0], start]),
+            method="Nelder-Mead",
+            options={"maxfev": _EVALUATIONS, "xatol": 1e-4, "fatol": 1e-10},
+        )
+        if found.fun < least:
+            best, least = _from(found.x, released), float(found.fun)
+    return best
+
+
+def drive_start(run: Recording) -> Vector:
+    """Return the first motor positions (3,) of a run; set-points where a position was missed."""
+    logged = run.motor_positions[0]
+    return np.where(np.isfinite(logged), logged, run.set_points[0])
+
+
+def _longest(recording: Recording) -> list[tuple[Matrix, Matrix]]:
+    left, runs = _MOST_ROWS, []
+    for run in recording.runs():
+        part = run.rows(0, min(len(run), left))
+        runs.append((np.ascontiguousarray(part.set_points), part.motor_positions))
+        left -= len(part)
+        if left < 2:
+            break
+    return runs
+
+
+def _released(runs: list[tuple[Matrix, Matrix]], fallback: Matrix) -> Matrix:
+    """Return pole and delay of each motor from its moves away from the tension, which no load hinders."""
+    drive = fallback.copy()
+    for j in range(3):
+        best = np.inf
+        for d in range(1, _MAX_DELAY + 1):
+            gaps, moves = _gaps(runs, j, d)
+            slack = (gaps < -0.02) & np.isfinite(moves)
+            if slack.sum() < 50:
+                continue
+            rate = float(moves[slack] @ gaps[slack] / (gaps[slack] @ gaps[slack]))
+            error = float(np.mean((moves[slack] - rate * gaps[slack]) ** 2))
+            if error < best and 0.001 < rate < 1.0:
+                best, drive[j] = error, (1.0 - rate, d)
+    return drive
+
+
+def _gaps(runs: list[tuple[Matrix, Matrix]], j: int, d: int) -> tuple[Vector, Vector]:
+    """Return how far the set-point was, and how far the motor went, over all samples of all runs."""
+    parts = [(u[: len(u) - d, j] - m[d - 1 : -1, j], m[d:, j] - m[d - 1 : -1, j]) for u, m in runs if len(u) > d + 1]
+    if not parts:
+        return np.zeros(0), np.zeros(0)
+    gaps, moves = zip(*parts, strict=True)
+    return np.concatenate(gaps), np.concatenate(moves)
+
+
+def _from(x: Vector, drive: Matrix) -> LoadedDrive:
+    from scipy.special import expit, logit
+
+    poles = expit(logit(np.clip(drive[:, 0], 1e-3, 1.0 - 1e-3)) + x[0])
+    return LoadedDrive(np.column_stack([poles, drive[:, 1]]), np.array([expit(x[1]), *x[2:]]))
+
+
+def _loaded_error(runs: list[tuple[Matrix, Matrix]], drive: LoadedDrive) -> float:
+    above, count = 0.0, 0
+    for u, m in runs:
+        start = np.where(np.isfinite(m[0]), m[0], u[0])
+        error = (drive.simulate(u, start) - m).ravel()
+        there = np.isfinite(error)
+        above += float(error[there] @ error[there])
+        count += int(there.sum())
+    return above / max(count, 1)

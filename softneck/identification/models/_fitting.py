@@ -1,24 +1,140 @@
-"""What every estimator begins and ends with: one recording to train on, and a model that knows its rows."""
+"""What every estimator begins and ends with: data fit to train on, dead times to try, a model that knows its rows.
+
+Rows are known by hash: a model remembers what it was trained on, so that validation can leave it out.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from softneck.core import Matrix
+import numpy as np
+
+from softneck.core import DataError, Matrix, Vector
 from softneck.signals import Recording, concatenate
 
-from ._checks import check_training
-from ._model import Model
+from ._model import WARM_UP, Model
 from ._ports import trained_set_points
-from ._rows import row_hashes
+from ._scores import nrmse_fit
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 # Kinds that take any robot.
 ANY_ROBOT = ("rls", "oe", "srivc", "subspace", "play")
+# Less than 2 s at 20 ms says nothing about a neck with a time constant of 0.2 s.
+MIN_ROWS = 100
+
+
+def check_training(recording: Recording) -> None:
+    """Raise DataError for a record too short, without excitation, or with an output that never moves."""
+    if len(recording) < MIN_ROWS:
+        raise DataError(
+            f"{len(recording)} rows are too few to identify from; at least {MIN_ROWS} are needed. Record longer."
+        )
+    span = np.ptp(recording.set_points, axis=0)
+    if span.max() < 1e-6:
+        raise DataError(
+            "the motor set-points are constant; nothing can be identified. Record with an excitation such as `eq22`."
+        )
+    outputs = recording.outputs
+    for axis, name in enumerate(recording.robot.outputs.names):
+        values = outputs[np.isfinite(outputs[:, axis]), axis]
+        if values.size < MIN_ROWS:
+            raise DataError(f"`{name}` has only {values.size} samples that were not missed; {MIN_ROWS} are needed.")
+        if np.ptp(values) < 1e-9:
+            raise DataError(f"`{name}` is constant; is its sensor connected?")
+
+
+# A row is told apart by itself and those before it: at rest, logged rows repeat to the last digit.
+_CONTEXT = 5
+# Files round angles to degrees and back; nine digits of a radian survive that.
+_DIGITS = 9
+
+
+def row_hashes(recording: Recording) -> np.ndarray:
+    """Return one uint64 per row (time,): of its set-points and outputs and those of the 4 rows before it."""
+    parts = [_run_hashes(run) for run in recording.runs()]
+    return np.concatenate(parts)
+
+
+def known_rows(recording: Recording, hashes: np.ndarray) -> np.ndarray:
+    """Return a mask (time,) of the rows whose hash is in `hashes`."""
+    return np.isin(row_hashes(recording), hashes)
+
+
+def _run_hashes(run: Recording) -> np.ndarray:
+    values = np.round(np.column_stack([run.set_points, run.outputs]), _DIGITS) + 0.0  # no -0.0
+    bits = np.ascontiguousarray(values, dtype=np.float64).view(np.uint64)
+    single = np.zeros(len(run), dtype=np.uint64)
+    for column in range(bits.shape[1]):
+        single = _mix(single ^ bits[:, column])
+    combined = np.zeros_like(single)
+    for back in range(min(_CONTEXT, len(run))):
+        shifted = np.zeros_like(single)
+        shifted[back:] = single[: single.size - back]
+        combined = _mix(combined ^ shifted)
+    return combined
+
+
+def _mix(x: np.ndarray) -> np.ndarray:
+    """Finaliser of splitmix64 (Steele, Lea and Flood 2014); integer overflow is meant."""
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9) + np.uint64(0x9E3779B97F4A7C15)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return x ^ (x >> np.uint64(31))
+
+
+def delay_samples(
+    delay: float | None, max_delay: float, sample_time: float, runs: Sequence[tuple[Matrix, Matrix]]
+) -> list[int]:
+    """Return the dead times to try, in samples.
+
+    Raises:
+        DataError: a given one is longer than every run.
+    """
+    longest = max(len(Y) for Y, _ in runs)
+    if delay is None:
+        return list(range(max(min(round(max_delay / sample_time), longest - 3), 0) + 1))
+    samples = round(delay / sample_time)
+    if samples >= longest:
+        raise DataError(
+            f"a dead time of {delay:g} s is longer than the longest run, {longest * sample_time:g} s; "
+            "lower `delay` or record longer."
+        )
+    return [samples]
+
+
+def free_run_fit(runs: Sequence[tuple[Matrix, Matrix]], a: Vector, B: Matrix, d: int) -> float:
+    """Return the simulation fit [%] of the first output over all runs; -inf where the model is unstable.
+
+    Args:
+        runs: outputs (time, ny) and inputs (time, nu).
+        a: (na,) denominator without its leading one.
+        B: (nu, nb) numerators.
+        d: dead time in samples.
+    """
+    from scipy.signal import lfilter, lfiltic
+
+    denominator = np.concatenate([[1.0], a])
+    if np.abs(np.roots(denominator)).max(initial=0.0) >= 1.0:
+        return -np.inf
+    measured, simulated = [], []
+    for Y, U in runs:
+        y = Y[:, 0]
+        there = np.isfinite(y)
+        total = np.zeros(len(U))
+        # The first input carries the start from the first measured output, the others start as if held before.
+        for j, b in enumerate(B):
+            numerator = np.concatenate([np.zeros(1 + d), b])
+            y0 = y[np.argmax(there)] if j == 0 and there.any() else 0.0
+            zi = lfiltic(numerator, denominator, np.full(a.size, y0), np.full(numerator.size, U[0, j]))
+            total += lfilter(numerator, denominator, U[:, j], zi=zi)[0]
+        measured.append(y[WARM_UP:])
+        simulated.append(total[WARM_UP:])
+    return nrmse_fit(np.concatenate(measured), np.concatenate(simulated))
+
+
 SAME_EXCITATION = "chosen on rows of the excitation it was trained on; a hold-out of another one chooses better"
 
 

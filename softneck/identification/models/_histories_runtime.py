@@ -42,7 +42,7 @@ def narx_rest(p: NarxArrays, parameters: np.ndarray, x: NarxState, outputs: np.n
     for j in range(p.H):
         for axis in range(p.outputs):
             x.y[j, axis] = parameters[axis]
-    random_seed(x.random, parameters[p.outputs + 2])
+    random_seed(x.random, float(parameters[p.outputs + 2]))
     outputs[:] = 0.0
     for axis in range(p.outputs):
         x.angles[axis] = parameters[axis]

@@ -30,8 +30,7 @@ from softneck.signals.recording._recording import require_same_robot
 
 from . import _linear_systems as _linear
 from . import _linearisation, _ports
-from ._arrays import check_arrays
-from ._composed import members, memory_of, runtime_of, set_now
+from ._arrays import check_arrays, members, memory_of, runtime_of, set_now
 
 if TYPE_CHECKING:
     import casadi

@@ -20,8 +20,9 @@ _TRAINED = "set_points_rad"
 
 def _output(robot: Robot, name: str, description: str, *, missing: bool = False) -> Port:
     unit = to_si(robot.outputs.unit)[1]
-    limits: dict[str, float] = {"minimum": -np.pi, "maximum": np.pi, "nominal": 0.2} if unit == "rad" else {}
-    return Port(name=name, unit=unit, description=description, missing=missing, **({} if missing else limits))
+    if unit != "rad" or missing:
+        return Port(name=name, unit=unit, description=description, missing=missing)
+    return Port(name=name, unit=unit, description=description, minimum=-np.pi, maximum=np.pi, nominal=0.2)
 
 
 def _motor(robot: Robot, name: str, description: str, *, missing: bool = False) -> Port:

@@ -12,9 +12,9 @@ from softneck.core import DataError, Matrix, Progress, SettingsError, require_po
 from softneck.runtime import load_functions
 from softneck.signals import Recording
 
+from ..models._drive import LoadedDrive, drive_start, fit_loaded_drive
 from ..models._error_feedback import fit_correction
 from ..models._fitting import SAME_EXCITATION, fitted_model, training_recording
-from ..models._loaded_drive import LoadedDrive, drive_start, fit_loaded_drive
 from ..models._model import Model
 from ..models._regressors import PAPER_EQ21, regression
 from ._levenberg import Layers, random_layers

@@ -11,7 +11,7 @@ from softneck.core import Matrix, Vector
 from softneck.runtime import load_functions
 from softneck.signals import TENDON_ANGLES, Recording, redefinition_matrix
 
-from ..models._loaded_drive import LoadedDrive, drive_start
+from ..models._drive import LoadedDrive, drive_start
 from ..models._scores import nrmse_fit
 
 FUNCTIONS = "softneck.identification.networks._nss_fit_runtime"

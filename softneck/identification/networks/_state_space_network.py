@@ -13,14 +13,13 @@ from softneck.core import DataError, Matrix, Progress, require_positive, require
 from softneck.runtime import load_functions
 from softneck.signals import TENDON_ANGLES, Recording, redefinition_matrix
 
+from ..models._drive import LoadedDrive, fit_loaded_drive
 from ..models._error_feedback import BEYOND, fit_echo
 from ..models._fitting import SAME_EXCITATION, fitted_model, training_recording
-from ..models._loaded_drive import LoadedDrive, fit_loaded_drive
 from ..models._model import Model
 from ._contraction import Contraction
 from ._nss_problem import FUNCTIONS, Records, Shape, free_run
-from ._nss_start import largest_rate, linear_start, whitened
-from ._nss_training import BestMap, Training, random_start, train_start
+from ._nss_training import BestMap, Training, largest_rate, linear_start, random_start, train_start, whitened
 
 # Steps of each start over windows of 1 sample, 0.2, 1 and 5 s; the whole free run takes what `iterations` says.
 _WINDOW_STEPS = (3, 3, 5, 5)

@@ -15,8 +15,8 @@ import numpy as np
 from softneck.core import DataError, Progress, SettingsError, require_one_of, require_whole, silent
 from softneck.signals import Recording
 
+from ..models._fitting import known_rows, row_hashes
 from ..models._model import WARM_UP, Model
-from ..models._rows import known_rows, row_hashes
 from ._trials import Estimator, Trial, attempt, settings_of
 
 if TYPE_CHECKING:

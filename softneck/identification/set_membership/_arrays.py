@@ -10,7 +10,7 @@ from softneck.core import FileFormatError, Matrix, Vector
 
 from ..linear._arrays import check_linear
 from ..models._arrays import check_table, within
-from ._principal_tree import is_frame, slant_nodes
+from ._trees import is_frame, slant_nodes
 
 
 def check_nlsm(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from softneck.core import DataError, FileFormatError, Matrix, Vector, read_archive, write_archive
 
 from ._forest import PointTree, all_cores, tighten
-from ._tree import tree_nodes
+from ._trees import tree_nodes
 
 _KIND = "cones"
 

@@ -1,4 +1,4 @@
-"""Exact bounds by branch and bound over a slanted tree (see `_principal_tree`).
+"""Exact bounds by branch and bound over a slanted tree (see `_trees`).
 
 Node j of level l is row 2^l + j of `nodes`.
 

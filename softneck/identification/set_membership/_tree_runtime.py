@@ -1,4 +1,4 @@
-"""Exact bounds by branch and bound over a kd-tree (see `_tree`): node j of level l is row 2^l + j of `nodes`.
+"""Exact bounds by branch and bound over a kd-tree (see `_trees`): node j of level l is row 2^l + j of `nodes`.
 
 A cone's value at a box is no better than its ymin (ymax) at the box's nearest point. Rounding keeps that
 order: gaps, squares, their sums in one order, roots and products all rise with their arguments, so a node

@@ -1,15 +1,72 @@
-"""What the numbers in the arrays of the structured kinds must be."""
+"""The numbers of the structured kinds: what those of the grey box start from, and what a file's must be."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
-from softneck.core import FileFormatError, Matrix
+from softneck.core import FileFormatError, Matrix, Vector
 
 from ..models._arrays import within
-from ._greybox_numbers import NUMBERS
+
+
+@dataclass(frozen=True, slots=True)
+class Number:
+    """One number of the neck's equations.
+
+    Attributes:
+        name: as in `_neck_equations_runtime`.
+        unit: SI; lengths of tendon and tensions are in radians of motor.
+        guess: where the search starts: the order of magnitude of a neck of 0.1 m with winches of 7.5 mm.
+        low, high: its range.
+        spread: of the weak prior around the guess: of its logarithm where `positive`, else of itself.
+        positive: searched by its logarithm.
+        about: one line.
+    """
+
+    name: str
+    unit: str
+    guess: float
+    low: float
+    high: float
+    spread: float
+    positive: bool
+    about: str
+
+    def encode(self, value: float) -> float:
+        """Return what the search moves."""
+        return float(np.log(value)) if self.positive else value
+
+    def decode(self, value: float) -> float:
+        """Return the number of what the search moved."""
+        return float(np.exp(value)) if self.positive else value
+
+
+NUMBERS = (
+    Number("drive_rate", "1/s", 10.0, 1.0, 80.0, 1.0, True, "position loop of the drives"),
+    Number("pretension", "rad", 0.3, 0.01, 5.0, 1.0, True, "stretch of each tendon at rest"),
+    Number("pull_limit", "rad", 0.6, 0.05, 50.0, 1.0, True, "stretch at which a drive stalls"),
+    Number("lever", "rad/rad", 7.0, 0.5, 40.0, 0.5, True, "radius of the tendons over radius of the winch"),
+    Number("gain", "1/(rad s)", 10.0, 0.05, 500.0, 1.0, True, "tension to rate of bending"),
+    Number("stiffness", "1/s", 10.0, 0.05, 500.0, 1.0, True, "of the link against bending"),
+    Number("stiffening", "1/(rad^2 s)", 3.0, 0.0, 300.0, 10.0, False, "cubic term of the stiffness"),
+    Number("asymmetry", "1", 0.0, -0.5, 0.5, 0.1, False, "stiffness is (1 + this) in pitch, (1 - this) in roll"),
+    Number("rest_pitch", "rad", 0.0, -0.3, 0.3, 0.1, False, "bend of the link without tendons"),
+    Number("rest_roll", "rad", 0.0, -0.3, 0.3, 0.1, False, "bend of the link without tendons"),
+    Number("compliance", "1", 3.0, 0.001, 50.0, 1.0, True, "compression per sum of the tensions"),
+    Number("axial_rate", "1/s", 20.0, 0.5, 300.0, 1.0, True, "rate of compression"),
+    Number("friction", "1/s", 0.3, 0.0, 300.0, 30.0, False, "hysteresis against bending"),
+    Number("friction_angle", "rad", 0.05, 0.003, 1.0, 1.0, True, "bend over which the hysteresis builds up"),
+    Number("twist", "rad", 0.0, -0.5, 0.5, 0.1, False, "turn of the tendons against the inclinometer"),
+    Number("sensor_rate", "1/s", 40.0, 2.0, 300.0, 1.0, True, "lag of the inclinometer"),
+)
+
+
+def decode(x: Vector) -> Vector:
+    """Return the numbers of what the search moved."""
+    return np.array([number.decode(value) for number, value in zip(NUMBERS, x, strict=True)])
 
 
 def check_play(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:

@@ -12,13 +12,12 @@ from softneck.core import DataError, Matrix, Progress, Vector, require_whole, si
 from softneck.runtime import load_functions
 from softneck.signals import Recording
 
+from ..models._drive import drive_start, fit_loaded_drive
 from ..models._error_feedback import fit_echo
-from ..models._fitting import training_recording
-from ..models._loaded_drive import drive_start, fit_loaded_drive
+from ..models._fitting import row_hashes, training_recording
 from ..models._model import Model
 from ..models._ports import trained_set_points
-from ..models._rows import row_hashes
-from ._greybox_numbers import NUMBERS, decode
+from ._arrays import NUMBERS, decode
 
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult

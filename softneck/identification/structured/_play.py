@@ -9,9 +9,9 @@ import numpy as np
 from softneck.core import DataError, Matrix, Progress, require_positive, require_whole, silent
 from softneck.signals import TENDON_ANGLES, Recording, redefinition_matrix
 
+from ..models._drive import LoadedDrive, fit_loaded_drive
 from ..models._error_feedback import BEYOND, fit_echo
 from ..models._fitting import SAME_EXCITATION, fitted_model, training_recording
-from ..models._loaded_drive import LoadedDrive, fit_loaded_drive
 from ..models._model import Model
 from ._play_terms import Data, PlayStructure, ridge, scores
 

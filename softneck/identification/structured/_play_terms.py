@@ -10,7 +10,7 @@ from softneck.core import DataError, Matrix, Vector
 from softneck.runtime import load_functions
 from softneck.signals import TENDON_ANGLES, Recording, redefinition_matrix
 
-from ..models._loaded_drive import FUNCTIONS, LoadedDrive, drive_start
+from ..models._drive import FUNCTIONS, LoadedDrive, drive_start
 from ..models._scores import nrmse_fit
 
 # Rows of each run in which its unknown past still shows [s]: those that `validate` does not score either.

@@ -10,11 +10,10 @@ import numpy as np
 from softneck.core import KINDS, Progress, SettingsError, find_kind, require_whole, resolve, silent
 from softneck.signals import Recording
 
-from ..models._composed import COMPOSED, memory_of, prefixed_arrays
-from ..models._fitting import one_recording
+from ..models._arrays import COMPOSED, memory_of, prefixed_arrays
+from ..models._fitting import one_recording, row_hashes
 from ..models._model import Model
 from ..models._ports import trained_set_points
-from ..models._rows import row_hashes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -19,15 +19,13 @@ from softneck.core import (
 )
 from softneck.signals import Recording
 
-from ..models._composed import COMPOSED, memory_of, prefixed_arrays
-from ..models._fitting import training_recording
+from ..models._arrays import COMPOSED, memory_of, prefixed_arrays
+from ..models._fitting import row_hashes, training_recording
 from ..models._model import WARM_UP, Model
 from ..models._ports import trained_set_points
 from ..models._regressors import lag_table
-from ..models._rows import row_hashes
 from ..models._scores import nrmse_fit
-from ..set_membership._regressor import gammas, scaled, set_arrays
-from ..set_membership._residual_form import residual_lags, residual_rows
+from ..set_membership._regressor import gammas, residual_lags, residual_rows, scaled, set_arrays
 from ..set_membership._set_membership import noise_level
 from ._ensemble import seeded
 

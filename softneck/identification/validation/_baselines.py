@@ -1,4 +1,14 @@
-"""What stands beside every model: persistence, the best linear one, and the noise ceiling."""
+"""What stands beside every model: persistence, the best linear one, and the noise ceiling.
+
+Persistence repeats what was measured. At 20 ms it fits 97 %, so nothing below it has predicted anything.
+
+The best linear one is the best that any linear time-invariant model of the set-points could have done on the very rows
+that are judged: least squares with hindsight, so an upper bound and no model to use. The response to each set-point is
+free over the first 0.3 s and a sum of orthonormal lags (a ladder of real poles from 0.0125 to 6.4 s) after that; the
+initial state of each stretch decays freely. A model that stays below has its error elsewhere than in its nonlinearity;
+one above has learnt something no linear model can. k steps ahead, measured outputs are known as well. Sources:
+Wahlberg 1991 (Laguerre), Ninness and Gustafsson 1997 (several poles).
+"""
 
 from __future__ import annotations
 
@@ -7,13 +17,130 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from softneck.core import Matrix
 from softneck.signals import Recording
 
 from ..models._scores import nrmse_fit
-from ._best_linear import best_linear
 from ._noise_ceiling import noise_ceiling
-from ._persistence import persistence
 from ._scored_rows import Rows, ScoredStretch
+
+
+def persistence(run: Recording, horizon: int) -> Matrix:
+    """Repeat what was measured `horizon` samples before (time, 2), the last sample that was not missed."""
+    y = held_outputs(run)
+    return np.vstack([np.repeat(y[:1], min(horizon, len(y)), axis=0), y[:-horizon]])
+
+
+def held_outputs(run: Recording) -> Matrix:
+    """Return pitch and roll (time, 2) [rad] with each missed sample replaced by the last one before it."""
+    y = run.outputs.copy()
+    for axis in range(2):
+        last = np.maximum.accumulate(np.where(np.isfinite(y[:, axis]), np.arange(len(y)), 0))
+        y[:, axis] = y[last, axis]
+    return y
+
+
+# Dead times of a neck and its drives: the response is free, tap by tap, for so long [s].
+_FREE_SECONDS = 0.3
+# Beyond, each octave of time constants [s] has its own pole: a lag between two of them is met to 1e-3.
+_TIME_CONSTANTS = 0.0125 * 2.0 ** np.arange(10)
+# So does the initial state of a stretch; what is faster has gone before its first row is judged.
+_DECAYS = _TIME_CONSTANTS[3:]
+# Measured samples of both outputs that a prediction k steps ahead may use.
+_PAST = 10
+# With fewer rows for each parameter the fit would flatter by more than 5 of what is left to 100.
+_ROWS_PER_PARAMETER = 10
+
+
+def best_linear(
+    stretches: Sequence[ScoredStretch], rows: Rows, horizons: Sequence[int | None]
+) -> list[list[float | None]]:
+    """Return for each horizon (None: free run) the fit [%] of pitch and roll; None where rows are too few.
+
+    For a finite horizon persistence and, in free run, every stable linear model of the set-points lies below.
+    """
+    inputs = np.concatenate([_response_columns(stretch.recording) for stretch in stretches])
+    columns = np.column_stack([np.ones(len(inputs)), inputs, _decay_columns(stretches)])
+    result: list[list[float | None]] = []
+    for horizon in horizons:
+        if horizon is None:
+            result.append(_fits(columns, rows.measured))
+            continue
+        past = np.concatenate([_past_columns(stretch.recording, horizon) for stretch in stretches])
+        result.append(_fits(np.column_stack([columns, past]), rows.judged(horizon)))
+    return result
+
+
+def _fits(columns: Matrix, measured: Matrix) -> list[float | None]:
+    there = np.isfinite(measured)
+    if (there[:, 0] == there[:, 1]).all():
+        return _fit_axes(columns, measured, there[:, 0])
+    return [_fit_axes(columns, measured[:, [axis]], there[:, axis])[0] for axis in range(2)]
+
+
+def _fit_axes(columns: Matrix, measured: Matrix, rows: np.ndarray) -> list[float | None]:
+    """Return the fits [%] of the columns of `measured` on the rows given, by QR and then least squares on R."""
+    if rows.sum() < _ROWS_PER_PARAMETER * columns.shape[1]:
+        return [None] * measured.shape[1]
+    X, Y = columns[rows], measured[rows]
+    # Set-points that stand still, or that move together, leave columns that say the same: the least norm takes them.
+    R = np.asarray(np.linalg.qr(np.column_stack([X, Y]), mode="r"))
+    p = X.shape[1]
+    theta = np.linalg.lstsq(R[:, :p], R[:, p:], rcond=None)[0]
+    fits = [nrmse_fit(y, yhat) for y, yhat in zip(Y.T, (X @ theta).T, strict=True)]
+    return [fit if np.isfinite(fit) else None for fit in fits]
+
+
+def _response_columns(run: Recording) -> Matrix:
+    """Return the three set-points (time, n) of the samples before, tap by tap, and then through the ladder."""
+    Ts, u = run.sample_time, run.set_points
+    taps = round(_FREE_SECONDS / Ts) + 1
+    columns = [_late(u, lag) for lag in range(1, taps + 1)]
+    stage = columns[-1]
+    p_before = 0.0
+    for number, p in enumerate(np.exp(-Ts / _TIME_CONSTANTS)):
+        # Orthonormal by an all-pass of the pole before (Takenaka-Malmquist); the first has none.
+        numerator = [0.0, 1.0] if number == 0 else [-p_before, 1.0]
+        stage = _filtered(numerator, [1.0, -p], stage)
+        columns.append(np.sqrt(1.0 - p**2) * stage)
+        p_before = p
+    return np.column_stack(columns)
+
+
+def _filtered(numerator: list[float], denominator: list[float], x: Matrix) -> Matrix:
+    """Return a first-order filter of x (time, 3) that had stood at x(0) before."""
+    from scipy.signal import lfilter
+
+    gain = sum(numerator) / sum(denominator)
+    # Steady state of the transposed direct form: z = y - b0 x.
+    z = (gain - numerator[0]) * x[:1]
+    return np.asarray(lfilter(numerator, denominator, x, axis=0, zi=z)[0])
+
+
+def _decay_columns(stretches: Sequence[ScoredStretch]) -> Matrix:
+    """Return decaying exponentials (time, 7 for each stretch), each zero outside its stretch."""
+    columns = np.zeros((sum(len(s.recording) for s in stretches), len(_DECAYS) * len(stretches)))
+    row = 0
+    for number, stretch in enumerate(stretches):
+        n = len(stretch.recording)
+        t = np.arange(n) * stretch.recording.sample_time
+        for i, seconds in enumerate(_DECAYS):
+            columns[row : row + n, len(_DECAYS) * number + i] = np.exp(-t / seconds)
+        row += n
+    return columns
+
+
+def _past_columns(run: Recording, horizon: int) -> Matrix:
+    """Return both outputs at t-k, t-k-1, ... (time, 20), a missed sample by the one before."""
+    held = np.nan_to_num(held_outputs(run))
+    return np.column_stack([_late(held, horizon + back) for back in range(_PAST)])
+
+
+def _late(x: Matrix, lag: int) -> Matrix:
+    """Return x(t - lag) (time, n), x(0) before the record."""
+    lag = min(lag, len(x))
+    return np.vstack([np.repeat(x[:1], lag, axis=0), x[: len(x) - lag]])
+
 
 _AXES = ("pitch", "roll")
 

@@ -17,12 +17,12 @@ import numpy as np
 from softneck.core import DataError, Matrix, Vector
 from softneck.signals import Recording, concatenate
 
-from ..models._composed import members
+from ..models._arrays import members
 from ..models._drive import DriveModel
+from ..models._fitting import known_rows
 from ..models._model import WARM_UP, Model
 from ..models._regressors import PAPER_EQ21, motor_signals, regression
-from ..models._rows import known_rows
-from ..set_membership._residual_form import residual_rows
+from ..set_membership._regressor import residual_rows
 from ._scored_rows import ScoredStretch
 
 QUANTILES = (0.5, 0.9, 0.99, 1.0)

@@ -9,8 +9,8 @@ import numpy as np
 from softneck.core import DataError, Matrix, Vector
 from softneck.signals import Recording
 
+from ..models._fitting import known_rows
 from ..models._model import WARM_UP
-from ..models._rows import known_rows
 
 # Far predictions cost `horizon` steps for each row, and neighbours err alike: so many steps are enough. 3,000 rows,
 # the paper's validation, are all predicted 25 samples ahead; of 30,000 every tenth one, which is 0.2 s after the last.

@@ -13,13 +13,13 @@ from softneck.signals import Recording
 
 from ..models._model import Model
 from ._baselines import Baselines, baselines
-from ._divergence import divergence
 from ._horizons import predict
 from ._novelty import Novelty, novelty
 from ._residual_tests import ResidualTests, residual_tests
 from ._score_tables import (
     INFINITE,
     coverage_tables,
+    divergence,
     free_run_bounds,
     interval_tables,
     outside_table,

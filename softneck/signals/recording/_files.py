@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,17 +14,48 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from softneck.core import DataError, FileFormatError, SoftneckError, Vector, atomic_write, to_si
-
 from softneck.robot import Robot, find_robot
 from softneck.robot._search import robot_file_of
 
 from ._channels import column_name, file_unit, known_channels, may_miss, parse_column
-from ._plain_csv import read_plain_csv
 from ._recording import Recording
 from ._times import median_step
 
 if TYPE_CHECKING:
     import pandas as pd
+
+# All that a table of numbers is made of; a file with anything else is left to pandas.
+_CHARACTERS = "0123456789+-.eE,\n"
+# Beyond this pandas is faster, import included.
+_LARGEST = 20_000_000
+
+
+def read_plain_csv(source: Path) -> dict[str, Vector] | None:
+    """Return title -> column of a CSV file of plain numbers, an empty cell as NaN; None where it is anything else.
+
+    The numbers are those that pandas reads: both round a decimal to the nearest double.
+    """
+    try:
+        if source.stat().st_size > _LARGEST:
+            return None
+        head, _, body = source.read_text(encoding="utf-8").replace("\r\n", "\n").partition("\n")
+        if head.startswith("# "):  # whose recording it is
+            head, _, body = body.partition("\n")
+    except (OSError, UnicodeDecodeError):
+        return None
+    titles = head.split(",")
+    if body.strip(_CHARACTERS) or not all(titles) or len(set(titles)) < len(titles) or '"' in head:
+        return None
+    rows = [line.split(",") for line in body.split("\n") if line]
+    if not rows or any(len(row) != len(titles) for row in rows):
+        return None
+    try:
+        columns = [
+            np.array([float(cell) if cell else math.nan for cell in column]) for column in zip(*rows, strict=True)
+        ]
+    except ValueError:
+        return None
+    return dict(zip(titles, columns, strict=True))
 
 
 # What the first line of a recording of another robot than the neck begins with; its tables follow as JSON.

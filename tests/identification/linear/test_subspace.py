@@ -11,7 +11,7 @@ import pytest
 
 from softneck.core import DataError, Matrix, SettingsError
 from softneck.identification import Subspace, load_model
-from softneck.identification.linear._subspace_fit import fit_subspace
+from softneck.identification.linear._subspace import fit_subspace
 from softneck.signals import SET_POINTS, Recording, signal
 
 from ...data import TS, neck_recording, recording_from

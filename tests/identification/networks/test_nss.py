@@ -7,11 +7,10 @@ import pytest
 
 from softneck.core import DataError, SettingsError
 from softneck.identification import INFINITE, Model, NeuralStateSpace, validate
-from softneck.identification.models._loaded_drive import fit_loaded_drive
+from softneck.identification.models._drive import fit_loaded_drive
 from softneck.identification.networks._contraction import Contraction, whitening
 from softneck.identification.networks._nss_problem import FUNCTIONS, Records, Shape, free_run
-from softneck.identification.networks._nss_start import linear_start, whitened
-from softneck.identification.networks._nss_training import BestMap, Training, random_start
+from softneck.identification.networks._nss_training import BestMap, Training, linear_start, random_start, whitened
 from softneck.identification.networks._state_space_network import INTERRUPTED
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.runtime import load_functions

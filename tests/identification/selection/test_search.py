@@ -10,7 +10,7 @@ import pytest
 
 from softneck.core import DataError, SettingsError, load
 from softneck.identification import INFINITE, Model, Rls, Search, SetMembership, search, validate
-from softneck.identification.models._rows import row_hashes
+from softneck.identification.models._fitting import row_hashes
 from softneck.signals import Recording
 
 from ...data import Truth, neck_recording

@@ -13,9 +13,16 @@ from softneck.core import DataError, SettingsError
 from softneck.identification import PAPER_EQ21, Model, SetMembership, gamma_curve, offending_pair, outside_seen
 from softneck.identification.models._regressors import regression
 from softneck.identification.set_membership._gamma import least_gammas
-from softneck.identification.set_membership._principal_tree import is_frame, slant_frames, slant_nodes, slant_order
 from softneck.identification.set_membership._set_membership import noise_level
-from softneck.identification.set_membership._tree import LEAF, tree_nodes, tree_order
+from softneck.identification.set_membership._trees import (
+    LEAF,
+    is_frame,
+    slant_frames,
+    slant_nodes,
+    slant_order,
+    tree_nodes,
+    tree_order,
+)
 from softneck.runtime import load_functions
 
 from ...data import TS, neck_recording, recording_from, short_neck

@@ -287,7 +287,7 @@ def test_wrong_settings_are_refused(settings: dict, message: str) -> None:
 
 
 def test_more_points_than_memory_are_told_before_they_are_built(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("softneck.identification.set_membership._memory.available_bytes", lambda: 24_000)
+    monkeypatch.setattr("softneck.identification.set_membership._cones.available_bytes", lambda: 24_000)
     # 3 x 8 bytes x (3 regressors + 2 outputs) a point.
     with pytest.raises(DataError, match=r"a set of 300 points of 3 regressors and 2 outputs .* at most 200 points fit"):
         Cones(epsilon=0.02).fit(*wave(300))

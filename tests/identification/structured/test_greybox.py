@@ -9,8 +9,8 @@ import pytest
 import statsmodels.api as sm
 
 from softneck.identification import INFINITE, GreyBox, Model, validate
+from softneck.identification.structured._arrays import NUMBERS
 from softneck.identification.structured._greybox import INTERRUPTED, _table
-from softneck.identification.structured._greybox_numbers import NUMBERS
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.runtime import load_functions
 from softneck.signals import SET_POINTS, Recording, signal

@@ -11,7 +11,7 @@ from softneck.core import FileFormatError, SettingsError
 from softneck.identification import Ensemble, Model, Play, Residual, SetMembership, combine
 from softneck.identification.models._arrays import check_arrays
 from softneck.runtime import bundle
-from softneck.runtime._composition import prefixed
+from softneck.runtime._bundle import prefixed
 
 from ...data import neck_recording, short_neck
 

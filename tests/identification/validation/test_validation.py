@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 
 from softneck.core import DataError, SettingsError
 from softneck.identification import WARM_UP, Model, Rls, nrmse_fit, validate
-from softneck.identification.models._rows import row_hashes
+from softneck.identification.models._fitting import row_hashes
 from softneck.identification.models._scores import r_squared, rmse, worst_error
 from softneck.identification.validation._horizons import predict
 from softneck.signals import concatenate, signal
