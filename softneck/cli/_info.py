@@ -94,9 +94,12 @@ def _recording(file: Path, html: Path | None, *, force: bool, quiet: bool) -> di
     with progress("info", quiet=quiet or quick) as report:
         report(0.0, "reading")
         recording = read_recording(file)
-        report(0.6, "checking")
-        found = assess_quality(recording)
+        neck = recording.robot.is_neck
         if html is not None:
+            recording.robot.require_neck(f"{file}: `--html`")
+        report(0.6, "checking")
+        found = assess_quality(recording) if neck else None
+        if html is not None and found is not None:
             from softneck.plots import quality_page, write_page  # matplotlib takes a while to import
 
             report(0.8, "drawing")
@@ -109,6 +112,7 @@ def _recording(file: Path, html: Path | None, *, force: bool, quiet: bool) -> di
         "sample_time_s": recording.sample_time,
         "channels": ", ".join(recording.channels),
         **({} if html is None else {"html": str(html)}),
+        **({} if neck else {"robot": recording.robot.label()}),
         "quality": found,
     }
 

@@ -135,6 +135,11 @@ class Robot:
             raise SettingsError(f"robot `{self.name}` gives no `{_file.KEY_OF[key]}`, which {what} needs; add it.")
         return value
 
+    def require_neck(self, what: str) -> None:
+        """Raise SettingsError where `what`, which takes necks alone, is given another robot."""
+        if not self.is_neck:
+            raise SettingsError(f"{what} takes necks only so far, not robot {self.label()}.")
+
     def label(self) -> str:
         """Return name and short hash, by which messages tell robots apart."""
         return f"`{self.name}` ({self.hash[:8]})"

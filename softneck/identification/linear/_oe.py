@@ -25,8 +25,8 @@ from ..models._drive import fit_drive
 from ..models._fitting import delay_samples, fitted_model, free_run_fit, training_recording
 from ..models._model import Model
 from ..models._state_space import axes_system, lss_arrays
-from ._operating_point import about, operating_point, with_offset
 from ._oe_fit import OutputErrorFit, default_starts, fit_output_error, largest_radius, pole_radius
+from ._operating_point import about, operating_point, with_offset
 from ._regression import arx_rows, require_excitation
 
 SOURCES = ("set_points", "positions")

@@ -90,8 +90,11 @@ class Rls:
         """Return the recursion of one output, for use sample by sample."""
         inputs = {"siso": 1, "miso": 3, "mimo": 3}[self.structure]  # of a neck
         outputs = 2 if self.structure == "mimo" else 1
+        return self._recursion(outputs * self.na + inputs * self.nb)
+
+    def _recursion(self, parameters: int) -> Recursion:
         return Recursion(
-            parameters=outputs * self.na + inputs * self.nb,
+            parameters=parameters,
             forgetting=self.forgetting,
             covariance_bound=self.covariance_bound if self.forgetting < 1.0 else 0.0,
             dead_zone=self.dead_zone,
@@ -198,7 +201,7 @@ class Rls:
             theta, F = np.zeros(n), _STANDARD_START * np.eye(n)
             load_functions(_STANDARD).rls_recursion(Phi, y, theta, F, self.forgetting)
             return theta, F
-        recursion = self.recursion()
+        recursion = self._recursion(n)
         state = recursion.initial_state()
         if self.forgetting < 1.0 or self.dead_zone > 0.0 or self.stable:
             state, _ = recursion.run(state, Phi, y)

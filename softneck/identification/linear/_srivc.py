@@ -202,7 +202,8 @@ class Srivc:
             sampled.append(model.sampled(recording.sample_time))
             continuous[name] = {"b": model.b.tolist(), "a": [1.0, *model.a.tolist()], "delay_s": model.delay}
             if self.resamples > 0:
-                found = settings.intervals(runs, recording.sample_time, fit, generator)
+                search = settings.search(recording.sample_time, stretch=directions.stretch)
+                found = bootstrap(search, runs, fit, count=self.resamples, generator=generator, level=self.level)
                 intervals[name] = found.as_dict()
         progress(1.0, "done")
         a, b, d = ([entry[i] for entry in sampled] for i in range(3))
@@ -237,7 +238,7 @@ class Srivc:
         columns = [(y[:, None], u[:, None]) for u, y in runs]
         measured = np.concatenate([y[np.isfinite(y)] for _, y in runs])
         spread = float(np.sum((measured - measured.mean()) ** 2))
-        search = self.search(sample_time)
+        search = self.search(sample_time, stretch=stretch)
         fixed = SrivcFitOptions(**{**asdict(search), "free_delay": False})
         best, fits, curve = None, {}, []
         last: SrivcFit | None = None
@@ -265,15 +266,16 @@ class Srivc:
         free = _best([*middle, *(search.improve(runs, f.model, f.starts) for f in nearby)])
         return (free if free is not None and free.cost < fits[best].cost else fits[best]), curve
 
-    def search(self, sample_time: float) -> SrivcFitOptions:
-        """Return how one axis is fitted."""
-        return SrivcFitOptions(
+    def search(self, sample_time: float, *, stretch: float = 1.0) -> SrivcFitOptions:
+        """Return how one axis is fitted, that of a robot that is `stretch` times slower than a neck."""
+        options = SrivcFitOptions(
             sample_time=sample_time,
             order=self.order,
             zeros=self.zeros,
             max_delay=self.max_delay,
             free_delay=self.delay is None,
         )
+        return replace(options, fastest=options.fastest / stretch)
 
     def intervals(self, runs: Runs, sample_time: float, fit: SrivcFit, generator: np.random.Generator) -> Intervals:
         """Return the bootstrap's intervals of one axis."""

@@ -7,8 +7,8 @@ away from its set-point, so it stays between the set-points it was given.
 load = [pole of q, c, c1, c2].
 
 Bank: each redefined input (theta, phi, delta) as it is and behind play operators (Visintin 1994, sec. III.2), and
-each of those through `order` equal low-pass filters: order * c * (1 + widths) signals for c redefined inputs, three of a neck, all of them between the
-least and the largest input ever given.
+each of those through `order` equal low-pass filters: order * c * (1 + widths) signals for c redefined inputs (three of
+a neck), all of them between the least and the largest input ever given.
 """
 
 import numpy as np

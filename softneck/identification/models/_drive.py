@@ -109,7 +109,7 @@ class LoadedDrive:
     """A lag with dead time for each motor, and the limit they share.
 
     Attributes:
-        drive: (3, 2) pole and delay, as in `DriveModel`.
+        drive: (motors, 2) pole and delay, as in `DriveModel`.
         load: (4,) pole of q, c, c1, c2 of `_bank_runtime`; `NO_LOAD` for none.
     """
 
@@ -130,7 +130,8 @@ def fit_loaded_drive(recording: Recording) -> LoadedDrive:
     from scipy.optimize import minimize
 
     plain = LoadedDrive(fit_drive(recording).array, NO_LOAD)
-    if not recording.has_motor_positions:
+    # What a common limit of tension is, is known of necks.
+    if not recording.has_motor_positions or not recording.robot.is_neck:
         return plain
     runs = _longest(recording)
     error = _loaded_error(runs, plain)
@@ -151,7 +152,7 @@ def fit_loaded_drive(recording: Recording) -> LoadedDrive:
 
 
 def drive_start(run: Recording) -> Vector:
-    """Return the first motor positions (3,) of a run; set-points where a position was missed."""
+    """Return the first motor positions (motors,) of a run; set-points where a position was missed."""
     logged = run.motor_positions[0]
     return np.where(np.isfinite(logged), logged, run.set_points[0])
 

@@ -151,15 +151,12 @@ def training_recording(recordings: Recording | list[Recording], *, any_robot: bo
         any_robot: whether the kind takes other robots than the neck.
 
     Raises:
-        DataError: too short, without excitation, with an output that never moves, or of a robot that the kind cannot
-            take.
+        DataError: too short, without excitation, or with an output that never moves.
+        SettingsError: a robot other than the neck where the kind does not take it.
     """
     recording = one_recording(recordings)
-    if not any_robot and not recording.robot.is_neck:
-        raise DataError(
-            f"this kind of model is for necks only so far, and the recording is of robot {recording.robot.label()}; "
-            f"identify {', '.join(ANY_ROBOT)}."
-        )
+    if not any_robot:
+        recording.robot.require_neck(f"this kind of model ({', '.join(ANY_ROBOT)} take any robot)")
     check_training(recording)
     return recording
 

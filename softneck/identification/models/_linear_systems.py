@@ -256,14 +256,15 @@ def _delayed(A: Matrix, B: Matrix, C: Matrix, delay: int) -> tuple[Matrix, Matri
 def _checked(model: Linear, output: str, input: str | None, angle_unit: str) -> tuple[str, float]:
     _require_linear(model.kind)
     robot = model.robot
+    if input is None or input in _REDEFINED:
+        robot.require_neck("what works on theta_i and phi_i (design, observers, families)")
     require_one_of("output", output, robot.outputs.names)
     require_one_of("angle_unit", angle_unit, ("rad", "deg"))
     if robot.is_neck:
         name = _REDEFINED[_OUTPUTS.index(output)] if input is None else input
         require_one_of("input", name, _REDEFINED + _MOTORS)
     else:
-        # Without redefined inputs: a robot of several motors has no one input of an output.
-        name = robot.set_points[0] if input is None and len(robot.set_points) == 1 else input or ""
+        name = input or ""
         require_one_of("input", name, robot.set_points)
     angle = to_si(robot.outputs.unit)[1] == "rad"
     return name, 180.0 / np.pi if angle_unit == "deg" and angle else 1.0

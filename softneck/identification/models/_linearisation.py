@@ -51,7 +51,7 @@ class Stepped(Protocol):
 
 
 def _motor_count(block: Block) -> int:
-    """Return the number of motors: set-points stand first among a plant's inputs, and nothing measured is given here."""
+    """Return the number of motors: their set-points stand first among a plant's inputs."""
     return sum(port.name.startswith("motor_setpoint_") for port in block.inputs)
 
 

@@ -104,6 +104,7 @@ def choose(
     Raises:
         DataError: no kind could be identified.
     """
+    train.robot.require_neck("`auto`")
     wanted = list(kinds) or list(kinds_to_try())
     unknown = [kind for kind in wanted if kind not in kinds_to_try()]
     if unknown:
