@@ -10,6 +10,7 @@ import pytest
 from softneck import identify, load, validate
 from softneck.core import KINDS, DataError, FileFormatError, Matrix, SettingsError
 from softneck.core._kinds import kinds_of
+from softneck.identification import choose
 from softneck.identification.models._directions import directions_of
 from softneck.identification.models._fitting import ANY_ROBOT
 from softneck.robot import Robot
@@ -113,6 +114,16 @@ def test_play_takes_any_robot(name: str, tmp_path: Path) -> None:
     assert min(fit or 0.0 for fit in fits) > 93.0
     model.save(tmp_path / "m.npz")
     np.testing.assert_array_equal(load(tmp_path / "m.npz").simulate(recording), model.simulate(recording))
+
+
+def test_the_kinds_that_take_a_robot_are_tried_and_the_best_is_chosen() -> None:
+    recording = recorded(ROBOTS["finger"], noise=1e-3, rows=400)
+    choice = choose(*recording.split(0.7), kinds=("rls", "oe", "nn"))
+    assert choice.chosen.kind in ("rls", "oe")
+    assert choice.chosen.fit > 90.0
+    failed = {one.kind: one.failure for one in choice.ranking if one.model is None}
+    assert list(failed) == ["nn"]
+    assert "necks only so far" in failed["nn"]
 
 
 def test_scores_are_by_the_outputs_names_and_in_their_unit() -> None:
