@@ -9,6 +9,7 @@ from . import loop as loop
 from . import plant as plant
 from . import plots as plots
 from . import report as report
+from . import robot as robot
 from . import runtime as runtime
 from . import signals as signals
 from . import verification as verification

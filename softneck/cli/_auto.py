@@ -50,6 +50,8 @@ def identify_auto(
     if html is not None:
         refuse_existing(html, force=force)
     parts = [read_recording(source) for source in recordings]
+    if html is not None:
+        parts[0].robot.require_neck("`--html` of `auto`")
     head, tail, other = _split(parts, train)
     with progress("identify auto", quiet=as_json) as report:
         choice = choose(head, tail, other_excitation=other, seed=seed or 0, progress=report)
@@ -70,7 +72,8 @@ def identify_auto(
         facts = _facts(choice, path)
         print_json({**facts, "linear_model": None if linear is None else str(linear_path), "refit": refit_all})
         return
-    print_table("Fit [%] on the rows held out, pitch/roll", _HEAD, _rows(choice))
+    names = "/".join(parts[0].robot.outputs.names)
+    print_table(f"Fit [%] on the rows held out, {names}", _HEAD, _rows(choice))
     click.echo(f"{choice.why}\n{path}\n{models[0].summary()}")
     for remark in [*said, *choice.remarks, *([REFITTED] if refit_all else [])]:
         note(remark)
@@ -117,9 +120,7 @@ def _row(one: KindTrial, chosen: bool) -> list[str]:
     size = sum(array.size for array in one.model.arrays.values())
     return [
         one.kind,
-        f"{percent(fits[INFINITE]['pitch'])}/{percent(fits[INFINITE]['roll'])}",
-        f"{percent(fits['1']['pitch'])}/{percent(fits['1']['roll'])}",
-        f"{percent(held['pitch'])}/{percent(held['roll'])}",
+        *("/".join(percent(fit) for fit in table.values()) for table in (fits[INFINITE], fits["1"], held)),
         f"{one.seconds:.1f} s",
         f"{size} numbers",
         "chosen" if chosen else "",

@@ -136,10 +136,14 @@ def _print(path: Path, model: Model, held_out: Validation | None, found: Search 
     one, free = held_out.fits["1"], held_out.fits[INFINITE]
     held = held_out.persistence["1"]
     what = "hold-out" if found is None else "end of the recording, which no trial saw,"
-    click.echo(f"{what} of {held_out.rows_scored} rows, fit [%] pitch/roll:")
-    click.echo(f"  persistence {percent(held['pitch'])}/{percent(held['roll'])}")
-    click.echo(f"  one step    {percent(one['pitch'])}/{percent(one['roll'])}")
-    click.echo(f"  free run    {percent(free['pitch'])}/{percent(free['roll'])}")
+    click.echo(f"{what} of {held_out.rows_scored} rows, fit [%] {'/'.join(model.robot.outputs.names)}:")
+    click.echo(f"  persistence {_fits(held)}")
+    click.echo(f"  one step    {_fits(one)}")
+    click.echo(f"  free run    {_fits(free)}")
+
+
+def _fits(table: dict[str, float | None]) -> str:
+    return "/".join(percent(fit) for fit in table.values())
 
 
 def _hold_out(model: Model, tail: Recording | None) -> Validation | None:

@@ -114,8 +114,8 @@ _LARGE = 20_000_000
 @force_option
 @json_option
 def command(file: Path, html: Path | None, force: bool, as_json: bool) -> None:
-    """Say what FILE is: a recording, model, observer, controller, FMU, loop, layout, neck, study, certificate or log
-    (tables, and those of `softneck drives run --log`).
+    """Say what FILE is: a recording, model, observer, controller, FMU, loop, layout, robot, neck, study, certificate or
+    log (tables, and those of `softneck drives run --log`).
 
     For a recording it also reports the quality: faults of its channels, and what its inputs can teach a model. For a
     log it reports what `softneck import --guess` would take each column for.
@@ -177,9 +177,12 @@ def _recording(file: Path, html: Path | None, *, force: bool, quiet: bool) -> di
     with progress("info", quiet=quiet or quick) as report:
         report(0.0, "reading")
         recording = read_recording(file)
-        report(0.6, "checking")
-        found = assess_quality(recording)
+        neck = recording.robot.is_neck
         if html is not None:
+            recording.robot.require_neck(f"{file}: `--html`")
+        report(0.6, "checking")
+        found = assess_quality(recording) if neck else None
+        if html is not None and found is not None:
             from softneck.plots import quality_page, write_page  # matplotlib takes a while to import
 
             report(0.8, "drawing")
@@ -192,6 +195,7 @@ def _recording(file: Path, html: Path | None, *, force: bool, quiet: bool) -> di
         "sample_time_s": recording.sample_time,
         "channels": ", ".join(recording.channels),
         **({} if html is None else {"html": str(html)}),
+        **({} if neck else {"robot": recording.robot.label()}),
         "quality": found,
     }
 
@@ -254,15 +258,19 @@ def _fmu(file: Path) -> dict[str, Any]:
 
 
 def _toml(file: Path) -> dict[str, Any]:
-    """Say what a TOML file is: a loop names a plant, a study what varies, a layout channels; else it must be a neck."""
+    """Say what a TOML file is: a robot names motors, a loop a plant, a study what varies; else it must be a neck."""
     from softneck.cosim import load_study
     from softneck.plant import NeckParameters, VirtualNeck
+    from softneck.robot import Robot
     from softneck.signals import read_layout
 
     try:
         table = tomllib.loads(file.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:  # no TOML, no UTF-8, thousands of digits or brackets
         raise FileFormatError(f"{file}: is not a TOML file ({error}).") from error
+    if table.keys() & {"motors", "outputs", "directions", "extends"}:
+        robot = Robot.read(file)
+        return {"type": "robot", "robot": robot.name, "hash": robot.hash, "summary": robot.summary()}
     if "plant" in table:
         return {"type": "loop", "parts": ", ".join(name for name in table if isinstance(table[name], dict))}
     if "vary" in table:

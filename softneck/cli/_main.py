@@ -22,6 +22,7 @@ _COMMANDS = {
     "demo": ("_demo", "Run the main job: experiment, models, FMUs, controller, closed loop, report."),
     "doctor": ("_doctor", "Say which parts of this machine work."),
     "info": ("_info", "Say what a file is."),
+    "robot": ("_robot", "Say what the robot is: show, start or check a robot.toml."),
     "record": ("_record", "Record a signal on the virtual neck."),
     "import": ("_import", "Turn any logger's table into a recording, by a layout file."),
     "identify": ("_identify", "Identify a model from recordings."),

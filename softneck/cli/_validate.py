@@ -72,6 +72,9 @@ def command(
         refuse_existing(html, force=force)
     loaded = {str(path): load_model(path) for path in models}
     recordings = {str(path): read_recording(path) for path in data}
+    if html is not None:
+        for path, recording in recordings.items():
+            recording.robot.require_neck(f"{path}: `--html`")
     rules = Rules(horizons, motors, include_training)
     known = read_together(training) if training else None
     with progress("validate", quiet=as_json) as report:
@@ -89,7 +92,8 @@ def command(
 
 
 def _print(results: list[Validation]) -> None:
-    print_table("Fit in %, errors in deg, pitch/roll", *fit_table(results))
+    outputs = results[0].robot.outputs
+    print_table(f"Fit in %, errors in {outputs.display_unit}, {'/'.join(outputs.names)}", *fit_table(results))
     for result in results:
         for line in remarks(result):
             click.echo(line)

@@ -20,13 +20,27 @@ _TO_SI: dict[str, tuple[float, str]] = {
     "N": (1.0, "N"),
     "kg": (1.0, "kg"),
     "g": (1e-3, "kg"),
+    "Pa": (1.0, "Pa"),
+    "kPa": (1e3, "Pa"),
+    "bar": (1e5, "Pa"),
+    "MPa": (1e6, "Pa"),
+    "psi": (6894.757293168361, "Pa"),
+    "V": (1.0, "V"),
+    "mV": (1e-3, "V"),
+    "A": (1.0, "A"),
     "1": (1.0, "1"),
 }
 
 
 def to_si(unit: str) -> tuple[float, str]:
-    """Return (factor, SI unit) such that SI value = factor * value; raise DataError for an unknown unit."""
+    """Return (factor, SI unit) such that SI value = factor * value; raise DataError for an unknown unit.
+
+    `bar/s` and the like go by the unit above the stroke.
+    """
     try:
+        if unit not in _TO_SI and str(unit).endswith("/s"):
+            factor, unit_si = _TO_SI[unit.removesuffix("/s")]
+            return factor, f"{unit_si}/s"
         return _TO_SI[unit]
     except KeyError:
         known = ", ".join(_TO_SI)

@@ -9,7 +9,6 @@ from .linear._pi import PiSettings as PiSettings
 from .linear._pid import PidSettings as PidSettings
 from .linear._ports import ControllerLimits as ControllerLimits
 from .linear._reduction import reduce_controller as reduce_controller
-from .plants._uncertain import UncertainPlant as UncertainPlant
 from .plants._uncertain import uncertain_plant as uncertain_plant
 from .predictive._controller import MpcController as MpcController
 from .predictive._disturbance import MeasuredDisturbance as MeasuredDisturbance

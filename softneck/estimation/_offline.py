@@ -115,12 +115,13 @@ def source_rows(observer: LinearFilter, run: Recording) -> tuple[Matrix, np.ndar
 
 
 def check_recording(observer: LinearFilter, recording: Recording) -> None:
-    """Raise DataError for another sample time or missing rates."""
+    """Raise DataError for another sample time, missing rates or another robot."""
     if not math.isclose(recording.sample_time, observer.sample_time, rel_tol=1e-6):
         raise DataError(
             f"the recording has sample time {recording.sample_time:g} s, the observer {observer.sample_time:g} s; "
             "resample it or design the observer for it."
         )
+    recording.robot.require_neck("an observer")
     if observer.form == "gyro":
         for axis in _AXES:
             _rate(recording, axis)

@@ -291,6 +291,7 @@ def ukf(model: Model, settings: KalmanSettings | None = None, *, memory: int | N
         raise SettingsError(
             f"an unscented filter needs an identified model, as `Play().fit(...)` gives; got {type(model).__name__}."
         )
+    model.robot.require_neck("an unscented filter")
     if chosen.form != "model" or chosen.steady:
         what = "constant gains" if chosen.form == "model" else f"form {chosen.form}"
         raise SettingsError(f"an unscented filter is over a model; {what} has no meaning with it. Use form=model.")

@@ -20,7 +20,6 @@ from ._page import Section as Section
 from ._page import Table as Table
 from ._page import page as page
 from ._page import write_page as write_page
-from ._quality_page import channels_figure as channels_figure
 from ._quality_page import correlation_figure as correlation_figure
 from ._quality_page import faults_figure as faults_figure
 from ._quality_page import quality_page as quality_page

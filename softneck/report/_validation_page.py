@@ -44,6 +44,8 @@ def validation_page(results: Sequence[Validation], *, title: str = "Validation")
         results: of `validate`, one for each model and recording.
         title: of the page.
     """
+    for result in results:
+        result.robot.require_neck("the page on a validation")
     sections = [_overview(results), *_comparisons(results), *(_section(result) for result in results)]
     return page(title, sections, footer="Written by softneck.")
 

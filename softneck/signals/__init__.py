@@ -1,7 +1,7 @@
 """Recordings, importers of foreign logs, quality reports and excitation signals.
 
 Files are read and written here; models do not enter.
-May import `core`.
+May import `robot` and below.
 """
 
 import lazy_loader

@@ -22,9 +22,10 @@ def read_together(paths: Sequence[Path]) -> Recording:
     """Read recordings as runs of one.
 
     Raises:
-        DataError: their sample times differ; the line names two that do.
+        DataError: their sample times or robots differ; the line names two that do.
     """
     from softneck.signals import concatenate, read_recording
+    from softneck.signals.recording._recording import require_same_robot
 
     recordings = [read_recording(path) for path in paths]
     for path, recording in zip(paths, recordings, strict=True):
@@ -34,6 +35,7 @@ def read_together(paths: Sequence[Path]) -> Recording:
                 f"{1e3 * recordings[0].sample_time:g} ms; recordings are used together at one sample time only. Take "
                 "each by itself, or bring one to the other's (Python: `softneck.signals.resampled`)."
             )
+        require_same_robot(recording.robot, recordings[0].robot, f"{paths[0]} and {path}: recordings")
     return concatenate(recordings)
 
 

@@ -24,8 +24,17 @@ _USELESS = -100.0
 
 
 def fit_table(results: Sequence[Validation]) -> tuple[Head, Cells]:
-    """Return the fits [%] of pitch and roll beside what they must be compared with."""
-    head = ["model on data", "horizon", "persist.", "best linear", "model", "95 % interval", "rms deg", "worst"]
+    """Return the fits [%] of the outputs beside what they must be compared with."""
+    head = [
+        "model on data",
+        "horizon",
+        "persist.",
+        "best linear",
+        "model",
+        "95 % interval",
+        f"rms {results[0].robot.outputs.display_unit}",
+        "worst",
+    ]
     cells: Cells = []
     for r in results:
         name = _short(f"{Path(r.model).stem} on {Path(r.data).stem}")
@@ -58,7 +67,7 @@ def remarks(r: Validation) -> list[str]:
     if r.coverage_pct is not None and r.mean_width_deg is not None and not lost:
         lines.append(
             f"{who}: free-run bounds hold {_pair(r.coverage_pct.values())} % of the samples, "
-            f"{_pair(r.mean_width_deg.values())} deg wide"
+            f"{_pair(r.mean_width_deg.values())} {r.robot.outputs.display_unit} wide"
         )
     if r.outside_pct is not None and not lost:
         lines.append(f"{who}: {_pair(r.outside_pct.values())} % of them lie outside what the model has seen")

@@ -76,6 +76,7 @@ class PartOpener:
             return make_reference(table["kind"], values)
         refuse_unknown("[reference]", values, ("file",))
         recording = read_recording(self._file("reference", str(values.get("file", ""))))
+        recording.robot.require_neck("[reference] file: a loop")
         if len(recording.runs()) > 1:
             raise DataError("[reference] file: the recording has several runs; cut out the one to follow.")
         channels = recording.channels
@@ -117,6 +118,8 @@ class PartOpener:
         if key == "fmu":
             return self._open((name, file, *settings), lambda: _fmu_part(file, f"[{name}]", table, as_role))
         thing = self._open((role, file), lambda: load(file, role=role))
+        if (robot := getattr(thing, "robot", None)) is not None:
+            robot.require_neck(f"[{name}] a loop")
         return BlockPart(thing.block())
 
     def _open(self, key: tuple[Any, ...], make: Callable[[], Any]) -> Any:

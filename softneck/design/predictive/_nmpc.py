@@ -118,6 +118,7 @@ class NmpcSettings:
                 f"nonlinear predictive control is over {', '.join(NONLINEAR_KINDS)}; got {got}. "
                 "For a linear model use `softneck design mpc`."
             )
+        model.robot.require_neck("nonlinear predictive control")
         plants = probed(model, redefinition_matrix(np.array(self.tendon_angles)))
         found = {
             axis: {

@@ -72,6 +72,7 @@ def _opened(kind: str, node: int, source: SensorSource) -> Any:
             path = source.folder / source.file
             log = path.suffix.lower() == ".mcap"
             recording = read_run_log(path).recording() if log else read_recording(path)
+            recording.robot.require_neck(f"{path}: a replay")
             return ReplaySensor(recording.time, recording.channels["pitch"], recording.channels["roll"])
         case "python":
             return make_python_sensor(source.python, source.options, source.folder)

@@ -28,7 +28,7 @@ def check_oe(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
 
 
 def check_state_space(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
-    within(np.array([sizes["n"]]), 2, 2 * sizes["H"], "the order")
+    within(np.array([sizes["n"]]), sizes["outputs"], sizes["outputs"] * sizes["H"], "the order")
     within(arrays["delay"][:1], 0, sizes["H"] - 1, "a dead time")
     within(arrays["delay"][1:], 0, 1, "the source")
 

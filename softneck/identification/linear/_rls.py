@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,11 +21,13 @@ from softneck.core import (
 from softneck.runtime import load_functions
 from softneck.signals import TENDON_ANGLES, Recording, redefine, redefinition_matrix
 
+from ..models._directions import Directions, directions_of
 from ..models._drive import fit_drive
 from ..models._fitting import delay_samples, fitted_model, free_run_fit, training_recording
 from ..models._model import WARM_UP, Model
 from ..models._scores import nrmse_fit
 from ..models._state_space import lss_arrays, varx_system
+from ._operating_point import about, operating_point, with_offset
 from ._recursion import EXACT_START, Recursion, require_forgetting
 from ._regression import arx_rows, require_excitation
 
@@ -33,7 +35,6 @@ _STANDARD, _UD = "softneck.identification.linear._recursion_runtime", "softneck.
 # F(0) of the standard form; a weaker start would cost it more digits than the start's pull does.
 _STANDARD_START = 1e8
 STRUCTURES = ("siso", "miso", "mimo")
-_AXES = ("pitch", "roll")
 Curve = list[list[float]]
 
 
@@ -45,7 +46,7 @@ class Rls:
         na, nb: orders of Eq. 23.
         delay: dead time [s]; None searches it.
         delay_by: the search's criterion on the training rows: "free_run" (simulation) or "one_step" (prediction).
-        max_delay: end of the search [s].
+        max_delay: end of the search [s], of another robot by its time constant over the neck's 0.2 s.
         forgetting: lambda in (0, 1]; 1 for Eq. 29, below for a constant forgetting factor (CFF-RLS).
         structure: "siso" over theta_i and phi_i, "miso" (each output from the three motors and its own past) or
             "mimo" (from the three motors and both pasts).
@@ -87,10 +88,13 @@ class Rls:
 
     def recursion(self) -> Recursion:
         """Return the recursion of one output, for use sample by sample."""
-        inputs = {"siso": 1, "miso": 3, "mimo": 3}[self.structure]
+        inputs = {"siso": 1, "miso": 3, "mimo": 3}[self.structure]  # of a neck
         outputs = 2 if self.structure == "mimo" else 1
+        return self._recursion(outputs * self.na + inputs * self.nb)
+
+    def _recursion(self, parameters: int) -> Recursion:
         return Recursion(
-            parameters=outputs * self.na + inputs * self.nb,
+            parameters=parameters,
             forgetting=self.forgetting,
             covariance_bound=self.covariance_bound if self.forgetting < 1.0 else 0.0,
             dead_zone=self.dead_zone,
@@ -108,21 +112,35 @@ class Rls:
         Raises:
             DataError: too short, constant, without two usable rows, or not enough excitation.
         """
-        recording = training_recording(recordings)
-        fit = self._fit_siso if self.structure == "siso" else self._fit_motors
-        arrays, findings = fit(recording, progress)
+        recording = training_recording(recordings, any_robot=True)
+        point = operating_point(recording)
+        centred = about(recording, point)
+        directions = directions_of(centred, [run.set_points for run in centred.runs()])
+        settings = replace(self, max_delay=self.max_delay * directions.stretch)
+        if self.structure == "siso":
+            arrays, findings = settings._fit_siso(centred, directions, progress)
+        else:
+            arrays, findings = settings._fit_motors(centred, progress)
+        if not recording.robot.is_neck:
+            findings |= directions.findings()
+        arrays = with_offset("rls", arrays, recording, point)
         progress(1.0, "done")
         return fitted_model(
             "rls", self, recording, arrays=arrays, findings={"delay_criterion": self.delay_by, **findings}
         )
 
-    def _fit_siso(self, recording: Recording, progress: Progress) -> tuple[dict[str, Matrix], dict]:
-        drive = fit_drive(recording)
-        runs = [(run.outputs, redefine(run.set_points)) for run in recording.runs()]
+    def _fit_siso(
+        self, recording: Recording, directions: Directions, progress: Progress
+    ) -> tuple[dict[str, Matrix], dict]:
+        drive, neck = fit_drive(recording), recording.robot.is_neck
+        runs = [
+            (run.outputs, redefine(run.set_points) if neck else run.set_points @ directions.weights.T)
+            for run in recording.runs()
+        ]
         a, b, delays, stds, numbers = [], [], [], [], []
         curves: dict[str, Curve] = {}
-        for axis, name in enumerate(_AXES):
-            progress(axis / 2, name)
+        for axis, name in enumerate(directions.names):
+            progress(axis / len(directions.names), name)
             one = [(Y[:, [axis]], U[:, [axis]]) for Y, U in runs]
             d, theta, std, curves[name], number = self._search(recording.sample_time, one, name)
             a.append(theta[: self.na])
@@ -130,6 +148,10 @@ class Rls:
             delays.append(float(d))
             stds.append(std.tolist())
             numbers.append(number)
+        found = {"delay_curve": curves, "condition_number": numbers, "parameter_std": stds}
+        if not neck:
+            thetas = [np.concatenate(pair) for pair in zip(a, b, strict=True)]
+            return axes_arrays(self, directions, thetas, [int(d) for d in delays], drive.array), found
         history = max(self.na, max(delays) + self.nb, drive.delay.max())
         arrays = {
             "history": np.array([float(int(history))]),
@@ -139,7 +161,7 @@ class Rls:
             "b": np.array(b),
             "delay": np.array(delays),
         }
-        return arrays, {"delay_curve": curves, "condition_number": numbers, "parameter_std": stds}
+        return arrays, found
 
     def _search(
         self, sample_time: float, runs: list[tuple[Matrix, Matrix]], name: str
@@ -179,7 +201,7 @@ class Rls:
             theta, F = np.zeros(n), _STANDARD_START * np.eye(n)
             load_functions(_STANDARD).rls_recursion(Phi, y, theta, F, self.forgetting)
             return theta, F
-        recursion = self.recursion()
+        recursion = self._recursion(n)
         state = recursion.initial_state()
         if self.forgetting < 1.0 or self.dead_zone > 0.0 or self.stable:
             state, _ = recursion.run(state, Phi, y)
@@ -188,27 +210,28 @@ class Rls:
         return state.theta, state.covariance
 
     def _fit_motors(self, recording: Recording, progress: Progress) -> tuple[dict[str, Matrix], dict]:
-        """Fit both outputs over the three motors; "miso" takes a dead time each, "mimo" one for both."""
+        """Fit all outputs over the motors; "miso" takes a dead time each, "mimo" one for all."""
         drive = fit_drive(recording).array
         Ts = recording.sample_time
         runs = [(run.outputs, run.set_points) for run in recording.runs()]
+        names = recording.robot.outputs.names
         if self.structure == "miso":
             found = []
-            for axis, name in enumerate(_AXES):
-                progress(axis / 2, name)
+            for axis, name in enumerate(names):
+                progress(axis / len(names), name)
                 found.append(self._search(Ts, [(Y[:, [axis]], U) for Y, U in runs], name))
             delays = [d for d, *_ in found]
             arrays = self._motor_arrays([theta for _, theta, *_ in found], delays, drive)
-            curves = {name: curve for name, (*_, curve, _) in zip(_AXES, found, strict=True)}
+            curves = {name: curve for name, (*_, curve, _) in zip(names, found, strict=True)}
             return arrays, {"delay_curve": curves, "condition_number": [number for *_, number in found]}
-        best, curves = None, {name: [] for name in _AXES}
+        best, curves = None, {name: [] for name in names}
         tried = delay_samples(self.delay, self.max_delay, Ts, runs)
         for step, d in enumerate(tried):
             progress(step / len(tried), f"{1e3 * d * Ts:.0f} ms")
-            both = [self._least_squares(_own_first(runs, axis), d, name) for axis, name in enumerate(_AXES)]
-            arrays = self._motor_arrays([theta for theta, *_ in both], [d, d], drive)
-            fits = _fits(Model(kind="rls", sample_time=Ts, arrays=arrays), recording)
-            for name, fit, (_, _, rms, _) in zip(_AXES, fits, both, strict=True):
+            both = [self._least_squares(_own_first(runs, axis), d, name) for axis, name in enumerate(names)]
+            arrays = self._motor_arrays([theta for theta, *_ in both], [d] * len(names), drive)
+            fits = _fits(Model(kind="rls", sample_time=Ts, arrays=arrays, robot=recording.robot), recording)
+            for name, fit, (_, _, rms, _) in zip(names, fits, both, strict=True):
                 curves[name].append([d * Ts, fit, rms])
             cost = -sum(fits) if self.delay_by == "free_run" else sum(rms for _, _, rms, _ in both)
             if best is None or cost < best[0]:
@@ -222,29 +245,48 @@ class Rls:
 
 
 def motor_arrays(settings: Rls, thetas: list[Vector], delays: list[int], drive: Matrix) -> dict[str, Matrix]:
-    """Return the runtime's arrays of parameters over the three motors, one vector for each output."""
+    """Return the runtime's arrays of parameters over the motors, one vector for each output."""
     na, nb, common = settings.na, settings.nb, min(delays)
     p = max(na, nb + max(delays) - common)
-    A, B = np.zeros((p, 2, 2)), np.zeros((p, 2, 3))
+    outputs, motors = len(thetas), len(drive)
+    A, B = np.zeros((p, outputs, outputs)), np.zeros((p, outputs, motors))
     for axis, (theta, d) in enumerate(zip(thetas, delays, strict=True)):
         A[:na, axis, axis] = theta[:na]
         rest = theta[na:]
         if settings.structure == "mimo":
-            A[:na, axis, 1 - axis] = rest[:na]
-            rest = rest[na:]
+            for other in _others(axis, outputs):
+                A[:na, axis, other] = rest[:na]
+                rest = rest[na:]
         late = d - common
-        B[late : late + nb, axis] = rest.reshape(3, nb).T
+        B[late : late + nb, axis] = rest.reshape(motors, nb).T
     return lss_arrays(varx_system(A, B), delay=common, drive=drive, history=p + common)
 
 
+def axes_arrays(
+    settings: Rls, directions: Directions, thetas: list[Vector], delays: list[int], drive: Matrix
+) -> dict[str, Matrix]:
+    """Return the runtime's arrays of parameters over redefined inputs, one vector for each output, over the motors."""
+    na = settings.na
+    spread = [
+        np.concatenate([theta[:na], np.outer(weights, theta[na:]).ravel()])
+        for theta, weights in zip(thetas, directions.weights, strict=True)
+    ]
+    return motor_arrays(replace(settings, structure="miso"), spread, delays, drive)
+
+
+def _others(axis: int, outputs: int) -> list[int]:
+    return [other for other in range(outputs) if other != axis]
+
+
 def _own_first(runs: list[tuple[Matrix, Matrix]], axis: int) -> list[tuple[Matrix, Matrix]]:
-    return [(Y[:, [axis, 1 - axis]], U) for Y, U in runs]
+    return [(Y[:, [axis, *_others(axis, Y.shape[1])]], U) for Y, U in runs]
 
 
 def _fits(model: Model, recording: Recording) -> list[float]:
-    """Return the free-run fits [%] of both outputs; -inf where the model is unstable."""
+    """Return the free-run fits [%] of all outputs; -inf where the model is unstable."""
+    axes = range(recording.outputs.shape[1])
     if np.abs(np.linalg.eigvals(model.arrays["A"])).max() >= 1.0:
-        return [-np.inf, -np.inf]
+        return [-np.inf for _ in axes]
     simulated = model.simulate(recording)
     starts = np.concatenate([np.arange(len(run)) for run in recording.runs()]) >= WARM_UP
-    return [nrmse_fit(recording.outputs[starts, axis], simulated[starts, axis]) for axis in range(2)]
+    return [nrmse_fit(recording.outputs[starts, axis], simulated[starts, axis]) for axis in axes]

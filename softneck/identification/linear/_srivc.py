@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -23,7 +23,8 @@ from softneck.signals import Recording
 
 from ..models._fitting import delay_samples, fitted_model, training_recording
 from ..models._model import Model
-from ._oe import AXES, SOURCES, axis_arrays, axis_runs
+from ._oe import SOURCES, axis_arrays, axis_runs
+from ._operating_point import about, operating_point, with_offset
 from ._regression import arx_rows, require_excitation
 from ._srivc_fit import Continuous, Runs, SrivcFit, SrivcFitOptions, with_delay
 
@@ -153,7 +154,7 @@ class Srivc:
         order: poles.
         zeros: zeros, below `order`.
         delay: dead time [s]; None estimates it, also between samples.
-        max_delay: bound on it [s].
+        max_delay: bound on it [s], of another robot by its time constant over the neck's 0.2 s.
         source: "set_points", or "positions" of the motors, see `OutputError`.
         resamples: of the bootstrap; 0 for no intervals.
         level: of the intervals.
@@ -188,21 +189,26 @@ class Srivc:
         Raises:
             DataError: too short, constant, not enough excitation, or no stable model.
         """
-        recording = training_recording(recordings)
+        recording = training_recording(recordings, any_robot=True)
+        point = operating_point(recording)
         generator = np.random.default_rng(self.seed)
         sampled, continuous, curves, intervals = [], {}, {}, {}
-        for axis, (name, runs) in enumerate(zip(AXES, axis_runs(recording, self.source), strict=True)):
-            progress(axis / 2, name)
-            fit, curves[name] = self.fit_axis(runs, recording.sample_time, name)
+        directions, inputs = axis_runs(about(recording, point), self.source)
+        settings = self if directions.stretch == 1.0 else replace(self, max_delay=self.max_delay * directions.stretch)
+        for axis, (name, runs) in enumerate(zip(directions.names, inputs, strict=True)):
+            progress(axis / len(inputs), name)
+            fit, curves[name] = settings.fit_axis(runs, recording.sample_time, name, stretch=directions.stretch)
             model = fit.model
             sampled.append(model.sampled(recording.sample_time))
             continuous[name] = {"b": model.b.tolist(), "a": [1.0, *model.a.tolist()], "delay_s": model.delay}
             if self.resamples > 0:
-                found = self.intervals(runs, recording.sample_time, fit, generator)
+                search = settings.search(recording.sample_time, stretch=directions.stretch)
+                found = bootstrap(search, runs, fit, count=self.resamples, generator=generator, level=self.level)
                 intervals[name] = found.as_dict()
         progress(1.0, "done")
         a, b, d = ([entry[i] for entry in sampled] for i in range(3))
-        arrays, functions = axis_arrays(recording, a, b, [float(samples) for samples in d], self.source)
+        arrays, functions = axis_arrays(recording, directions, a, b, [float(samples) for samples in d], self.source)
+        arrays = with_offset("srivc", arrays, recording, point)
         said = {"intervals": intervals, "level": self.level, "caution": _CAUTION} if intervals else {}
         return fitted_model(
             "srivc",
@@ -218,18 +224,21 @@ class Srivc:
             },
         )
 
-    def fit_axis(self, runs: Runs, sample_time: float, name: str) -> tuple[SrivcFit, list[list[float]]]:
+    def fit_axis(
+        self, runs: Runs, sample_time: float, name: str, *, stretch: float = 1.0
+    ) -> tuple[SrivcFit, list[list[float]]]:
         """Return the fit and the cost curve: rows of (delay [s], fit [%], one-step rms) at whole samples.
 
         Args:
             runs: input and output of each run, (time,) each.
             sample_time: [s].
             name: of the axis, for messages.
+            stretch: by how much slower than a neck it is.
         """
         columns = [(y[:, None], u[:, None]) for u, y in runs]
         measured = np.concatenate([y[np.isfinite(y)] for _, y in runs])
         spread = float(np.sum((measured - measured.mean()) ** 2))
-        search = self.search(sample_time)
+        search = self.search(sample_time, stretch=stretch)
         fixed = SrivcFitOptions(**{**asdict(search), "free_delay": False})
         best, fits, curve = None, {}, []
         last: SrivcFit | None = None
@@ -238,7 +247,7 @@ class Srivc:
             require_excitation(name, Phi)
             L = d * sample_time if self.delay is None else self.delay
             fit = fixed.improve(runs, with_delay(last.model, L), last.starts) if last is not None else None
-            fit = fit or _best([fixed.start(runs, pole, L) for pole in _POLES])
+            fit = fit or _best([fixed.start(runs, pole, L) for pole in np.array(_POLES) / stretch])
             if fit is None:
                 continue
             last = fits[d] = fit
@@ -257,15 +266,16 @@ class Srivc:
         free = _best([*middle, *(search.improve(runs, f.model, f.starts) for f in nearby)])
         return (free if free is not None and free.cost < fits[best].cost else fits[best]), curve
 
-    def search(self, sample_time: float) -> SrivcFitOptions:
-        """Return how one axis is fitted."""
-        return SrivcFitOptions(
+    def search(self, sample_time: float, *, stretch: float = 1.0) -> SrivcFitOptions:
+        """Return how one axis is fitted, that of a robot that is `stretch` times slower than a neck."""
+        options = SrivcFitOptions(
             sample_time=sample_time,
             order=self.order,
             zeros=self.zeros,
             max_delay=self.max_delay,
             free_delay=self.delay is None,
         )
+        return replace(options, fastest=options.fastest / stretch)
 
     def intervals(self, runs: Runs, sample_time: float, fit: SrivcFit, generator: np.random.Generator) -> Intervals:
         """Return the bootstrap's intervals of one axis."""

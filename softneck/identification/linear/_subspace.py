@@ -21,11 +21,13 @@ from softneck.core import (
 )
 from softneck.signals import Recording
 
+from ..models._directions import directions_of
 from ..models._drive import fit_drive
 from ..models._fitting import delay_samples, fitted_model, training_recording
 from ..models._model import Model
 from ..models._state_space import lss_arrays
-from ._oe import AXES, SOURCES
+from ._oe import SOURCES
+from ._operating_point import about, operating_point, with_offset
 from ._regression import condition
 
 # A mode slower than the record cannot be told from a drift: it is drawn in to this radius.
@@ -52,23 +54,24 @@ class SubspaceFit:
     cost: Vector
 
 
-def fit_subspace(runs: Runs, order: int, horizon: int) -> SubspaceFit:
+def fit_subspace(runs: Runs, order: int, horizon: int, *, offset: bool = False) -> SubspaceFit:
     """Identify from inputs (time, nu) and outputs (time, ny) of each run.
 
     Args:
         runs: never joined; a window with a missed output is left out.
         order: n.
         horizon: block rows of past and of future.
+        offset: whether outputs have a constant part, which no state is to stand for.
 
     Raises:
         DataError: every run too short, or too few windows.
     """
     windows = _Windows(runs, horizon)
-    gamma, sequence, values = windows.observability(order)
+    gamma, sequence, values = windows.observability(order, offset=offset)
     ny = runs[0][1].shape[1]
     C = gamma[:ny]
     A = _settled(np.linalg.lstsq(gamma[:-ny], gamma[ny:])[0])
-    B, cost = _input_matrix(runs, A, C)
+    B, cost = _input_matrix(runs, A, C, offset=offset)
     K = _gain(windows, sequence, A, B, C)
     return SubspaceFit(A=A, B=B, C=C, K=K, singular_values=values, cost=cost)
 
@@ -102,7 +105,7 @@ class _Windows:
             )
         self.data = np.concatenate(parts)
 
-    def observability(self, order: int) -> tuple[Matrix, Matrix, Vector]:
+    def observability(self, order: int, *, offset: bool) -> tuple[Matrix, Matrix, Vector]:
         """Return Gamma (h ny, n), the states (windows, n) at the first sample of each future, and singular values."""
         h, nu = self.horizon, self.nu
         flat = self.data.transpose(0, 2, 1)  # (windows, time, channel)
@@ -110,6 +113,8 @@ class _Windows:
         past = flat[:, :h].reshape(count, -1)
         future_u = flat[:, h:, :nu].reshape(count, -1)
         future_y = flat[:, h:, nu:].reshape(count, -1)
+        if offset:  # a constant is an input that is known as well: what it does is projected out with the others
+            future_u = np.column_stack([np.ones(count), future_u])
         R = np.asarray(np.linalg.qr(np.column_stack([future_u, past, future_y]), mode="r"))
         n1, n2 = future_u.shape[1], past.shape[1]
         R22, R23 = R[n1 : n1 + n2, n1 : n1 + n2], R[n1 : n1 + n2, n1 + n2 :]
@@ -122,7 +127,7 @@ class _Windows:
         return gamma, states, s[: 3 * order + 4]
 
 
-def _input_matrix(runs: Runs, A: Matrix, C: Matrix) -> tuple[Matrix, Vector]:
+def _input_matrix(runs: Runs, A: Matrix, C: Matrix, *, offset: bool) -> tuple[Matrix, Vector]:
     """Return B (n, nu) and the cost by least squares of the free run, each run with a start of its own."""
     from scipy.signal import lfilter
 
@@ -138,7 +143,9 @@ def _input_matrix(runs: Runs, A: Matrix, C: Matrix) -> tuple[Matrix, Vector]:
             s = np.column_stack([lfilter([0.0, 1.0], [1.0, -m], U[:, j]) for m in modes])
             forced[:, :, j * n : (j + 1) * n] = np.real(np.einsum("tm,ijm->tij", s, weights))
         free = np.real(np.einsum("tm,ijm->tij", modes ** np.arange(len(U))[:, None], weights))
-        X, F, y = forced.reshape(-1, n * nu), free.reshape(-1, n), Y.reshape(-1)
+        if offset:
+            forced = np.concatenate([forced, np.tile(np.eye(ny), (len(U), 1, 1))], axis=2)
+        X, F, y = forced.reshape(len(U) * ny, -1), free.reshape(-1, n), Y.reshape(-1)
         there = np.isfinite(y)
         Q, _ = np.linalg.qr(F[there])
         parts.append(X[there] - Q @ (Q.T @ X[there]))
@@ -148,7 +155,7 @@ def _input_matrix(runs: Runs, A: Matrix, C: Matrix) -> tuple[Matrix, Vector]:
     channel = np.concatenate([c for _, c in targets])
     theta = np.linalg.lstsq(X, y)[0]
     e = y - X @ theta
-    return theta.reshape(nu, n).T, np.array([float(e[channel == i] @ e[channel == i]) for i in range(ny)])
+    return theta[: n * nu].reshape(nu, n).T, np.array([float(e[channel == i] @ e[channel == i]) for i in range(ny)])
 
 
 def _gain(windows: _Windows, states: Matrix, A: Matrix, B: Matrix, C: Matrix) -> Matrix:
@@ -199,7 +206,7 @@ class Subspace:
         order: states, without the dead time.
         horizon: past and future samples that the projection looks at.
         delay: dead time of all motors [s]; None takes the one whose free run costs least.
-        max_delay: end of that search [s].
+        max_delay: end of that search [s], of another robot by its time constant over the neck's 0.2 s.
         source: "set_points", or "positions" of the motors, see `OutputError`.
     """
 
@@ -224,57 +231,71 @@ class Subspace:
         Raises:
             DataError: too short, constant, or motors that repeat each other.
         """
-        recording = training_recording(recordings)
+        recording = training_recording(recordings, any_robot=True)
         if self.source == "positions" and not recording.has_motor_positions:
             raise DataError("no motor positions were logged; use `source=set_points`.")
         motors = recording.motor_positions if self.source == "positions" else recording.set_points
         number = condition(motors)
         if not number <= _WORST_CONDITION:
             raise DataError(
-                f"the three motors repeat each other (condition number {number:.2g}), so their effects cannot be told "
-                "apart. Record with co-contraction in it (`mixed`), or identify `oe` or `srivc` over theta_i and phi_i."
+                f"the {motors.shape[1]} motors repeat each other (condition number {number:.2g}), so their effects "
+                "cannot be told apart. Record with co-contraction in it (`mixed`), or identify `oe` or `srivc` over "
+                "theta_i and phi_i."
             )
-        best, curves = self._search(recording, progress)
+        outputs = len(recording.robot.outputs.names)
+        if self.order < outputs:
+            raise DataError(f"{outputs} outputs need at least {outputs} states; raise `order`.")
+        point = operating_point(recording)
+        best, curves, found = self._search(about(recording, point), progress)
         fit, d = best
         drive = fit_drive(recording)
+        arrays = lss_arrays(
+            (fit.A, fit.B, fit.C, fit.K), delay=d, drive=drive.array, source=int(self.source == "positions")
+        )
+        arrays = with_offset("subspace", arrays, recording, point)
         progress(1.0, "done")
         return fitted_model(
             "subspace",
             self,
             recording,
-            arrays=lss_arrays(
-                (fit.A, fit.B, fit.C, fit.K), delay=d, drive=drive.array, source=int(self.source == "positions")
-            ),
+            arrays=arrays,
             findings={
                 "delay_criterion": "output_error",
                 "delay_curve": curves,
                 "singular_values": fit.singular_values.tolist(),
                 "condition_number": number,
+                **found,
             },
         )
 
-    def _search(self, recording: Recording, progress: Progress) -> tuple[tuple[SubspaceFit, int], dict[str, Any]]:
-        Ts = recording.sample_time
+    def _search(
+        self, recording: Recording, progress: Progress
+    ) -> tuple[tuple[SubspaceFit, int], dict[str, Any], dict[str, Any]]:
+        """Return fit and dead time of the least cost, the cost curves, and what was found of another robot's time."""
+        Ts, names = recording.sample_time, recording.robot.outputs.names
         runs = [
             (run.motor_positions if self.source == "positions" else run.set_points, run.outputs)
             for run in recording.runs()
         ]
+        directions = directions_of(recording, [U for U, _ in runs])
+        offset = not recording.robot.is_neck
         outputs = recording.outputs
         spread = np.nansum((outputs - np.nanmean(outputs, axis=0)) ** 2, axis=0)
         best: tuple[SubspaceFit, int] | None = None
-        curves: dict[str, list[list[float]]] = {name: [] for name in AXES}
-        tried = delay_samples(self.delay, self.max_delay, Ts, [(Y, U) for U, Y in runs])
+        curves: dict[str, list[list[float]]] = {name: [] for name in names}
+        tried = delay_samples(self.delay, self.max_delay * directions.stretch, Ts, [(Y, U) for U, Y in runs])
         for number, d in enumerate(tried):
             progress(number / len(tried), f"{1e3 * d * Ts:.0f} ms")
-            fit = fit_subspace([(_late(U, d), Y) for U, Y in runs], self.order, self.horizon)
-            for axis, name in enumerate(AXES):
+            fit = fit_subspace([(_late(U, d), Y) for U, Y in runs], self.order, self.horizon, offset=offset)
+            for axis, name in enumerate(names):
                 percent = 100.0 * (1.0 - float(np.sqrt(fit.cost[axis] / spread[axis])))
                 curves[name].append([d * Ts, percent, float(np.sqrt(fit.cost[axis] / len(outputs)))])
             if best is None or np.sum(fit.cost / spread) < np.sum(best[0].cost / spread):
                 best = (fit, d)
         if best is None:
             raise DataError("no dead time could be tried; record longer.")
-        return best, curves
+        found = {} if recording.robot.is_neck else {"time_constants_s": directions.seconds.tolist()}
+        return best, curves, found
 
 
 def _late(U: Matrix, d: int) -> Matrix:

@@ -15,7 +15,7 @@ from softneck.runtime import load_runtime
 from softneck.runtime._bundle import declared
 from softneck.runtime._layout import Arrays, StateVector
 
-from ._linear_systems import STATE_SPACE
+from ._linear_systems import AFFINE, STATE_SPACE
 
 COMPOSED = ("residual", "ensemble")
 
@@ -57,7 +57,9 @@ def members(arrays: Mapping[str, Matrix]) -> list[tuple[str, dict[str, Matrix]]]
 def runtime_of(kind: str, arrays: Mapping[str, Matrix]) -> str:
     """Return the name of the runtime, with those of the members (see `softneck.runtime.bundle`)."""
     if kind not in COMPOSED:
-        return STATE_SPACE if "A" in arrays and kind != "nss" else KINDS[kind].runtime
+        if "A" in arrays and kind != "nss":
+            return AFFINE if "offset" in arrays else STATE_SPACE
+        return KINDS[kind].runtime
     inner = ",".join(f"{runtime_of(member, part)}:{len(part)}" for member, part in members(arrays))
     return f"{KINDS[kind].runtime}({inner})"
 
@@ -96,10 +98,10 @@ def check_arrays(kind: str, arrays: Mapping[str, Matrix]) -> None:
         return
     # `rls` over the motors and more than one pole are state spaces as well.
     form = "subspace" if kind in ("rls", "oe", "srivc") and "A" in arrays else kind
-    names = declared(KINDS[form].runtime, Arrays).names()
+    names = declared(runtime_of(kind, arrays), Arrays).names()
     if tuple(arrays) != names:
         raise FileFormatError(f"a model of kind {kind} has the arrays {', '.join(names)}; got {', '.join(arrays)}.")
-    _check_numbers(form, arrays)
+    _check_numbers(form, arrays, runtime_of(kind, arrays))
 
 
 def _check_composed(kind: str, arrays: Mapping[str, Matrix]) -> None:
@@ -109,12 +111,12 @@ def _check_composed(kind: str, arrays: Mapping[str, Matrix]) -> None:
         raise FileFormatError(f"a model of kind {kind} starts with the arrays {', '.join(names)}.")
     if len(parts) < 1 or (kind == "residual" and len(parts) != 1):
         raise FileFormatError(f"a model of kind {kind} cannot have {len(parts)} members.")
-    _check_numbers(kind, own)
+    _check_numbers(kind, own, KINDS[kind].runtime)
     for member, part in parts:
         check_arrays(member, part)
 
 
-def _check_numbers(kind: str, arrays: Mapping[str, Matrix]) -> None:
+def _check_numbers(kind: str, arrays: Mapping[str, Matrix], runtime: str) -> None:
     """Check what the declaration of a kind says of its arrays, and what the kind's own check does."""
     for name, array in arrays.items():
         if array.dtype != np.float64 or not np.isfinite(array).all():
@@ -122,7 +124,7 @@ def _check_numbers(kind: str, arrays: Mapping[str, Matrix]) -> None:
     for name, what in {"history": "its history in samples", "memory": "its memory in samples"}.items():
         if name in arrays:  # before its number is a length of others
             within(arrays[name], 1, _LONGEST_HISTORY, what)
-    sizes = declared(KINDS[kind].runtime, Arrays).lengths(arrays)
+    sizes = declared(runtime, Arrays).lengths(arrays)
     if "drive" in arrays:
         within(arrays["drive"][:, 1], 0, sizes["H"], "a drive's delay")
     if KINDS[kind].check:

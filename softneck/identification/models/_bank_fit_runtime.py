@@ -6,14 +6,14 @@ from softneck.identification.models._bank_runtime import bank_advance, drive_adv
 
 
 def drive_run(drive: np.ndarray, load: np.ndarray, targets: np.ndarray, start: np.ndarray, motors: np.ndarray) -> None:
-    """Fill `motors` (time, 3) for set-points `targets` (time, 3), standing at `start` (3,) before."""
+    """Fill `motors` (time, motors) for set-points `targets` (time, motors), standing at `start` (motors,) before."""
     m = start.copy()
     q = start.copy()
     motors[0] = m
     for k in range(targets.shape[0] - 1):
         # In the order of the kinds' `step`: the load follows m(k), then the drive moves on to k+1 against it.
         load_advance(load, m, q)
-        for j in range(3):
+        for j in range(targets.shape[1]):
             back = k + 1 - int(drive[j, 1])  # m(k+1) answers to u(k+1-d)
             target = targets[back, j] if back >= 0 else start[j]
             m[j] = drive_advance(drive[j, 0], target, m[j], drive_limit(load, q, j))
@@ -23,14 +23,15 @@ def drive_run(drive: np.ndarray, load: np.ndarray, targets: np.ndarray, start: n
 def bank_run(
     redefinition: np.ndarray, widths: np.ndarray, chain: np.ndarray, motors: np.ndarray, signals: np.ndarray
 ) -> None:
-    """Fill `signals` (time, n) with the bank along `motors` (time, 3), at rest at the first row before."""
+    """Fill `signals` (time, n) with the bank along `motors` (time, motors), at rest at the first row before."""
     n = int(chain[1])
     count = widths.shape[0]
-    plays = np.zeros(3 * count)
-    bank = np.zeros(3 * (count + 1) * n)
-    for c in range(3):
+    inputs = redefinition.shape[0]
+    plays = np.zeros(inputs * count)
+    bank = np.zeros(inputs * (count + 1) * n)
+    for c in range(inputs):
         v = 0.0
-        for j in range(3):
+        for j in range(redefinition.shape[1]):
             v += redefinition[c, j] * motors[0, j]
         # Plays that came from zero, as a model's do that starts from rest and is then held.
         for i in range(count + 1):

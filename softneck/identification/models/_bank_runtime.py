@@ -7,8 +7,8 @@ away from its set-point, so it stays between the set-points it was given.
 load = [pole of q, c, c1, c2].
 
 Bank: each redefined input (theta, phi, delta) as it is and behind play operators (Visintin 1994, sec. III.2), and
-each of those through `order` equal low-pass filters: order * 3 * (1 + widths) signals, all of them between the
-least and the largest input ever given.
+each of those through `order` equal low-pass filters: order * c * (1 + widths) signals for c redefined inputs (three of
+a neck), all of them between the least and the largest input ever given.
 """
 
 import numpy as np
@@ -18,7 +18,10 @@ from softneck.runtime._rest_runtime import REST
 
 def drive_limit(load: np.ndarray, q: np.ndarray, j: int) -> float:
     """Return how far motor j gets under the load of now."""
-    mean = (q[0] + q[1] + q[2]) / 3.0
+    mean = 0.0
+    for i in range(q.shape[0]):
+        mean += q[i]
+    mean /= q.shape[0]
     # What one motor pulls beyond the others bends the neck, what all pull presses it together: two slopes of tension.
     return load[1] + load[2] * (q[j] - mean) + load[3] * mean
 
@@ -30,20 +33,23 @@ def drive_advance(pole: float, target: float, m: float, limit: float) -> float:
 
 def load_advance(load: np.ndarray, m: np.ndarray, q: np.ndarray) -> None:
     """Let q follow m (3,)."""
-    for j in range(3):
+    for j in range(q.shape[0]):
         q[j] = (load[0] * q[j] + (1.0 - load[0]) * m[j] + REST) - REST
 
 
 def bank_advance(
     redefinition: np.ndarray, widths: np.ndarray, chain: np.ndarray, m: np.ndarray, plays: np.ndarray, bank: np.ndarray
 ) -> None:
-    """Move `plays` (3 widths,) to m(k), and `bank` (3 (1 + widths) order,) to k+1; chain = [pole, order]."""
+    """Move `plays` (c widths,) to m(k), and `bank` (c (1 + widths) order,) to k+1; chain = [pole, order].
+
+    c is the number of redefined inputs, the rows of `redefinition` (c, motors).
+    """
     n = int(chain[1])
     count = widths.shape[0]
-    for c in range(3):
+    for c in range(redefinition.shape[0]):
         v = 0.0
         # Eq. 9-11: theta, phi, delta.
-        for j in range(3):
+        for j in range(redefinition.shape[1]):
             v += redefinition[c, j] * m[j]
         for i in range(count + 1):
             x = v

@@ -22,8 +22,8 @@ class DriveModel:
     """`m(k+1) = a m(k) + (1 - a) u(k+1-d)` per motor.
 
     Attributes:
-        pole: (3,) a.
-        delay: (3,) d in samples; 0 says that the position is the set-point (no positions were logged).
+        pole: (motors,) a.
+        delay: (motors,) d in samples; 0 says that the position is the set-point (no positions were logged).
     """
 
     pole: Vector
@@ -31,20 +31,21 @@ class DriveModel:
 
     @property
     def array(self) -> Matrix:
-        """(3, 2): pole and delay, as the runtime reads them."""
+        """(motors, 2): pole and delay, as the runtime reads them."""
         return np.column_stack([self.pole, self.delay])
 
     def simulate(self, set_points: Matrix, start: Vector) -> Matrix:
-        """Return motor positions (time, 3) [rad] for set-points (time, 3), from `start` (3,)."""
+        """Return motor positions (time, motors) [rad] for set-points (time, motors), from `start` (motors,)."""
         columns = zip(set_points.T, start, self.pole, self.delay, strict=True)
         return np.column_stack([_simulate(u, m0, a, int(d)) for u, m0, a, d in columns])
 
 
 def fit_drive(recording: Recording) -> DriveModel:
     """Identify the drives from logged positions; the identity where none were logged."""
+    motors = recording.set_points.shape[1]
     if not recording.has_motor_positions:
-        return DriveModel(np.zeros(3), np.zeros(3))
-    fits = [_fit_motor(recording, motor) for motor in range(3)]
+        return DriveModel(np.zeros(motors), np.zeros(motors))
+    fits = [_fit_motor(recording, motor) for motor in range(motors)]
     return DriveModel(np.array([a for a, _ in fits]), np.array([float(d) for _, d in fits]))
 
 
@@ -108,7 +109,7 @@ class LoadedDrive:
     """A lag with dead time for each motor, and the limit they share.
 
     Attributes:
-        drive: (3, 2) pole and delay, as in `DriveModel`.
+        drive: (motors, 2) pole and delay, as in `DriveModel`.
         load: (4,) pole of q, c, c1, c2 of `_bank_runtime`; `NO_LOAD` for none.
     """
 
@@ -129,7 +130,8 @@ def fit_loaded_drive(recording: Recording) -> LoadedDrive:
     from scipy.optimize import minimize
 
     plain = LoadedDrive(fit_drive(recording).array, NO_LOAD)
-    if not recording.has_motor_positions:
+    # What a common limit of tension is, is known of necks.
+    if not recording.has_motor_positions or not recording.robot.is_neck:
         return plain
     runs = _longest(recording)
     error = _loaded_error(runs, plain)
@@ -150,7 +152,7 @@ def fit_loaded_drive(recording: Recording) -> LoadedDrive:
 
 
 def drive_start(run: Recording) -> Vector:
-    """Return the first motor positions (3,) of a run; set-points where a position was missed."""
+    """Return the first motor positions (motors,) of a run; set-points where a position was missed."""
     logged = run.motor_positions[0]
     return np.where(np.isfinite(logged), logged, run.set_points[0])
 

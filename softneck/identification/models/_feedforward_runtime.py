@@ -18,7 +18,7 @@ def echo_rest(p: NarxArrays, x: NarxState, axis: int, f: float) -> None:
 
 
 def echo_added(p: NarxArrays, echo: np.ndarray, x: NarxState, axis: int, f: float) -> float:
-    """Return y(k+1) of one axis, and note `f`; echo (2, p)."""
+    """Return y(k+1) of one axis, and note `f`; echo (outputs, p)."""
     total = 0.0
     for i in range(echo.shape[1]):
         total += echo[axis, i] * x.y[i, axis]  # y - f of i + 1 samples before, as `narx_observe` left it
@@ -28,9 +28,9 @@ def echo_added(p: NarxArrays, echo: np.ndarray, x: NarxState, axis: int, f: floa
 
 def stalling_drives(p: NarxArrays, load: np.ndarray, q: np.ndarray, x: NarxState, outputs: np.ndarray) -> None:
     """Move the motors of now on from the newest of the histories, no further than their load lets them."""
-    for j in range(3):
+    for j in range(p.motors):
         d = int(p.drive[j, 1])
         if d > 0:
-            # In place of the lag of `narx_advance`, which knows no load and has moved `x.motors` on already.
+            # In place of the lag of `narx_forward`, which knows no load and has moved `x.motors` on already.
             x.motors[j] = drive_advance(p.drive[j, 0], x.u[d - 1, j], x.m[0, j], drive_limit(load, q, j))
-            outputs[2 + j] = x.motors[j]
+            outputs[p.outputs + j] = x.motors[j]

@@ -21,6 +21,8 @@ from ._scores import nrmse_fit
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
+# Kinds that take any robot.
+ANY_ROBOT = ("rls", "oe", "srivc", "subspace", "play")
 # Less than 2 s at 20 ms says nothing about a neck with a time constant of 0.2 s.
 MIN_ROWS = 100
 
@@ -37,7 +39,7 @@ def check_training(recording: Recording) -> None:
             "the motor set-points are constant; nothing can be identified. Record with an excitation such as `eq22`."
         )
     outputs = recording.outputs
-    for axis, name in enumerate(("pitch", "roll")):
+    for axis, name in enumerate(recording.robot.outputs.names):
         values = outputs[np.isfinite(outputs[:, axis]), axis]
         if values.size < MIN_ROWS:
             raise DataError(f"`{name}` has only {values.size} samples that were not missed; {MIN_ROWS} are needed.")
@@ -141,13 +143,20 @@ def one_recording(recordings: Recording | list[Recording]) -> Recording:
     return concatenate(recordings if isinstance(recordings, list) else [recordings])
 
 
-def training_recording(recordings: Recording | list[Recording]) -> Recording:
+def training_recording(recordings: Recording | list[Recording], *, any_robot: bool = False) -> Recording:
     """Return all runs as one recording to identify from.
+
+    Args:
+        recordings: of one robot and sample time.
+        any_robot: whether the kind takes other robots than the neck.
 
     Raises:
         DataError: too short, without excitation, or with an output that never moves.
+        SettingsError: a robot other than the neck where the kind does not take it.
     """
     recording = one_recording(recordings)
+    if not any_robot:
+        recording.robot.require_neck(f"this kind of model ({', '.join(ANY_ROBOT)} take any robot)")
     check_training(recording)
     return recording
 
@@ -168,4 +177,5 @@ def fitted_model(
         settings=asdict(settings),
         findings={**findings, **trained_set_points(recording)},
         training_rows=row_hashes(recording),
+        robot=recording.robot,
     )

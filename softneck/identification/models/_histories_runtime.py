@@ -6,48 +6,52 @@ from softneck.runtime._layout import Arrays, StateVector, array, cells, value
 from softneck.runtime._random_runtime import random_normal, random_seed
 from softneck.runtime._rest_runtime import REST
 
-# Parameters, in this order.
-NARX_START = 0  # pitch_start, roll_start
-NARX_USE_MEASUREMENT = 2
-NARX_NOISE_STD = 3
-NARX_NOISE_SEED = 4
+
+def narx_outputs(history: np.ndarray) -> int:
+    """Return the number of outputs: the neck's two where none is said."""
+    return int(history[1]) if history.shape[0] > 1 else 2
 
 
 class NarxArrays(Arrays):
     """The first arrays of every plant."""
 
-    history = array("1", "H: how many samples of each signal are kept")
-    drive = array("3, 2", "a and d of each motor: m(k+1) = a m(k) + (1 - a) u(k+1-d); d = 0: it is where it is sent")
+    history = array("sizes", "H: how many samples of each signal are kept; and how many outputs there are, if not two")
+    drive = array("motors, 2", "a, d of each motor: m(k+1) = a m(k) + (1 - a) u(k+1-d); d = 0: it is where it is sent")
     H = value("history", 0)
+    outputs = value("history", function=narx_outputs)
 
 
 class NarxState(StateVector):
     """Histories, newest first, and what holds now; kinds add what else they remember."""
 
-    u = cells("H, 3", "motor set-points [rad]")
-    m = cells("H, 3", "motor positions [rad]")
-    y = cells("H, 2", "pitch and roll [rad], or only their base where a kind adds something to it")
-    motors = cells("3", "motor positions of now [rad]")
-    angles = cells("2", "pitch and roll of now [rad]")
+    u = cells("H, motors", "motor set-points [rad]")
+    m = cells("H, motors", "motor positions [rad]")
+    y = cells("H, outputs", "pitch and roll [rad], or only their base where a kind adds something to it")
+    motors = cells("motors", "motor positions of now [rad]")
+    angles = cells("outputs", "pitch and roll of now [rad]")
     random = cells("6", "generator of the output noise")
-    added = cells("2", "how far the angles of now are above what goes into their history [rad]")
+    added = cells("outputs", "how far the angles of now are above what goes into their history [rad]")
+
+
+# Parameters, in this order: the start of each output, use_measurement, noise_std, noise_seed.
 
 
 def narx_rest(p: NarxArrays, parameters: np.ndarray, x: NarxState, outputs: np.ndarray) -> None:
     """Rest: motors at zero, outputs at their start values for ever."""
     x[:] = 0.0
     for j in range(p.H):
-        for axis in range(2):
-            x.y[j, axis] = parameters[NARX_START + axis]
-    for axis in range(2):
-        x.angles[axis] = parameters[NARX_START + axis]
-    random_seed(x.random, parameters[NARX_NOISE_SEED])
+        for axis in range(p.outputs):
+            x.y[j, axis] = parameters[axis]
+    random_seed(x.random, float(parameters[p.outputs + 2]))
     outputs[:] = 0.0
-    outputs[0] = parameters[NARX_START]
-    outputs[1] = parameters[NARX_START + 1]
-    if outputs.shape[0] == 9:  # bounds, which hold nothing but the start yet
-        outputs[5:7] = parameters[NARX_START]
-        outputs[7:9] = parameters[NARX_START + 1]
+    for axis in range(p.outputs):
+        x.angles[axis] = parameters[axis]
+        outputs[axis] = parameters[axis]
+    bounds = p.outputs + p.motors
+    if outputs.shape[0] > bounds:  # bounds, which hold nothing but the start yet
+        for axis in range(p.outputs):
+            outputs[bounds + 2 * axis] = parameters[axis]
+            outputs[bounds + 2 * axis + 1] = parameters[axis]
 
 
 def narx_push(history: np.ndarray, newest: np.ndarray) -> None:
@@ -60,47 +64,55 @@ def narx_push(history: np.ndarray, newest: np.ndarray) -> None:
 
 def narx_known(p: NarxArrays, parameters: np.ndarray, x: NarxState, inputs: np.ndarray) -> None:
     """Take in where angles and motors are at t_k: as measured, where they are."""
-    measured = parameters[NARX_USE_MEASUREMENT] > 0.5  # a Boolean parameter as a number
-    for axis in range(2):
-        if measured and np.isfinite(inputs[3 + axis]):  # NaN: not measured now
-            x.angles[axis] = inputs[3 + axis]
-    for j in range(3):
+    measured = parameters[p.outputs] > 0.5  # a Boolean parameter as a number
+    for axis in range(p.outputs):
+        if measured and np.isfinite(inputs[p.motors + axis]):  # NaN: not measured now
+            x.angles[axis] = inputs[p.motors + axis]
+    for j in range(p.motors):
         # A drive without delay is where it is sent, unless an encoder says otherwise.
         if p.drive[j, 1] == 0.0:
             x.motors[j] = inputs[j]
-        if measured and np.isfinite(inputs[5 + j]):
-            x.motors[j] = inputs[5 + j]
+        at = p.motors + p.outputs + j
+        if measured and np.isfinite(inputs[at]):
+            x.motors[j] = inputs[at]
 
 
 def narx_observe(p: NarxArrays, parameters: np.ndarray, x: NarxState, inputs: np.ndarray) -> None:
     """Push what is known at t_k into the histories: set-points, motors and outputs, measured where they are."""
     narx_known(p, parameters, x, inputs)
-    narx_push(x.u, inputs[:3])
+    narx_push(x.u, inputs[: p.motors])
     narx_push(x.m, x.motors)
     # What a kind adds is never fed back: its history holds the outputs without it.
     base = x.angles - x.added
     narx_push(x.y, base)
 
 
-def narx_advance(
-    p: NarxArrays, parameters: np.ndarray, x: NarxState, pitch: float, roll: float, outputs: np.ndarray
-) -> None:
-    """Take pitch and roll at t_k+1 as the new outputs, move the motors on, write the outputs."""
-    for j in range(3):
+def narx_forward(p: NarxArrays, parameters: np.ndarray, x: NarxState, ahead: np.ndarray, outputs: np.ndarray) -> None:
+    """Take `ahead` (outputs,), those at t_k+1, as the new outputs, move the motors on, write the outputs."""
+    for j in range(p.motors):
         d = int(p.drive[j, 1])
         if d > 0:
             a = p.drive[j, 0]
             # Row 0 of the history is u(k), so that u(k+1-d) is row d - 1; m is measured where it is.
             x.motors[j] = (a * x.motors[j] + (1.0 - a) * x.u[d - 1, j] + REST) - REST
-        outputs[2 + j] = x.motors[j]
-    x.angles[0] = (pitch + REST) - REST
-    x.angles[1] = (roll + REST) - REST
-    outputs[0] = x.angles[0]
-    outputs[1] = x.angles[1]
+        outputs[p.outputs + j] = x.motors[j]
+    for axis in range(p.outputs):
+        x.angles[axis] = (ahead[axis] + REST) - REST
+        outputs[axis] = x.angles[axis]
     # What a sensor would add is seen outside and never fed back.
-    if parameters[NARX_NOISE_STD] > 0.0:
-        outputs[0] += parameters[NARX_NOISE_STD] * random_normal(x.random)
-        outputs[1] += parameters[NARX_NOISE_STD] * random_normal(x.random)
+    if parameters[p.outputs + 1] > 0.0:
+        for axis in range(p.outputs):
+            outputs[axis] += parameters[p.outputs + 1] * random_normal(x.random)
+
+
+def narx_advance(
+    p: NarxArrays, parameters: np.ndarray, x: NarxState, pitch: float, roll: float, outputs: np.ndarray
+) -> None:
+    """Take pitch and roll at t_k+1 as the new outputs of a neck, move the motors on, write the outputs."""
+    ahead = np.empty(2)
+    ahead[0] = pitch
+    ahead[1] = roll
+    narx_forward(p, parameters, x, ahead, outputs)
 
 
 def narx_regressor(p: NarxArrays, table: np.ndarray, x: NarxState, axis: int, regressor: np.ndarray) -> None:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, Vector, require_one_of, require_whole
+from softneck.core import Matrix, SettingsError, Vector, require_one_of, require_whole, to_si
+from softneck.robot import Robot
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
 from ._state_space import system_of
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
 KINDS = ("rls", "oe", "srivc", "subspace")
 STATE_SPACE = "softneck.identification.linear._state_space_runtime"
+AFFINE = "softneck.identification.linear._affine_runtime"
 _OUTPUTS = ("pitch", "roll")
 _REDEFINED = ("theta_i", "phi_i", "delta_i")
 _MOTORS = ("motor_setpoint_1", "motor_setpoint_2", "motor_setpoint_3")
@@ -46,6 +48,11 @@ class Linear(Protocol):
         """What its estimator found."""
         ...
 
+    @property
+    def robot(self) -> Robot:
+        """Whose plant it is."""
+        ...
+
 
 def transfer_function(model: Linear, output: str, input: str | None, angle_unit: str) -> control.TransferFunction:
     """Return the discrete transfer function from `input` to `output`, with its delay in full.
@@ -57,7 +64,10 @@ def transfer_function(model: Linear, output: str, input: str | None, angle_unit:
 
     name, scale = _checked(model, output, input, angle_unit)
     axes = model.findings.get("transfer_functions")
-    if axes is not None:
+    if not model.robot.is_neck:
+        axis, motor = model.robot.outputs.names.index(output), model.robot.set_points.index(name)
+        numerator, denominator, delay = _of_motor(model.arrays, axis, motor)
+    elif axes is not None:
         numerator, denominator, delay = _of_findings(axes, _OUTPUTS.index(output), name)
     elif "A" in model.arrays:
         numerator, denominator, delay = _of_state_space(model.arrays, _OUTPUTS.index(output), name)
@@ -79,17 +89,18 @@ def state_space(model: Linear) -> control.StateSpace:
     import control
 
     _require_linear(model.kind)
-    if "A" in model.arrays and "transfer_functions" not in model.findings:
+    if not model.robot.is_neck or ("A" in model.arrays and "transfer_functions" not in model.findings):
         A, B, C, _ = system_of(model.arrays)
         A, B, C = _delayed(A, B, C, int(model.arrays["delay"][0]))
-        inputs = list(_MOTORS)
+        inputs = list(model.robot.set_points)
     else:
         parts = [control.ss(transfer_function(model, output, None, "rad")) for output in _OUTPUTS]
         joined: Any = control.append(*parts)
         A, B, C = np.asarray(joined.A), np.asarray(joined.B), np.asarray(joined.C)
         inputs = list(_REDEFINED[:2])
-    D = np.zeros((2, B.shape[1]))
-    return control.StateSpace(A, B, C, D, model.sample_time, inputs=inputs, outputs=list(_OUTPUTS), name="neck")
+    D = np.zeros((len(C), B.shape[1]))
+    outputs, name = list(model.robot.outputs.names), "neck" if model.robot.is_neck else "robot"
+    return control.StateSpace(A, B, C, D, model.sample_time, inputs=inputs, outputs=outputs, name=name)
 
 
 def continuous_function(
@@ -104,9 +115,8 @@ def continuous_function(
 
     name, scale = _checked(model, output, input, angle_unit)
     require_whole("pade", pade, 0, 12)
-    axis = _OUTPUTS.index(output)
     found = model.findings.get("continuous")
-    if found is not None and name == _REDEFINED[axis]:
+    if found is not None and name in _REDEFINED and output == dict(zip(_REDEFINED, _OUTPUTS, strict=False)).get(name):
         b, a, delay = found[output]["b"], found[output]["a"], float(found[output]["delay_s"])
     else:
         b, a, delay = _continuous(model, output, name)
@@ -118,7 +128,7 @@ def continuous_function(
 
 def describe(model: Linear) -> list[str]:
     """Return each axis in the paper's form, `G = exp(-L s) K/(s + p)`, in degrees, where it has one real pole."""
-    if "A" in model.arrays and "transfer_functions" not in model.findings:
+    if not model.robot.is_neck or ("A" in model.arrays and "transfer_functions" not in model.findings):
         poles = np.linalg.eigvals(model.arrays["A"])
         delay = model.arrays["delay"][0] * model.sample_time
         return [f"{poles.size} states, dead time {delay:.3g} s, poles {np.array2string(poles, precision=4)}"]
@@ -210,11 +220,19 @@ def _of_axis(arrays: Mapping[str, Matrix], axis: int, name: str) -> tuple[Vector
 
 
 def _of_state_space(arrays: Mapping[str, Matrix], axis: int, name: str) -> tuple[Vector, Vector, int]:
-    A, B, C, _ = system_of(arrays)
     if name in _MOTORS:
-        b = B[:, _MOTORS.index(name)]
-    else:
-        b = B @ np.linalg.inv(redefinition_matrix(TENDON_ANGLES))[:, _REDEFINED.index(name)]
+        return _of_motor(arrays, axis, _MOTORS.index(name))
+    b = arrays["B"] @ np.linalg.inv(redefinition_matrix(TENDON_ANGLES))[:, _REDEFINED.index(name)]
+    return _of_column(arrays, axis, b)
+
+
+def _of_motor(arrays: Mapping[str, Matrix], axis: int, motor: int) -> tuple[Vector, Vector, int]:
+    """Return numerator, denominator and dead time of one output from one motor."""
+    return _of_column(arrays, axis, arrays["B"][:, motor])
+
+
+def _of_column(arrays: Mapping[str, Matrix], axis: int, b: Vector) -> tuple[Vector, Vector, int]:
+    A, _, C, _ = system_of(arrays)
     # c (zI - A)^-1 b = (det(zI - A + b c) - det(zI - A)) / det(zI - A).
     denominator = np.real(np.poly(A))
     numerator = np.real(np.poly(A - np.outer(b, C[axis]))) - denominator
@@ -237,11 +255,19 @@ def _delayed(A: Matrix, B: Matrix, C: Matrix, delay: int) -> tuple[Matrix, Matri
 
 def _checked(model: Linear, output: str, input: str | None, angle_unit: str) -> tuple[str, float]:
     _require_linear(model.kind)
-    require_one_of("output", output, _OUTPUTS)
+    robot = model.robot
+    if input is None or input in _REDEFINED:
+        robot.require_neck("what works on theta_i and phi_i (design, observers, families)")
+    require_one_of("output", output, robot.outputs.names)
     require_one_of("angle_unit", angle_unit, ("rad", "deg"))
-    name = _REDEFINED[_OUTPUTS.index(output)] if input is None else input
-    require_one_of("input", name, _REDEFINED + _MOTORS)
-    return name, 180.0 / np.pi if angle_unit == "deg" else 1.0
+    if robot.is_neck:
+        name = _REDEFINED[_OUTPUTS.index(output)] if input is None else input
+        require_one_of("input", name, _REDEFINED + _MOTORS)
+    else:
+        name = input or ""
+        require_one_of("input", name, robot.set_points)
+    angle = to_si(robot.outputs.unit)[1] == "rad"
+    return name, 180.0 / np.pi if angle_unit == "deg" and angle else 1.0
 
 
 def _require_linear(kind: str) -> None:

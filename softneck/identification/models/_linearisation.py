@@ -16,8 +16,6 @@ from softneck.runtime._compile import load_tangent
 if TYPE_CHECKING:
     import control
 
-# The set-points stand first among a plant's inputs; what is measured is given to no step here.
-_MOTORS = 3
 # Some 4 s at a time; what has not come to rest after 200 s never does.
 _SETTLE, _TIMES = 200, 50
 _REST = 1e-12
@@ -28,9 +26,9 @@ class Jacobian(NamedTuple):
 
     Attributes:
         A: (n, n), in the order of the state's `values`.
-        B: (n, 3), from the motors' set-points [rad].
+        B: (n, motors), from the motors' set-points.
         C: (n_out, n), to the outputs that the step returns, in the order of the block's.
-        D: (n_out, 3).
+        D: (n_out, motors).
     """
 
     A: Matrix
@@ -52,18 +50,24 @@ class Stepped(Protocol):
         ...
 
 
+def _motor_count(block: Block) -> int:
+    """Return the number of motors: their set-points stand first among a plant's inputs."""
+    return sum(port.name.startswith("motor_setpoint_") for port in block.inputs)
+
+
 def jacobian(model: Stepped, state: State, inputs: ArrayLike) -> Jacobian:
     """Return the derivatives of `model.step(state, inputs)`; see `Model.jacobian`."""
     block = model.block()
+    motors = _motor_count(block)
     n, n_out = state.values.size, len(block.outputs)
     u = np.full(len(block.inputs), np.nan)
-    u[:_MOTORS] = finite_vector("inputs", inputs, _MOTORS)
-    X, U = np.zeros((n, n + _MOTORS)), np.zeros((u.size, n + _MOTORS))
+    u[:motors] = finite_vector("inputs", inputs, motors)
+    X, U = np.zeros((n, n + motors)), np.zeros((u.size, n + motors))
     X[:, :n] = np.eye(n)
-    U[:_MOTORS, n:] = np.eye(_MOTORS)
-    Y = np.zeros((n_out, n + _MOTORS))
+    U[:motors, n:] = np.eye(motors)
+    Y = np.zeros((n_out, n + motors))
     tangent = load_tangent(block.runtime)
-    tangent(block.arrays, state.parameters, state.values.copy(), u, np.zeros(n_out), X, U, Y, n + _MOTORS)
+    tangent(block.arrays, state.parameters, state.values.copy(), u, np.zeros(n_out), X, U, Y, n + motors)
     return Jacobian(X[:, :n], X[:, n:], Y[:, :n], Y[:, n:])
 
 
@@ -72,10 +76,12 @@ def linearised(model: Stepped, at: State | Mapping[str, float] | ArrayLike | Non
     import control
 
     block = model.block()
+    motors = _motor_count(block)
     load_tangent(block.runtime)  # a kind without derivatives need not come to rest first
     if isinstance(at, State):
         # The motors are told to stay where they are.
-        state, u = at, at.outputs[2 : 2 + _MOTORS]
+        outputs = len(block.inputs) - 2 * motors
+        state, u = at, at.outputs[outputs : outputs + motors]
     else:
         u = _set_points(block, at)
         state = _rest(model, block, u)
@@ -86,31 +92,32 @@ def linearised(model: Stepped, at: State | Mapping[str, float] | ArrayLike | Non
     B, C = np.vstack([J.B, J.D]), np.hstack([np.zeros((n_out, n)), np.eye(n_out)])
     kept = _reached(A, B) & _reached(A.T, C.T)
     return control.StateSpace(
-        A[kept][:, kept], B[kept], C[:, kept], np.zeros((n_out, _MOTORS)), block.sample_time,
-        inputs=[port.name for port in block.inputs[:_MOTORS]], outputs=[port.name for port in block.outputs],
+        A[kept][:, kept], B[kept], C[:, kept], np.zeros((n_out, motors)), block.sample_time,
+        inputs=[port.name for port in block.inputs[:motors]], outputs=[port.name for port in block.outputs],
         name=model.kind,
     )  # fmt: skip
 
 
 def _set_points(block: Block, at: Mapping[str, float] | ArrayLike | None) -> Vector:
-    """Return the motors' set-points (3,) that are asked for."""
-    names = [port.name for port in block.inputs[:_MOTORS]]
+    """Return the motors' set-points (motors,) that are asked for."""
+    motors = _motor_count(block)
+    names = [port.name for port in block.inputs[:motors]]
     if at is None:
-        return np.zeros(_MOTORS)
+        return np.zeros(motors)
     if isinstance(at, Mapping):
         given: Mapping[str, Any] = at
         unknown = sorted(set(given) - set(names))
         if unknown:
             raise SettingsError(f"`{unknown[0]}` is not a set-point; `at` takes {', '.join(names)}.")
-        return finite_vector("at", [given.get(name, 0.0) for name in names], _MOTORS)
-    return finite_vector("at", at, _MOTORS)
+        return finite_vector("at", [given.get(name, 0.0) for name in names], motors)
+    return finite_vector("at", at, motors)
 
 
 def _rest(model: Stepped, block: Block, u: Vector) -> State:
     """Return the state in which the model stands under the set-points `u`, run free until it does."""
     state = block.initial_state(use_measurement=0.0)
     rows = np.full((_SETTLE, len(block.inputs)), np.nan)
-    rows[:, :_MOTORS] = u
+    rows[:, : u.size] = u
     for _ in range(_TIMES):
         state, outputs = block.run(state, rows)
         if np.isfinite(outputs).all() and np.ptp(outputs[-_SETTLE // 4 :], axis=0).max() <= _REST:

@@ -18,12 +18,15 @@ from softneck.core import (
     SettingsError,
     Vector,
     require_one_of,
+    to_si,
     write_archive,
 )
 from softneck.core import load as load_file
 from softneck.core._checks import finite_vector
+from softneck.robot import Robot
 from softneck.runtime import Block, State
 from softneck.signals import Recording
+from softneck.signals.recording._recording import require_same_robot
 
 from . import _linear_systems as _linear
 from . import _linearisation, _ports
@@ -43,7 +46,7 @@ _SEARCHING = ("nlsm", "residual")
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Model:
-    """A plant identified from recordings: motor set-points in, pitch and roll out.
+    """A plant identified from recordings: motor set-points in, the outputs out (of a neck pitch and roll).
 
     Attributes:
         kind: name in the table of kinds.
@@ -52,6 +55,7 @@ class Model:
         settings: what the estimator was asked for.
         findings: what it found: cost curves, noise, parameters.
         training_rows: hashes of the rows it was trained on (see `row_hashes`).
+        robot: whose plant it is; the shapes below are a neck's, with 3 motors and 2 outputs.
     """
 
     kind: str
@@ -60,6 +64,7 @@ class Model:
     settings: Mapping[str, Any] = field(default_factory=dict)
     findings: Mapping[str, Any] = field(default_factory=dict)
     training_rows: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.uint64))
+    robot: Robot = field(default_factory=Robot.preset)
 
     def block(self) -> Block:
         """Return the model as a block, as the FMU builder and loops take it."""
@@ -69,9 +74,9 @@ class Model:
             runtime=runtime_of(self.kind, self.arrays),
             sample_time=self.sample_time,
             arrays=tuple(self.arrays.values()),
-            inputs=_ports.inputs(self.findings),
-            outputs=_ports.outputs(self.kind),
-            parameters=_ports.PARAMETERS,
+            inputs=_ports.inputs(self.findings, self.robot),
+            outputs=_ports.outputs(self.kind, self.robot),
+            parameters=_ports.parameters(self.robot),
         )
 
     def initial_state(self, recording: Recording | None = None, **parameters: float) -> State:
@@ -86,14 +91,15 @@ class Model:
             return block.initial_state(**{"use_measurement": 1.0, **parameters})
         if parameters:
             raise SettingsError("`initial_state` takes a recording or start values, not both.")
+        require_same_robot(recording.robot, self.robot, "a model and a recording")
         y0 = np.nan_to_num(recording.outputs[0])
         logged = recording.motor_positions[0]
         m0 = np.where(np.isfinite(logged), logged, recording.set_points[0])
-        start = block.initial_state(use_measurement=1.0, pitch_start=y0[0], roll_start=y0[1])
+        start = block.initial_state(use_measurement=1.0, **self._starts(y0))
         held = np.tile(np.concatenate([m0, y0, m0]), (memory_of(self.arrays), 1))
         state, _ = block.run(start, held)
         outputs = start.outputs.copy()
-        outputs[2:5] = m0
+        outputs[y0.size : y0.size + m0.size] = m0
         # The last `step` moved the outputs of now; set them back to what the first row says.
         values = state.values.copy()
         set_now(self.kind, self.arrays, values, m0, y0)
@@ -105,7 +111,7 @@ class Model:
         Args:
             state: at t_k.
             inputs: (3,) motor set-points [rad].
-            measured: pitch and roll, or those and three motor positions, measured at t_k [rad]; NaN where not.
+            measured: the outputs, or those and the motor positions, measured at t_k [rad]; NaN where not.
 
         Returns:
             The next state and (pitch, roll, three motor positions, and bounds for set membership) [rad].
@@ -113,13 +119,17 @@ class Model:
         Raises:
             DataError: wrong sizes or set-points that are not finite.
         """
-        u = np.full(8, np.nan)
-        u[:3] = finite_vector("inputs", inputs, 3)
+        motors, outputs = self._sizes
+        u = np.full(2 * motors + outputs, np.nan)
+        u[:motors] = finite_vector("inputs", inputs, motors)
         if measured is not None:
             values = np.asarray(measured, dtype=np.float64).ravel()
-            if values.size not in (2, 5):
-                raise DataError(f"`measured` must have 2 or 5 entries (pitch, roll, motors); got {values.size}.")
-            u[3 : 3 + values.size] = values
+            if values.size not in (outputs, outputs + motors):
+                raise DataError(
+                    f"`measured` must have {outputs} or {outputs + motors} entries "
+                    f"({', '.join(self.robot.outputs.names)}, motors); got {values.size}."
+                )
+            u[motors : motors + values.size] = values
         return self.block().step(state, u)
 
     def jacobian(self, state: State, inputs: ArrayLike) -> _linearisation.Jacobian:
@@ -226,11 +236,14 @@ class Model:
             if kind in _SEARCHING:
                 raise SettingsError(f"a model of kind `{kind}` searches its set; it cannot become a CasADi function.")
         start = self.block().initial_state(use_measurement=0.0, noise_std=0.0)
-        return step_function(self.block(), start.parameters, inputs=3)
+        return step_function(self.block(), start.parameters, inputs=self._sizes[0])
 
     def summary(self) -> str:
         """Return a few lines on what the model is, in degrees."""
         lines = [f"{self.kind}: {KINDS[self.kind].summary}", f"sample time {1e3 * self.sample_time:g} ms"]
+        if not self.robot.is_neck:
+            lines.append(f"robot {self.robot.label()}: {len(self.robot.motors.names)} motor(s), outputs "
+                         f"{', '.join(self.robot.outputs.names)}")  # fmt: skip
         if self.kind in _linear.KINDS:
             lines += _linear.describe(self)
         lines += [f"{key}: {_short(value)}" for key, value in self.findings.items() if _is_plain(value)]
@@ -246,10 +259,11 @@ class Model:
         header = {
             "kind": self.kind,
             "sample_time": self.sample_time,
-            "channels": {"inputs": ["motor_setpoint_1", "motor_setpoint_2", "motor_setpoint_3"], "unit": "rad"},
+            "channels": {"inputs": list(self.robot.set_points), "unit": to_si(self.robot.motors.unit)[1]},
             "arrays": list(self.arrays),
             "settings": dict(self.settings),
             "findings": dict(self.findings),
+            **({} if self.robot.is_neck else {"robot": self.robot.as_dict()}),
         }
         write_archive(path, header, {**self.arrays, "training_rows": self.training_rows}, force=force)
 
@@ -263,12 +277,22 @@ class Model:
             settings=header["settings"],
             findings=header["findings"],
             training_rows=arrays["training_rows"],
+            robot=Robot.from_dict(header["robot"]) if "robot" in header else Robot.preset("neck"),
         )
         check_arrays(model.kind, model.arrays)
         _check_header(model)
         return model
 
+    @property
+    def _sizes(self) -> tuple[int, int]:
+        """How many motors and how many outputs."""
+        return len(self.robot.motors.names), len(self.robot.outputs.names)
+
+    def _starts(self, y0: Vector) -> dict[str, float]:
+        return {f"{name}_start": float(y) for name, y in zip(self.robot.outputs.names, y0, strict=True)}
+
     def _check(self, recording: Recording) -> None:
+        require_same_robot(recording.robot, self.robot, "a model and a recording")
         if not np.isclose(recording.sample_time, self.sample_time, rtol=1e-3):
             raise DataError(
                 f"the model was identified at {self.sample_time:g} s and the recording is at "
@@ -286,14 +310,14 @@ class Model:
 
 
 def _check_header(model: Model) -> None:
-    if not 0.0 < model.sample_time < 10.0:
-        raise FileFormatError(f"a sample time of {model.sample_time} s is implausible for a neck.")
+    if not 0.0 < model.sample_time < (10.0 if model.robot.is_neck else np.inf):
+        raise FileFormatError(f"a sample time of {model.sample_time} s is implausible for {model.robot.name}.")
     if not isinstance(model.settings, dict) or not isinstance(model.findings, dict):
         raise FileFormatError("its settings and findings must be tables.")
     try:
-        _ports.inputs(model.findings)
+        _ports.inputs(model.findings, model.robot)
     except (KeyError, TypeError, ValueError) as error:
-        raise FileFormatError("its range of set-points must be three minima and three maxima.") from error
+        raise FileFormatError("its range of set-points must be a minimum and a maximum for each motor.") from error
     if model.training_rows.dtype != np.uint64 or model.training_rows.ndim != 1:
         raise FileFormatError("its training rows are not hashes.")
 
@@ -303,13 +327,15 @@ def load_model(path: str | Path) -> Model:
     return load_file(path, role="model")
 
 
-def _input_rows(run: Recording, motors: str, *, outputs: bool = True) -> Matrix:
-    rows = np.full((len(run), 8), np.nan)
-    rows[:, :3] = run.set_points
+def _input_rows(run: Recording, source: str, *, outputs: bool = True) -> Matrix:
+    U, Y = run.set_points, run.outputs
+    motors, both = U.shape[1], U.shape[1] + Y.shape[1]
+    rows = np.full((len(run), both + motors), np.nan)
+    rows[:, :motors] = U
     if outputs:
-        rows[:, 3:5] = run.outputs
-    if motors == "measured" and run.has_motor_positions:
-        rows[:, 5:] = run.motor_positions
+        rows[:, motors:both] = Y
+    if source == "measured" and run.has_motor_positions:
+        rows[:, both:] = run.motor_positions
     return rows
 
 

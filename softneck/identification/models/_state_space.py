@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from softneck.core import Matrix, Vector
-from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
 # A free run starts after 25 samples; an observer slower than this many starts from what it knows by then.
 _LONGEST_SETTLING = 200
@@ -26,32 +25,32 @@ def lss_arrays(
 ) -> dict[str, Matrix]:
     """Return the runtime's arrays of `x+ = A x + B u(k-delay) + K (y - C x)`, `y = C x`.
 
-    The states are changed so that the first two are pitch and roll and all others say (y, y, ...) where the model
+    The states are changed so that the first are the outputs and all others say (y, y, ...) where the model
     stands with outputs y: that is how the runtime starts.
 
     Args:
-        system: A (n, n), B (n, 3), C (2, n), K (n, 2).
+        system: A (n, n), B (n, motors), C (outputs, n), K (n, outputs), with n >= outputs.
         delay: dead time of all inputs in samples.
-        drive: (3, 2), see `_narx_runtime`.
+        drive: (motors, 2), see `_narx_runtime`.
         source: 1 where u are motor positions.
         history: samples held when a run starts; None takes as many as the observer needs to settle.
     """
     from scipy.linalg import null_space
 
     A, B, C, K = system
-    n = A.shape[0]
+    n, outputs = A.shape[0], C.shape[0]
     start = _standing(A, C)
     other = null_space(C).T
-    wanted = np.tile(np.eye(2), (n // 2 + 1, 1))[2:n]
+    wanted = np.tile(np.eye(outputs), (n // outputs + 1, 1))[outputs:n]
     M = np.vstack([C, other + (wanted - other @ start) @ C])
     inverse = np.linalg.inv(M)
     if history is None:
         radius = float(np.abs(np.linalg.eigvals(A - K @ C)).max(initial=0.0))
         settles = np.log(1e-3) / np.log(radius) if 0.0 < radius < 1.0 else 1.0
         history = int(min(np.ceil(settles), _LONGEST_SETTLING))
-    length = max(history, delay + 1, (n + 1) // 2, int(drive[:, 1].max(initial=0.0)), 1)
+    length = max(history, delay + 1, -(-n // outputs), int(drive[:, 1].max(initial=0.0)), 1)
     return {
-        "history": np.array([float(length)]),
+        "history": history_array(length, outputs),
         "drive": drive,
         "A": M @ A @ inverse,
         "B": M @ B,
@@ -63,41 +62,56 @@ def lss_arrays(
 def system_of(arrays: Mapping[str, Matrix]) -> tuple[Matrix, Matrix, Matrix, Matrix]:
     """Return A, B, C, K of the arrays, without the dead time."""
     n = arrays["A"].shape[0]
-    return arrays["A"], arrays["B"], np.eye(2, n), arrays["K"]
+    return arrays["A"], arrays["B"], np.eye(arrays["K"].shape[1], n), arrays["K"]
+
+
+def history_array(length: int, outputs: int) -> Vector:
+    """Return the array `history` of a model's file: how long it is, and the number of outputs where that is not two."""
+    return np.array([float(length)] if outputs == 2 else [float(length), float(outputs)])
 
 
 def varx_system(A: Matrix, B: Matrix) -> tuple[Matrix, Matrix, Matrix, Matrix]:
-    """Return the observer form of `y(k) = -sum A_i y(k-i) + sum B_i u(k-i)`, with A (p, 2, 2) and B (p, 2, 3).
+    """Return the observer form of `y(k) = -sum A_i y(k-i) + sum B_i u(k-i)`, with A (p, y, y) and B (p, y, u).
 
     Its observer is dead-beat: after p samples its prediction is that of the difference equation.
     """
-    p = A.shape[0]
-    n = 2 * p
+    p, y = A.shape[:2]
+    n = y * p
     F = np.zeros((n, n))
-    F[: n - 2, 2:] = np.eye(n - 2)
-    K = -A.reshape(n, 2)
-    C = np.eye(2, n)
+    F[: n - y, y:] = np.eye(n - y)
+    K = -A.reshape(n, y)
+    C = np.eye(y, n)
     return F + K @ C, B.reshape(n, B.shape[2]), C, K
 
 
-def axes_system(a: list[Vector], b: list[Vector]) -> tuple[Matrix, Matrix, Matrix, Matrix]:
-    """Return two transfer functions over theta_i and phi_i as one system over the motors, with a Kalman gain.
+def axes_system(
+    a: list[Vector],
+    b: list[Vector],
+    directions: Matrix,
+    noise: Sequence[tuple[float, float]] | None = None,
+) -> tuple[Matrix, Matrix, Matrix, Matrix]:
+    """Return transfer functions over redefined inputs as one system over the motors, with a Kalman gain.
 
     Args:
-        a: denominators without their leading ones.
+        a: denominators without their leading ones, of each output.
         b: numerators, b_1 first.
+        directions: (outputs, motors) the redefined input of each output, of a neck theta_i and phi_i.
+        noise: standard deviations of each input and output; None takes those of a neck.
     """
     from scipy.linalg import block_diag
 
-    parts = [_observer_form(*axis) for axis in zip(a, b, strict=True)]
-    T = redefinition_matrix(TENDON_ANGLES)
-    A, C = np.asarray(block_diag(*(F for F, _, _ in parts))), np.zeros((2, sum(len(F) for F, _, _ in parts)))
-    B = np.vstack([np.outer(G, T[axis]) for axis, (_, G, _) in enumerate(parts)])
-    C[0, 0] = C[1, len(parts[0][0])] = 1.0
+    noise = [(_INPUT_NOISE, _OUTPUT_NOISE)] * len(a) if noise is None else noise
+    parts = [_observer_form(*axis) for axis in zip(a, b, noise, strict=True)]
+    A, C = np.asarray(block_diag(*(F for F, _, _ in parts))), np.zeros((len(a), sum(len(F) for F, _, _ in parts)))
+    B = np.vstack([np.outer(G, directions[axis]) for axis, (_, G, _) in enumerate(parts)])
+    at = 0
+    for axis, (F, _, _) in enumerate(parts):
+        C[axis, at] = 1.0
+        at += len(F)
     return A, B, C, np.asarray(block_diag(*(K[:, None] for _, _, K in parts)))
 
 
-def _observer_form(a: Vector, b: Vector) -> tuple[Matrix, Vector, Vector]:
+def _observer_form(a: Vector, b: Vector, std: tuple[float, float]) -> tuple[Matrix, Vector, Vector]:
     """Return A (n, n), B (n,) and the gain K (n,) of one axis, its output the first state."""
     from scipy.linalg import solve_discrete_are
 
@@ -106,13 +120,15 @@ def _observer_form(a: Vector, b: Vector) -> tuple[Matrix, Vector, Vector]:
     F[: a.size, 0] = -a
     G = np.zeros(n)
     G[: b.size] = b
-    noise = _INPUT_NOISE**2 * np.outer(G, G) + 1e-12 * np.eye(n)
-    P = np.asarray(solve_discrete_are(F.T, np.eye(n, 1), noise, _OUTPUT_NOISE**2 * np.eye(1)))
-    return F, G, F @ P[:, 0] / (P[0, 0] + _OUTPUT_NOISE**2)
+    # Beside 0.0017 rad of a neck 1e-12 rad^2: enough that the equation has a solution.
+    floor = 1e-12 * (std[1] / _OUTPUT_NOISE) ** 2
+    noise = std[0] ** 2 * np.outer(G, G) + floor * np.eye(n)
+    P = np.asarray(solve_discrete_are(F.T, np.eye(n, 1), noise, std[1] ** 2 * np.eye(1)))
+    return F, G, F @ P[:, 0] / (P[0, 0] + std[1] ** 2)
 
 
 def _standing(A: Matrix, C: Matrix) -> Matrix:
-    """Return X (n, 2), the states with C X = I that move least in one sample."""
+    """Return X (n, outputs), the states with C X = I that move least in one sample."""
     from scipy.linalg import null_space
 
     n = A.shape[0]

@@ -10,7 +10,7 @@ from typing import Any
 from softneck.core import KINDS, DataError, Progress, SettingsError, SoftneckError, resolve, silent
 from softneck.signals import Recording
 
-from ..models._fitting import one_recording
+from ..models._fitting import ANY_ROBOT, one_recording
 from ..models._model import Model
 from ..uncertainty._ensemble import combine
 from ..uncertainty._residual import Residual
@@ -96,7 +96,7 @@ def choose(
     Args:
         train: to identify from.
         hold_out: never shown to any kind.
-        kinds: all where empty.
+        kinds: all where empty, those that take the robot where it is not a neck.
         other_excitation: whether `hold_out` is another experiment than `train`.
         seed: of kinds that start at random.
         progress: called with the part done and a word on it.
@@ -104,7 +104,8 @@ def choose(
     Raises:
         DataError: no kind could be identified.
     """
-    wanted = list(kinds) or list(kinds_to_try())
+    taken = kinds_to_try() if train.robot.is_neck else [kind for kind in kinds_to_try() if kind in ANY_ROBOT]
+    wanted = list(kinds) or list(taken)
     unknown = [kind for kind in wanted if kind not in kinds_to_try()]
     if unknown:
         raise SettingsError(f"`{unknown[0]}` cannot be tried; known: {', '.join(kinds_to_try())}.")
@@ -201,7 +202,7 @@ def _remarks(ranking: tuple[KindTrial, ...], other_excitation: bool) -> tuple[st
     if ranking[0].fit < _POOR:
         remarks.append(
             f"No kind reaches {_POOR:g} % in free run. Look for a drifting sensor, a wrong sample time or sign, motors "
-            "that were not logged, or an excitation that hardly moves the neck."
+            "that were not logged, or an excitation that hardly moves the robot."
         )
     failed = [one.kind for one in ranking if one.fit == float("-inf")]
     if failed:

@@ -158,6 +158,7 @@ def search(
         SettingsError: an unknown field, nothing to vary, or too many trials.
         DataError: a hold-out that is too short or holds training rows, or no trial can run free.
     """
+    train.robot.require_neck("a search over settings")
     require_one_of("strategy", strategy, STRATEGIES)
     require_one_of("rule", rule, RULES)
     require_whole("workers", workers, 1, 256)

@@ -71,7 +71,7 @@ def decode(x: Vector) -> Vector:
 
 def check_play(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
     within(arrays["chain"][1:], 1, 1000, "the order of the filters")
-    signals = 3 * (1 + sizes["w"]) * sizes["order"]
+    signals = sizes["c"] * (1 + sizes["w"]) * sizes["order"]
     within(arrays["table"], -1, signals - 1, "a term's signal")
     within(np.array([sizes["p"]]), 1, sizes["H"], "the length of the echo")
 

@@ -7,17 +7,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from softneck.core import DataError, Matrix, Progress, require_positive, require_whole, silent
-from softneck.signals import TENDON_ANGLES, Recording, redefinition_matrix
+from softneck.signals import Recording
 
-from ..models._drive import LoadedDrive, fit_loaded_drive
+from ..models._directions import directions_of
+from ..models._drive import LoadedDrive, drive_start, fit_loaded_drive
 from ..models._error_feedback import BEYOND, fit_echo
 from ..models._fitting import SAME_EXCITATION, fitted_model, training_recording
 from ..models._model import Model
+from ..models._state_space import history_array
 from ._play_terms import Data, PlayStructure, ridge, scores
 
 # What the hold-out chooses from: filters about as fast as the neck's 5 1/s and three times that; plays up to a
 # tenth of the motors' 6 rad.
 _RATES = (6.0, 15.0)
+# Of other robots, whose time constant is found only roughly, by that of the neck.
+_MORE_RATES = (4.0, 6.0, 10.0, 15.0, 25.0)
 _WIDTHS = ((), (0.3,), (0.1, 0.3, 0.6))
 _DEGREES = (1, 2, 3)
 _RIDGES = (1e-6, 1e-4, 1e-2)
@@ -85,11 +89,13 @@ class Play:
         Raises:
             DataError: too short, constant, or fewer rows than terms.
         """
-        recording = training_recording(recordings)
+        recording = training_recording(recordings, any_robot=True)
         progress(0.0, "drives")
         drive = fit_loaded_drive(recording)
-        data = Data.of(recording, drive)
-        extra = None if hold_out is None else Data.of(hold_out, drive)
+        directions = directions_of(recording, [drive.simulate(r.set_points, drive_start(r)) for r in recording.runs()])
+        T = directions.inputs(recording)
+        data = Data.of(recording, drive, directions, T)
+        extra = None if hold_out is None else Data.of(hold_out, drive, directions, T)
         form, weight, fit, tried = self._choose(data, extra, progress)
         progress(0.95, "all rows")
         arrays = _arrays(data, drive, form, weight, self.echo)
@@ -102,6 +108,8 @@ class Play:
             "hold_out_fit": fit,
             "tried": tried,
         }
+        if not recording.robot.is_neck:
+            findings |= directions.findings()
         if hold_out is None and tried > 1:
             findings["remark"] = SAME_EXCITATION
         progress(1.0, "done")
@@ -109,9 +117,11 @@ class Play:
 
     def _choose(self, data: Data, extra: Data | None, progress: Progress) -> tuple[PlayStructure, float, float, int]:
         """Return form and ridge of the best free run on the hold-out, its fit [%], and how many were tried."""
+        inputs, tilts = len(data.redefinition), min(len(data.redefinition), data.outputs.shape[1])
+        rates = _RATES if data.stretch == 1.0 else tuple(rate / data.stretch for rate in _MORE_RATES)
         forms = [
-            PlayStructure(rate, self.order, widths, degree)
-            for rate in (_RATES if self.rate is None else (self.rate,))
+            PlayStructure(rate, self.order, widths, degree, inputs, tilts)
+            for rate in (rates if self.rate is None else (self.rate,))
             for widths in (_WIDTHS if self.widths is None else (self.widths,))
             for degree in (_DEGREES if self.degree is None else (self.degree,))
         ]
@@ -149,18 +159,18 @@ def _arrays(data: Data, drive: LoadedDrive, form: PlayStructure, weight: float, 
     errors[~good] = np.nan
     edges = np.cumsum([len(motors) for motors in data.motors])[:-1]
     parts: list[Matrix] = np.split(errors, edges)
-    echo = np.array([fit_echo([part[:, axis] for part in parts], order, beyond=BEYOND) for axis in range(2)])
+    echo = np.array([fit_echo([part[:, axis] for part in parts], order, beyond=BEYOND) for axis in range(len(W))])
     history = int(max(order, drive.drive[:, 1].max(), 1))
     return {
-        "history": np.array([float(history)]),
+        "history": history_array(history, len(W)),
         "drive": drive.drive,
         "load": drive.load,
-        "redefinition": redefinition_matrix(TENDON_ANGLES),
+        "redefinition": data.redefinition,
         "widths": np.array(form.widths, dtype=np.float64),
         "chain": form.chain(data.sample_time),
         "table": form.table,
         "weights": W,
         "range": limits,
         "echo": echo,
-        "memory": np.array([float(np.ceil(_MEMORY / data.sample_time))]),
+        "memory": np.array([float(np.ceil(_MEMORY * data.stretch / data.sample_time))]),
     }

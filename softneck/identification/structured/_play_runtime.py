@@ -12,7 +12,7 @@ from softneck.identification.models._feedforward_runtime import echo_added, echo
 from softneck.identification.models._histories_runtime import (
     NarxArrays,
     NarxState,
-    narx_advance,
+    narx_forward,
     narx_observe,
     narx_rest,
 )
@@ -23,13 +23,13 @@ class PlayArrays(NarxArrays):
     """The bank of operators and filters, and the polynomial over it."""
 
     load = array("4", "where a drive stalls: pole, c, c1, c2 (see `_bank_runtime`)")
-    redefinition = array("3, 3", "T of Eq. 9-11: motors to redefined inputs")
+    redefinition = array("c, motors", "T of Eq. 9-11: motors to redefined inputs")
     widths = array("w", "widths of the play operators behind each redefined input [rad]")
     chain = array("2", "pole and number of the equal low-pass filters behind each operator")
     table = array("terms, 3", "signals of the bank that each term multiplies; -1 stands for 1")
-    weights = array("2, terms", "of the terms, for each axis")
-    range = array("2, 2", "least and largest f of each axis [rad]")
-    echo = array("2, p", "of what was measured above f, newest first")
+    weights = array("outputs, terms", "of the terms, for each axis")
+    range = array("outputs, 2", "least and largest f of each axis [rad]")
+    echo = array("outputs, p", "of what was measured above f, newest first")
     memory = array("1", "samples after which a held start has settled")
     order = value("chain", 1)
 
@@ -37,9 +37,9 @@ class PlayArrays(NarxArrays):
 class PlayState(NarxState):
     """Histories, load, operators and filters."""
 
-    q = cells("3", "motor positions behind a low-pass: the load of now [rad]")
-    plays = cells("3 * w", "play operators [rad]")
-    bank = cells("3 * (w + 1) * order", "filters [rad]")
+    q = cells("motors", "motor positions behind a low-pass: the load of now [rad]")
+    plays = cells("c * w", "play operators [rad]")
+    bank = cells("c * (w + 1) * order", "filters [rad]")
 
 
 def play_output(p: PlayArrays, bank: np.ndarray, axis: int) -> float:
@@ -53,7 +53,7 @@ def play_output(p: PlayArrays, bank: np.ndarray, axis: int) -> float:
 def initialise(p: PlayArrays, parameters: np.ndarray, x: PlayState, outputs: np.ndarray) -> None:
     """Rest: motors at zero, the output at its start value; what that is above f is remembered as measured."""
     narx_rest(p, parameters, x, outputs)
-    for axis in range(2):
+    for axis in range(p.outputs):
         echo_rest(p, x, axis, play_output(p, x.bank, axis))
 
 
@@ -63,9 +63,9 @@ def step(p: PlayArrays, parameters: np.ndarray, x: PlayState, inputs: np.ndarray
     # q, plays and filters take m(k) in and stand at k+1: what is read from them is y(k+1).
     load_advance(p.load, x.m[0], x.q)
     bank_advance(p.redefinition, p.widths, p.chain, x.m[0], x.plays, x.bank)
-    angles = np.empty(2)
-    for axis in range(2):
-        angles[axis] = echo_added(p, p.echo, x, axis, play_output(p, x.bank, axis))
-    narx_advance(p, parameters, x, angles[0], angles[1], outputs)
-    # The lag of `narx_advance` knows no load: these positions replace its own.
+    ahead = np.empty(p.outputs)
+    for axis in range(p.outputs):
+        ahead[axis] = echo_added(p, p.echo, x, axis, play_output(p, x.bank, axis))
+    narx_forward(p, parameters, x, ahead, outputs)
+    # The lag of `narx_forward` knows no load: these positions replace its own.
     stalling_drives(p, p.load, x.q, x, outputs)

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations_with_replacement
 
 import numpy as np
 
 from softneck.core import DataError, Matrix, Vector
 from softneck.runtime import load_functions
-from softneck.signals import TENDON_ANGLES, Recording, redefinition_matrix
+from softneck.signals import Recording
 
+from ..models._directions import Directions
 from ..models._drive import FUNCTIONS, LoadedDrive, drive_start
+from ..models._model import WARM_UP
 from ..models._scores import nrmse_fit
 
 # Rows of each run in which its unknown past still shows [s]: those that `validate` does not score either.
@@ -29,24 +32,28 @@ class PlayStructure:
         order: filters in a chain.
         widths: half-widths of the play operators [rad].
         degree: of the polynomial.
+        inputs: redefined inputs.
+        tilts: those of them that stand in cubes.
     """
 
     rate: float
     order: int
     widths: tuple[float, ...]
     degree: int
+    inputs: int = 3
+    tilts: int = 2
 
     @property
     def table(self) -> Matrix:
         """(n, 3) signals of which each term is the product; -1 stands for 1. The constant comes first."""
         chains = 1 + len(self.widths)
-        rows = [[-1, -1, -1]] + [[i, -1, -1] for i in range(3 * chains * self.order)]
+        rows = [[-1, -1, -1]] + [[i, -1, -1] for i in range(self.inputs * chains * self.order)]
         # The last filter but one: late enough for the neck's statics, whose curvature this is.
-        t, p, d = (c * chains * self.order + self.order - 2 for c in range(3))
+        late = [c * chains * self.order + self.order - 2 for c in range(self.inputs)]
         if self.degree >= 2:
-            rows += [[t, t, -1], [t, p, -1], [t, d, -1], [p, p, -1], [p, d, -1], [d, d, -1]]
+            rows += [[*pair, -1] for pair in combinations_with_replacement(late, 2)]
         if self.degree >= 3:
-            rows += [[t, t, t], [t, t, p], [t, p, p], [p, p, p]]
+            rows += [list(three) for three in combinations_with_replacement(late[: self.tilts], 3)]
         return np.array(rows, dtype=np.float64)
 
     def chain(self, sample_time: float) -> Vector:
@@ -59,12 +66,14 @@ class Data:
     """Simulated motors and measured outputs of all runs, rows in which the start shows marked.
 
     Attributes:
-        motors: one (time, 3) a run, simulated [rad].
-        measured: the same with what was logged, where it was [rad].
-        outputs: (time, 2) of all runs behind each other [rad].
+        motors: one (time, motors) a run, simulated.
+        measured: the same with what was logged, where it was.
+        outputs: (time, outputs) of all runs behind each other.
         settled: (time,) rows to learn from and to judge.
         groups: masks (time,) of rows to hold out in turn: the last fifth of each run; of many runs a third of them.
         sample_time: [s].
+        stretch: by how much the robot is slower than a neck.
+        redefinition: (inputs, motors) T of Eq. 9-11.
     """
 
     motors: list[Matrix]
@@ -73,16 +82,19 @@ class Data:
     settled: np.ndarray
     groups: list[np.ndarray]
     sample_time: float
+    stretch: float
+    redefinition: Matrix
 
     @classmethod
-    def of(cls, recording: Recording, drive: LoadedDrive) -> Data:
+    def of(cls, recording: Recording, drive: LoadedDrive, directions: Directions, redefinition: Matrix) -> Data:
         """Simulate the motors of a recording."""
         runs = recording.runs()
-        border = round(_SETTLED / recording.sample_time)
+        # Of another robot what `validate` does not score either.
+        border = round(_SETTLED / recording.sample_time) if recording.robot.is_neck else WARM_UP
         outputs = recording.outputs
         settled = np.concatenate([np.arange(len(run)) >= border for run in runs]) & np.isfinite(outputs).all(axis=1)
         if settled.sum() < 2:
-            raise DataError(f"every run is shorter than the {_SETTLED:g} s in which its start is forgotten.")
+            raise DataError(f"every run is shorter than the {border} samples in which its start is forgotten.")
         motors = [drive.simulate(run.set_points, drive_start(run)) for run in runs]
         logged = [run.motor_positions if run.has_motor_positions else m for run, m in zip(runs, motors, strict=True)]
         return cls(
@@ -92,6 +104,8 @@ class Data:
             settled=settled,
             groups=_groups([len(run) for run in runs]),
             sample_time=recording.sample_time,
+            stretch=directions.stretch,
+            redefinition=redefinition,
         )
 
     def terms(self, form: PlayStructure, *, measured: bool = False) -> Matrix:
@@ -100,9 +114,9 @@ class Data:
         widths, chain, table = np.array(form.widths), form.chain(self.sample_time), form.table.astype(int)
         parts = []
         for motors in self.measured if measured else self.motors:
-            signals = np.empty((len(motors), 3 * (1 + len(widths)) * form.order))
+            signals = np.empty((len(motors), len(self.redefinition) * (1 + len(widths)) * form.order))
             motors = np.ascontiguousarray(motors)
-            run(redefinition_matrix(TENDON_ANGLES), widths, chain, motors, signals)
+            run(self.redefinition, widths, chain, motors, signals)
             parts.append(np.column_stack([signals, np.ones(len(signals))]))  # -1 is the column of ones
         signals = np.concatenate(parts)
         return signals[:, table[:, 0]] * signals[:, table[:, 1]] * signals[:, table[:, 2]]
@@ -116,7 +130,7 @@ def _groups(lengths: list[int]) -> list[np.ndarray]:
 
 
 def ridge(X: Matrix, Y: Matrix, weight: float) -> Matrix:
-    """Return W (2, n) of the least `|Y - X W'|^2 / rows + weight |w|^2`, w of standardised terms but the constant."""
+    """Return W (outputs, n) of the least `|Y - X W'|^2 / rows + weight |w|^2`, w of standardised terms, no constant."""
     mean, scale = X.mean(axis=0), X.std(axis=0)
     mean[0], scale[0] = 0.0, 1.0
     scale = np.where(scale > 1e-9, scale, 1.0)
@@ -130,7 +144,7 @@ def ridge(X: Matrix, Y: Matrix, weight: float) -> Matrix:
 
 
 def scores(data: Data, hold_out: Data | None, form: PlayStructure, weights: tuple[float, ...]) -> list[float]:
-    """Return, for each ridge weight, the mean free-run fit [%] of both axes on rows that were not learnt from.
+    """Return, for each ridge weight, the mean free-run fit [%] of all outputs on rows that were not learnt from.
 
     Without `hold_out` parts of the data are held out in turn: the end of each run (of many runs a third of them,
     experiments of their own), and what is furthest from all the rest, which tells how the form extrapolates.
@@ -149,7 +163,7 @@ def scores(data: Data, hold_out: Data | None, form: PlayStructure, weights: tupl
 def _fold_score(fold: tuple[Matrix, Matrix, Matrix, Matrix], weight: float) -> float:
     X, Y, held, y = fold
     free = held @ ridge(X, Y, weight).T
-    return float(np.mean([nrmse_fit(y[:, axis], free[:, axis]) for axis in range(2)]))
+    return float(np.mean([nrmse_fit(y[:, axis], free[:, axis]) for axis in range(y.shape[1])]))
 
 
 def _far(signals: Matrix, good: np.ndarray) -> np.ndarray:

@@ -64,6 +64,8 @@ def combine(models: Sequence[Model]) -> Model:
         raise SettingsError(f"an ensemble needs at least two models; got {len(models)}.")
     if not np.allclose([model.sample_time for model in models], models[0].sample_time, rtol=1e-6):
         raise SettingsError("the models of an ensemble must have one sample time.")
+    for model in models:
+        model.robot.require_neck("an ensemble")
     memory = max(memory_of(model.arrays) for model in models)
     arrays = {
         "history": np.ones(1),

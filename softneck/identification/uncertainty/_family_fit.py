@@ -155,6 +155,7 @@ class FamilySettings:
         sample_time = _one_sample_time(parts)
         for part in parts:
             check_training(part)
+            part.robot.require_neck("a family")
         frequency = np.geomspace(_LOWEST, np.pi / sample_time, _FREQUENCIES)
         search = SrivcFitOptions(sample_time=sample_time, offset=True, max_delay=self.max_delay, fastest=_FASTEST)
         cut = [

@@ -34,7 +34,7 @@ def persistence(run: Recording, horizon: int) -> Matrix:
 def held_outputs(run: Recording) -> Matrix:
     """Return pitch and roll (time, 2) [rad] with each missed sample replaced by the last one before it."""
     y = run.outputs.copy()
-    for axis in range(2):
+    for axis in range(y.shape[1]):
         last = np.maximum.accumulate(np.where(np.isfinite(y[:, axis]), np.arange(len(y)), 0))
         y[:, axis] = y[last, axis]
     return y
@@ -142,9 +142,6 @@ def _late(x: Matrix, lag: int) -> Matrix:
     return np.vstack([np.repeat(x[:1], lag, axis=0), x[: len(x) - lag]])
 
 
-_AXES = ("pitch", "roll")
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Baselines:
     """Fits [%] of persistence and the best linear model, horizon -> axis -> fit; of a perfect one, axis -> fit."""
@@ -157,22 +154,27 @@ class Baselines:
 def baselines(
     recording: Recording, stretches: Sequence[ScoredStretch], rows: Rows, horizons: Sequence[int | str]
 ) -> Baselines:
-    """Return the baselines of the stretches judged; repeats are looked for in all of the recording."""
+    """Return the baselines of the stretches judged; repeats are looked for in all of the recording.
+
+    The best linear model and the noise ceiling look for what lasts as long as on a neck: of other robots there is none.
+    """
+    axes, neck = rows.names, recording.robot.is_neck
+    nothing: list[float | None] = [None] * len(axes)
     names = [str(h) for h in horizons]
     steps = [None if h == "inf" else int(h) for h in horizons]
-    bounds = best_linear(stretches, rows, steps)
+    bounds = best_linear(stretches, rows, steps) if neck else [nothing for _ in steps]
     held: dict[str, dict[str, float | None]] = {}
     for name, k in zip(names, steps, strict=True):
         if k is not None:
             predicted = np.concatenate([persistence(stretch.recording, k) for stretch in stretches])
             pairs = zip(rows.judged(k).T, predicted.T, strict=True)
-            held[name] = _by_axis([nrmse_fit(y, yhat) for y, yhat in pairs])
+            held[name] = _by_axis(axes, [nrmse_fit(y, yhat) for y, yhat in pairs])
     return Baselines(
         persistence=held,
-        best_linear={name: _by_axis(fits) for name, fits in zip(names, bounds, strict=True)},
-        noise_ceiling=_by_axis(noise_ceiling(recording, rows.measured)),
+        best_linear={name: _by_axis(axes, fits) for name, fits in zip(names, bounds, strict=True)},
+        noise_ceiling=_by_axis(axes, noise_ceiling(recording, rows.measured) if neck else nothing),
     )
 
 
-def _by_axis(fits: Sequence[float | None]) -> dict[str, float | None]:
-    return {a: f if f is not None and np.isfinite(f) else None for a, f in zip(_AXES, fits, strict=True)}
+def _by_axis(names: Sequence[str], fits: Sequence[float | None]) -> dict[str, float | None]:
+    return {a: f if f is not None and np.isfinite(f) else None for a, f in zip(names, fits, strict=True)}

@@ -39,17 +39,18 @@ def fit_intervals(
     errors = [y - yhat for y, yhat in zip(measured, predicted, strict=True)]
     length = block_length(np.column_stack([*errors, measured[0]]), stretch, sample_time)
     if length is None:
-        return [[None, None] for _ in measured]
+        return [[None] * measured[0].shape[1] for _ in measured]
     table = np.column_stack([_terms(y, e) for y, e in zip(measured, errors, strict=True)])
     sums = _block_sums(table, stretch, length)
     if not len(sums):  # no error is a number: the predictions are beyond all bounds
-        return [[None, None] for _ in measured]
+        return [[None] * measured[0].shape[1] for _ in measured]
+    axes = measured[0].shape[1]
     # The same blocks for every horizon and axis, and the same every time.
     drawn = np.random.default_rng(0).integers(len(sums), size=(RESAMPLES, -(-len(sums) // length)))
     picks = csr_array((np.ones(drawn.size), drawn.ravel(), np.arange(RESAMPLES + 1) * drawn.shape[1]),
                       shape=(RESAMPLES, len(sums)))  # fmt: skip
-    totals = (picks @ sums).reshape(RESAMPLES, len(measured), 2, 4)
-    return [[_interval(totals[:, h, axis]) for axis in range(2)] for h in range(len(measured))]
+    totals = (picks @ sums).reshape(RESAMPLES, len(measured), axes, 4)
+    return [[_interval(totals[:, h, axis]) for axis in range(axes)] for h in range(len(measured))]
 
 
 def block_length(signals: Matrix, stretch: np.ndarray, sample_time: float) -> int | None:

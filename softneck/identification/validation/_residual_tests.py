@@ -6,7 +6,7 @@ around it keep their true distance.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,13 +53,13 @@ class ResidualTests:
         causal = np.abs(self.cross_correlation[:, :, LAGS:])
         return bool((causal.max(axis=2) <= self.cross_bound * _sigmas(causal.size) / _sigmas(1)).all())
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the arrays as lists, for JSON."""
+    def as_dict(self, names: Sequence[str] = ("pitch", "roll")) -> dict[str, Any]:
+        """Return the arrays as lists, for JSON; `names` are those of the outputs."""
         return {
             "lags": self.lags.tolist(),
             "autocorrelation": self.autocorrelation.tolist(),
             "bound": self.bound.tolist(),
-            "p_value": {"pitch": float(self.p_value[0]), "roll": float(self.p_value[1])},
+            "p_value": dict(zip(names, self.p_value.tolist(), strict=True)),
             "cross_lags": self.cross_lags.tolist(),
             "cross_correlation": self.cross_correlation.tolist(),
             "cross_bound": self.cross_bound.tolist(),
@@ -77,8 +77,9 @@ def residual_tests(errors: Matrix, inputs: Matrix, stretch: np.ndarray) -> Resid
     from scipy.stats import chi2
 
     edges = np.flatnonzero(np.diff(stretch)) + 1
-    autocorrelation, bound, p_value = np.zeros((2, LAGS + 1)), np.full(2, np.nan), np.full(2, np.nan)
-    cross, cross_bound = np.zeros((2, inputs.shape[1], 2 * LAGS + 1)), np.full((2, inputs.shape[1]), np.nan)
+    axes = errors.shape[1]
+    autocorrelation, bound, p_value = np.zeros((axes, LAGS + 1)), np.full(axes, np.nan), np.full(axes, np.nan)
+    cross, cross_bound = np.zeros((axes, inputs.shape[1], 2 * LAGS + 1)), np.full((axes, inputs.shape[1]), np.nan)
     for axis, column in enumerate(errors.T):
         there = np.isfinite(column)
         n = int(there.sum())

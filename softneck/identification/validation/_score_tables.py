@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, Vector
+from softneck.robot import Robot
 
 from ..models._model import Model
 from ..models._scores import nrmse_fit, r_squared, rmse, worst_error
@@ -21,7 +22,9 @@ RANGES = 3.0
 _LEAST_RANGE = np.radians(5.0)
 
 
-def divergence(time: Vector, stretch: np.ndarray, free_run: Matrix, measured: Matrix) -> list[float | None]:
+def divergence(
+    time: Vector, stretch: np.ndarray, free_run: Matrix, measured: Matrix, *, neck: bool = True
+) -> list[float | None]:
     """Return for each stretch the time [s] at which its free run left the data's range, or None.
 
     Left is: further than three times the measured range (the larger of the two axes', at least 5 deg) from its
@@ -32,16 +35,17 @@ def divergence(time: Vector, stretch: np.ndarray, free_run: Matrix, measured: Ma
         stretch: (time,) number of the stretch.
         free_run: (time, 2) [rad].
         measured: (time, 2) [rad]; NaN where missed or not scored.
+        neck: whether these are angles; of other robots any number of outputs in any unit, with neither 5 deg nor turns.
     """
-    middle, reach = _range(measured)
-    inside = (np.abs(free_run - middle) <= RANGES * reach) & (np.abs(free_run) < np.pi)
+    middle, reach = _range(measured, _LEAST_RANGE if neck else 0.0)
+    inside = (np.abs(free_run - middle) <= RANGES * reach) & (np.abs(free_run) < (np.pi if neck else np.inf))
     gone = ~inside.all(axis=1)
     first = [np.flatnonzero(gone & (stretch == number)) for number in range(int(stretch[-1]) + 1)]
     return [float(time[rows[0]]) if rows.size else None for rows in first]
 
 
-def _range(measured: Matrix) -> tuple[Vector, float]:
-    middle, widths = np.zeros(2), [_LEAST_RANGE]
+def _range(measured: Matrix, least: float) -> tuple[Vector, float]:
+    middle, widths = np.zeros(measured.shape[1]), [least]
     for axis, y in enumerate(measured.T):
         there = y[np.isfinite(y)]
         if there.size:
@@ -52,28 +56,32 @@ def _range(measured: Matrix) -> tuple[Vector, float]:
 
 #: The name of the free run among the horizons of a validation.
 INFINITE = "inf"
-AXES = ("pitch", "roll")
-# Bounds of set membership follow pitch, roll and three motors in its outputs.
-_LOWER, _UPPER = (5, 7), (6, 8)
 
 
 def score_tables(
-    time: Vector, measured: dict[str, Matrix], predicted: dict[str, Matrix], *, lost: bool
+    rows: Rows, time: Vector, measured: dict[str, Matrix], predicted: dict[str, Matrix], *, lost: bool
 ) -> dict[str, Any]:
-    """Return the tables of scores by their names in `Validation`; a lost free run has none."""
+    """Return the tables of scores by their names in `Validation`; a lost free run has none.
+
+    Args:
+        rows: whose outputs these are.
+        time: (time,) [s].
+        measured, predicted: horizon -> (time, outputs).
+        lost: whether the free run diverged.
+    """
     tables: dict[str, Any] = {name: {} for name in ("fits", "rmse_deg", "r2", "worst_deg", "worst_time")}
     for h, y in measured.items():
         for table in tables.values():
-            table[h] = dict.fromkeys(AXES)
+            table[h] = dict.fromkeys(rows.names)
         if lost and h == INFINITE:
             continue
-        for i, axis in enumerate(AXES):
+        for i, axis in enumerate(rows.names):
             pair = (y[:, i], predicted[h][:, i])
             worst, row = worst_error(*pair)
             tables["fits"][h][axis] = _number(nrmse_fit(*pair))
-            tables["rmse_deg"][h][axis] = _number(np.degrees(rmse(*pair)))
+            tables["rmse_deg"][h][axis] = _number(rows.shown(rmse(*pair)))
             tables["r2"][h][axis] = _number(r_squared(*pair))
-            tables["worst_deg"][h][axis] = _number(np.degrees(worst))
+            tables["worst_deg"][h][axis] = _number(rows.shown(worst))
             tables["worst_time"][h][axis] = float(time[row]) if row >= 0 else None
     return tables
 
@@ -90,6 +98,7 @@ def run_tables(
     for number, stretch in enumerate(stretches):
         rows = rows_of_all.stretch == number
         scores = score_tables(
+            rows_of_all,
             rows_of_all.time[rows],
             {h: y[rows] for h, y in measured.items()},
             {h: y[rows] for h, y in predicted.items()},
@@ -113,24 +122,29 @@ def interval_tables(
     rows: Rows, measured: dict[str, Matrix], predicted: dict[str, Matrix], sample_time: float, *, lost: bool
 ) -> dict[str, dict[str, list[float] | None]]:
     """Return the bootstrap's interval of each fit."""
-    result: dict[str, dict[str, list[float] | None]] = {h: dict.fromkeys(AXES) for h in measured}
+    result: dict[str, dict[str, list[float] | None]] = {h: dict.fromkeys(rows.names) for h in measured}
     kept = [h for h in measured if not (lost and h == INFINITE)]
     if kept:
         found = fit_intervals([measured[h] for h in kept], [predicted[h] for h in kept], rows.stretch, sample_time)
-        result |= {h: dict(zip(AXES, pair, strict=True)) for h, pair in zip(kept, found, strict=True)}
+        result |= {h: dict(zip(rows.names, pair, strict=True)) for h, pair in zip(kept, found, strict=True)}
     return result
 
 
-def free_run_bounds(free: Matrix) -> tuple[Matrix, Matrix]:
-    """Return the lower and upper bounds (time, 2) among a model's outputs; NaN where its kind has none."""
-    if free.shape[1] <= max(_UPPER):
-        nothing = np.full((len(free), 2), np.nan)
+def free_run_bounds(free: Matrix, robot: Robot) -> tuple[Matrix, Matrix]:
+    """Return the lower and upper bounds (time, outputs) among a model's outputs; NaN where its kind has none.
+
+    Bounds of set membership follow the outputs and motors, lower and upper of one output after the other.
+    """
+    outputs = len(robot.outputs.names)
+    first = outputs + len(robot.motors.names)
+    if free.shape[1] <= first:
+        nothing = np.full((len(free), outputs), np.nan)
         return nothing, nothing
-    return free[:, list(_LOWER)], free[:, list(_UPPER)]
+    return free[:, first::2], free[:, first + 1 :: 2]
 
 
 def coverage_tables(
-    measured: Matrix, lower: Matrix, upper: Matrix
+    rows: Rows, measured: Matrix, lower: Matrix, upper: Matrix
 ) -> tuple[dict[str, float] | None, dict[str, float] | None]:
     """Return how many measured samples lie within the bounds [%], and how wide these are [deg]."""
     there = np.isfinite(measured) & np.isfinite(lower) & np.isfinite(upper)
@@ -140,18 +154,19 @@ def coverage_tables(
     count = np.maximum(there.sum(axis=0), 1)
     width = np.where(there, upper - lower, 0.0).sum(axis=0) / count
     coverage = 100.0 * inside.sum(axis=0) / count
-    return dict(zip(AXES, coverage.tolist(), strict=True)), dict(zip(AXES, np.degrees(width).tolist(), strict=True))
+    widths = [rows.shown(value) for value in width]
+    return dict(zip(rows.names, coverage.tolist(), strict=True)), dict(zip(rows.names, widths, strict=True))
 
 
 def outside_table(model: Model, measured: Matrix, free: Matrix) -> dict[str, float] | None:
     """Return how many measured samples [%] the bounds flag as outside what a set membership model has seen."""
-    lower, upper = free_run_bounds(free)
+    lower, upper = free_run_bounds(free, model.robot)
     there = np.isfinite(measured) & np.isfinite(lower) & np.isfinite(upper)
     if not there.any() or not knows_what_it_saw(model):
         return None
     flagged = outside_seen(model, free) & there
     share = 100.0 * flagged.sum(axis=0) / np.maximum(there.sum(axis=0), 1)
-    return dict(zip(AXES, share.tolist(), strict=True))
+    return dict(zip(model.robot.outputs.names, share.tolist(), strict=True))
 
 
 def _number(value: float) -> float | None:

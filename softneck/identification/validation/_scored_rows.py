@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, Vector
+from softneck.core import DataError, Matrix, Vector, to_si
+from softneck.robot import Robot
 from softneck.signals import Recording
 
 from ..models._fitting import known_rows
@@ -43,6 +44,7 @@ class Rows:
         since: (time,) samples since its start.
         measured: (time, 2) [rad]; NaN where missed or not scored.
         set_points: (time, 3) [rad].
+        robot: whose rows they are; another than the neck has its own numbers of motors and outputs, in SI.
     """
 
     time: Vector
@@ -50,6 +52,17 @@ class Rows:
     since: np.ndarray
     measured: Matrix
     set_points: Matrix
+    robot: Robot
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the outputs."""
+        return self.robot.outputs.names
+
+    def shown(self, value: float) -> float:
+        """Return an error in the unit in which scores show it: a neck's degrees, else the robot's `display_unit`."""
+        unit = self.robot.outputs.display_unit
+        return float(np.degrees(value)) if unit == "deg" else value / to_si(unit)[0]
 
     def judged(self, horizon: int | None) -> Matrix:
         """Return `measured`, NaN as well where there are not `horizon` samples of past; None is the free run."""
@@ -98,6 +111,7 @@ def pooled(stretches: list[ScoredStretch]) -> Rows:
         since=np.concatenate([np.arange(len(s.recording)) for s in stretches]),
         measured=np.concatenate(outputs),
         set_points=np.concatenate([s.recording.set_points for s in stretches]),
+        robot=stretches[0].recording.robot,
     )
 
 

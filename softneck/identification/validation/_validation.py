@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from softneck.core import DataError, Matrix, Vector, require_one_of
+from softneck.robot import Robot
 from softneck.signals import Recording
 
 from ..models._model import Model
@@ -45,7 +46,7 @@ class Validation:
         rows_scored, rows_left_out: rows judged, and rows left out because the model was trained on them.
         rows_by_horizon: rows judged at each horizon: those with so much past, and of long records not all.
         persistence, fits: fit [%] of repeating the last sample, and of the model.
-        rmse_deg, r2: root mean square error [deg]; R2 = 1 - SSE/SST.
+        rmse_deg, r2: root mean square error [deg], of another robot in its `display_unit`; R2 = 1 - SSE/SST.
         worst_deg, worst_time: largest absolute error [deg] and when it was [s].
         intervals: 95 % interval [low, high] of `fits` by a bootstrap over blocks.
         best_linear: fit [%] that no linear model of the set-points beats on these rows (see `best_linear`).
@@ -62,6 +63,7 @@ class Validation:
         time, run: (time,) [s] and the number of the stretch, for plots: no line joins two of them.
         measured, free_run, one_step: (time, 2) [rad], NaN where nothing is scored.
         lower, upper: (time, 2) [rad] bounds of the free run, NaN where there are none.
+        robot: whose outputs these are; of another than the neck they have its number and SI unit.
     """
 
     model: str
@@ -92,6 +94,7 @@ class Validation:
     one_step: Matrix
     lower: Matrix
     upper: Matrix
+    robot: Robot = field(default_factory=Robot.preset)
 
     @property
     def white(self) -> bool:
@@ -104,7 +107,15 @@ class Validation:
         return self.residual_tests.uncorrelated
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the entry of the public face's JSON."""
+        """Return the entry of the public face's JSON; of outputs in another unit than deg `rmse_deg` is `rmse`."""
+        entry = self._entry()
+        unit = self.robot.outputs.display_unit
+        if unit == "deg":
+            return entry
+        runs = [_without_deg(part) for part in entry["per_run"]]
+        return {**_without_deg(entry), "per_run": runs, "unit": unit}
+
+    def _entry(self) -> dict[str, Any]:
         return {
             "model": self.model,
             "data": self.data,
@@ -126,7 +137,7 @@ class Validation:
             "residuals": {
                 "white": self.white,
                 "uncorrelated_with_inputs": self.uncorrelated,
-                **self.residual_tests.as_dict(),
+                **self.residual_tests.as_dict(self.robot.outputs.names),
             },
             "novelty": None if self.novelty is None else self.novelty.as_dict(),
             "coverage_pct": self.coverage_pct,
@@ -134,6 +145,10 @@ class Validation:
             "outside_pct": self.outside_pct,
             "per_run": self.per_run,
         }
+
+
+def _without_deg(table: dict[str, Any]) -> dict[str, Any]:
+    return {key.removesuffix("_deg"): value for key, value in table.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,7 +226,8 @@ def judged_parts(
             "motors=measured needs logged motor positions and the recording has none; judge it with --motors simulated."
         )
     if not np.isfinite(recording.outputs).any():
-        raise DataError("neither pitch nor roll was ever measured; there is nothing to judge.")
+        names = " nor ".join(recording.robot.outputs.names)
+        raise DataError(f"neither {names} was ever measured; there is nothing to judge.")
     hashes = np.zeros(0, dtype=np.uint64) if rules.include_training else model.training_rows
     stretches, left_out = unseen_stretches(recording, hashes)
     longest = max(len(s.recording) for s in stretches)
@@ -234,18 +250,19 @@ def judge(
 ) -> Validation:
     """Return the validation of a model on its parts of a recording."""
     rows, horizons = parts.rows, [str(h) for h in rules.horizons]
+    axes = len(rows.names)
     outputs = _predictions(model, parts, rules)
     lost: list[float | None] = [None] * len(parts.stretches)
     if INFINITE in outputs:
-        lost = divergence(rows.time, rows.stretch, outputs[INFINITE][:, :2], rows.measured)
+        lost = divergence(rows.time, rows.stretch, outputs[INFINITE][:, :axes], rows.measured, neck=rows.robot.is_neck)
     first = min((t for t in lost if t is not None), default=None)
     measured = {h: rows.judged(None if h == INFINITE else int(h)) for h in horizons}
-    predicted = {h: outputs[h][:, :2] for h in horizons}
-    scores = score_tables(rows.time, measured, predicted, lost=first is not None)
-    tests = residual_tests(rows.measured - outputs["1"][:, :2], rows.set_points, rows.stretch)
-    free = outputs.get(INFINITE, np.full((rows.time.size, 2), np.nan))
-    lower, upper = free_run_bounds(free)
-    coverage, width = coverage_tables(rows.measured, lower, upper)
+    predicted = {h: outputs[h][:, :axes] for h in horizons}
+    scores = score_tables(rows, rows.time, measured, predicted, lost=first is not None)
+    tests = residual_tests(rows.measured - outputs["1"][:, :axes], rows.set_points, rows.stretch)
+    free = outputs.get(INFINITE, np.full((rows.time.size, axes), np.nan))
+    lower, upper = free_run_bounds(free, rows.robot)
+    coverage, width = coverage_tables(rows, rows.measured, lower, upper)
     return Validation(
         model=names[0],
         data=names[1],
@@ -260,17 +277,18 @@ def judge(
         per_run=run_tables(parts.stretches, rows, measured, predicted, lost),
         diverged=first,
         residual_tests=tests,
-        novelty=novelty(model, parts.stretches, training),
+        novelty=novelty(model, parts.stretches, training) if rows.robot.is_neck else None,
         coverage_pct=coverage,
         mean_width_deg=width,
         outside_pct=outside_table(model, rows.measured, free),
         time=rows.time,
         run=rows.stretch,
         measured=rows.measured,
-        free_run=free[:, :2],
-        one_step=outputs["1"][:, :2],
+        free_run=free[:, :axes],
+        one_step=outputs["1"][:, :axes],
         lower=lower,
         upper=upper,
+        robot=rows.robot,
     )
 
 

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import FileFormatError, SettingsError, SoftneckError, to_si
+from softneck.robot import Robot
 
-from ..recording._channels import known_channels, si_unit
+from ..recording._channels import NECK, known_channels, si_unit
 from ..recording._files import WHITESPACE, TextForm
 
 Column = str | int
@@ -55,6 +56,7 @@ class Layout:
         skip: lines before the table.
         unit_row: whether the line below the names holds units; it is left out.
         rows: first and last row (not included) to take.
+        robot: whose channels these are.
     """
 
     channels: Mapping[str, Source]
@@ -73,6 +75,7 @@ class Layout:
     skip: int = 0
     unit_row: bool = False
     rows: tuple[int, int] | None = None
+    robot: Robot = NECK
 
     @property
     def form(self) -> TextForm:
@@ -80,8 +83,8 @@ class Layout:
         return TextForm(self.header, self.delimiter, self.decimal, self.skip, self.unit_row)
 
 
-def read_layout(path: str | Path) -> Layout:
-    """Read a layout file (docs, "Layouts").
+def read_layout(path: str | Path, *, robot: Robot = NECK) -> Layout:
+    """Read a layout file (docs, "Layouts") of a log of `robot`.
 
     Raises:
         FileFormatError: no such file or no TOML.
@@ -95,15 +98,15 @@ def read_layout(path: str | Path) -> Layout:
     except (UnicodeDecodeError, OSError, ValueError) as error:  # ValueError: a null character in the path
         raise FileFormatError(f"{source}: is not a TOML file ({error}).") from error
     try:
-        return parse_layout(text)
+        return parse_layout(text, robot=robot)
     except FileFormatError as error:
         raise FileFormatError(f"{source}: {error}") from error
     except SoftneckError as error:
         raise SettingsError(f"{source}: {error}") from error
 
 
-def parse_layout(text: str) -> Layout:
-    """Return the layout that a TOML text holds; the inverse of `layout_toml`.
+def parse_layout(text: str, *, robot: Robot = NECK) -> Layout:
+    """Return the layout of a log of `robot` that a TOML text holds; the inverse of `layout_toml`.
 
     Raises:
         FileFormatError: no TOML.
@@ -114,14 +117,14 @@ def parse_layout(text: str) -> Layout:
     except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:  # int() refuses thousands of digits
         raise FileFormatError(f"is not a TOML file ({error}).") from error
     try:
-        return _layout(table)
+        return _layout(table, robot)
     except SoftneckError:
         raise
     except (TypeError, ValueError, AttributeError, OverflowError) as error:
         raise SettingsError(f"a value is of the wrong type ({error}).") from error
 
 
-def _layout(table: dict[str, Any]) -> Layout:
+def _layout(table: dict[str, Any], robot: Robot) -> Layout:
     _known_keys(table, {"file", "time", "channels", "tilt"}, "the layout")
     file, time = table.get("file", {}), table.get("time", {})
     tilt = table.get("tilt", {})
@@ -132,6 +135,8 @@ def _layout(table: dict[str, Any]) -> Layout:
         "[time]",
     )
     _known_keys(tilt, {"inclination", "orientation"}, "[tilt]")
+    if tilt:
+        robot.require_neck("[tilt]")
     if len(tilt) == 1:
         raise SettingsError("[tilt] needs both `inclination` and `orientation`.")
     if type(time.get("run_column", "")) not in (str, int):
@@ -144,7 +149,7 @@ def _layout(table: dict[str, Any]) -> Layout:
     if file.get("unit_row") is True and file.get("header") is False:
         raise SettingsError("[file] unit_row is the line below the names; a file without `header` has none.")
     return Layout(
-        channels={name: _channel_source(name, entry) for name, entry in table.get("channels", {}).items()},
+        channels={name: _channel_source(name, entry, robot) for name, entry in table.get("channels", {}).items()},
         inclination=_source(tilt["inclination"], "rad", "[tilt] inclination") if tilt else None,
         orientation=_source(tilt["orientation"], "rad", "[tilt] orientation") if tilt else None,
         time=_time_source(time),
@@ -160,6 +165,7 @@ def _layout(table: dict[str, Any]) -> Layout:
         skip=_skip(file.get("skip", 0)),
         unit_row=_flag(file, "unit_row", default=False),
         rows=(rows[0], rows[1]) if rows is not None else None,
+        robot=robot,
     )
 
 
@@ -169,10 +175,11 @@ def _time_source(time: dict[str, Any]) -> Source | None:
     return _source({"unit": "s", **_only(time, "column", "unit", "factor")}, "s", "[time]")
 
 
-def _channel_source(name: str, entry: Any) -> Source:
-    if name not in known_channels() or name == "time":
-        raise SettingsError(f"[channels.{name}]: not a channel of a recording; known: {', '.join(known_channels())}.")
-    return _source(entry, si_unit(name), f"[channels.{name}]")
+def _channel_source(name: str, entry: Any, robot: Robot) -> Source:
+    known = known_channels(robot)
+    if name not in known or name == "time":
+        raise SettingsError(f"[channels.{name}]: not a channel of a recording; known: {', '.join(known)}.")
+    return _source(entry, si_unit(name, robot), f"[channels.{name}]")
 
 
 def _source(entry: Any, quantity: str, where: str) -> Source:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from softneck.core import DataError, FileFormatError, SoftneckError, Vector, to_si
+from softneck.robot import Robot
 
 from ..recording._channels import MOTOR_POSITIONS, MOTOR_TURNS, SET_POINTS, may_miss
 from ..recording._files import integers, numbers, read_table
@@ -83,14 +84,15 @@ def _columns(layout: Layout) -> tuple[Column, ...]:
 
 
 def _imported(frame: pd.DataFrame, layout: Layout) -> ImportResult:
-    channels = {name: _values(frame, source, name) for name, source in layout.channels.items()}
+    channels = {name: _values(frame, source, name, layout.robot) for name, source in layout.channels.items()}
     if layout.inclination is not None and layout.orientation is not None:
-        i = _values(frame, layout.inclination, "pitch")
-        o = _values(frame, layout.orientation, "pitch")
+        i = _values(frame, layout.inclination, "pitch", layout.robot)
+        o = _values(frame, layout.orientation, "pitch", layout.robot)
         channels["pitch"], channels["roll"] = pitch_roll(i, o)
     samples, sample_time, notes = _clocked(frame, layout, channels)
-    recording = Recording(samples.time, sample_time, samples.channels, samples.run)
-    _refuse_turns(layout, recording.channels)
+    recording = Recording(samples.time, sample_time, samples.channels, samples.run, layout.robot)
+    if layout.robot.is_neck:
+        _refuse_turns(layout, recording.channels)
     if not np.ptp(recording.set_points, axis=0).any():
         notes += ("warning: no set-point ever changes: nothing can be identified from this log",)
     return ImportResult(recording, notes)
@@ -121,7 +123,7 @@ def _clocked(
         if sample_time is None:
             raise DataError("the layout gives neither a time column nor `sample_time_s`; give one.")
         return Samples(_counted(run) * sample_time, run, channels), sample_time, notes
-    time = _values(frame, layout.time, "time")
+    time = _values(frame, layout.time, "time", layout.robot)
     notes = ()
     if layout.new_run_at_restart and run.size:
         run[1:] = np.cumsum((np.diff(time) < 0) | (np.diff(run) != 0))
@@ -189,11 +191,13 @@ def _counted(run: np.ndarray) -> np.ndarray:
     return np.arange(run.size) - np.repeat(first, np.diff(np.append(first, run.size)))
 
 
-def _values(frame: pd.DataFrame, source: Source, channel: str) -> Vector:
+def _values(frame: pd.DataFrame, source: Source, channel: str, robot: Robot) -> Vector:
     total = np.zeros(len(frame))
     for term in source.terms:
         column = _column(frame, term.column, channel)
-        total = total + term.factor * numbers(column, str(term.column), missing=may_miss(channel), nan_words=True)
+        total = total + term.factor * numbers(
+            column, str(term.column), missing=may_miss(channel, robot), nan_words=True
+        )
     if total.size and np.isnan(total).all():
         named = ", ".join(f"`{term.column}`" for term in source.terms)
         raise DataError(

@@ -48,8 +48,8 @@ class SniffResult:
     units: dict[Column, str]
 
 
-def sniff(path: str | Path) -> SniffResult:
-    """Read a log of unknown form.
+def sniff(path: str | Path, *, fewest: int = _FEWEST) -> SniffResult:
+    """Read a log of unknown form, of at least `fewest` columns: those that a recording of its robot needs.
 
     Raises:
         FileFormatError: no such file, or no table.
@@ -61,11 +61,11 @@ def sniff(path: str | Path) -> SniffResult:
     suffix = source.suffix.lower()
     units: list[str] = []
     if suffix == ".mat":
-        frame, form, lines = _mat(source)
+        frame, form, lines = _mat(source, fewest)
     elif suffix == ".parquet":
         frame, form, lines = read_table(source, suffix, TextForm()), Layout(channels={}), ()
     else:
-        form, lines, units = _text_form(source)
+        form, lines, units = _text_form(source, fewest)
         frame = read_table(source, ".csv", form.form)
         if form.header:
             frame.columns = [str(name).strip() for name in frame.columns]
@@ -79,9 +79,10 @@ def sniff(path: str | Path) -> SniffResult:
             words.append(key)
         else:
             columns[key] = values
-    if len(columns) < _FEWEST:
+    if len(columns) < fewest:
+        needed = "three set-points, pitch and roll" if fewest == _FEWEST else "a set-point and an output at least"
         raise DataError(
-            f"{source}: has {len(columns)} column(s) of numbers; a recording needs three set-points, pitch and roll. "
+            f"{source}: has {len(columns)} column(s) of numbers; a recording needs {needed}. "
             "Is this a log? If so, write its delimiter into a layout and use --layout."
         )
     named = {name: unit for name, unit in zip(frame.columns, units, strict=False) if unit}
@@ -105,12 +106,12 @@ def _numbers(column: pd.Series) -> Vector | None:
     return values if values.size and filled.mean() > 0.5 and np.isfinite(values).any() else None
 
 
-def _mat(source: Path) -> tuple[pd.DataFrame, Layout, tuple[str, ...]]:
+def _mat(source: Path, fewest: int) -> tuple[pd.DataFrame, Layout, tuple[str, ...]]:
     arrays = mat_arrays(source)
     vectors = [array.size for array in arrays.values() if 1 in array.shape and array.size > 1]
     length, count = Counter(vectors).most_common(1)[0] if vectors else (0, 0)
-    matrices = {name: array for name, array in arrays.items() if min(array.shape) >= _FEWEST}
-    if count >= _FEWEST or not matrices:
+    matrices = {name: array for name, array in arrays.items() if min(array.shape) >= fewest}
+    if count >= fewest or not matrices:
         line = f"file: {count} vectors of {length} numbers by their names"
         return mat_table(source, arrays, None), Layout(channels={}), (line,)
     name = max(matrices, key=lambda key: matrices[key].size)
@@ -118,7 +119,7 @@ def _mat(source: Path) -> tuple[pd.DataFrame, Layout, tuple[str, ...]]:
     return mat_table(source, arrays, name), Layout(channels={}, variable=name, header=False), (line,)
 
 
-def _text_form(source: Path) -> tuple[Layout, tuple[str, ...], list[str]]:
+def _text_form(source: Path, fewest: int) -> tuple[Layout, tuple[str, ...], list[str]]:
     """Return how a text is a table, why, and the cells of its line of units."""
     with source.open("rb") as file:
         head = file.read(_HEAD_BYTES)
@@ -128,7 +129,7 @@ def _text_form(source: Path) -> tuple[Layout, tuple[str, ...], list[str]]:
     lines = [line for line in raw if line.strip()]
     if not lines:
         raise FileFormatError(f"{source}: cannot be read as a table (it is empty).")
-    delimiter, cells = _delimiter(lines)
+    delimiter, cells = _delimiter(lines, fewest)
     # A logger's remarks before the table are cut into another number of cells.
     skip = next((place for place, line in enumerate(raw) if len(_cells(line, delimiter)) == cells), 0)
     lines = [line for line in raw[skip:] if line.strip()]
@@ -171,11 +172,11 @@ def _cells(line: str, delimiter: str) -> list[str]:
     return line.split() if delimiter == WHITESPACE else [cell.strip('"') for cell in line.split(delimiter)]
 
 
-def _delimiter(lines: list[str]) -> tuple[str, int]:
+def _delimiter(lines: list[str], fewest: int) -> tuple[str, int]:
     """Return what cuts nearly all lines into equally many cells, and how many; a comma may be a decimal mark: late."""
     for delimiter in ("\t", ";", ",", WHITESPACE):
         counts = Counter(len(_cells(line, delimiter)) for line in lines)
         cells, often = counts.most_common(1)[0]
-        if cells >= _FEWEST and often >= 0.9 * len(lines):
+        if cells >= fewest and often >= 0.9 * len(lines):
             return delimiter, cells
     return ",", len(_cells(lines[0], ","))

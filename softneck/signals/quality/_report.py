@@ -23,8 +23,9 @@ def assess_quality(recording: Recording, *, motor_limit: float = MOTOR_LIMIT) ->
         motor_limit: how far motors go to either side [rad]; coverage of the region is relative to that.
 
     Raises:
-        SettingsError: a limit that is not positive.
+        SettingsError: a limit that is not positive, or a robot other than the neck.
     """
+    recording.robot.require_neck("the quality report")
     require_positive("motor_limit", motor_limit, "rad")
     return Quality(
         rows=len(recording),

@@ -4,29 +4,24 @@ from __future__ import annotations
 
 import math
 import re
+from functools import cache
 
 from softneck.core import DataError, to_si
+from softneck.robot import Robot
 
+NECK = Robot.preset("neck")
 MOTORS = (1, 2, 3)
-#: Names of the three channels with the motors' set-points.
-SET_POINTS = tuple(f"motor_setpoint_{j}" for j in MOTORS)
-MOTOR_POSITIONS = tuple(f"motor_position_{j}" for j in MOTORS)
+#: Names of the three channels with the motors' set-points of a neck.
+SET_POINTS = NECK.set_points
+MOTOR_POSITIONS = NECK.motor_positions
 # [rad] The motors stay within 6 rad: two turns are another unit, and in degrees hardly a move.
 MOTOR_TURNS = 4.0 * math.pi
-OUTPUTS = ("pitch", "roll")
-REQUIRED = (*SET_POINTS, *OUTPUTS)
+OUTPUTS = NECK.outputs.names
 
-_ANGLES = ("pitch", "roll")
-_TABLE: dict[str, str] = {
-    "time": "s",
-    **dict.fromkeys(SET_POINTS, "rad"),
-    **dict.fromkeys(MOTOR_POSITIONS, "rad"),
-    **{f"motor_velocity_{j}": "rad/s" for j in MOTORS},
-    **{f"tension_{j}": "N" for j in MOTORS},
-    **{f"{angle}{what}": "deg" for angle in _ANGLES
-       for what in ("", "_measured", "_estimate", "_reference", "_lower", "_upper")},
-    **{f"{angle}_rate{what}": "deg/s" for angle in _ANGLES for what in ("", "_measured", "_estimate")},
-    "cocontraction_reference": "rad",
+# Behind the name of an output: what else a recording may hold of it.
+_OF_OUTPUT = ("", "_measured", "_estimate", "_reference", "_lower", "_upper")
+_OF_RATE = ("_rate", "_rate_measured", "_rate_estimate")
+_OF_ALL = {
     "compression": "m",
     "payload": "kg",
     "push_x": "N",
@@ -37,37 +32,54 @@ _TABLE: dict[str, str] = {
     "healthy": "1",
     "enabled": "1",
     "measurement_valid": "1",
-}  # fmt: skip
-# Channels in which an empty cell is a sample that the sensor missed.
-_MAY_MISS = re.compile(r"(pitch|roll|motor_position|motor_velocity|compression|tension)")
+}
 # Channels that are set, not measured: they hold their value until the next one.
 _HELD = re.compile(r"(motor_setpoint_\d|.*_reference|healthy|enabled|measurement_valid|payload)$")
 _COLUMN = re.compile(r"^(?P<name>[^\[\]]+?)\s*\[(?P<unit>[^\[\]]*)\]$")
 
 
-def known_channels() -> tuple[str, ...]:
-    """Return the names of all channels a recording may have, `time` included."""
-    return tuple(_TABLE)
+@cache
+def _table(robot: Robot) -> dict[str, str]:
+    """Return channel -> unit in files of all channels that a recording of `robot` may have."""
+    motors = range(1, len(robot.motors.names) + 1)
+    unit, shown = robot.motors.unit, robot.outputs.display_unit
+    return {
+        "time": "s",
+        **dict.fromkeys(robot.set_points, unit),
+        **dict.fromkeys(robot.motor_positions, unit),
+        **{f"motor_velocity_{j}": f"{unit}/s" for j in motors},
+        **{f"tension_{j}": "N" for j in motors},
+        **{f"{output}{what}": shown for output in robot.outputs.names for what in _OF_OUTPUT},
+        **{f"{output}{what}": f"{shown}/s" for output in robot.outputs.names for what in _OF_RATE},
+        "cocontraction_reference": unit,
+        **_OF_ALL,
+    }
 
 
-def file_unit(channel: str) -> str:
+def known_channels(robot: Robot = NECK) -> tuple[str, ...]:
+    """Return the names of all channels a recording of `robot` may have, `time` included."""
+    return tuple(_table(robot))
+
+
+def file_unit(channel: str, robot: Robot = NECK) -> str:
     """Return the unit in which files carry `channel`."""
-    return _TABLE[channel]
+    return _table(robot)[channel]
 
 
-def si_unit(channel: str) -> str:
+def si_unit(channel: str, robot: Robot = NECK) -> str:
     """Return the SI unit in which arrays carry `channel`."""
-    return to_si(_TABLE[channel])[1]
+    return to_si(_table(robot)[channel])[1]
 
 
-def column_name(channel: str) -> str:
+def column_name(channel: str, robot: Robot = NECK) -> str:
     """Return the column title of `channel`, such as `pitch [deg]`."""
-    return f"{channel} [{_TABLE[channel]}]"
+    return f"{channel} [{_table(robot)[channel]}]"
 
 
-def may_miss(channel: str) -> bool:
-    """Return whether a sample of `channel` may be missing."""
-    return bool(_MAY_MISS.match(channel)) and not channel.endswith("_reference")
+def may_miss(channel: str, robot: Robot = NECK) -> bool:
+    """Return whether a sample of `channel` may be missing: an empty cell is one that the sensor missed."""
+    measured = (*robot.outputs.names, "motor_position", "motor_velocity", "compression", "tension")
+    return channel.startswith(measured) and not channel.endswith("_reference")
 
 
 def is_held(channel: str) -> bool:
@@ -75,24 +87,26 @@ def is_held(channel: str) -> bool:
     return bool(_HELD.match(channel))
 
 
-def parse_column(title: str) -> tuple[str, float]:
+def parse_column(title: str, robot: Robot = NECK) -> tuple[str, float]:
     """Return (channel, factor to SI) of a column title such as `pitch [deg]`.
 
     Raises:
         DataError: no such channel, no unit, or a unit of another quantity.
     """
+    table = _table(robot)
     match = _COLUMN.match(title.strip())
     if match is None:
         name = title.strip()
-        hint = f"write `{column_name(name)}`" if name in _TABLE else "use `softneck import` with a layout"
+        hint = f"write `{column_name(name, robot)}`" if name in table else "use `softneck import` with a layout"
         raise DataError(f"column `{name}` names no unit; {hint}.")
     name, unit = match["name"], match["unit"].strip()
-    if name not in _TABLE:
+    if name not in table:
+        whose = "" if robot.is_neck else f" of robot {robot.label()}"
         raise DataError(
-            f"column `{name}` is not a channel of a recording (those are {', '.join(_TABLE)}, run); "
+            f"column `{name}` is not a channel of a recording{whose} (those are {', '.join(table)}, run); "
             "rename or drop it, or use `softneck import` with a layout."
         )
     factor, unit_si = to_si(unit)
-    if unit_si != si_unit(name):
-        raise DataError(f"column `{name}` cannot be in `{unit}`; expected {_TABLE[name]} or its SI unit.")
+    if unit_si != si_unit(name, robot):
+        raise DataError(f"column `{name}` cannot be in `{unit}`; expected {table[name]} or its SI unit.")
     return name, factor

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import warnings
 from collections.abc import Mapping
@@ -13,8 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from softneck.core import DataError, FileFormatError, SoftneckError, Vector, atomic_write, to_si
+from softneck.robot import Robot, find_robot
+from softneck.robot._search import robot_file_of
 
-from ._channels import MOTOR_POSITIONS, OUTPUTS, column_name, file_unit, known_channels, may_miss, parse_column
+from ._channels import column_name, file_unit, known_channels, may_miss, parse_column
 from ._recording import Recording
 from ._times import median_step
 
@@ -36,6 +39,8 @@ def read_plain_csv(source: Path) -> dict[str, Vector] | None:
         if source.stat().st_size > _LARGEST:
             return None
         head, _, body = source.read_text(encoding="utf-8").replace("\r\n", "\n").partition("\n")
+        if head.startswith("# "):  # whose recording it is
+            head, _, body = body.partition("\n")
     except (OSError, UnicodeDecodeError):
         return None
     titles = head.split(",")
@@ -53,6 +58,8 @@ def read_plain_csv(source: Path) -> dict[str, Vector] | None:
     return dict(zip(titles, columns, strict=True))
 
 
+# What the first line of a recording of another robot than the neck begins with; its tables follow as JSON.
+ROBOT_LINE = "# robot "
 # The delimiter that means any number of blanks or tabs.
 WHITESPACE = "whitespace"
 
@@ -68,14 +75,19 @@ def write_recording(path: str | Path, recording: Recording, *, force: bool = Fal
     _require_samples(recording)
     with atomic_write(path, force=force) as temporary:
         if suffix == ".csv":
-            _write_csv(_titled(recording), temporary)
+            _write_csv(_titled(recording), temporary, _robot_line(recording.robot))
         else:
             recording_frame(recording).to_parquet(temporary, index=False)
 
 
-def _write_csv(columns: Mapping[str, np.ndarray], path: Path) -> None:
+def _robot_line(robot: Robot) -> str:
+    """Return the line that says whose recording a text is; that of the neck has none, as it always had."""
+    return "" if robot.is_neck else f"{ROBOT_LINE}{json.dumps(robot.as_dict())}\n"
+
+
+def _write_csv(columns: Mapping[str, np.ndarray], path: Path, before: str) -> None:
     """Write a table of numbers with the shortest digits that read back the same; NaN becomes an empty cell."""
-    head = ",".join(columns) + "\n"
+    head = before + ",".join(columns) + "\n"
     if find_spec("pyarrow") is None:
         rows = zip(*(column.tolist() for column in columns.values()), strict=True)
         lines = (",".join("" if cell != cell else repr(cell) for cell in row) + "\n" for row in rows)
@@ -95,36 +107,85 @@ def recording_frame(recording: Recording) -> pd.DataFrame:
     """Return the recording as a table whose columns say their unit, as in its file."""
     import pandas as pd
 
-    return pd.DataFrame(_titled(recording))
+    frame = pd.DataFrame(_titled(recording))
+    if not recording.robot.is_neck:
+        frame.attrs["robot"] = recording.robot.as_dict()
+    return frame
 
 
 def _titled(recording: Recording) -> dict[str, np.ndarray]:
     """Return title, which says the unit, -> column in that unit."""
+    robot = recording.robot
     columns: dict[str, np.ndarray] = {column_name("time"): recording.time}
-    for name in known_channels():
+    for name in known_channels(robot):
         if name in recording.channels:
-            columns[column_name(name)] = recording.channels[name] / to_si(file_unit(name))[0]
+            columns[column_name(name, robot)] = recording.channels[name] / to_si(file_unit(name, robot))[0]
     if recording.run.any():
         columns["run"] = recording.run
     return columns
 
 
-def read_recording(path: str | Path) -> Recording:
+def read_recording(path: str | Path, *, robot: str | Path | Robot | None = None) -> Recording:
     """Read a recording that `write_recording` wrote or that follows its form.
+
+    Args:
+        path: a `.csv` or `.parquet` file.
+        robot: whose it is: a robot, a preset's name or a robot file; None takes `robot.toml` beside the file or above
+            it, else what the recording says, else the neck.
 
     Raises:
         FileFormatError: no such file, or no table.
-        DataError: columns, units, numbers or times are not those of a recording; the line says which.
+        DataError: columns, units, numbers or times are not those of a recording of that robot; the line says which.
     """
     source = Path(path)
     suffix = recording_suffix(source)
+    said = _said_robot(source, suffix)
     columns: Mapping[str, pd.Series | Vector] | None = read_plain_csv(source) if suffix == ".csv" else None
     if columns is None:
-        columns = _columns(read_table(source, suffix, TextForm()))
+        columns = _columns(read_table(source, suffix, TextForm(skip=0 if said is None else 1)))
     try:
-        return _from_columns(columns)
+        return _from_columns(columns, _whose(source, said, robot))
     except SoftneckError as error:
         raise DataError(f"{source}: {error}") from error
+
+
+def _said_robot(source: Path, suffix: str) -> Robot | None:
+    """Return the robot that a file says it is of, or None.
+
+    Raises:
+        DataError: what it says is no robot.
+    """
+    said: object = None
+    try:
+        if suffix == ".parquet" and source.is_file():
+            from pyarrow import ArrowException
+            from pyarrow.parquet import read_schema
+
+            try:
+                attributes = (read_schema(source).metadata or {}).get(b"PANDAS_ATTRS", b"{}")
+            except (ValueError, OSError, ArrowException):
+                return None  # what is wrong with it the reader of the table says
+            said = json.loads(attributes).get("robot")
+        elif suffix == ".csv" and source.is_file():
+            with source.open(encoding="utf-8", errors="replace") as file:
+                line = file.readline()
+            said = json.loads(line.removeprefix(ROBOT_LINE)) if line.startswith(ROBOT_LINE) else None
+        return None if said is None else Robot.from_dict(said)  # pyright: ignore[reportArgumentType]
+    except (ValueError, AttributeError, TypeError, RecursionError) as error:
+        raise DataError(f"{source}: does not say whose recording it is ({error}).") from error
+
+
+def _whose(source: Path, said: Robot | None, given: str | Path | Robot | None) -> Robot:
+    """Return the robot of a file: the one given, else that of `robot.toml`, else what it says, else the neck.
+
+    Raises:
+        DataError: it says another than the one given or found.
+    """
+    found = find_robot(given, beside=source) if given is not None or robot_file_of(source) is not None else said
+    found = Robot.preset("neck") if found is None else found
+    if said is not None and said.hash != found.hash:
+        raise DataError(f"is a recording of robot {said.label()}, not of {found.label()}.")
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,30 +257,34 @@ def _columns(frame: pd.DataFrame) -> dict[str, pd.Series]:
     }
 
 
-def _from_columns(columns: Mapping[str, pd.Series | Vector]) -> Recording:
+def _from_columns(columns: Mapping[str, pd.Series | Vector], robot: Robot) -> Recording:
     run = np.zeros(0, dtype=np.int64)
     channels: dict[str, Vector] = {}
     for title, cells in columns.items():
         if title.strip() == "run":
             run = integers(cells)
             continue
-        name, factor = parse_column(title)
+        name, factor = parse_column(title, robot)
         if name in channels:
             raise DataError(f"channel `{name}` stands in two columns; drop one.")
-        channels[name] = factor * numbers(cells, name, missing=may_miss(name))
+        channels[name] = factor * numbers(cells, name, missing=may_miss(name, robot))
     if "time" not in channels:
         raise DataError("there is no column `time [s]`.")
     time = channels.pop("time")
-    recording = Recording(time, median_step(time, run), channels, run)
+    recording = Recording(time, median_step(time, run), channels, run, robot)
     _require_samples(recording)
     return recording
 
 
 def _require_samples(recording: Recording) -> None:
     """Raise DataError where a channel that models are made from has no sample at all."""
-    for name in (*OUTPUTS, *MOTOR_POSITIONS):
+    for name in (*recording.robot.outputs.names, *recording.robot.motor_positions):
         if name in recording.channels and np.isnan(recording.channels[name]).all():
-            hint = "Leave the column out" if name in MOTOR_POSITIONS else "A recording needs it; record it again"
+            hint = (
+                "Leave the column out"
+                if name in recording.robot.motor_positions
+                else "A recording needs it; record it again"
+            )
             raise DataError(
                 f"channel `{name}` has no sample in any of its {len(recording)} rows; is its sensor connected? {hint}."
             )

@@ -8,9 +8,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, Vector, require_positive
+from softneck.core import DataError, Matrix, Vector, require_positive, to_si
+from softneck.robot import Robot
 
-from ._channels import MOTOR_POSITIONS, OUTPUTS, REQUIRED, SET_POINTS, known_channels, may_miss
+from ._channels import NECK, known_channels, may_miss
 from ._times import check_times
 
 
@@ -21,14 +22,16 @@ class Recording:
     Attributes:
         time: (time,) [s], equidistant within each run; may restart at a new run.
         sample_time: [s].
-        channels: name -> (time,) in SI; the set-points, pitch and roll are always there. NaN: sample missed.
+        channels: name -> (time,) in SI; the set-points and the outputs are always there. NaN: sample missed.
         run: (time,) integers, constant over each experiment; 0 everywhere when not given.
+        robot: whose channels these are; the paper's neck when not given.
     """
 
     time: Vector
     sample_time: float
     channels: Mapping[str, Vector]
     run: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    robot: Robot = NECK
 
     def __post_init__(self) -> None:
         require_positive("sample_time", self.sample_time, "s")
@@ -46,25 +49,25 @@ class Recording:
 
     @property
     def set_points(self) -> Matrix:
-        """(time, 3) motor set-points [rad]."""
-        return np.column_stack([self.channels[name] for name in SET_POINTS])
+        """(time, motors) set-points in SI: of the neck (time, 3) [rad]."""
+        return np.column_stack([self.channels[name] for name in self.robot.set_points])
 
     @property
     def outputs(self) -> Matrix:
-        """(time, 2) pitch and roll [rad]; NaN where a sample was missed."""
-        return np.column_stack([self.channels[name] for name in OUTPUTS])
+        """(time, outputs) in SI: of the neck (time, 2), pitch and roll [rad]; NaN where a sample was missed."""
+        return np.column_stack([self.channels[name] for name in self.robot.outputs.names])
 
     @property
     def has_motor_positions(self) -> bool:
         """Whether motor positions were logged."""
-        return all(name in self.channels for name in MOTOR_POSITIONS)
+        return all(name in self.channels for name in self.robot.motor_positions)
 
     @property
     def motor_positions(self) -> Matrix:
-        """(time, 3) measured motor positions [rad]; the set-points where none were logged."""
+        """(time, motors) measured motor positions in SI; the set-points where none were logged."""
         if not self.has_motor_positions:
             return self.set_points
-        return np.column_stack([self.channels[name] for name in MOTOR_POSITIONS])
+        return np.column_stack([self.channels[name] for name in self.robot.motor_positions])
 
     def runs(self) -> tuple[Recording, ...]:
         """Return each experiment as a recording of its own."""
@@ -76,7 +79,7 @@ class Recording:
         """Return rows start to stop (not included)."""
         part = slice(start, stop)
         channels = {name: values[part] for name, values in self.channels.items()}
-        return Recording(self.time[part], self.sample_time, channels, self.run[part])
+        return Recording(self.time[part], self.sample_time, channels, self.run[part], self.robot)
 
     def split(self, fraction: float) -> tuple[Recording, Recording]:
         """Return the first `fraction` of each run's rows and the rest.
@@ -161,24 +164,28 @@ class Recording:
         return replace(self, channels={**self.channels, **channels})
 
     def _check_channels(self) -> None:
-        missing = [name for name in REQUIRED if name not in self.channels]
+        required, known = (*self.robot.set_points, *self.robot.outputs.names), known_channels(self.robot)
+        missing = [name for name in required if name not in self.channels]
         if missing:
-            raise DataError(f"a recording needs the channels {', '.join(REQUIRED)}; missing: {', '.join(missing)}.")
+            whose = "" if self.robot.is_neck else f" of robot {self.robot.label()}"
+            raise DataError(
+                f"a recording{whose} needs the channels {', '.join(required)}; missing: {', '.join(missing)}."
+            )
         if len(self) == 0:
             raise DataError("the recording has no rows.")
         for name, values in self.channels.items():
-            if name not in known_channels() or name == "time":
-                raise DataError(f"`{name}` is not a channel of a recording; known: {', '.join(known_channels())}.")
+            if name not in known or name == "time":
+                raise DataError(f"`{name}` is not a channel of a recording; known: {', '.join(known)}.")
             if values.shape != (len(self),):
                 raise DataError(f"channel `{name}` has shape {values.shape}; time has {(len(self),)}.")
-            bad = np.isinf(values) if may_miss(name) else ~np.isfinite(values)
+            bad = np.isinf(values) if may_miss(name, self.robot) else ~np.isfinite(values)
             if bad.any():
                 row = int(np.argmax(bad))
                 raise DataError(
                     f"channel `{name}` is {values[row]} at row {row} (t = {self.time[row]:g} s); "
                     "it must be finite. Mend the log or cut it before that row."
                 )
-        for name in OUTPUTS:
+        for name in self.robot.outputs.names if to_si(self.robot.outputs.unit)[1] == "rad" else ():
             far = np.abs(self.channels[name]) > np.pi
             if far.any():
                 row = int(np.argmax(far))
@@ -205,7 +212,7 @@ def concatenate(recordings: list[Recording] | tuple[Recording, ...]) -> Recordin
     """Put recordings of one sample time behind each other as separate runs; channels that all have are kept.
 
     Raises:
-        DataError: none given, or sample times differ.
+        DataError: none given, or sample times or robots differ.
     """
     if not recordings:
         raise DataError("there is no recording to work on; the part to train on is empty.")
@@ -217,6 +224,7 @@ def concatenate(recordings: list[Recording] | tuple[Recording, ...]) -> Recordin
                 f"recordings of different sample times cannot be used together: {first.sample_time:g} s and "
                 f"{recording.sample_time:g} s. Work on each by itself, or bring one to the other's by `resampled`."
             )
+        require_same_robot(recording.robot, first.robot, "recordings")
         parts.extend(recording.runs())
     names = [name for name in first.channels if all(name in part.channels for part in parts)]
     return Recording(
@@ -224,4 +232,11 @@ def concatenate(recordings: list[Recording] | tuple[Recording, ...]) -> Recordin
         first.sample_time,
         {name: np.concatenate([part.channels[name] for part in parts]) for name in names},
         np.concatenate([np.full(len(part), number, dtype=np.int64) for number, part in enumerate(parts)]),
+        first.robot,
     )
+
+
+def require_same_robot(one: Robot, other: Robot, what: str) -> None:
+    """Raise DataError where `what` are of two robots whose numbers mean different things."""
+    if one.hash != other.hash:
+        raise DataError(f"{what} of two robots cannot be used together: {other.label()} and {one.label()}.")

@@ -125,7 +125,7 @@ def resampled(recording: Recording, sample_time: float) -> Recording:
             f"a run of {shortest} rows at {recording.sample_time:g} s has no two samples {sample_time:g} s apart."
         )
     even, _ = resample(Samples(recording.time, recording.run, recording.channels), sample_time)
-    return Recording(even.time, sample_time, even.channels, even.run)
+    return Recording(even.time, sample_time, even.channels, even.run, recording.robot)
 
 
 def resample(samples: Samples, sample_time: float) -> tuple[Samples, float]:

@@ -11,7 +11,6 @@ import numpy as np
 
 from softneck.core import DataError, FileFormatError, Vector
 
-from ._channels import OUTPUTS
 from ._recording import Recording
 
 
@@ -39,12 +38,13 @@ class Trend:
             raise DataError("a trend needs finite levels and slopes of the same channels, for one run at least.")
 
     @classmethod
-    def of(cls, recording: Recording, channels: Sequence[str] = OUTPUTS) -> Trend:
-        """Return the least-squares lines of `channels`; missed samples count for nothing.
+    def of(cls, recording: Recording, channels: Sequence[str] | None = None) -> Trend:
+        """Return the least-squares lines of `channels` (None: the outputs); missed samples count for nothing.
 
         Raises:
             DataError: the recording has no such channel.
         """
+        channels = recording.robot.outputs.names if channels is None else channels
         absent = [name for name in channels if name not in recording.channels]
         if absent:
             raise DataError(f"the recording has no channel `{absent[0]}` to take a trend from.")

@@ -116,7 +116,7 @@ def test_the_dead_time_of_a_clean_neck_is_found() -> None:
 
 def test_what_cannot_be_fitted_is_named() -> None:
     P = signal("aprbs", duration=12.0, seed=1).set_points
-    with pytest.raises(DataError, match=r"the three motors repeat each other .*identify `oe` or `srivc`"):
+    with pytest.raises(DataError, match=r"the 3 motors repeat each other .*identify `oe` or `srivc`"):
         Subspace().fit(recording_from(P - P.mean(axis=1, keepdims=True), noise=1e-4))
     with pytest.raises(DataError, match=r"windows of 30 samples without a missed one are too few"):
         Subspace(delay=0.0).fit(neck_recording(150))

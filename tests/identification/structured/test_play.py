@@ -7,11 +7,12 @@ import pytest
 
 from softneck.core import DataError, SettingsError
 from softneck.identification import INFINITE, Model, Play, validate
+from softneck.identification.models._directions import directions_of
 from softneck.identification.models._drive import FUNCTIONS, NO_LOAD, LoadedDrive, fit_loaded_drive
 from softneck.identification.models._error_feedback import fit_echo
 from softneck.identification.structured._play_terms import Data, PlayStructure, ridge
 from softneck.runtime import load_functions
-from softneck.signals import Recording
+from softneck.signals import Recording, redefinition_matrix
 from softneck.signals.recording._channels import MOTOR_POSITIONS
 
 from ...data import TRUTH, drive_positions, neck_recording, short_neck
@@ -126,7 +127,9 @@ def test_training_sees_what_the_free_run_computes() -> None:
     recording = short_neck()
     model = Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording)
     drive = LoadedDrive(model.arrays["drive"], model.arrays["load"])
-    terms = Data.of(recording, drive).terms(PlayStructure(15.0, 5, (0.2,), 3))
+    terms = Data.of(recording, drive, directions_of(recording, []), redefinition_matrix()).terms(
+        PlayStructure(15.0, 5, (0.2,), 3)
+    )
     f = np.clip(terms @ model.arrays["weights"].T, *model.arrays["range"].T)
     free = model.simulate(recording, warm_up=1)[:, :2]
     # The echo of the one measured sample and its motors has died out after 200 samples.

@@ -1,0 +1,86 @@
+"""softneck robot: the file that says what a robot is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from softneck.core import SettingsError, atomic_write
+
+from .shared._console import print_json
+from .shared._options import force_option, json_option
+
+if TYPE_CHECKING:
+    from softneck.robot import Robot
+
+
+@click.group("robot", epilog="Example: softneck robot new --preset antagonist, then softneck robot check")
+def command() -> None:
+    """Say what the robot is: its motors, outputs, directions and limits (`robot.toml`).
+
+    Presets: neck (the paper's), arm, antagonist, finger, trunk4. Without FILE: `robot.toml` in this folder or
+    one above it, else the preset neck. Each takes `--json`.
+    """
+
+
+@command.command("show")
+@click.argument("file", required=False, metavar="[FILE|PRESET]")
+@json_option
+def show(file: str | None, as_json: bool) -> None:
+    """Show what is given and what is not."""
+    robot = _robot(file)
+    if as_json:
+        print_json({**robot.as_dict(), "hash": robot.hash})
+        return
+    click.echo(f"{robot.summary()}\nhash: {robot.hash}")
+
+
+@command.command("new")
+@click.argument("file", required=False, default="robot.toml", type=click.Path(path_type=Path))
+@click.option("--preset", default="neck", show_default=True, help="Which robot to begin with.")
+@force_option
+@json_option
+def new(file: Path, preset: str, force: bool, as_json: bool) -> None:
+    """Write a preset into FILE (robot.toml), to edit."""
+    from softneck.robot._file import preset_text
+
+    if file.suffix.lower() != ".toml":
+        raise SettingsError(f"{file}: must end in `.toml`, by which softneck recognises the file.")
+    text = preset_text(preset)
+    with atomic_write(file, force=force) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    if as_json:
+        print_json({"file": str(file), "preset": preset})
+        return
+    click.echo(f"{file}: the preset {preset}; edit it, then softneck robot check {file}")
+
+
+@command.command("check")
+@click.argument("file", required=False, metavar="[FILE]")
+@json_option
+def check(file: str | None, as_json: bool) -> None:
+    """Check FILE and the files that it names; exit code 2 where something is wrong."""
+    robot = _robot(file)
+    _check_files(robot)
+    if as_json:
+        print_json({"robot": robot.name, "hash": robot.hash, "holds": True})
+        return
+    click.echo(f"{robot.label()}: nothing is wrong\n{robot.summary().splitlines()[-1]}")
+
+
+def _robot(file: str | None) -> Robot:
+    from softneck.robot import find_robot
+
+    return find_robot(file, beside=Path("here"))
+
+
+def _check_files(robot: Robot) -> None:
+    from .shared._neck import load_neck
+
+    folder = robot.folder or Path()
+    if robot.neck is not None:
+        load_neck(robot.neck if robot.neck in ("paper", "lab") else str(folder / robot.neck))
+    if robot.drives is not None and not (folder / robot.drives).is_file():
+        raise SettingsError(f"`drives.file`: {folder / robot.drives}: no such file.")

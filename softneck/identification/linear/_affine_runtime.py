@@ -1,0 +1,39 @@
+"""A linear state space around an operating point, of robots whose outputs are not zero at rest.
+
+x(k+1) = A x(k) + B u(k - delay) + K (y(k) - offset - C x(k)),    y = C x + offset
+"""
+
+import numpy as np
+
+from softneck.identification.linear._state_space_parts_runtime import StateSpaceArrays, lss_next, lss_observe
+from softneck.identification.models._histories_runtime import NarxState, narx_forward, narx_rest
+from softneck.runtime._layout import array
+
+
+class AffineArrays(StateSpaceArrays):
+    """Those of the state space, and where it stands without inputs."""
+
+    offset = array("outputs", "outputs where states and inputs are zero")
+
+
+def initialise(p: AffineArrays, parameters: np.ndarray, x: NarxState, outputs: np.ndarray) -> None:
+    """Rest: motors at zero, outputs at their start values for ever."""
+    narx_rest(p, parameters, x, outputs)
+    for j in range(p.H):
+        for axis in range(p.outputs):
+            x.y[j, axis] -= p.offset[axis]
+
+
+def step(p: AffineArrays, parameters: np.ndarray, x: NarxState, inputs: np.ndarray, outputs: np.ndarray) -> None:
+    """Advance by one sample."""
+    lss_observe(p, parameters, x, inputs)
+    states = x.y
+    e = np.empty(p.outputs)
+    for axis in range(p.outputs):
+        e[axis] = x.angles[axis] - p.offset[axis] - states[axis]
+    ahead = np.zeros(p.n)
+    lss_next(p, x, e, ahead)
+    states[: p.n] = ahead
+    for axis in range(p.outputs):
+        ahead[axis] += p.offset[axis]
+    narx_forward(p, parameters, x, ahead, outputs)

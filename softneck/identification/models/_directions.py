@@ -1,0 +1,154 @@
+"""Which way a robot's motors move its outputs, and how fast: known of a neck, found from data for other robots.
+
+A neck's redefined inputs are theta_i and phi_i, and its time constant is 0.2 s: what is in seconds in the estimators
+was chosen for that. For another robot each output is fitted by one low-pass filter with dead time over all motors
+(least squares for each time constant and dead time tried): its weights are the output's direction where the robot gives
+none, and its time constant by 0.2 s is what those seconds are stretched by.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from softneck.core import DataError, Matrix, Vector
+from softneck.signals import Recording, redefinition_matrix
+
+# The neck's time constant [s], for which the seconds in the estimators' defaults were chosen.
+NECK_SECONDS = 0.2
+# Time constants tried: from half a sample to a third of the longest run, beyond which all is drift.
+_TRIED = 40
+# Dead times tried then: up to one and a half of the time constant found without any, in so many steps at most.
+_DEAD_TIME, _DEAD_TIMES = 1.5, 20
+# Standard deviation of a neck's redefined inputs under its usual excitations [rad].
+_NECK_SIZE = 2.0
+# Motors whose filtered motions repeat each other to this share are told apart by nothing: the least weights are taken.
+_ALIKE = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Directions:
+    """How a robot answers to its motors.
+
+    Attributes:
+        names: of the outputs.
+        weights: (outputs, motors) of the motors in the redefined input of each output.
+        seconds: (outputs,) time constants [s].
+        learned: whether the weights were found from data.
+    """
+
+    names: tuple[str, ...]
+    weights: Matrix
+    seconds: Vector
+    learned: bool
+
+    @property
+    def stretch(self) -> float:
+        """By how much the robot is slower than a neck."""
+        return float(np.exp(np.mean(np.log(self.seconds)))) / NECK_SECONDS
+
+    def inputs(self, recording: Recording) -> Matrix:
+        """Return T (motors, motors) of all redefined inputs: the directions first, then what moves none of them.
+
+        Of a neck theta_i, phi_i and delta_i; of another robot each of the size that those have.
+        """
+        if recording.robot.is_neck:
+            return redefinition_matrix()
+        rows = _independent(self.weights)
+        _, _, basis = np.linalg.svd(rows)
+        T = np.vstack([rows, basis[len(rows) :]])
+        size = (recording.set_points @ T.T).std(axis=0)
+        return _NECK_SIZE * T / np.where(size > 0.0, size, _NECK_SIZE)[:, None]
+
+    def findings(self) -> dict[str, object]:
+        """Return what a model's findings say of it; nothing of a neck, which needs no finding."""
+        return {
+            "time_constants_s": self.seconds.tolist(),
+            "directions": self.weights.tolist(),
+            "directions_from": "data" if self.learned else "robot",
+        }
+
+
+def directions_of(recording: Recording, motors: list[Matrix]) -> Directions:
+    """Return the directions of a recording's robot.
+
+    Args:
+        recording: to learn from.
+        motors: what drives the outputs, (time, motors) of each run.
+
+    Raises:
+        DataError: an output follows no motor.
+    """
+    robot = recording.robot
+    names = robot.outputs.names
+    if robot.is_neck:
+        return Directions(names, redefinition_matrix()[:2], np.full(2, NECK_SECONDS), False)
+    outputs = [run.outputs for run in recording.runs()]
+    given = robot.weights()
+    found, seconds = [], []
+    for axis, name in enumerate(names):
+        inputs = motors if given is None else [U @ given[[axis]].T for U in motors]
+        tau, weights = _first_order(inputs, [Y[:, axis] for Y in outputs], recording.sample_time)
+        size = float(np.linalg.norm(weights))
+        if not size > 0.0:
+            raise DataError(f"`{name}` follows no motor; is its sensor connected, and did the motors move?")
+        found.append(weights / size if given is None else given[axis])
+        seconds.append(tau)
+    return Directions(names, np.array(found), np.array(seconds), given is None)
+
+
+def _first_order(inputs: Sequence[Matrix], outputs: Sequence[Vector], sample_time: float) -> tuple[float, Vector]:
+    """Return time constant [s] and weights (motors,) of the low-pass filter over all inputs that fits best."""
+    from scipy.optimize import minimize_scalar
+
+    longest = max(len(U) for U in inputs) * sample_time
+    y = np.concatenate(outputs)
+    there = np.isfinite(y)
+    scale = np.concatenate(inputs).std(axis=0)
+    scale = np.where(scale > 0.0, scale, np.inf)  # a motor that never moves has no say
+
+    def fit(tau: float, late: int) -> tuple[float, Vector]:
+        X = np.vstack([_block_of_starts(_filtered(U / scale, np.exp(-sample_time / tau), late), i, len(inputs))
+                       for i, U in enumerate(inputs)])[there]  # fmt: skip
+        theta = np.linalg.lstsq(X, y[there], rcond=_ALIKE)[0]
+        return float(np.sum((y[there] - X @ theta) ** 2)), theta[: inputs[0].shape[1]] / scale
+
+    ladder = np.geomspace(0.5 * sample_time, longest / 3.0, _TRIED)
+    tau = float(min(ladder, key=lambda tau: fit(tau, 0)[0]))
+    most = int(min(_DEAD_TIME * tau, longest / 3.0) / sample_time)
+    best = (np.inf, tau, 0)
+    for late in range(0, most + 1, max(most // _DEAD_TIMES, 1)):
+        # Dead time takes from the time constant that was found without any.
+        found: Any = minimize_scalar(lambda x, late=late: fit(np.exp(x), late)[0], method="bounded",
+                                bounds=(np.log(tau / 8.0), np.log(2.0 * tau)), options={"xatol": 1e-3})  # fmt: skip
+        best = min(best, (float(found.fun), float(np.exp(found.x)), late))
+    return best[1], fit(best[1], best[2])[1]
+
+
+def _independent(weights: Matrix) -> Matrix:
+    """Return the rows that the rows before them do not make up, as far as can be told."""
+    kept: list[Vector] = []
+    for row in weights / np.linalg.norm(weights, axis=1, keepdims=True):
+        if np.linalg.matrix_rank(np.array([*kept, row]), tol=0.1) > len(kept):
+            kept.append(row)
+    return np.array(kept)
+
+
+def _filtered(U: Matrix, pole: float, late: int) -> tuple[Matrix, Vector]:
+    """Return `U` (time, n) `late` samples later behind a low-pass that had settled at its first row, and its decay."""
+    from scipy.signal import lfilter
+
+    delayed = np.vstack([np.repeat(U[:1], late + 1, axis=0), U])[: len(U)]  # y(k+1) answers to u(k - late)
+    X = lfilter([1.0 - pole], [1.0, -pole], delayed, axis=0, zi=pole * delayed[:1])[0]
+    return np.asarray(X), pole ** np.arange(len(U))
+
+
+def _block_of_starts(filtered: tuple[Matrix, Vector], run: int, runs: int) -> Matrix:
+    """Return the regressors of one run: inputs, a constant of all, and the run's own start."""
+    X, decay = filtered
+    starts = np.zeros((len(X), runs))
+    starts[:, run] = decay
+    return np.column_stack([X, np.ones(len(X)), starts])

@@ -1,0 +1,120 @@
+"""Motors and outputs of a robot: what they are called, their units and their limits."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from softneck.core import SettingsError, to_si
+
+MOST_MOTORS, MOST_OUTPUTS = 8, 4
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+# What recordings call other things: an output of that name, or one that ends so, could not be told from them.
+_TAKEN = re.compile(r"(time|run|motor_.*|payload|compression|push_.*|base_tilt_.*|innovation|healthy|enabled|.*_"
+                    r"(rate|measured|estimate|reference|lower|upper|start|valid))")  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Motors:
+    """The 1 to 8 motors, tendons or chambers that a robot is moved by; limits in `unit`, None where not given.
+
+    Attributes:
+        names: for people; channels are numbered, `motor_setpoint_1` and so on, in this order.
+        unit: of set-points and positions in the robot's files, such as "rad" or "bar".
+        setpoint_min: (motors,) lowest set-points.
+        setpoint_max: (motors,) highest set-points.
+        rate_limit: (motors,) largest changes of the set-points [`unit`/s].
+        sign: (motors,) -1 where the hardware counts against softneck, whose motors pull where they are positive.
+    """
+
+    names: tuple[str, ...]
+    unit: str
+    setpoint_min: tuple[float, ...] | None = None
+    setpoint_max: tuple[float, ...] | None = None
+    rate_limit: tuple[float, ...] | None = None
+    sign: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        _check_names("motors", self.names, MOST_MOTORS)
+        _unit("motors.unit", self.unit)
+        if not self.sign:
+            object.__setattr__(self, "sign", (1.0,) * len(self.names))
+        _one_each("motors", self.names, self.setpoint_min, self.setpoint_max, self.rate_limit, self.sign)
+        check_range("motors", "setpoint_min", "setpoint_max", self.setpoint_min, self.setpoint_max)
+        if self.rate_limit is not None and min(self.rate_limit) <= 0.0:
+            raise SettingsError(f"`motors.rate_limit` must be positive [{self.unit}/s]; got {min(self.rate_limit):g}.")
+        if not set(self.sign) <= {1.0, -1.0}:
+            raise SettingsError(f"`motors.sign` must be 1 or -1; got {_first_not(self.sign, (1.0, -1.0)):g}.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outputs:
+    """The 1 to 4 measured outputs; limits in `unit`, None where not given.
+
+    Attributes:
+        names: as their channels are called.
+        unit: of `min` and `max`, such as "rad".
+        display_unit: in which files, reports and plots show them, such as "deg".
+        min: (outputs,) lowest values.
+        max: (outputs,) highest values.
+    """
+
+    names: tuple[str, ...]
+    unit: str
+    display_unit: str = ""
+    min: tuple[float, ...] | None = None
+    max: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        _check_names("outputs", self.names, MOST_OUTPUTS)
+        for name in self.names:
+            if _TAKEN.fullmatch(name):
+                raise SettingsError(f"`outputs.names` holds `{name}`, which recordings call something else; rename it.")
+        quantity = _unit("outputs.unit", self.unit)
+        if not self.display_unit:
+            object.__setattr__(self, "display_unit", self.unit)
+        if _unit("outputs.display_unit", self.display_unit) != quantity:
+            raise SettingsError(f"`outputs.display_unit` cannot be {self.display_unit} where `unit` is {self.unit}.")
+        _one_each("outputs", self.names, self.min, self.max)
+        check_range("outputs", "min", "max", self.min, self.max)
+
+
+def check_range(
+    table: str, low: str, high: str, lowest: Sequence[float] | None, highest: Sequence[float] | None
+) -> None:
+    """Raise SettingsError where a lowest value is not below its highest."""
+    for a, b in zip(lowest or (), highest or (), strict=False):
+        if a >= b:
+            raise SettingsError(f"`{table}.{low}` must be below `{table}.{high}`; got {a:g} and {b:g}.")
+
+
+def _check_names(table: str, names: Sequence[str], most: int) -> None:
+    if not 1 <= len(names) <= most:
+        raise SettingsError(f"`{table}.names` must hold 1 to {most} names; got {len(names)}.")
+    for name in names:
+        if not _NAME.fullmatch(name):
+            raise SettingsError(f"`{table}.names` holds `{name}`; a name has letters, digits and _, a letter first.")
+        if list(names).count(name) > 1:
+            raise SettingsError(f"`{table}.names` holds `{name}` twice; each name stands for one channel.")
+
+
+def _unit(key: str, unit: str) -> str:
+    try:
+        return to_si(unit)[1]
+    except SettingsError as error:
+        raise SettingsError(f"`{key}`: {error}") from error
+    except ValueError as error:
+        raise SettingsError(f"`{key}`: {error}") from error
+
+
+def _one_each(table: str, names: Sequence[str], *values: Sequence[float] | None) -> None:
+    for value in values:
+        if value is not None and len(value) != len(names):
+            raise SettingsError(
+                f"`{table}` gives {len(value)} values for its {len(names)} names; give one for all or one for each."
+            )
+
+
+def _first_not(values: Sequence[float], allowed: Sequence[float]) -> float:
+    return next(value for value in values if value not in allowed)

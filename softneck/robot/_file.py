@@ -1,0 +1,204 @@
+"""`robot.toml`: its tables and keys, what `extends` takes over, and presets."""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import math
+import tomllib
+from collections.abc import Iterator, Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from softneck.core import FileFormatError, SettingsError, SoftneckError, require_one_of
+
+from ._channels import Motors, Outputs
+from ._directions import Directions
+
+PRESETS = ("neck", "arm", "antagonist", "finger", "trunk4")
+#: Table -> its keys and what they hold; "" is the top of the file. A number of "each" stands for all channels, or one
+# for each of them.
+KEYS: dict[str, dict[str, str]] = {
+    "": {"name": "text", "extends": "text", "sample_time_s": "number"},
+    "motors": {"names": "texts", "unit": "text", "setpoint_min": "each", "setpoint_max": "each", "rate_limit": "each",
+               "sign": "each"},
+    "outputs": {"names": "texts", "unit": "text", "display_unit": "text", "min": "each", "max": "each"},
+    "directions": {"kind": "text", "angles_deg": "numbers", "matrix": "rows"},
+    "winch": {"radius_m": "number"},
+    "sensor": {"noise_std": "number", "delay_s": "number", "rate_hz": "number"},
+    "plant": {"neck": "text"},
+    "drives": {"file": "text"},
+}  # fmt: skip
+#: Attribute of `Robot` -> its key in the file.
+KEY_OF = {
+    "sample_time_s": "sample_time_s",
+    "winch_radius_m": "winch.radius_m",
+    "noise_std": "sensor.noise_std",
+    "delay_s": "sensor.delay_s",
+    "rate_hz": "sensor.rate_hz",
+    "neck": "plant.neck",
+    "drives": "drives.file",
+}
+_SAID = {
+    "text": "a text",
+    "texts": "a list of texts",
+    "number": "a number",
+    "numbers": "a list of numbers",
+    "rows": "a list of rows of numbers",
+    "each": "a number, or a list of one for each",
+}
+# What is in a unit goes with it: table -> the keys, also of other tables, that a new `unit` there makes void.
+_IN_UNIT = {
+    "motors": (("motors", "setpoint_min"), ("motors", "setpoint_max"), ("motors", "rate_limit")),
+    "outputs": (("outputs", "display_unit"), ("outputs", "min"), ("outputs", "max"), ("sensor", "noise_std")),
+}
+
+
+def read_table(path: Path) -> dict[str, Any]:
+    """Return the tables of a TOML file.
+
+    Raises:
+        FileFormatError: no such file, or no TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise FileFormatError(f"{path}: no such robot file; `softneck robot new {path}` writes one.") from error
+    except (ValueError, RecursionError) as error:  # no TOML, no UTF-8, thousands of digits or brackets
+        raise FileFormatError(f"{path}: is not a TOML file ({error}).") from error
+
+
+def preset_text(name: str) -> str:
+    """Return the text of a preset's file.
+
+    Raises:
+        SettingsError: no such preset.
+    """
+    require_one_of("the robot preset", name, PRESETS)
+    return files("softneck.robot").joinpath("presets", f"{name}.toml").read_text(encoding="utf-8")
+
+
+def preset_table(name: str) -> dict[str, Any]:
+    """Return the tables of a preset."""
+    return tomllib.loads(preset_text(name))
+
+
+def fields(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments of `Robot` that the tables of a file give, with those of the preset that it extends.
+
+    Raises:
+        SettingsError: a key that no robot has, or a value of another type than its key's.
+    """
+    _check(table)
+    whole = _extended(table)
+    for name in ("motors", "outputs", "directions"):
+        if name not in whole:
+            raise SettingsError(f"there is no table `[{name}]`; write it, or `extends` one of {', '.join(PRESETS)}.")
+    motors, outputs = dict(whole["motors"]), dict(whole["outputs"])
+    for name, part in (("motors", motors), ("outputs", outputs)):
+        for key in ("names", "unit"):
+            if key not in part:
+                raise SettingsError(f"`{name}.{key}` is missing; write it, or `extends` one of {', '.join(PRESETS)}.")
+    directions = {key: _tuple(value) for key, value in whole["directions"].items()}
+    if "kind" not in directions:
+        raise SettingsError('`directions.kind` is missing; it is "tendons", "identified" or "matrix".')
+    return {
+        "name": whole.get("name", ""),
+        "motors": Motors(**_for_each(motors)),
+        "outputs": Outputs(**_for_each(outputs)),
+        "directions": Directions(**directions),
+        **{name: _looked_up(whole, key) for name, key in KEY_OF.items()},
+    }
+
+
+@contextlib.contextmanager
+def named(path: str | Path) -> Iterator[None]:
+    """Put the name of the file before what is wrong in it."""
+    try:
+        yield
+    except SoftneckError as error:
+        raise SettingsError(f"{path}: {error}") from error
+
+
+def _check(table: Mapping[str, Any]) -> None:
+    if not isinstance(table, Mapping):
+        raise SettingsError("a robot is made of tables.")
+    for key, value in table.items():
+        if key in KEYS[""]:
+            _check_value(key, value, KEYS[""][key])
+        elif key in KEYS and isinstance(value, Mapping):
+            for inner, item in value.items():
+                if inner not in KEYS[key]:
+                    raise _unknown(f"{key}.{inner}", inner, list(KEYS[key]), f"{key}.")
+                _check_value(f"{key}.{inner}", item, KEYS[key][inner])
+        elif key in KEYS and key:
+            raise SettingsError(f"`{key}` must be a table; write `[{key}]` and its keys below.")
+        else:
+            raise _unknown(key, key, [*KEYS[""], *(name for name in KEYS if name)], "")
+
+
+def _unknown(shown: str, key: str, known: list[str], prefix: str) -> SettingsError:
+    near = difflib.get_close_matches(key, known, n=1)
+    hint = f"did you mean `{prefix}{near[0]}`?" if near else f"known: {', '.join(known)}."
+    return SettingsError(f"unknown key `{shown}`; {hint}")
+
+
+def _check_value(key: str, value: Any, what: str) -> None:
+    def number(item: Any) -> bool:
+        return isinstance(item, int | float) and not isinstance(item, bool) and math.isfinite(item)
+
+    def all_of(items: Any, holds: Any) -> bool:
+        return isinstance(items, list | tuple) and len(items) > 0 and all(holds(item) for item in items)
+
+    fits = {
+        "text": isinstance(value, str) and value != "",
+        "texts": all_of(value, lambda item: isinstance(item, str)),
+        "number": number(value),
+        "numbers": all_of(value, number),
+        "rows": all_of(value, lambda row: all_of(row, number)),
+        "each": number(value) or all_of(value, number),
+    }
+    if not fits[what]:
+        raise SettingsError(f"`{key}` must be {_SAID[what]}; got {value!r}.")
+
+
+def _extended(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the tables with what stands in the preset that they extend, key by key."""
+    if "extends" not in table:
+        return dict(table)
+    base = _extended(preset_table(table["extends"]))
+    for name, others in _IN_UNIT.items():
+        new = table.get(name, {})
+        if new.get("unit", base[name]["unit"]) != base[name]["unit"]:
+            for where, key in others:
+                base.get(where, {}).pop(key, None)
+    found = {key: value for key, value in {**base, **table}.items() if key != "extends"}
+    for name in KEYS:
+        # Directions go together: angles of the one and a matrix of the other would be none.
+        if isinstance(base.get(name), Mapping) and isinstance(table.get(name), Mapping) and name != "directions":
+            found[name] = {**base[name], **table[name]}
+    return found
+
+
+def _for_each(part: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keys of motors or outputs as their class takes them: one number for all becomes one for each."""
+    count = len(part["names"])
+    found = {}
+    for key, value in part.items():
+        one = isinstance(value, int | float)
+        found[key] = (float(value),) * count if one else _tuple(value)
+    return found
+
+
+def _tuple(value: Any) -> Any:
+    """Return lists as tuples, and their numbers as floats."""
+    if isinstance(value, list | tuple):
+        return tuple(_tuple(item) for item in value)
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+
+def _looked_up(table: Mapping[str, Any], key: str) -> Any:
+    where, _, last = key.rpartition(".")
+    value = (table.get(where, {}) if where else table).get(last)
+    return float(value) if isinstance(value, int | float) else value

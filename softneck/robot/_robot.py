@@ -1,0 +1,217 @@
+"""The robot that recordings, models and controllers belong to."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softneck.core import Matrix, SettingsError, require_positive
+
+from . import _file
+from ._channels import Motors, Outputs
+from ._directions import Directions
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Robot:
+    """A robot that motors move: what it is, and what is known of it; None where it is not given.
+
+    Attributes:
+        name: for people.
+        motors: the 1 to 8 motors.
+        outputs: the 1 to 4 measured outputs.
+        directions: which motors move which outputs.
+        sample_time_s: [s].
+        winch_radius_m: [m], of tendons on winches.
+        noise_std: standard deviation of the sensor's noise, in the unit of the outputs.
+        delay_s: of the sensor [s].
+        rate_hz: samples of the sensor per second [1/s].
+        neck: the virtual plant that stands for the robot: "paper", "lab" or a neck file.
+        drives: file of the drives.
+        folder: where the files that it names are; None for a preset.
+    """
+
+    name: str
+    motors: Motors
+    outputs: Outputs
+    directions: Directions
+    sample_time_s: float | None = None
+    winch_radius_m: float | None = None
+    noise_std: float | None = None
+    delay_s: float | None = None
+    rate_hz: float | None = None
+    neck: str | None = None
+    drives: str | None = None
+    folder: Path | None = None
+
+    def __post_init__(self) -> None:
+        if not self.name.strip() or not self.name.isprintable():
+            raise SettingsError(f"`name` must be one line of text; got {self.name!r}.")
+        self.directions.check(len(self.motors.names), len(self.outputs.names))
+        for key, unit in (("sample_time_s", "s"), ("winch_radius_m", "m"), ("rate_hz", "1/s")):
+            if (value := getattr(self, key)) is not None:
+                require_positive(key, value, unit)
+        for key in ("noise_std", "delay_s"):
+            if (value := getattr(self, key)) is not None and not 0.0 <= value < np.inf:
+                raise SettingsError(f"`sensor.{key}` must not be negative; got {value:g}.")
+
+    @classmethod
+    def preset(cls, name: str = "neck") -> Robot:
+        """Return one of ours: `neck` (the paper's), `arm`, `antagonist`, `finger` or `trunk4`.
+
+        Raises:
+            SettingsError: no such preset.
+        """
+        return _preset(name)
+
+    @classmethod
+    def read(cls, path: str | Path) -> Robot:
+        """Read a `robot.toml`.
+
+        Raises:
+            FileFormatError: no such file, or no TOML.
+            SettingsError: a key or a value that is not one of a robot; the line says which.
+        """
+        table = _file.read_table(Path(path))
+        with _file.named(path):
+            return cls(**_file.fields(table), folder=Path(path).parent)
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> Robot:
+        """Return the robot that `as_dict` wrote, or the tables of a `robot.toml`.
+
+        Raises:
+            SettingsError: a key or a value that is not one of a robot.
+        """
+        return cls(**_file.fields(content))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the tables of its `robot.toml`, without `extends`; what is not given is left out."""
+        return _table(self)
+
+    @property
+    def set_points(self) -> tuple[str, ...]:
+        """The channels of the motors' set-points."""
+        return tuple(f"motor_setpoint_{j + 1}" for j in range(len(self.motors.names)))
+
+    @property
+    def motor_positions(self) -> tuple[str, ...]:
+        """The channels of the motors' measured positions."""
+        return tuple(f"motor_position_{j + 1}" for j in range(len(self.motors.names)))
+
+    @property
+    def hash(self) -> str:
+        """SHA-256 of what a number in a file means: channels, units and directions.
+
+        Names of motors, limits, rates, sensor, drives and virtual plant may change and files still fit each other.
+        """
+        return _hash(self)
+
+    @property
+    def is_neck(self) -> bool:
+        """Whether its channels and directions are those of the paper's neck."""
+        return self.hash == Robot.preset("neck").hash
+
+    def weights(self) -> Matrix | None:
+        """Return the weights (outputs, motors) of the motors in each output's direction; None: to be identified."""
+        weights = self.directions.weights()
+        return None if weights is None else weights[: len(self.outputs.names)]
+
+    def require(self, key: str, what: str) -> Any:
+        """Return a value that `what` (such as "softneck record") needs.
+
+        Raises:
+            SettingsError: the robot does not give it.
+        """
+        value = getattr(self, key)
+        if value is None:
+            raise SettingsError(f"robot `{self.name}` gives no `{_file.KEY_OF[key]}`, which {what} needs; add it.")
+        return value
+
+    def require_neck(self, what: str) -> None:
+        """Raise SettingsError where `what`, which takes necks alone, is given another robot."""
+        if not self.is_neck:
+            raise SettingsError(f"{what} takes necks only so far, not robot {self.label()}.")
+
+    def label(self) -> str:
+        """Return name and short hash, by which messages tell robots apart."""
+        return f"`{self.name}` ({self.hash[:8]})"
+
+    def summary(self) -> str:
+        """Return a few lines on the robot, for people."""
+        return _summary(self)
+
+
+@cache
+def _hash(robot: Robot) -> str:
+    table = robot.as_dict()
+    outputs = {key: table["outputs"][key] for key in ("names", "unit", "display_unit")}
+    told = [len(robot.motors.names), robot.motors.unit, outputs, table["directions"]]
+    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+
+
+@cache
+def _preset(name: str) -> Robot:
+    return Robot(**_file.fields(_file.preset_table(name)))
+
+
+def _table(robot: Robot) -> dict[str, Any]:
+    """Return the tables of a robot's file; what is not given is left out."""
+    table: dict[str, Any] = {"name": robot.name}
+    for name in ("motors", "outputs", "directions"):
+        part = getattr(robot, name)
+        values = {key: getattr(part, key) for key in _file.KEYS[name]}
+        table[name] = {key: _short(key, value) for key, value in values.items() if value is not None and value != ()}
+    if set(robot.motors.sign) == {1.0}:
+        del table["motors"]["sign"]
+    for attribute, key in _file.KEY_OF.items():
+        where, _, last = key.rpartition(".")
+        if (value := getattr(robot, attribute)) is not None:
+            (table.setdefault(where, {}) if where else table)[last] = value
+    return {key: table[key] for key in ("name", "sample_time_s", *_file.KEYS) if key in table}
+
+
+def _summary(robot: Robot) -> str:
+    """Return a few lines on a robot."""
+    motors, outputs = robot.motors, robot.outputs
+    lines = [
+        f"{robot.name}: {len(motors.names)} motor(s) [{motors.unit}], {len(outputs.names)} output(s)",
+        f"motors: {', '.join(motors.names)}; set-points "
+        + _range(motors.setpoint_min, motors.setpoint_max, motors.unit),
+        f"outputs: {', '.join(outputs.names)} [{outputs.display_unit}]; "
+        + _range(outputs.min, outputs.max, outputs.unit),
+        f"directions: {robot.directions.kind}"
+        + (
+            f" at {', '.join(f'{a:g}' for a in robot.directions.angles_deg)} deg" if robot.directions.angles_deg else ""
+        ),
+    ]
+    values = {key: getattr(robot, name) for name, key in _file.KEY_OF.items()}
+    given = [f"{key} = {value}" for key, value in values.items() if value is not None]
+    absent = [key for key, value in values.items() if value is None]
+    lines += [f"given: {', '.join(given)}"] if given else []
+    lines += [f"not given: {', '.join(absent)}"] if absent else []
+    return "\n".join(lines)
+
+
+def _short(key: str, value: Any) -> Any:
+    """Return a value as a file says it: one number where all are the same."""
+    if isinstance(value, tuple):
+        if key in ("names", "angles_deg", "matrix"):
+            return [list(item) if isinstance(item, tuple) else item for item in value]
+        return value[0] if len(set(value)) == 1 else list(value)
+    return value
+
+
+def _range(low: tuple[float, ...] | None, high: tuple[float, ...] | None, unit: str) -> str:
+    if low is None and high is None:
+        return "no range given"
+    a = "-inf" if low is None else f"{min(low):g}"
+    b = "inf" if high is None else f"{max(high):g}"
+    return f"{a} to {b} {unit}"

@@ -1,0 +1,172 @@
+"""A robot and a layout proposed from a log of another robot than the neck, by the titles of its columns."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from softneck.core import DataError, to_si
+from softneck.robot import Robot
+
+from ._column_titles import read_title
+from ._layout import Column, Layout, Source, Term
+from ._table_format import SniffResult, sniff
+
+# Words for what a robot is moved by; what else moves is an output.
+_MOVERS = {
+    "motor", "motors", "setpoint", "set", "target", "command", "cmd", "input", "u", "pressure", "pump", "valve",
+    "voltage", "volt", "chamber", "tendon", "cable", "servo", "actuator", "winch", "pwm", "duty", "control", "force",
+    "torque", "heater",
+}  # fmt: skip
+_UNIT = re.compile(r"[\[(]\s*([^\])]+?)\s*[\])]\s*$")
+_WORD = re.compile(r"[a-z]+|\d+")
+
+
+@dataclass(frozen=True, slots=True)
+class RobotGuess:
+    """What a log seems to be of.
+
+    Attributes:
+        robot: its directions are to be identified.
+        layout: how the log becomes a recording of it.
+        lines: what each column was taken for.
+    """
+
+    robot: Robot
+    layout: Layout
+    lines: tuple[str, ...]
+
+
+def guess_robot(path: str | Path) -> RobotGuess:
+    """Return the robot that a log's titles speak of: motors by their words, and all else that moves as outputs.
+
+    Raises:
+        FileFormatError: no such file, or no table.
+        DataError: columns without titles, no motor, no output, or more than a robot can have.
+    """
+    table = sniff(path, fewest=2)
+    time, run, rest = _clock(table)
+    motors = [title for title in rest if _words(title) & _MOVERS]
+    outputs = [title for title in rest if title not in motors]
+    if not motors:
+        raise DataError(
+            f"{path}: no title names a motor, pressure, valve or set-point; it has {', '.join(rest) or 'none'}. "
+            "Write a robot.toml (`softneck robot new`) and a layout."
+        )
+    if not outputs:
+        raise DataError(f"{path}: beside {', '.join(motors)} no column moves that could be an output.")
+    units = [_common_unit(path, table, titles) for titles in (motors, outputs)]
+    content = {
+        "name": re.sub(r"[^A-Za-z0-9_ ]+", "_", Path(path).stem),
+        "motors": {"names": _names(motors), "unit": units[0]},
+        "outputs": {"names": _names(outputs), "unit": units[1]},
+        "directions": {"kind": "identified"},
+    }
+    robot = Robot.from_dict(content)
+    layout = _layout(table, robot, motors, outputs, (time, run))
+    lines = (
+        *table.lines,
+        f"motors [{units[0]}]: {', '.join(motors)}: because of words in their titles",
+        f"outputs [{units[1]}]: {', '.join(outputs)}: because they move and are nothing else",
+        "directions: to be identified; write tendon angles or a matrix into the robot file if you know them",
+    )
+    return RobotGuess(robot, layout, lines)
+
+
+def layout_for(path: str | Path, robot: Robot) -> Layout:
+    """Return the layout of a log whose titles are the robot's channels, or the names of its motors and outputs.
+
+    Raises:
+        FileFormatError: no such file, or no table.
+        DataError: a column is not there.
+    """
+    table = sniff(path, fewest=2)
+    time, run, rest = _clock(table)
+    found = {" ".join(_WORD.findall(_UNIT.sub("", title).lower())): title for title in rest}
+
+    def title_of(*names: str) -> str:
+        keys = [" ".join(_WORD.findall(name.lower())) for name in names]
+        title = next((found[key] for key in keys if key in found), None)
+        if title is None:
+            raise DataError(f"{path}: no column is titled `{names[-1]}`; it has {', '.join(rest)}. Write a layout.")
+        return title
+
+    motors = [title_of(channel, name) for channel, name in zip(robot.set_points, robot.motors.names, strict=True)]
+    outputs = [title_of(name) for name in robot.outputs.names]
+    return _layout(table, robot, motors, outputs, (time, run))
+
+
+def _clock(table: SniffResult) -> tuple[Column | None, Column | None, list[str]]:
+    """Return the columns of time and run, and the titles of all others that move."""
+    titles = [column for column in table.columns if isinstance(column, str)]
+    if len(titles) < len(table.columns):
+        raise DataError("the log has no titles; name its columns in a layout, and its robot in a robot.toml.")
+    roles = {title: read_title(title).role for title in titles}
+    time = next((title for title in titles if roles[title] == "time"), None)
+    run = next((title for title in titles if roles[title] == "run"), None)
+    moving = [t for t in titles if t not in (time, run) and np.nanmax(table.columns[t]) > np.nanmin(table.columns[t])]
+    return time, run, moving
+
+
+def _layout(
+    table: SniffResult,
+    robot: Robot,
+    motors: Sequence[str],
+    outputs: Sequence[str],
+    clock: tuple[Column | None, Column | None],
+) -> Layout:
+    pairs = [*zip(robot.set_points, motors, strict=True), *zip(robot.outputs.names, outputs, strict=True)]
+    default = dict.fromkeys(robot.set_points, robot.motors.unit) | dict.fromkeys(
+        robot.outputs.names, robot.outputs.display_unit
+    )
+    time = None if clock[0] is None else Source((Term(clock[0]),), read_title(str(clock[0])).unit or "s")
+    return replace(
+        table.form,
+        channels={name: Source((Term(title),), _unit_of(table, title) or default[name]) for name, title in pairs},
+        time=time,
+        sample_time=robot.sample_time_s if time is None else None,
+        run=clock[1],
+        robot=robot,
+    )
+
+
+def _common_unit(path: str | Path, table: SniffResult, titles: Sequence[str]) -> str:
+    """Return the unit that titles name; 1 where none does.
+
+    Raises:
+        DataError: units of two quantities, which one robot's motors or outputs cannot have.
+    """
+    named = [_unit_of(table, title) or "1" for title in titles]
+    if len({to_si(unit)[1] for unit in named}) > 1:
+        raise DataError(
+            f"{path}: {', '.join(titles)} are in {', '.join(named)}, and a robot has one unit for all of them; "
+            "leave out columns by a layout of your own."
+        )
+    return named[0]
+
+
+def _unit_of(table: SniffResult, title: str) -> str | None:
+    match = _UNIT.search(title)
+    unit = match[1] if match else table.units.get(title)
+    try:
+        return None if unit is None else unit if to_si(unit) else None
+    except DataError:
+        return None
+
+
+def _words(title: str) -> set[str]:
+    return set(_WORD.findall(_UNIT.sub("", title).lower()))
+
+
+def _names(titles: Sequence[str]) -> list[str]:
+    """Return titles as names: letters, digits and _, a letter first, none twice."""
+    names: list[str] = []
+    for number, title in enumerate(titles):
+        name = re.sub(r"\W+", "_", _UNIT.sub("", title).strip(), flags=re.ASCII).strip("_") or f"c{number + 1}"
+        name = name if name[0].isalpha() else f"c_{name}"
+        names.append(name if name not in names else f"{name}_{number + 1}")
+    return names

@@ -1,0 +1,98 @@
+"""From a log of another robot to a judged model on the command line, and the commands that take necks only."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softneck.robot import Robot
+from softneck.signals import read_recording
+
+from .conftest import Call
+
+HEAD = "time [s];pump voltage [V];valve_2 [V];level [mm];run\n"
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    """Two tanks' runs with a lag of 20 samples behind both motors, titled as a lab would."""
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(1.0, 5.0, (60, 2)), 10, axis=0)
+    y = np.zeros(600)
+    for k in range(599):
+        y[k + 1] = 0.95 * y[k] + 0.05 * (30.0 * u[k, 0] - 10.0 * u[k, 1])
+    rows = [f"{4 * (k % 300)};{u[k, 0]};{u[k, 1]};{y[k] + 0.1 * rng.standard_normal()};{k // 300}" for k in range(600)]
+    path = tmp_path / "plant.txt"
+    path.write_text(HEAD + "\n".join(rows) + "\n")
+    return path
+
+
+def test_a_log_becomes_a_robot_a_recording_and_a_model(call: Call, log: Path) -> None:
+    said = call("import", log, "--robot-out", "robot.toml", "-o", "rec.csv", "--json")
+    assert said.code == 0, said.err
+    facts = json.loads(said.out)
+    assert (facts["rows"], facts["runs"], facts["sample_time_s"]) == (600, 2, 4.0)
+    robot = Robot.read("robot.toml")
+    assert (robot.motors.names, robot.motors.unit) == (("pump_voltage", "valve_2"), "V")
+    assert (robot.outputs.names, robot.outputs.unit) == (("level",), "mm")
+    assert read_recording("rec.csv").robot.hash == robot.hash
+    # Again, by the layout that was written and the robot file beside the log.
+    assert call("import", log, "--layout", "rec.layout.toml", "-o", "again.csv").code == 0
+    np.testing.assert_array_equal(read_recording("again.csv").outputs, read_recording("rec.csv").outputs)
+    info = json.loads(call("info", "rec.csv", "--json").out)
+    assert info["robot"] == robot.label()
+    said = call("identify", "rls", "rec.csv", "-o", "m.npz", "--set", "delay=0.0", "--json")
+    assert said.code == 0, said.err
+    directions = np.array(json.loads(said.out)["findings"]["directions"])[0]
+    # Noise of 0.1 mm in a motion of tens; weights are of length 1.
+    np.testing.assert_allclose(directions, np.array([3.0, -1.0]) / np.sqrt(10.0), atol=0.02)
+    entry = json.loads(call("validate", "m.npz", "--data", "rec.csv", "--json").out)["models"][0]
+    assert entry["unit"] == "mm"
+    assert entry["fits"]["model"]["inf"]["level"] > 97.0
+    assert "level" in call("validate", "m.npz", "--data", "rec.csv").out
+
+
+def test_a_log_titled_as_the_robot_s_file_says_needs_no_layout(call: Call, log: Path, tmp_path: Path) -> None:
+    tank = 'name = "tank"\n[motors]\nnames = ["pump voltage", "valve_2"]\nunit = "V"\n[outputs]\nnames = ["level"]\n'
+    (tmp_path / "robot.toml").write_text(tank.replace("pump voltage", "pump_voltage") + 'unit = "mm"\n'
+                                         '[directions]\nkind = "matrix"\nmatrix = [[3.0, -1.0]]\n')  # fmt: skip
+    assert call("import", log, "--guess", "-o", "rec.csv").code == 0
+    assert read_recording("rec.csv").robot.name == "tank"
+
+
+def test_bad_imports_are_one_line(call: Call, log: Path, tmp_path: Path) -> None:
+    said = call("import", log, "--robot", "trunk4", "--guess", "-o", "rec.csv")
+    assert (said.code, "no column is titled `motor_1`" in said.err) == (2, True)
+    said = call("import", log, "--robot-out", "r.toml", "--guess", "-o", "rec.csv")
+    assert (said.code, "leave out --guess" in said.error) == (2, True)
+    (tmp_path / "b.csv").write_text("time,a,b\n0,1,2\n1,2,3\n2,4,1\n")
+    said = call("import", "b.csv", "--robot-out", "r.toml", "-o", "rec.csv")
+    assert (said.code, "no title names a motor" in said.err) == (2, True)
+    (tmp_path / "c.csv").write_text("time,valve [V],pressure [bar],x\n0,1,2,1\n1,2,3,2\n2,4,1,1\n")
+    said = call("import", "c.csv", "--robot-out", "r.toml", "-o", "rec.csv")
+    assert (said.code, "one unit for all of them" in said.err) == (2, True)
+    assert not (tmp_path / "r.toml").exists()
+    assert not (tmp_path / "rec.csv").exists()
+
+
+def test_commands_that_take_necks_only_say_so_in_a_line(call: Call, log: Path) -> None:
+    assert call("import", log, "--robot-out", "robot.toml", "-o", "rec.csv").code == 0
+    assert call("identify", "rls", "rec.csv", "-o", "m.npz", "--set", "delay=0.0").code == 0
+    for arguments in (
+        ("identify", "nn", "rec.csv", "-o", "nn.npz"),
+        ("identify", "auto", "rec.csv", "-o", "auto.npz", "--html", "a.html"),
+        ("identify", "rls", "rec.csv", "-o", "s.npz", "--search", "na=1,2", "--hold-out", "rec.csv"),
+        ("family", "rec.csv", "-o", "f.npz"),
+        ("design", "pi", "m.npz", "-o", "c.npz", "--any-fit"),
+        ("observer", "m.npz", "-o", "o.npz"),
+        ("fmu", "m.npz", "-o", "M.fmu"),
+        ("info", "rec.csv", "--html", "q.html"),
+        ("validate", "m.npz", "--data", "rec.csv", "--html", "v.html"),
+    ):
+        said = call(*arguments)
+        assert said.code == 2, (arguments, said)
+        assert "necks only so far, not robot `plant`" in said.err, (arguments, said)
+        assert not {"nn.npz", "auto.npz", "s.npz", "f.npz", "c.npz", "o.npz"} & {p.name for p in Path().glob("*.npz")}

@@ -1,0 +1,180 @@
+"""Models of other robots than the neck: the truth behind clean records, time scales, files, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softneck import identify, load, validate
+from softneck.core import KINDS, DataError, FileFormatError, Matrix, SettingsError
+from softneck.core._kinds import kinds_of
+from softneck.identification import choose
+from softneck.identification.models._directions import directions_of
+from softneck.identification.models._fitting import ANY_ROBOT
+from softneck.robot import Robot
+from softneck.signals import Recording
+
+POLE, GAIN, DELAY = 0.9, 0.08, 3
+# Three outputs of four chambers that nobody told the directions of.
+BELLOWS = {
+    "name": "bellows",
+    "motors": {"names": ["a", "b", "c", "d"], "unit": "bar"},
+    "outputs": {"names": ["x", "y", "z"], "unit": "mm"},
+    "directions": {"kind": "identified"},
+}
+WEIGHTS = np.array([[0.8, -0.6, 0.0, 0.0], [0.0, 0.6, 0.8, 0.0], [0.5, 0.5, 0.5, 0.5]])
+ROBOTS = {name: Robot.preset(name) for name in ("finger", "antagonist", "trunk4")} | {
+    "bellows": Robot.from_dict(BELLOWS)
+}
+KINDS_AND_SETTINGS = {
+    "rls": {"delay": 0.06},
+    "oe": {"delay": 0.06},
+    "srivc": {"delay": 0.06, "resamples": 0},
+    "subspace": {"delay": 0.06, "horizon": 8},
+}
+
+
+def weights_of(robot: Robot) -> Matrix:
+    given = robot.weights()
+    return WEIGHTS if given is None else given
+
+
+def recorded(
+    robot: Robot, *, sample_time: float = 0.02, rows: int = 700, noise: float = 0.0, rest: float = 0.0
+) -> Recording:
+    """Each output a lag behind its direction, DELAY + 1 samples late, around `rest`."""
+    rng = np.random.default_rng(4)
+    W = weights_of(robot)
+    U = np.repeat(rng.uniform(-2.0, 2.0, (rows // 10 + 1, W.shape[1])), 10, axis=0)[:rows]
+    Y = np.zeros((rows, len(W)))
+    for k in range(rows - 1):
+        Y[k + 1] = POLE * Y[k] + (1.0 - POLE) * GAIN * W @ U[max(k - DELAY, 0)]
+    Y += rest + noise * rng.standard_normal(Y.shape)
+    channels = dict(zip(robot.set_points, U.T, strict=True)) | dict(zip(robot.outputs.names, Y.T, strict=True))
+    return Recording(sample_time * np.arange(rows), sample_time, channels, robot=robot)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("kind", KINDS_AND_SETTINGS)
+def test_the_truth_behind_a_record_is_recovered(kind: str, name: str, tmp_path: Path) -> None:
+    recording = recorded(ROBOTS[name], noise=1e-5, rest=0.3)
+    order = {"order": len(recording.robot.outputs.names) + 1} if kind == "subspace" else {}
+    model = identify(kind, recording, **KINDS_AND_SETTINGS[kind], **order)
+    free = model.simulate(recording)[25:, : recording.outputs.shape[1]]
+    # Noise of 1e-5 in a motion of 0.1: what is left is a few times that, also for the many numbers of `subspace`.
+    assert np.abs(free - recording.outputs[25:]).max() < 2e-3
+    system = model.ss()
+    np.testing.assert_allclose(system.dcgain(), GAIN * weights_of(ROBOTS[name]), atol=2e-3)
+    assert np.abs(np.abs(system.poles()) - POLE).min() < 2e-3
+    model.save(tmp_path / "m.npz")
+    again = load(tmp_path / "m.npz")
+    assert again.robot.hash == recording.robot.hash
+    np.testing.assert_array_equal(again.simulate(recording), model.simulate(recording))
+    assert [port.name for port in again.block().outputs][: free.shape[1]] == list(recording.robot.outputs.names)
+
+
+def test_directions_that_nobody_gave_are_learned_with_the_time_constant() -> None:
+    recording = recorded(ROBOTS["bellows"])
+    found = directions_of(recording, [recording.set_points])
+    assert found.learned
+    # The dead time of three samples bends the low-pass that is fitted here a little; weights are of length 1.
+    np.testing.assert_allclose(found.weights, WEIGHTS / np.linalg.norm(WEIGHTS, axis=1, keepdims=True), atol=0.02)
+    assert np.all((found.seconds > 0.15) & (found.seconds < 0.35))  # 0.19 s, and part of the dead time
+    assert found.findings()["directions_from"] == "data"
+
+
+@pytest.mark.parametrize("kind", ["rls", "oe", "srivc"])
+def test_the_same_rows_at_another_sample_time_give_the_same_model(kind: str) -> None:
+    """Nothing is in seconds: a tank sampled every 4 s is identified as well as a finger every 20 ms."""
+    # Seconds of the two: a search over dead times is in seconds by itself, and shorter where it is told.
+    settings = {"resamples": 0} if kind == "srivc" else {}
+    fast, slow = (recorded(ROBOTS["finger"], sample_time=s, rows=300, noise=1e-3) for s in (0.02, 4.0))
+    model, other = identify(kind, fast, **settings), identify(kind, slow, **settings)
+    assert other.findings["time_constants_s"] == pytest.approx(200.0 * np.array(model.findings["time_constants_s"]))
+    # The searches take the same steps but for rounding.
+    np.testing.assert_allclose(other.simulate(slow), model.simulate(fast), atol=1e-6)
+    assert other.arrays["delay"][0] == model.arrays["delay"][0]
+
+
+def test_rls_over_the_motors_takes_any_robot() -> None:
+    recording = recorded(ROBOTS["bellows"], noise=1e-5)
+    for structure in ("miso", "mimo"):
+        model = identify("rls", recording, structure=structure, delay=0.06)
+        np.testing.assert_allclose(model.ss().dcgain(), GAIN * WEIGHTS, atol=2e-3)
+
+
+@pytest.mark.parametrize("name", ["finger", "bellows"])
+def test_play_takes_any_robot(name: str, tmp_path: Path) -> None:
+    recording = recorded(ROBOTS[name], noise=1e-4, rest=0.3)
+    # A lag of 0.2 s behind a chain of five filters of 0.02 s: what such a chain cannot follow is a few per cent.
+    model = identify("play", recording, rate=20.0, order=6, widths=(), degree=2, ridge=1e-6)
+    fits = validate(model, recording, include_training=True).fits["inf"].values()
+    assert min(fit or 0.0 for fit in fits) > 93.0
+    model.save(tmp_path / "m.npz")
+    np.testing.assert_array_equal(load(tmp_path / "m.npz").simulate(recording), model.simulate(recording))
+
+
+def test_the_kinds_that_take_a_robot_are_tried_and_the_best_is_chosen() -> None:
+    recording = recorded(ROBOTS["finger"], noise=1e-3, rows=400)
+    choice = choose(*recording.split(0.7), kinds=("rls", "oe", "nn"))
+    assert choice.chosen.kind in ("rls", "oe")
+    assert choice.chosen.fit > 90.0
+    failed = {one.kind: one.failure for one in choice.ranking if one.model is None}
+    assert list(failed) == ["nn"]
+    assert "necks only so far" in failed["nn"]
+
+
+def test_scores_are_by_the_outputs_names_and_in_their_unit() -> None:
+    recording = recorded(ROBOTS["bellows"], noise=1e-3)
+    head, tail = recording.split(0.6)
+    said = validate(identify("oe", head, delay=0.06), tail).as_dict()
+    assert list(said["fits"]["model"]["inf"]) == ["x", "y", "z"]
+    assert said["unit"] == "mm"
+    # Noise of 1e-3 m.
+    assert all(0.7 < value < 1.5 for value in said["rmse"]["inf"].values())
+    assert "rmse_deg" not in said
+    finger = recorded(ROBOTS["finger"], noise=1e-3)
+    assert "rmse_deg" in validate(identify("oe", finger, delay=0.06), finger, include_training=True).as_dict()
+
+
+@pytest.mark.parametrize("kind", sorted(set(kinds_of("model")) - set(ANY_ROBOT) - {"ensemble"}))
+def test_kinds_that_take_necks_only_say_so_in_a_line(kind: str) -> None:
+    settings = {"base": "oe"} if kind == "residual" else {}
+    with pytest.raises(SettingsError, match=r"takes? .*necks only so far, not robot `finger`|takes necks only so far"):
+        identify(kind, recorded(ROBOTS["finger"]), **settings)
+
+
+def test_models_and_recordings_of_two_robots_are_not_mixed() -> None:
+    model = identify("oe", recorded(ROBOTS["finger"]), delay=0.06)
+    with pytest.raises(DataError, match=r"of two robots cannot be used together: `finger` \(\w+\) and `antagonist` \("):
+        model.simulate(recorded(ROBOTS["antagonist"]))
+    with pytest.raises(DataError, match="of two robots"):
+        model.initial_state(recorded(ROBOTS["trunk4"]))
+
+
+def test_what_is_designed_on_redefined_inputs_refuses_other_robots() -> None:
+    model = identify("oe", recorded(ROBOTS["trunk4"]), delay=0.06)
+    with pytest.raises(SettingsError, match="takes necks only so far, not robot `trunk4`"):
+        model.tf("pitch")
+    G = model.tf("pitch", input="motor_setpoint_1")
+    assert float(G.dcgain()) == pytest.approx(GAIN, abs=2e-3)
+
+
+def test_an_output_that_follows_no_motor_is_said() -> None:
+    recording = recorded(ROBOTS["finger"])
+    rng = np.random.default_rng(0)
+    still = recording.with_channels(motor_setpoint_1=np.r_[1.0, np.zeros(len(recording) - 1)] * 0.0 + 1.0)
+    with pytest.raises(DataError, match="set-points are constant"):
+        identify("oe", still.with_channels(pitch=rng.standard_normal(len(recording)) * 0.01))
+
+
+def test_a_file_whose_arrays_do_not_fit_its_robot_is_refused(tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    model = identify("oe", recorded(ROBOTS["finger"]), delay=0.06)
+    replace(model, robot=ROBOTS["trunk4"]).save(tmp_path / "m.npz")
+    with pytest.raises(FileFormatError):
+        load(tmp_path / "m.npz")
+    assert set(ANY_ROBOT) <= set(KINDS)
