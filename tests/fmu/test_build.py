@@ -15,8 +15,9 @@ import pytest
 from fmpy.validation import validate_fmu
 
 from softneck import load
-from softneck.core import OutputFileError, SettingsError
+from softneck.core import OutputFileError, SettingsError, to_si
 from softneck.fmu import FmuInfo, build_fmu, fmu_info
+from softneck.fmu.describe._description import _UNITS
 from softneck.runtime import Block, Port
 
 GOLDEN = Path(__file__).parents[1] / "golden"
@@ -187,3 +188,14 @@ def test_what_is_told_of_a_model_escapes_what_it_was_told(toys: Any) -> None:
     assert (info.description, info.stop_time) == ("a lag & more", 4.0)
     for text in ("a lag &amp; more", "&lt;b&gt;", "fit &lt; 90 %", "What it is not good for"):
         assert text in info.documentation
+
+
+@pytest.mark.parametrize("unit", [unit for unit, (_, shown) in _UNITS.items() if shown])
+def test_the_unit_that_a_tool_displays_is_the_same_quantity(unit: str) -> None:
+    shown = _UNITS[unit][1]
+    assert shown is not None
+    name, factor = shown
+    to_unit, si = to_si(name)
+    assert si == unit
+    # FMI's factor leads to the display unit, ours to SI: 180 / pi and pi / 180 each round once.
+    assert factor * to_unit == pytest.approx(1.0, rel=1e-15)

@@ -94,6 +94,9 @@ def test_any_curve_makes_a_picture_that_is_xml_and_within_its_frame(values: np.n
     points = np.array(re.findall(r"[ML](\S+) ([-\d.]+)", curve), dtype=float).reshape(-1, 2)
     assert len(points) == np.isfinite(values).sum()
     assert ((points >= 0) & (points <= [640, 240])).all()
+    # SVG draws nothing of a path that does not begin by moving; each stretch without gaps moves once.
+    finite = np.isfinite(values)
+    assert curve.count("M") == np.count_nonzero(np.diff(finite.astype(int), prepend=0) == 1)
 
 
 @pytest.mark.parametrize("lacking", ["linux64", "win64"])
