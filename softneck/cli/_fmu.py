@@ -59,8 +59,8 @@ def command(
 ) -> None:  # fmt: skip
     """Package FILE as a Co-Simulation FMU of FMI 2.0 or 3.0.
 
-    FILE is a model, observer or controller (.npz), a neck parameter file (.toml), a neck preset (paper, lab), or a
-    loop file, from whose [reference] a reference FMU is built.
+    FILE is a model, observer or controller (.npz), a neck parameter file (.toml), a neck preset (paper, lab, rough),
+    or a loop file, from whose [reference] a reference FMU is built.
     """
     from softneck.fmu import build_compiled_fmu, build_fmu, fmu_info
 
@@ -105,7 +105,7 @@ def open_buildable(source: str | Path) -> Buildable:
     if Path(source).suffix not in ("", ".toml"):
         raise FileFormatError(
             f"{source}: no FMU can be built from a `{Path(source).suffix}` file; give a model, controller or observer "
-            "(.npz), a neck or loop file (.toml), or a preset (paper, lab)."
+            "(.npz), a neck or loop file (.toml), or a preset (paper, lab, rough)."
         )
     if is_loop_file(Path(source)):
         return reference_of(Path(source))

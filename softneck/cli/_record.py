@@ -21,7 +21,7 @@ from .shared._options import force_option, json_option, output_option
 )
 @click.argument("signal_name", metavar="SIGNAL")
 @output_option("recording", "REC", required=True)
-@click.option("--neck", default="paper", show_default=True, metavar="paper|lab|NECK.toml", help="Which neck.")
+@click.option("--neck", default="paper", show_default=True, metavar="paper|lab|rough|NECK.toml", help="Which neck.")
 @click.option("--duration", type=float, metavar="S", help="Length in seconds. [default: the signal's own]")
 @click.option(
     "--seed", type=click.IntRange(0, 2**31 - 2), default=0, show_default=True, help="Seed of noise and signal."

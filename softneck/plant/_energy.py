@@ -111,8 +111,10 @@ def _potentials(p: dict[str, float], q: Vector, P: Vector, free: Vector, payload
     b, s = q[:2], q[2]
     beta = float(np.hypot(b[0], b[1]))
     skew = np.array([1.0 + p["stiffness_asymmetry"], 1.0 - p["stiffness_asymmetry"]])
-    rest = np.array([p["rest_pitch"], p["rest_roll"]])
-    bending = 0.5 * p["bending_stiffness"] * float(skew @ (b - rest) ** 2) + 0.25 * p["bending_stiffening"] * beta**4
+    bend = b - np.array([p["rest_pitch"], p["rest_roll"]])
+    cosine, sine = math.cos(p["stiffness_angle"]), math.sin(p["stiffness_angle"])
+    planes = np.array([cosine * bend[0] + sine * bend[1], cosine * bend[1] - sine * bend[0]])
+    bending = 0.5 * p["bending_stiffness"] * float(skew @ planes**2) + 0.25 * p["bending_stiffening"] * beta**4
     wall = 0.5 * _WALL_RATIO * p["axial_stiffness"] * max(0.0, s - p["compression_limit"]) ** 2
     axial = 0.5 * p["axial_stiffness"] * s**2 + 0.25 * p["axial_stiffening"] * s**4
     length = p["link_length"] - s

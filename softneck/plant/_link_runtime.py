@@ -12,22 +12,22 @@ LINK_WALL_RATIO = 50.0
 
 def link_elastic(
     x: tuple[float, float, float, float, float, float],
-    c: tuple[float, float, float, float, float, float, float, float, float, float],
+    c: tuple[float, float, float, float, float, float, float, float, float, float, float],
 ) -> tuple[float, float, float]:
     """Return the link's own elastic and viscous forces on (b1, b2, s).
 
-    `x` is (b1, b2, s, their rates); `c` is (k1, k2, cubic bending stiffness, bending damping, rest b1,
+    `x` is (b1, b2, s, their rates); `c` is (k1, k2, k12, cubic bending stiffness, bending damping, rest b1,
     rest b2, axial stiffness, cubic axial stiffness, axial damping, compression limit).
     """
     b1, b2, s, w1, w2, v = x
-    k1, k2, k3, damping, r1, r2, axial, axial3, axial_damping, limit = c
+    k1, k2, k12, k3, damping, r1, r2, axial, axial3, axial_damping, limit = c
     stiffening = k3 * (b1 * b1 + b2 * b2)
     force = -axial * s - axial3 * s * s * s - axial_damping * v
     if s > limit:  # zero at the limit: the force has no jump
         force -= LINK_WALL_RATIO * axial * (s - limit)
     return (
-        -k1 * (b1 - r1) - stiffening * b1 - damping * w1,
-        -k2 * (b2 - r2) - stiffening * b2 - damping * w2,
+        -k1 * (b1 - r1) - k12 * (b2 - r2) - stiffening * b1 - damping * w1,
+        -k2 * (b2 - r2) - k12 * (b1 - r1) - stiffening * b2 - damping * w2,
         force,
     )
 

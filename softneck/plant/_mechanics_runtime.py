@@ -44,6 +44,7 @@ from softneck.plant._index_runtime import (
     NECK_SPEED_BANDWIDTH,
     NECK_SPEED_INTEGRAL_TIME,
     NECK_SPEED_LIMIT,
+    NECK_STIFFNESS_ANGLE,
     NECK_STIFFNESS_ASYMMETRY,
     NECK_SUPPLY_VOLTAGE,
     NECK_TENDON_ANGLE_1,
@@ -84,10 +85,13 @@ class NeckBody(StateVector):
 def neck_constants(q: np.ndarray) -> tuple:
     """Return (link, hysteresis, tendon, geometry, directions, drive, filter) from the parameters."""
     k = float(q[NECK_BENDING_STIFFNESS])
+    # K = k diag(1 + alpha, 1 - alpha) in planes turned by the angle.
     asymmetry = float(q[NECK_STIFFNESS_ASYMMETRY])
+    double = 2.0 * float(q[NECK_STIFFNESS_ANGLE])
     link = (
-        k * (1.0 + asymmetry),  # K = k diag(1 + alpha, 1 - alpha)
-        k * (1.0 - asymmetry),
+        k * (1.0 + asymmetry * math.cos(double)),
+        k * (1.0 - asymmetry * math.cos(double)),
+        k * asymmetry * math.sin(double),
         float(q[NECK_BENDING_STIFFENING]),
         float(q[NECK_BENDING_DAMPING]),
         float(q[NECK_REST_PITCH]),
@@ -254,8 +258,8 @@ def neck_rest(q: np.ndarray, c: tuple) -> tuple[float, float, float, float, floa
     link = c[0]
     pretension = c[6][2]
     load = neck_load(q, 0.0, 0.0, 0.0, 0.0, 0.0)
-    b1 = link[4]
-    b2 = link[5]
+    b1 = link[5]
+    b2 = link[6]
     s = 0.0
     for _ in range(200):
         body = (b1, b2, s, 0.0, 0.0, 0.0)
@@ -271,11 +275,15 @@ def neck_rest(q: np.ndarray, c: tuple) -> tuple[float, float, float, float, floa
             q2 -= pretension * t2
             qs -= pretension * ts
         # Newton along s. Along b the link's own stiffness does: weights and tendons only weaken it, below buckling.
-        slope = link[6] + 3.0 * link[7] * s * s
-        if s > link[9]:
-            slope += LINK_WALL_RATIO * link[6]
-        b1 += q1 / (link[0] + 3.0 * link[2] * (b1 * b1 + b2 * b2))
-        b2 += q2 / (link[1] + 3.0 * link[2] * (b1 * b1 + b2 * b2))
+        slope = link[7] + 3.0 * link[8] * s * s
+        if s > link[10]:
+            slope += LINK_WALL_RATIO * link[7]
+        # K^-1 q, each row by its Schur complement.
+        k1 = link[0] + 3.0 * link[3] * (b1 * b1 + b2 * b2)
+        k2 = link[1] + 3.0 * link[3] * (b1 * b1 + b2 * b2)
+        b1 += (q1 - link[2] / k2 * q2) / (k1 - link[2] * link[2] / k2)
+        k2 = link[1] + 3.0 * link[3] * (b1 * b1 + b2 * b2)
+        b2 += (q2 - link[2] / k1 * q1) / (k2 - link[2] * link[2] / k1)
         s += qs / slope
     f = bend_functions(b1 * b1 + b2 * b2)
     body = (b1, b2, s, 0.0, 0.0, 0.0)
@@ -297,12 +305,14 @@ def neck_substeps(c: tuple, load: tuple, sample_time: float, wanted: int) -> int
     loss = 3.0 * (tendon[1] + tendon[2] * pull / tendon[3])
     arm = geometry[1] ** 2
     # Bounds, not values: 3 k3 is the cube's slope at 1 rad, H / z_r the hysteresis' at a turn.
-    stiffness = max(link[0], link[1]) + 3.0 * link[2] + hysteresis[0] / hysteresis[1] + 3.0 * tendon[0] * arm
+    stiffness = (
+        max(link[0], link[1]) + abs(link[2]) + 3.0 * link[3] + hysteresis[0] / hysteresis[1] + 3.0 * tendon[0] * arm
+    )
     # d / J bounds an overdamped mode, the root of k / J an undamped one, their sum both.
-    bending = (link[3] + loss * arm) / load[3] + math.sqrt(stiffness / load[3])
+    bending = (link[4] + loss * arm) / load[3] + math.sqrt(stiffness / load[3])
     # As if the link rested on its wall.
-    wall = link[6] * (1.0 + LINK_WALL_RATIO) + 3.0 * link[7] * link[9] ** 2 + 3.0 * tendon[0]
-    axial = (link[8] + loss) / load[4] + math.sqrt(wall / load[4])
+    wall = link[7] * (1.0 + LINK_WALL_RATIO) + 3.0 * link[8] * link[10] ** 2 + 3.0 * tendon[0]
+    axial = (link[9] + loss) / load[4] + math.sqrt(wall / load[4])
     inertia = drive[7]
     # The gear's friction at its steepest, as the guides' above.
     damped = tendon[1] * winch * winch / inertia + drive[8] / (drive[9] * inertia)

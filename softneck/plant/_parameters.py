@@ -14,7 +14,7 @@ import numpy as np
 from softneck.core import FileFormatError, SettingsError, Vector, require_between, require_one_of
 from softneck.runtime import Port
 
-from ._presets import LAB, SENSORS
+from ._presets import PRESETS, SENSORS
 
 # What `sample` scales: nobody has measured these on the neck.
 _UNCERTAIN = (
@@ -62,6 +62,9 @@ class NeckParameters:
     )
     stiffness_asymmetry: float = _number(
         -0.05, "1", -0.9, 0.9, "stiffness is (1 + this) in pitch, (1 - this) in roll", "calibrated"
+    )
+    stiffness_angle: float = _number(
+        0.0, "rad", -3.2, 3.2, "turns the two planes of that asymmetry from tendon 1 towards roll", "off but in `rough`"
     )
     rest_pitch: float = _number(
         -0.0152, "rad", -0.3, 0.3, "bend of the unloaded printed link towards tendon 1", "calibrated"
@@ -142,16 +145,17 @@ class NeckParameters:
     @classmethod
     def lab(cls) -> NeckParameters:
         """Return the neck fitted to the lab's own open-loop recording."""
-        return cls(**LAB)
+        return cls(**PRESETS["lab"])
+
+    @classmethod
+    def rough(cls) -> NeckParameters:
+        """Return the neck that is as hard for a line to follow as the paper's was (Tables 3 and 4)."""
+        return cls(**PRESETS["rough"])
 
     @classmethod
     def preset(cls, name: str) -> NeckParameters:
-        """Return the preset `paper` or `lab`, or the neck of the TOML file of that name."""
-        if name == "paper":
-            return cls.paper()
-        if name == "lab":
-            return cls.lab()
-        return cls.from_toml(name)
+        """Return the preset `paper`, `lab` or `rough`, or the neck of the TOML file of that name."""
+        return cls(**PRESETS[name]) if name in PRESETS else cls.from_toml(name)
 
     @classmethod
     def from_toml(cls, path: str | Path) -> NeckParameters:
@@ -166,13 +170,13 @@ class NeckParameters:
             content = tomllib.loads(source.read_text(encoding="utf-8"))
         except OSError as error:
             raise FileFormatError(
-                f"{source}: cannot be read ({error.strerror}); use paper, lab or a neck file (.toml)."
+                f"{source}: cannot be read ({error.strerror}); use {', '.join(PRESETS)} or a neck file (.toml)."
             ) from error
         except (ValueError, RecursionError) as error:
             raise FileFormatError(f"{source}: is not valid TOML ({error}).") from error
         preset = content.pop("preset", "paper")
-        if preset not in ("paper", "lab"):
-            raise FileFormatError(f'{source}: `preset` must be "paper" or "lab"; got {preset!r}.')
+        if preset not in PRESETS:
+            raise FileFormatError(f"{source}: `preset` must be one of {', '.join(PRESETS)}; got {preset!r}.")
         names = cls.names()
         unknown = [name for name in content if name not in names]
         if unknown:

@@ -31,7 +31,7 @@ SENSORS: dict[str, dict[str, float]] = {
 }
 
 # Fitted to the lab's open-loop recording of the neck with a central spring (winch of 10 mm, MPU-9250).
-LAB: dict[str, float] = {
+_LAB = {
     **SENSORS["mpu9250"],
     "axial_damping": 8.0,
     "axial_stiffness": 2210.0,
@@ -55,3 +55,25 @@ LAB: dict[str, float] = {
     "tendon_stiffness": 2860.0,
     "winch_radius": 0.01,
 }
+
+# Found by `benchmarks/rough_neck.py`: a line follows it no better than the paper's neck. Slow winches tell fast motion
+# from slow, stiffer planes between the motors' and tendons out of place tell pitch from roll.
+_ROUGH = {
+    "bending_damping": 0.05443,
+    "bending_stiffness": 0.562,
+    "drive_latency": 0.08012,
+    "guide_friction": 0.06954,
+    "position_gain": 24.39,
+    "pretension": 1.701,
+    "rest_pitch": -0.01606,
+    "rest_roll": -0.0102,
+    "sensor_delay": 0.07097,
+    "speed_limit": 4.123,
+    "stiffness_angle": 0.5332,
+    "stiffness_asymmetry": 0.3541,
+    "tendon_angle_2": 2.066,
+    "tendon_angle_3": 4.186,
+}
+
+# What each preset has other than the defaults, which are those of `paper`.
+PRESETS: dict[str, dict[str, float]] = {"paper": {}, "lab": _LAB, "rough": _ROUGH}

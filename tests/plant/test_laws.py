@@ -85,8 +85,9 @@ def test_statics_are_the_minimum_of_potential_energy(motors: tuple[float, float,
     # Hysteresis remembers how the neck got here, so it is off; friction vanishes with speed.
     # The link is stiff enough to carry 1 kg by itself: a buckled neck has many minima.
     parameters = quiet(
-        hysteresis_torque=0.0, gear_friction=0.0, rest_pitch=0.02, stiffness_asymmetry=0.1, bending_stiffness=1.2
-    )
+        hysteresis_torque=0.0, gear_friction=0.0, rest_pitch=0.02, stiffness_asymmetry=0.1, stiffness_angle=0.4,
+        bending_stiffness=1.2,
+    )  # fmt: skip
     block = VirtualNeck(parameters).block()
     state, Y = block.run(block.initial_state(), inputs(1000, motors, payload))
     x = body(state)
@@ -103,14 +104,16 @@ def test_statics_are_the_minimum_of_potential_energy(motors: tuple[float, float,
 
 
 def test_a_third_of_a_turn_turns_the_answer() -> None:
-    block = VirtualNeck(quiet()).block()
+    # The link's stiffer plane, which is not one of symmetry, turns with it.
+    block = VirtualNeck(quiet(stiffness_asymmetry=0.3, stiffness_angle=0.2)).block()
+    turned = VirtualNeck(quiet(stiffness_asymmetry=0.3, stiffness_angle=0.2 + 2 * np.pi / 3)).block()
     rng = np.random.default_rng(3)
     t = np.arange(300) * 0.02
     motors = np.column_stack(
         [2.0 * np.sin(w * t + f) for w, f in zip((1.0, 2.3, 3.1), rng.uniform(0, 6, 3), strict=True)]
     )
     _, here = block.run(block.initial_state(), inputs(300, motors))
-    _, there = block.run(block.initial_state(), inputs(300, np.roll(motors, 1, axis=1)))
+    _, there = turned.run(turned.initial_state(), inputs(300, np.roll(motors, 1, axis=1)))
     # Normals, not angles: pitch and roll are projections and do not turn linearly.
     turn = np.array([[np.cos(a := 2 * np.pi / 3), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
     # Rounding, grown by the chatter of tendons between slack and taut.

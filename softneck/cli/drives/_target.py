@@ -174,7 +174,7 @@ override_option = click.option(
     "--override", "overrides", multiple=True, metavar="NAME",
     help=f"Ignore a check that fails, by name: {', '.join(OVERRIDES)}.",
 )  # fmt: skip
-neck_option = click.option("--neck", metavar="paper|lab|NECK.toml", help="The virtual neck of --simulated.")
+neck_option = click.option("--neck", metavar="paper|lab|rough|NECK.toml", help="The virtual neck of --simulated.")
 
 
 def look_of(link: CanLink | VirtualLink, file: DrivesFile) -> Callable[[], Tilt | None]:

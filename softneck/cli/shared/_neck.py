@@ -11,21 +11,15 @@ if TYPE_CHECKING:
     from softneck.plant import NeckParameters
 
 
-_PRESETS = ("paper", "lab")
-
-
 def load_neck(name: str) -> NeckParameters:
-    """Return the parameters of preset `paper` or `lab`, or of a TOML file.
+    """Return the parameters of a preset, or of a TOML file.
 
     Raises:
         SettingsError: neither a preset nor a neck file.
     """
     from softneck.plant import NeckParameters
+    from softneck.plant._presets import PRESETS
 
-    if name == "paper":
-        return NeckParameters.paper()
-    if name == "lab":
-        return NeckParameters.lab()
-    if not Path(name).is_file():
-        raise SettingsError(f"`{name}` is neither a neck preset ({', '.join(_PRESETS)}) nor a file.")
-    return NeckParameters.from_toml(name)
+    if name not in PRESETS and not Path(name).is_file():
+        raise SettingsError(f"`{name}` is neither a neck preset ({', '.join(PRESETS)}) nor a file.")
+    return NeckParameters.preset(name)

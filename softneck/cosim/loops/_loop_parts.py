@@ -14,6 +14,7 @@ from softneck.loop import BlockPart, Part, RecordingReference, Reference
 from softneck.loop._reference_parts import AheadReference
 from softneck.loop._references import make_reference
 from softneck.plant import NeckParameters, VirtualNeck
+from softneck.plant._presets import PRESETS
 from softneck.runtime import Block
 from softneck.signals import read_recording
 
@@ -33,8 +34,6 @@ OBJECT = "object"
 # What may stand beside `fmu`: how an FMU that nobody here wrote becomes a part, and where it runs.
 _FMU_KEYS = ("names", "units", "sample_time_s", "isolated", "timeout_s")
 _REFERENCES = ("step", "ramp", "sine", "rotation", "recording")
-# What `neck` may be beside a file of parameters.
-PRESETS = ("paper", "lab")
 
 
 class PartOpener:

@@ -23,7 +23,7 @@ from ._server import STATES, serve
 
 @click.command()
 @click.argument("bus", metavar="INTERFACE:CHANNEL")
-@click.option("--neck", default="paper", show_default=True, help="paper, lab or a neck file (.toml).")
+@click.option("--neck", default="paper", show_default=True, help="paper, lab, rough or a neck file (.toml).")
 @click.option("--profile", type=click.Choice(list(PROFILES)), default="ipos2015", show_default=True)
 @click.option("--homed", is_flag=True, help="As if `softneck drives zero` had been run.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of the inclinometer's noise.")
