@@ -10,14 +10,14 @@ from pathlib import Path
 
 from softneck.core import OutputFileError, SettingsError, atomic_write
 from softneck.cosim import Result
-from softneck.identification import Model
+from softneck.identification import Model, Validation
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.plots import neck_view, page, write_page
 from softneck.signals import write_recording
 
 from ._closing import DemoDesign, close_loops, design
 from ._demo_page import sections
-from ._experiments import Experiments, Tell, ValidationPair, identify, judge, record_experiments
+from ._experiments import Experiments, Tell, ValidationPair, identify, judge, on_rough, record_experiments
 from ._packaging import PackagedFmu, package
 from ._tables import demo_json, score_line
 
@@ -54,12 +54,13 @@ class DemoSettings:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Demo:
-    """All that the demo found."""
+    """All that the demo found; `rough` has the free runs of what was trained anew on the preset `rough`."""
 
     settings: DemoSettings
     experiments: Experiments
     models: Mapping[str, Model]
     judged: Mapping[tuple[str, str], ValidationPair]
+    rough: Mapping[tuple[str, str], Validation]
     packaged: Mapping[str, PackagedFmu]
     designed: DemoDesign
     loops: Mapping[str, Result]
@@ -72,7 +73,7 @@ class Demo:
 
     def as_dict(self) -> dict:
         """Return the demo's JSON."""
-        return demo_json(self.judged, self.packaged, self.loops) | {
+        return demo_json(self.judged, self.rough, self.packaged, self.loops) | {
             "holds": self.holds,
             "experiment_s": self.settings.duration,
             "shortened": self.settings.duration < FULL_DURATION,
@@ -101,6 +102,7 @@ def run_demo(settings: DemoSettings, *, tell: Tell) -> Demo:
     for name, model in models.items():
         model.save(out / "models" / f"{name}.npz", force=True)
     judged = judge(models, experiments, tell=tell)
+    rough = on_rough(duration=settings.duration, tell=tell)
     plants = {**models, "virtual_neck": VirtualNeck(neck)}
     compared = experiments.tests["rotation"].rows(0, settings.compare_rows)
     scores = {name: score_line(judged, name) for name in models}
@@ -118,6 +120,7 @@ def run_demo(settings: DemoSettings, *, tell: Tell) -> Demo:
         experiments=experiments,
         models=models,
         judged=judged,
+        rough=rough,
         packaged=packaged,
         designed=designed,
         loops=loops,
@@ -144,6 +147,7 @@ def _write_results(demo: Demo, tell: Tell) -> None:
             experiments=demo.experiments,
             models=demo.models,
             judged=demo.judged,
+            rough=demo.rough,
             packaged=demo.packaged,
             designed=demo.designed,
             loops=demo.loops,

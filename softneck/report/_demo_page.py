@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from softneck.cosim import Result
-from softneck.identification import INFINITE, Model
+from softneck.identification import INFINITE, Model, Validation
 from softneck.plots import Chart, Section, Table
 from softneck.plots._charts import delay_chart, loop_chart, recording_chart, validation_chart
 from softneck.signals import Recording
@@ -31,6 +31,7 @@ def sections(
     experiments: Experiments,
     models: Mapping[str, Model],
     judged: Mapping[tuple[str, str], ValidationPair],
+    rough: Mapping[tuple[str, str], Validation],
     packaged: Mapping[str, PackagedFmu],
     designed: DemoDesign,
     loops: Mapping[str, Result],
@@ -38,7 +39,7 @@ def sections(
 ) -> Sequence[Section]:
     """Return the report's sections."""
     return [
-        _overview(judged, packaged, loops, shortened),
+        _overview(judged, rough, packaged, loops, shortened),
         _experiment_section(experiments),
         _model_section(models),
         *(_validation_section(data, judged, models) for data in experiments.judged),
@@ -49,6 +50,7 @@ def sections(
 
 def _overview(
     judged: Mapping[tuple[str, str], ValidationPair],
+    rough: Mapping[tuple[str, str], Validation],
     packaged: Mapping[str, PackagedFmu],
     loops: Mapping[str, Result],
     shortened: bool,
@@ -57,7 +59,7 @@ def _overview(
     if shortened:
         words.insert(0, "This is the quick form: the experiment is shorter than the paper's and the training less.")
     tables = [
-        Table("Models, ours beside the paper's", FIT_HEAD, fit_rows(judged)),
+        Table("Models, ours beside the paper's", FIT_HEAD, fit_rows(judged, rough)),
         Table("FMUs in fmpy against the Python models, free run", *fmu_rows(packaged)),
         Table("Closed loops over FMUs against the virtual neck", *loop_rows(loops)),
     ]

@@ -9,7 +9,7 @@ from typing import Any
 from softneck.identification import INFINITE
 
 from . import _paper
-from ._reproduce import Reproduction, Verdicts
+from ._reproduce import ROUGH, Reproduction, Verdicts
 
 AXES = ("pitch", "roll")
 NAMES = {"nlsm": "SM", "nn": "NN", "rls": "RLS"}
@@ -18,12 +18,15 @@ _WHERE_FREE = {"rotation": "section 7.4.1, test 3", "sine": "section 7.4.2, test
 _ONE_STEP, _FREE, _MEASURED = "one step", "free run", "free run, measured motors"
 # Fits are printed by the paper to 0.01 %, but no plant of ours is known to better than a point.
 _SAME = 1.0
-PAPER_HEAD = ["where", "model, axis", "what it is", "persistence", "paper", "ours", "other necks", "the difference"]
+PAPER_HEAD = [
+    "where", "model, axis", "what it is", "persistence", "paper", "ours", "`rough`", "other necks", "the difference",
+]  # fmt: skip
 PAPER_NOTE = (
     "Fit 100 (1 - |y - yhat| / |y - mean y|) in %. SM and NN of Tables 3 and 4 are one step ahead, RLS a free run; "
     "section 7.4 is a free run with measured motors. SM's norm has no weights and the units of the paper's logs, "
     "motors in rad and angles in deg; `scaling` is SM with weights chosen for free run. `Other necks` is the span of "
-    "the same estimator, trained anew, over the other plants. A figure of the paper inside these needs no other cause; "
+    "the same estimator, trained anew, over the other plants; `rough` is the one that a line follows no better than "
+    "the paper's neck. A figure of the paper inside these needs no other cause; "
     "`unexplained`: none tried here."
 )
 
@@ -37,6 +40,7 @@ class Entry:
         model, data, axis, configuration: what it scores.
         persistence: of the same rows one step ahead [%], where the figure is one step ahead.
         paper, ours: fits [%]; ours is None where the free run diverged.
+        rough: the same on the preset `rough` [%]; None where it diverged, or the preset is not among the other necks.
         span: least and largest fit over the other necks [%], or None.
         scaling: ours with the other scaling of the regressor [%], or None.
     """
@@ -49,6 +53,7 @@ class Entry:
     persistence: float | None
     paper: float
     ours: float | None
+    rough: float | None
     span: tuple[float, float] | None
     scaling: float | None
 
@@ -77,6 +82,7 @@ class Entry:
             "persistence": self.persistence,
             "paper": self.paper,
             "ours": self.ours,
+            "rough": self.rough,
             "other_necks": None if self.span is None else list(self.span),
             "other_scaling": self.scaling,
             "difference": self.verdict,
@@ -95,6 +101,7 @@ class Entry:
             held,
             f"{self.paper:.1f}",
             _number(self.ours),
+            _number(self.rough),
             span,
             self.verdict,
         ]
@@ -124,6 +131,7 @@ def _entries(found: Reproduction) -> Iterator[Entry]:
                     persistence=found.judged[key].free.persistence["1"][axis] if configuration == _ONE_STEP else None,
                     paper=figure,
                     ours=_fit(found.judged, key, axis, configuration),
+                    rough=_fit(found.others[ROUGH], key, axis, configuration) if ROUGH in found.others else None,
                     span=_span(found.others, key, axis, configuration),
                     scaling=_fit(found.rescaled, key, axis, configuration) if key in found.rescaled else None,
                 )

@@ -17,6 +17,8 @@ from ._experiments import Experiments, Tell, ValidationPair, judge, record_exper
 # The paper's norm (Eq. 16) has no weights, and its logs have motors in radians and angles in degrees: taken as they
 # are, an angle weighs 180/pi times a motor.
 AS_LOGGED = 180.0 / np.pi
+# The preset that a line follows no better than the paper's neck.
+ROUGH = "rough"
 _DURATION = 200.0
 _SPREAD_SEED = 0
 
@@ -30,8 +32,8 @@ class ReproduceSettings:
     Attributes:
         iterations: of the network's training, for each axis.
         seed: of the network's start.
-        other_necks: how many other plants say what is the plant's: the `lab` preset, then necks drawn
-            around `paper` (20 % spread).
+        other_necks: how many other plants say what is the plant's: the presets `rough` and `lab`, then necks
+            drawn around `paper` (20 % spread).
         duration: of Eq. 22 [s]; the paper's is 200.
     """
 
@@ -109,5 +111,5 @@ def _models(experiments: Experiments, settings: ReproduceSettings, tell: Tell) -
 
 def _other_necks(count: int) -> dict[str, NeckParameters]:
     rng = np.random.default_rng(_SPREAD_SEED)
-    drawn = {f"neck {number + 1}": NeckParameters.paper().sample(rng) for number in range(max(count - 1, 0))}
-    return dict(list({"lab": NeckParameters.lab(), **drawn}.items())[:count])
+    drawn = {f"neck {number + 1}": NeckParameters.paper().sample(rng) for number in range(max(count - 2, 0))}
+    return dict(list({ROUGH: NeckParameters.rough(), "lab": NeckParameters.lab(), **drawn}.items())[:count])

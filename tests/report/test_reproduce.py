@@ -33,6 +33,10 @@ def test_every_published_fit_stands_beside_ours(found: Reproduction) -> None:
     assert table_3["nlsm", "pitch"] == 93.9794
     assert table_3["rls", "roll"] == 82.7217
     assert {row.configuration for row in rows if row.model == "rls"} == {"free run"}
+    # The one other neck is `rough`, which is named.
+    assert list(found.others) == ["rough"]
+    assert all(row.span == (row.rough, row.rough) for row in rows if row.rough is not None)
+    assert any(row.rough is not None and row.rough != row.ours for row in rows if row.model == "rls")
 
 
 def test_persistence_stands_beside_every_one_step_fit_and_only_there(found: Reproduction) -> None:
