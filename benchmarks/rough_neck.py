@@ -34,7 +34,8 @@ from tests.oracles.one_pole import (
 )
 
 OUT = Path("build/rough_neck")
-# Where the search begins, found by hand, and how far a step of one goes: in parts where positive, else in its unit.
+# Where the search begins, found by hand and by coarser searches, and how far a step of one goes: in parts where
+# positive, else in its unit.
 # `across` and `along` are the asymmetry's sine and cosine parts, a sin(2 angle) and a cos(2 angle).
 START = {
     "bending_stiffness": (0.56, 0.3), "bending_damping": (0.055, 0.5), "along": (0.17, 0.15), "across": (0.33, 0.15),
