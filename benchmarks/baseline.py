@@ -358,7 +358,11 @@ def _controlled(results: list[dict[str, Any]]) -> str:
 def _oscillating(results: list[dict[str, Any]]) -> str:
     if "failed" in results[0]:
         return "no design"
-    return f"{results[0]['gain']:.1f}" if results[0]["gain"] else f"> {GAINS[-1]:g}"
+    gain = results[0]["gain"]
+    if gain is None:
+        return f"> {GAINS[-1]:g}"
+    # At the least that was tried: perhaps it does so as it is.
+    return f"<= {gain:.1f}" if gain == GAINS[0] else f"{gain:.1f}"
 
 
 def _number(value: float, places: int = 0) -> str:
