@@ -21,7 +21,7 @@ from tests.foreign_necks.held_out import HELD_OUT
 from tests.foreign_necks.necks import NECKS, ForeignNeck, record
 
 HEAD = ("neck", "line %", "hysteresis deg", "slack %", "3 rad deg", "dead time s", "times real time")
-OURS = ("paper", "lab")
+OURS = ("paper", "rough", "lab")
 
 
 def main() -> None:

@@ -31,7 +31,7 @@ from softneck.signals import Excitation, Recording, signal
 from tests.foreign_necks.choosing import choice, leave_one_out
 from tests.foreign_necks.necks import CHOOSING, ForeignNeck, record
 
-OURS = ("paper", "lab")
+OURS = ("paper", "rough", "lab")
 OUT = Path("build/leave_one_neck_out")
 TESTS = ("steps", "sine", "rotation")
 # (excitation, seed of the noise or None for a perfect sensor) -> what one specimen makes of it.
