@@ -90,13 +90,14 @@ TIMES = st.tuples(st.floats(0.0, 0.4), st.floats(0.0, 0.4))
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(names=PAIRS, times=TIMES)
 def test_pairs(names: tuple[str, str], times: tuple[float, float]) -> None:
     safe(play(names, times))
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 @settings(max_examples=2000, deadline=None)
 @given(names=PAIRS, times=TIMES, seed=st.integers(0, 1000))
 def test_thousands_of_pairs(names: tuple[str, str], times: tuple[float, float], seed: int) -> None:
