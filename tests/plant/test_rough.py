@@ -14,7 +14,8 @@ from softneck.signals import Recording, redefine, signal
 
 from ..oracles.one_pole import PAPER_FITS, PAPER_GAINS, fits, least_squares
 
-# What issue 26 asks of each of the eight figures [points].
+pytestmark = pytest.mark.slow  # four records of minutes
+# How near each of the eight figures is to the paper's [points].
 CLOSE = 5.0
 
 
