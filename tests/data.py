@@ -19,7 +19,7 @@ LAYOUTS = ROOT / "examples" / "layouts"
 TS = 0.02
 
 
-def slow_but(values: Iterable[str], short: Iterable[str], nightly: Iterable[str] = ()) -> list[Any]:
+def slow_but(values: Iterable[Any], short: Iterable[Any], nightly: Iterable[Any] = ()) -> list[Any]:
     """Return `values` as parameters of a test.
 
     `make test` runs `short`, `make slow` the others, but for those of `nightly`, for which CI has no time.

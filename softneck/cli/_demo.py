@@ -9,9 +9,8 @@ import click
 
 from softneck.core import CheckFailedError, OutputFileError
 
-from .shared._console import note, print_json, print_table
+from .shared._console import Stages, note, print_json, print_table
 from .shared._options import force_option, json_option
-from .shared._stages import Stages
 
 if TYPE_CHECKING:
     from softneck.report._demo import Demo

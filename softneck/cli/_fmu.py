@@ -13,8 +13,7 @@ from softneck.fmu.compiled._platforms import PLATFORMS
 
 from .shared._console import print_json, progress
 from .shared._neck import load_neck
-from .shared._options import force_option, json_option, output_option, target
-from .shared._recordings import read_together
+from .shared._options import force_option, json_option, output_option, read_together, target
 
 if TYPE_CHECKING:
     from softneck.fmu.describe._describe import Buildable

@@ -22,8 +22,7 @@ from ._search import (
     write_plot,
 )
 from .shared._console import note, percent, print_json, progress
-from .shared._options import apply_settings, force_option, json_option, output_option, set_option, target
-from .shared._recordings import read_together
+from .shared._options import apply_settings, force_option, json_option, output_option, read_together, set_option, target
 from .shared._validate_table import useless, with_fit
 
 if TYPE_CHECKING:

@@ -79,7 +79,7 @@ def _fitted(observer: Any, data: tuple[Path, ...], *, fixed: tuple[str, ...]) ->
     """Return noise levels fitted to the first part of each run, whether the rest speaks for them, and what to say."""
     # Imported here: `softneck --help` must not wait for scipy's optimisers.
     from softneck.estimation import consistency, fit_noise
-    from softneck.estimation._bridging import bridging_error
+    from softneck.estimation._consistency import bridging_error
     from softneck.signals import concatenate, read_recording
 
     recordings = [read_recording(path) for path in data]

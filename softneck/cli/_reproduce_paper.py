@@ -8,9 +8,8 @@ import click
 
 from softneck.core import refuse_existing
 
-from .shared._console import note, print_json, print_table
+from .shared._console import Stages, note, print_json, print_table
 from .shared._options import force_option, json_option
-from .shared._stages import Stages
 
 
 @click.command("reproduce-paper", epilog="Example: softneck reproduce-paper --html build/paper.html")

@@ -10,8 +10,7 @@ import click
 from softneck.core import CheckFailedError, SettingsError, refuse_existing
 
 from .shared._console import print_json, print_table, progress
-from .shared._options import force_option, json_option
-from .shared._recordings import read_together
+from .shared._options import force_option, json_option, read_together
 from .shared._validate_table import fit_table, remarks, useless
 
 if TYPE_CHECKING:

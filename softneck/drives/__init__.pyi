@@ -3,9 +3,9 @@ from .bus._file import default_drives as default_drives
 from .bus._file import load_drives as load_drives
 from .bus._link import CanLink as CanLink
 from .bus._link import open_bus as open_bus
-from .commissioning._experiment import Experiment as Experiment
 from .commissioning._jog import jog as jog
 from .commissioning._neck_file import neck_drives as neck_drives
+from .commissioning._record import Experiment as Experiment
 from .commissioning._record import record_signal as record_signal
 from .commissioning._zero import zero as zero
 from .logs._log_file import read_run_log as read_run_log

@@ -16,7 +16,7 @@ from softneck.core import FileFormatError, Matrix, SettingsError, Vector, write_
 from softneck.runtime import Block, Port, State
 from softneck.signals import Recording
 
-from ._forms import NOISES, STATES
+from ._forms import NOISES, STATES, steady_gains, system
 from ._kalman_parts_runtime import (
     KALMAN_DIVIDER,
     KALMAN_FROZEN,
@@ -28,7 +28,6 @@ from ._kalman_parts_runtime import (
     KalmanArrays,
 )
 from ._offline import Estimates, filter_recording, smooth_recording
-from ._steady import steady_gains, system
 from ._steady_kalman_runtime import SteadyKalmanArrays
 
 if TYPE_CHECKING:

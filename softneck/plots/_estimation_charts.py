@@ -9,7 +9,7 @@ import numpy as np
 from softneck.core import Vector
 
 from ._chart import Chart, Curve, Level, Panel
-from ._matplotlib import chart_figure
+from ._figures import chart_figure
 from ._style import BLUE, GREY, ORANGE
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import numpy as np
 from softneck.core import DataError, Vector
 
 from ._chart import Chart, Curve, Panel
-from ._matplotlib import chart_figure
+from ._figures import chart_figure
 from ._style import BLUE, GREY, RED, looks
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import Any
 
 from softneck.core import SettingsError, atomic_write
 from softneck.cosim import Result, load_loop, make_loop, simulate
-from softneck.cosim.loops._setup import LoopSetup
+from softneck.cosim.loops._loop_file import LoopSetup
 from softneck.loop import check_limits
 from softneck.plots import chart_figure
 from softneck.plots._charts import loop_chart

@@ -13,9 +13,8 @@ from softneck.core import Progress, Vector
 from softneck.runtime import Block
 
 from ._confidence import MarginInterval, intervals
-from ._gaps import Gaps, gaps
 from ._laws import ControllerUnderTest
-from ._linear import LinearLaw, judged, margins
+from ._linear import Gaps, LinearLaw, gaps, judged, margins
 from ._neck_loops import STEP_AT, NeckRun, neck_changes, run_necks
 from ._plants import AXES, Plants, UncertainNeck, all_plants, join, nominal_plants
 from ._requirements import Requirements

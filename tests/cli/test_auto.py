@@ -32,6 +32,7 @@ def test_auto_ranks_explains_and_saves(call: Call, recording: Path) -> None:
     assert call("identify", "auto", recording, "-o", "best.npz").code == 2
 
 
+@pytest.mark.slow
 def test_auto_saves_the_best_linear_model_beside_one_that_design_would_refuse(
     call: Call, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

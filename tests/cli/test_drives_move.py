@@ -6,8 +6,7 @@ import json
 
 import pytest
 
-from softneck.cli.drives._arm import require_armed, words
-from softneck.cli.drives._target import sensor_of
+from softneck.cli.drives._target import require_armed, sensor_of, words
 from softneck.core import SettingsError
 from softneck.drives import load_drives
 from softneck.signals import read_recording

@@ -16,13 +16,12 @@ import numpy as np
 import pytest
 from rich.console import Console, RenderableType
 
-from softneck.cli.drives._picture import to_line
 from softneck.cli.drives._screen import from_line
-from softneck.cli.drives._view import LiveView, live_view
+from softneck.cli.drives._view import LiveView, live_view, to_line
 from softneck.drives.logs._times import CycleFigures, CycleTimes
 from softneck.drives.master import Event, Phase
+from softneck.drives.master._cia301 import NodeState
 from softneck.drives.master._cia402 import DriveState
-from softneck.drives.master._nmt import NodeState
 from softneck.drives.running._snapshot import DriveSnapshot, Snapshot
 
 DEG = math.pi / 180.0

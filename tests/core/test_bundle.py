@@ -17,6 +17,8 @@ from softneck.runtime import bundle, load_runtime
 from softneck.runtime._bundle import content_name
 from softneck.runtime._compile import _linked, _runtime, compiled_name, load_linked
 
+from ..data import slow_but
+
 RUNTIMES = sorted({kind.runtime for kind in KINDS.values() if kind.runtime} | {"softneck.plant._neck_runtime"})
 
 
@@ -76,7 +78,7 @@ def test_a_module_that_is_not_there_is_refused() -> None:
         bundle("softneck_absent_runtime")
 
 
-@pytest.mark.parametrize("runtime", RUNTIMES)
+@pytest.mark.parametrize("runtime", slow_but(RUNTIMES, RUNTIMES[::4]))
 def test_a_bundle_runs_with_numpy_alone(runtime: str, tmp_path: Path) -> None:
     (tmp_path / "carried.py").write_text(bundle(runtime), encoding="utf-8")
     code = (

@@ -16,8 +16,7 @@ from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] - it has n
 
 from softneck.core import OutputFileError, SettingsError
 from softneck.cosim import load_loop, simulate, write_ssp
-from softneck.cosim.loops._loop_file import reference_of
-from softneck.cosim.loops._setup import LoopSetup
+from softneck.cosim.loops._loop_file import LoopSetup, reference_of
 from softneck.fmu import build_fmu
 from softneck.loop import BlockPart, Loop, SensorFault, StepReference
 

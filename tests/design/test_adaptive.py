@@ -18,7 +18,7 @@ from softneck.design import AdaptiveSettings, LinearController, VaryingControlle
 from softneck.design.linear._assembly import assemble
 from softneck.design.linear._tuning import Gains
 from softneck.design.varying._adaptive_runtime import AdaptiveArrays, AdaptiveState
-from softneck.design.varying._model_following import following_axis
+from softneck.design.varying._scheduled import following_axis
 from softneck.estimation import AxisPlant, LinearNeck
 from softneck.identification import Recursion
 from softneck.loop import BlockPart, Loop, LoopResult, run_loop

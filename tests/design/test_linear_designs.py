@@ -25,6 +25,7 @@ from softneck.design.linear._pid import PidGains
 from softneck.design.linear._sweep import make_sweep
 from softneck.design.plants._step_and_load import StepAndLoad
 
+from ..data import slow_but
 from ..oracles.bake_off import bake_off_neck, bake_off_plant, bake_off_plants, block_stepper, run_bake_off
 
 TS = 0.02
@@ -38,7 +39,11 @@ def axis_of(controller: Any) -> AxisController:
     return AxisController(A=A[:n, :n], Br=Br[:n, :1], By=By[:n, :1], C=C[:1, :n], Dr=Dr[0, 0], Dy=Dy[0, 0], L=L[:n, :1])
 
 
-@pytest.mark.parametrize("settings", [HinfSettings(), LqgSettings(), PiSettings()], ids=["hinf", "lqg", "pi"])
+@pytest.mark.parametrize(
+    "settings",
+    [pytest.param(HinfSettings(), marks=pytest.mark.slow), LqgSettings(), PiSettings()],
+    ids=["hinf", "lqg", "pi"],
+)
 @pytest.mark.parametrize("test", [StepAndLoad(), StepAndLoad(reference=0.5, slew_limit=0.1)], ids=["small", "limited"])
 def test_the_sweep_of_a_search_is_the_bake_off(settings: Any, test: StepAndLoad) -> None:
     controller = settings.design(bake_off_neck())
@@ -199,7 +204,7 @@ def test_a_hidden_integrator_has_no_conditioning() -> None:
         conditioning_gain(np.diag([1.0, 0.5]), np.ones((2, 1)), np.array([[0.0, 1.0]]), 0.0)
 
 
-@pytest.mark.parametrize("order", [2, 3, 4, 5, 6])
+@pytest.mark.parametrize("order", slow_but([2, 3, 4, 5, 6], [2, 5]))
 def test_reduction_keeps_its_bound_and_its_integrator(order: int) -> None:
     K: Any = NcfSettings(gain_spread=0.0, conditioning="hanus").design(bake_off_neck())
     axis = axis_of(K)
@@ -214,6 +219,7 @@ def test_reduction_keeps_its_bound_and_its_integrator(order: int) -> None:
     assert np.all(np.diff(found.singular_values) <= 0.0)
 
 
+@pytest.mark.slow
 def test_a_reduced_design_says_what_it_lost() -> None:
     full = NcfSettings().design(bake_off_neck())
     small = NcfSettings(controller_order=4).design(bake_off_neck())

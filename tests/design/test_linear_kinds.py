@@ -10,7 +10,7 @@ from softneck.design import PiSettings
 from softneck.estimation import KalmanSettings, axis_plant
 from softneck.identification import Model, OutputError, Rls, Srivc, Subspace
 
-from ..data import neck_recording
+from ..data import neck_recording, slow_but
 
 KINDS = {
     "rls": Rls(max_delay=0.12),
@@ -22,7 +22,7 @@ KINDS = {
 }
 
 
-@pytest.fixture(scope="module", params=list(KINDS))
+@pytest.fixture(scope="module", params=slow_but(KINDS, ["oe", "subspace"]))
 def model(request: pytest.FixtureRequest) -> Model:
     return KINDS[request.param].fit(neck_recording(1500, noise=1e-3))
 

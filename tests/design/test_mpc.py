@@ -77,6 +77,7 @@ def test_the_runtimes_solver_equals_daqp(kind: str, request: pytest.FixtureReque
     assert most > 10  # limits were active
 
 
+@pytest.mark.slow
 def test_casadi_says_the_same_of_the_same_expression(soft: MpcController) -> None:
     qp = soft.program().function()
     solver = ca.conic("oracle", "osqp", {"h": qp.sparsity_out(0), "a": qp.sparsity_out(2)}, {
@@ -194,6 +195,7 @@ def test_tendons_stay_taut(soft: MpcController) -> None:
     assert least[1] < -0.4  # without the limit co-contraction goes where it was asked
 
 
+@pytest.mark.slow
 def test_out_of_iterations_the_previous_plan_goes_on_and_is_counted() -> None:
     settings = {"bandwidth": 8.0, "lead_limit": 12.0}
     full = MpcSettings(**settings).design(bake_off_neck())  # type: ignore[arg-type]

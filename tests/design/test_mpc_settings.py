@@ -126,6 +126,7 @@ def test_models_it_cannot_use_are_refused() -> None:
         MpcSettings(scenarios=2, bandwidth=8.0).design(bake_off_neck())
 
 
+@pytest.mark.slow
 def test_review_tells_what_is_doubtful() -> None:
     assert MpcSettings(bandwidth=8.0).design(bake_off_neck()).review() == []
     short = MpcSettings(bandwidth=8.0, horizon=4, moves=2, lead_limit=0.1, angle_limit=0.8, position_limit=2.0).design(
@@ -138,7 +139,12 @@ def test_review_tells_what_is_doubtful() -> None:
 
 
 @pytest.mark.parametrize(
-    "limits", [{"minimum_tautness": -0.2}, {"angle_limit": 0.3}, {"angle_limit": 0.3, "minimum_tautness": -0.2}]
+    "limits",
+    [
+        pytest.param({"minimum_tautness": -0.2}, marks=pytest.mark.slow),
+        pytest.param({"angle_limit": 0.3}, marks=pytest.mark.slow),
+        {"angle_limit": 0.3, "minimum_tautness": -0.2},
+    ],
 )
 def test_limits_that_are_not_active_change_no_gain(limits: dict[str, float], plain: MpcController) -> None:
     limited = MpcSettings(bandwidth=8.0, **limits).design(bake_off_neck())  # type: ignore[arg-type]

@@ -76,6 +76,7 @@ def test_tightened_limits_hold_on_every_sample(pair: tuple[MpcController, MpcCon
         assert slack <= 0.0
 
 
+@pytest.mark.slow
 def test_without_tightening_they_do_not(pair: tuple[MpcController, MpcController]) -> None:
     found = [worst(pair[0], GAINS[-1], seed) for seed in range(4)]
     assert min(beyond for beyond, _ in found) > math.radians(1.0)

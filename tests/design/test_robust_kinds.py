@@ -73,7 +73,7 @@ def test_every_sample_is_stable(kind: str) -> None:
         assert np.abs(control.poles(loop_of(robust(kind), plant))).max() < 1.0
 
 
-@pytest.mark.parametrize("kind", list(KINDS))
+@pytest.mark.parametrize("kind", slow_but(KINDS, ["pi", "lqg"]))
 def test_the_worst_sensitivity_is_kept_and_is_what_it_says(kind: str) -> None:
     controller = robust(kind)
     K: Any = controller.ss()
@@ -145,6 +145,7 @@ def test_matlab_gets_the_same_system(kind: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(system(z), robust(kind).ss()(z))
 
 
+@pytest.mark.slow
 def test_equal_axes_are_designed_once_and_others_are_not() -> None:
     b = bake_off_plant(0.8, 0.7)
     neck = LinearNeck(pitch=bake_off_plant().tf(), roll=b.tf())
@@ -188,6 +189,7 @@ def test_a_design_of_a_control_system_equals_that_of_a_model() -> None:
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["riccati", "slycot"])
 def test_hinf_with_a_cover_proves_what_it_covers(method: str) -> None:
     if method == "slycot":

@@ -12,6 +12,8 @@ import pytest
 from softneck.core import SettingsError
 from softneck.design import diskmargin, nugap, robstab, wcgain
 
+from ..data import slow_but
+
 TS = 0.02
 POLE = math.exp(-5.293 * TS)
 NECK = control.TransferFunction([math.radians(27.69) / 5.293 * (1.0 - POLE)], [1.0, -POLE, 0.0, 0.0, 0.0, 0.0], TS)
@@ -32,8 +34,8 @@ def _satellite() -> Any:
     return plant * control.StateSpace([], [], [], [[1.0, -2.0], [0.0, 1.0]])
 
 
-@pytest.mark.parametrize("skew", [0.0, 1.0, -1.0])
-@pytest.mark.parametrize("loop", ["neck", "satellite"])
+@pytest.mark.parametrize("skew", slow_but([0.0, 1.0, -1.0], [0.0, 1.0]))
+@pytest.mark.parametrize("loop", slow_but(["neck", "satellite"], ["satellite"]))
 def test_disk_margins_are_those_of_python_control(loop: str, skew: float) -> None:
     pytest.importorskip("slycot")
     L: Any = 30.0 * NECK if loop == "neck" else _satellite()

@@ -18,7 +18,7 @@ from softneck.core import DataError, FileFormatError, SettingsError, load, read_
 from softneck.design import LinearController, ScheduledSettings, VaryingController
 from softneck.design.linear._assembly import assemble
 from softneck.design.linear._tuning import Gains
-from softneck.design.varying._model_following import following_axis
+from softneck.design.varying._scheduled import following_axis
 from softneck.estimation import LinearNeck, axis_plant
 from softneck.identification import Family, FamilySettings, Lpv
 from softneck.loop import BlockPart, Loop, StepReference, metrics, run_loop

@@ -39,7 +39,9 @@ def norm_of_mixed(G: Any, K: Any, weights: list[Any], points: int = 2000) -> flo
     return float(np.sqrt(np.max(np.sum(sizes, axis=0))))
 
 
-@pytest.mark.parametrize("plant", [DISCRETE, CONTINUOUS], ids=["exact_delay", "pade"])
+@pytest.mark.parametrize(
+    "plant", [DISCRETE, pytest.param(CONTINUOUS, marks=pytest.mark.slow)], ids=["exact_delay", "pade"]
+)
 @pytest.mark.parametrize("W3", [None, makeweight(0.3, 20.0, 5.0)], ids=["two", "three"])
 def test_our_riccati_synthesis_equals_slycot(plant: Any, W3: Any) -> None:
     pytest.importorskip("slycot")

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import can
 
-import softneck.cli.drives._arm
+import softneck.cli.drives._target
 from softneck.cli._main import run
 from softneck.drives.simulated import SimulatedNeck, SimulatedSettings, serve
 from softneck.plant import NeckParameters
 
 
 def main() -> int:
-    softneck.cli.drives._arm.HARMLESS = ()  # pyright: ignore[reportPrivateImportUsage]
+    softneck.cli.drives._target.HARMLESS = ()  # pyright: ignore[reportPrivateImportUsage]
     ended = threading.Event()
     with can.Bus("served", interface="virtual") as theirs:
         neck = SimulatedNeck(NeckParameters.paper(), SimulatedSettings(homed=True))

@@ -35,7 +35,7 @@ from softneck.drives import (
 from softneck.drives.bus._link import BusError, VirtualLink
 from softneck.drives.bus._why import reason
 from softneck.drives.master import Frame, Tilt
-from softneck.drives.master._frame import BUS_OFF
+from softneck.drives.master._cia301 import BUS_OFF
 from softneck.drives.running._stop import require_reset, require_stopped
 from softneck.drives.sensing._python_sensor import make_python_sensor
 from softneck.drives.sensing._sensor import look_at

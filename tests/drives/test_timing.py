@@ -21,9 +21,8 @@ from softneck.core import SettingsError
 from softneck.drives import Snapshots
 from softneck.drives.logs._times import CycleTimes
 from softneck.drives.running import _timing as timing
-from softneck.drives.running._ask import Ask
 from softneck.drives.running._notify import Notifier
-from softneck.drives.running._timing import Ending, steady
+from softneck.drives.running._timing import Ask, Ending, steady
 
 from .bench import Bench
 

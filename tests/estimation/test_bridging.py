@@ -9,7 +9,7 @@ import pytest
 
 from softneck.core import DataError
 from softneck.estimation import KalmanSettings
-from softneck.estimation._bridging import bridging_error
+from softneck.estimation._consistency import bridging_error
 
 from .necks import neck, recording
 

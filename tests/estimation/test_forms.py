@@ -13,6 +13,7 @@ from softneck.core import DataError, SettingsError
 from softneck.estimation import KalmanSettings, LinearNeck, axis_plant
 from softneck.signals import Recording
 
+from ..data import slow_but
 from .necks import TS, changed, neck, recording, rows_of, run_block, run_plain, smooth_motion
 
 FAST = 0.01
@@ -80,7 +81,7 @@ def test_the_gyro_carries_the_angle_through_a_second_of_darkness() -> None:
     assert np.abs(error).max() < math.radians(0.1)
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.01, 0.025, 0.05])
+@pytest.mark.parametrize("delay", slow_but([0.0, 0.01, 0.025, 0.05], [0.0, 0.025]))
 @pytest.mark.parametrize("form", ["gyro", "kinematic"])
 def test_a_late_sensor_of_known_delay_costs_no_lag(form: str, delay: float) -> None:
     record = smooth_motion(noise_deg=0.001, bias_deg=0.0)

@@ -11,8 +11,7 @@ import pytest
 
 from softneck.core import FileFormatError, SettingsError, load, read_archive, write_archive
 from softneck.estimation import KalmanSettings
-from softneck.estimation._forms import FORMS
-from softneck.estimation._steady import steady_covariance, steady_gains
+from softneck.estimation._forms import FORMS, steady_covariance, steady_gains
 
 from .necks import changed, neck, recording, rows_of, run_block, run_plain, smooth_motion
 

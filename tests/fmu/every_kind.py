@@ -259,6 +259,8 @@ HEAVY = ("ensemble", "any", "nmpc")
 # One of each sort, for tests that take long with every kind: models, one of them with bounds, an observer, a
 # controller, the neck.
 SHORT = ("rls", "nlsm", "kalman", "pi", "neck")
+# One of each family of runtimes.
+FAMILIES = (*SHORT, "subspace", "nn", "play", "greybox", "mpc", "scheduled")
 
 
 @cache

@@ -58,7 +58,7 @@ def neck(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture(scope="module", params=[*CONTROLLERS, pytest.param("nmpc", marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=slow_but([*CONTROLLERS, "nmpc"], ["pi", "hinf", "scheduled", "mpc"]))
 def kind(request: pytest.FixtureRequest) -> str:
     return request.param
 

@@ -19,7 +19,7 @@ from softneck.fmu.python import _build
 from softneck.identification import Rls, validate
 
 from ..data import slow_but
-from .every_kind import HEAVY, KINDS, block_of, recording
+from .every_kind import KINDS, SHORT, block_of, recording
 
 
 def _page(path: Path) -> str:
@@ -27,7 +27,7 @@ def _page(path: Path) -> str:
         return archive.read("documentation/index.html").decode()
 
 
-@pytest.mark.parametrize("kind", slow_but(KINDS, [kind for kind in KINDS if kind not in HEAVY]))
+@pytest.mark.parametrize("kind", slow_but(KINDS, SHORT))
 def test_every_fmu_carries_page_picture_icon_and_licences(kind: str, tmp_path: Path) -> None:
     path = build_fmu(block_of(kind), tmp_path / f"{kind}.fmu", info=FmuInfo(license="CC-BY-4.0"))
     with zipfile.ZipFile(path) as archive:

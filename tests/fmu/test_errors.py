@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +29,44 @@ def test_an_input_that_is_no_number_is_an_error_that_names_it(
             fmu.set(motor_setpoint_1=value)
         text = f"Lag: motor_setpoint_1 was set to {value}; it must be finite."
         assert (3, text) in fmu.log
-        assert text in capfd.readouterr().err
+        said = capfd.readouterr().err
+    # What a host did wrong is one line; where in the code it was noticed helps nobody.
+    assert text in said
+    assert "Traceback" not in said
+
+
+def test_an_unforeseen_error_says_where_it_happened(
+    lag_fmu: Path, running: Any, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with running(lag_fmu) as fmu:
+        fmu.begin()
+        with pytest.raises(FMICallException, match="fmi2GetReal"):
+            fmu.fmu.getReal([10_000])
+        said = capfd.readouterr().err
+    assert "Traceback" in said
+    assert "IndexError" in said
+
+
+class _Trap:
+    """Pickled, a program: it makes the file `path`."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (self._path,)
+
+
+def test_a_pickle_among_the_arrays_is_never_opened(lag_fmu: Path, running: Any, tmp_path: Path) -> None:
+    trap, hostile = tmp_path / "sprung", tmp_path / "Hostile.fmu"
+    content = io.BytesIO()
+    np.save(content, np.array([_Trap(trap)], dtype=object), allow_pickle=True)
+    with zipfile.ZipFile(lag_fmu) as honest, zipfile.ZipFile(hostile, "w") as target:
+        for name in honest.namelist():
+            target.writestr(name, content.getvalue() if name == "resources/arrays.npy" else honest.read(name))
+    with pytest.raises(Exception, match="Failed to instantiate"), running(hostile):
+        pass
+    assert not trap.exists()
 
 
 def test_missing_measurements_are_allowed_where_the_port_says_so(lag_fmu: Path, running: Any) -> None:

@@ -55,6 +55,7 @@ def test_an_importer_computes_what_python_does(importer: str, kind: str, path: P
     np.testing.assert_allclose(seen, expected, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_fmutool_finds_it_compliant(kind: str, path: Path) -> None:
     need("fmu_manipulation_toolbox")
     tool = Path(sys.executable).with_name("fmutool")
@@ -66,6 +67,7 @@ def test_fmutool_finds_it_compliant(kind: str, path: Path) -> None:
     assert "No semantic error" in text, text[-2000:]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [["info"], ["validate"], ["simulate", "--stop-time", "0.2"]], ids=lambda c: c[0])
 def test_fmpys_own_command_line_works_on_it(command: list[str], kind: str, path: Path) -> None:
     done = subprocess.run(

@@ -154,6 +154,7 @@ def _write_sources(folder: Path, sources: Sources) -> None:
         (folder / name).write_text(text)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("own", [True, False], ids=["own", "standard"])
 def test_the_sources_compile_without_a_warning_and_fit_the_standards_headers(own: bool, tmp_path: Path) -> None:
     _write_sources(tmp_path, c_sources())

@@ -23,7 +23,8 @@ from fmpy.validation import validate_fmu
 from softneck.fmu import build_compiled_fmu, build_fmu, unpacked
 from softneck.runtime import Block
 
-from .every_kind import NATIVE, TS, as_block, block_of, inputs_of, plain_run
+from ..data import slow_but
+from .every_kind import FAMILIES, NATIVE, TS, as_block, block_of, inputs_of, plain_run
 
 ROWS = 400
 pytestmark = pytest.mark.skipif(
@@ -31,7 +32,7 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-@pytest.fixture(scope="module", params=NATIVE)
+@pytest.fixture(scope="module", params=slow_but(NATIVE, FAMILIES))
 def kind(request: pytest.FixtureRequest) -> str:
     return request.param
 
@@ -233,6 +234,7 @@ def test_an_importer_computes_what_python_does(importer: str, name: str, tmp_pat
     _assert_equal(np.load(out), expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fmi", [2, 3])
 def test_fmutool_finds_it_compliant(fmi: int, tmp_path: Path) -> None:
     tool = Path(sys.executable).with_name("fmutool")

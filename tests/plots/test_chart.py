@@ -8,8 +8,7 @@ from matplotlib.patches import Rectangle
 
 from softneck.core import DataError, SettingsError
 from softneck.plots import Chart, Curve, Level, Panel, chart_figure
-from softneck.plots._charts import recording_chart, validation_chart
-from softneck.plots._timeline import timeline
+from softneck.plots._charts import recording_chart, timeline, validation_chart
 
 
 def _wave(columns: int, rows: int = 100) -> np.ndarray:

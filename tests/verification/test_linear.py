@@ -11,8 +11,7 @@ import pytest
 
 from softneck.design import diskmargin, mu_bounds, nugap
 from softneck.design.robust._mu import two_scalars
-from softneck.verification._gaps import gaps
-from softneck.verification._linear import LinearLaw, judged, margins, radii
+from softneck.verification._linear import LinearLaw, gaps, judged, margins, radii
 from softneck.verification._plants import (
     AxisBox,
     Plants,

@@ -18,7 +18,7 @@ from ..shared._console import note
 from ._target import Target
 
 if TYPE_CHECKING:
-    from softneck.cosim.loops._setup import LoopSetup
+    from softneck.cosim.loops._loop_file import LoopSetup
     from softneck.drives.logs._run_log import RunLogger
 
 

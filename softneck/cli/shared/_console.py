@@ -5,13 +5,15 @@ from __future__ import annotations
 import contextlib
 import json
 import sys
+import time
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from typing import Any
 
 import click
 
+from softneck.core import Progress, silent
 from softneck.core import Progress as ProgressCallback
-from softneck.core import silent
 
 
 def print_json(value: Any) -> None:
@@ -88,3 +90,31 @@ def _plain(value: Any) -> Any:
     if isinstance(value, str | int | float | bool) or value is None:
         return value
     return str(value)
+
+
+class Stages:
+    """Announces stages; each ends when the next begins."""
+
+    def __init__(self, *, quiet: bool) -> None:
+        self._quiet = quiet
+        self._stack = ExitStack()
+        self._name = ""
+        self._since = 0.0
+
+    def __enter__(self) -> Stages:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end()
+
+    def begin(self, name: str) -> Progress:
+        """End the stage before and start the next."""
+        self._end()
+        self._name, self._since = name, time.monotonic()
+        return self._stack.enter_context(progress(name, quiet=self._quiet))
+
+    def _end(self) -> None:
+        self._stack.close()
+        if self._name and not self._quiet:
+            note(f"{self._name}: {time.monotonic() - self._since:.1f} s")
+        self._name = ""

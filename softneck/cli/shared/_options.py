@@ -1,4 +1,4 @@
-"""Options that several subcommands share."""
+"""Options and arguments that several subcommands share."""
 
 from __future__ import annotations
 
@@ -7,12 +7,37 @@ import math
 import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from softneck.core import SettingsError
+from softneck.core import DataError, SettingsError
 from softneck.core._kinds import make_settings
+
+if TYPE_CHECKING:
+    from softneck.signals import Recording
+
+
+def read_together(paths: Sequence[Path]) -> Recording:
+    """Read recordings as runs of one.
+
+    Raises:
+        DataError: their sample times or robots differ; the line names two that do.
+    """
+    from softneck.signals import concatenate, read_recording
+    from softneck.signals.recording._recording import require_same_robot
+
+    recordings = [read_recording(path) for path in paths]
+    for path, recording in zip(paths, recordings, strict=True):
+        if not math.isclose(recording.sample_time, recordings[0].sample_time, rel_tol=1e-6):
+            raise DataError(
+                f"{path}: is at {1e3 * recording.sample_time:g} ms and {paths[0]} at "
+                f"{1e3 * recordings[0].sample_time:g} ms; recordings are used together at one sample time only. Take "
+                "each by itself, or bring one to the other's (Python: `softneck.signals.resampled`)."
+            )
+        require_same_robot(recording.robot, recordings[0].robot, f"{paths[0]} and {path}: recordings")
+    return concatenate(recordings)
+
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout and nothing else.")
 force_option = click.option("--force", is_flag=True, help="Replace an existing file.")

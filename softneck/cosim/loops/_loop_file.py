@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from softneck.core import FileFormatError, SettingsError, SoftneckError, file_hash
+from softneck.core import FileFormatError, SettingsError, SoftneckError, file_hash, require_one_of
 from softneck.loop import Fault, Loop, Part, ReferenceBlock
 from softneck.loop._faults import make_fault
 from softneck.loop._reference_parts import AheadReference
@@ -15,7 +16,27 @@ from ..parts._fmu_part import FmuPart
 from ..parts._isolated import IsolatedPart
 from ._loop_parts import OBJECT, PRESETS, SOURCES, PartOpener
 from ._loop_values import number, numbers, read_toml, refuse_unknown, tables, texts
-from ._setup import LoopSetup
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class LoopSetup:
+    """A loop with what is asked of it; a loop file describes one.
+
+    Attributes:
+        loop: the parts, the reference, the order.
+        limits: metric -> upper limit, such as "pitch.overshoot_pct": 5.0.
+        files: what was read for it: role -> (path, SHA-256).
+        angle: which angle the metrics judge: "true" (where the plant offers it) or "measured".
+    """
+
+    loop: Loop
+    limits: Mapping[str, float] = field(default_factory=dict)
+    files: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    angle: str = "true"
+
+    def __post_init__(self) -> None:
+        require_one_of("angle", self.angle, ("true", "measured"))
+
 
 _TOP = (
     "duration_s", "sample_time_s", "order", "plant", "observer", "controller", "reference", "part", "connections",

@@ -13,9 +13,8 @@ from softneck.loop._references import reference_field, reference_keys
 
 from ..parts._fmu_part import FmuPart
 from ..parts._isolated import IsolatedPart
-from ._loop_file import normal_table
+from ._loop_file import LoopSetup, normal_table
 from ._loop_parts import OBJECT
-from ._setup import LoopSetup
 
 _PARTS = ("plant", "observer", "controller")
 _SOURCES = ("fmu", "model", "file", "neck", "python", OBJECT)

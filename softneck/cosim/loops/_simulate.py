@@ -11,9 +11,8 @@ from softneck.core import SettingsError
 from softneck.loop import Loop, LoopState, run_loop
 from softneck.loop._run import StepCallback
 
-from ._loop_file import load_loop, make_loop
+from ._loop_file import LoopSetup, load_loop, make_loop
 from ._result import Result
-from ._setup import LoopSetup
 
 
 def simulate(

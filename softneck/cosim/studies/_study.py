@@ -15,11 +15,10 @@ from softneck.loop import Loop, LoopRun
 from softneck.loop._result import METRICS
 from softneck.runtime import Block
 
-from ..loops._loop_file import make_loop, normal_table
+from ..loops._loop_file import LoopSetup, make_loop, normal_table
 from ..loops._loop_parts import OBJECT
 from ..loops._loop_table import check_key, loop_table, set_sources, settable, with_values
 from ..loops._loop_values import read_toml
-from ..loops._setup import LoopSetup
 from ._vary import StudyPoints, Vary, flattened, make_vary
 
 _TOP = ("loop", "runs", "seed", "sampling", "objectives", "vary")

@@ -14,9 +14,8 @@ from numpy.typing import ArrayLike
 from softneck.core import Matrix, Vector, atomic_write, write_archive
 from softneck.runtime import Block, State
 
-from ._limits import ControllerLimits
 from ._linear_parts_runtime import LinearArrays
-from ._ports import controller_inputs, controller_outputs
+from ._ports import ControllerLimits, controller_inputs, controller_outputs
 
 if TYPE_CHECKING:
     import control

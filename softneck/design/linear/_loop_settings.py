@@ -8,7 +8,7 @@ from softneck.core import require_between, require_one_of
 from softneck.estimation._settings import ORDERS
 from softneck.signals import TENDON_ANGLES
 
-from ._limits import ControllerLimits
+from ._ports import ControllerLimits
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

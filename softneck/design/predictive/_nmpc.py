@@ -28,9 +28,8 @@ from softneck.runtime import Block, Port, State
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
 from ..linear._ports import controller_inputs, controller_outputs, limit_ports
-from ._nmpc_arrays import controller_arrays
 from ._nmpc_part import NmpcPart, SampleSolution, explain
-from ._nmpc_prepared import NonlinearProblem
+from ._nmpc_prepared import NonlinearProblem, controller_arrays
 from ._settings import spaced_starts
 from ._tuning import move_weight
 

@@ -122,3 +122,20 @@ def disturbance_ahead(pole: float, horizon: int) -> Matrix:
     """Return (horizon, 2): what level and rate of now make of the next samples."""
     i = np.arange(1, horizon + 1)
     return np.column_stack([np.ones(horizon), (1.0 - pole**i) / (1.0 - pole)])
+
+
+def controller_arrays(controller: NonlinearController) -> tuple[Matrix, ...]:
+    """Return the controller's own arrays, in the order of `_nmpc_runtime`; those of the model stand behind them."""
+    s, prepared = controller.settings, Preparation(controller)
+    p, block = prepared.problem, controller.model.block()
+    start = block.initial_state(use_measurement=0.0, noise_std=0.0)
+    slack = 0.0 if s.angle_limit is None else s.slack_weight * float(p.weights[0].max())
+    constants = np.array([
+        controller.sample_time, p.horizon, s.window, prepared.ahead, prepared.lead, prepared.keep, p.move_weight,
+        p.cocontraction_weight, slack, s.angle_limit or 0.0, s.budget, float(s.converged), COAST, SETTLE,
+        len(block.outputs),
+    ])  # fmt: skip
+    return (
+        constants, np.array(p.starts, dtype=np.float64), p.T, p.weights, prepared.gains, prepared.future,
+        prepared.slopes, prepared.inverse / prepared.gain, prepared.asked_at.astype(np.float64), start.parameters,
+    )  # fmt: skip

@@ -19,8 +19,7 @@ from softneck.identification import Model
 from softneck.loop import RecordingReference, Reference
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
-from ..linear._limits import require_taut
-from ..linear._ports import MAX_MOTOR
+from ..linear._ports import MAX_MOTOR, require_taut
 from ._optimal import OptimalControl, Task
 
 # Kinks leave a solution without the last digits: a cost that changes by less than this, five times in a row, is one.

@@ -22,9 +22,8 @@ from softneck.estimation._axis import HasTransferFunctions
 from softneck.estimation._settings import ORDERS
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
-from ..linear._limits import require_taut
 from ..linear._margins import frequencies
-from ..linear._ports import MAX_MOTOR
+from ..linear._ports import MAX_MOTOR, require_taut
 from ._arrays import Tuning, assemble, observer_bandwidth, with_filter, with_gains
 from ._controller import MpcController
 from ._disturbance import MeasuredDisturbance

@@ -15,8 +15,7 @@ from softneck.runtime import Block, Port, State
 from softneck.runtime._bundle import declared
 from softneck.runtime._layout import Arrays
 
-from ..linear._limits import ControllerLimits
-from ..linear._ports import controller_inputs, controller_outputs
+from ..linear._ports import ControllerLimits, controller_inputs, controller_outputs
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

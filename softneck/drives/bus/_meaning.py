@@ -5,8 +5,8 @@ from __future__ import annotations
 import struct
 
 from ..master import Frame
+from ..master._cia301 import node_state
 from ..master._cia402 import state_of
-from ..master._nmt import node_state
 
 _NMT = {1: "start", 2: "stop", 128: "pre-operational", 129: "reset", 130: "reset communication"}
 

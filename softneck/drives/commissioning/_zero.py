@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 from softneck.core import CheckFailedError, SoftneckError
 
 from ..bus._file import DriveEntry, DrivesFile
-from ..bus._guarded import GuardedLink
-from ..bus._link import Link
+from ..bus._link import GuardedLink, Link
 from ..bus._objects import (
     HOMED_MARK,
     MASTER_NODE,
@@ -25,8 +24,8 @@ from ..bus._sdo import Objects, load_eds
 from ..bus._units import counts_to_position
 from ..master import Frame, Tilt
 from ..master._cia402 import DriveState, state_of
-from ..running._ask import Operator
 from ..running._stop import disarm, wait
+from ..running._timing import Operator
 
 if TYPE_CHECKING:
     from canopen.objectdictionary import ObjectDictionary

@@ -20,9 +20,8 @@ from ..master import MasterSettings
 from ..master._fieldbus import BusSettings
 from ..master._settings import LimitSettings, RampSettings, SensorSettings, WatchSettings
 from ._cycle import Cycle, decode_cycle
-from ._motion import motion_at
 from ._result import recording_of, signal_units
-from ._rows import experiment_channels, experiment_recording, experiment_table
+from ._rows import experiment_channels, experiment_recording, experiment_table, motion_at
 from ._run_log import LOG_VERSION, METADATA
 
 # No record of ours comes near; a damaged length must not reserve the memory of the machine.

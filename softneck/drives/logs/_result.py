@@ -14,7 +14,7 @@ from softneck.signals import Recording
 from softneck.signals.recording._channels import known_channels
 
 from ..master import Event
-from ._motion import speed_channels
+from ._rows import speed_channels
 from ._times import CycleTimes
 
 _RATES = ("pitch_rate_measured", "roll_rate_measured")

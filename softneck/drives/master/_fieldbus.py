@@ -8,10 +8,9 @@ from dataclasses import dataclass
 
 from softneck.core import require_between, require_whole
 
+from ._cia301 import Command, Frame, NodeState, nmt_frame, node_state
 from ._cia402 import DriveState, Goal, control_word, state_of
 from ._events import Event
-from ._frame import Frame
-from ._nmt import Command, NodeState, nmt_frame, node_state
 
 _TPDO = struct.Struct("<Hih")
 _RPDO = struct.Struct("<Hi")

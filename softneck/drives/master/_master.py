@@ -6,10 +6,10 @@ import math
 from collections import Counter, deque
 from collections.abc import Sequence
 
+from ._cia301 import Frame
 from ._cia402 import OFF, POWERED, DriveState, Goal
 from ._events import IDLE_TOO, Event, Reaction
 from ._fieldbus import Fieldbus
-from ._frame import Frame
 from ._gate import Gate, Tilt
 from ._limiter import Limiter
 from ._measured import Measurement, Pilot, Triple

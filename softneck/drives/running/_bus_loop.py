@@ -21,16 +21,15 @@ from ..logs._result import fault_table, require_unstopped
 from ..logs._run_log import RunLogger, run_facts
 from ..logs._times import CycleTimes
 from ..master import Event, Frame, Master, MasterSettings, Tilt
+from ..master._cia301 import Command as NmtCommand
+from ..master._cia301 import nmt_frame
 from ..master._measured import Pilot
-from ..master._nmt import Command as NmtCommand
-from ..master._nmt import nmt_frame
 from ..master._supervisor import ACTIVE
 from ..sensing._sensor import Sensor
-from ._ask import Ask, Operator
 from ._notify import Notifier
 from ._preflight import preflight
 from ._stop import disarm, stop
-from ._timing import Ending, steady
+from ._timing import Ask, Ending, Operator, steady
 from ._virtual import VirtualRun, Watch
 
 # Before the first cycle on a bus each drive is given this time to become operational [s].

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from softneck.core import CheckFailedError, check_certificate, read_certificate
 from softneck.core._certificate import Certificate, certificate_path
-from softneck.cosim.loops._setup import LoopSetup
+from softneck.cosim.loops._loop_file import LoopSetup
 from softneck.loop import Loop, LoopResult, LoopRun
 from softneck.verification import read_requirements
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from softneck.core import SettingsError, load
 from softneck.cosim import FmuPart
-from softneck.cosim.loops._setup import LoopSetup
+from softneck.cosim.loops._loop_file import LoopSetup
 from softneck.loop import BlockPart, Loop, Part
 from softneck.plant import NeckParameters
 
@@ -18,10 +18,10 @@ from ..logs._result import DrivesResult
 from ..logs._run_log import RunLogger
 from ..master import Frame, Master, MasterSettings, Tilt
 from ..sensing._sensor import Sensor
-from ._ask import Operator
 from ._bus_loop import Session, run_session
 from ._pilot import LoopPilot
-from ._run_signals import RunLog
+from ._signals import RunLog
+from ._timing import Operator
 from ._virtual import Watch, simulated_neck
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
-from ._ask import Ask
+from ._timing import Ask
 
 _INTERRUPT = b"\x03"
 # The terminal is closed, a service is ended: as Ctrl-C. Ctrl-Z would hang the loop that feeds the drives: it stops.

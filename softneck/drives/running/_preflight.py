@@ -27,8 +27,8 @@ from ..bus._objects import (
 )
 from ..bus._sdo import Objects, SdoError, load_eds
 from ..master import Frame
+from ..master._cia301 import Command, nmt_frame
 from ..master._cia402 import DriveState, state_of
-from ..master._nmt import Command, nmt_frame
 from ..sensing._sensor import LOOK, Sensor, look_at
 from ._scan import DRIVE, devices_at, or_none, require_bus, several_devices
 

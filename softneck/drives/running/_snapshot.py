@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ..master import Event, Master, Phase
+from ..master._cia301 import NodeState
 from ..master._cia402 import DriveState
-from ..master._nmt import NodeState
 from ._pilot import LoopPilot
 
 Triple = tuple[float, float, float]

@@ -7,8 +7,7 @@ from collections.abc import Mapping, Sequence
 from softneck.core import CheckFailedError
 
 from ..bus._file import DrivesFile
-from ..bus._guarded import GuardedLink
-from ..bus._link import Link
+from ..bus._link import GuardedLink, Link
 from ..bus._objects import disarm_writes
 from ..bus._sdo import Objects, SdoError, load_eds
 from ..master import Frame

@@ -8,11 +8,21 @@ import gc
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from enum import StrEnum
 
 from softneck.core import SettingsError
 
-from ._ask import Ask
+
+class Ask(StrEnum):
+    """What an operator wants of a run."""
+
+    LEAVE = "leave"
+    STOP = "stop"
+
+
+Operator = Callable[[], Ask | None]
+
 
 # Of 1 to 99: above ordinary work and below the kernel's own threads for interrupts, which have 50.
 _PRIORITY = 40

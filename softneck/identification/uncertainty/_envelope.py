@@ -60,13 +60,8 @@ def _feasible(x: Vector, e: Vector, order: int, closeness: float) -> Vector | No
     powers = x[:, None] ** np.arange(order + 1) / (1.0 + x[:, None] ** order)
     e2 = e[:, None] ** 2
     # Rows by their own size: e spans decades.
-    rows = np.vstack(
-        [
-            np.hstack([-powers / e2, powers]),
-            np.hstack([powers / e2, -(closeness**2) * powers]),
-            np.hstack([np.zeros_like(powers), -powers]),
-        ]
-    )
+    zeros = np.zeros_like(powers)
+    rows = np.block([[-powers / e2, powers], [powers / e2, -(closeness**2) * powers], [zeros, -powers]])
     # Positive coefficients at both ends keep N and D positive beyond the grid; their scale is free, so D sums to one.
     ends = [(1e-7 if i in (0, order) else None, None) for i in range(order + 1)]
     total: Matrix = np.concatenate([np.zeros(order + 1), np.ones(order + 1)])[None, :]

@@ -12,8 +12,8 @@ from softneck.drives import DrivesFile, default_drives, jog, neck_drives, record
 from softneck.drives.bus._link import VirtualLink
 from softneck.drives.commissioning._jog import JogResult, judge
 from softneck.drives.commissioning._record import drive_limits
-from softneck.drives.running._ask import Ask
 from softneck.drives.running._bus_loop import Session
+from softneck.drives.running._timing import Ask
 from softneck.plant import NeckParameters
 from softneck.signals import prepare, signal
 

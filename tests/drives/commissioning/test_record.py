@@ -12,8 +12,8 @@ from softneck.drives import default_drives, neck_drives, preflight, record_signa
 from softneck.drives.bus._link import VirtualLink
 from softneck.drives.commissioning._record import ExperimentResult, drive_limits
 from softneck.drives.master import Master, Tilt
-from softneck.drives.running._ask import Ask
 from softneck.drives.running._bus_loop import Session
+from softneck.drives.running._timing import Ask
 from softneck.identification import Rls
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import Excitation, prepare, signal
@@ -36,12 +36,14 @@ def recorded(*excitations: Excitation, link: VirtualLink | None = None, **sessio
     return record_signal(excitations, replace(Session(file=FILE, link=link or link_to()), **session))
 
 
+SLOW = [("steps", None), ("rotation", None), ("aprbs", 20.0), ("sine", None), ("eq22", None), ("mixed", None)]
+
+
 @pytest.mark.parametrize("neck", ["paper", "lab"])
 @pytest.mark.parametrize(
     ("name", "duration"),
-    [("eq22", 20.0), ("steps", None), ("rotation", None), ("aprbs", 20.0), ("sine", None),
-     pytest.param("eq22", None, marks=pytest.mark.slow), pytest.param("mixed", None, marks=pytest.mark.slow)],
-)  # fmt: skip
+    [("eq22", 20.0), *(pytest.param(name, duration, marks=pytest.mark.slow) for name, duration in SLOW)],
+)
 def test_it_equals_softneck_record_over_the_same_neck(name: str, duration: float | None, neck: str) -> None:
     """With the drives set up for the neck, as `--simulated --neck` does."""
     parameters = QUIET[neck]

@@ -27,8 +27,8 @@ from softneck.drives.commissioning._jog import jog_pilot
 from softneck.drives.commissioning._record import drive_limits
 from softneck.drives.logs._run_log import RunLogger
 from softneck.drives.master._settings import RampSettings
-from softneck.drives.running._ask import Ask, Operator
 from softneck.drives.running._bus_loop import Session
+from softneck.drives.running._timing import Ask, Operator
 from softneck.drives.simulated import SimulatedNeck, SimulatedSettings, serve
 from softneck.plant import NeckParameters
 from softneck.signals import Recording

@@ -12,7 +12,7 @@ from softneck.drives.logs._cycle import frame_of, frame_text
 from softneck.drives.logs._frame_log import FrameLog
 from softneck.drives.logs._run_log import RunLogger
 from softneck.drives.master import Frame
-from softneck.drives.master._frame import BUS_OFF
+from softneck.drives.master._cia301 import BUS_OFF
 
 FRAMES = st.builds(Frame, st.integers(0, 0x7FF), st.binary(max_size=8), st.booleans(), st.booleans())
 

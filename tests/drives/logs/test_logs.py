@@ -28,6 +28,7 @@ from softneck.drives.logs._run_log import RunLogger, run_facts
 from softneck.drives.master import Frame, Phase, Tilt
 from softneck.drives.running._pilot import LoopPilot
 
+from ...data import slow_but
 from ..bench import Bench
 from ..conftest import Project
 from ..scenarios import SCENARIOS
@@ -90,7 +91,7 @@ def test_a_cycle_reads_back_to_the_bit(cycle: Cycle) -> None:
 # -- replay -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", list(SCENARIOS))
+@pytest.mark.parametrize("name", slow_but(SCENARIOS, list(SCENARIOS)[::4]))
 def test_every_fault_of_the_table_replays_to_the_same_stop(tmp_path: Path, name: str) -> None:
     bench = logged_bench(tmp_path / "run.mcap", name)
     log = read_run_log(tmp_path / "run.mcap")
@@ -131,6 +132,7 @@ def test_the_controller_computed_again_gives_the_same_run(run: Path, project: Pr
     assert result.answers == len(log.rows)
 
 
+@pytest.mark.slow
 def test_another_controller_is_found_at_its_first_answer(run: Path, project: Project) -> None:
     other = project.write_loop("other_reference.toml", 'kind = "step"\npitch_deg = 15.5\nat_s = 1.0', 4.0)
     log = read_run_log(run)

@@ -11,8 +11,8 @@ from softneck.cosim import load_loop
 from softneck.drives import DrivesResult, Snapshots, default_drives, prepare, run_simulated
 from softneck.drives.bus._link import VirtualLink
 from softneck.drives.master import Frame, Master, Phase
+from softneck.drives.master._cia301 import NodeState
 from softneck.drives.master._cia402 import DriveState
-from softneck.drives.master._nmt import NodeState
 from softneck.drives.running._snapshot import Snapshot
 from softneck.drives.running._virtual import recorded
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import struct
 
 from softneck.drives.master import Frame
+from softneck.drives.master._cia301 import BUS_OFF, NodeState
 from softneck.drives.master._cia402 import DriveState, Goal
 from softneck.drives.master._fieldbus import BusSettings, Fieldbus
-from softneck.drives.master._frame import BUS_OFF
-from softneck.drives.master._nmt import NodeState
 
 T = 0.01
 OFF = (Goal.OFF,) * 3

@@ -75,8 +75,8 @@ def test_the_sampled_form_is_exact_also_between_samples(model: Continuous) -> No
     )
 
 
-@pytest.mark.parametrize("model", [NECK, SECOND], ids=["one pole", "two poles"])
-@pytest.mark.parametrize(("pole", "delay"), [(2.0, 0.02), (15.0, 0.16)])
+@pytest.mark.parametrize("model", [NECK, pytest.param(SECOND, marks=pytest.mark.slow)], ids=["one pole", "two poles"])
+@pytest.mark.parametrize(("pole", "delay"), [(2.0, 0.02), pytest.param(15.0, 0.16, marks=pytest.mark.slow)])
 def test_a_clean_record_gives_the_system_behind_it(model: Continuous, pole: float, delay: float) -> None:
     u = steps(1500, seed=1)
     n = model.a.size

@@ -105,6 +105,7 @@ def test_tf_ss_free_run_and_file_are_one_system(tmp_path: Path) -> None:
     assert "4 states" in model.summary()
 
 
+@pytest.mark.slow
 def test_the_dead_time_of_a_clean_neck_is_found() -> None:
     model = Subspace(order=2, max_delay=0.12).fit(neck_recording(1200, noise=1e-4))
     curve = np.array(model.findings["delay_curve"]["pitch"])

@@ -11,7 +11,7 @@ from softneck.core import DataError, SettingsError
 from softneck.identification import Choice, Play, choose, refit
 from softneck.identification.selection._auto import ALIKE, REFITTED, kinds_to_try
 
-from ...data import neck_recording
+from ...data import neck_recording, slow_but
 
 TRAIN, OTHER = neck_recording(900), neck_recording(500, seed=12)
 
@@ -47,9 +47,10 @@ def test_the_residual_is_on_the_best_and_the_ensemble_of_the_others(choice: Choi
     assert sorted(models["ensemble"].settings["members"]) == ["play", "rls"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kinds",
-    [("play",), ("rls", "residual"), pytest.param(("rls", "play", "ensemble"), marks=pytest.mark.slow)],
+    slow_but([("play",), ("rls", "residual"), ("rls", "play", "ensemble")], [("play",)]),
 )
 def test_a_refit_is_the_chosen_kind_on_all_rows_and_keeps_the_scores_of_before(kinds: tuple[str, ...]) -> None:
     found = choose(TRAIN, OTHER, kinds=kinds, other_excitation=True)

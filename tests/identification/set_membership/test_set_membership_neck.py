@@ -59,6 +59,7 @@ def test_eq21_with_a_chosen_scale_runs_free(
         assert free_run(paper, recording) >= least[name], name
 
 
+@pytest.mark.slow
 def test_one_step_ahead_the_bounds_of_eq21_hold(paper: Model, eq22: tuple[Recording, Recording]) -> None:
     assert coverage(eq22[1], paper.predict(eq22[1])) >= 0.97  # the issue's; 99.9 % measured
 

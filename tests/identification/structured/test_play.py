@@ -136,6 +136,7 @@ def test_training_sees_what_the_free_run_computes() -> None:
     np.testing.assert_allclose(free[200:], f[200:], rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_model_is_found_behind_clean_data() -> None:
     train, test = neck_recording(2400, noise=1e-4), neck_recording(1000, seed=9, noise=1e-4)
     fits = validate(Play().fit(train), test, horizons=(1, INFINITE)).fits

@@ -29,6 +29,7 @@ def test_the_free_run_fits_and_stays_within_its_bounds(
     assert inside.mean() >= 0.97
 
 
+@pytest.mark.slow
 def test_bounds_widen_where_nothing_was_seen(recordings: dict[str, Recording], model: Model) -> None:
     known, new = (model.simulate(recordings[name])[25:] for name in ("validation", "rotation"))
     widths = [np.mean(Y[:, [6, 8]] - Y[:, [5, 7]]) for Y in (known, new)]

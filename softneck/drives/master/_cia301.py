@@ -1,10 +1,32 @@
-"""Network management (CiA 301, 7.3.2): node states, commands, and the frames that carry them."""
+"""CAN frames inside the core, and network management (CiA 301, 7.3.2): node states, commands, and their frames.
+
+python-can's message exists at the edge only.
+"""
 
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import NamedTuple
 
-from ._frame import Frame
+
+class Frame(NamedTuple):
+    """One frame on the CAN bus.
+
+    Attributes:
+        identifier: COB-ID.
+        data: at most 8 bytes.
+        remote: a remote request (RTR).
+        error: not from the bus but about it: the adapter reports an error; data is b"off" for bus-off.
+    """
+
+    identifier: int
+    data: bytes = b""
+    remote: bool = False
+    error: bool = False
+
+
+BUS_OFF = Frame(0, b"off", error=True)
+"""What the edge puts in when the adapter went bus-off or is gone."""
 
 
 class NodeState(IntEnum):
