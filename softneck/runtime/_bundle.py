@@ -102,6 +102,8 @@ class _Prefix(ast.NodeTransformer):
 _LOOPS = "softneck.runtime._loops_runtime"
 _MEMBERS = "softneck.runtime._members_runtime"
 _DECLARATIONS = "softneck.runtime._layout"
+# Motors and outputs of a neck, for which a text is written where its runtime's name says no others.
+_NECK = (3, 2)
 _ALLOWED = {"numpy", "math", "__future__", _DECLARATIONS}
 
 
@@ -127,6 +129,7 @@ def bundle(runtime: str, *, loops: bool = True, skip: tuple[str, ...] = ()) -> s
         SettingsError: a module imports what a runtime must not, or two define the same name.
     """
     outer, members = _members(runtime)
+    outer, sizes = _sizes(outer)
     order: list[str] = []
     _collect(outer, order)
     texts = [bundle(member, loops=False) for member, _ in members]
@@ -135,12 +138,12 @@ def bundle(runtime: str, *, loops: bool = True, skip: tuple[str, ...] = ()) -> s
     if members and _MEMBERS in order:
         order.remove(_MEMBERS)
         texts.append(member_calls([count for _, count in members], own_arrays(outer), tangents=tangents))
-    found = {module: [piece for piece in _pieces(module) if not set(skip) & piece.names] for module in order}
+    found = {module: [piece for piece in _pieces(module, sizes) if not set(skip) & piece.names] for module in order}
     home = next((module for module in order if _defines(found[module], "step")), None)
     if home is not None and not any(_defines(pieces, "state_size") for pieces in found.values()):
-        found[home].append(_piece(state_size(declared(home, Arrays), declared(home, StateVector))))
+        found[home].append(_piece(state_size(declared(home, Arrays), declared(home, StateVector), dict(sizes))))
     if loops:
-        found[_LOOPS] = [piece for piece in _pieces(_LOOPS) if "step" not in piece.names]
+        found[_LOOPS] = [piece for piece in _pieces(_LOOPS, sizes) if "step" not in piece.names]
     _check_names(found)
     kept = _needed(found, outer, {name for text in texts for name in _read(ast.parse(text))})
     parts = ["# A softneck runtime: generated, do not edit.", "import math", "", "import numpy as np", "", *texts]
@@ -151,6 +154,18 @@ def bundle(runtime: str, *, loops: bool = True, skip: tuple[str, ...] = ()) -> s
 def content_name(text: str, prefix: str = "softneck") -> str:
     """Return a module name that the content of `text` decides."""
     return f"{prefix}_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
+
+
+def sized(runtime: str, motors: int, outputs: int) -> str:
+    """Return the name of a runtime whose text is for so many motors and outputs; that of a neck's is its own."""
+    return runtime if (motors, outputs) == _NECK else f"{runtime}@{motors}x{outputs}"
+
+
+def _sizes(outer: str) -> tuple[str, tuple[tuple[str, int], ...]]:
+    """Return the module of a runtime's name, and the motors and outputs that its text is for."""
+    module, _, size = outer.partition("@")
+    motors, outputs = map(int, size.split("x")) if size else _NECK
+    return module, (("motors", motors), ("outputs", outputs))
 
 
 def own_arrays(outer: str) -> int:
@@ -164,6 +179,7 @@ def declared(module: str, base: type) -> Any:
     Raises:
         SettingsError: it names none.
     """
+    module = module.partition("@")[0]
     functions = [node for node in _tree(module).body if isinstance(node, ast.FunctionDef)]
     for function in sorted(functions, key=lambda node: node.name != "step"):
         for argument in function.args.args:
@@ -196,8 +212,8 @@ def _collect(module: str, order: list[str]) -> None:
 
 
 @cache
-def _pieces(module: str) -> tuple[_Piece, ...]:
-    """Return the functions and constants of a module, with places for names."""
+def _pieces(module: str, sizes: tuple[tuple[str, int], ...]) -> tuple[_Piece, ...]:
+    """Return the functions and constants of a module, with places for names, written for a robot of these sizes."""
 
     def find(name: str) -> Any:
         return None if hasattr(builtins, name) else getattr(import_module(module), name, None)
@@ -207,7 +223,7 @@ def _pieces(module: str) -> tuple[_Piece, ...]:
         if isinstance(node, ast.Import | ast.ImportFrom):
             _check_import(module, node)
         elif isinstance(node, ast.FunctionDef):
-            kept.append(_piece(lowered(node, find, module)))
+            kept.append(_piece(lowered(node, find, module, dict(sizes))))
         elif isinstance(node, ast.Assign):
             kept.append(_piece(node))
         elif not isinstance(node, ast.ClassDef | ast.Expr):

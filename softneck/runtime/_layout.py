@@ -53,11 +53,16 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class Symbol:
-    """A length that an array's entry holds, or that a function of the runtime makes of arrays."""
+    """A length that an array's entry holds, or that a function of the runtime makes of arrays.
+
+    A `written` one is a number in the text, which is written for each size anew (see `_bundle.sized`): loops over the
+    three motors of a neck are as fast as if nobody could have more.
+    """
 
     array: str
     places: tuple[int, ...] = ()
     function: Callable[..., int] | None = None
+    written: bool = False
 
 
 def array(shape: str, meaning: str) -> Any:
@@ -75,9 +80,9 @@ def rest(meaning: str) -> Any:
     return Field((), meaning, open=True)
 
 
-def value(array_name: str, *places: int, function: Callable[..., int] | None = None) -> Any:
+def value(array_name: str, *places: int, function: Callable[..., int] | None = None, written: bool = False) -> Any:
     """Declare a symbol: the whole number at `places` of an array, or `function` of that array."""
-    return Symbol(array_name, places, function)
+    return Symbol(array_name, places, function, written)
 
 
 class _Layout:

@@ -7,6 +7,7 @@ stand for are read from the arrays once, where the function begins.
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -15,13 +16,16 @@ from softneck.core import SettingsError
 from ._layout import Arrays, StateVector, Symbol
 
 
-def lowered(function: ast.FunctionDef, find: Callable[[str], Any], where: str) -> ast.FunctionDef:
+def lowered(
+    function: ast.FunctionDef, find: Callable[[str], Any], where: str, sizes: Mapping[str, int]
+) -> ast.FunctionDef:
     """Return `function` with places for names, without its docstring and the names of layouts.
 
     Args:
         function: as it is written.
         find: returns what a name in the function's module stands for.
         where: the module, for messages.
+        sizes: what symbols that are `written` are in this text.
 
     Raises:
         SettingsError: a name that the declaration does not have, or a part of a state used in a way that has no place.
@@ -36,26 +40,30 @@ def lowered(function: ast.FunctionDef, find: Callable[[str], Any], where: str) -
     for argument in function.args.args:
         argument.annotation = None if argument.arg in layouts else argument.annotation
     function.returns = None if layout(function.returns) else function.returns
-    names = _Names(layouts, find, f"{where}: `{function.name}`")
+    names = _Names(layouts, find, f"{where}: `{function.name}`", sizes)
     body = function.body[1:] if ast.get_docstring(function, clean=False) is not None else function.body
     body = [names.visit(statement) for statement in body] or [ast.Pass()]
     function.body = [*names.begin(), *body]
     return ast.fix_missing_locations(function)
 
 
-def state_size(arrays: type[Arrays], state: type[StateVector]) -> ast.FunctionDef:
+def state_size(arrays: type[Arrays], state: type[StateVector], sizes: Mapping[str, int]) -> ast.FunctionDef:
     """Return the function that tells the length of a state, for a kind that does not write it itself."""
     text = f"def state_size(p):\n    return {state.__name__}.size(p)\n"
     function = next(node for node in ast.parse(text).body if isinstance(node, ast.FunctionDef))
     function.args.args[0].annotation = ast.Name(arrays.__name__)
-    return lowered(function, {arrays.__name__: arrays, state.__name__: state}.get, "state_size")
+    return lowered(function, {arrays.__name__: arrays, state.__name__: state}.get, "state_size", sizes)
 
 
 class _Names(ast.NodeTransformer):
     """Rewrites one function."""
 
-    def __init__(self, layouts: Mapping[str, type], find: Callable[[str], Any], where: str) -> None:
+    def __init__(
+        self, layouts: Mapping[str, type], find: Callable[[str], Any], where: str, sizes: Mapping[str, int]
+    ) -> None:
         self._layouts, self._find, self._where = layouts, find, where
+        owner = next((layout for layout in layouts.values() if issubclass(layout, Arrays)), Arrays)
+        self._sizes = {name: sizes[name] for name, symbol in owner.symbols.items() if symbol.written}
         self._used: dict[str, ast.expr] = {}
 
     def begin(self) -> list[ast.stmt]:
@@ -104,20 +112,21 @@ class _Names(ast.NodeTransformer):
         if name not in layout.fields:
             raise self._fail(f"{layout.__name__} declares no `{name}`")
         item, begin = layout.fields[name], self._begin(owner, layout, name)
+        shape = self._sized(item.shape)
         place: ast.expr
         if item.open:
             place = ast.Slice(begin if index is None else _sum(begin, self._border(index[0])), None)
-        elif not item.shape:
+        elif not shape:
             place = begin
         elif index is None:
-            place = ast.Slice(begin, _sum(begin, self._product(item.shape)))
-        elif len(index) == len(item.shape) and not any(isinstance(i, ast.Slice) for i in index):
+            place = ast.Slice(begin, _sum(begin, self._product(shape)))
+        elif len(index) == len(shape) and not any(isinstance(i, ast.Slice) for i in index):
             place = begin
             for dimension, i in enumerate(index):
-                place = _sum(place, _times(i, self._product(item.shape[dimension + 1 :])))
+                place = _sum(place, _times(i, self._product(shape[dimension + 1 :])))
         elif len(index) == 1:
-            first, last = self._rows(index[0], item.shape)
-            row = self._product(item.shape[1:])
+            first, last = self._rows(index[0], shape)
+            row = self._product(shape[1:])
             place = ast.Slice(_sum(begin, _times(first, row)), _sum(begin, _times(last, row)))
         else:
             raise self._fail(f"`{name}[...]` of these indices is no stretch of the state")
@@ -152,7 +161,7 @@ class _Names(ast.NodeTransformer):
             if other == name or item.open:
                 break
             factor, lengths = 1, []
-            for text in item.shape:
+            for text in self._sized(item.shape):
                 factor, lengths = (factor * int(text), lengths) if text.isdigit() else (factor, [*lengths, text])
             term = ast.unparse(self._product(tuple(lengths))) if lengths else ""
             terms[term] = terms.get(term, 0) + factor
@@ -178,13 +187,21 @@ class _Names(ast.NodeTransformer):
         return Symbols().visit(ast.parse(text, mode="eval").body)
 
     def _symbol(self, name: str) -> ast.expr:
-        """Return the variable that holds a symbol, which the function reads at its begin."""
+        """Return the variable that holds a symbol, which the function reads at its begin, or what it is written as."""
+        if name in self._sizes:
+            return ast.Constant(self._sizes[name])
         if name not in self._used:
             owner = next((key for key, layout in self._layouts.items() if issubclass(layout, Arrays)), None)
             if owner is None:
                 raise self._fail(f"it needs the length `{name}` and has no arrays to read it from")
             self._used[name] = self._source(owner, self._layouts[owner], name)
         return ast.Name(f"_{name}", ast.Load())
+
+    def _sized(self, shape: tuple[str, ...]) -> tuple[str, ...]:
+        """Return a shape with numbers for the symbols that the text is written for."""
+        for name, size in self._sizes.items():
+            shape = tuple(re.sub(rf"\b{name}\b", str(size), text) for text in shape)
+        return shape
 
     def _source(self, owner: str, layout: type[Arrays], name: str) -> ast.expr:
         if name in layout.symbols:

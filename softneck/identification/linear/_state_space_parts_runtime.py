@@ -1,4 +1,4 @@
-"""What linear state spaces share: their arrays, what they take in, and their next states.
+"""What linear state spaces share: their arrays, and what they take in.
 
 States stand where other kinds keep their histories of outputs (n <= outputs H).
 """
@@ -7,7 +7,6 @@ import numpy as np
 
 from softneck.identification.models._histories_runtime import NarxArrays, NarxState, narx_known, narx_push
 from softneck.runtime._layout import array
-from softneck.runtime._rest_runtime import REST
 
 
 class StateSpaceArrays(NarxArrays):
@@ -24,19 +23,3 @@ def lss_observe(p: StateSpaceArrays, parameters: np.ndarray, x: NarxState, input
     narx_known(p, parameters, x, inputs)
     narx_push(x.u, inputs[: p.motors])
     narx_push(x.m, x.motors)
-
-
-def lss_next(p: StateSpaceArrays, x: NarxState, e: np.ndarray, ahead: np.ndarray) -> None:
-    """Fill `ahead` (n,) with the next states; e (outputs,) is what measurements are above the first of them."""
-    states = x.y
-    # Motor positions stand H samples of all motors behind set-points.
-    back = int(p.delay[0]) + p.H * int(p.delay[1])
-    for i in range(p.n):
-        value = 0.0
-        for axis in range(p.outputs):
-            value += p.K[i, axis] * e[axis]
-        for j in range(p.n):
-            value += p.A[i, j] * states[j]
-        for j in range(p.motors):
-            value += p.B[i, j] * x.u[back, j]
-        ahead[i] = (value + REST) - REST

@@ -7,9 +7,10 @@ The first states are the outputs, a neck's pitch and roll.
 
 import numpy as np
 
-from softneck.identification.linear._state_space_parts_runtime import StateSpaceArrays, lss_next, lss_observe
+from softneck.identification.linear._state_space_parts_runtime import StateSpaceArrays, lss_observe
 from softneck.identification.models._histories_runtime import NarxState, narx_forward
 from softneck.identification.models._narx_runtime import initialise as initialise
+from softneck.runtime._rest_runtime import REST
 
 
 def step(p: StateSpaceArrays, parameters: np.ndarray, x: NarxState, inputs: np.ndarray, outputs: np.ndarray) -> None:
@@ -23,6 +24,16 @@ def step(p: StateSpaceArrays, parameters: np.ndarray, x: NarxState, inputs: np.n
         e[axis] = x.angles[axis] - states[axis]
     # Beside the states, as every row needs all the old ones.
     ahead = np.zeros(p.n)
-    lss_next(p, x, e, ahead)
+    # Motor positions stand H samples of all motors behind set-points.
+    back = int(p.delay[0]) + p.H * int(p.delay[1])
+    for i in range(p.n):
+        value = 0.0
+        for axis in range(p.outputs):
+            value += p.K[i, axis] * e[axis]
+        for j in range(p.n):
+            value += p.A[i, j] * states[j]
+        for j in range(p.motors):
+            value += p.B[i, j] * x.u[back, j]
+        ahead[i] = (value + REST) - REST
     states[: p.n] = ahead
     narx_forward(p, parameters, x, ahead, outputs)

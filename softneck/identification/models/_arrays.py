@@ -12,7 +12,7 @@ import numpy as np
 
 from softneck.core import KINDS, FileFormatError, Matrix, SettingsError, Vector, resolve
 from softneck.runtime import load_runtime
-from softneck.runtime._bundle import declared
+from softneck.runtime._bundle import declared, sized
 from softneck.runtime._layout import Arrays, StateVector
 
 from ._linear_systems import AFFINE, STATE_SPACE
@@ -57,9 +57,11 @@ def members(arrays: Mapping[str, Matrix]) -> list[tuple[str, dict[str, Matrix]]]
 def runtime_of(kind: str, arrays: Mapping[str, Matrix]) -> str:
     """Return the name of the runtime, with those of the members (see `softneck.runtime.bundle`)."""
     if kind not in COMPOSED:
+        runtime = KINDS[kind].runtime
         if "A" in arrays and kind != "nss":
-            return AFFINE if "offset" in arrays else STATE_SPACE
-        return KINDS[kind].runtime
+            runtime = AFFINE if "offset" in arrays else STATE_SPACE
+        history = arrays["history"]
+        return sized(runtime, len(arrays["drive"]), int(history[1]) if len(history) > 1 else 2)
     inner = ",".join(f"{runtime_of(member, part)}:{len(part)}" for member, part in members(arrays))
     return f"{KINDS[kind].runtime}({inner})"
 

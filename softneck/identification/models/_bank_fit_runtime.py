@@ -13,10 +13,14 @@ def drive_run(drive: np.ndarray, load: np.ndarray, targets: np.ndarray, start: n
     for k in range(targets.shape[0] - 1):
         # In the order of the kinds' `step`: the load follows m(k), then the drive moves on to k+1 against it.
         load_advance(load, m, q)
+        mean = 0.0
+        for j in range(q.shape[0]):
+            mean += q[j]
+        mean /= q.shape[0]
         for j in range(targets.shape[1]):
             back = k + 1 - int(drive[j, 1])  # m(k+1) answers to u(k+1-d)
             target = targets[back, j] if back >= 0 else start[j]
-            m[j] = drive_advance(drive[j, 0], target, m[j], drive_limit(load, q, j))
+            m[j] = drive_advance(drive[j, 0], target, m[j], drive_limit(load, q[j], mean))
         motors[k + 1] = m
 
 

@@ -16,14 +16,10 @@ import numpy as np
 from softneck.runtime._rest_runtime import REST
 
 
-def drive_limit(load: np.ndarray, q: np.ndarray, j: int) -> float:
-    """Return how far motor j gets under the load of now."""
-    mean = 0.0
-    for i in range(q.shape[0]):
-        mean += q[i]
-    mean /= q.shape[0]
+def drive_limit(load: np.ndarray, q: float, mean: float) -> float:
+    """Return how far a motor gets under the load of now: its own q, and the mean of all."""
     # What one motor pulls beyond the others bends the neck, what all pull presses it together: two slopes of tension.
-    return load[1] + load[2] * (q[j] - mean) + load[3] * mean
+    return load[1] + load[2] * (q - mean) + load[3] * mean
 
 
 def drive_advance(pole: float, target: float, m: float, limit: float) -> float:

@@ -28,9 +28,13 @@ def echo_added(p: NarxArrays, echo: np.ndarray, x: NarxState, axis: int, f: floa
 
 def stalling_drives(p: NarxArrays, load: np.ndarray, q: np.ndarray, x: NarxState, outputs: np.ndarray) -> None:
     """Move the motors of now on from the newest of the histories, no further than their load lets them."""
+    mean = 0.0
+    for j in range(p.motors):
+        mean += q[j]
+    mean /= p.motors
     for j in range(p.motors):
         d = int(p.drive[j, 1])
         if d > 0:
             # In place of the lag of `narx_forward`, which knows no load and has moved `x.motors` on already.
-            x.motors[j] = drive_advance(p.drive[j, 0], x.u[d - 1, j], x.m[0, j], drive_limit(load, q, j))
+            x.motors[j] = drive_advance(p.drive[j, 0], x.u[d - 1, j], x.m[0, j], drive_limit(load, q[j], mean))
             outputs[p.outputs + j] = x.motors[j]

@@ -12,13 +12,19 @@ def narx_outputs(history: np.ndarray) -> int:
     return int(history[1]) if history.shape[0] > 1 else 2
 
 
+def narx_motors(drive: np.ndarray) -> int:
+    """Return the number of motors."""
+    return drive.shape[0]
+
+
 class NarxArrays(Arrays):
     """The first arrays of every plant."""
 
     history = array("sizes", "H: how many samples of each signal are kept; and how many outputs there are, if not two")
     drive = array("motors, 2", "a, d of each motor: m(k+1) = a m(k) + (1 - a) u(k+1-d); d = 0: it is where it is sent")
     H = value("history", 0)
-    outputs = value("history", function=narx_outputs)
+    outputs = value("history", function=narx_outputs, written=True)
+    motors = value("drive", function=narx_motors, written=True)
 
 
 class NarxState(StateVector):
@@ -108,11 +114,21 @@ def narx_forward(p: NarxArrays, parameters: np.ndarray, x: NarxState, ahead: np.
 def narx_advance(
     p: NarxArrays, parameters: np.ndarray, x: NarxState, pitch: float, roll: float, outputs: np.ndarray
 ) -> None:
-    """Take pitch and roll at t_k+1 as the new outputs of a neck, move the motors on, write the outputs."""
-    ahead = np.empty(2)
-    ahead[0] = pitch
-    ahead[1] = roll
-    narx_forward(p, parameters, x, ahead, outputs)
+    """Do as `narx_forward` with pitch and roll of a neck; no call of it, which would take a tenth of a small step."""
+    for j in range(p.motors):
+        d = int(p.drive[j, 1])
+        if d > 0:
+            a = p.drive[j, 0]
+            # As above.
+            x.motors[j] = (a * x.motors[j] + (1.0 - a) * x.u[d - 1, j] + REST) - REST
+        outputs[p.outputs + j] = x.motors[j]
+    x.angles[0] = (pitch + REST) - REST
+    x.angles[1] = (roll + REST) - REST
+    outputs[0] = x.angles[0]
+    outputs[1] = x.angles[1]
+    if parameters[3] > 0.0:
+        outputs[0] += parameters[3] * random_normal(x.random)
+        outputs[1] += parameters[3] * random_normal(x.random)
 
 
 def narx_regressor(p: NarxArrays, table: np.ndarray, x: NarxState, axis: int, regressor: np.ndarray) -> None:
