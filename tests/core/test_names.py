@@ -45,7 +45,7 @@ def run(body: str, H: int = 3, n: int = 2, q: int = 2, x: np.ndarray | None = No
     function = ast.parse(f'def f(p: Matrices, x: Memory, i: int = 0):\n    """Words."""\n    {lines}').body[0]
     assert isinstance(function, ast.FunctionDef)
     names = {"Matrices": Matrices, "Memory": Memory}
-    text = ast.unparse(lowered(function, names.get, "here"))
+    text = ast.unparse(lowered(function, names.get, "here", {}))
     assert "Words" not in text
     space: dict[str, Any] = {}
     exec(text, space)
@@ -104,7 +104,7 @@ def test_a_part_whose_place_depends_on_arrays_needs_them() -> None:
     function = ast.parse("def f(x: Memory):\n    return x.x[0]").body[0]
     assert isinstance(function, ast.FunctionDef)
     with pytest.raises(SettingsError, match="needs the length `H` and has no arrays"):
-        lowered(function, {"Memory": Memory}.get, "here")
+        lowered(function, {"Memory": Memory}.get, "here", {})
 
 
 def test_shapes_that_do_not_fit_each_other_are_named() -> None:

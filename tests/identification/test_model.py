@@ -190,5 +190,5 @@ def test_noise_has_its_size_and_leaves_the_state_alone(models: dict[str, Model])
 def test_a_file_with_half_a_range_of_set_points_is_refused(seen: object) -> None:
     from softneck.identification.models._model import _check_header
 
-    with pytest.raises(FileFormatError, match="three minima and three maxima"):
+    with pytest.raises(FileFormatError, match="a minimum and a maximum for each motor"):
         _check_header(Model(kind="rls", sample_time=0.02, arrays={}, findings={"set_points_rad": seen}))
