@@ -240,6 +240,7 @@ LEAST = {"validation": 95.0, "steps": 85.0, "sine": 85.0, "rotation": 85.0}
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_the_figures_of_the_issue_on_the_virtual_neck() -> None:
     neck = VirtualNeck(NeckParameters.paper())
     made = {n: record(signal(n), neck, seed=s) for s, n in enumerate(("eq22", "steps", "sine", "rotation"), start=1)}

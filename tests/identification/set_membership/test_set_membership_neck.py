@@ -74,6 +74,7 @@ def test_dividing_by_the_standard_deviation_is_a_trap(
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_the_residual_form_from_mixed_excitation(tests: dict[str, Recording]) -> None:
     # Of five seeds that whose epsilon, chosen as 4 times the noise, gave the widest bounds.
     mixed = record(signal("mixed", duration=140.0, seed=1), VirtualNeck(NeckParameters.paper()), seed=11)

@@ -173,6 +173,7 @@ def test_it_bends_for_a_neck_that_is_none_of_its_kind_and_without_logged_motors(
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_the_figures_of_the_issue_on_the_virtual_neck() -> None:
     neck = VirtualNeck(NeckParameters.paper())
     made = {n: record(signal(n), neck, seed=s) for s, n in enumerate(("eq22", "steps", "sine", "rotation"), start=1)}
