@@ -111,7 +111,9 @@ def test_facts_of_another_version_are_one_line() -> None:
         Experiment.of({**EXPERIMENT.facts(), "colour": "red"})
 
 
+# In real time: where neighbours take the processor for 30 ms, the run ends before it has begun.
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_a_jog_over_a_bus_of_python_can_replays(tmp_path: Path) -> None:
     """In real time; however well this machine keeps the cycles, the log gives the same decisions."""
     file = replace(FILE, ramps=RampSettings(speed=3.0, settle=0.1, tolerance=0.2), sensor_kind="can", sensor_node=10)
