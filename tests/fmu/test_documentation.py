@@ -19,7 +19,7 @@ from softneck.fmu.python import _build
 from softneck.identification import Rls, validate
 
 from ..data import slow_but
-from .every_kind import KINDS, SHORT, block_of, recording
+from .every_kind import FAMILIES, KINDS, SHORT, block_of, recording
 
 
 def _page(path: Path) -> str:
@@ -27,7 +27,7 @@ def _page(path: Path) -> str:
         return archive.read("documentation/index.html").decode()
 
 
-@pytest.mark.parametrize("kind", slow_but(KINDS, SHORT))
+@pytest.mark.parametrize("kind", slow_but(KINDS, SHORT, set(KINDS) - {*FAMILIES}))
 def test_every_fmu_carries_page_picture_icon_and_licences(kind: str, tmp_path: Path) -> None:
     path = build_fmu(block_of(kind), tmp_path / f"{kind}.fmu", info=FmuInfo(license="CC-BY-4.0"))
     with zipfile.ZipFile(path) as archive:

@@ -20,7 +20,7 @@ PACKAGES = {"libcosim": "libcosimpy", "ecos": "ecospy", "pathsim": "pathsim_fmi"
 ROWS = 60
 
 
-@pytest.fixture(scope="module", params=slow_but(KINDS, SHORT, set(KINDS) - {*SHORT, "nn", "play", "mpc", "scheduled"}))
+@pytest.fixture(scope="module", params=slow_but(KINDS, SHORT, set(KINDS) - {*SHORT, "mpc"}))
 def kind(request: pytest.FixtureRequest) -> str:
     return request.param
 
