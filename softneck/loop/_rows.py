@@ -172,8 +172,11 @@ class Rows:
             ),
             table,
         )
-        # A block is stepped in place; whoever else calls it gets a copy of its outputs.
-        self._steps = tuple(part.step if isinstance(part, BlockPart) else part.advance for part in self._parts)
+        # A block is stepped in place; who calls it, or has an `advance` of their own, gives a copy of its outputs.
+        plain = [isinstance(part, BlockPart) and type(part).advance is BlockPart.advance for part in self._parts]
+        self._steps = tuple(
+            getattr(part, "step" if own else "advance") for part, own in zip(self._parts, plain, strict=True)
+        )
 
     def run(self, first: int, stop: int, table: Matrix, *, compiled: bool = False) -> tuple[int, int]:
         """Run rows `first` to `stop`, noted in `table`; return 0 or what went wrong, and the part."""
