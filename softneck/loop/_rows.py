@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 from itertools import pairwise
+from typing import TypeGuard
 
 import numpy as np
 
@@ -172,11 +173,8 @@ class Rows:
             ),
             table,
         )
-        # A block is stepped in place; who calls it, or has an `advance` of their own, gives a copy of its outputs.
-        plain = [isinstance(part, BlockPart) and type(part).advance is BlockPart.advance for part in self._parts]
-        self._steps = tuple(
-            getattr(part, "step" if own else "advance") for part, own in zip(self._parts, plain, strict=True)
-        )
+        # A block is stepped in place; whoever else calls it gets a copy of its outputs.
+        self._steps = tuple(part.step if _is_its_block(part) else part.advance for part in self._parts)
 
     def run(self, first: int, stop: int, table: Matrix, *, compiled: bool = False) -> tuple[int, int]:
         """Run rows `first` to `stop`, noted in `table`; return 0 or what went wrong, and the part."""
@@ -196,13 +194,18 @@ class Rows:
     @cached_property
     def _linked(self) -> tuple[Callable[..., tuple[int, int]], tuple, tuple]:
         """The compiled rows, and their plan and parts."""
-        parts = [part for part in self._parts if isinstance(part, BlockPart)]
+        parts = [part for part in self._parts if _is_its_block(part)]
         function = load_linked(_MODULE, [part.block.runtime for part in parts]).run_rows
         memories = tuple(zip(*(part.memory[:2] for part in parts), strict=True))
         actions = tuple(np.array(column, dtype=np.int64) for column in self._cycle)
         return function, (actions, *self._plan[1:]), (tuple(part.block.arrays for part in parts), *memories)
 
 
+def _is_its_block(part: Part) -> TypeGuard[BlockPart]:
+    """Return whether a part does what its block does; not where it has an `advance` of its own."""
+    return isinstance(part, BlockPart) and type(part).advance is BlockPart.advance
+
+
 def can_compile(parts: Mapping[str, Part]) -> bool:
     """Return whether all parts are blocks whose runtimes numba compiled."""
-    return all(isinstance(part, BlockPart) and load_runtime(part.block.runtime).compiled for part in parts.values())
+    return all(_is_its_block(part) and load_runtime(part.block.runtime).compiled for part in parts.values())

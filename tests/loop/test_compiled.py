@@ -9,7 +9,7 @@ from typing import Any
 import control
 import pytest
 
-from softneck.core import DataError
+from softneck.core import DataError, Vector
 from softneck.design import PiSettings
 from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.loop import (
@@ -145,3 +145,22 @@ def test_watched_loops_run_in_python(loop: Callable[..., Loop]) -> None:
     result = run_loop(loop(), compiled=True, on_step=lambda row: seen.append(row.index) or row.index == 9)
     assert seen == list(range(10))
     assert result.time.size == 10
+
+
+class Counted(BlockPart):
+    """A part that does more than its block."""
+
+    calls = 0
+
+    def advance(self, time: float, inputs: Vector) -> Vector:
+        self.calls += 1
+        return super().advance(time, inputs)
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_part_with_an_advance_of_its_own_is_called(
+    compiled: bool, loop: Callable[..., Loop], parts: dict[str, Block]
+) -> None:
+    observer = Counted(parts["observer"])
+    _same(run_loop(loop()), run_loop(loop(observer=observer), compiled=compiled))
+    assert observer.calls >= 100  # 2 s at 20 ms
