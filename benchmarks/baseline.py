@@ -12,7 +12,6 @@ them: use --fresh after a change.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
 import time
@@ -38,6 +37,7 @@ from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import Block
 from softneck.signals import Excitation, Recording, signal
 from tests.foreign_necks.held_out import HELD_OUT
+from tests.foreign_necks.kept import keep, kept_lines
 from tests.foreign_necks.necks import NECKS, ForeignNeck, record
 
 OURS = ("paper", "rough")
@@ -260,9 +260,7 @@ def computed(unit: list[Job], kept: Path) -> list[dict[str, Any]]:
             except SoftneckError as error:
                 found = {"failed": str(error)}
             results.append({**found, "seconds": round(time.process_time() - begin, 1)})
-            with kept.open("a", encoding="utf-8") as file:
-                # The break comes first: what a kill cut short spoils no line but its own.
-                file.write("\n" + json.dumps({"job": astuple(job), "found": results[-1]}))
+            keep(kept, {"job": astuple(job), "found": results[-1]})
     return results
 
 
@@ -293,15 +291,8 @@ def compute(wanted: list[Job], workers: int, *, fresh: bool) -> dict[Job, dict[s
 
 
 def _known(kept: Path) -> dict[Job, dict[str, Any]]:
-    """Return what is kept; a line that was cut short counts for nothing."""
-    found = {}
-    for text in kept.read_text(encoding="utf-8").splitlines() if kept.exists() else ():
-        try:
-            line = json.loads(text)
-        except json.JSONDecodeError:
-            continue
-        found[Job(*line["job"])] = line["found"]
-    return found
+    """Return what is kept."""
+    return {Job(*line["job"]): line["found"] for line in kept_lines(kept)}
 
 
 def tables(found: dict[Job, dict[str, Any]], necks: list[str]) -> None:

@@ -10,7 +10,6 @@ computed them: use --fresh after a change. What is chosen from where is the same
 from __future__ import annotations
 
 import argparse
-import json
 import os
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -29,6 +28,7 @@ from softneck.identification import INFINITE, OutputError, Rls, validate
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.signals import Excitation, Recording, signal
 from tests.foreign_necks.choosing import choice, leave_one_out
+from tests.foreign_necks.kept import keep, kept_lines
 from tests.foreign_necks.necks import CHOOSING, ForeignNeck, record
 
 OURS = ("paper", "rough", "lab")
@@ -154,22 +154,15 @@ def all_scores(what: str, seed: int, specimens: int, workers: int, *, fresh: boo
         jobs = {pool.submit(scored, what, name, seed, number): (name, number) for name, number in missing}
         for job in as_completed(jobs):
             known[jobs[job]] = job.result()
-            with kept.open("a", encoding="utf-8") as file:
-                line = {"neck": jobs[job], "values": values, "scores": known[jobs[job]]}
-                # The break comes first: what a kill cut short spoils no line but its own.
-                file.write("\n" + json.dumps(line))
+            keep(kept, {"neck": jobs[job], "values": values, "scores": known[jobs[job]]})
             print(f"  {jobs[job][0]} {jobs[job][1]}", flush=True)
     return {name: np.array([known[name, number] for number in range(specimens)]) for name in (*CHOOSING, *OURS)}
 
 
 def _known(kept: Path, values: list[Any]) -> dict[tuple[str, int], list[float]]:
-    """Return what is kept of these candidates; a line that was cut short counts for nothing."""
+    """Return what is kept of these candidates."""
     found = {}
-    for text in kept.read_text(encoding="utf-8").splitlines() if kept.exists() else ():
-        try:
-            line = json.loads(text)
-        except json.JSONDecodeError:
-            continue
+    for line in kept_lines(kept):
         if line["values"] == values:
             found[line["neck"][0], line["neck"][1]] = line["scores"]
     return found

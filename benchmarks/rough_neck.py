@@ -9,7 +9,6 @@ was. They are of the code that computed them: use --fresh after a change.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -23,6 +22,7 @@ from softneck.identification.models._linear_systems import continuous_parameters
 from softneck.plant import NeckParameters
 from softneck.report._experiments import Experiments, record_experiments
 from softneck.signals import redefine
+from tests.foreign_necks.kept import keep, kept_lines
 from tests.oracles.one_pole import (
     PAPER_FITS,
     PAPER_GAINS,
@@ -106,11 +106,7 @@ def search(seed: int, pole: float, *, fresh: bool) -> None:
     if fresh:
         kept.unlink(missing_ok=True)
     known: dict[tuple[float, ...], Vector] = {}
-    for text in kept.read_text(encoding="utf-8").splitlines() if kept.exists() else ():
-        try:
-            line = json.loads(text)
-        except json.JSONDecodeError:  # cut short by a kill
-            continue
+    for line in kept_lines(kept):
         known[tuple(line["x"])] = np.array(line["cost"])
     best = math.inf
 
@@ -119,8 +115,7 @@ def search(seed: int, pole: float, *, fresh: bool) -> None:
         key = tuple(x.tolist())
         if key not in known:
             known[key] = cost(x, pole)
-            with kept.open("a", encoding="utf-8") as file:
-                file.write("\n" + json.dumps({"x": key, "cost": known[key].tolist()}))
+            keep(kept, {"x": key, "cost": known[key].tolist()})
         total = float(known[key] @ known[key])
         if total < best:
             best = total
