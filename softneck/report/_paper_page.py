@@ -16,7 +16,7 @@ from ._reproduce import Reproduction
 
 _PLANT = (
     "The plant is a virtual neck (preset `paper`), not the paper's hardware. What could be the plant's shows in the "
-    "column `other necks`: the same estimators on the presets `rough` and `lab` and on necks drawn around `paper`."
+    "column other necks: the same estimators on the presets rough and lab and on necks drawn around paper."
 )
 # Title of a section -> the numbers of its figures.
 PARTS = {

@@ -19,13 +19,13 @@ _ONE_STEP, _FREE, _MEASURED = "one step", "free run", "free run, measured motors
 # Fits are printed by the paper to 0.01 %, but no plant of ours is known to better than a point.
 _SAME = 1.0
 PAPER_HEAD = [
-    "where", "model, axis", "what it is", "persistence", "paper", "ours", "`rough`", "other necks", "the difference",
+    "where", "model, axis", "what it is", "persistence", "paper", "ours", "rough", "other necks", "the difference",
 ]  # fmt: skip
 PAPER_NOTE = (
     "Fit 100 (1 - |y - yhat| / |y - mean y|) in %. SM and NN of Tables 3 and 4 are one step ahead, RLS a free run; "
     "section 7.4 is a free run with measured motors. SM's norm has no weights and the units of the paper's logs, "
     "motors in rad and angles in deg; `scaling` is SM with weights chosen for free run. `Other necks` is the span of "
-    "the same estimator, trained anew, over the other plants; `rough` is the one that a line follows no better than "
+    "the same estimator, trained anew, over the other plants; rough is the one that a line follows no better than "
     "the paper's neck. A figure of the paper inside these needs no other cause; "
     "`unexplained`: none tried here."
 )

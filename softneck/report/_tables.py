@@ -17,7 +17,7 @@ Head = list[str]
 Rows = list[list[str]]
 FIT_HEAD = [
     "model on data", "persistence", "one step", "paper, one step", "free run", "paper, free run",
-    "free, measured motors", "paper, same", "free run on `rough`",
+    "free, measured motors", "paper, same", "free run on rough",
 ]  # fmt: skip
 FIT_NOTE = (
     "Fit 100 (1 - |y - yhat| / |y - mean y|) in %, pitch/roll. Persistence repeats the last sample: a one-step fit "
@@ -26,7 +26,7 @@ FIT_NOTE = (
     "free run with measured motors. The paper's plant is the real neck, ours the virtual one. nlsm is set membership "
     "over the paper's Eq. 21; nlsm_residual, which the paper does not have, is set membership on what the free run of "
     "rls leaves over: nothing is fed back, so it cannot drift. The last column is of the same kind, identified anew on "
-    "the preset `rough`, which a line follows no better than the paper's neck."
+    "the preset rough, which a line follows no better than the paper's neck."
 )
 
 
