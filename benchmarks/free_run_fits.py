@@ -1,7 +1,7 @@
 """Print the free-run fits of docs/howto/which_model.md and docs/theory/set_membership.md.
 
-`python benchmarks/free_run_fits.py forms`: both forms of set membership on preset `paper`, from Eq. 22 and `mixed`,
-with what their bounds hold and their mean half-width.
+`python benchmarks/free_run_fits.py forms [PRESET]`: both forms of set membership on preset `paper` or another, from
+Eq. 22 and `mixed`, with what their bounds hold and their mean half-width.
 `python benchmarks/free_run_fits.py necks [SEED...]`: every kind with its defaults on necks drawn around `paper`
 (seeds 100 to 102), trained on Eq. 22.
 """
@@ -32,18 +32,18 @@ from softneck.report._experiments import record_experiments
 from softneck.signals import Recording, signal
 
 
-def main(what: str, seeds: list[int]) -> None:
+def main(what: str, which: list[str]) -> None:
     """Run one of the two tables."""
     if what == "forms":
-        forms()
+        forms(*which)
     else:
-        for seed in seeds or [100, 101, 102]:
-            necks(seed)
+        for seed in which or ("100", "101", "102"):
+            necks(int(seed))
 
 
-def forms() -> None:
+def forms(preset: str = "paper") -> None:
     """Print both forms of set membership: fits, coverage and half-widths."""
-    neck = NeckParameters.paper()
+    neck = NeckParameters.preset(preset)
     data, tests = experiments(neck)
     mixed = record(signal("mixed", duration=140.0), VirtualNeck(neck), seed=1)
     for name, training in {"eq22": data, "mixed": mixed}.items():
@@ -86,4 +86,4 @@ def pair(values: Mapping[str, float | None] | None) -> str:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1] if len(sys.argv) > 1 else "forms", [int(word) for word in sys.argv[2:]])
+    main(sys.argv[1] if len(sys.argv) > 1 else "forms", sys.argv[2:])

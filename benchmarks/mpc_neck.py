@@ -58,19 +58,19 @@ FOLLOWING: dict[str, Any] = {
 
 def pi(_part: str) -> Any:
     """Return the simplest controller, which knows no limits: for comparison."""
-    return PiSettings().design(neck_table.identified_model())
+    return PiSettings().design(neck_table.identified_model("paper"))
 
 
 def mpc(part: str) -> Any:
     """Return linear predictive control on the family over the payloads."""
     settings = MpcSettings(**(FOLLOWING if part == "rotation" else SOFT))
-    return settings.design(neck_table.family())
+    return settings.design(neck_table.family("paper"))
 
 
 def mpc_tight(part: str) -> Any:
     """Return the same with limits that hold on samples of the family, tightened by what trials still passed."""
     settings = MpcSettings(**SOFT, scenarios=3, tightening=True) if part != "rotation" else MpcSettings(**FOLLOWING)
-    return settings.design(neck_table.family())
+    return settings.design(neck_table.family("paper"))
 
 
 CONTROLLERS: dict[str, Callable[[str], Any]] = {"pi": pi, "mpc": mpc, "mpc_tight": mpc_tight}
@@ -81,7 +81,7 @@ def nmpc(part: str) -> Any:
     following: dict[str, Any] = {"preview": 0.6, "bandwidth": 12.0, "reference_time": 0.05}
     asked: dict[str, Any] = following if part == "rotation" else {"angle_limit": LIMIT}
     settings = NmpcSettings(**asked)
-    return settings.design(Network().fit(neck_table.recordings()[0]))
+    return settings.design(Network().fit(neck_table.recordings("paper")[0]))
 
 
 CONTROLLERS: dict[str, Callable[[str], Any]] = {"pi": pi, "mpc": mpc, "nmpc": nmpc}
@@ -156,7 +156,7 @@ def run(controller: Any, reference: Any, duration: float, payload: float, seed: 
     return run_loop(
         Loop(
             plant=BlockPart(VirtualNeck(NeckSteps().parameters()).block(noise_seed=seed)),
-            observer=BlockPart(neck_table.observer().block()),
+            observer=BlockPart(neck_table.observer("paper").block()),
             controller=BlockPart(controller.block()) if hasattr(controller, "block") else controller.part(),
             reference=AheadReference(reference, preview) if preview > 0.0 else reference,
             duration=duration,

@@ -2,8 +2,9 @@
 
 `python benchmarks/neck_table.py [KIND...] [--workers 2] [--cases]`: orientations 0, 45 and 90 deg with payloads of 0 to
 1 kg, preset `paper` with the 3DM inclinometer and its observer, sequential order, judged on the true angle. Each kind
-is designed, with its defaults or the settings below, on what was identified on that neck. `--seed`, `--size-deg`,
-`--payloads` and `--orientations-deg` ask for other steps than those the settings were chosen on.
+is designed, with its defaults or the settings below, on what was identified on that neck. `--neck`, `--seed`,
+`--size-deg`, `--payloads` and `--orientations-deg` ask for another neck and other steps than those the settings were
+chosen on.
 """
 
 from __future__ import annotations
@@ -54,6 +55,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--cases", action="store_true", help="print every case as well")
     usual = NeckSteps()
+    parser.add_argument("--neck", default=usual.neck, help="preset or neck file")
     parser.add_argument("--seed", type=int, default=usual.seed, help="of the sensor's noise in the first run")
     parser.add_argument("--size-deg", type=float, default=math.degrees(usual.size))
     parser.add_argument("--payloads", type=float, nargs="+", default=usual.payloads, metavar="KG")
@@ -62,6 +64,7 @@ def main() -> None:
     )
     options = parser.parse_args()
     steps = NeckSteps(
+        neck=options.neck,
         seed=options.seed,
         size=math.radians(options.size_deg),
         payloads=tuple(options.payloads),
@@ -86,16 +89,16 @@ def row_of(kind: str, steps: NeckSteps) -> NeckRow:
         return NeckRow(name=kind, skipped=LEFT_OUT[kind])
     try:
         settings = resolve(KINDS[kind].settings)(**SETTINGS.get(kind, {}))
-        controller = settings.design(identified_model() if kind in ON_MODEL else family())
-        return neck_row(kind, controller, observer(), steps)
+        controller = settings.design(identified_model(steps.neck) if kind in ON_MODEL else family(steps.neck))
+        return neck_row(kind, controller, observer(steps.neck), steps)
     except SoftneckError as error:
         return NeckRow(name=kind, skipped=str(error))
 
 
 @cache
-def recordings() -> list[Recording]:
-    """Return Eq. 22 on the neck of the table, 80 s at each of three payloads."""
-    neck = VirtualNeck(NeckSteps().parameters())
+def recordings(name: str) -> list[Recording]:
+    """Return Eq. 22 on that neck, 80 s at each of three payloads."""
+    neck = VirtualNeck(NeckSteps(neck=name).parameters())
     return [
         record(signal("eq22"), neck, seed=100 + i, payload=payload).rows(0, 4000)
         for i, payload in enumerate((0.0, 0.5, 1.0))
@@ -103,21 +106,21 @@ def recordings() -> list[Recording]:
 
 
 @cache
-def identified_model() -> Model:
+def identified_model(name: str) -> Model:
     """Return the linear model without payload."""
-    return Rls(max_delay=0.2).fit(recordings()[0])
+    return Rls(max_delay=0.2).fit(recordings(name)[0])
 
 
 @cache
-def family() -> Family:
+def family(name: str) -> Family:
     """Return the uncertain plant over the payloads."""
-    return FamilySettings().fit(recordings())
+    return FamilySettings().fit(recordings(name))
 
 
 @cache
-def observer() -> KalmanObserver:
+def observer(name: str) -> KalmanObserver:
     """Return the inclinometer's observer."""
-    return KalmanSettings(sensor="3dm-gx5-10").design(identified_model())
+    return KalmanSettings(sensor="3dm-gx5-10").design(identified_model(name))
 
 
 def print_cases(rows: list[NeckRow]) -> None:

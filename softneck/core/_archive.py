@@ -44,6 +44,10 @@ def read_archive(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray
     source = Path(path)
     if not source.is_file():
         raise FileFormatError(f"{source}: no such file.")
+    if not zipfile.is_zipfile(source):
+        raise FileFormatError(
+            f"{source}: is not a softneck file or is damaged; expected a model, family, controller or observer (.npz)."
+        )
     try:
         _refuse_bomb(source)
         with np.load(source, allow_pickle=False) as archive:

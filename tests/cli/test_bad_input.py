@@ -89,6 +89,8 @@ def test_a_model_that_is_none(call: Call, tmp_path: Path, recording: Path) -> No
     refused(said, "m.npz: is not a softneck file or is damaged", tmp_path, {"m.npz"})
     (tmp_path / "m.npz").write_text(recording.read_text())
     refused(call("info", "m.npz"), "m.npz: is not a softneck file", tmp_path, {"m.npz"})
+    said = call("validate", recording, "--data", recording, "--json")
+    refused(said, "expected a model, family, controller or observer", tmp_path, {"m.npz"})
 
 
 def test_a_model_of_another_version(call: Call, tmp_path: Path, recording: Path, rls_file: Path) -> None:
