@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from softneck.core import DataError, FileFormatError, SettingsError, file_hash, load, read_archive, refuse_existing
-from softneck.core._kinds import fitting
+from softneck.core._kinds import KINDS, fitting
 
 from .shared._console import print_json, progress
 from .shared._options import force_option, json_option
@@ -154,7 +154,8 @@ def _describe(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dic
             thing = load(file)
             with fitting(file):
                 summary = thing.summary()
-            return {"type": type(thing).__name__.lower(), "kind": header["kind"], "summary": summary}
+            kind = header["kind"]
+            return {"type": KINDS[kind].role if kind in KINDS else kind, "kind": kind, "summary": summary}
         case ".fmu":
             return _fmu(file)
         case ".toml":

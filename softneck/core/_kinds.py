@@ -20,8 +20,8 @@ class Kind:
 
     Attributes:
         name: what users type and what a file's header says.
-        role: "model", "observer", "controller", "family" or "state".
-        settings: dotted path of the settings class whose `fit` or `design` makes it.
+        role: "model", "observer", "controller", "family", "frequency response" or "state".
+        settings: dotted path of the settings class whose `fit` or `design` makes it, or of the function.
         result: dotted path of the class that a file becomes, by its `from_archive`.
         runtime: dotted name of the runtime module (see `core.bundle`); "" for what no loop steps.
         summary: one line for `--help` and the docs.
@@ -85,6 +85,9 @@ KINDS: dict[str, Kind] = {
              "", "what a neck identified sample by sample has learnt"),
         Kind("family", "family", "softneck.identification:FamilySettings", "softneck.identification:Family", "",
              "uncertain linear plant: nominal, box, samples and a weight over them"),
+        Kind("frf", "frequency response", "softneck.identification:frequency_response",
+             "softneck.identification:FrequencyResponse", "",
+             "nonparametric frequency response with confidence and coherence"),
         Kind("kalman", "observer", "softneck.estimation:KalmanSettings", "softneck.estimation:KalmanObserver",
              "softneck.estimation._kalman_runtime",
              "Kalman filter over an identified linear model with a disturbance state"),

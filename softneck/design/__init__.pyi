@@ -4,11 +4,9 @@ from .linear._custom import CustomSettings as CustomSettings
 from .linear._fopi import FopiSettings as FopiSettings
 from .linear._fractional import fopi as fopi
 from .linear._lqg import LqgSettings as LqgSettings
-from .linear._margins import loop_margins as loop_margins
 from .linear._pi import PiSettings as PiSettings
 from .linear._pid import PidSettings as PidSettings
 from .linear._ports import ControllerLimits as ControllerLimits
-from .linear._reduction import reduce_controller as reduce_controller
 from .plants._uncertain import uncertain_plant as uncertain_plant
 from .predictive._controller import MpcController as MpcController
 from .predictive._disturbance import MeasuredDisturbance as MeasuredDisturbance

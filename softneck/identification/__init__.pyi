@@ -31,9 +31,10 @@ from .uncertainty._ensemble import Ensemble as Ensemble
 from .uncertainty._ensemble import combine as combine
 from .uncertainty._family import Family as Family
 from .uncertainty._family_fit import FamilySettings as FamilySettings
+from .uncertainty._frf import FrequencyResponse as FrequencyResponse
+from .uncertainty._frf_fit import frequency_response as frequency_response
 from .uncertainty._lpv import Lpv as Lpv
 from .uncertainty._residual import Residual as Residual
-from .validation._compare import Comparison as Comparison
 from .validation._compare import compare as compare
 from .validation._novelty import Novelty as Novelty
 from .validation._score_tables import INFINITE as INFINITE

@@ -1,5 +1,4 @@
 from ._batch import simulate_batch as simulate_batch
-from ._energy import neck_energy as neck_energy
 from ._neck import VirtualNeck as VirtualNeck
 from ._parameters import NeckParameters as NeckParameters
 from ._record import record as record

@@ -13,6 +13,7 @@ from ._figures import residual_figure as residual_figure
 from ._figures import validation_figure as validation_figure
 from ._identification_figures import convergence_figure as convergence_figure
 from ._identification_figures import cover_figure as cover_figure
+from ._identification_figures import frequency_response_figure as frequency_response_figure
 from ._identification_figures import local_map_figure as local_map_figure
 from ._identification_figures import search_figure as search_figure
 from ._neck3d import neck_view as neck_view

@@ -88,6 +88,67 @@ def cover_figure(frequency: Vector, errors: Matrix, weight: Vector, title: str) 
     return figure
 
 
+def frequency_response_figure(
+    frequency: Vector,
+    response: np.ndarray,
+    radius: Vector,
+    coherence: Vector,
+    title: str,
+    *,
+    unit: str,
+    models: Mapping[str, np.ndarray] | None = None,
+    sines: Sequence[tuple[float, complex, str]] = (),
+) -> Figure:
+    """Draw gain, phase and coherence of one entry of a frequency response, models beside it.
+
+    Args:
+        frequency: (n,) [rad/s].
+        response: (n,) complex, NaN where it is not known.
+        radius: (n,) of the circles in which it lies with 95 %.
+        coherence: (n,) 0 to 1.
+        title: of the figure.
+        unit: of `response`.
+        models: name -> (n,) complex.
+        sines: (frequency [rad/s], describing function, label) of sines that were played.
+    """
+    figure, (gain, phase, explained) = new_figure(3, row_height=2.3)
+    size = np.abs(response)
+    gain.loglog(frequency, size, color=BLUE, lw=1.2, marker=".", ms=3, label="data, 95 %")
+    # What reaches zero has no end on a logarithmic axis.
+    gain.fill_between(frequency, np.maximum(size - radius, 1e-3 * size), size + radius, color=BLUE, alpha=0.2, lw=0)
+    # The phase of a circle that holds zero is anything.
+    known = radius < size
+    phases = np.where(known, np.degrees(_unwrapped(response, known)), np.nan)
+    reach = np.degrees(np.arcsin(np.where(known, radius / size, 0.0)))
+    phase.semilogx(frequency, phases, color=BLUE, lw=1.2, marker=".", ms=3)
+    phase.fill_between(frequency, phases - reach, phases + reach, color=BLUE, alpha=0.2, lw=0)
+    for number, (name, values) in enumerate((models or {}).items()):
+        colour = _COLOURS[1 + number % (len(_COLOURS) - 1)]
+        gain.loglog(frequency, np.abs(values), color=colour, lw=1.2, label=name)
+        phase.semilogx(frequency, np.degrees(np.unwrap(np.angle(values))), color=colour, lw=1.2)
+    for w, value, name in sines:
+        gain.loglog(w, abs(value), color=RED, marker="x", ls="", label=name)
+        phase.semilogx(w, np.degrees(np.angle(value)), color=RED, marker="x", ls="")
+    if known.any():
+        # Frequencies at which nothing is known would flatten what is.
+        gain.set_ylim(0.3 * size[known].min(), 3.0 * size[known].max())
+    explained.semilogx(frequency, coherence, color=BLUE, lw=1.2)
+    explained.set_ylim(-0.05, 1.05)
+    label(gain, f"gain [{unit}]")
+    label(phase, "phase [deg]", legend=False)
+    label(explained, "coherence", legend=False)
+    explained.set_xlabel("frequency [rad/s]")
+    figure.suptitle(title)
+    return figure
+
+
+def _unwrapped(response: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return the phase [rad] without jumps over what is known."""
+    phase = np.full(response.shape, np.nan)
+    phase[known] = np.unwrap(np.angle(response[known]))
+    return phase
+
+
 # Fits further below the best are no candidates and would flatten the curve.
 _DEPTH = 25.0
 

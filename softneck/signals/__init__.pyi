@@ -1,5 +1,6 @@
 from .excitation._limits import SetPointLimits as SetPointLimits
 from .excitation._limits import prepare as prepare
+from .excitation._multisine import multisine_experiments as multisine_experiments
 from .excitation._signals import SAMPLE_TIME as SAMPLE_TIME
 from .excitation._signals import Excitation as Excitation
 from .excitation._signals import signal as signal

@@ -11,7 +11,7 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from softneck.core import SettingsError
-from softneck.design import HinfSettings, LqgSettings, NcfSettings, PidSettings, PiSettings, fopi, reduce_controller
+from softneck.design import HinfSettings, LqgSettings, NcfSettings, PidSettings, PiSettings, fopi
 from softneck.design.linear._assembly import AxisController
 from softneck.design.linear._axis_loop import (
     axis_margins,
@@ -22,6 +22,7 @@ from softneck.design.linear._axis_loop import (
 )
 from softneck.design.linear._fractional import FractionalPid
 from softneck.design.linear._pid import PidGains
+from softneck.design.linear._reduction import reduce_controller
 from softneck.design.linear._sweep import make_sweep
 from softneck.design.plants._step_and_load import StepAndLoad
 

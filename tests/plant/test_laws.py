@@ -7,8 +7,8 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 
-from softneck.plant import NeckParameters, VirtualNeck, neck_energy
-from softneck.plant._energy import body, free_lengths, potential_energy
+from softneck.plant import NeckParameters, VirtualNeck
+from softneck.plant._energy import body, free_lengths, neck_energy, potential_energy
 from softneck.plant._mechanics_runtime import NeckBody, neck_constants, neck_load, neck_rates, neck_substeps
 from softneck.runtime import Block, State
 from softneck.runtime._layout import Arrays

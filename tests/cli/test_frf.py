@@ -1,0 +1,38 @@
+"""softneck frf: from recordings to a response with a page and models beside it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from softneck import load
+from softneck.identification import OutputError
+from softneck.plant import NeckParameters, VirtualNeck, record
+from softneck.signals import concatenate, multisine_experiments, write_recording
+
+from .conftest import Call
+
+
+def test_a_response_is_written_drawn_and_described(call: Call, tmp_path: Path) -> None:
+    neck = VirtualNeck(NeckParameters.paper())
+    parts = [
+        record(item, neck, seed=i)
+        for i, item in enumerate(multisine_experiments(amplitude=0.4, band=(1.0, 12.0), realisations=2))
+    ]
+    write_recording(tmp_path / "m.csv", concatenate(parts))
+    OutputError().fit(concatenate(parts)).save(tmp_path / "oe.npz")
+    said = call("frf", "m.csv", "-o", "f.npz", "--model", "oe.npz", "--html", "f.html", "--json")
+    assert said.code == 0, said.err
+    facts = json.loads(said.out)
+    assert (facts["method"], facts["own_inputs"]) == ("robust", {"pitch": "theta_i", "roll": "phi_i"})
+    low, high = facts["band_rad_s"]["pitch"]
+    assert 1.0 <= low < high <= 12.1
+    assert "theta_i to pitch" in (tmp_path / "f.html").read_text(encoding="utf-8")
+    assert "supported from" in load(tmp_path / "f.npz").summary()
+    info = json.loads(call("info", "f.npz", "--json").out)
+    assert (info["type"], info["kind"]) == ("frequency response", "frf")
+    again = call("frf", "m.csv", "-o", "f.npz")
+    assert (again.code, "exists" in again.error) == (2, True)
+    mixed = call("frf", "m.csv", "-o", "g.npz", "--model", "f.npz")
+    assert (mixed.code, "f.npz: only a linear model or a family has a response to draw" in mixed.error) == (2, True)
+    assert not (tmp_path / "g.npz").exists()
