@@ -28,6 +28,7 @@ from softneck.core import SettingsError
 from ._layout import Arrays, StateVector
 from ._names import lowered, state_size
 from ._tangent import with_tangent
+from ._unrolled import unrolled
 
 # Set from outside by whoever compiles; one for all (see `_compiled_runtime`).
 _SHARED = {"COMPILED"}
@@ -219,7 +220,8 @@ def _pieces(module: str, sizes: tuple[tuple[str, int], ...]) -> tuple[_Piece, ..
         return None if hasattr(builtins, name) else getattr(import_module(module), name, None)
 
     kept: list[_Piece] = []
-    for node in ast.parse(_source(module)).body:  # its own tree, as names become places in it
+    for statement in ast.parse(_source(module)).body:  # its own tree, as names become places in it
+        node = unrolled(statement, dict(sizes))
         if isinstance(node, ast.Import | ast.ImportFrom):
             _check_import(module, node)
         elif isinstance(node, ast.FunctionDef):
