@@ -105,6 +105,8 @@ _MEMBERS = "softneck.runtime._members_runtime"
 _DECLARATIONS = "softneck.runtime._layout"
 # Motors and outputs of a neck, for which a text is written where its runtime's name says no others.
 _NECK = (3, 2)
+# `module@n` reads its sizes from its arrays: one text for all robots, as the compiled library holds it.
+ANY_SIZE = "n"
 _ALLOWED = {"numpy", "math", "__future__", _DECLARATIONS}
 
 
@@ -163,8 +165,10 @@ def sized(runtime: str, motors: int, outputs: int) -> str:
 
 
 def _sizes(outer: str) -> tuple[str, tuple[tuple[str, int], ...]]:
-    """Return the module of a runtime's name, and the motors and outputs that its text is for."""
+    """Return the module of a runtime's name, and the motors and outputs that its text is for; none: it reads them."""
     module, _, size = outer.partition("@")
+    if size == ANY_SIZE:
+        return module, ()
     motors, outputs = map(int, size.split("x")) if size else _NECK
     return module, (("motors", motors), ("outputs", outputs))
 

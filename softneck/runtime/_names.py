@@ -63,7 +63,7 @@ class _Names(ast.NodeTransformer):
     ) -> None:
         self._layouts, self._find, self._where = layouts, find, where
         symbols = {name: symbol for layout in layouts.values() for name, symbol in layout.symbols.items()}
-        self._sizes = {name: sizes[name] for name, symbol in symbols.items() if symbol.written}
+        self._sizes = {name: sizes[name] for name, symbol in symbols.items() if symbol.written and name in sizes}
         self._used: dict[str, ast.expr] = {}
 
     def begin(self) -> list[ast.stmt]:

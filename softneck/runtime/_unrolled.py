@@ -22,7 +22,7 @@ _FOLDED = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul}
 
 def unrolled(node: ast.stmt, sizes: Mapping[str, int]) -> ast.stmt:
     """Return a statement as it is for a robot of these sizes; one that names none comes back as it is."""
-    known = {name: sizes[size] for name, size in _NAMES.items()}
+    known = {name: sizes[size] for name, size in _NAMES.items() if size in sizes}
     if isinstance(node, ast.Assign) and any(isinstance(t, ast.Name) and t.id in known for t in node.targets):
         return node  # where the names are defined
     return _Unroll(known).visit(node) if _uses(node, known) else node
