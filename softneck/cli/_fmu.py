@@ -95,15 +95,12 @@ def command(
 def open_buildable(source: str | Path) -> Buildable:
     """Return what `source` names: a softneck file, a neck file or a neck preset."""
     from softneck.cosim.loops._loop_file import is_loop_file, reference_of
-    from softneck.identification import Model
     from softneck.plant import VirtualNeck
 
     if Path(source).suffix == ".npz":
         thing = load(source)
         if not hasattr(thing, "block"):
             raise FileFormatError(f"{source}: is not a model, observer or controller, so no FMU can be built from it.")
-        if isinstance(thing, Model):
-            thing.robot.require_neck(f"{source}: an FMU")
         return thing
     if Path(source).suffix not in ("", ".toml"):
         raise FileFormatError(

@@ -1,4 +1,4 @@
-"""softneck record: an experiment on the virtual neck."""
+"""softneck record: an experiment on the virtual neck, or on that of another robot."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from softneck.core import refuse_existing, require_between
+from softneck.core import refuse_existing, require_between, to_si
+from softneck.robot import Robot, find_robot
 from softneck.signals import SetPointLimits, prepare, signal, signal_names, write_recording
 
 from .shared._console import print_json, progress
@@ -16,12 +17,21 @@ from .shared._options import force_option, json_option, output_option
 
 @click.command(
     "record",
-    help="Record SIGNAL on the virtual neck.\n\nSignals: " + ", ".join(signal_names()) + ".",
+    help="Record SIGNAL on the virtual neck, or on that of a robot.\n\nSignals: " + ", ".join(signal_names()) + ".",
     epilog="Example: softneck record eq22 -o eq22.csv --neck paper --seed 1",
 )
 @click.argument("signal_name", metavar="SIGNAL")
 @output_option("recording", "REC", required=True)
-@click.option("--neck", default="paper", show_default=True, metavar="paper|lab|rough|NECK.toml", help="Which neck.")
+@click.option(
+    "--robot",
+    metavar="PRESET|ROBOT.toml",
+    help="Whose tendons, outputs and limits.  [default: robot.toml beside REC or above, else the neck]",
+)
+@click.option(
+    "--neck",
+    metavar="paper|lab|rough|NECK.toml",
+    help="Which neck, or whose physics the robot has.  [default: what the robot says; paper]",
+)
 @click.option("--duration", type=float, metavar="S", help="Length in seconds. [default: the signal's own]")
 @click.option(
     "--seed", type=click.IntRange(0, 2**31 - 2), default=0, show_default=True, help="Seed of noise and signal."
@@ -37,7 +47,8 @@ from .shared._options import force_option, json_option, output_option
 def command(
     signal_name: str,
     output: Path,
-    neck: str,
+    robot: str | None,
+    neck: str | None,
     duration: float | None,
     seed: int,
     payload: float,
@@ -49,18 +60,20 @@ def command(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Record SIGNAL on the virtual neck."""
+    """Record SIGNAL on the virtual neck or robot."""
     from softneck.plant import VirtualNeck, record
     from softneck.signals.recording._files import recording_suffix
 
     recording_suffix(output)
     refuse_existing(output, force=force)
     require_between("--payload", payload, 0.0, 1.0, "kg")
+    whose = find_robot(robot, beside=output)
+    virtual = VirtualNeck.of(whose, None if neck is None else load_neck(neck))
     bounds = {"position": max_position, "speed": max_speed, "slack": max_slack}
-    limits = SetPointLimits(**{name: value for name, value in bounds.items() if value is not None})
-    excitation, changes = prepare(signal(signal_name, duration=duration, seed=seed), limits, ramp_s=ramp)
+    limits = SetPointLimits(**_allowed(whose) | {name: value for name, value in bounds.items() if value is not None})
+    excitation, changes = prepare(signal(signal_name, duration=duration, seed=seed, robot=whose), limits, ramp_s=ramp)
     with progress("record", quiet=as_json):
-        recording = record(excitation, VirtualNeck(load_neck(neck)), seed=seed, payload=payload, noise=not no_noise)
+        recording = record(excitation, virtual, seed=seed, payload=payload, noise=not no_noise)
     write_recording(output, recording, force=force)
     if as_json:
         facts = {"recording": str(output), "rows": len(recording), "sample_time_s": recording.sample_time}
@@ -69,3 +82,13 @@ def command(
     click.echo(f"{output}: {len(recording)} rows of {signal_name} at {1e3 * recording.sample_time:g} ms")
     if ramp > 0 or limits != SetPointLimits():
         click.echo(f"set-points: {changes}")
+
+
+def _allowed(robot: Robot) -> dict[str, float]:
+    """Return the bounds on set-points that a robot gives [rad], [rad/s]; of the neck those of its signals."""
+    motors, scale = robot.motors, to_si(robot.motors.unit)[0]
+    if robot == Robot.preset():
+        return {}
+    ends = [*(motors.setpoint_min or ()), *(motors.setpoint_max or ())]
+    given = {"position": [abs(end) for end in ends], "speed": motors.rate_limit and [min(motors.rate_limit)]}
+    return {name: scale * max(values) for name, values in given.items() if values}

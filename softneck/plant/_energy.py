@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike
 
 from softneck.core import Vector
 from softneck.runtime import State
-from softneck.runtime._layout import Arrays
 
 from ._mechanics_runtime import NeckBody
+from ._neck_runtime import VirtualNeckArrays
 from ._parameters import NeckParameters
 
 _GRAVITY = 9.80665
@@ -55,8 +55,7 @@ def neck_energy(state: State, *, payload: float = 0.0) -> NeckEnergy:
         state: of the block of `VirtualNeck`.
         payload: mass on the platform [kg].
     """
-    names = NeckParameters.names()
-    p = dict(zip(names, state.parameters.tolist(), strict=False))
+    p = dict(zip(_names(state), state.parameters.tolist(), strict=False))
     x = body(state)
     length, radius = p["link_length"], p["platform_radius"]
     carried = ((p["platform_mass"], p["platform_height"]), (payload, p["payload_height"]), (0.25 * p["link_mass"], 0.0))
@@ -102,8 +101,19 @@ def free_lengths(state: State) -> Vector:
 
 def body(state: State) -> dict[str, Vector]:
     """Return the parts of `NeckBody`, by name."""
-    # Their lengths do not depend on any array.
-    return {name: state.values[place] for name, place in NeckBody.parts(Arrays(())).items()}
+    setup = np.array([[0.0, 0.0, 0.0, 0.0, _tendons(state), 0.0]])  # the first parts' lengths depend on no others
+    return {name: state.values[place] for name, place in NeckBody.parts(VirtualNeckArrays((setup,))).items()}
+
+
+def _tendons(state: State) -> int:
+    """Return how many tendons there are: each has an angle among the parameters, behind which the seed stands."""
+    return state.parameters.size - 1 - (len(NeckParameters.names()) - 3)
+
+
+def _names(state: State) -> list[str]:
+    """Return the names of the parameters."""
+    others = [name for name in NeckParameters.names() if not name.startswith("tendon_angle_")]
+    return [*others[:3], *(f"tendon_angle_{j + 1}" for j in range(_tendons(state))), *others[3:]]
 
 
 def _potentials(p: dict[str, float], q: Vector, P: Vector, free: Vector, payload: float) -> tuple[float, float, float]:
@@ -119,7 +129,7 @@ def _potentials(p: dict[str, float], q: Vector, P: Vector, free: Vector, payload
     axial = 0.5 * p["axial_stiffness"] * s**2 + 0.25 * p["axial_stiffening"] * s**4
     length = p["link_length"] - s
     tendons = 0.0
-    for j in range(3):
+    for j in range(P.size):
         angle = p[f"tendon_angle_{j + 1}"]
         lean = b[0] * math.cos(angle) + b[1] * math.sin(angle)
         chord = float(np.sinc(beta / (2.0 * np.pi))) * (length - p["attachment_radius"] * lean)

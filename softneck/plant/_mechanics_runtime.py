@@ -1,8 +1,9 @@
-"""The neck's differential equation: link, three tendons, three drives, attitude filter.
+"""The neck's differential equation: link, tendons, their drives, attitude filter.
 
-Its 19 states are the parts of `NeckBody` before the free lengths; for speed they go from function to function as a
-tuple in that order. Inertia is constant: that of a platform on a link bent by small angles, M (L0/2 + c)^2 + J; how it
-changes with the bend is left out, as the neck is overdamped.
+Its 19 states (10 + 3 n with n tendons) are the parts of `NeckBody` before the free lengths; for speed they go from
+function to function as a tuple in that order. Inertia is constant: that of a platform on a link bent by small angles,
+M (L0/2 + c)^2 + J; how it changes with the bend is left out, as the neck is overdamped. A robot of one output bends in
+one plane: its second bend stays zero.
 """
 
 import math
@@ -47,9 +48,7 @@ from softneck.plant._index_runtime import (
     NECK_STIFFNESS_ANGLE,
     NECK_STIFFNESS_ASYMMETRY,
     NECK_SUPPLY_VOLTAGE,
-    NECK_TENDON_ANGLE_1,
-    NECK_TENDON_ANGLE_2,
-    NECK_TENDON_ANGLE_3,
+    NECK_TENDON_ANGLE,
     NECK_TENDON_DAMPING,
     NECK_TENDON_STIFFNESS,
     NECK_TORQUE_CONSTANT,
@@ -57,7 +56,8 @@ from softneck.plant._index_runtime import (
 )
 from softneck.plant._link_runtime import LINK_WALL_RATIO, link_elastic, link_hysteresis, link_weight
 from softneck.plant._tendon_runtime import tendon_chord, tendon_tension
-from softneck.runtime._layout import StateVector, cells
+from softneck.runtime._layout import StateVector, cells, value
+from softneck.runtime._sizes_runtime import MOTORS, OUTPUTS
 
 NECK_GRAVITY = 9.80665
 # Winch speed over which the gear's Coulomb friction is smoothed [rad/s]; numerical.
@@ -68,18 +68,19 @@ NECK_MOST_SUBSTEPS = 2000
 
 
 class NeckBody(StateVector):
-    """The 19 continuous states, in the order of `neck_rates`, and the tendons' lengths, which stay."""
+    """The continuous states, in the order of `neck_rates`, and the tendons' lengths, which stay."""
 
+    motors = value("setup", written=True)
     b = cells("2", "bending vector, towards where the neck leans [rad]")
     s = cells("", "compression of the link [m]")
     w = cells("2", "rates of b [rad/s]")
     v = cells("", "rate of s [m/s]")
     z = cells("2", "hysteresis [rad]")
-    position = cells("3", "of the winches [rad]")
-    speed = cells("3", "of the winches [rad/s]")
-    integral = cells("3", "of the drives' speed loops: torque at the winch [N m]")
+    position = cells("motors", "of the winches [rad]")
+    speed = cells("motors", "of the winches [rad/s]")
+    integral = cells("motors", "of the drives' speed loops: torque at the winch [N m]")
     filtered = cells("2", "pitch and roll behind the attitude filter [rad]")
-    free = cells("3", "unstretched lengths of the tendons at winch position zero [m]")
+    free = cells("motors", "unstretched lengths of the tendons at winch position zero [m]")
 
 
 def neck_constants(q: np.ndarray) -> tuple:
@@ -109,11 +110,7 @@ def neck_constants(q: np.ndarray) -> tuple:
         float(q[NECK_GUIDE_SPEED]),
     )
     geometry = (float(q[NECK_LINK_LENGTH]), float(q[NECK_ATTACHMENT_RADIUS]))
-    directions = (
-        (math.cos(q[NECK_TENDON_ANGLE_1]), math.sin(q[NECK_TENDON_ANGLE_1])),
-        (math.cos(q[NECK_TENDON_ANGLE_2]), math.sin(q[NECK_TENDON_ANGLE_2])),
-        (math.cos(q[NECK_TENDON_ANGLE_3]), math.sin(q[NECK_TENDON_ANGLE_3])),
-    )
+    directions = tuple((math.cos(q[NECK_TENDON_ANGLE + j]), math.sin(q[NECK_TENDON_ANGLE + j])) for j in range(MOTORS))
     rest = (float(q[NECK_WINCH_RADIUS]), float(q[NECK_SENSOR_LAG]), float(q[NECK_PRETENSION]))
     return link, hysteresis, tendon, geometry, directions, neck_drive(q), rest
 
@@ -166,15 +163,20 @@ def neck_load(
     return weight, (R[6], R[7], R[8]), R, inertia, mass
 
 
-def neck_rates(
-    x: tuple,
-    command: tuple[float, float, float],
-    free: tuple[float, float, float],
-    c: tuple,
-    load: tuple,
-) -> tuple:
-    """Return the time derivatives of the 19 states."""
-    b1, b2, s, w1, w2, v, z1, z2, p1, p2, p3, o1, o2, o3, i1, i2, i3, f1, f2 = x
+def neck_disturbed(q: np.ndarray, disturbance: np.ndarray) -> tuple:
+    """Return the load under `disturbance`: payload [kg], push [N] and tilt of the base [rad] along each output."""
+    push_y, base_roll = 0.0, 0.0
+    if OUTPUTS > 1:
+        push_y, base_roll = float(disturbance[2]), float(disturbance[4])
+    return neck_load(
+        q, float(disturbance[0]), float(disturbance[1]), push_y, float(disturbance[1 + OUTPUTS]), base_roll
+    )
+
+
+def neck_rates(x: tuple, command: tuple, free: tuple, c: tuple, load: tuple) -> tuple:
+    """Return the time derivatives of the states; `command` [rad] and `free` [m] have one entry for each motor."""
+    b1, b2, s, w1, w2, v, z1, z2 = x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7]
+    f1, f2 = x[8 + 3 * MOTORS], x[9 + 3 * MOTORS]
     link, hysteresis, _, geometry, directions, drive, rest = c
     winch = rest[0]
     body = (b1, b2, s, w1, w2, v)
@@ -182,35 +184,34 @@ def neck_rates(
     q1, q2, qs = link_elastic(body, link)
     # The arc is L0 - s long.
     g1, g2, gs = link_weight((b1, b2, geometry[0] - s), f, load[1], load[0])
-    t1, a1, c1, cs1 = neck_pull(body, f, directions[0], p1, o1, free[0], c)
-    t2, a2, c2, cs2 = neck_pull(body, f, directions[1], p2, o2, free[1], c)
-    t3, a3, c3, cs3 = neck_pull(body, f, directions[2], p3, o3, free[2], c)
+    # Behind the link's eight come positions, speeds and integrals of the drives.
+    pulls = tuple(neck_pull(body, f, directions[j], x[8 + j], x[8 + MOTORS + j], free[j], c) for j in range(MOTORS))
+    force1, force2, force = q1 + g1, q2 + g2, qs + gs
+    for j in range(MOTORS):
+        force1 += pulls[j][1]
+        force2 += pulls[j][2]
+        force += pulls[j][3]
     stuck = hysteresis[0] / hysteresis[1]  # H / z_r
     dz1, dz2 = link_hysteresis(z1, z2, w1, w2, hysteresis[1])
     inertia = load[3]
     # The tendon's torque r T stands against the drive's.
-    u1, d1 = drive_rates((p1, o1, i1), command[0], winch * t1, drive)
-    u2, d2 = drive_rates((p2, o2, i2), command[1], winch * t2, drive)
-    u3, d3 = drive_rates((p3, o3, i3), command[2], winch * t3, drive)
+    driven = tuple(
+        drive_rates((x[8 + j], x[8 + MOTORS + j], x[8 + 2 * MOTORS + j]), command[j], winch * pulls[j][0], drive)
+        for j in range(MOTORS)
+    )
     pitch, roll, _, _ = lean_angles((b1, b2, w1, w2), f, load[2])
     return (
         w1,
         w2,
         v,
-        (q1 + g1 + a1 + a2 + a3 - stuck * z1) / inertia,
-        (q2 + g2 + c1 + c2 + c3 - stuck * z2) / inertia,
-        (qs + gs + cs1 + cs2 + cs3) / load[4],
+        (force1 - stuck * z1) / inertia,
+        (force2 - stuck * z2) / inertia if OUTPUTS > 1 else 0.0,
+        force / load[4],
         dz1,
         dz2,
-        o1,
-        o2,
-        o3,
-        u1,
-        u2,
-        u3,
-        d1,
-        d2,
-        d3,
+        *(x[8 + MOTORS + j] for j in range(MOTORS)),
+        *(driven[j][0] for j in range(MOTORS)),
+        *(driven[j][1] for j in range(MOTORS)),
         (pitch - f1) / rest[1],
         (roll - f2) / rest[1],
     )
@@ -234,14 +235,11 @@ def neck_pull(
     return at_winch, -at_platform * g1, -at_platform * g2, -at_platform * gs
 
 
-def neck_tensions(x: NeckBody, c: tuple) -> tuple[float, float, float]:
-    """Return the three tensions at the winches [N]."""
-    body = (x.b[0], x.b[1], x.s, x.w[0], x.w[1], x.v)
-    f = bend_functions(x.b[0] * x.b[0] + x.b[1] * x.b[1])
-    t1, _, _, _ = neck_pull(body, f, c[4][0], x.position[0], x.speed[0], x.free[0], c)
-    t2, _, _, _ = neck_pull(body, f, c[4][1], x.position[1], x.speed[1], x.free[1], c)
-    t3, _, _, _ = neck_pull(body, f, c[4][2], x.position[2], x.speed[2], x.free[2], c)
-    return t1, t2, t3
+def neck_tensions(x: tuple, free: tuple, c: tuple) -> tuple:
+    """Return the tensions at the winches [N] in the continuous states `x`."""
+    body = (x[0], x[1], x[2], x[3], x[4], x[5])
+    f = bend_functions(x[0] * x[0] + x[1] * x[1])
+    return tuple(neck_pull(body, f, c[4][j], x[8 + j], x[8 + MOTORS + j], free[j], c)[0] for j in range(MOTORS))
 
 
 def neck_lean(x: NeckBody, load: tuple) -> tuple[float, float, float, float]:
@@ -249,8 +247,8 @@ def neck_lean(x: NeckBody, load: tuple) -> tuple[float, float, float, float]:
     return lean_angles((x.b[0], x.b[1], x.w[0], x.w[1]), bend_functions(x.b[0] * x.b[0] + x.b[1] * x.b[1]), load[2])
 
 
-def neck_rest(q: np.ndarray, c: tuple) -> tuple[float, float, float, float, float, float]:
-    """Return (b1, b2, s, free lengths of the tendons) at rest: all tensions at the pretension, no payload.
+def neck_rest(q: np.ndarray, c: tuple) -> tuple:
+    """Return (b1, b2, s, free length of each tendon) at rest: all tensions at the pretension, no payload.
 
     A fixed point: bending from the link's stiffness, compression by Newton. It contracts while the
     pretension and the weights stay below the load that buckles the link, which `NeckParameters` checks.
@@ -259,7 +257,7 @@ def neck_rest(q: np.ndarray, c: tuple) -> tuple[float, float, float, float, floa
     pretension = c[6][2]
     load = neck_load(q, 0.0, 0.0, 0.0, 0.0, 0.0)
     b1 = link[5]
-    b2 = link[6]
+    b2 = link[6] if OUTPUTS > 1 else 0.0
     s = 0.0
     for _ in range(200):
         body = (b1, b2, s, 0.0, 0.0, 0.0)
@@ -269,7 +267,7 @@ def neck_rest(q: np.ndarray, c: tuple) -> tuple[float, float, float, float, floa
         q1 += g1
         q2 += g2
         qs += gs
-        for i in range(3):
+        for i in range(MOTORS):
             _, _, t1, t2, ts = tendon_chord(body, f, c[4][i], c[3])
             q1 -= pretension * t1
             q2 -= pretension * t2
@@ -281,18 +279,18 @@ def neck_rest(q: np.ndarray, c: tuple) -> tuple[float, float, float, float, floa
         # K^-1 q, each row by its Schur complement.
         k1 = link[0] + 3.0 * link[3] * (b1 * b1 + b2 * b2)
         k2 = link[1] + 3.0 * link[3] * (b1 * b1 + b2 * b2)
-        b1 += (q1 - link[2] / k2 * q2) / (k1 - link[2] * link[2] / k2)
-        k2 = link[1] + 3.0 * link[3] * (b1 * b1 + b2 * b2)
-        b2 += (q2 - link[2] / k1 * q1) / (k2 - link[2] * link[2] / k1)
+        if OUTPUTS > 1:
+            b1 += (q1 - link[2] / k2 * q2) / (k1 - link[2] * link[2] / k2)
+            k2 = link[1] + 3.0 * link[3] * (b1 * b1 + b2 * b2)
+            b2 += (q2 - link[2] / k1 * q1) / (k2 - link[2] * link[2] / k1)
+        else:
+            b1 += q1 / k1
         s += qs / slope
     f = bend_functions(b1 * b1 + b2 * b2)
     body = (b1, b2, s, 0.0, 0.0, 0.0)
     # So long that the pretension alone stretches them.
     stretch = pretension / c[2][0]
-    l1, _, _, _, _ = tendon_chord(body, f, c[4][0], c[3])
-    l2, _, _, _, _ = tendon_chord(body, f, c[4][1], c[3])
-    l3, _, _, _, _ = tendon_chord(body, f, c[4][2], c[3])
-    return b1, b2, s, l1 - stretch, l2 - stretch, l3 - stretch
+    return (b1, b2, s, *(tendon_chord(body, f, c[4][j], c[3])[0] - stretch for j in range(MOTORS)))
 
 
 def neck_substeps(c: tuple, load: tuple, sample_time: float, wanted: int) -> int:
@@ -301,17 +299,17 @@ def neck_substeps(c: tuple, load: tuple, sample_time: float, wanted: int) -> int
     winch = rest[0]
     # The highest tension to reckon with: what a drive can pull at its current limit, and half of it again.
     pull = 1.5 * max(drive[4] / winch, rest[2])
-    # Guides at their steepest, where tanh has slope 1, are dampers too; three tendons pull.
-    loss = 3.0 * (tendon[1] + tendon[2] * pull / tendon[3])
+    # Guides at their steepest, where tanh has slope 1, are dampers too; all tendons pull.
+    loss = MOTORS * (tendon[1] + tendon[2] * pull / tendon[3])
     arm = geometry[1] ** 2
     # Bounds, not values: 3 k3 is the cube's slope at 1 rad, H / z_r the hysteresis' at a turn.
     stiffness = (
-        max(link[0], link[1]) + abs(link[2]) + 3.0 * link[3] + hysteresis[0] / hysteresis[1] + 3.0 * tendon[0] * arm
+        max(link[0], link[1]) + abs(link[2]) + 3.0 * link[3] + hysteresis[0] / hysteresis[1] + MOTORS * tendon[0] * arm
     )
     # d / J bounds an overdamped mode, the root of k / J an undamped one, their sum both.
     bending = (link[4] + loss * arm) / load[3] + math.sqrt(stiffness / load[3])
     # As if the link rested on its wall.
-    wall = link[7] * (1.0 + LINK_WALL_RATIO) + 3.0 * link[8] * link[10] ** 2 + 3.0 * tendon[0]
+    wall = link[7] * (1.0 + LINK_WALL_RATIO) + 3.0 * link[8] * link[10] ** 2 + MOTORS * tendon[0]
     axial = (link[9] + loss) / load[4] + math.sqrt(wall / load[4])
     inertia = drive[7]
     # The gear's friction at its steepest, as the guides' above.

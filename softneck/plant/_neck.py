@@ -1,14 +1,19 @@
-"""The virtual neck as a block that loops, FMUs and recordings share."""
+"""The virtual neck as a block that loops, FMUs and recordings share; its physics for other tendon-driven robots."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from softneck.core import SettingsError, require_between
+import numpy as np
+
+from softneck.core import Matrix, SettingsError, require_between, to_si
+from softneck.robot import Robot
 from softneck.runtime import Block, Port
+from softneck.runtime._bundle import sized
 
 from ._parameters import NeckParameters
+from ._presets import PRESETS
 
 RUNTIME = "softneck.plant._neck_runtime"
 # Longest internal step [s]: the fastest mode of the presets is then 0.5 to 0.9 of the inverse step.
@@ -18,42 +23,98 @@ _LONGEST_LATENCY = 0.1
 _LONGEST_DELAY = 0.2
 
 
-def _inputs(limit: float) -> tuple[Port, ...]:
+def _inputs(robot: Robot, ranges: Matrix) -> tuple[Port, ...]:
     set_points = tuple(
-        Port(name=f"motor_setpoint_{i}", unit="rad", description=f"position of winch {i}; positive pulls",
-             minimum=-limit, maximum=limit, nominal=1.0)
-        for i in (1, 2, 3)
+        Port(name=name, unit="rad", description=f"position of winch {j + 1}; positive pulls", minimum=float(low),
+             maximum=float(high), nominal=1.0)
+        for j, (name, (low, high)) in enumerate(zip(robot.set_points, ranges, strict=True))
     )  # fmt: skip
+    outputs, pushes = robot.outputs.names, ("in the direction of tendon 1", "a quarter turn from tendon 1")
+    if not robot.is_neck:
+        pushes = ("in the direction of 0 deg", "in the direction of 90 deg")
     return (
         *set_points,
         Port(name="payload", unit="kg", description="mass on the platform", minimum=0.0, maximum=5.0),
-        Port(name="push_x", unit="N", description="push on the platform in the direction of tendon 1"),
-        Port(name="push_y", unit="N", description="push on the platform, a quarter turn from tendon 1"),
-        Port(name="base_tilt_pitch", unit="rad", description="lean of the base in pitch", minimum=-1.5, maximum=1.5),
-        Port(name="base_tilt_roll", unit="rad", description="lean of the base in roll", minimum=-1.5, maximum=1.5),
-    )
+        *(
+            Port(name=name, unit="N", description=f"push on the platform {where}")
+            for name, where, _ in zip(("push_x", "push_y"), pushes, outputs, strict=False)
+        ),
+        *(
+            Port(name=f"base_tilt_{name}", unit="rad", description=f"lean of the base in {name}", minimum=-1.5,
+                 maximum=1.5)
+            for name in outputs
+        ),
+    )  # fmt: skip
 
 
-def _outputs() -> tuple[Port, ...]:
+def _outputs(robot: Robot) -> tuple[Port, ...]:
+    outputs, motors = robot.outputs.names, range(1, len(robot.motors.names) + 1)
+    towards = ("towards tendon 1", "across it") if robot.is_neck else ("towards 0 deg", "towards 90 deg")
     return (
-        Port(name="pitch", unit="rad", description="true inclination against the vertical, towards tendon 1"),
-        Port(name="roll", unit="rad", description="true inclination against the vertical, across it"),
-        Port(name="pitch_measured", unit="rad", description="pitch as the inclinometer gives it"),
-        Port(name="roll_measured", unit="rad", description="roll as the inclinometer gives it"),
-        Port(name="pitch_rate_measured", unit="rad/s", description="pitch rate of the gyro"),
-        Port(name="roll_rate_measured", unit="rad/s", description="roll rate of the gyro"),
+        *(
+            Port(name=name, unit="rad", description=f"true inclination against the vertical, {where}")
+            for name, where in zip(outputs, towards, strict=False)
+        ),
+        *(
+            Port(name=f"{name}_measured", unit="rad", description=f"{name} as the inclinometer gives it")
+            for name in outputs
+        ),
+        *(Port(name=f"{name}_rate_measured", unit="rad/s", description=f"{name} rate of the gyro") for name in outputs),
         Port(name="measurement_valid", description="false while the inclinometer drops out", boolean=True, start=1.0),
-        *(Port(name=f"motor_position_{i}", unit="rad", description=f"encoder of winch {i}") for i in (1, 2, 3)),
-        *(Port(name=f"tension_{i}", unit="N", description=f"tension of tendon {i} at its winch") for i in (1, 2, 3)),
+        *(Port(name=f"motor_position_{i}", unit="rad", description=f"encoder of winch {i}") for i in motors),
+        *(Port(name=f"tension_{i}", unit="N", description=f"tension of tendon {i} at its winch") for i in motors),
         Port(name="compression", unit="m", description="axial compression of the link"),
     )
 
 
 @dataclass(frozen=True, slots=True)
 class VirtualNeck:
-    """A physics model of the tendon-driven soft neck (docs, "The virtual neck")."""
+    """A physics model of the tendon-driven soft neck (docs, "The virtual neck"), or of a robot built like it.
+
+    Attributes:
+        parameters: its numbers; the tendons' angles in them are a neck's, other robots tell their own.
+        robot: whose tendons, outputs and limits of set-points these are; one output: it bends in one plane.
+
+    Raises:
+        SettingsError: a robot without tendons that turn angles, or a link that so many tendons would buckle.
+    """
 
     parameters: NeckParameters
+    robot: Robot = field(default_factory=Robot.preset)
+
+    def __post_init__(self) -> None:
+        if not self.robot.is_neck:
+            _check_robot(self.robot)
+            self.parameters.check_buckling(len(self.robot.motors.names))
+
+    @classmethod
+    def of(cls, robot: Robot, neck: NeckParameters | None = None) -> VirtualNeck:
+        """Return the virtual plant that stands for a robot.
+
+        What the robot gives of winch, limits and sensor takes the place of the neck's; the preset `neck` gives nothing.
+
+        Args:
+            robot: whose.
+            neck: its physics; None takes those that the robot's `plant.neck` names.
+
+        Raises:
+            SettingsError: the robot names no plant, or one of its values is not of a tendon-driven robot.
+        """
+        _check_robot(robot)
+        if neck is None:
+            name = robot.require("neck", "the virtual plant")
+            inside = robot.folder is not None and name not in PRESETS
+            neck = NeckParameters.preset(str(robot.folder / name) if inside else name)  # pyright: ignore[reportOptionalOperand]
+        if robot == Robot.preset():
+            return cls(neck)
+        scale = to_si(robot.outputs.unit)[0]
+        given = {
+            "winch_radius": robot.winch_radius_m,
+            "position_limit": None if robot.motors.setpoint_max is None else float(np.abs(_ranges(robot, 0.0)).max()),
+            "sensor_delay": robot.delay_s,
+            "noise_std": None if robot.noise_std is None else scale * robot.noise_std,
+        }
+        return cls(neck.replace(**{name: value for name, value in given.items() if value is not None}), robot)
 
     def block(self, *, noise_seed: int = 0, sample_time: float = 0.02, internal_step: float = INTERNAL_STEP) -> Block:
         """Return the neck as a plant of that sample time [s].
@@ -74,6 +135,8 @@ class VirtualNeck:
             raise SettingsError(f"`noise_seed` must be an integer from 0 to 2147483646; got {noise_seed}.")
         queue = math.ceil(_LONGEST_LATENCY / sample_time) + 1
         history = math.ceil(_LONGEST_DELAY / sample_time) + 2
+        motors, outputs = len(self.robot.motors.names), len(self.robot.outputs.names)
+        setup = [sample_time, substeps, queue, history] + [motors, outputs] * ((motors, outputs) != (3, 2))
         seed = Port(
             name="noise_seed", description="seed of the sensor's noise", start=float(noise_seed), minimum=0.0,
             integer=True,
@@ -81,22 +144,64 @@ class VirtualNeck:
         return Block(
             kind="virtual_neck",
             role="plant",
-            runtime=RUNTIME,
+            runtime=sized(RUNTIME, motors, outputs),
             sample_time=sample_time,
-            arrays=([[sample_time, substeps, queue, history]],),  # pyright: ignore[reportArgumentType]
-            inputs=_inputs(self.parameters.position_limit),
-            outputs=_outputs(),
-            parameters=(*self.parameters.ports(), seed),
+            arrays=([setup],),  # pyright: ignore[reportArgumentType]
+            inputs=_inputs(self.robot, self.ranges()),
+            outputs=_outputs(self.robot),
+            parameters=(*self._parameter_ports(), seed),
         )
+
+    def ranges(self) -> Matrix:
+        """Return the least and the largest set-point of each motor, (motors, 2) [rad]."""
+        return _ranges(self.robot, self.parameters.position_limit)
+
+    def _parameter_ports(self) -> tuple[Port, ...]:
+        ports = self.parameters.ports()
+        if self.robot.is_neck:
+            return ports
+        first = [port.name for port in ports].index("tendon_angle_1")
+        angles = tuple(
+            Port(name=f"tendon_angle_{j}", unit="rad", description=f"direction of tendon {j}",
+                 start=math.radians(angle % 360.0), minimum=-7.0, maximum=7.0)
+            for j, angle in enumerate(self.robot.directions.angles_deg, 1)
+        )  # fmt: skip
+        return (*ports[:first], *angles, *ports[first + 3 :])
 
     def summary(self) -> str:
         """Return a few lines on the neck, for people."""
         p = self.parameters
+        what = "the tendon-driven soft neck" if self.robot.is_neck else f"robot {self.robot.label()}"
         return "\n".join(
             [
-                "virtual neck: a physics model of the tendon-driven soft neck",
+                f"virtual neck: a physics model of {what}",
                 f"link {1e3 * p.link_length:.1f} mm, tendons at {1e3 * p.attachment_radius:.1f} mm, "
                 f"winch {1e3 * p.winch_radius:.1f} mm",
                 f"inclinometer noise {math.degrees(p.noise_std):.3f} deg",
             ]
+        )
+
+
+def _ranges(robot: Robot, limit: float) -> Matrix:
+    """Return the least and the largest set-point of each motor [rad]; +-`limit` of a neck and where none is given."""
+    scale, motors = to_si(robot.motors.unit)[0], len(robot.motors.names)
+    given = (robot.motors.setpoint_min, robot.motors.setpoint_max)
+    if robot == Robot.preset():
+        given = (None, None)
+    low, high = (np.full(motors, end) if side is None else scale * np.array(side)
+                 for side, end in zip(given, (-limit, limit), strict=True))  # fmt: skip
+    return np.column_stack([low, high])
+
+
+def _check_robot(robot: Robot) -> None:
+    """Raise SettingsError unless tendons on winches bend the robot."""
+    for what, unit in (("motors", robot.motors.unit), ("outputs", robot.outputs.unit)):
+        if to_si(unit)[1] != "rad":
+            raise SettingsError(
+                f"the virtual plant has {what} in rad or deg, and `{what}.unit` of robot {robot.label()} is {unit}."
+            )
+    if robot.directions.kind != "tendons":
+        raise SettingsError(
+            f"the virtual plant must know where tendons stand, and `directions` of robot {robot.label()} are "
+            f'"{robot.directions.kind}"; write kind = "tendons" and angles_deg.'
         )

@@ -34,6 +34,7 @@ from softneck.plant._index_runtime import (
 from softneck.plant._mechanics_runtime import (
     NeckBody,
     neck_constants,
+    neck_disturbed,
     neck_lean,
     neck_load,
     neck_rates,
@@ -43,6 +44,7 @@ from softneck.plant._mechanics_runtime import (
 )
 from softneck.runtime._layout import Arrays, array, cells, value
 from softneck.runtime._random_runtime import random_seed
+from softneck.runtime._sizes_runtime import MOTORS, OUTPUTS
 
 # Numbers of `setup`, in this order.
 NECK_TS = 0
@@ -51,13 +53,22 @@ NECK_SENT = 2
 NECK_SAMPLES = 3
 
 
+def neck_motors(setup: np.ndarray) -> int:
+    """Return the number of motors: a neck's three where none is said."""
+    return int(setup[0, 4]) if setup.shape[1] > 4 else 3
+
+
 class VirtualNeckArrays(Arrays):
     """How the neck is sampled; what it is made of are its parameters."""
 
-    setup = array("1, 4", "sample time [s], substeps per sample, set-points kept, sensor samples kept")
+    setup = array(
+        "1, numbers",
+        "sample time [s], substeps a sample, set-points kept, sensor samples kept; motors and outputs, if not 3 and 2",
+    )
     substeps = value("setup", 0, NECK_SUBSTEPS)
     sent = value("setup", 0, NECK_SENT)
     samples = value("setup", 0, NECK_SAMPLES)
+    motors = value("setup", function=neck_motors, written=True)
 
 
 class VirtualNeckState(NeckBody):
@@ -65,7 +76,7 @@ class VirtualNeckState(NeckBody):
 
     random = cells("6", "generator of the sensor's noise")
     noise = cells("9", "see `InclinometerNoise`")
-    queue = cells("sent, 3", "set-points, newest first [rad]")
+    queue = cells("sent, motors", "set-points, newest first [rad]")
     history = cells("samples, 6", "see `InclinometerHistory`")
 
 
@@ -73,8 +84,10 @@ def initialise(p: VirtualNeckArrays, parameters: np.ndarray, x: VirtualNeckState
     """Fill `x` and `outputs` with the neck at rest: set-points zero, tendons at their pretension."""
     x[:] = 0.0
     c = neck_constants(parameters)
-    x.b[0], x.b[1], x.s, x.free[0], x.free[1], x.free[2] = neck_rest(parameters, c)
-    for i in range(3):
+    rest = neck_rest(parameters, c)
+    x.b[0], x.b[1], x.s = rest[0], rest[1], rest[2]
+    for i in range(MOTORS):
+        x.free[i] = rest[3 + i]
         # What a drive needs to hold its tendon's pretension.
         x.integral[i] = parameters[NECK_WINCH_RADIUS] * parameters[NECK_PRETENSION]
     # Payload, pushes and a tilted base are inputs: at t_0 there are none.
@@ -98,10 +111,8 @@ def step(
     sample_time = float(p.setup[0, NECK_TS])
     neck_enqueue(x.queue, inputs, float(parameters[NECK_POSITION_LIMIT]))
     c = neck_constants(parameters)
-    load = neck_load(
-        parameters, float(inputs[3]), float(inputs[4]), float(inputs[5]), float(inputs[6]), float(inputs[7])
-    )
-    free = (float(x.free[0]), float(x.free[1]), float(x.free[2]))
+    load = neck_disturbed(parameters, inputs[MOTORS:])
+    free = neck_free(x)
     # In every step: the payload is an input, and moves the modes.
     count = neck_substeps(c, load, sample_time, p.substeps)
     h = sample_time / count
@@ -110,7 +121,7 @@ def step(
     for i in range(count):
         # How many samples old the set-points are that have arrived by now; 1e-9 for delays of whole samples.
         age = max(0, math.ceil((latency - i * h) / sample_time - 1e-9))
-        command = (float(x.queue[age, 0]), float(x.queue[age, 1]), float(x.queue[age, 2]))
+        command = tuple(float(x.queue[age, j]) for j in range(MOTORS))
         moving = neck_runge_kutta(moving, h, command, free, c, load)
     neck_write(x, moving)
     neck_sense(p, parameters, x, c, load, outputs)
@@ -132,9 +143,9 @@ def neck_sense(
 
 def neck_enqueue(queue: np.ndarray, inputs: np.ndarray, limit: float) -> None:
     """Put the newest set-points, clamped to +-`limit`, in front of the queue."""
-    for i in range(queue.shape[0] - 1, 2, -1):  # triples: [i - 3] is the same motor's
-        queue[i] = queue[i - 3]
-    for i in range(3):
+    for i in range(queue.shape[0] - 1, MOTORS - 1, -1):  # row by row: [i - MOTORS] is the same motor's
+        queue[i] = queue[i - MOTORS]
+    for i in range(MOTORS):
         queue[i] = min(max(float(inputs[i]), -limit), limit)
 
 
@@ -163,54 +174,44 @@ def neck_measure(p: VirtualNeckArrays, parameters: np.ndarray, x: VirtualNeckSta
 def neck_outputs(parameters: np.ndarray, x: VirtualNeckState, c: tuple, load: tuple, outputs: np.ndarray) -> None:
     """Fill `outputs` from the state: truth, measurement, encoders, tensions, compression."""
     lean = neck_lean(x, load)
-    outputs[0] = lean[0]
-    outputs[1] = lean[1]
-    outputs[2], outputs[3], outputs[4], outputs[5], outputs[6] = inclinometer_shown(x.noise)
+    shown = inclinometer_shown(x.noise)
+    for axis in range(OUTPUTS):
+        outputs[axis] = lean[axis]
+        outputs[OUTPUTS + axis] = shown[axis]
+        outputs[2 * OUTPUTS + axis] = shown[2 + axis]
+    outputs[3 * OUTPUTS] = shown[4]
     counts = float(parameters[NECK_ENCODER_COUNTS])
     # Only what is logged is in counts: the drives' loops see the position itself.
     quantum = 2.0 * math.pi / counts if counts > 0.0 else 0.0
-    for i in range(3):
-        outputs[7 + i] = inclinometer_round(float(x.position[i]), quantum)
-    outputs[10], outputs[11], outputs[12] = neck_tensions(x, c)
-    outputs[13] = x.s
+    tensions = neck_tensions(neck_read(x), neck_free(x), c)
+    for i in range(MOTORS):
+        outputs[3 * OUTPUTS + 1 + i] = inclinometer_round(float(x.position[i]), quantum)
+        outputs[3 * OUTPUTS + 1 + MOTORS + i] = tensions[i]
+    outputs[3 * OUTPUTS + 1 + 2 * MOTORS] = x.s
+
+
+def neck_free(x: NeckBody) -> tuple:
+    """Return the unstretched lengths of the tendons as a tuple of floats."""
+    return tuple(float(x.free[j]) for j in range(MOTORS))
 
 
 def neck_read(x: NeckBody) -> tuple:
-    """Return the 19 continuous states as a tuple of floats."""
-    return (
-        float(x.b[0]), float(x.b[1]), float(x.s), float(x.w[0]), float(x.w[1]), float(x.v), float(x.z[0]),
-        float(x.z[1]), float(x.position[0]), float(x.position[1]), float(x.position[2]), float(x.speed[0]),
-        float(x.speed[1]), float(x.speed[2]), float(x.integral[0]), float(x.integral[1]), float(x.integral[2]),
-        float(x.filtered[0]), float(x.filtered[1]),
-    )  # fmt: skip
+    """Return the continuous states, the first of `x`, as a tuple of floats."""
+    return tuple(float(x[i]) for i in range(10 + 3 * MOTORS))
 
 
 def neck_write(x: NeckBody, moving: tuple) -> None:
-    """Write the 19 continuous states back."""
-    (
-        x.b[0], x.b[1], x.s, x.w[0], x.w[1], x.v, x.z[0], x.z[1], x.position[0], x.position[1], x.position[2],
-        x.speed[0], x.speed[1], x.speed[2], x.integral[0], x.integral[1], x.integral[2], x.filtered[0], x.filtered[1],
-    ) = moving  # fmt: skip
+    """Write the continuous states back."""
+    for i in range(10 + 3 * MOTORS):
+        x[i] = moving[i]
 
 
 def neck_along(x: tuple, k: tuple, h: float) -> tuple:
     """Return x + h k, entry by entry."""
-    return (
-        x[0] + h * k[0], x[1] + h * k[1], x[2] + h * k[2], x[3] + h * k[3], x[4] + h * k[4],
-        x[5] + h * k[5], x[6] + h * k[6], x[7] + h * k[7], x[8] + h * k[8], x[9] + h * k[9],
-        x[10] + h * k[10], x[11] + h * k[11], x[12] + h * k[12], x[13] + h * k[13], x[14] + h * k[14],
-        x[15] + h * k[15], x[16] + h * k[16], x[17] + h * k[17], x[18] + h * k[18],
-    )  # fmt: skip
+    return tuple(x[i] + h * k[i] for i in range(10 + 3 * MOTORS))
 
 
-def neck_runge_kutta(
-    x: tuple,
-    h: float,
-    command: tuple[float, float, float],
-    free: tuple[float, float, float],
-    c: tuple,
-    load: tuple,
-) -> tuple:
+def neck_runge_kutta(x: tuple, h: float, command: tuple, free: tuple, c: tuple, load: tuple) -> tuple:
     """Return the continuous states `h` later by the classical method of order four."""
     k1 = neck_rates(x, command, free, c, load)
     k2 = neck_rates(neck_along(x, k1, 0.5 * h), command, free, c, load)

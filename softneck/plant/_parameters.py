@@ -135,7 +135,7 @@ class NeckParameters:
                 raise SettingsError(f"`{item.name}` must be a number [{item.metadata['unit']}]; got {value!r}.")
             require_between(item.name, float(value), item.metadata["low"], item.metadata["high"], item.metadata["unit"])
         self._check_geometry()
-        self._check_buckling()
+        self.check_buckling(3)
 
     @classmethod
     def paper(cls) -> NeckParameters:
@@ -280,12 +280,13 @@ class NeckParameters:
                 f"would be shorter than the link allows ({shortest:g} m). Lower it or raise `tendon_stiffness`."
             )
 
-    def _check_buckling(self) -> None:
+    def check_buckling(self, tendons: int) -> None:
+        """Raise SettingsError where the weight, and so many tendons at their pretension, would buckle the link."""
         # Straight link: the tendons' tension and the weight take from the bending stiffness (d^2 U / d b^2).
         weight = 9.80665 * (self.platform_mass + 0.25 * self.link_mass)
         moment = 9.80665 * self.platform_mass * self.platform_height
-        tendons = 3.0 * self.pretension * self.link_length / 12.0
-        lost = tendons + weight * self.link_length / 3.0 + moment
+        pressed = tendons * self.pretension * self.link_length / 12.0
+        lost = pressed + weight * self.link_length / 3.0 + moment
         least = self.bending_stiffness * (1.0 - abs(self.stiffness_asymmetry))
         if lost >= 0.9 * least:
             raise SettingsError(

@@ -26,6 +26,7 @@ class Port:
         boolean: a Boolean, carried as 0.0 or 1.0.
         integer: a whole number; Int64 in FMI 3.0, Real in FMI 2.0.
         missing: NaN is allowed and means "not measured".
+        display_unit: for people; "": what is usual for `unit`.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Port:
     boolean: bool = False
     integer: bool = False
     missing: bool = False
+    display_unit: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -28,6 +28,7 @@ from softneck.core import SettingsError
 from ._layout import Arrays, StateVector
 from ._names import lowered, state_size
 from ._tangent import with_tangent
+from ._unrolled import unrolled
 
 # Set from outside by whoever compiles; one for all (see `_compiled_runtime`).
 _SHARED = {"COMPILED"}
@@ -104,6 +105,8 @@ _MEMBERS = "softneck.runtime._members_runtime"
 _DECLARATIONS = "softneck.runtime._layout"
 # Motors and outputs of a neck, for which a text is written where its runtime's name says no others.
 _NECK = (3, 2)
+# `module@n` reads its sizes from its arrays: one text for all robots, as the compiled library holds it.
+ANY_SIZE = "n"
 _ALLOWED = {"numpy", "math", "__future__", _DECLARATIONS}
 
 
@@ -162,8 +165,10 @@ def sized(runtime: str, motors: int, outputs: int) -> str:
 
 
 def _sizes(outer: str) -> tuple[str, tuple[tuple[str, int], ...]]:
-    """Return the module of a runtime's name, and the motors and outputs that its text is for."""
+    """Return the module of a runtime's name, and the motors and outputs that its text is for; none: it reads them."""
     module, _, size = outer.partition("@")
+    if size == ANY_SIZE:
+        return module, ()
     motors, outputs = map(int, size.split("x")) if size else _NECK
     return module, (("motors", motors), ("outputs", outputs))
 
@@ -219,7 +224,8 @@ def _pieces(module: str, sizes: tuple[tuple[str, int], ...]) -> tuple[_Piece, ..
         return None if hasattr(builtins, name) else getattr(import_module(module), name, None)
 
     kept: list[_Piece] = []
-    for node in ast.parse(_source(module)).body:  # its own tree, as names become places in it
+    for statement in ast.parse(_source(module)).body:  # its own tree, as names become places in it
+        node = unrolled(statement, dict(sizes))
         if isinstance(node, ast.Import | ast.ImportFrom):
             _check_import(module, node)
         elif isinstance(node, ast.FunctionDef):

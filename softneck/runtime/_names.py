@@ -62,8 +62,8 @@ class _Names(ast.NodeTransformer):
         self, layouts: Mapping[str, type], find: Callable[[str], Any], where: str, sizes: Mapping[str, int]
     ) -> None:
         self._layouts, self._find, self._where = layouts, find, where
-        owner = next((layout for layout in layouts.values() if issubclass(layout, Arrays)), Arrays)
-        self._sizes = {name: sizes[name] for name, symbol in owner.symbols.items() if symbol.written}
+        symbols = {name: symbol for layout in layouts.values() for name, symbol in layout.symbols.items()}
+        self._sizes = {name: sizes[name] for name, symbol in symbols.items() if symbol.written and name in sizes}
         self._used: dict[str, ast.expr] = {}
 
     def begin(self) -> list[ast.stmt]:

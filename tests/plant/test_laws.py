@@ -10,13 +10,13 @@ from scipy.optimize import minimize
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.plant._energy import body, free_lengths, neck_energy, potential_energy
 from softneck.plant._mechanics_runtime import NeckBody, neck_constants, neck_load, neck_rates, neck_substeps
+from softneck.plant._neck_runtime import VirtualNeckArrays
 from softneck.runtime import Block, State
-from softneck.runtime._layout import Arrays
 
 # Where the plant's outputs are in its port order.
 TENSIONS = slice(10, 13)
 # And the parts of its state.
-AT = NeckBody.parts(Arrays(()))
+AT = NeckBody.parts(VirtualNeckArrays(VirtualNeck(NeckParameters.paper()).block().arrays))
 MOVING = slice(0, AT["free"].start)
 
 

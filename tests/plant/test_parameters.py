@@ -18,7 +18,9 @@ from softneck.signals import Excitation, signal
 def test_the_runtime_reads_each_parameter_where_the_vector_has_it() -> None:
     places = {name[5:].lower(): value for name, value in vars(index).items() if name.startswith("NECK_")}
     expected = {name: place for place, name in enumerate((*NeckParameters.names(), "noise_seed"))}
-    assert places == expected
+    # The first of as many angles as there are motors.
+    expected = {name: place for name, place in expected.items() if not name.startswith("tendon_angle_")}
+    assert places == {**expected, "tendon_angle": 3}
 
 
 def test_every_parameter_has_unit_range_text_and_source() -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from softneck.core import Matrix, SettingsError
 from softneck.runtime import Block, Port
 
-from .translate._kinds import RUNTIMES, ranks_of
+from .translate._kinds import RUNTIMES, module_of, ranks_of
 
 _MAGIC = b"SNMODEL\0"
 FORMAT = 1
@@ -45,23 +45,24 @@ def node_of(runtime: str, arrays: tuple[Matrix, ...]) -> Node:
     """
     outer, _, inner = runtime.partition("(")
     pairs = [part.rpartition(":") for part in _split(inner[:-1])] if inner else []
-    if outer not in RUNTIMES:
+    runs = module_of(outer)
+    if runs not in RUNTIMES:
         raise SettingsError(
             f"`{outer}` cannot be in a compiled FMU: it is not in the table of softneck.fmu.compiled; "
             "use `--backend python`."
         )
     own = len(arrays) - sum(int(count) for _, _, count in pairs)
     ranks = tuple(array.ndim for array in arrays[: max(own, 0)])
-    if ranks != ranks_of(outer):
+    if ranks != ranks_of(runs):
         raise SettingsError(
-            f"`{outer}` has arrays of ranks {ranks} and the compiled library expects {ranks_of(outer)}; "
+            f"`{outer}` has arrays of ranks {ranks} and the compiled library expects {ranks_of(runs)}; "
             "use `--backend python`, or correct its declaration."
         )
     members, first = [], own
     for name, _, count in pairs:
         members.append(node_of(name, arrays[first : first + int(count)]))
         first += int(count)
-    return Node(outer, arrays[:own], tuple(members))
+    return Node(runs, arrays[:own], tuple(members))
 
 
 def _split(inner: str) -> list[str]:

@@ -7,15 +7,13 @@ from dataclasses import asdict
 from html import escape
 from typing import Any, Protocol
 
-import numpy as np
-
+from softneck.core import to_si
 from softneck.identification import Validation
 from softneck.runtime import Block
 
 from ._documentation import FmuInfo
 from ._figures import line_chart
 
-_AXES = ("pitch", "roll")
 # Of a free run, in the picture [s].
 _SHOWN = 30.0
 _HEADINGS = {
@@ -94,10 +92,12 @@ def _fits(validation: Validation) -> str:
     rows = []
     for name, scores in (("persistence", validation.persistence), ("this model", validation.fits)):
         for horizon, fit in scores.items():
-            cells = "".join(f"<td>{_percent(fit.get(axis))}</td>" for axis in _AXES)
+            cells = "".join(f"<td>{_percent(fit.get(axis))}</td>" for axis in validation.robot.outputs.names)
             ahead = {"inf": "free run", "1": "one sample ahead"}.get(horizon, f"{horizon} samples ahead")
             rows.append(f"<tr><td>{name}</td><td>{ahead}</td>{cells}</tr>")
-    head = "<tr><th></th><th></th><th>pitch</th><th>roll</th></tr>"
+    head = (
+        f"<tr><th></th><th></th>{''.join(f'<th>{escape(axis)}</th>' for axis in validation.robot.outputs.names)}</tr>"
+    )
     diverged = "" if validation.diverged is None else f" Its free run diverged at t = {validation.diverged:g} s."
     return (
         f"<p>NRMSE fit in %, on {validation.rows_scored} rows of {escape(validation.data)}; "
@@ -111,15 +111,16 @@ def _percent(fit: float | None) -> str:
 
 
 def _free_run(validation: Validation) -> str:
-    """Return both angles over the first stretch, at most half a minute of it."""
+    """Return each output over the first stretch, at most half a minute of it."""
     stretch = validation.run == validation.run[0]
     time = validation.time[stretch]
     keep = time < time[0] + _SHOWN
-    figures = []
-    for column, axis in enumerate(_AXES):
+    figures, outputs = [], validation.robot.outputs
+    scale = to_si(outputs.display_unit)[0]
+    for column, axis in enumerate(outputs.names):
         curves = {
-            "measured": np.degrees(validation.measured[stretch, column][keep]),
-            "free run": np.degrees(validation.free_run[stretch, column][keep]),
+            "measured": validation.measured[stretch, column][keep] / scale,
+            "free run": validation.free_run[stretch, column][keep] / scale,
         }
-        figures.append(f"<figure>{line_chart(time[keep], curves, title=axis, unit='deg')}</figure>")
+        figures.append(f"<figure>{line_chart(time[keep], curves, title=axis, unit=outputs.display_unit)}</figure>")
     return "".join(figures)

@@ -16,18 +16,10 @@ from softneck.runtime import Block, Port
 
 from ._documentation import FmuInfo
 from ._modelled_drives import with_modelled_drives
+from ._units import base_exponents, display_unit
 
 # Paper, section 3: the neck tilts up to 0.7 rad or so; more in a reference is nearly always degrees.
 REFERENCE_LIMIT = 0.8
-# unit -> exponents of the SI base units and (display unit, factor to it).
-_UNITS: dict[str, tuple[dict[str, str], tuple[str, float] | None]] = {
-    "rad": ({"rad": "1"}, ("deg", 180.0 / math.pi)),
-    "rad/s": ({"rad": "1", "s": "-1"}, ("deg/s", 180.0 / math.pi)),
-    "s": ({"s": "1"}, None),
-    "m": ({"m": "1"}, ("mm", 1e3)),
-    "kg": ({"kg": "1"}, None),
-    "N": ({"kg": "1", "m": "1", "s": "-2"}, None),
-}
 _NONE = ("", "1")
 
 
@@ -138,17 +130,19 @@ def _co_simulation(root: Element, identity: Identity) -> None:
 
 def add_unit_definitions(root: Element, block: Block) -> None:
     """Add the units that the variables use; FMI 2 and 3 write them alike."""
-    used = sorted({port.unit for port in (*block.inputs, *block.outputs, *block.parameters) if _has_unit(port)})
+    ports = [port for port in (*block.inputs, *block.outputs, *block.parameters) if _has_unit(port)]
+    used = sorted({port.unit for port in ports})
     if not used:
         return
     definitions = SubElement(root, "UnitDefinitions")
     for name in used:
         unit = SubElement(definitions, "Unit", name=name)
-        base, display = _UNITS.get(name, ({}, None))
+        base = base_exponents(name)
         if base:
             SubElement(unit, "BaseUnit", base)
-        if display:
-            SubElement(unit, "DisplayUnit", name=display[0], factor=repr(display[1]))
+        shown = {display_unit(port) for port in ports if port.unit == name}
+        for display, factor in sorted(pair for pair in shown if pair[0] != name):
+            SubElement(unit, "DisplayUnit", name=display, factor=repr(factor))
 
 
 def _annotation(root: Element, block: Block) -> None:
@@ -206,8 +200,8 @@ def unit_attributes(port: Port) -> dict[str, str]:
     """Return unit and display unit."""
     if not _has_unit(port):
         return {}
-    display = _UNITS.get(port.unit, ({}, None))[1]
-    return {"unit": port.unit} | ({"displayUnit": display[0]} if display else {})
+    display, _ = display_unit(port)
+    return {"unit": port.unit} | ({"displayUnit": display} if display != port.unit else {})
 
 
 def range_attributes(port: Port) -> dict[str, str]:

@@ -12,7 +12,9 @@ from html import escape
 import numpy as np
 
 from softneck.core import Matrix, Vector
-from softneck.runtime import Block, load_runtime
+from softneck.runtime import Block, Port, load_runtime
+
+from ._units import display_unit
 
 _WIDTH, _HEIGHT = 640.0, 256.0
 _LEFT, _RIGHT, _TOP, _BOTTOM = 56.0, 12.0, 44.0, 34.0
@@ -85,44 +87,60 @@ _DURATION, _AT = 4.0, 0.5  # of the picture, and of the step in it [s]
 # Plain Python takes some 35 ms for a sample of nonlinear predictive control, and an FMU is built in two seconds.
 _SHORT = {"nmpc": (0.5, 0.1)}
 _MANY = 1_000_000  # numbers
-# role -> the input that steps (the first of these that there is), by how much, and what shows the answer.
-_STEPS = {
-    "plant": (("motor_setpoint_1",), 2.0, ("pitch", "roll")),
-    "observer": (("motor_setpoint_1",), 2.0, ("pitch", "roll", "pitch_rate", "roll_rate")),
-    "controller": (("pitch_reference", "roll_reference"), 0.1, ("motor_setpoint",)),
-    "reference": ((), 0.0, ("pitch_reference", "roll_reference", "cocontraction_reference")),
-}
+_STEP = {"plant": 2.0, "observer": 2.0, "controller": 0.1}  # of the first set-point, or the first reference [rad]
 
 
 def response_figure(block: Block) -> str:
     """Return a figure (HTML) of the step response of a block, alone and from its start values; "" if it has none."""
-    inputs, size, shown = _STEPS[block.role]
     names = [port.name for port in block.inputs]
-    stepped = next((name for name in inputs if name in names), "")
-    columns = [i for i, port in enumerate(block.outputs) if not port.boolean and _is_shown(port.name, shown)]
-    if (inputs and not stepped) or not columns:
+    stepped = _stepped(block)
+    columns = _shown(block)
+    if (stepped is None and block.role != "reference") or not columns:
         return ""
+    size = 0.0 if stepped is None else _size(stepped, block.role)
     duration, at = _SHORT.get(block.kind, (_DURATION, _AT))
     samples = min(round(duration / block.sample_time), 2000)
     u = np.tile([port.start for port in block.inputs], (samples, 1)).reshape(samples, len(names))
     u[:, [i for i, port in enumerate(block.inputs) if port.missing]] = np.nan
-    if stepped:
-        u[round(at / block.sample_time) :, names.index(stepped)] += size
+    if stepped is not None:
+        u[round(at / block.sample_time) :, names.index(stepped.name)] += size
     y = _answers(block, u)
     if not np.isfinite(y[:, columns]).all():
         return ""
-    units = {block.outputs[i].unit for i in columns}
-    degrees = units <= {"rad", "rad/s"} and block.role != "controller"
-    factor, unit = (180.0 / np.pi, "deg, deg/s" if "rad/s" in units else "deg") if degrees else (1.0, "rad")
+    controls = block.role == "controller"  # set-points as they are sent
+    shown = {i: (block.outputs[i].unit, 1.0) if controls else display_unit(block.outputs[i]) for i in columns}
+    unit = ", ".join(sorted({name for name, _ in shown.values()}))
     time = block.sample_time * np.arange(samples)
-    curves = {block.outputs[i].name: factor * y[:, i] for i in columns}
-    what = f"Answer to a step of {size:g} rad in {stepped}" if stepped else "Course"
-    alone = "" if block.role == "plant" or not stepped else ", alone, with all other inputs at their start values"
+    curves = {block.outputs[i].name: factor * y[:, i] for i, (_, factor) in shown.items()}
+    what = "Course" if stepped is None else f"Answer to a step of {size:g} {stepped.unit} in {stepped.name}"
+    alone = "" if block.role == "plant" or stepped is None else ", alone, with all other inputs at their start values"
     return f"<figure>{line_chart(time, curves, title=what, unit=unit)}<figcaption>{what}{alone}.</figcaption></figure>"
 
 
-def _is_shown(name: str, shown: tuple[str, ...]) -> bool:
-    return name in shown or name.rstrip("_0123456789") in shown
+def _stepped(block: Block) -> Port | None:
+    """Return the input that steps: the first reference of a controller, the first set-point of others; None: none."""
+    ending = "_reference" if block.role == "controller" else "motor_setpoint_1"
+    steps = (port for port in block.inputs if port.name.endswith(ending) and block.role != "reference")
+    return next(steps, None)
+
+
+def _size(stepped: Port, role: str) -> float:
+    """Return the size of a step; where that of a neck means nothing, half of what the input goes to."""
+    high = stepped.maximum
+    return _STEP[role] if stepped.unit == "rad" or high is None else 0.5 * high
+
+
+def _shown(block: Block) -> list[int]:
+    """Return which outputs answer: set-points of a controller, references, else what is measured and its rate."""
+    measured = {port.name.removesuffix("_measured") for port in (*block.inputs, *block.outputs)
+                if port.name.endswith("_measured")}  # fmt: skip
+    found = {
+        "controller": lambda name: name.startswith("motor_setpoint_"),
+        "reference": lambda name: name.endswith("_reference"),
+        "observer": lambda name: name.removesuffix("_rate") in measured,
+        "plant": lambda name: name in measured,
+    }[block.role]
+    return [i for i, port in enumerate(block.outputs) if not port.boolean and found(port.name)]
 
 
 def _answers(block: Block, u: Matrix) -> Matrix:

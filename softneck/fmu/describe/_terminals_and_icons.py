@@ -16,7 +16,7 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 import numpy as np
 
 from softneck.core import Matrix
-from softneck.runtime import Block
+from softneck.runtime import Block, Port
 
 _SIZE = 96
 # Polylines in a unit square, y downwards; drawn with round ends. One picture a role, one colour a kind.
@@ -76,27 +76,33 @@ TERMINALS = "terminalsAndIcons/terminalsAndIcons.xml"
 _DESCRIPTIONS = {
     "motors": "Set-points and positions of the motors",
     "angles": "Angles of the platform, and what an observer says of them",
+    "outputs": "Outputs of the robot, and what an observer says of them",
     "measurement": "What the sensors say",
     "reference": "Where the platform shall be",
 }
-_ANGLES = ("pitch", "roll", "pitch_rate", "roll_rate", "healthy")
+# Behind an output's name: what tells that there is one.
+_TOLD = ("_measured", "_reference")
 
 
 def terminals(block: Block) -> dict[str, list[str]]:
     """Return terminal -> names of its inputs and outputs, without empty terminals."""
-    names = [port.name for port in (*block.inputs, *block.outputs)]
-    found = {title: [name for name in names if _terminal_of(name) == title] for title in _DESCRIPTIONS}
+    ports = (*block.inputs, *block.outputs)
+    outputs = {port.name.removesuffix(end) for port in ports for end in _TOLD if port.name.endswith(end)}
+    found = {title: [port.name for port in ports if _terminal_of(port, outputs) == title] for title in _DESCRIPTIONS}
     return {title: members for title, members in found.items() if members}
 
 
-def _terminal_of(name: str) -> str:
+def _terminal_of(port: Port, outputs: set[str]) -> str:
+    name = port.name
     if "_measured" in name or name == "measurement_valid":
         return "measurement"
     if name.startswith(("motor_setpoint_", "motor_position_")):
         return "motors"
     if name.endswith("_reference") or name == "enabled":
         return "reference"
-    return "angles" if name in _ANGLES else ""
+    if name != "healthy" and name.removesuffix("_rate") not in outputs - {"cocontraction"}:
+        return ""
+    return "angles" if port.boolean or port.unit in ("rad", "rad/s") else "outputs"
 
 
 def terminals_file(block: Block) -> dict[str, bytes]:

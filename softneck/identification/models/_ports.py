@@ -20,14 +20,26 @@ _TRAINED = "set_points_rad"
 
 def _output(robot: Robot, name: str, description: str, *, missing: bool = False) -> Port:
     unit = to_si(robot.outputs.unit)[1]
+    port = Port(
+        name=name, unit=unit, description=description, missing=missing, display_unit=_shown(robot, outputs=True)
+    )
     if unit != "rad" or missing:
-        return Port(name=name, unit=unit, description=description, missing=missing)
-    return Port(name=name, unit=unit, description=description, minimum=-np.pi, maximum=np.pi, nominal=0.2)
+        return port
+    return replace(port, minimum=-np.pi, maximum=np.pi, nominal=0.2)
 
 
 def _motor(robot: Robot, name: str, description: str, *, missing: bool = False) -> Port:
     unit = to_si(robot.motors.unit)[1]
-    return Port(name=name, unit=unit, description=description, nominal=1.0 if unit == "rad" else None, missing=missing)
+    nominal = 1.0 if unit == "rad" else None
+    return Port(name=name, unit=unit, description=description, nominal=nominal, missing=missing,
+                display_unit=_shown(robot, outputs=False))  # fmt: skip
+
+
+def _shown(robot: Robot, *, outputs: bool) -> str:
+    """Return the unit in which people see outputs or motors; that of a neck is the usual one."""
+    if robot.is_neck:
+        return ""
+    return robot.outputs.display_unit if outputs else robot.motors.unit
 
 
 def _platform(robot: Robot, name: str) -> str:

@@ -1,4 +1,8 @@
-"""The paper's signals and the excitations beside them; their definitions are frozen by hashes in the tests."""
+"""The paper's signals and the excitations beside them; their definitions are frozen by hashes in the tests.
+
+Other robots get them by where their motors pull (see `Pulls`), mapped from the neck's range of set-points, +-6 rad,
+onto theirs.
+"""
 
 from __future__ import annotations
 
@@ -6,19 +10,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, Vector, require_between, require_one_of
+from softneck.core import Matrix, SettingsError, Vector, require_between, require_one_of, to_si
+from softneck.robot import Robot
 
 from ..recording._redefinition import motors_from
 
 #: Sample time of the paper's experiments [s].
 SAMPLE_TIME = 0.02
-# Table 2: columns are motors 1, 2, 3; phi_4 of motor 3 is 0.95 as printed, not 0.095.
+# Table 2: columns are motors 1, 2, 3; phi_4 of motor 3 is 0.95 as printed, not 0.095. phi_1 and phi_2 are the tendons'
+# angles, to two digits.
 _OMEGA = (1.0, 0.25, 1.5, 2.56, 1.75, 1.66, 4.0)
 _PHI_1 = np.array([0.0, 2.09, 4.18])
-_PHI_2 = np.array([0.0, 2.09, 4.18])
 _PHI_4 = np.array([0.095, 0.095, 0.95])
 _PHI_3, _PHI_5, _PHI_6, _PHI_7 = 0.32, 0.09, 0.29, 0.67
-# [s] of each signal when no other length is asked for; None: any length.
+# The neck's set-points [rad] (paper, section 3.1), for which sizes below are.
+_NECK_RANGE = 6.0
+# [s] of each signal when no other length is asked for, for the neck.
 _DURATIONS = {"eq22": 200.0, "steps": 26.0, "sine": 30.0, "rotation": 30.0, "aprbs": 140.0, "multisine": 140.0,
               "mixed": 140.0}  # fmt: skip
 # A day at 20 ms is 4 million samples and 1 GB as text.
@@ -34,7 +41,7 @@ class Excitation:
     Attributes:
         name: of the signal.
         time: (time,) [s].
-        set_points: (time, 3) [rad].
+        set_points: (time, motors) in SI, of the neck (time, 3) [rad].
         sample_time: [s].
     """
 
@@ -44,51 +51,99 @@ class Excitation:
     sample_time: float = SAMPLE_TIME
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Pulls:
+    """Where the motors pull, by which signals move them together.
+
+    Attributes:
+        angles: (motors,) tendon angles [rad]; evenly around where a robot gives none.
+        rows: (outputs, motors) weights of the motors in each output, the largest 1 or -1.
+        neck: these are the paper's.
+    """
+
+    angles: Vector
+    rows: Matrix
+    neck: bool
+
+    @classmethod
+    def of(cls, robot: Robot) -> Pulls:
+        """Return those of a robot."""
+        motors, outputs = len(robot.motors.names), len(robot.outputs.names)
+        angles = np.radians(robot.directions.angles_deg or np.arange(motors) * 360.0 / motors)
+        weights = robot.weights()
+        if weights is None:  # nobody knows yet: waves that run around, one for each output
+            weights = np.cos(
+                np.outer(np.arange(outputs) // 2 + 1, angles) - np.pi / 2 * (np.arange(outputs) % 2)[:, None]
+            )
+        size = np.abs(weights).max(axis=1, keepdims=True)
+        # Rounded: -1/2 is -1/2, not the nearest that a cosine comes to.
+        return cls(angles, np.round(weights / np.where(size > 1e-9, size, 1.0), 12), robot.is_neck)
+
+
 def signal_names() -> tuple[str, ...]:
     """Return the names of all signals."""
     return tuple(_DURATIONS)
 
 
-def signal(name: str, *, duration: float | None = None, seed: int = 0) -> Excitation:
-    """Return the set-points of a signal of the public face at 20 ms.
+def signal(name: str, *, duration: float | None = None, seed: int = 0, robot: Robot | None = None) -> Excitation:
+    """Return the set-points of a signal of the public face, at 20 ms or the robot's sample time.
 
     Args:
         name: eq22, steps, sine, rotation, aprbs, multisine or mixed.
         duration: [s]; the signal's own where None. Longer than its own only for those without a fixed length.
         seed: of aprbs, multisine and mixed.
+        robot: whose motors move, within its range of set-points; None: the neck's.
 
     Raises:
-        SettingsError: unknown name, or a duration under a sample or beyond a day.
+        SettingsError: unknown name, a duration under a sample or beyond a day, or a robot without sample time.
     """
     require_one_of("signal", name, signal_names())
-    length = _DURATIONS[name] if duration is None else duration
-    require_between("duration", length, SAMPLE_TIME, _LONGEST, "s")
-    if name in _FIXED and length > _DURATIONS[name]:
-        raise SettingsError(f"`{name}` is {_DURATIONS[name]:g} s long by definition; got a duration of {length:g} s.")
-    t = np.arange(round(length / SAMPLE_TIME)) * SAMPLE_TIME
+    robot = Robot.preset() if robot is None else robot
+    pulls, Ts = Pulls.of(robot), robot.require("sample_time_s", "a signal")
+    longest = 2.0 + 8.0 * pulls.angles.size if name == "steps" else _DURATIONS[name]
+    length = longest if duration is None else duration
+    require_between("duration", length, Ts, _LONGEST, "s")
+    if name in _FIXED and length > longest:
+        raise SettingsError(f"`{name}` is {longest:g} s long by definition; got a duration of {length:g} s.")
+    t = np.arange(round(length / Ts)) * Ts
     rng = np.random.default_rng(seed)
     makers = {
-        "eq22": lambda: eq22(t),
-        "steps": lambda: _steps(t),
-        "sine": lambda: _sine(t),
-        "rotation": lambda: _rotation(t),
-        "aprbs": lambda: _aprbs(t, rng),
-        "multisine": lambda: _multisine(t, rng),
-        "mixed": lambda: _mixed(t, rng),
+        "eq22": lambda: eq22(t, pulls),
+        "steps": lambda: _steps(t, pulls),
+        "sine": lambda: _sine(t, pulls),
+        "rotation": lambda: _rotation(t, pulls),
+        "aprbs": lambda: _aprbs(t, rng, pulls),
+        "multisine": lambda: _multisine(t, rng, pulls),
+        "mixed": lambda: _mixed(t, rng, pulls),
     }
-    return Excitation(name, t, makers[name]())
+    return Excitation(name, t, _in_range(makers[name](), robot), Ts)
 
 
-def eq22(t: Vector) -> Matrix:
-    """Return the identification signal of Eq. 22 with Table 2, (time, 3) [rad]."""
+def _in_range(P: Matrix, robot: Robot) -> Matrix:
+    """Return set-points of motors that go from -6 to 6 rad as those of a robot's, in SI."""
+    given, scale = (robot.motors.setpoint_min, robot.motors.setpoint_max), to_si(robot.motors.unit)[0]
+    low, high = (
+        side * _NECK_RANGE if values is None else scale * np.array(values)
+        for side, values in zip((-1.0, 1.0), given, strict=True)
+    )
+    if np.all(low == -_NECK_RANGE) and np.all(high == _NECK_RANGE):
+        return P
+    return np.clip(0.5 * (low + high) + 0.5 * (high - low) * P / _NECK_RANGE, low, high)
+
+
+def eq22(t: Vector, pulls: Pulls) -> Matrix:
+    """Return the identification signal of Eq. 22 with Table 2, (time, motors) [rad]; others spread its phi_4."""
     w1, w2, w3, w4, w5, w6, w7 = _OMEGA
+    phi_1 = _PHI_1 if pulls.neck else pulls.angles
+    # Each motor another: tendons that face each other would mirror each other else, and nothing be known of their sum.
+    phi_4 = _PHI_4 if pulls.neck else np.linspace(_PHI_4[0], _PHI_4[-1], phi_1.size)
     T = t[:, None]
-    carrier = 0.6 * np.sin(2.0 * np.sin(w1 * T + _PHI_1) + np.cos(w1 * T + _PHI_2))
+    carrier = 0.6 * np.sin(2.0 * np.sin(w1 * T + phi_1) + np.cos(w1 * T + phi_1))
     envelope = (
         3.0
         + np.sin(w2 * T)
         + np.sin(w3 * T + _PHI_3)
-        + np.sin(w1 * T - _PHI_4)
+        + np.sin(w1 * T - phi_4)
         + np.sin(w4 * T)
         + np.sin(w5 * T + _PHI_5)
         + np.sin(w6 * T + _PHI_6) * np.sin(w7 * T + _PHI_7) / 2.0
@@ -96,51 +151,59 @@ def eq22(t: Vector) -> Matrix:
     return carrier * np.abs(envelope)
 
 
-def _steps(t: Vector) -> Matrix:
+def _steps(t: Vector, pulls: Pulls) -> Matrix:
     """Test 1: each motor at 3 rad for 8 s, one after the other."""
     # Half a sample of tolerance: instants are multiples of 20 ms only to rounding.
-    now = t + 0.5 * SAMPLE_TIME
-    return np.column_stack([np.where((now >= 1 + 8 * j) & (now < 9 + 8 * j), 3.0, 0.0) for j in range(3)])
+    now = t + 0.5 * _sample_time(t)
+    motors = range(pulls.angles.size)
+    return np.column_stack([np.where((now >= 1 + 8 * j) & (now < 9 + 8 * j), 3.0, 0.0) for j in motors])
 
 
-def _sine(t: Vector) -> Matrix:
-    """Test 2: 0.05 to 0.6 Hz over 30 s; the first half along theta_i, the second along phi_i."""
+def _sine(t: Vector, pulls: Pulls) -> Matrix:
+    """Test 2: 0.05 to 0.6 Hz over 30 s; one part along each output, of the neck theta_i and phi_i."""
     phase = 2.0 * np.pi * (0.05 * t + (0.6 - 0.05) / 30.0 * t**2 / 2.0)
     s = 2.6 * np.sin(phase)
-    first = (t + 0.5 * SAMPLE_TIME < 15.0)[:, None]
-    zero = np.zeros_like(s)
-    return np.where(first, np.column_stack([s, -s / 2, -s / 2]), np.column_stack([zero, s, -s]))
+    outputs = len(pulls.rows)
+    part = np.minimum((t + 0.5 * _sample_time(t)) * outputs / 30.0, outputs - 1).astype(int)
+    rows = pulls.rows[part]
+    return np.where(rows == 0.0, 0.0, s[:, None] * rows)
 
 
-def _rotation(t: Vector) -> Matrix:
+def _rotation(t: Vector, pulls: Pulls) -> Matrix:
     """Test 3: the tilt turns at 1.2 rad/s, its size ramped in over 3 s."""
     size = 2.8 * np.minimum(1.0, t / 3.0)
-    return np.column_stack([size * np.cos(1.2 * t - 2.0 * np.pi * j / 3.0) for j in range(3)])
+    return np.column_stack([size * np.cos(1.2 * t - angle) for angle in pulls.angles])
 
 
-def _aprbs(t: Vector, rng: np.random.Generator) -> Matrix:
-    """Amplitude-modulated PRBS on the redefined inputs; each level held for 0.4 to 2.4 s."""
-    inputs = np.column_stack([_levels(t, rng, size) for size in (4.0, 4.0, 0.8)])
-    return np.clip(motors_from(inputs), -4.5, 4.5)
+def _aprbs(t: Vector, rng: np.random.Generator, pulls: Pulls) -> Matrix:
+    """Amplitude-modulated PRBS along each output and on co-contraction; each level held for 0.4 to 2.4 s."""
+    inputs = np.column_stack([_levels(t, rng, size) for size in (*(4.0,) * len(pulls.rows), 0.8)])
+    # Of the neck the inverse redefinition, which is two thirds of the weights.
+    motors = motors_from(inputs) if pulls.neck else 2.0 / 3.0 * inputs[:, :-1] @ pulls.rows + inputs[:, -1:]
+    return np.clip(motors, -4.5, 4.5)
+
+
+def _sample_time(t: Vector) -> float:
+    return float(t[1] - t[0]) if t.size > 1 else SAMPLE_TIME
 
 
 def _levels(t: Vector, rng: np.random.Generator, size: float) -> Vector:
     values = np.empty_like(t)
     start = 0
     while start < t.size:
-        stop = start + round(rng.uniform(0.4, 2.4) / SAMPLE_TIME)
+        stop = start + max(1, round(rng.uniform(0.4, 2.4) / _sample_time(t)))
         values[start:stop] = rng.uniform(-size, size)
         start = stop
     return values
 
 
-def _multisine(t: Vector, rng: np.random.Generator) -> Matrix:
+def _multisine(t: Vector, rng: np.random.Generator, pulls: Pulls) -> Matrix:
     """Random-phase multisine up to 4 rad/s, the least crest factor of 200 draws per motor."""
-    period = max(t.size * SAMPLE_TIME, SAMPLE_TIME)
+    period = max(t.size, 1) * _sample_time(t)
     tones = 2.0 * np.pi / period * np.arange(1, max(2, int(4.0 * period / (2.0 * np.pi)) + 1))
     # 32 tones spread over the band keep the draw cheap and leave the crest factor low.
     tones = tones[np.unique(np.linspace(0, tones.size - 1, 32).round().astype(int))]
-    return np.column_stack([_low_crest(t, tones, rng) for _ in range(3)])
+    return np.column_stack([_low_crest(t, tones, rng) for _ in pulls.angles])
 
 
 def _low_crest(t: Vector, tones: Vector, rng: np.random.Generator) -> Vector:
@@ -153,17 +216,17 @@ def _low_crest(t: Vector, tones: Vector, rng: np.random.Generator) -> Vector:
     return 3.2 * s / np.abs(s).max(initial=1e-12)
 
 
-def _mixed(t: Vector, rng: np.random.Generator) -> Matrix:
+def _mixed(t: Vector, rng: np.random.Generator, pulls: Pulls) -> Matrix:
     """Eq. 22, aprbs, multisine, then single-tendon and co-contraction moves, in fixed shares."""
     edges = np.round(np.array([0.0, 0.34, 0.66, 0.88, 0.95, 1.0]) * t.size).astype(int)
-    lengths = np.diff(edges)
-    local = [np.arange(n) * SAMPLE_TIME for n in lengths]
-    parts = [eq22(local[0]), _aprbs(local[1], rng), _multisine(local[2], rng)]
-    parts += [_single_tendon(local[3], rng), np.repeat(_levels(local[4], rng, 2.5)[:, None], 3, axis=1)]
+    lengths, motors = np.diff(edges), pulls.angles.size
+    local = [np.arange(n) * _sample_time(t) for n in lengths]
+    parts = [eq22(local[0], pulls), _aprbs(local[1], rng, pulls), _multisine(local[2], rng, pulls)]
+    parts += [_single_tendon(local[3], rng, motors), np.repeat(_levels(local[4], rng, 2.5)[:, None], motors, axis=1)]
     return np.concatenate(parts)
 
 
-def _single_tendon(t: Vector, rng: np.random.Generator) -> Matrix:
+def _single_tendon(t: Vector, rng: np.random.Generator, motors: int) -> Matrix:
     levels = _levels(t, rng, 3.5)
-    motor = np.floor(t / 1.6).astype(int) % 3
-    return np.where(motor[:, None] == np.arange(3), levels[:, None], 0.0)
+    motor = np.floor(t / 1.6).astype(int) % motors
+    return np.where(motor[:, None] == np.arange(motors), levels[:, None], 0.0)

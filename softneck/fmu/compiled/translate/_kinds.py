@@ -7,10 +7,10 @@ why.
 
 from __future__ import annotations
 
-from softneck.runtime._bundle import declared
+from softneck.runtime._bundle import ANY_SIZE, declared
 from softneck.runtime._layout import Arrays
 
-RUNTIMES = (
+_NECKS = (
     "softneck.identification.linear._rls_runtime",
     "softneck.identification.linear._oe_runtime",
     "softneck.identification.linear._state_space_runtime",
@@ -31,6 +31,13 @@ RUNTIMES = (
     "softneck.fmu.describe._modelled_drives_runtime",
     "softneck.loop._reference_runtime",
 )
+# Those that robots of other sizes have; once more for all of these, so that the neck's know their sizes beforehand.
+_ROBOTS = (
+    "softneck.identification.linear._affine_runtime",
+    "softneck.identification.linear._state_space_runtime",
+    "softneck.identification.structured._play_runtime",
+)
+RUNTIMES = (*_NECKS, *(f"{module}@{ANY_SIZE}" for module in _ROBOTS))
 
 # Which of a step's functions are compiled for speed, all others for size: those with so many loops within each other.
 # A network, a search among thousands of points and a quadratic program spend their time in every loop; the neck in
@@ -42,6 +49,11 @@ FAST = {
     "softneck.estimation._kalman_runtime": 2,
     "softneck.design.predictive._mpc_runtime": 1,
 }
+
+
+def module_of(runtime: str) -> str:
+    """Return the module in the library that runs a runtime: its own, or that of all sizes."""
+    return runtime if runtime in RUNTIMES else f"{runtime.partition('@')[0]}@{ANY_SIZE}"
 
 
 def ranks_of(module: str) -> tuple[int, ...]:
