@@ -6,9 +6,17 @@ from pathlib import Path
 
 import click
 
-from softneck.core import refuse_existing, require_between, to_si
+from softneck.core import SettingsError, refuse_existing, require_between, to_si
 from softneck.robot import Robot, find_robot
-from softneck.signals import SetPointLimits, prepare, signal, signal_names, write_recording
+from softneck.signals import (
+    SetPointLimits,
+    concatenate,
+    multisine_experiments,
+    prepare,
+    signal,
+    signal_names,
+    write_recording,
+)
 
 from .shared._console import print_json, progress
 from .shared._neck import load_neck
@@ -36,6 +44,16 @@ from .shared._options import force_option, json_option, output_option
 @click.option(
     "--seed", type=click.IntRange(0, 2**31 - 2), default=0, show_default=True, help="Seed of noise and signal."
 )
+@click.option("--amplitude", type=float, metavar="A", help="`multisine` for `frf`: largest input. [default: 1]")
+@click.option(
+    "--band", metavar="LOW,HIGH", help="`multisine` for `frf`: from where to where [rad/s]; one value: a sine."
+)
+@click.option(
+    "--realisations",
+    type=int,
+    metavar="N",
+    help="`multisine` for `frf`: draws of the phases. [default: 4; 1 of a sine]",
+)
 @click.option("--payload", type=float, default=0.0, show_default=True, metavar="KG", help="Payload on the platform.")
 @click.option("--no-noise", is_flag=True, help="Simulate a perfect inclinometer.")
 @click.option("--ramp", type=float, default=0.0, metavar="S", help="Ramp in from rest and out to it. [default: none]")
@@ -51,6 +69,9 @@ def command(
     neck: str | None,
     duration: float | None,
     seed: int,
+    amplitude: float | None,
+    band: str | None,
+    realisations: int | None,
     payload: float,
     no_noise: bool,
     ramp: float,
@@ -71,9 +92,27 @@ def command(
     virtual = VirtualNeck.of(whose, None if neck is None else load_neck(neck))
     bounds = {"position": max_position, "speed": max_speed, "slack": max_slack}
     limits = SetPointLimits(**_allowed(whose) | {name: value for name, value in bounds.items() if value is not None})
-    excitation, changes = prepare(signal(signal_name, duration=duration, seed=seed, robot=whose), limits, ramp_s=ramp)
-    with progress("record", quiet=as_json):
-        recording = record(excitation, virtual, seed=seed, payload=payload, noise=not no_noise)
+    experiment = {"amplitude": amplitude, "band": _band(band), "realisations": realisations}
+    asked = {name: value for name, value in experiment.items() if value is not None}
+    if asked and (signal_name != "multisine" or duration is not None or ramp > 0.0):
+        raise SettingsError(
+            f"`--{next(iter(asked))}` asks for the experiments of `softneck frf`: the signal is `multisine` then, and "
+            "takes no `--duration` and no `--ramp`, which would end its periods."
+        )
+    if asked:
+        played = multisine_experiments(seed=seed, robot=whose, **asked)
+    else:
+        played = [signal(signal_name, duration=duration, seed=seed, robot=whose)]
+    prepared = [prepare(item, limits, ramp_s=ramp) for item in played]
+    changes = prepared[0][1]
+    if asked and any(item != type(changes)() for _, item in prepared):
+        raise SettingsError("the experiments go beyond the motors' limits; lower `--amplitude` or the top of `--band`.")
+    with progress("record", quiet=as_json) as report:
+        runs = []
+        for number, (excitation, _) in enumerate(prepared):
+            runs.append(record(excitation, virtual, seed=seed + number, payload=payload, noise=not no_noise))
+            report((number + 1) / len(prepared), f"run {number + 1} of {len(prepared)}")
+        recording = runs[0] if len(runs) == 1 else concatenate(runs)
     write_recording(output, recording, force=force)
     if as_json:
         facts = {"recording": str(output), "rows": len(recording), "sample_time_s": recording.sample_time}
@@ -82,6 +121,18 @@ def command(
     click.echo(f"{output}: {len(recording)} rows of {signal_name} at {1e3 * recording.sample_time:g} ms")
     if ramp > 0 or limits != SetPointLimits():
         click.echo(f"set-points: {changes}")
+
+
+def _band(text: str | None) -> tuple[float, float] | None:
+    """Return the ends [rad/s] that `--band` names, None where it is not given."""
+    if text is None:
+        return None
+    words = text.split(",")
+    try:
+        low, high = (float(word) for word in (words if len(words) == 2 else words * 2))
+    except ValueError:
+        raise SettingsError(f"`--band` is two frequencies in rad/s, such as 0.5,25, or one; got `{text}`.") from None
+    return low, high
 
 
 def _allowed(robot: Robot) -> dict[str, float]:

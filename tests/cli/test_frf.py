@@ -36,3 +36,22 @@ def test_a_response_is_written_drawn_and_described(call: Call, tmp_path: Path) -
     mixed = call("frf", "m.csv", "-o", "g.npz", "--model", "f.npz")
     assert (mixed.code, "f.npz: only a linear model or a family has a response to draw" in mixed.error) == (2, True)
     assert not (tmp_path / "g.npz").exists()
+
+
+def test_what_it_needs_is_recorded_and_refused_in_a_line(call: Call, tmp_path: Path) -> None:
+    said = call("record", "multisine", "--amplitude", "0.3", "--band", "2,6", "--realisations", "2", "-o", "m.csv")
+    assert said.code == 0, said.err
+    assert json.loads(call("frf", "m.csv", "--json").out)["method"] == "robust"
+    for options, line in (
+        (
+            ("eq22", "--band", "1,2"),
+            "`--band` asks for the experiments of `softneck frf`: the signal is `multisine` then",
+        ),
+        (("multisine", "--amplitude", "1", "--duration", "9"), "takes no `--duration`"),
+        (("multisine", "--band", "1,2,3"), "`--band` is two frequencies in rad/s, such as 0.5,25, or one; got `1,2,3`"),
+        (("multisine", "--band", "9,2"), "`band` must rise within"),
+        (("multisine", "--amplitude", "20"), "beyond the motors' limits; lower `--amplitude`"),
+    ):
+        refused = call("record", *options, "-o", "u.csv")
+        assert (refused.code, line in refused.error) == (2, True), refused.error
+        assert not (tmp_path / "u.csv").exists()

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError, Matrix, SettingsError
-from softneck.plant import NeckParameters, VirtualNeck, neck_energy, record
-from softneck.plant._energy import body
+from softneck.plant import NeckParameters, VirtualNeck, record
+from softneck.plant._energy import body, neck_energy
 from softneck.robot import Robot
 from softneck.runtime import Block, State, load_runtime
 from softneck.signals import Excitation, signal, signal_names

@@ -245,11 +245,16 @@ _REAL = ("frequency", "freedom", "coherence", "noise", "amplitude")
 _COMPLEX = ("response", "covariance")
 
 
+# Outputs that answer a sine less than this part of the one that answers most are left out of the summary.
+_HEARD = 0.1
+
+
 def _sine_line(item: Sine, of: FrequencyResponse, scale: float, unit: str) -> str:
     main = int(np.argmax(item.amplitude))
     answers = ", ".join(
         f"{name} {scale * abs(G):.3g} {unit} at {np.degrees(np.angle(G)):.0f} deg, harmonics {100 * d:.0f} %"
         for name, G, d in zip(of.outputs, item.response, item.distortion, strict=True)
+        if abs(G) >= _HEARD * max(map(abs, item.response))
     )
     return f"sine of {item.amplitude[main]:.2g} on {of.inputs[main]} at {item.frequency:.3g} rad/s: {answers}"
 

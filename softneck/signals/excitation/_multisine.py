@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softneck.core import Matrix, SettingsError, require_between, require_whole
+from softneck.core import Matrix, SettingsError, require_between, require_whole, to_si
 from softneck.robot import Robot
 
 from ..recording._channels import NECK
-from ._signals import SAMPLE_TIME, Excitation
+from ._signals import Excitation
 
 # The first period holds the transient; two more tell noise from the rest.
 _PERIODS = 3
@@ -31,10 +31,9 @@ def multisine_experiments(
     *,
     amplitude: float = 1.0,
     band: tuple[float, float] = (0.5, 25.0),
-    realisations: int = 4,
+    realisations: int | None = None,
     seed: int = 0,
     robot: Robot = NECK,
-    sample_time: float = SAMPLE_TIME,
 ) -> list[Excitation]:
     """Return the experiments that `frequency_response` takes apart into response, noise and nonlinear distortion.
 
@@ -46,17 +45,18 @@ def multisine_experiments(
     Args:
         amplitude: largest value of any direction's input, in the motors' unit.
         band: lowest and highest frequency [rad/s]; a period is one cycle of the lowest.
-        realisations: draws of the phases; with a sine, repetitions.
+        realisations: draws of the phases, 4 where not given; of a sine repetitions, 1.
         seed: of the phases.
-        robot: whose directions and motors.
-        sample_time: [s].
+        robot: whose directions and motors move, at its sample time.
 
     Raises:
-        SettingsError: an empty band, one beyond a quarter of the sampling rate, or directions that are not given.
+        SettingsError: an empty band, one beyond a quarter of the sampling rate, or directions or a sample time that
+            the robot does not give.
     """
-    low, high = band
+    (low, high), sample_time = band, robot.require("sample_time_s", "a signal")
     require_between("amplitude", amplitude, 1e-6, 1e6, robot.motors.unit)
-    require_whole("realisations", realisations, 1, 100)
+    count = realisations if realisations is not None else 1 if low == high else 4
+    require_whole("realisations", count, 1, 100)
     fastest = 2.0 * np.pi / (_SAMPLES_PER_CYCLE * sample_time)
     if not 2.0 * np.pi / _LONGEST <= low <= high <= fastest:
         raise SettingsError(
@@ -71,15 +71,17 @@ def multisine_experiments(
     rows = round(2.0 * np.pi / (low * sample_time))
     lines = np.arange(1, max(1, int(high / low + 1e-9)) + 1)
     chosen = np.unique(np.geomspace(1, lines[-1], _LINES).round().astype(int))
-    inputs = _sines(weights.shape[0], realisations) if lines.size == 1 else None
+    inputs = _sines(weights.shape[0], count) if lines.size == 1 else None
     if inputs is None:
-        inputs = _realisations(weights.shape[0], realisations, chosen, np.random.default_rng(seed))
+        inputs = _realisations(weights.shape[0], count, chosen, np.random.default_rng(seed))
     waves = [_period(phasors, chosen, rows) for phasors in inputs]
-    scale = amplitude / max(float(np.abs(wave).max()) for wave in waves)
+    scale = to_si(robot.motors.unit)[0] * amplitude / max(float(np.abs(wave).max()) for wave in waves)
     to_motors = np.linalg.pinv(weights).T
-    count = _CYCLES if lines.size == 1 else _PERIODS
-    time = np.arange(count * rows) * sample_time
-    return [Excitation("multisine", time, np.tile(scale * wave @ to_motors, (count, 1)), sample_time) for wave in waves]
+    repeated = _CYCLES if lines.size == 1 else _PERIODS
+    time = np.arange(repeated * rows) * sample_time
+    return [
+        Excitation("multisine", time, np.tile(scale * wave @ to_motors, (repeated, 1)), sample_time) for wave in waves
+    ]
 
 
 def _sines(q: int, repetitions: int) -> list[_Phasors]:
