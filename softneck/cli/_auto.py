@@ -50,8 +50,6 @@ def identify_auto(
     if html is not None:
         refuse_existing(html, force=force)
     parts = [read_recording(source) for source in recordings]
-    if html is not None:
-        parts[0].robot.require_neck("`--html` of `auto`")
     head, tail, other = _split(parts, train)
     with progress("identify auto", quiet=as_json) as report:
         choice = choose(head, tail, other_excitation=other, seed=seed or 0, progress=report)
@@ -148,13 +146,15 @@ def _facts(choice: Choice, path: Path) -> dict:
 def _page(choice: Choice) -> str:
     from softneck.plots import Section, Table, page, validation_figure
 
-    table = Table("Fit [%] on the rows held out, pitch/roll", _HEAD, _rows(choice))
+    judged = next((one.judged for one in choice.ranking if one.judged is not None), None)
+    names = () if judged is None else judged.robot.outputs.names
+    table = Table(f"Fit [%] on the rows held out, {'/'.join(names)}", _HEAD, _rows(choice))
     sections = [Section("Which model", text=[choice.why, *choice.remarks], tables=[table])]
     for one in choice.ranking:
         if one.judged is None or (one is not choice.chosen and one is not choice.ranking[0]):
             continue
         curves = {"free run": one.judged.free_run}
-        figure = validation_figure(one.judged.time, one.judged.measured, curves, one.kind)
+        figure = validation_figure(one.judged.time, one.judged.measured, curves, one.kind, robot=one.judged.robot)
         sections.append(
             Section(one.kind, text=[one.model.summary() if one.model else ""], figures=[(one.kind, figure)])
         )

@@ -60,7 +60,8 @@ def command(
     """Package FILE as a Co-Simulation FMU of FMI 2.0 or 3.0.
 
     FILE is a model, observer or controller (.npz), a neck parameter file (.toml), a neck preset (paper, lab, rough),
-    or a loop file, from whose [reference] a reference FMU is built.
+    a robot file or preset, whose virtual plant it becomes, or a loop file, from whose [reference] a reference FMU is
+    built.
     """
     from softneck.fmu import build_compiled_fmu, build_fmu, fmu_info
 
@@ -93,9 +94,11 @@ def command(
 
 
 def open_buildable(source: str | Path) -> Buildable:
-    """Return what `source` names: a softneck file, a neck file or a neck preset."""
+    """Return what `source` names: a softneck file, a neck or a robot by its file or preset."""
     from softneck.cosim.loops._loop_file import is_loop_file, reference_of
     from softneck.plant import VirtualNeck
+    from softneck.robot import Robot
+    from softneck.robot._file import PRESETS
 
     if Path(source).suffix == ".npz":
         thing = load(source)
@@ -105,8 +108,12 @@ def open_buildable(source: str | Path) -> Buildable:
     if Path(source).suffix not in ("", ".toml"):
         raise FileFormatError(
             f"{source}: no FMU can be built from a `{Path(source).suffix}` file; give a model, controller or observer "
-            "(.npz), a neck or loop file (.toml), or a preset (paper, lab, rough)."
+            "(.npz), a neck, robot or loop file (.toml), or a preset (paper, lab, rough)."
         )
+    if str(source) in PRESETS:
+        return VirtualNeck.of(Robot.preset(str(source)))
+    if _has_keys(Path(source), {"motors", "outputs", "directions", "extends"}):
+        return VirtualNeck.of(Robot.read(source))
     if is_loop_file(Path(source)):
         return reference_of(Path(source))
     return VirtualNeck(load_neck(str(source)))
@@ -157,13 +164,17 @@ def _is_neck(path: Path) -> bool:
     """Return whether a file means to be a neck's; what is wrong in it is said when it is read."""
     from softneck.plant import NeckParameters
 
-    if path.suffix != ".toml":
+    return _has_keys(path, {"preset", *NeckParameters.names()})
+
+
+def _has_keys(path: Path, keys: set[str]) -> bool:
+    """Return whether a TOML file has one of these keys."""
+    if path.suffix != ".toml" or not path.is_file():
         return False
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        return not keys.isdisjoint(tomllib.loads(path.read_text(encoding="utf-8")))
     except (ValueError, RecursionError):
         return False
-    return not set(content).isdisjoint({"preset", *NeckParameters.names()})
 
 
 def _stem(file: str) -> str:

@@ -179,15 +179,19 @@ def _recording(file: Path, html: Path | None, *, force: bool, quiet: bool) -> di
         report(0.0, "reading")
         recording = read_recording(file)
         neck = recording.robot.is_neck
-        if html is not None:
-            recording.robot.require_neck(f"{file}: `--html`")
         report(0.6, "checking")
         found = assess_quality(recording) if neck else None
-        if html is not None and found is not None:
+        if html is not None:
             from softneck.plots import quality_page, write_page  # matplotlib takes a while to import
+            from softneck.plots._recording_page import recording_page
 
             report(0.8, "drawing")
-            write_page(html, quality_page(recording, found, f"Quality of {file.name}"), force=force)
+            drawn = (
+                recording_page(recording, file.name)
+                if found is None
+                else quality_page(recording, found, f"Quality of {file.name}")
+            )
+            write_page(html, drawn, force=force)
     return {
         "type": "recording",
         "rows": len(recording),

@@ -72,9 +72,6 @@ def command(
         refuse_existing(html, force=force)
     loaded = {str(path): load_model(path) for path in models}
     recordings = {str(path): read_recording(path) for path in data}
-    if html is not None:
-        for path, recording in recordings.items():
-            recording.robot.require_neck(f"{path}: `--html`")
     rules = Rules(horizons, motors, include_training)
     known = read_together(training) if training else None
     with progress("validate", quiet=as_json) as report:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -147,8 +147,8 @@ class VirtualNeck:
             runtime=sized(RUNTIME, motors, outputs),
             sample_time=sample_time,
             arrays=([setup],),  # pyright: ignore[reportArgumentType]
-            inputs=_inputs(self.robot, self.ranges()),
-            outputs=_outputs(self.robot),
+            inputs=_as_shown(_inputs(self.robot, self.ranges()), self.robot),
+            outputs=_as_shown(_outputs(self.robot), self.robot),
             parameters=(*self._parameter_ports(), seed),
         )
 
@@ -180,6 +180,20 @@ class VirtualNeck:
                 f"inclinometer noise {math.degrees(p.noise_std):.3f} deg",
             ]
         )
+
+
+def _as_shown(ports: tuple[Port, ...], robot: Robot) -> tuple[Port, ...]:
+    """Return ports that say in which units people see the robot; those of a neck are the usual ones."""
+    if robot.is_neck:
+        return ports
+    motors, outputs = robot.motors.unit, robot.outputs.display_unit
+
+    def shown(port: Port) -> str:
+        if port.unit == "rad":
+            return motors if port.name.startswith("motor_") else outputs
+        return f"{outputs}/s" if port.unit == "rad/s" else ""
+
+    return tuple(replace(port, display_unit=shown(port)) for port in ports)
 
 
 def _ranges(robot: Robot, limit: float) -> Matrix:

@@ -8,10 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, Vector
+from softneck.core import DataError, Matrix, Vector, to_si
+from softneck.robot import Robot
+from softneck.signals.recording._channels import NECK
 
 from ._chart import Chart, Curve, Level, Panel
-from ._style import AXES, BLUE, COLOURS, GREEN, GREY, MOTOR_COLOURS, ORANGE, SKY, looks
+from ._style import ALL_MOTOR_COLOURS, BLUE, COLOURS, GREEN, GREY, MOTOR_COLOURS, ORANGE, SKY, looks, shown
 
 # Of the whole time: the space between two runs that both start at zero.
 _SPACE = 0.03
@@ -83,30 +85,42 @@ def _moved(time: Vector, breaks: np.ndarray, usual: float) -> tuple[Vector, bool
 
 BLACK = "black"
 _ZERO = Level(0.0, dashed=False)
+_OUTPUT_COLOURS = (BLUE, ORANGE, GREEN, SKY)
 
 
 def recording_chart(
-    time: Vector, set_points: Matrix, outputs: Matrix, title: str, *, run: np.ndarray | None = None
+    time: Vector,
+    set_points: Matrix,
+    outputs: Matrix,
+    title: str,
+    *,
+    run: np.ndarray | None = None,
+    robot: Robot = NECK,
 ) -> Chart:
     """Describe an experiment.
 
     Args:
         time: (time,) [s].
-        set_points: (time, 3) [rad], held between samples.
-        outputs: (time, 2) pitch and roll [rad], drawn in degrees; NaN where a sample was missed.
+        set_points: (time, motors) in SI, of a neck (time, 3) [rad], held between samples.
+        outputs: (time, outputs) in SI, of a neck pitch and roll [rad]; drawn in the robot's display unit, of a neck
+            degrees; NaN where a sample was missed.
         title: of the chart.
         run: (time,) numbers of the runs; None where there is one.
+        robot: whose motors and outputs these are.
     """
     line = timeline(time, run)
+    unit, drawn = robot.motors.unit, robot.outputs.display_unit
+    sent = set_points / to_si(unit)[0]
     motors = [
-        Curve(line.x, line.spread(set_points[:, j]), f"motor {j + 1}", MOTOR_COLOURS[j], "step", 0.9) for j in range(3)
+        Curve(line.x, line.spread(sent[:, j]), f"motor {j + 1}", ALL_MOTOR_COLOURS[j], "step", 0.9)
+        for j in range(sent.shape[1])
     ]
     angles = [
-        Curve(line.x, line.spread(np.degrees(outputs[:, i])), AXES[i], colour, width=0.9)
-        for i, colour in enumerate((BLUE, ORANGE))
+        Curve(line.x, line.spread(shown(outputs[:, i], robot)), name, colour, width=0.9)
+        for i, (name, colour) in enumerate(zip(robot.outputs.names, _OUTPUT_COLOURS, strict=False))
     ]
-    borders = _borders(line)
-    panels = [Panel(motors, "set-point [rad]", levels=borders), Panel(angles, "angle [deg]", levels=borders)]
+    borders, what = _borders(line), "angle" if drawn == "deg" else "output"
+    panels = [Panel(motors, f"set-point [{unit}]", levels=borders), Panel(angles, f"{what} [{drawn}]", levels=borders)]
     return Chart(title, panels, line.x_label)
 
 
@@ -119,43 +133,45 @@ def validation_chart(
     bounds: tuple[Matrix, Matrix] | None = None,
     run: np.ndarray | None = None,
     caption: str = "",
+    robot: Robot = NECK,
 ) -> Chart:
-    """Describe measured and predicted pitch and roll, each with its error (measured - predicted) below.
+    """Describe measured and predicted outputs, each with its error (measured - predicted) below.
 
     Args:
         time: (time,) [s].
-        measured: (time, 2) [rad], NaN where a row is not scored.
-        predictions: name -> (time, 2) [rad]; NaN where there is none.
+        measured: (time, outputs) in SI, of a neck pitch and roll [rad]; NaN where a row is not scored.
+        predictions: name -> (time, outputs); NaN where there is none.
         title: of the chart.
-        bounds: lower and upper (time, 2) [rad] that a model promises, drawn as a band.
+        bounds: lower and upper (time, outputs) that a model promises, drawn as a band.
         run: (time,) numbers of the stretches, which no line joins; None: wherever the time jumps.
         caption: for under the chart.
+        robot: whose outputs these are; they are drawn in its display unit.
     """
     line = timeline(time, run)
-    panels = []
-    for i, axis in enumerate(AXES):
-        y = line.spread(np.degrees(measured[:, i]))
+    panels, unit = [], robot.outputs.display_unit
+    for i, axis in enumerate(robot.outputs.names):
+        y = line.spread(shown(measured[:, i], robot))
         curves, errors = [], []
         if bounds is not None:
-            lower, upper = (line.spread(np.degrees(edge[:, i])) for edge in bounds)
+            lower, upper = (line.spread(shown(edge[:, i], robot)) for edge in bounds)
             curves.append(Curve(line.x, lower, "bounds", SKY, "band", upper=upper))
         curves.append(Curve(line.x, y, "measured", BLACK, width=1.2))
         for (name, values), (colour, style) in zip(predictions.items(), looks(), strict=False):
-            yhat = line.spread(np.degrees(values[:, i]))
+            yhat = line.spread(shown(values[:, i], robot))
             curves.append(Curve(line.x, yhat, name, colour, style, 0.9))
             errors.append(Curve(line.x, y - yhat, name, colour, style, 0.8))
-        panels.append(Panel(curves, f"{axis} [deg]", y_range=_range_for(y, curves)))
-        panels.append(Panel(errors, "error [deg]", levels=(_ZERO,), legend=False))
+        panels.append(Panel(curves, f"{axis} [{unit}]", y_range=_range_for(y, curves, 1.0 if unit == "deg" else 0.0)))
+        panels.append(Panel(errors, f"error [{unit}]", levels=(_ZERO,), legend=False))
     return Chart(title, panels, line.x_label, caption=caption, row_height=1.9)
 
 
-def _range_for(measured: Vector, curves: list[Curve]) -> tuple[float, float] | None:
-    """Keep what was measured readable beside a prediction that runs far off; None where none does."""
+def _range_for(measured: Vector, curves: list[Curve], least: float) -> tuple[float, float] | None:
+    """Keep what was measured, or as much as `least`, readable beside a prediction that runs off; None: none does."""
     seen = measured[np.isfinite(measured)]
     if seen.size == 0:
         return None
     low, high = float(seen.min()), float(seen.max())
-    room = max(high - low, 1.0)
+    room = max(high - low, least) or 1.0
     far = max((float(np.nanmax(np.abs(c.y), initial=0.0)) for c in curves), default=0.0)
     return (low - 0.5 * room, high + 0.5 * room) if far > max(abs(low), abs(high)) + 2.0 * room else None
 
@@ -170,7 +186,7 @@ def loop_chart(time: Vector, signals: Mapping[str, Vector], title: str, *, capti
         title: of the chart.
         caption: for under the chart.
     """
-    panels = [_angle_panel(time, signals, axis) for axis in AXES]
+    panels = [_angle_panel(time, signals, axis) for axis in NECK.outputs.names]
     motors = []
     for j, colour in enumerate(MOTOR_COLOURS, start=1):
         motors.append(Curve(time, signals[f"motor_setpoint_{j}"], f"set-point {j}", colour, "step"))

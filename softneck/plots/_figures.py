@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from softneck.core import Matrix, Vector
+from softneck.robot import Robot
+from softneck.signals.recording._channels import NECK
 
 from ._chart import Chart, Curve, Panel, bar_width
 from ._charts import delay_chart, loop_chart, recording_chart, validation_chart
@@ -100,9 +102,10 @@ def validation_figure(
     *,
     bounds: tuple[Matrix, Matrix] | None = None,
     run: np.ndarray | None = None,
+    robot: Robot = NECK,
 ) -> Figure:
-    """Draw `validation_chart`: measured and predicted pitch and roll (time, 2) [rad], each with its error below."""
-    return chart_figure(validation_chart(time, measured, predictions, title, bounds=bounds, run=run))
+    """Draw `validation_chart`: measured and predicted outputs, of a neck (time, 2) [rad], each with its error below."""
+    return chart_figure(validation_chart(time, measured, predictions, title, bounds=bounds, run=run, robot=robot))
 
 
 def loop_figure(time: Vector, signals: Mapping[str, Vector], title: str) -> Figure:

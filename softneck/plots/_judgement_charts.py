@@ -7,9 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 
 from softneck.core import DataError, Matrix, Vector
+from softneck.robot import Robot
+from softneck.signals.recording._channels import NECK
 
 from ._chart import Chart, Curve, Level, Panel
-from ._style import AXES, BLUE, GREY, RED, looks
+from ._style import BLUE, GREY, RED, looks, shown
 
 _BOUND = "99 % bounds"
 # Bins of a histogram at most; more are thinner than what a screen shows.
@@ -22,39 +24,41 @@ def residual_chart(
     title: str,
     *,
     caption: str = "",
+    robot: Robot = NECK,
 ) -> Chart:
-    """Describe residual tests as MATLAB's `resid`: one column for pitch, one for roll.
+    """Describe residual tests as MATLAB's `resid`: one column for each output, of a neck pitch and roll.
 
     Args:
-        autocorrelation: of the one-step errors: lags (n,) [samples], values (2, n) and their bounds (2,); lag 0,
-            which is 1, is not drawn.
-        cross_correlation: with the motors' set-points: lags (m,) [samples], values (2, 3, m), bounds (2, 3).
+        autocorrelation: of the one-step errors: lags (n,) [samples], values (outputs, n) and their bounds (outputs,);
+            lag 0, which is 1, is not drawn.
+        cross_correlation: with the motors' set-points: lags (m,) [samples], values (outputs, motors, m), bounds
+            (outputs, motors).
         title: of the chart.
         caption: for under the chart.
+        robot: whose outputs and motors these are.
 
     Raises:
         DataError: shapes do not fit.
     """
     lags, values, bounds = autocorrelation
     cross_lags, cross, cross_bounds = cross_correlation
-    if values.shape != (2, len(lags)) or cross.shape != (2, 3, len(cross_lags)):
+    axes, motors = robot.outputs.names, len(robot.motors.names)
+    if values.shape != (len(axes), len(lags)) or cross.shape != (len(axes), motors, len(cross_lags)):
         raise DataError(
-            f"residual tests need correlations (2, lags) and (2, 3, lags); got {values.shape} at {len(lags)} lags "
-            f"and {cross.shape} at {len(cross_lags)}."
+            f"residual tests need correlations ({len(axes)}, lags) and ({len(axes)}, {motors}, lags); got "
+            f"{values.shape} at {len(lags)} lags and {cross.shape} at {len(cross_lags)}."
         )
     kept = np.asarray(lags) != 0
     panels = [
-        _stems(np.asarray(lags)[kept], values[i, kept], float(bounds[i]), f"{AXES[i]}: error with itself later")
-        for i in range(2)
+        _stems(np.asarray(lags)[kept], values[i, kept], float(bounds[i]), f"{axis}: error with itself later")
+        for i, axis in enumerate(axes)
     ]
-    for j in range(3):
+    for j in range(motors):
         panels += [
-            _stems(
-                cross_lags, cross[i, j], float(cross_bounds[i, j]), f"{AXES[i]}: error with set-point {j + 1} earlier"
-            )
-            for i in range(2)
+            _stems(cross_lags, cross[i, j], float(cross_bounds[i, j]), f"{axis}: error with set-point {j + 1} earlier")
+            for i, axis in enumerate(axes)
         ]
-    return Chart(title, panels, "lag [samples]", columns=2, linked=False, caption=caption, row_height=1.9)
+    return Chart(title, panels, "lag [samples]", columns=len(axes), linked=False, caption=caption, row_height=1.9)
 
 
 def _stems(lags: np.ndarray, values: Vector, bound: float, title: str) -> Panel:
@@ -71,22 +75,24 @@ def _stems(lags: np.ndarray, values: Vector, bound: float, title: str) -> Panel:
     return Panel(curves, "correlation", levels=levels, title=title, legend=False, y_range=(-edge, edge))
 
 
-def histogram_chart(errors: Matrix, title: str, *, caption: str = "") -> Chart:
+def histogram_chart(errors: Matrix, title: str, *, caption: str = "", robot: Robot = NECK) -> Chart:
     """Describe how errors are spread, beside the normal curve of the same mean and standard deviation.
 
     Args:
-        errors: (time, 2) of pitch and roll [rad], drawn in degrees; rows that are not finite are left out.
+        errors: (time, outputs) in SI, of a neck of pitch and roll [rad]; rows that are not finite are left out.
         title: of the chart.
         caption: for under the chart.
+        robot: whose outputs these are; errors are drawn in its display unit.
 
     Raises:
         DataError: no error is finite.
     """
-    panels = [_histogram(AXES[i], np.degrees(errors[:, i])) for i in range(2)]
-    return Chart(title, panels, "error [deg]", columns=2, linked=False, caption=caption)
+    axes, unit = robot.outputs.names, robot.outputs.display_unit
+    panels = [_histogram(axis, shown(errors[:, i], robot), unit) for i, axis in enumerate(axes)]
+    return Chart(title, panels, f"error [{unit}]", columns=len(axes), linked=False, caption=caption)
 
 
-def _histogram(axis: str, errors: Vector) -> Panel:
+def _histogram(axis: str, errors: Vector, unit: str) -> Panel:
     e = errors[np.isfinite(errors)]
     if e.size == 0:
         raise DataError(f"there is no error of {axis} to draw a histogram of.")
@@ -104,8 +110,8 @@ def _histogram(axis: str, errors: Vector) -> Panel:
         x = np.linspace(low, high, 301)
         normal = np.exp(-0.5 * ((x - mean) / spread) ** 2) / (spread * np.sqrt(2 * np.pi))
         curves.append(Curve(x, normal, "normal", RED, width=1.2))
-    title = f"{axis}: mean {mean:.3g} deg, standard deviation {spread:.3g} deg"
-    return Panel(curves, "density [1/deg]", title=title)
+    title = f"{axis}: mean {mean:.3g} {unit}, standard deviation {spread:.3g} {unit}"
+    return Panel(curves, f"density [1/{unit}]", title=title)
 
 
 def cost_chart(

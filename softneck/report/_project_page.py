@@ -80,7 +80,9 @@ def _data(project: Project) -> Section | None:
 
 
 def _recorded(name: str, recording: Recording) -> Chart:
-    return recording_chart(recording.time, recording.set_points, recording.outputs, name, run=recording.run)
+    return recording_chart(
+        recording.time, recording.set_points, recording.outputs, name, run=recording.run, robot=recording.robot
+    )
 
 
 def _models(project: Project) -> Section | None:
@@ -123,8 +125,9 @@ def _fits(result: Any) -> list[str]:
 
 def _judged(result: Any, title: str) -> Chart:
     return validation_chart(
-        result.time, result.measured, {"free run": drawable(result.free_run)}, title, run=result.run
-    )
+        result.time, result.measured, {"free run": drawable(result, result.free_run)}, title, run=result.run,
+        robot=result.robot,
+    )  # fmt: skip
 
 
 def _uncertain(project: Project) -> Section | None:

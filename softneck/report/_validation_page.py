@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix
+from softneck.core import Matrix, to_si
 from softneck.identification import INFINITE, Validation
 from softneck.plots import Chart, Section, Table, page
 from softneck.plots._charts import validation_chart
 from softneck.plots._judgement_charts import histogram_chart, residual_chart
 
 VALIDATION_NOTE = (
-    "Fit is 100 (1 - |y - yhat| / |y - mean y|) in %, pitch/roll. Persistence repeats the last sample: a one-step fit "
+    "Fit is 100 (1 - |y - yhat| / |y - mean y|) in %, {outputs}. Persistence repeats the last sample: a one-step fit "
     "that is not above it says nothing. Best linear was fitted on the judged rows themselves: no linear model of the "
     "set-points has a better free run on them. The free run has the set-points alone (or the logged motors, if asked "
     "for); that is what an FMU of the plant does. Rows that a model was trained on are left out."
@@ -28,11 +28,12 @@ _RESIDUALS = (
     "controller from the outputs show at negative lags."
 )
 _HEAD = [
-    "model on data", "samples ahead", "persistence", "best linear", "model", "95 % interval", "rms [deg]",
-    "worst [deg]", "R2",
+    "model on data", "samples ahead", "persistence", "best linear", "model", "95 % interval", "rms [{unit}]",
+    "worst [{unit}]", "R2",
 ]  # fmt: skip
-# A free run beyond this has diverged [rad]; it is not drawn from there on, for the rest to stay readable.
-_DRAWN = np.pi
+# A free run beyond this has diverged [rad], of other outputs than angles beyond so many times what was measured; it is
+# not drawn from there on, for the rest to stay readable.
+_DRAWN, _DRAWN_TIMES = np.pi, 10.0
 
 
 def validation_page(results: Sequence[Validation], *, title: str = "Validation") -> str:
@@ -44,14 +45,13 @@ def validation_page(results: Sequence[Validation], *, title: str = "Validation")
         results: of `validate`, one for each model and recording.
         title: of the page.
     """
-    for result in results:
-        result.robot.require_neck("the page on a validation")
     sections = [_overview(results), *_comparisons(results), *(_section(result) for result in results)]
     return page(title, sections, footer="Written by softneck.")
 
 
 def _overview(results: Sequence[Validation]) -> Section:
-    rows = []
+    rows, outputs = [], results[0].robot.outputs
+    names, unit = "/".join(outputs.names), outputs.display_unit
     for r in results:
         for h in r.fits:
             tables = (r.persistence, r.best_linear, r.fits, r.intervals)
@@ -65,10 +65,12 @@ def _overview(results: Sequence[Validation]) -> Section:
                     _cell(r.r2[h], 3),
                 ]
             )
-    fits = Table("Fit in %, errors in deg, pitch/roll", _HEAD, rows)
+    fits = Table(f"Fit in %, errors in {unit}, {names}", [title.format(unit=unit) for title in _HEAD], rows)
     counts = [[_name(r), str(r.rows_scored), str(r.rows_left_out), *_verdicts(r)] for r in results]
     head = ["model on data", "rows judged", "left out", "one-step errors white", "follow no input", "free run diverged"]
-    return Section("Fits", text=[VALIDATION_NOTE], tables=[fits, Table("What was judged", head, counts)])
+    return Section(
+        "Fits", text=[VALIDATION_NOTE.format(outputs=names)], tables=[fits, Table("What was judged", head, counts)]
+    )
 
 
 def _verdicts(r: Validation) -> list[str]:
@@ -87,29 +89,31 @@ def _comparisons(results: Sequence[Validation]) -> list[Section]:
     for group in groups.values():
         if len(group) > 1:
             data = Path(group[0].data).stem
-            runs = {Path(r.model).stem: drawable(r.free_run) for r in group}
-            runs = runs if len(runs) == len(group) else {r.model: drawable(r.free_run) for r in group}
+            runs = {Path(r.model).stem: drawable(r, r.free_run) for r in group}
+            runs = runs if len(runs) == len(group) else {r.model: drawable(r, r.free_run) for r in group}
+            first = group[0]
             chart = validation_chart(
-                group[0].time, group[0].measured, runs, "Free runs", run=group[0].run, caption=_ERROR
+                first.time, first.measured, runs, "Free runs", run=first.run, caption=_ERROR, robot=first.robot
             )
             sections.append(Section(f"All models on {data}", charts=[chart]))
     return sections
 
 
 def _section(r: Validation) -> Section:
-    predictions = {"one step": drawable(r.one_step)}
+    predictions = {"one step": drawable(r, r.one_step)}
     if INFINITE in r.fits:
-        predictions["free run"] = drawable(r.free_run)
+        predictions["free run"] = drawable(r, r.free_run)
     bounds = _bounds_of(r)
     caption = _ERROR + (" The band holds the model's bounds of its free run." if bounds else "")
     curves = validation_chart(
-        r.time, r.measured, predictions, "Measured and predicted", bounds=bounds, run=r.run, caption=caption
-    )
+        r.time, r.measured, predictions, "Measured and predicted", bounds=bounds, run=r.run, caption=caption,
+        robot=r.robot,
+    )  # fmt: skip
     charts = [curves, _residuals(r)]
     for name, values in predictions.items():
         errors = r.measured - values
         if np.isfinite(errors).any(axis=0).all():
-            charts.append(histogram_chart(errors, f"Errors, {name}"))
+            charts.append(histogram_chart(errors, f"Errors, {name}", robot=r.robot))
     return Section(_name(r), text=_remarks(r), tables=_run_tables(r), charts=charts)
 
 
@@ -120,6 +124,7 @@ def _residuals(r: Validation) -> Chart:
         (tests.cross_lags, tests.cross_correlation, tests.cross_bound),
         "Residual tests of the one-step errors",
         caption=_RESIDUALS,
+        robot=r.robot,
     )
 
 
@@ -132,14 +137,15 @@ def _remarks(r: Validation) -> list[str]:
             f"{'follow no set-point' if r.uncorrelated else 'follow the set-points'} (99 %)."
         ]
     if r.diverged is not None:
-        words.append(f"The free run diverged at {r.diverged:.2f} s and is not drawn beyond half a turn.")
+        far = "half a turn" if _turns(r) else f"{_DRAWN_TIMES:g} times what was measured"
+        words.append(f"The free run diverged at {r.diverged:.2f} s and is not drawn beyond {far}.")
     if any(fit is not None for fit in r.noise_ceiling.values()):
         ceiling = _cell(r.noise_ceiling, 1)
         words.append(f"Repeated set-points say that a perfect model would fit {ceiling} % (noise ceiling).")
     if r.coverage_pct is not None and r.mean_width_deg is not None:
         words.append(
             f"The bounds of the free run hold {_cell(r.coverage_pct, 1)} % of the samples and are "
-            f"{_cell(r.mean_width_deg, 1)} deg wide in the mean."
+            f"{_cell(r.mean_width_deg, 1)} {r.robot.outputs.display_unit} wide in the mean."
         )
     if r.outside_pct is not None:
         words.append(
@@ -165,7 +171,7 @@ def _run_tables(r: Validation) -> list[Table]:
         [str(e["run"]), f"{e['start_s']:.2f}", str(e["rows_scored"]), *(_cell(e["fits"][h], 1) for h in horizons)]
         for e in r.per_run
     ]
-    return [Table("Fit [%] of each run, pitch/roll", head, rows)]
+    return [Table(f"Fit [%] of each run, {'/'.join(r.robot.outputs.names)}", head, rows)]
 
 
 def _cell(values: dict[str, Any], digits: int) -> str:
@@ -184,12 +190,19 @@ def _name(r: Validation) -> str:
     return f"{Path(r.model).stem} on {Path(r.data).stem}"
 
 
-def drawable(values: Matrix) -> Matrix:
+def drawable(r: Validation, values: Matrix) -> Matrix:
+    """Return outputs without what has diverged."""
+    most = _DRAWN if _turns(r) else _DRAWN_TIMES * float(np.nanmax(np.abs(r.measured), initial=0.0))
     with np.errstate(invalid="ignore"):
-        return np.where(np.abs(values) < _DRAWN, values, np.nan)
+        return np.where(np.abs(values) < most, values, np.nan)
+
+
+def _turns(r: Validation) -> bool:
+    """Return whether the outputs are angles."""
+    return to_si(r.robot.outputs.unit)[1] == "rad"
 
 
 def _bounds_of(r: Validation) -> tuple[Matrix, Matrix] | None:
     if not np.isfinite(r.lower).any():
         return None
-    return drawable(r.lower), drawable(r.upper)
+    return drawable(r, r.lower), drawable(r, r.upper)

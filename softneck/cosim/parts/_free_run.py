@@ -89,7 +89,7 @@ def simulate_fmu_free_run(
         )
     tables = []
     for run in recording.runs():
-        drive = {f"motor_setpoint_{j + 1}": run.set_points[:, j] for j in range(3)}
+        drive = dict(zip(run.robot.set_points, run.set_points.T, strict=True))
         tables.append(
             drive_fmu(path, drive, parameters=parameters, outputs=outputs, start_time=float(run.time[0]), report=report)
         )

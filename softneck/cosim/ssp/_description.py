@@ -23,6 +23,7 @@ _BASE = {
     "m": {"m": "1"},
     "kg": {"kg": "1"},
     "N": {"kg": "1", "m": "1", "s": "-2"},
+    "Pa": {"kg": "1", "m": "-1", "s": "-2"},
 }
 # Drawing: signals flow from left to right, the observer below on the way back. Units are those of the canvas.
 _PLACES = {"reference": (0, 2), "controller": (1, 2), "plant": (2, 2), "observer": (1, 0)}

@@ -17,19 +17,33 @@ from softneck.runtime._members_runtime import member_initialise, member_size, me
 from softneck.runtime._rest_runtime import REST
 
 
+def drives_first(drive: np.ndarray) -> int:
+    """Return where motor positions begin among the inputs: behind a neck's references, angles where none is said."""
+    return int(drive[2]) if drive.shape[0] > 2 else 5
+
+
+def drives_motors(drive: np.ndarray) -> int:
+    """Return the number of motors: a neck's three where none is said."""
+    return int(drive[3]) if drive.shape[0] > 2 else 3
+
+
 class DrivesArrays(Arrays):
     """The drives, all alike; the arrays of the controller follow."""
 
-    drive = array("2", "a and d of m(k+1) = a m(k) + (1 - a) u(k+1-d), d at least 1")
+    drive = array(
+        "numbers", "a, d of m(k+1) = a m(k) + (1 - a) u(k+1-d), d at least 1; first input and motors, if not 5, 3"
+    )
     d = value("drive", 1)
+    first = value("drive", function=drives_first)
+    motors = value("drive", function=drives_motors)
 
 
 class DrivesState(StateVector):
     """Where the modelled motors are; the controller's state follows."""
 
     started = cells("", "1 from the first step on")
-    motors = cells("3", "modelled motor positions of now [rad]")
-    u = cells("d, 3", "set-points, newest first [rad]")
+    m = cells("motors", "modelled motor positions of now [rad]")
+    u = cells("d, motors", "set-points, newest first [rad]")
     controller = rest("state of the controller")
 
 
@@ -52,15 +66,15 @@ def step(p: DrivesArrays, parameters: np.ndarray, x: DrivesState, inputs: np.nda
     """
     if x.started == 0.0:
         # Connected positions say where the motors begin; without them it is at rest, 0.
-        x.motors[:] = inputs[5:8]
+        x.m[:] = inputs[p.first : p.first + p.motors]
         for i in range(p.d):
-            x.u[i] = inputs[5:8]
+            x.u[i] = inputs[p.first : p.first + p.motors]
         x.started = 1.0
     own = parameters.shape[0] - 1
     given = inputs.copy()
     if parameters[own] <= 0.5:
-        given[5:8] = x.motors
+        given[p.first : p.first + p.motors] = x.m
     member_step(p, 0, parameters[:own], x.controller, given, outputs)
     narx_push(x.u, outputs)
-    for j in range(3):
-        x.motors[j] = (p.drive[0] * x.motors[j] + (1.0 - p.drive[0]) * x.u[p.d - 1, j] + REST) - REST
+    for j in range(p.motors):
+        x.m[j] = (p.drive[0] * x.m[j] + (1.0 - p.drive[0]) * x.u[p.d - 1, j] + REST) - REST

@@ -7,6 +7,8 @@ why.
 
 from __future__ import annotations
 
+import re
+
 from softneck.runtime._bundle import ANY_SIZE, declared
 from softneck.runtime._layout import Arrays
 
@@ -53,7 +55,9 @@ FAST = {
 
 def module_of(runtime: str) -> str:
     """Return the module in the library that runs a runtime: its own, or that of all sizes."""
-    return runtime if runtime in RUNTIMES else f"{runtime.partition('@')[0]}@{ANY_SIZE}"
+    plain, _, size = runtime.partition("@")
+    sized = not size or re.fullmatch(r"[1-8]x[1-4]", size) is not None  # the name may come from a file
+    return f"{plain}@{ANY_SIZE}" if sized and runtime not in RUNTIMES else runtime
 
 
 def ranks_of(module: str) -> tuple[int, ...]:

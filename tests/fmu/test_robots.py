@@ -1,0 +1,175 @@
+"""FMUs of robots with other motors and outputs: variables, units, terminals, and the model's own numbers."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import fmpy
+import numpy as np
+import pytest
+from fmpy.validation import validate_fmu
+
+from softneck.core import Matrix, SettingsError
+from softneck.cosim.parts._free_run import drive_fmu
+from softneck.fmu import build_compiled_fmu, build_fmu, fmu_info
+from softneck.fmu.describe._modelled_drives import with_modelled_drives
+from softneck.fmu.describe._terminals_and_icons import terminals
+from softneck.identification import Model, OutputError, Play, validate
+from softneck.plant import VirtualNeck
+from softneck.robot import Robot
+from softneck.runtime import Block, Port, load_runtime
+from softneck.signals import Recording
+
+TS = 0.02
+ROWS = 500
+WARM_UP = 300
+CHAMBERS = {
+    "name": "chambers",
+    "sample_time_s": TS,
+    "motors": {"names": ["left", "right"], "unit": "bar", "setpoint_min": 0.0, "setpoint_max": 2.0},
+    "outputs": {"names": ["x", "y", "z"], "unit": "m", "display_unit": "mm"},
+    "directions": {"kind": "identified"},
+}
+native = pytest.mark.skipif(
+    shutil.which("cc") is None and not os.environ.get("CI"), reason="no C compiler here, and no library is built"
+)
+BACKENDS = [("python", 2), pytest.param("compiled", 2, marks=native), pytest.param("compiled", 3, marks=native)]
+
+
+@cache
+def recording(chambers: bool) -> Recording:
+    """First-order answers of three lengths to two pressures, or of one angle to two tendons."""
+    robot = Robot.from_dict(CHAMBERS) if chambers else Robot.preset("antagonist")
+    rng = np.random.default_rng(0)
+    scale, G = (1e5, [[0.02, 0.01], [-0.01, 0.03], [0.005, -0.02]]) if chambers else (1.0, [[0.1, -0.1]])
+    u = np.repeat(rng.uniform(0.2, 1.8, (ROWS // 20, 2)), 20, axis=0)
+    y = np.zeros((ROWS, len(G)))
+    for k in range(ROWS - 1):
+        y[k + 1] = 0.8 * y[k] + 0.2 * np.array(G) @ u[k]
+    y += 1e-4 * rng.standard_normal(y.shape)
+    channels = dict(zip((*robot.set_points, *robot.outputs.names), (*scale * u.T, *y.T), strict=True))
+    return Recording(np.arange(ROWS) * TS, TS, channels, robot=robot)
+
+
+@cache
+def model(kind: str, chambers: bool) -> Model:
+    settings: dict[str, Any] = {"oe": OutputError(delay=0.0), "play": Play(rate=15.0, widths=(0.2,), degree=1)}
+    return settings[kind].fit(recording(chambers))
+
+
+def built(block: Block, path: Path, backend: str, fmi: int) -> Path:
+    if backend == "python":
+        build_fmu(block, path)
+    else:
+        build_compiled_fmu(block, path, fmi=fmi)
+    assert not validate_fmu(str(path))
+    return path
+
+
+def variables(path: Path) -> dict[str, Any]:
+    return {item.name: item for item in fmpy.read_model_description(str(path)).modelVariables}
+
+
+@pytest.mark.parametrize(("backend", "fmi"), BACKENDS)
+def test_an_fmu_is_simulated_as_its_model(backend: str, fmi: int, tmp_path: Path) -> None:
+    rec, chosen = recording(False), model("oe", False)
+    path = built(chosen.block(), tmp_path / "Oe.fmu", backend, fmi)
+    measured = rec.channels["pitch"].copy()
+    measured[WARM_UP:] = np.nan
+    inputs = {name: rec.channels[name] for name in rec.robot.set_points} | {"pitch_measured": measured}
+    found = drive_fmu(path, inputs, parameters={"use_measurement": 1.0})
+    # What the start was is forgotten: 0.8^300 is below rounding.
+    expected = chosen.simulate(rec, warm_up=WARM_UP)
+    np.testing.assert_allclose(found[WARM_UP:], expected[WARM_UP:], atol=1e-12)
+
+
+@pytest.mark.parametrize(("backend", "fmi"), BACKENDS)
+@pytest.mark.parametrize("kind", ["oe", "play"])
+def test_pressures_and_lengths_keep_their_names_units_and_ranges(
+    kind: str, backend: str, fmi: int, tmp_path: Path
+) -> None:
+    rec, block = recording(True), model(kind, True).block()
+    path = built(block, tmp_path / "Chambers.fmu", backend, fmi)
+    found = variables(path)
+    assert list(found)[:10] == [
+        "motor_setpoint_1", "motor_setpoint_2", "x_measured", "y_measured", "z_measured",
+        "motor_position_measured_1", "motor_position_measured_2", "x", "y", "z",
+    ]  # fmt: skip
+    assert [found[name].causality for name in ("x_start", "z_start", "use_measurement")] == ["parameter"] * 3
+    pressure = found["motor_setpoint_1"]
+    assert float(pressure.max) == rec.channels["motor_setpoint_1"].max()
+    units = {unit.name: unit for unit in fmpy.read_model_description(str(path)).unitDefinitions}
+    (bar,), (mm,) = units["Pa"].displayUnits, units["m"].displayUnits
+    assert (bar.name, bar.factor, mm.name, mm.factor) == ("bar", 1e-5, "mm", 1e3)
+    assert (pressure.displayUnit, found["x"].displayUnit) == ("bar", "mm")
+    inputs = {name: rec.channels[name][:60] for name in rec.robot.set_points}
+    # To rounding: sums in another order, 1e5 Pa of what makes 1e-2 m.
+    np.testing.assert_allclose(
+        drive_fmu(path, inputs, parameters={"use_measurement": 0.0}), plain(block, 60, **inputs), rtol=1e-9, atol=1e-12
+    )
+
+
+def plain(block: Block, rows: int, **inputs: Matrix) -> Matrix:
+    """Outputs of a block in plain Python from its start, its parameters at their starts but use_measurement."""
+    runtime = load_runtime(block.runtime, compiled=False)
+    q, U = np.array([port.start for port in block.parameters]), np.zeros((rows, len(block.inputs)))
+    for column, port in zip(U.T, block.inputs, strict=True):
+        column[:] = inputs.get(port.name, np.nan if port.missing else port.start)
+    x, Y = np.zeros(runtime.state_size(block.arrays)), np.zeros((rows, len(block.outputs)))
+    runtime.initialise(block.arrays, q, x, Y[0])
+    for k in range(rows - 1):
+        runtime.step(block.arrays, q, x, U[k], Y[k + 1])
+    return Y
+
+
+def test_terminals_and_pages_speak_of_the_robot_s_outputs() -> None:
+    chosen = model("oe", True)
+    assert terminals(chosen.block())["outputs"] == ["x", "y", "z"]
+    assert terminals(model("oe", False).block())["angles"] == ["pitch"]
+    page = fmu_info(chosen, validation=validate(chosen, recording(True), include_training=True)).documentation
+    assert all(f"<th>{name}</th>" in page for name in "xyz")
+    assert page.count("[mm]") == 3
+
+
+def test_a_robot_s_virtual_plant_is_an_fmu(tmp_path: Path) -> None:
+    block = VirtualNeck.of(Robot.preset("antagonist")).block(internal_step=0.004)
+    path = built(block, tmp_path / "Antagonist.fmu", "python", 2)
+    inputs = {"motor_setpoint_1": np.full(15, 2.0), "payload": np.full(15, 0.1)}
+    np.testing.assert_allclose(drive_fmu(path, inputs), plain(block, 15, **inputs), atol=1e-9)
+    assert [name for name in variables(path) if name.startswith("tendon_angle_")] == [
+        "tendon_angle_1", "tendon_angle_2",
+    ]  # fmt: skip
+
+
+@native
+def test_a_virtual_plant_of_another_size_is_not_in_the_compiled_library_and_says_so(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match=r"cannot be in a compiled FMU.*--backend python"):
+        build_compiled_fmu(VirtualNeck.of(Robot.preset("trunk4")).block(), tmp_path / "Trunk.fmu")
+
+
+def test_a_controller_of_two_motors_has_the_drives_of_two() -> None:
+    neck = with_modelled_drives(_controller(3, 2))
+    assert [array.tolist()[2:] for array in neck.arrays[:1]] == [[]]
+    two = with_modelled_drives(_controller(2, 1))
+    assert two.arrays[0].tolist()[2:] == [3.0, 2.0]
+    assert two.parameters[-1].description.startswith("true: the motors are where motor_position_1..2 say")
+    bar = _controller(2, 1)
+    bar = replace(bar, inputs=tuple(replace(port, unit="Pa") for port in bar.inputs))
+    assert with_modelled_drives(bar) is bar
+
+
+def _controller(motors: int, outputs: int) -> Block:
+    """Ports in the order of our controllers: references, co-contraction, outputs, positions."""
+    names = ["pitch", "roll"][:outputs]
+    inputs = [f"{name}_reference" for name in names] + ["cocontraction_reference", *names]
+    inputs += [f"motor_position_{j + 1}" for j in range(motors)]
+    return Block(
+        kind="pid", role="controller", runtime="softneck.design.linear._linear_controller_runtime", sample_time=TS,
+        arrays=(), inputs=tuple(Port(name=name, unit="rad") for name in inputs),
+        outputs=tuple(Port(name=f"motor_setpoint_{j + 1}", unit="rad") for j in range(motors)),
+    )  # fmt: skip
