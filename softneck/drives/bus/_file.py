@@ -19,10 +19,14 @@ from softneck.core import (
     require_positive,
     require_whole,
 )
+from softneck.robot import Robot
+from softneck.signals.recording._channels import NECK
 
 from ..master import MasterSettings
 from ..master._fieldbus import BusSettings
 from ..master._settings import LimitSettings, RampSettings, SensorSettings, WatchSettings
+from ._load import MOST, bus_load
+from ._robot import channels_of, count_word, ranges, require_signs, require_table, robot_of
 from ._sensor_source import SENSORS, SOURCE_KEYS, SensorSource, make_source
 from ._units import DriveScale, current_to_internal, internal_to_current
 
@@ -139,7 +143,7 @@ class DrivesFile:
 
     Attributes:
         profile: "ipos2015" or "ds402".
-        drives: of motors 1, 2, 3.
+        drives: of the motors, in their order.
         eds: an EDS of one's own, None for ours.
         cycle: bus period [s].
         bit_rate: [bit/s].
@@ -148,10 +152,11 @@ class DrivesFile:
             `sensor_source`.
         quick_stop: deceleration of a quick stop (6085h) [rad/s^2].
         following: window (6065h) [rad]; following_time: its time-out (6066h) [s].
+        robot: what the drives move; None: the neck, with no limits beside those here.
     """
 
     profile: str
-    drives: tuple[DriveEntry, DriveEntry, DriveEntry]
+    drives: tuple[DriveEntry, ...]
     eds: Path | None = None
     cycle: float = 0.01
     bit_rate: int = 1_000_000
@@ -168,6 +173,7 @@ class DrivesFile:
     quick_stop: float = 200.0
     following: float = 2.0
     following_time: float = 0.2
+    robot: Robot | None = None
 
     def __post_init__(self) -> None:
         require_one_of("profile", self.profile, PROFILES)
@@ -178,15 +184,54 @@ class DrivesFile:
         require_between("following_s", self.following_time, 0.01, 0.2, "s")
         require_one_of("kind", self.sensor_kind, SENSORS)
         require_whole("node", self.sensor_node, 1, 126)
-        nodes = self.nodes
-        if len(set(nodes)) != 3:
-            raise SettingsError(f"the three drives need three node numbers; got {nodes[0]}, {nodes[1]}, {nodes[2]}.")
+        nodes, motors = self.nodes, len(self.moves.motors.names)
+        if len(nodes) != motors:
+            raise SettingsError(f"there are {len(nodes)} drives for the {motors} motors of robot {self.moves.label()}.")
+        if len(set(nodes)) != motors:
+            word = count_word(motors)
+            raise SettingsError(f"the {word} drives need {word} node numbers; got {', '.join(map(str, nodes))}.")
+        if self.sensor_kind == "can" and self.sensor_node in nodes:
+            raise SettingsError(f"[sensor] node {self.sensor_node} is that of a drive; each device needs its own.")
+        if self.robot is not None:
+            require_signs([drive.scale.reversed for drive in self.drives], self.robot)
+        if self.load > MOST:
+            raise SettingsError(
+                f"{motors} drives every {1e3 * self.cycle:g} ms would take {100.0 * self.load:.0f} % of a bus with "
+                f"{self.bit_rate:g} bit/s; at most {100.0 * MOST:g} % work. Raise `bit_rate` or `period_s` of [bus]."
+            )
 
     @property
-    def nodes(self) -> tuple[int, int, int]:
-        """Node numbers of motors 1 to 3."""
-        one, two, three = (drive.node for drive in self.drives)
-        return one, two, three
+    def nodes(self) -> tuple[int, ...]:
+        """Node numbers of the motors."""
+        return tuple(drive.node for drive in self.drives)
+
+    @property
+    def moves(self) -> Robot:
+        """What the drives move: the neck where no robot is spoken of."""
+        return self.robot or NECK
+
+    @property
+    def ranges(self) -> tuple[tuple[float, float, float], ...]:
+        """Of each motor: lowest and highest set-point [rad], largest speed [rad/s]; the tighter of robot and file."""
+        return ranges(self.robot, self.limits)
+
+    @property
+    def weights(self) -> tuple[tuple[float, ...], ...]:
+        """Directions of the outputs, (outputs, motors); () where they are to be identified."""
+        channels = channels_of(self.robot, self.limits)
+        return self.watch.weights if channels is None or channels.weights is None else channels.weights
+
+    @property
+    def load(self) -> float:
+        """The part of the bus that the cyclic traffic takes at worst."""
+        return bus_load(
+            len(self.drives),
+            cycle=self.cycle,
+            guard_cycles=self.guard_cycles,
+            bit_rate=self.bit_rate,
+            # No inclinometer sends more often than the bus turns.
+            sensor_period=self.cycle if self.sensor_kind == "can" else 0.0,
+        )
 
     @property
     def guard_cycles(self) -> int:
@@ -218,23 +263,30 @@ class DrivesFile:
                  for unit, scale in zip(raise_per_mille, scales, strict=True)]  # fmt: skip
         bus = BusSettings(nodes=self.nodes, cycle=self.cycle, guarding=guarding, guard_cycles=self.guard_cycles)
         return MasterSettings(
-            counts_per_radian=(k[0], k[1], k[2]),
-            newton_per_unit=(n[0], n[1], n[2]),
+            counts_per_radian=tuple(k),
+            newton_per_unit=tuple(n),
             sample_cycles=round(ratio),
             bus=bus,
             limits=self.limits,
             sensor=self.sensor,
             watch=self.watch,
             ramps=self.ramps,
+            channels=channels_of(self.robot, self.limits),
         )
 
 
-def load_drives(path: str | Path) -> DrivesFile:
+def load_drives(path: str | Path, robot: str | Path | Robot | None = None) -> DrivesFile:
     """Read a drives file.
+
+    Args:
+        path: of the file.
+        robot: what the drives move: a preset, a robot file or a robot; None: `robot.toml` beside the drives file or
+            above it, else the neck.
 
     Raises:
         FileFormatError: no such file or no TOML.
-        SettingsError: an unknown or missing key, or a value that does not fit; the line names table and key.
+        SettingsError: an unknown or missing key, a value that does not fit, or a robot with other motors, signs or
+            winches; the line names table and key.
     """
     source = Path(path)
     try:
@@ -244,7 +296,7 @@ def load_drives(path: str | Path) -> DrivesFile:
     except (ValueError, RecursionError) as error:
         raise FileFormatError(f"{source}: is not valid TOML ({error}).") from error
     try:
-        return make_drives(table, source.parent)
+        return make_drives(table, source.parent, robot_of(robot, source))
     except (SettingsError, DataError, FileFormatError) as error:
         raise type(error)(f"{source}: {error}") from error
 
@@ -300,17 +352,22 @@ _CLASSES = {
 _FIELDS = {"ramp": "ramps"}
 
 
-def make_drives(table: Mapping[str, Any], folder: Path = Path()) -> DrivesFile:
-    """Return what a table with the keys of a drives file describes; an EDS is looked for in `folder`."""
+def make_drives(table: Mapping[str, Any], folder: Path = Path(), robot: Robot | None = None) -> DrivesFile:
+    """Return what a table with the keys of a drives file describes for `robot`; an EDS is looked for in `folder`."""
+    table = require_table(table, robot)
     _refuse_unknown("the file", table, _TOP)
     if "profile" not in table:
         raise SettingsError(f"`profile` is missing; it is one of {', '.join(PROFILES)}.")
-    entries = table.get("drive")
-    if not isinstance(entries, list) or len(entries) != 3:
+    entries, motors = table.get("drive"), len((robot or NECK).motors.names)
+    if not isinstance(entries, list) or len(entries) != motors:
         count = len(entries) if isinstance(entries, list) else 0
-        raise SettingsError(f"three [[drive]] tables are needed, motors 1 to 3 in this order; there are {count}.")
-    one, two, three = (_drive(number, entry) for number, entry in enumerate(entries, start=1))
-    values: dict[str, Any] = {"profile": table["profile"], "drives": (one, two, three)}
+        whose = "" if robot is None else f" for robot {robot.label()}"
+        what = "tables are needed" if motors > 1 else "table is needed"
+        raise SettingsError(
+            f"{count_word(motors)} [[drive]] {what}{whose}, motors 1 to {motors} in this order; there are {count}."
+        )
+    drives = tuple(_drive(number, entry) for number, entry in enumerate(entries, start=1))
+    values: dict[str, Any] = {"profile": table["profile"], "drives": drives, "robot": robot}
     for name, setting in _CLASSES.items():
         if name not in table:
             continue
@@ -386,7 +443,12 @@ def _refuse_unknown(where: str, table: Mapping[str, Any], known: tuple[str, ...]
         raise SettingsError(f"unknown key `{unknown[0]}` of {where}; it takes {', '.join(known)}.")
 
 
-def default_drives(profile: str = "ipos2015", **changes: Any) -> DrivesFile:
-    """Return the file for simulated drives that nobody wrote one for: nodes 1 to 3, the lab's set-up."""
-    one, two, three = (DriveEntry(node=node, scale=DriveScale(peak_current=10.0)) for node in (1, 2, 3))
-    return dataclasses.replace(DrivesFile(profile=profile, drives=(one, two, three)), **changes)
+def default_drives(profile: str = "ipos2015", *, robot: Robot | None = None, **changes: Any) -> DrivesFile:
+    """Return the file for simulated drives that nobody wrote one for: nodes from 1 on, the lab's set-up."""
+    entries = []
+    for node, sign in enumerate((robot or NECK).motors.sign, start=1):
+        entries.append(DriveEntry(node=node, scale=DriveScale(peak_current=10.0, reversed=sign < 0.0)))
+    radius = None if robot is None else robot.winch_radius_m
+    neck = Neck() if radius is None else Neck(winch_radius=radius)
+    file = DrivesFile(profile=profile, drives=tuple(entries), neck=neck, robot=robot)
+    return dataclasses.replace(file, **changes)
