@@ -145,13 +145,13 @@ def zero_command(
     from softneck.drives import preflight, zero
     from softneck.drives.running._keyboard import Keyboard
 
-    parameters = load_neck(neck or "paper")
-    chosen = target_of(drives_file, bus, simulated, arm, neck=parameters, robot=robot)
+    virtual = load_neck(neck) if neck else None
+    chosen = target_of(drives_file, bus, simulated, arm, neck=virtual, robot=robot)
     if any(path.suffix.lower() == ".mcap" for path in logs):
         raise SettingsError("zero has no cycles to replay; its --log ends in .blf or .log.")
     require_logs(logs, no_log=no_log, force=force)
     with (
-        open_link(chosen, moves=True, neck=parameters) as link,
+        open_link(chosen, moves=True) as link,
         opened_log(chosen, "zero", logs, no_log=no_log, force=force, ending=".blf") as log,
     ):
         link.tap = None if log is None else log.frame

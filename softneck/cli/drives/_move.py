@@ -86,22 +86,24 @@ def jog_command(
     """
     from softneck.drives import jog
     from softneck.drives.running._keyboard import Keyboard
+    from softneck.drives.running._virtual import physics_of
 
     require_logs(logs, no_log=no_log, force=force)
-    parameters = load_neck(neck or "paper")
-    chosen = target_of(drives_file, bus, simulated, arm, neck=parameters, robot=robot)
+    virtual = load_neck(neck) if neck else None
+    chosen = target_of(drives_file, bus, simulated, arm, neck=virtual, robot=robot)
     _checked(chosen, pace)
-    angles = (parameters.tendon_angle_1, parameters.tendon_angle_2, parameters.tendon_angle_3)
-    tendon_angles = angles if chosen.is_neck else None
+    # A neck's tendons stand where its own file says.
+    physics = physics_of(chosen.file.moves, virtual) if chosen.is_neck else None
+    angles = physics and (physics.tendon_angle_1, physics.tendon_angle_2, physics.tendon_angle_3)
     with (
-        open_link(chosen, moves=True, homed=True, neck=parameters) as link,
+        open_link(chosen, moves=True, homed=True) as link,
         opened_log(chosen, "jog", logs, no_log=no_log, force=force) as log,
     ):
         with progress("jog", quiet=as_json) as tell, Keyboard() as keyboard:
             found = jog(
                 motor,
                 _session(chosen, link, keyboard, overrides, pace, log, drives_of(drives_file)),
-                tendon_angles=tendon_angles,
+                tendon_angles=angles,
                 amplitude=amplitude,
                 report=lambda done: tell(done, f"motor {motor}"),
             )
@@ -178,8 +180,8 @@ def record_command(
     refuse_existing(output, force=force)
     require_logs(logs, no_log=no_log, force=force)
     require_between("--payload", payload, 0.0, 1.0, "kg")
-    parameters = load_neck(neck or "paper")
-    chosen = target_of(drives_file, bus, simulated, arm, neck=parameters, robot=robot)
+    virtual = load_neck(neck) if neck else None
+    chosen = target_of(drives_file, bus, simulated, arm, neck=virtual, robot=robot)
     _checked(chosen, pace)
     limits = drive_limits(chosen.file, position=max_position, speed=max_speed, slack=max_slack)
     moved = chosen.file.robot
@@ -189,7 +191,7 @@ def record_command(
     )  # fmt: skip
     prepared = experiment.prepared()
     with (
-        open_link(chosen, moves=True, homed=True, neck=parameters, seed=seed) as link,
+        open_link(chosen, moves=True, homed=True, seed=seed) as link,
         opened_log(chosen, "record", logs, no_log=no_log, force=force) as log,
     ):
         if isinstance(link, VirtualLink):

@@ -9,7 +9,7 @@ import contextlib
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -76,12 +76,13 @@ _LOOK = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Which drives a command talks to."""
+    """Which drives a command talks to; `neck` is the virtual one that was asked for."""
 
     file: DrivesFile
     bus: str | None
     simulated: bool
     arm: bool
+    neck: NeckParameters | None = None
 
     @property
     def is_neck(self) -> bool:
@@ -116,7 +117,7 @@ def target_of(
     """
     from softneck.drives import default_drives, load_drives, neck_drives
     from softneck.drives.bus._robot import robot_of
-    from softneck.drives.running._virtual import stand_in
+    from softneck.drives.running._virtual import physics_of, stand_in
 
     moved = None if robot is None else robot_of(robot, None)
     if drives_file is None and moved is not None and moved.drives is not None:
@@ -127,28 +128,23 @@ def target_of(
         raise SettingsError("drives on a bus need --drives DRIVES.toml: softneck does not guess their limits.")
     if drives_file is not None:
         file = load_drives(drives_file, moved)
-    elif moved is not None and not moved.is_neck:
-        file = default_drives(robot=moved)
     else:
-        file = replace(default_drives() if neck is None else neck_drives(neck), robot=moved)
-    if simulated and (told := stand_in(file)):
+        physics = neck if moved is None else physics_of(moved, neck)
+        file = default_drives(robot=moved) if physics is None else neck_drives(physics, moved)
+    if simulated and (told := stand_in(file, neck)):
         note(told)
-    return Target(file, bus, simulated, arm)
+    return Target(file, bus, simulated, arm, neck)
 
 
 @contextlib.contextmanager
-def open_link(
-    chosen: Target, *, moves: bool, homed: bool = False, neck: NeckParameters | None = None, seed: int = 0
-) -> Iterator[CanLink | VirtualLink]:
+def open_link(chosen: Target, *, moves: bool, homed: bool = False, seed: int = 0) -> Iterator[CanLink | VirtualLink]:
     """Yield the bus, or simulated drives on a virtual neck; what moves a bus must be armed."""
     from softneck.drives import open_bus
     from softneck.drives.bus._link import VirtualLink
     from softneck.drives.running._virtual import simulated_plant
-    from softneck.plant import NeckParameters
 
     if chosen.simulated:
-        plant = neck or NeckParameters.paper()
-        yield VirtualLink(simulated_plant(chosen.file, plant, sample_time=SAMPLE_TIME, homed=homed, seed=seed))
+        yield VirtualLink(simulated_plant(chosen.file, chosen.neck, sample_time=SAMPLE_TIME, homed=homed, seed=seed))
         return
     if moves:
         require_armed(str(chosen.bus), arm=chosen.arm)

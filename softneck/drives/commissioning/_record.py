@@ -220,12 +220,9 @@ class Experiment:
     def _signals(self, number: int) -> list[Excitation]:
         """Return what is played in round `number`: a signal by name, or the runs of a recording."""
         if Path(self.signal).suffix.lower() not in (".csv", ".parquet"):
-            if self.robot is not None and not self.robot.is_neck:
-                raise SettingsError(
-                    f"the signals by name are for three motors, not for robot {self.robot.label()}; give a recording "
-                    "of it, whose set-points are played."
-                )
-            return [signal(self.signal, duration=self.duration, seed=self.seed + number)]
+            # A neck's signals are those of the paper, whatever its own limits.
+            own = None if self.robot is None or self.robot.is_neck else self.robot
+            return [signal(self.signal, duration=self.duration, seed=self.seed + number, robot=own)]
         recording = read_recording(self.signal)
         require_same_robot(recording.robot, self.robot or NECK, f"{self.signal} and the drives: set-points")
         rows = None if self.duration is None else max(2, round(self.duration / recording.sample_time))

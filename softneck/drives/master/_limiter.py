@@ -45,6 +45,8 @@ class Limiter:
         """Return the set-point of this cycle [rad] on the way to `wanted`; `tension` [N] is estimated."""
         limits, T = self._limits, self._cycle
         low, high, fastest = self._range
+        # A winch that unwound beyond its range without power comes back as it is led: no jump to the edge.
+        low, high = min(low, self.value), max(high, self.value)
         why = ""
         goal = wanted
         if not low <= goal <= high:
@@ -74,7 +76,6 @@ class Limiter:
             why = why or "acceleration"
             speed = self.speed + math.copysign(change, speed - self.speed)
         self.speed = speed
-        # A winch that unwound beyond its range without power comes back at its speed: no jump to the edge.
-        self.value = min(max(self.value + T * speed, min(low, self.value)), max(high, self.value))
+        self.value = min(max(self.value + T * speed, low), high)
         self.clamped = why if abs(self.value - wanted) > _SAME else ""
         return self.value

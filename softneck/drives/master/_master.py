@@ -57,12 +57,8 @@ class Master:
         self._limiters = tuple(Limiter(settings.limits, settings.bus.cycle, own) for own in ranges)
         self._scales = tuple(zip(self.bus.drives, settings.counts_per_radian, settings.newton_per_unit, strict=True))
         self._clamped = Leaky(settings.limits.persistent, settings.bus.cycle)
-        rest = (0.0,) * count
-        self.positions: Motors = rest
-        self.tensions: Motors = rest
-        self.setpoints: Motors = rest
-        self.wanted: Motors = rest
-        self._from: Motors = rest
+        self.positions: Motors = (0.0,) * count
+        self.tensions = self.setpoints = self.wanted = self._from = self.positions
         self.counts: Counter[str] = Counter()
         self.events: deque[Event] = deque(maxlen=1000)
         self.cycle = 0
@@ -170,11 +166,8 @@ class Master:
 
     def _measure(self) -> None:
         zero = self.settings.zero_counts
-        positions, tensions = [], []
-        for view, per_radian, newton in self._scales:
-            positions.append((view.counts - zero) / per_radian)
-            tensions.append(view.current * newton)
-        self.positions, self.tensions = tuple(positions), tuple(tensions)
+        self.positions = tuple([(view.counts - zero) / per_radian for view, per_radian, _ in self._scales])
+        self.tensions = tuple([view.current * newton for view, _, newton in self._scales])
 
     def _judge(self, now: float, events: list[Event]) -> None:
         if not events:

@@ -118,9 +118,7 @@ def run_simulated(
         raise SettingsError("the loop's plant is not a virtual neck; say which one the drives are to turn (--neck).")
     loop = deployed.loop
     pilot = LoopPilot(loop, file.moves)
-    virtual = simulated_plant(
-        file, parameters or NeckParameters.paper(), sample_time=pilot.sample_time, seed=noise_seed(loop)
-    )
+    virtual = simulated_plant(file, parameters, sample_time=pilot.sample_time, seed=noise_seed(loop))
     disturbances = {name: value for name, value in loop.plant_inputs.items() if not name.startswith("motor_")}
     virtual.set(**disturbances)
     link = VirtualLink(virtual)

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from softneck.core import SettingsError, to_si
-from softneck.plant import NeckParameters
+from softneck.plant import NeckParameters, VirtualNeck
+from softneck.robot import Robot
 
 from ..bus._file import DrivesFile
 from ..bus._link import VirtualLink
@@ -29,8 +30,14 @@ _LITTLE = 1e-5
 def simulated_neck(
     file: DrivesFile, parameters: NeckParameters, *, sample_time: float, homed: bool = True, seed: int = 0
 ) -> SimulatedNeck:
-    """Return the virtual neck with drives that are set up as `file` says the real ones are."""
-    return SimulatedNeck(parameters, _settings(file, sample_time, homed, seed))
+    """Return the virtual neck, or a robot built like it, with drives that are set up as `file` says the real ones are.
+
+    Raises:
+        SettingsError: a robot without tendons, or that the neck's physics does not fit.
+    """
+    # The neck's tendons stand where its own file says.
+    robot = None if file.moves.is_neck else file.moves
+    return SimulatedNeck(parameters, _settings(file, sample_time, homed, seed), robot)
 
 
 def simulated_springs(
@@ -66,17 +73,33 @@ def simulated_springs(
 
 
 def simulated_plant(
-    file: DrivesFile, parameters: NeckParameters, *, sample_time: float, homed: bool = True, seed: int = 0
+    file: DrivesFile, neck: NeckParameters | None, *, sample_time: float, homed: bool = True, seed: int = 0
 ) -> SimulatedNeck | SimulatedSprings:
-    """Return what the simulated drives of `file` turn: the virtual neck, or springs for a robot that is none."""
-    if file.moves.is_neck:
-        return simulated_neck(file, parameters, sample_time=sample_time, homed=homed, seed=seed)
-    return simulated_springs(file, sample_time=sample_time, homed=homed, seed=seed)
+    """Return what the simulated drives of `file` turn: the virtual plant, or springs where nothing stands for a robot.
+
+    Args:
+        file: of the drives, and what they move.
+        neck: physics of the virtual plant; None: those that the robot names.
+        sample_time, homed, seed: see `SimulatedSettings`.
+    """
+    physics = physics_of(file.moves, neck)
+    if physics is None:
+        return simulated_springs(file, sample_time=sample_time, homed=homed, seed=seed)
+    return simulated_neck(file, physics, sample_time=sample_time, homed=homed, seed=seed)
 
 
-def stand_in(file: DrivesFile) -> str:
-    """Return what to say of simulated drives that turn no virtual neck, "" of the others."""
-    if file.moves.is_neck:
+def physics_of(robot: Robot, neck: NeckParameters | None = None) -> NeckParameters | None:
+    """Return the physics of what stands for a robot: `neck`, or what the robot names; None where nothing does."""
+    if robot.is_neck:
+        return neck or VirtualNeck.of(robot, None if robot.neck else NeckParameters.paper()).parameters
+    if robot.directions.kind != "tendons" or (neck is None and robot.neck is None):
+        return None
+    return VirtualNeck.of(robot, neck).parameters
+
+
+def stand_in(file: DrivesFile, neck: NeckParameters | None) -> str:
+    """Return what to say of simulated drives that turn no virtual plant, "" of the others."""
+    if physics_of(file.moves, neck) is not None:
         return ""
     gain, pole = file.watch.gain, file.watch.pole
     return (

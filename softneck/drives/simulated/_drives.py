@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -132,3 +133,42 @@ def sensed(
         return nothing, nothing, False
     jump = math.radians(60.0) if kind == "jumps" else 0.0
     return (values[0] + jump, *values[1:]), rates, True
+
+
+class TiltSample(NamedTuple):
+    """One sample of the inclinometer, NaN and `valid` False where it dropped out."""
+
+    time: float
+    pitch: float
+    roll: float
+    pitch_rate: float
+    roll_rate: float
+    valid: bool
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """Both angles [rad]."""
+        return self.pitch, self.roll
+
+    @property
+    def rates(self) -> tuple[float, ...]:
+        """Both rates [rad/s]."""
+        return self.pitch_rate, self.roll_rate
+
+
+class OutputSample(NamedTuple):
+    """One sample of the sensor: values [rad] and rates [rad/s] of all outputs; NaN and not `valid` where it drops."""
+
+    time: float
+    values: tuple[float, ...]
+    rates: tuple[float, ...]
+    valid: bool
+
+
+def sample_at(
+    now: float, values: tuple[float, ...], rates: tuple[float, ...], *, valid: bool
+) -> TiltSample | OutputSample:
+    """Return the sample at `now` [s]; two outputs are the angles of a tilt."""
+    if len(values) == 2:
+        return TiltSample(now, *values, *rates, valid=valid)
+    return OutputSample(now, values, rates, valid)

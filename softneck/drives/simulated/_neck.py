@@ -1,46 +1,23 @@
-"""Three simulated drives on the virtual neck, and its inclinometer: what hangs on the bus."""
+"""Simulated drives on the virtual neck, or on a robot built like it, and its inclinometer: what hangs on the bus."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from types import ModuleType
-from typing import NamedTuple
 
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.plant._neck_runtime import VirtualNeckArrays, VirtualNeckState
+from softneck.robot import Robot
 from softneck.runtime import load_functions
+from softneck.runtime._bundle import sized
 
-from ._drives import SimulatedDrives, SimulatedSettings, sensed
+from ._drives import OutputSample, SimulatedDrives, SimulatedSettings, TiltSample, sample_at, sensed
 from ._frame import CanFrame
 from ._servo_runtime import SERVO_STUCK
-
-_DISTURBANCES = ("payload", "push_x", "push_y", "base_tilt_pitch", "base_tilt_roll")
-_OUTPUTS = 14
-
-
-class TiltSample(NamedTuple):
-    """One sample of the inclinometer, NaN and `valid` False where it dropped out."""
-
-    time: float
-    pitch: float
-    roll: float
-    pitch_rate: float
-    roll_rate: float
-    valid: bool
-
-    @property
-    def values(self) -> tuple[float, ...]:
-        """Both angles [rad]."""
-        return self.pitch, self.roll
-
-    @property
-    def rates(self) -> tuple[float, ...]:
-        """Both rates [rad/s]."""
-        return self.pitch_rate, self.roll_rate
 
 
 class SimulatedNeck:
@@ -48,49 +25,54 @@ class SimulatedNeck:
 
     Attributes:
         drives: the nodes on the bus.
-        outputs: (14,) the neck's outputs at the inclinometer's last sample, in the order of its block.
-        disturbance: (5,) payload [kg], pushes [N], tilt of the base [rad].
+        outputs: the neck's outputs at the inclinometer's last sample, in the order of its block; of a neck (14,).
+        disturbance: payload [kg], pushes [N], tilt of the base [rad]; of a neck (5,).
         sensor: "works", "drops", "freezes", "nan" or "jumps".
     """
 
-    def __init__(self, parameters: NeckParameters, settings: SimulatedSettings) -> None:
-        """Put the neck at rest; its drives are without power and, if `homed`, know their zero."""
+    def __init__(self, parameters: NeckParameters, settings: SimulatedSettings, robot: Robot | None = None) -> None:
+        """Put the neck, or `robot`, at rest; its drives are without power and, if `homed`, know their zero."""
         self.parameters, self.settings = parameters, settings
-        block = VirtualNeck(parameters).block(noise_seed=settings.seed, sample_time=settings.sample_time)
+        robot = Robot.preset() if robot is None else robot
+        neck = VirtualNeck(parameters, robot)
+        block = neck.block(noise_seed=settings.seed, sample_time=settings.sample_time)
+        motors, self._angles = len(robot.motors.names), len(robot.outputs.names)
+        self._names = tuple(port.name for port in block.outputs)
+        self._disturbances = tuple(port.name for port in block.inputs[motors:])
         start = block.initial_state()
         self._arrays, self._q, self._x = block.arrays, start.parameters, start.values.copy()
         self._free = VirtualNeckState.parts(VirtualNeckArrays(block.arrays))["free"]
         self.outputs: Vector = start.outputs.copy()
-        self.disturbance: Vector = np.zeros(len(_DISTURBANCES))
+        self.disturbance: Vector = np.zeros(len(self._disturbances))
         self._on_bus = SimulatedDrives(
             settings, current_limit=parameters.current_limit, latency=parameters.drive_latency
         )
         self.drives = self._on_bus.nodes
         self.motion: Matrix = self._on_bus.motion
-        self._functions: ModuleType = load_functions("softneck.drives.simulated._servo_runtime")
+        self._functions: ModuleType = load_functions(
+            sized("softneck.drives.simulated._servo_runtime", motors, self._angles)
+        )
         self._samples = 0
         self.sensor = "works"
-        pitch, roll, pitch_rate, roll_rate = (float(value) for value in self.outputs[2:6])
-        self._last = TiltSample(0.0, pitch, roll, pitch_rate, roll_rate, True)
-        self._newest = self._last
+        self._last = self._newest = sample_at(0.0, *self._measured(), valid=True)
 
     def set(self, **disturbance: float) -> None:
-        """Set payload [kg], push_x, push_y [N], base_tilt_pitch or base_tilt_roll [rad].
+        """Set payload [kg], push_x, push_y [N], base_tilt_pitch or base_tilt_roll [rad], as far as the neck has them.
 
         Raises:
             SettingsError: another name.
         """
         for name, value in disturbance.items():
-            if name not in _DISTURBANCES:
-                raise SettingsError(f"`{name}` is not a disturbance; the neck has {', '.join(_DISTURBANCES)}.")
-            self.disturbance[_DISTURBANCES.index(name)] = value
+            if name not in self._disturbances:
+                raise SettingsError(f"`{name}` is not a disturbance; the neck has {', '.join(self._disturbances)}.")
+            self.disturbance[self._disturbances.index(name)] = value
 
     def tear(self, tendon: int) -> None:
-        """Let tendon 1, 2 or 3 hang: it is a metre too long."""
+        """Let a tendon, from 1 on, hang: it is a metre too long."""
         self._x[self._free][tendon - 1] += 1.0
 
     def block(self, motor: int) -> None:
-        """Hold winch 1, 2 or 3 where it is, whatever its motor does."""
+        """Hold a winch, from 1 on, where it is, whatever its motor does."""
         self.motion[motor - 1, SERVO_STUCK] = 1.0
 
     def run(self, frames: Sequence[CanFrame], now: float) -> list[CanFrame]:
@@ -102,36 +84,34 @@ class SimulatedNeck:
         bus = self._on_bus
         self._functions.servo_ticks(self._q, self._x, self.disturbance, bus.motion, bus.ring, bus.ticks, bus.h)
 
-    def sample(self, now: float) -> TiltSample:
+    def sample(self, now: float) -> TiltSample | OutputSample:
         """Take one sample of the inclinometer; to be called each `sample_time`."""
         self._newest = self._sampled(now)
         return self._newest
 
-    def _sampled(self, now: float) -> TiltSample:
+    def _measured(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Return what the inclinometer gives, and its gyro: behind the true angles."""
+        m = self._angles
+        return tuple(self.outputs[m : 2 * m].tolist()), tuple(self.outputs[2 * m : 3 * m].tolist())
+
+    def _sampled(self, now: float) -> TiltSample | OutputSample:
         if self._samples:
             self._functions.winch_sense(self._arrays, self._q, self._x, self.disturbance, self.outputs)
         self._samples += 1
-        y = self.outputs
-        valid = y[6] > 0.5
+        valid = bool(self.outputs[3 * self._angles] > 0.5)
         if self.sensor == "freezes":
             return self._last._replace(time=now)
-        values, rates = tuple(y[2:4].tolist()), tuple(y[4:6].tolist())
-        (pitch, roll), (pitch_rate, roll_rate), valid = sensed(self.sensor, values, rates, valid=bool(valid))
-        taken = TiltSample(now, pitch, roll, pitch_rate, roll_rate, valid)
-        if not math.isnan(pitch):
+        values, rates, valid = sensed(self.sensor, *self._measured(), valid=valid)
+        taken = sample_at(now, values, rates, valid=valid)
+        if not math.isnan(values[0]):
             self._last = taken
         return taken
 
     @property
-    def newest(self) -> TiltSample:
+    def newest(self) -> TiltSample | OutputSample:
         """The last sample that was taken."""
         return self._newest
 
     def truth(self) -> Mapping[str, float]:
         """Return the neck's outputs at the last sample by name: true angles, tensions, compression."""
-        names = (
-            "pitch", "roll", "pitch_measured", "roll_measured", "pitch_rate_measured", "roll_rate_measured",
-            "measurement_valid", "motor_position_1", "motor_position_2", "motor_position_3", "tension_1",
-            "tension_2", "tension_3", "compression",
-        )  # fmt: skip
-        return dict(zip(names, (float(value) for value in self.outputs), strict=True))
+        return dict(zip(self._names, (float(value) for value in self.outputs), strict=True))

@@ -119,13 +119,12 @@ def test_set_points_stay_within_the_tighter_limits_of_each_motor() -> None:
     assert fault.name == "clamp_persistent"
 
 
-def test_a_winch_beyond_its_range_comes_back_at_its_speed() -> None:
+def test_a_winch_beyond_its_range_comes_back_as_it_is_led() -> None:
     limits = replace(LimitSettings(), slack=0.0)
-    limiter = Limiter(limits, 0.01, (0.0, 4.0, 1.0))
+    limiter = Limiter(limits, 0.01, (0.0, 4.0, 15.0))
     limiter.reset(-0.5)
-    before = limiter.value
-    for _ in range(100):
-        now = limiter.step(0.0, 1.0)
-        assert 0.0 <= now - before <= 0.01 + 1e-12
-        before = now
-    assert before == pytest.approx(0.0, abs=1e-9)
+    # A ramp of 1 rad/s, as on the way in; then further out, which is not followed.
+    for k in range(1, 31):
+        assert limiter.step(-0.5 + 0.01 * k, 1.0) == pytest.approx(-0.5 + 0.01 * k, abs=1e-9)
+    assert limiter.step(-2.0, 1.0) >= -0.2 - 1e-9
+    assert limiter.clamped == "position"
