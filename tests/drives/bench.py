@@ -6,14 +6,14 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import replace
 
-from softneck.drives import DrivesFile, default_drives, simulated_neck
+from softneck.drives import DrivesFile, default_drives
 from softneck.drives.bus._link import VirtualLink
 from softneck.drives.bus._objects import Write, guarding_writes, limit_writes, mode_writes, option_writes, pdo_writes
 from softneck.drives.master import Frame, Master, MasterSettings, Phase
 from softneck.drives.master._cia301 import Command, nmt_frame
 from softneck.drives.master._measured import Measurement
 from softneck.drives.master._settings import RampSettings
-from softneck.drives.running._virtual import VirtualRun
+from softneck.drives.running._virtual import VirtualRun, simulated_plant
 from softneck.drives.simulated import SimulatedDrive
 from softneck.plant import NeckParameters
 
@@ -27,15 +27,15 @@ FAST = RampSettings(speed=3.0, settle=0.04, tolerance=0.2)
 class Script:
     """A pilot that asks for `wanted`, or does what `act` says."""
 
-    def __init__(self, rows: int = 100_000) -> None:
-        self.wanted: tuple[float, float, float] = (0.5, -0.25, -0.25)
-        self.act: Callable[[Measurement], tuple[float, float, float] | None] | None = None
+    def __init__(self, rows: int = 100_000, motors: int = 3) -> None:
+        self.wanted: tuple[float, ...] = (0.5, *(-0.5 / max(motors - 1, 1),) * (motors - 1))
+        self.act: Callable[[Measurement], tuple[float, ...] | None] | None = None
         self.rows, self.started, self.steps = rows, 0, 0
 
     def start(self) -> None:
         self.started += 1
 
-    def step(self, measured: Measurement) -> tuple[float, float, float] | None:
+    def step(self, measured: Measurement) -> tuple[float, ...] | None:
         self.steps += 1
         return self.wanted if self.act is None else self.act(measured)
 
@@ -65,9 +65,10 @@ class Bench:
         rows: int = 100_000,
     ) -> None:
         self.file = replace(file or default_drives(), ramps=FAST)
-        self.neck = simulated_neck(self.file, neck or NeckParameters.paper(), sample_time=TS, seed=seed)
+        count = len(self.file.drives)
+        self.neck = simulated_plant(self.file, neck or NeckParameters.paper(), sample_time=TS, seed=seed)
         self.link = VirtualLink(self.neck)
-        self.pilot = Script(rows)
+        self.pilot = Script(rows, count)
         settings = self.file.master_settings(TS, guarding=guarding)
         settings = replace(settings, bus=replace(settings.bus, off=off))
         self.master = Master(settings if change is None else change(settings), self.pilot)
@@ -84,8 +85,8 @@ class Bench:
         self.run = VirtualRun(self.link, self.master)
         self.jobs: list[tuple[float, Callable[[Bench], object]]] = []
         self.stopped_at: float | None = None
-        self.drive_stopped_at: list[float | None] = [None, None, None]
-        self._enabled_once = [False, False, False]
+        self.drive_stopped_at: list[float | None] = [None] * count
+        self._enabled_once = [False] * count
         self.restarted: set[int] = set()
         self.widest = 0.0
         self.trace = hashlib.sha256()

@@ -228,8 +228,8 @@ def _three_bad(bench: Bench, kind: str) -> None:
     assert bench.phase is Phase.RUNNING
     assert bench.master.counts["sample_discarded"] == 1
     assert bench.master.tilt is not None
-    assert math.isfinite(bench.master.tilt.pitch)
-    assert abs(bench.master.tilt.pitch) < 0.5
+    assert math.isfinite(bench.master.tilt.values[0])
+    assert abs(bench.master.tilt.values[0]) < 0.5
     if not bench.master.sample_due:
         bench.step()
     bench.neck.sensor = kind

@@ -244,7 +244,7 @@ def test_an_inclinometer_on_the_bus_is_started_and_asked() -> None:
         theirs.send(can.Message(arbitration_id=0x18A, data=data, is_extended_id=False))
         tilt = look_at(CanInclinometer(10), link, 0.5)
         assert tilt is not None
-        assert (math.degrees(tilt.pitch), math.degrees(tilt.roll)) == pytest.approx((1.0, -2.0))
+        assert tuple(map(math.degrees, tilt.values)) == pytest.approx((1.0, -2.0))
         assert look_at(CanInclinometer(10), link, 0.05) is None
 
 

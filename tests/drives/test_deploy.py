@@ -131,11 +131,6 @@ def virtual(*, homed: bool = False) -> VirtualLink:
     return VirtualLink(simulated_neck(default_drives(), NeckParameters.paper(), sample_time=0.02, homed=homed))
 
 
-def look(link: VirtualLink) -> Tilt:
-    sample = link.neck.newest
-    return Tilt(sample.pitch, sample.roll, valid=sample.valid)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("profile", ["ipos2015", "ds402"])
 def test_zero_tensions_every_tendon_and_marks_the_drives(profile: str) -> None:
@@ -144,7 +139,7 @@ def test_zero_tensions_every_tendon_and_marks_the_drives(profile: str) -> None:
     report = preflight(link, file)
     tensions = []
     zeroed = zero(
-        link, file, lambda: (tensions.append([link.neck.motion[i][26] for i in range(3)]), look(link))[1],
+        link, file, lambda: (tensions.append([link.neck.motion[i][26] for i in range(3)]), link.newest)[1],
         guarding=report.guarding,
     )  # fmt: skip
     assert all(pulled > 0.5 for pulled in zeroed.pulled)
@@ -163,7 +158,7 @@ def test_a_torn_tendon_is_found_while_zeroing() -> None:
     link.neck.tear(2)
     report = preflight(link, file)
     with pytest.raises(CheckFailedError, match=r"node 2: the tendon of this motor did not get tight within 10 s"):
-        zero(link, file, lambda: look(link), guarding=report.guarding)
+        zero(link, file, lambda: link.newest, guarding=report.guarding)
     assert all(drive.axis.state == 0x40 for drive in link.neck.drives)
 
 
@@ -173,7 +168,7 @@ def test_a_neck_that_leans_is_not_zeroed() -> None:
     link.neck.set(base_tilt_pitch=0.3)
     report = preflight(link, file)
     with pytest.raises(CheckFailedError, match=r"the neck leans by pitch .* No zero was set"):
-        zero(link, file, lambda: look(link), guarding=report.guarding)
+        zero(link, file, lambda: link.newest, guarding=report.guarding)
     assert not any(drive.axis.homed for drive in link.neck.drives)
 
 
@@ -184,7 +179,7 @@ def test_another_slow_loop_is_found_while_zeroing() -> None:
         drive.axis.slow_loop = 0.5e-3
     report = preflight(link, file)
     with pytest.raises(CheckFailedError, match=r"node 1: its speed \(606Ch\) is 0\.\d+ times that of its position"):
-        zero(link, file, lambda: look(link), guarding=report.guarding)
+        zero(link, file, lambda: link.newest, guarding=report.guarding)
 
 
 def test_a_run_without_zero_is_refused() -> None:

@@ -10,7 +10,7 @@ from softneck.core import CheckFailedError
 from softneck.drives import default_drives, preflight, simulated_neck, zero
 from softneck.drives.bus._link import VirtualLink
 from softneck.drives.commissioning._jog import jog_pilot
-from softneck.drives.master import Frame, Phase, Tilt
+from softneck.drives.master import Frame, Phase
 from softneck.drives.running._bus_loop import RunEnd, Session, run_session
 from softneck.plant import NeckParameters
 
@@ -48,11 +48,7 @@ def test_slow_answers_do_not_trip_a_drive_while_it_is_zeroed() -> None:
     file = default_drives()
     report = preflight(link, file)
 
-    def look() -> Tilt:
-        sample = link.neck.newest
-        return Tilt(sample.pitch, sample.roll, valid=sample.valid)
-
-    zero(link, file, look, guarding=report.guarding)
+    zero(link, file, lambda: link.newest, guarding=report.guarding)
     link.receive(0.5)
     assert [(drive.axis.state, drive.axis.fault) for drive in link.neck.drives] == [(OFF, 0)] * 3
 

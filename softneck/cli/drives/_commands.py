@@ -53,7 +53,9 @@ def command() -> None:
 @command.command("scan")
 @drives_options
 @json_option
-def scan_command(drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, as_json: bool) -> None:
+def scan_command(
+    drives_file: Path | None, bus: str | None, simulated: bool, robot: str | None, arm: bool, as_json: bool
+) -> None:
     """List the nodes on the bus; sends reads only. Exit code 1 if none answers, or several devices at one number."""
     from softneck.drives import default_drives, scan
     from softneck.drives.running._scan import several_devices
@@ -61,7 +63,7 @@ def scan_command(drives_file: Path | None, bus: str | None, simulated: bool, arm
     if bus is not None and drives_file is None:
         chosen = Target(default_drives(), bus, False, arm)
     else:
-        chosen = target_of(drives_file, bus, simulated, arm)
+        chosen = target_of(drives_file, bus, simulated, arm, robot=robot)
     with open_link(chosen, moves=False) as link:
         found = scan(link, bit_rate=chosen.file.bit_rate)
     if as_json:
@@ -90,7 +92,13 @@ def _serials(serials: list[int | None]) -> str:
 @override_option
 @json_option
 def check_command(
-    drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, overrides: tuple[str, ...], as_json: bool
+    drives_file: Path | None,
+    bus: str | None,
+    simulated: bool,
+    robot: str | None,
+    arm: bool,
+    overrides: tuple[str, ...],
+    as_json: bool,
 ) -> None:
     """Pre-flight: identity, firmware, factors, modes, options, limits, guarding; each value written is read back.
 
@@ -98,7 +106,7 @@ def check_command(
     """
     from softneck.drives import preflight
 
-    chosen = target_of(drives_file, bus, simulated, arm)
+    chosen = target_of(drives_file, bus, simulated, arm, robot=robot)
     names = checked_names(overrides)
     with open_link(chosen, moves=False, homed=True) as link:
         sensor = None if chosen.simulated else sensor_or_reason(chosen.file, str(chosen.bus))
@@ -126,7 +134,8 @@ def _show(report: Report, *, as_json: bool) -> None:
 @force_option
 @json_option
 def zero_command(
-    drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, overrides: tuple[str, ...],
+    drives_file: Path | None, bus: str | None, simulated: bool, robot: str | None, arm: bool,
+    overrides: tuple[str, ...],
     neck: str | None, logs: tuple[Path, ...], no_log: bool, force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Tension each tendon gently, set the encoders' zero there, and verify with the inclinometer.
@@ -136,13 +145,13 @@ def zero_command(
     from softneck.drives import preflight, zero
     from softneck.drives.running._keyboard import Keyboard
 
-    parameters = load_neck(neck or "paper")
-    chosen = target_of(drives_file, bus, simulated, arm, neck=parameters)
+    virtual = load_neck(neck) if neck else None
+    chosen = target_of(drives_file, bus, simulated, arm, neck=virtual, robot=robot)
     if any(path.suffix.lower() == ".mcap" for path in logs):
         raise SettingsError("zero has no cycles to replay; its --log ends in .blf or .log.")
     require_logs(logs, no_log=no_log, force=force)
     with (
-        open_link(chosen, moves=True, neck=parameters) as link,
+        open_link(chosen, moves=True) as link,
         opened_log(chosen, "zero", logs, no_log=no_log, force=force, ending=".blf") as log,
     ):
         link.tap = None if log is None else log.frame
@@ -187,7 +196,8 @@ def zero_command(
 @json_option
 def run_command(
     controller: Path, loop_file: Path, certificates: tuple[Path, ...], drives_file: Path | None, bus: str | None,
-    simulated: bool, arm: bool, overrides: tuple[str, ...], neck: str | None, pace: float | None, realtime: bool,
+    simulated: bool, robot: str | None, arm: bool, overrides: tuple[str, ...], neck: str | None, pace: float | None,
+    realtime: bool,
     logs: tuple[Path, ...], no_log: bool, output: Path | None, trust: bool, force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Run CONTROLLER in the loop of LOOP.toml on the drives: enable, ramp in, control, ramp out, switch off.
@@ -217,7 +227,7 @@ def run_command(
     if drives_file is None and "drives" in setup.files:
         drives_file = Path(setup.files["drives"][0])
     virtual = load_neck(neck) if neck else neck_of(setup.loop)
-    chosen = target_of(drives_file, bus, simulated, arm, neck=virtual)
+    chosen = target_of(drives_file, bus, simulated, arm, neck=virtual, robot=robot)
     if not controller.is_file():
         raise SettingsError(f"{controller}: no such file.")
     certified = require_certified(setup, controller, certificates, names, drives=drives_file)
@@ -276,12 +286,14 @@ def _print_run(path: Path, result: DrivesResult, *, as_json: bool) -> None:
 @command.command("stop")
 @drives_options
 @json_option
-def stop_command(drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, as_json: bool) -> None:
+def stop_command(
+    drives_file: Path | None, bus: str | None, simulated: bool, robot: str | None, arm: bool, as_json: bool
+) -> None:
     """Quick stop, then no voltage, for every drive; always allowed. Exit code 1 if one may still have power."""
     from softneck.drives import stop
     from softneck.drives.running._stop import require_stopped
 
-    chosen = target_of(drives_file, bus, simulated, arm)
+    chosen = target_of(drives_file, bus, simulated, arm, robot=robot)
     with open_link(chosen, moves=False) as link:
         states = stop(link, chosen.file)
     _states(states, "stopped", as_json=as_json)
@@ -291,12 +303,14 @@ def stop_command(drives_file: Path | None, bus: str | None, simulated: bool, arm
 @command.command("reset")
 @drives_options
 @json_option
-def reset_command(drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, as_json: bool) -> None:
+def reset_command(
+    drives_file: Path | None, bus: str | None, simulated: bool, robot: str | None, arm: bool, as_json: bool
+) -> None:
     """Acknowledge latched faults; nothing else ever does, and nothing moves by it. Exit code 1 if a fault stays."""
     from softneck.drives import reset
     from softneck.drives.running._stop import require_reset
 
-    chosen = target_of(drives_file, bus, simulated, arm)
+    chosen = target_of(drives_file, bus, simulated, arm, robot=robot)
     with open_link(chosen, moves=False) as link:
         states = reset(link, chosen.file)
     _states(states, "reset", as_json=as_json)

@@ -63,7 +63,7 @@ def _checked(chosen: Target, pace: float | None) -> None:
 
 
 @click.command("jog", epilog="Example: softneck drives jog 1 --drives drives.toml --bus socketcan:can0 --arm")
-@click.argument("motor", metavar="N", type=click.IntRange(1, 3))
+@click.argument("motor", metavar="N", type=click.IntRange(1, 8))
 @click.option(
     "--amplitude", type=float, default=0.5, show_default=True, metavar="RAD", help="Amplitude of the motor's move."
 )
@@ -75,9 +75,9 @@ def _checked(chosen: Target, pace: float | None) -> None:
 @force_option
 @json_option
 def jog_command(
-    motor: int, amplitude: float, drives_file: Path | None, bus: str | None, simulated: bool, arm: bool,
-    overrides: tuple[str, ...], neck: str | None, pace: float | None, logs: tuple[Path, ...], no_log: bool, force: bool,
-    as_json: bool,
+    motor: int, amplitude: float, drives_file: Path | None, bus: str | None, simulated: bool, robot: str | None,
+    arm: bool, overrides: tuple[str, ...], neck: str | None, pace: float | None, logs: tuple[Path, ...], no_log: bool,
+    force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Pull the tendon of motor N a little, let it out as much, and look where the neck goes.
 
@@ -86,14 +86,17 @@ def jog_command(
     """
     from softneck.drives import jog
     from softneck.drives.running._keyboard import Keyboard
+    from softneck.drives.running._virtual import physics_of
 
     require_logs(logs, no_log=no_log, force=force)
-    parameters = load_neck(neck or "paper")
-    chosen = target_of(drives_file, bus, simulated, arm, neck=parameters)
+    virtual = load_neck(neck) if neck else None
+    chosen = target_of(drives_file, bus, simulated, arm, neck=virtual, robot=robot)
     _checked(chosen, pace)
-    angles = (parameters.tendon_angle_1, parameters.tendon_angle_2, parameters.tendon_angle_3)
+    # A neck's tendons stand where its own file says.
+    physics = physics_of(chosen.file.moves, virtual) if chosen.is_neck else None
+    angles = physics and (physics.tendon_angle_1, physics.tendon_angle_2, physics.tendon_angle_3)
     with (
-        open_link(chosen, moves=True, homed=True, neck=parameters) as link,
+        open_link(chosen, moves=True, homed=True) as link,
         opened_log(chosen, "jog", logs, no_log=no_log, force=force) as log,
     ):
         with progress("jog", quiet=as_json) as tell, Keyboard() as keyboard:
@@ -115,7 +118,7 @@ def _print_jog(found: JogResult, *, as_json: bool) -> None:
         print_json(values)
         return
     rows = []
-    for name in ("pitch_deg", "roll_deg", "tilt_deg", "direction_deg"):
+    for name in values["expected"]:
         cells = [values[key][name] for key in ("expected", "seen")]
         rows.append([name, *("-" if cell is None or cell != cell else f"{cell:.2f}" for cell in cells)])
     print_table(f"Motor {found.motor} (node {found.node}): {found.verdict}", ["way up", "expected", "seen"], rows)
@@ -123,8 +126,10 @@ def _print_jog(found: JogResult, *, as_json: bool) -> None:
 
 @click.command(
     "record",
-    help="Record SIGNAL on the neck's drives: an identification experiment, ramped in and out.\n\n"
-    "Signals: " + ", ".join(signal_names()) + ". The drives must be zeroed. If a fault ends it early, what was "
+    help="Record SIGNAL on the drives: an identification experiment, ramped in and out.\n\n"
+    "Signals: "
+    + ", ".join(signal_names())
+    + ", or a recording whose set-points are played. The drives must be zeroed. If a fault ends it early, what was "
     "recorded until then is written, and the exit code is 1; Ctrl-C ramps to rest, keeps the data, and exits with 130.",
     epilog="Example: softneck drives record eq22 -o eq22.csv --drives drives.toml --bus socketcan:can0 --arm",
 )
@@ -159,7 +164,8 @@ def _print_jog(found: JogResult, *, as_json: bool) -> None:
 def record_command(
     signal_name: str, output: Path, duration: float | None, runs: int, seed: int, ramp: float,
     max_position: float | None, max_speed: float | None, max_slack: float | None, payload: float,
-    drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, overrides: tuple[str, ...],
+    drives_file: Path | None, bus: str | None, simulated: bool, robot: str | None, arm: bool,
+    overrides: tuple[str, ...],
     neck: str | None, pace: float | None, logs: tuple[Path, ...], no_log: bool, force: bool,
     as_json: bool,
 ) -> None:  # fmt: skip
@@ -174,20 +180,25 @@ def record_command(
     refuse_existing(output, force=force)
     require_logs(logs, no_log=no_log, force=force)
     require_between("--payload", payload, 0.0, 1.0, "kg")
-    parameters = load_neck(neck or "paper")
-    chosen = target_of(drives_file, bus, simulated, arm, neck=parameters)
+    virtual = load_neck(neck) if neck else None
+    chosen = target_of(drives_file, bus, simulated, arm, neck=virtual, robot=robot)
     _checked(chosen, pace)
     limits = drive_limits(chosen.file, position=max_position, speed=max_speed, slack=max_slack)
-    experiment = Experiment(signal=signal_name, limits=limits, duration=duration, seed=seed, runs=runs, ramp=ramp)
+    moved = chosen.file.robot
+    experiment = Experiment(
+        signal=signal_name, limits=limits, duration=duration, seed=seed, runs=runs, ramp=ramp, robot=moved,
+        ranges=() if moved is None else chosen.file.ranges,
+    )  # fmt: skip
     prepared = experiment.prepared()
     with (
-        open_link(chosen, moves=True, homed=True, neck=parameters, seed=seed) as link,
+        open_link(chosen, moves=True, homed=True, seed=seed) as link,
         opened_log(chosen, "record", logs, no_log=no_log, force=force) as log,
     ):
         if isinstance(link, VirtualLink):
             link.neck.set(payload=payload)
         with progress("record", quiet=as_json) as tell, Keyboard() as keyboard:
-            session = _session(chosen, link, keyboard, overrides, pace, log, drives_of(drives_file))
+            files = {**drives_of(drives_file), **({"signal": signal_name} if Path(signal_name).is_file() else {})}
+            session = _session(chosen, link, keyboard, overrides, pace, log, files)
             recorded = record_signal(
                 [excitation for excitation, _ in prepared],
                 replace(session, facts={"record": experiment.facts()}),

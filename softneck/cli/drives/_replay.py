@@ -72,7 +72,9 @@ def _pilot(run: LoggedRun, loop_file: Path | None, controller: Path | None) -> P
         if "jog" in run.facts:
             return jog_pilot(**run.facts["jog"])
         if "record" in run.facts:
-            return Experiment.of(run.facts["record"]).pilot()
+            channels = run.settings().channels
+            robot, ranges = (None, ()) if channels is None else (run.robot, channels.ranges)
+            return Experiment.of(run.facts["record"], robot, ranges).pilot()
     except (SoftneckError, TypeError) as error:
         raise FileFormatError(f"{run.path}: what it played does not fit this softneck ({error}).") from error
     files = {role: Path(str(entry.get("path"))) for role, entry in run.facts.get("files", {}).items()}
@@ -85,4 +87,4 @@ def _pilot(run: LoggedRun, loop_file: Path | None, controller: Path | None) -> P
             if given is not None:
                 raise SettingsError(f"{path}: no such file.")
             return None
-    return LoopPilot(prepare(load_loop(loop), chosen).loop)
+    return LoopPilot(prepare(load_loop(loop), chosen).loop, run.robot)

@@ -65,7 +65,7 @@ def _head(picture: dict[str, Any]) -> Text:
 
 def _angles(picture: dict[str, Any], *, narrow: bool) -> Table:
     table = _table(narrow, "angle [deg]", "reference", "measured", "estimate", "error")
-    for name, (reference, measured, estimate) in zip(("pitch", "roll"), picture["angles"], strict=True):
+    for name, (reference, measured, estimate) in zip(picture["outputs"], picture["angles"], strict=True):
         row = (reference, measured, estimate, reference - measured)
         table.add_row(name, *(_number(math.degrees(value), ".2f") for value in row))
     return table

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from softneck.drives import CanLink, DrivesFile
     from softneck.drives.bus._link import VirtualLink
     from softneck.drives.master import Frame, Tilt
+    from softneck.drives.master._gate import Reading
     from softneck.drives.running._keyboard import Keyboard
     from softneck.drives.sensing._sensor import Sensor
     from softneck.plant import NeckParameters
@@ -75,12 +76,18 @@ _LOOK = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Which drives a command talks to."""
+    """Which drives a command talks to; `neck` is the virtual one that was asked for."""
 
     file: DrivesFile
     bus: str | None
     simulated: bool
     arm: bool
+    neck: NeckParameters | None = None
+
+    @property
+    def is_neck(self) -> bool:
+        """Whether the drives move a neck."""
+        return self.file.moves.is_neck
 
 
 def drives_options(function: Callable) -> Callable:
@@ -90,6 +97,9 @@ def drives_options(function: Callable) -> Callable:
                      help="Node ids, gear, encoder, signs, limits, sensor, guarding."),
         click.option("--bus", metavar="INTERFACE:CHANNEL", help="CAN bus, such as socketcan:can0 or virtual:x."),
         click.option("--simulated", is_flag=True, help="Simulated drives on the virtual neck, in this process."),
+        click.option("--robot", metavar="ROBOT",
+                     help="What the drives move: a preset or a robot file.  [default: robot.toml beside the drives "
+                     "file or above it, else the neck]"),
         click.option("--arm", is_flag=True, help="Allow drives on a bus to move."),
     )  # fmt: skip
     for option in reversed(options):
@@ -98,35 +108,43 @@ def drives_options(function: Callable) -> Callable:
 
 
 def target_of(
-    drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, *, neck: NeckParameters | None = None
+    drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, *, neck: NeckParameters | None = None,
+    robot: str | Path | None = None,
 ) -> Target:  # fmt: skip
-    """Return which drives the options mean; simulated ones without a file are set up for the virtual `neck`."""
-    from softneck.drives import default_drives, load_drives, neck_drives
+    """Return which drives the options mean; simulated ones without a file are set up for the virtual `neck`.
 
+    A robot that is given may name its drives file.
+    """
+    from softneck.drives import default_drives, load_drives, neck_drives
+    from softneck.drives.bus._robot import robot_of
+    from softneck.drives.running._virtual import physics_of, stand_in
+
+    moved = None if robot is None else robot_of(robot, None)
+    if drives_file is None and moved is not None and moved.drives is not None:
+        drives_file = (moved.folder or Path()) / moved.drives
     if (bus is None) == (not simulated):
         raise SettingsError("say which drives: --bus INTERFACE:CHANNEL or --simulated.")
     if drives_file is None and not simulated:
         raise SettingsError("drives on a bus need --drives DRIVES.toml: softneck does not guess their limits.")
     if drives_file is not None:
-        file = load_drives(drives_file)
+        file = load_drives(drives_file, moved)
     else:
-        file = default_drives() if neck is None else neck_drives(neck)
-    return Target(file, bus, simulated, arm)
+        physics = neck if moved is None else physics_of(moved, neck)
+        file = default_drives(robot=moved) if physics is None else neck_drives(physics, moved)
+    if simulated and (told := stand_in(file, neck)):
+        note(told)
+    return Target(file, bus, simulated, arm, neck)
 
 
 @contextlib.contextmanager
-def open_link(
-    chosen: Target, *, moves: bool, homed: bool = False, neck: NeckParameters | None = None, seed: int = 0
-) -> Iterator[CanLink | VirtualLink]:
+def open_link(chosen: Target, *, moves: bool, homed: bool = False, seed: int = 0) -> Iterator[CanLink | VirtualLink]:
     """Yield the bus, or simulated drives on a virtual neck; what moves a bus must be armed."""
-    from softneck.drives import open_bus, simulated_neck
+    from softneck.drives import open_bus
     from softneck.drives.bus._link import VirtualLink
-    from softneck.plant import NeckParameters
+    from softneck.drives.running._virtual import simulated_plant
 
     if chosen.simulated:
-        yield VirtualLink(
-            simulated_neck(chosen.file, neck or NeckParameters.paper(), sample_time=SAMPLE_TIME, homed=homed, seed=seed)
-        )
+        yield VirtualLink(simulated_plant(chosen.file, chosen.neck, sample_time=SAMPLE_TIME, homed=homed, seed=seed))
         return
     if moves:
         require_armed(str(chosen.bus), arm=chosen.arm)
@@ -177,21 +195,15 @@ override_option = click.option(
 neck_option = click.option("--neck", metavar="paper|lab|rough|NECK.toml", help="The virtual neck of --simulated.")
 
 
-def look_of(link: CanLink | VirtualLink, file: DrivesFile) -> Callable[[], Tilt | None]:
+def look_of(link: CanLink | VirtualLink, file: DrivesFile) -> Callable[[], Tilt | Reading | None]:
     """Return what gives the newest sample of the inclinometer."""
     from softneck.drives.bus._link import VirtualLink
-    from softneck.drives.master import Tilt
 
     if isinstance(link, VirtualLink):
-
-        def sample() -> Tilt:
-            taken = link.neck.newest
-            return Tilt(taken.pitch, taken.roll, taken.pitch_rate, taken.roll_rate, taken.valid)
-
-        return sample
+        return lambda: link.newest
     sensor = sensor_of(file, link.name)
 
-    def look() -> Tilt | None:
+    def look() -> Tilt | Reading | None:
         until = link.now + _LOOK
         while link.now < until:
             tilt = sensor.read(link.now, link.receive(0.02))
@@ -223,7 +235,7 @@ def _told(file: DrivesFile) -> Iterator[Any]:
     """Yield the inclinometer; say at the end what happened to it, which no drive and no watch can know."""
     from softneck.drives import open_sensor
 
-    with open_sensor(file.sensor_kind, file.sensor_node, file.sensor_source) as sensor:
+    with open_sensor(file.sensor_kind, file.sensor_node, file.sensor_source, file.moves) as sensor:
         try:
             yield sensor
         finally:

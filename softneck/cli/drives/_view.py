@@ -29,6 +29,7 @@ from softneck.drives.master._cia402 import DriveState
 if TYPE_CHECKING:
     from softneck.drives.logs._times import CycleFigures
     from softneck.drives.master import Frame, Master, Tilt
+    from softneck.drives.master._gate import Reading
     from softneck.drives.running._snapshot import DriveSnapshot, Snapshot
     from softneck.drives.running._virtual import Watch
 
@@ -60,7 +61,8 @@ def to_line(
         "since": snapshot.time - begin,
         "cycle": snapshot.cycle,
         "fault": None if snapshot.fault is None else str(snapshot.fault),
-        "angles": list(zip(snapshot.references[:2], snapshot.angles, snapshot.estimates, strict=True)),
+        "outputs": list(snapshot.outputs),
+        "angles": list(zip(snapshot.references[:-1], snapshot.angles, snapshot.estimates, strict=True)),
         "motors": list(zip(snapshot.setpoints, snapshot.positions, snapshot.tensions, strict=True)),
         "tension_limit": snapshot.tension_limit,
         "drives": [_drive(drive) for drive in snapshot.drives],
@@ -153,7 +155,7 @@ class LiveView:
         self._thread.join()
 
     def watch(
-        self, now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Tilt | None, master: Master
+        self, now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Tilt | Reading | None, master: Master
     ) -> None:
         """Look at `master` after its cycle at `now` [s]; one of the `watches` of a run."""
         self.show(self._snapshots.take(master, now))

@@ -1,29 +1,29 @@
-"""`drives.toml`: node ids, gear, encoder, signs, limits, sensor, guarding, read strictly."""
+"""What a drives file says: node ids, gear, encoder, signs, limits, sensor, guarding, and what the drives move."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-import tomllib
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from softneck.core import (
-    DataError,
-    FileFormatError,
     SettingsError,
     require_between,
     require_one_of,
     require_positive,
     require_whole,
 )
+from softneck.robot import Robot
+from softneck.signals.recording._channels import NECK
 
 from ..master import MasterSettings
 from ..master._fieldbus import BusSettings
 from ..master._settings import LimitSettings, RampSettings, SensorSettings, WatchSettings
-from ._sensor_source import SENSORS, SOURCE_KEYS, SensorSource, make_source
+from ._load import MOST, bus_load
+from ._robot import channels_of, count_word, ranges, require_signs
+from ._sensor_source import SENSORS, SensorSource
 from ._units import DriveScale, current_to_internal, internal_to_current
 
 PROFILES = ("ipos2015", "ds402")
@@ -139,7 +139,7 @@ class DrivesFile:
 
     Attributes:
         profile: "ipos2015" or "ds402".
-        drives: of motors 1, 2, 3.
+        drives: of the motors, in their order.
         eds: an EDS of one's own, None for ours.
         cycle: bus period [s].
         bit_rate: [bit/s].
@@ -148,10 +148,11 @@ class DrivesFile:
             `sensor_source`.
         quick_stop: deceleration of a quick stop (6085h) [rad/s^2].
         following: window (6065h) [rad]; following_time: its time-out (6066h) [s].
+        robot: what the drives move; None: the neck, with no limits beside those here.
     """
 
     profile: str
-    drives: tuple[DriveEntry, DriveEntry, DriveEntry]
+    drives: tuple[DriveEntry, ...]
     eds: Path | None = None
     cycle: float = 0.01
     bit_rate: int = 1_000_000
@@ -168,6 +169,7 @@ class DrivesFile:
     quick_stop: float = 200.0
     following: float = 2.0
     following_time: float = 0.2
+    robot: Robot | None = None
 
     def __post_init__(self) -> None:
         require_one_of("profile", self.profile, PROFILES)
@@ -178,15 +180,54 @@ class DrivesFile:
         require_between("following_s", self.following_time, 0.01, 0.2, "s")
         require_one_of("kind", self.sensor_kind, SENSORS)
         require_whole("node", self.sensor_node, 1, 126)
-        nodes = self.nodes
-        if len(set(nodes)) != 3:
-            raise SettingsError(f"the three drives need three node numbers; got {nodes[0]}, {nodes[1]}, {nodes[2]}.")
+        nodes, motors = self.nodes, len(self.moves.motors.names)
+        if len(nodes) != motors:
+            raise SettingsError(f"there are {len(nodes)} drives for the {motors} motors of robot {self.moves.label()}.")
+        if len(set(nodes)) != motors:
+            word = count_word(motors)
+            raise SettingsError(f"the {word} drives need {word} node numbers; got {', '.join(map(str, nodes))}.")
+        if self.sensor_kind == "can" and self.sensor_node in nodes:
+            raise SettingsError(f"[sensor] node {self.sensor_node} is that of a drive; each device needs its own.")
+        if self.robot is not None:
+            require_signs([drive.scale.reversed for drive in self.drives], self.robot)
+        if self.load > MOST:
+            raise SettingsError(
+                f"{motors} drives every {1e3 * self.cycle:g} ms would take {100.0 * self.load:.0f} % of a bus with "
+                f"{self.bit_rate:g} bit/s; at most {100.0 * MOST:g} % work. Raise `bit_rate` or `period_s` of [bus]."
+            )
 
     @property
-    def nodes(self) -> tuple[int, int, int]:
-        """Node numbers of motors 1 to 3."""
-        one, two, three = (drive.node for drive in self.drives)
-        return one, two, three
+    def nodes(self) -> tuple[int, ...]:
+        """Node numbers of the motors."""
+        return tuple(drive.node for drive in self.drives)
+
+    @property
+    def moves(self) -> Robot:
+        """What the drives move: the neck where no robot is spoken of."""
+        return self.robot or NECK
+
+    @property
+    def ranges(self) -> tuple[tuple[float, float, float], ...]:
+        """Of each motor: lowest and highest set-point [rad], largest speed [rad/s]; the tighter of robot and file."""
+        return ranges(self.robot, self.limits)
+
+    @property
+    def weights(self) -> tuple[tuple[float, ...], ...]:
+        """Directions of the outputs, (outputs, motors); () where they are to be identified."""
+        channels = channels_of(self.robot, self.limits)
+        return self.watch.weights if channels is None or channels.weights is None else channels.weights
+
+    @property
+    def load(self) -> float:
+        """The part of the bus that the cyclic traffic takes at worst."""
+        return bus_load(
+            len(self.drives),
+            cycle=self.cycle,
+            guard_cycles=self.guard_cycles,
+            bit_rate=self.bit_rate,
+            # No inclinometer sends more often than the bus turns.
+            sensor_period=self.cycle if self.sensor_kind == "can" else 0.0,
+        )
 
     @property
     def guard_cycles(self) -> int:
@@ -218,175 +259,24 @@ class DrivesFile:
                  for unit, scale in zip(raise_per_mille, scales, strict=True)]  # fmt: skip
         bus = BusSettings(nodes=self.nodes, cycle=self.cycle, guarding=guarding, guard_cycles=self.guard_cycles)
         return MasterSettings(
-            counts_per_radian=(k[0], k[1], k[2]),
-            newton_per_unit=(n[0], n[1], n[2]),
+            counts_per_radian=tuple(k),
+            newton_per_unit=tuple(n),
             sample_cycles=round(ratio),
             bus=bus,
             limits=self.limits,
             sensor=self.sensor,
             watch=self.watch,
             ramps=self.ramps,
+            channels=channels_of(self.robot, self.limits),
         )
 
 
-def load_drives(path: str | Path) -> DrivesFile:
-    """Read a drives file.
-
-    Raises:
-        FileFormatError: no such file or no TOML.
-        SettingsError: an unknown or missing key, or a value that does not fit; the line names table and key.
-    """
-    source = Path(path)
-    try:
-        table = tomllib.loads(source.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise FileFormatError(f"{source}: cannot be read ({error.strerror}).") from error
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{source}: is not valid TOML ({error}).") from error
-    try:
-        return make_drives(table, source.parent)
-    except (SettingsError, DataError, FileFormatError) as error:
-        raise type(error)(f"{source}: {error}") from error
-
-
-# Table -> key in the file -> (field, factor to SI).
-_KEYS: dict[str, dict[str, tuple[str, float]]] = {
-    "guarding": {"kind": ("kind", 0.0), "time_s": ("time", 1.0)},
-    "zero": {
-        "current_A": ("current", 1.0), "speed_rad_s": ("speed", 1.0), "still_rad_s": ("still", 1.0),
-        "still_s": ("still_time", 1.0), "timeout_s": ("timeout", 1.0), "tilt_deg": ("tilt", math.radians(1.0)),
-    },
-    "neck": {
-        "winch_radius_m": ("winch_radius", 1.0), "torque_constant_Nm_A": ("torque_constant", 1.0),
-        "gear_efficiency": ("efficiency", 1.0),
-    },
-    "limits": {
-        "position_rad": ("position", 1.0), "speed_rad_s": ("speed", 1.0), "acceleration_rad_s2": ("acceleration", 1.0),
-        "persistent_s": ("persistent", 1.0), "tension_N": ("tension", 1.0), "slack_N": ("slack", 1.0),
-        "slack_unwind_rad": ("slack_unwind", 1.0),
-    },
-    "sensor": {
-        "dropout_s": ("dropout", 1.0), "frozen_samples": ("frozen_samples", 0.0), "bad_samples": ("bad_samples", 0.0),
-        "angle_deg": ("angle", math.radians(1.0)), "rate_deg_s": ("rate", math.radians(1.0)),
-        "margin_deg": ("margin", math.radians(1.0)), "on_loss": ("on_loss", 0.0), "hold_s": ("hold", 1.0),
-    },
-    "watch": {
-        "following_rad": ("following", 1.0), "tilt_deg": ("tilt", math.radians(1.0)), "gain": ("gain", 1.0),
-        "pole_per_s": ("pole", 1.0), "pushed_N": ("pushed", 1.0),
-    },
-    "ramp": {
-        "speed_rad_s": ("speed", 1.0), "settle_s": ("settle", 1.0), "tolerance_rad": ("tolerance", 1.0),
-        "enable_timeout_s": ("enable_timeout", 1.0), "timeout_s": ("timeout", 1.0),
-    },
-    "bus": {"period_s": ("cycle", 1.0), "bit_rate": ("bit_rate", 0.0)},
-    "quick": {
-        "quick_stop_rad_s2": ("quick_stop", 1.0), "following_rad": ("following", 1.0),
-        "following_s": ("following_time", 1.0),
-    },
-    "scale": {
-        "peak_current_A": ("peak_current", 1.0), "gear": ("gear", 1.0), "encoder_counts": ("counts_per_turn", 1.0),
-        "slow_loop_s": ("slow_loop", 1.0), "reversed": ("reversed", 0.0),
-    },
-    "drive": {
-        "node": ("node", 0.0), "current_limit_A": ("current_limit", 1.0), "vendor": ("vendor", 0.0),
-        "product": ("product", 0.0), "serial": ("serial", 0.0), "firmware": ("firmware", 0.0),
-    },
-}  # fmt: skip
-_TOP = ("profile", "eds", "bus", "guarding", "drive", "limits", "stop", "sensor", "watch", "zero", "ramp", "neck")
-_CLASSES = {
-    "guarding": Guarding, "zero": ZeroSettings, "neck": Neck, "limits": LimitSettings, "sensor": SensorSettings,
-    "watch": WatchSettings, "ramp": RampSettings,
-}  # fmt: skip
-_FIELDS = {"ramp": "ramps"}
-
-
-def make_drives(table: Mapping[str, Any], folder: Path = Path()) -> DrivesFile:
-    """Return what a table with the keys of a drives file describes; an EDS is looked for in `folder`."""
-    _refuse_unknown("the file", table, _TOP)
-    if "profile" not in table:
-        raise SettingsError(f"`profile` is missing; it is one of {', '.join(PROFILES)}.")
-    entries = table.get("drive")
-    if not isinstance(entries, list) or len(entries) != 3:
-        count = len(entries) if isinstance(entries, list) else 0
-        raise SettingsError(f"three [[drive]] tables are needed, motors 1 to 3 in this order; there are {count}.")
-    one, two, three = (_drive(number, entry) for number, entry in enumerate(entries, start=1))
-    values: dict[str, Any] = {"profile": table["profile"], "drives": (one, two, three)}
-    for name, setting in _CLASSES.items():
-        if name not in table:
-            continue
-        content = dict(_table(name, table[name]))
-        if name == "sensor":
-            values |= {f"sensor_{key}": content.pop(key) for key in ("kind", "node") if key in content}
-            kind, own = values.get("sensor_kind", "simulated"), [key for key in content if key in SOURCE_KEYS]
-            values["sensor_source"] = make_source(kind, {key: content.pop(key) for key in own}, folder)
-        values[_FIELDS.get(name, name)] = _made(f"[{name}]", setting, name, content)
-    values |= _values("[bus]", "bus", _table("bus", table.get("bus", {})))
-    values |= _values("[stop]", "quick", _table("stop", table.get("stop", {})))
-    if "eds" in table:
-        values["eds"] = folder / str(table["eds"])
-    return DrivesFile(**values)
-
-
-def _drive(number: int, entry: Any) -> DriveEntry:
-    where = f"[[drive]] {number}"
-    content = dict(_table(where, entry))
-    known = {**_KEYS["scale"], **_KEYS["drive"]}
-    _refuse_unknown(where, content, tuple(known))
-    for key in ("node", "peak_current_A"):
-        if key not in content:
-            raise SettingsError(f"{where}: `{key}` is missing.")
-    scale = {key: value for key, value in content.items() if key in _KEYS["scale"]}
-    rest = {key: value for key, value in content.items() if key in _KEYS["drive"]}
-    try:
-        made = _made(where, DriveScale, "scale", scale)
-        return DriveEntry(scale=made, **_values(where, "drive", rest))
-    except (SettingsError, DataError) as error:
-        text = str(error)
-        raise SettingsError(text if text.startswith(where) else f"{where}: {text}") from error
-
-
-def _made(where: str, setting: type, name: str, content: Mapping[str, Any]) -> Any:
-    try:
-        return setting(**_values(where, name, content))
-    except SettingsError as error:
-        raise SettingsError(f"{where}: {error}") from error
-
-
-def _values(where: str, name: str, content: Mapping[str, Any]) -> dict[str, Any]:
-    keys = _KEYS[name]
-    _refuse_unknown(where, content, tuple(keys))
-    return {keys[key][0]: _value(f"{where} {key}", value, keys[key][1]) for key, value in content.items()}
-
-
-_WHOLE = ("node", "vendor", "product", "serial", "bit_rate", "frozen_samples", "bad_samples")
-
-
-def _value(where: str, value: Any, factor: float) -> Any:
-    key = where.rpartition(" ")[2]
-    if factor == 0.0:
-        wanted: type = bool if key == "reversed" else int if key in _WHOLE else str
-        if not isinstance(value, wanted) or (wanted is int and isinstance(value, bool)):
-            words = {bool: "true or false", int: "a whole number", str: "a text"}
-            raise SettingsError(f"{where} must be {words[wanted]}; got {value!r}.")
-        return value
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise SettingsError(f"{where} must be a number; got {value!r}.")
-    return factor * value
-
-
-def _table(name: str, value: Any) -> Mapping[str, Any]:
-    if not isinstance(value, dict):
-        raise SettingsError(f"`{name}` must be a table.")
-    return value
-
-
-def _refuse_unknown(where: str, table: Mapping[str, Any], known: tuple[str, ...]) -> None:
-    unknown = [key for key in table if key not in known]
-    if unknown:
-        raise SettingsError(f"unknown key `{unknown[0]}` of {where}; it takes {', '.join(known)}.")
-
-
-def default_drives(profile: str = "ipos2015", **changes: Any) -> DrivesFile:
-    """Return the file for simulated drives that nobody wrote one for: nodes 1 to 3, the lab's set-up."""
-    one, two, three = (DriveEntry(node=node, scale=DriveScale(peak_current=10.0)) for node in (1, 2, 3))
-    return dataclasses.replace(DrivesFile(profile=profile, drives=(one, two, three)), **changes)
+def default_drives(profile: str = "ipos2015", *, robot: Robot | None = None, **changes: Any) -> DrivesFile:
+    """Return the file for simulated drives that nobody wrote one for: nodes from 1 on, the lab's set-up."""
+    entries = []
+    for node, sign in enumerate((robot or NECK).motors.sign, start=1):
+        entries.append(DriveEntry(node=node, scale=DriveScale(peak_current=10.0, reversed=sign < 0.0)))
+    radius = None if robot is None else robot.winch_radius_m
+    neck = Neck() if radius is None else Neck(winch_radius=radius)
+    file = DrivesFile(profile=profile, drives=tuple(entries), neck=neck, robot=robot)
+    return dataclasses.replace(file, **changes)

@@ -13,8 +13,10 @@ from softneck.core import SettingsError, SoftneckError
 
 from ..master import Frame
 from ..master._cia301 import BUS_OFF
+from ..master._gate import Reading, Tilt, sample_of
 from ..simulated import SimulatedNeck
 from ..simulated._frame import CanFrame
+from ..simulated._springs import SimulatedSprings
 from ._why import reason
 
 # Interfaces whose far end is a program on this machine: no drive can be behind them.
@@ -51,7 +53,7 @@ class VirtualLink:
     """The bus to simulated drives in virtual time: waiting is what lets time pass.
 
     Attributes:
-        neck: what hangs on it.
+        neck: what hangs on it: the virtual neck with its drives, or springs in the place of another robot.
         cut: no frame passes.
         tap: called with (time, from_master, frame) for each frame that is on the wire.
         lose: returns whether a frame is lost: (from_master, frame).
@@ -59,7 +61,7 @@ class VirtualLink:
         sampling: whether passing time makes the inclinometer sample; else whoever steps the link does.
     """
 
-    def __init__(self, neck: SimulatedNeck) -> None:
+    def __init__(self, neck: SimulatedNeck | SimulatedSprings) -> None:
         """Begin at t = 0."""
         self.neck = neck
         self.cycle = neck.settings.cycle
@@ -91,6 +93,12 @@ class VirtualLink:
             frame = Frame(answer[0], answer[1], answer[2])
             if self._passes(False, frame):
                 self._inbox.append(frame)
+
+    @property
+    def newest(self) -> Tilt | Reading:
+        """The sensor's newest sample, as the master takes it."""
+        sample = self.neck.newest
+        return sample_of(sample.values, sample.rates, valid=sample.valid)
 
     def pass_time(self) -> None:
         """Let one cycle pass: drives, neck, and what the drives say by themselves."""

@@ -119,7 +119,9 @@ def option_writes() -> list[Write]:
 
 def limit_writes(file: DrivesFile, entry: DriveEntry) -> list[Write]:
     """Position limits, quick stop, following error, current."""
-    edges = [position_to_counts(sign * file.limits.position, entry.scale) + HOMED_MARK for sign in (-1.0, 1.0)]
+    # Pulled no further than the robot allows. Paid out a winch may be that unwound without power: it must come back.
+    _, high, _ = file.ranges[file.drives.index(entry)]
+    edges = [position_to_counts(edge, entry.scale) + HOMED_MARK for edge in (-file.limits.position, high)]
     window = abs(position_to_counts(file.following, entry.scale))
     return [
         Write(0x607D, 1, min(edges), "limits"),

@@ -9,6 +9,7 @@ import numpy as np
 
 from softneck.core import Vector
 from softneck.plant import NeckParameters, VirtualNeck, settle
+from softneck.robot import Robot
 
 from ..bus._file import DrivesFile, Neck, default_drives
 
@@ -16,15 +17,17 @@ from ..bus._file import DrivesFile, Neck, default_drives
 _PULLED = 3.0
 
 
-def neck_drives(parameters: NeckParameters) -> DrivesFile:
+def neck_drives(parameters: NeckParameters, robot: Robot | None = None) -> DrivesFile:
     """Return `default_drives` for the neck of `parameters`; those of the paper's neck are the default itself.
+
+    Or for `robot` with that physics.
 
     Current limit, gear, winch and motor constant are the neck's. What belongs to them keeps its proportion to the
     default: the tension at which a run stops to what the motors can pull (1.9 times as much), the current that
     tightens the tendons in `zero` and the tension of one that hangs to the pretension, the watch's gain and
     tolerance and how far a hanging tendon may be let out to how far the neck tilts.
     """
-    file, paper = default_drives(), NeckParameters.paper()
+    file, paper = default_drives(robot=robot), NeckParameters.paper()
     drives = tuple(
         replace(entry, current_limit=parameters.current_limit, scale=replace(entry.scale, gear=parameters.gear_ratio))
         for entry in file.drives
@@ -36,11 +39,15 @@ def neck_drives(parameters: NeckParameters) -> DrivesFile:
     )
     pulls = _newton_per_ampere(parameters) / _newton_per_ampere(paper)
     pretension = parameters.pretension / paper.pretension
-    tilts = _tilt(parameters) / _tilt(paper)
+    upright = file.zero.tilt
+    if not file.moves.is_neck:
+        # Friction of the gears leaves four tendons that are tightened one by one 6 deg off, where three leave 2 deg.
+        upright = 2.0 * upright + _rest(VirtualNeck(parameters.without_noise(), file.moves))
+    tilts = _tilt(VirtualNeck(parameters.without_noise(), file.moves)) / _tilt(VirtualNeck(paper.without_noise()))
     angles = (parameters.tendon_angle_1, parameters.tendon_angle_2, parameters.tendon_angle_3)
     return replace(
         file,
-        drives=(drives[0], drives[1], drives[2]),
+        drives=drives,
         neck=neck,
         limits=replace(
             file.limits,
@@ -49,7 +56,7 @@ def neck_drives(parameters: NeckParameters) -> DrivesFile:
             slack=file.limits.slack * pretension,
             slack_unwind=file.limits.slack_unwind * tilts,
         ),
-        zero=replace(file.zero, current=file.zero.current * pretension / pulls),
+        zero=replace(file.zero, current=file.zero.current * pretension / pulls, tilt=upright),
         watch=replace(file.watch, gain=file.watch.gain * tilts, tilt=file.watch.tilt * tilts, tendon_angles=angles),
     )
 
@@ -58,9 +65,18 @@ def _newton_per_ampere(p: NeckParameters) -> float:
     return p.torque_constant * p.gear_ratio * p.gear_efficiency / p.winch_radius
 
 
-def _tilt(parameters: NeckParameters) -> float:
+def _rest(neck: VirtualNeck) -> float:
+    """Return how far the pretension alone bends it, where its tendons do not pull against each other [rad]."""
+    out = settle(neck.block(), np.zeros(len(neck.robot.motors.names))).outputs
+    return max(abs(float(angle)) for angle in out[: len(neck.robot.outputs.names)])
+
+
+def _tilt(neck: VirtualNeck) -> float:
     """Return how far the neck tilts when its tendons are moved as Eq. 9 and 10 have it, without payload [rad]."""
-    angles = np.array([parameters.tendon_angle_1, parameters.tendon_angle_2, parameters.tendon_angle_3])
-    P: Vector = _PULLED * 2.0 / 3.0 * np.cos(angles)
-    out = settle(VirtualNeck(parameters.without_noise()).block(), P).outputs
-    return math.hypot(float(out[0]), float(out[1]))
+    p, weights = neck.parameters, neck.robot.weights()
+    P: Vector = _PULLED * 2.0 / 3.0 * np.cos(np.array([p.tendon_angle_1, p.tendon_angle_2, p.tendon_angle_3]))
+    if not neck.robot.is_neck and weights is not None:
+        # Along the first output's direction, so that the motors come to as much together.
+        P = _PULLED * weights[0] / np.dot(weights[0], weights[0])
+    out = settle(neck.block(), P).outputs
+    return math.hypot(*(float(angle) for angle in out[: len(neck.robot.outputs.names)]))

@@ -8,13 +8,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from softneck.core import CheckFailedError, DataError, FileFormatError, SettingsError, Vector
-from softneck.signals import SET_POINTS, Excitation, Recording, SetPointLimits, prepare, signal
+from softneck.robot import Robot
+from softneck.signals import Excitation, Recording, SetPointLimits, prepare, read_recording, signal
 from softneck.signals.excitation._limits import Changes
+from softneck.signals.recording._channels import NECK
+from softneck.signals.recording._recording import require_same_robot
 
 from ..bus._file import DrivesFile
 from ..logs._rows import experiment_recording
@@ -78,20 +82,23 @@ def drive_limits(
     Raises:
         SettingsError: beyond the drives file.
     """
-    own = file.limits
+    # One number for all motors here; what each of them may do beyond its own range is clipped by `Experiment`.
+    farthest = max(max(-low, high) for low, high, _ in file.ranges)
+    slowest = min(fastest for _, _, fastest in file.ranges)
+    whose = "[limits] in the drives file" if file.robot is None else "[limits] in the drives file, or of the robot"
     for name, value, most, unit in (
-        ("--max-position", position, own.position, "rad"),
-        ("--max-speed", speed, own.speed, "rad/s"),
-        ("--max-slack", slack, own.position, "rad"),
+        ("--max-position", position, farthest, "rad"),
+        ("--max-speed", speed, slowest, "rad/s"),
+        ("--max-slack", slack, farthest, "rad"),
     ):
         if value is not None and value > most:
-            raise SettingsError(f"{name} {value:g} is beyond the {most:g} {unit} of [limits] in the drives file.")
+            raise SettingsError(f"{name} {value:g} is beyond the {most:g} {unit} of {whose}.")
     return SetPointLimits(
-        position=own.position if position is None else position,
+        position=farthest if position is None else position,
         # A quarter of what the drives take: with their current limit the motors follow the quickest signals up to
         # there: Eq. 22 leaves the paper's motors 1.5 rad behind for 0.28 s at a third, for 0.04 s at a quarter.
-        speed=own.speed / 4.0 if speed is None else speed,
-        slack=min(own.slack_unwind, own.position, _SLACK) if slack is None else slack,
+        speed=slowest / 4.0 if speed is None else speed,
+        slack=min(file.limits.slack_unwind, farthest, _SLACK) if slack is None else slack,
     )
 
 
@@ -129,17 +136,18 @@ def record_signal(
 
     session = replace(session, watches=(log, tell, *session.watches))
     ended = run_session(session, SignalPilot(set_points), sample_time=sample_time, most=len(run) * sample_time)
-    recording = experiment_recording(log.columns(), run[: log.rows], sample_time)
+    recording = experiment_recording(log.columns(), run[: log.rows], sample_time, session.file.moves)
     return ExperimentResult(recording, int(np.count_nonzero(run)), ended)
 
 
 def joined(excitations: Sequence[Excitation], sample_time: float) -> tuple[np.ndarray, Vector]:
-    """Return all set-points (rows, 3) with pauses at rest between, and the number of the run, 0 in pauses."""
+    """Return all set-points (rows, motors) with pauses at rest between, and the number of the run, 0 in pauses."""
     parts, runs = [], []
+    motors = np.shape(excitations[0].set_points)[1]
     pause = round(_PAUSE / sample_time)
     for number, excitation in enumerate(excitations, start=1):
         if parts:
-            parts.append(np.zeros((pause, 3)))
+            parts.append(np.zeros((pause, motors)))
             runs.append(np.zeros(pause))
         parts.append(np.asarray(excitation.set_points, dtype=np.float64))
         runs.append(np.full(len(parts[-1]), float(number)))
@@ -148,23 +156,29 @@ def joined(excitations: Sequence[Excitation], sample_time: float) -> tuple[np.nd
 
 def _require_playable(excitation: Excitation, file: DrivesFile, sample_time: float) -> None:
     P = np.asarray(excitation.set_points, dtype=np.float64)
-    if P.ndim != 2 or P.shape[1] != len(SET_POINTS) or len(P) < 2:
-        raise DataError(f"set-points must have shape (time, 3) with at least 2 rows; got {P.shape}.")
+    motors = len(file.nodes)
+    if P.ndim != 2 or P.shape[1] != motors or len(P) < 2:
+        raise DataError(f"set-points must have shape (time, {motors}) with at least 2 rows; got {P.shape}.")
     if not math.isclose(excitation.sample_time, sample_time, rel_tol=1e-9):
         raise SettingsError("the signals of one experiment need one sample time.")
     if not np.isfinite(P).all():
         raise DataError(f"the set-points of {excitation.name} must be finite.")
-    most = float(np.abs(P).max())
-    if most > file.limits.position + _ROUNDING:
+    low, high, fastest = np.array(file.ranges).T
+    whose = "drives file allows" if file.robot is None else "drives file or the robot allow"
+    if (high + _ROUNDING < P).any() or (low - _ROUNDING > P).any():
+        most = float(P.flat[np.argmax(np.maximum(P - high, low - P))])
+        allowed = f"{high[0]:g} rad" if file.robot is None else "less"
         raise SettingsError(
-            f"{excitation.name} asks for {most:.3g} rad; the drives file allows {file.limits.position:g} rad. "
+            f"{excitation.name} asks for {abs(most) if file.robot is None else most:.3g} rad; the {whose} {allowed}. "
             "Lower --max-position."
         )
     # From rest to the first row and from the last one to rest within one sample.
-    speed = float(np.abs(np.diff(np.vstack([np.zeros(3), P, np.zeros(3)]), axis=0)).max()) / sample_time
-    if speed > file.limits.speed * (1.0 + _ROUNDING):
+    rest = np.zeros(motors)
+    speeds = np.abs(np.diff(np.vstack([rest, P, rest]), axis=0)).max(axis=0) / sample_time
+    if (speeds > fastest * (1.0 + _ROUNDING)).any():
+        j = int(np.argmax(speeds / fastest))
         raise SettingsError(
-            f"{excitation.name} asks for {speed:.3g} rad/s; the drives file allows {file.limits.speed:g} rad/s. "
+            f"{excitation.name} asks for {speeds[j]:.3g} rad/s; the {whose} {fastest[j]:g} rad/s. "
             "Lower --max-speed, and ramp it in and out (--ramp)."
         )
 
@@ -174,12 +188,14 @@ class Experiment:
     """What `softneck drives record` plays.
 
     Attributes:
-        signal: name of it.
+        signal: name of it, or a recording whose set-points are played, all of its runs.
         limits: of the set-points, see `drive_limits`.
         duration: [s]; None: the signal's own.
         seed: of the first run; it rises by one with each.
         runs: how often it is played.
         ramp: from rest and to it [s].
+        robot: whose motors they are; None: a neck's, not spoken of.
+        ranges: of each motor: lowest and highest set-point [rad], largest speed [rad/s]; () for none beside `limits`.
     """
 
     signal: str
@@ -188,17 +204,39 @@ class Experiment:
     seed: int = 0
     runs: int = 1
     ramp: float = 2.0
+    robot: Robot | None = None
+    ranges: tuple[tuple[float, float, float], ...] = ()
 
     def prepared(self) -> list[tuple[Excitation, Changes]]:
         """Return for each run the signal within its limits, and what they changed.
 
         Raises:
             SettingsError: no such signal, or limits that it cannot keep.
+            FileFormatError, DataError: no such recording, or one of another robot.
         """
+        signals = [one for number in range(self.runs) for one in self._signals(number)]
+        return [prepare(self._in_range(one), self.limits, ramp_s=self.ramp) for one in signals]
+
+    def _signals(self, number: int) -> list[Excitation]:
+        """Return what is played in round `number`: a signal by name, or the runs of a recording."""
+        if Path(self.signal).suffix.lower() not in (".csv", ".parquet"):
+            # A neck's signals are those of the paper, whatever its own limits.
+            own = None if self.robot is None or self.robot.is_neck else self.robot
+            return [signal(self.signal, duration=self.duration, seed=self.seed + number, robot=own)]
+        recording = read_recording(self.signal)
+        require_same_robot(recording.robot, self.robot or NECK, f"{self.signal} and the drives: set-points")
+        rows = None if self.duration is None else max(2, round(self.duration / recording.sample_time))
         return [
-            prepare(signal(self.signal, duration=self.duration, seed=self.seed + number), self.limits, ramp_s=self.ramp)
-            for number in range(self.runs)
+            Excitation(self.signal, part.time[:rows] - part.time[0], part.set_points[:rows], recording.sample_time)
+            for part in recording.runs()
         ]
+
+    def _in_range(self, excitation: Excitation) -> Excitation:
+        """Return a signal within the range of each motor, which is the tighter one of robot and drives file."""
+        if not self.ranges:
+            return excitation
+        low, high, _ = np.array(self.ranges).T
+        return replace(excitation, set_points=np.clip(excitation.set_points, low, high))
 
     def pilot(self) -> SignalPilot:
         """Return what plays all runs with their pauses."""
@@ -206,17 +244,20 @@ class Experiment:
         return SignalPilot(joined(parts, parts[0].sample_time)[0])
 
     def facts(self) -> dict[str, Any]:
-        """Return what a log holds of it."""
-        return asdict(self)
+        """Return what a log holds of it; the robot and its ranges stand elsewhere there."""
+        return {key: value for key, value in asdict(self).items() if key not in ("robot", "ranges")}
 
     @classmethod
-    def of(cls, facts: Mapping[str, Any]) -> Experiment:
-        """Return the experiment that `facts` tells.
+    def of(
+        cls, facts: Mapping[str, Any], robot: Robot | None = None, ranges: tuple[tuple[float, float, float], ...] = ()
+    ) -> Experiment:
+        """Return the experiment that `facts` tells, of `robot` within `ranges`.
 
         Raises:
             FileFormatError: they are damaged, or of another version.
         """
         try:
-            return cls(**{**facts, "limits": SetPointLimits(**facts["limits"])})
+            limits = SetPointLimits(**facts["limits"])
+            return cls(**{**facts, "limits": limits, "robot": robot, "ranges": ranges})
         except (KeyError, TypeError, SettingsError) as error:
             raise FileFormatError(f"the log's experiment does not fit this softneck ({error}).") from error

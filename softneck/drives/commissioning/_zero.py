@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +24,7 @@ from ..bus._sdo import Objects, load_eds
 from ..bus._units import counts_to_position
 from ..master import Frame, Tilt
 from ..master._cia402 import DriveState, state_of
+from ..master._gate import Reading
 from ..running._stop import disarm, wait
 from ..running._timing import Operator
 
@@ -41,7 +42,7 @@ _FAST_ENOUGH = 0.3
 _SETTLE = 1.0
 _ENABLE_TIME = 1.0
 
-Look = Callable[[], Tilt | None]
+Look = Callable[[], Tilt | Reading | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,21 +52,19 @@ class ZeroResult:
     Attributes:
         nodes: of the drives.
         pulled: how far each winch turned until its tendon was tight [rad].
-        pitch, roll: of the neck then [rad].
+        outputs: what is measured, and how much of it then [rad].
     """
 
     nodes: tuple[int, ...]
     pulled: tuple[float, ...]
-    pitch: float
-    roll: float
+    outputs: Mapping[str, float]
 
     def table(self) -> dict[str, Any]:
         """Return the JSON of `softneck drives zero`."""
         return {
             "zeroed": True,
             "motors": [{"node": n, "pulled_rad": p} for n, p in zip(self.nodes, self.pulled, strict=True)],
-            "pitch_deg": math.degrees(self.pitch),
-            "roll_deg": math.degrees(self.roll),
+            **{f"{name}_deg": math.degrees(angle) for name, angle in self.outputs.items()},
         }
 
 
@@ -125,7 +124,7 @@ class _Motor:
 
 
 def zero(link: Link, file: DrivesFile, look: Look, *, guarding: str, operator: Operator | None = None) -> ZeroResult:
-    """Tension the tendons of motors 1 to 3, set the encoders' zero there, verify, and switch the drives off.
+    """Tension the tendons of all motors, set the encoders' zero there, verify, and switch the drives off.
 
     Args:
         link: to the bus; the drives are configured and their nodes operational or pre-operational.
@@ -151,7 +150,7 @@ def zero(link: Link, file: DrivesFile, look: Look, *, guarding: str, operator: O
             _tension(guarded, motor, operator)
         # What the later ones pulled may have loosened the first: all pull on with their small current.
         _rest(guarded, _SETTLE, operator)
-        tilt = _upright(file, look)
+        outputs = _upright(file, look)
         for motor in motors:
             _set_zero(guarded, motor)
     finally:
@@ -162,7 +161,7 @@ def zero(link: Link, file: DrivesFile, look: Look, *, guarding: str, operator: O
             f"node {node}: did not confirm that it is switched off: {why}. Press the hardware stop (Enable input)."
         )
     pulled = tuple(motor.pulled for motor in motors)
-    return ZeroResult(file.nodes, pulled, tilt.pitch, tilt.roll)
+    return ZeroResult(file.nodes, pulled, outputs)
 
 
 def _tension(link: Link, motor: _Motor, operator: Operator | None) -> None:
@@ -202,18 +201,20 @@ def _tension(link: Link, motor: _Motor, operator: Operator | None) -> None:
         )
 
 
-def _upright(file: DrivesFile, look: Look) -> Tilt:
+def _upright(file: DrivesFile, look: Look) -> dict[str, float]:
     tilt = look()
     if tilt is None or not tilt.valid:
         raise CheckFailedError("the inclinometer gives no sample; the zero cannot be verified.")
-    worst = max(abs(tilt.pitch), abs(tilt.roll))
+    found = dict(zip(file.moves.outputs.names, tilt.values, strict=True))
+    worst = max(map(abs, found.values()))
     if not worst <= file.zero.tilt:
+        told = ", ".join(f"{name} {math.degrees(angle):.1f}" for name, angle in found.items())
         raise CheckFailedError(
-            f"the neck leans by pitch {math.degrees(tilt.pitch):.1f}, roll {math.degrees(tilt.roll):.1f} deg with all "
-            f"tendons tight; {math.degrees(file.zero.tilt):g} deg are allowed. No zero was set: look for a tendon that "
-            "slipped or hangs."
+            f"the {'neck' if file.moves.is_neck else 'robot'} leans by {told} deg with all tendons tight; "
+            f"{math.degrees(file.zero.tilt):g} deg are allowed. No zero was set: look for a tendon that slipped or "
+            "hangs."
         )
-    return tilt
+    return found
 
 
 def _set_zero(link: Link, motor: _Motor) -> None:

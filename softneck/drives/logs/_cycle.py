@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from ..master import Frame, Master, Tilt
-from ..master._measured import Measurement, Pilot
+from ..master._gate import Reading, sample_of
+from ..master._measured import Measurement, Motors, Pilot
 
-Triple = tuple[float, float, float]
 # What the pilot was asked and what it said: ("start", None), ("finished", bool), ("step", set-points or None), or
 # (what, "Error: text") where it raised.
 Answer = tuple[str, Any]
@@ -31,14 +31,14 @@ class Cycle(NamedTuple):
 
     time: float
     received: tuple[Frame, ...]
-    tilt: Tilt | None
+    tilt: Tilt | Reading | None
     taken: tuple[tuple[str, str], ...]
     answers: tuple[Answer, ...]
     sent: tuple[Frame, ...]
     phase: str
-    positions: Triple
-    setpoints: Triple
-    tensions: Triple
+    positions: Motors
+    setpoints: Motors
+    tensions: Motors
 
 
 class LoggedPilot:
@@ -58,7 +58,7 @@ class LoggedPilot:
             raise
         self._answers.append(("start", None))
 
-    def step(self, measured: Measurement) -> Triple | None:
+    def step(self, measured: Measurement) -> Motors | None:
         """Return what the pilot returns."""
         try:
             answer = self._pilot.step(measured)
@@ -86,7 +86,12 @@ class LoggedPilot:
 
 
 def cycle_of(
-    master: Master, pilot: LoggedPilot, now: float, received: Sequence[Frame], tilt: Tilt | None, sent: Sequence[Frame]
+    master: Master,
+    pilot: LoggedPilot,
+    now: float,
+    received: Sequence[Frame],
+    tilt: Tilt | Reading | None,
+    sent: Sequence[Frame],
 ) -> Cycle:
     """Return the step that `master` has just done."""
     return Cycle(
@@ -107,7 +112,7 @@ def encode_cycle(cycle: Cycle) -> dict[str, Any]:
         "tensions": _numbers(cycle.tensions),
     }
     if cycle.tilt is not None:
-        table["tilt"] = [*_numbers(cycle.tilt[:4]), cycle.tilt.valid]
+        table["tilt"] = [*_numbers((*cycle.tilt.values, *cycle.tilt.rates)), cycle.tilt.valid]
     if cycle.taken:
         table["taken"] = [list(pair) for pair in cycle.taken]
     if cycle.answers:
@@ -125,14 +130,14 @@ def decode_cycle(table: dict[str, Any]) -> Cycle:
     return Cycle(
         float(table["time"]),
         tuple(frame_of(text) for text in table["received"]),
-        None if tilt is None else Tilt(*(float(value) for value in tilt[:4]), valid=bool(tilt[4])),
+        None if tilt is None else _tilt(tilt),
         tuple((str(what), str(why)) for what, why in table.get("taken", ())),
         tuple((str(what), _read_answer(value)) for what, value in table.get("answers", ())),
         tuple(frame_of(text) for text in table["sent"]),
         str(table["phase"]),
-        _triple(table["positions"]),
-        _triple(table["setpoints"]),
-        _triple(table["tensions"]),
+        _motors(table["positions"]),
+        _motors(table["setpoints"]),
+        _motors(table["tensions"]),
     )
 
 
@@ -159,13 +164,19 @@ def _answer(value: Any) -> Any:
 
 
 def _read_answer(value: Any) -> Any:
-    return _triple(value) if isinstance(value, list) else value
+    return _motors(value) if isinstance(value, list) else value
 
 
 def _numbers(values: Sequence[float]) -> list[Any]:
     return [float(value) if math.isfinite(value) else repr(float(value)) for value in values]
 
 
-def _triple(values: Sequence[Any]) -> Triple:
-    a, b, c = (float(value) for value in values)
-    return a, b, c
+def _motors(values: Sequence[Any]) -> Motors:
+    return tuple(float(value) for value in values)
+
+
+def _tilt(values: Sequence[Any]) -> Tilt | Reading:
+    """Return the sample that was logged as its values, its rates, and whether it is valid."""
+    *numbers, valid = values
+    count = len(numbers) // 2
+    return sample_of(_motors(numbers[:count]), _motors(numbers[count:]), valid=bool(valid))

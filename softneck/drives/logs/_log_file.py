@@ -12,13 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import DataError, FileFormatError, Vector, file_hash
+from softneck.core import DataError, FileFormatError, SettingsError, Vector, file_hash
 from softneck.loop import LoopResult
+from softneck.robot import Robot
 from softneck.signals import Recording
+from softneck.signals.recording._channels import NECK
 
 from ..master import MasterSettings
 from ..master._fieldbus import BusSettings
-from ..master._settings import LimitSettings, RampSettings, SensorSettings, WatchSettings
+from ..master._settings import ChannelSettings, LimitSettings, RampSettings, SensorSettings, WatchSettings
 from ._cycle import Cycle, decode_cycle
 from ._result import recording_of, signal_units
 from ._rows import experiment_channels, experiment_recording, experiment_table, motion_at
@@ -32,6 +34,7 @@ _PARTS: dict[str, type] = {
     "sensor": SensorSettings,
     "watch": WatchSettings,
     "ramps": RampSettings,
+    "channels": ChannelSettings,
 }
 
 
@@ -65,7 +68,7 @@ class LoggedRun:
         """
         try:
             table = dict(self.facts["settings"])
-            parts = {name: kind(**_tuples(table.pop(name))) for name, kind in _PARTS.items()}
+            parts = {name: kind(**_tuples(table.pop(name))) for name, kind in _PARTS.items() if name in table}
             return MasterSettings(**_tuples(table), **parts)
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise FileFormatError(f"{self.path}: its settings do not fit this softneck ({error}).") from error
@@ -76,6 +79,20 @@ class LoggedRun:
         signals: dict[str, Vector] = {name: np.array([row.get(name, math.nan) for row in self.rows]) for name in names}
         step = self.sample_time
         return LoopResult(np.arange(len(self.rows)) * step, signals, signal_units(names), step)
+
+    @property
+    def robot(self) -> Robot:
+        """What the drives moved: the neck where the log does not say.
+
+        Raises:
+            FileFormatError: what it says is no robot.
+        """
+        if "robot" not in self.facts:
+            return NECK
+        try:
+            return Robot.from_dict(self.facts["robot"])
+        except SettingsError as error:
+            raise FileFormatError(f"{self.path}: its robot is damaged: {error}") from error
 
     @property
     def sample_time(self) -> float:
@@ -92,16 +109,22 @@ class LoggedRun:
         if len(self.rows) < 2:
             raise DataError(f"{self.path}: the controller did not run, so there is nothing to identify from.")
         times = np.array([cycle.time for cycle in self.cycles])
-        positions = np.array([cycle.positions for cycle in self.cycles]).reshape(-1, 3)
+        robot = self.robot
+        try:
+            positions = np.array([cycle.positions for cycle in self.cycles]).reshape(-1, len(robot.motors.names))
+        except ValueError as error:
+            raise FileFormatError(f"{self.path}: holds positions of other motors than its robot's.") from error
         if "run" not in self.rows[0]:
-            return recording_of(self.signals(), motion_at(times, positions, self.row_cycles)[1])
+            return recording_of(self.signals(), motion_at(times, positions, self.row_cycles)[1], robot)
         # A row of an experiment is logged when its set-points were sent to their end.
         late = self.settings().sample_cycles - 1
         columns = experiment_channels(
-            experiment_table(self.rows), *motion_at(times, positions, [cycle - late for cycle in self.row_cycles])
+            experiment_table(self.rows, robot),
+            *motion_at(times, positions, [cycle - late for cycle in self.row_cycles]),
+            robot,
         )
         run = np.array([row["run"] for row in self.rows])
-        recording = experiment_recording(columns, run, self.sample_time)
+        recording = experiment_recording(columns, run, self.sample_time, robot)
         if recording is None:
             raise DataError(f"{self.path}: holds no angles, so there is nothing to identify from.")
         return recording
@@ -174,8 +197,12 @@ def _table(data: bytes) -> dict[str, Any]:
 
 
 def _tuples(table: Mapping[str, Any]) -> dict[str, Any]:
-    values = {key: tuple(value) if isinstance(value, list) else value for key, value in table.items()}
+    values = {key: _tuple(value) for key, value in table.items()}
     return {key: frozenset(value) if key == "off" else value for key, value in values.items()}
+
+
+def _tuple(value: Any) -> Any:
+    return tuple(_tuple(item) for item in value) if isinstance(value, list) else value
 
 
 def _damage() -> tuple[type[Exception], ...]:

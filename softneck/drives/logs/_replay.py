@@ -10,8 +10,8 @@ from softneck.core import CheckFailedError, DataError
 
 from ..bus._meaning import meaning
 from ..master import Master
-from ..master._measured import Measurement, Pilot
-from ._cycle import Answer, Cycle, LoggedPilot, Triple, cycle_of
+from ..master._measured import Measurement, Motors, Pilot
+from ._cycle import Answer, Cycle, LoggedPilot, cycle_of
 from ._log_file import LoggedRun
 
 
@@ -90,7 +90,7 @@ class _ReplayPilot:
     def start(self) -> None:
         self._next("start")
 
-    def step(self, measured: Measurement) -> Triple | None:
+    def step(self, measured: Measurement) -> Motors | None:
         del measured
         return self._next("step")
 

@@ -10,14 +10,13 @@ import numpy as np
 
 from softneck.core import CheckFailedError, Matrix
 from softneck.loop import LoopResult, metrics
+from softneck.robot import Robot
 from softneck.signals import Recording
-from softneck.signals.recording._channels import known_channels
+from softneck.signals.recording._channels import NECK, known_channels
 
 from ..master import Event
 from ._rows import speed_channels
 from ._times import CycleTimes
-
-_RATES = ("pitch_rate_measured", "roll_rate_measured")
 
 
 def signal_units(names: Iterable[str]) -> dict[str, str]:
@@ -26,25 +25,26 @@ def signal_units(names: Iterable[str]) -> dict[str, str]:
     return units | ({"compression": "m"} if "compression" in units else {})
 
 
-def recording_of(signals: LoopResult, speeds: Matrix) -> Recording:
+def recording_of(signals: LoopResult, speeds: Matrix, robot: Robot = NECK) -> Recording:
     """Return a run as a recording: as measured, with true angles and tensions where simulated drives know them.
 
     Args:
         signals: of the run.
-        speeds: of the motors at its samples, (time, 3) [rad/s].
+        speeds: of the motors at its samples, (time, motors) [rad/s].
+        robot: what was moved.
     """
-    known = set(known_channels())
+    known = set(known_channels(robot))
     channels = {name: values for name, values in signals.signals.items() if name in known}
-    for axis in ("pitch", "roll"):
+    for axis in robot.outputs.names:
         channels.setdefault(axis, signals[f"{axis}_measured"])
-    for j in (1, 2, 3):
+    for j in range(1, len(robot.motors.names) + 1):
         channels.setdefault(f"tension_{j}", signals[f"tension_estimate_{j}"])
-    for rate in _RATES:
+    for rate in (f"{axis}_rate_measured" for axis in robot.outputs.names):
         if not np.isfinite(channels.get(rate, np.nan)).any():
             channels.pop(rate, None)
     if np.isfinite(speeds).any():
         channels |= speed_channels(speeds)
-    return Recording(signals.time, signals.sample_time, channels)
+    return Recording(signals.time, signals.sample_time, channels, robot=robot)
 
 
 _UNHEARD = "The drives cannot be reached; their own guarding stops them within 0.1 s"
@@ -94,7 +94,8 @@ class DrivesResult:
         simulated: whether the drives were.
         times: of the cycles, in real time.
         terminated: whether SIGTERM asked for the end.
-        speeds: of the motors at the rows of `signals`, (rows, 3) [rad/s].
+        speeds: of the motors at the rows of `signals`, (rows, motors) [rad/s].
+        robot: what was moved.
     """
 
     signals: LoopResult
@@ -111,6 +112,7 @@ class DrivesResult:
     notes: tuple[str, ...] = field(default=())
     terminated: bool = False
     speeds: Matrix = field(default_factory=lambda: np.zeros((0, 3)))
+    robot: Robot = NECK
 
     @property
     def completed(self) -> bool:
@@ -128,7 +130,7 @@ class DrivesResult:
 
     def recording(self) -> Recording:
         """Return the run as a recording: as measured, with true angles where simulated drives know them."""
-        return recording_of(self.signals, self.speeds)
+        return recording_of(self.signals, self.speeds, self.robot)
 
     def table(self) -> dict[str, Any]:
         """Return the JSON of `softneck drives run`."""
@@ -145,6 +147,7 @@ class DrivesResult:
             "longest_step_s": self.times.longest_step,
             "times": None if self.simulated else self.times.table(),
             "terminated": self.terminated,
-            "metrics": metrics(self.signals) if len(self.signals.time) > 1 else None,
+            # Of other robots a loop has no metrics yet.
+            "metrics": metrics(self.signals) if len(self.signals.time) > 1 and self.robot.is_neck else None,
             "notes": list(self.notes),
         }  # fmt: skip

@@ -14,15 +14,17 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from softneck.core import Matrix, Vector
+from softneck.robot import Robot
 from softneck.signals import Recording
+from softneck.signals.recording._channels import NECK
 
 
 class Motion:
     """Times and positions of all bus cycles so far."""
 
-    def __init__(self) -> None:
+    def __init__(self, motors: int = 3) -> None:
         """Begin with nothing."""
-        self._times, self._positions = array("d"), array("d")
+        self._times, self._positions, self._motors = array("d"), array("d"), motors
 
     def __len__(self) -> int:
         """Number of cycles."""
@@ -35,22 +37,23 @@ class Motion:
 
     def at(self, cycles: Sequence[int]) -> tuple[Matrix, Matrix]:
         """Return `motion_at` of these cycles."""
-        return motion_at(np.array(self._times), np.array(self._positions).reshape(-1, 3), cycles)
+        return motion_at(np.array(self._times), np.array(self._positions).reshape(-1, self._motors), cycles)
 
 
 def motion_at(times: Vector, positions: Matrix, cycles: Sequence[int]) -> tuple[Matrix, Matrix]:
-    """Return positions [rad] and speeds [rad/s] of the motors at the times of `cycles`, (rows, 3) each.
+    """Return positions [rad] and speeds [rad/s] of the motors at the times of `cycles`, (rows, motors) each.
 
     A speed is the central difference over the cycles before and after: off by h^2/6 of the third derivative, and by at
     most one count over 2 h. NaN where the cycles after it are missing.
 
     Args:
         times: of all cycles, (cycles,) [s].
-        positions: as read in all cycles, (cycles, 3) [rad]: those of the cycle before.
+        positions: as read in all cycles, (cycles, motors) [rad]: those of the cycle before.
         cycles: which ones.
     """
     k = np.asarray(cycles, dtype=np.int64)
-    here, speed = np.full((k.size, 3), np.nan), np.full((k.size, 3), np.nan)
+    here = np.full((k.size, positions.shape[1]), np.nan)
+    speed = here.copy()
     known = k + 1 < len(times)
     here[known] = positions[k[known] + 1]
     around = (k >= 1) & (k + 2 < len(times))
@@ -60,45 +63,56 @@ def motion_at(times: Vector, positions: Matrix, cycles: Sequence[int]) -> tuple[
 
 
 def speed_channels(speeds: Matrix) -> dict[str, Vector]:
-    """Return speeds (rows, 3) as channels of a recording."""
-    return {f"motor_velocity_{j + 1}": speeds[:, j].copy() for j in range(3)}
+    """Return speeds (rows, motors) as channels of a recording."""
+    return {f"motor_velocity_{j + 1}": speeds[:, j].copy() for j in range(speeds.shape[1])}
 
 
-COLUMNS = (
-    *(f"motor_setpoint_{j}" for j in (1, 2, 3)), "pitch", "roll", "pitch_rate", "roll_rate",
-    *(f"tension_{j}" for j in (1, 2, 3)), "compression",
-)  # fmt: skip
-_WHERE_MEASURED = ("pitch_rate", "roll_rate", "compression", *(f"motor_velocity_{j}" for j in (1, 2, 3)))
+def truths(robot: Robot) -> tuple[str, ...]:
+    """Return what simulated drives know of a robot beyond what is measured: tensions, and a neck's compression."""
+    return (*(f"tension_{j}" for j in range(1, len(robot.motors.names) + 1)), "compression")
 
 
-def experiment_channels(table: Matrix, positions: Matrix, speeds: Matrix) -> dict[str, Vector]:
+def columns_of(robot: Robot) -> tuple[str, ...]:
+    """Return what a row of an experiment holds: set-points, outputs, their rates, and what `truths` are."""
+    outputs = robot.outputs.names
+    return (*robot.set_points, *outputs, *(f"{name}_rate" for name in outputs), *truths(robot))
+
+
+def experiment_channels(
+    table: Matrix, positions: Matrix, speeds: Matrix, robot: Robot = NECK
+) -> dict[str, Vector]:  # fmt: skip
     """Return the channels of an experiment: rows of a `SignalLog`, positions and speeds at their times."""
-    columns = dict(zip(COLUMNS, table.T.copy(), strict=True))
-    moved = {f"motor_position_{j + 1}": positions[:, j].copy() for j in range(3)} | speed_channels(speeds)
+    columns = dict(zip(columns_of(robot), table.T.copy(), strict=True))
+    moved = dict(zip(robot.motor_positions, positions.T.copy(), strict=True)) | speed_channels(speeds)
+    maybe = {"compression", *(f"{name}_rate" for name in robot.outputs.names)}
     return {
         name: values
         for name, values in ({**columns, **moved}).items()
-        if name not in _WHERE_MEASURED or np.isfinite(values).any()
+        if (name not in maybe and not name.startswith("motor_velocity_")) or np.isfinite(values).any()
     }
 
 
-def experiment_table(rows: Sequence[Mapping[str, float]]) -> Matrix:
+def experiment_table(rows: Sequence[Mapping[str, float]], robot: Robot = NECK) -> Matrix:
     """Return logged rows as the table of a `SignalLog`."""
-    return np.array([[row.get(name, math.nan) for name in COLUMNS] for row in rows]).reshape(-1, len(COLUMNS))
+    names = columns_of(robot)
+    return np.array([[row.get(name, math.nan) for name in names] for row in rows]).reshape(-1, len(names))
 
 
-def experiment_recording(columns: Mapping[str, Vector], run: Vector, sample_time: float) -> Recording | None:
+def experiment_recording(
+    columns: Mapping[str, Vector], run: Vector, sample_time: float, robot: Robot = NECK
+) -> Recording | None:
     """Return rows of an experiment without its pauses; None where there are fewer than two, or no angles.
 
     Args:
         columns: channel -> (rows,).
         run: number of the run of each row, 0 in pauses, (rows,).
         sample_time: [s].
+        robot: what was moved.
     """
     kept = np.flatnonzero(run)
     if kept.size < 2:
         return None
     channels = {name: values[kept] for name, values in columns.items()}
-    if not all(np.isfinite(channels[name]).any() for name in ("pitch", "roll")):
+    if not all(np.isfinite(channels[name]).any() for name in robot.outputs.names):
         return None
-    return Recording(kept * sample_time, sample_time, channels, run[kept].astype(np.int64))
+    return Recording(kept * sample_time, sample_time, channels, run[kept].astype(np.int64), robot)

@@ -17,6 +17,7 @@ from softneck import __version__
 from softneck.core import OutputFileError, SettingsError, file_hash, refuse_existing
 
 from ..master import Event, Frame, Master, MasterSettings, Tilt
+from ..master._gate import Reading
 from ._cycle import Cycle, LoggedPilot, cycle_of, encode_cycle
 from ._frame_log import FRAME_LOGS, BlfSink, CandumpSink
 
@@ -96,10 +97,11 @@ def run_facts(
     settings: MasterSettings, files: Mapping[str, str | Path], *, simulated: bool, **more: Any
 ) -> dict[str, Any]:
     """Return what a log says about its run: the master's settings and the files, by hash, that acted in it."""
+    told = dataclasses.asdict(settings) | {"bus": dataclasses.asdict(settings.bus) | {"off": sorted(settings.bus.off)}}
     return {
         "softneck": __version__,
-        "settings": dataclasses.asdict(settings)
-        | {"bus": dataclasses.asdict(settings.bus) | {"off": sorted(settings.bus.off)}},
+        # Logs of a neck say nothing of channels, as they always did.
+        "settings": {key: value for key, value in told.items() if value is not None},
         "simulated": simulated,
         "files": {role: {"path": str(Path(path).resolve()), "sha256": file_hash(path)} for role, path in files.items()},
         **more,
@@ -173,7 +175,7 @@ class RunLogger:
         """Return what is to be called after each step of a master that asks `pilot`."""
 
         def watch(
-            now: float, received: Sequence[Frame], sent: Sequence[Frame], tilt: Tilt | None, master: Master
+            now: float, received: Sequence[Frame], sent: Sequence[Frame], tilt: Tilt | Reading | None, master: Master
         ) -> None:
             row, self._row = self._row, None
             cycle = cycle_of(master, pilot, now, received, tilt, sent)

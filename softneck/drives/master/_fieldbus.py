@@ -25,7 +25,7 @@ class BusSettings:
     """The cyclic traffic.
 
     Attributes:
-        nodes: node numbers of motors 1 to 3.
+        nodes: node numbers of the motors, in their order.
         cycle: [s].
         guarding: "life" (guarding by RTR) or "heartbeat".
         guard_cycles: cycles between two guarding requests, or two heartbeats of ours.
@@ -37,7 +37,7 @@ class BusSettings:
         off: names of guards that are switched off; for the tests that prove each one to be needed.
     """
 
-    nodes: tuple[int, int, int] = (1, 2, 3)
+    nodes: tuple[int, ...] = (1, 2, 3)
     cycle: float = 0.01
     guarding: str = "life"
     guard_cycles: int = 2
@@ -85,7 +85,7 @@ class DriveView:
 
 
 class Fieldbus:
-    """Reads and writes the cyclic frames of three drives.
+    """Reads and writes the cyclic frames of all drives.
 
     Attributes:
         settings: as given.

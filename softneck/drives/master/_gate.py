@@ -1,8 +1,9 @@
-"""What of the inclinometer's samples may be believed."""
+"""What of the inclinometer's samples may be believed: those of a robot's outputs."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from ._events import Event
@@ -24,6 +25,38 @@ class Tilt(NamedTuple):
     roll_rate: float = math.nan
     valid: bool = True
 
+    @property
+    def values(self) -> tuple[float, ...]:
+        """Both angles [rad]."""
+        return self.pitch, self.roll
+
+    @property
+    def rates(self) -> tuple[float, ...]:
+        """Both rates [rad/s]."""
+        return self.pitch_rate, self.roll_rate
+
+
+class Reading(NamedTuple):
+    """One sample of a robot whose outputs are not two angles.
+
+    Attributes:
+        values: of the outputs [rad].
+        rates: [rad/s]; NaN without a gyro.
+        valid: False while the sensor itself says that it has nothing.
+    """
+
+    values: tuple[float, ...]
+    rates: tuple[float, ...]
+    valid: bool = True
+
+
+def sample_of(values: Sequence[float], rates: Sequence[float] = (), *, valid: bool = True) -> Tilt | Reading:
+    """Return the sample of so many outputs; `rates` are NaN where none are given."""
+    known = tuple(rates) or (math.nan,) * len(values)
+    if len(values) == 2:
+        return Tilt(*values, *known, valid=valid)
+    return Reading(tuple(values), known, valid)
+
 
 class Gate:
     """Passes samples on, counts what is wrong with them, and says when the sensor is lost.
@@ -35,13 +68,13 @@ class Gate:
     def __init__(self, settings: SensorSettings) -> None:
         """Believe nothing yet."""
         self._settings = settings
-        self.last: Tilt | None = None
-        self._raw: tuple[float, float] | None = None
+        self.last: Tilt | Reading | None = None
+        self._raw: tuple[float, ...] | None = None
         self._same = self._bad = 0
         self._good_at: float | None = None
         self._first: float | None = None
 
-    def step(self, now: float, sample: Tilt | None, events: list[Event]) -> bool:
+    def step(self, now: float, sample: Tilt | Reading | None, events: list[Event]) -> bool:
         """Take the sample that is due, None if none came; return whether it is believed."""
         s = self._settings
         if self._first is None:
@@ -49,8 +82,9 @@ class Gate:
         good = sample is not None and sample.valid
         if sample is not None and sample.valid:
             reason = self._reason(now, sample)
-            self._same = self._same + 1 if (sample.pitch, sample.roll) == self._raw else 1
-            self._raw = (sample.pitch, sample.roll)
+            values = sample.values
+            self._same = self._same + 1 if values == self._raw else 1
+            self._raw = values
             if reason:
                 good = False
                 self._bad += 1
@@ -68,15 +102,16 @@ class Gate:
             events.append(Event(now, "sensor_lost", 0, f"no valid sample for {since * 1e3:.0f} ms"))
         return good
 
-    def _reason(self, now: float, sample: Tilt) -> str:
+    def _reason(self, now: float, sample: Tilt | Reading) -> str:
         """Return why `sample` is not valid, "" if it may be."""
         s = self._settings
-        if not (math.isfinite(sample.pitch) and math.isfinite(sample.roll)):
+        values = sample.values
+        if not all(map(math.isfinite, values)):
             return "not finite"
-        if abs(sample.pitch) > s.angle or abs(sample.roll) > s.angle:
+        if max(map(abs, values)) > s.angle:
             return "beyond what the neck can bend"
         if self.last is not None and self._good_at is not None:
             most = s.rate * (now - self._good_at) + s.margin
-            if abs(sample.pitch - self.last.pitch) > most or abs(sample.roll - self.last.roll) > most:
+            if any(abs(new - old) > most for new, old in zip(values, self.last.values, strict=True)):
                 return "an outlier"
         return ""

@@ -21,11 +21,18 @@ class Limiter:
         clamped: whether the last step was limited, and by what ("" if not).
     """
 
-    __slots__ = ("_cycle", "_limits", "_slack_at", "clamped", "speed", "value")
+    __slots__ = ("_cycle", "_limits", "_range", "_slack_at", "clamped", "speed", "value")
 
-    def __init__(self, limits: LimitSettings, cycle: float) -> None:
-        """Begin at zero, at rest."""
+    def __init__(self, limits: LimitSettings, cycle: float, own: tuple[float, float, float] | None = None) -> None:
+        """Begin at zero, at rest.
+
+        Args:
+            limits: of all motors.
+            cycle: of the bus [s].
+            own: of this motor: lowest and highest set-point [rad], largest speed [rad/s].
+        """
         self._limits, self._cycle = limits, cycle
+        self._range = own or (-limits.position, limits.position, limits.speed)
         self.value = self.speed = 0.0
         self.clamped = ""
         self._slack_at: float | None = None
@@ -37,7 +44,9 @@ class Limiter:
     def step(self, wanted: float, tension: float) -> float:
         """Return the set-point of this cycle [rad] on the way to `wanted`; `tension` [N] is estimated."""
         limits, T = self._limits, self._cycle
-        low, high = -limits.position, limits.position
+        low, high, fastest = self._range
+        # A winch that unwound beyond its range without power comes back as it is led: no jump to the edge.
+        low, high = min(low, self.value), max(high, self.value)
         why = ""
         goal = wanted
         if not low <= goal <= high:
@@ -56,9 +65,9 @@ class Limiter:
         speed = way / T
         # Not faster than allowed, nor than what still stops at the goal: v^2 / (2 a) + v T / 2 = way, in steps of T.
         a = limits.acceleration
-        most = min(limits.speed, a * (math.sqrt(0.25 * T * T + 2.0 * abs(way) / a) - 0.5 * T))
+        most = min(fastest, a * (math.sqrt(0.25 * T * T + 2.0 * abs(way) / a) - 0.5 * T))
         if abs(speed) > most:
-            if abs(speed) > limits.speed * (1.0 + _SAME):
+            if abs(speed) > fastest * (1.0 + _SAME):
                 why = why or "speed"
             speed = math.copysign(most, speed)
         change = a * T

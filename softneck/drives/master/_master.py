@@ -10,9 +10,9 @@ from ._cia301 import Frame
 from ._cia402 import OFF, POWERED, DriveState, Goal
 from ._events import IDLE_TOO, Event, Reaction
 from ._fieldbus import Fieldbus
-from ._gate import Gate, Tilt
+from ._gate import Gate, Reading, Tilt
 from ._limiter import Limiter
-from ._measured import Measurement, Pilot, Triple
+from ._measured import Measurement, Motors, Pilot
 from ._settings import MasterSettings
 from ._supervisor import ACTIVE, FINAL, GOALS, Phase, Signal, Supervisor
 from ._watches import Leaky, Watches
@@ -28,7 +28,7 @@ _MOVED = frozenset({Phase.RAMP_IN, Phase.RUNNING, Phase.RAMP_OUT, Phase.RETREAT}
 
 
 class Master:
-    """Three drives and one neck, from enabling to switched off, and every fault between.
+    """All drives and what they move, from enabling to switched off, and every fault between.
 
     Attributes:
         settings: as given.
@@ -50,14 +50,15 @@ class Master:
         self.bus = Fieldbus(settings.bus)
         self.supervisor = Supervisor(settings.bus.off)
         self._gate = Gate(settings.sensor)
-        self._watches = Watches(settings.watch, settings.limits)
-        self._limiters = tuple(Limiter(settings.limits, settings.bus.cycle) for _ in range(3))
+        count = len(self.bus.drives)
+        channels = settings.channels
+        self._watches = Watches(settings.watch, settings.limits, channels and channels.weights, count)
+        ranges = channels.ranges if channels else [None] * count
+        self._limiters = tuple(Limiter(settings.limits, settings.bus.cycle, own) for own in ranges)
+        self._scales = tuple(zip(self.bus.drives, settings.counts_per_radian, settings.newton_per_unit, strict=True))
         self._clamped = Leaky(settings.limits.persistent, settings.bus.cycle)
-        self.positions: Triple = (0.0, 0.0, 0.0)
-        self.tensions: Triple = (0.0, 0.0, 0.0)
-        self.setpoints: Triple = (0.0, 0.0, 0.0)
-        self.wanted: Triple = (0.0, 0.0, 0.0)
-        self._from: Triple = (0.0, 0.0, 0.0)
+        self.positions: Motors = (0.0,) * count
+        self.tensions = self.setpoints = self.wanted = self._from = self.positions
         self.counts: Counter[str] = Counter()
         self.events: deque[Event] = deque(maxlen=1000)
         self.cycle = 0
@@ -65,7 +66,7 @@ class Master:
         self._missing, self._index = 0, -1
         self._part, self._arrived_at = 0, _NEVER
         self._enabling, self._enabling_since = 0, _NEVER
-        self._hold_at: Triple | None = None
+        self._hold_at: Motors | None = None
         self._asked: list[Signal] = []
         self.requests: list[tuple[str, str]] = []
         self.taken: tuple[tuple[str, str], ...] = ()
@@ -100,7 +101,7 @@ class Master:
         self.requests.append(("stop", reason))
         self._told(Event(self._now or 0.0, "operator", 0, reason))
 
-    def step(self, now: float, frames: Sequence[Frame], tilt: Tilt | None = None) -> list[Frame]:
+    def step(self, now: float, frames: Sequence[Frame], tilt: Tilt | Reading | None = None) -> list[Frame]:
         """Return the frames to send at `now` [s, monotonic].
 
         Args:
@@ -139,7 +140,7 @@ class Master:
         return self._index >= 0 and self._part == 1 and self.supervisor.phase is Phase.RUNNING
 
     @property
-    def tilt(self) -> Tilt | None:
+    def tilt(self) -> Tilt | Reading | None:
         """The last believed sample of the inclinometer."""
         return self._gate.last
 
@@ -164,10 +165,9 @@ class Master:
         return [Event(now, "late_cycle")] if gap > 1.5 else []
 
     def _measure(self) -> None:
-        s, d = self.settings, self.bus.drives
-        k, zero, n = s.counts_per_radian, s.zero_counts, s.newton_per_unit
-        self.positions = ((d[0].counts - zero) / k[0], (d[1].counts - zero) / k[1], (d[2].counts - zero) / k[2])
-        self.tensions = (d[0].current * n[0], d[1].current * n[1], d[2].current * n[2])
+        zero = self.settings.zero_counts
+        self.positions = tuple([(view.counts - zero) / per_radian for view, per_radian, _ in self._scales])
+        self.tensions = tuple([view.current * newton for view, _, newton in self._scales])
 
     def _judge(self, now: float, events: list[Event]) -> None:
         if not events:
@@ -204,7 +204,7 @@ class Master:
             self._watches.motors(now, self.setpoints, self.positions, self.settings.bus.nodes, self.tensions, events)
             if due:
                 last = self._gate.last
-                measured = (last.pitch, last.roll) if fresh and last else None
+                measured = last.values if fresh and last else None
                 step = self.settings.sample_cycles * self.settings.bus.cycle
                 self._watches.tilt(now, step, self.positions, measured, events)
         if events:
@@ -236,8 +236,8 @@ class Master:
         if view.state is DriveState.ENABLED and view.fresh:
             self._enabling += 1
             self._enabling_since = now
-            if self._enabling == 3:
-                self._enabling = 2
+            if self._enabling == len(self.bus.drives):
+                self._enabling -= 1
                 if self._gate.last is not None:
                     self._change(now, Signal.ENABLED)
         elif now - self._enabling_since > self.settings.ramps.enable_timeout:
@@ -276,7 +276,7 @@ class Master:
         self._missing = 0
         self.wanted = self._from = self.setpoints
         if self._gate.last is not None:
-            self._watches.align(self._gate.last.pitch, self._gate.last.roll, self.positions)
+            self._watches.align(self._gate.last.values, self.positions)
         try:
             self.pilot.start()
         except Exception as error:
@@ -296,8 +296,7 @@ class Master:
             events.append(Event(now, name))
         self._part += 1
         share = min(self._part / cycles, 1.0)
-        a, b = self._from, self.wanted
-        wanted = [a[i] + share * (b[i] - a[i]) for i in range(3)]
+        wanted = [a + share * (b - a) for a, b in zip(self._from, self.wanted, strict=True)]
         self._limit(now, wanted, events, count=True)
 
     def _consult(self, now: float, fresh: bool, events: list[Event]) -> None:
@@ -316,14 +315,16 @@ class Master:
                 self._missing += 1
                 self._from = self.wanted
                 return
-            a, b, c = answer
-            if not (math.isfinite(a) and math.isfinite(b) and math.isfinite(c)):
-                raise ValueError(f"set-points {a:g}, {b:g}, {c:g} are not finite")
+            wanted = tuple(answer)
+            if len(wanted) != len(self.bus.drives):
+                raise ValueError(f"{len(wanted)} set-points for {len(self.bus.drives)} motors")
+            if not all(map(math.isfinite, wanted)):
+                raise ValueError(f"set-points {', '.join(f'{value:g}' for value in wanted)} are not finite")
         except Exception as error:
             self._failed(now, error)
             return
         self._missing = 0
-        self._from, self.wanted = self.wanted, (a, b, c)
+        self._from, self.wanted = self.wanted, wanted
 
     def _failed(self, now: float, error: Exception) -> None:
         self._judge(now, [Event(now, "controller_failed", 0, f"{type(error).__name__}: {error}")])
@@ -333,7 +334,7 @@ class Master:
         for limiter, value, tension in zip(self._limiters, wanted, self.tensions, strict=True):
             values.append(limiter.step(value, tension))
             why = why or limiter.clamped
-        self.setpoints = (values[0], values[1], values[2])
+        self.setpoints = tuple(values)
         if not count:
             return
         if why:
@@ -383,18 +384,16 @@ class Master:
             if view.state is not DriveState.ENABLED:
                 limiter.reset(position)
             values.append(limiter.value)
-        self.setpoints = (values[0], values[1], values[2])
+        self.setpoints = tuple(values)
 
     # -- what goes out ------------------------------------------------------------------------------------------
 
-    def _goals(self) -> tuple[Goal, Goal, Goal]:
-        goal = GOALS[self.supervisor.phase]
+    def _goals(self) -> list[Goal]:
+        goal, count = GOALS[self.supervisor.phase], len(self.bus.drives)
         if self.supervisor.phase is not Phase.ENABLING:
-            return goal, goal, goal
-        one, two, three = (goal if i <= self._enabling else Goal.OFF for i in range(3))
-        return one, two, three
+            return [goal] * count
+        return [goal if i <= self._enabling else Goal.OFF for i in range(count)]
 
-    def _targets(self) -> tuple[int, int, int]:
-        s = self.settings
-        k, zero, p = s.counts_per_radian, s.zero_counts, self.setpoints
-        return round(p[0] * k[0]) + zero, round(p[1] * k[1]) + zero, round(p[2] * k[2]) + zero
+    def _targets(self) -> list[int]:
+        k, zero = self.settings.counts_per_radian, self.settings.zero_counts
+        return [round(position * scale) + zero for position, scale in zip(self.setpoints, k, strict=True)]

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from ._gate import Tilt
+from ._gate import Reading, Tilt
 
-Triple = tuple[float, float, float]
+# One number for each motor.
+Motors = tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,9 +23,9 @@ class Measurement:
     """
 
     index: int
-    tilt: Tilt
+    tilt: Tilt | Reading
     fresh: bool
-    positions: Triple
+    positions: Motors
 
 
 class Pilot(Protocol):
@@ -34,8 +35,8 @@ class Pilot(Protocol):
         """Begin anew."""
         ...
 
-    def step(self, measured: Measurement) -> Triple | None:
-        """Return the set-points [rad]; None if there are none in time."""
+    def step(self, measured: Measurement) -> Motors | None:
+        """Return the set-points [rad], one for each motor; None if there are none in time."""
         ...
 
     def finished(self, index: int) -> bool:

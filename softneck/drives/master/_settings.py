@@ -106,6 +106,12 @@ class WatchSettings:
         require_between("pole", self.pole, 0.1, 100.0, "1/s")
         require_between("pushed", self.pushed, 0.05, 200.0, "N")
 
+    @property
+    def weights(self) -> tuple[tuple[float, ...], ...]:
+        """The neck's directions, pitch and roll by its tendons (2, motors)."""
+        angles = self.tendon_angles
+        return tuple(math.cos(angle) for angle in angles), tuple(math.sin(angle) for angle in angles)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RampSettings:
@@ -134,6 +140,22 @@ class RampSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ChannelSettings:
+    """What the master must know of a robot that is given.
+
+    Attributes:
+        outputs: names of what is measured.
+        weights: (outputs, motors), each output's direction; () where they are to be identified, and nothing watches
+            then whether motors and outputs fit each other; None: of the neck, by its tendons' angles.
+        ranges: of each motor: lowest and highest set-point [rad], largest speed [rad/s].
+    """
+
+    outputs: tuple[str, ...]
+    weights: tuple[tuple[float, ...], ...] | None
+    ranges: tuple[tuple[float, float, float], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MasterSettings:
     """All settings of the master: bus, limits, inclinometer, watches, ramps.
 
@@ -143,10 +165,11 @@ class MasterSettings:
         newton_per_unit: tension for one unit of each drive's current, with sign.
         sample_cycles: bus cycles for one sample of the controller.
         bus, limits, sensor, watch, ramps: as their classes say.
+        channels: of the robot; None: the neck, with no limits beside `limits`.
     """
 
-    counts_per_radian: tuple[float, float, float]
-    newton_per_unit: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    counts_per_radian: tuple[float, ...]
+    newton_per_unit: tuple[float, ...] = (0.0, 0.0, 0.0)
     zero_counts: int = 1
     sample_cycles: int = 2
     bus: BusSettings = field(default_factory=BusSettings)
@@ -154,6 +177,12 @@ class MasterSettings:
     sensor: SensorSettings = field(default_factory=SensorSettings)
     watch: WatchSettings = field(default_factory=WatchSettings)
     ramps: RampSettings = field(default_factory=RampSettings)
+    channels: ChannelSettings | None = None
 
     def __post_init__(self) -> None:
         require_whole("sample_cycles", self.sample_cycles, 1, 20)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of what is measured."""
+        return ("pitch", "roll") if self.channels is None else self.channels.outputs

@@ -53,36 +53,39 @@ class Watches:
     """All of them, over one run.
 
     Attributes:
-        pitch, roll: that the model gives [rad].
+        angles: that the model gives [rad].
     """
 
-    def __init__(self, settings: WatchSettings, limits: LimitSettings) -> None:
-        """Begin with the neck upright."""
+    def __init__(
+        self,
+        settings: WatchSettings,
+        limits: LimitSettings,
+        weights: Sequence[Sequence[float]] | None = None,
+        motors: int = 3,
+    ) -> None:
+        """Begin upright; `weights` (outputs, motors) are directions, () where nobody knows them, None: the neck's."""
         self._settings, self._limits = settings, limits
-        first, second, third = settings.tendon_angles
-        self._rows = (
-            (math.cos(first), math.cos(second), math.cos(third)),
-            (math.sin(first), math.sin(second), math.sin(third)),
-        )
-        self.pitch = self.roll = 0.0
-        self._offset = (0.0, 0.0)
+        self._rows = settings.weights if weights is None else weights
+        self.angles = [0.0] * len(self._rows)
+        self._offset = self.angles
         self._started = False
         self._tilted = Patience()
-        self._behind = tuple(Patience() for _ in range(3))
-        self._pulled = tuple(Patience() for _ in range(3))
-        self._pushes = tuple(Patience() for _ in range(3))
+        self._behind = tuple(Patience() for _ in range(motors))
+        self._pulled = tuple(Patience() for _ in range(motors))
+        self._pushes = tuple(Patience() for _ in range(motors))
 
-    def align(self, pitch: float, roll: float, positions: Sequence[float]) -> None:
+    def align(self, measured: Sequence[float], positions: Sequence[float]) -> None:
         """Take the angles before the motors move as those that belong to `positions`: a bias of sensor or link."""
-        pitch_gain, roll_gain = self._static(positions)
-        self.pitch, self.roll = pitch_gain, roll_gain
-        self._offset = (pitch - pitch_gain, roll - roll_gain)
+        if not self._rows:
+            return
+        self.angles = self._static(positions)
+        self._offset = [there - here for there, here in zip(measured, self.angles, strict=True)]
         self._started = True
 
     def motors(self, now: float, setpoints: Sequence[float], positions: Sequence[float], nodes: Sequence[int],
                tensions: Sequence[float], events: list[Event]) -> None:  # fmt: skip
         """Compare motors with their set-points, tendons with what they bear; each cycle while enabled."""
-        for i in range(3):
+        for i in range(len(nodes)):
             gap = abs(setpoints[i] - positions[i])
             if self._behind[i].over(now, gap > self._settings.following):
                 events.append(Event(now, "following", nodes[i], f"{gap:.2f} rad behind"))
@@ -91,31 +94,35 @@ class Watches:
 
     def signs(self, now: float, nodes: Sequence[int], tensions: Sequence[float], events: list[Event]) -> None:
         """Look whether tendons pull; each cycle of the ramp in, in which every motor tightens its own."""
-        for i in range(3):
+        for i in range(len(nodes)):
             if self._pushes[i].over(now, tensions[i] < -self._settings.pushed):
                 text = f"motor {i + 1}, about {tensions[i]:.1f} N: is `reversed` of its drive right?"
                 events.append(Event(now, "pushed", nodes[i], f"{text} See `softneck drives jog {i + 1}`"))
 
-    def tilt(self, now: float, step: float, positions: Sequence[float], measured: tuple[float, float] | None,
+    def tilt(self, now: float, step: float, positions: Sequence[float], measured: Sequence[float] | None,
              events: list[Event]) -> None:  # fmt: skip
         """Advance the model by `step` [s] and compare; each sample while enabled."""
         if not self._started:
             return
-        pitch, roll = self._static(positions)
         share = 1.0 - math.exp(-self._settings.pole * step)
-        self.pitch += share * (pitch - self.pitch)
-        self.roll += share * (roll - self.roll)
+        ends = self._static(positions)
+        self.angles = [angle + share * (end - angle) for angle, end in zip(self.angles, ends, strict=True)]
         if measured is None:
             # What was not measured cannot diverge; the gate watches missing samples.
             return
-        gap = max(abs(measured[0] - self._offset[0] - self.pitch), abs(measured[1] - self._offset[1] - self.roll))
+        gap = max(
+            abs(there - offset - here) for there, offset, here in zip(measured, self._offset, self.angles, strict=True)
+        )
         if self._tilted.over(now, gap > self._settings.tilt):
             events.append(Event(now, "diverged", 0, f"{math.degrees(gap):.0f} deg off"))
 
-    def _static(self, P: Sequence[float]) -> tuple[float, float]:
+    def _static(self, P: Sequence[float]) -> list[float]:
         """Return the tilt that motors at `P` end at: Eq. 9, 10 for tendons in any direction, and the gain."""
-        gain, (c, s) = self._settings.gain, self._rows
-        return (
-            gain * (c[0] * P[0] + c[1] * P[1] + c[2] * P[2]),
-            gain * (s[0] * P[0] + s[1] * P[1] + s[2] * P[2]),
-        )
+        ends = []
+        for row in self._rows:
+            # Not `sum`, which rounds in another way from Python 3.12 on.
+            total = 0.0
+            for weight, position in zip(row, P, strict=True):
+                total += weight * position
+            ends.append(self._settings.gain * total)
+        return ends

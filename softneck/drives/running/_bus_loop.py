@@ -20,7 +20,7 @@ from ..logs._cycle import LoggedPilot
 from ..logs._result import fault_table, require_unstopped
 from ..logs._run_log import RunLogger, run_facts
 from ..logs._times import CycleTimes
-from ..master import Event, Frame, Master, MasterSettings, Tilt
+from ..master import Event, Frame, Master, MasterSettings
 from ..master._cia301 import Command as NmtCommand
 from ..master._cia301 import nmt_frame
 from ..master._measured import Pilot
@@ -91,7 +91,7 @@ class RunEnd:
     times: CycleTimes
     wall_time: float
     terminated: bool = False
-    tensions: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    tensions: tuple[float, ...] = ()
 
     def require(self) -> None:
         """Raise CheckFailedError if something stopped the drives."""
@@ -161,7 +161,8 @@ def _run_session(
     settings = file.master_settings(sample_time, guarding=checked.guarding)
     settings = settings if session.settings is None else session.settings(settings)
     if log is not None:
-        log.describe(run_facts(settings, session.files, simulated=session.simulated, **session.facts))
+        whose = {} if file.moves.is_neck else {"robot": file.moves.as_dict()}
+        log.describe(run_facts(settings, session.files, simulated=session.simulated, **whose, **session.facts))
         pilot = LoggedPilot(pilot)
         session = replace(session, watches=(*session.watches, log.watch(pilot)))
     master = Master(settings, pilot)
@@ -169,9 +170,9 @@ def _run_session(
     if begin is not None:
         begin(master)
     times, ending = CycleTimes(file.cycle), Ending()
-    tensions = [(0.0, 0.0, 0.0)]
+    tensions = [(0.0,) * len(file.nodes)]
 
-    def remember(_now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Tilt | None, master: Master) -> None:
+    def remember(_now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Any, master: Master) -> None:
         if master.supervisor.phase in ACTIVE:
             tensions[0] = master.tensions
 
@@ -206,7 +207,7 @@ def _in_virtual_time(
 ) -> None:  # fmt: skip
     begin, first = time.perf_counter(), link.now
 
-    def ends(_now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Tilt | None, _master: Master) -> None:
+    def ends(_now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Any, _master: Master) -> None:
         now = time.perf_counter()
         times.take(now, 0.0)
         if session.operator is not None:

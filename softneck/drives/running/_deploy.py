@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from softneck.core import SettingsError, load
 from softneck.cosim import FmuPart
@@ -16,13 +17,13 @@ from ..bus._file import DrivesFile
 from ..bus._link import CanLink, VirtualLink
 from ..logs._result import DrivesResult
 from ..logs._run_log import RunLogger
-from ..master import Frame, Master, MasterSettings, Tilt
+from ..master import Frame, Master, MasterSettings
 from ..sensing._sensor import Sensor
 from ._bus_loop import Session, run_session
 from ._pilot import LoopPilot
 from ._signals import RunLog
 from ._timing import Operator
-from ._virtual import Watch, simulated_neck
+from ._virtual import Watch, simulated_plant
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,11 +114,11 @@ def run_simulated(
         SettingsError: no neck is known.
     """
     parameters = neck or deployed.neck
-    if parameters is None:
+    if parameters is None and file.moves.is_neck:
         raise SettingsError("the loop's plant is not a virtual neck; say which one the drives are to turn (--neck).")
     loop = deployed.loop
-    pilot = LoopPilot(loop)
-    virtual = simulated_neck(file, parameters, sample_time=pilot.sample_time, seed=noise_seed(loop))
+    pilot = LoopPilot(loop, file.moves)
+    virtual = simulated_plant(file, parameters, sample_time=pilot.sample_time, seed=noise_seed(loop))
     disturbances = {name: value for name, value in loop.plant_inputs.items() if not name.startswith("motor_")}
     virtual.set(**disturbances)
     link = VirtualLink(virtual)
@@ -164,7 +165,7 @@ def run_on_bus(
         CheckFailedError: the pre-flight failed; nothing moved.
         SettingsError: `realtime` is not permitted; nothing was sent.
     """
-    pilot = LoopPilot(deployed.loop)
+    pilot = LoopPilot(deployed.loop, file.moves)
     pilot.warm()
     session = Session(
         file=file, link=link, sensor=sensor, override=override, watches=tuple(watches), operator=operator,
@@ -181,7 +182,7 @@ def _run(
     rows = max(1, round(deployed.loop.duration / pilot.sample_time))
     neck = session.link.neck if isinstance(session.link, VirtualLink) else None
 
-    def watch(now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Tilt | None, master: Master) -> None:
+    def watch(now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Any, master: Master) -> None:
         row = log.take(now, master, None if neck is None else neck.truth())
         if not master.ran:
             return
@@ -215,4 +216,5 @@ def _run(
         notes=deployed.notes,
         terminated=ended.terminated,
         speeds=log.speeds(),
+        robot=session.file.moves,
     )

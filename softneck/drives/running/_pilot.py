@@ -12,13 +12,15 @@ from softneck.loop import Loop
 from softneck.loop._rows import Rows, cycle
 from softneck.loop._rows_runtime import ROWS_RECORD, ROWS_REFER, ROWS_SHOW, ROWS_STEP
 from softneck.loop._wiring import wire
+from softneck.robot import Robot
+from softneck.signals.recording._channels import NECK
 
-from ..master import Tilt
-from ..master._measured import Measurement
+from ..master._gate import sample_of
+from ..master._measured import Measurement, Motors
 
 # Nothing is recorded here: the master's log does that.
 _NO_TABLE = np.zeros((0, 0))
-_ANGLES = ("pitch", "roll", "pitch_rate", "roll_rate")
+_NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight")
 
 
 class LoopPilot:
@@ -26,9 +28,10 @@ class LoopPilot:
 
     Attributes:
         columns: names of what `row` returns.
+        robot: whose motors and outputs they are.
     """
 
-    def __init__(self, loop: Loop) -> None:
+    def __init__(self, loop: Loop, robot: Robot = NECK) -> None:
         """Wire observer, controller and further parts as `softneck simulate` does; the plant gives ports only.
 
         Raises:
@@ -36,7 +39,7 @@ class LoopPilot:
         """
         if loop.order != "sequential":
             raise SettingsError('drives run in the order "sequential"; the loop has order = "jacobi".')
-        self._loop, self._parts = loop, loop.parts
+        self._loop, self._parts, self.robot = loop, loop.parts, robot
         steps = {name: part.sample_time for name, part in self._parts.items()}
         if max(steps.values()) > min(steps.values()) * (1.0 + 1e-6):
             listed = ", ".join(f"{name} {step:g} s" for name, step in steps.items())
@@ -56,10 +59,16 @@ class LoopPilot:
         names = [port.name for port in loop.controller.outputs]
         try:
             first = wiring.spans["controller"].start
-            self._chosen = np.array([first + names.index(f"motor_setpoint_{j}") for j in (1, 2, 3)])
+            self._chosen = np.array([first + names.index(name) for name in robot.set_points])
         except ValueError as error:
-            raise SettingsError(f"the controller does not give three motor set-points: {', '.join(names)}.") from error
-        self._tilts = [(name, self._places[f"{name}{end}"]) for name in _ANGLES for end in ("_measured", "")
+            word = _NUMBERS[len(robot.set_points)]
+            raise SettingsError(f"the controller does not give {word} motor set-points: {', '.join(names)}.") from error
+        more = [name for name in names if name.startswith("motor_setpoint_") and name not in robot.set_points]
+        if more:
+            raise SettingsError(f"the controller gives `{more[0]}`, which robot {robot.label()} does not have.")
+        # Where the plant would say each output and each rate, by their number in a sample.
+        outputs = [*robot.outputs.names, *(f"{name}_rate" for name in robot.outputs.names)]
+        self._tilts = [(i, self._places[f"{name}{end}"]) for i, name in enumerate(outputs) for end in ("_measured", "")
                        if f"{name}{end}" in self._places]  # fmt: skip
         self._rows = round(loop.duration / self.sample_time)
         self._running = self._begun({})
@@ -78,9 +87,10 @@ class LoopPilot:
     def warm(self) -> None:
         """Step all parts once with the neck at rest: what compiles or loads at its first call does so before a run."""
         self.start()
-        self.step(Measurement(0, Tilt(0.0, 0.0), True, (0.0, 0.0, 0.0)))
+        rest = sample_of((0.0,) * len(self.robot.outputs.names))
+        self.step(Measurement(0, rest, True, (0.0,) * len(self.robot.motors.names)))
 
-    def step(self, measured: Measurement) -> tuple[float, float, float] | None:
+    def step(self, measured: Measurement) -> Motors | None:
         """Step observer and controller with what was measured now."""
         running, index = self._running, measured.index
         self._measure(measured, running.held[self._plant])
@@ -89,8 +99,7 @@ class LoopPilot:
         problem, part = running.run(index, index + 1, _NO_TABLE)
         if problem:
             self._wiring.taps[running.names[part]].read(running.bus, index * self.sample_time)
-        a, b, c = running.bus[self._chosen].tolist()
-        return a, b, c
+        return tuple(running.bus[self._chosen].tolist())
 
     def finished(self, index: int) -> bool:
         """Return whether the loop's duration is over."""
@@ -122,14 +131,14 @@ class LoopPilot:
 
     def _measure(self, measured: Measurement, outputs: Vector) -> None:
         """Write to the plant's `outputs` what hardware says."""
-        tilt, places = measured.tilt, self._places
-        for name, place in self._tilts:
-            value = getattr(tilt, name)
-            outputs[place] = value if math.isfinite(value) else 0.0
-        for j in (1, 2, 3):
-            place = places.get(f"motor_position_{j}")
+        places = self._places
+        said = (*measured.tilt.values, *measured.tilt.rates)
+        for i, place in self._tilts:
+            outputs[place] = said[i] if math.isfinite(said[i]) else 0.0
+        for name, position in zip(self.robot.motor_positions, measured.positions, strict=True):
+            place = places.get(name)
             if place is not None:
-                outputs[place] = measured.positions[j - 1]
+                outputs[place] = position
         place = places.get("measurement_valid")
         if place is not None:
             outputs[place] = 1.0 if measured.fresh else 0.0

@@ -25,6 +25,7 @@ from ..bus._objects import (
     pdo_writes,
     require_eds,
 )
+from ..bus._robot import limits_said
 from ..bus._sdo import Objects, SdoError, load_eds
 from ..master import Frame
 from ..master._cia301 import Command, nmt_frame
@@ -165,6 +166,8 @@ def preflight(
     dictionary = load_eds(file.profile, file.eds)
     require_eds(dictionary, file.profile, str(file.eds or f"{file.profile}.eds"))
     rows = _Checks()
+    if file.robot is not None:
+        _tell_robot(file, rows)
     other = listen(link, file.nodes)
     rows.add(0, "second master", other or "none", not other, "Stop the other master before this one starts.")
     if other:
@@ -197,6 +200,17 @@ def preflight(
     return Report(tuple(rows.rows), guarding, tuple(override))
 
 
+def _tell_robot(file: DrivesFile, rows: _Checks) -> None:
+    """Say what the robot changes: its limits where they are the tighter ones, what is watched, how full the bus is."""
+    robot = file.moves
+    rows.add(0, "robot", robot.label(), True)
+    for node, said in zip(file.nodes, limits_said(robot, file.limits), strict=True):
+        rows.add(node, "set-points", said, True)
+    if not file.weights:
+        rows.add(0, "diverged", "not watched: the robot's directions are to be identified", True)
+    rows.add(0, "bus load", f"{100.0 * file.load:.0f} % of {file.bit_rate:g} bit/s at worst", True)
+
+
 def _check_sensor(link: Link, file: DrivesFile, sensor: Sensor, rows: _Checks) -> None:
     """Look for one sample that may be an angle of the neck; a drive must not get power without."""
     on_bus = file.sensor_kind == "can"
@@ -207,9 +221,10 @@ def _check_sensor(link: Link, file: DrivesFile, sensor: Sensor, rows: _Checks) -
     node, holds, found = file.sensor_node if on_bus else 0, False, f"no sample within {LOOK:g} s"
     advice = "Is it on, is `node` of [sensor] right?" if on_bus else "Is it plugged in and does it send?"
     if tilt is not None:
-        angles = [math.degrees(angle) for angle in (tilt.pitch, tilt.roll)]
+        angles = [math.degrees(angle) for angle in tilt.values]
         holds = tilt.valid and all(abs(angle) <= math.degrees(file.sensor.angle) for angle in angles)
-        found = f"pitch {angles[0]:.2f}, roll {angles[1]:.2f} deg"
+        named = zip(file.moves.outputs.names, angles, strict=True)
+        found = ", ".join(f"{name} {angle:.2f}" for name, angle in named) + " deg"
         advice = "The neck cannot have that angle: is it mounted upright, is it the right sensor?"
     rows.add(node, "inclinometer", found, holds, getattr(sensor, "problem", "") or advice)
 

@@ -10,20 +10,18 @@ import numpy as np
 
 from softneck.core import Matrix, Vector
 from softneck.loop import LoopResult
+from softneck.signals.recording._channels import NECK
 
 from ..bus._link import VirtualLink
 from ..logs._result import signal_units
-from ..logs._rows import COLUMNS, Motion, experiment_channels
+from ..logs._rows import Motion, columns_of, experiment_channels, truths
 from ..master import Frame, Master, Phase, Tilt
-from ..master._measured import Measurement
+from ..master._gate import Reading
+from ..master._measured import Measurement, Motors
 from ._pilot import LoopPilot
 
 if TYPE_CHECKING:
     from ._bus_loop import Session
-
-_MEASURED = ("pitch_measured", "roll_measured")
-_RATES = ("pitch_rate_measured", "roll_rate_measured")
-_TRUTH = ("pitch", "roll", "tension_1", "tension_2", "tension_3", "compression")
 
 
 class RunLog:
@@ -31,19 +29,20 @@ class RunLog:
 
     def __init__(self, pilot: LoopPilot) -> None:
         """Prepare the columns."""
-        self._pilot = pilot
+        self._pilot, self._robot = pilot, pilot.robot
+        outputs = pilot.robot.outputs.names
         places = {}
-        for name in ("pitch_reference", "roll_reference", "cocontraction_reference"):
-            places[name] = pilot.slot("reference", name)
-        for j in (1, 2, 3):
-            places[f"motor_setpoint_{j}"] = pilot.slot("controller", f"motor_setpoint_{j}")
-        for name in ("pitch", "roll"):
+        for name in (*outputs, "cocontraction"):
+            places[f"{name}_reference"] = pilot.slot("reference", f"{name}_reference")
+        for name in pilot.robot.set_points:
+            places[name] = pilot.slot("controller", name)
+        for name in outputs:
             places[f"{name}_estimate"] = pilot.slot("observer", name)
         places["healthy"] = pilot.slot("observer", "healthy")
         self._places = {name: place for name, place in places.items() if place is not None}
         self._rows: list[list[float]] = []
         self._index = -1
-        self._motion, self._cycles = Motion(), list[int]()
+        self._motion, self._cycles = Motion(len(pilot.robot.motors.names)), list[int]()
 
     def take(self, now: float, master: Master, truth: Mapping[str, float] | None) -> dict[str, float] | None:
         """Take the cycle at `now` [s]; add the row of its sample, once, and return it by name."""
@@ -56,19 +55,27 @@ class RunLog:
         row = [float(signals[place]) for place in self._places.values()]
         tilt = master.tilt
         row += [*master.positions, *master.tensions]
-        row += [tilt.pitch, tilt.roll, tilt.pitch_rate, tilt.roll_rate] if tilt is not None else [np.nan] * 4
+        nothing = [math.nan] * (2 * len(self._robot.outputs.names))
+        row += nothing if tilt is None else [*tilt.values, *tilt.rates]
         if truth is not None:
-            row += [truth[name] for name in _TRUTH]
+            row += [truth.get(name, math.nan) for name in self._truths]
         self._rows.append(row)
         return dict(zip(self._names(truth is not None), row, strict=True))
 
     def _names(self, truth: bool) -> list[str]:
-        names = [*self._places, *(f"motor_position_{j}" for j in (1, 2, 3))]
-        names += [f"tension_estimate_{j}" for j in (1, 2, 3)] + [*_MEASURED, *_RATES]
-        return names + (list(_TRUTH) if truth else [])
+        robot = self._robot
+        names = [*self._places, *robot.motor_positions]
+        names += [f"tension_estimate_{j}" for j in range(1, len(robot.motors.names) + 1)]
+        names += [f"{name}{what}_measured" for what in ("", "_rate") for name in robot.outputs.names]
+        return names + (list(self._truths) if truth else [])
+
+    @property
+    def _truths(self) -> tuple[str, ...]:
+        names = (*self._robot.outputs.names, *truths(self._robot))
+        return names if self._robot.is_neck else names[:-1]
 
     def speeds(self) -> Matrix:
-        """Return the motors' speeds at all rows, (rows, 3) [rad/s]."""
+        """Return the motors' speeds at all rows, (rows, motors) [rad/s]."""
         return self._motion.at(self._cycles)[1]
 
     def result(self, sample_time: float, *, truth: bool) -> LoopResult:
@@ -80,16 +87,16 @@ class RunLog:
 
 
 class SignalPilot:
-    """Plays set-points (rows, 3) [rad], one row each sample."""
+    """Plays set-points (rows, motors) [rad], one row each sample."""
 
     def __init__(self, set_points: Matrix) -> None:
         """Play `set_points` from the first row on."""
-        self._rows = [(float(a), float(b), float(c)) for a, b, c in set_points]
+        self._rows = [tuple(row) for row in np.asarray(set_points, dtype=np.float64).tolist()]
 
     def start(self) -> None:
         """Nothing is kept between samples."""
 
-    def step(self, measured: Measurement) -> tuple[float, float, float] | None:
+    def step(self, measured: Measurement) -> Motors | None:
         """Return the set-points of this sample."""
         return self._rows[measured.index]
 
@@ -107,9 +114,12 @@ class SignalLog:
 
     def __init__(self, rows: int, *, run: Vector | None = None, session: Session | None = None) -> None:
         """Make room for `rows`; with a `session` each row goes into its log too, with its number in `run`."""
-        self._table = np.full((rows, len(COLUMNS)), np.nan)
+        self._robot = NECK if session is None else session.file.moves
+        self._names = columns_of(self._robot)
+        self._motors, self._outputs = len(self._robot.motors.names), len(self._robot.outputs.names)
+        self._table = np.full((rows, len(self._names)), np.nan)
         self._first: list[int] = []
-        self._motion = Motion()
+        self._motion = Motion(self._motors)
         self._run = run
         self._log = None if session is None else session.log
         link = None if session is None else session.link
@@ -119,8 +129,9 @@ class SignalLog:
         self.index = -1
 
     def __call__(
-        self, now: float, frames_in: Sequence[Frame], frames_out: Sequence[Frame], tilt: Tilt | None, master: Master
-    ) -> None:
+        self, now: float, frames_in: Sequence[Frame], frames_out: Sequence[Frame], tilt: Tilt | Reading | None,
+        master: Master,
+    ) -> None:  # fmt: skip
         """Take what this cycle measured and sent."""
         del frames_in, frames_out
         self._motion.take(now, master.positions)
@@ -132,19 +143,20 @@ class SignalLog:
             self._measure(self._table[self.index], tilt, master)
         self._cycles += 1
         self._complete = self._cycles == master.settings.sample_cycles
-        self._table[self.index, :3] = master.setpoints
+        self._table[self.index, : self._motors] = master.setpoints
         if self._complete and self._log is not None:
-            row = dict(zip(COLUMNS, self._table[self.index].tolist(), strict=True))
+            row = dict(zip(self._names, self._table[self.index].tolist(), strict=True))
             self._log.signals({**row, "run": 1.0 if self._run is None else float(self._run[self.index])})
 
-    def _measure(self, row: Vector, tilt: Tilt | None, master: Master) -> None:
+    def _measure(self, row: Vector, tilt: Tilt | Reading | None, master: Master) -> None:
+        known = self._motors + 2 * self._outputs
         if tilt is not None and master.tilt is tilt:
-            row[3:7] = tilt.pitch, tilt.roll, tilt.pitch_rate, tilt.roll_rate
+            row[self._motors : known] = (*tilt.values, *tilt.rates)
         if self._truth is None:
-            row[7:10] = master.tensions
+            row[known : known + self._motors] = master.tensions
         else:
             truth = self._truth()
-            row[7:] = [truth[name] for name in COLUMNS[7:]]
+            row[known:] = [truth.get(name, math.nan) for name in self._names[known:]]
 
     @property
     def rows(self) -> int:
@@ -153,7 +165,7 @@ class SignalLog:
 
     def columns(self) -> dict[str, Vector]:
         """Return the channels of a recording; those only that were measured."""
-        return experiment_channels(self._table[: self.rows], *self._motion.at(self._first[: self.rows]))
+        return experiment_channels(self._table[: self.rows], *self._motion.at(self._first[: self.rows]), self._robot)
 
 
 def raised_cosine(rows: int) -> Vector:

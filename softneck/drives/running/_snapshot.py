@@ -13,19 +13,11 @@ from dataclasses import dataclass
 from ..master import Event, Master, Phase
 from ..master._cia301 import NodeState
 from ..master._cia402 import DriveState
+from ..master._measured import Motors
 from ._pilot import LoopPilot
 
-Triple = tuple[float, float, float]
 # So many of the last events are copied.
 _EVENTS = 5
-_NONE: Triple = (math.nan, math.nan, math.nan)
-_SIGNALS = (
-    ("reference", "pitch_reference"),
-    ("reference", "roll_reference"),
-    ("reference", "cocontraction_reference"),
-    ("observer", "pitch"),
-    ("observer", "roll"),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,12 +50,13 @@ class Snapshot:
         cycle: its number.
         phase: of the run.
         index: of the controller's sample, -1 before the first.
-        references: of pitch, roll and co-contraction [rad]; NaN while the controller does not run.
-        angles: pitch and roll of the last believed sample of the inclinometer [rad]; NaN before the first.
-        estimates: pitch and roll as the observer has them [rad]; NaN while it does not run, or if there is none.
+        outputs: names of what is measured, of a neck pitch and roll.
+        references: of the outputs and of co-contraction [rad]; NaN while the controller does not run.
+        angles: outputs of the last believed sample of the inclinometer [rad]; NaN before the first.
+        estimates: outputs as the observer has them [rad]; NaN while it does not run, or if there is none.
         setpoints, positions: of the motors, as sent and as measured [rad].
         tensions: of the tendons, from the current that the drives report (TPDO) over the motor's constant [N].
-        drives: all three.
+        drives: all of them.
         events: the last five.
         counts: event name -> how often so far.
         fault: what ended the run, None if nothing did.
@@ -76,12 +69,12 @@ class Snapshot:
     cycle: int
     phase: Phase
     index: int
-    references: Triple
-    angles: tuple[float, float]
-    estimates: tuple[float, float]
-    setpoints: Triple
-    positions: Triple
-    tensions: Triple
+    references: Motors
+    angles: tuple[float, ...]
+    estimates: tuple[float, ...]
+    setpoints: Motors
+    positions: Motors
+    tensions: Motors
     drives: tuple[DriveSnapshot, ...]
     events: tuple[Event, ...]
     counts: Mapping[str, int]
@@ -89,6 +82,7 @@ class Snapshot:
     period: float
     sample_time: float
     tension_limit: float
+    outputs: tuple[str, ...] = ("pitch", "roll")
 
     @property
     def run_time(self) -> float:
@@ -107,7 +101,8 @@ class Snapshots:
     def take(self, master: Master, now: float) -> Snapshot:
         """Return what there is to see after the step at `now` [s]."""
         supervisor, events, tilt, settings = master.supervisor, master.events, master.tilt, master.settings
-        pitch_reference, roll_reference, common, pitch, roll = self._signals(master)
+        outputs = ("pitch", "roll") if settings.channels is None else settings.channels.outputs
+        signals = self._signals(master, outputs)
         # A deque is indexed in constant time at its ends only; copying all of it would take longer with each event.
         newest = tuple([events[i] for i in range(-min(_EVENTS, len(events)), 0)])
         return Snapshot(
@@ -115,9 +110,9 @@ class Snapshots:
             cycle=master.cycle,
             phase=supervisor.phase,
             index=master.index,
-            references=(pitch_reference, roll_reference, common),
-            angles=(math.nan, math.nan) if tilt is None else (tilt.pitch, tilt.roll),
-            estimates=(pitch, roll),
+            references=signals[: len(outputs) + 1],
+            angles=(math.nan,) * len(outputs) if tilt is None else tilt.values,
+            estimates=signals[len(outputs) + 1 :],
             setpoints=master.setpoints,
             positions=master.positions,
             tensions=master.tensions,
@@ -136,16 +131,19 @@ class Snapshots:
             period=settings.bus.cycle,
             sample_time=settings.sample_cycles * settings.bus.cycle,
             tension_limit=settings.limits.tension,
+            outputs=outputs,
         )  # fmt: skip
 
-    def _signals(self, master: Master) -> tuple[float, float, float, float, float]:
+    def _signals(self, master: Master, outputs: tuple[str, ...]) -> Motors:
+        """Return the references of the outputs and of co-contraction, and the estimates of the outputs."""
         pilot = master.pilot
         # Beyond the run they would be the last ones, and say something that nobody asks for any more.
         if not isinstance(pilot, LoopPilot) or master.index < 0 or master.supervisor.phase is not Phase.RUNNING:
-            return (*_NONE, math.nan, math.nan)
+            return (math.nan,) * (2 * len(outputs) + 1)
         if pilot is not self._pilot:
             self._pilot = pilot
-            self._slots = tuple(pilot.slot(part, port) for part, port in _SIGNALS)
+            wanted = [("reference", f"{name}_reference") for name in (*outputs, "cocontraction")]
+            wanted += [("observer", name) for name in outputs]
+            self._slots = tuple(pilot.slot(part, port) for part, port in wanted)
         signals = pilot.signals
-        a, b, c, d, e = [math.nan if slot is None else float(signals[slot]) for slot in self._slots]
-        return a, b, c, d, e
+        return tuple([math.nan if slot is None else float(signals[slot]) for slot in self._slots])

@@ -5,40 +5,125 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from softneck.plant import NeckParameters
+import numpy as np
+
+from softneck.core import SettingsError, to_si
+from softneck.plant import NeckParameters, VirtualNeck
+from softneck.robot import Robot
 
 from ..bus._file import DrivesFile
 from ..bus._link import VirtualLink
 from ..master import Frame, Master, Tilt
+from ..master._gate import Reading
 from ..simulated import SimulatedNeck, SimulatedSettings
+from ..simulated._springs import SimulatedSprings, SpringSettings
 
 # A run is over at the latest this long after its loop, whatever happens [s].
 _PATIENCE = 120.0
 
 # Called after each cycle: (now, frames in, frames out, sample of the inclinometer or None, master).
-Watch = Callable[[float, Sequence[Frame], Sequence[Frame], Tilt | None, Master], None]
+Watch = Callable[[float, Sequence[Frame], Sequence[Frame], Tilt | Reading | None, Master], None]
+# Noise of the stand-in's sensor where the robot gives none [rad]: none at all would look frozen.
+_LITTLE = 1e-5
 
 
 def simulated_neck(
     file: DrivesFile, parameters: NeckParameters, *, sample_time: float, homed: bool = True, seed: int = 0
 ) -> SimulatedNeck:
-    """Return the virtual neck with drives that are set up as `file` says the real ones are."""
-    one, two, three = (entry.scale for entry in file.drives)
-    settings = SimulatedSettings(
+    """Return the virtual neck, or a robot built like it, with drives that are set up as `file` says the real ones are.
+
+    Raises:
+        SettingsError: a robot without tendons, or that the neck's physics does not fit.
+    """
+    # The neck's tendons stand where its own file says.
+    robot = None if file.moves.is_neck else file.moves
+    return SimulatedNeck(parameters, _settings(file, sample_time, homed, seed), robot)
+
+
+def simulated_springs(
+    file: DrivesFile, *, sample_time: float, homed: bool = True, seed: int = 0
+) -> SimulatedSprings:  # fmt: skip
+    """Return drives on what stands for a robot without virtual plant: springs, and outputs by its directions.
+
+    Gain and lag of the outputs are those that the drives file watches for, motors and winches its own.
+
+    Raises:
+        SettingsError: the robot's directions are to be identified: nobody knows yet what its motors do.
+    """
+    robot, neck = file.moves, file.neck
+    weights = robot.weights()
+    if weights is None:
+        raise SettingsError(
+            f"robot {robot.label()}: its directions are to be identified, so that nothing can stand for it; simulated "
+            'drives need `directions` of kind "tendons" or "matrix".'
+        )
+    springs = SpringSettings(
+        outputs=robot.outputs.names,
+        weights=np.ascontiguousarray(file.watch.gain * weights),
+        pole=file.watch.pole,
+        reach=tuple(max(-low, high) for low, high, _ in file.ranges),
+        torque_constant=neck.torque_constant,
+        efficiency=neck.efficiency,
+        current_limit=tuple(entry.current_limit for entry in file.drives),
+        winch_radius=neck.winch_radius,
+        pretension_current=file.zero.current,
+        noise_std=(robot.noise_std or 0.0) * to_si(robot.outputs.unit)[0] or _LITTLE,
+    )
+    return SimulatedSprings(springs, _settings(file, sample_time, homed, seed))
+
+
+def simulated_plant(
+    file: DrivesFile, neck: NeckParameters | None, *, sample_time: float, homed: bool = True, seed: int = 0
+) -> SimulatedNeck | SimulatedSprings:
+    """Return what the simulated drives of `file` turn: the virtual plant, or springs where nothing stands for a robot.
+
+    Args:
+        file: of the drives, and what they move.
+        neck: physics of the virtual plant; None: those that the robot names.
+        sample_time, homed, seed: see `SimulatedSettings`.
+    """
+    physics = physics_of(file.moves, neck)
+    if physics is None:
+        return simulated_springs(file, sample_time=sample_time, homed=homed, seed=seed)
+    return simulated_neck(file, physics, sample_time=sample_time, homed=homed, seed=seed)
+
+
+def physics_of(robot: Robot, neck: NeckParameters | None = None) -> NeckParameters | None:
+    """Return the physics of what stands for a robot: `neck`, or what the robot names; None where nothing does."""
+    if robot.is_neck:
+        return neck or VirtualNeck.of(robot, None if robot.neck else NeckParameters.paper()).parameters
+    if robot.directions.kind != "tendons" or (neck is None and robot.neck is None):
+        return None
+    return VirtualNeck.of(robot, neck).parameters
+
+
+def stand_in(file: DrivesFile, neck: NeckParameters | None) -> str:
+    """Return what to say of simulated drives that turn no virtual plant, "" of the others."""
+    if physics_of(file.moves, neck) is not None:
+        return ""
+    gain, pole = file.watch.gain, file.watch.pole
+    return (
+        f"robot {file.moves.label()} has no virtual plant here: each motor turns a spring, and the outputs follow its "
+        f"directions by {gain:.3g} rad/rad with one time constant, {1.0 / pole:.3g} s ([watch] of the drives file)"
+    )
+
+
+def _settings(file: DrivesFile, sample_time: float, homed: bool, seed: int) -> SimulatedSettings:
+    scales = [entry.scale for entry in file.drives]
+    return SimulatedSettings(
         nodes=file.nodes,
         profile=file.profile,
-        gear=(one.gear, two.gear, three.gear),
-        counts_per_turn=(one.counts_per_turn, two.counts_per_turn, three.counts_per_turn),
-        reversed=(one.reversed, two.reversed, three.reversed),
-        peak_current=(one.peak_current, two.peak_current, three.peak_current),
-        slow_loop=(one.slow_loop, two.slow_loop, three.slow_loop),
+        gear=tuple(scale.gear for scale in scales),
+        counts_per_turn=tuple(scale.counts_per_turn for scale in scales),
+        reversed=tuple(scale.reversed for scale in scales),
+        peak_current=tuple(scale.peak_current for scale in scales),
+        slow_loop=tuple(scale.slow_loop for scale in scales),
         sample_time=sample_time,
         cycle=file.cycle,
         hold=sample_time,
         homed=homed,
         seed=seed,
     )
-    return SimulatedNeck(parameters, settings)
 
 
 @dataclass(slots=True)
@@ -60,7 +145,7 @@ class VirtualRun:
     host_stopped: bool = False
     watch: Callable[[VirtualRun], None] | None = None
     cycles: int = 0
-    newest: Tilt | None = None
+    newest: Tilt | Reading | None = None
     watches: tuple[Watch, ...] = ()
 
     def step(self) -> None:
@@ -69,8 +154,8 @@ class VirtualRun:
         link.sampling = False
         now = link.now
         if self.cycles % master.settings.sample_cycles == 0:
-            sample = link.neck.sample(now)
-            self.newest = Tilt(sample.pitch, sample.roll, sample.pitch_rate, sample.roll_rate, sample.valid)
+            link.neck.sample(now)
+            self.newest = link.newest
         if self.host_stopped:
             link.send(())
         else:

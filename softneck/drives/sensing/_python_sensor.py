@@ -13,6 +13,7 @@ from typing import Any
 from softneck.core import SettingsError
 
 from ..master import Frame, Tilt
+from ..master._gate import Reading, sample_of
 from ._serial import SensorError
 
 _METHODS = ("take", "read")
@@ -27,9 +28,9 @@ class PythonInclinometer:
         problem: why it is asked no more, or which call took long; "" if all is well.
     """
 
-    def __init__(self, sensor: Any, name: str) -> None:
-        """Ask `sensor`, called `name` where something is said about it."""
-        self._sensor, self.name = sensor, name
+    def __init__(self, sensor: Any, name: str, outputs: int = 2) -> None:
+        """Ask `sensor` for so many outputs; it is called `name` where something is said about it."""
+        self._sensor, self.name, self._outputs = sensor, name, outputs
         self.problem = ""
         self._ended = False
 
@@ -37,19 +38,28 @@ class PythonInclinometer:
         """Hand over frames of a cycle without a sample."""
         self._call("take", frames)
 
-    def read(self, now: float, frames: Sequence[Frame]) -> Tilt | None:
+    def read(self, now: float, frames: Sequence[Frame]) -> Tilt | Reading | None:
         """Return the newest sample; None if none came, or where it returned something else."""
         answer = self._call("read", now, frames)
         if answer is None:
             return None
         try:
-            if not isinstance(answer, Tilt):
-                raise TypeError(f"{type(answer).__name__} {answer!r:.60} is not a softneck.drives.master.Tilt")
-            pitch, roll, pitch_rate, roll_rate = (float(value) for value in answer[:4])
+            return self._sample(answer)
         except (TypeError, ValueError) as error:
             self._end(f"`read` returned no sample: {error}")
             return None
-        return Tilt(pitch, roll, pitch_rate, roll_rate, bool(answer.valid))
+
+    def _sample(self, answer: Any) -> Tilt | Reading:
+        """Return a `Tilt`, or one number for each output of another robot, as a sample."""
+        if isinstance(answer, Tilt) and self._outputs == 2:
+            pitch, roll, pitch_rate, roll_rate = (float(value) for value in answer[:4])
+            return Tilt(pitch, roll, pitch_rate, roll_rate, bool(answer.valid))
+        if self._outputs == 2:
+            raise TypeError(f"{type(answer).__name__} {answer!r:.60} is not a softneck.drives.master.Tilt")
+        values = [float(value) for value in answer]
+        if len(values) != self._outputs:
+            raise TypeError(f"{len(values)} numbers for {self._outputs} outputs")
+        return sample_of(values)
 
     def close(self) -> None:
         """Close it if it can be closed."""
@@ -77,8 +87,12 @@ class PythonInclinometer:
         self._ended, self.problem = True, f"{problem}. It was not asked again."
 
 
-def make_python_sensor(python: str, options: Mapping[str, Any], folder: Path) -> PythonInclinometer:
+def make_python_sensor(
+    python: str, options: Mapping[str, Any], folder: Path, *, outputs: int = 2
+) -> PythonInclinometer:
     """Call the factory `package.module:factory` with `options`; `folder` is looked into for the module too.
+
+    Its sensor says `Tilt`s, or for a robot of other than two outputs a sequence with one number for each [rad].
 
     Raises:
         SettingsError: there is no such factory, or it returns no sensor.
@@ -104,4 +118,4 @@ def make_python_sensor(python: str, options: Mapping[str, Any], folder: Path) ->
     missing = [method for method in _METHODS if not callable(getattr(sensor, method, None))]
     if missing:
         raise SettingsError(f"[sensor] python = `{python}` returned a sensor without `{missing[0]}`.")
-    return PythonInclinometer(sensor, python)
+    return PythonInclinometer(sensor, python, outputs)

@@ -7,12 +7,18 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import numpy as np
+
 from softneck.core import SettingsError, Vector
+from softneck.robot import Robot
 from softneck.signals import read_recording
+from softneck.signals.recording._channels import NECK
+from softneck.signals.recording._recording import require_same_robot
 
 from ..bus._sensor_source import SENSORS, SensorSource
 from ..logs._log_file import read_run_log
 from ..master import Frame, Tilt
+from ..master._gate import Reading, sample_of
 from ._python_sensor import make_python_sensor
 from ._sensor import CanInclinometer
 from ._serial import SerialInclinometer
@@ -21,9 +27,9 @@ from ._serial import SerialInclinometer
 class ReplaySensor:
     """Plays a recording as inclinometer: the sample that is due since the first reading, each once."""
 
-    def __init__(self, time: Vector, pitch: Vector, roll: Vector) -> None:
-        """Play `pitch` and `roll` [rad] at `time` [s], all of shape (N,)."""
-        self._time, self._pitch, self._roll = time - time[0], pitch, roll
+    def __init__(self, time: Vector, *outputs: Vector) -> None:
+        """Play the outputs, such as pitch and roll [rad], at `time` [s], all of shape (N,)."""
+        self._time, self._outputs = time - time[0], np.column_stack(outputs)
         self._begin: float | None = None
         self._told = -1
 
@@ -31,7 +37,7 @@ class ReplaySensor:
         """Nothing on the bus is of interest."""
         del frames
 
-    def read(self, now: float, frames: Sequence[Frame]) -> Tilt | None:
+    def read(self, now: float, frames: Sequence[Frame]) -> Tilt | Reading | None:
         """Return the newest sample that is due, None if it was told already or the recording is over."""
         del frames
         self._begin = now if self._begin is None else self._begin
@@ -40,20 +46,39 @@ class ReplaySensor:
         if k == self._told or k < 0:
             return None
         self._told = k
-        pitch, roll = float(self._pitch[k]), float(self._roll[k])
-        return Tilt(pitch, roll, valid=math.isfinite(pitch) and math.isfinite(roll))
+        values = self._outputs[k].tolist()
+        return sample_of(values, valid=all(map(math.isfinite, values)))
+
+
+class _FirstAngle:
+    """Of a two-axis inclinometer the first angle, for a robot with one output; it sits with that axis in its plane."""
+
+    def __init__(self, sensor: SerialInclinometer) -> None:
+        self._sensor, self.name, self.close = sensor, sensor.name, sensor.close
+
+    @property
+    def problem(self) -> str:
+        return self._sensor.problem
+
+    def take(self, frames: Sequence[Frame]) -> None:
+        self._sensor.take(frames)
+
+    def read(self, now: float, frames: Sequence[Frame]) -> Tilt | Reading | None:
+        tilt = self._sensor.read(now, frames)
+        return None if tilt is None else sample_of(tilt.values[:1], tilt.rates[:1], valid=tilt.valid)
 
 
 @contextlib.contextmanager
-def open_sensor(kind: str, node: int, source: SensorSource) -> Iterator[Any]:
-    """Yield the inclinometer of a drives file; see the protocol `Sensor`.
+def open_sensor(kind: str, node: int, source: SensorSource, robot: Robot = NECK) -> Iterator[Any]:
+    """Yield the inclinometer of a drives file, or what else measures the outputs of `robot`; see `Sensor`.
 
     Raises:
+        DataError: a recording of another robot.
         SettingsError: a simulated one, a factory that cannot be called, or that returns no sensor.
         SensorError: no port, no permission, silent, or another protocol.
         FileFormatError: no such recording.
     """
-    sensor = _opened(kind, node, source)
+    sensor = _opened(kind, node, source, robot)
     try:
         yield sensor
     finally:
@@ -62,19 +87,26 @@ def open_sensor(kind: str, node: int, source: SensorSource) -> Iterator[Any]:
             close()
 
 
-def _opened(kind: str, node: int, source: SensorSource) -> Any:
+def _opened(kind: str, node: int, source: SensorSource, robot: Robot) -> Any:
+    count = len(robot.outputs.names)
     match kind:
         case "can":
-            return CanInclinometer(node)
+            return CanInclinometer(node, count)
         case "serial":
-            return SerialInclinometer(source.port, baud=source.baud, request=source.request, start=source.start)
+            if count > 2:
+                raise SettingsError(
+                    f'[sensor] kind = "serial" has two angles; robot {robot.label()} has {count} outputs. Write kind = '
+                    '"python".'
+                )
+            sensor = SerialInclinometer(source.port, baud=source.baud, request=source.request, start=source.start)
+            return sensor if count == 2 else _FirstAngle(sensor)
         case "replay":
             path = source.folder / source.file
             log = path.suffix.lower() == ".mcap"
             recording = read_run_log(path).recording() if log else read_recording(path)
-            recording.robot.require_neck(f"{path}: a replay")
-            return ReplaySensor(recording.time, recording.channels["pitch"], recording.channels["roll"])
+            require_same_robot(recording.robot, robot, f"{path} and the drives: outputs")
+            return ReplaySensor(recording.time, *recording.outputs.T)
         case "python":
-            return make_python_sensor(source.python, source.options, source.folder)
+            return make_python_sensor(source.python, source.options, source.folder, outputs=count)
         case _:
             raise SettingsError(f'[sensor] kind is "{kind}"; on a bus it must be one of {", ".join(SENSORS[1:])}.')

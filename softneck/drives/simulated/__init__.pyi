@@ -1,4 +1,4 @@
+from ._drives import SimulatedSettings as SimulatedSettings
 from ._neck import SimulatedNeck as SimulatedNeck
-from ._neck import SimulatedSettings as SimulatedSettings
 from ._node import SimulatedDrive as SimulatedDrive
 from ._server import serve as serve

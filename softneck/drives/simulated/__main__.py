@@ -10,20 +10,28 @@ import socket
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import click
 
 from softneck.plant import NeckParameters
+from softneck.robot import Robot, find_robot
 
+from ._drives import SimulatedSettings
 from ._frame import CanFrame
-from ._neck import SimulatedNeck, SimulatedSettings
+from ._neck import SimulatedNeck
 from ._profiles import PROFILES
 from ._server import STATES, serve
+from ._springs import SimulatedSprings, SpringSettings
+
+# Of the lab's drives: static tilt by Eq. 31 [rad/rad], range [rad], current limit [A].
+_GAIN, _REACH, _CURRENT = 0.483 / 5.293, 6.0, 0.0299
 
 
 @click.command()
 @click.argument("bus", metavar="INTERFACE:CHANNEL")
 @click.option("--neck", default="paper", show_default=True, help="paper, lab, rough or a neck file (.toml).")
+@click.option("--robot", help="Instead of a neck: a robot's preset or file; its motors turn springs here.")
 @click.option("--profile", type=click.Choice(list(PROFILES)), default="ipos2015", show_default=True)
 @click.option("--homed", is_flag=True, help="As if `softneck drives zero` had been run.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of the inclinometer's noise.")
@@ -32,17 +40,24 @@ from ._server import STATES, serve
 @click.option("--sensor-socket", type=click.Path(path_type=Path),
               help="The inclinometer is softneck.drives.simulated.inclinometer and listens there.")  # fmt: skip
 def main(
-    bus: str, neck: str, profile: str, homed: bool, seed: int, report: bool, cycle: float, sensor_socket: Path | None
-) -> None:
+    bus: str, neck: str, robot: str | None, profile: str, homed: bool, seed: int, report: bool, cycle: float,
+    sensor_socket: Path | None,
+) -> None:  # fmt: skip
     """Simulate three drives (nodes 1 to 3), the neck and an inclinometer (node 10) on a bus, until Ctrl-C.
+
+    With --robot as many drives as it has motors, from node 1 on.
 
     SIGUSR1 presses the hardware stop at the drives' Enable inputs, and releases it when it is sent again.
     """
     import can
 
     interface, _, channel = bus.partition(":")
-    settings = SimulatedSettings(profile=profile, homed=homed, seed=seed, cycle=cycle)
-    virtual = SimulatedNeck(NeckParameters.preset(neck), settings)
+    common: dict[str, Any] = {"profile": profile, "homed": homed, "seed": seed, "cycle": cycle}
+    virtual = (
+        SimulatedNeck(NeckParameters.preset(neck), SimulatedSettings(**common))
+        if robot is None
+        else _springs(find_robot(robot), common)
+    )
     # All that compiles at its first call does so before the drives answer.
     virtual.move()
     virtual.sample(0.0)
@@ -52,11 +67,27 @@ def main(
         _forwarded(sensor_socket) as sensor,
         hardware_stop(virtual),
     ):
-        click.echo(f"three {profile} drives on {bus}; Ctrl-C ends them", err=True)
+        count = {3: "three"}.get(len(virtual.drives), str(len(virtual.drives)))
+        click.echo(f"{count} {profile} drives on {bus}; Ctrl-C ends them", err=True)
         serve(opened, virtual, sensor=sensor, report=_print if report else None)
 
 
-def _print(now: float, neck: SimulatedNeck, row: int) -> None:
+def _springs(robot: Robot, common: dict[str, Any]) -> SimulatedSprings:
+    weights = robot.weights()
+    if weights is None:
+        raise click.ClickException(f"robot {robot.label()}: nothing can stand for it before its directions are known.")
+    count, lab = len(robot.motors.names), SimulatedSettings()
+    each = {name: getattr(lab, name)[:1] * count for name in ("gear", "counts_per_turn", "peak_current", "slow_loop")}
+    settings = SimulatedSettings(
+        nodes=tuple(range(1, count + 1)), reversed=tuple(sign < 0.0 for sign in robot.motors.sign), **each, **common
+    )
+    springs = SpringSettings(
+        outputs=robot.outputs.names, weights=_GAIN * weights, reach=(_REACH,) * count, current_limit=(_CURRENT,) * count
+    )
+    return SimulatedSprings(springs, settings)
+
+
+def _print(now: float, neck: SimulatedNeck | SimulatedSprings, row: int) -> None:
     axis = neck.drives[row].axis
     line = {"time_s": now, "node": axis.node, "state": STATES[axis.state], "fault": f"{axis.fault:04X}h",
             "counts": axis.getters[(0x6064, 0)]()}  # fmt: skip
@@ -65,7 +96,7 @@ def _print(now: float, neck: SimulatedNeck, row: int) -> None:
 
 
 @contextlib.contextmanager
-def hardware_stop(neck: SimulatedNeck) -> Iterator[None]:
+def hardware_stop(neck: SimulatedNeck | SimulatedSprings) -> Iterator[None]:
     """Let SIGUSR1 open and close the Enable inputs of all drives, as the push-button does that one hand is at."""
     number = getattr(signal, "SIGUSR1", None)
     if number is None:

@@ -12,8 +12,8 @@ from typing import Any
 from . import _power as power
 from ._frame import CanFrame
 from ._neck import SimulatedNeck
+from ._springs import SimulatedSprings
 
-_SLOPES = struct.Struct("<ii")
 _NOTHING = -(2**31)
 _RESOLUTION = math.radians(0.001)
 STATES = {
@@ -25,18 +25,18 @@ STATES = {
 
 def serve(
     bus: Any,
-    neck: SimulatedNeck,
+    neck: SimulatedNeck | SimulatedSprings,
     *,
     sensor_node: int = 10,
     stopped: Callable[[], bool] | None = None,
     sensor: Callable[[CanFrame], None] | None = None,
-    report: Callable[[float, SimulatedNeck, int], None] | None = None,
+    report: Callable[[float, SimulatedNeck | SimulatedSprings, int], None] | None = None,
 ) -> None:
     """Answer frames on `bus` and let the neck move, until `stopped` returns True.
 
     Args:
         bus: an open bus of python-can.
-        neck: what hangs on it.
+        neck: what hangs on it; of more than two outputs the first two are sent.
         sensor_node: node of the inclinometer, which sends its slopes in a TPDO of its own (CiA 410, 0.001 deg).
         stopped: asked in each cycle.
         sensor: takes the inclinometer's frames instead of `bus`: it is then a process of its own.
@@ -84,11 +84,12 @@ def serve(
             tell()
 
 
-def _slopes(neck: SimulatedNeck, now: float, node: int) -> CanFrame:
+def _slopes(neck: SimulatedNeck | SimulatedSprings, now: float, node: int) -> CanFrame:
     sample = neck.sample(now)
-    pair = (sample.pitch, sample.roll) if sample.valid else (math.nan, math.nan)
-    values = [_NOTHING if math.isnan(value) else round(value / _RESOLUTION) for value in pair]
-    return CanFrame(0x180 + node, _SLOPES.pack(*values))
+    # An inclinometer has one axis or two.
+    angles = sample.values[:2]
+    values = [round(angle / _RESOLUTION) if sample.valid and not math.isnan(angle) else _NOTHING for angle in angles]
+    return CanFrame(0x180 + node, struct.pack(f"<{len(values)}i", *values))
 
 
 def _send(bus: Any, frames: list[CanFrame]) -> None:

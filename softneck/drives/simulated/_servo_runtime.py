@@ -1,7 +1,7 @@
-"""Motion of three simulated drives on the virtual neck: generators, limits, position and speed loops.
+"""Motion of the simulated drives on the virtual neck: generators, limits, position and speed loops.
 
 One row of `motion` per drive, in encoder counts of the drive (its own sign), seconds, amperes:
-see SERVO_* for the columns. `ring` (3, n) holds past demands, for the latency of the cyclic mode.
+see SERVO_* for the columns. `ring` (motors, n) holds past demands, for the latency of the cyclic mode.
 """
 
 import math
@@ -13,10 +13,11 @@ from softneck.plant._index_runtime import (
     NECK_GEAR_RATIO,
     NECK_TORQUE_CONSTANT,
 )
-from softneck.plant._mechanics_runtime import NeckBody, neck_constants, neck_load, neck_substeps
+from softneck.plant._mechanics_runtime import NeckBody, neck_constants, neck_disturbed, neck_substeps
 from softneck.plant._neck_runtime import neck_read, neck_write
 from softneck.plant._winch_runtime import winch_advance, winch_constants, winch_motion
 from softneck.plant._winch_runtime import winch_sense as winch_sense
+from softneck.runtime._sizes_runtime import MOTORS
 
 SERVO_POWER = 0  # 1.0: the loops are closed; 0.0: no current
 SERVO_MODE = 1  # 0 stop with SERVO_DECELERATION, 1 profile position, 3 profile velocity, 8 cyclic position
@@ -60,15 +61,8 @@ def servo_ticks(
 ) -> None:
     """Advance drives and neck by `ticks` of `h` [s]."""
     c = neck_constants(parameters)
-    load = neck_load(
-        parameters,
-        float(disturbance[0]),
-        float(disturbance[1]),
-        float(disturbance[2]),
-        float(disturbance[3]),
-        float(disturbance[4]),
-    )
-    free = (float(x.free[0]), float(x.free[1]), float(x.free[2]))
+    load = neck_disturbed(parameters, disturbance)
+    free = tuple(float(x.free[j]) for j in range(MOTORS))
     passive = winch_constants(c)
     # As many Runge-Kutta steps as the neck needs within a tick.
     count = neck_substeps(c, load, h, 1)
@@ -78,12 +72,12 @@ def servo_ticks(
     moving = neck_read(x)
     for _ in range(ticks):
         position, speed = winch_motion(moving)
-        t1 = servo_tick(motion[0], ring[0], position[0], speed[0], c[5], per_ampere, h)
-        t2 = servo_tick(motion[1], ring[1], position[1], speed[1], c[5], per_ampere, h)
-        t3 = servo_tick(motion[2], ring[2], position[2], speed[2], c[5], per_ampere, h)
-        moving = winch_advance(moving, (t1, t2, t3), free, passive, load, h, count)
+        torques = tuple(
+            servo_tick(motion[j], ring[j], position[j], speed[j], c[5], per_ampere, h) for j in range(MOTORS)
+        )
+        moving = winch_advance(moving, torques, free, passive, load, h, count)
     neck_write(x, moving)
-    for i in range(3):
+    for i in range(MOTORS):
         servo_read(motion[i], x.position[i], x.speed[i])
 
 

@@ -142,7 +142,8 @@ def test_noise_of_the_lab_does_not_matter() -> None:
     ],
 )
 def test_the_nearest_of_six_ways(seen: complex, noise: float, verdict: str) -> None:
-    assert judge(complex(seen), noise, 0.05, PSI, 1)[0] == verdict
+    z = complex(seen)
+    assert judge((z.real, z.imag), noise, (0.05, 0.0), [(math.cos(a), math.sin(a)) for a in PSI], 1)[0] == verdict
 
 
 def test_an_operator_stops_it() -> None:

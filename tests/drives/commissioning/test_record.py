@@ -11,7 +11,7 @@ from softneck.core import CheckFailedError, SettingsError
 from softneck.drives import default_drives, neck_drives, preflight, record_signal, simulated_neck, zero
 from softneck.drives.bus._link import VirtualLink
 from softneck.drives.commissioning._record import ExperimentResult, drive_limits
-from softneck.drives.master import Master, Tilt
+from softneck.drives.master import Master
 from softneck.drives.running._bus_loop import Session
 from softneck.drives.running._timing import Ask
 from softneck.identification import Rls
@@ -201,11 +201,7 @@ def test_the_first_experiment_after_zeroing_ends_as_planned() -> None:
     """The tendons keep the tension of `zero`; the motors have what is left of their current."""
     link = VirtualLink(simulated_neck(FILE, NECK, sample_time=0.02, homed=False))
 
-    def look() -> Tilt:
-        sample = link.neck.newest
-        return Tilt(sample.pitch, sample.roll, valid=sample.valid)
-
-    zero(link, FILE, look, guarding=preflight(link, FILE).guarding)
+    zero(link, FILE, lambda: link.newest, guarding=preflight(link, FILE).guarding)
     recorded = record_signal([excitation("eq22", 40.0)], Session(file=FILE, link=link))
     recorded.require()
     assert recorded.rows == recorded.planned

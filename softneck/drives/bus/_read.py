@@ -1,0 +1,187 @@
+"""`drives.toml`, read strictly."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from softneck.core import DataError, FileFormatError, SettingsError
+from softneck.robot import Robot
+from softneck.signals.recording._channels import NECK
+
+from ..master._settings import LimitSettings, RampSettings, SensorSettings, WatchSettings
+from ._file import PROFILES, DriveEntry, DrivesFile, Guarding, Neck, ZeroSettings
+from ._robot import count_word, require_table, robot_of
+from ._sensor_source import SOURCE_KEYS, make_source
+from ._units import DriveScale
+
+
+def load_drives(path: str | Path, robot: str | Path | Robot | None = None) -> DrivesFile:
+    """Read a drives file.
+
+    Args:
+        path: of the file.
+        robot: what the drives move: a preset, a robot file or a robot; None: `robot.toml` beside the drives file or
+            above it, else the neck.
+
+    Raises:
+        FileFormatError: no such file or no TOML.
+        SettingsError: an unknown or missing key, a value that does not fit, or a robot with other motors, signs or
+            winches; the line names table and key.
+    """
+    source = Path(path)
+    try:
+        table = tomllib.loads(source.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise FileFormatError(f"{source}: cannot be read ({error.strerror}).") from error
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f"{source}: is not valid TOML ({error}).") from error
+    try:
+        return make_drives(table, source.parent, robot_of(robot, source))
+    except (SettingsError, DataError, FileFormatError) as error:
+        raise type(error)(f"{source}: {error}") from error
+
+
+# Table -> key in the file -> (field, factor to SI).
+_KEYS: dict[str, dict[str, tuple[str, float]]] = {
+    "guarding": {"kind": ("kind", 0.0), "time_s": ("time", 1.0)},
+    "zero": {
+        "current_A": ("current", 1.0), "speed_rad_s": ("speed", 1.0), "still_rad_s": ("still", 1.0),
+        "still_s": ("still_time", 1.0), "timeout_s": ("timeout", 1.0), "tilt_deg": ("tilt", math.radians(1.0)),
+    },
+    "neck": {
+        "winch_radius_m": ("winch_radius", 1.0), "torque_constant_Nm_A": ("torque_constant", 1.0),
+        "gear_efficiency": ("efficiency", 1.0),
+    },
+    "limits": {
+        "position_rad": ("position", 1.0), "speed_rad_s": ("speed", 1.0), "acceleration_rad_s2": ("acceleration", 1.0),
+        "persistent_s": ("persistent", 1.0), "tension_N": ("tension", 1.0), "slack_N": ("slack", 1.0),
+        "slack_unwind_rad": ("slack_unwind", 1.0),
+    },
+    "sensor": {
+        "dropout_s": ("dropout", 1.0), "frozen_samples": ("frozen_samples", 0.0), "bad_samples": ("bad_samples", 0.0),
+        "angle_deg": ("angle", math.radians(1.0)), "rate_deg_s": ("rate", math.radians(1.0)),
+        "margin_deg": ("margin", math.radians(1.0)), "on_loss": ("on_loss", 0.0), "hold_s": ("hold", 1.0),
+    },
+    "watch": {
+        "following_rad": ("following", 1.0), "tilt_deg": ("tilt", math.radians(1.0)), "gain": ("gain", 1.0),
+        "pole_per_s": ("pole", 1.0), "pushed_N": ("pushed", 1.0),
+    },
+    "ramp": {
+        "speed_rad_s": ("speed", 1.0), "settle_s": ("settle", 1.0), "tolerance_rad": ("tolerance", 1.0),
+        "enable_timeout_s": ("enable_timeout", 1.0), "timeout_s": ("timeout", 1.0),
+    },
+    "bus": {"period_s": ("cycle", 1.0), "bit_rate": ("bit_rate", 0.0)},
+    "quick": {
+        "quick_stop_rad_s2": ("quick_stop", 1.0), "following_rad": ("following", 1.0),
+        "following_s": ("following_time", 1.0),
+    },
+    "scale": {
+        "peak_current_A": ("peak_current", 1.0), "gear": ("gear", 1.0), "encoder_counts": ("counts_per_turn", 1.0),
+        "slow_loop_s": ("slow_loop", 1.0), "reversed": ("reversed", 0.0),
+    },
+    "drive": {
+        "node": ("node", 0.0), "current_limit_A": ("current_limit", 1.0), "vendor": ("vendor", 0.0),
+        "product": ("product", 0.0), "serial": ("serial", 0.0), "firmware": ("firmware", 0.0),
+    },
+}  # fmt: skip
+_TOP = ("profile", "eds", "bus", "guarding", "drive", "limits", "stop", "sensor", "watch", "zero", "ramp", "neck")
+_CLASSES = {
+    "guarding": Guarding, "zero": ZeroSettings, "neck": Neck, "limits": LimitSettings, "sensor": SensorSettings,
+    "watch": WatchSettings, "ramp": RampSettings,
+}  # fmt: skip
+_FIELDS = {"ramp": "ramps"}
+
+
+def make_drives(table: Mapping[str, Any], folder: Path = Path(), robot: Robot | None = None) -> DrivesFile:
+    """Return what a table with the keys of a drives file describes for `robot`; an EDS is looked for in `folder`."""
+    table = require_table(table, robot)
+    _refuse_unknown("the file", table, _TOP)
+    if "profile" not in table:
+        raise SettingsError(f"`profile` is missing; it is one of {', '.join(PROFILES)}.")
+    entries, motors = table.get("drive"), len((robot or NECK).motors.names)
+    if not isinstance(entries, list) or len(entries) != motors:
+        count = len(entries) if isinstance(entries, list) else 0
+        whose = "" if robot is None else f" for robot {robot.label()}"
+        what = "tables are needed" if motors > 1 else "table is needed"
+        raise SettingsError(
+            f"{count_word(motors)} [[drive]] {what}{whose}, motors 1 to {motors} in this order; there are {count}."
+        )
+    drives = tuple(_drive(number, entry) for number, entry in enumerate(entries, start=1))
+    values: dict[str, Any] = {"profile": table["profile"], "drives": drives, "robot": robot}
+    for name, setting in _CLASSES.items():
+        if name not in table:
+            continue
+        content = dict(_table(name, table[name]))
+        if name == "sensor":
+            values |= {f"sensor_{key}": content.pop(key) for key in ("kind", "node") if key in content}
+            kind, own = values.get("sensor_kind", "simulated"), [key for key in content if key in SOURCE_KEYS]
+            values["sensor_source"] = make_source(kind, {key: content.pop(key) for key in own}, folder)
+        values[_FIELDS.get(name, name)] = _made(f"[{name}]", setting, name, content)
+    values |= _values("[bus]", "bus", _table("bus", table.get("bus", {})))
+    values |= _values("[stop]", "quick", _table("stop", table.get("stop", {})))
+    if "eds" in table:
+        values["eds"] = folder / str(table["eds"])
+    return DrivesFile(**values)
+
+
+def _drive(number: int, entry: Any) -> DriveEntry:
+    where = f"[[drive]] {number}"
+    content = dict(_table(where, entry))
+    known = {**_KEYS["scale"], **_KEYS["drive"]}
+    _refuse_unknown(where, content, tuple(known))
+    for key in ("node", "peak_current_A"):
+        if key not in content:
+            raise SettingsError(f"{where}: `{key}` is missing.")
+    scale = {key: value for key, value in content.items() if key in _KEYS["scale"]}
+    rest = {key: value for key, value in content.items() if key in _KEYS["drive"]}
+    try:
+        made = _made(where, DriveScale, "scale", scale)
+        return DriveEntry(scale=made, **_values(where, "drive", rest))
+    except (SettingsError, DataError) as error:
+        text = str(error)
+        raise SettingsError(text if text.startswith(where) else f"{where}: {text}") from error
+
+
+def _made(where: str, setting: type, name: str, content: Mapping[str, Any]) -> Any:
+    try:
+        return setting(**_values(where, name, content))
+    except SettingsError as error:
+        raise SettingsError(f"{where}: {error}") from error
+
+
+def _values(where: str, name: str, content: Mapping[str, Any]) -> dict[str, Any]:
+    keys = _KEYS[name]
+    _refuse_unknown(where, content, tuple(keys))
+    return {keys[key][0]: _value(f"{where} {key}", value, keys[key][1]) for key, value in content.items()}
+
+
+_WHOLE = ("node", "vendor", "product", "serial", "bit_rate", "frozen_samples", "bad_samples")
+
+
+def _value(where: str, value: Any, factor: float) -> Any:
+    key = where.rpartition(" ")[2]
+    if factor == 0.0:
+        wanted: type = bool if key == "reversed" else int if key in _WHOLE else str
+        if not isinstance(value, wanted) or (wanted is int and isinstance(value, bool)):
+            words = {bool: "true or false", int: "a whole number", str: "a text"}
+            raise SettingsError(f"{where} must be {words[wanted]}; got {value!r}.")
+        return value
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise SettingsError(f"{where} must be a number; got {value!r}.")
+    return factor * value
+
+
+def _table(name: str, value: Any) -> Mapping[str, Any]:
+    if not isinstance(value, dict):
+        raise SettingsError(f"`{name}` must be a table.")
+    return value
+
+
+def _refuse_unknown(where: str, table: Mapping[str, Any], known: tuple[str, ...]) -> None:
+    unknown = [key for key in table if key not in known]
+    if unknown:
+        raise SettingsError(f"unknown key `{unknown[0]}` of {where}; it takes {', '.join(known)}.")

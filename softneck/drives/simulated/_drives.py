@@ -1,0 +1,174 @@
+"""Simulated drives, whatever they turn: nodes on the bus, rows of motion; and what a sensor does wrong."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from softneck.core import Matrix, SettingsError, require_between, require_one_of
+
+from ._axis import Axis
+from ._frame import CanFrame
+from ._node import SimulatedDrive
+from ._profiles import PROFILES
+from ._servo_runtime import (
+    SERVO_CURRENT_LIMIT,
+    SERVO_LAG,
+    SERVO_PLACE,
+    SERVO_POSITION,
+    SERVO_SCALE,
+    SERVO_SIZE,
+    SERVO_ZERO,
+)
+
+_TICK = 1e-3
+# What the ring must hold: the upper end of `drive_latency`, 0.1 s, in ticks.
+_RING = 128
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SimulatedSettings:
+    """How the simulated drives are set up; given by whoever configured the real ones.
+
+    Attributes:
+        nodes: node numbers, one for each motor.
+        profile: "ipos2015" or "ds402".
+        gear, counts_per_turn: of each drive.
+        reversed: whether the winch pulls when the counts fall, one each.
+        peak_current: [A], one each.
+        slow_loop: [s], one each.
+        sample_time: of the inclinometer [s].
+        cycle: time between SYNC messages [s].
+        hold: time over which master and drives spread one move of the set-point [s]; half of it counts as part of
+            the neck's drive latency.
+        homed: the drives were zeroed with the neck at rest before.
+        seed: of the inclinometer's noise.
+    """
+
+    nodes: tuple[int, ...] = (1, 2, 3)
+    profile: str = "ipos2015"
+    gear: tuple[float, ...] = (1539.0 / 65.0, 1539.0 / 65.0, 1539.0 / 65.0)
+    counts_per_turn: tuple[float, ...] = (2048.0, 2048.0, 2048.0)
+    reversed: tuple[bool, ...] = (False, False, False)
+    peak_current: tuple[float, ...] = (10.0, 10.0, 10.0)
+    slow_loop: tuple[float, ...] = (1e-3, 1e-3, 1e-3)
+    sample_time: float = 0.02
+    cycle: float = 0.01
+    hold: float = 0.02
+    homed: bool = True
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        require_one_of("profile", self.profile, tuple(PROFILES))
+        require_between("cycle", self.cycle, 0.001, 0.1, "s")
+        for name in ("gear", "counts_per_turn", "reversed", "peak_current", "slow_loop"):
+            if len(getattr(self, name)) != len(self.nodes):
+                raise SettingsError(f"`{name}` must have one value for each of the {len(self.nodes)} nodes.")
+
+
+class SimulatedDrives:
+    """All drives of a robot, stepped by whoever owns the time and what they turn.
+
+    Attributes:
+        nodes: on the bus.
+        motion: (motors, SERVO_SIZE), see the servo runtime; ring: (motors, n) past demands.
+        ticks: of the servo loops in one bus cycle; h: time of one [s].
+    """
+
+    def __init__(self, settings: SimulatedSettings, *, current_limit: float, latency: float) -> None:
+        """Make drives without power; if `homed`, they know their zero.
+
+        Args:
+            settings: of the drives.
+            current_limit: until somebody sets it [A].
+            latency: of the cyclic mode [s].
+        """
+        count = len(settings.nodes)
+        self.motion: Matrix = np.zeros((count, SERVO_SIZE))
+        self.ring: Matrix = np.zeros((count, _RING))
+        self.ticks = max(1, round(settings.cycle / _TICK))
+        self.h = settings.cycle / self.ticks
+        lag = latency - 0.5 * settings.hold
+        for row in range(count):
+            size = settings.gear[row] * settings.counts_per_turn[row] / (2.0 * math.pi)
+            self.motion[row, SERVO_SCALE] = -size if settings.reversed[row] else size
+            self.motion[row, SERVO_LAG] = max(0, round(lag / self.h))
+            self.motion[row, SERVO_PLACE] = 0
+        self.nodes = tuple(self._drive(settings, row, current_limit) for row in range(count))
+
+    def _drive(self, s: SimulatedSettings, row: int, current_limit: float) -> SimulatedDrive:
+        m = self.motion[row]
+        axis = Axis(
+            s.nodes[row], PROFILES[s.profile](), m, peak_current=s.peak_current[row], slow_loop=s.slow_loop[row]
+        )
+        axis.tick = self.h
+        m[SERVO_CURRENT_LIMIT] = current_limit
+        if s.homed:
+            # As `drives zero` leaves it: home offset 1 count, which no drive has after a reset.
+            axis.values[(0x607C, 0)] = 1
+            m[SERVO_ZERO], m[SERVO_POSITION] = 1.0, 1.0
+            axis.homed = True
+        return SimulatedDrive(axis)
+
+    def run(self, frames: Sequence[CanFrame], now: float) -> list[CanFrame]:
+        """Deliver `frames` at `now`, and return what the drives send in answer."""
+        for frame in frames:
+            for drive in self.nodes:
+                drive.receive(now, frame)
+        return [frame for drive in self.nodes for frame in drive.tick(now)]
+
+
+def sensed(
+    kind: str, values: tuple[float, ...], rates: tuple[float, ...], *, valid: bool
+) -> tuple[tuple[float, ...], tuple[float, ...], bool]:
+    """Return what a sensor says that "works", "drops", gives "nan" or "jumps" by 60 deg: values, rates, valid."""
+    nothing = (math.nan,) * len(values)
+    if kind == "nan":
+        return nothing, nothing, True
+    if kind == "drops" or not valid:
+        return nothing, nothing, False
+    jump = math.radians(60.0) if kind == "jumps" else 0.0
+    return (values[0] + jump, *values[1:]), rates, True
+
+
+class TiltSample(NamedTuple):
+    """One sample of the inclinometer, NaN and `valid` False where it dropped out."""
+
+    time: float
+    pitch: float
+    roll: float
+    pitch_rate: float
+    roll_rate: float
+    valid: bool
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """Both angles [rad]."""
+        return self.pitch, self.roll
+
+    @property
+    def rates(self) -> tuple[float, ...]:
+        """Both rates [rad/s]."""
+        return self.pitch_rate, self.roll_rate
+
+
+class OutputSample(NamedTuple):
+    """One sample of the sensor: values [rad] and rates [rad/s] of all outputs; NaN and not `valid` where it drops."""
+
+    time: float
+    values: tuple[float, ...]
+    rates: tuple[float, ...]
+    valid: bool
+
+
+def sample_at(
+    now: float, values: tuple[float, ...], rates: tuple[float, ...], *, valid: bool
+) -> TiltSample | OutputSample:
+    """Return the sample at `now` [s]; two outputs are the angles of a tilt."""
+    if len(values) == 2:
+        return TiltSample(now, *values, *rates, valid=valid)
+    return OutputSample(now, values, rates, valid)

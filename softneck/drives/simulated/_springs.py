@@ -1,0 +1,168 @@
+"""A stand-in for robots without a virtual plant: each motor against a spring, outputs by the robot's directions.
+
+It holds drives, master and sensor to each other in every fault, and says nothing of the robot's own dynamics.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import ModuleType
+
+import numpy as np
+
+from softneck.core import Matrix, SettingsError, Vector, require_positive
+from softneck.plant import NeckParameters
+from softneck.plant._index_runtime import (
+    NECK_CURRENT_LIMIT,
+    NECK_GEAR_EFFICIENCY,
+    NECK_GEAR_RATIO,
+    NECK_TORQUE_CONSTANT,
+)
+from softneck.plant._mechanics_runtime import neck_drive
+from softneck.runtime import load_functions
+
+from ._drives import OutputSample, SimulatedDrives, SimulatedSettings, TiltSample, sample_at, sensed
+from ._frame import CanFrame
+from ._servo_runtime import SERVO_POSITION, SERVO_SCALE, SERVO_STUCK, SERVO_ZERO
+from ._springs_runtime import SPRING_DRIVE, SPRING_PER_AMPERE, SPRING_REST, SPRING_SIZE, SPRING_STIFFNESS
+
+# From rest to the end of its range a tendon pulls by this part more than at rest, if its motor can.
+_MORE, _SPARE = 0.4, 0.8
+# How far winches are loose before `drives zero` [rad].
+_LOOSE = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpringSettings:
+    """What the motors turn, and what is measured of it.
+
+    Attributes:
+        outputs: names of what is measured.
+        weights: (outputs, motors), where the outputs end for each radian of the motors [rad/rad].
+        pole: of the lag on the way there [1/s].
+        reach: largest size of each motor's set-point [rad].
+        torque_constant, efficiency: of motors and gears [N m/A].
+        current_limit: of each motor [A].
+        winch_radius: [m].
+        pretension_current: which holds a tendon at P = 0 [A].
+        noise_std: of the sensor [rad]; a sensor without any noise would look frozen.
+
+    What is not given is the lab's: motors, gears, winches, and the neck's lag.
+    """
+
+    outputs: tuple[str, ...]
+    weights: Matrix
+    reach: tuple[float, ...]
+    current_limit: tuple[float, ...]
+    pole: float = 5.293
+    torque_constant: float = 0.0839
+    efficiency: float = 0.81
+    winch_radius: float = 0.0075
+    pretension_current: float = 0.0151
+    noise_std: float = 1e-5
+
+    def __post_init__(self) -> None:
+        if self.weights.shape != (len(self.outputs), len(self.reach)):
+            raise SettingsError(f"`weights` must be outputs x motors; got shape {self.weights.shape}.")
+        require_positive("noise_std", self.noise_std, "rad")
+
+
+class SimulatedSprings:
+    """Springs with their drives and sensor, stepped by whoever owns the time; in the place of a `SimulatedNeck`.
+
+    Attributes:
+        settings: of the drives.
+        drives: the nodes on the bus.
+        outputs: (2, outputs) values [rad] and rates [rad/s] as they are.
+        motion: of the drives, see the servo runtime.
+        sensor: "works", "drops", "freezes", "nan" or "jumps".
+    """
+
+    def __init__(self, springs: SpringSettings, settings: SimulatedSettings) -> None:
+        """Put all at rest; drives are without power, and tendons are loose where they were not homed."""
+        self.settings, self._springs = settings, springs
+        latency = NeckParameters.paper().drive_latency
+        self._on_bus = SimulatedDrives(settings, current_limit=springs.current_limit[0], latency=latency)
+        self.drives, self.motion = self._on_bus.nodes, self._on_bus.motion
+        count = len(settings.nodes)
+        self._winches: Matrix = np.zeros((4, count))
+        self._winches[3] = 1.0
+        if not settings.homed:
+            self._winches[0], self._winches[3] = -_LOOSE, 0.0
+            # Encoders begin at zero where they get their supply.
+            self.motion[:, SERVO_ZERO] = self.motion[:, SERVO_SCALE] * _LOOSE
+            self.motion[:, SERVO_POSITION] = 0.0
+        self._table = np.array([_spring(springs, settings.gear[row], row) for row in range(count)])
+        self.outputs: Matrix = np.zeros((2, len(springs.outputs)))
+        self._functions: ModuleType = load_functions("softneck.drives.simulated._springs_runtime")
+        self._share = 1.0 - math.exp(-springs.pole * self._on_bus.h)
+        self._noise = np.random.default_rng(settings.seed)
+        self.sensor = "works"
+        nothing = (0.0,) * len(springs.outputs)
+        self.newest = self._last = sample_at(0.0, nothing, nothing, valid=True)
+
+    def set(self, **disturbance: float) -> None:
+        """Take no disturbance: there is nothing here that a load could bend.
+
+        Raises:
+            SettingsError: one that is not zero.
+        """
+        for name, value in disturbance.items():
+            if value:
+                raise SettingsError(f"`{name}`: simulated drives that turn springs take no load; leave it out.")
+
+    def tear(self, tendon: int) -> None:
+        """Let tendon `tendon`, from 1, hang: nothing pulls at its winch any more."""
+        self._table[tendon - 1, SPRING_REST : SPRING_STIFFNESS + 1] = 0.0
+
+    def block(self, motor: int) -> None:
+        """Hold winch `motor`, from 1, where it is, whatever its motor does."""
+        self.motion[motor - 1, SERVO_STUCK] = 1.0
+
+    def run(self, frames: Sequence[CanFrame], now: float) -> list[CanFrame]:
+        """Deliver `frames` at `now`, and return what the drives send in answer."""
+        return self._on_bus.run(frames, now)
+
+    def move(self) -> None:
+        """Let one cycle of time pass."""
+        bus = self._on_bus
+        self._functions.springs_ticks(
+            self._table, self._springs.weights, self._share, self._winches, self.outputs, bus.motion, bus.ring,
+            bus.ticks, bus.h,
+        )  # fmt: skip
+
+    def sample(self, now: float) -> TiltSample | OutputSample:
+        """Take one sample of the sensor; to be called each `sample_time`."""
+        noise: Vector = self._noise.normal(0.0, self._springs.noise_std, len(self._springs.outputs))
+        if self.sensor == "freezes":
+            self.newest = self._last._replace(time=now)
+            return self.newest
+        values, rates = tuple((self.outputs[0] + noise).tolist()), tuple(self.outputs[1].tolist())
+        values, rates, valid = sensed(self.sensor, values, rates, valid=True)
+        self.newest = sample_at(now, values, rates, valid=valid)
+        if not math.isnan(self.newest.values[0]):
+            self._last = self.newest
+        return self.newest
+
+    def truth(self) -> Mapping[str, float]:
+        """Return outputs [rad] and tensions [N] by name."""
+        tensions = (self._winches[2] / self._springs.winch_radius).tolist()
+        values = dict(zip(self._springs.outputs, self.outputs[0].tolist(), strict=True))
+        return values | {f"tension_{j}": value for j, value in enumerate(tensions, start=1)}
+
+
+def _spring(springs: SpringSettings, gear: float, row: int) -> Vector:
+    """Return the row of the table for one motor: what is not given of it is as in the paper's."""
+    motor = NeckParameters.paper().vector()
+    motor[NECK_GEAR_RATIO], motor[NECK_CURRENT_LIMIT] = gear, springs.current_limit[row]
+    motor[NECK_TORQUE_CONSTANT], motor[NECK_GEAR_EFFICIENCY] = springs.torque_constant, springs.efficiency
+    values = np.zeros(SPRING_SIZE)
+    per_ampere = springs.torque_constant * gear * springs.efficiency
+    rest, most = per_ampere * springs.pretension_current, per_ampere * springs.current_limit[row]
+    more = min(_MORE * rest, _SPARE * max(0.0, most - rest))
+    values[SPRING_PER_AMPERE], values[SPRING_REST] = per_ampere, rest
+    values[SPRING_STIFFNESS] = more / springs.reach[row]
+    values[SPRING_DRIVE:] = neck_drive(motor)
+    return values
