@@ -83,16 +83,58 @@ def test_commands_that_take_necks_only_say_so_in_a_line(call: Call, log: Path) -
     assert call("identify", "rls", "rec.csv", "-o", "m.npz", "--set", "delay=0.0").code == 0
     for arguments in (
         ("identify", "nn", "rec.csv", "-o", "nn.npz"),
-        ("identify", "auto", "rec.csv", "-o", "auto.npz", "--html", "a.html"),
         ("identify", "rls", "rec.csv", "-o", "s.npz", "--search", "na=1,2", "--hold-out", "rec.csv"),
         ("family", "rec.csv", "-o", "f.npz"),
         ("design", "pi", "m.npz", "-o", "c.npz", "--any-fit"),
         ("observer", "m.npz", "-o", "o.npz"),
-        ("fmu", "m.npz", "-o", "M.fmu"),
-        ("info", "rec.csv", "--html", "q.html"),
-        ("validate", "m.npz", "--data", "rec.csv", "--html", "v.html"),
     ):
         said = call(*arguments)
         assert said.code == 2, (arguments, said)
         assert "necks only so far, not robot `plant`" in said.err, (arguments, said)
         assert not {"nn.npz", "auto.npz", "s.npz", "f.npz", "c.npz", "o.npz"} & {p.name for p in Path().glob("*.npz")}
+
+
+def test_fmus_and_pages_of_a_tank(call: Call, log: Path, tmp_path: Path) -> None:
+    assert call("import", log, "--robot-out", "robot.toml", "-o", "rec.csv").code == 0
+    assert call("identify", "rls", "rec.csv", "-o", "m.npz", "--set", "delay=0.0").code == 0
+    assert call("fmu", "m.npz", "-o", "M.fmu", "--data", "rec.csv").code == 0
+    assert call("info", "rec.csv", "--html", "q.html").code == 0
+    assert call("validate", "m.npz", "--data", "rec.csv", "--html", "v.html").code == 0
+    assert "motor_setpoint_2" in (tmp_path / "q.html").read_text(encoding="utf-8")
+    assert "errors in mm, level" in (tmp_path / "v.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_the_page_of_a_choice_for_a_tank(call: Call, log: Path, tmp_path: Path) -> None:
+    assert call("import", log, "--robot-out", "robot.toml", "-o", "rec.csv").code == 0
+    assert call("identify", "auto", "rec.csv", "-o", "auto.npz", "--html", "a.html").code == 0
+    assert "held out, level" in (tmp_path / "a.html").read_text(encoding="utf-8")
+
+
+def test_record_takes_a_robot_s_tendons_and_range(call: Call) -> None:
+    assert call("record", "multisine", "-o", "arm.csv", "--robot", "arm", "--neck", "lab", "--duration", "2").code == 0
+    rec = read_recording("arm.csv")
+    assert rec.robot.hash == Robot.preset("arm").hash
+    # Multisine is 3.2 of the neck's 6 rad, of the arm's 4.
+    assert 1.5 < np.abs(rec.set_points).max() < 3.2 * 4.0 / 6.0 + 1e-9
+
+
+def test_record_takes_the_robot_beside_the_recording_and_says_what_it_lacks(call: Call, tmp_path: Path) -> None:
+    assert call("robot", "new", "--preset", "arm").code == 0
+    said = call("record", "steps", "-o", "rec.csv")
+    assert (said.code, len(said.error.splitlines())) == (2, 1)
+    assert "robot `arm` gives no `plant.neck`, which the virtual plant needs; add it." in said.error
+    (tmp_path / "robot.toml").write_text('extends = "antagonist"\nname = "muscles"\n[motors]\nunit = "bar"\n')
+    said = call("record", "steps", "-o", "rec.csv")
+    assert said.code == 2
+    assert "the virtual plant has motors in rad or deg, and `motors.unit` of robot `muscles`" in said.error
+    assert not (tmp_path / "rec.csv").exists()
+
+
+def test_a_robot_is_an_fmu_by_its_preset_or_file(call: Call, tmp_path: Path) -> None:
+    assert call("fmu", "antagonist", "-o", "A.fmu").code == 0
+    assert call("robot", "new", "mine.toml", "--preset", "antagonist").code == 0
+    assert call("fmu", "mine.toml", "-o", "B.fmu").code == 0
+    said = call("fmu", "antagonist", "-o", "C.fmu", "--backend", "compiled")
+    assert (said.code, "use `--backend python`" in said.error) == (2, True)
+    assert not (tmp_path / "C.fmu").exists()
