@@ -1,4 +1,4 @@
-"""The neck's drives: CANopen master, safety, commissioning, runs, logs, and simulated drives.
+"""Drives of necks and other robots: CANopen master, safety, commissioning, runs, logs, and simulated drives.
 
 Hardware is touched in `bus` and `sensing` only.
 May import `verification`, `cosim` and below.

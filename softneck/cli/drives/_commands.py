@@ -230,8 +230,9 @@ def run_command(
     chosen = target_of(drives_file, bus, simulated, arm, neck=virtual, robot=robot)
     if not controller.is_file():
         raise SettingsError(f"{controller}: no such file.")
-    certified = require_certified(setup, controller, certificates, names, drives=drives_file)
-    deployed = prepare(setup, controller)
+    moved = chosen.file.moves
+    certified = require_certified(setup, controller, certificates, names, drives=drives_file, robot=moved)
+    deployed = prepare(setup, controller, moved)
     for text in deployed.notes:
         note(text)
     if certified is not None:

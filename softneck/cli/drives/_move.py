@@ -92,6 +92,8 @@ def jog_command(
     virtual = load_neck(neck) if neck else None
     chosen = target_of(drives_file, bus, simulated, arm, neck=virtual, robot=robot)
     _checked(chosen, pace)
+    if motor > len(chosen.file.nodes):
+        raise click.BadParameter(f"{motor} is not in the range 1<=x<={len(chosen.file.nodes)}.", param_hint="'N'")
     # A neck's tendons stand where its own file says.
     physics = physics_of(chosen.file.moves, virtual) if chosen.is_neck else None
     angles = physics and (physics.tendon_angle_1, physics.tendon_angle_2, physics.tendon_angle_3)

@@ -87,4 +87,4 @@ def _pilot(run: LoggedRun, loop_file: Path | None, controller: Path | None) -> P
             if given is not None:
                 raise SettingsError(f"{path}: no such file.")
             return None
-    return LoopPilot(prepare(load_loop(loop), chosen).loop, run.robot)
+    return LoopPilot(prepare(load_loop(loop), chosen, run.robot).loop, run.robot)

@@ -10,6 +10,8 @@ from softneck.core import CheckFailedError, check_certificate, read_certificate
 from softneck.core._certificate import Certificate, certificate_path
 from softneck.cosim.loops._loop_file import LoopSetup
 from softneck.loop import Loop, LoopResult, LoopRun
+from softneck.robot import Robot
+from softneck.signals.recording._channels import NECK
 from softneck.verification import read_requirements
 
 # What `softneck verify` must have shown before a controller gets to drives, each at least as strictly as its defaults
@@ -46,6 +48,7 @@ def require_certified(
     override: Collection[str] = (),
     *,
     drives: Path | None = None,
+    robot: Robot | None = None,
 ) -> tuple[Certificate, Certificate] | None:
     """Return the certificates of `verify` and of `simulate` that let a run begin; None where they are overridden.
 
@@ -55,10 +58,12 @@ def require_certified(
         certificates: that were given; one that is not is looked for beside the controller, or beside the loop file.
         override: "certificate" in it lets everything pass.
         drives: the drives file, where one is used.
+        robot: what the drives move; None: the neck.
 
     Raises:
         FileFormatError: no certificate, damaged or edited.
-        CheckFailedError: one is missing, does not hold, asks for too little, or a file is not covered by it.
+        CheckFailedError: one is missing, does not hold, asks for too little, is of another robot, or a file is not
+            covered by it.
     """
     if "certificate" in override:
         return None
@@ -71,6 +76,8 @@ def require_certified(
     verified = _covering("verify", certificates, controller, [controller])
     _require_minimum(verified)
     simulated = _covering("simulate", certificates, loop, files_that_act(setup, controller, drives))
+    for found in (verified, simulated):
+        _require_robot(found, robot or NECK)
     covered = float(simulated.contents.get("duration_s") or 0.0)
     # Half a sample: a duration is a whole number of them.
     if covered < setup.loop.duration - 0.5 * setup.loop.controller.sample_time:
@@ -99,6 +106,16 @@ def _covering(kind: str, given: Sequence[Path], item: Path, files: Sequence[Path
         except CheckFailedError as error:
             refused = refused or error
     raise CheckFailedError(str(refused))
+
+
+def _require_robot(found: Certificate, robot: Robot) -> None:
+    """Raise CheckFailedError unless a certificate is of `robot`: by the hash in it, or of a neck without one."""
+    said = str(found.contents.get("robot", NECK.hash))
+    if said != robot.hash:
+        raise CheckFailedError(
+            f"{found.path}: is of the robot with the hash {said[:8]}, the drives move {robot.label()}; certify the "
+            f"controller for that one, {_OVERRIDE}"
+        )
 
 
 def _require_minimum(found: Certificate) -> None:

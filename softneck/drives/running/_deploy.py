@@ -12,6 +12,9 @@ from softneck.cosim import FmuPart
 from softneck.cosim.loops._loop_file import LoopSetup
 from softneck.loop import BlockPart, Loop, Part
 from softneck.plant import NeckParameters
+from softneck.robot import Robot
+from softneck.signals.recording._channels import NECK
+from softneck.signals.recording._recording import require_same_robot
 
 from ..bus._file import DrivesFile
 from ..bus._link import CanLink, VirtualLink
@@ -41,11 +44,17 @@ class Deployment:
     notes: tuple[str, ...] = ()
 
 
-def prepare(setup: LoopSetup, controller: Path | None = None) -> Deployment:
+def prepare(setup: LoopSetup, controller: Path | None = None, robot: Robot | None = None) -> Deployment:
     """Return the loop of `setup` with the controller in file `controller`, an FMU or a softneck file.
+
+    Args:
+        setup: the loop, as its file describes it.
+        controller: that is to run; None: the loop's own.
+        robot: what the drives move; None: the neck.
 
     Raises:
         SettingsError: a controller that does not fit the loop.
+        DataError: one of another robot.
     """
     loop, notes = setup.loop, []
     if controller is not None:
@@ -53,7 +62,9 @@ def prepare(setup: LoopSetup, controller: Path | None = None) -> Deployment:
         if controller.suffix.lower() == ".fmu":
             part = FmuPart(controller, role="controller")
         else:
-            part = BlockPart(load(controller, role="controller").block())
+            found = load(controller, role="controller")
+            require_same_robot(getattr(found, "robot", NECK), robot or NECK, f"{controller} and drives")
+            part = BlockPart(found.block())
         loop = replace(loop, controller=part)
     if loop.faults:
         notes.append(f"the loop file's {len(loop.faults)} fault(s) are not applied to drives")

@@ -114,12 +114,13 @@ class SimulatedDrives:
             axis.homed = True
         return SimulatedDrive(axis)
 
-    def run(self, frames: Sequence[CanFrame], now: float) -> list[CanFrame]:
-        """Deliver `frames` at `now`, and return what the drives send in answer."""
-        for frame in frames:
-            for drive in self.nodes:
-                drive.receive(now, frame)
-        return [frame for drive in self.nodes for frame in drive.tick(now)]
+
+def exchange(drives: Sequence[SimulatedDrive], frames: Sequence[CanFrame], now: float) -> list[CanFrame]:
+    """Deliver `frames` at `now` [s] to all drives, and return what they send in answer."""
+    for frame in frames:
+        for drive in drives:
+            drive.receive(now, frame)
+    return [frame for drive in drives for frame in drive.tick(now)]
 
 
 def sensed(

@@ -15,7 +15,7 @@ from softneck.robot import Robot
 from softneck.runtime import load_functions
 from softneck.runtime._bundle import sized
 
-from ._drives import OutputSample, SimulatedDrives, SimulatedSettings, TiltSample, sample_at, sensed
+from ._drives import OutputSample, SimulatedDrives, SimulatedSettings, TiltSample, exchange, sample_at, sensed
 from ._frame import CanFrame
 from ._servo_runtime import SERVO_STUCK
 
@@ -77,7 +77,7 @@ class SimulatedNeck:
 
     def run(self, frames: Sequence[CanFrame], now: float) -> list[CanFrame]:
         """Deliver `frames` at `now`, and return what the drives send in answer."""
-        return self._on_bus.run(frames, now)
+        return exchange(self.drives, frames, now)
 
     def move(self) -> None:
         """Let one cycle of time pass for drives and neck."""
