@@ -127,6 +127,7 @@ def _setup(table: Mapping[str, Any], source: Path, opened: dict[Any, Any] | None
     if "drives" in table:
         opener.drives(table["drives"])
     robot = opener.robot(table.get("robot"), None if source.is_dir() else source)
+    parts["plant"] = opener.plant_of(robot, parts["plant"])
     reference = opener.reference(table["reference"], parts["controller"].sample_time, robot)
     if isinstance(reference, FmuPart | IsolatedPart):
         parts["reference"], described["reference"] = reference, table["reference"]

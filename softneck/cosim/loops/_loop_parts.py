@@ -48,6 +48,8 @@ class PartOpener:
         self.folder, self.files = folder, dict[str, tuple[str, str]]()
         # Part -> whose it is, where it says so.
         self.robots: dict[str, Robot] = {}
+        # Of the virtual neck, where the plant is one.
+        self._physics: NeckParameters | None = None
         self._step, self._opened = step, opened
 
     def robot(self, given: Any, beside: Path | None) -> Robot:
@@ -140,19 +142,28 @@ class PartOpener:
             raise SettingsError(f"[{name}] {key} must be a text; got {value!r}.")
         if key == "python":
             return self._from_python(name, value)
-        if key == "neck":
-            self.robots[name] = _NECK
         if key == "neck" and value in PRESETS:
-            return BlockPart(VirtualNeck(NeckParameters.preset(value)).block(sample_time=self._step))
+            return self._virtual(NeckParameters.preset(value))
         file = self._file(name, value)
         if key == "neck":
-            return BlockPart(VirtualNeck(NeckParameters.from_toml(file)).block(sample_time=self._step))
+            return self._virtual(NeckParameters.from_toml(file))
         settings = sorted((k, repr(v)) for k, v in table.items() if k != "parameters")
         if key == "fmu":
             return self._open((name, file, *settings), lambda: _fmu_part(file, f"[{name}]", table, as_role))
         thing = self._open((role, file), lambda: load(file, role=role))
         self._says(name, thing)
         return BlockPart(thing.block())
+
+    def _virtual(self, parameters: NeckParameters) -> Part:
+        """Return the virtual neck; `plant_of` makes another robot's of its physics."""
+        self._physics = parameters
+        return BlockPart(VirtualNeck(parameters).block(sample_time=self._step))
+
+    def plant_of(self, robot: Robot, made: Part) -> Part:
+        """Return the plant of a loop of `robot`: the one that was `made`, or its virtual plant of the same physics."""
+        if robot.is_neck or self._physics is None:
+            return made
+        return BlockPart(VirtualNeck.of(robot, self._physics).block(sample_time=self._step))
 
     def _says(self, name: str, thing: Any) -> None:
         """Remember whose a part is, if it says so."""
