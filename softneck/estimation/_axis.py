@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from softneck.core import DataError, Matrix, SettingsError, Vector
+from softneck.identification.models._directions import NECK_SECONDS
+from softneck.robot import Robot
 
 if TYPE_CHECKING:
     import control
@@ -18,10 +20,10 @@ AXES = ("pitch", "roll")
 
 
 class HasTransferFunctions(Protocol):
-    """Any linear model of the neck: an identified one, or a `LinearNeck`."""
+    """Any linear model: an identified one, a family, or a `LinearNeck`; it may say its `robot`."""
 
     def tf(self, output: str, /) -> Any:
-        """Return the discrete transfer function to "pitch" (from theta_i) or "roll" (from phi_i)."""
+        """Return the discrete transfer function to an output from its redefined input: to "pitch" from theta_i."""
         ...
 
 
@@ -53,12 +55,15 @@ class AxisPlant:
         denominator: (n + 1,) coefficients of A, the first is 1.
         delay: samples beyond the one that B/A has itself.
         sample_time: [s].
+        stretch: by how much it is slower than a neck, where it is another robot's: what is looked for in seconds
+            (frequencies, horizons) is stretched by it.
     """
 
     numerator: Vector
     denominator: Vector
     delay: int
     sample_time: float
+    stretch: float = 1.0
 
     @property
     def order(self) -> int:
@@ -100,12 +105,11 @@ class AxisPlant:
         a = float(slowest.real)
         rest = np.real(np.poly(np.delete(poles, int(np.argmax(np.abs(poles))))))
         numerator = self.numerator * (1.0 - moved) / (1.0 - a)
-        return AxisPlant(numerator, np.convolve(rest, [1.0, -moved]), self.delay, self.sample_time)
+        return replace(self, numerator=numerator, denominator=np.convolve(rest, [1.0, -moved]))
 
     def delayed(self, least: float) -> AxisPlant:
         """Return the same plant with a dead time of at least `least` [s], in whole samples."""
-        delay = max(self.delay, round(least / self.sample_time))
-        return AxisPlant(self.numerator, self.denominator, delay, self.sample_time)
+        return replace(self, delay=max(self.delay, round(least / self.sample_time)))
 
     def resampled(self, sample_time: float) -> AxisPlant:
         """Return the same plant, between whose samples the input is held, at a shorter `sample_time` [s].
@@ -141,7 +145,7 @@ class AxisPlant:
         # Markov parameters times the denominator give the numerator.
         markov = np.array([C @ np.linalg.matrix_power(Ad, i) @ Bd for i in range(n)])
         numerator = np.convolve(markov, denominator)[:n]
-        return AxisPlant(numerator, denominator, self.delay * ratio, sample_time)
+        return AxisPlant(numerator, denominator, self.delay * ratio, sample_time, self.stretch)
 
     def tf(self, *, extra_delay: int = 0) -> control.TransferFunction:
         """Return it as a `control.TransferFunction` with `extra_delay` samples more."""
@@ -152,7 +156,7 @@ class AxisPlant:
 
 
 def axis_plant(model: HasTransferFunctions, axis: str) -> AxisPlant:
-    """Return `axis` ("pitch" or "roll") of a linear model, its dead time split off.
+    """Return `axis` ("pitch", "roll" or another robot's output) of a linear model, its dead time split off.
 
     Raises:
         SettingsError: the model is not linear, not discrete, or not stable.
@@ -176,7 +180,21 @@ def axis_plant(model: HasTransferFunctions, axis: str) -> AxisPlant:
     delay = min(poles_at_zero, denominator.size - numerator.size - 1)
     A = denominator[: denominator.size - delay]
     B = np.concatenate([np.zeros(A.size - 1 - numerator.size), numerator])
-    return AxisPlant(B / A[0], A / A[0], delay, float(dt))
+    return AxisPlant(B / A[0], A / A[0], delay, float(dt), _stretch(model, A, float(dt)))
+
+
+def robot_of(source: Any) -> Robot:
+    """Return whose plant a linear model is; one that does not say is a neck's."""
+    return getattr(source, "robot", Robot.preset())
+
+
+def _stretch(model: HasTransferFunctions, denominator: Vector, sample_time: float) -> float:
+    """Return by how much a robot is slower than a neck, by its slowest pole."""
+    if robot_of(model).is_neck:
+        return 1.0
+    radius = float(np.abs(np.roots(denominator)).max(initial=0.0))
+    slowest = -sample_time / math.log(radius) if radius > 0.0 else 0.0
+    return max(slowest, sample_time) / NECK_SECONDS
 
 
 def _check(axis: str, numerator: Vector, denominator: Vector) -> None:

@@ -19,7 +19,7 @@ from softneck.core import (
 )
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
-from ._axis import AXES, AxisPlant, HasTransferFunctions, axis_plant
+from ._axis import AXES, AxisPlant, HasTransferFunctions, axis_plant, robot_of
 from ._forms import FORMS, NOISES, RATE_STD, FilterMatrices, gyro_form, kinematic_form, model_form, steady_gains
 from ._kalman import KalmanObserver
 
@@ -174,6 +174,7 @@ class KalmanSettings:
             SettingsError: a model that is not linear, discrete and stable, axes of different sample times, or times
                 that do not divide.
         """
+        robot_of(model).require_neck("an observer")
         plants = [axis_plant(model, axis) for axis in AXES]
         times = [plant.sample_time for plant in plants]
         if not math.isclose(*times, rel_tol=1e-9):

@@ -10,13 +10,15 @@ from statistics import NormalDist
 import numpy as np
 
 from softneck.core import DataError, SettingsError, Vector, to_si
+from softneck.robot import Robot
 from softneck.runtime import Port
 
 from ._faults import AXES, Fault, MotorFault, NeckFault, SensorFault, with_kind
 from ._faults_runtime import FAULT_ADD, FAULT_DELAY, FAULT_DROPOUT, FAULT_FREEZE, FAULT_SLOW
 from ._part import Part
-from ._wiring import BusSignal, Tap, Wiring
+from ._wiring import BusSignal, Tap, Wiring, measured_names
 
+_NECK = Robot.preset("neck")
 # What each kind does but those that add something.
 _WHAT = {
     "dropout": FAULT_DROPOUT, "freeze": FAULT_FREEZE, "stuck": FAULT_FREEZE, "delay": FAULT_DELAY, "slow": FAULT_SLOW,
@@ -133,34 +135,39 @@ class FaultStages:
 
 
 def place_faults(
-    faults: Sequence[Fault], wiring: Wiring, parts: Mapping[str, Part], *, step: float, rows: int
+    faults: Sequence[Fault],
+    wiring: Wiring,
+    parts: Mapping[str, Part],
+    *,
+    step: float,
+    rows: int,
+    robot: Robot = _NECK,
 ) -> tuple[Wiring, FaultStages]:
     """Put `faults` between the parts for `rows` rows of `step` [s] and return the wiring with their detours.
 
     Raises:
         SettingsError: the plant lacks what a fault acts on, or a delay is not a multiple of the step.
     """
-    detours = _FaultRouting(wiring)
+    detours = _FaultRouting(wiring, measured_names(robot))
     sensors, plant = [], []
     for fault in faults:
         if isinstance(fault, SensorFault):
-            names = sensor_outputs(fault, parts["plant"])
+            names = sensor_outputs(fault, parts["plant"], robot)
             slots = [detours.of_output(name) for name in names]
             flags = [detours.of_output("measurement_valid")] if _drops(fault, parts["plant"]) else []
             sensors.append(ActiveFault(fault, slots, flags, _scales(parts["plant"].outputs, names, fault), step))
         else:
-            names = _plant_inputs(fault, parts["plant"])
+            names = _plant_inputs(fault, parts["plant"], robot)
             slots = [detours.of_input(name) for name in names]
             plant.append(ActiveFault(fault, slots, [], _scales(parts["plant"].inputs, names, fault), step))
     return detours.wiring(), FaultStages(detours.places(), sensors, plant, rows)
 
 
-def sensor_outputs(fault: SensorFault, plant: Part) -> tuple[str, ...]:
+def sensor_outputs(fault: SensorFault, plant: Part, robot: Robot = _NECK) -> tuple[str, ...]:
     """Return the plant's outputs that a sensor fault acts on."""
     known = {port.name for port in plant.outputs}
-    names = fault.signals or tuple(
-        f"{axis}_measured" if f"{axis}_measured" in known else axis for axis in AXES[fault.axis]
-    )
+    axes = robot.outputs.names if fault.axis == "both" else AXES[fault.axis]
+    names = fault.signals or tuple(f"{axis}_measured" if f"{axis}_measured" in known else axis for axis in axes)
     for name in names:
         if name not in known:
             raise SettingsError(f"the {with_kind(fault)} acts on `{name}`, which is not an output of the plant.")
@@ -171,9 +178,13 @@ def _drops(fault: SensorFault, plant: Part) -> bool:
     return fault.kind == "dropout" and any(port.name == "measurement_valid" for port in plant.outputs)
 
 
-def _plant_inputs(fault: MotorFault | NeckFault, plant: Part) -> tuple[str, ...]:
+def _plant_inputs(fault: MotorFault | NeckFault, plant: Part, robot: Robot) -> tuple[str, ...]:
     if isinstance(fault, MotorFault):
-        return tuple(f"motor_setpoint_{j}" for j in ((fault.motor,) if fault.motor else (1, 2, 3)))
+        if fault.motor > len(robot.set_points):
+            raise SettingsError(
+                f"the {with_kind(fault)} is of motor {fault.motor}; `{robot.name}` has {len(robot.set_points)}."
+            )
+        return (robot.set_points[fault.motor - 1],) if fault.motor else robot.set_points
     known = [port.name for port in plant.inputs]
     for name in fault.values:
         if name not in known:
@@ -207,8 +218,8 @@ def _lag(fault: Fault, step: float) -> int:
 class _FaultRouting:
     """New places on the bus for signals that faults change, and readers sent there."""
 
-    def __init__(self, wiring: Wiring) -> None:
-        self._wiring = wiring
+    def __init__(self, wiring: Wiring, measured: tuple[str, ...]) -> None:
+        self._wiring, self._measured = wiring, measured
         self._start = wiring.start.tolist()
         self._named = list(wiring.named)
         self._taps = dict(wiring.taps)
@@ -219,7 +230,7 @@ class _FaultRouting:
         """Return the place where all readers but the plant itself now find the plant's output `name`."""
         if name not in self._outputs:
             old, port = next((n.slot, n.port) for n in self._named if n.part == "plant" and n.port.name == name)
-            new = self._add(old, "sensor", replace(port, name=_measured(name)))
+            new = self._add(old, "sensor", replace(port, name=f"{name}_measured" if name in self._measured else name))
             for part, tap in self._taps.items():
                 if part != "plant":
                     self._taps[part] = _redirected(tap, old, new, fragile=not port.boolean)
@@ -252,11 +263,6 @@ class _FaultRouting:
     def places(self) -> list[list[int]]:
         """Return from where to where the plant's outputs are copied, and what it reads."""
         return [[pair[i] for pair in table.values()] for table in (self._outputs, self._inputs) for i in (0, 1)]
-
-
-def _measured(name: str) -> str:
-    """Return how a result names what the sensor says: a plant's `pitch` becomes `pitch_measured`."""
-    return f"{name}_measured" if name in ("pitch", "roll", "pitch_rate", "roll_rate") else name
 
 
 def _redirected(tap: Tap, old: int, new: int, *, fragile: bool) -> Tap:

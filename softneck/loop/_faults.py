@@ -19,9 +19,11 @@ from softneck.core import (
     require_whole,
     to_si,
 )
+from softneck.robot import Robot
 
 SENSOR_FAULTS = ("dropout", "freeze", "bias", "outlier", "delay", "noise")
 MOTOR_FAULTS = ("stuck", "slow", "offset")
+_NECK = Robot.preset("neck")
 AXES = {"pitch": ("pitch",), "roll": ("roll",), "both": ("pitch", "roll")}
 
 
@@ -34,7 +36,7 @@ class SensorFault:
             (plus `size`), "outlier" (plus or minus `size` in a `share` of the samples), "delay" (older by
             `delay`), "noise" (plus white noise of standard deviation `std`).
         start: [s]; duration: [s], infinity for the rest of the run.
-        axis: "pitch", "roll" or "both".
+        axis: "pitch", "roll" or "both"; "both" are all outputs of another robot, whose single ones are `signals`.
         signals: other outputs of the plant instead, such as ("pitch_rate_measured",).
         size, std: [rad], or the SI unit of `signals`.
         share: of the samples, 0 to 1.
@@ -79,6 +81,7 @@ class MotorFault:
         motor: 1, 2 or 3; 0 for all.
         rate: [rad/s].
         size: [rad].
+        robot: whose motor it is; of another than the neck rate and size are in the SI unit of its motors.
     """
 
     kind: str
@@ -87,12 +90,15 @@ class MotorFault:
     motor: int = 1
     rate: float = 0.0
     size: float = 0.0
+    robot: Robot = _NECK
 
     def __post_init__(self) -> None:
         require_one_of("kind", self.kind, MOTOR_FAULTS)
         _check_window(self.start, self.duration)
-        require_whole("motor", self.motor, 0, 3)
-        require_between("size", self.size, -6.0, 6.0, "rad")
+        require_whole("motor", self.motor, 0, len(self.robot.motors.names))
+        if self.robot.is_neck:
+            require_between("size", self.size, -6.0, 6.0, "rad")
+        require_finite("size", self.size)
         if self.kind == "slow":
             require_positive("rate", self.rate, "rad/s")
         if self.kind == "offset" and self.size == 0.0:
@@ -144,7 +150,7 @@ FAULT_KINDS = tuple(_FILE)
 _UNITS = {"hz": None, "n": "N", "rad_s": "rad/s", "deg_s": "deg/s"}
 
 
-def make_fault(kind: str, values: Mapping[str, object]) -> Fault:
+def make_fault(kind: str, values: Mapping[str, object], robot: Robot = _NECK) -> Fault:
     """Return a fault from the keys of a loop file, which end in their unit: `start_s`, `size_deg`, `payload_kg`.
 
     Raises:
@@ -163,6 +169,8 @@ def make_fault(kind: str, values: Mapping[str, object]) -> Fault:
     try:
         if made is NeckFault:
             return NeckFault(values={what + name: value for name, value in chosen.items()}, **window)  # pyright: ignore[reportArgumentType]
+        if made is MotorFault:
+            chosen["robot"] = robot
         return made(kind=what, **chosen, **window)
     except SettingsError as error:
         raise SettingsError(f"{kind}: {error}") from error

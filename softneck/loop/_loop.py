@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from softneck.core import SettingsError, require_one_of, require_positive
+from softneck.robot import Robot
 
 from ._faults import Fault
 from ._part import Part
@@ -34,6 +35,8 @@ class Loop:
         others: further parts by name, such as a filter; and `other_parameters` their parameters.
         other_inputs: part -> constants for inputs of the observer, the controller or one of the others.
         connections: "part.input" -> "part.output" where names alone do not say it.
+        robot: whose loop it is; of another than the neck the reference returns a value for each output instead of
+            pitch and roll.
     """
 
     plant: Part
@@ -51,6 +54,7 @@ class Loop:
     other_parameters: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     other_inputs: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     connections: Mapping[str, str] = field(default_factory=dict)
+    robot: Robot = field(default_factory=Robot.preset)
 
     def __post_init__(self) -> None:
         require_positive("duration", self.duration, "s")

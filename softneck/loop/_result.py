@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from softneck.core import DataError, SettingsError, Vector, require_one_of
+from softneck.core import DataError, SettingsError, Vector, require_one_of, to_si
+from softneck.robot import Robot
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,12 +25,14 @@ class LoopResult:
             `roll_estimate` the observer's.
         units: name -> unit.
         sample_time: [s].
+        robot: whose loop it was.
     """
 
     time: Vector
     signals: Mapping[str, Vector]
     units: Mapping[str, str]
     sample_time: float
+    robot: Robot = field(default_factory=Robot.preset)
 
     def __getitem__(self, name: str) -> Vector:
         """Return one signal (N,); raise DataError with the known names if there is none."""
@@ -39,10 +42,10 @@ class LoopResult:
             raise DataError(f"the result has no signal `{name}`; it has {', '.join(self.signals)}.") from None
 
     def angle(self, axis: str, which: str = "true") -> Vector:
-        """Return an angle (N,) of `axis` ("pitch" or "roll"); the other one where the plant does not offer `which`.
+        """Return an output (N,), of a neck "pitch" or "roll"; the other one where the plant does not offer `which`.
 
         Args:
-            axis: "pitch" or "roll".
+            axis: name of the output.
             which: "true" or "measured".
         """
         names = (axis, f"{axis}_measured") if which == "true" else (f"{axis}_measured", axis)
@@ -83,6 +86,9 @@ def metrics(result: LoopResult, *, angle: str = "true") -> Metrics:
     P1^2 + P2^2 + P3^2 [rad^2 s], `total_variation_rad` = sum of all moves, `limit_violation_s` = time with a
     set-point beyond 6 rad [s]; `slack_s` = time with a tendon without tension [s], None where no tension is known.
 
+    Another robot has a table for each of its outputs. What is in deg and rad above is in the display unit of its
+    outputs and the unit of its motors, which end the names (`rms_error_mm`, `max_bar`); angles stay in deg.
+
     Args:
         result: of a run.
         angle: "true" (where the plant offers it, else measured) or "measured"; missing samples are left out.
@@ -91,21 +97,38 @@ def metrics(result: LoopResult, *, angle: str = "true") -> Metrics:
         SettingsError: another `angle`.
     """
     require_one_of("angle", angle, ("true", "measured"))
-    P = np.column_stack([result[f"motor_setpoint_{j}"] for j in (1, 2, 3)])
+    robot = result.robot
+    unit = robot.motors.unit
+    P = np.column_stack([result[name] for name in robot.set_points]) / to_si(unit)[0]
     moves = np.abs(np.diff(P, axis=0))
-    beyond = np.any(np.abs(P) > MAX_POSITION * (1.0 + 1e-9), axis=1)
     return {
-        "pitch": _axis(result, "pitch", angle),
-        "roll": _axis(result, "roll", angle),
+        **{name: _axis(result, name, angle) for name in robot.outputs.names},
         "motors": {
-            "max_rad": float(np.abs(P).max()),
-            "max_rate_rad_s": float(moves.max(initial=0.0)) / result.sample_time,
+            f"max_{_word(unit)}": float(np.abs(P).max()),
+            f"max_rate_{_word(unit)}_s": float(moves.max(initial=0.0)) / result.sample_time,
             "effort": float(np.sum(P**2) * result.sample_time),
-            "total_variation_rad": float(moves.sum()),
-            "limit_violation_s": float(beyond.sum() * result.sample_time),
+            f"total_variation_{_word(unit)}": float(moves.sum()),
+            "limit_violation_s": float(_beyond(P, robot).sum() * result.sample_time),
             "slack_s": _slack(result),
         },
     }
+
+
+def _beyond(P: np.ndarray, robot: Robot) -> np.ndarray:
+    """Return (time,) where a set-point (time, motors) is beyond what its motor may do."""
+    if robot.is_neck:
+        return np.any(np.abs(P) > MAX_POSITION * (1.0 + 1e-9), axis=1)
+    low, high = robot.motors.setpoint_min, robot.motors.setpoint_max
+    beyond = np.zeros(P.shape, dtype=bool)
+    if low is not None and high is not None:
+        rounding = 1e-9 * np.abs([low, high]).max()
+        beyond = (np.array(low) - rounding > P) | (np.array(high) + rounding < P)
+    return beyond.any(axis=1)
+
+
+def _word(unit: str) -> str:
+    """Return a unit as the end of a name."""
+    return unit.replace("/", "_")
 
 
 def check_limits(values: Mapping[str, Any], limits: Mapping[str, float]) -> list[dict[str, Any]]:
@@ -133,23 +156,26 @@ def check_limits(values: Mapping[str, Any], limits: Mapping[str, float]) -> list
 def _axis(result: LoopResult, axis: str, angle: str) -> dict[str, float | None]:
     r, y = result[f"{axis}_reference"], result.angle(axis, angle)
     step = _find_step(r)
+    if step is not None and step[0] == 0 and not result.robot.is_neck:
+        step = (0, float(_held(y)[0]), step[2])  # where it stood, which need not be zero
     first = 0 if step is None else step[0]
     error = r - y
     known = np.isfinite(error)
     tail = error[first + math.floor((1.0 - _STEADY_PART) * (r.size - first)) :]
     shape: dict[str, float | None] = {"rise_s": None, "settling_s": None, "overshoot_pct": None}
-    if step is not None and known[step[0] :].any():
+    if step is not None and known[step[0] :].any() and step[2] != step[1]:
         k, low, high = step
         response = (y[k:] - low) / (high - low)
         shape = _step_shape(_held(response), result.sample_time)
     size, since = np.abs(error[known]), result.time[known] - result.time[first]
+    unit, factor = _shown_unit(result.robot)
     return {
         **shape,
-        "rms_error_deg": _rms_deg(error),
+        f"rms_error_{unit}": _rms(error, factor),
         "iae": float(np.sum(size) * result.sample_time),
         "ise": float(np.sum(size**2) * result.sample_time),
         "itae": float(np.sum(size * np.maximum(since, 0.0)) * result.sample_time),
-        "steady_rms_deg": _rms_deg(tail),
+        f"steady_rms_{unit}": _rms(tail, factor),
     }
 
 
@@ -160,7 +186,8 @@ def _held(y: Vector) -> Vector:
 
 
 def _slack(result: LoopResult) -> float | None:
-    names = [f"tension_{j}" for j in (1, 2, 3) if f"tension_{j}" in result.signals]
+    motors = range(1, len(result.robot.motors.names) + 1)
+    names = [f"tension_{j}" for j in motors if f"tension_{j}" in result.signals]
     if not names:
         return None
     slack = np.any([result[name] <= _SLACK for name in names], axis=0)
@@ -193,6 +220,15 @@ def _step_shape(y: Vector, sample_time: float) -> dict[str, float | None]:
     }
 
 
-def _rms_deg(error: Vector) -> float | None:
+def _shown_unit(robot: Robot) -> tuple[str, float | None]:
+    """Return the unit of errors as the end of a name, and its factor to SI; of angles deg, and None."""
+    factor, si = to_si(robot.outputs.display_unit)
+    return ("deg", None) if si == "rad" else (_word(robot.outputs.display_unit), factor)
+
+
+def _rms(error: Vector, factor: float | None) -> float | None:
     known = error[np.isfinite(error)]
-    return math.degrees(math.sqrt(float(np.mean(known**2)))) if known.size else None
+    if not known.size:
+        return None
+    rms = math.sqrt(float(np.mean(known**2)))
+    return math.degrees(rms) if factor is None else rms / factor

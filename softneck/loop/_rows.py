@@ -19,7 +19,7 @@ from softneck.runtime._compile import load_linked
 from ._disturbed_bus import FaultStages
 from ._part import BlockPart, Part
 from ._rows_runtime import ROWS_DISTURB, ROWS_RECORD, ROWS_REFER, ROWS_SHOW, ROWS_STEP, run_rows
-from ._wiring import REFERENCE_PORTS, Tap, Wiring
+from ._wiring import Tap, Wiring
 
 # What to do, the part or place that it is about, every how many rows.
 Action = tuple[int, int, int]
@@ -161,7 +161,7 @@ class Rows:
         self._signals = (self.bus, self.held, tuple(shown), self._following)
         taps = [wiring.taps[name] for name in self.names]
         missing = [[port.missing for port in part.outputs] if checked else [] for part in self._parts]
-        table = np.zeros((0, len(REFERENCE_PORTS))) if reference is None else reference
+        table = np.zeros((0, shown[-1].size)) if reference is None else reference
         self._plan = (
             self._cycle,
             step,

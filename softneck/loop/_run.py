@@ -18,7 +18,7 @@ from ._part import Part
 from ._result import LoopResult
 from ._rows import Rows, can_compile, cycle, late
 from ._state import LoopState, SaveablePart
-from ._wiring import REFERENCE_PORTS, BusSignal, Wiring, wire
+from ._wiring import BusSignal, Wiring, reference_ports, wire
 
 # Ratio of two sample times that should be whole; 1e-6 allows 0.02 / 0.01 in binary and nothing else.
 _RATIO_TOLERANCE = 1e-6
@@ -100,12 +100,14 @@ class LoopRun:
         """
         self.loop, self._parts = loop, loop.parts
         self.step, ratios = _schedule(self._parts)
-        wiring = wire(self._parts, loop.constants, loop.connections)
+        wiring = wire(self._parts, loop.constants, loop.connections, loop.robot)
         self._cycle = cycle(
             self._parts, wiring.taps, ratios, order=loop.order, disturbed=bool(loop.faults)
         )  # fmt: skip
         self.row, self.rows = 0, max(1, round(loop.duration / self.step))
-        self._wiring, self._faults = place_faults(loop.faults, wiring, self._parts, step=self.step, rows=self.rows)
+        self._wiring, self._faults = place_faults(
+            loop.faults, wiring, self._parts, step=self.step, rows=self.rows, robot=loop.robot
+        )  # fmt: skip
         self._columns = _columns(self._wiring)
         self._table = np.empty((self.rows, self._wiring.start.size))
         self._reference = _reference_table(loop, self.step, self.rows)
@@ -180,7 +182,7 @@ class LoopRun:
         by_slot = {item.slot: item for item in self._wiring.named}
         for name, slot in self._columns.items():
             signals[name], units[name] = _in_si(self._table[: self.row, slot], by_slot[slot].port)
-        return LoopResult(np.arange(self.row) * self.step, signals, units, self.step)
+        return LoopResult(np.arange(self.row) * self.step, signals, units, self.step, self.loop.robot)
 
     def state(self) -> LoopState:
         """Return all that the run remembers.
@@ -249,17 +251,17 @@ def _schedule(parts: Mapping[str, Part]) -> tuple[float, dict[str, int]]:
 
 
 def _reference_table(loop: Loop, step: float, rows: int) -> Matrix | None:
-    """Return (rows, 4) all samples of a reference that is a function; None for one that is a part."""
+    """Return (rows, outputs + 2) all samples of a reference that is a function; None for one that is a part."""
     if hasattr(loop.reference, "advance"):
         return None
-    function: Callable[[float], tuple[float, float, float]] = loop.reference  # pyright: ignore[reportAssignmentType]
-    table = np.ones((rows, len(REFERENCE_PORTS)))
+    function: Callable[[float], tuple[float, ...]] = loop.reference  # pyright: ignore[reportAssignmentType]
+    table = np.ones((rows, len(reference_ports(loop.robot))))
     for k in range(rows):
-        table[k, :3] = function(k * step)
+        table[k, :-1] = function(k * step)
     bad = np.flatnonzero(~np.isfinite(table).all(axis=1))
     if bad.size:
         k = int(bad[0])
-        raise DataError(f"the reference is {table[k, :3].tolist()} at t = {k * step:g} s; it must be finite.")
+        raise DataError(f"the reference is {table[k, :-1].tolist()} at t = {k * step:g} s; it must be finite.")
     return table
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softneck.core import DataError, SettingsError, Vector, to_si
+from softneck.robot import Robot
 from softneck.runtime import Port
 
 from ._part import Part
@@ -24,18 +25,36 @@ REFERENCE_PORTS = (
     Port(name="enabled", description="whether the controller may move the motors", start=1.0, boolean=True),
 )
 
-# Where an input comes from, best source first; a name without an entry connects to an equal name.
-_SOURCES: dict[str, tuple[tuple[str, str], ...]] = {
-    "pitch_measured": (("plant", "pitch_measured"), ("plant", "pitch")),
-    "roll_measured": (("plant", "roll_measured"), ("plant", "roll")),
-    "pitch_rate_measured": (("plant", "pitch_rate_measured"), ("plant", "pitch_rate")),
-    "roll_rate_measured": (("plant", "roll_rate_measured"), ("plant", "roll_rate")),
-    "healthy": (("observer", "healthy"), ("plant", "measurement_valid")),
-}
-_MEASURED = ("pitch", "roll", "pitch_rate", "roll_rate")
+_HEALTHY = (("observer", "healthy"), ("plant", "measurement_valid"))
+_NECK = Robot.preset("neck")
 _USUAL = ("plant", "observer", "controller", "reference")
 # What holds where nobody says otherwise: measurements are valid, controllers enabled.
 _DEFAULTS = {"healthy": 1.0, "measurement_valid": 1.0, "enabled": 1.0}
+
+
+def reference_ports(robot: Robot = _NECK) -> tuple[Port, ...]:
+    """Return the outputs of a reference of `robot`."""
+    if robot.is_neck:
+        return REFERENCE_PORTS
+    unit, motor = to_si(robot.outputs.unit)[1], to_si(robot.motors.unit)[1]
+    return (
+        *(Port(name=f"{name}_reference", unit=unit, description=f"wanted {name}") for name in robot.outputs.names),
+        Port(name="cocontraction_reference", unit=motor, description="wanted mean of the motors"),
+        REFERENCE_PORTS[-1],
+    )
+
+
+def measured_names(robot: Robot) -> tuple[str, ...]:
+    """Return the names of outputs and their rates, which a sensor may tell."""
+    return (*robot.outputs.names, *(f"{name}_rate" for name in robot.outputs.names))
+
+
+def _sources(wanted: str, robot: Robot) -> tuple[tuple[str, str], ...]:
+    """Return where an input comes from, best source first; nothing for a name that connects to an equal name."""
+    if wanted == "healthy":
+        return _HEALTHY
+    bare = wanted.removesuffix("_measured")
+    return (("plant", wanted), ("plant", bare)) if wanted != bare and bare in measured_names(robot) else ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +132,7 @@ def wire(
     parts: Mapping[str, Part],
     constants: Mapping[str, Mapping[str, float]],
     connections: Mapping[str, str] | None = None,
+    robot: Robot = _NECK,
 ) -> Wiring:
     """Connect the parts "plant", "controller" and others by name.
 
@@ -120,14 +140,15 @@ def wire(
         parts: name in the loop -> part.
         constants: part -> values of inputs that nobody else writes, such as `payload` of the plant.
         connections: "part.input" -> "part.output" for what names alone do not say.
+        robot: whose loop it is.
 
     Raises:
         SettingsError: an input without a source, two writers, units that do not fit, an unknown name.
     """
-    _check_plant(parts["plant"], constants.get("plant", {}))
+    _check_plant(parts["plant"], constants.get("plant", {}), robot)
     ports = [(name, port) for name, part in parts.items() for port in part.outputs]
     if "reference" not in parts:
-        ports += [("reference", port) for port in REFERENCE_PORTS]
+        ports += [("reference", port) for port in reference_ports(robot)]
     slots = {(name, port.name): i for i, (name, port) in enumerate(ports)}
     links = _links(connections or {}, parts, slots, constants)
     extra: list[float] = []
@@ -135,7 +156,7 @@ def wire(
     taps = {}
     for name, part in parts.items():
         _check_constants(name, part, constants.get(name, {}))
-        finder = _Finder(name, parts, slots, constants.get(name, {}), links)
+        finder = _Finder(name, parts, slots, constants.get(name, {}), links, robot)
         places = []
         for value in map(finder.source, part.inputs):
             if isinstance(value, tuple):
@@ -146,7 +167,7 @@ def wire(
         taps[name] = _tap(name, part, places, ports)
     start = np.array([port.start for _, port in ports] + extra)
     named = tuple(BusSignal(i, part, port) for i, (part, port) in enumerate(ports))
-    return Wiring(start, named, _spans(parts), taps)
+    return Wiring(start, named, _spans(parts, len(reference_ports(robot))), taps)
 
 
 def _links(
@@ -184,11 +205,11 @@ def _offers(part: str, parts: Mapping[str, Part], what: str) -> str:
     return f"the {part} has {', '.join(port.name for port in getattr(parts[part], what)) or 'none'}."
 
 
-def _check_plant(plant: Part, constants: Mapping[str, float]) -> None:
+def _check_plant(plant: Part, constants: Mapping[str, float], robot: Robot) -> None:
     names = [port.name for port in plant.inputs]
-    for j in (1, 2, 3):
-        if f"motor_setpoint_{j}" not in names:
-            raise SettingsError(f"the plant has no input `motor_setpoint_{j}`; its inputs are {', '.join(names)}.")
+    for name in robot.set_points:
+        if name not in names:
+            raise SettingsError(f"the plant has no input `{name}`; its inputs are {', '.join(names)}.")
     for name in constants:
         if name.startswith("motor_setpoint_"):
             raise SettingsError(f"the plant's input `{name}` has two writers: the controller and a constant.")
@@ -210,6 +231,7 @@ class _Finder:
     slots: Mapping[tuple[str, str], int]
     constants: Mapping[str, float]
     links: Mapping[tuple[str, str], tuple[str, str]]
+    robot: Robot
 
     def source(self, port: Port) -> tuple[str, str] | float:
         """Return (part, output) that feeds `port`, or the constant that it gets."""
@@ -219,7 +241,7 @@ class _Finder:
             return float(self.constants[port.name])
         if self.name == "plant" and not port.name.startswith("motor_setpoint_"):
             return math.nan if port.missing else port.start
-        for candidate in _candidates(self.name, port.name, self.parts):
+        for candidate in _candidates(self.name, port.name, self.parts, self.robot):
             if candidate in self.slots:
                 return candidate
         others = [part for part in self._further() if (part, port.name) in self.slots]
@@ -232,7 +254,8 @@ class _Finder:
             return others[0], port.name
         if port.name in _DEFAULTS:
             return _DEFAULTS[port.name]
-        tried = " or ".join(f"`{out}` of the {part}" for part, out in _candidates(self.name, port.name, self.parts))
+        candidates = _candidates(self.name, port.name, self.parts, self.robot)
+        tried = " or ".join(f"`{out}` of the {part}" for part, out in candidates)
         raise SettingsError(f"nothing feeds input `{port.name}` of the {self.name}; it would take {tried}.")
 
     def _further(self) -> list[str]:
@@ -242,14 +265,14 @@ class _Finder:
         return [part for part in self.parts if part != self.name and part not in usual]
 
 
-def _candidates(name: str, wanted: str, parts: Mapping[str, Part]) -> Iterator[tuple[str, str]]:
-    if wanted in _SOURCES:
-        yield from _SOURCES[wanted]
+def _candidates(name: str, wanted: str, parts: Mapping[str, Part], robot: Robot) -> Iterator[tuple[str, str]]:
+    if sources := _sources(wanted, robot):
+        yield from sources
     elif wanted.startswith("motor_setpoint_"):
         yield ("controller", wanted)
-    elif name == "controller" and wanted in _MEASURED:
+    elif name == "controller" and wanted in measured_names(robot):
         # With an observer its estimate or nothing: a silent fall-back would hide a wrong observer.
-        yield from [("observer", wanted)] if "observer" in parts else _SOURCES[f"{wanted}_measured"]
+        yield from [("observer", wanted)] if "observer" in parts else _sources(f"{wanted}_measured", robot)
     else:
         yield from ((part, wanted) for part in ("reference", "plant", "observer") if part != name)
 
@@ -286,10 +309,10 @@ def _factor(origin: str, source: Port, target: str, port: Port) -> float:
     return a / b
 
 
-def _spans(parts: Mapping[str, Part]) -> dict[str, slice]:
+def _spans(parts: Mapping[str, Part], references: int) -> dict[str, slice]:
     spans, first = {}, 0
     for name, part in parts.items():
         spans[name] = slice(first, first + len(part.outputs))
         first += len(part.outputs)
-    spans.setdefault("reference", slice(first, first + len(REFERENCE_PORTS)))
+    spans.setdefault("reference", slice(first, first + references))
     return spans

@@ -13,6 +13,7 @@ import numpy as np
 
 from softneck.core import DataError, Progress, SettingsError, silent
 from softneck.core._certificate import certificate_contents
+from softneck.estimation._axis import robot_of
 
 from ._agreement import Agreement, agreements
 from ._evidence import Evidence, gather, worst_row
@@ -225,6 +226,8 @@ def verify(
     """
     begin = time.perf_counter()
     asked = read_requirements() if requirements is None else requirements
+    for thing in (controller, *_named(plants).values(), *(() if observer is None else (observer,))):
+        robot_of(thing).require_neck("verification")
     necks = sources_of(_named(plants), asked)
     eyes = None if observer is None else observer.block()
     judged = judge(controller, order=order, observer=observer is not None)

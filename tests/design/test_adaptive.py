@@ -138,7 +138,10 @@ def linear(settings: AdaptiveSettings) -> LinearController:
     axis = following_axis(Gains(K, Ti), AxisPlant(np.array([B]), np.array([1.0, -POLE]), 4, TS), 4, settings.leak_time)
     time = settings.reference_time
     arrays = assemble(
-        (axis, axis), reference_times=(time, time, time), sample_time=TS, tendon_angles=settings.tendon_angles
+        (axis, axis),
+        reference_times=(time, time, time),
+        constants=np.array([TS]),
+        redefinition=settings.neck_redefinition(),
     )
     return LinearController(
         kind="pi", sample_time=TS, order="sequential", design={}, arrays=arrays, limits=settings.limits()

@@ -8,12 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
+from scipy.linalg import null_space
 from scipy.optimize import linprog
 
 from softneck.core import SettingsError, load, read_archive, write_archive
 from softneck.design import LinearController, PiSettings
+from softneck.robot._redefined import redefinition_of
 from softneck.runtime import load_functions
 from softneck.signals import redefinition_matrix
 
@@ -32,8 +34,16 @@ ROUNDING = 1e-12
 
 
 def tendons(T: np.ndarray, wanted: np.ndarray, position: float, least: float) -> np.ndarray:
-    target = np.empty(3)
-    RUNTIME.allocate_tendons(np.ascontiguousarray(np.linalg.inv(T)), wanted, position, least, target)
+    bounds = (np.full(3, -position), np.full(3, position))
+    return allocated(np.ascontiguousarray(np.linalg.inv(T)), wanted, bounds, least, taut=least > -position)
+
+
+def allocated(
+    inverse: np.ndarray, wanted: np.ndarray, bounds: tuple[np.ndarray, np.ndarray], least: float, *, taut: bool
+) -> np.ndarray:
+    target = np.empty(len(inverse))
+    limits = np.concatenate([[100.0, 100.0, least], *bounds])
+    RUNTIME.allocate_tendons(inverse, wanted, limits, taut, target)
     return target
 
 
@@ -132,6 +142,76 @@ def test_tendons_have_no_number(tilt: tuple[float, float], common: float, positi
     first = tendons(T, np.array([*tilt, common]), position, part * position)
     turned = tendons(T, np.array([*(turn @ np.array(tilt)), common]), position, part * position)
     np.testing.assert_allclose(np.roll(first, 1), turned, atol=1e-11)
+
+
+@st.composite
+def any_robot(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray]:
+    """Weights of 1 to 4 outputs over 1 to 8 motors, tendons around an axis among them, and what is wanted."""
+    outputs = draw(st.integers(1, 4))
+    motors = draw(st.integers(outputs, 8))
+    rng = np.random.default_rng(draw(st.integers(0, 10_000)))
+    angles = rng.uniform(0.0, 2.0 * math.pi, motors)
+    tendons_only = outputs <= 2 and draw(st.booleans())
+    W = np.array([np.cos(angles), np.sin(angles)])[:outputs] if tendons_only else rng.normal(size=(outputs, motors))
+    assume(np.linalg.svd(W, compute_uv=False)[-1] > 0.1)
+    return W, rng.normal(size=outputs + 1) * draw(st.floats(0.1, 5.0))
+
+
+@given(robot=any_robot())
+def test_the_inverse_of_any_robot_gives_the_least_motors_and_a_shared_cocontraction(
+    robot: tuple[np.ndarray, np.ndarray],
+) -> None:
+    W, wanted = robot
+    outputs, motors = W.shape
+    T, inverse = redefinition_of(W, tuple("abcd"[:outputs]))
+    tilt, common = inverse[:, :-1], inverse[:, -1]
+    # Rounding by the condition of W, at most some 1e2 here.
+    np.testing.assert_allclose(W @ tilt, np.eye(outputs), atol=1e-11)
+    np.testing.assert_allclose(T[:-1] @ common, 0.0, atol=1e-9)
+    # No null space of W in it: no motors that give the same are smaller.
+    np.testing.assert_allclose(null_space(W).T @ tilt, 0.0, atol=1e-11)
+    if motors > outputs:
+        assert common.mean() == pytest.approx(1.0)
+        assert T[-1] @ inverse @ wanted == pytest.approx(wanted[-1], abs=1e-8)
+        # The nearest of the null space to (1, .., 1): what is left of it stands on the null space.
+        nearest = common / (common @ common) * common.sum()
+        np.testing.assert_allclose(null_space(W).T @ (np.ones(motors) - nearest), 0.0, atol=1e-8)
+    else:
+        assert not common.any()
+
+
+@given(robot=any_robot(), seed=st.integers(0, 1000), unipolar=st.booleans())
+def test_any_robot_gives_away_no_more_tilt_than_a_linear_program(
+    robot: tuple[np.ndarray, np.ndarray], seed: int, unipolar: bool
+) -> None:
+    W, wanted = robot
+    motors, rng = W.shape[1], np.random.default_rng(seed)
+    inverse = redefinition_of(W, tuple("abcd"[: len(W)]))[1]
+    # Co-contraction a thousand times the mean in one motor is one that the program cannot tell from none.
+    assume(np.abs(inverse[:, -1]).max() < 1e3 and np.all((inverse[:, -1] == 0.0) | (np.abs(inverse[:, -1]) > 1e-3)))
+    low = np.zeros(motors) if unipolar else -rng.uniform(0.5, 6.0, motors)
+    high = rng.uniform(1.0, 6.0, motors)
+    got = allocated(inverse, wanted, (low, high), -10.0, taut=True)
+    assert np.all(got >= low - ROUNDING)
+    assert np.all(got <= high + ROUNDING)
+    asked = wanted[:-1]
+    p, c = inverse[:, :-1] @ asked, inverse[:, -1]
+    kept = float(W @ got @ asked / (asked @ asked))
+    # The direction of tilt stays; 1e-9: conditions of W up to 1e2, motors up to 1e2.
+    np.testing.assert_allclose(W @ got, kept * asked, atol=1e-9)
+    # Co-contraction comes before tilt, within what all motors can at rest, and rises for the tilt's sake alone.
+    at_rest = linprog(
+        [0.0], A_ub=np.concatenate([c, -c])[:, None], b_ub=np.concatenate([high, -low]), bounds=[(None, None)]
+    )
+    assert at_rest.success
+    rows, limits = np.block([[p[:, None], c[:, None]], [-p[:, None], -c[:, None]]]), np.concatenate([high, -low])
+    ends = [
+        linprog([s], A_ub=np.concatenate([c, -c])[:, None], b_ub=limits, bounds=[(-1e4, 1e4)]).x[0] for s in (1.0, -1.0)
+    ]
+    least = min(max(wanted[-1], ends[0]), ends[1])
+    best = linprog([-1.0, 0.0], A_ub=rows, b_ub=limits, bounds=[(0.0, 1.0), (least, None)]).x[0]
+    # The program is solved to 1e-9; small shares of co-contraction widen that.
+    assert kept == pytest.approx(best, abs=1e-5)
 
 
 def pi(*, least_position: float = -6.0, least_cocontraction: float = -6.0) -> LinearController:

@@ -59,8 +59,8 @@ def test_equal_operating_points_make_the_linear_controller() -> None:
     linear = LinearController(
         kind="pi", sample_time=TS, order="sequential", design={}, limits=ScheduledSettings().limits(),
         arrays=assemble(
-            (axes[0], axes[1]), reference_times=(0.06, 0.06, 0.06), sample_time=TS,
-            tendon_angles=ScheduledSettings().tendon_angles,
+            (axes[0], axes[1]), reference_times=(0.06, 0.06, 0.06), constants=np.array([TS]),
+            redefinition=ScheduledSettings().neck_redefinition(),
         ),
     )  # fmt: skip
     U = inputs(300)

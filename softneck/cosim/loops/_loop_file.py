@@ -11,6 +11,7 @@ from softneck.core import FileFormatError, SettingsError, SoftneckError, file_ha
 from softneck.loop import Fault, Loop, Part, ReferenceBlock
 from softneck.loop._faults import make_fault
 from softneck.loop._reference_parts import AheadReference
+from softneck.robot import Robot, find_robot
 
 from ..parts._fmu_part import FmuPart
 from ..parts._isolated import IsolatedPart
@@ -40,7 +41,7 @@ class LoopSetup:
 
 _TOP = (
     "duration_s", "sample_time_s", "order", "plant", "observer", "controller", "reference", "part", "connections",
-    "fault", "limits", "angle", "folder", "drives",
+    "fault", "limits", "angle", "folder", "drives", "robot",
 )  # fmt: skip
 _SAME_SAMPLE_TIME = 1e-6
 
@@ -83,6 +84,7 @@ def reference_of(path: str | Path) -> ReferenceBlock:
     source = Path(path)
     table = read_toml(source)
     try:
+        find_robot(beside=source).require_neck("the FMU of a reference")
         reference = PartOpener(source.parent).reference(table["reference"])
         if isinstance(reference, AheadReference):
             reference = reference.reference
@@ -124,7 +126,9 @@ def _setup(table: Mapping[str, Any], source: Path, opened: dict[Any, Any] | None
     described |= others
     if "drives" in table:
         opener.drives(table["drives"])
-    reference = opener.reference(table["reference"], parts["controller"].sample_time)
+    robot = opener.robot(table.get("robot"), None if source.is_dir() else source)
+    parts["plant"] = opener.plant_of(robot, parts["plant"])
+    reference = opener.reference(table["reference"], parts["controller"].sample_time, robot)
     if isinstance(reference, FmuPart | IsolatedPart):
         parts["reference"], described["reference"] = reference, table["reference"]
     inputs, parameters = _constants(parts, described)
@@ -142,7 +146,8 @@ def _setup(table: Mapping[str, Any], source: Path, opened: dict[Any, Any] | None
         other_parameters=parameters,
         other_inputs=inputs,
         others={name: parts[name] for name in others},
-        faults=_faults(table.get("fault", [])),
+        faults=_faults(table.get("fault", []), robot),
+        robot=robot,
         connections=texts("[connections]", table.get("connections", {})),
     )
     _check_sample_time(loop, table.get("sample_time_s"))
@@ -197,12 +202,12 @@ def _named_parts(listed: Any) -> dict[str, Mapping[str, Any]]:
     return named
 
 
-def _faults(listed: Any) -> tuple[Fault, ...]:
+def _faults(listed: Any, robot: Robot) -> tuple[Fault, ...]:
     faults = []
     for place, table in enumerate(tables("fault", listed), start=1):
         values = {key: value for key, value in table.items() if key != "kind"}
         try:
-            faults.append(make_fault(str(table.get("kind", "")), values))
+            faults.append(make_fault(str(table.get("kind", "")), values, robot))
         except SettingsError as error:
             raise SettingsError(f"[[fault]] {place}: {error}") from error
     return tuple(faults)

@@ -13,10 +13,13 @@ from softneck.core import DataError, FileFormatError, SettingsError, file_hash, 
 from softneck.loop import BlockPart, Part, RecordingReference, Reference
 from softneck.loop._reference_parts import AheadReference
 from softneck.loop._references import make_reference
+from softneck.loop._robot_references import recorded_reference, robot_reference
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.plant._presets import PRESETS
+from softneck.robot import Robot, find_robot
 from softneck.runtime import Block
 from softneck.signals import read_recording
+from softneck.signals.recording._recording import require_same_robot
 
 from ..parts._fmu_part import FmuPart
 from ..parts._isolated import IsolatedPart
@@ -33,6 +36,7 @@ _OTHER_SOURCES = ("fmu", "file", "python")
 OBJECT = "object"
 # What may stand beside `fmu`: how an FMU that nobody here wrote becomes a part, and where it runs.
 _FMU_KEYS = ("names", "units", "sample_time_s", "isolated", "timeout_s")
+_NECK = Robot.preset("neck")
 _REFERENCES = ("step", "ramp", "sine", "rotation", "recording")
 
 
@@ -42,7 +46,32 @@ class PartOpener:
     def __init__(self, folder: Path, *, step: float = 0.02, opened: dict[Any, Any] | None = None) -> None:
         """Open relative to `folder`; necks step every `step` [s], `opened` remembers parts for the next loop."""
         self.folder, self.files = folder, dict[str, tuple[str, str]]()
+        # Part -> whose it is, where it says so.
+        self.robots: dict[str, Robot] = {}
+        # Of the virtual neck, where the plant is one.
+        self._physics: NeckParameters | None = None
         self._step, self._opened = step, opened
+
+    def robot(self, given: Any, beside: Path | None) -> Robot:
+        """Return whose loop it is: as its parts say, else the one that is `given`, else the one beside the file.
+
+        Raises:
+            SettingsError: two of them are of two robots; the line names both.
+        """
+        if given is not None and not isinstance(given, str | Robot):
+            raise SettingsError(f"`robot` must be a preset or a robot file; got {given!r}.")
+        if given is not None:
+            file = self.folder / given if isinstance(given, str) else None
+            self.robots = {"robot": find_robot(file if file is not None and file.is_file() else given), **self.robots}
+        if not self.robots:
+            return find_robot(beside=beside)
+        first, robot = next(iter(self.robots.items()))
+        for name, other in self.robots.items():
+            if other.hash != robot.hash:
+                raise SettingsError(
+                    f"[{name}] is of robot {other.label()} and [{first}] of robot {robot.label()}; a loop is of one."
+                )
+        return robot
 
     def part(self, name: str, table: Any) -> Part:
         """Return plant, observer or controller."""
@@ -54,9 +83,10 @@ class PartOpener:
         rest = {key: value for key, value in table.items() if key not in ("name", "role")}
         return self._made(name, rest, _OTHER_SOURCES, None, as_role=str(table.get("role", "controller")))
 
-    def reference(self, table: Any, sample_time: float = 0.02) -> Reference | Part:
+    def reference(self, table: Any, sample_time: float = 0.02, robot: Robot = _NECK) -> Reference | Part:
         """Return what the table [reference] describes; with `ahead_s` a part that tells it so long before."""
         if isinstance(table, dict) and "ahead_s" in table:
+            robot.require_neck("[reference] ahead_s")
             rest = {key: value for key, value in table.items() if key != "ahead_s"}
             made = self.reference(rest)
             if hasattr(made, "advance"):
@@ -72,13 +102,16 @@ class PartOpener:
             raise SettingsError(f"[reference] kind must be one of {', '.join(_REFERENCES)}.")
         values = {key: value for key, value in table.items() if key != "kind"}
         if table["kind"] != "recording":
-            return make_reference(table["kind"], values)
+            return make_reference(table["kind"], values) if robot.is_neck else robot_reference(
+                table["kind"], values, robot)  # fmt: skip
         refuse_unknown("[reference]", values, ("file",))
         recording = read_recording(self._file("reference", str(values.get("file", ""))))
-        recording.robot.require_neck("[reference] file: a loop")
+        require_same_robot(recording.robot, robot, "[reference] file and the loop")
         if len(recording.runs()) > 1:
             raise DataError("[reference] file: the recording has several runs; cut out the one to follow.")
         channels = recording.channels
+        if not robot.is_neck:
+            return recorded_reference(recording.time - recording.time[0], channels, robot)
         pitch, roll = (channels.get(f"{axis}_reference", channels[axis]) for axis in ("pitch", "roll"))
         time = recording.time - recording.time[0]
         return RecordingReference(
@@ -103,23 +136,39 @@ class PartOpener:
             )
         key, value = given[0], table[given[0]]
         if key == OBJECT:
+            self._says(name, value)
             return _part_of(name, value)
         if not isinstance(value, str):
             raise SettingsError(f"[{name}] {key} must be a text; got {value!r}.")
         if key == "python":
             return self._from_python(name, value)
         if key == "neck" and value in PRESETS:
-            return BlockPart(VirtualNeck(NeckParameters.preset(value)).block(sample_time=self._step))
+            return self._virtual(NeckParameters.preset(value))
         file = self._file(name, value)
         if key == "neck":
-            return BlockPart(VirtualNeck(NeckParameters.from_toml(file)).block(sample_time=self._step))
+            return self._virtual(NeckParameters.from_toml(file))
         settings = sorted((k, repr(v)) for k, v in table.items() if k != "parameters")
         if key == "fmu":
             return self._open((name, file, *settings), lambda: _fmu_part(file, f"[{name}]", table, as_role))
         thing = self._open((role, file), lambda: load(file, role=role))
-        if (robot := getattr(thing, "robot", None)) is not None:
-            robot.require_neck(f"[{name}] a loop")
+        self._says(name, thing)
         return BlockPart(thing.block())
+
+    def _virtual(self, parameters: NeckParameters) -> Part:
+        """Return the virtual neck; `plant_of` makes another robot's of its physics."""
+        self._physics = parameters
+        return BlockPart(VirtualNeck(parameters).block(sample_time=self._step))
+
+    def plant_of(self, robot: Robot, made: Part) -> Part:
+        """Return the plant of a loop of `robot`: the one that was `made`, or its virtual plant of the same physics."""
+        if robot.is_neck or self._physics is None:
+            return made
+        return BlockPart(VirtualNeck.of(robot, self._physics).block(sample_time=self._step))
+
+    def _says(self, name: str, thing: Any) -> None:
+        """Remember whose a part is, if it says so."""
+        if isinstance(robot := getattr(thing, "robot", None), Robot):
+            self.robots[name] = robot
 
     def _open(self, key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
         """Return what `make` opens, remembered if this reader shares what it opens; a changed file is opened again."""

@@ -10,12 +10,15 @@ from softneck.core import SettingsError
 from softneck.loop import BlockPart, Loop, Part
 from softneck.loop._faults import fault_field, fault_keys
 from softneck.loop._references import reference_field, reference_keys
+from softneck.loop._robot_references import reference_key
+from softneck.robot import Robot
 
 from ..parts._fmu_part import FmuPart
 from ..parts._isolated import IsolatedPart
 from ._loop_file import LoopSetup, normal_table
 from ._loop_parts import OBJECT
 
+_NECK = Robot.preset("neck")
 _PARTS = ("plant", "observer", "controller")
 _SOURCES = ("fmu", "model", "file", "neck", "python", OBJECT)
 _PLAIN = ("duration_s", "order", "angle", "sample_time_s")
@@ -34,6 +37,8 @@ def loop_table(loop: Loop | LoopSetup) -> dict[str, Any]:
             table.setdefault("part", []).append({"name": name, "role": part.role, **described})
         else:
             table[name] = described
+    if not plain.robot.is_neck:
+        table["robot"] = plain.robot
     if "reference" not in table:
         table["reference"] = reference_keys(plain.reference) or {OBJECT: plain.reference}  # pyright: ignore[reportArgumentType]
     if plain.faults:
@@ -53,13 +58,14 @@ def with_values(table: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str
     return made
 
 
-def check_key(table: Mapping[str, Any], key: str, names: Mapping[str, set[str] | None]) -> None:
+def check_key(table: Mapping[str, Any], key: str, names: Mapping[str, set[str] | None], robot: Robot = _NECK) -> None:
     """Raise SettingsError unless `key` leads to something in the loop.
 
     Args:
         table: of the loop.
         key: dotted, such as "plant.parameters.payload", "reference.pitch_deg", "fault.0.start_s".
         names: part -> parameters and inputs that may be set; None where the part does not say.
+        robot: whose loop it is.
     """
     head, _, rest = key.partition(".")
     if not rest:
@@ -76,12 +82,22 @@ def check_key(table: Mapping[str, Any], key: str, names: Mapping[str, set[str] |
         reference = table.get("reference", {})
         if OBJECT not in reference and "fmu" not in reference:
             kind = str(reference.get("kind"))
-            known = reference_field(kind, rest) or ("file" if rest == "file" and kind == "recording" else None)
+            known = _field(kind, rest, robot) or ("file" if rest == "file" and kind == "recording" else None)
             _check_field(key, rest, known, f"a {kind} reference")
             return
     elif head not in table:
         raise SettingsError(f"the loop has no {head}, so no key `{key}`.")
     _check_part_key(key, head, rest, names)
+
+
+def _field(kind: str, key: str, robot: Robot) -> str | None:
+    """Return what a key sets in a reference of `kind`, if there is something."""
+    if robot.is_neck:
+        return reference_field(kind, key)
+    try:
+        return reference_key(kind, key, robot)[0]
+    except (KeyError, SettingsError):
+        return None
 
 
 def set_sources(key: str) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 from softneck.core import DataError, SettingsError, Vector, to_si
 from softneck.core._certificate import certificate_contents
 from softneck.loop import LoopResult, check_limits, metrics
+from softneck.robot import Robot
 from softneck.signals import Recording
 from softneck.signals.recording._channels import file_unit, known_channels
 
@@ -46,6 +47,11 @@ class Result:
         return self.signals[name]
 
     @property
+    def robot(self) -> Robot:
+        """Whose loop it was."""
+        return self.signals.robot
+
+    @property
     def metrics(self) -> dict[str, dict[str, float | None]]:
         """Rise, settling, overshoot and errors of each axis, and what the motors did."""
         return metrics(self.signals, angle=self.angle)
@@ -72,17 +78,17 @@ class Result:
 
         columns = {"time [s]": self.signals.time}
         for name, values in self.signals.signals.items():
-            unit, factor = _shown(name, self.signals.units[name])
+            unit, factor = _shown(name, self.signals.units[name], self.robot)
             columns[f"{name} [{unit}]"] = values * factor
         return pd.DataFrame(columns)
 
     def recording(self) -> Recording:
         """Return the run as a recording: its channels of those names, with pitch and roll true where offered."""
-        known = set(known_channels())
+        known = set(known_channels(self.robot))
         channels = {name: values for name, values in self.signals.signals.items() if name in known}
-        for axis in ("pitch", "roll"):
+        for axis in self.robot.outputs.names:
             channels.setdefault(axis, self.signals.angle(axis))
-        return Recording(self.signals.time, self.signals.sample_time, channels)
+        return Recording(self.signals.time, self.signals.sample_time, channels, robot=self.robot)
 
     def report(self) -> dict[str, Any]:
         """Return the JSON of `softneck simulate`."""
@@ -91,12 +97,12 @@ class Result:
     def trace(self) -> dict[str, list[Any]]:
         """Return some rows of the run, by which it is known again: their numbers, set-points and angles.
 
-        The keys are "row", "motor_setpoint_1" to 3, "pitch", "roll"; the values have shape (rows,), in rad;
-        an angle that was not measured there is None.
+        The keys are "row", "motor_setpoint_1" to 3 and "pitch", "roll", or another robot's set-points and outputs; the
+        values have shape (rows,), in SI; an angle that was not measured there is None.
         """
         rows = np.unique(np.linspace(0, len(self.signals.time) - 1, _TRACE_ROWS).astype(int))
-        kept = {f"motor_setpoint_{j}": self.signals[f"motor_setpoint_{j}"] for j in (1, 2, 3)}
-        kept |= {axis: self.signals.angle(axis) for axis in ("pitch", "roll")}
+        kept = {name: self.signals[name] for name in self.robot.set_points}
+        kept |= {axis: self.signals.angle(axis) for axis in self.robot.outputs.names}
         cells = {name: [x if np.isfinite(x) else None for x in values[rows].tolist()] for name, values in kept.items()}
         return {"row": rows.tolist(), **cells}
 
@@ -116,15 +122,16 @@ class Result:
             "angle": self.angle,
             "sample_time_s": self.signals.sample_time,
             "duration_s": len(self.signals.time) * self.signals.sample_time,
+            **({} if self.robot.is_neck else {"robot": {"name": self.robot.name, "hash": self.robot.hash}}),
         }
         return certificate_contents("simulate", holds=self.holds, files=self.files, more=more)
 
 
-def _shown(name: str, unit: str) -> tuple[str, float]:
+def _shown(name: str, unit: str, robot: Robot) -> tuple[str, float]:
     """Return the unit in which a table shows a signal, and the factor to it."""
     try:
         to_unit, si = to_si(unit or "1")
     except DataError:
         return unit, 1.0  # a foreign FMU's own unit stays as it is
-    shown = file_unit(name) if name in known_channels() else {"rad": "deg", "rad/s": "deg/s"}.get(si, si)
+    shown = file_unit(name, robot) if name in known_channels(robot) else {"rad": "deg", "rad/s": "deg/s"}.get(si, si)
     return (shown, to_unit / to_si(shown)[0]) if to_si(shown)[1] == si else (unit or "1", 1.0)

@@ -96,9 +96,10 @@ class Study:
             for name, part in setup.loop.parts.items():
                 more = settable(part)
                 names[name] = None if more is None else (names.get(name) or set()) | more
+        loop = make_loop(with_values(self.loop, kinds), self.folder).loop
         for key in self.vary:
-            check_key(table, key, names)
-        LoopRun(make_loop(with_values(self.loop, kinds), self.folder).loop)
+            check_key(table, key, names, loop.robot)
+        LoopRun(loop)
 
     def description(self) -> dict[str, Any]:
         """Return what the study is, as JSON values, with the hash of every file that it names."""

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector
-from softneck.signals import redefinition_matrix
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -63,25 +63,26 @@ def pi_axis(gain: float, integral_time: float, sample_time: float) -> AxisContro
 
 
 def assemble(
-    axes: tuple[AxisController, AxisController],
+    axes: Sequence[AxisController],
     *,
-    reference_times: tuple[float, float, float],
-    sample_time: float,
-    tendon_angles: tuple[float, float, float],
+    reference_times: Sequence[float],
+    redefinition: tuple[Matrix, Matrix],
+    constants: Vector,
 ) -> tuple[Matrix, ...]:
     """Return the arrays of `LinearArrays`.
 
     Args:
-        axes: controllers of pitch and roll.
-        reference_times: time constants of the reference filters of pitch, roll, co-contraction [s]; 0 for none.
-        sample_time: [s].
-        tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
+        axes: controllers of all axes: of pitch and roll.
+        reference_times: time constants of the reference filters of all axes and of co-contraction [s]; 0 for none.
+        redefinition: T (axes + 1, motors) and its inverse.
+        constants: of the runtime, the sample time [s] first.
     """
     from scipy.linalg import block_diag
 
+    sample_time = float(constants[0])
     a = np.array([math.exp(-sample_time / time) if time > 0.0 else 0.0 for time in reference_times])
     # rf_k = a rf_k-1 + (1 - a) r_k, with state a rf_k-1: what is asked now acts now.
-    Af, Bf, Cf, Df = np.diag(a), np.diag(a * (1.0 - a)), np.eye(3), np.diag(1.0 - a)
+    Af, Bf, Cf, Df = np.diag(a), np.diag(a * (1.0 - a)), np.eye(a.size), np.diag(1.0 - a)
     A, Br, By, C, L = (
         np.asarray(block_diag(*parts), dtype=np.float64)
         for parts in (
@@ -93,22 +94,21 @@ def assemble(
         )
     )
     Dr, Dy = np.diag([axis.Dr for axis in axes]), np.diag([axis.Dy for axis in axes])
-    T = redefinition_matrix(np.array(tendon_angles))
     align = _alignment(A, Br + By, C, Dr + Dy)
     # The filter's state at rest, where rf = r.
     rest = np.diag(a)
-    constants: Vector = np.array([sample_time])
-    return (Af, Bf, Cf, Df, A, Br, By, C, Dr, Dy, L, align, rest, T, np.linalg.inv(T), constants)
+    return (Af, Bf, Cf, Df, A, Br, By, C, Dr, Dy, L, align, rest, *redefinition, constants)
 
 
 def _alignment(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> Matrix:
-    """Return M (n, 4) with x = M (y, v): the state nearest to rest under r = y that gives exactly v.
+    """Return M (n, 2 axes) with x = M (y, v): the state nearest to rest under r = y that gives exactly v.
 
     x minimises |(I - A) x - B y| subject to C x = v - D y, by its Lagrange conditions.
     """
     n = A.shape[0]
     E = np.eye(n) - A
     top = np.hstack([E.T @ E, C.T])
-    bottom = np.hstack([C, np.zeros((2, 2))])
-    right = np.block([[E.T @ B, np.zeros((n, 2))], [-D, np.eye(2)]])
+    m = C.shape[0]
+    bottom = np.hstack([C, np.zeros((m, m))])
+    right = np.block([[E.T @ B, np.zeros((n, m))], [-D, np.eye(m)]])
     return np.linalg.lstsq(np.vstack([top, bottom]), right, rcond=None)[0][:n]

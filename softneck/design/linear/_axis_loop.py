@@ -12,7 +12,7 @@ from softneck.core import Matrix, SettingsError, Vector
 from softneck.estimation import AxisPlant
 
 from ._assembly import AxisController
-from ._margins import Margins, frequencies
+from ._margins import LOWEST, Margins, frequencies
 
 # Samples are judged on a coarser grid than margins: 4 % apart, a peak of |S| changes by less than 2e-3 between two.
 _COARSE = 4
@@ -125,7 +125,7 @@ def axis_margins(axis: AxisController, plant: AxisPlant, extra_delay: int) -> Ma
     radius = closed_radius(axis, plant, extra_delay)
     if radius >= 1.0:
         raise SettingsError(f"the closed loop is not stable (spectral radius {radius:.4f}); ask for less.")
-    w = frequencies(plant.sample_time)
+    w = frequencies(plant.sample_time, lowest=LOWEST / plant.stretch)
     loop = feedback_response(axis, np.exp(1j * w * plant.sample_time)) * plant.response(w, extra_delay=extra_delay)
     data = (np.abs(loop), np.degrees(np.unwrap(np.angle(loop))), w)
     gain, phase, _, _, crossover, _ = (float(value) for value in control.stability_margins(data))
@@ -136,15 +136,15 @@ def axis_margins(axis: AxisController, plant: AxisPlant, extra_delay: int) -> Ma
 
 def sensitivities(axis: AxisController, plants: Sequence[AxisPlant], extra_delay: int) -> Vector:
     """Return Ms of every plant (plants,); the loops are taken to be stable."""
-    w = coarse(plants[0].sample_time)
+    w = coarse(plants[0])
     K = feedback_response(axis, np.exp(1j * w * plants[0].sample_time))
     loops = np.array([K * plant.response(w, extra_delay=extra_delay) for plant in plants])
     return np.max(1.0 / np.abs(1.0 + loops), axis=1)
 
 
-def coarse(sample_time: float) -> Vector:
+def coarse(plant: AxisPlant) -> Vector:
     """Return frequencies [rad/s] for many samples, 4 % apart, the Nyquist frequency among them."""
-    return frequencies(sample_time)[::-_COARSE][::-1]
+    return frequencies(plant.sample_time, lowest=LOWEST / plant.stretch)[::-_COARSE][::-1]
 
 
 def unstable_samples(axis: AxisController, plants: Sequence[AxisPlant], extra_delay: int) -> list[int]:

@@ -12,16 +12,15 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError, require_between, require_one_of, require_whole
 from softneck.estimation import AxisPlant
-from softneck.estimation._axis import AXES
-from softneck.signals import redefinition_matrix
 
 from ..plants._step_and_load import StepAndLoad
-from ..plants._uncertain import UncertainAxis, uncertain_plant
+from ..plants._uncertain import UncertainAxis, UncertainPlant, uncertain_plant
 from ._assembly import AxisController, assemble
 from ._axis_loop import axis_margins, conditioning_candidates, sensitivities, unstable_samples
 from ._controller import LinearController
 from ._loop_settings import LoopSettings
 from ._margins import Margins
+from ._ports import ControllerLimits
 from ._reduction import reduce_axis
 from ._sweep import Sweep, make_sweep
 
@@ -91,27 +90,35 @@ class AxisSettings(LoopSettings, ABC):
             SettingsError: a plant that does not fit, no solution, or a loop that does not hold on every sample.
         """
         uncertain = uncertain_plant(plant)
-        axes = {name: self._prepared(uncertain.axis(name)) for name in AXES}
+        return self.of_robot(uncertain)._designed(uncertain)
+
+    def _designed(self, uncertain: UncertainPlant) -> LinearController:
+        limits, redefinition = self.limits(uncertain.robot), self.redefinition(uncertain)
+        axes = {name: self._prepared(uncertain.axis(name)) for name in uncertain.names}
+        axes = {
+            name: replace(axis, test=self._test(axis.nominal, limits, redefinition[1])) for name, axis in axes.items()
+        }
         made: dict[str, tuple[AxisController, float, dict[str, Any]]] = {}
         for name, axis in axes.items():
-            if name == "roll" and self._shared() and axis.same_as(axes["pitch"]):
-                made["roll"] = made["pitch"]
+            same = next((other for other in made if self._shared() and axis.same_as(axes[other])), None)
+            if same is not None:
+                made[name] = made[same]
                 continue
             try:
                 made[name] = self._made(axis, name)
             except SettingsError as error:
                 raise SettingsError(f"{name}: {error}") from error
-        times = [made[name][1] for name in AXES]
+        times = [made[name][1] for name in axes]
         return LinearController(
             kind=self.KIND,
             sample_time=uncertain.sample_time,
             arrays=assemble(
-                (made["pitch"][0], made["roll"][0]),
-                reference_times=(times[0], times[1], max(times)),
-                sample_time=uncertain.sample_time,
-                tendon_angles=self.tendon_angles,
+                [made[name][0] for name in axes],
+                reference_times=(*times, max(times)),
+                redefinition=redefinition,
+                constants=limits.constants(uncertain.sample_time),
             ),
-            limits=self.limits(),
+            limits=limits,
             order=self.order,
             design={
                 "settings": self._stored(),
@@ -122,7 +129,7 @@ class AxisSettings(LoopSettings, ABC):
 
     @abstractmethod
     def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:
-        """Return the controller of one axis, "pitch" or "roll"."""
+        """Return the controller of one axis, named by its output."""
 
     def _shared(self) -> bool:
         """Return whether equal axes get the same controller."""
@@ -180,7 +187,7 @@ class AxisSettings(LoopSettings, ABC):
         def keeps(samples: int) -> bool:
             return bool(sweep.run(controller, samples * axis.sample_time, L).overshoot.max() <= self.overshoot_pct)
 
-        low, high = _first_filter(axis.nominal), _SLOWEST
+        low, high = _first_filter(axis.nominal), _slowest_filter(axis.nominal)
         if keeps(low):
             return low * axis.sample_time
         if not keeps(high):
@@ -214,14 +221,25 @@ class AxisSettings(LoopSettings, ABC):
 
     def _sweep(self, axis: UncertainAxis) -> Sweep:
         """Return the samples ready for steps within the limits of the motors."""
+        return make_sweep(axis.samples, extra_delay=self.extra_delay, test=axis.test)
+
+    def _test(self, plant: AxisPlant, limits: ControllerLimits, inverse: Matrix) -> StepAndLoad:
+        """Return the step and the load that a controller of this axis is judged by."""
         # The motor that moves most has 2/3 of theta_i (Eq. 9), 0.577 of phi_i: the tighter one is taken.
-        share = float(np.abs(np.linalg.inv(redefinition_matrix(np.array(self.tendon_angles)))[:, :2]).max())
+        share = float(np.abs(inverse[:, :-1]).max())
         test = StepAndLoad(
-            sample_time=axis.sample_time,
-            position_limit=self.position_limit / share,
-            slew_limit=self.slew_limit * axis.sample_time / share,
+            sample_time=plant.sample_time,
+            position_limit=limits.position_limit / share,
+            slew_limit=limits.slew_limit * plant.sample_time / share,
         )
-        return make_sweep(axis.samples, extra_delay=self.extra_delay, test=test)
+        if limits.robot.is_neck:
+            return test
+        # As large and as long for this robot as 10 deg, -0.5 rad and 6 s are for a neck, which they take 2 of 9 rad.
+        asked = 2.0 / 9.0 * test.position_limit * abs(plant.static_gain)
+        return replace(
+            test, reference=asked, load=-0.5 / 9.0 * test.position_limit, load_at=plant.stretch * test.load_at,
+            duration=plant.stretch * test.duration, size=test.reference / asked,
+        )  # fmt: skip
 
     def _keeps_all(self, controller: AxisController, axis: UncertainAxis) -> bool:
         """Return whether every sample is stable and keeps `max_sensitivity`."""
@@ -259,7 +277,12 @@ class AxisSettings(LoopSettings, ABC):
 
 def _first_filter(plant: AxisPlant) -> int:
     """Return half the plant's lag [samples]: a reference that is faster only runs into the motors' limits."""
-    return min(round(0.5 * slowest_time(plant) / plant.sample_time), _SLOWEST // 2)
+    return min(round(0.5 * slowest_time(plant) / plant.sample_time), _slowest_filter(plant) // 2)
+
+
+def _slowest_filter(plant: AxisPlant) -> int:
+    """Return the slowest reference filter that is tried [samples]: 2 s of a neck at 20 ms."""
+    return _SLOWEST if plant.stretch == 1.0 else max(_SLOWEST, math.ceil(2.0 * plant.stretch / plant.sample_time))
 
 
 def _attempt(build: Callable[[float], AxisDesign], speed: float) -> AxisDesign | None:
@@ -272,7 +295,7 @@ def _attempt(build: Callable[[float], AxisDesign], speed: float) -> AxisDesign |
 
 def scaled(plant: AxisPlant, factor: float) -> AxisPlant:
     """Return the plant with its gain times `factor`."""
-    return AxisPlant(factor * plant.numerator, plant.denominator, plant.delay, plant.sample_time)
+    return replace(plant, numerator=factor * plant.numerator)
 
 
 def slowest_time(plant: AxisPlant) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import Matrix, Vector, atomic_write, write_archive
+from softneck.identification.models._linear_systems import redefined_input
+from softneck.robot import Robot
 from softneck.runtime import Block, State
+from softneck.runtime._bundle import sized
 
 from ._linear_parts_runtime import LinearArrays
 from ._ports import ControllerLimits, controller_inputs, controller_outputs
@@ -26,7 +29,7 @@ _RUNTIME = "softneck.design.linear._linear_controller_runtime"
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class LinearController:
-    """A designed controller of pitch and roll with reference filter, limits, conditioning and allocation.
+    """A designed controller of all outputs with reference filter, limits, conditioning and allocation.
 
     Attributes:
         kind: name in the table of kinds.
@@ -44,16 +47,21 @@ class LinearController:
     order: str
     design: Mapping[str, Any]
 
+    @property
+    def robot(self) -> Robot:
+        """Whose controller it is."""
+        return self.limits.robot
+
     def block(self) -> Block:
         """Return the controller as a block of role "controller"."""
         return Block(
             kind=self.kind,
             role="controller",
-            runtime=_RUNTIME,
+            runtime=sized(_RUNTIME, len(self.robot.motors.names), len(self.robot.outputs.names)),
             sample_time=self.sample_time,
             arrays=self.arrays,
-            inputs=controller_inputs(),
-            outputs=controller_outputs(),
+            inputs=controller_inputs(self.robot),
+            outputs=controller_outputs(self.robot),
             parameters=self.limits.ports(),
         )
 
@@ -70,17 +78,19 @@ class LinearController:
         import control
 
         p = LinearArrays(self.arrays)
-        Af, Bf, Cf, Df = p.Af[:2, :2], p.Bf[:2, :2], p.Cf[:2, :2], p.Df[:2, :2]
-        states = np.block([[Af, np.zeros((2, len(p.A)))], [p.Br @ Cf, p.A]])
-        inputs = np.block([[Bf, np.zeros((2, 2))], [p.Br @ Df, p.By]])
+        names = self.robot.outputs.names
+        m = len(names)
+        Af, Bf, Cf, Df = p.Af[:m, :m], p.Bf[:m, :m], p.Cf[:m, :m], p.Df[:m, :m]
+        states = np.block([[Af, np.zeros((m, len(p.A)))], [p.Br @ Cf, p.A]])
+        inputs = np.block([[Bf, np.zeros((m, m))], [p.Br @ Df, p.By]])
         return control.StateSpace(
             states,
             inputs,
             np.hstack([p.Dr @ Cf, p.C]),
             np.hstack([p.Dr @ Df, p.Dy]),
             self.sample_time,
-            inputs=["pitch_reference", "roll_reference", "pitch", "roll"],
-            outputs=["theta_i", "phi_i"],
+            inputs=[*(f"{name}_reference" for name in names), *names],
+            outputs=[redefined_input(self.robot, name) for name in names],
             name=self.kind,
         )
 
@@ -104,13 +114,13 @@ class LinearController:
             f"{self.design.get('extra_delay', 0)} samples of delay added to the plant for it",
             *self.limits.lines(self.sample_time),
         ]
-        for axis in ("pitch", "roll"):
+        for axis in self.robot.outputs.names:
             item = self.design.get(axis, {})
             gains = ", ".join(f"{name} {value:.4g}" for name, value in item.get("gains", {}).items())
             lines.append(f"  {axis}: {gains}; designed for a dead time of {1e3 * item.get('dead_time_s', 0.0):g} ms")
             lines += _findings(item)
             for title, key in (("as identified", "margins"), ("small moves", "margins_small_moves")):
-                if key in item:
+                if key in item and (title == "as identified" or self.robot.is_neck):
                     lines.append(f"    {title}: {_margins(item[key])}")
         return "\n".join(lines)
 
@@ -120,12 +130,13 @@ class LinearController:
         header = {
             "kind": self.kind,
             "sample_time": self.sample_time,
-            **asdict(self.limits),
+            **self.limits.header(),
             "order": self.order,
             "design": dict(self.design),
             "inputs": [port.name for port in block.inputs],
             "outputs": [port.name for port in block.outputs],
             "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
+            **({} if self.robot.is_neck else {"robot": self.robot.as_dict()}),
         }
         write_archive(path, header, dict(zip(LinearArrays.names(), self.arrays, strict=True)), force=force)
 
@@ -136,13 +147,15 @@ class LinearController:
             kind=str(header["kind"]),
             sample_time=float(header["sample_time"]),
             arrays=tuple(LinearArrays.read(arrays).values()),
-            # Files of the first version do not know the rules for taut tendons.
-            limits=ControllerLimits(
-                **{item.name: float(header[item.name]) for item in fields(ControllerLimits) if item.name in header}
-            ),
+            limits=ControllerLimits.from_header(header, robot_in(header)),
             order=str(header["order"]),
             design=dict(header["design"]),
         )
+
+
+def robot_in(header: Mapping[str, Any]) -> Robot:
+    """Return whose controller a file's header is of; one that does not say is a neck's."""
+    return Robot.from_dict(header["robot"]) if "robot" in header else Robot.preset("neck")
 
 
 def _findings(item: Mapping[str, Any]) -> list[str]:

@@ -12,10 +12,11 @@ import numpy as np
 from softneck.core import DataError, SettingsError
 from softneck.estimation._axis import AXES
 
-from ..plants._uncertain import UncertainAxis
+from ..plants._uncertain import UncertainAxis, UncertainPlant
 from ._assembly import AxisController
 from ._axis_loop import conditioning_gain, error_feedback
 from ._axis_settings import AxisDesign, AxisSettings
+from ._controller import LinearController
 
 _INPUTS = {"pitch": "theta_i", "roll": "phi_i"}
 
@@ -44,6 +45,10 @@ class CustomSettings(AxisSettings):
             )
         for name in AXES:
             _require_system(self._of(name))
+
+    def _designed(self, uncertain: UncertainPlant) -> LinearController:
+        uncertain.robot.require_neck("a controller of one's own")
+        return AxisSettings._designed(self, uncertain)
 
     def _of(self, name: str) -> Any:
         return self.controller[name] if isinstance(self.controller, Mapping) else self.controller

@@ -1,4 +1,4 @@
-"""A linear controller of both axes with limits and tendon allocation; see `_linear_parts_runtime` for its equations."""
+"""A linear controller of all axes with limits and tendon allocation; see `_linear_parts_runtime` for its equations."""
 
 import numpy as np
 
@@ -15,7 +15,8 @@ from softneck.design.linear._rest_runtime import initialise as initialise
 def step(p: LinearArrays, parameters: np.ndarray, x: LinearState, inputs: np.ndarray, outputs: np.ndarray) -> None:
     """Compute the set-points for now, and the state for the next sample.
 
-    inputs: pitch, roll and co-contraction reference, pitch, roll, motor_position_1..3, healthy, enabled.
+    inputs: pitch, roll and co-contraction reference, pitch, roll, motor_position_1..3, healthy, enabled; the outputs of
+    another robot stand for pitch and roll.
     outputs: motor_setpoint_1..3.
     parameters: position limit [rad], slew limit [rad/s], lead limit [rad], least position of a motor [rad], least
     co-contraction [rad].
@@ -24,13 +25,14 @@ def step(p: LinearArrays, parameters: np.ndarray, x: LinearState, inputs: np.nda
     if not linear_finite(inputs):
         outputs[:] = x.held
         return
+    flags = 2 * p.outputs + 1 + p.motors
     # Whoever had the motors before: this controller takes over where they are.
     if x.started == 0.0:
-        x.held[:] = inputs[5:8]
-    active = inputs[8] > 0.5 and inputs[9] > 0.5
+        x.held[:] = inputs[2 * p.outputs + 1 : flags]
+    active = inputs[flags] > 0.5 and inputs[flags + 1] > 0.5
     # Held set-points and an aligned state for as long as it may not act, so that it begins without a bump.
     if x.started == 0.0 or not active:
-        linear_align(p, x, inputs[3:5])
+        linear_align(p, x, inputs[p.outputs + 1 : 2 * p.outputs + 1])
     x.started = 1.0
     if active:
         linear_control(p, parameters, x, inputs)

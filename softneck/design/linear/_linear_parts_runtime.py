@@ -1,4 +1,4 @@
-"""Any linear two-degree-of-freedom controller of both axes: equations, conditioning, alignment.
+"""Any linear two-degree-of-freedom controller of all axes: equations, conditioning, alignment.
 
     reference filter   rf = Cf xf + Df r,               xf+ = Af xf + Bf r
     controller          v = C x + Dr rf + Dy y,          x+ = A x + Br rf + By y + L (v_limited - v)
@@ -12,37 +12,52 @@ import math
 import numpy as np
 
 from softneck.design.linear._allocation_runtime import allocate
-from softneck.runtime._layout import Arrays, StateVector, array, cells
+from softneck.runtime._layout import Arrays, StateVector, array, cells, value
 from softneck.runtime._rest_runtime import REST
 
 LINEAR_REFERENCE_LIMIT = 0.8  # [rad], as the ports' min and max
 LINEAR_MOTOR_LIMIT = 6.0  # [rad], the paper's largest rotation (section 3.1)
 
 
+def linear_outputs(direct: np.ndarray) -> int:
+    """Return the number of outputs: the references are one more, co-contraction."""
+    return direct.shape[0] - 1
+
+
+def linear_motors(inverse: np.ndarray) -> int:
+    """Return the number of motors."""
+    return inverse.shape[0]
+
+
 class FilterArrays(Arrays):
     """The reference filter, from r = (pitch, roll, co-contraction) to rf."""
 
     Af = array("m, m", "rf = Cf xf + Df r, xf+ = Af xf + Bf r")
-    Bf = array("m, 3", "")
-    Cf = array("3, m", "")
-    Df = array("3, 3", "")
+    Bf = array("m, references", "")
+    Cf = array("references, m", "")
+    Df = array("references, references", "")
+    outputs = value("Df", function=linear_outputs, written=True)
 
 
 class LinearArrays(FilterArrays):
     """A controller from rf and y = (pitch, roll) to v = (theta_i, phi_i)."""
 
     A = array("n, n", "v = C x + Dr rf + Dy y, x+ = A x + Br rf + By y + L (v_limited - v)")
-    Br = array("n, 2", "")
-    By = array("n, 2", "")
-    C = array("2, n", "")
-    Dr = array("2, 2", "")
-    Dy = array("2, 2", "")
-    L = array("n, 2", "conditioning")
-    align = array("n, 4", "from y and v to the state nearest to rest that asks for v")
-    rest = array("m, 3", "from r to the filter's state at rest")
-    T = array("3, 3", "of Eq. 9-11: motors to (theta_i, phi_i, delta_i)")
-    T_inverse = array("3, 3", "redefined inputs to motors")
-    constants = array("1", "sample time [s]")
+    Br = array("n, outputs", "")
+    By = array("n, outputs", "")
+    C = array("outputs, n", "")
+    Dr = array("outputs, outputs", "")
+    Dy = array("outputs, outputs", "")
+    L = array("n, outputs", "conditioning")
+    align = array("n, 2 * outputs", "from y and v to the state nearest to rest that asks for v")
+    rest = array("m, references", "from r to the filter's state at rest")
+    T = array("references, motors", "of Eq. 9-11: motors to (theta_i, phi_i, delta_i)")
+    T_inverse = array("motors, references", "redefined inputs to motors")
+    constants = array(
+        "numbers",
+        "sample time [s]; of other robots than the neck also the lowest and highest set-points, and references",
+    )
+    motors = value("T_inverse", function=linear_motors, written=True)
 
 
 class LinearState(StateVector):
@@ -50,62 +65,85 @@ class LinearState(StateVector):
 
     xf = cells("m", "state of the reference filter")
     x = cells("n", "state of the controller")
-    held = cells("3", "set-points held [rad]")
+    held = cells("motors", "set-points held [rad]")
     started = cells("", "1 from the first step on")
 
 
 def linear_align(p: LinearArrays, x: LinearState, y: np.ndarray) -> None:
     """Choose the state that asks for the held set-points while the reference is where the neck is: no bump."""
     v = np.dot(p.T, x.held)
-    known = np.empty(4)
-    known[:2] = y
-    known[2:] = v[:2]
+    known = np.empty(2 * p.outputs)
+    known[: p.outputs] = y
+    known[p.outputs :] = v[: p.outputs]
     # As if the references had been y and the co-contraction of now for ever.
-    rest = np.empty(3)
-    rest[:2] = y
-    rest[2] = v[2]
+    rest = np.empty(p.outputs + 1)
+    rest[: p.outputs] = y
+    rest[p.outputs] = v[p.outputs]
     x.xf[:] = np.dot(p.rest, rest)
     x.x[:] = np.dot(p.align, known)
 
 
 def linear_finite(inputs: np.ndarray) -> bool:
-    """Return whether references, angles and motor positions are numbers."""
+    """Return whether references, angles and motor positions are numbers: all inputs but the two flags."""
     total = 0.0  # one that is none makes the sum none
-    for i in range(8):
+    for i in range(inputs.shape[0] - 2):
         total += inputs[i]
     return math.isfinite(total)
 
 
 def linear_control(p: LinearArrays, parameters: np.ndarray, x: LinearState, inputs: np.ndarray) -> None:
     """One sample of filter, controller, limits and conditioning."""
-    y = inputs[3:5]
-    r = linear_asked(parameters, inputs)
+    y = inputs[p.outputs + 1 : 2 * p.outputs + 1]
+    r = linear_asked(p, p.constants, parameters, inputs)
     # Of now, before the filter moves on: r acts at once where Df lets it.
-    rf = linear_reference(p, parameters, x.xf, inputs)
-    wanted = np.empty(3)
-    wanted[:2] = np.dot(p.C, x.x) + np.dot(p.Dr, rf[:2]) + np.dot(p.Dy, y)
-    wanted[2] = rf[2]
-    # Position, lead, move in one sample, least position.
-    limits = np.array([parameters[0], parameters[2], parameters[1] * p.constants[0], parameters[3]])
-    allocate(p.T_inverse, wanted, limits, inputs[5:8], x.held)
+    rf = linear_reference(p, p.constants, parameters, x.xf, inputs)
+    wanted = np.empty(p.outputs + 1)
+    wanted[: p.outputs] = np.dot(p.C, x.x) + np.dot(p.Dr, rf[: p.outputs]) + np.dot(p.Dy, y)
+    wanted[p.outputs] = rf[p.outputs]
+    # Of other robots set-points may go from a pressure of zero on: co-contraction is raised to that always.
+    taut = p.numbers > 1 or parameters[3] > -parameters[0]
+    motors = inputs[2 * p.outputs + 1 : 2 * p.outputs + 1 + p.motors]
+    allocate(p.T_inverse, wanted, linear_limits(p, parameters), taut, motors, x.held)
     # What the limits took away: the controller's state moves as if it had never been asked for.
-    excess = np.dot(p.T, x.held)[:2] - wanted[:2]
+    excess = np.dot(p.T, x.held)[: p.outputs] - wanted[: p.outputs]
     # Last, as v is of the states of now.
     x.xf[:] = (np.dot(p.Af, x.xf) + np.dot(p.Bf, r) + REST) - REST
-    ahead = np.dot(p.A, x.x) + np.dot(p.Br, rf[:2]) + np.dot(p.By, y) + np.dot(p.L, excess)
+    ahead = np.dot(p.A, x.x) + np.dot(p.Br, rf[: p.outputs]) + np.dot(p.By, y) + np.dot(p.L, excess)
     x.x[:] = (ahead + REST) - REST
 
 
-def linear_asked(parameters: np.ndarray, inputs: np.ndarray) -> np.ndarray:
-    """Return the references (3,) within what may be asked for."""
-    r = np.empty(3)
-    for i in range(2):
-        r[i] = min(max(inputs[i], -LINEAR_REFERENCE_LIMIT), LINEAR_REFERENCE_LIMIT)
+def linear_limits(p: LinearArrays, parameters: np.ndarray) -> np.ndarray:
+    """Return what `allocate` takes: lead, move in one sample, least position, lowest and highest set-points."""
+    limits = np.empty(3 + 2 * p.motors)
+    limits[0], limits[1], limits[2] = parameters[2], parameters[1] * p.constants[0], parameters[3]
+    for j in range(p.motors):
+        low, high = -parameters[0], parameters[0]
+        if p.numbers > 1:
+            low, high = max(low, p.constants[1 + j]), min(high, p.constants[1 + p.motors + j])
+        limits[3 + j] = low
+        limits[3 + p.motors + j] = high
+    return limits
+
+
+def linear_asked(p: FilterArrays, constants: np.ndarray, parameters: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+    """Return the references (outputs + 1,) within what may be asked for."""
+    r = np.empty(p.outputs + 1)
+    low, high, least, most = -LINEAR_REFERENCE_LIMIT, LINEAR_REFERENCE_LIMIT, -LINEAR_MOTOR_LIMIT, LINEAR_MOTOR_LIMIT
+    # Of another robot the last constants: lowest, then highest of each reference.
+    first = constants.shape[0] - 2 * (p.outputs + 1)
+    for i in range(p.outputs):
+        if first > 0:
+            low, high = constants[first + i], constants[first + p.outputs + 1 + i]
+        r[i] = min(max(inputs[i], low), high)
+    if first > 0:
+        least, most = constants[first + p.outputs], constants[first + 2 * p.outputs + 1]
     # Before the filter, so that motors which start below the least co-contraction come to it without a bump.
-    r[2] = min(max(inputs[2], -LINEAR_MOTOR_LIMIT, parameters[4]), LINEAR_MOTOR_LIMIT)
+    r[p.outputs] = min(max(inputs[p.outputs], least, parameters[4]), most)
     return r
 
 
-def linear_reference(p: FilterArrays, parameters: np.ndarray, xf: np.ndarray, inputs: np.ndarray) -> np.ndarray:
-    """Return the filtered references (3,) of now."""
-    return np.dot(p.Cf, xf) + np.dot(p.Df, linear_asked(parameters, inputs))
+def linear_reference(
+    p: FilterArrays, constants: np.ndarray, parameters: np.ndarray, xf: np.ndarray, inputs: np.ndarray
+) -> np.ndarray:
+    """Return the filtered references (outputs + 1,) of now."""
+    return np.dot(p.Cf, xf) + np.dot(p.Df, linear_asked(p, constants, parameters, inputs))

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
-from softneck.core import require_between, require_one_of
+import numpy as np
+
+from softneck.core import Matrix, SettingsError, require_between, require_one_of
 from softneck.estimation._settings import ORDERS
-from softneck.signals import TENDON_ANGLES
+from softneck.robot import Robot
+from softneck.robot._neck_default import NeckDefault
+from softneck.robot._redefined import redefinition_of
+from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
-from ._ports import ControllerLimits
+from ..plants._uncertain import UncertainPlant
+from ._ports import LIMITS, ControllerLimits, robot_limits
+
+_NECK = Robot.preset("neck")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -16,6 +25,9 @@ class LoopSettings:
     """Settings that all designs around a linear plant share; a kind adds its own and `design`.
 
     A kind calls `LoopSettings.__post_init__(self)` by name: with slots `super()` would look in the wrong class.
+
+    The defaults are the neck's. Of another robot no dead time and no faster pole is taken for granted, and its limits
+    are those of its file; limits that are given are in the unit of its motors.
 
     Attributes:
         least_delay: the dead time is taken as at least this [s]; a fit of free runs hides it in the pole.
@@ -35,13 +47,13 @@ class LoopSettings:
     """
 
     # The paper's own dead time and pole (Eq. 31: 0.08 s, 5.293 1/s).
-    least_delay: float = 0.08
-    small_move_pole: float = 5.293
-    position_limit: float = 6.0
-    slew_limit: float = 12.5
-    lead_limit: float = 0.4
-    least_position: float = -6.0
-    least_cocontraction: float = -6.0
+    least_delay: float = NeckDefault(0.08)
+    small_move_pole: float = NeckDefault(5.293)
+    position_limit: float = NeckDefault(6.0)
+    slew_limit: float = NeckDefault(12.5)
+    lead_limit: float = NeckDefault(0.4)
+    least_position: float = NeckDefault(-6.0)
+    least_cocontraction: float = NeckDefault(-6.0)
     order: str = "sequential"
     observer: bool = True
     tendon_angles: tuple[float, float, float] = tuple(TENDON_ANGLES.tolist())
@@ -52,8 +64,43 @@ class LoopSettings:
         require_one_of("order", self.order, ORDERS)
         self.limits()
 
-    def limits(self) -> ControllerLimits:
-        """Return the limits of the set-points."""
+    def of_robot(self, plant: UncertainPlant) -> Self:
+        """Return the settings for the robot of `plant`: where nobody says otherwise, nothing that is known of necks.
+
+        Raises:
+            SettingsError: tendon angles for a robot that has its own.
+        """
+        if plant.robot.is_neck:
+            return self
+        if self.tendon_angles != tuple(TENDON_ANGLES.tolist()):
+            raise SettingsError(f"`tendon_angles` are of necks; those of `{plant.robot.name}` are in its robot file.")
+        others = {
+            name: value for name, value in self._others(plant).items() if isinstance(getattr(self, name), NeckDefault)
+        }
+        return replace(self, **others)
+
+    def _others(self, plant: UncertainPlant) -> dict[str, Any]:  # noqa: ARG002 - kinds add what depends on it
+        """Return what stands for another robot in the place of the neck's defaults."""
+        return {"least_delay": 0.0, "small_move_pole": 0.0}
+
+    def redefinition(self, plant: UncertainPlant) -> tuple[Matrix, Matrix]:
+        """Return T from motors to the redefined inputs of all axes and co-contraction, and its inverse."""
+        return self.neck_redefinition() if plant.weights is None else redefinition_of(plant.weights, plant.names)
+
+    def neck_redefinition(self) -> tuple[Matrix, Matrix]:
+        """Return T of Eq. 9-11 and its inverse."""
+        T = redefinition_matrix(np.array(self.tendon_angles))
+        return T, np.linalg.inv(T)
+
+    def limits(self, robot: Robot = _NECK) -> ControllerLimits:
+        """Return the limits of the set-points.
+
+        Raises:
+            SettingsError: a robot's limit that neither its file nor a setting says.
+        """
+        if not robot.is_neck:
+            given = {name: getattr(self, name) for name in LIMITS}
+            return robot_limits(robot, {key: v for key, v in given.items() if not isinstance(v, NeckDefault)})
         return ControllerLimits(
             position_limit=self.position_limit,
             slew_limit=self.slew_limit,

@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     import control
 
 
+# Lowest frequency on which a neck's loop is judged [rad/s]; loops of slower robots are from where their times are.
+LOWEST = 0.05
+
+
 @dataclass(frozen=True, slots=True)
 class Margins:
     """How far a loop is from instability.
@@ -34,14 +38,14 @@ class Margins:
     delay: float
 
 
-def frequencies(sample_time: float, *, lowest: float = 0.05) -> Vector:
+def frequencies(sample_time: float, *, lowest: float = LOWEST) -> Vector:
     """Return the frequencies [rad/s] on which loops are judged, up to the Nyquist frequency."""
     # 1 % apart: the peak of |S| of a well-damped loop changes by less than 1e-4 between two of them.
     highest = math.pi / sample_time
     return np.geomspace(lowest, highest, math.ceil(math.log(highest / lowest) / 0.01))
 
 
-def loop_margins(loop: control.TransferFunction) -> Margins:
+def loop_margins(loop: control.TransferFunction, *, lowest: float = LOWEST) -> Margins:
     """Return the margins of the discrete open loop `loop`, verified to be stable when closed.
 
     Gain and phase margin are python-control's, from the exact z^-d; Ms is from the frequency response.
@@ -61,7 +65,7 @@ def loop_margins(loop: control.TransferFunction) -> Margins:
         # It says that polynomials of this order are inaccurate and that it takes the frequency response instead.
         warnings.filterwarnings("ignore", "stability_margins: Falling back", UserWarning)
         gain, phase, _, _, crossover, _ = control.stability_margins(loop)
-    response = np.asarray(loop(np.exp(1j * frequencies(dt) * dt)))
+    response = np.asarray(loop(np.exp(1j * frequencies(dt, lowest=lowest) * dt)))
     sensitivity = float(np.abs(1.0 / (1.0 + response)).max())
     angle = math.radians(float(phase))
     delay = angle / crossover if math.isfinite(angle) and crossover > 0 else math.inf

@@ -7,15 +7,16 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from softneck.core import SettingsError, require_between, require_one_of, require_positive
-from softneck.estimation._axis import AXES, HasTransferFunctions
+from softneck.estimation._axis import HasTransferFunctions
+from softneck.robot._neck_default import NeckDefault
 
-from ..plants._uncertain import UncertainAxis, uncertain_plant
+from ..plants._uncertain import UncertainAxis, UncertainPlant, uncertain_plant
 from ._assembly import assemble, pi_axis
 from ._axis_loop import sensitivities, unstable_samples
-from ._axis_settings import margins_json
+from ._axis_settings import margins_json, slowest_time
 from ._controller import LinearController
 from ._loop_settings import LoopSettings
-from ._margins import loop_margins
+from ._margins import LOWEST, loop_margins
 from ._pid import place_pid
 from ._tuning import Gains, Plants, open_loop, reference_time, tune_pi
 
@@ -41,7 +42,7 @@ class PiSettings(LoopSettings):
         max_sensitivity: bound on Ms, on the identified plant and on its faster form.
         phase_margin: least phase margin [rad], on both.
         reference_time: time constant of the reference filter [s]; None for the least with which no plant within
-            `gain_spread` overshoots by more than `overshoot_pct`.
+            `gain_spread` overshoots by more than `overshoot_pct`. Of another robot the slowest pole's, if not given.
         overshoot_pct: of a step, without limits.
         gain_spread: relative spread of the plant's gain that the filter allows for.
     """
@@ -52,7 +53,7 @@ class PiSettings(LoopSettings):
     max_sensitivity: float = 1.5
     phase_margin: float = math.radians(60.0)
     # About the time constant of the paper's neck, 1/5.293 s: what is asked faster only runs into limits.
-    reference_time: float | None = 0.2
+    reference_time: float | None = NeckDefault(0.2)
     overshoot_pct: float = 2.0
     gain_spread: float = 0.2
 
@@ -69,38 +70,46 @@ class PiSettings(LoopSettings):
         require_between("gain_spread", self.gain_spread, 0.0, 0.9)
 
     def design(self, model: HasTransferFunctions) -> LinearController:
-        """Return the controller for `model`, anything with `tf("pitch")` and `tf("roll")`.
+        """Return the controller for `model`, anything with `tf("pitch")` and `tf("roll")`, or of another robot.
 
         Raises:
             SettingsError: a model that is not linear, discrete and stable, or no gains that keep the robustness.
         """
         uncertain = uncertain_plant(model)
-        sample_time = uncertain.sample_time
-        plants = [uncertain.axis(axis).prepared(self.least_delay, self.small_move_pole) for axis in AXES]
+        return self.of_robot(uncertain)._designed(uncertain)
+
+    def _others(self, plant: UncertainPlant) -> dict[str, Any]:
+        slowest = max(slowest_time(axis.nominal) for axis in plant.axes.values())
+        return {**LoopSettings._others(self, plant), "reference_time": slowest}
+
+    def _designed(self, uncertain: UncertainPlant) -> LinearController:
+        sample_time, names, limits = uncertain.sample_time, uncertain.names, self.limits(uncertain.robot)
+        plants = [uncertain.axis(axis).prepared(self.least_delay, self.small_move_pole) for axis in names]
         families = [self._family(plant) for plant in plants]
-        # Axes that are the same plants are tuned once.
-        each = range(1 if plants[0].same_as(plants[1]) else 2)
-        tuned = [self._tuned(families[i]) for i in each]
-        filters = [self._filter(families[i], tuned[i]) for i in each]
-        tuned, filters = [tuned[0], tuned[-1]], [filters[0], filters[-1]]
+        tuned: list[Gains] = []
+        filters: list[float] = []
+        for i, plant in enumerate(plants):
+            # Axes that are the same plants are tuned once.
+            same = next((j for j in range(i) if plants[j].same_as(plant)), None)
+            tuned.append(self._tuned(families[i]) if same is None else tuned[same])
+            filters.append(self._filter(families[i], tuned[i]) if same is None else filters[same])
         found = {
             axis: _findings(plant, len(self._small(plant)), self.extra_delay, gains, time)
-            for axis, plant, gains, time in zip(AXES, plants, tuned, filters, strict=True)
+            for axis, plant, gains, time in zip(names, plants, tuned, filters, strict=True)
         }
-        for axis in AXES if self.tuning == "samples" else ():
+        for axis in names if self.tuning == "samples" else ():
             if found[axis]["samples_unstable"]:
                 raise SettingsError(f"{axis}: not every sample is stable; lower `max_sensitivity`.")
-        first, second = (pi_axis(gains.gain, gains.integral_time, sample_time) for gains in tuned)
         return LinearController(
             kind="pi",
             sample_time=sample_time,
             arrays=assemble(
-                (first, second),
-                reference_times=(filters[0], filters[1], max(filters)),
-                sample_time=sample_time,
-                tendon_angles=self.tendon_angles,
+                [pi_axis(gains.gain, gains.integral_time, sample_time) for gains in tuned],
+                reference_times=(*filters, max(filters)),
+                redefinition=self.redefinition(uncertain),
+                constants=limits.constants(sample_time),
             ),
-            limits=self.limits(),
+            limits=limits,
             order=self.order,
             design={"settings": asdict(self), "extra_delay": self.extra_delay, **found},
         )
@@ -137,7 +146,8 @@ class PiSettings(LoopSettings):
 def _findings(plant: UncertainAxis, small: int, extra_delay: int, gains: Gains, filter_time: float) -> dict[str, Any]:
     """Return gains and margins of one axis as JSON values; None stands for infinity."""
     family = plant.samples[:small]
-    margins = [margins_json(loop_margins(open_loop(item, extra_delay, gains))) for item in family]
+    lowest = LOWEST / plant.nominal.stretch
+    margins = [margins_json(loop_margins(open_loop(item, extra_delay, gains), lowest=lowest)) for item in family]
     axis = pi_axis(gains.gain, gains.integral_time, plant.sample_time)
     lost = unstable_samples(axis, plant.samples, extra_delay)
     named = {"K": gains.gain, "Ti_s": gains.integral_time, "reference_time_s": filter_time}

@@ -181,19 +181,22 @@ class _Judge:
     loops: np.ndarray
     sample_time: float
     static_gain: float
+    stretch: float
 
     @classmethod
     def of(cls, settings: PidSettings, axis: UncertainAxis) -> _Judge:
         dt = axis.sample_time
-        w = coarse(dt)
+        w = coarse(axis.nominal)
         loops = np.array([plant.response(w, extra_delay=settings.extra_delay) for plant in axis.samples])
-        return cls(settings, settings._sweep(axis), np.exp(1j * w * dt), loops, dt, axis.nominal.static_gain)
+        return cls(settings, settings._sweep(axis), np.exp(1j * w * dt), loops, dt, axis.nominal.static_gain,
+                   axis.nominal.stretch)  # fmt: skip
 
     def hardest(self, gains: PidGains) -> _Judge:
         """Return the judge of the samples on which a load is worst under `gains`: the others do not decide."""
         axis = gains.axis(self.sample_time)
         with np.errstate(over="ignore", invalid="ignore"):
-            loads = np.nan_to_num(self.sweep.run(axis, _WHILE_SEARCHING, axis.conditioning()).load_rms, nan=np.inf)
+            run = self.sweep.run(axis, _WHILE_SEARCHING * self.stretch, axis.conditioning())
+        loads = np.nan_to_num(run.load_rms, nan=np.inf)
         chosen = np.argsort(loads)[::-1][:_HARDEST]
         few = replace(self.sweep, plants=self.sweep.plants[chosen].copy(), delays=self.sweep.delays[chosen])
         return replace(self, sweep=few)
@@ -202,7 +205,8 @@ class _Judge:
         """Return the worst rms from the load on [deg]."""
         axis = gains.axis(self.sample_time)
         with np.errstate(over="ignore", invalid="ignore"):
-            worst = float(self.sweep.run(axis, _WHILE_SEARCHING, axis.conditioning()).load_rms.max())
+            run = self.sweep.run(axis, _WHILE_SEARCHING * self.stretch, axis.conditioning())
+        worst = float(run.load_rms.max()) * self.sweep.test.size
         return worst if math.isfinite(worst) else 1e6
 
     def excess(self, gains: PidGains) -> float:

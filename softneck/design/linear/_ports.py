@@ -2,52 +2,74 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
-from softneck.core import SettingsError, require_between
+import numpy as np
+
+from softneck.core import SettingsError, Vector, require_between, require_positive, to_si
+from softneck.robot import Robot
 from softneck.runtime import Port
 
 # The neck's inclination stays below 0.7 rad; motors within 6 rad (paper, section 5).
 MAX_REFERENCE = 0.8
 MAX_MOTOR = 6.0
 MAX_SLEW = 1000.0
+_NECK = Robot.preset("neck")
+# A reference that nobody limits: beyond any number in SI that a robot's output has, and a number in files still.
+_UNLIMITED = 1e12
 
 
-def limit_ports(starts: tuple[float, float, float, float, float]) -> tuple[Port, ...]:
+def limit_ports(starts: tuple[float, float, float, float, float], robot: Robot = _NECK) -> tuple[Port, ...]:
     """Return the parameters of every controller with allocation, in the order of `_allocation_runtime`'s callers.
 
     Args:
-        starts: position limit [rad], slew limit [rad/s], lead limit, least position, least co-contraction [rad].
+        starts: position limit [rad], slew limit [rad/s], lead limit, least position, least co-contraction [rad]; of
+            another robot in the SI unit of its motors.
+        robot: whose motors they are.
     """
     position, slew, lead, least, common = starts
+    unit, neck = to_si(robot.motors.unit)[1], robot.is_neck
+    smallest = 0.01 if neck else 0.0
+
+    def port(name: str, start: float, low: float, most: float, what: str = "", per: str = "") -> Port:
+        return Port(name=name, unit=unit + per, start=start, minimum=low if neck or low == 0.0 else None,
+                    maximum=most if neck else None, description=what)  # fmt: skip
+
     return (
-        Port(name="position_limit", unit="rad", start=position, minimum=0.01, maximum=MAX_MOTOR),
-        Port(name="slew_limit", unit="rad/s", start=slew, minimum=0.01, maximum=MAX_SLEW),
-        Port(name="lead_limit", unit="rad", start=lead, minimum=0.01, maximum=2.0 * MAX_MOTOR),
-        Port(name="least_position", unit="rad", start=least, minimum=-MAX_MOTOR, maximum=MAX_MOTOR,
-             description="no motor below this, co-contraction is raised instead"),
-        Port(name="least_cocontraction", unit="rad", start=common, minimum=-MAX_MOTOR, maximum=MAX_MOTOR,
-             description="lower bound of the co-contraction reference"),
-    )  # fmt: skip
+        port("position_limit", position, smallest, MAX_MOTOR),
+        port("slew_limit", slew, smallest, MAX_SLEW, per="/s"),
+        port("lead_limit", lead, smallest, 2.0 * MAX_MOTOR),
+        port("least_position", least, -MAX_MOTOR, MAX_MOTOR, "no motor below this, co-contraction is raised instead"),
+        port("least_cocontraction", common, -MAX_MOTOR, MAX_MOTOR, "lower bound of the co-contraction reference"),
+    )
 
 
-def controller_outputs() -> tuple[Port, ...]:
-    """Return the outputs: three set-points."""
-    return tuple(_motor(f"motor_setpoint_{j}", "set-point of motor") for j in (1, 2, 3))
+def controller_outputs(robot: Robot = _NECK) -> tuple[Port, ...]:
+    """Return the outputs: the motors' set-points."""
+    ranges = motor_ranges(robot, None)
+    return tuple(_motor(robot, name, "set-point of motor", ranges) for name in robot.set_points)
 
 
-def controller_inputs() -> tuple[Port, ...]:
-    """Return the inputs: references, angles, motors and flags."""
+def controller_inputs(robot: Robot = _NECK) -> tuple[Port, ...]:
+    """Return the inputs: references, outputs, motors and flags."""
+    neck, unit = robot.is_neck, to_si(robot.outputs.unit)[1]
+    lowest, highest = reference_ranges(robot)
+    ranges = motor_ranges(robot, None)
     references = tuple(
-        Port(name=f"{axis}_reference", unit="rad", minimum=-MAX_REFERENCE, maximum=MAX_REFERENCE,
-             description=f"wanted {axis}") for axis in ("pitch", "roll")
+        Port(name=f"{name}_reference", unit=unit, description=f"wanted {name}",
+             minimum=None if low <= -_UNLIMITED else low, maximum=None if high >= _UNLIMITED else high)
+        for name, low, high in zip(robot.outputs.names, lowest, highest, strict=True)
     )  # fmt: skip
     cocontraction = Port(
-        name="cocontraction_reference", unit="rad", minimum=-MAX_MOTOR, maximum=MAX_MOTOR,
-        description="wanted delta_i (Eq. 11)",
+        name="cocontraction_reference", unit=to_si(robot.motors.unit)[1],
+        minimum=None if ranges is None else min(ranges[0]), maximum=None if ranges is None else max(ranges[1]),
+        description="wanted delta_i (Eq. 11)" if neck else "wanted mean of the motors that moves no output",
     )  # fmt: skip
-    angles = tuple(Port(name=axis, unit="rad", description=f"{axis} of the neck") for axis in ("pitch", "roll"))
-    motors = tuple(_motor(f"motor_position_{j}", "measured position of motor") for j in (1, 2, 3))
+    whose = "the neck" if neck else robot.name
+    angles = tuple(Port(name=name, unit=unit, description=f"{name} of {whose}") for name in robot.outputs.names)
+    motors = tuple(_motor(robot, name, "measured position of motor", ranges) for name in robot.motor_positions)
     flags = (
         Port(name="healthy", description="the angles can be trusted", start=1.0, boolean=True),
         Port(name="enabled", description="may move the motors", start=1.0, boolean=True),
@@ -55,8 +77,34 @@ def controller_inputs() -> tuple[Port, ...]:
     return (*references, cocontraction, *angles, *motors, *flags)
 
 
-def _motor(name: str, what: str) -> Port:
-    return Port(name=name, unit="rad", description=f"{what} {name[-1]}", minimum=-MAX_MOTOR, maximum=MAX_MOTOR)
+def _motor(robot: Robot, name: str, what: str, ranges: tuple[Vector, Vector] | None) -> Port:
+    j = int(name[-1]) - 1
+    low, high = (None, None) if ranges is None else (float(ranges[0][j]), float(ranges[1][j]))
+    return Port(
+        name=name, unit=to_si(robot.motors.unit)[1], description=f"{what} {name[-1]}", minimum=low, maximum=high
+    )
+
+
+def motor_ranges(robot: Robot, position: float | None) -> tuple[Vector, Vector] | None:
+    """Return the lowest and highest set-points (motors,) in SI; None where neither the robot nor `position` says."""
+    motors, factor = robot.motors, to_si(robot.motors.unit)[0]
+    if robot.is_neck:
+        return np.full(3, -MAX_MOTOR), np.full(3, MAX_MOTOR)
+    if motors.setpoint_min is None or motors.setpoint_max is None:
+        most = np.full(len(motors.names), 0.0 if position is None else position)
+        return None if position is None else (-most, most)
+    low, high = factor * np.array(motors.setpoint_min), factor * np.array(motors.setpoint_max)
+    return (low, high) if position is None else (np.maximum(low, -position), np.minimum(high, position))
+
+
+def reference_ranges(robot: Robot) -> tuple[Vector, Vector]:
+    """Return the lowest and highest references (outputs,) in SI: what the robot's outputs may be."""
+    outputs, factor, size = robot.outputs, to_si(robot.outputs.unit)[0], len(robot.outputs.names)
+    if robot.is_neck:
+        return np.full(size, -MAX_REFERENCE), np.full(size, MAX_REFERENCE)
+    low = np.full(size, -_UNLIMITED) if outputs.min is None else factor * np.array(outputs.min)
+    high = np.full(size, _UNLIMITED) if outputs.max is None else factor * np.array(outputs.max)
+    return low, high
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,6 +118,8 @@ class ControllerLimits:
         least_position: no motor is let out below this [rad], co-contraction is raised instead; tendons stay taut.
             -6 for no such rule.
         least_cocontraction: the co-contraction reference is at least this [rad of delta_i]; -6 for no such rule.
+        robot: whose motors they are; of another than the neck all are in the SI unit of its motors, which stay within
+            its own `setpoint_min` and `setpoint_max` as well.
     """
 
     position_limit: float = MAX_MOTOR
@@ -77,8 +127,13 @@ class ControllerLimits:
     lead_limit: float = 0.8
     least_position: float = -MAX_MOTOR
     least_cocontraction: float = -MAX_MOTOR
+    robot: Robot = field(default_factory=Robot.preset)
 
     def __post_init__(self) -> None:
+        if not self.robot.is_neck:
+            for name, unit in (("position_limit", ""), ("slew_limit", "/s"), ("lead_limit", "")):
+                require_positive(name, getattr(self, name), to_si(self.robot.motors.unit)[1] + unit)
+            return
         require_between("position_limit", self.position_limit, 0.01, MAX_MOTOR, "rad")
         require_between("slew_limit", self.slew_limit, 0.01, MAX_SLEW, "rad/s")
         require_between("lead_limit", self.lead_limit, 0.01, 2.0 * MAX_MOTOR, "rad")
@@ -86,17 +141,88 @@ class ControllerLimits:
 
     def ports(self) -> tuple[Port, ...]:
         """Return them as parameters of a block."""
-        return limit_ports(
-            (self.position_limit, self.slew_limit, self.lead_limit, self.least_position, self.least_cocontraction)
-        )
+        starts = (self.position_limit, self.slew_limit, self.lead_limit, self.least_position, self.least_cocontraction)
+        return limit_ports(starts, self.robot)
+
+    def header(self) -> dict[str, float]:
+        """Return the numbers as a file keeps them."""
+        return {name: getattr(self, name) for name in LIMITS}
+
+    @classmethod
+    def from_header(cls, header: Mapping[str, Any], robot: Robot) -> ControllerLimits:
+        """Return the limits of a file; those of the first version do not know the rules for taut tendons."""
+        return cls(robot=robot, **{name: float(header[name]) for name in LIMITS if name in header})
+
+    def constants(self, sample_time: float) -> Vector:
+        """Return the runtime's constants: the sample time, of another robot also its ranges of set-points, references.
+
+        Raises:
+            SettingsError: the robot does not say how far its motors go.
+        """
+        if self.robot.is_neck:
+            return np.array([sample_time])
+        ranges = motor_ranges(self.robot, self.position_limit)
+        if ranges is None:
+            raise _not_given(self.robot, "motors.setpoint_min` and `setpoint_max", "position_limit")
+        low, high = reference_ranges(self.robot)
+        return np.array([sample_time, *ranges[0], *ranges[1], *low, ranges[0].min(), *high, ranges[1].max()])
 
     def lines(self, sample_time: float) -> list[str]:
         """Return some lines for people."""
+        if not self.robot.is_neck:
+            return [self._line_of_robot()]
         return [
             f"  limits: |P| <= {self.position_limit:g} rad, slew {self.slew_limit:g} rad/s "
             f"({self.slew_limit * sample_time:g} rad per sample), lead {self.lead_limit:g} rad before the motors",
             *_taut_lines(self.least_position, self.least_cocontraction),
         ]
+
+    def _line_of_robot(self) -> str:
+        """Return a line in the unit of the robot's files."""
+        unit = self.robot.motors.unit
+        factor = to_si(unit)[0]
+        ranges = motor_ranges(self.robot, self.position_limit)
+        told = (
+            ""
+            if ranges is None
+            else f"set-points {ranges[0].min() / factor:g} to {ranges[1].max() / factor:g} {unit}, "
+        )
+        return (
+            f"  robot {self.robot.label()}: {told}slew {self.slew_limit / factor:g} {unit}/s, lead "
+            f"{self.lead_limit / factor:g} {unit} before the motors"
+        )
+
+
+LIMITS = ("position_limit", "slew_limit", "lead_limit", "least_position", "least_cocontraction")
+
+
+def robot_limits(robot: Robot, given: Mapping[str, float]) -> ControllerLimits:
+    """Return the limits of another robot than the neck: those `given` in the unit of its motors, else its file's.
+
+    Where no lead is given, set-points may run ahead of the motors as far as these go.
+
+    Raises:
+        SettingsError: a limit that neither says.
+    """
+    factor, motors = to_si(robot.motors.unit)[0], robot.motors
+    limits = {name: factor * value for name, value in given.items()}
+    ranges = motor_ranges(robot, limits.get("position_limit"))
+    if ranges is None:
+        raise _not_given(robot, "motors.setpoint_min` and `setpoint_max", "position_limit")
+    if "slew_limit" not in limits and motors.rate_limit is None:
+        raise _not_given(robot, "motors.rate_limit", "slew_limit")
+    most = float(np.abs(ranges).max())
+    usual = {"position_limit": most, "lead_limit": 2.0 * most, "least_position": -most, "least_cocontraction": -most}
+    if motors.rate_limit is not None:
+        usual["slew_limit"] = factor * min(motors.rate_limit)
+    return ControllerLimits(robot=robot, **{**usual, **limits})
+
+
+def _not_given(robot: Robot, key: str, setting: str) -> SettingsError:
+    return SettingsError(
+        f"robot `{robot.name}` gives no `{key}`, which a controller needs; add it, or give `{setting}` in "
+        f"{robot.motors.unit}."
+    )
 
 
 def require_taut(least_position: float, least_cocontraction: float, position_limit: float) -> None:

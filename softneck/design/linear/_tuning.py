@@ -12,7 +12,7 @@ from softneck.core import Matrix, SettingsError, Vector
 from softneck.estimation import AxisPlant
 
 from ._axis_loop import coarse
-from ._margins import frequencies
+from ._margins import LOWEST, frequencies
 
 if TYPE_CHECKING:
     import control
@@ -56,7 +56,8 @@ def tune_pi(plants: Plants, extra_delay: int, max_sensitivity: float, phase_marg
         SettingsError: none do.
     """
     plant = plants[0]
-    w = frequencies(plant.sample_time) if len(plants) <= _FEW else coarse(plant.sample_time)
+    fine = len(plants) <= _FEW
+    w = frequencies(plant.sample_time, lowest=LOWEST / plant.stretch) if fine else coarse(plant)
     z = np.exp(1j * w * plant.sample_time)
     # (plants, frequencies)
     G = np.array([item.response(w, extra_delay=extra_delay) for item in plants]) / plant.static_gain
@@ -111,11 +112,11 @@ def reference_time(plants: Plants, extra_delay: int, gains: Gains, *, gain_sprea
     """
     from scipy.signal import lfilter
 
-    sample_time = plants[0].sample_time
-    rows = math.ceil(_HORIZON / sample_time)
+    sample_time, stretch = plants[0].sample_time, plants[0].stretch
+    rows = math.ceil(_HORIZON * stretch / sample_time)
     scales = (1.0 - gain_spread, 1.0, 1.0 + gain_spread) if gain_spread > 0.0 else (1.0,)
     steps = [_step_response(plant, extra_delay, gains, rows, scale) for plant in plants for scale in scales]
-    for samples in range(1 + math.ceil(_SLOWEST_FILTER / sample_time)):
+    for samples in range(1 + math.ceil(_SLOWEST_FILTER * stretch / sample_time)):
         a = math.exp(-1.0 / samples) if samples else 0.0
         peak = max(float(np.max(lfilter([1.0 - a], [1.0, -a], step))) for step in steps)
         if peak <= 1.0 + overshoot:

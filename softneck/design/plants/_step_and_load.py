@@ -22,6 +22,7 @@ class StepAndLoad:
         load_at: from when on [s].
         duration: [s].
         sample_time: [s].
+        size: of another robot, what makes its outputs as large as a neck's: 10 deg over `reference`.
     """
 
     reference: float = math.radians(10.0)
@@ -31,6 +32,7 @@ class StepAndLoad:
     load_at: float = 3.5
     duration: float = 6.0
     sample_time: float = 0.02
+    size: float = 1.0
 
     def __post_init__(self) -> None:
         for name in ("reference", "position_limit", "slew_limit", "load_at", "sample_time"):

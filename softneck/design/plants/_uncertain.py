@@ -1,17 +1,22 @@
-"""The uncertain plant of a design: a nominal plant and samples of what it may be, for both axes."""
+"""The uncertain plant of a design: a nominal plant and samples of what it may be, for all axes."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import DataError, SettingsError, SoftneckError, require_one_of
+from softneck.core import DataError, Matrix, SettingsError, SoftneckError, require_one_of
 from softneck.estimation import AxisPlant, LinearNeck, axis_plant
-from softneck.estimation._axis import AXES
+from softneck.estimation._axis import AXES, robot_of
+from softneck.identification.models._linear_systems import weights_of
+from softneck.robot import Robot
+from softneck.signals.recording._recording import require_same_robot
+
+from ._step_and_load import StepAndLoad
 
 if TYPE_CHECKING:
     import control
@@ -29,10 +34,12 @@ class UncertainAxis:
     Attributes:
         nominal: the plant that synthesis takes.
         samples: every plant that the controller must hold on; the nominal one is the first.
+        test: what a controller is judged by on all of them; None where nobody judges.
     """
 
     nominal: AxisPlant
     samples: tuple[AxisPlant, ...]
+    test: StepAndLoad | None = None
 
     @property
     def sample_time(self) -> float:
@@ -62,20 +69,33 @@ class UncertainAxis:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UncertainPlant:
-    """Both axes of an uncertain neck; what every design of this package works on."""
+    """All axes of an uncertain robot, of a neck pitch and roll; what every design of this package works on.
 
-    pitch: UncertainAxis
-    roll: UncertainAxis
+    Attributes:
+        axes: output -> what its axis may be.
+        robot: whose plant it is.
+        weights: (outputs, motors) of the motors in the redefined input of each axis; None for a neck, which has theta_i
+            and phi_i.
+    """
+
+    axes: Mapping[str, UncertainAxis]
+    robot: Robot = field(default_factory=Robot.preset)
+    weights: Matrix | None = None
 
     @property
     def sample_time(self) -> float:
         """[s]."""
-        return self.pitch.sample_time
+        return next(iter(self.axes.values())).sample_time
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The outputs."""
+        return tuple(self.axes)
 
     def axis(self, name: str) -> UncertainAxis:
-        """Return "pitch" or "roll"."""
-        require_one_of("axis", name, AXES)
-        return self.pitch if name == "pitch" else self.roll
+        """Return the axis of an output."""
+        require_one_of("axis", name, self.names)
+        return self.axes[name]
 
     def tf(self, output: str) -> control.TransferFunction:
         """Return the nominal plant of an axis, as a model's `tf`."""
@@ -109,7 +129,10 @@ def uncertain_plant(source: Any) -> UncertainPlant:
         if not source:
             raise DataError("the list of samples is empty; the first is the nominal plant.")
         each = [uncertain_plant(item) for item in source]
-        return _joined({axis: [s for item in each for s in item.axis(axis).samples] for axis in AXES})
+        for item in each[1:]:
+            require_same_robot(item.robot, each[0].robot, "plants")
+        joined = {axis: [s for item in each for s in item.axis(axis).samples] for axis in each[0].names}
+        return replace(_joined(joined), robot=each[0].robot, weights=each[0].weights)
     if isinstance(source, control.StateSpace | control.TransferFunction):
         return _joined({axis: [_plant(_of_system(source, axis), axis, "the plant")] for axis in AXES})
     if not hasattr(source, "tf"):
@@ -117,13 +140,22 @@ def uncertain_plant(source: Any) -> UncertainPlant:
             f"a linear model is needed, one with `tf`; got {type(source).__name__}. "
             "Identify `rls`, or give a discrete control.TransferFunction."
         )
-    return _joined({axis: _of_model(source, axis) for axis in AXES})
+    robot = robot_of(source)
+    joined = _joined({axis: _of_model(source, axis) for axis in robot.outputs.names})
+    return joined if robot.is_neck else replace(joined, robot=robot, weights=_weights(source))
+
+
+def _weights(source: Any) -> Matrix:
+    """Return the weights of the motors in each axis: a family may say its own, as a model's findings do."""
+    own = getattr(source, "weights", None)
+    return weights_of(source) if own is None else np.asarray(own() if callable(own) else own)
 
 
 def _of_model(model: Any, axis: str) -> list[AxisPlant]:
     nominal = axis_plant(model, axis)
     samples = model.samples(axis) if callable(getattr(model, "samples", None)) else []
-    return [nominal, *(_plant(item, axis, f"sample {i} of the family") for i, item in enumerate(samples))]
+    plants = (_plant(item, axis, f"sample {i} of the family") for i, item in enumerate(samples))
+    return [nominal, *(replace(plant, stretch=nominal.stretch) for plant in plants)]
 
 
 def _of_mapping(source: Mapping[str, Any]) -> UncertainPlant:
@@ -145,9 +177,10 @@ def _of_mapping(source: Mapping[str, Any]) -> UncertainPlant:
 
 def _joined(axes: Mapping[str, list[AxisPlant]]) -> UncertainPlant:
     times = {axis: plants[0].sample_time for axis, plants in axes.items()}
-    if not math.isclose(*times.values(), rel_tol=1e-9):
+    if max(times.values()) - min(times.values()) > 1e-9 * max(times.values()):
         raise SettingsError(
-            f"pitch and roll have different sample times, {times['pitch']:g} s and {times['roll']:g} s; resample one."
+            f"{' and '.join(times)} have different sample times, "
+            f"{' and '.join(f'{time:g} s' for time in times.values())}; resample one."
         )
     for axis, plants in axes.items():
         for i, plant in enumerate(plants):
@@ -162,8 +195,7 @@ def _joined(axes: Mapping[str, list[AxisPlant]]) -> UncertainPlant:
                     f"{plants[0].static_gain:.4g}: no controller with integral action holds both signs. "
                     "Leave that sample out, or check the signs of its recording."
                 )
-    made = {axis: UncertainAxis(plants[0], tuple(plants)) for axis, plants in axes.items()}
-    return UncertainPlant(made["pitch"], made["roll"])
+    return UncertainPlant({axis: UncertainAxis(plants[0], tuple(plants)) for axis, plants in axes.items()})
 
 
 def _plant(system: Any, axis: str, what: str) -> AxisPlant:

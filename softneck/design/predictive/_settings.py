@@ -18,7 +18,7 @@ from softneck.core import (
     require_whole,
 )
 from softneck.estimation import axis_plant
-from softneck.estimation._axis import HasTransferFunctions
+from softneck.estimation._axis import HasTransferFunctions, robot_of
 from softneck.estimation._settings import ORDERS
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
@@ -181,6 +181,7 @@ class MpcSettings:
             SettingsError: a model that is not linear, discrete and stable, limits that contradict each other, or a
                 robustness that nothing keeps.
         """
+        robot_of(model).require_neck("predictive control")
         nominal = self._nominal(model)
         Ts = nominal[0].sample_time
         samples = sample_pairs(model, self.least_delay)

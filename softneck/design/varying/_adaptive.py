@@ -10,7 +10,7 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, require_between
 from softneck.estimation import AxisPlant, axis_plant
-from softneck.estimation._axis import HasTransferFunctions
+from softneck.estimation._axis import HasTransferFunctions, robot_of
 from softneck.runtime import Port
 
 from ..linear._assembly import assemble, pi_axis
@@ -96,6 +96,7 @@ class AdaptiveSettings(LoopSettings):
             raise SettingsError(
                 f"adaptive control starts from one model or a family; got {len(model)} models. Name one."
             )
+        robot_of(model).require_neck("adaptive control")
         plants = [self._plant(model, axis) for axis in AXES]
         Ts = plants[0].sample_time
         if not math.isclose(Ts, plants[1].sample_time, rel_tol=1e-9):
@@ -191,8 +192,8 @@ class AdaptiveSettings(LoopSettings):
         common = assemble(
             (pi_axis(1.0, 1.0, Ts), pi_axis(1.0, 1.0, Ts)),
             reference_times=(time, time, time),
-            sample_time=Ts,
-            tendon_angles=self.tendon_angles,
+            redefinition=self.neck_redefinition(),
+            constants=self.limits().constants(Ts),
         )
         guards = [
             self.forgetting, self.covariance_bound, self.dead_zone,

@@ -1,4 +1,4 @@
-"""Indirect adaptive control of both axes: what the neck is, learnt as it moves, and the gains that follow from it.
+"""Indirect adaptive control of all axes: what the neck is, learnt as it moves, and the gains that follow from it.
 
 Each axis is y+ = a y + b u(k-d) with the delay d known. Its a and b are estimated by recursive least squares in the
 kit's U D U' form on angles and inputs behind one band-pass, (1 - z^-1) / (1 - f z^-1)^2, which takes out offsets and
@@ -26,6 +26,7 @@ from softneck.design.linear._linear_parts_runtime import (
     LinearState,
     linear_control,
     linear_finite,
+    linear_motors,
     linear_reference,
 )
 from softneck.identification.linear._ud_runtime import ud_guarded
@@ -48,47 +49,51 @@ ADAPTIVE_AVERAGE = 0.98
 
 
 def adaptive_longest(delays: np.ndarray) -> int:
-    """Return the longer delay [samples]."""
-    return int(max(delays[0], delays[1]))
+    """Return the longest delay [samples]."""
+    longest = delays[0]
+    for i in range(1, delays.shape[0]):  # numpy's `max` would take a tenth of a step's time
+        longest = max(longest, delays[i])
+    return int(longest)
 
 
 class AdaptiveArrays(FilterArrays):
     """Reference filter, allocation, and what is known of the neck before anything is learnt."""
 
-    rest = array("m, 3", "from r to the filter's state at rest")
-    T = array("3, 3", "of Eq. 9-11: motors to (theta_i, phi_i, delta_i)")
-    T_inverse = array("3, 3", "redefined inputs to motors")
-    constants = array("1", "sample time [s]")
-    nominal = array("2, 2", "a and b of each axis")
-    box = array("2, 4", "least and largest a, least and largest static gain of each axis")
-    delays = array("2", "d of each axis [samples]")
-    loop = array("2", "kappa of each axis")
+    rest = array("m, references", "from r to the filter's state at rest")
+    T = array("references, motors", "of Eq. 9-11: motors to (theta_i, phi_i, delta_i)")
+    T_inverse = array("motors, references", "redefined inputs to motors")
+    constants = array("numbers", "as of the linear controller")
+    nominal = array("outputs, 2", "a and b of each axis")
+    box = array("outputs, 4", "least and largest a, least and largest static gain of each axis")
+    delays = array("outputs", "d of each axis [samples]")
+    loop = array("outputs", "kappa of each axis")
     guards = array("10", "see ADAPTIVE_*")
     d = value("delays", function=adaptive_longest)
+    motors = value("T_inverse", function=linear_motors, written=True)
 
 
 class AdaptiveState(LinearState):
     """That of the linear controller, and for each axis what it learnt."""
 
-    x = cells("2, d + 2", "integral s, then y of the model and its past, newest first [rad]")
-    theta = cells("2, 2", "estimate: -a and b")
-    U = cells("2, 2, 2", "of the covariance U D U': U' without its ones")
-    D = cells("2, 2", "")
-    tally = cells("2, 4", "counts of the recursion (see `ud_guarded`)")
-    used = cells("2, 2", "a and b in use")
-    angle = cells("2, 3", "angle of before, and behind one and both poles of the band-pass [rad]")
-    input = cells("2, 3", "the same of the input v")
-    line = cells("2, d + 1", "band-passed inputs, newest first")
-    power = cells("2", "mean square of the band-passed input [rad^2]")
-    missed = cells("2", "mean square of the estimate's errors [rad^2]")
-    nominal_missed = cells("2", "of the nominal plant's")
-    samples = cells("2", "in the line since the last stop")
+    x = cells("outputs, d + 2", "integral s, then y of the model and its past, newest first [rad]")
+    theta = cells("outputs, 2", "estimate: -a and b")
+    U = cells("outputs, 2, 2", "of the covariance U D U': U' without its ones")
+    D = cells("outputs, 2", "")
+    tally = cells("outputs, 4", "counts of the recursion (see `ud_guarded`)")
+    used = cells("outputs, 2", "a and b in use")
+    angle = cells("outputs, 3", "angle of before, and behind one and both poles of the band-pass [rad]")
+    input = cells("outputs, 3", "the same of the input v")
+    line = cells("outputs, d + 1", "band-passed inputs, newest first")
+    power = cells("outputs", "mean square of the band-passed input [rad^2]")
+    missed = cells("outputs", "mean square of the estimate's errors [rad^2]")
+    nominal_missed = cells("outputs", "of the nominal plant's")
+    samples = cells("outputs", "in the line since the last stop")
 
 
 def initialise(p: AdaptiveArrays, parameters: np.ndarray, x: AdaptiveState, outputs: np.ndarray) -> None:
     """Start with motors at rest and the nominal plant."""
     x[:] = 0.0
-    for axis in range(2):
+    for axis in range(p.outputs):
         adaptive_forget(p, x, axis)
         x.used[axis] = p.nominal[axis]
     outputs[:] = 0.0
@@ -104,30 +109,31 @@ def step(p: AdaptiveArrays, parameters: np.ndarray, x: AdaptiveState, inputs: np
         x.samples[:] = 0.0
         outputs[:] = x.held
         return
+    flags = 2 * p.outputs + 1 + p.motors
     if x.started == 0.0:
-        x.held[:] = inputs[5:8]
-    active = inputs[8] > 0.5 and inputs[9] > 0.5
+        x.held[:] = inputs[2 * p.outputs + 1 : flags]
+    active = inputs[flags] > 0.5 and inputs[flags + 1] > 0.5
     # A regression needs the sample before.
     going = active and x.started > 0.5
-    for axis in range(2):
+    for axis in range(p.outputs):
         if going:
             if parameters[5] > 0.5:
-                adaptive_learn(p, x, axis, inputs[3 + axis])
+                adaptive_learn(p, x, axis, inputs[p.outputs + 1 + axis])
             before = adaptive_asked(p, parameters, x, axis, inputs)
             adaptive_redesign(p, x, axis, parameters[5] > 0.5)
             # New gains move no motor: the integral takes up what they would have changed.
             change = adaptive_asked(p, parameters, x, axis, inputs) - before
             x.x[axis, 0] -= change
         # Behind the learning, which needs the band-pass of before.
-        adaptive_see(p, x, axis, inputs[3 + axis], going)
+        adaptive_see(p, x, axis, inputs[p.outputs + 1 + axis], going)
     now = adaptive_arrays(p, x)
     if x.started == 0.0 or not active:
-        adaptive_align(p, now, x, inputs[3:5])
+        adaptive_align(p, now, x, inputs[p.outputs + 1 : 2 * p.outputs + 1])
     x.started = 1.0
     if active:
         linear_control(now, parameters, x, inputs)
     v = np.dot(p.T, x.held)
-    for axis in range(2):
+    for axis in range(p.outputs):
         adaptive_push(p, x, axis, v[axis], active)
     outputs[:] = x.held
 
@@ -215,10 +221,10 @@ def adaptive_redesign(p: AdaptiveArrays, x: AdaptiveState, axis: int, adapt: boo
 
 def adaptive_asked(p: AdaptiveArrays, parameters: np.ndarray, x: AdaptiveState, axis: int, inputs: np.ndarray) -> float:
     """Return what the gains in use ask for, without the integral."""
-    rf = linear_reference(p, parameters, x.xf, inputs)[axis]
+    rf = linear_reference(p, p.constants, parameters, x.xf, inputs)[axis]
     ym = x.x[axis, 1 + int(p.delays[axis])]
     a, b = x.used[axis, 0], x.used[axis, 1]
-    return float(((1.0 - a) * rf + p.loop[axis] * (ym - inputs[3 + axis])) / b)
+    return float(((1.0 - a) * rf + p.loop[axis] * (ym - inputs[p.outputs + 1 + axis])) / b)
 
 
 def adaptive_see(p: AdaptiveArrays, x: AdaptiveState, axis: int, y: float, going: bool) -> None:
@@ -256,9 +262,10 @@ def adaptive_arrays(p: AdaptiveArrays, x: AdaptiveState) -> LinearArrays:
     """Return the arrays of the linear controller for a and b in use."""
     # s, ym and its past of d samples, for each axis.
     n = p.d + 2
-    A, Br, By = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2)), np.zeros((2 * n, 2))
-    C, Dr, Dy, L = np.zeros((2, 2 * n)), np.zeros((2, 2)), np.zeros((2, 2)), np.zeros((2 * n, 2))
-    for axis in range(2):
+    m, rows = p.outputs, p.outputs * n
+    A, Br, By = np.zeros((rows, rows)), np.zeros((rows, m)), np.zeros((rows, m))
+    C, Dr, Dy, L = np.zeros((m, rows)), np.zeros((m, m)), np.zeros((m, m)), np.zeros((rows, m))
+    for axis in range(p.outputs):
         a, b, kappa = x.used[axis, 0], x.used[axis, 1], p.loop[axis]
         o = axis * n
         seen = o + 1 + int(p.delays[axis])
@@ -276,7 +283,7 @@ def adaptive_arrays(p: AdaptiveArrays, x: AdaptiveState) -> LinearArrays:
         L[o, axis] = p.guards[ADAPTIVE_LEAK]  # gives up what is beyond a limit over `leak_time`
         L[o + 1, axis] = b  # the model gets what the motors could do, and waits
     # `adaptive_align` aligns: no matrix of y and v can, as it would move with the gains.
-    align = np.zeros((2 * n, 4))
+    align = np.zeros((rows, 2 * m))
     return (  # pyright: ignore[reportReturnType]  # a tuple is what arrays are in the bundle
         p.Af, p.Bf, p.Cf, p.Df, A, Br, By, C, Dr, Dy, L, align, p.rest, p.T, p.T_inverse, p.constants,
     )  # fmt: skip
@@ -285,11 +292,11 @@ def adaptive_arrays(p: AdaptiveArrays, x: AdaptiveState) -> LinearArrays:
 def adaptive_align(p: AdaptiveArrays, now: LinearArrays, x: AdaptiveState, y: np.ndarray) -> None:
     """Let the model rest where the neck is, and the integral ask for what is held besides: no bump."""
     v = np.dot(p.T, x.held)
-    rest = np.empty(3)
-    rest[:2] = y
-    rest[2] = v[2]
+    rest = np.empty(p.outputs + 1)
+    rest[: p.outputs] = y
+    rest[p.outputs] = v[p.outputs]
     x.xf[:] = np.dot(p.rest, rest)
-    for axis in range(2):
+    for axis in range(p.outputs):
         x.x[axis] = y[axis]
         # v = rf / G_0 + s where ym = y: Dr is 1 / G_0.
         x.x[axis, 0] = v[axis] - now.Dr[axis, axis] * y[axis]

@@ -10,7 +10,7 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError, require_between
 from softneck.estimation import AxisPlant
-from softneck.estimation._axis import HasTransferFunctions
+from softneck.estimation._axis import HasTransferFunctions, robot_of
 from softneck.identification import Family
 
 from ..linear._assembly import AxisController, assemble
@@ -104,6 +104,8 @@ class ScheduledSettings(LoopSettings):
             SettingsError: fewer than two operating points, no gains that keep the robustness, or a loop between two
                 points that does not keep it.
         """
+        for item in plant if isinstance(plant, Sequence) else (plant,):
+            robot_of(item).require_neck("scheduling over the inclination")
         points = [self._with_doubt(point) for point in self._points(plant)]
         sample_time = points[0].plants[0][0].sample_time
         gains = [tuple(self._tune(point, axis) for axis in range(2)) for point in points]
@@ -171,12 +173,13 @@ class ScheduledSettings(LoopSettings):
             ]
             for axis in range(2)
         ]
+        redefinition, constants = self.neck_redefinition(), self.limits().constants(sample_time)
         each = [
             assemble(
                 (pitch, roll),
                 reference_times=(self.reference_time, self.reference_time, self.reference_time),
-                sample_time=sample_time,
-                tendon_angles=self.tendon_angles,
+                redefinition=redefinition,
+                constants=constants,
             )
             for pitch, roll in zip(*axes, strict=True)
         ]

@@ -19,9 +19,10 @@ from softneck.design.linear._linear_parts_runtime import (
     linear_align,
     linear_control,
     linear_finite,
+    linear_motors,
 )
 from softneck.design.linear._rest_runtime import initialise as initialise
-from softneck.runtime._layout import array, cells
+from softneck.runtime._layout import array, cells, value
 
 
 class ScheduledArrays(FilterArrays):
@@ -41,6 +42,7 @@ class ScheduledArrays(FilterArrays):
     constants = array("1", "sample time [s]")
     knots = array("k", "inclinations, rising [rad]")
     memory = array("1", "pole of the inclination's lag")
+    motors = value("T_inverse", function=linear_motors, written=True)
 
 
 class ScheduledState(LinearState):

@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import Matrix, Vector, write_archive
+from softneck.robot import Robot
 from softneck.runtime import Block, Port, State
-from softneck.runtime._bundle import declared
+from softneck.runtime._bundle import declared, sized
 from softneck.runtime._layout import Arrays
 
+from ..linear._controller import robot_in
 from ..linear._ports import ControllerLimits, controller_inputs, controller_outputs
 
 
@@ -44,16 +46,21 @@ class VaryingController:
     lines: tuple[str, ...] = ()
     design: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def robot(self) -> Robot:
+        """Whose controller it is."""
+        return self.limits.robot
+
     def block(self) -> Block:
         """Return the controller as a block of role "controller"."""
         return Block(
             kind=self.kind,
             role="controller",
-            runtime=self.runtime,
+            runtime=sized(self.runtime, len(self.robot.motors.names), len(self.robot.outputs.names)),
             sample_time=self.sample_time,
             arrays=tuple(self.arrays.values()),
-            inputs=controller_inputs(),
-            outputs=controller_outputs(),
+            inputs=controller_inputs(self.robot),
+            outputs=controller_outputs(self.robot),
             parameters=(*self.limits.ports(), *self.parameters),
         )
 
@@ -79,7 +86,7 @@ class VaryingController:
         header = {
             "kind": self.kind,
             "sample_time": self.sample_time,
-            "limits": asdict(self.limits),
+            "limits": self.limits.header(),
             "order": self.order,
             "names": list(self.arrays),
             # None of them is an integer, and files of format 1 do not say so.
@@ -89,6 +96,7 @@ class VaryingController:
             "inputs": [port.name for port in block.inputs],
             "outputs": [port.name for port in block.outputs],
             "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
+            **({} if self.robot.is_neck else {"robot": self.robot.as_dict()}),
         }
         write_archive(path, header, self.arrays, force=force)
 
@@ -101,7 +109,7 @@ class VaryingController:
             runtime=RUNTIMES[kind],
             sample_time=float(header["sample_time"]),
             arrays=declared(RUNTIMES[kind], Arrays).read(arrays),
-            limits=ControllerLimits(**header["limits"]),
+            limits=ControllerLimits.from_header(header["limits"], robot_in(header)),
             order=str(header["order"]),
             parameters=tuple(Port(**port) for port in header["parameters"]),
             lines=tuple(str(line) for line in header["lines"]),

@@ -9,6 +9,7 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, require_one_of, require_whole, to_si
 from softneck.robot import Robot
+from softneck.robot._redefined import redefinition_of
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
 from ._state_space import system_of
@@ -65,8 +66,7 @@ def transfer_function(model: Linear, output: str, input: str | None, angle_unit:
     name, scale = _checked(model, output, input, angle_unit)
     axes = model.findings.get("transfer_functions")
     if not model.robot.is_neck:
-        axis, motor = model.robot.outputs.names.index(output), model.robot.set_points.index(name)
-        numerator, denominator, delay = _of_motor(model.arrays, axis, motor)
+        numerator, denominator, delay = _of_robot(model, output, name)
     elif axes is not None:
         numerator, denominator, delay = _of_findings(axes, _OUTPUTS.index(output), name)
     elif "A" in model.arrays:
@@ -198,6 +198,41 @@ def _dead_time(numerator: Vector, denominator: Vector) -> int:
     return min(at_zero, denominator.size - above.size - 1) if above.size else 0
 
 
+def redefined_input(robot: Robot, output: str) -> str:
+    """Return what the redefined input of an output is called: of a neck theta_i and phi_i."""
+    return _REDEFINED[_OUTPUTS.index(output)] if robot.is_neck else f"{output}_input"
+
+
+def weights_of(model: Linear) -> Matrix:
+    """Return the weights (outputs, motors) of the motors in each output's direction, given or learned.
+
+    Raises:
+        SettingsError: the robot's directions are to be identified, and the model says nothing of them.
+    """
+    weights = model.robot.weights()
+    if weights is None:
+        found = model.findings.get("directions")
+        if found is None:
+            raise SettingsError(
+                f"the model of kind `{model.kind}` says nothing of the directions of robot `{model.robot.name}`, "
+                'which are "identified"; identify `oe` or `rls`, or give `directions.matrix`.'
+            )
+        weights = np.array(found, dtype=np.float64)
+    return weights
+
+
+def _of_robot(model: Linear, output: str, name: str) -> tuple[Vector, Vector, int]:
+    """Return numerator, denominator and dead time to an output from a motor, or from its own redefined input."""
+    axis = model.robot.outputs.names.index(output)
+    if name in model.robot.set_points:
+        return _of_motor(model.arrays, axis, model.robot.set_points.index(name))
+    entry = model.findings.get("transfer_functions", {}).get(output)
+    if entry is not None:  # one axis alone: the state space has the poles of all
+        return np.array(entry["b"]), np.concatenate([[1.0], entry["a"]]), int(entry["delay"])
+    inverse = redefinition_of(weights_of(model), model.robot.outputs.names)[1]
+    return _of_column(model.arrays, axis, model.arrays["B"] @ inverse[:, axis])
+
+
 def _of_findings(axes: Mapping[str, Any], axis: int, name: str) -> tuple[Vector, Vector, int]:
     """Return one axis of a model whose arrays hold both in one state space."""
     entry = axes[_OUTPUTS[axis]]
@@ -256,16 +291,14 @@ def _delayed(A: Matrix, B: Matrix, C: Matrix, delay: int) -> tuple[Matrix, Matri
 def _checked(model: Linear, output: str, input: str | None, angle_unit: str) -> tuple[str, float]:
     _require_linear(model.kind)
     robot = model.robot
-    if input is None or input in _REDEFINED:
-        robot.require_neck("what works on theta_i and phi_i (design, observers, families)")
     require_one_of("output", output, robot.outputs.names)
     require_one_of("angle_unit", angle_unit, ("rad", "deg"))
     if robot.is_neck:
         name = _REDEFINED[_OUTPUTS.index(output)] if input is None else input
         require_one_of("input", name, _REDEFINED + _MOTORS)
     else:
-        name = input or ""
-        require_one_of("input", name, robot.set_points)
+        name = redefined_input(robot, output) if input is None else input
+        require_one_of("input", name, (redefined_input(robot, output), *robot.set_points))
     angle = to_si(robot.outputs.unit)[1] == "rad"
     return name, 180.0 / np.pi if angle_unit == "deg" and angle else 1.0
 

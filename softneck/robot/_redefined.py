@@ -1,0 +1,50 @@
+"""Redefined inputs of any robot: one for each output, co-contraction behind them, and the motors that give them.
+
+Of the neck these are Eq. 9 to 11. In general v = W P with the weights W of the robot's directions, and of all motors
+that give v the nearest to zero are taken, W^+ v. Co-contraction moves along what tilts nothing: the vector of W's null
+space nearest to (1, .., 1), scaled so that its mean is 1 and co-contraction is the mean that it adds to the motors (for
+the neck Eq. 11). What else the null space has is held at zero; where it has nothing, there is no co-contraction.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from softneck.core import Matrix, SettingsError
+
+# Below this part of the largest singular value a direction is one that the motors cannot move.
+_LEAST = 1e-6
+# A null space further than this from (1, .., 1) has no vector that all motors share.
+_SHARED = 1e-9
+
+
+def redefinition_of(weights: Matrix, names: tuple[str, ...]) -> tuple[Matrix, Matrix]:
+    """Return T (outputs + 1, motors) to the redefined inputs and co-contraction, and T^-1 (motors, outputs + 1).
+
+    Without a null space the last row and column are zero.
+
+    Args:
+        weights: (outputs, motors) of the motors in each output's direction.
+        names: of the outputs, for the message.
+
+    Raises:
+        SettingsError: the motors cannot move all outputs independently.
+    """
+    _, s, Vh = np.linalg.svd(weights / np.linalg.norm(weights, axis=1, keepdims=True))
+    outputs, motors = weights.shape
+    if motors < outputs or s[outputs - 1] < _LEAST * s[0]:
+        raise SettingsError(
+            f"{motors} motor(s) cannot move {', '.join(names)} independently; a controller needs directions that span "
+            "all outputs."
+        )
+    ones = np.ones(motors)
+    shared = Vh[outputs:].T @ (Vh[outputs:] @ ones)
+    if np.linalg.norm(shared) > _SHARED * np.linalg.norm(ones):
+        shared *= motors / shared.sum()
+        back = shared / (shared @ shared)
+    else:
+        shared, back = np.zeros(motors), np.zeros(motors)
+    inverse = np.column_stack([np.linalg.pinv(weights), shared])
+    # What rounding leaves of a motor that takes no part.
+    inverse[np.abs(inverse) < 1e-14 * np.abs(inverse).max(axis=0, initial=0.0)] = 0.0
+    return np.vstack([weights, back]), inverse

@@ -1,0 +1,198 @@
+"""Controllers of other robots than the neck: loops that close, limits of their files, units, and what is refused."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from softneck import identify, load, record
+from softneck.core import SettingsError
+from softneck.cosim import make_loop, simulate
+from softneck.cosim.loops._loop_table import check_key
+from softneck.design import PiSettings, design_controller
+from softneck.estimation import KalmanSettings
+from softneck.identification import Model
+from softneck.identification.models._state_space import lss_arrays
+from softneck.loop._faults import make_fault
+from softneck.plant import VirtualNeck
+from softneck.robot import Robot
+from softneck.signals import signal
+from softneck.verification import verify
+
+TS, POLE, DELAY = 0.02, 0.9, 3
+# Three lengths that four chambers move; nobody told their directions, and they are 50 mm long at rest.
+BELLOWS = Robot.from_dict({
+    "name": "bellows",
+    "motors": {"names": ["a", "b", "c", "d"], "unit": "bar", "setpoint_min": 0, "setpoint_max": 3, "rate_limit": 20},
+    "outputs": {"names": ["x", "y", "z"], "unit": "mm", "min": 40, "max": 60},
+    "directions": {"kind": "identified"},
+})  # fmt: skip
+LEARNED = np.array([[0.8, -0.6, 0.0, 0.0], [0.0, 0.6, 0.8, 0.0], [0.5, 0.5, 0.5, 0.5]])
+KINDS = ("pi", "pid", "fopi", "hinf", "ncf", "lqg")
+
+
+def plant(robot: Robot, *, gain: float = 0.08, rest: float = 0.0) -> Model:
+    """Each output a lag behind its direction, as `oe` finds it."""
+    given = robot.weights()
+    W = LEARNED if given is None else given
+    m = len(W)
+    system = (POLE * np.eye(m), (1.0 - POLE) * gain * W, np.eye(m), 0.1 * np.eye(m))
+    drive = np.zeros((W.shape[1], 2))
+    entry = {"a": [-POLE], "b": [(1.0 - POLE) * gain], "delay": DELAY}
+    return Model(
+        kind="oe",
+        sample_time=TS,
+        arrays={**lss_arrays(system, delay=DELAY, drive=drive), "offset": np.full(m, rest)},
+        findings={"transfer_functions": dict.fromkeys(robot.outputs.names, entry), "directions": W.tolist()},
+        robot=robot,
+    )
+
+
+def closed(model: Model, controller: Any, *, duration: float = 4.0, **reference: Any) -> Any:
+    return simulate({
+        "duration_s": duration, "plant": model, "controller": controller,
+        "reference": {"kind": "step", "at_s": 0.5, **reference},
+    })  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_linear_kind_is_designed_for_other_robots(kind: str, tmp_path: Path) -> None:
+    """The margins asked for hold on the loop itself, whatever the units: gains scale, times stay."""
+    few, many = (plant(Robot.preset("antagonist"), gain=gain) for gain in (0.08, 8e-6))
+    one, other = design_controller(kind, few), design_controller(kind, many)
+    K, scaled = (one.ss(), other.ss())
+    z = np.exp(1j * np.geomspace(0.5, 100.0, 30) * TS)
+    if kind != "pid":  # whose simplex ends elsewhere from another start, within the same bounds
+        # Bisections end within 3 % of the same speed.
+        np.testing.assert_allclose(1e-4 * scaled(z)[0], K(z)[0], rtol=0.05)
+    for found in (one, other):
+        assert found.design["pitch"]["margins"]["sensitivity"] < 2.01
+        assert found.design["pitch"].get("samples_unstable", 0) == 0
+    assert list(K.input_labels) == ["pitch_reference", "pitch"]
+    assert list(K.output_labels) == ["pitch_input"]
+    one.save(tmp_path / "c.npz")
+    again = load(tmp_path / "c.npz")
+    assert again.robot.hash == one.robot.hash
+    assert [port.name for port in again.block().outputs] == ["motor_setpoint_1", "motor_setpoint_2"]
+    for a, b in zip(one.arrays, again.arrays, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_an_antagonist_follows_a_step_and_its_tendons_share_the_pull() -> None:
+    model = plant(Robot.preset("antagonist"))
+    result = closed(model, design_controller("pi", model), pitch_deg=6.0, cocontraction_rad=0.3)
+    found = result.metrics
+    assert set(found) == {"pitch", "motors"}
+    assert found["pitch"]["overshoot_pct"] < 2.0
+    assert found["pitch"]["settling_s"] < 1.0
+    P = np.column_stack([result[f"motor_setpoint_{j}"] for j in (1, 2)])
+    # 6 deg by a gain of 0.08 rad/rad of P1 - P2, around the co-contraction asked for.
+    tilt = math.radians(6.0) / 0.08
+    np.testing.assert_allclose(P[-1], [0.3 + tilt / 2.0, 0.3 - tilt / 2.0], rtol=1e-3)
+    recording = result.recording()
+    assert recording.robot.hash == model.robot.hash
+    assert recording.set_points.shape[1] == 2
+
+
+@pytest.mark.slow
+def test_three_lengths_of_four_chambers_in_bar_and_mm() -> None:
+    model = plant(BELLOWS, gain=1e-7, rest=0.03)
+    controller = design_controller("pi", model, slew_limit=10.0)
+    assert "set-points 0 to 3 bar, slew 10 bar/s" in controller.summary()
+    result = closed(model, controller, duration=6.0, x=41.0, y_mm=43.0, z=49.0, at_s=0.0, cocontraction=1.0)
+    for name in ("x", "y", "z"):
+        assert result.metrics[name]["steady_rms_mm"] < 0.01
+    P = np.column_stack([result[f"motor_setpoint_{j}"] for j in range(1, 5)])
+    assert P.min() >= 0.0
+    assert P.max() <= 3e5
+    assert np.abs(np.diff(P, axis=0)).max() <= 1e6 * TS * (1.0 + 1e-9)
+    assert result.metrics["motors"]["max_bar"] == pytest.approx(P.max() / 1e5)
+
+
+def test_limits_come_from_the_robot_file_and_what_is_missing_is_asked_for() -> None:
+    table = Robot.preset("antagonist").as_dict()
+    del table["motors"]["rate_limit"]
+    model = plant(Robot.from_dict(table))
+    with pytest.raises(SettingsError, match=r"robot `antagonist` gives no `motors.rate_limit`.*or give `slew_limit`"):
+        PiSettings().design(model)
+    limits = PiSettings(slew_limit=3.0, position_limit=4.0).design(model).limits
+    assert (limits.slew_limit, limits.position_limit) == (3.0, 4.0)
+    # The neck's own numbers given on purpose are given: only its defaults say nothing of others.
+    assert PiSettings(slew_limit=12.5, lead_limit=0.4).design(model).limits.lead_limit == 0.4
+    with pytest.raises(SettingsError, match="`tendon_angles` are of necks"):
+        PiSettings(slew_limit=3.0, tendon_angles=(0.0, 2.0, 4.0)).design(model)
+
+
+def test_a_loop_is_of_one_robot() -> None:
+    model, other = plant(Robot.preset("antagonist")), plant(Robot.preset("finger"))
+    controller = PiSettings().design(model)
+    with pytest.raises(SettingsError, match=r"\[controller\] is of robot `antagonist` .* \[plant\] of robot `finger`"):
+        closed(other, controller, pitch_deg=5.0)
+    # A neck's virtual plant becomes that of the loop's robot, and says so by its channels.
+    loop = make_loop(
+        {"duration_s": 1.0, "plant": "paper", "controller": controller, "reference": {"kind": "step"}}
+    ).loop
+    assert [port.name for port in loop.plant.inputs][:3] == ["motor_setpoint_1", "motor_setpoint_2", "payload"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["antagonist", "trunk4"])
+def test_the_whole_way_over_the_virtual_plant(name: str) -> None:
+    """Recorded, identified, designed and closed over the physics that stands for the robot."""
+    robot = Robot.preset(name)
+    recording = record(signal("aprbs", duration=40.0, robot=robot), VirtualNeck.of(robot), seed=1)
+    controller = design_controller("pi", identify("oe", recording))
+    result = simulate({"duration_s": 6.0, "plant": "paper", "controller": controller,
+                       "reference": {"kind": "step", "at_s": 1.0, "pitch_deg": 8.0}})  # fmt: skip
+    assert result.robot.hash == robot.hash
+    # The gain of a line through large moves is some 20 % off for small ones.
+    assert result.metrics["pitch"]["overshoot_pct"] < 25.0
+    assert result.metrics["pitch"]["steady_rms_deg"] < 0.3
+
+
+@pytest.mark.parametrize(
+    ("reference", "said"),
+    [
+        ({"roll_deg": 3.0}, "unknown key `roll_deg` of a step reference"),
+        ({"pitch_mm": 3.0}, "unknown key `pitch_mm` of a step reference"),
+        ({"pitch": 80.0}, r"`pitch` is beyond what `antagonist` may do: -0.8 to 0.8 rad"),
+        ({"kind": "rotation", "inclination_deg": 3.0}, 'kind = "rotation" is for two angles'),
+        ({"pitch": "far"}, "`pitch` must be a number"),
+    ],
+)
+def test_references_that_a_robot_cannot_follow_are_refused(reference: dict[str, Any], said: str) -> None:
+    model = plant(Robot.preset("antagonist"))
+    with pytest.raises(SettingsError, match=said):
+        closed(model, PiSettings().design(model), **reference)
+
+
+def test_keys_of_studies_and_faults_know_the_robot() -> None:
+    model = plant(Robot.preset("antagonist"))
+    table = {"reference": {"kind": "step"}, "duration_s": 1.0}
+    check_key(table, "reference.pitch_deg", {}, model.robot)
+    with pytest.raises(SettingsError, match="`roll_deg` is not part of a step reference"):
+        check_key(table, "reference.roll_deg", {}, model.robot)
+    with pytest.raises(SettingsError, match="`motor` must be a whole number between 0 and 2"):
+        make_fault("motor_stuck", {"motor": 3}, model.robot)
+
+
+@pytest.mark.parametrize("kind", ["adaptive", "mpc", "scheduled"])
+def test_kinds_that_take_necks_only_say_so(kind: str) -> None:
+    with pytest.raises(SettingsError, match=r"takes necks only so far, not robot `antagonist`"):
+        design_controller(kind, plant(Robot.preset("antagonist")))
+
+
+def test_an_observer_takes_necks_only_and_says_so() -> None:
+    # Pitch, roll and enough motors: a trunk looks like a neck to who does not ask.
+    with pytest.raises(SettingsError, match="an observer takes necks only so far, not robot `trunk4`"):
+        KalmanSettings().design(plant(Robot.preset("trunk4")))
+
+
+def test_verification_takes_necks_only_and_says_so() -> None:
+    model = plant(Robot.preset("trunk4"))
+    with pytest.raises(SettingsError, match="verification takes necks only so far, not robot `trunk4`"):
+        verify(PiSettings().design(model), model)
