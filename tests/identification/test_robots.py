@@ -10,7 +10,7 @@ import pytest
 from softneck import identify, load, validate
 from softneck.core import KINDS, DataError, FileFormatError, Matrix, SettingsError
 from softneck.core._kinds import kinds_of
-from softneck.identification import choose
+from softneck.identification import FamilySettings, choose
 from softneck.identification.models._directions import directions_of
 from softneck.identification.models._fitting import ANY_ROBOT
 from softneck.identification.networks._nss_problem import sensor_limits
@@ -163,6 +163,42 @@ def test_a_sensor_that_stands_at_its_end_is_seen() -> None:
     assert limits.tolist() == [[-np.inf, top]]
     model = identify("nss", recording.with_channels(pitch=np.minimum(y, top)), **NETWORKS["nss"])
     assert model.simulate(recording)[30:, 0].max() <= top + 1e-12
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["finger", "trunk4"])
+@pytest.mark.parametrize("sample_time", [0.02, 1.0])
+def test_a_family_holds_the_truth_of_each_axis(name: str, sample_time: float, tmp_path: Path) -> None:
+    recording = recorded(ROBOTS[name], sample_time=sample_time, rows=500, noise=1e-4, rest=0.3)
+    family = FamilySettings(window=4.0, weight_order=1).fit(recording)
+    assert list(family.axes) == list(recording.robot.outputs.names)
+    assert family.directions is not None
+    np.testing.assert_allclose(family.directions, weights_of(recording.robot))
+    for output, axis in family.axes.items():
+        gain, pole, delay = axis.nominal
+        # Noise of a thousandth of the motion; the middle of a box over a few windows.
+        assert gain == pytest.approx(GAIN, rel=0.03)
+        assert pole == pytest.approx(-np.log(POLE) / sample_time, rel=0.05)
+        assert delay == pytest.approx(DELAY * sample_time, rel=0.1)
+        assert family.covered(output) <= 1.0 + 1e-9
+        G, W = family.tf(output), family.weight(output)
+        assert float(np.real(G.dcgain())) == pytest.approx(gain, rel=1e-6)
+        assert np.all(np.real(W.poles()) < 0.0)
+    # Each axis answers to its own direction; the record's first motion, from no rest, costs a tenth.
+    np.testing.assert_allclose(family.cross, GAIN * np.eye(len(family.axes)), atol=0.15 * GAIN)
+    family.save(tmp_path / "f.npz")
+    again = load(tmp_path / "f.npz")
+    assert again.robot.hash == recording.robot.hash
+    assert again.summary() == family.summary()
+    np.testing.assert_array_equal(again.directions, family.directions)
+
+
+def test_what_of_a_family_is_a_neck_s_alone_is_refused() -> None:
+    recording = recorded(ROBOTS["antagonist"])
+    with pytest.raises(SettingsError, match=r"`lpv_knots`.* takes necks only so far, not robot `antagonist`"):
+        FamilySettings(lpv_knots=3).fit(recording)
+    with pytest.raises(DataError, match="recordings of two robots"):
+        FamilySettings().fit([recording, recorded(ROBOTS["finger"])])
 
 
 def test_the_kinds_that_take_a_robot_are_tried_and_the_best_is_chosen() -> None:
