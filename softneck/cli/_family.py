@@ -48,6 +48,9 @@ def command(
     if html is not None:
         refuse_existing(html, force=force)
     parts = [read_recording(source) for source in recordings]
+    if html is not None:
+        for source, part in zip(recordings, parts, strict=True):
+            part.robot.require_neck(f"{source}: `--html` of `family`")
     with progress("family", quiet=as_json) as report:
         family = chosen.fit(parts, progress=report)
     family.save(path, force=replace)
@@ -75,7 +78,10 @@ def _facts(path: Path, family: Family) -> dict[str, Any]:
         "family": str(path),
         "sample_time_s": family.sample_time,
         "axes": axes,
-        "cross_gains": {"from": ["theta_i", "phi_i", "delta_i"], "pitch": family.cross[0], "roll": family.cross[1]},
+        "cross_gains": {
+            "from": ["theta_i", "phi_i", "delta_i"] if family.robot.is_neck else list(family.axes),
+            **dict(zip(family.axes, family.cross, strict=True)),
+        },
         "compression": _named(family.compression),
         "settings": family.settings,
         "findings": family.findings,

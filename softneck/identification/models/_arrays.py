@@ -18,6 +18,8 @@ from softneck.runtime._layout import Arrays, StateVector
 from ._linear_systems import AFFINE, STATE_SPACE
 
 COMPOSED = ("residual", "ensemble")
+# Of `nss` where the state is corrected by what is measured.
+OBSERVED_NSS = "softneck.identification.networks._nss_observed_runtime"
 
 
 def prefixed_arrays(members: list[tuple[str, Mapping[str, Matrix]]]) -> dict[str, Matrix]:
@@ -58,8 +60,9 @@ def runtime_of(kind: str, arrays: Mapping[str, Matrix]) -> str:
     """Return the name of the runtime, with those of the members (see `softneck.runtime.bundle`)."""
     if kind not in COMPOSED:
         runtime = KINDS[kind].runtime
-        if "A" in arrays and kind != "nss":
-            runtime = AFFINE if "offset" in arrays else STATE_SPACE
+        if "A" in arrays:
+            state_space = AFFINE if "offset" in arrays else STATE_SPACE
+            runtime = (OBSERVED_NSS if "gain" in arrays else runtime) if kind == "nss" else state_space
         history = arrays["history"]
         return sized(runtime, len(arrays["drive"]), int(history[1]) if len(history) > 1 else 2)
     inner = ",".join(f"{runtime_of(member, part)}:{len(part)}" for member, part in members(arrays))
@@ -133,13 +136,13 @@ def _check_numbers(kind: str, arrays: Mapping[str, Matrix], runtime: str) -> Non
         resolve(KINDS[kind].check)(arrays, sizes)
 
 
-def check_table(table: Matrix, history: int) -> None:
-    """Check rows (source, channel, lag)."""
+def check_table(table: Matrix, sizes: Mapping[str, int]) -> None:
+    """Check rows (source, channel, lag) of a model of these sizes."""
     within(np.array([len(table)]), 1, np.inf, "the number of regressors")
     within(table[:, 0], 0, 3, "a regressor's source")
-    within(table[:, 1], 0, 2, "a regressor's channel")
-    within(table[table[:, 0] == 3, 1], 0, 1, "a regressor's output")
-    within(table[:, 2], 1, history, "a regressor's lag")
+    within(table[table[:, 0] < 3, 1], 0, sizes["motors"] - 1, "a regressor's channel")
+    within(table[table[:, 0] == 3, 1], 0, sizes["outputs"] - 1, "a regressor's output")
+    within(table[:, 2], 1, sizes["H"], "a regressor's lag")
 
 
 def within(values: Matrix, low: float, high: float, what: str) -> None:

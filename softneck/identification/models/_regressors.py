@@ -25,8 +25,17 @@ PAPER_EQ21 = np.array(
 )  # fmt: skip
 
 
+# Between the samples in the regressor of another robot, in the time of a neck [s]: a fifth of its time constant.
+_APART = 0.04
+
+
 def lag_table(
-    outputs: Sequence[int], set_points: Sequence[int], motors: Sequence[int], *, both_outputs: bool = False
+    outputs: Sequence[int],
+    set_points: Sequence[int],
+    motors: Sequence[int],
+    *,
+    both_outputs: bool = False,
+    sizes: tuple[int, int] = (3, 2),
 ) -> Matrix:
     """Return the regressor of these lags [samples]: of the output, of all set-points and of all motor positions.
 
@@ -34,18 +43,35 @@ def lag_table(
         outputs: lags of y; empty for a regressor that nothing is fed back to.
         set_points: lags of u_i.
         motors: lags of M_i.
-        both_outputs: pitch and roll for either axis, as form `residual` takes them from its base.
+        both_outputs: all outputs for each of them, as form `residual` takes them from its base.
+        sizes: numbers of motors and outputs.
 
     Raises:
         SettingsError: no lag at all.
     """
-    own = [[3, c, lag] for lag in outputs for c in range(2)] if both_outputs else [[0, 0, lag] for lag in outputs]
+    own = (
+        [[3, c, lag] for lag in outputs for c in range(sizes[1])] if both_outputs else [[0, 0, lag] for lag in outputs]
+    )
     rows = (
-        own + [[1, c, lag] for c in range(3) for lag in set_points] + [[2, c, lag] for lag in motors for c in range(3)]
+        own
+        + [[1, c, lag] for c in range(sizes[0]) for lag in set_points]
+        + [[2, c, lag] for lag in motors for c in range(sizes[0])]
     )
     if not rows:
         raise SettingsError("the regressor is empty: give lags of outputs, set-points or motors.")
     return np.array(rows, dtype=np.float64)
+
+
+def scaled_table(recording: Recording, sample_time: float) -> Matrix:
+    """Return the regressor of another robot: three samples of its output and of all set-points, apart by its speed.
+
+    Args:
+        recording: of the robot.
+        sample_time: in the time of a neck [s].
+    """
+    sizes = len(recording.robot.motors.names), len(recording.robot.outputs.names)
+    lags = [1 + i * max(round(_APART / sample_time), 1) for i in range(3)]
+    return lag_table(lags, lags, [], sizes=sizes)
 
 
 def history_length(table: Matrix, drive: DriveModel) -> int:
@@ -82,6 +108,6 @@ def _run_regression(run: Recording, table: Matrix, axis: int) -> tuple[Matrix, V
     lag = int(table[:, 2].max())
     if len(run) <= lag:
         return np.zeros((0, table.shape[0])), np.zeros(0)
-    sources = (run.outputs[:, [axis, axis, axis]], run.set_points, run.motor_positions)
+    sources = (run.outputs[:, [axis]], run.set_points, run.motor_positions)
     columns = [sources[int(s)][lag - int(back) : len(run) - int(back), int(c)] for s, c, back in table]
     return np.column_stack(columns), run.outputs[lag:, axis]

@@ -12,7 +12,7 @@ from ..models._arrays import check_table, within
 
 
 def check_nn(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
-    check_table(arrays["table"], sizes["H"])
+    check_table(arrays["table"], sizes)
     if (arrays["correction"] < 0).any() or (arrays["correction"] >= 1).any():
         raise FileFormatError("its correction's memory and gain are not from 0 to 1, so that it would not die out.")
 

@@ -1,7 +1,8 @@
 """Free runs of one axis of the NLARX network over prepared regressors, with exact derivatives by all weights.
 
-Row k of `Z` (time, n) is the scaled regressor of y(k); its first column, the last output, is filled in here:
-`z_0 = shift + gain y` of the scaled output y. Weights stand in the order W1, b1, W2, b2, w3, b3, row by row.
+Row k of `Z` (time, n) is the scaled regressor of y(k); its first columns, past outputs by `lags` (f,), are filled in
+here: `z_j = shift_j + gain_j y(k - lag_j)` of the scaled output y. Weights stand in the order W1, b1, W2, b2, w3, b3,
+row by row.
 """
 
 import math
@@ -42,8 +43,9 @@ def nn_gradient(
     second: np.ndarray,
     back: np.ndarray,
     g: np.ndarray,
-) -> float:
-    """Fill `g` with the derivatives by all weights; return the derivative by z_0. `back` (h1,) is scratch."""
+    by: np.ndarray,
+) -> None:
+    """Fill `g` with the derivatives by all weights, `by` (f,) with those by the first of z; `back` (h1,) is scratch."""
     n = z.shape[0]
     b1 = h1 * n
     W2 = b1 + h1
@@ -60,33 +62,39 @@ def nn_gradient(
         for j in range(h1):
             g[W2 + i * h1 + j] = d * first[j]
             back[j] += d * w[W2 + i * h1 + j]
-    by_first = 0.0
+    by[:] = 0.0
     for i in range(h1):
         d = (1.0 - first[i] * first[i]) * back[i]
         g[b1 + i] = d
-        # Column 0 of W1 belongs to the last output: this is what free runs feed back.
-        by_first += d * w[i * n]
+        # The first columns of W1 belong to past outputs: these are what free runs feed back.
+        for j in range(by.shape[0]):
+            by[j] += d * w[i * n + j]
         for j in range(n):
             g[i * n + j] = d * z[j]
-    return by_first
 
 
 def nn_free(
-    w: np.ndarray, h1: int, h2: int, Z: np.ndarray, starts: np.ndarray, shift: float, gain: float, y: np.ndarray
+    w: np.ndarray,
+    h1: int,
+    h2: int,
+    Z: np.ndarray,
+    lags: np.ndarray,
+    starts: np.ndarray,
+    shift: np.ndarray,
+    gain: np.ndarray,
+    y: np.ndarray,
 ) -> None:
-    """Fill `y` (time,) with free runs; where `starts` is a number the last output is that, a measured one."""
+    """Fill `y` (time,) with free runs; where `starts` (time, f) is a number the past output is that, a measured one."""
     first = np.empty(h1)
     second = np.empty(h2)
     z = np.empty(Z.shape[1])
-    last = 0.0
     for k in range(Z.shape[0]):
-        # NaN: the free run goes on from its own output.
-        if np.isfinite(starts[k]):
-            last = starts[k]
         z[:] = Z[k]
-        z[0] = shift + gain * last
-        last = nn_scalar(w, h1, h2, z, first, second)
-        y[k] = last
+        for j in range(lags.shape[0]):
+            # NaN: the free run goes on from its own output.
+            past = starts[k, j] if np.isfinite(starts[k, j]) else y[k - lags[j]]
+            z[j] = shift[j] + gain[j] * past
+        y[k] = nn_scalar(w, h1, h2, z, first, second)
 
 
 def nn_sensitivities(
@@ -94,9 +102,10 @@ def nn_sensitivities(
     h1: int,
     h2: int,
     Z: np.ndarray,
+    lags: np.ndarray,
     starts: np.ndarray,
-    shift: float,
-    gain: float,
+    shift: np.ndarray,
+    gain: np.ndarray,
     thin: int,
     y: np.ndarray,
     J: np.ndarray,
@@ -107,19 +116,25 @@ def nn_sensitivities(
     back = np.empty(h1)
     z = np.empty(Z.shape[1])
     g = np.empty(w.shape[0])
-    s = np.zeros(w.shape[0])
-    last = 0.0
+    by = np.empty(lags.shape[0])
+    # dy/dw of the last samples: that of y(k) is in row k modulo their number.
+    kept = int(lags.max())
+    S = np.zeros((kept, w.shape[0]))
     for k in range(Z.shape[0]):
-        if np.isfinite(starts[k]):
-            last = starts[k]
-            s[:] = 0.0  # a measurement depends on no weight
         z[:] = Z[k]
-        z[0] = shift + gain * last
-        last = nn_scalar(w, h1, h2, z, first, second)
-        # dy_k = df/dw + df/dy dy_(k-1), with z_0 = shift + gain y.
-        slope = gain * nn_gradient(w, h1, h2, z, first, second, back, g)
-        for i in range(w.shape[0]):
-            s[i] = g[i] + slope * s[i]
-        y[k] = last
+        for j in range(lags.shape[0]):
+            past = starts[k, j] if np.isfinite(starts[k, j]) else y[k - lags[j]]
+            z[j] = shift[j] + gain[j] * past
+        y[k] = nn_scalar(w, h1, h2, z, first, second)
+        # dy_k = df/dw + sum_j df/dz_j gain_j dy_(k-lag_j).
+        nn_gradient(w, h1, h2, z, first, second, back, g, by)
+        for j in range(lags.shape[0]):
+            if np.isfinite(starts[k, j]):
+                continue  # a measurement depends on no weight
+            slope = gain[j] * by[j]
+            s = S[(k - lags[j]) % kept]
+            for i in range(w.shape[0]):
+                g[i] = g[i] + slope * s[i]
+        S[k % kept] = g
         if k % thin == 0:
-            J[k // thin] = s
+            J[k // thin] = g

@@ -14,7 +14,7 @@ from softneck.identification.models._feedforward_runtime import stalling_drives
 from softneck.identification.models._histories_runtime import (
     NarxArrays,
     NarxState,
-    narx_advance,
+    narx_forward,
     narx_observe,
     narx_regressor,
     narx_rest,
@@ -23,35 +23,35 @@ from softneck.runtime._layout import array, cells
 
 
 class NnArrays(NarxArrays):
-    """Weights of one network for each axis, pitch first."""
+    """Weights of one network for each output."""
 
     table = array("n, 3", "regressors: source, channel and lag of each (see `narx_regressor`)")
-    W1 = array("2, h1, n", "first layer")
-    b1 = array("2, h1", "its offsets")
-    W2 = array("2, h2, h1", "second layer")
-    b2 = array("2, h2", "its offsets")
-    w3 = array("2, h2", "output")
-    b3 = array("2", "its offset")
-    input_scale = array("2, 2, n", "mean and standard deviation of each regressor")
-    output_scale = array("2, 2", "mean and standard deviation of the output [rad]")
+    W1 = array("outputs, h1, n", "first layer")
+    b1 = array("outputs, h1", "its offsets")
+    W2 = array("outputs, h2, h1", "second layer")
+    b2 = array("outputs, h2", "its offsets")
+    w3 = array("outputs, h2", "output")
+    b3 = array("outputs", "its offset")
+    input_scale = array("outputs, 2, n", "mean and standard deviation of each regressor")
+    output_scale = array("outputs, 2", "mean and standard deviation of the output [rad]")
     load = array("4", "where a drive stalls: pole, c, c1, c2 (see `_bank_runtime`)")
-    correction = array("2, 2", "memory and gain of the disturbance")
+    correction = array("outputs, 2", "memory and gain of the disturbance")
 
 
 class NnState(NarxState):
     """Histories, and what the network's drives and disturbance remember."""
 
-    q = cells("3", "motor positions behind a low-pass: the load of now [rad]")
-    own = cells("2", "N: the network's part of the outputs of now [rad]")
-    disturbance = cells("2", "d: what the network misses [rad]")
+    q = cells("motors", "motor positions behind a low-pass: the load of now [rad]")
+    own = cells("outputs", "N: the network's part of the outputs of now [rad]")
+    disturbance = cells("outputs", "d: what the network misses [rad]")
 
 
 def initialise(p: NnArrays, parameters: np.ndarray, x: NnState, outputs: np.ndarray) -> None:
     """Rest: motors at zero, outputs at their start values for ever."""
     narx_rest(p, parameters, x, outputs)
     # At the start the network has said what the output is: it misses nothing (d = 0).
-    x.own[0] = parameters[0]
-    x.own[1] = parameters[1]
+    for axis in range(p.outputs):
+        x.own[axis] = parameters[axis]
 
 
 def nn_output(p: NnArrays, axis: int, regressor: np.ndarray) -> float:
@@ -71,14 +71,14 @@ def step(p: NnArrays, parameters: np.ndarray, x: NnState, inputs: np.ndarray, ou
     # q(k+1) from m(k): the drives below stall at the load that they have by then.
     load_advance(p.load, x.m[0], q)
     regressor = np.empty(p.n)
-    angles = np.empty(2)
-    for axis in range(2):
+    ahead = np.empty(p.outputs)
+    for axis in range(p.outputs):
         # The newest output in the history is measured, or what was said before: then nothing is missed.
         missed = x.y[0, axis] - x.own[axis] - x.disturbance[axis]
         x.disturbance[axis] = p.correction[axis, 0] * (x.disturbance[axis] + p.correction[axis, 1] * missed)
         narx_regressor(p, p.table, x, axis, regressor)
         x.own[axis] = nn_output(p, axis, regressor)
-        angles[axis] = x.own[axis] + x.disturbance[axis]
-    narx_advance(p, parameters, x, angles[0], angles[1], outputs)
-    # The lag of `narx_advance` knows no load: these positions replace its own.
+        ahead[axis] = x.own[axis] + x.disturbance[axis]
+    narx_forward(p, parameters, x, ahead, outputs)
+    # The lag of `narx_forward` knows no load: these positions replace its own.
     stalling_drives(p, p.load, q, x, outputs)

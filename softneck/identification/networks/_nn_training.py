@@ -11,17 +11,20 @@ from softneck.core import Matrix, Vector
 from softneck.runtime import load_functions
 from softneck.signals import Recording
 
-from ..models._regressors import PAPER_EQ21
 from ..models._scores import nrmse_fit
 from ._levenberg import Layers, jacobian, levenberg, random_layers
 
 FUNCTIONS = "softneck.identification.networks._nn_fit_runtime"
-# Every third row: at 20 ms neighbours say the same, and the time is that of the rows.
-THIN = 3
+# A row is learnt from so often [s], every third at 20 ms: neighbours say the same, and the time is that of the rows.
+_EVERY = 0.06
+# Rows that are too few to leave any out.
+_FEW = 2000
 # Windows of free run [s]: from a few steps over the neck's time constant to many of them.
 _WINDOWS = (0.2, 1.0, 5.0)
 # Weight of an error of one step beside one of free run, which is some five times larger.
 _ONE_STEP_WEIGHT = 5.0
+
+
 # A network is taken only if its one-step fit on the hold-out is within this of the best seen [points].
 _ONE_STEP_LOSS = 0.15
 _SETTLED = 25
@@ -36,29 +39,44 @@ class AxisData:
         simulated: (time, n) along simulated motors; no row crosses a run's border.
         target: (time,) scaled output, NaN where it was missed.
         first: (time,) whether a run begins here.
-        shift, gain: first regressor from the scaled output, `shift + gain y`.
-        window: samples of one second.
+        lags: (f,) of the first regressors, past outputs [samples].
+        shift, gain: (f,) those from the scaled output, `shift + gain y`.
+        window: samples of one second of a neck.
+        neck: whether they are a neck's; of other robots the free run counts, however short their samples are.
     """
 
     measured: Matrix
     simulated: Matrix
     target: Vector
     first: np.ndarray
-    shift: float
-    gain: float
+    lags: np.ndarray
+    shift: Vector
+    gain: Vector
     window: float
+    neck: bool
 
-    def starts(self, length: int) -> Vector:
-        """(time,) measured outputs before each window of `length` samples; NaN elsewhere."""
-        values = np.full(self.target.size, np.nan)
-        since = np.arange(self.target.size) - np.maximum.accumulate(
-            np.where(self.first, np.arange(self.target.size), 0)
-        )
-        here = self.first | (since % length == 0)
-        last = (self.measured[:, 0] - self.shift) / self.gain
-        values[here] = last[here]
-        # A run whose first sample was missed starts from the mean.
-        values[self.first & ~np.isfinite(values)] = 0.0
+    @property
+    def thin(self) -> int:
+        """Of so many rows one is learnt from."""
+        often = round(_EVERY * self.window)
+        return max(often if self.neck else min(often, self.target.size // _FEW), 1)
+
+    def starts(self, length: int) -> Matrix:
+        """(time, f) measured past outputs where they are from before a window of `length` samples; NaN elsewhere."""
+        return self._past(self._since % length < self.lags[:, None])
+
+    @property
+    def _since(self) -> np.ndarray:
+        """(time,) samples since the run began."""
+        rows = np.arange(self.target.size)
+        return rows - np.maximum.accumulate(np.where(self.first, rows, 0))
+
+    def _past(self, known: np.ndarray) -> Matrix:
+        """Return the measured past outputs (time, f) where `known` (f, time), and NaN elsewhere."""
+        last = (self.measured[:, : self.lags.size] - self.shift) / self.gain
+        values = np.where(known.T, last, np.nan)
+        # A run whose first samples were missed starts from the mean.
+        values[(self._since < self.lags[:, None]).T & ~np.isfinite(values)] = 0.0
         return values
 
     def one_step_errors(self, layers: Layers) -> list[Vector]:
@@ -70,33 +88,32 @@ class AxisData:
 
     def weights_fit(self, layers: Layers) -> tuple[float, float]:
         """Return the one-step and the free-run fit [%], without the first samples of each run."""
-        since = np.arange(self.target.size) - np.maximum.accumulate(
-            np.where(self.first, np.arange(self.target.size), 0)
-        )
+        since = self._since
         y = np.where(since >= _SETTLED, self.target, np.nan)
         known = np.isfinite(self.measured).all(axis=1)
         one = np.full(y.size, np.nan)
         one[known] = layers.output(self.measured[known])
-        starts = np.where(since < _SETTLED, (self.measured[:, 0] - self.shift) / self.gain, np.nan)
-        starts[self.first & ~np.isfinite(starts)] = 0.0
+        starts = self._past(since < _SETTLED - 1 + self.lags[:, None])
         free = np.empty(y.size)
-        call = (layers.vector(), layers.b1.size, layers.b2.size, self.simulated, starts, self.shift, self.gain, free)
-        load_functions(FUNCTIONS).nn_free(*call)
+        sizes = (layers.vector(), layers.b1.size, layers.b2.size)
+        load_functions(FUNCTIONS).nn_free(*sizes, self.simulated, self.lags, starts, self.shift, self.gain, free)
         return nrmse_fit(np.where(known, y, np.nan), np.nan_to_num(one)), nrmse_fit(y, free)
 
 
 def axis_data(
-    recording: Recording, motors: Matrix, axis: int, scale: tuple[Matrix, Vector] | None
+    recording: Recording, motors: Matrix, axis: int, table: Matrix, window: float, scale: tuple[Matrix, Vector] | None
 ) -> tuple[AxisData, Matrix, Vector]:
     """Return the data of one axis, its input scale (2, n) and output scale (2,).
 
     Args:
         recording: with logged motors, or those of the drive model.
-        motors: (time, 3) simulated [rad].
-        axis: 0 pitch, 1 roll.
+        motors: (time, motors) simulated [rad].
+        axis: of the outputs.
+        table: rows (source, channel, lag), past outputs first.
+        window: samples of one second of a neck.
         scale: of other data, to be used again.
     """
-    lag = int(PAPER_EQ21[:, 2].max())
+    lag = int(table[:, 2].max())
     X, S, y, first = [], [], [], []
     at = 0
     for run in recording.runs():
@@ -106,8 +123,8 @@ def axis_data(
             continue
         rows = len(run)
         for positions, into in ((run.motor_positions, X), (part, S)):
-            sources = (run.outputs[:, [axis, axis, axis]], run.set_points, positions)
-            columns = [sources[int(s)][lag - int(b) : rows - int(b), int(c)] for s, c, b in PAPER_EQ21]
+            sources = (run.outputs[:, [axis]], run.set_points, positions)
+            columns = [sources[int(s)][lag - int(b) : rows - int(b), int(c)] for s, c, b in table]
             into.append(np.column_stack(columns))
         y.append(run.outputs[lag:, axis])
         first.append(np.arange(rows - lag) == 0)
@@ -120,14 +137,17 @@ def axis_data(
             np.array([seen.mean(), max(float(seen.std()), 1e-9)]),
         )
     (mean, spread), (middle, size) = scale
+    fed = table[:, 0] == 0
     data = AxisData(
         measured=(measured - mean) / spread,
         simulated=np.ascontiguousarray((simulated - mean) / spread),
         target=(target - middle) / size,
         first=np.concatenate(first),
-        shift=float((middle - mean[0]) / spread[0]),
-        gain=float(size / spread[0]),
-        window=1.0 / recording.sample_time,
+        lags=table[fed, 2].astype(np.int64),
+        shift=(middle - mean[fed]) / spread[fed],
+        gain=size / spread[fed],
+        window=window,
+        neck=recording.robot.is_neck,
     )
     return data, scale[0], scale[1]
 
@@ -147,7 +167,7 @@ class Best:
         """Judge a network; return whether to go on."""
         one, free = self.hold_out.weights_fit(layers)
         top = max(self.one, one)
-        if self.layers is None or (free > self.free and one > top - _ONE_STEP_LOSS):
+        if self.layers is None or (free > self.free and (one > top - _ONE_STEP_LOSS or not self.hold_out.neck)):
             self.layers, self.free = layers, free
         self.one = top
         self.tell(f"{what}, loss {cost:.4g}, hold-out {self.free:.1f} %")
@@ -176,7 +196,7 @@ def train_axis(
         rng: of the starts.
     """
     known = np.isfinite(data.measured).all(axis=1) & np.isfinite(data.target)
-    rows = np.flatnonzero(known)[::THIN]
+    rows = np.flatnonzero(known)[:: data.thin]
     Z, target = data.measured[rows], data.target[rows]
     ends: list[tuple[float, Layers, float]] = []
     for number, decay in enumerate(decays):
@@ -224,21 +244,22 @@ def _windows(
     """Minimise the errors of free runs over windows, and of one step beside them so that neither is given up."""
     functions = load_functions(FUNCTIONS)
     starts, h1, h2 = data.starts(length), start.b1.size, start.b2.size
-    there = np.isfinite(data.target[::THIN])
+    there = np.isfinite(data.target[:: data.thin])
     free = np.empty(data.target.size)
     J = np.empty((there.size, start.vector().size))
     Z, target = data.measured[rows], data.target[rows]
+    one_step = _ONE_STEP_WEIGHT if data.neck else 1.0
 
     def errors(w: Vector, *, derivatives: bool) -> tuple[Vector, Matrix | None]:
-        call = (w, h1, h2, data.simulated, starts, data.shift, data.gain)
+        call = (w, h1, h2, data.simulated, data.lags, starts, data.shift, data.gain)
         if not derivatives:
             functions.nn_free(*call, free)
             one, by_one = start.like(w).output(Z), None
         else:
-            functions.nn_sensitivities(*call, THIN, free, J)
+            functions.nn_sensitivities(*call, data.thin, free, J)
             one, by_one = jacobian(start.like(w), Z)
-        error = np.concatenate([(data.target - free)[::THIN][there], _ONE_STEP_WEIGHT * (target - one)])
-        return error, None if by_one is None else np.vstack([J[there], _ONE_STEP_WEIGHT * by_one])
+        error = np.concatenate([(data.target - free)[:: data.thin][there], one_step * (target - one)])
+        return error, None if by_one is None else np.vstack([J[there], one_step * by_one])
 
     def seen(w: Vector, cost: float) -> bool:
         return best.see(start.like(w), cost, f"windows of {length}")

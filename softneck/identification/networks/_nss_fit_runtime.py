@@ -10,8 +10,8 @@ from softneck.identification.networks._nss_map_runtime import nss_inputs, nss_ne
 
 
 def nss_signals(redefinition: np.ndarray, widths: np.ndarray, motors: np.ndarray, V: np.ndarray) -> None:
-    """Fill `V` (time, 3 (1 + widths)) with the inputs along `motors` (time, 3); plays come from zero."""
-    plays = np.zeros(3 * widths.shape[0])
+    """Fill `V` (time, c (1 + widths)) with the inputs along `motors` (time, motors); plays come from zero."""
+    plays = np.zeros(redefinition.shape[0] * widths.shape[0])
     for k in range(motors.shape[0]):
         nss_inputs(redefinition, widths, motors[k], plays, V[k])
 
@@ -28,13 +28,14 @@ def nss_free(
     seen: np.ndarray,
     Y: np.ndarray,
 ) -> None:
-    """Fill `Y` (time, 2) with free runs, and `seen` (time, n) with the states behind them.
+    """Fill `Y` (time, outputs) with free runs, and `seen` (time, n) with the states behind them.
 
-    With a `gain` (n, 2) that is not zero each state is corrected by `gain (measured - y)` first, where `measured`
-    (time, 2) is a number, and `seen` holds what it was corrected to.
+    With a `gain` (n, outputs) that is not zero each state is corrected by `gain (measured - y)` first, where `measured`
+    (time, outputs) is a number, and `seen` holds what it was corrected to.
     """
     p = V.shape[1]
-    edge = np.cumsum(np.array([n * n, n * p, n * q, q * n, q * p, q, q * q, 2 * n]))  # where the matrices end in w
+    m = Y.shape[1]
+    edge = np.cumsum(np.array([n * n, n * p, n * q, q * n, q * p, q, q * q, m * n]))  # where the matrices end in w
     A = w[: edge[0]].copy().reshape(n, n)
     B = w[edge[0] : edge[1]].copy().reshape(n, p)
     E = w[edge[1] : edge[2]].copy().reshape(n, q)
@@ -42,7 +43,7 @@ def nss_free(
     G = w[edge[3] : edge[4]].copy().reshape(q, p)
     h = w[edge[4] : edge[5]].copy()
     D = w[edge[5] : edge[6]].copy().reshape(q, q)
-    C = w[edge[6] : edge[7]].copy().reshape(2, n)
+    C = w[edge[6] : edge[7]].copy().reshape(m, n)
     c = w[edge[7] :].copy()
     x = np.zeros(n)
     ahead = np.zeros(n)
@@ -53,12 +54,12 @@ def nss_free(
         elif begin[k] == 2:
             x[:] = states[k]
         # Before it is corrected: the error of Y is that of a prediction.
-        for a in range(2):
+        for a in range(m):
             total = c[a]
             for i in range(n):
                 total += C[a, i] * x[i]
             Y[k, a] = total
-        for a in range(2):
+        for a in range(m):
             if np.isfinite(measured[k, a]):  # NaN: nothing measured, the state runs free
                 for i in range(n):
                     x[i] += gain[i, a] * (measured[k, a] - Y[k, a])
@@ -74,13 +75,16 @@ def nss_sensitivities(
     V: np.ndarray,
     begin: np.ndarray,
     states: np.ndarray,
+    gain: np.ndarray,
+    measured: np.ndarray,
     rows: np.ndarray,
     Y: np.ndarray,
     J: np.ndarray,
 ) -> None:
-    """As `nss_free` without a gain; where `rows` (time,) is r >= 0, J[2 r] and J[2 r + 1] are dy(k)/dw."""
+    """As `nss_free`; where `rows` (time,) is r >= 0, J[m r] .. are dy(k)/dw of the m outputs."""
     p = V.shape[1]
-    edge = np.cumsum(np.array([n * n, n * p, n * q, q * n, q * p, q, q * q, 2 * n]))
+    m = Y.shape[1]
+    edge = np.cumsum(np.array([n * n, n * p, n * q, q * n, q * p, q, q * q, m * n]))
     A = w[: edge[0]].copy().reshape(n, n)
     B = w[edge[0] : edge[1]].copy().reshape(n, p)
     E = w[edge[1] : edge[2]].copy().reshape(n, q)
@@ -88,9 +92,10 @@ def nss_sensitivities(
     G = w[edge[3] : edge[4]].copy().reshape(q, p)
     h = w[edge[4] : edge[5]].copy()
     D = w[edge[5] : edge[6]].copy().reshape(q, q)
-    C = w[edge[6] : edge[7]].copy().reshape(2, n)
+    C = w[edge[6] : edge[7]].copy().reshape(m, n)
     c = w[edge[7] :].copy()
-    inner = int(edge[6])  # C and c do not move the state
+    last = int(edge[6])
+    inner = w.shape[0] if np.isfinite(measured).any() else last  # C and c move the state only where it is corrected
     x = np.zeros(n)
     ahead = np.zeros(n)
     t = np.empty(q)
@@ -98,6 +103,7 @@ def nss_sensitivities(
     R = np.empty((n, q))
     S = np.zeros((n, inner))
     moved = np.zeros((n, inner))
+    by = np.empty((m, w.shape[0]))
     for k in range(V.shape[0]):
         if begin[k] == 1:
             x[:] = 0.0
@@ -106,22 +112,30 @@ def nss_sensitivities(
             x[:] = states[k]
             S[:] = 0.0
         r = rows[k]
-        for a in range(2):
+        for a in range(m):
             total = c[a]
             for i in range(n):
                 total += C[a, i] * x[i]
             Y[k, a] = total
             # Rows that nobody asked for move S all the same, below.
-            if r >= 0:
-                line = J[2 * r + a]
+            if r >= 0 or np.isfinite(measured[k, a]):
+                line = by[a]
                 line[:] = 0.0
                 # dy/dw = C dx/dw, and C and c by themselves.
                 for i in range(n):
                     weight = C[a, i]
                     for l in range(inner):
                         line[l] += weight * S[i, l]
-                    line[inner + a * n + i] = x[i]
-                line[inner + 2 * n + a] = 1.0
+                    line[last + a * n + i] += x[i]
+                line[last + m * n + a] += 1.0
+                if r >= 0:
+                    J[m * r + a] = line
+        for a in range(m):
+            if np.isfinite(measured[k, a]):
+                for i in range(n):
+                    x[i] += gain[i, a] * (measured[k, a] - Y[k, a])
+                    for l in range(inner):
+                        S[i, l] -= gain[i, a] * by[a, l]
         nss_next(A, B, E, F, G, h, D, x, V[k], t, ahead)
         # R: how the sums into the neurons, those behind each of them included, move the state.
         for i in range(n):

@@ -12,12 +12,12 @@ import numpy as np
 
 
 def nss_inputs(redefinition: np.ndarray, widths: np.ndarray, m: np.ndarray, plays: np.ndarray, v: np.ndarray) -> None:
-    """Move `plays` (3 widths,) to the motors `m` (3,), and fill `v` (3 (1 + widths),)."""
+    """Move `plays` (c widths,) to the motors `m` (motors,), and fill `v` (c (1 + widths),) for c redefined inputs."""
     count = widths.shape[0]
-    for c in range(3):
+    for c in range(redefinition.shape[0]):
         # Eq. 9-11.
         value = 0.0
-        for j in range(3):
+        for j in range(redefinition.shape[1]):
             value += redefinition[c, j] * m[j]
         at = c * (count + 1)
         v[at] = value

@@ -15,13 +15,17 @@ from softneck.runtime import load_functions
 from softneck.signals import Recording, redefine
 
 from ..linear._oe_fit import OutputErrorFit, default_starts, fit_output_error, pole_radius
+from ..models._directions import Directions
 from ..models._drive import LoadedDrive, drive_start
 from ._contraction import Contraction, whitening
 from ._levenberg import levenberg
-from ._nss_problem import FUNCTIONS, Records, Shape, free_run, observed
+from ._nss_problem import FUNCTIONS, Inputs, Records, Shape, free_run, observed
 
 # Dead times of the sensor to try [samples]; what is longer hides in the poles.
 _DELAYS = (0, 1, 2, 3, 4)
+# Of other robots, in the time of a neck [s].
+_LATE = (0.0, 0.02, 0.04, 0.06, 0.08, 0.12, 0.2, 0.4)
+_WORTH = 1.1
 # Co-contraction stiffens, and compresses more slowly than the neck bends [1/s].
 _COCONTRACTION_RATE = 1.5
 # A pole beyond this remembers for longer than a window [s].
@@ -32,34 +36,42 @@ _SLOWEST_START = 2.0
 _STATE_NOISE, _OUTPUT_NOISE = 0.05, 0.01
 
 
-def linear_start(recording: Recording, drive: LoadedDrive, order: int) -> tuple[list[OutputErrorFit], int]:
-    """Return the output-error models of both axes from simulated motors, and the dead time of the least cost.
+def linear_start(
+    recording: Recording, drive: LoadedDrive, directions: Directions, order: int
+) -> tuple[list[OutputErrorFit], int]:
+    """Return the output-error models of all axes from simulated motors, and the dead time of the least cost.
 
     Raises:
         DataError: no stable model.
     """
-    axes: list[list[tuple[Vector, Vector]]] = [[], []]
+    axes: list[list[tuple[Vector, Vector]]] = [[] for _ in directions.names]
     for run in recording.runs():
-        U = redefine(drive.simulate(run.set_points, drive_start(run)))
-        for axis in range(2):
+        motors = drive.simulate(run.set_points, drive_start(run))
+        U = redefine(motors) if recording.robot.is_neck else motors @ directions.weights.T
+        for axis in range(len(axes)):
             if np.isfinite(run.outputs[:, axis]).any():
                 axes[axis].append((U[:, axis], run.outputs[:, axis]))
     for axis, runs in enumerate(axes):
         middle = np.nanmean(np.concatenate([y for _, y in runs]))
         rest = np.mean(np.concatenate([u for u, _ in runs]))
         axes[axis] = [(np.ascontiguousarray(u - rest), y - middle) for u, y in runs]
-    best: tuple[float, int, list[OutputErrorFit]] | None = None
-    for delay in _DELAYS:
-        fits = [fit_output_error(runs, order, order, delay, _starts(order, recording.sample_time)) for runs in axes]
+    tried: list[tuple[float, int, list[OutputErrorFit]]] = []
+    # In the time of a neck: what starts from time constants starts from the robot's.
+    starts = default_starts(order, recording.sample_time / directions.stretch, None)
+    for delay in _DELAYS if recording.robot.is_neck else _late(recording.sample_time / directions.stretch):
+        fits = [fit_output_error(runs, order, order, delay, starts) for runs in axes]
         found = [fit for fit in fits if fit is not None]
-        if len(found) < 2:
+        if len(found) < len(axes):
             continue
         cost = sum(fit.cost / max(_power(runs), 1e-12) for fit, runs in zip(found, axes, strict=True))
-        if best is None or cost < best[0]:
-            best = (cost, delay, found)
-    if best is None:
+        tried.append((cost, delay, found))
+    if not tried:
         raise DataError("no stable linear model to start from; record with more excitation.")
-    return best[2], best[1]
+    least = min(cost for cost, _, _ in tried)
+    # Of another robot the shortest that is as good: a linear model takes what bends for dead time.
+    worth = 1.0 if recording.robot.is_neck else _WORTH
+    _, delay, fits = next(one for one in tried if one[0] <= worth * least)
+    return fits, delay
 
 
 def largest_rate(sample_time: float) -> float:
@@ -67,44 +79,50 @@ def largest_rate(sample_time: float) -> float:
     return float(np.exp(-sample_time / _SLOWEST))
 
 
-def _starts(order: int, sample_time: float) -> list[Vector]:
-    return default_starts(order, sample_time, None)
+def _late(sample_time: float) -> list[int]:
+    """Return dead times to try for another robot, up to twice its time constant."""
+    return sorted({round(late / sample_time) for late in _LATE})
 
 
 def _power(runs: list[tuple[Vector, Vector]]) -> float:
     return float(sum(np.nansum(y**2) for _, y in runs))
 
 
-def whitened(fits: list[OutputErrorFit], records: Records, neurons: int) -> tuple[Shape, Vector, Matrix]:
-    """Return shape, weights without neurons, and an observer's gain (n, 2), states of unit covariance.
+def whitened(fits: list[OutputErrorFit], records: Records, made: Inputs, neurons: int) -> tuple[Shape, Vector, Matrix]:
+    """Return shape, weights without neurons, and an observer's gain (n, outputs), states of unit covariance.
 
-    States are those of both axes and one of co-contraction, which no output shows yet.
+    States are those of all axes and one for each input that moves none of them (a neck's co-contraction), which no
+    output shows yet.
     """
     from scipy.linalg import block_diag, solve_discrete_are
 
     scales = records.scales
-    chain = scales.inputs.size // 3
+    chain = 1 + made.widths.size
+    shares = made.directions.shares(made.redefinition)
+    outputs, beside = len(fits), range(made.directions.independent, len(made.redefinition))
     parts = [_observer_form(fit, np.exp(-records.sample_time / _SLOWEST_START)) for fit in fits]
     slow = np.exp(-_COCONTRACTION_RATE * records.sample_time)
-    A = np.asarray(block_diag(*(F for F, _ in parts), slow))
+    A = np.asarray(block_diag(*(F for F, _ in parts), *(slow for _ in beside)))
     n = len(A)
-    B, C = np.zeros((n, scales.inputs.size)), np.zeros((2, n))
+    B, C = np.zeros((n, scales.inputs.size)), np.zeros((outputs, n))
     at = 0
     for axis, (F, g) in enumerate(parts):
-        B[at : at + len(F), axis * chain] = g * scales.inputs[axis * chain] / scales.outputs[axis]
+        for c, share in enumerate(shares[axis]):
+            B[at : at + len(F), c * chain] = g * share * scales.inputs[c * chain] / scales.outputs[axis]
         C[axis, at] = 1.0
         at += len(F)
-    B[at, 2 * chain] = 1.0 - slow
-    shape = Shape(n, scales.inputs.size, neurons)
+    for i, c in enumerate(beside):
+        B[at + i, c * chain] = 1.0 - slow
+    shape = Shape(n, scales.inputs.size, neurons, outputs)
     w = shape.vector({name: np.zeros(size) for name, size in shape.shapes.items()} | {"A": A, "B": B, "C": C})
-    Y, X = free_run(shape, w, records)
+    Y, X = free_run(shape, w, records, np.zeros((n, outputs)))
     states = X[records.own]
-    P = np.cov(states, rowvar=False)
+    P = np.atleast_2d(np.cov(states, rowvar=False))
     L = whitening(A, P, 0.9999 * largest_rate(records.sample_time))
     inverse = np.linalg.inv(L)
     arrays = shape.arrays(w) | {"A": inverse @ A @ L, "B": inverse @ B, "C": C @ L}
     arrays["c"] = np.nanmean((records.outputs - Y)[records.settled], axis=0)
-    Q, R = _STATE_NOISE**2 * np.eye(n), _OUTPUT_NOISE**2 * np.eye(2)
+    Q, R = _STATE_NOISE**2 * np.eye(n), _OUTPUT_NOISE**2 * np.eye(outputs)
     P = np.asarray(solve_discrete_are(arrays["A"].T, arrays["C"].T, Q, R))
     gain = P @ arrays["C"].T @ np.linalg.inv(arrays["C"] @ P @ arrays["C"].T + R)
     return shape, shape.vector(arrays), gain
@@ -120,8 +138,6 @@ def _observer_form(fit: OutputErrorFit, radius: float) -> tuple[Matrix, Vector]:
 
 # Windows [s], from one sample over the neck's time constant to many of them; the whole free run comes last.
 WINDOWS = (0.0, 0.2, 1.0, 5.0, None)
-# A row is learnt from every so often [s]: a quarter of the neck's time constant.
-_EVERY = 0.06
 # Weights that no contraction binds, in their order behind its parameters.
 _FREE = ("B", "G", "h", "C", "c")
 
@@ -138,7 +154,7 @@ class BestMap:
 
     def see(self, training: Training, theta: Vector, cost: float, what: str) -> bool:
         """Judge parameters; return whether to go on."""
-        Y, _ = free_run(training.shape, training.weights(theta), self.hold_out)
+        Y, _ = free_run(training.shape, training.weights(theta), self.hold_out, training.gain)
         fit = self.hold_out.fit(Y)
         if self.theta is None or fit > self.fit:
             self.theta, self.fit = theta, fit
@@ -153,7 +169,7 @@ class Training:
     Attributes:
         shape: of the map.
         contraction: whose parameters give A, E, F and D.
-        gain: (n, 2) of the observer that starts windows.
+        gain: (n, outputs) of the observer that starts windows.
         records: rows to learn from.
         decay: weight of the squared distance to `base` beside the squared errors of scaled outputs.
         base: what parameters are drawn to: the linear model, with neurons that see no inputs.
@@ -176,24 +192,26 @@ class Training:
             length = max(round(seconds / records.sample_time), 2)
             states = observed(self.shape, self.weights(theta), records, self.gain)
             begin[(begin == 0) & (np.arange(begin.size) % length == 0)] = 2
-        chosen = np.flatnonzero(records.settled)[:: max(round(_EVERY / records.sample_time), 1)]
+        chosen = records.learnt
         rows = np.full(begin.size, -1, dtype=np.int64)
         rows[chosen] = np.arange(chosen.size)
         y = records.outputs[chosen].ravel()
         there = np.isfinite(y)
+        low, high = records.limits.T
         Y, seen_states = np.empty(records.outputs.shape), np.empty((begin.size, n))
         J = np.empty((y.size, int(self.shape.vector_size)))
-        still, unseen = np.zeros((n, 2)), np.full(records.outputs.shape, np.nan)
 
         def errors(w: Vector, *, derivatives: bool) -> tuple[Vector, Matrix | None]:
             parameters = self.base + w
             call = (self.weights(parameters), n, q, records.inputs, begin, states)
             if derivatives:
-                functions.nss_sensitivities(*call, rows, Y, J)
-                J[~there] = 0.0
+                functions.nss_sensitivities(*call, self.gain, records.told, rows, Y, J)
             else:
-                functions.nss_free(*call, still, unseen, seen_states, Y)
-            error = np.where(there, y - Y[chosen].ravel(), 0.0)
+                functions.nss_free(*call, self.gain, records.told, seen_states, Y)
+            shown = np.clip(Y[chosen], low, high).ravel()
+            error = np.where(there, y - shown, 0.0)
+            if derivatives:
+                J[~there | (shown != Y[chosen].ravel())] = 0.0  # what is beyond a sensor's limit is not seen
             return error, self.chained(parameters, J) if derivatives else None
 
         def seen(w: Vector, cost: float) -> bool:

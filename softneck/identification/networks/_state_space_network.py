@@ -11,14 +11,16 @@ import numpy as np
 
 from softneck.core import DataError, Matrix, Progress, require_positive, require_whole, silent
 from softneck.runtime import load_functions
-from softneck.signals import TENDON_ANGLES, Recording, redefinition_matrix
+from softneck.signals import Recording
 
-from ..models._drive import LoadedDrive, fit_loaded_drive
+from ..models._directions import directions_of
+from ..models._drive import drive_start, fit_loaded_drive
 from ..models._error_feedback import BEYOND, fit_echo
 from ..models._fitting import SAME_EXCITATION, fitted_model, training_recording
 from ..models._model import Model
+from ..models._state_space import history_array
 from ._contraction import Contraction
-from ._nss_problem import FUNCTIONS, Records, Shape, free_run
+from ._nss_problem import FUNCTIONS, Inputs, Records, Shape, free_run, sensor_limits
 from ._nss_training import BestMap, Training, largest_rate, linear_start, random_start, train_start, whitened
 
 # Steps of each start over windows of 1 sample, 0.2, 1 and 5 s; the whole free run takes what `iterations` says.
@@ -41,7 +43,7 @@ class NeuralStateSpace:
     free run on the hold-out (`hold_out`, else the last fifth of each run) goes on, at last on all rows.
 
     Attributes:
-        order: poles of the linear model of each axis; one more state is that of co-contraction.
+        order: poles of the linear model of each axis; each input that moves none (co-contraction) has a state more.
         neurons: tanh neurons, each of which sees the states, the inputs and the neurons before it.
         widths: half-widths of the play operators [rad].
         starts: random starts.
@@ -79,7 +81,7 @@ class NeuralStateSpace:
         hold_out: Recording | None = None,
         progress: Progress = silent,
     ) -> Model:
-        """Identify both axes, two starts at a time; Ctrl-C keeps the best so far.
+        """Identify all axes, two starts at a time; Ctrl-C keeps the best so far.
 
         Args:
             recordings: one or several of one sample time; their runs are never joined.
@@ -91,23 +93,29 @@ class NeuralStateSpace:
         """
         from threadpoolctl import threadpool_limits
 
-        recording = training_recording(recordings)
+        recording = training_recording(recordings, any_robot=True)
         progress(0.0, "drives and linear model")
         drive = fit_loaded_drive(recording)
         with threadpool_limits(limits=1):
-            fits, delay = linear_start(recording, drive, self.order)
-            records = Records.of(recording, drive, np.array(self.widths), delay)
-            shape, linear, gain = whitened(fits, records, self.neurons)
-            contraction = Contraction(shape.states, self.neurons, largest_rate(recording.sample_time))
+            directions = directions_of(
+                recording, [drive.simulate(r.set_points, drive_start(r)) for r in recording.runs()]
+            )
+            fits, delay = linear_start(recording, drive, directions, self.order)
+            made = Inputs(drive, directions, directions.inputs(recording), np.array(self.widths), delay)
+            records = Records.of(recording, made)
+            shape, linear, gain = whitened(fits, records, made, self.neurons)
+            contraction = Contraction(shape.states, self.neurons, largest_rate(records.sample_time))
             self._check_rows(records, shape)
             judge = records.only(records.held_out)
             if hold_out is not None:
-                judge = Records.of(hold_out, drive, np.array(self.widths), delay, scales=records.scales)
+                judge = Records.of(hold_out, made, scales=records.scales)
             job = _Job(self, shape, contraction, gain, shape.arrays(linear), records, judge, hold_out is None)
             theta, found = job.run(progress)
             weights = shape.arrays(job.weights(theta))
-            arrays = _arrays(recording, drive, records.scales, np.array(self.widths), delay, weights, self.echo)
+            arrays = _arrays(recording, made, records, weights, (self.echo, gain))
         findings: dict[str, Any] = {"delay": delay, "parameters": theta.size, **found}
+        if not recording.robot.is_neck:
+            findings |= directions.findings()
         if hold_out is None:
             findings["remark"] = SAME_EXCITATION
         progress(1.0, "done")
@@ -226,40 +234,45 @@ def _wait(work: Any, numbers: range, told: _TrainingProgress, progress: Progress
 
 
 def _arrays(
-    recording: Recording,
-    drive: LoadedDrive,
-    scales: Any,
-    widths: np.ndarray,
-    delay: int,
-    weights: dict[str, Matrix],
-    order: int,
+    recording: Recording, made: Inputs, trained: Records, weights: dict[str, Matrix], feedback: tuple[int, Matrix]
 ) -> dict[str, Matrix]:
     """Return what the runtime reads, scales and all."""
-    shape = Shape(len(weights["A"]), weights["B"].shape[1], weights["h"].size)
-    records = Records.of(recording, drive, widths, delay, scales=scales, logged=True)
-    # What is measured beside the outputs are the motors: the errors of one step are those along them.
-    Y, _ = free_run(shape, shape.vector(weights), records)
+    shape = Shape(len(weights["A"]), weights["B"].shape[1], weights["h"].size, len(weights["C"]))
+    scales, drive = trained.scales, made.drive
+    order, gain = feedback
     seen = recording.outputs[np.isfinite(recording.outputs).all(axis=1)]
     lowest, highest = seen.min(axis=0), seen.max(axis=0)
     wider = _BEYOND * (highest - lowest)
     limits = np.column_stack([lowest - wider, highest + wider])
+    B, G = weights["B"] / scales.inputs, weights["G"] / scales.inputs
+    standing = sensor_limits(recording)
+    limits = np.where(np.isfinite(standing), standing, limits)
+    # The map was trained around the inputs' means: about zero its states, and what reads them, are shifted.
+    x = np.linalg.solve(np.eye(shape.states) - weights["A"], B @ scales.rest)
+    arrays = {
+        "history": history_array(int(max(order, drive.drive[:, 1].max(), made.delay + 1)), shape.outputs),
+        "drive": drive.drive,
+        "load": drive.load,
+        "redefinition": made.redefinition,
+        "widths": made.widths,
+        "delay": np.array([float(made.delay)]),
+        **weights,
+        "B": B,
+        "G": G,
+        "h": weights["h"] - weights["F"] @ x - G @ scales.rest,
+        "C": weights["C"] * scales.outputs[:, None],
+        "c": scales.middle + scales.outputs * (weights["c"] - weights["C"] @ x),
+        "range": limits,
+        "echo": np.zeros((shape.outputs, 1)),
+        "memory": np.array([float(np.ceil(_MEMORY / trained.sample_time))]),
+    }
+    if not recording.robot.is_neck:
+        return {**arrays, "gain": gain / scales.outputs}
+    # What is measured beside the outputs are the motors: the errors of one step are those along them.
+    records = Records.of(recording, made, scales=scales, logged=True)
+    Y, _ = free_run(shape, shape.vector(weights), records, gain)
     free = np.clip(scales.middle + scales.outputs * Y, limits[:, 0], limits[:, 1])
     errors = np.where(records.settled[:, None], scales.middle + scales.outputs * records.outputs - free, np.nan)
     runs = np.split(errors, np.flatnonzero(records.first)[1:])
-    echo = np.array([fit_echo([run[:, axis] for run in runs], order, beyond=BEYOND) for axis in range(2)])
-    return {
-        "history": np.array([float(max(order, drive.drive[:, 1].max(), delay + 1))]),
-        "drive": drive.drive,
-        "load": drive.load,
-        "redefinition": redefinition_matrix(TENDON_ANGLES),
-        "widths": widths,
-        "delay": np.array([float(delay)]),
-        **weights,
-        "B": weights["B"] / scales.inputs,
-        "G": weights["G"] / scales.inputs,
-        "C": weights["C"] * scales.outputs[:, None],
-        "c": scales.middle + scales.outputs * weights["c"],
-        "range": limits,
-        "echo": echo,
-        "memory": np.array([float(np.ceil(_MEMORY / recording.sample_time))]),
-    }
+    echo = np.array([fit_echo([run[:, axis] for run in runs], order, beyond=BEYOND) for axis in range(shape.outputs)])
+    return {**arrays, "echo": echo}

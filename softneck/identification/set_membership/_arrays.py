@@ -19,7 +19,7 @@ def check_nlsm(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
 
 
 def check_set(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
-    check_table(arrays["table"], sizes["H"])
+    check_table(arrays["table"], sizes)
     within(np.array([sizes["rows"]]), 1, np.inf, "the number of points")
     frame, slopes = arrays["frame"], _slopes(arrays)
     if not all(is_frame(rows) for rows in frame):

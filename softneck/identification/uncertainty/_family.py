@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softneck.core import FileFormatError, Matrix, SettingsError, Vector, require_one_of, write_archive
+from softneck.robot import Robot
 
 from ..linear._srivc_fit import Continuous
 from ._lpv import Lpv
@@ -53,13 +54,16 @@ class Family:
 
     Attributes:
         sample_time: [s].
-        axes: pitch and roll.
+        axes: by the names of the outputs, pitch and roll.
         frequency: (m,) at which the weight was fitted [rad/s], up to the Nyquist frequency.
-        cross: (2, 3) static gains from theta_i, phi_i, delta_i to pitch and roll [rad/rad]; NaN where not excited.
-        cross_std: (2, 3).
+        cross: (2, 3) static gains from theta_i, phi_i, delta_i to pitch and roll [rad/rad]; NaN where not excited. Of
+            another robot (outputs, outputs), from the input of each output.
+        cross_std: as `cross`.
         compression: (3,) static gain [m/rad], pole [1/s], dead time [s] of G_delta; NaN where not recorded.
         lpv: gain and pole over the inclination, or None.
         settings, findings: what was asked and what was found.
+        robot: whose plant it is; its outputs and motors in their SI units where a neck's are in rad.
+        directions: (outputs, motors) weights of the motors in each axis's input; None for a neck, whose are Eq. 9, 10.
     """
 
     sample_time: float
@@ -71,6 +75,8 @@ class Family:
     lpv: Lpv | None = None
     settings: dict[str, Any] = field(default_factory=dict)
     findings: dict[str, Any] = field(default_factory=dict)
+    robot: Robot = field(default_factory=Robot.preset)
+    directions: Matrix | None = None
 
     def nominal(self, output: str) -> Continuous:
         """Return the nominal plant of an axis, `K exp(-L s)/(s + p)`."""
@@ -106,7 +112,9 @@ class Family:
         return float(np.max(errors / W))
 
     def summary(self) -> str:
-        """Return a few lines, in degrees."""
+        """Return a few lines, in degrees; of another robot in the SI units of its channels."""
+        if not self.robot.is_neck:
+            return "\n".join(self._plain_lines())
         lines = [f"family of {self.findings.get('recordings', 0)} recordings, {1e3 * self.sample_time:g} ms"]
         for name, axis in self.axes.items():
             counts = [int(np.sum(axis.where[:, 0] == scope)) for scope in range(3)]
@@ -133,6 +141,22 @@ class Family:
                 lines.append(f"{key}: {self.findings[key]}")
         return "\n".join(lines)
 
+    def _plain_lines(self) -> list[str]:
+        lines = [
+            f"family of {self.findings.get('recordings', 0)} recordings of robot {self.robot.label()}, "
+            f"sampled every {self.sample_time:g} s"
+        ]
+        for name, axis in self.axes.items():
+            low, high = axis.box
+            gain, pole, delay = axis.nominal
+            lines.append(
+                f"{name}: G(s) = exp(-{delay:.4g} s) {gain * pole:.4g}/(s + {pole:.4g}); gain {low[0]:.4g} to "
+                f"{high[0]:.4g}, pole {low[1]:.4g} to {high[1]:.4g} 1/s, dead time {low[2]:.4g} to {high[2]:.4g} s; "
+                f"{int(axis.used.sum())} samples, |G/G0 - 1| at most {axis.envelope.max():.2f}, by the weight covered "
+                f"to {self.covered(name):.3f}"
+            )
+        return [*lines, f"caution: {self.findings.get('caution', '')}"]
+
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write the family to an `.npz` file."""
         arrays: dict[str, np.ndarray] = {
@@ -151,7 +175,10 @@ class Family:
             "settings": self.settings,
             "findings": self.findings,
             "lpv_source": None if self.lpv is None else self.lpv.source,
+            **({} if self.robot.is_neck else {"robot": self.robot.as_dict()}),
         }
+        if self.directions is not None:
+            arrays["directions"] = self.directions
         write_archive(path, header, arrays, force=force)
 
     @classmethod
@@ -160,12 +187,16 @@ class Family:
         for name, array in arrays.items():
             if array.dtype != np.float64:
                 raise FileFormatError(f"its array `{name}` is not of floats.")
+        robot = Robot.from_dict(header["robot"]) if "robot" in header else Robot.preset("neck")
         axes = {
             name: AxisFamily(**{key: arrays[f"{name}_{key}"] for key in AxisFamily.__dataclass_fields__})
-            for name in AXES
+            for name in robot.outputs.names
         }
         for name, axis in axes.items():
-            _check(name, axis, arrays["frequency"].size)
+            _check(name, axis, arrays["frequency"].size, robot)
+        weights = arrays.get("directions")
+        if not robot.is_neck and (weights is None or weights.shape != (len(axes), len(robot.motors.names))):
+            raise FileFormatError("its array `directions` is not of outputs x motors.")
         lpv = None
         if header["lpv_source"] is not None:
             parts = {key: arrays[f"lpv_{key}"] for key in ("knots", "gains", "poles", "delays")}
@@ -183,16 +214,18 @@ class Family:
             lpv=lpv,
             settings=header["settings"],
             findings=header["findings"],
+            robot=robot,
+            directions=weights,
         )
 
     def _axis(self, output: str) -> AxisFamily:
-        require_one_of("output", output, AXES)
+        require_one_of("output", output, tuple(self.axes))
         return self.axes[output]
 
     def _system(self, model: Continuous, output: str, continuous: bool, pade: int) -> control.TransferFunction:
         import control
 
-        names = {"inputs": [_INPUTS[output]], "outputs": [output]}
+        names = {"inputs": [_INPUTS[output] if self.robot.is_neck else f"{output}_input"], "outputs": [output]}
         if continuous:
             if not 0 <= pade <= 12:
                 raise SettingsError(f"`pade` must be between 0 and 12; got {pade}.")
@@ -239,7 +272,7 @@ def _cross_line(cross: Matrix) -> str:
 _LARGEST, _LONGEST = 1e4, 10.0
 
 
-def _check(name: str, axis: AxisFamily, frequencies: int) -> None:
+def _check(name: str, axis: AxisFamily, frequencies: int, robot: Robot) -> None:
     n = axis.samples.shape[0]
     shapes = {
         "samples": (n, 3), "std": (n, 4), "where": (n, 5), "used": (n,), "nominal": (3,), "box": (2, 3),
@@ -253,7 +286,10 @@ def _check(name: str, axis: AxisFamily, frequencies: int) -> None:
             raise FileFormatError(f"its array `{name}_{key}` is not finite.")
     for key in ("samples", "nominal", "box"):
         table = np.atleast_2d(getattr(axis, key))
-        if (np.abs(table) > _LARGEST).any() or (table[:, 2] < 0.0).any() or (table[:, 2] > _LONGEST).any():
+        if not robot.is_neck:
+            if (table[:, 1] <= 0.0).any() or (table[:, 2] < 0.0).any():
+                raise FileFormatError(f"its array `{name}_{key}` is not of poles above and dead times from zero.")
+        elif (np.abs(table) > _LARGEST).any() or (table[:, 2] < 0.0).any() or (table[:, 2] > _LONGEST).any():
             raise FileFormatError(
                 f"its array `{name}_{key}` is not of gains and poles up to {_LARGEST:g} and dead times from 0 to "
                 f"{_LONGEST:g} s."

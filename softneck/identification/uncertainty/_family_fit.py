@@ -19,32 +19,39 @@ from softneck.core import (
     require_whole,
     silent,
 )
-from softneck.signals import Recording, redefine
+from softneck.signals import Recording, concatenate, redefine
 
 from ..linear._oe import SOURCES
 from ..linear._srivc_fit import Continuous, SrivcFitOptions
+from ..models._directions import Directions, directions_of
 from ..models._fitting import check_training
 from ._envelope import envelope_weight
 from ._family import AXES, SCOPES, AxisFamily, Family, one_pole, relative_errors
-from ._local_models import Local, Window, fit_local, windows
+from ._local_models import Local, Window, axis_inputs, fit_local, windows
 from ._lpv import Lpv, fit_lpv
 
 _RUNS_NEEDED = 100
 
 
-def cross_gains(recordings: Sequence[Recording], nominal: Sequence[Continuous], source: str) -> tuple[Matrix, Matrix]:
-    """Return static gains (2, 3) [rad/rad] from theta_i, phi_i, delta_i to pitch and roll, and their deviations.
+def cross_gains(
+    recordings: Sequence[Recording], nominal: Sequence[Continuous], directions: Directions, source: str
+) -> tuple[Matrix, Matrix]:
+    """Return static gains (outputs, channels) from the inputs of all axes to each output, and their deviations.
+
+    Of a neck (2, 3) [rad/rad], from theta_i, phi_i, delta_i to pitch and roll.
 
     Every input is given the pole and the dead time of the output's own axis; gains and an offset for each run by
     least squares, so that only ratios of slow effects are told.
 
     Args:
-        recordings: of one neck.
-        nominal: models of pitch and roll.
+        recordings: of one robot.
+        nominal: models of its outputs.
+        directions: which way its motors move them.
         source: "set_points" or "positions".
     """
-    gains, stds = np.full((2, 3), np.nan), np.full((2, 3), np.nan)
-    for axis in range(2):
+    channels = axis_inputs(recordings[0].rows(0, 2), directions, source).shape[1]
+    gains, stds = np.full((len(nominal), channels), np.nan), np.full((len(nominal), channels), np.nan)
+    for axis in range(len(nominal)):
         parts, targets = [], []
         for recording in recordings:
             for run in recording.runs():
@@ -52,8 +59,8 @@ def cross_gains(recordings: Sequence[Recording], nominal: Sequence[Continuous], 
                 there = np.isfinite(y)
                 if there.sum() < _RUNS_NEEDED:
                     continue
-                U = redefine(run.motor_positions if source == "positions" else run.set_points)
-                X = np.column_stack([_unit_response(nominal[axis], U[:, j], run.sample_time) for j in range(3)])[there]
+                U = axis_inputs(run, directions, source)
+                X = np.column_stack([_unit_response(nominal[axis], u, run.sample_time) for u in U.T])[there]
                 parts.append(X - X.mean(axis=0))
                 targets.append(y[there] - y[there].mean())
         if not parts:
@@ -62,7 +69,7 @@ def cross_gains(recordings: Sequence[Recording], nominal: Sequence[Continuous], 
         moved = X.std(axis=0) > 1e-6
         theta, *_ = np.linalg.lstsq(X[:, moved], y)
         e = y - X[:, moved] @ theta
-        covariance = np.linalg.pinv(X[:, moved].T @ X[:, moved]) * float(e @ e) / max(y.size - 3, 1)
+        covariance = np.linalg.pinv(X[:, moved].T @ X[:, moved]) * float(e @ e) / max(y.size - channels, 1)
         gains[axis, moved], stds[axis, moved] = theta, np.sqrt(np.diag(covariance))
     return gains, stds
 
@@ -110,6 +117,8 @@ _CAUTION = (
 class FamilySettings:
     """Local models `K exp(-L s)/(s + p)` by `srivc`, and the uncertain plant over them.
 
+    Of another robot one for each output, from its direction, given or learned; what is in seconds here goes by its time
+    constant over a neck's 0.2 s.
     Every recording (payload) is cut into windows; windows of one inclination and direction make an operating point.
 
     Attributes:
@@ -155,24 +164,36 @@ class FamilySettings:
         sample_time = _one_sample_time(parts)
         for part in parts:
             check_training(part)
-            part.robot.require_neck("a family")
-        frequency = np.geomspace(_LOWEST, np.pi / sample_time, _FREQUENCIES)
-        search = SrivcFitOptions(sample_time=sample_time, offset=True, max_delay=self.max_delay, fastest=_FASTEST)
+            if self.lpv_knots > 0:
+                part.robot.require_neck("`lpv_knots`: an interpolation over the inclination")
+        robot, together = parts[0].robot, concatenate(parts)
+        motors = [run.motor_positions if self.source == "positions" else run.set_points for run in together.runs()]
+        directions = directions_of(together, motors)
+        # Seconds of a neck, by the robot's time constant.
+        slow = directions.stretch
+        frequency = np.geomspace(_LOWEST / slow, np.pi / sample_time, _FREQUENCIES)
+        search = SrivcFitOptions(
+            sample_time=sample_time, offset=True, max_delay=self.max_delay * slow, fastest=_FASTEST / slow
+        )
         cut = [
             window
             for number, part in enumerate(parts)
-            for window in windows(part, number, length=self.window, lead=self.max_delay, source=self.source)
+            for window in windows(
+                part, number, directions, length=self.window * slow, lead=self.max_delay * slow, source=self.source
+            )
         ]
         axes, dropped = {}, {}
-        for axis, name in enumerate(AXES):
-            progress(0.4 * axis, f"local models of {name}")
-            found, lost = self._local_models(search, cut, axis, len(parts))
+        for axis, name in enumerate(directions.names):
+            progress(0.8 * axis / len(directions.names), f"local models of {name}")
+            found, lost = self._local_models(search, cut, axis, len(parts), slow)
             dropped[name] = lost
             axes[name] = self._axis(name, found, frequency, sample_time, lost)
         progress(0.8, "cross gains")
-        nominal = [one_pole(axes[name].nominal) for name in AXES]
-        cross, cross_std = cross_gains(parts, nominal, self.source)
-        squeezed = fit_compression(parts, SrivcFitOptions(sample_time=sample_time, offset=True), self.source)
+        nominal = [one_pole(axes[name].nominal) for name in directions.names]
+        cross, cross_std = cross_gains(parts, nominal, directions, self.source)
+        squeezed = None
+        if robot.is_neck:
+            squeezed = fit_compression(parts, SrivcFitOptions(sample_time=sample_time, offset=True), self.source)
         lpv, fits = self._lpv(parts, axes, sample_time) if self.lpv_knots > 0 else (None, {})
         progress(1.0, "done")
         return Family(
@@ -189,15 +210,18 @@ class FamilySettings:
                 "windows": len(cut),
                 "windows_that_said_too_little": dropped,
                 "caution": _CAUTION,
+                **({} if robot.is_neck else directions.findings()),
                 **fits,
             },
+            robot=robot,
+            directions=None if robot.is_neck else directions.weights,
         )
 
     def _local_models(
-        self, search: SrivcFitOptions, cut: Sequence[Window], axis: int, recordings: int
+        self, search: SrivcFitOptions, cut: Sequence[Window], axis: int, recordings: int, slow: float
     ) -> tuple[list[Local], int]:
         """Return the local models of an axis: windows, operating points, recordings; and how many windows gave none."""
-        single = [fit_local(search, [window], axis, scope="window") for window in cut]
+        single = [fit_local(search, [window], axis, scope="window", stretch=slow) for window in cut]
         there = [local for local in single if local is not None]
         near = one_pole(np.median([local.numbers for local in there], axis=0)) if there else None
         # A point is made of windows that said something alone; one that stood still adds nothing.
@@ -208,10 +232,13 @@ class FamilySettings:
             key = (window.recording, int(window.inclination / self.inclination_step), sector)
             points.setdefault(key, []).append(window)
         found = [*there]
-        found += [fit_local(search, group, axis, scope="point", near=near) for _, group in sorted(points.items())]
+        found += [
+            fit_local(search, group, axis, scope="point", near=near, stretch=slow)
+            for _, group in sorted(points.items())
+        ]
         for number in range(recordings):
             group = [window for window in useful if window.recording == number]
-            found.append(fit_local(search, group, axis, scope="recording", near=near))
+            found.append(fit_local(search, group, axis, scope="recording", near=near, stretch=slow))
         return [local for local in found if local is not None], len(cut) - len(there)
 
     def _axis(self, name: str, found: list[Local], frequency: Vector, sample_time: float, lost: int) -> AxisFamily:

@@ -11,9 +11,12 @@ from softneck.core import Matrix, Vector
 from softneck.signals import Recording, redefine
 
 from ..linear._srivc_fit import Continuous, Runs, SrivcFit, SrivcFitOptions
+from ..models._directions import Directions
 
 # Below this spread of its input a window says nothing of an axis [rad]: 0.05 rad move the neck by 0.3 deg.
 _LEAST_INPUT = 0.05
+# Of another robot: in parts of the input's spread, of a neck's 2 rad; and how far a neck goes from its mean [rad].
+_LEAST_PART, _NECK_TILT = 0.025, 0.2
 # A local model is kept where these are known to better than these parts of themselves.
 _WORST_GAIN, _WORST_POLE = 0.3, 0.6
 _LEAST_FIT = 50.0
@@ -56,9 +59,10 @@ class Window:
     Attributes:
         recording: index.
         time: of its middle [s].
-        inputs: (time, 3) theta_i, phi_i, delta_i.
-        outputs: (time, 2), NaN in the rows before.
+        inputs: (time, channels) theta_i, phi_i, delta_i of a neck; that of each output of another robot.
+        outputs: (time, outputs), NaN in the rows before.
         inclination, direction: means over it [rad].
+        least: (channels,) the spread of an input below which it says nothing.
     """
 
     recording: int
@@ -67,6 +71,7 @@ class Window:
     outputs: Matrix
     inclination: float
     direction: float
+    least: Vector
 
     def run(self, axis: int) -> tuple[Vector, Vector]:
         """Return input and output of an axis."""
@@ -75,7 +80,7 @@ class Window:
     def excited(self, axis: int) -> bool:
         """Return whether the axis is driven and measured in it."""
         y = self.outputs[:, axis]
-        return float(self.inputs[:, axis].std()) > _LEAST_INPUT and int(np.isfinite(y).sum()) > 0.5 * y.size
+        return float(self.inputs[:, axis].std()) > self.least[axis] and int(np.isfinite(y).sum()) > 0.5 * y.size
 
 
 def tilt(outputs: Matrix) -> tuple[Vector, Vector]:
@@ -84,12 +89,34 @@ def tilt(outputs: Matrix) -> tuple[Vector, Vector]:
     return np.arctan(np.hypot(p, r)), np.arctan2(p, -r)
 
 
-def windows(recording: Recording, number: int, *, length: float, lead: float, source: str) -> list[Window]:
+def axis_inputs(run: Recording, directions: Directions, source: str) -> Matrix:
+    """Return what drives each axis (time, channels): theta_i, phi_i, delta_i of a neck."""
+    motors = run.motor_positions if source == "positions" else run.set_points
+    return redefine(motors) if run.robot.is_neck else motors @ directions.weights.T
+
+
+def _place(outputs: Matrix, recording: Recording) -> tuple[Vector, Vector]:
+    """Return inclination and direction (time,) [rad]; of another robot how far it is from its mean, as a neck would be.
+
+    A neck's operating points are 7.5 deg wide, and it goes some 0.2 rad to each side.
+    """
+    if recording.robot.is_neck:
+        return tilt(outputs)
+    seen = recording.outputs
+    moved = _NECK_TILT * (outputs - np.nanmean(seen, axis=0)) / np.nanstd(seen, axis=0)
+    other = moved[:, 1] if moved.shape[1] > 1 else np.zeros(len(moved))
+    return np.linalg.norm(moved, axis=1), np.arctan2(moved[:, 0], -other)
+
+
+def windows(
+    recording: Recording, number: int, directions: Directions, *, length: float, lead: float, source: str
+) -> list[Window]:
     """Cut every run into half-overlapping windows of `length` [s], a shorter run of at least half of it into one.
 
     Args:
         recording: to cut.
         number: its index.
+        directions: which way its motors move its outputs.
         length: of a window [s].
         lead: rows before a window whose inputs still act in it [s].
         source: "set_points" or "positions".
@@ -97,8 +124,10 @@ def windows(recording: Recording, number: int, *, length: float, lead: float, so
     Ts = recording.sample_time
     size, before = round(length / Ts), round(lead / Ts)
     cut: list[Window] = []
+    spread = axis_inputs(recording, directions, source).std(axis=0)
+    least = np.full(spread.size, _LEAST_INPUT) if recording.robot.is_neck else _LEAST_PART * spread
     for run in recording.runs():
-        U = redefine(run.motor_positions if source == "positions" else run.set_points)
+        U = axis_inputs(run, directions, source)
         Y = run.outputs
         if len(run) < size // 2:
             continue
@@ -106,7 +135,7 @@ def windows(recording: Recording, number: int, *, length: float, lead: float, so
             first, stop = max(start - before, 0), min(start + size, len(run))
             outputs = Y[first:stop].copy()
             outputs[: start - first] = np.nan
-            inclination, direction = tilt(Y[start:stop])
+            inclination, direction = _place(Y[start:stop], recording)
             # The mean of a direction is that of its vector.
             mean = np.nanmean(inclination * np.exp(1j * direction))
             cut.append(
@@ -117,35 +146,43 @@ def windows(recording: Recording, number: int, *, length: float, lead: float, so
                     outputs=outputs,
                     inclination=float(np.nanmean(inclination)),
                     direction=float(np.angle(mean)),
+                    least=least,
                 )
             )
     return cut
 
 
 def fit_local(
-    search: SrivcFitOptions, group: Sequence[Window], axis: int, *, scope: str, near: Continuous | None = None
+    search: SrivcFitOptions,
+    group: Sequence[Window],
+    axis: int,
+    *,
+    scope: str,
+    near: Continuous | None = None,
+    stretch: float = 1.0,
 ) -> Local | None:
     """Fit one model to all windows of a group, each with its own start and offset; None where they say too little.
 
     Args:
         search: how to fit.
         group: windows.
-        axis: 0 pitch, 1 roll.
+        axis: of the outputs.
         scope: of the result.
         near: model to start from as well.
+        stretch: by how much the robot is slower than a neck.
     """
     chosen = [window for window in group if window.excited(axis)]
     if not chosen:
         return None
     runs: Runs = [window.run(axis) for window in chosen]
-    fits = [search.start(runs, pole, delay) for pole in _POLES for delay in (0.3 * search.max_delay,)]
+    fits = [search.start(runs, pole / stretch, delay) for pole in _POLES for delay in (0.3 * search.max_delay,)]
     if near is not None:
         fits.append(search.improve(runs, near, [np.zeros(2) for _ in runs]))
     there = [fit for fit in fits if fit is not None]
     if not there:
         return None
     best = min(there, key=lambda fit: fit.cost)
-    std, percent = _quality(search, runs, best)
+    std, percent = _quality(search, runs, best, stretch)
     model = best.model
     gain, pole = model.b[0] / model.a[0], model.a[0]
     sure = std[0] < _WORST_GAIN * abs(gain) and std[1] < _WORST_POLE * pole and percent > _LEAST_FIT
@@ -168,13 +205,13 @@ def fit_local(
     )
 
 
-def _quality(search: SrivcFitOptions, runs: Runs, fit: SrivcFit) -> tuple[Vector, float]:
+def _quality(search: SrivcFitOptions, runs: Runs, fit: SrivcFit, stretch: float) -> tuple[Vector, float]:
     """Return standard deviations of static gain, pole, dead time and K, and the fit [%] about each run's mean."""
     errors = [(y - s)[np.isfinite(y)] for (_, y), s in zip(runs, fit.simulated, strict=True)]
     spread = sum(float(np.sum((y[np.isfinite(y)] - np.nanmean(y)) ** 2)) for _, y in runs)
     e = np.concatenate(errors)
     # Errors that stay for n samples count as one in n.
-    variance = float(np.mean(e**2)) * _correlation_time(errors, round(1.0 / search.sample_time))
+    variance = float(np.mean(e**2)) * _correlation_time(errors, round(stretch / search.sample_time))
     covariance = variance * np.linalg.pinv(fit.information, hermitian=True)
     p, K = fit.model.a[0], fit.model.b[0]
     slope = np.array([-K / p**2, 1.0 / p, 0.0])

@@ -17,37 +17,39 @@ FUNCTIONS = load_functions("softneck.identification.networks._nn_fit_runtime")
 RNG = np.random.default_rng(5)
 NET = random_layers(4, (5, 3), RNG)
 Z = RNG.standard_normal((24, 4))
-SHIFT, GAIN = 0.2, 0.7
+# Two past outputs are fed back, the second from three samples before.
+LAGS, SHIFT, GAIN = np.array([1, 3]), np.array([0.2, -0.1]), np.array([0.7, 0.4])
 NAN = np.nan
 
 
 def free_run(w: np.ndarray, starts: np.ndarray) -> np.ndarray:
     y = np.empty(len(Z))
-    FUNCTIONS.nn_free(w, 5, 3, Z, starts, SHIFT, GAIN, y)
+    FUNCTIONS.nn_free(w, 5, 3, Z, LAGS, starts, SHIFT, GAIN, y)
     return y
 
 
 def starts(*at: int) -> np.ndarray:
-    values = np.full(len(Z), NAN)
-    values[list(at)] = 0.3
+    values = np.full((len(Z), 2), NAN)
+    for k in at:
+        values[k, 0], values[k : k + 3, 1] = 0.3, 0.3
     return values
 
 
 def test_windows_of_one_step_are_the_network_on_measured_outputs() -> None:
-    y = free_run(NET.vector(), np.full(len(Z), 0.3))
+    y = free_run(NET.vector(), np.full((len(Z), 2), 0.3))
     given = Z.copy()
-    given[:, 0] = SHIFT + GAIN * 0.3
+    given[:, :2] = SHIFT + GAIN * 0.3
     # The same sums in another order.
     np.testing.assert_allclose(y, NET.output(given), rtol=0, atol=1e-13)
     J, again = np.empty((len(Z), NET.vector().size)), np.empty(len(Z))
-    FUNCTIONS.nn_sensitivities(NET.vector(), 5, 3, Z, np.full(len(Z), 0.3), SHIFT, GAIN, 1, again, J)
+    FUNCTIONS.nn_sensitivities(NET.vector(), 5, 3, Z, LAGS, np.full((len(Z), 2), 0.3), SHIFT, GAIN, 1, again, J)
     np.testing.assert_allclose(J, jacobian(NET, given)[1], rtol=0, atol=1e-13)
 
 
 def test_the_sensitivities_of_a_free_run_are_central_differences() -> None:
     w, h, begin = NET.vector(), 1e-5, starts(0, 10)
     J, y = np.empty((8, w.size)), np.empty(len(Z))
-    FUNCTIONS.nn_sensitivities(w, 5, 3, Z, begin, SHIFT, GAIN, 3, y, J)
+    FUNCTIONS.nn_sensitivities(w, 5, 3, Z, LAGS, begin, SHIFT, GAIN, 3, y, J)
     np.testing.assert_array_equal(y, free_run(w, begin))
     numeric = np.column_stack(
         [(free_run(w + h * e, begin) - free_run(w - h * e, begin))[::3] / (2 * h) for e in np.eye(w.size)]

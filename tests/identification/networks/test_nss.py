@@ -7,9 +7,10 @@ import pytest
 
 from softneck.core import DataError, SettingsError
 from softneck.identification import INFINITE, Model, NeuralStateSpace, validate
+from softneck.identification.models._directions import directions_of
 from softneck.identification.models._drive import fit_loaded_drive
 from softneck.identification.networks._contraction import Contraction, whitening
-from softneck.identification.networks._nss_problem import FUNCTIONS, Records, Shape, free_run
+from softneck.identification.networks._nss_problem import FUNCTIONS, Inputs, Records, Shape, free_run
 from softneck.identification.networks._nss_training import BestMap, Training, linear_start, random_start, whitened
 from softneck.identification.networks._state_space_network import INTERRUPTED
 from softneck.plant import NeckParameters, VirtualNeck, record
@@ -19,7 +20,7 @@ from softneck.signals import signal
 from ...data import neck_recording, short_neck
 
 SMALL = NeuralStateSpace(order=1, neurons=2, starts=2, iterations=3)
-SHAPE = Shape(3, 4, 2)
+SHAPE = Shape(3, 4, 2, 2)
 MAP = Contraction(3, 2, 0.98)
 ONES = np.array([0.3])
 
@@ -91,26 +92,40 @@ def problem() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     return w, V, begin, states
 
 
-def run(w: np.ndarray, V: np.ndarray, begin: np.ndarray, states: np.ndarray, *, compiled: bool = True) -> np.ndarray:
+GAIN = 0.3 * np.random.default_rng(7).standard_normal((3, 2))
+UNTOLD = np.full((40, 2), np.nan)
+# Told both outputs for a while, then one of them.
+TOLD = UNTOLD.copy()
+TOLD[25:30], TOLD[30:35, 1] = 0.4, -0.2
+
+
+def run(
+    w: np.ndarray, V: np.ndarray, begin: np.ndarray, states: np.ndarray, told: np.ndarray, *, compiled: bool = True
+) -> np.ndarray:
     Y, seen = np.empty((len(V), 2)), np.empty((len(V), 3))
-    functions = load_functions(FUNCTIONS, compiled=compiled)
-    functions.nss_free(w, 3, 2, V, begin, states, np.zeros((3, 2)), np.full((len(V), 2), np.nan), seen, Y)
+    load_functions(FUNCTIONS, compiled=compiled).nss_free(w, 3, 2, V, begin, states, GAIN, told, seen, Y)
     return Y
 
 
+@pytest.mark.parametrize("told", [UNTOLD, TOLD], ids=["free", "told"])
 @pytest.mark.parametrize("compiled", [True, False])
-def test_the_sensitivities_of_free_runs_and_windows_are_central_differences(*, compiled: bool) -> None:
+def test_the_sensitivities_of_free_runs_and_windows_are_central_differences(
+    told: np.ndarray, *, compiled: bool
+) -> None:
     w, V, begin, states = problem()
     w[SHAPE.vector_size - 12 : SHAPE.vector_size - 8] = [0.0, 0.0, 0.5, 0.0]  # D is strictly lower triangular
     rows = np.full(40, -1, dtype=np.int64)
     rows[::3] = np.arange(14)
     J, Y = np.empty((28, w.size)), np.empty((40, 2))
-    load_functions(FUNCTIONS, compiled=compiled).nss_sensitivities(w, 3, 2, V, begin, states, rows, Y, J)
+    load_functions(FUNCTIONS, compiled=compiled).nss_sensitivities(w, 3, 2, V, begin, states, GAIN, told, rows, Y, J)
     # The same sums in the same order; numba may fuse none of them.
-    np.testing.assert_allclose(Y, run(w, V, begin, states, compiled=compiled), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(Y, run(w, V, begin, states, told, compiled=compiled), rtol=0, atol=1e-14)
     h = 1e-5
     numeric = np.column_stack(
-        [(run(w + h * e, V, begin, states) - run(w - h * e, V, begin, states))[::3].ravel() for e in np.eye(w.size)]
+        [
+            (run(w + h * e, V, begin, states, told) - run(w - h * e, V, begin, states, told))[::3].ravel()
+            for e in np.eye(w.size)
+        ]
     ) / (2 * h)  # fmt: skip
     inside = np.ones(w.size, dtype=bool)
     inside[np.flatnonzero(np.triu(np.ones((2, 2)))) + w.size - 12] = False
@@ -135,23 +150,25 @@ def test_the_chain_to_the_parameters_is_that_of_central_differences() -> None:
 def started(neurons: int) -> tuple[Records, Shape, np.ndarray, np.ndarray]:
     recording = neck_recording(900)
     drive = fit_loaded_drive(recording)
-    fits, delay = linear_start(recording, drive, 1)
-    records = Records.of(recording, drive, ONES, delay)
-    return records, *whitened(fits, records, neurons)
+    directions = directions_of(recording, [])
+    fits, delay = linear_start(recording, drive, directions, 1)
+    made = Inputs(drive, directions, directions.inputs(recording), ONES, delay)
+    records = Records.of(recording, made)
+    return records, *whitened(fits, records, made, neurons)
 
 
 def test_training_starts_from_the_free_run_of_the_output_error_model() -> None:
     records, shape, linear, gain = started(2)
     # The neck is linear: output error on simulated motors is all but the truth.
-    assert records.fit(free_run(shape, linear, records)[0]) > 95.0
+    assert records.fit(free_run(shape, linear, records, gain)[0]) > 95.0
     contraction = Contraction(shape.states, 2, 0.996)
     theta, base = random_start(shape.arrays(linear), shape, contraction, np.random.default_rng(0))
     training = Training(shape, contraction, gain, records, 0.1, base)
-    X = free_run(shape, linear, records)[1][records.own]
+    X = free_run(shape, linear, records, gain)[1][records.own]
     np.testing.assert_allclose(np.cov(X.T), np.eye(shape.states), rtol=0, atol=0.3)
-    idle, _ = free_run(shape, training.weights(theta), records)
+    idle, _ = free_run(shape, training.weights(theta), records, gain)
     # The factor of H and back, along 900 steps of a stable map.
-    np.testing.assert_allclose(idle, free_run(shape, linear, records)[0], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(idle, free_run(shape, linear, records, gain)[0], rtol=0, atol=1e-9)
     best = BestMap(records, lambda _: None, lambda: False)
     for seconds in (0.0, 0.2, None):
         training.search(theta, seconds, 2, best, "")
@@ -160,17 +177,19 @@ def test_training_starts_from_the_free_run_of_the_output_error_model() -> None:
 
 def test_training_sees_what_the_free_run_computes(models: dict[str, Model]) -> None:
     model, recording = models["nss"], short_neck()
-    drive = fit_loaded_drive(recording)
-    records = Records.of(recording, drive, model.arrays["widths"], int(model.arrays["delay"][0]))
+    directions = directions_of(recording, [])
+    widths, delay = model.arrays["widths"], int(model.arrays["delay"][0])
+    made = Inputs(fit_loaded_drive(recording), directions, directions.inputs(recording), widths, delay)
+    records = Records.of(recording, made)
     scales = records.scales
-    shape = Shape(len(model.arrays["A"]), model.arrays["B"].shape[1], model.arrays["h"].size)
+    shape = Shape(len(model.arrays["A"]), model.arrays["B"].shape[1], model.arrays["h"].size, 2)
     scaled = dict(model.arrays) | {
         "B": model.arrays["B"] * scales.inputs,
         "G": model.arrays["G"] * scales.inputs,
         "C": model.arrays["C"] / scales.outputs[:, None],
         "c": (model.arrays["c"] - scales.middle) / scales.outputs,
     }
-    Y, _ = free_run(shape, shape.vector(scaled), records)
+    Y, _ = free_run(shape, shape.vector(scaled), records, np.zeros((shape.states, 2)))
     expected = np.clip(scales.middle + scales.outputs * Y, *model.arrays["range"].T)[records.own]
     free = model.simulate(recording, warm_up=1)[:, :2]
     # Both starts are held for seconds, four of them in training, where the rate allows 5 s: nothing but what they
