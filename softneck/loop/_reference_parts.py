@@ -9,10 +9,11 @@ from dataclasses import fields, replace
 import numpy as np
 
 from softneck.core import DataError, SettingsError, Vector, require_positive
+from softneck.robot import Robot
 from softneck.runtime import Block, Port
 
 from ._references import RampReference, RecordingReference, Reference, RotationReference, SineReference, StepReference
-from ._wiring import REFERENCE_PORTS
+from ._wiring import REFERENCE_PORTS, reference_ports
 
 _AHEAD_PORTS = tuple(
     Port(name=f"{axis}_reference_ahead", unit="rad", description=f"wanted {axis}, `ahead` from now")
@@ -60,7 +61,7 @@ class AheadReference:
 
 
 _KINDS: tuple[type, ...] = (StepReference, RampReference, SineReference, RotationReference)
-_RECORDED = 4
+_RECORDED, _WRITTEN = 4, 5
 # The runtime's order; the starts of those that a kind does not have are never read.
 _PARAMETERS = (
     Port(name="pitch", unit="rad", minimum=-0.8, maximum=0.8, description="end value or amplitude"),
@@ -77,17 +78,25 @@ _PARAMETERS = (
 class ReferenceBlock:
     """A reference that an FMU can be built of (`softneck.fmu.describe._describe.Buildable`)."""
 
-    def __init__(self, reference: Reference, *, sample_time: float = 0.02, duration: float | None = None) -> None:
+    def __init__(
+        self,
+        reference: Reference,
+        *,
+        sample_time: float = 0.02,
+        duration: float | None = None,
+        robot: Robot | None = None,
+    ) -> None:
         """Describe `reference` as a block.
 
         Args:
             reference: one of softneck's own, or any function of time if `duration` is given.
             sample_time: [s].
-            duration: for how long a function of your own is written down, sample by sample [s].
+            duration: for how long a function of your own, or of another robot, is written down, sample by sample [s].
+            robot: whose; None: the neck's.
         """
         require_positive("sample_time", sample_time, "s")
         self.reference, self.sample_time = reference, sample_time
-        self._duration = duration
+        self._duration, self._robot = duration, Robot.preset() if robot is None else robot
 
     def block(self) -> Block:
         """Return the block; its outputs are those of the reference, one sample after each step.
@@ -96,11 +105,12 @@ class ReferenceBlock:
             SettingsError: a function of the user's own without a duration.
         """
         kind, starts, table = self._described()
-        parameters = tuple(replace(port, start=starts.get(port.name, port.start)) for port in _PARAMETERS)
+        ports = _PARAMETERS if self._robot.is_neck else _PARAMETERS[-1:]
+        parameters = tuple(replace(port, start=starts.get(port.name, port.start)) for port in ports)
         return Block(
             kind="reference", role="reference", runtime="softneck.loop._reference_runtime",
             sample_time=self.sample_time, arrays=(np.array([float(kind), self.sample_time]), table), inputs=(),
-            outputs=REFERENCE_PORTS, parameters=parameters,
+            outputs=reference_ports(self._robot), parameters=parameters,
         )  # fmt: skip
 
     def summary(self) -> str:
@@ -111,6 +121,8 @@ class ReferenceBlock:
 
     def _described(self) -> tuple[int, dict[str, float], np.ndarray]:
         reference = self.reference
+        if not self._robot.is_neck:
+            return _WRITTEN, {}, self._table()
         for kind, known in enumerate(_KINDS):
             if isinstance(reference, known):
                 starts = {item.name: float(getattr(reference, item.name)) for item in fields(known)}
@@ -118,7 +130,11 @@ class ReferenceBlock:
         if isinstance(reference, RecordingReference):
             third = np.zeros(reference.time.size) if reference.cocontraction is None else reference.cocontraction
             return _RECORDED, {}, np.column_stack([reference.time, reference.pitch, reference.roll, third])
+        return _RECORDED, {}, self._table()
+
+    def _table(self) -> np.ndarray:
+        """Return (rows, 1 + values): the reference's values, sample by sample."""
         if self._duration is None:
             raise SettingsError("a reference of your own needs the duration over which it is written down.")
         times = np.arange(math.ceil(self._duration / self.sample_time) + 1) * self.sample_time
-        return _RECORDED, {}, np.array([[time, *reference(time)] for time in times.tolist()])
+        return np.array([[time, *self.reference(time)] for time in times.tolist()])

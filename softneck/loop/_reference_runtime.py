@@ -13,8 +13,8 @@ from softneck.runtime._layout import Arrays, StateVector, array, cells
 class ReferenceArrays(Arrays):
     """Which reference, and the rows of a recorded one."""
 
-    setup = array("2", "kind: 0 step, 1 ramp, 2 sine, 3 rotation, 4 recording; sample time [s]")
-    table = array("rows, 4", "time [s], pitch, roll, co-contraction [rad] of a recording")
+    setup = array("2", "kind: 0 step, 1 ramp, 2 sine, 3 rotation, 4 recording, 5 of any robot; sample time [s]")
+    table = array("rows, columns", "time [s], pitch, roll, co-contraction [rad] of a recording; outputs of any robot")
 
 
 class ReferenceState(StateVector):
@@ -46,6 +46,13 @@ def reference_at(p: ReferenceArrays, parameters: np.ndarray, x: ReferenceState, 
     """
     kind = int(p.setup[0])
     time = x.sample * p.setup[1]  # from a count: sums of sample times would drift
+    if kind == 5:
+        k = reference_row(time, p.table, int(x.row))
+        x.row = float(k)
+        for j in range(1, p.columns):
+            outputs[j - 1] = p.table[k, j]
+        outputs[p.columns - 1] = parameters[0]  # its one parameter: enabled
+        return
     pitch, roll, cocontraction = parameters[0], parameters[1], parameters[2]
     frequency, at, rise = parameters[4], parameters[5], parameters[6]
     if kind == 0:

@@ -101,9 +101,14 @@ def write_ssp(loop: Loop | LoopSetup, path: str | Path, *, force: bool = False, 
         raise SettingsError("an SSP file cannot hold the loop's faults; take [[fault]] out of a copy of the loop file.")
     step = min(part.sample_time for part in plain.parts.values())
     if not hasattr(plain.reference, "advance"):
-        block = ReferenceBlock(plain.reference, sample_time=step, duration=plain.duration).block()  # pyright: ignore[reportArgumentType]
+        block = ReferenceBlock(
+            plain.reference,
+            sample_time=step,
+            duration=plain.duration,
+            robot=plain.robot,  # pyright: ignore[reportArgumentType]
+        ).block()
         plain = replace(plain, reference=BlockPart(block))
-    wiring = wire(plain.parts, plain.constants, plain.connections)
+    wiring = wire(plain.parts, plain.constants, plain.connections, plain.robot)
     with tempfile.TemporaryDirectory(prefix="softneck-ssp-") as folder:
         sources = {name: _fmu_of(name, part, Path(folder), compiled) for name, part in plain.parts.items()}
         parts = [_component(name, part, sources[name], plain, wiring) for name, part in plain.parts.items()]

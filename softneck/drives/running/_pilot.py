@@ -45,7 +45,7 @@ class LoopPilot:
             listed = ", ".join(f"{name} {step:g} s" for name, step in steps.items())
             raise SettingsError(f"on drives all parts of a loop need one sample time; it has {listed}.")
         self.sample_time = loop.controller.sample_time
-        wiring = wire(self._parts, loop.constants, loop.connections)
+        wiring = wire(self._parts, loop.constants, loop.connections, robot)
         self._wiring = wiring
         # As in a simulation, but that the plant is hardware, and nobody knows the reference's rows ahead.
         actions = cycle(self._parts, wiring.taps, dict.fromkeys(self._parts, 1), order=loop.order, disturbed=False)
