@@ -20,7 +20,7 @@ from softneck.fmu import build_compiled_fmu, build_fmu, fmu_info
 from softneck.fmu.compiled._model_file import node_of
 from softneck.fmu.describe._modelled_drives import with_modelled_drives
 from softneck.fmu.describe._terminals_and_icons import terminals
-from softneck.identification import Model, OutputError, Play, validate
+from softneck.identification import Model, NeuralStateSpace, OutputError, Play, validate
 from softneck.plant import VirtualNeck
 from softneck.robot import Robot
 from softneck.runtime import Block, Port, load_runtime
@@ -59,7 +59,11 @@ def recording(chambers: bool) -> Recording:
 
 @cache
 def model(kind: str, chambers: bool) -> Model:
-    settings: dict[str, Any] = {"oe": OutputError(delay=0.0), "play": Play(rate=15.0, widths=(0.2,), degree=1)}
+    settings: dict[str, Any] = {
+        "oe": OutputError(delay=0.0),
+        "play": Play(rate=15.0, widths=(0.2,), degree=1),
+        "nss": NeuralStateSpace(neurons=3, starts=1, iterations=3),
+    }
     return settings[kind].fit(recording(chambers))
 
 
@@ -90,7 +94,7 @@ def test_an_fmu_is_simulated_as_its_model(backend: str, fmi: int, tmp_path: Path
 
 
 @pytest.mark.parametrize(("backend", "fmi"), BACKENDS)
-@pytest.mark.parametrize("kind", ["oe", "play"])
+@pytest.mark.parametrize("kind", ["oe", "play", pytest.param("nss", marks=pytest.mark.slow)])
 def test_pressures_and_lengths_keep_their_names_units_and_ranges(
     kind: str, backend: str, fmi: int, tmp_path: Path
 ) -> None:

@@ -35,6 +35,8 @@ _NECKS = (
 )
 # Those that robots of other sizes have; once more for all of these, so that the neck's know their sizes beforehand.
 _ROBOTS = (
+    "softneck.identification.networks._nn_runtime",
+    "softneck.identification.networks._nss_observed_runtime",
     "softneck.identification.linear._affine_runtime",
     "softneck.identification.linear._state_space_runtime",
     "softneck.identification.structured._play_runtime",
