@@ -131,10 +131,7 @@ def test_record_takes_the_robot_beside_the_recording_and_says_what_it_lacks(call
     assert not (tmp_path / "rec.csv").exists()
 
 
-def test_a_robot_is_an_fmu_by_its_preset_or_file(call: Call, tmp_path: Path) -> None:
+def test_a_robot_is_an_fmu_by_its_preset_or_file(call: Call) -> None:
     assert call("fmu", "antagonist", "-o", "A.fmu").code == 0
     assert call("robot", "new", "mine.toml", "--preset", "antagonist").code == 0
     assert call("fmu", "mine.toml", "-o", "B.fmu").code == 0
-    said = call("fmu", "antagonist", "-o", "C.fmu", "--backend", "compiled")
-    assert (said.code, "use `--backend python`" in said.error) == (2, True)
-    assert not (tmp_path / "C.fmu").exists()

@@ -17,9 +17,10 @@ from fmpy.validation import validate_fmu
 from softneck.core import Matrix, SettingsError
 from softneck.cosim.parts._free_run import drive_fmu
 from softneck.fmu import build_compiled_fmu, build_fmu, fmu_info
+from softneck.fmu.compiled._model_file import node_of
 from softneck.fmu.describe._modelled_drives import with_modelled_drives
 from softneck.fmu.describe._terminals_and_icons import terminals
-from softneck.identification import Model, OutputError, Play, validate
+from softneck.identification import Model, NeuralStateSpace, OutputError, Play, validate
 from softneck.plant import VirtualNeck
 from softneck.robot import Robot
 from softneck.runtime import Block, Port, load_runtime
@@ -58,7 +59,11 @@ def recording(chambers: bool) -> Recording:
 
 @cache
 def model(kind: str, chambers: bool) -> Model:
-    settings: dict[str, Any] = {"oe": OutputError(delay=0.0), "play": Play(rate=15.0, widths=(0.2,), degree=1)}
+    settings: dict[str, Any] = {
+        "oe": OutputError(delay=0.0),
+        "play": Play(rate=15.0, widths=(0.2,), degree=1),
+        "nss": NeuralStateSpace(neurons=3, starts=1, iterations=3),
+    }
     return settings[kind].fit(recording(chambers))
 
 
@@ -89,7 +94,7 @@ def test_an_fmu_is_simulated_as_its_model(backend: str, fmi: int, tmp_path: Path
 
 
 @pytest.mark.parametrize(("backend", "fmi"), BACKENDS)
-@pytest.mark.parametrize("kind", ["oe", "play"])
+@pytest.mark.parametrize("kind", ["oe", "play", pytest.param("nss", marks=pytest.mark.slow)])
 def test_pressures_and_lengths_keep_their_names_units_and_ranges(
     kind: str, backend: str, fmi: int, tmp_path: Path
 ) -> None:
@@ -136,9 +141,10 @@ def test_terminals_and_pages_speak_of_the_robot_s_outputs() -> None:
     assert page.count("[mm]") == 3
 
 
-def test_a_robot_s_virtual_plant_is_an_fmu(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("backend", "fmi"), BACKENDS[:2])
+def test_a_robot_s_virtual_plant_is_an_fmu(backend: str, fmi: int, tmp_path: Path) -> None:
     block = VirtualNeck.of(Robot.preset("antagonist")).block(internal_step=0.004)
-    path = built(block, tmp_path / "Antagonist.fmu", "python", 2)
+    path = built(block, tmp_path / "Antagonist.fmu", backend, fmi)
     inputs = {"motor_setpoint_1": np.full(15, 2.0), "payload": np.full(15, 0.1)}
     np.testing.assert_allclose(drive_fmu(path, inputs), plain(block, 15, **inputs), atol=1e-9)
     assert [name for name in variables(path) if name.startswith("tendon_angle_")] == [
@@ -146,10 +152,11 @@ def test_a_robot_s_virtual_plant_is_an_fmu(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
-@native
-def test_a_virtual_plant_of_another_size_is_not_in_the_compiled_library_and_says_so(tmp_path: Path) -> None:
-    with pytest.raises(SettingsError, match=r"cannot be in a compiled FMU.*--backend python"):
-        build_compiled_fmu(VirtualNeck.of(Robot.preset("trunk4")).block(), tmp_path / "Trunk.fmu")
+def test_sizes_that_no_robot_has_are_not_made() -> None:
+    block = VirtualNeck.of(Robot.preset("antagonist")).block()
+    for size in ("9x1", "2x1x1", "999999x2", "n"):
+        with pytest.raises(SettingsError, match="cannot be in a compiled FMU"):
+            node_of(f"softneck.plant._neck_runtime@{size}", block.arrays)
 
 
 def test_a_controller_of_two_motors_has_the_drives_of_two() -> None:

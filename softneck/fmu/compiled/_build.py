@@ -69,7 +69,7 @@ def build_compiled_fmu(
         raise SettingsError(f"unknown FMI version {fmi}; use 2 or 3.")
     block = described_block(block)
     modules = node_of(block.runtime, block.arrays).modules
-    library = find_library()
+    library = find_library(modules)
     _check_kinds(modules, library.sources)
     folders = _folders(library, platforms, fmi)
     members = _members(block, info or FmuInfo(), name, fmi, library.sources)

@@ -21,6 +21,7 @@ from ..python._zip import deflated
 from ._compilers import compile_for, compile_here, local_compiler
 from ._platforms import PLATFORMS, here
 from ._sources import GENERATED, HERE, Sources, c_sources, sources_key
+from .translate._kinds import RUNTIMES
 
 BINARIES = HERE / "binaries"
 _MANIFEST = "manifest.json"
@@ -44,13 +45,18 @@ class Library:
     streams: dict[bytes, bytes] = field(default_factory=dict)
 
 
-def find_library() -> Library:
+def find_library(modules: set[str] | None = None) -> Library:
     """Return the libraries that are here, compiling for this machine only where none are.
+
+    Args:
+        modules: that it must hold; those of robots of other sizes than the neck's are compiled, for this machine only.
 
     Raises:
         FileFormatError: a library is damaged.
         SettingsError: there is none, and no C compiler.
     """
+    if modules and not modules <= set(RUNTIMES):
+        return _local_library(tuple(sorted(modules)))
     return packaged_library() or _local_library()
 
 
@@ -144,7 +150,7 @@ def _packed(data: bytes) -> bytes:
     return zopfli.compress(data)[2:-4]  # without zlib's head and checksum
 
 
-def _local_library() -> Library:
+def _local_library(modules: tuple[str, ...] = RUNTIMES) -> Library:
     """Return the library of this machine: from the user's cache, or compiled now."""
     machine, compiler = here(), local_compiler()
     if machine is None or compiler is None:
@@ -152,10 +158,10 @@ def _local_library() -> Library:
             "there is no compiled library here and no C compiler to make one; run `make native` (it needs "
             "`pip install ziglang`), install a C compiler, or use `--backend python`."
         )
-    folder = _cache_folder() / sources_key()
+    folder = _cache_folder() / sources_key(modules)
     library, generated, refused = folder / f"library{machine.suffix}", folder / GENERATED, folder / "refused.json"
     if not refused.is_file():
-        sources = c_sources()
+        sources = c_sources(modules)
         folder.mkdir(parents=True, exist_ok=True)
         # The last one is the sign that all are there.
         for path, data in (
@@ -168,7 +174,8 @@ def _local_library() -> Library:
     files = {path.name: path.read_text(encoding="utf-8") for path in sorted((HERE / "c").glob("*.[ch]"))}
     files[GENERATED] = generated.read_text(encoding="utf-8")
     sources = Sources(files, json.loads(refused.read_text(encoding="utf-8")))
-    origin = f"compiled by {compiler[0]} for this machine alone ({machine.name}); `make native` builds all platforms"
+    origin = f"compiled by {compiler[0]} for this machine alone ({machine.name})"
+    origin += "; `make native` builds all platforms" if modules == RUNTIMES else ", as the robot's sizes are its own"
     return Library({machine.name: library.read_bytes()}, sources, origin)
 
 

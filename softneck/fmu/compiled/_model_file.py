@@ -14,7 +14,7 @@ import numpy as np
 from softneck.core import Matrix, SettingsError
 from softneck.runtime import Block, Port
 
-from .translate._kinds import RUNTIMES, module_of, ranks_of
+from .translate._kinds import is_known, module_of, ranks_of
 
 _MAGIC = b"SNMODEL\0"
 FORMAT = 1
@@ -46,7 +46,7 @@ def node_of(runtime: str, arrays: tuple[Matrix, ...]) -> Node:
     outer, _, inner = runtime.partition("(")
     pairs = [part.rpartition(":") for part in _split(inner[:-1])] if inner else []
     runs = module_of(outer)
-    if runs not in RUNTIMES:
+    if not is_known(runs):
         raise SettingsError(
             f"`{outer}` cannot be in a compiled FMU: it is not in the table of softneck.fmu.compiled; "
             "use `--backend python`."

@@ -37,10 +37,10 @@ class Sources:
     refused: dict[str, str]
 
 
-def c_sources() -> Sources:
-    """Return the C sources of the library, translated now."""
+def c_sources(modules: tuple[str, ...] = RUNTIMES) -> Sources:
+    """Return the C sources of the library, or of one of other runtime `modules`, translated now."""
     unit, refused = Unit(), {}
-    for module in RUNTIMES:
+    for module in modules:
         try:
             unit.add(module, ranks_of(module))
         except TranslationError as error:
@@ -51,13 +51,13 @@ def c_sources() -> Sources:
 
 
 @cache
-def sources_key() -> str:
+def sources_key(modules: tuple[str, ...] = RUNTIMES) -> str:
     """Return a digest of all that the library is made of: runtimes, translator, sources written by hand, flags.
 
     Far faster than translating: it tells whether a library that is there is still the right one.
     """
-    texts = [bundle(module, loops=False) for module in RUNTIMES]
-    digest = hashlib.sha256(repr((FLAGS, [ranks_of(module) for module in RUNTIMES], texts)).encode())
+    texts = [bundle(module, loops=False) for module in modules]
+    digest = hashlib.sha256(repr((FLAGS, [ranks_of(module) for module in modules], texts)).encode())
     # By name: a wheel has the packages in other folders than a checkout. By content where a name is there twice.
     paths = [*HERE.rglob("*.py"), *(HERE / "c").glob("*.[ch]")]
     for name, content in sorted((path.name.encode(), path.read_bytes()) for path in paths):

@@ -35,11 +35,16 @@ _NECKS = (
 )
 # Those that robots of other sizes have; once more for all of these, so that the neck's know their sizes beforehand.
 _ROBOTS = (
+    "softneck.identification.networks._nn_runtime",
+    "softneck.identification.networks._nss_observed_runtime",
     "softneck.identification.linear._affine_runtime",
     "softneck.identification.linear._state_space_runtime",
     "softneck.identification.structured._play_runtime",
 )
 RUNTIMES = (*_NECKS, *(f"{module}@{ANY_SIZE}" for module in _ROBOTS))
+# Its tuples have the robot's sizes: one text for all there is none, and whoever wants one compiles it (see `_library`).
+_EACH_SIZE = "softneck.plant._neck_runtime"
+_SIZE = re.compile(r"[1-8]x[1-4]")
 
 # Which of a step's functions are compiled for speed, all others for size: those with so many loops within each other.
 # A network, a search among thousands of points and a quadratic program spend their time in every loop; the neck in
@@ -56,8 +61,14 @@ FAST = {
 def module_of(runtime: str) -> str:
     """Return the module in the library that runs a runtime: its own, or that of all sizes."""
     plain, _, size = runtime.partition("@")
-    sized = not size or re.fullmatch(r"[1-8]x[1-4]", size) is not None  # the name may come from a file
-    return f"{plain}@{ANY_SIZE}" if sized and runtime not in RUNTIMES else runtime
+    sized = not size or _SIZE.fullmatch(size) is not None  # the name may come from a file
+    return f"{plain}@{ANY_SIZE}" if sized and runtime not in RUNTIMES and plain != _EACH_SIZE else runtime
+
+
+def is_known(module: str) -> bool:
+    """Return whether a module is in the library, or can be compiled beside it for a robot of its sizes."""
+    plain, _, size = module.partition("@")
+    return module in RUNTIMES or (plain == _EACH_SIZE and _SIZE.fullmatch(size) is not None)
 
 
 def ranks_of(module: str) -> tuple[int, ...]:
