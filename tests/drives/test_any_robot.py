@@ -369,7 +369,7 @@ def loop_of(moved: Robot, act: Any) -> Loop:
     asked = ["pitch_reference", "roll_reference", *names]
     controller = Ports("controller", asked, list(moved.set_points), act)
 
-    def wanted(t: float) -> tuple[float, ...]:
+    def wanted(t: float) -> tuple[float, float, float]:
         return (0.1 if t > 0.5 else 0.0, 0.0, 0.0)
 
     return Loop(plant=plant, controller=controller, reference=wanted, duration=3.0, robot=moved)
