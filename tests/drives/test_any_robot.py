@@ -368,9 +368,11 @@ def loop_of(moved: Robot, act: Any) -> Loop:
     plant = Ports("plant", list(moved.set_points), [*names, *moved.motor_positions])
     asked = ["pitch_reference", "roll_reference", *names]
     controller = Ports("controller", asked, list(moved.set_points), act)
-    return Loop(
-        plant=plant, controller=controller, reference=lambda t: (0.1 if t > 0.5 else 0.0, 0.0, 0.0), duration=3.0
-    )
+
+    def wanted(t: float) -> tuple[float, float, float]:
+        return (0.1 if t > 0.5 else 0.0, 0.0, 0.0)
+
+    return Loop(plant=plant, controller=controller, reference=wanted, duration=3.0, robot=moved)
 
 
 def test_a_controller_runs_on_four_drives_by_the_names_of_its_ports(tmp_path: Path) -> None:
@@ -397,11 +399,9 @@ def test_a_controller_runs_on_four_drives_by_the_names_of_its_ports(tmp_path: Pa
     assert again.answers == len(recording)
 
 
-def test_a_controller_of_another_number_of_motors_is_refused() -> None:
-    with pytest.raises(SettingsError, match="does not give four motor set-points"):
+def test_a_loop_of_another_robot_is_refused() -> None:
+    with pytest.raises(SoftneckError, match=r"loop and drives of two robots .* `trunk4` .* and `neck`"):
         LoopPilot(loop_of(Robot.preset(), None), Robot.preset("trunk4"))
-    with pytest.raises(SettingsError, match="gives `motor_setpoint_4`, which robot `neck`"):
-        LoopPilot(loop_of(Robot.preset("trunk4"), None))
 
 
 def test_a_certificate_of_another_robot_arms_nothing(tmp_path: Path) -> None:

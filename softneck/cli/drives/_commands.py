@@ -227,18 +227,19 @@ def run_command(
     if drives_file is None and "drives" in setup.files:
         drives_file = Path(setup.files["drives"][0])
     virtual = load_neck(neck) if neck else neck_of(setup.loop)
-    chosen = target_of(drives_file, bus, simulated, arm, neck=virtual, robot=robot)
+    moves: Any = robot if robot or setup.loop.robot.is_neck else setup.loop.robot
+    chosen = target_of(drives_file, bus, simulated, arm, neck=virtual, robot=moves)
     if not controller.is_file():
         raise SettingsError(f"{controller}: no such file.")
     moved = chosen.file.moves
-    certified = require_certified(setup, controller, certificates, names, drives=drives_file, robot=moved)
+    certified = require_certified(setup, controller, certificates, names, drives=chosen.path, robot=moved)
     deployed = prepare(setup, controller, moved)
     for text in deployed.notes:
         note(text)
     if certified is not None:
         again = require_same_again(deployed.loop, certified[1])
         note(f"{certified[1].path}: {again:g} of {deployed.loop.duration:g} s run again on the loop's plant: the same")
-    files = acting_files(setup, loop_file, controller, drives_file)
+    files = acting_files(setup, loop_file, controller, chosen.path)
     live = not as_json and (not chosen.simulated or pace is not None)
     sensor: Any = None if chosen.simulated else sensor_of(chosen.file, str(chosen.bus))
     with contextlib.ExitStack() as stack:

@@ -104,7 +104,7 @@ def jog_command(
         with progress("jog", quiet=as_json) as tell, Keyboard() as keyboard:
             found = jog(
                 motor,
-                _session(chosen, link, keyboard, overrides, pace, log, drives_of(drives_file)),
+                _session(chosen, link, keyboard, overrides, pace, log, drives_of(chosen.path)),
                 tendon_angles=angles,
                 amplitude=amplitude,
                 report=lambda done: tell(done, f"motor {motor}"),
@@ -199,7 +199,7 @@ def record_command(
         if isinstance(link, VirtualLink):
             link.neck.set(payload=payload)
         with progress("record", quiet=as_json) as tell, Keyboard() as keyboard:
-            files = {**drives_of(drives_file), **({"signal": signal_name} if Path(signal_name).is_file() else {})}
+            files = {**drives_of(chosen.path), **({"signal": signal_name} if Path(signal_name).is_file() else {})}
             session = _session(chosen, link, keyboard, overrides, pace, log, files)
             recorded = record_signal(
                 [excitation for excitation, _ in prepared],

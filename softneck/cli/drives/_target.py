@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from softneck.drives.running._keyboard import Keyboard
     from softneck.drives.sensing._sensor import Sensor
     from softneck.plant import NeckParameters
+    from softneck.robot import Robot
 
 # For a service, where nobody can type: the same words.
 VARIABLE = "SOFTNECK_ARM"
@@ -76,13 +77,14 @@ _LOOK = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Which drives a command talks to; `neck` is the virtual one that was asked for."""
+    """Which drives a command talks to; `neck` is the virtual one that was asked for, `path` that of the drives file."""
 
     file: DrivesFile
     bus: str | None
     simulated: bool
     arm: bool
     neck: NeckParameters | None = None
+    path: Path | None = None
 
     @property
     def is_neck(self) -> bool:
@@ -109,7 +111,7 @@ def drives_options(function: Callable) -> Callable:
 
 def target_of(
     drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, *, neck: NeckParameters | None = None,
-    robot: str | Path | None = None,
+    robot: str | Path | Robot | None = None,
 ) -> Target:  # fmt: skip
     """Return which drives the options mean; simulated ones without a file are set up for the virtual `neck`.
 
@@ -133,7 +135,7 @@ def target_of(
         file = default_drives(robot=moved) if physics is None else neck_drives(physics, moved)
     if simulated and (told := stand_in(file, neck)):
         note(told)
-    return Target(file, bus, simulated, arm, neck)
+    return Target(file, bus, simulated, arm, neck, drives_file)
 
 
 @contextlib.contextmanager

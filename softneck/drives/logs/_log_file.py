@@ -78,7 +78,7 @@ class LoggedRun:
         names = list(dict.fromkeys(name for row in self.rows for name in row))
         signals: dict[str, Vector] = {name: np.array([row.get(name, math.nan) for row in self.rows]) for name in names}
         step = self.sample_time
-        return LoopResult(np.arange(len(self.rows)) * step, signals, signal_units(names), step)
+        return LoopResult(np.arange(len(self.rows)) * step, signals, signal_units(names), step, self.robot)
 
     @property
     def robot(self) -> Robot:

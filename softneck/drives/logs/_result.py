@@ -147,7 +147,6 @@ class DrivesResult:
             "longest_step_s": self.times.longest_step,
             "times": None if self.simulated else self.times.table(),
             "terminated": self.terminated,
-            # Of other robots a loop has no metrics yet.
-            "metrics": metrics(self.signals) if len(self.signals.time) > 1 and self.robot.is_neck else None,
+            "metrics": metrics(self.signals) if len(self.signals.time) > 1 else None,
             "notes": list(self.notes),
         }  # fmt: skip

@@ -46,7 +46,10 @@ class Limiter:
         limits, T = self._limits, self._cycle
         low, high, fastest = self._range
         # A winch that unwound beyond its range without power comes back as it is led: no jump to the edge.
-        low, high = min(low, self.value), max(high, self.value)
+        if self.value < low:
+            low = self.value
+        elif self.value > high:
+            high = self.value
         why = ""
         goal = wanted
         if not low <= goal <= high:

@@ -389,10 +389,10 @@ class Master:
     # -- what goes out ------------------------------------------------------------------------------------------
 
     def _goals(self) -> list[Goal]:
-        goal, count = GOALS[self.supervisor.phase], len(self.bus.drives)
+        goal = GOALS[self.supervisor.phase]
         if self.supervisor.phase is not Phase.ENABLING:
-            return [goal] * count
-        return [goal if i <= self._enabling else Goal.OFF for i in range(count)]
+            return [goal] * len(self._scales)
+        return [goal if i <= self._enabling else Goal.OFF for i in range(len(self._scales))]
 
     def _targets(self) -> list[int]:
         k, zero = self.settings.counts_per_radian, self.settings.zero_counts

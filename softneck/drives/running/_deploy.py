@@ -76,7 +76,8 @@ def neck_of(loop: Loop) -> NeckParameters | None:
     block = getattr(loop.plant, "block", None)
     ports = getattr(loop.plant, "parameters", None) or getattr(block, "parameters", ())
     starts = {port.name: port.start for port in ports}
-    names = NeckParameters.names()
+    # The tendons of another robot stand where its robot file says.
+    names = [name for name in NeckParameters.names() if loop.robot.is_neck or not name.startswith("tendon_angle")]
     if not all(name in starts for name in names):
         return None
     values = {name: starts[name] for name in names}

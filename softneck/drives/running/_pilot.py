@@ -14,6 +14,7 @@ from softneck.loop._rows_runtime import ROWS_RECORD, ROWS_REFER, ROWS_SHOW, ROWS
 from softneck.loop._wiring import wire
 from softneck.robot import Robot
 from softneck.signals.recording._channels import NECK
+from softneck.signals.recording._recording import require_same_robot
 
 from ..master._gate import sample_of
 from ..master._measured import Measurement, Motors
@@ -35,6 +36,7 @@ class LoopPilot:
         """Wire observer, controller and further parts as `softneck simulate` does; the plant gives ports only.
 
         Raises:
+            DataError: the loop is of another robot.
             SettingsError: a Jacobi loop, sample times that differ, a plant without motor positions and angles.
         """
         if loop.order != "sequential":
@@ -45,7 +47,8 @@ class LoopPilot:
             listed = ", ".join(f"{name} {step:g} s" for name, step in steps.items())
             raise SettingsError(f"on drives all parts of a loop need one sample time; it has {listed}.")
         self.sample_time = loop.controller.sample_time
-        wiring = wire(self._parts, loop.constants, loop.connections, robot)
+        require_same_robot(loop.robot, robot, "loop and drives")
+        wiring = wire(self._parts, loop.constants, loop.connections, loop.robot)
         self._wiring = wiring
         # As in a simulation, but that the plant is hardware, and nobody knows the reference's rows ahead.
         actions = cycle(self._parts, wiring.taps, dict.fromkeys(self._parts, 1), order=loop.order, disturbed=False)
@@ -63,9 +66,6 @@ class LoopPilot:
         except ValueError as error:
             word = _NUMBERS[len(robot.set_points)]
             raise SettingsError(f"the controller does not give {word} motor set-points: {', '.join(names)}.") from error
-        more = [name for name in names if name.startswith("motor_setpoint_") and name not in robot.set_points]
-        if more:
-            raise SettingsError(f"the controller gives `{more[0]}`, which robot {robot.label()} does not have.")
         # Where the plant would say each output and each rate, by their number in a sample.
         outputs = [*robot.outputs.names, *(f"{name}_rate" for name in robot.outputs.names)]
         self._tilts = [(i, self._places[f"{name}{end}"]) for i, name in enumerate(outputs) for end in ("_measured", "")
@@ -95,7 +95,7 @@ class LoopPilot:
         running, index = self._running, measured.index
         self._measure(measured, running.held[self._plant])
         if "reference" not in self._parts:
-            running.held[-1][:3] = self._loop.reference(index * self.sample_time)  # pyright: ignore[reportCallIssue]
+            running.held[-1][:-1] = self._loop.reference(index * self.sample_time)  # pyright: ignore[reportCallIssue]
         problem, part = running.run(index, index + 1, _NO_TABLE)
         if problem:
             self._wiring.taps[running.names[part]].read(running.bus, index * self.sample_time)

@@ -83,7 +83,8 @@ class RunLog:
         names = self._names(truth)
         table = np.array(self._rows) if self._rows else np.zeros((0, len(names)))
         signals: dict[str, Vector] = {name: table[:, i].copy() for i, name in enumerate(names)}
-        return LoopResult(np.arange(len(table)) * sample_time, signals, signal_units(names), sample_time)
+        time = np.arange(len(table)) * sample_time
+        return LoopResult(time, signals, signal_units(names), sample_time, self._robot)
 
 
 class SignalPilot:
