@@ -49,6 +49,8 @@ def command(
             refuse_existing(extra, force=force)
     require_trusted(loop_file, trust=trust)
     setup = load_loop(loop_file)
+    if html is not None:
+        setup.loop.robot.require_neck(f"{loop_file}: `--html` of a loop")
     if certificate is not None and not setup.limits:
         raise SettingsError(
             f"{loop_file}: has no [limits], so a certificate would show nothing; state some, such as "

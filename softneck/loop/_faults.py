@@ -171,7 +171,7 @@ def make_fault(kind: str, values: Mapping[str, object], robot: Robot = _NECK) ->
             return NeckFault(values={what + name: value for name, value in chosen.items()}, **window)  # pyright: ignore[reportArgumentType]
         if made is MotorFault:
             chosen["robot"] = robot
-        return made(kind=what, **chosen, **window)
+        return made(kind=what, **chosen, **window)  # pyright: ignore[reportArgumentType]
     except SettingsError as error:
         raise SettingsError(f"{kind}: {error}") from error
 

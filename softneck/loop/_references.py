@@ -27,9 +27,12 @@ _MAX_ANGLE = 0.8
 
 
 class Reference(Protocol):
-    """Anything that returns pitch [rad], roll [rad] and co-contraction delta_i [rad] at `time` [s]."""
+    """Anything that returns pitch [rad], roll [rad] and co-contraction delta_i [rad] at `time` [s].
 
-    def __call__(self, time: float, /) -> Triple:
+    Of another robot all outputs, then co-contraction.
+    """
+
+    def __call__(self, time: float, /) -> tuple[float, ...]:
         """Return the reference at `time`."""
         ...
 

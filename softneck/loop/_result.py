@@ -117,13 +117,13 @@ def metrics(result: LoopResult, *, angle: str = "true") -> Metrics:
 def _beyond(P: np.ndarray, robot: Robot) -> np.ndarray:
     """Return (time,) where a set-point (time, motors) is beyond what its motor may do."""
     if robot.is_neck:
-        return np.any(np.abs(P) > MAX_POSITION * (1.0 + 1e-9), axis=1)
+        return np.asarray(np.any(np.abs(P) > MAX_POSITION * (1.0 + 1e-9), axis=1))
     low, high = robot.motors.setpoint_min, robot.motors.setpoint_max
     beyond = np.zeros(P.shape, dtype=bool)
     if low is not None and high is not None:
         rounding = 1e-9 * np.abs([low, high]).max()
         beyond = (np.array(low) - rounding > P) | (np.array(high) + rounding < P)
-    return beyond.any(axis=1)
+    return np.asarray(beyond.any(axis=1))
 
 
 def _word(unit: str) -> str:

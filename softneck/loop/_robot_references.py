@@ -133,7 +133,7 @@ def reference_key(kind: str, key: str, robot: Robot) -> tuple[str, float]:
         try:
             factor, si = to_si(unit)
         except SoftneckError:
-            si = ""
+            factor, si = 1.0, ""
         if si == to_si(units[name])[1]:
             return name, factor
     found, factor = _SECONDS.get(key, ("frequency" if key == "frequency_hz" else "", 1.0))

@@ -76,7 +76,7 @@ def allocate_tendons(
             share = abs(inverse[j, axes])
             if share > 0.0:
                 common = max(common, allocate_floor(low[j], least, inverse[j, axes], taut) / share)
-    scale = allocate_scale(inverse, low, high, least, taut, target, common)
+    scale = allocate_scale(inverse, low, high, least, taut, target, common)  # pyright: ignore[reportArgumentType]
     if taut:
         # delta = max(delta_ref, max_j (P_least - s p_j) / c_j).
         for j in range(n):

@@ -146,9 +146,9 @@ def uncertain_plant(source: Any) -> UncertainPlant:
 
 
 def _weights(source: Any) -> Matrix:
-    """Return the weights of the motors in each axis: a family may say its own, as a model's findings do."""
-    own = getattr(source, "weights", None)
-    return weights_of(source) if own is None else np.asarray(own() if callable(own) else own)
+    """Return the weights of the motors in each axis: a family has its own, a model those of its findings."""
+    own = getattr(source, "directions", None)
+    return weights_of(source) if own is None else np.asarray(own)
 
 
 def _of_model(model: Any, axis: str) -> list[AxisPlant]:
