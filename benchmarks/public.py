@@ -1,0 +1,207 @@
+"""Public benchmarks of system identification, from files that the user has: `python benchmarks/public.py DIR`.
+
+Each is read in the format in which it is published, split as its authors say, and judged by the RMSE of a free run over
+the test record, whose first samples (the benchmark's own window) align the model. Kind and settings are chosen on the
+last 30 % of the training record; the test record is used once, at the end. Nothing is downloaded: of a file that is not
+there it is said where it is described.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softneck import identify
+from softneck.core import Matrix, SoftneckError, Vector
+from softneck.identification import Model
+from softneck.robot import Robot
+from softneck.signals import Recording
+
+HOLD_OUT = 0.3
+Candidate = tuple[str, dict[str, Any]]
+_NSS = {"widths": (), "order": 3, "neurons": 4, "decay": 0.1, "iterations": 30}
+# Kinds and settings to choose from; starts matter where a record is short.
+CANDIDATES: tuple[Candidate, ...] = (
+    *(("nss", {**_NSS, "seed": seed}) for seed in range(3)),
+    ("nss", {}),
+    ("nn", {}),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Benchmark:
+    """One data set.
+
+    Attributes:
+        name: on the command line.
+        file: what must be in the folder.
+        described: where it is described.
+        read: makes the training record and the test records by name of the files in a folder.
+        window: samples of a test record that align the model, by the benchmark's rules.
+        unit: of the RMSE.
+        published: figures of others, with their source.
+    """
+
+    name: str
+    file: str
+    described: str
+    read: Callable[[Path], tuple[Recording, dict[str, Recording]]]
+    window: int
+    unit: str
+    published: str
+
+
+def recording(name: str, sample_time: float, U: Matrix, Y: Matrix, *, units: tuple[str, str] = ("V", "V")) -> Recording:
+    """Return a recording of the robot `name` with inputs (time, motors) and outputs (time, outputs) in `units`."""
+    U, Y = U.reshape(len(U), -1), Y.reshape(len(Y), -1)
+    names = ["y"] if Y.shape[1] == 1 else [f"y{i + 1}" for i in range(Y.shape[1])]
+    robot = Robot.from_dict(
+        {
+            "name": name,
+            "motors": {"names": [f"u{i + 1}" for i in range(U.shape[1])], "unit": units[0]},
+            "outputs": {"names": names, "unit": units[1]},
+            "directions": {"kind": "identified"},
+        }
+    )
+    channels = dict(zip(robot.set_points, U.T, strict=True)) | dict(zip(names, Y.T, strict=True))
+    return Recording(sample_time * np.arange(len(U)), sample_time, channels, robot=robot)
+
+
+def _mat(path: Path, *names: str) -> list[Vector]:
+    from scipy.io import loadmat
+
+    content = loadmat(path)
+    return [np.asarray(content[name], dtype=np.float64).ravel() for name in names]
+
+
+def tanks(folder: Path) -> tuple[Recording, dict[str, Recording]]:
+    """Cascaded tanks: uEst, yEst to learn from, uVal, yVal to judge."""
+    u, y, u_test, y_test, Ts = _mat(folder / "dataBenchmark.mat", "uEst", "yEst", "uVal", "yVal", "Ts")
+    return recording("tanks", Ts[0], u, y), {"validation": recording("tanks", Ts[0], u_test, y_test)}
+
+
+def silverbox(folder: Path) -> tuple[Recording, dict[str, Recording]]:
+    """Silverbox: three quarters of the multisine to learn from; the rest and the arrow head, also without its tip."""
+    u, y = _mat(folder / "SNLS80mV.mat", "V1", "V2")
+    Ts, edge = 1.0 / 610.35, 40650 + int(0.75 * (127400 - 40650))
+
+    def part(first: int, stop: int) -> Recording:
+        return recording("silverbox", Ts, u[first:stop], y[first:stop])
+
+    test = {"multisine": part(edge, 127400), "arrow": part(100, 40575), "arrow without its tip": part(100, 32100)}
+    return part(40650, edge), test
+
+
+def wiener_hammerstein(folder: Path) -> tuple[Recording, dict[str, Recording]]:
+    """Wiener-Hammerstein 2009: 100,000 samples from 5,200 on to learn from, the next 78,800 to judge."""
+    u, y, fs = _mat(folder / "WienerHammerBenchMark.mat", "uBenchMark", "yBenchMark", "fs")
+    parts = [(5200, 105200), (105200, 184000)]
+    train, test = (recording("wiener-hammerstein", 1.0 / fs[0], u[a:b], y[a:b]) for a, b in parts)
+    return train, {"test": test}
+
+
+def emps(folder: Path) -> tuple[Recording, dict[str, Recording]]:
+    """EMPS: force `vir` to position `qm`; the pulses are the test."""
+    found = []
+    for name in ("DATA_EMPS.mat", "DATA_EMPS_PULSES.mat"):
+        u, y, t = _mat(folder / name, "vir", "qm", "t")
+        found.append(recording("emps", float(t[1] - t[0]), u, y, units=("N", "m")))
+    return found[0], {"pulses": found[1]}
+
+
+def pneumatic_arm(folder: Path) -> tuple[Recording, dict[str, Recording]]:
+    """A pneumatic arm: pressure_1..3 to x, y; of each trial (column `run`) the last 30 % is the test."""
+    from softneck.signals import concatenate
+
+    with (folder / "pneumatic_arm_two_trials.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    table = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+    U = np.column_stack([table[f"pressure_{j}"] for j in (1, 2, 3)])
+    Y = np.column_stack([table["x"], table["y"]])
+    Ts = float(np.median(np.diff(table["time [s]"])))
+    trials = [table["run"] == number for number in np.unique(table["run"])]
+    parts = [recording("pneumatic arm", Ts, U[there], Y[there], units=("1", "1")).split(0.7) for there in trials]
+    return concatenate([head for head, _ in parts]), {"ends": concatenate([tail for _, tail in parts])}
+
+
+_SITE = "nonlinearbenchmark.org/benchmarks/"
+# Figures of others, RMSE of simulation.
+_BASELINES = "Champneys et al. 2024, arXiv 2405.10779"
+BENCHMARKS = (
+    Benchmark("tanks", "dataBenchmark.mat", _SITE + "cascaded-tanks", tanks, 5, "V",
+              f"GRU 0.396, P-NARX 0.413 V ({_BASELINES})"),
+    Benchmark("silverbox", "SNLS80mV.mat", _SITE + "silverbox", silverbox, 50, "V",
+              f"GRU 0.00149, polynomial state space about 0.0003 V ({_BASELINES}, and what it quotes)"),
+    Benchmark("wiener-hammerstein", "WienerHammerBenchMark.mat", _SITE + "wiener-hammerstein", wiener_hammerstein, 50,
+              "V", f"see {_BASELINES}"),
+    Benchmark("emps", "DATA_EMPS.mat", _SITE + "emps", emps, 20, "m", f"see {_BASELINES}"),
+    Benchmark("pneumatic-arm", "pneumatic_arm_two_trials.csv", "Bruder, Gillespie, Remy and Vasudevan 2019, "
+              "arXiv 1902.02827; github.com/ramvasudevan/soft-robot-koopman", pneumatic_arm, 25, "1", "-"),
+)  # fmt: skip
+
+
+def rmse(model: Model, test: Recording, window: int) -> Vector:
+    """Return the RMSE (outputs,) of a free run, the first `window` samples of each run left out."""
+    errors = []
+    for run in test.runs():
+        free = model.simulate(run, warm_up=window)[:, : run.outputs.shape[1]]
+        errors.append((run.outputs - free)[window:])
+    return np.sqrt(np.nanmean(np.concatenate(errors) ** 2, axis=0))
+
+
+def choose(train: Recording, candidates: Sequence[Candidate], window: int) -> tuple[Candidate, float]:
+    """Return what runs freest of error over the last 30 % of the training record, and its RMSE over its spread."""
+    head, tail = train.split(1.0 - HOLD_OUT)
+    spread = np.nanstd(tail.outputs, axis=0)
+    scored = []
+    for number, (kind, settings) in enumerate(candidates):
+        try:
+            error = float(np.mean(rmse(identify(kind, head, **settings), tail, window) / spread))
+        except SoftneckError as failure:
+            print(f"  {kind} {settings}: {failure}")
+            continue
+        print(f"  {kind} {settings}: {100.0 * error:.2f} % of the hold-out's spread", flush=True)
+        scored.append((error, number))
+    if not scored:
+        raise SystemExit("no kind could be identified from this record.")
+    error, number = min(scored)
+    return candidates[number], error
+
+
+def run(benchmark: Benchmark, folder: Path, candidates: Sequence[Candidate] = CANDIDATES) -> dict[str, Vector]:
+    """Choose, identify from the whole training record, print and return the RMSE of each test record."""
+    train, tests = benchmark.read(folder)
+    print(f"{benchmark.name}: {len(train)} rows to learn from")
+    (kind, settings), _ = choose(train, candidates, benchmark.window)
+    model = identify(kind, train, **settings)
+    found = {name: rmse(model, test, benchmark.window) for name, test in tests.items()}
+    for name, error in found.items():
+        shown = ", ".join(f"{value:.4g}" for value in error)
+        print(f"  {name}: RMSE {shown} {benchmark.unit} by {kind}; published: {benchmark.published}", flush=True)
+    return found
+
+
+def main() -> None:
+    """Run what is there."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("folder", type=Path, metavar="DIR", help="where the files are")
+    parser.add_argument("--only", choices=[benchmark.name for benchmark in BENCHMARKS])
+    arguments = parser.parse_args()
+    for benchmark in BENCHMARKS:
+        if arguments.only not in (None, benchmark.name):
+            continue
+        if (arguments.folder / benchmark.file).is_file():
+            run(benchmark, arguments.folder)
+        else:
+            missing = f"no {benchmark.file} in {arguments.folder}"
+            print(f"{benchmark.name}: {missing}; it is described at {benchmark.described}.")
+
+
+if __name__ == "__main__":
+    main()
