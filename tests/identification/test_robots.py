@@ -14,6 +14,7 @@ from softneck.identification import FamilySettings, choose
 from softneck.identification.models._directions import directions_of
 from softneck.identification.models._fitting import ANY_ROBOT
 from softneck.identification.networks._nss_problem import sensor_limits
+from softneck.identification.uncertainty._ensemble import combine
 from softneck.robot import Robot
 from softneck.signals import Recording
 
@@ -199,6 +200,22 @@ def test_what_of_a_family_is_a_neck_s_alone_is_refused() -> None:
         FamilySettings(lpv_knots=3).fit(recording)
     with pytest.raises(DataError, match="recordings of two robots"):
         FamilySettings().fit([recording, recorded(ROBOTS["finger"])])
+
+
+def test_an_ensemble_of_any_robot_is_the_median_of_its_members(tmp_path: Path) -> None:
+    recording = recorded(ROBOTS["finger"], noise=1e-3, rows=300)
+    parts = [identify("oe", recording, delay=delay) for delay in (0.02, 0.06, 0.1)]
+    model = combine(parts)
+    free = [part.simulate(recording)[:, 0] for part in parts]
+    found = model.simulate(recording)
+    # Held before the start for as long as the slowest member asks: after a hundred rows that is forgotten.
+    expected = np.column_stack([np.median(free, axis=0), np.min(free, axis=0), np.max(free, axis=0)])
+    # Behind the one motor's position: the least and the largest.
+    np.testing.assert_allclose(found[100:, [0, 2, 3]], expected[100:], rtol=0, atol=1e-5)
+    model.save(tmp_path / "m.npz")
+    np.testing.assert_array_equal(load(tmp_path / "m.npz").simulate(recording), found)
+    with pytest.raises(DataError, match="the members of an ensemble of two robots"):
+        combine([parts[0], identify("oe", recorded(ROBOTS["antagonist"], rows=300), delay=0.06)])
 
 
 def test_the_kinds_that_take_a_robot_are_tried_and_the_best_is_chosen() -> None:

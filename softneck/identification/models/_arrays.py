@@ -66,7 +66,11 @@ def runtime_of(kind: str, arrays: Mapping[str, Matrix]) -> str:
         history = arrays["history"]
         return sized(runtime, len(arrays["drive"]), int(history[1]) if len(history) > 1 else 2)
     inner = ",".join(f"{runtime_of(member, part)}:{len(part)}" for member, part in members(arrays))
-    return f"{KINDS[kind].runtime}({inner})"
+    history = arrays["history"]
+    outer = KINDS[kind].runtime
+    if len(history) > 2:
+        outer = sized(outer, int(history[2]), int(history[1]))
+    return f"{outer}({inner})"
 
 
 def memory_of(arrays: Mapping[str, Matrix]) -> int:

@@ -9,6 +9,7 @@ import numpy as np
 
 from softneck.core import KINDS, Progress, SettingsError, find_kind, require_whole, resolve, silent
 from softneck.signals import Recording
+from softneck.signals.recording._recording import require_same_robot
 
 from ..models._arrays import COMPOSED, memory_of, prefixed_arrays
 from ..models._fitting import one_recording, row_hashes
@@ -21,7 +22,8 @@ class Ensemble:
     """Median of the free runs of several kinds; `pitch_lower` and `pitch_upper` are the least and the largest.
 
     Attributes:
-        members: kinds, each with its default settings; one named twice is trained with another seed.
+        members: kinds, each with its default settings; one named twice is trained with another seed. For another robot
+            than the neck `nss` stands for `greybox`, which knows necks only.
         seed: of the first member that starts at random; the next have the next seeds.
     """
 
@@ -46,12 +48,14 @@ class Ensemble:
         """
         recording = one_recording(recordings)
         models = []
-        for number, kind in enumerate(self.members):
-            part = _part(progress, number, len(self.members), kind)
+        known = {} if recording.robot.is_neck else {"greybox": "nss"}
+        members = tuple(known.get(kind, kind) for kind in self.members)
+        for number, kind in enumerate(members):
+            part = _part(progress, number, len(members), kind)
             models.append(seeded(kind, self.seed + number).fit(recording, progress=part))
         progress(1.0, "done")
         joined = combine(models)
-        return replace(joined, settings=asdict(self), training_rows=row_hashes(recording))
+        return replace(joined, settings=asdict(replace(self, members=members)), training_rows=row_hashes(recording))
 
 
 def combine(models: Sequence[Model]) -> Model:
@@ -59,16 +63,18 @@ def combine(models: Sequence[Model]) -> Model:
 
     Raises:
         SettingsError: fewer than two, of different sample times, or one that holds others itself.
+        DataError: models of two robots.
     """
     if len(models) < 2:
         raise SettingsError(f"an ensemble needs at least two models; got {len(models)}.")
     if not np.allclose([model.sample_time for model in models], models[0].sample_time, rtol=1e-6):
         raise SettingsError("the models of an ensemble must have one sample time.")
+    robot = models[0].robot
     for model in models:
-        model.robot.require_neck("an ensemble")
+        require_same_robot(model.robot, robot, "the members of an ensemble")
     memory = max(memory_of(model.arrays) for model in models)
     arrays = {
-        "history": np.ones(1),
+        "history": np.array([1.0] if robot.is_neck else [1.0, len(robot.outputs.names), len(robot.motors.names)]),
         "memory": np.array([float(memory)]),
         **prefixed_arrays([(model.kind, model.arrays) for model in models]),
     }
@@ -82,6 +88,7 @@ def combine(models: Sequence[Model]) -> Model:
             **trained_set_points(*(model.findings for model in models)),
         },
         training_rows=np.unique(np.concatenate([model.training_rows for model in models])),
+        robot=robot,
     )
 
 

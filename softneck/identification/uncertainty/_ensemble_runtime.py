@@ -5,16 +5,28 @@ Each member runs free on its own outputs; a median of bounded numbers is bounded
 
 import numpy as np
 
-from softneck.runtime._layout import Arrays, StateVector, array, cells, rest
+from softneck.runtime._layout import Arrays, StateVector, array, cells, rest, value
 from softneck.runtime._members_runtime import member_count, member_initialise, member_size, member_step
 from softneck.runtime._random_runtime import random_normal, random_seed
+
+
+def ensemble_outputs(history: np.ndarray) -> int:
+    """Return the number of outputs: the neck's two where none is said."""
+    return int(history[1]) if history.shape[0] > 1 else 2
+
+
+def ensemble_motors(history: np.ndarray) -> int:
+    """Return the number of motors: the neck's three where none is said."""
+    return int(history[2]) if history.shape[0] > 2 else 3
 
 
 class EnsembleArrays(Arrays):
     """Those of the members follow."""
 
-    history = array("1", "H: how many samples of each signal are kept")
+    history = array("sizes", "H: how many samples of each signal are kept; and outputs and motors, if not a neck's")
     memory = array("1", "samples after which a held start has settled")
+    outputs = value("history", function=ensemble_outputs, written=True)
+    motors = value("history", function=ensemble_motors, written=True)
 
 
 class EnsembleState(StateVector):
@@ -34,45 +46,48 @@ def state_size(p: EnsembleArrays) -> int:
 
 def initialise(p: EnsembleArrays, parameters: np.ndarray, x: EnsembleState, outputs: np.ndarray) -> None:
     """Rest: as the members rest."""
-    own = np.zeros(9)
+    bounds = p.outputs + p.motors
+    own = np.zeros(bounds + 2 * p.outputs)
     at = 0
     members = x.members
-    random_seed(x.random, parameters[4])
+    random_seed(x.random, parameters[p.outputs + 2])
     for i in range(member_count()):
         size = member_size(p, i)
         member_initialise(p, i, parameters, members[at : at + size], own)
         at += size
     # Members start alike: what the last one says holds for all.
-    outputs[:5] = own[:5]
-    outputs[5:7] = own[0]
-    outputs[7:9] = own[1]
+    outputs[:bounds] = own[:bounds]
+    for axis in range(p.outputs):
+        outputs[bounds + 2 * axis] = own[axis]
+        outputs[bounds + 2 * axis + 1] = own[axis]
 
 
 def step(p: EnsembleArrays, parameters: np.ndarray, x: EnsembleState, inputs: np.ndarray, outputs: np.ndarray) -> None:
-    """Advance by one sample; the bounds of pitch and roll follow the motor positions in `outputs`."""
-    # Parameter 3 is `noise_std`: noise comes once, on the median, and from this kind's generator.
+    """Advance by one sample; the bounds of the outputs follow the motor positions in `outputs`."""
+    # Behind `use_measurement` stands `noise_std`: noise comes once, on the median, from this kind's generator.
     quiet = parameters.copy()
-    quiet[3] = 0.0
+    quiet[p.outputs + 1] = 0.0
     count = member_count()
-    angles = np.empty((2, count))
-    own = np.zeros(9)
+    bounds = p.outputs + p.motors
+    angles = np.empty((p.outputs, count))
+    own = np.zeros(bounds + 2 * p.outputs)
     at = 0
     members = x.members
     for i in range(count):
         size = member_size(p, i)
         member_step(p, i, quiet, members[at : at + size], inputs, own)
-        angles[0, i] = own[0]
-        angles[1, i] = own[1]
+        for axis in range(p.outputs):
+            angles[axis, i] = own[axis]
         # Motors are not averaged: the first member's drives stand for all.
         if i == 0:
-            outputs[2:5] = own[2:5]
+            outputs[p.outputs : bounds] = own[p.outputs : bounds]
         at += size
-    for axis in range(2):
+    for axis in range(p.outputs):
         inorder = np.sort(angles[axis])
         # Of an even number the mean of the middle two.
         outputs[axis] = 0.5 * (inorder[(count - 1) // 2] + inorder[count // 2])
-        outputs[5 + 2 * axis] = inorder[0]
-        outputs[6 + 2 * axis] = inorder[count - 1]
-    if parameters[3] > 0.0:
-        outputs[0] += parameters[3] * random_normal(x.random)
-        outputs[1] += parameters[3] * random_normal(x.random)
+        outputs[bounds + 2 * axis] = inorder[0]
+        outputs[bounds + 2 * axis + 1] = inorder[count - 1]
+    if parameters[p.outputs + 1] > 0.0:
+        for axis in range(p.outputs):
+            outputs[axis] += parameters[p.outputs + 1] * random_normal(x.random)
