@@ -50,7 +50,7 @@ def initialise(p: EnsembleArrays, parameters: np.ndarray, x: EnsembleState, outp
     own = np.zeros(bounds + 2 * p.outputs)
     at = 0
     members = x.members
-    random_seed(x.random, parameters[p.outputs + 2])
+    random_seed(x.random, float(parameters[p.outputs + 2]))
     for i in range(member_count()):
         size = member_size(p, i)
         member_initialise(p, i, parameters, members[at : at + size], own)
