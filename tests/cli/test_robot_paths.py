@@ -44,6 +44,12 @@ def test_a_log_becomes_a_robot_a_recording_and_a_model(call: Call, log: Path) ->
     np.testing.assert_array_equal(read_recording("again.csv").outputs, read_recording("rec.csv").outputs)
     info = json.loads(call("info", "rec.csv", "--json").out)
     assert info["robot"] == robot.label()
+    # In the folder of another robot it is refused, not described as some logger's table.
+    Path("elsewhere").mkdir()
+    assert call("robot", "new", "--preset", "finger", "elsewhere/robot.toml").code == 0
+    Path("elsewhere/rec.csv").write_bytes(Path("rec.csv").read_bytes())
+    refused = call("info", "elsewhere/rec.csv")
+    assert (refused.code, "is a recording of robot" in refused.error) == (2, True), refused.error
     said = call("identify", "rls", "rec.csv", "-o", "m.npz", "--set", "delay=0.0", "--json")
     assert said.code == 0, said.err
     directions = np.array(json.loads(said.out)["findings"]["directions"])[0]
@@ -82,10 +88,9 @@ def test_commands_that_take_necks_only_say_so_in_a_line(call: Call, log: Path) -
     assert call("import", log, "--robot-out", "robot.toml", "-o", "rec.csv").code == 0
     assert call("identify", "rls", "rec.csv", "-o", "m.npz", "--set", "delay=0.0").code == 0
     for arguments in (
-        ("identify", "nn", "rec.csv", "-o", "nn.npz"),
+        ("identify", "nlsm", "rec.csv", "-o", "nn.npz"),
         ("identify", "rls", "rec.csv", "-o", "s.npz", "--search", "na=1,2", "--hold-out", "rec.csv"),
-        ("family", "rec.csv", "-o", "f.npz"),
-        ("design", "pi", "m.npz", "-o", "c.npz", "--any-fit"),
+        ("design", "mpc", "m.npz", "-o", "c.npz", "--any-fit"),
         ("observer", "m.npz", "-o", "o.npz"),
     ):
         said = call(*arguments)

@@ -33,7 +33,7 @@ KINDS: dict[str, Callable[..., Any]] = {
     "pi": PiSettings, "pid": PidSettings, "fopi": FopiSettings, "hinf": HinfSettings, "ncf": NcfSettings,
     "lqg": LqgSettings, "custom": _custom, "scheduled": ScheduledSettings, "adaptive": AdaptiveSettings,
 }  # fmt: skip
-LIMITS = {
+LIMITS: dict[str, Any] = {
     "position_limit": 3.0, "slew_limit": 5.0, "lead_limit": 0.7, "least_position": -0.5, "least_cocontraction": 0.25
 }  # fmt: skip
 

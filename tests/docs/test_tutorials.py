@@ -18,6 +18,7 @@ PAGES = {
     "csv_to_fmu": ("neck.csv", "neck.layout.toml", "quality.html", "rls.npz", "fit.html", "Neck.fmu", "report.html"),
     "design_study": ("pareto.png", "study/runs.parquet", "my_neck/build/study/report.html"),
     "closed_loop_ci": ("my_neck/loop.json", "my_neck/loop.html"),
+    "your_robot": ("oe.npz", "loop.json", "Arm.fmu", "Pi.fmu", "loop.ssp"),
     "fmu_in_our_loop": ("Arm.fmu", "pi.npz", "loop.html"),
 }
 pytestmark = pytest.mark.slow

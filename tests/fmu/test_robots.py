@@ -16,6 +16,7 @@ from fmpy.validation import validate_fmu
 
 from softneck.core import Matrix, SettingsError
 from softneck.cosim.parts._free_run import drive_fmu
+from softneck.design import PiSettings
 from softneck.fmu import build_compiled_fmu, build_fmu, fmu_info
 from softneck.fmu.compiled._model_file import node_of
 from softneck.fmu.describe._modelled_drives import with_modelled_drives
@@ -150,6 +151,19 @@ def test_a_robot_s_virtual_plant_is_an_fmu(backend: str, fmi: int, tmp_path: Pat
     assert [name for name in variables(path) if name.startswith("tendon_angle_")] == [
         "tendon_angle_1", "tendon_angle_2",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("backend", "fmi"), BACKENDS[1:])
+def test_a_controller_of_two_motors_is_an_fmu(backend: str, fmi: int, tmp_path: Path) -> None:
+    controller = PiSettings().design(model("oe", False)).block()
+    path = built(controller, tmp_path / "Pi.fmu", backend, fmi)
+    rng = np.random.default_rng(1)
+    inputs = {"pitch_reference": np.full(80, 0.1), "pitch": 0.02 * rng.standard_normal(80)}
+    inputs |= {f"motor_position_{j}": 0.1 * rng.standard_normal(80) for j in (1, 2)}
+    asked = {"use_motor_positions": 1.0}
+    # A controller answers at once, a plant a sample later. The same operations, compiled by another compiler.
+    found, expected = drive_fmu(path, inputs, parameters=asked), plain(controller, 80, **inputs)
+    np.testing.assert_allclose(found[:-1], expected[1:], rtol=1e-9, atol=1e-12)
 
 
 def test_sizes_that_no_robot_has_are_not_made() -> None:

@@ -102,10 +102,10 @@ def write_ssp(loop: Loop | LoopSetup, path: str | Path, *, force: bool = False, 
     step = min(part.sample_time for part in plain.parts.values())
     if not hasattr(plain.reference, "advance"):
         block = ReferenceBlock(
-            plain.reference,
+            plain.reference,  # pyright: ignore[reportArgumentType]
             sample_time=step,
             duration=plain.duration,
-            robot=plain.robot,  # pyright: ignore[reportArgumentType]
+            robot=plain.robot,
         ).block()
         plain = replace(plain, reference=BlockPart(block))
     wiring = wire(plain.parts, plain.constants, plain.connections, plain.robot)

@@ -109,26 +109,27 @@ def step(p: AdaptiveArrays, parameters: np.ndarray, x: AdaptiveState, inputs: np
         x.samples[:] = 0.0
         outputs[:] = x.held
         return
-    flags = 2 * p.outputs + 1 + p.motors
+    first = int(p.outputs) + 1  # of the angles; references and co-contraction stand before them
+    flags = int(2 * p.outputs + 1 + p.motors)
     if x.started == 0.0:
-        x.held[:] = inputs[2 * p.outputs + 1 : flags]
+        x.held[:] = inputs[2 * first - 1 : flags]
     active = inputs[flags] > 0.5 and inputs[flags + 1] > 0.5
     # A regression needs the sample before.
     going = active and x.started > 0.5
     for axis in range(p.outputs):
         if going:
             if parameters[5] > 0.5:
-                adaptive_learn(p, x, axis, inputs[p.outputs + 1 + axis])
+                adaptive_learn(p, x, axis, inputs[first + axis])
             before = adaptive_asked(p, parameters, x, axis, inputs)
             adaptive_redesign(p, x, axis, parameters[5] > 0.5)
             # New gains move no motor: the integral takes up what they would have changed.
             change = adaptive_asked(p, parameters, x, axis, inputs) - before
             x.x[axis, 0] -= change
         # Behind the learning, which needs the band-pass of before.
-        adaptive_see(p, x, axis, inputs[p.outputs + 1 + axis], going)
+        adaptive_see(p, x, axis, inputs[first + axis], going)
     now = adaptive_arrays(p, x)
     if x.started == 0.0 or not active:
-        adaptive_align(p, now, x, inputs[p.outputs + 1 : 2 * p.outputs + 1])
+        adaptive_align(p, now, x, inputs[first : 2 * first - 1])
     x.started = 1.0
     if active:
         linear_control(now, parameters, x, inputs)

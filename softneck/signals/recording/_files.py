@@ -139,7 +139,7 @@ def read_recording(path: str | Path, *, robot: str | Path | Robot | None = None)
     """
     source = Path(path)
     suffix = recording_suffix(source)
-    said = _said_robot(source, suffix)
+    said = said_robot(source, suffix)
     columns: Mapping[str, pd.Series | Vector] | None = read_plain_csv(source) if suffix == ".csv" else None
     if columns is None:
         columns = _columns(read_table(source, suffix, TextForm(skip=0 if said is None else 1)))
@@ -149,7 +149,7 @@ def read_recording(path: str | Path, *, robot: str | Path | Robot | None = None)
         raise DataError(f"{source}: {error}") from error
 
 
-def _said_robot(source: Path, suffix: str) -> Robot | None:
+def said_robot(source: Path, suffix: str) -> Robot | None:
     """Return the robot that a file says it is of, or None.
 
     Raises:

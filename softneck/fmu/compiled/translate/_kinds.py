@@ -19,6 +19,7 @@ _NECKS = (
     "softneck.identification.set_membership._nlsm_runtime",
     "softneck.identification.networks._nn_runtime",
     "softneck.identification.structured._play_runtime",
+    "softneck.design.linear._linear_controller_runtime",
     "softneck.identification.networks._nss_runtime",
     "softneck.identification.structured._greybox_runtime",
     "softneck.identification.uncertainty._residual_runtime",
@@ -40,6 +41,8 @@ _ROBOTS = (
     "softneck.identification.linear._affine_runtime",
     "softneck.identification.linear._state_space_runtime",
     "softneck.identification.structured._play_runtime",
+    "softneck.design.linear._linear_controller_runtime",
+    "softneck.loop._reference_runtime",
 )
 RUNTIMES = (*_NECKS, *(f"{module}@{ANY_SIZE}" for module in _ROBOTS))
 # Its tuples have the robot's sizes: one text for all there is none, and whoever wants one compiles it (see `_library`).
