@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 
 @click.command(
-    "frf", epilog="Example: softneck record multisine --band 0.5,25 --amplitude 0.3 -o small.csv; "
-    "softneck frf small.csv -o small.npz --html frf.html"
+    "frf", epilog="Example: softneck frf small.csv -o small.npz --html frf.html; what it takes best: "
+    "softneck record multisine --band 0.5,25 --amplitude 0.3 -o small.csv"
 )  # fmt: skip
 @click.argument("recordings", nargs=-1, required=True, type=click.Path(path_type=Path))
 @output_option("frequency response", "FRF")

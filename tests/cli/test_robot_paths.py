@@ -110,6 +110,7 @@ def test_fmus_and_pages_of_a_tank(call: Call, log: Path, tmp_path: Path) -> None
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_the_page_of_a_choice_for_a_tank(call: Call, log: Path, tmp_path: Path) -> None:
     assert call("import", log, "--robot-out", "robot.toml", "-o", "rec.csv").code == 0
     assert call("identify", "auto", "rec.csv", "-o", "auto.npz", "--html", "a.html").code == 0

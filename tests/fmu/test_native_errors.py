@@ -210,7 +210,7 @@ def test_a_kind_that_the_translator_refused_says_why(tmp_path: Path, monkeypatch
     library = _library.find_library()
     refused = {"softneck.identification.linear._rls_runtime": "`step`: `np.linalg.solve(A, b)`: no translation to C."}
     changed = dataclasses.replace(library, sources=dataclasses.replace(library.sources, refused=refused))
-    monkeypatch.setattr(_build, "find_library", lambda: changed)
+    monkeypatch.setattr(_build, "find_library", lambda _: changed)
     with pytest.raises(SettingsError, match=r"_rls_runtime` cannot be in a compiled FMU: `step`: `np.linalg"):
         build_compiled_fmu(block_of("rls"), tmp_path / "X.fmu")
 
@@ -220,7 +220,7 @@ def test_platforms_that_are_unknown_or_not_built_are_named(tmp_path: Path, monke
 
     library = _library.find_library()
     only = dataclasses.replace(library, binaries={"aarch64-linux": b"not run here"})
-    monkeypatch.setattr(_build, "find_library", lambda: only)
+    monkeypatch.setattr(_build, "find_library", lambda _: only)
     with pytest.raises(SettingsError, match="unknown platform `amiga`"):
         build_compiled_fmu(block_of("rls"), tmp_path / "X.fmu", platforms=("amiga",))
     with pytest.raises(SettingsError, match="x86_64-windows is not built, only that for aarch64-linux; run `make nat"):

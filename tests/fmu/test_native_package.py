@@ -154,7 +154,7 @@ def test_the_sources_of_one_kind_hold_no_other() -> None:
     assert "sn_kind_count = 1;" in alone
     assert "mpc_" not in alone
     assert len(alone) < len(text) / 10
-    assert only_kinds(text, set(re.findall(r'\{"(softneck\.[\w.]+)"', text))) == text
+    assert only_kinds(text, set(re.findall(r'\{"(softneck\.[\w.@]+)"', text))) == text
 
 
 @pytest.mark.slow

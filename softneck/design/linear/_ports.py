@@ -60,11 +60,12 @@ def controller_inputs(robot: Robot = _NECK) -> tuple[Port, ...]:
     references = tuple(
         Port(name=f"{name}_reference", unit=unit, description=f"wanted {name}",
              minimum=None if low <= -_UNLIMITED else low, maximum=None if high >= _UNLIMITED else high)
-        for name, low, high in zip(robot.outputs.names, lowest, highest, strict=True)
+        for name, low, high in zip(robot.outputs.names, map(float, lowest), map(float, highest), strict=True)
     )  # fmt: skip
     cocontraction = Port(
         name="cocontraction_reference", unit=to_si(robot.motors.unit)[1],
-        minimum=None if ranges is None else min(ranges[0]), maximum=None if ranges is None else max(ranges[1]),
+        minimum=None if ranges is None else float(min(ranges[0])),
+        maximum=None if ranges is None else float(max(ranges[1])),
         description="wanted delta_i (Eq. 11)" if neck else "wanted mean of the motors that moves no output",
     )  # fmt: skip
     whose = "the neck" if neck else robot.name

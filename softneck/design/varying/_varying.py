@@ -90,7 +90,10 @@ class VaryingController:
             "order": self.order,
             "names": list(self.arrays),
             # None of them is an integer, and files of format 1 do not say so.
-            "parameters": [{k: v for k, v in asdict(port).items() if k != "integer"} for port in self.parameters],
+            "parameters": [
+                {k: v for k, v in asdict(port).items() if k not in ("integer", "display_unit")}
+                for port in self.parameters
+            ],
             "lines": list(self.lines),
             "design": dict(self.design),
             "inputs": [port.name for port in block.inputs],

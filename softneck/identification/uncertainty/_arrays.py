@@ -12,4 +12,5 @@ from ..set_membership._arrays import check_set
 
 def check_residual(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
     within(arrays["table"][:, 0], 2, 3, "a regressor's source")
-    check_set(arrays, sizes)
+    # Its runtime is written for the neck.
+    check_set(arrays, {**sizes, "motors": 3, "outputs": 2})
