@@ -259,8 +259,8 @@ def test_models_and_recordings_of_two_robots_are_not_mixed() -> None:
 def test_a_transfer_function_is_of_the_direction_or_of_a_motor() -> None:
     model = identify("oe", recorded(ROBOTS["trunk4"]), delay=0.06)
     # The direction of tendons at 0 and 180 deg is the difference of their motors.
-    for chosen in ({}, {"input": "motor_setpoint_1"}):
-        assert float(model.tf("pitch", **chosen).dcgain()) == pytest.approx(GAIN, abs=2e-3)
+    for G in (model.tf("pitch"), model.tf("pitch", input="motor_setpoint_1")):
+        assert float(G.dcgain()) == pytest.approx(GAIN, abs=2e-3)
 
 
 def test_an_output_that_follows_no_motor_is_said() -> None:
