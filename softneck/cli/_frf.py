@@ -50,7 +50,7 @@ def command(
     from softneck.plots import write_page
     from softneck.signals import read_recording
 
-    path, replace = target(output, "frf/frf.npz", force=force)
+    path, replace = target(output, "frf/frf.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
     if html is not None:
         refuse_existing(html, force=force)
@@ -79,11 +79,9 @@ def _curve(found: FrequencyResponse, thing: Model | Family, name: str) -> dict[s
 
 
 def _page(found: FrequencyResponse, models: dict[str, dict[str, np.ndarray]]) -> str:
-    from softneck.core import to_si
     from softneck.plots import Section, frequency_response_figure, page
 
-    shown = found.robot.outputs.display_unit
-    scale, unit = 1.0 / to_si(shown)[0], f"{shown}/{found.robot.motors.unit}"
+    scale, per_input, unit = found.shown()
     sections: list[Any] = [Section("The response", text=found.summary().splitlines())]
     radius = found.radius()
     for i, output in enumerate(found.outputs):
@@ -91,7 +89,7 @@ def _page(found: FrequencyResponse, models: dict[str, dict[str, np.ndarray]]) ->
         a = found.inputs.index(source)
         title = f"{source} to {output}"
         played = [
-            (item.frequency, scale * item.response[i], f"sine of {item.amplitude[a]:.2g}")
+            (item.frequency, scale * item.response[i], f"sine of {per_input * item.amplitude[a]:.2g}")
             for item in found.sines
             if int(np.argmax(item.amplitude)) == a
         ]

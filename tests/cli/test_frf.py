@@ -42,6 +42,8 @@ def test_what_it_needs_is_recorded_and_refused_in_a_line(call: Call, tmp_path: P
     said = call("record", "multisine", "--amplitude", "0.3", "--band", "2,6", "--realisations", "2", "-o", "m.csv")
     assert said.code == 0, said.err
     assert json.loads(call("frf", "m.csv", "--json").out)["method"] == "robust"
+    said = call("frf", "m.csv", "-o", "f.csv")
+    assert (said.code, "f.csv: must end in `.npz`" in said.error) == (2, True)
     for options, line in (
         (
             ("eq22", "--band", "1,2"),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import FileFormatError, SettingsError, Vector, require_between, write_archive
+from softneck.core import FileFormatError, SettingsError, Vector, require_between, to_si, write_archive
 from softneck.robot import Robot
 
 from ._periodic import Sine
@@ -133,19 +133,20 @@ class FrequencyResponse:
 
     def summary(self) -> str:
         """Return a few lines, in the robot's display unit."""
-        unit = f"{self.robot.outputs.display_unit}/{self.robot.motors.unit}"
+        scale, per_input, unit = self.shown()
         lines = [
             f"frequency response, {METHODS[self.method]}; {self.frequency.size} frequencies, "
             f"{self.frequency[0]:.3g} to {self.frequency[-1]:.3g} rad/s"
         ]
-        sizes = ", ".join(f"{name} {size:.2g}" for name, size in zip(self.inputs, self.amplitude, strict=True))
+        sizes = ", ".join(
+            f"{name} {per_input * size:.2g}" for name, size in zip(self.inputs, self.amplitude, strict=True)
+        )
         lines.append(
             f"amplitude (rms times sqrt 2) [{self.robot.motors.unit}]: {sizes}; it holds for inputs of this size"
         )
-        scale = self._display()
         for output in () if self.method == "sines" else self.outputs:
             lines += self._axis_lines(output, scale, unit)
-        lines += [_sine_line(sine, self, scale, unit) for sine in self.sines]
+        lines += [_sine_line(sine, self) for sine in self.sines]
         lines += [
             f"{key}: {value}" for key, value in self.findings.items() if key in ("closed_loop", "missing", "caution")
         ]
@@ -159,7 +160,7 @@ class FrequencyResponse:
             "frequencies": int(self.frequency.size),
             "inputs": self.inputs,
             "own_inputs": {output: self.own_input(output) for output in self.outputs},
-            "amplitude_rad": self.amplitude.tolist(),
+            f"amplitude_{to_si(self.robot.motors.unit)[1]}": self.amplitude.tolist(),
             "band_rad_s": {output: None if band is None else list(band) for output, band in bands.items()},
             "sines": [_sine_dict(item) for item in self.sines],
             "findings": self.findings,
@@ -214,11 +215,11 @@ class FrequencyResponse:
                 raise SettingsError(f"unknown channel `{name}`; use one of {', '.join(names)}.")
         return self.outputs.index(output), self.inputs.index(source)
 
-    def _display(self) -> float:
-        """Return what one SI unit of the outputs is in the display unit."""
-        from softneck.core import to_si
-
-        return 1.0 / to_si(self.robot.outputs.display_unit)[0]
+    def shown(self) -> tuple[float, float, str]:
+        """Return what a response and an input in SI are multiplied by for people, and the unit of the response."""
+        outputs, motors = self.robot.outputs.display_unit, self.robot.motors.unit
+        per_input = to_si(motors)[0]
+        return per_input / to_si(outputs)[0], 1.0 / per_input, f"{outputs}/{motors}"
 
     def _axis_lines(self, output: str, scale: float, unit: str) -> list[str]:
         """Return a line on the band, and some five on values spread over the frequencies where something is known."""
@@ -249,14 +250,17 @@ _COMPLEX = ("response", "covariance")
 _HEARD = 0.1
 
 
-def _sine_line(item: Sine, of: FrequencyResponse, scale: float, unit: str) -> str:
+def _sine_line(item: Sine, of: FrequencyResponse) -> str:
+    scale, per_input, unit = of.shown()
     main = int(np.argmax(item.amplitude))
     answers = ", ".join(
         f"{name} {scale * abs(G):.3g} {unit} at {np.degrees(np.angle(G)):.0f} deg, harmonics {100 * d:.0f} %"
         for name, G, d in zip(of.outputs, item.response, item.distortion, strict=True)
         if abs(G) >= _HEARD * max(map(abs, item.response))
     )
-    return f"sine of {item.amplitude[main]:.2g} on {of.inputs[main]} at {item.frequency:.3g} rad/s: {answers}"
+    return (
+        f"sine of {per_input * item.amplitude[main]:.2g} on {of.inputs[main]} at {item.frequency:.3g} rad/s: {answers}"
+    )
 
 
 def _sine_dict(item: Sine) -> dict[str, Any]:

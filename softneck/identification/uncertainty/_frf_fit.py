@@ -71,7 +71,7 @@ def frequency_response(recordings: Recording | Sequence[Recording], *, source: s
     missed = sum(run.missed for run in runs)
     findings: dict[str, Any] = {"runs": len(runs), "rows": sum(run.inputs.shape[0] for run in runs)}
     if missed:
-        findings["missing"] = f"{missed} samples that the sensor missed were filled by straight lines"
+        findings["missing"] = f"{missed} rows with a missing sample were filled by straight lines"
     if any(run.references is not None for run in runs):
         findings["closed_loop"] = "recorded in a closed loop: from the reference to outputs and inputs, S_yr S_ur^-1"
     noise = np.full(found.response.shape, np.nan) if found.noise is None else found.noise
@@ -117,18 +117,23 @@ def _one(parts: Sequence[Recording]) -> tuple[Robot, float]:
 
 def _run(run: Recording, transform: Matrix, source: str) -> _Run:
     motors = run.motor_positions if source == "positions" else run.set_points
-    Y = run.outputs.copy()
-    lost = ~np.isfinite(Y)
-    if lost.mean() > _MISSED:
+    lost = ~np.isfinite(np.hstack([motors, run.outputs]))
+    worst = float(lost.mean(axis=0).max())
+    if worst > _MISSED:
         raise DataError(
-            f"run {int(run.run[0])}: the sensor missed {100 * lost.mean():.0f} % of its samples, more than "
+            f"run {int(run.run[0])}: {100 * worst:.0f} % of a channel's samples are missing, more than "
             f"{100 * _MISSED:.0f} %; record again."
         )
-    rows = np.arange(len(run))
-    for i in range(Y.shape[1]):
-        if lost[:, i].any():
-            Y[lost[:, i], i] = np.interp(rows[lost[:, i]], rows[~lost[:, i]], Y[~lost[:, i], i])
-    return _Run(np.nan_to_num(motors) @ transform.T, Y, _references(run), int(lost.any(axis=1).sum()))
+    return _Run(_filled(motors) @ transform.T, _filled(run.outputs), _references(run), int(lost.any(axis=1).sum()))
+
+
+def _filled(values: Matrix) -> Matrix:
+    """Return (time, n) with straight lines where samples are missing."""
+    rows, filled = np.arange(values.shape[0]), values.copy()
+    for column in filled.T:
+        there = np.isfinite(column)
+        column[~there] = np.interp(rows[~there], rows[there], column[there])
+    return filled
 
 
 def _references(run: Recording) -> Matrix | None:

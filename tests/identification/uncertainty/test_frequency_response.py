@@ -247,7 +247,7 @@ def test_bad_input_is_named() -> None:
         frequency_response(still)
     with pytest.raises(DataError, match=r"run 0 has 150 rows; a frequency response of what is not periodic needs 200"):
         frequency_response(recording(u[:150], y[:150]))
-    with pytest.raises(DataError, match="the sensor missed 20 % of its samples, more than 10 %"):
+    with pytest.raises(DataError, match="20 % of a channel's samples are missing, more than 10 %"):
         frequency_response(recording(u, holes))
     with pytest.raises(DataError, match="recorded in a closed loop whose reference rests"):
         frequency_response(recording(u, y, pitch_reference=np.zeros(300)))
@@ -269,3 +269,34 @@ def test_runs_are_never_joined() -> None:
     parts = played(6)
     apart, together = frequency_response(parts), frequency_response(concatenate(parts))
     np.testing.assert_array_equal(apart.response, together.response)
+
+
+def test_pressures_and_lengths_are_shown_in_their_units() -> None:
+    robot = Robot.from_dict({
+        "name": "bellows", "sample_time_s": TS, "motors": {"names": ["p"], "unit": "bar"},
+        "outputs": {"names": ["x"], "unit": "mm"}, "directions": {"kind": "matrix", "matrix": [[1.0]]},
+    })  # fmt: skip
+    parts = []
+    for item in multisine_experiments(amplitude=2.0, realisations=2, robot=robot):
+        # 3 mm/bar at rest.
+        x = 3e-8 * run(axis(1.0, (5.0,), 2), item.set_points[:, 0])
+        parts.append(Recording(item.time, TS, {"motor_setpoint_1": item.set_points[:, 0], "x": x}, robot=robot))
+    found = frequency_response(parts)
+    said, slowest = found.summary(), 3.0 * abs(5.0 / (5.0 + 0.5j))
+    # Three digits are printed; the period is a whole number of samples.
+    assert f"0.50 rad/s: {slowest:.3g} +-" in said
+    assert "mm/bar" in said
+    assert found.as_dict()["amplitude_Pa"][0] == pytest.approx(found.amplitude[0])
+    assert f"towards_x {1e-5 * found.amplitude[0]:.2g};" in said
+
+
+def test_motors_that_were_not_always_logged_are_filled_and_not_zero() -> None:
+    u = np.repeat(np.random.default_rng(0).standard_normal((60, 2)), 10, axis=0)
+    y = answers(u)
+    whole = recording(u, y)
+    motors = {f"motor_position_{j + 1}": whole.set_points[:, j].copy() for j in range(3)}
+    for values in motors.values():
+        values[5::50] = np.nan  # in the middle of a level, so that a straight line is the level
+    found = frequency_response(whole.with_channels(**motors), source="positions")
+    np.testing.assert_allclose(found.response, frequency_response(whole).response, atol=1e-12)
+    assert found.findings["missing"].startswith("12 rows")
