@@ -91,7 +91,7 @@ def attempt(estimator: Any, settings: Mapping[str, Any], train: Recording, hold_
         free_run=fits,
         one_step=_fits(y, one_step),
         score=float(np.mean(there)) if whole else -np.inf,
-        error=_standard_error(y, free_run) if whole else float("nan"),
+        error=standard_error(y, free_run) if whole else float("nan"),
         size=model_size(model),
         seconds=seconds,
         diverged=diverged,
@@ -123,8 +123,8 @@ def _fits(y: Matrix, outputs: Matrix) -> dict[str, float | None]:
     return {name: fit if np.isfinite(fit) else None for name, fit in zip(AXES, fits, strict=True)}
 
 
-def _standard_error(y: Matrix, outputs: Matrix) -> float:
-    """Return the standard error of the mean of both fits [%], by resampling blocks of the hold-out."""
+def standard_error(y: Matrix, outputs: Matrix) -> float:
+    """Return the standard error of the mean of the outputs' fits [%], by resampling blocks of the hold-out."""
     wrong, spread = _block_sums((y - outputs) ** 2), _block_sums((y - np.nanmean(y, axis=0)) ** 2)
     # Any generator will do, but the same search must give the same answer.
     drawn = np.random.default_rng(0).integers(len(wrong), size=(_RESAMPLES, len(wrong)))
