@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from scipy.stats import spearmanr
+from scipy.stats import rankdata
 from threadpoolctl import threadpool_limits
 
 from benchmarks.baseline import Job, compute, records_of_tests, training
@@ -80,7 +80,7 @@ def choices(necks: list[str], seed: int, workers: int, *, fresh: bool) -> dict[s
 
 
 def _rank_correlation(a: list[float], b: list[float]) -> float:
-    return float(np.asarray(spearmanr(a, b))[0])
+    return float(np.corrcoef(rankdata(a), rankdata(b))[0, 1])
 
 
 def main() -> None:
@@ -103,7 +103,7 @@ def main() -> None:
         truth = {job.kind: fit for job, fit in truths.items() if job.neck == neck} | {OTHER_FORM: one["form"]}
         kinds = [kind for kind in truth if kind in one["scores"]]
         worth = [truth[kind] for kind in kinds]
-        rho, held = (float(spearmanr([one[what][kind] for kind in kinds], worth)[0]) for what in ("scores", "hold_out"))
+        rho, held = (_rank_correlation([one[what][kind] for kind in kinds], worth) for what in ("scores", "hold_out"))
         best = max(truth, key=lambda kind: truth[kind])
         rhos.append(rho)
         print(

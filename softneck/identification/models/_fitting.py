@@ -13,6 +13,7 @@ import numpy as np
 
 from softneck.core import DataError, Matrix, Vector
 from softneck.signals import Recording, concatenate
+from softneck.signals.quality._poor_excitation import independent_motions
 
 from ._model import WARM_UP, Model
 from ._ports import trained_set_points
@@ -143,12 +144,15 @@ def one_recording(recordings: Recording | list[Recording]) -> Recording:
     return concatenate(recordings if isinstance(recordings, list) else [recordings])
 
 
-def training_recording(recordings: Recording | list[Recording], *, any_robot: bool = False) -> Recording:
+def training_recording(
+    recordings: Recording | list[Recording], *, any_robot: bool = False, all_motors: bool = False
+) -> Recording:
     """Return all runs as one recording to identify from.
 
     Args:
         recordings: of one robot and sample time.
         any_robot: whether the kind takes other robots than the neck.
+        all_motors: whether the kind learns what each motor does, and so cannot cope with motors that move as one.
 
     Raises:
         DataError: too short, without excitation, or with an output that never moves.
@@ -158,6 +162,13 @@ def training_recording(recordings: Recording | list[Recording], *, any_robot: bo
     if not any_robot:
         recording.robot.require_neck(f"this kind of model ({', '.join(ANY_ROBOT)} take any robot)")
     check_training(recording)
+    outputs, motions = len(recording.robot.outputs.names), independent_motions(recording)
+    if all_motors and motions < outputs:
+        raise DataError(
+            f"the motors move along {motions} direction(s) for {outputs} outputs, and this kind learns what each motor "
+            "does: it would be wrong elsewhere. Record with all motors moving independently (`eq22`, `mixed`), or take "
+            "`oe`."
+        )
     return recording
 
 

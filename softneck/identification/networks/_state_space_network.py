@@ -93,7 +93,7 @@ class NeuralStateSpace:
         """
         from threadpoolctl import threadpool_limits
 
-        recording = training_recording(recordings, any_robot=True)
+        recording = training_recording(recordings, any_robot=True, all_motors=True)
         progress(0.0, "drives and linear model")
         drive = fit_loaded_drive(recording)
         with threadpool_limits(limits=1):

@@ -11,6 +11,7 @@ import numpy as np
 
 from softneck.core import KINDS, DataError, Matrix, Progress, SettingsError, SoftneckError, resolve, silent
 from softneck.signals import Recording
+from softneck.signals.quality._poor_excitation import poor_excitation
 
 from ..models._arrays import members
 from ..models._fitting import ANY_ROBOT, one_recording
@@ -190,7 +191,8 @@ def choose(
     ranking = race.ranking()
     progress(1.0, f"chosen: {chosen.kind}")
     alike = [one for one in ranking if one.fit > chosen.fit - ALIKE and one is not chosen]
-    return Choice(ranking, chosen, _why(chosen, alike), _remarks(ranking, other_excitation), seed)
+    remarks = (*poor_excitation(train), *_remarks(ranking, other_excitation))
+    return Choice(ranking, chosen, _why(chosen, alike), remarks, seed)
 
 
 def refit(choice: Choice, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:

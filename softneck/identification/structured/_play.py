@@ -89,7 +89,7 @@ class Play:
         Raises:
             DataError: too short, constant, or fewer rows than terms.
         """
-        recording = training_recording(recordings, any_robot=True)
+        recording = training_recording(recordings, any_robot=True, all_motors=True)
         progress(0.0, "drives")
         drive = fit_loaded_drive(recording)
         directions = directions_of(recording, [drive.simulate(r.set_points, drive_start(r)) for r in recording.runs()])
