@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,70 +16,36 @@ from softneck.core import (
     require_one_of,
     require_positive,
     require_whole,
+    to_si,
 )
 from softneck.robot import Robot
 from softneck.robot._neck_default import NeckDefault
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
 from ._axis import AxisPlant, HasTransferFunctions, axis_plant, directions_of, robot_of
-from ._forms import FORMS, NOISES, FilterMatrices, Reach, gyro_form, kinematic_form, model_form, steady_gains
+from ._forms import (
+    FORMS,
+    NOISES,
+    FilterMatrices,
+    Reach,
+    gyro_form,
+    kinematic_form,
+    model_form,
+    noise_units,
+    steady_gains,
+)
 from ._kalman import KalmanObserver
 from ._kalman_parts_runtime import KALMAN_LAG, KALMAN_MORE_LAGS
-from ._robot_sensor import linear_reach, robot_noise, robot_timing
-
-
-@dataclass(frozen=True, slots=True)
-class SensorNoise:
-    """An inclinometer.
-
-    Attributes:
-        name: what users type.
-        noise_std: standard deviation of pitch and of roll at rest [rad].
-        gyro_noise_std: standard deviation of its rates from sample to sample [rad/s].
-        source: where the numbers come from.
-    """
-
-    name: str
-    noise_std: float
-    gyro_noise_std: float
-    source: str
-
-
-# Upper ends of what the recordings show on plateaus: a filter that trusts too little lags a little,
-# one that trusts too much rejects good samples. Rates were not recorded: data sheet class.
-SENSORS: dict[str, SensorNoise] = {
-    sensor.name: sensor
-    for sensor in (
-        SensorNoise(
-            "mpu9250",
-            math.radians(0.29),
-            math.radians(0.1),
-            "Arduino with MPU-9250: 0.26 to 0.29 deg on plateaus of the recordings; rates: data sheet class",
-        ),
-        SensorNoise(
-            "3dm-gx5-10",
-            math.radians(0.04),
-            math.radians(0.05),
-            "3DM-GX5-10, 50 Hz: 0.02 to 0.04 deg on plateaus of the recordings; rates: data sheet class",
-        ),
-        SensorNoise(
-            "paper", math.radians(0.05), math.radians(0.1), "the virtual neck's inclinometer in the paper preset"
-        ),
-    )
-}
-
-
-def find_sensor(name: str) -> SensorNoise:
-    """Return the sensor of that name; raise SettingsError with the known ones if there is none."""
-    try:
-        return SENSORS[name]
-    except KeyError:
-        raise SettingsError(f"unknown sensor `{name}`; use one of {', '.join(SENSORS)}.") from None
-
+from ._reach import linear_reach
+from ._sensors import find_sensor
 
 ORDERS = ("sequential", "jacobi")
 # Sample times and delays that are whole multiples but for the rounding of decimal fractions.
 _ROUNDING = 1e-6
+_WHAT = "an observer"
+_NECK_PERIOD = 0.02
+# A sensor that gives a sample every 20 ms is given up after 0.1 s without one.
+_MISSED = 5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -195,8 +161,8 @@ class KalmanSettings:
             asked, reach, noise = self.of_neck(), Reach(), self.noise
             sensor = self.sensor if self.measurement_noise_std is None else "none"
         else:
-            asked, reach = robot_timing(self, robot, period), linear_reach(plants, robot, directions_of(model))
-            noise, sensor = robot_noise(self, robot, reach, max(plant.stretch for plant in plants), period)
+            asked, reach = self.robot_timing(robot, period), linear_reach(plants, robot, directions_of(model))
+            noise, sensor = self.robot_noise(robot, reach, max(plant.stretch for plant in plants), period)
         constants = asked.constants([plant.delay for plant in plants], period, reach)
         arrays = self._form(plants, period, reach).arrays(self._sources(robot, model), constants)
         return KalmanObserver(
@@ -226,6 +192,65 @@ class KalmanSettings:
                 "rates between two measurements must be known when the second comes."
             )
         return self
+
+    def robot_timing(self, robot: Robot, period: float) -> KalmanSettings:
+        """Return the settings with delay and rate of the robot's sensor, where nobody says otherwise.
+
+        Raises:
+            SettingsError: the robot gives no delay or rate of its sensor.
+        """
+        delay, wait, timeout = self.sensor_delay, self.sensor_period, self.healthy_timeout
+        if isinstance(delay, NeckDefault):
+            delay = max(float(robot.require("delay_s", _WHAT)), self.gyro_delay)
+        if wait is None:
+            # Whole samples, and no more than the sensor takes: what it holds counts as an old sample that long.
+            wait = period * max(1, math.floor(1.0 / (float(robot.require("rate_hz", _WHAT)) * period) + 1e-6))
+        if isinstance(timeout, NeckDefault):
+            timeout = _MISSED * wait
+        return replace(self, sensor_delay=float(delay), sensor_period=wait, healthy_timeout=float(timeout))
+
+    def robot_noise(
+        self, robot: Robot, reach: Reach, stretch: float, period: float
+    ) -> tuple[tuple[float, float, float], str]:
+        """Return the noise levels of the form in SI, and which sensor they are of.
+
+        Levels that are given are in the unit of the robot's outputs (angles in rad), those that are not are the neck's,
+        stretched by how far and how fast the outputs go.
+
+        Raises:
+            SettingsError: a level that neither the robot's file nor a setting says.
+        """
+        factor, si = to_si(robot.outputs.unit)
+        moved = reach.rate / Reach().rate
+        scales = {
+            "model_noise_std": moved * period / _NECK_PERIOD, "disturbance_noise_std": moved * period / _NECK_PERIOD,
+            "acceleration_noise_std": moved / stretch, "angle_noise_std": reach.start / Reach().start,
+            "bias_noise_std": moved,
+        }  # fmt: skip
+        preset = None if self.sensor == "paper" else find_sensor(self.sensor)
+        if preset is not None and si != "rad":
+            raise SettingsError(f"`sensor` {self.sensor} measures angles, robot {robot.label()} has none; drop it.")
+        levels, sensor = [], self.sensor if preset is not None else "robot"
+        for name, unit in noise_units(self.form, robot):
+            value = getattr(self, name)
+            if isinstance(value, NeckDefault):
+                levels.append(float(value) * scales[name])
+            elif value is not None:
+                levels.append(float(value) if si == "rad" else factor * float(value))
+                sensor = "none" if name == "measurement_noise_std" else sensor
+            elif name == "measurement_noise_std":
+                told = preset.noise_std if preset is not None else factor * float(robot.require("noise_std", _WHAT))
+                if not told > 0.0:
+                    raise SettingsError(
+                        f"robot `{robot.name}` gives `sensor.noise_std` = 0, and {_WHAT} needs a positive one; raise it, "
+                        f"or give `{name}`."
+                    )
+                levels.append(told)
+            elif preset is not None:
+                levels.append(3.0 * preset.gyro_noise_std)
+            else:
+                raise SettingsError(f"robot `{robot.name}` says nothing of its rates' noise; give `{name}` [{unit}].")
+        return (levels[0], levels[1], levels[2]), sensor
 
     def _form(self, plants: list[AxisPlant], period: float, reach: Reach) -> FilterMatrices:
         if self.form == "model":

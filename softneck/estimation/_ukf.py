@@ -21,12 +21,12 @@ from softneck.signals.recording._recording import require_same_robot
 from ._forms import Reach
 from ._kalman_parts_runtime import KALMAN_GATE, KALMAN_LEAD, KalmanCounters
 from ._offline import Estimates, measured_angles
-from ._robot_sensor import robot_noise, robot_timing, simulated_reach
+from ._reach import simulated_reach
 from ._settings import KalmanSettings
 from ._ukf_memory import LONGEST, angle_memory
 
-# What the model's angle may be off at the start, as a part of what its output may: 5 deg of a neck's 40. The second does
-# not pass the model, so that it may be large without sending sigma points to where no neck ever was.
+# What the model's angle may be off at the start, as a part of what its output may: 5 deg of a neck's 40. The second
+# does not pass the model, so that it may be large without sending sigma points to where no neck ever was.
 _START_MODEL = 0.125
 # Places of the counters; the last begins the outputs that were measured last.
 _COUNTERS = {name: place for place, name in enumerate(KalmanCounters.fields)}
@@ -339,11 +339,11 @@ def ukf(model: Model, settings: KalmanSettings | None = None, *, memory: int | N
         chosen.of_neck()
     else:
         reach = simulated_reach(model)
-        timed = robot_timing(chosen, model.robot, model.sample_time)
+        timed = chosen.robot_timing(model.robot, model.sample_time)
         if isinstance(chosen.sensor_delay, NeckDefault):
             # The robot's own delay: to whole samples, as the filter's states are.
             timed = replace(timed, sensor_delay=round(timed.sensor_delay / model.sample_time) * model.sample_time)
-        noise, chosen = robot_noise(chosen, model.robot, reach, 1.0, model.sample_time)[0], timed
+        noise, chosen = chosen.robot_noise(model.robot, reach, 1.0, model.sample_time)[0], timed
     lead = float(chosen.constants((0,) * len(model.robot.outputs.names), model.sample_time)[KALMAN_LEAD])
     if lead != int(lead):
         raise SettingsError(

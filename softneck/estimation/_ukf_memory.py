@@ -6,7 +6,7 @@ import numpy as np
 
 from softneck.identification import Model
 
-from ._robot_sensor import random_run, trained_levels
+from ._reach import random_run, trained_levels
 
 LONGEST = 12
 # What of an angle is left in the prediction, relative to its largest effect, that no longer counts.

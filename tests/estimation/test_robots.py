@@ -33,8 +33,8 @@ def recording(model: Model, *, rows: int = 400, noise: float = 1.0, seed: int = 
     """Levels at random through the model, with `noise` times the sensor's noise on what is measured."""
     robot, rng = model.robot, np.random.default_rng(seed)
     n, m = len(robot.motors.names), len(robot.outputs.names)
-    limits = 1e5 * np.array([0.0, 3.0]) if robot is SENSED else np.array([-2.0, 2.0])
-    u = np.repeat(rng.uniform(*limits, (rows // 40, n)), 40, axis=0)
+    low, high = (0.0, 3e5) if robot is SENSED else (-2.0, 2.0)
+    u = np.repeat(rng.uniform(low, high, (rows // 40, n)), 40, axis=0)
     block = model.block()
     given = np.full((rows, 2 * n + m), np.nan)
     given[:, :n] = u
@@ -55,7 +55,7 @@ def run_block(observer: KalmanObserver, record: Recording, *, compiled: bool) ->
     names = record.robot.outputs.names
     z = np.column_stack([record.channels[f"{name}_measured"] for name in names])
     P = record.set_points[np.maximum(np.arange(len(record)) - 1, 0)]
-    U = np.column_stack([P, z, np.isfinite(z).all(axis=1)])
+    U: Any = np.column_stack([P, z, np.isfinite(z).all(axis=1)])
     if observer.form == "gyro":
         U = np.column_stack([U, *(record.channels[f"{name}_rate"] for name in names)])
     block = observer.block()
