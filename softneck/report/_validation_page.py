@@ -148,10 +148,8 @@ def _remarks(r: Validation) -> list[str]:
             f"{_cell(r.mean_width_deg, 1)} {r.robot.outputs.display_unit} wide in the mean."
         )
     if r.outside_pct is not None:
-        words.append(
-            f"At {_cell(r.outside_pct, 1)} % of the samples the bounds are wider than 99 % of the training rows have "
-            "them: the model has never seen that."
-        )
+        words.append(f"{_cell(r.outside_pct, 1)} % of the samples lie outside what the model has seen.")
+    words += [f"{said[0].upper()}{said[1:]}." for said in r.bounds_remarks]
     if r.novelty is not None and r.novelty.larger is not None:
         p50, p90, p99, most = (f"{value:.1f}" for value in r.novelty.larger)
         words.append(

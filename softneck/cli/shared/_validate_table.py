@@ -80,11 +80,32 @@ def remarks(r: Validation) -> list[str]:
         )
     if r.outside_pct is not None and not lost:
         lines.append(f"{who}: {_pair(r.outside_pct.values())} % of them lie outside what the model has seen")
+    lines += [f"{who}: {said}" for said in r.bounds_remarks if not lost]
+    if not lost:
+        lines += _calibrated(who, r)
     if r.novelty is not None and r.novelty.larger is not None:
         p50, p90, p99, most = (f"{value:.1f}" for value in r.novelty.larger)
         lines.append(
             f"{who}: novelty {p50} (median), {p90} (90 %), {p99} (99 %), {most} (largest) times the training's spacing"
         )
+    return lines
+
+
+def _calibrated(who: str, r: Validation) -> list[str]:
+    """Return the bounds that whole records allow, or why there are none."""
+    found, unit = r.calibrated_bounds, r.robot.outputs.display_unit
+    lines = []
+    for what, of in (("pointwise", "any sample"), ("path", "all samples")):
+        for axis, bound in found.get(what, {}).items():
+            held = (
+                "" if bound["coverage_pct"] is None else f"; left out one by one it held {bound['coverage_pct']:.0f} %"
+            )
+            lines.append(
+                f"{who}: calibrated on {found['records']} records, 90 % for {of} of a further one: {axis} "
+                f"+-{bound['half_width']:.2f} {unit}{held}"
+            )
+    if found["reason"] is not None:
+        lines.append(f"{who}: no calibrated bounds, {found['reason']}" if not lines else f"{who}: {found['reason']}")
     return lines
 
 

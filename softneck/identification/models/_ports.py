@@ -83,6 +83,12 @@ def trained_set_points(*sources: Recording | Mapping[str, Any]) -> dict[str, Any
     return {_TRAINED: {"min": np.nanmin(rows, axis=0).tolist(), "max": np.nanmax(rows, axis=0).tolist()}}
 
 
+def trained_range(findings: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the least and largest set-points (motors,) that a model was trained on, in SI; None where it has none."""
+    seen = findings.get(_TRAINED)
+    return None if seen is None else (np.array(seen["min"]), np.array(seen["max"]))
+
+
 def inputs(findings: Mapping[str, Any], robot: Robot) -> tuple[Port, ...]:
     """Return the inputs; the set-points range over what the model was trained on."""
     motors = range(1, len(robot.motors.names) + 1)

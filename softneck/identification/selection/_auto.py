@@ -38,7 +38,7 @@ _SCREENED: dict[str, dict[str, Any]] = {
     "greybox": {"evaluations": 15, "sensor_delay": 2},
     "nn": {"starts": 1, "iterations": 8, "refine": 6},
     "nlsm": {"output_weight": 5.0},
-    "nss": {"starts": 1, "iterations": 20},
+    "nss": {"starts": 4, "iterations": 4},
 }
 # Of the noise: the epsilon of screened sets, whose own choice among many takes several times as long.
 _SIGMAS = 8.0

@@ -1,9 +1,9 @@
 """Motions that nobody recorded: where kinds that were trained alike part, most of them are wrong.
 
-The exam's set-points stay within those that were trained on and move as fast, but otherwise than they did: levels that
-are held, many tones, one motor at a time. No measurement says what is right there. What says most is the median of all
-models, each weighing by what it is worth on rows left out: a kind that leaves it alone has learnt the record and not
-the robot. That is a comparison, not a proof: kinds that share a bias agree (Ovadia et al. 2019).
+The exam's set-points stay within those that were trained on, move together as much and as fast, but otherwise: levels
+that are held, many tones, one motor after the other. No measurement says what is right there. What says most is the
+median of all models, each weighing by what it is worth on rows left out: a kind that leaves it alone has learnt the
+record and not the robot. That is a comparison, no proof: kinds that share a bias agree (Ovadia et al. 2019).
 """
 
 from __future__ import annotations
@@ -90,8 +90,8 @@ def _exam(train: Recording, own: Matrix) -> Recording:
     rows = np.arange(0.0, len(P) - 1.0, Ts / (SAMPLE_TIME * _stretch(train)))
     P = np.column_stack([np.interp(rows, np.arange(len(P)), column) for column in P.T])
     U = train.set_points
-    size = U.std(axis=0) / np.maximum(P.std(axis=0), 1e-12)
-    P = np.clip(U.mean(axis=0) + size * (P - P.mean(axis=0)), *np.quantile(U, _RANGE, axis=0))
+    P = U.mean(axis=0) + (P - P.mean(axis=0)) @ _root(P, -0.5) @ _root(U, 0.5)
+    P = np.clip(P, *np.quantile(U, _RANGE, axis=0))
     share = np.linspace(0.0, 1.0, max(round(_RAMP * _stretch(train) / Ts), 2))[:, None]
     U = np.vstack([first.set_points[0] + share * (P[0] - first.set_points[0]), P])
     Y = np.full((len(U), train.outputs.shape[1]), np.nan)
@@ -99,6 +99,12 @@ def _exam(train: Recording, own: Matrix) -> Recording:
     robot = train.robot
     channels = dict(zip((*robot.set_points, *robot.outputs.names), (*U.T, *Y.T), strict=True))
     return Recording(np.arange(len(U)) * Ts, Ts, channels, robot=robot)
+
+
+def _root(P: Matrix, power: float) -> Matrix:
+    """Return a power of the covariance (motors, motors), which says how much motors move together."""
+    variances, axes = np.linalg.eigh(np.atleast_2d(np.cov(P.T)))
+    return axes * np.maximum(variances, 1e-12 * variances[-1]) ** power @ axes.T
 
 
 def _on_motors(P: Matrix, motors: int) -> Matrix:

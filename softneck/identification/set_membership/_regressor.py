@@ -132,6 +132,27 @@ def gammas(data: Data, scale: Vector, epsilons: Sequence[Vector]) -> list[Vector
     return [np.array(pair) for pair in zip(*columns, strict=True)]
 
 
+def widened(data: Data, scale: Vector, epsilon: Vector) -> tuple[Vector, Vector]:
+    """Return epsilon (2,), doubled until a function fits the data where none did, and the least gamma (2,) for it.
+
+    Rows of several payloads have equal regressors and unequal outputs: what parts them counts as noise.
+    """
+    gamma = gammas(data, scale, [epsilon])[0]
+    while gamma.max() > 1e100:
+        epsilon = np.where(gamma > 1e100, 2.0 * epsilon, epsilon)
+        gamma = gammas(data, scale, [epsilon])[0]
+    return epsilon, gamma
+
+
+def widening(chosen: Vector, taken: Vector) -> dict[str, str]:
+    """Return the finding that says where epsilon [rad] was widened; empty where it was not."""
+    if np.array_equal(chosen, taken):
+        return {}
+    wide, narrow = ("/".join(f"{value:.3g}" for value in np.degrees(values)) for values in (taken, chosen))
+    why = "equal regressors have unequal outputs (several payloads?)"
+    return {"widened": f"epsilon is {wide} deg instead of {narrow}: {why}"}
+
+
 def scaled(points: Matrix, scale: Vector) -> Matrix:
     """Return points (n, N) in the norm of Eq. 16, each component times its weight."""
     return np.ascontiguousarray(points * scale[:, None])

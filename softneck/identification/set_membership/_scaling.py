@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, Progress, SettingsError, Vector
+from softneck.core import Matrix, Progress, SettingsError, Vector
 from softneck.signals import Recording
 
 from ._regressor import Data, Ground, gammas
@@ -96,18 +96,23 @@ class HoldOut:
     def choose(self, outputs: Sequence[float], motors: Sequence[float], progress: Progress) -> list[ScaleTrial]:
         """Return all that was tried, the best first: weights of outputs, then of motors beside the best of those."""
         tried = self._try([(weight, 1.0) for weight in outputs], progress)
+        if not tried:  # no function fits with any: equal regressors have unequal outputs, so that all are widened
+            return replace(self, epsilons=[2.0 * epsilon for epsilon in self.epsilons]).choose(
+                outputs, motors, progress
+            )
         best = self.best_first(tried)[0]
         tried += self._try([(best.output_weight or 1.0, weight) for weight in motors], progress)
         return self.best_first(tried)
 
     def fixed(self, scale: Vector) -> list[ScaleTrial]:
         """Return each epsilon with one scale, the best first."""
-        return self.best_first(list(self._scale(scale, None, None)))
+        tried = list(self._scale(scale, None, None))
+        if not tried:
+            return replace(self, epsilons=[2.0 * epsilon for epsilon in self.epsilons]).fixed(scale)
+        return self.best_first(tried)
 
     def best_first(self, tried: list[ScaleTrial]) -> list[ScaleTrial]:
-        """Return them by falling score; raises DataError where no function fits the data with any of them."""
-        if not tried:
-            raise DataError("equal regressors have unequal outputs beyond any epsilon tried; set `epsilon` higher.")
+        """Return them by falling score."""
         ranked = sorted(tried, key=lambda one: -one.score)
         if self.narrow:
             as_good = [t for t in ranked if t.score >= ranked[0].score - AS_GOOD and t.coverage >= COVERAGE]

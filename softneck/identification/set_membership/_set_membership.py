@@ -30,7 +30,7 @@ from ..models._regressors import lag_table
 from ._cones import usual_width
 from ._forest import all_cores, plant
 from ._gamma import require_feasible
-from ._regressor import Ground, gammas, residual_lags, scaled
+from ._regressor import Ground, gammas, residual_lags, scaled, widened, widening
 from ._scaling import RULES, HoldOut, ScaleTrial, grouped_scale, ruled_scale
 
 _FINDING = "usual_half_width_deg"
@@ -170,14 +170,19 @@ class SetMembership:
         data = ground.data(recording)
         chosen, tried = self._choose(ground, recording, noise, progress)
         scale = chosen.scale if chosen.scale.size else ruled_scale(self.scale, ground.table, data)
-        gamma = gammas(data, scale, [chosen.epsilon])[0]
         sets = [(scaled(X, scale), y) for X, y in data]
-        require_feasible(recording, ground.table, sets, gamma, chosen.epsilon)
-        arrays = ground.arrays(data, scale, gamma, chosen.epsilon)
+        # An epsilon that was asked for is kept or refused.
+        if self.epsilon is None:
+            epsilon, gamma = widened(data, scale, chosen.epsilon)
+        else:
+            epsilon, gamma = chosen.epsilon, gammas(data, scale, [chosen.epsilon])[0]
+        require_feasible(recording, ground.table, sets, gamma, epsilon)
+        arrays = ground.arrays(data, scale, gamma, epsilon)
         progress(1.0, "done")
         findings = {"form": self.form, "noise_deg": np.degrees(noise).tolist(), **_findings(chosen, tried, scale)}
         findings |= {"gamma": gamma.tolist(), "points": int(arrays["values"].shape[1])}
-        findings |= usual_widths(sets, gamma, chosen.epsilon)
+        findings |= {"epsilon_deg": np.degrees(epsilon).tolist(), **widening(chosen.epsilon, epsilon)}
+        findings |= usual_widths(sets, gamma, epsilon)
         return fitted_model("nlsm", self, recording, arrays=arrays, findings=findings)
 
     def _ground(self, recording: Recording, drive: DriveModel) -> Ground:

@@ -25,8 +25,8 @@ from ..models._model import WARM_UP, Model
 from ..models._ports import trained_set_points
 from ..models._regressors import lag_table
 from ..models._scores import nrmse_fit
-from ..set_membership._regressor import gammas, residual_lags, residual_rows, scaled, set_arrays
-from ..set_membership._set_membership import noise_level
+from ..set_membership._regressor import gammas, residual_lags, residual_rows, scaled, set_arrays, widened, widening
+from ..set_membership._set_membership import noise_level, usual_widths
 from ._ensemble import seeded
 
 # Of the noise: below what the base and the last 0.8 s leave unexplained, gamma and the bounds' width grow a
@@ -82,13 +82,15 @@ class Residual:
         """Return a set over the residual of a base that is there already."""
         noise = np.array([noise_level(recording, axis) for axis in range(2)])
         given = self.epsilon
-        epsilon = self._narrowest(base, recording, noise) if given is None else np.full(2, given)
-        arrays, gamma = self._arrays(base, recording, epsilon)
+        wanted = self._narrowest(base, recording, noise) if given is None else np.full(2, given)
+        arrays, gamma, epsilon, points = self._arrays(base, recording, wanted)
         findings = {
             "base": base.kind,
             "epsilon_deg": np.degrees(epsilon).tolist(),
             "gamma": gamma.tolist(),
             "points": int(arrays["values"].shape[1]),
+            **widening(wanted, epsilon),
+            **usual_widths(points, gamma, epsilon),
             **{key: value for key, value in base.findings.items() if key in ("remark", "interrupted")},
             **trained_set_points(recording, base.findings),
         }
@@ -108,20 +110,26 @@ class Residual:
             return _SIGMAS[0] * noise
         found: list[tuple[float, float, Vector]] = []
         for sigmas in _SIGMAS:
-            arrays, _ = self._arrays(base, head, sigmas * noise)
+            arrays = self._arrays(base, head, sigmas * noise)[0]
             Y = Model(kind="residual", sample_time=head.sample_time, arrays=arrays).simulate(tail)[WARM_UP:]
             fit = sum(nrmse_fit(tail.outputs[WARM_UP:, axis], Y[:, axis]) for axis in range(2)) / 2.0
             found.append((fit, float(np.mean(Y[:, [6, 8]] - Y[:, [5, 7]])), sigmas * noise))
         best = max(fit for fit, _, _ in found)
         return min((entry for entry in found if entry[0] >= best - _ALIKE), key=lambda entry: entry[1])[2]
 
-    def _arrays(self, base: Model, recording: Recording, epsilon: Vector) -> tuple[dict[str, Matrix], Vector]:
+    def _arrays(
+        self, base: Model, recording: Recording, epsilon: Vector
+    ) -> tuple[dict[str, Matrix], Vector, Vector, list[tuple[Matrix, Vector]]]:
+        """Return the arrays, gamma (2,), the epsilon (2,) taken, and each axis' scaled regressors and targets."""
         lags = residual_lags(recording.sample_time)
         table = lag_table(lags, (), lags, both_outputs=True)
         scale = np.where(table[:, 0] == 3, self.angle_weight, 1.0)
         rows = [residual_rows(recording, base, table, axis) for axis in range(2)]
         points = [(scaled(X, scale), y) for X, y in rows]
-        gamma = gammas(rows, scale, [epsilon])[0]
+        if self.epsilon is None:
+            epsilon, gamma = widened(rows, scale, epsilon)
+        else:
+            gamma = gammas(rows, scale, [epsilon])[0]
         if gamma.max() > 1e100:
             raise DataError(
                 f"epsilon {np.degrees(epsilon).round(4).tolist()} deg is below the noise: equal regressors have "
@@ -135,4 +143,4 @@ class Residual:
             **set_arrays(points, gamma, epsilon),
             **prefixed_arrays([(base.kind, base.arrays)]),
         }
-        return arrays, gamma
+        return arrays, gamma, epsilon, points

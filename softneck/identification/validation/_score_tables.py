@@ -11,6 +11,7 @@ from softneck.core import Matrix, Vector
 from softneck.robot import Robot
 
 from ..models._model import Model
+from ..models._ports import trained_range
 from ..models._scores import nrmse_fit, r_squared, rmse, worst_error
 from ..set_membership._set_membership import knows_what_it_saw, outside_seen
 from ._bootstrap import fit_intervals
@@ -54,6 +55,8 @@ def _range(measured: Matrix, least: float) -> tuple[Vector, float]:
     return middle, float(max(widths))
 
 
+# A set-point so much of the trained range beyond it [1] is the same to any model, and to the rounding of a file.
+_BEYOND = 1e-6
 # Blocks over which the spread of a fit is shown: eight say how they differ, and 2 s are ten time constants of a neck.
 _MOST_BLOCKS, _LEAST_BLOCK = 8, 100
 
@@ -198,14 +201,25 @@ def coverage_tables(
     return dict(zip(rows.names, coverage.tolist(), strict=True)), dict(zip(rows.names, widths, strict=True))
 
 
-def outside_table(model: Model, measured: Matrix, free: Matrix) -> dict[str, float] | None:
-    """Return how many measured samples [%] the bounds flag as outside what a set membership model has seen."""
+def outside_table(model: Model, rows: Rows, free: Matrix) -> dict[str, float] | None:
+    """Return how many measured samples [%] lie outside what a model has seen; None where it does not know.
+
+    Set membership says so by its bounds; of any other kind those count whose set-points were not trained on.
+    """
     lower, upper = free_run_bounds(free, model.robot)
-    there = np.isfinite(measured) & np.isfinite(lower) & np.isfinite(upper)
-    if not there.any() or not knows_what_it_saw(model):
-        return None
-    flagged = outside_seen(model, free) & there
-    share = 100.0 * flagged.sum(axis=0) / np.maximum(there.sum(axis=0), 1)
+    there = np.isfinite(rows.measured)
+    if knows_what_it_saw(model) and (there & np.isfinite(lower) & np.isfinite(upper)).any():
+        there &= np.isfinite(lower) & np.isfinite(upper)
+        flagged = outside_seen(model, free)
+    else:
+        trained = trained_range(model.findings)
+        if trained is None or not there.any():
+            return None
+        least, most = trained
+        slack = _BEYOND * (most - least)
+        beyond = (rows.set_points < least - slack) | (rows.set_points > most + slack)
+        flagged = np.repeat(beyond.any(axis=1, keepdims=True), there.shape[1], axis=1)
+    share = 100.0 * (flagged & there).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
     return dict(zip(model.robot.outputs.names, share.tolist(), strict=True))
 
 

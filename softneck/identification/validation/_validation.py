@@ -14,6 +14,7 @@ from softneck.signals import Recording
 
 from ..models._model import WARM_UP, Model
 from ._baselines import Baselines, baselines
+from ._bounds import calibrated_bounds, judged_bounds, useful_parts
 from ._horizons import predict
 from ._novelty import Novelty, novelty
 from ._residual_tests import ResidualTests, residual_tests
@@ -31,6 +32,8 @@ from ._score_tables import (
 from ._scored_rows import Rows, ScoredStretch, pooled, unseen_stretches
 
 _HORIZONS = (1, 5, 25, INFINITE)
+# Kinds whose bounds are guaranteed under an assumption; an ensemble's are its members' least and largest.
+_PROMISING = ("nlsm", "residual")
 
 Scores = dict[str, dict[str, float | None]]
 
@@ -61,13 +64,16 @@ class Validation:
         diverged: time [s] at which the first free run left the data's range, or None.
         residual_tests: of the one-step errors; `white` and `uncorrelated` are their verdicts.
         novelty: how far the judged rows lie from the training rows, where these are known.
-        coverage_pct, mean_width_deg: of set membership in free run: axis -> measured samples within the bounds [%],
-            and their mean distance [deg]; None for other kinds.
-        outside_pct: of set membership in free run: axis -> measured samples [%] at which the bounds are wider than
-            training's usually are (see `outside_seen`); None for other kinds.
+        coverage_pct, mean_width_deg: of kinds with bounds in free run: axis -> measured samples within them [%], and
+            their mean distance [deg], None where that is more than the range of the data; None for other kinds.
+        bounds_remarks: where these bounds are of no use or do not hold what they promise.
+        calibrated_bounds: of every kind, from nine or more stretches: see `_bounds`; else why there are none.
+        outside_pct: axis -> measured samples [%] outside what the model has seen: of set membership where its bounds
+            are wider than training's usually are (see `outside_seen`), of other kinds where a set-point lies beyond
+            those that it was trained on; None where the model does not know.
         time, run: (time,) [s] and the number of the stretch, for plots: no line joins two of them.
         measured, free_run, one_step: (time, 2) [rad], NaN where nothing is scored.
-        lower, upper: (time, 2) [rad] bounds of the free run, NaN where there are none.
+        lower, upper: (time, 2) [rad] bounds of the free run, NaN where none is narrower than the data.
         robot: whose outputs these are; of another than the neck they have its number and SI unit.
     """
 
@@ -92,7 +98,9 @@ class Validation:
     residual_tests: ResidualTests
     novelty: Novelty | None
     coverage_pct: dict[str, float] | None
-    mean_width_deg: dict[str, float] | None
+    mean_width_deg: dict[str, float | None] | None
+    bounds_remarks: tuple[str, ...]
+    calibrated_bounds: dict[str, Any]
     outside_pct: dict[str, float] | None
     time: Vector
     run: np.ndarray
@@ -151,6 +159,8 @@ class Validation:
             "novelty": None if self.novelty is None else self.novelty.as_dict(),
             "coverage_pct": self.coverage_pct,
             "mean_width_deg": self.mean_width_deg,
+            "bounds_remarks": list(self.bounds_remarks),
+            "calibrated_bounds": self.calibrated_bounds,
             "outside_pct": self.outside_pct,
             "per_run": self.per_run,
         }
@@ -277,6 +287,12 @@ def judge(
     free = outputs.get(INFINITE, np.full((rows.time.size, axes), np.nan))
     lower, upper = free_run_bounds(free, rows.robot)
     coverage, width = coverage_tables(rows, rows.measured, lower, upper)
+    useful_width, said = judged_bounds(rows, coverage, width, promised=model.kind in _PROMISING)
+    if first is None and INFINITE in outputs:
+        calibrated = calibrated_bounds(rows, rows.measured - free[:, :axes])
+    else:
+        calibrated = {"reason": "there is no free run, or it diverged"}
+    lower, upper = useful_parts(rows, lower, upper)
     per_run = run_tables(parts.stretches, rows, measured, predicted, lost)
     return Validation(
         model=names[0],
@@ -296,8 +312,10 @@ def judge(
         residual_tests=tests,
         novelty=novelty(model, parts.stretches, training) if rows.robot.is_neck else None,
         coverage_pct=coverage,
-        mean_width_deg=width,
-        outside_pct=outside_table(model, rows.measured, free),
+        mean_width_deg=useful_width,
+        bounds_remarks=tuple(said),
+        calibrated_bounds=calibrated,
+        outside_pct=outside_table(model, rows, free),
         time=rows.time,
         run=rows.stretch,
         measured=rows.measured,

@@ -1,0 +1,131 @@
+"""What bounds are worth: whether they held what they promise, whether they are of use, and bounds from whole records.
+
+Calibrated bounds take the errors of whole stretches as exchangeable, never rows: a free run that is wrong is wrong for
+long. The half-width for the largest error of a further record is an order statistic of the records' largest errors
+(Stankeviciute et al. 2021); that for one of its samples weighs each record alike, and a further one as infinite (Lee,
+Barber and Willett 2023). At 90 % either needs nine records. On motions unlike these the coverage is what it turns out
+to be: no guarantee (Barber et al. 2023).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from softneck.core import Matrix, Vector
+
+from ._scored_rows import Rows
+
+LEVEL = 0.9
+#: Records at least for a bound at 90 %: nine of ten are below the largest of nine and a tenth.
+LEAST_RECORDS = 9
+# Wider than this part of what was measured a bound says nothing that the range of the data does not.
+_USEFUL = 0.5
+# What set membership promises is all of it; this much less is rounding and outliers [%].
+_PROMISED = 99.0
+
+
+def useful_parts(rows: Rows, lower: Matrix, upper: Matrix) -> tuple[Matrix, Matrix]:
+    """Return the bounds (time, outputs), NaN where they are wider than the range of what was measured."""
+    too_wide = ~(upper - lower <= _range(rows))
+    return np.where(too_wide, np.nan, lower), np.where(too_wide, np.nan, upper)
+
+
+def judged_bounds(
+    rows: Rows, coverage: dict[str, float] | None, width: dict[str, float] | None, *, promised: bool
+) -> tuple[dict[str, float | None] | None, list[str]]:
+    """Return the mean widths without those that nobody can use, and what there is to say, one line each.
+
+    Args:
+        rows: those judged.
+        coverage, width: of `coverage_tables`.
+        promised: whether the bounds promise to hold all samples, as set membership does.
+    """
+    if coverage is None or width is None:
+        return None, []
+    unit = rows.robot.outputs.display_unit
+    shown: dict[str, float | None] = dict(width)
+    said = []
+    for (name, wide), span in zip(width.items(), _range(rows), strict=True):
+        range_ = rows.shown(float(span))
+        if wide > range_:
+            shown[name] = None
+            said.append(
+                f"no useful bound in {name}: it would be wider than all that was measured ({range_:.3g} {unit})"
+            )
+        elif wide > _USEFUL * range_:
+            said.append(
+                f"no useful bound in {name}: {wide:.3g} {unit} wide in the mean, more than half of what was measured "
+                f"({range_:.3g} {unit})"
+            )
+        if promised and coverage[name] < _PROMISED:
+            said.append(
+                f"the bounds of {name} promise all samples and held {coverage[name]:.0f} %: their assumption (noise "
+                "within epsilon, a slope of at most gamma) does not hold on these rows"
+            )
+    return shown, said
+
+
+def calibrated_bounds(rows: Rows, errors: Matrix) -> dict[str, Any]:
+    """Return half-widths at 90 % around a free run, from whole stretches, and what each held on stretches left out.
+
+    `pointwise` is for any one sample of a further record of this kind, `path` for all of its samples at once.
+
+    Args:
+        rows: those judged.
+        errors: (time, outputs) measured less free run; NaN where not judged.
+
+    Returns:
+        Level, number of records, and for each of both axis -> half-width and coverage; or the reason why there is none.
+    """
+    records = [errors[rows.stretch == number] for number in range(int(rows.stretch[-1]) + 1)]
+    records = [record for record in records if np.isfinite(record).all(axis=1).any()]
+    found: dict[str, Any] = {"level_pct": 100.0 * LEVEL, "records": len(records), "reason": None}
+    if len(records) < LEAST_RECORDS:
+        reason = f"{len(records)} record(s): bounds at {100 * LEVEL:g} % need {LEAST_RECORDS} that are exchangeable"
+        return {**found, "reason": reason}
+    reasons = []
+    for what, half_width in (("pointwise", _pointwise), ("path", _path)):
+        found[what] = {}
+        for i, name in enumerate(rows.names):
+            parts = [np.abs(record[np.isfinite(record[:, i]), i]) for record in records]
+            half = half_width(parts)
+            if 2.0 * half > _USEFUL * float(_range(rows)[i]):
+                reasons.append(f"no useful {what} bound in {name}: wider than half of what was measured")
+                continue
+            found[what][name] = {"half_width": rows.shown(half), "coverage_pct": _left_out(parts, half_width, what)}
+    return {**found, "reason": "; ".join(reasons) or None}
+
+
+def _path(parts: Sequence[Vector]) -> float:
+    """Return what the largest error of a further record stays below with 90 %."""
+    largest = np.sort([part.max() for part in parts])
+    rank = int(np.ceil(LEVEL * (len(parts) + 1) - 1e-9))
+    return float(largest[rank - 1]) if rank <= len(parts) else float("inf")
+
+
+def _pointwise(parts: Sequence[Vector]) -> float:
+    """Return what one error of a further record stays below with 90 %: each record weighs alike, a further one too."""
+    values = np.concatenate(parts)
+    weights = np.concatenate([np.full(part.size, 1.0 / (part.size * (len(parts) + 1))) for part in parts])
+    order = np.argsort(values)
+    reached = np.flatnonzero(np.cumsum(weights[order]) >= LEVEL - 1e-9)
+    return float(values[order][reached[0]]) if reached.size else float("inf")
+
+
+def _left_out(parts: Sequence[Vector], half_width: Any, what: str) -> float | None:
+    """Return what share [%] of each record, or of records as a whole, the bound of all the others holds."""
+    if len(parts) <= LEAST_RECORDS:
+        return None
+    held = []
+    for number, part in enumerate(parts):
+        inside = part <= half_width([*parts[:number], *parts[number + 1 :]])
+        held.append(inside.all() if what == "path" else inside.mean())
+    return 100.0 * float(np.mean(held))
+
+
+def _range(rows: Rows) -> Vector:
+    """Return the range of what was measured (outputs,); NaN where nothing was."""
+    return np.array([np.ptp(y[np.isfinite(y)]) if np.isfinite(y).any() else np.nan for y in rows.measured.T])
