@@ -181,7 +181,10 @@ class SetMembership:
         progress(1.0, "done")
         findings = {"form": self.form, "noise_deg": np.degrees(noise).tolist(), **_findings(chosen, tried, scale)}
         findings |= {"gamma": gamma.tolist(), "points": int(arrays["values"].shape[1])}
-        findings |= {"epsilon_deg": np.degrees(epsilon).tolist(), **widening(chosen.epsilon, epsilon)}
+        if self.epsilon is None:
+            sigmas = _RESIDUAL_SIGMAS if self.form == "residual" else _EPSILON_SIGMAS
+            findings |= widening(np.minimum(sigmas[-1] * noise, epsilon), epsilon)
+        findings["epsilon_deg"] = np.degrees(epsilon).tolist()
         findings |= usual_widths(sets, gamma, epsilon)
         return fitted_model("nlsm", self, recording, arrays=arrays, findings=findings)
 

@@ -89,7 +89,7 @@ class Residual:
             "epsilon_deg": np.degrees(epsilon).tolist(),
             "gamma": gamma.tolist(),
             "points": int(arrays["values"].shape[1]),
-            **widening(wanted, epsilon),
+            **({} if given is not None else widening(np.minimum(_SIGMAS[-1] * noise, epsilon), epsilon)),
             **usual_widths(points, gamma, epsilon),
             **{key: value for key, value in base.findings.items() if key in ("remark", "interrupted")},
             **trained_set_points(recording, base.findings),

@@ -101,13 +101,14 @@ def test_every_kind_says_how_much_lies_outside_what_it_has_seen(models: dict[str
 def test_several_payloads_widen_epsilon_instead_of_refusing() -> None:
     """The same set-points with another payload: equal regressors, unequal outputs, in a form without feedback."""
     bare = neck_recording(260)
-    heavy = bare.with_channels(pitch=1.1 * bare.outputs[:, 0] + 0.05)
+    # From the same first row: the base, which starts there, then simulates the same.
+    heavy = bare.with_channels(pitch=np.append(bare.outputs[0, 0], 1.1 * bare.outputs[1:, 0] + 0.05))
     both = concatenate([bare, heavy])
-    model = SetMembership(form="residual", output_weight=5.0).fit(both)
+    model = SetMembership(form="residual", base="rls", output_weight=5.0).fit(both)
     assert "equal regressors have unequal outputs" in model.findings["widened"]
     # Where both stand still their outputs part by 0.05 rad: half of it to either side is the least epsilon.
     assert model.findings["epsilon_deg"][0] >= np.degrees(0.05) / 2.0
     free = model.simulate(both)
     inside = (free[:, 5] <= both.outputs[:, 0]) & (both.outputs[:, 0] <= free[:, 6])
     assert inside[100:260].mean() > 0.95
-    assert "widened" not in SetMembership(form="residual", output_weight=5.0).fit(bare).findings
+    assert "widened" not in SetMembership(form="residual", base="rls", output_weight=5.0).fit(bare).findings
