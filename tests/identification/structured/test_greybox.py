@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -118,6 +119,9 @@ def test_the_numbers_behind_its_own_equations_are_found(fitted: Model, truth: np
 class _Line:
     """A problem whose errors are linear in what is searched, so that least squares says all about it."""
 
+    numbers = NUMBERS
+    directions = SimpleNamespace(stretch=1.0)
+
     def __init__(self) -> None:
         rng = np.random.default_rng(0)
         self.A = rng.standard_normal((400, len(NUMBERS)))
@@ -126,6 +130,39 @@ class _Line:
     def errors(self, x: np.ndarray, delay: int) -> np.ndarray:
         del delay
         return self.A @ (x - np.array([number.encode(number.guess) for number in NUMBERS])) - self.noise
+
+
+def tendons_of(*degrees: float, axes: int = 2) -> np.ndarray:
+    """What stands behind the numbers for tendons at these angles, by its definition."""
+    e = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)) * (axes > 1)])
+    return np.concatenate([[np.linalg.eigvalsh(e @ e.T).max() / len(degrees)], *e])
+
+
+def run_tendons(numbers: np.ndarray, U: np.ndarray, axes: int) -> np.ndarray:
+    M, Y = np.empty(U.shape), np.empty((len(U), axes))
+    FUNCTIONS.neck_run(numbers, TS, np.full(U.shape[1], 3.0), 2, 50, U, U[0].copy(), M, Y)
+    return Y
+
+
+def test_tendons_where_those_of_a_neck_are_bend_as_a_neck() -> None:
+    numbers = GUESS.copy()
+    numbers[NAMES.index("twist")] = 0.1
+    U = np.ascontiguousarray(signal("eq22").set_points[:200])
+    at = np.concatenate([numbers, tendons_of(0.0, 120.0, 240.0)])
+    # Sines of sums in two ways: rounding along 200 samples.
+    np.testing.assert_allclose(run_tendons(at, U, 2), run(numbers, U)[1], rtol=0, atol=1e-12)
+
+
+def test_a_robot_of_one_output_bends_in_its_plane_as_one_with_two_tendons_there() -> None:
+    u = signal("eq22").set_points[:200, :1]
+    pair = np.ascontiguousarray(np.column_stack([u, -u]))
+    one = run_tendons(np.concatenate([GUESS, tendons_of(0.0, 180.0, axes=1)]), pair, 1)
+    both = run_tendons(np.concatenate([GUESS, tendons_of(0.0, 180.0)]), pair, 2)
+    # Rounding of sin 180 deg.
+    np.testing.assert_allclose(both, np.column_stack([one, np.zeros(200)]), rtol=0, atol=1e-12)
+    # Mirrored motors bend the other way: what is between two tendons is symmetric.
+    other = run_tendons(np.concatenate([GUESS, tendons_of(0.0, 180.0, axes=1)]), np.ascontiguousarray(pair[:, ::-1]), 1)
+    np.testing.assert_allclose(other, -one, rtol=0, atol=1e-12)
 
 
 def test_intervals_of_a_linear_problem_are_those_of_ordinary_least_squares() -> None:
