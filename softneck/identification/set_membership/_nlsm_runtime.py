@@ -43,7 +43,10 @@ def initialise(p: NlsmArrays, parameters: np.ndarray, x: NarxState, outputs: np.
     # Of another robot than a neck the base is zero at rest and the outputs need not be: the set adds where they are.
     if p.nb > 0 and p.c == p.outputs:
         for axis in range(p.outputs):
-            echo_rest(p, x, axis, np.mean(p.values[axis]))
+            total = 0.0
+            for k in range(p.rows):
+                total += p.values[axis, k]
+            echo_rest(p, x, axis, total / p.rows)
 
 
 def nlsm_bounds(
