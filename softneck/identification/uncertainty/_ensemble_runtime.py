@@ -5,19 +5,10 @@ Each member runs free on its own outputs; a median of bounded numbers is bounded
 
 import numpy as np
 
+from softneck.identification.uncertainty._composed_runtime import composed_motors, composed_outputs
 from softneck.runtime._layout import Arrays, StateVector, array, cells, rest, value
 from softneck.runtime._members_runtime import member_count, member_initialise, member_size, member_step
 from softneck.runtime._random_runtime import random_normal, random_seed
-
-
-def ensemble_outputs(history: np.ndarray) -> int:
-    """Return the number of outputs: the neck's two where none is said."""
-    return int(history[1]) if history.shape[0] > 1 else 2
-
-
-def ensemble_motors(history: np.ndarray) -> int:
-    """Return the number of motors: the neck's three where none is said."""
-    return int(history[2]) if history.shape[0] > 2 else 3
 
 
 class EnsembleArrays(Arrays):
@@ -25,8 +16,8 @@ class EnsembleArrays(Arrays):
 
     history = array("sizes", "H: how many samples of each signal are kept; and outputs and motors, if not a neck's")
     memory = array("1", "samples after which a held start has settled")
-    outputs = value("history", function=ensemble_outputs, written=True)
-    motors = value("history", function=ensemble_motors, written=True)
+    outputs = value("history", function=composed_outputs, written=True)
+    motors = value("history", function=composed_motors, written=True)
 
 
 class EnsembleState(StateVector):

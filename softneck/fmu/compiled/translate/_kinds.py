@@ -36,6 +36,10 @@ _NECKS = (
 )
 # Those that robots of other sizes have; once more for all of these, so that the neck's know their sizes beforehand.
 _ROBOTS = (
+    "softneck.identification.set_membership._nlsm_runtime",
+    "softneck.identification.structured._greybox_runtime",
+    "softneck.identification.uncertainty._residual_runtime",
+    "softneck.identification.uncertainty._ensemble_runtime",
     "softneck.identification.networks._nn_runtime",
     "softneck.identification.networks._nss_observed_runtime",
     "softneck.identification.linear._affine_runtime",
