@@ -32,6 +32,7 @@ def identify_auto(
     train: float,
     refit_all: bool,
     seed: int | None,
+    robot: str | None,
     html: Path | None,
     force: bool,
     as_json: bool,
@@ -49,7 +50,7 @@ def identify_auto(
         refuse_existing(file, force=overwrite)
     if html is not None:
         refuse_existing(html, force=force)
-    parts = [read_recording(source) for source in recordings]
+    parts = [read_recording(source, robot=robot) for source in recordings]
     head, tail, other = _split(parts, train)
     with progress("identify auto", quiet=as_json) as report:
         choice = choose(head, tail, other_excitation=other, seed=seed or 0, progress=report)

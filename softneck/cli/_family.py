@@ -12,6 +12,7 @@ from softneck.core import CheckFailedError, file_hash, refuse_existing
 
 from .shared._console import print_json, progress
 from .shared._options import apply_settings, force_option, json_option, output_option, set_option, target
+from .shared._robot import robot_option
 
 if TYPE_CHECKING:
     from softneck.identification import Family
@@ -35,6 +36,7 @@ _SCOPES = ("windows", "operating points", "recordings")
     help="Recording that the family is not fitted to, and judged by: where it needs more than the weight. Repeatable.",
 )
 @click.option("--html", type=click.Path(path_type=Path), help="Write a page with maps and the weight.")
+@robot_option
 @force_option
 @json_option
 def command(
@@ -43,6 +45,7 @@ def command(
     settings: tuple[str, ...],
     tests: tuple[Path, ...],
     html: Path | None,
+    robot: str | None,
     force: bool,
     as_json: bool,
 ) -> None:
@@ -60,7 +63,7 @@ def command(
     refuse_existing(path, force=replace)
     if html is not None:
         refuse_existing(html, force=force)
-    parts = [read_recording(source) for source in recordings]
+    parts = [read_recording(source, robot=robot) for source in recordings]
     if html is not None:
         for source, part in zip(recordings, parts, strict=True):
             part.robot.require_neck(f"{source}: `--html` of `family`")

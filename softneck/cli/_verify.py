@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from softneck.core import CheckFailedError, SettingsError, file_hash, load, refuse_existing, write_certificate
+from softneck.core import CheckFailedError, SettingsError, file_hash, refuse_existing, write_certificate
 from softneck.core._certificate import CERTIFICATE_ENDING
 from softneck.loop._loop import ORDERS
 
 from .shared._console import print_json, print_table, progress
 from .shared._options import force_option, json_option, output_option, target
+from .shared._robot import load_of, robot_option
 
 if TYPE_CHECKING:
     from softneck.verification import Verification
@@ -44,6 +45,7 @@ def _print_requirements(context: click.Context, _: click.Parameter, value: bool)
 @click.option(
     "--order", type=click.Choice(ORDERS), help="Order of the loop. [default: that of the controller's design]"
 )
+@robot_option
 @output_option("certificate", "CERTIFICATE")
 @click.option("--html", type=_PATH, help="Write a page with the verdict, and all behind it in plots.")
 @force_option
@@ -54,6 +56,7 @@ def command(
     requirements: Path | None,
     observer: Path | None,
     order: str | None,
+    robot: str | None,
     output: Path | None,
     html: Path | None,
     force: bool,
@@ -71,13 +74,13 @@ def command(
     if html is not None:
         refuse_existing(html, force=force)
     asked = read_requirements(requirements)
-    things, eyes = _opened(plants), None if observer is None else load(observer, role="observer")
+    things, eyes = _opened(plants, robot), None if observer is None else load_of(observer, robot, role="observer")
     files = {"controller": controller, **{f"plant {k}": item for k, item in enumerate(plants, start=1)}}
     files |= {} if requirements is None else {"requirements": requirements}
     files |= {} if observer is None else {"observer": observer}
     neck_file = Path(str(asked.neck["preset"]))
     files |= {"neck": neck_file} if neck_file.suffix == ".toml" else {}
-    judged = load(controller, role="controller")
+    judged = load_of(controller, robot, role="controller")
     with progress("verify", quiet=as_json) as report:
         found = verify(
             judged, things, asked, order=order, observer=eyes, progress=report,
@@ -98,10 +101,10 @@ def command(
         raise CheckFailedError(f"{controller}: {len(found.failed)} requirement(s) do not hold: {listed}.")
 
 
-def _opened(plants: tuple[Path, ...]) -> dict[str, Any]:
+def _opened(plants: tuple[Path, ...], robot: str | None) -> dict[str, Any]:
     things: dict[str, Any] = {}
     for item in plants:
-        thing = load(item)
+        thing = load_of(item, robot)
         if not hasattr(thing, "tf"):
             raise SettingsError(f"{item}: a linear MODEL or a FAMILY is needed; this is a {type(thing).__name__}.")
         things[item.name if item.name not in things else str(item)] = thing

@@ -142,7 +142,7 @@ def uncertain_plant(source: Any) -> UncertainPlant:
         )
     robot = robot_of(source)
     joined = _joined({axis: _of_model(source, axis) for axis in robot.outputs.names})
-    return joined if robot.is_neck else replace(joined, robot=robot, weights=_weights(source))
+    return replace(joined, robot=robot, weights=None if robot.is_neck else _weights(source))
 
 
 def _weights(source: Any) -> Matrix:

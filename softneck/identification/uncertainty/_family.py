@@ -256,7 +256,7 @@ class Family:
             "settings": self.settings,
             "findings": self.findings,
             "lpv_source": None if self.lpv is None else self.lpv.source,
-            **({} if self.robot.is_neck else {"robot": self.robot.as_dict()}),
+            **self.robot.in_header(),
         }
         if self.directions is not None:
             arrays["directions"] = self.directions
