@@ -3,8 +3,6 @@
 At rest on the reference nothing changes, so the loop keeps its operating point whatever its gain.
 """
 
-import math
-
 import numpy as np
 
 from softneck.runtime._layout import Arrays, StateVector, array, cells, value
@@ -43,7 +41,7 @@ def step(p: LouderArrays, parameters: np.ndarray, x: LouderState, inputs: np.nda
             held[j] = held[j - 1]
         held[0] = inputs[c] - inputs[p.n + c]
         # Between two samples a straight line: at a tenth of the sampling rate that is 1.6 % short, and no later.
-        whole = int(math.floor(parameters[half + axis]))
+        whole = int(parameters[half + axis])
         part = parameters[half + axis] - whole
         late = held[whole]
         if part > 0.0:

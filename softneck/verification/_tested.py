@@ -1,8 +1,8 @@
 """Margins of a tested family: of every response within the weight that its recordings support, in their band.
 
 At each frequency the loop is any point of a disk, `L = L0 (1 + W D)`, `|D| <= 1`; margins are those of the worst point,
-in closed form. Above the band nothing is known: a gain that moves the crossover of the worst loop there is not certified,
-and a loop that crosses there has no margin that the data support.
+in closed form. Above the band nothing is known: a gain that moves the crossover of the worst loop there is not
+certified, and a loop that crosses there has no margin that the data support.
 """
 
 from __future__ import annotations
@@ -57,9 +57,7 @@ class TestedAxis:
         )
 
 
-def tested_axis(
-    measured: AxisMeasured, law: LinearLaw, axis: int, *, source: str, name: str, extra: int
-) -> TestedAxis:
+def tested_axis(measured: AxisMeasured, law: LinearLaw, axis: int, *, source: str, name: str, extra: int) -> TestedAxis:
     """Return the margins of one axis that hold for every response within the weight.
 
     Args:
@@ -81,7 +79,7 @@ def tested_axis(
     if loud[-1] >= 1.0:
         crossover = math.inf
     mu = W * np.abs(L / (1.0 + L))
-    values = {key: item for key, item in _disk_margins(L, W, w).items()}
+    values = _disk_margins(L, W, w)
     # The gain at which the loudest loop would cross where nothing is known.
     values["gain_margin"] = np.minimum(values["gain_margin"], 1.0 / max(loud[-1], 1e-12))
     peaks = ("sensitivity", "complementary")
@@ -142,9 +140,7 @@ def _gain_ratio(L: np.ndarray, W: Vector) -> Vector:
     return np.minimum(*ratios)
 
 
-def tested_axes(
-    families: Mapping[str, Any], law: LinearLaw, axes: tuple[str, ...], extra: int
-) -> list[TestedAxis]:
+def tested_axes(families: Mapping[str, Any], law: LinearLaw, axes: tuple[str, ...], extra: int) -> list[TestedAxis]:
     """Return what the data support about every axis of every family that was tested against them."""
     return [
         tested_axis(measured, law, axes.index(axis), source=name, name=axis, extra=extra)
