@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from softneck.core import SettingsError, find_kind, refuse_existing, resolve
+from softneck.core import SettingsError, find_kind, refuse_existing, resolve, to_si
 
 from .shared._console import print_json
 from .shared._options import apply_settings, force_option, json_option, output_option, set_option, target
@@ -24,7 +23,9 @@ _FITTED = 0.7
 @click.command("observer", epilog="Example: softneck observer rls.npz -o observer.npz --sensor paper")
 @click.argument("model", type=click.Path(path_type=Path))
 @output_option("observer", "OBSERVER")
-@click.option("--sensor", help="Sensor preset: its noise is the measurement noise. [default: paper]")
+@click.option(
+    "--sensor", help="Sensor preset: its noise is the measurement noise. [default: paper; of another robot its own]"
+)
 @click.option(
     "--data",
     multiple=True,
@@ -90,7 +91,8 @@ def _fitted(
     parts = [recording.split(_FITTED) for recording in recordings]
     fit = fit_noise(observer, [head for head, _ in parts], fixed=fixed)
     held_out = concatenate([tail for _, tail in parts])
-    default, fitted = (math.degrees(bridging_error(item, held_out)) for item in (observer, fit.observer))
+    unit = observer.robot.outputs.display_unit
+    default, fitted = (bridging_error(item, held_out) / to_si(unit)[0] for item in (observer, fit.observer))
     kept = fitted < default
     before, after = fit.log_likelihood
     lines = [
@@ -100,7 +102,7 @@ def _fitted(
     if fit.at_bound:
         lines.append(f"  not determined by the data: {', '.join(fit.at_bound)}")
     verdict = "kept" if kept else "not better, so the default levels are kept"
-    lines.append(f"  gaps of 5 samples over {len(held_out)} rows held out: {default:.3f} deg RMS by the default "
+    lines.append(f"  gaps of 5 samples over {len(held_out)} rows held out: {default:.3f} {unit} RMS by the default "
                  f"{fitted:.3f} by the fitted levels: {verdict}")  # fmt: skip
     for path, recording in zip(data, recordings, strict=True):
         taken = fit.observer if kept else observer

@@ -39,6 +39,13 @@ _NOTE = (
     show_default=True,
     help="Free run from set-points alone, or with logged motor positions as the paper does.",
 )
+@click.option(
+    "--initial",
+    type=click.Choice(["warm", "cold"]),
+    default="warm",
+    show_default=True,
+    help="Free run from 25 measured samples, or from the first row only as an FMU starts.",
+)
 @click.option("--include-training", is_flag=True, help="Also score rows that the model was trained on.")
 @click.option(
     "--training",
@@ -55,6 +62,7 @@ def command(
     data: tuple[Path, ...],
     horizon: str,
     motors: str,
+    initial: str,
     include_training: bool,
     training: tuple[Path, ...],
     html: Path | None,
@@ -75,7 +83,7 @@ def command(
         refuse_existing(html, force=force)
     loaded = {str(path): load_of(path, robot, role="model") for path in models}
     recordings = {str(path): read_recording(path, robot=robot) for path in data}
-    rules = Rules(horizons, motors, include_training)
+    rules = Rules(horizons, motors, include_training, initial)
     known = read_together(training, robot) if training else None
     with progress("validate", quiet=as_json) as report:
         comparison = compare(loaded, recordings, rules=rules, training=known, progress=report)

@@ -41,6 +41,8 @@ _ROBOTS = (
     "softneck.identification.linear._affine_runtime",
     "softneck.identification.linear._state_space_runtime",
     "softneck.identification.structured._play_runtime",
+    "softneck.estimation._kalman_runtime",
+    "softneck.estimation._steady_kalman_runtime",
     "softneck.design.linear._linear_controller_runtime",
     "softneck.loop._reference_runtime",
 )
