@@ -297,7 +297,7 @@ _LINEAR_GROUPS = ("stability", "axes", "mimo", "robust", *AXES)
 
 
 def _unsupported(item: Requirement, evidence: Evidence) -> str:
-    """Return why the data do not support a linear requirement, "" where they do: the loop may cross above their band."""
+    """Return why the data do not support a linear requirement: the loop may cross above their band; else ""."""
     group = item.metric.partition(".")[0]
     if group not in _LINEAR_GROUPS:
         return ""
@@ -306,7 +306,7 @@ def _unsupported(item: Requirement, evidence: Evidence) -> str:
 
 
 def validity(evidence: Evidence, tested: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a certificate says of where it is valid: band, amplitudes, confidence, recordings; and the margins."""
+    """Return what a certificate says of where it is valid (band, amplitudes, confidence, recordings), and margins."""
     bands = np.array([part.band for part in evidence.tested])
     amplitudes = [size for item in tested.values() for size in item["amplitude"] if size > 0.0]
     simulated = crossing_values(evidence.crossings)

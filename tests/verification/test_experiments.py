@@ -37,7 +37,9 @@ def over(plants: Plants, row: int, *, cross: float = 0.0) -> LoopUnderTest:
         cross=(cross, cross), sample_time=TS,
     )  # fmt: skip
     inputs = {"load_pitch": 0.0, "load_roll": 0.0}
-    return LoopUnderTest(name="p", plant=lambda: BlockPart(block), controller=pi().block(), inputs=inputs, compiled=False)
+    return LoopUnderTest(
+        name="p", plant=lambda: BlockPart(block), controller=pi().block(), inputs=inputs, compiled=False
+    )
 
 
 def first(loop: LoopUnderTest, axes: str, what: str) -> float:
