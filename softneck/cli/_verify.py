@@ -110,7 +110,8 @@ def command(
 
 def _opened(plants: tuple[Path, ...], robot: str | None) -> dict[str, Any]:
     from softneck.cosim import FmuPart
-    from softneck.plant import PRESETS, NeckParameters
+    from softneck.plant import NeckParameters
+    from softneck.plant._presets import PRESETS
 
     things: dict[str, Any] = {}
     for item in plants:
