@@ -61,23 +61,28 @@ def command(
 ) -> None:
     """Verify CONTROLLER on every plant of the linear MODELs and FAMILYs and on the virtual neck.
 
+    Of another robot on the virtual plant that its robot.toml names, if it does.
+
     Writes a certificate: each requirement with its value, limit and worst plant, and the hashes of all files read;
     beside it a loop file for every worst plant, for `softneck simulate`. Exit code 1 if a requirement does not hold.
     """
+    from softneck.estimation._axis import robot_of
     from softneck.verification import read_requirements, verify
+    from softneck.verification._neck_loops import neck_file_of
 
     path, replace = target(output, f"certificates/{controller.stem}{CERTIFICATE_ENDING}", force=force, ending=".json")
     refuse_existing(path, force=replace)
     if html is not None:
         refuse_existing(html, force=force)
-    asked = read_requirements(requirements)
+    judged = load(controller, role="controller")
+    robot = robot_of(judged)
+    asked = read_requirements(requirements, robot=robot)
     things, eyes = _opened(plants), None if observer is None else load(observer, role="observer")
     files = {"controller": controller, **{f"plant {k}": item for k, item in enumerate(plants, start=1)}}
     files |= {} if requirements is None else {"requirements": requirements}
     files |= {} if observer is None else {"observer": observer}
-    neck_file = Path(str(asked.neck["preset"]))
+    neck_file = neck_file_of(robot, asked)
     files |= {"neck": neck_file} if neck_file.suffix == ".toml" else {}
-    judged = load(controller, role="controller")
     with progress("verify", quiet=as_json) as report:
         found = verify(
             judged, things, asked, order=order, observer=eyes, progress=report,

@@ -14,13 +14,15 @@ import numpy as np
 from softneck.core import DataError, Progress, SettingsError, silent
 from softneck.core._certificate import certificate_contents
 from softneck.estimation._axis import robot_of
+from softneck.signals.recording._recording import require_same_robot
 
 from ._agreement import Agreement, agreements
 from ._evidence import Evidence, gather, worst_row
 from ._laws import ControllerUnderTest, judge
 from ._neck_loops import check_blocks
-from ._plants import AXES, UncertainNeck, neck_of_family, neck_of_model
+from ._plants import UncertainNeck, neck_of_family, neck_of_model
 from ._requirements import Requirement, Requirements, read_requirements
+from ._scale import scaled
 from ._steps import check_ports
 from ._worst import write_linear, write_neck
 
@@ -141,13 +143,21 @@ class Verification:
             "nu_gap": [
                 {"source": neck.name, "axis": axis, "largest_gap": pair[i].gap.max(), "margin": pair[i].margin}
                 for part in evidence.linear[:1] for neck, pair in zip(self.necks, part.gaps, strict=True)
-                for i, axis in enumerate(AXES)
+                for i, axis in enumerate(neck.names)
             ],
             "settings": {
-                name: dict(getattr(self.requirements, name)) for name in ("uncertainty", "sampling", "step", "neck")
+                name: self.requirements.table(name) for name in ("uncertainty", "sampling", "step", "neck")
             },
+            **self._robot(),
         }  # fmt: skip
         return certificate_contents("verify", holds=self.holds, files=self.files, more=plain(more))
+
+    def _robot(self) -> dict[str, Any]:
+        """Return of another robot than the neck who it is, and by what the defaults were stretched to it."""
+        robot, (time, size) = self.controller.robot, self.requirements.scale
+        if robot.is_neck:
+            return {}
+        return {"robot": {"name": robot.name, "hash": robot.hash}, "scale": {"time": time, "size": size}}
 
     def write_worst(
         self, folder: str | Path, *, controller: str | Path, observer: str | Path | None = None, force: bool = False
@@ -160,20 +170,23 @@ class Verification:
             force: replace what stands there.
         """
         target, files = Path(folder), {}
+        axes = self.controller.robot.outputs.names
         for number, verdict in enumerate(self.verdicts):
             worst, name = dict(verdict.worst), verdict.requirement.metric.replace(".", "_")
             if worst.get("kind") == "linear":
                 facts = {
                     "name": worst["name"], "numerator": worst["numerator"], "denominator": worst["denominator"],
                     "delay": worst["delay_samples"], "cross": worst["cross"], "sample_time": worst["sample_time_s"],
-                    "axis": 1 if worst["axis"] == "roll" else 0,
+                    "axis": axes.index(worst["axis"]) if worst["axis"] in axes else 0,
                 }  # fmt: skip
                 files[number] = write_linear(
-                    target, name, facts, controller=Path(controller), step=self.requirements.step, force=force
-                )
+                    target, name, facts, controller=Path(controller), asked=self.requirements,
+                    weights=self.necks[0].weights, force=force,
+                )  # fmt: skip
             elif worst.get("kind") == "neck":
                 seen = None if observer is None else Path(observer)
-                files[number] = write_neck(target, name, worst, controller=Path(controller), observer=seen, force=force)
+                files[number] = write_neck(target, name, worst, controller=Path(controller), observer=seen, force=force,
+                                           robot=self.controller.robot)  # fmt: skip
         return files
 
 
@@ -223,15 +236,19 @@ def verify(
 
     Raises:
         SettingsError: another sample time, other channels, no plants.
+        DataError: controller, plants and observer of two robots.
     """
     begin = time.perf_counter()
-    asked = read_requirements() if requirements is None else requirements
-    for thing in (controller, *_named(plants).values(), *(() if observer is None else (observer,))):
-        robot_of(thing).require_neck("verification")
+    robot = robot_of(controller)
+    for what, thing in (*_named(plants).items(), *(() if observer is None else (("observer", observer),))):
+        require_same_robot(robot_of(thing), robot, f"the controller and {what}")
+    asked = read_requirements(robot=robot) if requirements is None else requirements.of_robot(robot)
+    if not robot.is_neck:
+        asked = scaled(asked, sources_of(_named(plants), asked))
     necks = sources_of(_named(plants), asked)
     eyes = None if observer is None else observer.block()
     judged = judge(controller, order=order, observer=observer is not None)
-    check_ports(judged.block)
+    check_ports(judged.block, robot)
     check_blocks(judged.block, eyes)
     for neck in necks:
         if not math.isclose(neck.sample_time, judged.block.sample_time, rel_tol=1e-6):
@@ -264,7 +281,7 @@ def _verdict(item: Requirement, evidence: Evidence) -> Verdict:
     values = evidence.metrics.get(item.metric)
     if values is None:
         group = item.metric.partition(".")[0]
-        group = "axes" if group in AXES else group
+        group = "axes" if group in evidence.plants.axes else group
         why = evidence.not_computed.get(item.metric, evidence.not_computed.get(group, "it was not computed"))
         note = f"not computed: {why}"
         return Verdict(item, None, False if item.asked else None, {}, note)
@@ -277,9 +294,9 @@ def _box(neck: UncertainNeck) -> dict[str, Any]:
     return {
         axis: {
             "nominal": box.nominal, "low": box.low, "high": box.high, "samples": box.samples.shape[0],
-            "unit": ["rad/rad", "1/s", "s"],
+            "unit": ["rad/rad" if neck.robot.is_neck else "SI", "1/s", "s"],
         }
-        for axis, box in zip(AXES, neck.axes, strict=True)
+        for axis, box in zip(neck.names, neck.axes, strict=True)
     }  # fmt: skip
 
 
