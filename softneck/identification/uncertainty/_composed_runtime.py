@@ -27,15 +27,4 @@ class ComposedArrays(Arrays):
 def composed_median(inorder: np.ndarray) -> float:
     """Return the median of numbers in order; of an even number of them the mean of the middle two."""
     count = inorder.shape[0]
-    return 0.5 * (inorder[(count - 1) // 2] + inorder[count // 2])
-
-
-def composed_sort(values: np.ndarray) -> None:
-    """Put a few numbers in order, in place: by insertion, for which `np.sort` takes long to compile and to start."""
-    for i in range(1, values.shape[0]):
-        value = values[i]
-        j = i
-        while j > 0 and values[j - 1] > value:
-            values[j] = values[j - 1]
-            j -= 1
-        values[j] = value
+    return float(0.5 * (inorder[(count - 1) // 2] + inorder[count // 2]))

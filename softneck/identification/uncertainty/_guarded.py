@@ -66,7 +66,7 @@ class Guarded:
     members: int = 5
     base: str | None = None
     agreement: float = 0.25
-    unseen: float = 0.4
+    unseen: float = 0.1
     fade: float = 0.3
     seed: int = 0
     workers: int | None = None

@@ -37,11 +37,11 @@ def done(jobs: Sequence[Job], workers: int, progress: Progress) -> list[Any]:
 
     pool = ProcessPoolExecutor(workers, timeout=None, initializer=_begin_worker, env=_ENVIRONMENT)
     try:
-        futures = {pool.submit(job.function, *job.arguments): job for job in jobs}
+        futures = [pool.submit(job.function, *job.arguments) for job in jobs]
         progress(0.0, f"{len(jobs)} models in {workers} processes")
         for number, future in enumerate(as_completed(futures), start=1):
             future.result()
-            progress(number / len(jobs), futures[future].name)
+            progress(number / len(jobs), f"{number} of {len(jobs)} models")
     except BaseException:
         pool.shutdown(wait=True, kill_workers=True)
         raise

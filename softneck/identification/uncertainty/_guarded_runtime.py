@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from softneck.identification.uncertainty._composed_runtime import ComposedArrays, composed_median, composed_sort
+from softneck.identification.uncertainty._composed_runtime import ComposedArrays, composed_median
 from softneck.runtime._layout import StateVector, array, cells, rest
 from softneck.runtime._members_runtime import member_count, member_initialise, member_size, member_step
 from softneck.runtime._random_runtime import random_normal, random_seed
@@ -67,16 +67,14 @@ def initialise(p: GuardedArrays, parameters: np.ndarray, x: GuardedState, output
 
 def guarded_distance(seen: np.ndarray, reach: float, motors: np.ndarray) -> float:
     """Return how far motors (motors,) are beyond the reach of all points that were seen [rad]."""
-    least = np.inf
+    least = math.inf
     for i in range(seen.shape[0]):
         total = 0.0
         for j in range(seen.shape[1]):
             gap = seen[i, j] - motors[j]
             total += gap * gap
-        if total < least:
-            least = total
-    beyond = math.sqrt(least) - reach
-    return beyond if beyond > 0.0 else 0.0
+        least = min(least, total)
+    return max(math.sqrt(least) - reach, 0.0)
 
 
 def guarded_weight(
@@ -88,9 +86,7 @@ def guarded_weight(
         apart = spread[axis]
         unseen = slope[axis] * distance
         # Over the base's variance: w = 1 / (1 + doubt).
-        own = (agreement * apart * apart + unseen * unseen) / (sigma[axis] * sigma[axis])
-        if own > doubt:
-            doubt = own
+        doubt = max(doubt, (agreement * apart * apart + unseen * unseen) / (sigma[axis] * sigma[axis]))
     return 1.0 / (1.0 + doubt)
 
 
@@ -118,11 +114,11 @@ def step(p: GuardedArrays, parameters: np.ndarray, x: GuardedState, inputs: np.n
     x.distance = guarded_distance(p.seen, p.reach[0], outputs[p.outputs : bounds])
     agreed = np.empty(p.outputs)
     for axis in range(p.outputs):
-        composed_sort(angles[axis])
-        agreed[axis] = composed_median(angles[axis])
+        inorder = np.sort(angles[axis])
+        agreed[axis] = composed_median(inorder)
         total = 0.0
         for i in range(count):
-            total += abs(angles[axis, i] - agreed[axis])
+            total += abs(inorder[i] - agreed[axis])
         x.spread[axis] = total / count
     move = guarded_weight(p.sigma, p.slope, p.fading[0], x.spread, x.distance) - x.weight
     x.weight += min(max(move, -p.fading[1]), p.fading[1])
