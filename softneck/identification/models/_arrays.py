@@ -17,7 +17,9 @@ from softneck.runtime._layout import Arrays, StateVector
 
 from ._linear_systems import AFFINE, STATE_SPACE
 
-COMPOSED = ("residual", "ensemble")
+COMPOSED = ("residual", "ensemble", "guarded")
+# A base and one other at least.
+_LEAST_MEMBERS = {"guarded": 2}
 # Of `nss` where the state is corrected by what is measured.
 OBSERVED_NSS = "softneck.identification.networks._nss_observed_runtime"
 
@@ -123,7 +125,7 @@ def _check_composed(kind: str, arrays: Mapping[str, Matrix]) -> None:
     own, parts = own_arrays(arrays), members(arrays)
     if tuple(arrays)[: len(own)] != names:
         raise FileFormatError(f"a model of kind {kind} starts with the arrays {', '.join(names)}.")
-    if len(parts) < 1 or (kind == "residual" and len(parts) != 1):
+    if len(parts) < _LEAST_MEMBERS.get(kind, 1) or (kind == "residual" and len(parts) != 1):
         raise FileFormatError(f"a model of kind {kind} cannot have {len(parts)} members.")
     _check_numbers(kind, own, KINDS[kind].runtime)
     for member, part in parts:

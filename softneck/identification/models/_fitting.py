@@ -24,7 +24,9 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 # Kinds that take any robot.
-ANY_ROBOT = ("rls", "oe", "srivc", "subspace", "play", "nss", "nn", "ensemble", "nlsm", "residual", "greybox")
+ANY_ROBOT = (
+    "rls", "oe", "srivc", "subspace", "play", "nss", "nn", "ensemble", "nlsm", "residual", "greybox", "guarded",
+)  # fmt: skip
 # Less than 2 s at 20 ms says nothing about a neck with a time constant of 0.2 s.
 MIN_ROWS = 100
 

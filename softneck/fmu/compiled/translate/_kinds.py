@@ -24,6 +24,7 @@ _NECKS = (
     "softneck.identification.structured._greybox_runtime",
     "softneck.identification.uncertainty._residual_runtime",
     "softneck.identification.uncertainty._ensemble_runtime",
+    "softneck.identification.uncertainty._guarded_runtime",
     "softneck.plant._neck_runtime",
     "softneck.estimation._kalman_runtime",
     "softneck.estimation._steady_kalman_runtime",
