@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,7 +36,7 @@ def _print_requirements(context: click.Context, _: click.Parameter, value: bool)
     epilog="Example: softneck verify pi.npz neck_family.npz -o pi.certificate.json --html pi.html",
 )
 @click.argument("controller", type=_PATH)
-@click.argument("plants", metavar="MODEL|FAMILY...", nargs=-1, required=True, type=_PATH)
+@click.argument("plants", metavar="MODEL|FAMILY|NECK|FMU...", nargs=-1, required=True, type=_PATH)
 @click.option("--requirements", type=_PATH, metavar="TOML", help="What must hold, where it differs from the defaults.")
 @click.option(
     "--print-requirements", is_flag=True, is_eager=True, expose_value=False, callback=_print_requirements,
@@ -62,25 +63,36 @@ def command(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Verify CONTROLLER on every plant of the linear MODELs and FAMILYs and on the virtual neck.
+    """Verify CONTROLLER on every plant of the linear MODELs and FAMILYs, and in loops over plants that step.
+
+    Those are nonlinear MODELs, NECKs (a neck file, or a preset by its name) and FMUs: on them margins are found by
+    experiment too. Without any the preset of the requirements is shown, which is a foreign plant and does not decide.
+
+    Of another robot on the virtual plant that its robot.toml names, if it does.
 
     Writes a certificate: each requirement with its value, limit and worst plant, and the hashes of all files read;
     beside it a loop file for every worst plant, for `softneck simulate`. Exit code 1 if a requirement does not hold.
     """
+    from softneck.estimation._axis import robot_of
     from softneck.verification import read_requirements, verify
+    from softneck.verification._neck_loops import neck_file_of
 
     path, replace = target(output, f"certificates/{controller.stem}{CERTIFICATE_ENDING}", force=force, ending=".json")
     refuse_existing(path, force=replace)
     if html is not None:
         refuse_existing(html, force=force)
-    asked = read_requirements(requirements)
+    judged = load_of(controller, robot, role="controller")
+    whose = robot_of(judged)
+    asked = read_requirements(requirements, robot=whose)
     things, eyes = _opened(plants, robot), None if observer is None else load_of(observer, robot, role="observer")
-    files = {"controller": controller, **{f"plant {k}": item for k, item in enumerate(plants, start=1)}}
+    files = {
+        "controller": controller,
+        **{f"plant {k}": item for k, item in enumerate(plants, start=1) if item.is_file()},
+    }
     files |= {} if requirements is None else {"requirements": requirements}
     files |= {} if observer is None else {"observer": observer}
-    neck_file = Path(str(asked.neck["preset"]))
+    neck_file = neck_file_of(whose, asked)
     files |= {"neck": neck_file} if neck_file.suffix == ".toml" else {}
-    judged = load_of(controller, robot, role="controller")
     with progress("verify", quiet=as_json) as report:
         found = verify(
             judged, things, asked, order=order, observer=eyes, progress=report,
@@ -102,11 +114,22 @@ def command(
 
 
 def _opened(plants: tuple[Path, ...], robot: str | None) -> dict[str, Any]:
+    from softneck.cosim import FmuPart
+    from softneck.plant import NeckParameters
+    from softneck.plant._presets import PRESETS
+
     things: dict[str, Any] = {}
     for item in plants:
-        thing = load_of(item, robot)
-        if not hasattr(thing, "tf"):
-            raise SettingsError(f"{item}: a linear MODEL or a FAMILY is needed; this is a {type(thing).__name__}.")
+        if item.suffix == ".fmu":
+            thing: Any = partial(FmuPart, item, role="plant")
+        elif item.suffix == ".toml" or (str(item) in PRESETS and not item.exists()):
+            thing = NeckParameters.preset(str(item))
+        else:
+            thing = load_of(item, robot)
+            if not hasattr(thing, "tf"):
+                raise SettingsError(
+                    f"{item}: a MODEL, FAMILY, NECK or FMU is needed; this is a {type(thing).__name__}."
+                )
         things[item.name if item.name not in things else str(item)] = thing
     return things
 

@@ -10,17 +10,21 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Progress, Vector
+from softneck.loop._result import shown_unit
 from softneck.runtime import Block
 
 from ._confidence import MarginInterval, intervals
+from ._experiments import Crossing, LoopUnderTest, crossing_facts, crossing_values, crossings
 from ._laws import ControllerUnderTest
 from ._linear import Gaps, LinearLaw, gaps, judged, margins
-from ._neck_loops import STEP_AT, NeckRun, neck_changes, run_necks
-from ._plants import AXES, Plants, UncertainNeck, all_plants, join, nominal_plants
+from ._neck_loops import STEP_AT, NeckRun, direction, neck_changes, no_virtual_plant, run_necks
+from ._own_plants import OwnPlant
+from ._plants import Plants, UncertainNeck, all_plants, join, nominal_plants
 from ._requirements import Requirements
 from ._search import SearchResult, search
 from ._steps import Steps, StepTest, run_steps
 from ._structured import StructuredResult, structured
+from ._tested import TestedAxis, tested_axes
 
 # Samples of delay that are added to see how the loop stands it.
 _DELAYS = 9
@@ -56,7 +60,7 @@ class LinearEvidence:
         margins: name -> (n,).
         found: by the search; None where it was switched off.
         structured: by neck.
-        gaps: by neck: pitch and roll.
+        gaps: by neck, of each axis.
         intervals: of the margins.
         delays: rows of (samples added, largest radius, least disk margin, largest sensitivity).
     """
@@ -67,7 +71,7 @@ class LinearEvidence:
     margins: dict[str, Vector]
     found: SearchResult | None
     structured: list[list[StructuredResult]]
-    gaps: list[tuple[Gaps, Gaps]]
+    gaps: list[tuple[Gaps, ...]]
     intervals: list[MarginInterval]
     delays: np.ndarray
 
@@ -84,6 +88,9 @@ class Evidence:
         necks: loops over the virtual neck.
         metrics: name -> values.
         not_computed: metric or check -> why.
+        foreign: whether `necks` are not the user's own plants.
+        tested: what the data support, of each axis of each family that was tested against them.
+        crossings: margins by experiment on the user's own plants.
     """
 
     plants: Plants
@@ -94,6 +101,9 @@ class Evidence:
     necks: list[NeckRun]
     metrics: dict[str, Values] = field(default_factory=dict)
     not_computed: dict[str, str] = field(default_factory=dict)
+    foreign: bool = True
+    tested: list[TestedAxis] = field(default_factory=list)
+    crossings: list[Crossing] = field(default_factory=list)
 
 
 def gather(
@@ -103,8 +113,20 @@ def gather(
     *,
     observer: Block | None,
     progress: Progress,
+    families: Mapping[str, Any] | None = None,
+    own: Sequence[OwnPlant] = (),
 ) -> Evidence:
-    """Compute all evidence; what the requirements do not need is computed too, where it is cheap."""
+    """Compute all evidence; what the requirements do not need is computed too, where it is cheap.
+
+    Args:
+        controller: that is judged.
+        necks: sources of linear plants.
+        asked: the requirements.
+        observer: of loops over plants that step.
+        progress: called now and then.
+        families: by name, those whose weight over the data is asked.
+        own: the user's plants that step.
+    """
     sources = list(necks)
     seed = int(asked.sampling["seed"])
     base = all_plants(sources, int(asked.sampling["plants"]), seed)
@@ -117,15 +139,35 @@ def gather(
     progress(0.5, "steps against every plant")
     stepped = join([plants, *(part.plants.take(np.arange(len(plants), len(part.plants))) for part in linear)])
     test = StepTest(
-        step=math.radians(asked.step["size_deg"]), duration=float(asked.step["duration_s"]),
-        noise=math.radians(asked.step["noise_deg"]), load=float(asked.step["load_rad"]), seed=seed,
+        step=asked.si(asked.step["size_deg"]), duration=float(asked.step["duration_s"]),
+        noise=asked.si(asked.step["noise_deg"]), load=asked.motor_si(float(asked.step["load_rad"])), seed=seed,
     )  # fmt: skip
-    steps = run_steps(stepped, controller.block, test)
+    steps = run_steps(stepped, controller.block, test, robot=controller.robot, weights=sources[0].weights)
+    why = no_virtual_plant(controller.robot, asked)
     runs = run_necks(
-        controller.block, asked.neck, order=controller.order, observer=observer, seed=seed,
-        progress=lambda done, text: progress(0.6 + 0.4 * done, text),
-    ) if asked.neck["necks"] else []  # fmt: skip
-    evidence = Evidence(plants, w, linear, steps, stepped, runs)
+        controller.block, asked, order=controller.order, observer=observer, seed=seed,
+        progress=lambda done, text: progress(0.6 + 0.2 * done, text), own=own,
+    ) if own or not why else []  # fmt: skip
+    payloads = sorted({float(kg) for kg in (min(asked.neck["payloads_kg"]), max(asked.neck["payloads_kg"]))})
+    loops = [
+        LoopUnderTest(
+            name=f"{plant.name}, {kg:g} kg" if plant.payload else plant.name, controller=controller.block,
+            plant=lambda plant=plant: plant.quiet(controller.block.sample_time), observer=observer,
+            order=controller.order, inputs={"payload": kg} if plant.payload else {},
+        )
+        for plant in own for kg in (payloads if plant.payload else (0.0,))
+    ]  # fmt: skip
+    found = crossings(loops, progress=lambda done, text: progress(0.8 + 0.2 * done, text)) if loops else []
+    tested = [
+        item
+        for law in controller.laws.values()
+        for item in tested_axes(families or {}, law, plants.axes, controller.extra)
+    ]
+    evidence = Evidence(
+        plants, w, linear, steps, stepped, runs, foreign=_foreign(asked, own), tested=tested, crossings=found
+    )
+    if why and not own:
+        evidence.not_computed["neck"] = why
     _tell(evidence, controller, asked, observer is not None)
     progress(1.0, "done")
     return evidence
@@ -139,20 +181,19 @@ def _linear(
     found = search(necks, law, w, extra=extra, generations=generations, seed=seed) if generations else None
     tried = plants if found is None else join([plants, found.plants.later(extra)])
     table = margins(tried, law, w)
-    drawn = np.random.default_rng(seed).uniform(-1.0, 1.0, (_SCALED, 2, 3))
+    drawn = np.random.default_rng(seed).uniform(-1.0, 1.0, (_SCALED, len(plants.axes), 3))
     drawn[: _SCALED // 3] = np.sign(drawn[: _SCALED // 3])
     wanted = any(item.metric == "robust.sensitivity" for item in asked.bounds)
     parts = [structured(neck, law, extra=extra, drawn=drawn, performance=wanted or detailed) for neck in necks]
     nominals = [plant.later(extra) for plant in nominal_plants(necks)]
     distances = []
     for source, nominal in enumerate(nominals):
-        first, second = gaps(nominal, tried.take(np.flatnonzero(tried.source == source)), law, w)
-        distances.append((first, second))
-    ratio = np.zeros((2, len(tried)))
-    for source, pair in enumerate(distances):
-        for i in (0, 1):
-            ratio[i, tried.source == source] = pair[i].ratio
-    table |= {f"{axis}.nu_gap_ratio": ratio[i] for i, axis in enumerate(AXES)}
+        distances.append(gaps(nominal, tried.take(np.flatnonzero(tried.source == source)), law, w))
+    ratio = np.zeros((len(plants.axes), len(tried)))
+    for source, each in enumerate(distances):
+        for i, found_gaps in enumerate(each):
+            ratio[i, tried.source == source] = found_gaps.ratio
+    table |= {f"{axis}.nu_gap_ratio": ratio[i] for i, axis in enumerate(plants.axes)}
     spread = [row for neck in necks for row in intervals(neck, law, w, extra=extra)] if detailed else []
     return LinearEvidence(name, law, tried, table, found, parts, distances, spread, _delays(plants, law, w))
 
@@ -162,10 +203,45 @@ def _delays(plants: Plants, law: LinearLaw, w: Vector) -> np.ndarray:
     few = plants.take(np.arange(min(_DELAY_PLANTS, len(plants))))
     for samples in range(_DELAYS):
         table = margins(few.later(samples), law, w)
-        disks = np.minimum(table["pitch.disk_margin"], table["roll.disk_margin"])
-        peaks = np.maximum(table["pitch.sensitivity"], table["roll.sensitivity"])
+        disks = np.min([table[f"{axis}.disk_margin"] for axis in plants.axes], axis=0)
+        peaks = np.max([table[f"{axis}.sensitivity"] for axis in plants.axes], axis=0)
         rows.append([samples, table["stability.radius"].max(), disks.min(), peaks.max()])
     return np.array(rows)
+
+
+def _foreign(asked: Requirements, own: Sequence[OwnPlant]) -> bool:
+    """Return whether the necks in the loops are presets that nobody asked to decide; a neck file is the user's own."""
+    if not asked.robot.is_neck and "preset" not in asked.own.get("neck", {}):
+        return False  # its own file says what stands for it
+    return not (own or asked.neck["decides"] or str(asked.neck["preset"]).endswith(".toml"))
+
+
+def _tell_data(evidence: Evidence) -> None:
+    """Add the margins that the data support, and those by experiment."""
+    for item in evidence.tested:
+        for name, value in item.margins.items():
+            about = _tested_describer(item, name)
+            for group in (item.axis, "axes"):
+                _add(evidence, f"{group}.{name}", Values(np.array([value]), about))
+        _add(evidence, "robust.mu", Values(np.array([item.mu]), _tested_describer(item, "mu")))
+    if not evidence.tested:
+        evidence.not_computed["the band of the data"] = (
+            "no FAMILY was given that is tested against data; all linear checks are about models alone"
+        )
+    for name, (values, behind) in crossing_values(evidence.crossings).items():
+        _add(evidence, name, Values(values, lambda row, behind=behind: crossing_facts(behind[row])))
+    if not evidence.crossings:
+        evidence.not_computed["margins by experiment"] = (
+            "no plant of yours that steps was given (a nonlinear MODEL, a NECK, an FMU)"
+        )
+
+
+def _tested_describer(item: TestedAxis, name: str) -> Describe:
+    facts = {
+        "kind": "data", "name": f"{item.source}: the weight over its recordings", "axis": item.axis,
+        "frequency_rad_s": item.at[name], "band_rad_s": list(item.band),
+    }  # fmt: skip
+    return lambda _: dict(facts)
 
 
 def _tell(evidence: Evidence, controller: ControllerUnderTest, asked: Requirements, observer: bool) -> None:
@@ -188,15 +264,19 @@ def _tell(evidence: Evidence, controller: ControllerUnderTest, asked: Requiremen
         absent["stability between frozen points"] = (
             "linear checks hold at frozen points; motion between them is simulated"
         )
+    _tell_data(evidence)
     for name, values in evidence.steps.metrics.items():
-        metrics[f"step.{name}"] = Values(values, _step_describer(evidence, name))
+        metrics[f"step.{asked.name_of(name)}"] = Values(values, _step_describer(evidence, name))
     if not evidence.necks:
-        absent["neck"] = "no loops over the virtual neck were asked for (necks = 0)"
         return
     describe = _neck_describer(evidence, controller, asked)
     for name in evidence.necks[0].metrics:
         values = np.array([run.metrics[name] for run in evidence.necks])
-        metrics[f"neck.{name}"] = Values(values, describe)
+        metrics[f"neck.{asked.name_of(name)}"] = Values(values, describe)
+    if np.isnan(metrics["neck.slack_s"].values).any():
+        del metrics["neck.slack_s"]
+        absent["neck.slack_s"] = "a plant tells no tensions; give a NECK, a file or a preset by its name"
+        return
     # What a heavier payload leaves of the pretension is no matter of the controller's.
     light = [k for k, run in enumerate(evidence.necks) if run.payload <= asked.neck["taut_up_to_kg"]]
     if light:
@@ -220,10 +300,11 @@ def _tell_linear(evidence: Evidence, part: LinearEvidence) -> None:
         worst = count + int(np.argmax(radius[count:]))
         _add(evidence, "stability.searched_radius", Values(met, lambda _: describe(worst)))
     for name, values in table.items():
-        _add(evidence, name, Values(values, _with_axis(describe, name)))
-    smaller = {name.partition(".")[2] for name in table if name.startswith("pitch.")}
+        _add(evidence, name, Values(values, _with_axis(describe, name, part.plants.axes)))
+    axes = part.plants.axes
+    smaller = {name.partition(".")[2] for name in table if name.startswith(f"{axes[0]}.")}
     for name in smaller:
-        for axis in AXES:
+        for axis in axes:
             _add(evidence, f"axes.{name}", evidence_of(part, f"{axis}.{name}", describe))
     for rows in part.structured:
         for row in rows:
@@ -235,7 +316,7 @@ def _tell_linear(evidence: Evidence, part: LinearEvidence) -> None:
 
 def evidence_of(part: LinearEvidence, name: str, describe: Describe) -> Values:
     """Return the values of one margin with a describer that knows its axis."""
-    return Values(part.margins[name], _with_axis(describe, name))
+    return Values(part.margins[name], _with_axis(describe, name, part.plants.axes))
 
 
 def _add(evidence: Evidence, name: str, more: Values) -> None:
@@ -252,16 +333,16 @@ def _add(evidence: Evidence, name: str, more: Values) -> None:
     evidence.metrics[name] = Values(np.concatenate([before.values, more.values]), describe)
 
 
-def _with_axis(describe: Describe, name: str) -> Describe:
+def _with_axis(describe: Describe, name: str, axes: tuple[str, ...]) -> Describe:
     axis = name.partition(".")[0]
-    return lambda row: {**describe(row), "axis": axis if axis in AXES else "both"}
+    return lambda row: {**describe(row), "axis": axis if axis in axes else "both"}
 
 
 def plant_facts(plants: Plants, row: int) -> dict[str, Any]:
     """Return one plant as JSON values."""
     axes = {
         axis: dict(zip(("static_gain_rad_per_rad", "pole_per_s", "dead_time_s"), numbers.tolist(), strict=True))
-        for axis, numbers in zip(AXES, plants.numbers[row], strict=True)
+        for axis, numbers in zip(plants.axes, plants.numbers[row], strict=True)
     }
     return {
         "kind": "linear", "name": plants.names[row], **axes, "cross": plants.cross[row].tolist(),
@@ -283,16 +364,19 @@ def _structured_describer(row: StructuredResult, point: str) -> Describe:
 
 def _step_describer(evidence: Evidence, name: str) -> Describe:
     worse = evidence.steps.worse[name]
-    return lambda row: {**plant_facts(evidence.stepped, row), "axis": AXES[int(worse[row])]}
+    return lambda row: {**plant_facts(evidence.stepped, row), "axis": evidence.stepped.axes[int(worse[row])]}
 
 
 def _neck_describer(evidence: Evidence, controller: ControllerUnderTest, asked: Requirements) -> Describe:
     def describe(row: int) -> dict[str, Any]:
         run = evidence.necks[row]
         size = float(asked.neck["size_deg"])
+        parameters = {} if run.parameters is None else neck_changes(run.parameters, controller.robot)
         return {
-            "kind": "neck", "name": run.name, "parameters": neck_changes(run.parameters), "payload_kg": run.payload,
-            "pitch_deg": size * math.cos(run.orientation), "roll_deg": size * math.sin(run.orientation),
+            "kind": "own" if run.parameters is None else "neck", "name": run.name, "parameters": parameters,
+            "payload_kg": run.payload,
+            **{f"{name}_{shown_unit(controller.robot)[0]}": size * share for name, share in
+               zip(controller.robot.outputs.names, direction(run.orientation, controller.robot), strict=True)},
             "seed": run.seed, "at_s": STEP_AT, "duration_s": STEP_AT + float(asked.neck["duration_s"]),
             "sample_time_s": controller.block.sample_time, "order": controller.order,
         }  # fmt: skip

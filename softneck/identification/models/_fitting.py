@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, Vector
+from softneck.core import DataError, Matrix, Vector, to_si
+from softneck.robot import Robot
 from softneck.signals import Recording, concatenate
 from softneck.signals.quality._poor_excitation import independent_motions
 
@@ -23,7 +24,9 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 # Kinds that take any robot.
-ANY_ROBOT = ("rls", "oe", "srivc", "subspace", "play", "nss", "nn", "ensemble")
+ANY_ROBOT = (
+    "rls", "oe", "srivc", "subspace", "play", "nss", "nn", "ensemble", "nlsm", "residual", "greybox", "guarded",
+)  # fmt: skip
 # Less than 2 s at 20 ms says nothing about a neck with a time constant of 0.2 s.
 MIN_ROWS = 100
 
@@ -170,6 +173,12 @@ def training_recording(
             "`oe`."
         )
     return recording
+
+
+def in_display_unit(robot: Robot, values: Vector) -> Vector:
+    """Return what is in the SI unit of the outputs in that in which people see them."""
+    unit = robot.outputs.display_unit
+    return np.degrees(values) if unit == "deg" else values / to_si(unit)[0]
 
 
 def fitted_model(

@@ -17,7 +17,7 @@ from ..models._arrays import members
 from ..models._fitting import ANY_ROBOT, one_recording
 from ..models._linear_systems import KINDS as LINEAR
 from ..models._model import Model
-from ..set_membership._set_membership import noise_level
+from ..set_membership._set_membership import noise_levels
 from ..uncertainty._ensemble import combine
 from ..uncertainty._residual import Residual
 from ..validation._score_tables import INFINITE
@@ -344,7 +344,7 @@ class _Race:
             return combine([model for model in best if model.kind != "residual"][:_MOST_MEMBERS])
         short = dict(_SCREENED.get(kind, {}))
         if kind in ("nlsm", "residual"):
-            short["epsilon"] = _SIGMAS * max(noise_level(train, axis) for axis in range(train.outputs.shape[1]))
+            short["epsilon"] = _SIGMAS * float(noise_levels(train).max())
         settings = _settings(kind, self.seed, short)
         return settings.on(best[0], train) if kind == "residual" and best else settings.fit(train)
 
