@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from softneck.core import SettingsError, find_kind, refuse_existing, resolve
+from softneck.core import SettingsError, find_kind, refuse_existing, resolve, to_si
 
 from .shared._console import print_json
 from .shared._options import apply_settings, force_option, json_option, output_option, set_option, target
+from .shared._robot import load_of, robot_option
 
 if TYPE_CHECKING:
     from softneck.estimation._noise import NoiseFit
@@ -23,7 +23,9 @@ _FITTED = 0.7
 @click.command("observer", epilog="Example: softneck observer rls.npz -o observer.npz --sensor paper")
 @click.argument("model", type=click.Path(path_type=Path))
 @output_option("observer", "OBSERVER")
-@click.option("--sensor", help="Sensor preset: its noise is the measurement noise. [default: paper]")
+@click.option(
+    "--sensor", help="Sensor preset: its noise is the measurement noise. [default: paper; of another robot its own]"
+)
 @click.option(
     "--data",
     multiple=True,
@@ -33,6 +35,7 @@ _FITTED = 0.7
     "measurement. May be given several times.",
 )
 @click.option("--gyro", is_flag=True, help="Driven by the gyro's rates, with their bias as a state (form=gyro).")
+@robot_option
 @set_option
 @force_option
 @json_option
@@ -42,6 +45,7 @@ def command(
     sensor: str | None,
     data: tuple[Path, ...],
     gyro: bool,
+    robot: str | None,
     settings: tuple[str, ...],
     force: bool,
     as_json: bool,
@@ -50,7 +54,6 @@ def command(
 
     Three forms: the model with a disturbance on each axis (default), --gyro, and --set form=kinematic.
     """
-    from softneck.identification import load_model
 
     kind = find_kind("kalman", "observer")
     path, replace = target(output, "observers/kalman.npz", force=force, ending=".npz")
@@ -58,11 +61,11 @@ def command(
     if gyro and any(setting.replace(" ", "").startswith("form=") for setting in settings):
         raise SettingsError("--gyro is the same as --set form=gyro; give only one of them.")
     chosen = apply_settings(resolve(kind.settings), settings, sensor=sensor, form="gyro" if gyro else None)
-    observer = chosen.design(load_model(model))
+    observer = chosen.design(load_of(model, robot, role="model"))
     told: dict[str, Any] = {}
     lines: list[str] = []
     if data:
-        fit, kept, lines = _fitted(observer, data, fixed=() if sensor is None else (observer.noise_names[0],))
+        fit, kept, lines = _fitted(observer, data, robot, fixed=() if sensor is None else (observer.noise_names[0],))
         observer = fit.observer if kept else observer
         told = {"fit": {"rows": fit.rows, "outliers": fit.outliers, "log_likelihood": list(fit.log_likelihood),
                         "at_bound": list(fit.at_bound), "kept": kept}}  # fmt: skip
@@ -75,18 +78,21 @@ def command(
     click.echo("\n".join([str(path), observer.summary(), *lines]))
 
 
-def _fitted(observer: Any, data: tuple[Path, ...], *, fixed: tuple[str, ...]) -> tuple[NoiseFit, bool, list[str]]:
+def _fitted(
+    observer: Any, data: tuple[Path, ...], robot: str | None, *, fixed: tuple[str, ...]
+) -> tuple[NoiseFit, bool, list[str]]:
     """Return noise levels fitted to the first part of each run, whether the rest speaks for them, and what to say."""
     # Imported here: `softneck --help` must not wait for scipy's optimisers.
     from softneck.estimation import consistency, fit_noise
     from softneck.estimation._consistency import bridging_error
     from softneck.signals import concatenate, read_recording
 
-    recordings = [read_recording(path) for path in data]
+    recordings = [read_recording(path, robot=robot) for path in data]
     parts = [recording.split(_FITTED) for recording in recordings]
     fit = fit_noise(observer, [head for head, _ in parts], fixed=fixed)
     held_out = concatenate([tail for _, tail in parts])
-    default, fitted = (math.degrees(bridging_error(item, held_out)) for item in (observer, fit.observer))
+    unit = observer.robot.outputs.display_unit
+    default, fitted = (bridging_error(item, held_out) / to_si(unit)[0] for item in (observer, fit.observer))
     kept = fitted < default
     before, after = fit.log_likelihood
     lines = [
@@ -96,7 +102,7 @@ def _fitted(observer: Any, data: tuple[Path, ...], *, fixed: tuple[str, ...]) ->
     if fit.at_bound:
         lines.append(f"  not determined by the data: {', '.join(fit.at_bound)}")
     verdict = "kept" if kept else "not better, so the default levels are kept"
-    lines.append(f"  gaps of 5 samples over {len(held_out)} rows held out: {default:.3f} deg RMS by the default "
+    lines.append(f"  gaps of 5 samples over {len(held_out)} rows held out: {default:.3f} {unit} RMS by the default "
                  f"{fitted:.3f} by the fitted levels: {verdict}")  # fmt: skip
     for path, recording in zip(data, recordings, strict=True):
         taken = fit.observer if kept else observer

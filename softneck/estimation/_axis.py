@@ -10,6 +10,7 @@ import numpy as np
 
 from softneck.core import DataError, Matrix, SettingsError, Vector
 from softneck.identification.models._directions import NECK_SECONDS
+from softneck.identification.models._linear_systems import weights_of
 from softneck.robot import Robot
 
 if TYPE_CHECKING:
@@ -186,6 +187,12 @@ def axis_plant(model: HasTransferFunctions, axis: str) -> AxisPlant:
 def robot_of(source: Any) -> Robot:
     """Return whose plant a linear model is; one that does not say is a neck's."""
     return getattr(source, "robot", Robot.preset())
+
+
+def directions_of(source: Any) -> Matrix:
+    """Return the weights (outputs, motors) of the motors in each axis: a family has its own, a model its findings'."""
+    own = getattr(source, "directions", None)
+    return weights_of(source) if own is None else np.asarray(own)
 
 
 def _stretch(model: HasTransferFunctions, denominator: Vector, sample_time: float) -> float:

@@ -16,21 +16,20 @@ from ._kalman import KalmanObserver
 from ._offline import Estimates
 from ._ukf import UkfObserver
 
-_DEGREES = 2
 # Samples averaged for a curve that shows where a filter is too sure: half a second at 100 Hz.
 _WINDOW = 50
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Squares:
-    """Normalised squares of one quantity, chi-square with 2 degrees of freedom for a consistent filter.
+    """Normalised squares of one quantity, of a consistent filter chi-square with a degree of freedom for each output.
 
     Attributes:
         time: (n,) [s] of the samples that count.
         values: (n,).
         band: both ends of the two-sided interval of `level` for one sample.
         inside: part of the values within the band; `level` is expected.
-        mean: 2 is expected; more: the filter is too sure of itself.
+        mean: the number of outputs is expected; more: the filter is too sure of itself.
         mean_band: interval of `level` for the mean of n independent values (Bar-Shalom 2001, sec. 5.4.2).
         average: (n,) running mean over `window` values.
         average_band: interval of `level` for one value of `average`.
@@ -55,7 +54,7 @@ class Consistency:
     Attributes:
         level: of all bands.
         nis: e' S^-1 e of every measurement that was taken in; outliers would drown what it says of the noise levels.
-        nees: (x - xhat)' P^-1 (x - xhat) of both angles; None where the truth is not known.
+        nees: (x - xhat)' P^-1 (x - xhat) of all outputs; None where the truth is not known.
         rejected: measurements that the gate refused; of good ones it refuses 1 - `gate_level`.
         autocorrelation: (20,) of the NIS at lags 1 to 20; of white innovations 95 % stay within +-1.96/sqrt(n).
     """
@@ -108,7 +107,7 @@ def consistency(
     nis = estimates.innovation[taken]
     return Consistency(
         level=level,
-        nis=_squares(estimates.time[taken], nis, level),
+        nis=_squares(estimates.time[taken], nis, level, len(recording.robot.outputs.names)),
         nees=_nees(observer, recording, estimates, counts, level),
         rejected=rows.size - taken.size,
         autocorrelation=_autocorrelation(nis),
@@ -118,7 +117,8 @@ def consistency(
 def _nees(
     observer: KalmanObserver | UkfObserver, recording: Recording, estimates: Estimates, counts: np.ndarray, level: float
 ) -> Squares | None:
-    if not all(f"{axis}_measured" in recording.channels for axis in ("pitch", "roll")):
+    names = recording.robot.outputs.names
+    if not all(f"{axis}_measured" in recording.channels for axis in names):
         return None
     parts, times = [], []
     start = 0
@@ -134,21 +134,21 @@ def _nees(
         parts.append(squares[good])
         times.append(run.time[good])
         start += len(run)
-    return _squares(np.concatenate(times), np.concatenate(parts), level)
+    return _squares(np.concatenate(times), np.concatenate(parts), level, len(names))
 
 
-def _squares(time: Vector, values: Vector, level: float) -> Squares:
+def _squares(time: Vector, values: Vector, level: float, degrees: int) -> Squares:
     from scipy.stats import chi2
 
     tails = np.array([0.5 - 0.5 * level, 0.5 + 0.5 * level])
-    low, high = chi2.ppf(tails, _DEGREES)
+    low, high = chi2.ppf(tails, degrees)
     n = values.size
     window = min(_WINDOW, n)
     sums = np.cumsum(np.concatenate([[0.0], values]))
     average = np.full(n, np.nan)
     average[window - 1 :] = (sums[window:] - sums[:-window]) / window
-    mean_low, mean_high = chi2.ppf(tails, _DEGREES * n) / n
-    part_low, part_high = chi2.ppf(tails, _DEGREES * window) / window
+    mean_low, mean_high = chi2.ppf(tails, degrees * n) / n
+    part_low, part_high = chi2.ppf(tails, degrees * window) / window
     return Squares(
         time=time,
         values=values,
@@ -176,7 +176,7 @@ _SETTLE = 50
 
 
 def bridging_error(observer: KalmanObserver, recording: Recording) -> float:
-    """Return the RMS [rad] between angles measured in gaps of five samples and what the filter says without them.
+    """Return the RMS [SI] between outputs measured in gaps of five samples and what the filter says without them.
 
     Likelihood rewards levels that trust any measurement where the model is wrong; a gap shows what they cost.
 
@@ -190,8 +190,9 @@ def bridging_error(observer: KalmanObserver, recording: Recording) -> float:
     row = np.concatenate([np.arange(len(run)) for run in recording.runs()])
     gap = (row >= _SETTLE) & (row % _PERIOD >= _PERIOD - _GAP)
     # As `measured_angles` takes them: beside a column of the measurement, `pitch` is the truth.
-    kind = "_measured" if {"pitch_measured", "roll_measured"} <= set(recording.channels) else ""
-    names = (f"pitch{kind}", f"roll{kind}")
+    axes = recording.robot.outputs.names
+    kind = "_measured" if {f"{axis}_measured" for axis in axes} <= set(recording.channels) else ""
+    names = [f"{axis}{kind}" for axis in axes]
     measured = np.column_stack([recording.channels[name] for name in names])
     judged = gap & np.isfinite(measured).all(axis=1)
     if not judged.any():

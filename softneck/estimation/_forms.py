@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, Vector
+from softneck.core import Matrix, SettingsError, Vector, to_si
+from softneck.robot import Robot
 
 from ._axis import AxisPlant
 from ._kalman_parts_runtime import KALMAN_DIVIDER, KalmanArrays
@@ -24,29 +25,46 @@ NOISES: dict[str, tuple[tuple[str, str], ...]] = {
     ),
     "gyro": (("measurement_noise_std", "rad"), ("gyro_noise_std", "rad/s"), ("bias_noise_std", "rad/s")),
 }
-STATES = {
-    "model": "model and disturbance of pitch and roll",
-    "kinematic": "angle and rate of pitch and roll",
-    "gyro": "angle and gyro bias of pitch and roll",
-}
-# The neck reaches some 40 deg (paper, section 5): so far off may the first angle be.
-_START_STD = math.radians(40.0)
-# Set-points may stand anywhere in +-6 rad when a filter starts: a third of it as standard deviation.
+STATES = {"model": "model and disturbance", "kinematic": "angle and rate", "gyro": "angle and gyro bias"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reach:
+    """How far and how fast a robot's outputs go, in SI; the defaults are the neck's.
+
+    Attributes:
+        start: standard deviation of the first output when nothing is known; the neck reaches some 40 deg (paper,
+            section 5).
+        held: of an output that set-points hold which may stand anywhere; None: what 2 rad do, a third of the neck's
+            range.
+        rate: what the rate may be when nothing tells it [1/s]; the neck moves by up to 0.8 deg in 20 ms.
+        bias: of a gyro that was not zeroed [1/s]; up to some deg/s (MPU-9250 data sheet: 5).
+    """
+
+    start: float = math.radians(40.0)
+    held: float | None = None
+    rate: float = math.radians(40.0)
+    bias: float = math.radians(5.0)
+
+
+_NECK = Reach()
 _START_INPUT = 2.0
-# The neck moves by up to 0.8 deg in 20 ms: what its rate may be when nothing tells it [rad/s].
-RATE_STD = math.radians(40.0)
-# A gyro that was not zeroed is off by up to some deg/s (MPU-9250 data sheet: 5).
-_START_BIAS = math.radians(5.0)
+
+
+def noise_units(form: str, robot: Robot) -> tuple[tuple[str, str], ...]:
+    """Return name and SI unit of the noise levels of a form for a robot's outputs."""
+    unit = to_si(robot.outputs.unit)[1]
+    return tuple((name, told.replace("rad", unit)) for name, told in NOISES[form])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FilterMatrices:
-    """Matrices of both axes together, as the runtime takes them.
+    """Matrices of all axes together, as the runtime takes them.
 
     Attributes:
         F: (n, n) state over one sample.
-        B: (n, 2) of the inputs.
-        H: (2, n) angles.
+        B: (n, outputs) of the inputs.
+        H: (outputs, n) angles.
         first_noise, second_noise: (n, n) unit covariances of the process noises.
         start: (n, n) covariance when nothing is known.
         forced: (n, n) added before a measurement is taken in by force.
@@ -66,7 +84,7 @@ class FilterMatrices:
         return (*items, sources, constants)
 
 
-def model_form(plants: Sequence[AxisPlant]) -> FilterMatrices:
+def model_form(plants: Sequence[AxisPlant], reach: Reach = _NECK) -> FilterMatrices:
     """Return model states and an output disturbance that walks, on each axis."""
     from scipy.linalg import solve_discrete_lyapunov
 
@@ -78,34 +96,35 @@ def model_form(plants: Sequence[AxisPlant]) -> FilterMatrices:
         QM[0, 0] = QW[-1, -1] = 1.0
         # The model's spread under a white input, scaled to what set-points of _START_INPUT held for long do.
         spread = np.asarray(solve_discrete_lyapunov(A, np.outer(b, b)))
-        spread *= (_START_INPUT * plant.static_gain) ** 2 / spread[0, 0]
-        P0 = _diagonal(0.5 * (spread + spread.T), _START_STD**2 * np.eye(1))
+        held = _START_INPUT * plant.static_gain if reach.held is None else reach.held
+        spread *= held**2 / spread[0, 0]
+        P0 = _diagonal(0.5 * (spread + spread.T), reach.start**2 * np.eye(1))
         axes.append((F, np.append(b, 0.0)[:, None], np.append(c, 1.0)[None, :], QM, QW, P0, P0))
-    return _both(axes)
+    return _all(axes)
 
 
-def kinematic_form(sample_time: float) -> FilterMatrices:
+def kinematic_form(sample_time: float, outputs: int = 2, reach: Reach = _NECK) -> FilterMatrices:
     """Return angle and rate, driven by an acceleration constant over each sample (Bar-Shalom 2001, sec. 6.3.2)."""
     T = sample_time
     F = np.array([[1.0, T], [0.0, 1.0]])
     g = np.array([0.5 * T * T, T])
-    P0 = np.diag([_START_STD**2, RATE_STD**2])
+    P0 = np.diag([reach.start**2, reach.rate**2])
     axis = (F, np.zeros((2, 1)), np.array([[1.0, 0.0]]), np.outer(g, g), np.diag([1.0, 0.0]), P0, P0)
-    return _both([axis, axis])
+    return _all([axis] * outputs)
 
 
-def gyro_form(sample_time: float) -> FilterMatrices:
+def gyro_form(sample_time: float, outputs: int = 2, reach: Reach = _NECK) -> FilterMatrices:
     """Return angle and gyro bias: the angle rises by what the gyro says minus its bias (Lefferts 1982)."""
     T = sample_time
     F = np.array([[1.0, -T], [0.0, 1.0]])
-    P0 = np.diag([_START_STD**2, _START_BIAS**2])
+    P0 = np.diag([reach.start**2, reach.bias**2])
     # A measurement taken in by force moves the angle; the bias is none the worse for it.
-    forced = np.diag([_START_STD**2, 0.0])
+    forced = np.diag([reach.start**2, 0.0])
     axis = (F, np.array([[T], [0.0]]), np.array([[1.0, 0.0]]), np.diag([T * T, 0.0]), np.diag([0.0, 1.0]), P0, forced)
-    return _both([axis, axis])
+    return _all([axis] * outputs)
 
 
-def _both(axes: Sequence[tuple[Matrix, ...]]) -> FilterMatrices:
+def _all(axes: Sequence[tuple[Matrix, ...]]) -> FilterMatrices:
     return FilterMatrices(*(_diagonal(*(axis[i] for axis in axes)) for i in range(7)))
 
 
@@ -140,13 +159,13 @@ def steady_covariance(arrays: tuple[Matrix, ...], noise: tuple[float, float, flo
 
 def steady_gains(arrays: tuple[Matrix, ...], noise: tuple[float, float, float]) -> tuple[Matrix, ...]:
     """Return gain and inverse innovation covariance in steady state, at the start and by force: six matrices."""
-    P, p, R = steady_covariance(arrays, noise), KalmanArrays(arrays), noise[0] ** 2 * np.eye(2)
+    P, p, R = steady_covariance(arrays, noise), KalmanArrays(arrays), system(arrays, noise)[3]
     pairs = (gain(P, p.H, R), gain(P + p.P0, p.H, R), gain(P + p.PF, p.H, R))
     return tuple(np.ascontiguousarray(matrix) for pair in pairs for matrix in pair)
 
 
 def gain(P: Matrix, H: Matrix, R: Matrix) -> tuple[Matrix, Matrix]:
-    """Return K = P H' S^-1 (n, 2) and S^-1 (2, 2)."""
+    """Return K = P H' S^-1 (n, outputs) and S^-1 (outputs, outputs)."""
     SI = np.linalg.inv(H @ P @ H.T + R)
     return P @ H.T @ SI, SI
 
@@ -155,4 +174,4 @@ def system(arrays: tuple[Matrix, ...], noise: tuple[float, float, float]) -> tup
     """Return F, H, Q and R of one sample."""
     p = KalmanArrays(arrays)
     measurement, first, second = noise
-    return p.F, p.H, first**2 * p.first_noise + second**2 * p.second_noise, measurement**2 * np.eye(2)
+    return p.F, p.H, first**2 * p.first_noise + second**2 * p.second_noise, measurement**2 * np.eye(len(p.H))

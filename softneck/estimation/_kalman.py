@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,20 +12,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import FileFormatError, Matrix, SettingsError, Vector, write_archive
+from softneck.core import FileFormatError, Matrix, SettingsError, Vector, to_si, write_archive
+from softneck.robot import Robot
 from softneck.runtime import Block, Port, State
+from softneck.runtime._bundle import sized
 from softneck.signals import Recording
 
-from ._forms import NOISES, STATES, steady_gains, system
+from ._forms import NOISES, STATES, noise_units, steady_gains, system
 from ._kalman_parts_runtime import (
     KALMAN_DIVIDER,
     KALMAN_FROZEN,
     KALMAN_GATE,
-    KALMAN_LAG,
     KALMAN_LEAD,
+    KALMAN_MORE_LAGS,
     KALMAN_REJECTIONS,
     KALMAN_TIMEOUT,
     KalmanArrays,
+    kalman_lag,
 )
 from ._offline import Estimates, filter_recording, smooth_recording
 from ._steady_kalman_runtime import SteadyKalmanArrays
@@ -36,7 +39,7 @@ if TYPE_CHECKING:
 
 _RUNTIME = "softneck.estimation._kalman_runtime"
 _STEADY = "softneck.estimation._steady_kalman_runtime"
-_MEASURED = ("pitch", "roll")
+_NECK = Robot.preset("neck")
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -47,10 +50,12 @@ class KalmanObserver:
         form: "model", "gyro" or "kinematic".
         sample_time: [s].
         arrays: those of `KalmanArrays`; with steady gains those of `SteadyKalmanArrays`.
-        noise: standard deviations, named and in the units of `noise_names`.
-        sensor: name of the preset, "none" where the noise was given, "data" where it was estimated.
+        noise: standard deviations, named as `noise_names`, in SI.
+        sensor: name of the preset, "none" where the noise was given, "data" where it was estimated, "robot" where the
+            robot's file says it.
         order: of the loop it is for.
         gate_level: chi-square level of the gate.
+        robot: whose outputs it estimates.
     """
 
     form: str = "model"
@@ -60,6 +65,7 @@ class KalmanObserver:
     sensor: str
     order: str
     gate_level: float
+    robot: Robot = _NECK
 
     def __post_init__(self) -> None:
         for name in ("first_noise", "second_noise", "P0", "PF"):
@@ -70,10 +76,10 @@ class KalmanObserver:
         return KalmanArrays(self.arrays)
 
     @property
-    def delays(self) -> tuple[int, int]:
-        """Samples that set-points need to act on pitch and roll, beyond the first; 0 where they do not act."""
-        pitch, roll = self._named.constants[KALMAN_LAG : KALMAN_LAG + 2]
-        return (int(pitch), int(roll)) if self.form == "model" else (0, 0)
+    def delays(self) -> tuple[int, ...]:
+        """Samples that set-points need to act on each output, beyond the first; 0 where they do not act."""
+        acts, axes = self.form == "model", range(len(self.robot.outputs.names))
+        return tuple(int(kalman_lag(self._named.constants, axis)) if acts else 0 for axis in axes)
 
     @property
     def noise_names(self) -> tuple[str, ...]:
@@ -93,7 +99,7 @@ class KalmanObserver:
     def with_noise(self, noise: Sequence[float], *, sensor: str = "none") -> KalmanObserver:
         """Return the same filter with other noise levels, steady gains made anew."""
         levels = (float(noise[0]), float(noise[1]), float(noise[2]))
-        for (name, unit), value in zip(NOISES[self.form], levels, strict=True):
+        for (name, unit), value in zip(noise_units(self.form, self.robot), levels, strict=True):
             if not (math.isfinite(value) and value > 0.0):
                 raise SettingsError(f"`{name}` must be positive [{unit}]; got {value}.")
         bare = dataclasses.replace(self, noise=levels, sensor=sensor, arrays=self.arrays[: len(KalmanArrays.names())])
@@ -106,19 +112,22 @@ class KalmanObserver:
 
     def block(self) -> Block:
         """Return the filter as a block of role "observer"."""
-        inputs, outputs = observer_ports(self.form)
-        levels = list(zip(NOISES[self.form], self.noise, strict=True))
+        inputs, outputs = observer_ports(self.form, self.robot)
+        levels = list(zip(noise_units(self.form, self.robot), self.noise, strict=True))
+        least, most = (1e-9, 1e3) if self.robot.is_neck else (0.0, None)
         return Block(
             kind="kalman",
             role="observer",
-            runtime=_STEADY if self.is_steady else _RUNTIME,
+            runtime=sized(
+                _STEADY if self.is_steady else _RUNTIME, len(self.robot.motors.names), len(self.robot.outputs.names)
+            ),
             sample_time=self.sample_time,
             arrays=self.arrays,
             inputs=inputs,
             outputs=outputs,
             parameters=tuple(
                 # Levels of process noise are part of constant gains and cannot be changed there.
-                Port(name=name, unit=unit, start=value, minimum=1e-9, maximum=1e3 if unit != "rad" else math.pi,
+                Port(name=name, unit=unit, start=value, minimum=least, maximum=most if unit != "rad" else math.pi,
                      description="standard deviation")
                 for (name, unit), value in (levels[:1] if self.is_steady else levels)
             ),
@@ -133,15 +142,15 @@ class KalmanObserver:
         return self.block().step(state, inputs)
 
     def filterpy(self) -> KalmanFilter:
-        """Return a configured `filterpy.kalman.KalmanFilter` (2 inputs, 2 measurements).
+        """Return a configured `filterpy.kalman.KalmanFilter`, an input and a measurement for each output.
 
-        Give `predict(u)` the inputs that act, (2, 1): delayed theta_i and phi_i, or rates of the gyro; and
+        Give `predict(u)` the inputs that act, (outputs, 1): delayed theta_i and phi_i, or rates of the gyro; and
         `update(None)` where nothing was measured: a NaN in `update` would stay in its state for good.
         """
         from filterpy.kalman import KalmanFilter
 
         F, H, Q, R = system(self.arrays, self.noise)
-        kf: Any = KalmanFilter(dim_x=F.shape[0], dim_z=2, dim_u=2)
+        kf: Any = KalmanFilter(dim_x=F.shape[0], dim_z=H.shape[0], dim_u=H.shape[0])
         kf.F, kf.B, kf.H = F.copy(), self._named.B.copy(), H.copy()
         kf.P, kf.Q, kf.R = self._named.P0.copy(), Q, R
         return kf
@@ -163,16 +172,18 @@ class KalmanObserver:
 
     def summary(self) -> str:
         """Return some lines for people."""
-        n, c, d = len(self._named.F), self._named.constants, self.delays
-        acts = f"; set-points act after {d[0] + 1} and {d[1] + 1} samples" if self.form == "model" else ""
+        n, c = len(self._named.F), self._named.constants
+        acts = f"; set-points act after {_and(d + 1 for d in self.delays)} samples" if self.form == "model" else ""
+        shown, si = to_si(self.robot.outputs.display_unit)
         levels = [
-            f"{name.removesuffix('_noise_std')} {math.degrees(value):.3g} {unit.replace('rad', 'deg')}"
-            for (name, unit), value in zip(NOISES[self.form], self.noise, strict=True)
+            f"{name.removesuffix('_noise_std')} {value / shown:.3g} "
+            f"{unit.replace(si, self.robot.outputs.display_unit, 1)}"
+            for (name, unit), value in zip(noise_units(self.form, self.robot), self.noise, strict=True)
         ]
         lines = [
             f"kalman observer, {self.sample_time * 1e3:g} ms, {self.order} order, sensor {self.sensor}",
             f"  {self.form} form, {'constant gains' if self.is_steady else 'gains from the covariance'}",
-            f"  {n} states: {STATES[self.form]}{acts}",
+            f"  {n} states: {STATES[self.form]} of {_and(self.robot.outputs.names)}{acts}",
             f"  noise: {', '.join(levels)}",
             f"  gate: chi-square level {self.gate_level:g} (innovation <= {c[KALMAN_GATE]:.3g}); "
             f"by force after {c[KALMAN_REJECTIONS]:g} rejections",
@@ -199,6 +210,7 @@ class KalmanObserver:
             "inputs": [port.name for port in block.inputs],
             "outputs": [port.name for port in block.outputs],
             "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
+            **({} if self.robot.is_neck else {"robot": self.robot.as_dict()}),
         }
         names = SteadyKalmanArrays.names()  # of a filter without steady gains the first
         write_archive(path, header, dict(zip(names, self.arrays, strict=False)), force=force)
@@ -208,8 +220,12 @@ class KalmanObserver:
         """Return the observer that `save` wrote; `softneck.core.load` calls this."""
         form = str(header["form"])
         items = (SteadyKalmanArrays if "gain" in arrays else KalmanArrays).read(arrays)
-        if items["sources"].shape[1] != (2 if form == "gyro" else 3):
+        robot = Robot.from_dict(header["robot"]) if "robot" in header else _NECK
+        outputs, motors = len(robot.outputs.names), len(robot.motors.names)
+        if items["sources"].shape != (outputs, outputs if form == "gyro" else motors):
             raise FileFormatError(f"its array `sources` is not of form {form}; design the observer again.")
+        if items["constants"].size != KALMAN_MORE_LAGS + max(outputs - 2, 0):
+            raise FileFormatError("its array `constants` has another length; design the observer again.")
         levels = [float(header["noise"][name]) for name, _ in NOISES[form]]
         try:
             return cls(
@@ -220,27 +236,44 @@ class KalmanObserver:
                 sensor=str(header["sensor"]),
                 order=str(header["order"]),
                 gate_level=float(header["gate_level"]),
+                robot=robot,
             )
         except SettingsError as error:
             raise FileFormatError(f"{error} Design the observer again.") from error
 
 
-def observer_ports(form: str) -> tuple[tuple[Port, ...], tuple[Port, ...]]:
+def observer_ports(form: str, robot: Robot = _NECK) -> tuple[tuple[Port, ...], tuple[Port, ...]]:
     """Return the inputs and outputs of a filter of one form."""
-    u = tuple(Port(name=f"motor_setpoint_{j}", unit="rad", minimum=-6.0, maximum=6.0) for j in (1, 2, 3))
-    y = tuple(Port(name=f"{a}_measured", unit="rad", description=f"measured {a}", missing=True) for a in _MEASURED)
-    valid = Port(name="measurement_valid", description="whether the angles were measured", start=1.0, boolean=True)
+    names, unit, motor = robot.outputs.names, to_si(robot.outputs.unit)[1], to_si(robot.motors.unit)[1]
+    most = 6.0 if robot.is_neck else None
+    # What people see of a neck's angles is usual.
+    shown, told = ("", "") if robot.is_neck else (robot.outputs.display_unit, robot.motors.unit)
+    u = tuple(
+        Port(name=name, unit=motor, minimum=None if most is None else -most, maximum=most, display_unit=told)
+        for name in robot.set_points
+    )
+    y = tuple(
+        Port(name=f"{a}_measured", unit=unit, description=f"measured {a}", missing=True, display_unit=shown)
+        for a in names
+    )
+    what = "angles" if robot.is_neck else "outputs"
+    valid = Port(name="measurement_valid", description=f"whether the {what} were measured", start=1.0, boolean=True)
     rates = tuple(
-        Port(name=f"{a}_rate_measured", unit="rad/s", description=f"{a} rate of the gyro", missing=True)
-        for a in _MEASURED
+        Port(name=f"{a}_rate_measured", unit=f"{unit}/s", description=f"{a} rate of the gyro", missing=True)
+        for a in names
     )
     outputs = (
-        *(Port(name=a, unit="rad", description=f"estimated {a}") for a in _MEASURED),
-        *(Port(name=f"{a}_rate", unit="rad/s", description=f"estimated rate of {a}") for a in _MEASURED),
+        *(Port(name=a, unit=unit, description=f"estimated {a}", display_unit=shown) for a in names),
+        *(Port(name=f"{a}_rate", unit=f"{unit}/s", description=f"estimated rate of {a}") for a in names),
         Port(name="innovation", description="normalised innovation squared; 0 when nothing was measured"),
         Port(name="healthy", description="a measurement was accepted in time", boolean=True),
     )
     return (*u, *y, valid, *(rates if form == "gyro" else ())), outputs
+
+
+def _and(items: Iterable[object]) -> str:
+    *most, last = (str(item) for item in items)
+    return f"{', '.join(most)} and {last}" if most else last
 
 
 def _require_covariance(name: str, P: Matrix) -> None:

@@ -8,7 +8,7 @@ from softneck.runtime._compiled_runtime import COMPILED
 from softneck.runtime._layout import Arrays, StateVector, array, cells, value
 
 # Places in `constants`.
-KALMAN_LAG = 0  # and 1: samples that the inputs of the two axes need to act; parts of a sample are interpolated
+KALMAN_LAG = 0  # and 1: samples that inputs of the first two axes need to act; parts of a sample are interpolated
 KALMAN_GATE = 2  # largest normalised innovation squared
 KALMAN_REJECTIONS = 3  # in a row, then the next measurement is taken in by force
 KALMAN_TIMEOUT = 4  # samples without an accepted measurement until unhealthy
@@ -17,7 +17,8 @@ KALMAN_LEAD = 6  # samples from the filter's time to now: how late measurements 
 KALMAN_DIVIDER = 7  # samples of the filter per sample of the sensor
 KALMAN_FROZEN = 8  # identical measurements that mean a frozen sensor; 0: never
 KALMAN_GYRO = 9  # 1: the sources are the gyro's rates, 0: the set-points
-KALMAN_GAP = 10  # what the angle may do unseen in a sample without gyro [rad]
+KALMAN_GAP = 10  # what an output may do unseen in a sample without gyro [rad]
+KALMAN_MORE_LAGS = 11  # those of further axes
 # Memory of the mean square: some 20 samples, as many as a frozen sensor needs to be told.
 KALMAN_KEEP = 0.95
 # A sensor that scatters by less than a tenth of its stated noise is a simulated one, and may well stand still.
@@ -28,22 +29,35 @@ def kalman_line_length(c: np.ndarray) -> int:
     """Return how many past inputs each axis keeps."""
     # One sample more where a lag lies between two: a straight line needs both ends.
     longest = max(c[KALMAN_LAG], c[KALMAN_LAG + 1])
+    for i in range(KALMAN_MORE_LAGS, c.shape[0]):
+        longest = max(longest, c[i])
     whole = int(longest)
     return whole + 2 if longest > whole else whole + 1
+
+
+def kalman_lag(c: np.ndarray, axis: int) -> float:
+    """Return the samples that the input of an axis needs to act."""
+    return float(c[KALMAN_LAG + axis] if axis < 2 else c[KALMAN_MORE_LAGS - 2 + axis])
+
+
+def kalman_outputs(H: np.ndarray) -> int:
+    """Return the number of outputs."""
+    return H.shape[0]
 
 
 class KalmanArrays(Arrays):
     """x+ = F x + B u + w, y = H x + e, where w has the covariance q1^2 first_noise + q2^2 second_noise."""
 
     F = array("n, n", "state over one sample")
-    B = array("n, 2", "of the inputs of both axes")
-    H = array("2, n", "from state to pitch and roll")
+    B = array("n, outputs", "of the inputs of all axes")
+    H = array("outputs, n", "from state to pitch and roll")
     first_noise = array("n, n", "unit covariance of the first process noise")
     second_noise = array("n, n", "unit covariance of the second")
     P0 = array("n, n", "covariance at the start")
     PF = array("n, n", "added before a measurement is taken in by force")
-    sources = array("2, sources_in", "T: from three set-points, or two rates of the gyro, to the inputs")
-    constants = array("11", "see KALMAN_*")
+    sources = array("outputs, sources_in", "T: from the set-points, or the rates of the gyro, to the inputs")
+    constants = array("numbers", "see KALMAN_*: 11, and one for each output beyond two")
+    outputs = value("H", function=kalman_outputs, written=True)
     length = value("constants", function=kalman_line_length)
 
 
@@ -54,19 +68,18 @@ class KalmanCounters(StateVector):
     rejected = cells("", "measurements refused in a row")
     unheard = cells("", "samples since an accepted measurement, up to the timeout")
     age = cells("", "samples since a new measurement")
-    pitch = cells("", "last measured [rad]")
-    roll = cells("", "last measured [rad]")
     repeats = cells("", "of the last measurement in a row; -1: none came yet")
     scatter = cells("", "mean square of what changes from one measurement to the next [rad^2]")
     log_det = cells("", "of the last innovation's covariance")
-    rates = cells("2", "last of the gyro [rad/s]")
+    measured = cells("outputs", "last [rad]")
 
 
 class KalmanState(KalmanCounters):
     """Counters, the estimate, and what the sources said."""
 
+    rates = cells("outputs", "last of the gyro [rad/s]")
     x = cells("n", "estimate at the filter's time")
-    lines = cells("2, length", "past inputs of each axis, in a ring: `samples` tells which is newest")
+    lines = cells("outputs, length", "past inputs of each axis, in a ring: `samples` tells which is newest")
 
 
 def kalman_clear(c: np.ndarray, x: KalmanCounters) -> None:
@@ -75,18 +88,22 @@ def kalman_clear(c: np.ndarray, x: KalmanCounters) -> None:
     x.repeats = -1.0
 
 
-def kalman_usable(c: np.ndarray, x: KalmanCounters, inputs: np.ndarray, noise: float) -> bool:
-    """Return whether `inputs` holds a new measurement of a sensor that lives.
+def kalman_usable(c: np.ndarray, x: KalmanCounters, y: np.ndarray, valid: float, noise: float) -> bool:
+    """Return whether the outputs `y` are a new measurement of a sensor that lives.
 
     A slower sensor's sample is often held: within its period an unchanged value is the old one.
     """
     x.age += 1.0
-    pitch, roll = inputs[3], inputs[4]
-    # A measurement is of both axes; a sensor that says NaN is as good as one that says invalid.
-    if not (inputs[5] > 0.5 and math.isfinite(pitch) and math.isfinite(roll)):
+    m = y.shape[0]
+    # A measurement is of all axes; a sensor that says NaN is as good as one that says invalid.
+    if not valid > 0.5:
         return False
-    came = x.repeats >= 0.0
-    same = came and pitch == x.pitch and roll == x.roll
+    came = bool(x.repeats >= 0.0)
+    same = came
+    for i in range(m):
+        if not math.isfinite(y[i]):
+            return False
+        same = same and bool(y[i] == x.measured[i])
     if same and x.age < c[KALMAN_DIVIDER]:
         return False
     x.age = 0.0
@@ -94,12 +111,14 @@ def kalman_usable(c: np.ndarray, x: KalmanCounters, inputs: np.ndarray, noise: f
         x.repeats += 1.0
     else:
         if came:
-            # Mean of both axes; of a neck that stands still it is twice the noise's variance.
-            change = 0.5 * ((pitch - x.pitch) ** 2 + (roll - x.roll) ** 2)
-            x.scatter = KALMAN_KEEP * x.scatter + (1.0 - KALMAN_KEEP) * change
+            # Mean of all axes; of a neck that stands still it is twice the noise's variance.
+            change = 0.0
+            for i in range(m):
+                change += (y[i] - x.measured[i]) ** 2
+            x.scatter = KALMAN_KEEP * x.scatter + (1.0 - KALMAN_KEEP) * (change / m)
         x.repeats = 0.0
-        x.pitch = pitch
-        x.roll = roll
+        for i in range(m):
+            x.measured[i] = y[i]
     return not kalman_frozen(c, x, noise)
 
 
@@ -128,34 +147,51 @@ def kalman_healthy(c: np.ndarray, x: KalmanCounters, noise: float) -> bool:
     return bool(x.unheard < c[KALMAN_TIMEOUT] and not kalman_frozen(c, x, noise))
 
 
+def kalman_first(p: KalmanArrays, inputs: np.ndarray) -> int:
+    """Return where the measured outputs begin among the inputs: behind the set-points."""
+    behind = 2 * p.outputs + 1 if p.constants[KALMAN_GYRO] > 0.5 else p.outputs + 1
+    return inputs.shape[0] - behind
+
+
 def kalman_push(p: KalmanArrays, x: KalmanState, inputs: np.ndarray, u: np.ndarray) -> bool:
-    """Put what the sources say now into the lines, fill `u` (2,) with what acts; return whether a gyro said nothing."""
+    """Put what the sources say now into the lines, fill `u` with what acts; return whether a gyro said nothing."""
     T, c = p.sources, p.constants
     lost = False
     if c[KALMAN_GYRO] > 0.5:
-        pitch, roll = inputs[6], inputs[7]
+        valid = kalman_first(p, inputs) + p.outputs
+        held = True
+        for i in range(p.outputs):
+            rate = inputs[valid + 1 + i]
+            lost = lost or not math.isfinite(rate)
+            held = held and bool(rate == x.rates[i])
         # Behind an invalid measurement an unchanged rate is one that the plant holds.
-        lost = not (math.isfinite(pitch) and math.isfinite(roll))
-        lost = lost or (inputs[5] < 0.5 and x.samples > 0.0 and pitch == x.rates[0] and roll == x.rates[1])
+        lost = lost or bool(inputs[valid] < 0.5 and x.samples > 0.0 and held)
         if not lost:
-            x.rates[0] = pitch
-            x.rates[1] = roll
+            x.rates[:] = inputs[valid + 1 :]
         # Lost rates leave the last ones; `step` widens P by what the angle may do meanwhile.
-        u[0] = T[0, 0] * x.rates[0] + T[0, 1] * x.rates[1]
-        u[1] = T[1, 0] * x.rates[0] + T[1, 1] * x.rates[1]
+        for i in range(p.outputs):
+            u[i] = kalman_row(T, i, x.rates)
     else:
-        # Eq. 9 and 10; the kinematic form has zeros here.
-        u[0] = T[0, 0] * inputs[0] + T[0, 1] * inputs[1] + T[0, 2] * inputs[2]
-        u[1] = T[1, 0] * inputs[0] + T[1, 1] * inputs[1] + T[1, 2] * inputs[2]
+        for i in range(p.outputs):
+            # Eq. 9 and 10; the kinematic form has zeros here.
+            u[i] = kalman_row(T, i, inputs)
     newest = int(x.samples) % p.length
-    for axis in range(2):
+    for axis in range(p.outputs):
         line = x.lines[axis]
         if x.samples == 0.0:
             # Nothing is known of the past: the sources stood still.
             line[:] = u[axis]
         line[newest] = u[axis]
-        u[axis] = kalman_lagged(line, newest, c[KALMAN_LAG + axis])
+        u[axis] = kalman_lagged(line, newest, kalman_lag(c, axis))
     return lost
+
+
+def kalman_row(T: np.ndarray, i: int, u: np.ndarray) -> float:
+    """Return row `i` of T u, of as many entries of `u` as T takes."""
+    total = 0.0
+    for j in range(T.shape[1]):
+        total += T[i, j] * u[j]
+    return total
 
 
 def kalman_lagged(line: np.ndarray, newest: int, lag: float) -> float:
@@ -174,28 +210,26 @@ def kalman_lagged(line: np.ndarray, newest: int, lag: float) -> float:
 def kalman_tell(p: KalmanArrays, x: KalmanState, noise: float, outputs: np.ndarray) -> None:
     """Carry the estimate from the filter's time to now; fill all outputs but the innovation."""
     F, B, H, c = p.F, p.B, p.H, p.constants
+    m = p.outputs
     newest = int(x.samples) % p.length
     whole = int(c[KALMAN_LEAD])
     part = c[KALMAN_LEAD] - whole
-    now, first, second = x.x, x.lines[0], x.lines[1]
-    u = np.empty(2)
-    y0, y1 = 0.0, 0.0
+    now = x.x
+    u, before = np.empty(m), np.empty(m)
     for i in range(whole + 1):
         # What carries the estimate from i samples after its time to i + 1: newer by i + 1 than the last that acted.
-        u[0] = kalman_lagged(first, newest, c[KALMAN_LAG] - 1.0 - i)
-        u[1] = kalman_lagged(second, newest, c[KALMAN_LAG + 1] - 1.0 - i)
+        for axis in range(m):
+            u[axis] = kalman_lagged(x.lines[axis], newest, kalman_lag(c, axis) - 1.0 - i)
         if i == whole:
-            y = kalman_dot(H, now)
-            y0, y1 = y[0], y[1]
+            before[:] = kalman_dot(H, now)
         now = kalman_ahead(F, now, B, u)
     y = kalman_dot(H, now)
-    # Between samples by a straight line, whose slope is the rate.
-    outputs[0] = y0 + part * (y[0] - y0)
-    outputs[1] = y1 + part * (y[1] - y1)
-    # The model's own rate over that sample, not a difference of noisy estimates.
-    outputs[2] = (y[0] - y0) / c[KALMAN_PERIOD]
-    outputs[3] = (y[1] - y1) / c[KALMAN_PERIOD]
-    outputs[5] = 1.0 if kalman_healthy(c, x, noise) else 0.0
+    for axis in range(m):
+        # Between samples by a straight line, whose slope is the rate.
+        outputs[axis] = before[axis] + part * (y[axis] - before[axis])
+        # The model's own rate over that sample, not a difference of noisy estimates.
+        outputs[m + axis] = (y[axis] - before[axis]) / c[KALMAN_PERIOD]
+    outputs[2 * m + 1] = 1.0 if kalman_healthy(c, x, noise) else 0.0
 
 
 def kalman_dot(A: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -217,7 +251,9 @@ def kalman_ahead(F: np.ndarray, x: np.ndarray, B: np.ndarray, u: np.ndarray) -> 
         return np.dot(F, x) + np.dot(B, u)
     y = np.empty(F.shape[0])
     for i in range(F.shape[0]):
-        total = B[i, 0] * u[0] + B[i, 1] * u[1]
+        total = 0.0
+        for j in range(B.shape[1]):
+            total += B[i, j] * u[j]
         for j in range(F.shape[1]):
             total += F[i, j] * x[j]
         y[i] = total

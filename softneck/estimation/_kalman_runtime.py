@@ -16,6 +16,7 @@ from softneck.estimation._kalman_parts_runtime import (
     kalman_clear,
     kalman_count,
     kalman_dot,
+    kalman_first,
     kalman_forced,
     kalman_push,
     kalman_tell,
@@ -44,14 +45,16 @@ def step(p: KalmanArrays, parameters: np.ndarray, x: KalmanFullState, inputs: np
     """Predict with the inputs that acted until now, then take in the measurement where there is a credible one.
 
     inputs: motor_setpoint_1..3, pitch_measured, roll_measured, measurement_valid; with gyro pitch_rate_measured,
-    roll_rate_measured.
+    roll_rate_measured. The outputs of another robot stand for pitch and roll.
     outputs: pitch, roll, pitch_rate, roll_rate, innovation, healthy.
     parameters: measurement noise and two process noises (standard deviations).
     """
     c = p.constants
-    u = np.empty(2)
+    u = np.empty(p.outputs)
     lost = kalman_push(p, x, inputs, u)
-    usable = kalman_usable(c, x, inputs, parameters[0])
+    first = kalman_first(p, inputs)
+    measured = inputs[first : first + p.outputs]
+    usable = kalman_usable(c, x, measured, float(inputs[first + p.outputs]), parameters[0])
     forced = kalman_forced(c, x)
     P = x.P.reshape((p.n, p.n))
     kalman_predict(p, parameters, x.x, P, u)
@@ -66,10 +69,10 @@ def step(p: KalmanArrays, parameters: np.ndarray, x: KalmanFullState, inputs: np
         P += p.PF
     innovation, accepted = 0.0, False
     if usable:
-        innovation, accepted = kalman_correct(p, parameters[0], x, P, inputs, forced)
+        innovation, accepted = kalman_correct(p, parameters[0], x, P, measured, forced)
     kalman_count(c, x, usable, accepted)
     kalman_tell(p, x, parameters[0], outputs)
-    outputs[4] = innovation
+    outputs[2 * p.outputs] = innovation
     x.samples += 1.0
 
 
@@ -90,31 +93,72 @@ def kalman_predict(p: KalmanArrays, parameters: np.ndarray, x: np.ndarray, P: np
 
 
 def kalman_correct(
-    p: KalmanArrays, noise: float, x: KalmanFullState, P: np.ndarray, inputs: np.ndarray, forced: bool
+    p: KalmanArrays, noise: float, x: KalmanFullState, P: np.ndarray, measured: np.ndarray, forced: bool
 ) -> tuple[float, bool]:
     """Take the measurement into x and P unless the gate refuses; return e' S^-1 e and whether it was taken in."""
-    e = inputs[3:5] - kalman_dot(p.H, x.x)
-    e0, e1, r = float(e[0]), float(e[1]), float(noise * noise)
-    # S = H P H' + R of two outputs: written out, made symmetric, its inverse by the determinant.
+    e = measured - kalman_dot(p.H, x.x)
+    r = float(noise * noise)
     PH = kalman_columns(P, p.H)
     S = kalman_columns(p.H, PH.T)
-    s00, s01, s11 = float(S[0, 0]) + r, 0.5 * float(S[0, 1] + S[1, 0]), float(S[1, 1]) + r
-    determinant = s00 * s11 - s01 * s01
-    # e' S^-1 e, the NIS: chi-square with 2 degrees of freedom if the filter is true.
-    innovation = (s11 * e0 * e0 - 2.0 * s01 * e0 * e1 + s00 * e1 * e1) / determinant
-    x.log_det = math.log(determinant)
+    if p.outputs == 2:
+        innovation, log_det = kalman_two(S, e, r)
+    else:
+        innovation, log_det = kalman_more(S, e, r)
+    x.log_det = log_det
     # The gate; x and P stay as predicted where it refuses.
     if not (forced or innovation <= p.constants[KALMAN_GATE]):
         return innovation, False
-    # S becomes its inverse; the gain needs no more of it.
-    S[0, 0] = s11 / determinant
-    S[1, 1] = s00 / determinant
-    S[0, 1] = S[1, 0] = -s01 / determinant
     K = kalman_columns(PH, S)  # P H' S^-1, which is its own transpose
     estimate = x.x  # numba would copy the stretch for `x.x[:] +=`
     estimate += kalman_dot(K, e)
     kalman_joseph(P, K, p.H, r)
     return innovation, True
+
+
+def kalman_two(S: np.ndarray, e: np.ndarray, r: float) -> tuple[float, float]:
+    """Add R to H P H' of two outputs, replace it by its inverse S^-1; return e' S^-1 e and log det S.
+
+    Written out: made symmetric, its inverse by the determinant.
+    """
+    e0, e1 = float(e[0]), float(e[1])
+    s00, s01, s11 = float(S[0, 0]) + r, 0.5 * float(S[0, 1] + S[1, 0]), float(S[1, 1]) + r
+    determinant = s00 * s11 - s01 * s01
+    # e' S^-1 e, the NIS: chi-square with 2 degrees of freedom if the filter is true.
+    innovation = (s11 * e0 * e0 - 2.0 * s01 * e0 * e1 + s00 * e1 * e1) / determinant
+    S[0, 0] = s11 / determinant
+    S[1, 1] = s00 / determinant
+    S[0, 1] = S[1, 0] = -s01 / determinant
+    return innovation, math.log(determinant)
+
+
+def kalman_more(S: np.ndarray, e: np.ndarray, r: float) -> tuple[float, float]:
+    """Do what `kalman_two` does for any number of outputs, by the factor S = L L' (Golub and Van Loan, sec. 4.2)."""
+    m = S.shape[0]
+    L, inverse = np.zeros((m, m)), np.zeros((m, m))
+    log_det, innovation = 0.0, 0.0
+    for i in range(m):
+        for j in range(i + 1):
+            total = S[i, i] + r if i == j else 0.5 * (S[i, j] + S[j, i])
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            L[i, j] = math.sqrt(total) if i == j else total / L[j, j]
+        log_det += 2.0 * math.log(L[i, i])
+        # Row i of L^-1, with which the NIS is the square of L^-1 e.
+        whitened = 0.0
+        for j in range(i + 1):
+            total = 1.0 if i == j else 0.0
+            for k in range(j, i):
+                total -= L[i, k] * inverse[k, j]
+            inverse[i, j] = total / L[i, i]
+            whitened += inverse[i, j] * e[j]
+        innovation += whitened * whitened
+    for i in range(m):
+        for j in range(m):
+            total = 0.0
+            for k in range(max(i, j), m):
+                total += inverse[k, i] * inverse[k, j]
+            S[i, j] = total
+    return innovation, log_det
 
 
 def kalman_joseph(P: np.ndarray, K: np.ndarray, H: np.ndarray, r: float) -> None:
@@ -132,23 +176,29 @@ def kalman_joseph(P: np.ndarray, K: np.ndarray, H: np.ndarray, r: float) -> None
     for i in range(n):
         J[i, i] = 1.0
         for j in range(n):
-            J[i, j] -= K[i, 0] * H[0, j] + K[i, 1] * H[1, j]
+            total = 0.0
+            for k in range(K.shape[1]):
+                total += K[i, k] * H[k, j]
+            J[i, j] -= total
     kalman_sandwich(J, P)
     for i in range(n):
         for j in range(n):
-            P[i, j] += r * (K[i, 0] * K[j, 0] + K[i, 1] * K[j, 1])
+            total = 0.0
+            for k in range(K.shape[1]):
+                total += K[i, k] * K[j, k]
+            P[i, j] += r * total
 
 
 def kalman_columns(A: np.ndarray, H: np.ndarray) -> np.ndarray:
-    """Return A H', two columns."""
+    """Return A H', a column for each output."""
     if not COMPILED:
         return np.dot(A, H.T)
-    Y = np.zeros((A.shape[0], 2))
+    m = H.shape[0]
+    Y = np.zeros((A.shape[0], m))
     for k in range(A.shape[1]):
-        h0, h1 = H[0, k], H[1, k]
         for i in range(A.shape[0]):
-            Y[i, 0] += A[i, k] * h0
-            Y[i, 1] += A[i, k] * h1
+            for j in range(m):
+                Y[i, j] += A[i, k] * H[j, k]
     return Y
 
 

@@ -16,7 +16,7 @@ def kalman_cost(
 
     The arrays' gate must be open: with a gate, no noise at all would be the best fit to what is left.
     """
-    outputs = np.zeros(6)
+    outputs = np.zeros(2 * p.outputs + 2)
     total, count = 0.0, 0
     for k in range(inputs.shape[0]):
         # A step that judges no measurement leaves it.
@@ -24,6 +24,6 @@ def kalman_cost(
         step(p, parameters, x, inputs[k], outputs)
         if k >= start and not math.isnan(x.log_det):
             # -2 log L but for a constant: e' S^-1 e is the output `innovation`.
-            total += x.log_det + outputs[4]
+            total += float(x.log_det + outputs[2 * p.outputs])
             count += 1
     return total, count

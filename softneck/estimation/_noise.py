@@ -9,6 +9,7 @@ import numpy as np
 
 from softneck.core import DataError, Matrix, SettingsError, Vector
 from softneck.runtime import load_functions
+from softneck.runtime._bundle import sized
 from softneck.signals import Recording
 
 from ._kalman import KalmanObserver
@@ -132,7 +133,9 @@ class _Cost:
     """The cost of levels over all runs, per measurement."""
 
     def __init__(self, observer: KalmanObserver, runs: Sequence[Recording]) -> None:
-        self._functions = load_functions("softneck.estimation._likelihood_runtime")
+        motors, outputs = len(observer.robot.motors.names), len(observer.robot.outputs.names)
+        self._functions = load_functions(sized("softneck.estimation._likelihood_runtime", motors, outputs))
+        self._told = 2 * outputs + 2
         arrays = dict(zip(KalmanArrays.names(), observer.arrays, strict=False))  # without steady gains
         arrays["constants"] = constants = arrays["constants"].copy()
         # No gate, no force, no frozen sensor: the likelihood is of all that was measured.
@@ -156,7 +159,7 @@ class _Cost:
         return sum(self._run(table, noise)[0] for table in self._tables) / self.rows
 
     def _run(self, table: Matrix, noise: Sequence[float]) -> tuple[float, int]:
-        state, outputs, parameters = np.zeros(self._size), np.zeros(6), np.array(noise)
+        state, outputs, parameters = np.zeros(self._size), np.zeros(self._told), np.array(noise)
         self._functions.initialise(self._arrays, parameters, state, outputs)
         return self._functions.kalman_cost(self._arrays, parameters, state, table, _SETTLE)
 
@@ -164,14 +167,11 @@ class _Cost:
 def _table(observer: KalmanObserver, run: Recording, z: Matrix) -> Matrix:
     """Return the runtime's inputs row by row, as a loop would give them."""
     sources, lost = source_rows(observer, run)
-    table = np.ones((len(run), 8 if observer.form == "gyro" else 6))
-    table[:, 3:5] = z
+    valid = np.ones((len(run), 1))
     if observer.form == "gyro":
-        table[:, :3] = 0.0
-        table[:, 6:8] = np.where(lost[:, None], np.nan, sources)
-    else:
-        table[:, :3] = sources
-    return table
+        none = np.zeros((len(run), len(run.robot.motors.names)))
+        return np.hstack([none, z, valid, np.where(lost[:, None], np.nan, sources)])
+    return np.hstack([sources, z, valid])
 
 
 def _outliers(z: Matrix) -> np.ndarray:

@@ -9,7 +9,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from softneck.core import DataError, Matrix, Vector
+from softneck.robot import Robot
 from softneck.signals import Recording
+from softneck.signals.recording._recording import require_same_robot
 
 from ._kalman_parts_runtime import (
     KALMAN_DIVIDER,
@@ -17,15 +19,13 @@ from ._kalman_parts_runtime import (
     KALMAN_GAP,
     KALMAN_GATE,
     KALMAN_KEEP,
-    KALMAN_LAG,
     KALMAN_LEAD,
     KALMAN_REJECTIONS,
     KALMAN_STILL,
     KALMAN_TIMEOUT,
     KalmanArrays,
+    kalman_lag,
 )
-
-_AXES = ("pitch", "roll")
 
 
 class LinearFilter(Protocol):
@@ -40,32 +40,32 @@ class LinearFilter(Protocol):
     @property
     def order(self) -> str: ...
     @property
+    def robot(self) -> Robot: ...
+    @property
     def sample_time(self) -> float: ...
     def filterpy(self) -> Any: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimates:
-    """What the filter made of a recording, row by row.
+    """What the filter made of a recording, row by row; angles of another robot are its outputs, in SI.
 
     Attributes:
         time: (time,) [s].
-        pitch, roll: (time,) estimates at the time of the row [rad].
-        pitch_rate, roll_rate: (time,) [rad/s].
+        outputs: (time, outputs) estimates at the time of the row: of a neck pitch and roll [rad].
+        rates: (time, outputs) [rad/s].
         innovation: (time,) normalised innovation squared; 0 where nothing was measured.
         accepted: (time,) bool, whether the measurement was taken in.
         healthy: (time,) bool.
         judged: (time,) bool, whether there was a measurement to judge.
-        aligned: (time, 2) pitch and roll at the instant of the measurement; differs where the sensor is late.
-        covariance: (time, 2, 2) of `aligned` [rad^2].
+        aligned: (time, outputs) at the instant of the measurement; differs where the sensor is late.
+        covariance: (time, outputs, outputs) of `aligned` [rad^2].
         log_det: (time,) log det of the innovation's covariance; 0 where nothing was measured.
     """
 
     time: Vector
-    pitch: Vector
-    roll: Vector
-    pitch_rate: Vector
-    roll_rate: Vector
+    outputs: Matrix
+    rates: Matrix
     innovation: Vector
     accepted: np.ndarray
     healthy: np.ndarray
@@ -73,6 +73,26 @@ class Estimates:
     aligned: Matrix
     covariance: np.ndarray
     log_det: Vector
+
+    @property
+    def pitch(self) -> Vector:
+        """Of a neck: the estimates of pitch (time,) [rad]."""
+        return self.outputs[:, 0]
+
+    @property
+    def roll(self) -> Vector:
+        """Of a neck: the estimates of roll (time,) [rad]."""
+        return self.outputs[:, 1]
+
+    @property
+    def pitch_rate(self) -> Vector:
+        """Of a neck: the rates of pitch (time,) [rad/s]."""
+        return self.rates[:, 0]
+
+    @property
+    def roll_rate(self) -> Vector:
+        """Of a neck: the rates of roll (time,) [rad/s]."""
+        return self.rates[:, 1]
 
 
 @dataclass(slots=True)
@@ -99,16 +119,17 @@ def smooth_recording(observer: LinearFilter, recording: Recording) -> Estimates:
 
 
 def measured_angles(run: Recording) -> Matrix:
-    """Return the measured angles (time, 2): `pitch_measured` where a simulation logged it, else `pitch`."""
-    return np.column_stack([run.channels.get(f"{axis}_measured", run.channels[axis]) for axis in _AXES])
+    """Return the measured outputs (time, outputs): `pitch_measured` where a simulation logged it, else `pitch`."""
+    names = run.robot.outputs.names
+    return np.column_stack([run.channels.get(f"{axis}_measured", run.channels[axis]) for axis in names])
 
 
 def source_rows(observer: LinearFilter, run: Recording) -> tuple[Matrix, np.ndarray]:
-    """Return what the filter's sources say in each row (time, 2 or 3), and where the gyro said nothing (time,)."""
+    """Return what the filter's sources say in each row (time, sources), and where the gyro said nothing (time,)."""
     if observer.form != "gyro":
         # The set-points of t_k are commanded after the measurement of t_k: the filter knows those before.
         return run.set_points[np.maximum(np.arange(len(run)) - 1, 0)], np.zeros(len(run), dtype=bool)
-    rates = np.column_stack([_rate(run, axis) for axis in _AXES])
+    rates = np.column_stack([_rate(run, axis) for axis in run.robot.outputs.names])
     lost = np.asarray(~np.isfinite(rates).all(axis=1))
     known = np.maximum.accumulate(np.where(lost, -1, np.arange(len(run))))
     return np.where(known[:, None] < 0, 0.0, rates[known]), lost
@@ -121,9 +142,9 @@ def check_recording(observer: LinearFilter, recording: Recording) -> None:
             f"the recording has sample time {recording.sample_time:g} s, the observer {observer.sample_time:g} s; "
             "resample it or design the observer for it."
         )
-    recording.robot.require_neck("an observer")
+    require_same_robot(recording.robot, observer.robot, "the recording and the observer")
     if observer.form == "gyro":
-        for axis in _AXES:
+        for axis in recording.robot.outputs.names:
             _rate(recording, axis)
 
 
@@ -149,10 +170,8 @@ def _over_runs(observer: LinearFilter, recording: Recording, *, smooth: bool) ->
     innovation, accepted, healthy, judged, log_det = flags.T.copy()
     return Estimates(
         time=recording.time,
-        pitch=angle[:, 0].copy(),
-        roll=angle[:, 1].copy(),
-        pitch_rate=rate[:, 0].copy(),
-        roll_rate=rate[:, 1].copy(),
+        outputs=angle,
+        rates=rate,
         innovation=innovation,
         accepted=accepted > 0.5,
         healthy=healthy > 0.5,
@@ -209,14 +228,14 @@ def _backward(observer: LinearFilter, passed: _Pass) -> tuple[Matrix, np.ndarray
 
 
 def _told(observer: LinearFilter, passed: _Pass, x: Matrix, P: np.ndarray, *, smooth: bool) -> tuple[np.ndarray, ...]:
-    """Return angles and rates (time, 2) carried ahead by the sensor's delay, flags, aligned angles, covariances."""
+    """Return outputs and rates (time, outputs) ahead by the sensor's delay, flags, aligned outputs, covariances."""
     p = KalmanArrays(observer.arrays)
     H, c = p.H, p.constants
     whole = int(c[KALMAN_LEAD])
     part = c[KALMAN_LEAD] - whole
     size = len(x)
     # ahead[i, k]: the angles i samples after the filter's time of row k.
-    ahead = np.empty((whole + 2, size, 2))
+    ahead = np.empty((whole + 2, size, len(H)))
     for k in range(size):
         if smooth:
             kept = min(size - 1 - k, whole + 1)
@@ -233,16 +252,16 @@ def _told(observer: LinearFilter, passed: _Pass, x: Matrix, P: np.ndarray, *, sm
     return angle, rate, np.array(passed.flags, dtype=float), ahead[0].copy(), H @ P @ H.T
 
 
-def _lags(observer: LinearFilter) -> tuple[float, float]:
+def _lags(observer: LinearFilter) -> list[float]:
     """Return the lags of the inputs; what a Jacobi loop adds, a recording does not have."""
     late = float(observer.order == "jacobi" and observer.form == "model")
-    pitch, roll = KalmanArrays(observer.arrays).constants[KALMAN_LAG : KALMAN_LAG + 2]
-    return float(pitch) - late, float(roll) - late
+    c = KalmanArrays(observer.arrays).constants
+    return [kalman_lag(c, axis) - late for axis in range(len(observer.robot.outputs.names))]
 
 
 def _input(observer: LinearFilter, sources: Matrix, k: int, ahead: int = 0) -> Vector:
-    """Return the inputs (2,) that act `ahead` samples after the filter's time of row k, from what row k knows."""
-    u = np.empty(2)
+    """Return the inputs (outputs,) that act `ahead` samples after the filter's time of row k, from what row k knows."""
+    u = np.empty(sources.shape[1])
     for axis, lag in enumerate(_lags(observer)):
         place = max(k - max(lag - ahead, 0.0), 0.0)
         u[axis] = (
@@ -254,7 +273,7 @@ def _input(observer: LinearFilter, sources: Matrix, k: int, ahead: int = 0) -> V
 def _usable(z: Matrix, c: Vector, noise: float) -> tuple[np.ndarray, np.ndarray]:
     """Return where a new measurement of a living sensor came, and where the sensor is frozen (time,)."""
     usable, frozen = np.zeros(len(z), dtype=bool), np.zeros(len(z), dtype=bool)
-    last, age, repeats, scatter = np.full(2, np.nan), math.inf, 0, 0.0
+    last, age, repeats, scatter = np.full(z.shape[1], np.nan), math.inf, 0, 0.0
     for k, angles in enumerate(z):
         age += 1
         same = bool((angles == last).all())

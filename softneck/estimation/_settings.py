@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,75 +16,49 @@ from softneck.core import (
     require_one_of,
     require_positive,
     require_whole,
+    to_si,
 )
+from softneck.robot import Robot
+from softneck.robot._neck_default import NeckDefault
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
-from ._axis import AXES, AxisPlant, HasTransferFunctions, axis_plant, robot_of
-from ._forms import FORMS, NOISES, RATE_STD, FilterMatrices, gyro_form, kinematic_form, model_form, steady_gains
+from ._axis import AxisPlant, HasTransferFunctions, axis_plant, directions_of, robot_of
+from ._forms import (
+    FORMS,
+    NOISES,
+    FilterMatrices,
+    Reach,
+    gyro_form,
+    kinematic_form,
+    model_form,
+    noise_units,
+    steady_gains,
+)
 from ._kalman import KalmanObserver
-
-
-@dataclass(frozen=True, slots=True)
-class SensorNoise:
-    """An inclinometer.
-
-    Attributes:
-        name: what users type.
-        noise_std: standard deviation of pitch and of roll at rest [rad].
-        gyro_noise_std: standard deviation of its rates from sample to sample [rad/s].
-        source: where the numbers come from.
-    """
-
-    name: str
-    noise_std: float
-    gyro_noise_std: float
-    source: str
-
-
-# Upper ends of what the recordings show on plateaus: a filter that trusts too little lags a little,
-# one that trusts too much rejects good samples. Rates were not recorded: data sheet class.
-SENSORS: dict[str, SensorNoise] = {
-    sensor.name: sensor
-    for sensor in (
-        SensorNoise(
-            "mpu9250",
-            math.radians(0.29),
-            math.radians(0.1),
-            "Arduino with MPU-9250: 0.26 to 0.29 deg on plateaus of the recordings; rates: data sheet class",
-        ),
-        SensorNoise(
-            "3dm-gx5-10",
-            math.radians(0.04),
-            math.radians(0.05),
-            "3DM-GX5-10, 50 Hz: 0.02 to 0.04 deg on plateaus of the recordings; rates: data sheet class",
-        ),
-        SensorNoise(
-            "paper", math.radians(0.05), math.radians(0.1), "the virtual neck's inclinometer in the paper preset"
-        ),
-    )
-}
-
-
-def find_sensor(name: str) -> SensorNoise:
-    """Return the sensor of that name; raise SettingsError with the known ones if there is none."""
-    try:
-        return SENSORS[name]
-    except KeyError:
-        raise SettingsError(f"unknown sensor `{name}`; use one of {', '.join(SENSORS)}.") from None
-
+from ._kalman_parts_runtime import KALMAN_LAG, KALMAN_MORE_LAGS
+from ._reach import linear_reach
+from ._sensors import find_sensor
 
 ORDERS = ("sequential", "jacobi")
 # Sample times and delays that are whole multiples but for the rounding of decimal fractions.
 _ROUNDING = 1e-6
+_WHAT = "an observer"
+_NECK_PERIOD = 0.02
+# A sensor that gives a sample every 20 ms is given up after 0.1 s without one.
+_MISSED = 5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KalmanSettings:
-    """Kalman filter of pitch and roll in one of three forms.
+    """Kalman filter of pitch and roll, or of another robot's outputs, in one of three forms.
 
     "model": the angle is what an identified linear model makes of the delayed set-points plus a disturbance that
     walks. "gyro": the angle rises by what the gyro says minus a bias that walks. "kinematic": angle and rate under
     a white acceleration. Measurement noise is white.
+
+    The defaults are the neck's. Of another robot noise, delay and rate of the sensor are those of its file, and the
+    other levels follow from how far and how fast its outputs go; those given are in the unit of its outputs, angles in
+    rad.
 
     Attributes:
         form: "model", "gyro" or "kinematic".
@@ -114,21 +88,21 @@ class KalmanSettings:
     sensor: str = "paper"
     measurement_noise_std: float | None = None
     # The neck moves by up to 0.8 deg in 20 ms, and a fit to large moves is some 20 % off in small ones.
-    model_noise_std: float = math.radians(0.15)
-    disturbance_noise_std: float = math.radians(0.02)
+    model_noise_std: float = NeckDefault(math.radians(0.15))
+    disturbance_noise_std: float = NeckDefault(math.radians(0.02))
     # 40 deg/s within 0.15 s, as the neck's pole of 5 1/s allows.
-    acceleration_noise_std: float = 5.0
-    angle_noise_std: float = 1e-6
+    acceleration_noise_std: float = NeckDefault(5.0)
+    angle_noise_std: float = NeckDefault(1e-6)
     gyro_noise_std: float | None = None
     # A bias that wanders by 0.2 deg/s in some 10 s.
-    bias_noise_std: float = math.radians(0.01)
+    bias_noise_std: float = NeckDefault(math.radians(0.01))
     sample_time: float | None = None
     sensor_period: float | None = None
-    sensor_delay: float = 0.0
+    sensor_delay: float = NeckDefault(0.0)
     gyro_delay: float = 0.0
     gate_level: float = 0.9999
     max_rejections: int = 10
-    healthy_timeout: float = 0.1
+    healthy_timeout: float = NeckDefault(0.1)
     frozen_samples: int = 20
     steady: bool = False
     order: str = "sequential"
@@ -140,13 +114,13 @@ class KalmanSettings:
         for names in NOISES.values():
             for name, unit in names:
                 if getattr(self, name) is not None:
-                    _require_noise(name, getattr(self, name), unit)
+                    require_positive(name, getattr(self, name), unit)
         for name in ("sample_time", "sensor_period"):
             if getattr(self, name) is not None:
                 require_positive(name, getattr(self, name), "s")
         require_between("sensor_delay", self.sensor_delay, 0.0, 1.0, "s")
         require_between("gyro_delay", self.gyro_delay, 0.0, 1.0, "s")
-        if self.gyro_delay > self.sensor_delay:
+        if self.gyro_delay > self.sensor_delay and not isinstance(self.sensor_delay, NeckDefault):
             raise SettingsError(
                 f"`gyro_delay` {self.gyro_delay:g} s must be at most `sensor_delay`, {self.sensor_delay:g} s: the "
                 "rates between two measurements must be known when the second comes."
@@ -168,66 +142,156 @@ class KalmanSettings:
         return first, second, third
 
     def design(self, model: HasTransferFunctions) -> KalmanObserver:
-        """Return the filter for `model`, anything with `tf("pitch")` and `tf("roll")`.
+        """Return the filter for `model`, anything with `tf("pitch")` and `tf("roll")`, or of another robot's outputs.
 
         Raises:
-            SettingsError: a model that is not linear, discrete and stable, axes of different sample times, or times
-                that do not divide.
+            SettingsError: a model that is not linear, discrete and stable, axes of different sample times, times that
+                do not divide, or what another robot's file does not say of its sensor and motors.
         """
-        robot_of(model).require_neck("an observer")
-        plants = [axis_plant(model, axis) for axis in AXES]
+        robot = robot_of(model)
+        names = robot.outputs.names
+        plants = [axis_plant(model, axis) for axis in names]
         times = [plant.sample_time for plant in plants]
-        if not math.isclose(*times, rel_tol=1e-9):
-            raise SettingsError(f"pitch and roll have different sample times, {times[0]:g} s and {times[1]:g} s.")
+        if not all(math.isclose(times[0], time, rel_tol=1e-9) for time in times):
+            each = " and ".join(f"{time:g} s" for time in times)
+            raise SettingsError(f"{' and '.join(names)} have different sample times, {each}.")
         period = times[0] if self.sample_time is None else self.sample_time
         plants = [plant.resampled(period) for plant in plants]
-        constants, sources = self.constants([plant.delay for plant in plants], period), self._sources()
-        arrays = self._form(plants, period).arrays(sources, constants)
+        if robot.is_neck:
+            asked, reach, noise = self.of_neck(), Reach(), self.noise
+            sensor = self.sensor if self.measurement_noise_std is None else "none"
+        else:
+            asked, reach = self.robot_timing(robot, period), linear_reach(plants, robot, directions_of(model))
+            noise, sensor = self.robot_noise(robot, reach, max(plant.stretch for plant in plants), period)
+        constants = asked.constants([plant.delay for plant in plants], period, reach)
+        arrays = self._form(plants, period, reach).arrays(self._sources(robot, model), constants)
         return KalmanObserver(
             form=self.form,
             sample_time=period,
-            arrays=(*arrays, *steady_gains(arrays, self.noise)) if self.steady else arrays,
-            noise=self.noise,
-            sensor=self.sensor if self.measurement_noise_std is None else "none",
+            arrays=(*arrays, *steady_gains(arrays, noise)) if self.steady else arrays,
+            noise=noise,
+            sensor=sensor,
             order=self.order,
             gate_level=self.gate_level,
+            robot=robot,
         )
 
-    def _form(self, plants: list[AxisPlant], period: float) -> FilterMatrices:
-        if self.form == "model":
-            return model_form(plants)
-        return gyro_form(period) if self.form == "gyro" else kinematic_form(period)
+    def of_neck(self) -> KalmanSettings:
+        """Return the settings, which must be a neck's.
 
-    def _sources(self) -> Matrix:
+        Raises:
+            SettingsError: noise levels beyond pi, or rates later than the angles.
+        """
+        for name, unit in {pair for names in NOISES.values() for pair in names}:
+            value = getattr(self, name)
+            if unit == "rad" and value is not None and value > math.pi:
+                raise SettingsError(f"`{name}` is a standard deviation in rad; got {value:g}: degrees?")
+        if self.gyro_delay > self.sensor_delay:
+            raise SettingsError(
+                f"`gyro_delay` {self.gyro_delay:g} s must be at most `sensor_delay`, {self.sensor_delay:g} s: the "
+                "rates between two measurements must be known when the second comes."
+            )
+        return self
+
+    def robot_timing(self, robot: Robot, period: float) -> KalmanSettings:
+        """Return the settings with delay and rate of the robot's sensor, where nobody says otherwise.
+
+        Raises:
+            SettingsError: the robot gives no delay or rate of its sensor.
+        """
+        delay, wait, timeout = self.sensor_delay, self.sensor_period, self.healthy_timeout
+        if isinstance(delay, NeckDefault):
+            delay = max(float(robot.require("delay_s", _WHAT)), self.gyro_delay)
+        if wait is None:
+            # Whole samples, and no more than the sensor takes: what it holds counts as an old sample that long.
+            wait = period * max(1, math.floor(1.0 / (float(robot.require("rate_hz", _WHAT)) * period) + 1e-6))
+        if isinstance(timeout, NeckDefault):
+            timeout = _MISSED * wait
+        return replace(self, sensor_delay=float(delay), sensor_period=wait, healthy_timeout=float(timeout))
+
+    def robot_noise(
+        self, robot: Robot, reach: Reach, stretch: float, period: float
+    ) -> tuple[tuple[float, float, float], str]:
+        """Return the noise levels of the form in SI, and which sensor they are of.
+
+        Levels that are given are in the unit of the robot's outputs (angles in rad), those that are not are the neck's,
+        stretched by how far and how fast the outputs go.
+
+        Raises:
+            SettingsError: a level that neither the robot's file nor a setting says.
+        """
+        factor, si = to_si(robot.outputs.unit)
+        moved = reach.rate / Reach().rate
+        scales = {
+            "model_noise_std": moved * period / _NECK_PERIOD, "disturbance_noise_std": moved * period / _NECK_PERIOD,
+            "acceleration_noise_std": moved / stretch, "angle_noise_std": reach.start / Reach().start,
+            "bias_noise_std": moved,
+        }  # fmt: skip
+        preset = None if self.sensor == "paper" else find_sensor(self.sensor)
+        if preset is not None and si != "rad":
+            raise SettingsError(f"`sensor` {self.sensor} measures angles, robot {robot.label()} has none; drop it.")
+        levels, sensor = [], self.sensor if preset is not None else "robot"
+        for name, unit in noise_units(self.form, robot):
+            value = getattr(self, name)
+            if isinstance(value, NeckDefault):
+                levels.append(float(value) * scales[name])
+            elif value is not None:
+                levels.append(float(value) if si == "rad" else factor * float(value))
+                sensor = "none" if name == "measurement_noise_std" else sensor
+            elif name == "measurement_noise_std":
+                told = preset.noise_std if preset is not None else factor * float(robot.require("noise_std", _WHAT))
+                if not told > 0.0:
+                    raise SettingsError(
+                        f"robot `{robot.name}` gives `sensor.noise_std` = 0, and {_WHAT} needs a positive one; raise it, "
+                        f"or give `{name}`."
+                    )
+                levels.append(told)
+            elif preset is not None:
+                levels.append(3.0 * preset.gyro_noise_std)
+            else:
+                raise SettingsError(f"robot `{robot.name}` says nothing of its rates' noise; give `{name}` [{unit}].")
+        return (levels[0], levels[1], levels[2]), sensor
+
+    def _form(self, plants: list[AxisPlant], period: float, reach: Reach) -> FilterMatrices:
+        if self.form == "model":
+            return model_form(plants, reach)
+        return (gyro_form if self.form == "gyro" else kinematic_form)(period, len(plants), reach)
+
+    def _sources(self, robot: Robot, model: HasTransferFunctions) -> Matrix:
         if self.form == "gyro":
-            return np.eye(2)
-        T = redefinition_matrix(np.array(self.tendon_angles))[:2]
+            return np.eye(len(robot.outputs.names))
+        T = redefinition_matrix(np.array(self.tendon_angles))[:2] if robot.is_neck else directions_of(model)
         return T if self.form == "model" else np.zeros_like(T)
 
-    def constants(self, delays: Sequence[int], period: float) -> Vector:
+    def constants(self, delays: Sequence[int], period: float, reach: Reach | None = None) -> Vector:
         """Return the constants in the places that `_kalman_parts_runtime` names.
 
         Args:
-            delays: samples that set-points need to act on pitch and on roll, beyond the first.
+            delays: samples that set-points need to act on each output, beyond the first.
             period: the filter's sample time [s].
+            reach: how fast the outputs go; None: as fast as the neck's.
         """
         from scipy.stats import chi2
 
-        lags = [0.0, 0.0]
+        lags = [0.0 for _ in delays]
         if self.form == "model":
             lags = [delay + float(self.order == "jacobi") for delay in delays]
         if self.form == "gyro":
             # Between two measurements acts the mean of the rates at both ends: half a sample ago.
-            lags = [0.5 + (self.sensor_delay - self.gyro_delay) / period] * 2
-        gate = float(chi2.ppf(self.gate_level, df=len(AXES)))
+            lags = [0.5 + (self.sensor_delay - self.gyro_delay) / period] * len(delays)
+        gate = float(chi2.ppf(self.gate_level, df=len(delays)))
         timeout = math.ceil(self.healthy_timeout / period - 1e-9)
         lead = self.sensor_delay / period
         lead = round(lead) if abs(lead - round(lead)) < _ROUNDING else lead
-        gap = RATE_STD * period
-        return np.array(
-            [*lags, gate, self.max_rejections, timeout, period, lead, self._divider(period), self.frozen_samples,
-             float(self.form == "gyro"), gap]
+        gap = (reach or Reach()).rate * period
+        found = np.zeros(KALMAN_MORE_LAGS + max(len(lags) - 2, 0))
+        found[KALMAN_LAG : KALMAN_LAG + min(len(lags), 2)] = lags[:2]
+        found[2:KALMAN_MORE_LAGS] = (
+            gate, self.max_rejections, timeout, period, lead, self._divider(period), self.frozen_samples,
+            float(self.form == "gyro"), gap,
         )  # fmt: skip
+        found[KALMAN_MORE_LAGS:] = lags[2:]
+        return found
 
     def _divider(self, period: float) -> int:
         if self.sensor_period is None:
@@ -244,9 +308,3 @@ class KalmanSettings:
                 f"{self.sensor_period:g} s, or the filter is never healthy."
             )
         return divider
-
-
-def _require_noise(name: str, value: float, unit: str) -> None:
-    require_positive(name, value, unit)
-    if unit == "rad" and value > math.pi:
-        raise SettingsError(f"`{name}` is a standard deviation in rad; got {value:g}: degrees?")

@@ -10,8 +10,10 @@ from softneck.estimation._kalman_parts_runtime import (
     kalman_clear,
     kalman_count,
     kalman_dot,
+    kalman_first,
     kalman_forced,
     kalman_push,
+    kalman_row,
     kalman_tell,
     kalman_usable,
 )
@@ -22,12 +24,12 @@ from softneck.runtime._rest_runtime import REST
 class SteadyKalmanArrays(KalmanArrays):
     """K and S^-1 when measurements came for long, at the start, and where one is taken in by force."""
 
-    gain = array("n, 2", "K in steady state")
-    inverse_spread = array("2, 2", "S^-1 in steady state")
-    start_gain = array("n, 2", "while inputs from before the start are on their way")
-    start_inverse_spread = array("2, 2", "S^-1 then")
-    forced_gain = array("n, 2", "by force")
-    forced_inverse_spread = array("2, 2", "S^-1 then")
+    gain = array("n, outputs", "K in steady state")
+    inverse_spread = array("outputs, outputs", "S^-1 in steady state")
+    start_gain = array("n, outputs", "while inputs from before the start are on their way")
+    start_inverse_spread = array("outputs, outputs", "S^-1 then")
+    forced_gain = array("n, outputs", "by force")
+    forced_inverse_spread = array("outputs, outputs", "S^-1 then")
 
 
 def initialise(p: SteadyKalmanArrays, parameters: np.ndarray, x: KalmanState, outputs: np.ndarray) -> None:
@@ -45,9 +47,11 @@ def step(
     parameters: the measurement noise, which only tells a frozen sensor from a noise-free one.
     """
     c = p.constants
-    u = np.empty(2)
+    m = p.outputs
+    u = np.empty(m)
     kalman_push(p, x, inputs, u)
-    usable = kalman_usable(c, x, inputs, parameters[0])
+    first = kalman_first(p, inputs)
+    usable = kalman_usable(c, x, inputs[first : first + m], float(inputs[first + m]), parameters[0])
     forced = kalman_forced(c, x)
     # Two gains more stand for what the full filter adds to P.
     K, SI = p.gain, p.inverse_spread
@@ -58,15 +62,18 @@ def step(
     estimate = kalman_ahead(p.F, x.x, p.B, u)
     innovation, accepted = 0.0, False
     if usable:
-        y = kalman_dot(p.H, estimate)
-        e0, e1 = inputs[3] - y[0], inputs[4] - y[1]
+        e = inputs[first : first + m] - kalman_dot(p.H, estimate)
         # e' S^-1 e, S of these noise levels: the gate is that of the full filter.
-        innovation = SI[0, 0] * e0 * e0 + (SI[0, 1] + SI[1, 0]) * e0 * e1 + SI[1, 1] * e1 * e1
+        for i in range(m):
+            innovation += SI[i, i] * e[i] * e[i]
+            for j in range(i + 1, m):
+                innovation += (SI[i, j] + SI[j, i]) * e[i] * e[j]
         accepted = forced or innovation <= c[KALMAN_GATE]
         if accepted:
-            estimate += e0 * K[:, 0] + e1 * K[:, 1]  # x = x- + K e
+            for i in range(p.n):
+                estimate[i] += kalman_row(K, i, e)  # x = x- + K e
     x.x[:] = (estimate + REST) - REST
     kalman_count(c, x, usable, accepted)
     kalman_tell(p, x, parameters[0], outputs)
-    outputs[4] = innovation
+    outputs[2 * m] = innovation
     x.samples += 1.0

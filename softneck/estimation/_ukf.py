@@ -3,29 +3,33 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import DataError, Matrix, SettingsError, Vector, require_whole
+from softneck.core import DataError, Matrix, SettingsError, Vector, require_whole, to_si
 from softneck.identification import WARM_UP, Model
+from softneck.robot import Robot
+from softneck.robot._neck_default import NeckDefault
 from softneck.runtime import Block, State, load_functions
-from softneck.runtime._layout import Arrays
 from softneck.signals import Recording
+from softneck.signals.recording._recording import require_same_robot
 
+from ._forms import Reach
 from ._kalman_parts_runtime import KALMAN_GATE, KALMAN_LEAD, KalmanCounters
 from ._offline import Estimates, measured_angles
+from ._reach import simulated_reach
 from ._settings import KalmanSettings
 from ._ukf_memory import LONGEST, angle_memory
 
-# What the model's angle may be off at the start, and what its output may: the second does not pass the model, so that
-# it may be large without sending sigma points to where no neck ever was.
-_START_MODEL = math.radians(5.0)
-_START_OUTPUT = math.radians(40.0)
-_COUNTERS = KalmanCounters.parts(Arrays(()))
+# What the model's angle may be off at the start, as a part of what its output may: 5 deg of a neck's 40. The second
+# does not pass the model, so that it may be large without sending sigma points to where no neck ever was.
+_START_MODEL = 0.125
+# Places of the counters; the last begins the outputs that were measured last.
+_COUNTERS = {name: place for place, name in enumerate(KalmanCounters.fields)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,19 +49,32 @@ class UkfStep:
 class UkfObserver:
     """An unscented Kalman filter over an identified model of any kind; `ukf` makes it.
 
-    States, by pairs of pitch and roll: the model's angle now and at `memory` - 1 samples before, and a disturbance of
-    the angle that walks. What else the model remembers (inputs, drives, plays, older angles) follows from what was
-    estimated. A state is a `State`: plain numbers that can be stored.
+    States, by pairs of pitch and roll, or by all outputs of another robot: the model's angle now and at `memory` - 1
+    samples before, and a disturbance of the angle that walks. What else the model remembers (inputs, drives, plays,
+    older angles) follows from what was estimated. A state is a `State`: plain numbers that can be stored.
 
     Attributes:
         model: the model that sigma points pass.
-        settings: noise levels, gate, sensor and order; of form "model".
+        settings: gate, sensor's timing and order; of form "model".
         memory: angles, the newest first, whose uncertainty passes the model.
+        noise: of measurement, model and disturbance, in SI; () for those of the settings, which are a neck's.
+        start: standard deviation of the outputs when nothing is known, in SI.
     """
 
     model: Model
     settings: KalmanSettings
     memory: int
+    noise: tuple[float, ...] = ()
+    start: float = Reach().start
+
+    def __post_init__(self) -> None:
+        if not self.noise:
+            object.__setattr__(self, "noise", self.settings.noise)
+
+    @property
+    def robot(self) -> Robot:
+        """Whose outputs it estimates."""
+        return self.model.robot
 
     @property
     def sample_time(self) -> float:
@@ -71,12 +88,14 @@ class UkfObserver:
 
     def summary(self) -> str:
         """Return some lines for people."""
-        levels = zip(("measurement", "model", "disturbance"), self.settings.noise, strict=True)
+        levels = zip(("measurement", "model", "disturbance"), self.noise, strict=True)
+        shown = self.robot.outputs.display_unit
+        per, names = to_si(shown)[0], " and ".join(self.robot.outputs.names)
         return "\n".join(
             (
                 f"unscented Kalman observer over {self.model.kind}, {self.sample_time * 1e3:g} ms",
-                f"  {2 * self.memory + 2} states: {self.memory} angles and a disturbance of pitch and roll",
-                f"  noise: {', '.join(f'{name} {math.degrees(value):.3g} deg' for name, value in levels)}",
+                f"  {self._m * (self.memory + 1)} states: {self.memory} angles and a disturbance of {names}",
+                f"  noise: {', '.join(f'{name} {value / per:.3g} {shown}' for name, value in levels)}",
             )
         )
 
@@ -91,14 +110,15 @@ class UkfObserver:
         """Return the state before the first row, when nothing is known."""
         values = np.zeros(self._places[-1])
         self._rules.kalman_clear(self._constants, values)
-        return State(values, np.zeros(0), np.zeros(6))
+        return State(values, np.zeros(0), np.zeros(2 * self._m + 2))
 
     def step(self, state: State, inputs: ArrayLike) -> tuple[State, Vector]:
         """Return the next state and the outputs valid now.
 
         Args:
             state: of before.
-            inputs: (6,) motor_setpoint_1..3, pitch_measured, roll_measured [rad], measurement_valid; angles may be NaN.
+            inputs: (motors + outputs + 1,) of a neck motor_setpoint_1..3, pitch_measured, roll_measured [rad],
+                measurement_valid; angles may be NaN.
 
         Returns:
             The state, and pitch, roll, pitch_rate, roll_rate, innovation, healthy, as `KalmanObserver` gives them.
@@ -120,25 +140,28 @@ class UkfObserver:
     def advance(self, values: Vector, inputs: ArrayLike) -> UkfStep:
         """Do what `step` does on the numbers of a state, and tell more of it."""
         given = np.asarray(inputs, dtype=np.float64).ravel()
-        if given.size != 6 or not np.isfinite(given[:3]).all():
+        n, m = self._n, self._m
+        if given.size != n + m + 1 or not np.isfinite(given[:n]).all():
+            names = ", ".join(f"{name}_measured" for name in self.robot.outputs.names)
             raise DataError(
-                "an unscented filter takes 6 inputs (three set-points [rad], which must be finite, pitch_measured, "
-                f"roll_measured, measurement_valid); got {given.tolist()}."
+                f"an unscented filter takes {n + m + 1} inputs ({n} set-points, which must be finite, {names}, "
+                f"measurement_valid); got {given.tolist()}."
             )
-        rules, c, noise = self._rules, self._constants, self.settings.noise[0]
+        y, valid = given[n : n + m], given[n + m]
+        rules, c, noise = self._rules, self._constants, self.noise[0]
         counters, base, x, P, past = self._parts(values)
-        samples = counters[_COUNTERS["samples"]]
+        samples = float(counters[_COUNTERS["samples"]])
         if samples == 0.0:
-            base, x, P, past = self._first(given)
-        past = np.vstack([past[1:], given[:3]])
-        usable = rules.kalman_usable(c, counters, given, noise)
+            base, x, P, past = self._first(given[:n], y if valid > 0.5 else np.zeros(m))
+        past = np.vstack([past[1:], given[:n]])
+        usable = rules.kalman_usable(c, counters, y, valid, noise)
         forced = rules.kalman_forced(c, counters)
         kf = self._predicted(base, x, P, past, widen=bool(samples < WARM_UP or forced))
         # The oldest angle leaves the states: with the last estimate of it the model moves on.
-        base, _ = self._moved(base, past[:1], x[None, -4:-2])
-        innovation, accepted, log_det = self._corrected(kf, given[3:5], usable, forced=forced)
+        base, _ = self._moved(base, past[:1], x[None, -2 * m : -m])
+        innovation, accepted, log_det = self._corrected(kf, y, usable, forced=forced)
         rules.kalman_count(c, counters, usable, accepted)
-        samples += 1.0
+        counters[_COUNTERS["samples"]] = samples + 1.0
         healthy = rules.kalman_healthy(c, counters, noise)
         angle, rate = self._told(base, kf.x, past)
         H = self._H
@@ -152,33 +175,32 @@ class UkfObserver:
             covariance=H @ kf.P @ H.T,
         )
 
-    def _first(self, given: Vector) -> tuple[Vector, Vector, Matrix, Matrix]:
+    def _first(self, setpoints: Vector, y: Vector) -> tuple[Vector, Vector, Matrix, Matrix]:
         """Return model, states, covariance and past inputs as if the neck had stood at the first row for ever."""
-        y = np.nan_to_num(given[3:5]) if given[5] > 0.5 else np.zeros(2)
-        names = ("motor_setpoint_1", "motor_setpoint_2", "motor_setpoint_3", "pitch", "roll")
-        held: dict[str, Vector] = dict(zip(names, np.tile(np.concatenate([given[:3], y]), (2, 1)).T, strict=True))
-        start = self.model.initial_state(Recording(np.arange(2) * self.sample_time, self.sample_time, held))
-        x = np.concatenate([np.tile(y, self.memory), np.zeros(2)])
-        return start.values, x, self._doubt, np.tile(given[:3], (self._kept, 1))
+        y = np.nan_to_num(y)
+        names = (*self.robot.set_points, *self.robot.outputs.names)
+        held: dict[str, Vector] = dict(zip(names, np.tile(np.concatenate([setpoints, y]), (2, 1)).T, strict=True))
+        still = Recording(np.arange(2) * self.sample_time, self.sample_time, held, robot=self.robot)
+        x = np.concatenate([np.tile(y, self.memory), np.zeros(self._m)])
+        return self.model.initial_state(still).values, x, self._doubt, np.tile(setpoints, (self._kept, 1))
 
     def _predicted(self, base: Vector, x: Vector, P: Matrix, past: Matrix, *, widen: bool) -> Any:
         """Return filterpy's filter one sample on."""
         from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
-        n, L = x.size, self.memory
+        n, L, m = x.size, self.memory, self._m
         # Weights of 1/2n on every point and none on the middle one: no covariance can become indefinite.
         points = MerweScaledSigmaPoints(n, alpha=1.0, beta=2.0, kappa=0.0)
-        kf: Any = UnscentedKalmanFilter(n, 2, self.sample_time, hx=self._H.dot, fx=None, points=points)
-        first, second = self.settings.noise[1:]
-        kf.R = self.settings.noise[0] ** 2 * np.eye(2)
-        kf.Q = np.zeros((n, n))
-        kf.Q[[0, 1], [0, 1]], kf.Q[[-1, -2], [-1, -2]] = first**2, second**2
+        kf: Any = UnscentedKalmanFilter(n, m, self.sample_time, hx=self._H.dot, fx=None, points=points)
+        first, second = self.noise[1:]
+        kf.R = self.noise[0] ** 2 * np.eye(m)
+        kf.Q = np.diag(np.concatenate([np.full(m, first**2), np.zeros(n - 2 * m), np.full(m, second**2)]))
         kf.x, kf.P = x.copy(), P.copy()
 
         def ahead(point: Vector, _: Any) -> Vector:
-            angles = point[:-2].reshape(L, 2)[::-1]
+            angles = point[:-m].reshape(L, m)[::-1]
             _, outputs = self._moved(base, past[:L], angles)
-            return np.concatenate([outputs[-1, :2], point[: 2 * L - 2], point[-2:]])
+            return np.concatenate([outputs[-1, :m], point[: m * (L - 1)], point[-m:]])
 
         kf.predict(fx=ahead)
         kf.P = 0.5 * (kf.P + kf.P.T) + (self._doubt if widen else 0.0)
@@ -200,20 +222,21 @@ class UkfObserver:
 
     def _told(self, base: Vector, x: Vector, past: Matrix) -> tuple[Vector, Vector]:
         """Return angles and rates of now: the mean carried ahead by the sensor's delay, and by one sample more."""
-        L, lead = self.memory, self._lead
+        L, lead, m = self.memory, self._lead, self._m
         # `base` is L - 1 samples before the filter's time; of inputs not yet known the newest stands for all. A model
         # of measured angles has the sensor's delay in its dead time: what it says `lead` samples on is true now.
         rows = past[np.minimum(np.arange(1, L + lead + 1), self._kept - 1)]
-        angles = np.full((L + lead, 2), np.nan)
-        angles[:L] = x[:-2].reshape(L, 2)[::-1]
-        outputs = self._moved(base, rows, angles)[1][:, :2]
-        now = outputs[-2] if lead > 0 else x[:2]
-        return now + x[-2:], (outputs[-1] - now) / self.sample_time
+        angles = np.full((L + lead, m), np.nan)
+        angles[:L] = x[:-m].reshape(L, m)[::-1]
+        outputs = self._moved(base, rows, angles)[1][:, :m]
+        now = outputs[-2] if lead > 0 else x[:m]
+        return now + x[-m:], (outputs[-1] - now) / self.sample_time
 
     def _moved(self, base: Vector, setpoints: Matrix, angles: Matrix) -> tuple[Vector, Matrix]:
         """Return the model some samples on from `base`, told its `angles` in each of them, and its outputs."""
-        rows = np.full((len(setpoints), 8), np.nan)
-        rows[:, :3], rows[:, 3:5] = setpoints, angles
+        n = self._n
+        rows = np.full((len(setpoints), 2 * n + self._m), np.nan)
+        rows[:, :n], rows[:, n : n + self._m] = setpoints, angles
         state, outputs = self._plant.run(State(base, self._parameters, np.zeros(0)), rows)
         return state.values, outputs
 
@@ -222,7 +245,7 @@ class UkfObserver:
         if values.size != self._places[-1]:
             raise DataError(f"the state has {values.size} numbers, this filter's {self._places[-1]}; start it anew.")
         counters, base, x, P, past = np.split(values.copy(), self._places[:-1])
-        return counters, base, x, P.reshape(x.size, x.size), past.reshape(-1, 3)
+        return counters, base, x, P.reshape(x.size, x.size), past.reshape(-1, self._n)
 
     @cached_property
     def _rules(self) -> Any:
@@ -239,7 +262,17 @@ class UkfObserver:
 
     @cached_property
     def _constants(self) -> Vector:
-        return self.settings.constants((0, 0), self.sample_time)
+        return self.settings.constants((0,) * self._m, self.sample_time)
+
+    @property
+    def _n(self) -> int:
+        """Motors."""
+        return len(self.robot.motors.names)
+
+    @property
+    def _m(self) -> int:
+        """Outputs."""
+        return len(self.robot.outputs.names)
 
     @property
     def _lead(self) -> int:
@@ -252,21 +285,21 @@ class UkfObserver:
 
     @cached_property
     def _H(self) -> Matrix:
-        H = np.zeros((2, 2 * self.memory + 2))
-        H[[0, 1], [0, 1]] = H[[0, 1], [-2, -1]] = 1.0
-        return H
+        one = np.eye(self._m)
+        return np.hstack([one, np.zeros((self._m, self._m * (self.memory - 1))), one])
 
     @cached_property
     def _doubt(self) -> Matrix:
         """The covariance when nothing is known, and what is added where the measurement must have its way."""
-        return np.diag([_START_MODEL**2] * (2 * self.memory) + [_START_OUTPUT**2] * 2)
+        model = (_START_MODEL * self.start) ** 2
+        return np.diag([model] * (self._m * self.memory) + [self.start**2] * self._m)
 
     @cached_property
     def _places(self) -> list[int]:
         """Where the parts of a state end."""
-        n = 2 * self.memory + 2
-        counters = max(part.stop for part in _COUNTERS.values())
-        sizes = [counters, self._plant.initial_state().values.size, n, n * n, 3 * self._kept]
+        n = self._m * (self.memory + 1)
+        counters = _COUNTERS["measured"] + self._m
+        sizes = [counters, self._plant.initial_state().values.size, n, n * n, self._n * self._kept]
         return [int(end) for end in np.cumsum(sizes)]
 
 
@@ -291,7 +324,6 @@ def ukf(model: Model, settings: KalmanSettings | None = None, *, memory: int | N
         raise SettingsError(
             f"an unscented filter needs an identified model, as `Play().fit(...)` gives; got {type(model).__name__}."
         )
-    model.robot.require_neck("an unscented filter")
     if chosen.form != "model" or chosen.steady:
         what = "constant gains" if chosen.form == "model" else f"form {chosen.form}"
         raise SettingsError(f"an unscented filter is over a model; {what} has no meaning with it. Use form=model.")
@@ -302,13 +334,24 @@ def ukf(model: Model, settings: KalmanSettings | None = None, *, memory: int | N
         )
     if memory is not None:
         require_whole("memory", memory, 1, LONGEST)
-    lead = float(chosen.constants((0, 0), model.sample_time)[KALMAN_LEAD])
+    reach, noise = Reach(), chosen.noise
+    if model.robot.is_neck:
+        chosen.of_neck()
+    else:
+        reach = simulated_reach(model)
+        timed = chosen.robot_timing(model.robot, model.sample_time)
+        if isinstance(chosen.sensor_delay, NeckDefault):
+            # The robot's own delay: to whole samples, as the filter's states are.
+            timed = replace(timed, sensor_delay=round(timed.sensor_delay / model.sample_time) * model.sample_time)
+        noise, chosen = chosen.robot_noise(model.robot, reach, 1.0, model.sample_time)[0], timed
+    lead = float(chosen.constants((0,) * len(model.robot.outputs.names), model.sample_time)[KALMAN_LEAD])
     if lead != int(lead):
         raise SettingsError(
             f"`sensor_delay` {chosen.sensor_delay:g} s must be whole samples of {model.sample_time:g} s in an "
             "unscented filter; take the nearest."
         )
-    return UkfObserver(model=model, settings=chosen, memory=angle_memory(model) if memory is None else memory)
+    kept = angle_memory(model) if memory is None else memory
+    return UkfObserver(model=model, settings=chosen, memory=kept, noise=noise, start=reach.start)
 
 
 def estimate_recording(observer: UkfObserver, recording: Recording) -> Estimates:
@@ -318,17 +361,16 @@ def estimate_recording(observer: UkfObserver, recording: Recording) -> Estimates
             f"the recording has sample time {recording.sample_time:g} s, the model {observer.sample_time:g} s; "
             "resample it or identify the model at its sample time."
         )
+    require_same_robot(recording.robot, observer.robot, "the recording and the observer")
     rows = [row for run in recording.runs() for row in _run(observer, run)]
-    outputs = np.array([row.outputs for row in rows])
+    outputs, m = np.array([row.outputs for row in rows]), len(observer.robot.outputs.names)
     return Estimates(
         time=recording.time,
-        pitch=outputs[:, 0].copy(),
-        roll=outputs[:, 1].copy(),
-        pitch_rate=outputs[:, 2].copy(),
-        roll_rate=outputs[:, 3].copy(),
-        innovation=outputs[:, 4].copy(),
+        outputs=outputs[:, :m].copy(),
+        rates=outputs[:, m : 2 * m].copy(),
+        innovation=outputs[:, 2 * m].copy(),
         accepted=np.array([row.accepted for row in rows]),
-        healthy=outputs[:, 5] > 0.5,
+        healthy=outputs[:, 2 * m + 1] > 0.5,
         judged=np.array([row.judged for row in rows]),
         aligned=np.array([row.aligned for row in rows]),
         covariance=np.array([row.covariance for row in rows]),

@@ -23,7 +23,7 @@ class UkfPart:
         self.observer = observer
         self.inputs: tuple[Port, ...]
         self.outputs: tuple[Port, ...]
-        self.inputs, self.outputs = observer_ports("model")
+        self.inputs, self.outputs = observer_ports("model", observer.robot)
         self.sample_time = observer.sample_time
         self._state = observer.initial_state()
 

@@ -1,10 +1,10 @@
-"""Loops over the virtual neck: the preset and plausible ones around it, at every payload and orientation."""
+"""Loops over the user's own plants, or over the virtual neck and plausible ones around it."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,8 +12,10 @@ import numpy as np
 
 from softneck.core import DataError, Progress, SettingsError
 from softneck.loop import BlockPart, Loop, LoopResult, StepReference, metrics, run_loop
-from softneck.plant import NeckParameters, VirtualNeck
+from softneck.plant import NeckParameters
 from softneck.runtime import Block
+
+from ._own_plants import OwnPlant, own_plant
 
 # When the step comes [s]: after the controller took over the motors.
 STEP_AT = 0.5
@@ -25,11 +27,11 @@ _SMALL = 0.05
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NeckRun:
-    """One loop over the virtual neck.
+    """One loop over an own plant or the virtual neck.
 
     Attributes:
         name: "paper, 0.5 kg, 45 deg".
-        parameters: the neck's.
+        parameters: the neck's; None of a plant that is no virtual neck.
         payload: [kg].
         orientation: of the step [rad].
         seed: of the sensor's noise.
@@ -38,7 +40,7 @@ class NeckRun:
     """
 
     name: str
-    parameters: NeckParameters
+    parameters: NeckParameters | None
     payload: float
     orientation: float
     seed: int
@@ -54,35 +56,43 @@ def run_necks(
     observer: Block | None,
     seed: int,
     progress: Progress,
+    own: Sequence[OwnPlant] = (),
 ) -> list[NeckRun]:
-    """Return all runs that the table [neck] of the requirements asks for.
+    """Return all runs that the table [neck] of the requirements asks for, over the user's own plants if there are any.
 
     Raises:
         SettingsError: controller and observer that do not fit the neck.
     """
+    plants = own or _presets(table, seed)
+    cases = [
+        (plant, payload, angle) for plant in plants
+        for payload in (table["payloads_kg"] if plant.payload else (0.0,)) for angle in table["orientations_deg"]
+    ]  # fmt: skip
+    runs = []
+    for number, (plant, payload, angle) in enumerate(cases):
+        name = f"{plant.name}, {payload:g} kg, {angle:g} deg"
+        progress(number / len(cases), name)
+        loop = _loop(controller, plant, float(payload), math.radians(angle), table, order, observer, seed + number)
+        values, result = _judge(loop)
+        runs.append(NeckRun(name, plant.parameters, float(payload), math.radians(angle), seed + number, values, result))
+    return runs
+
+
+def _presets(table: Mapping[str, Any], seed: int) -> list[OwnPlant]:
+    """Return the preset of the table [neck] and plausible necks around it."""
     preset = NeckParameters.preset(str(table["preset"]))
     rng = np.random.default_rng(seed)
     spread = table["spread_pct"] / 100.0
     count = int(table["necks"])
     necks = [preset, *(preset.sample(rng, spread=spread) for _ in range(count - 1))][:count]
-    cases = [
-        (k, payload, angle) for k in range(len(necks)) for payload in table["payloads_kg"]
-        for angle in table["orientations_deg"]
-    ]  # fmt: skip
-    runs = []
-    for number, (k, payload, angle) in enumerate(cases):
-        title = table["preset"] if k == 0 else f"{table['preset']} varied {k}"
-        name = f"{title}, {payload:g} kg, {angle:g} deg"
-        progress(number / len(cases), name)
-        loop = _loop(controller, necks[k], float(payload), math.radians(angle), table, order, observer, seed + number)
-        values, result = _judge(loop)
-        runs.append(NeckRun(name, necks[k], float(payload), math.radians(angle), seed + number, values, result))
-    return runs
+    return [
+        own_plant(neck, table["preset"] if k == 0 else f"{table['preset']} varied {k}") for k, neck in enumerate(necks)
+    ]
 
 
 def _loop(
     controller: Block,
-    neck: NeckParameters,
+    plant: OwnPlant,
     payload: float,
     orientation: float,
     table: Mapping[str, Any],
@@ -92,13 +102,13 @@ def _loop(
 ) -> Loop:
     size = math.radians(table["size_deg"])
     return Loop(
-        plant=BlockPart(VirtualNeck(neck).block(noise_seed=seed, sample_time=controller.sample_time)),
+        plant=plant.make(seed, controller.sample_time),
         controller=BlockPart(controller),
         observer=None if observer is None else BlockPart(observer),
         reference=StepReference(pitch=size * math.cos(orientation), roll=size * math.sin(orientation), at=STEP_AT),
         duration=STEP_AT + float(table["duration_s"]),
         order=order,
-        plant_inputs={"payload": payload},
+        plant_inputs={"payload": payload} if plant.payload else {},
         # Nobody knows the step before it comes: a predictive controller sees the reference of now as that of later.
         connections={
             f"controller.{port.name}": f"reference.{port.name.removesuffix('_ahead')}"
@@ -123,7 +133,9 @@ def _judge(loop: Loop) -> tuple[dict[str, float], LoopResult | None]:
         values[name] = (
             math.inf if any(value is None for value in found) else max(float(value or 0.0) for value in found)
         )
-    values |= {name: float(table["motors"][name] or 0.0) for name in _MOTORS}
+    told = {name: table["motors"][name] for name in _MOTORS}
+    # A plant that tells no tension says nothing of slack tendons.
+    values |= {name: math.nan if value is None else float(value) for name, value in told.items()}
     return values, result
 
 

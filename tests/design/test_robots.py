@@ -14,7 +14,6 @@ from softneck.core import SettingsError
 from softneck.cosim import make_loop, simulate
 from softneck.cosim.loops._loop_table import check_key
 from softneck.design import PiSettings, design_controller
-from softneck.estimation import KalmanSettings
 from softneck.identification import Model
 from softneck.identification.models._state_space import lss_arrays
 from softneck.loop._faults import make_fault
@@ -185,12 +184,6 @@ def test_keys_of_studies_and_faults_know_the_robot() -> None:
 def test_kinds_that_take_necks_only_say_so(kind: str) -> None:
     with pytest.raises(SettingsError, match=r"takes necks only so far, not robot `antagonist`"):
         design_controller(kind, plant(Robot.preset("antagonist")))
-
-
-def test_an_observer_takes_necks_only_and_says_so() -> None:
-    # Pitch, roll and enough motors: a trunk looks like a neck to who does not ask.
-    with pytest.raises(SettingsError, match="an observer takes necks only so far, not robot `trunk4`"):
-        KalmanSettings().design(plant(Robot.preset("trunk4")))
 
 
 def test_verification_takes_necks_only_and_says_so() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from softneck.core import DataError, FileFormatError, SettingsError, load, read_archive, write_archive
 from softneck.estimation import KalmanSettings, LinearNeck, axis_plant
-from softneck.estimation._settings import SENSORS
+from softneck.estimation._sensors import SENSORS
 from softneck.signals import Recording
 
 from .necks import TS, neck, recording, run_block
@@ -175,8 +175,8 @@ def test_a_damaged_observer_file_is_refused(tmp_path: Path) -> None:
     KalmanSettings().design(neck()).save(tmp_path / "o.npz")
     header, arrays = read_archive(tmp_path / "o.npz")
     header = {key: value for key, value in header.items() if not key.startswith("format")}
-    write_archive(tmp_path / "bad.npz", header, {**arrays, "B": arrays["B"].T})
-    with pytest.raises(FileFormatError, match=r"its array `B` has shape \(2, 4\); \(4, 2\) is needed"):
+    write_archive(tmp_path / "bad.npz", header, {**arrays, "H": arrays["H"].T})
+    with pytest.raises(FileFormatError, match=r"its array `H` has shape \(4, 2\); \(2, 4\) is needed"):
         load(tmp_path / "bad.npz")
 
 

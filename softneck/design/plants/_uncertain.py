@@ -11,8 +11,7 @@ import numpy as np
 
 from softneck.core import DataError, Matrix, SettingsError, SoftneckError, require_one_of
 from softneck.estimation import AxisPlant, LinearNeck, axis_plant
-from softneck.estimation._axis import AXES, robot_of
-from softneck.identification.models._linear_systems import weights_of
+from softneck.estimation._axis import AXES, directions_of, robot_of
 from softneck.robot import Robot
 from softneck.signals.recording._recording import require_same_robot
 
@@ -142,13 +141,7 @@ def uncertain_plant(source: Any) -> UncertainPlant:
         )
     robot = robot_of(source)
     joined = _joined({axis: _of_model(source, axis) for axis in robot.outputs.names})
-    return joined if robot.is_neck else replace(joined, robot=robot, weights=_weights(source))
-
-
-def _weights(source: Any) -> Matrix:
-    """Return the weights of the motors in each axis: a family has its own, a model those of its findings."""
-    own = getattr(source, "directions", None)
-    return weights_of(source) if own is None else np.asarray(own)
+    return replace(joined, robot=robot, weights=None if robot.is_neck else directions_of(source))
 
 
 def _of_model(model: Any, axis: str) -> list[AxisPlant]:

@@ -102,6 +102,11 @@ def set_now(kind: str, arrays: Mapping[str, Matrix], values: Vector, m: Vector, 
 _LONGEST_HISTORY = 60_000
 
 
+def memory_array(seconds: float, sample_time: float) -> Vector:
+    """Return the array `memory` of a model's file: samples in so many seconds, as far as a file goes."""
+    return np.array([float(min(np.ceil(seconds / sample_time), _LONGEST_HISTORY))])
+
+
 def check_arrays(kind: str, arrays: Mapping[str, Matrix]) -> None:
     """Raise FileFormatError unless the arrays are finite, in order, and of shapes that fit each other."""
     if kind in COMPOSED:

@@ -37,11 +37,18 @@ _NECKS = (
 )
 # Those that robots of other sizes have; once more for all of these, so that the neck's know their sizes beforehand.
 _ROBOTS = (
+    "softneck.identification.set_membership._nlsm_runtime",
+    "softneck.identification.structured._greybox_runtime",
+    "softneck.identification.uncertainty._residual_runtime",
+    "softneck.identification.uncertainty._ensemble_runtime",
+    "softneck.identification.uncertainty._guarded_runtime",
     "softneck.identification.networks._nn_runtime",
     "softneck.identification.networks._nss_observed_runtime",
     "softneck.identification.linear._affine_runtime",
     "softneck.identification.linear._state_space_runtime",
     "softneck.identification.structured._play_runtime",
+    "softneck.estimation._kalman_runtime",
+    "softneck.estimation._steady_kalman_runtime",
     "softneck.design.linear._linear_controller_runtime",
     "softneck.loop._reference_runtime",
 )
