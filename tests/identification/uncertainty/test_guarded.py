@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 import softneck
-from softneck.core import DataError, FileFormatError, Matrix, SettingsError
+from softneck.core import DataError, FileFormatError, Matrix, SettingsError, silent
 from softneck.identification import Model, Network, OutputError, Rls
 from softneck.identification.models._arrays import check_arrays
 from softneck.identification.uncertainty._guarded import Guarded, _covering, _least_missing
-from softneck.identification.uncertainty._guarded_base import Base
+from softneck.identification.uncertainty._guarded_base import Base, fitted_base
+from softneck.identification.uncertainty._guarded_jobs import Job, done
 from softneck.identification.uncertainty._left_out import left_out, left_out_error
 from softneck.runtime import load_runtime
-from softneck.runtime._compile import Runtime
+from softneck.runtime._compile import Runtime, load_tangent
 from softneck.signals import concatenate
 
 from ...data import Truth, neck_recording, recording_from, short_neck
@@ -183,6 +184,42 @@ def test_play_is_guarded_by_name_and_a_robot_may_have_it() -> None:
     assert model.training_rows.size == 1200
     assert model.settings["of"] == "play"
     check_arrays("guarded", model.arrays)
+
+
+@pytest.mark.slow
+def test_processes_change_no_result() -> None:
+    jobs = [Job(kind, fitted_base, (kind, short_neck())) for kind in ("rls", "oe")]
+    here, there = done(jobs, 1, silent), done(jobs, 2, silent)
+    for one, other in zip(here, there, strict=True):
+        assert (one.error == other.error).all()
+        assert all((one.model.arrays[name] == array).all() for name, array in other.model.arrays.items())
+
+
+@pytest.mark.slow
+def test_its_derivative_is_what_differences_say() -> None:
+    model = guarded([line(g) for g in (0.9, 1.0, 1.3)])
+    arrays, runtime = tuple(model.arrays.values()), plain(model)
+    parameters, x = np.zeros(len(model.block().parameters)), np.zeros(runtime.state_size(arrays))
+    y, u = np.zeros(5), np.full(8, np.nan)
+    runtime.initialise(arrays, parameters, x, y)
+    for row in UNSEEN.set_points[:60]:
+        u[:3] = row
+        runtime.step(arrays, parameters, x, u, y)
+    rng = np.random.default_rng(0)
+    X, U, Y = rng.standard_normal((x.size, 4)), np.zeros((8, 4)), np.zeros((5, 4))
+    U[:3] = rng.standard_normal((3, 4))
+    X[np.abs(x) > 1e3] = 0.0  # generators of random numbers
+    moved, rows, out = x.copy(), X.copy(), y.copy()
+    load_tangent(model.block().runtime, compiled=False)(arrays, parameters, moved, u, out, rows, U, Y, 4)
+    for d in range(4):
+
+        def run(h: float, d: int = d) -> Matrix:
+            state, outputs = x + h * X[:, d], y.copy()
+            runtime.step(arrays, parameters, state, u + h * U[:, d], outputs)
+            return outputs
+
+        # Central differences: h^2 of curvature and eps / h of rounding are about 1e-9.
+        np.testing.assert_allclose(Y[:, d], (run(1e-6) - run(-1e-6)) / 2e-6, rtol=1e-5, atol=1e-6)
 
 
 def test_what_cannot_be_is_refused(fitted: Model) -> None:
