@@ -16,11 +16,12 @@ from softneck.identification.uncertainty._guarded import Guarded, _covering, _le
 from softneck.identification.uncertainty._guarded_base import Base, fitted_base
 from softneck.identification.uncertainty._guarded_jobs import Job, done
 from softneck.identification.uncertainty._left_out import left_out, left_out_error
+from softneck.robot import Robot
 from softneck.runtime import load_runtime
 from softneck.runtime._compile import Runtime, load_tangent
-from softneck.signals import concatenate
+from softneck.signals import Recording, concatenate
 
-from ...data import Truth, neck_recording, recording_from, short_neck
+from ...data import TS, Truth, neck_recording, recording_from, short_neck
 
 UNSEEN = neck_recording(100, seed=31)
 SIGMA = 0.01
@@ -67,6 +68,24 @@ def test_equal_members_within_what_was_seen_are_the_model_to_the_bit() -> None:
     outputs, states = free_run(guarded([member] * 3), U)
     assert (states[:, WEIGHT] == 1.0).all()
     assert (outputs[:, :2] == free_run(member, U)[0][:, :2]).all()
+
+
+def test_any_robot_has_it() -> None:
+    robot = Robot.preset("antagonist")
+    names, outputs = robot.set_points, robot.outputs.names
+    rng = np.random.default_rng(2)
+    U = np.repeat(rng.uniform(-2.0, 2.0, (60, len(names))), 10, axis=0)
+    Y = np.zeros((600, len(outputs)))
+    for k in range(599):
+        Y[k + 1] = 0.9 * Y[k] + 0.01 * (U[max(k - 3, 0), 0] - U[max(k - 3, 0), 1])
+    channels = dict(zip(names, U.T, strict=True)) | dict(zip(outputs, Y.T, strict=True))
+    recording = Recording(TS * np.arange(600), TS, channels, robot=robot)
+    member = OutputError(nf=1, nb=1, delay=0.06).fit(recording)
+    model = Guarded(of="play").around(
+        Base(member, np.full(len(outputs), SIGMA), np.array([90.0])), [member] * 2, recording
+    )
+    check_arrays("guarded", model.arrays)
+    assert (free_run(model, U[:50])[0] == free_run(member, U[:50])[0]).all()
 
 
 def test_members_far_apart_leave_the_output_to_the_base() -> None:
