@@ -91,9 +91,8 @@ class Guarded:
         Raises:
             DataError: what a member raises, or no base that fits.
         """
-        recording = training_recording(recordings, any_robot=self.of in ("nn", "nss", "play"))
-        bases = BASES if recording.robot.is_neck else BASES[1:]
-        jobs = [Job("base", base_or_reason, (kind, recording)) for kind in bases]
+        recording = training_recording(recordings, any_robot=True)
+        jobs = [Job("base", base_or_reason, (kind, recording)) for kind in BASES]
         if self.base is not None:
             jobs = [Job("base", fitted_base, (self.base, recording))]
         wanted = len(jobs)

@@ -9,17 +9,19 @@ import numpy as np
 import pytest
 
 import softneck
-from softneck.core import DataError, FileFormatError, Matrix, SettingsError
+from softneck.core import DataError, FileFormatError, Matrix, SettingsError, silent
 from softneck.identification import Model, Network, OutputError, Rls
 from softneck.identification.models._arrays import check_arrays
 from softneck.identification.uncertainty._guarded import Guarded, _covering, _least_missing
-from softneck.identification.uncertainty._guarded_base import Base
+from softneck.identification.uncertainty._guarded_base import Base, fitted_base
+from softneck.identification.uncertainty._guarded_jobs import Job, done
 from softneck.identification.uncertainty._left_out import left_out, left_out_error
+from softneck.robot import Robot
 from softneck.runtime import load_runtime
-from softneck.runtime._compile import Runtime
-from softneck.signals import concatenate
+from softneck.runtime._compile import Runtime, load_tangent
+from softneck.signals import Recording, concatenate
 
-from ...data import Truth, neck_recording, recording_from, short_neck
+from ...data import TS, Truth, neck_recording, recording_from, short_neck
 
 UNSEEN = neck_recording(100, seed=31)
 SIGMA = 0.01
@@ -66,6 +68,24 @@ def test_equal_members_within_what_was_seen_are_the_model_to_the_bit() -> None:
     outputs, states = free_run(guarded([member] * 3), U)
     assert (states[:, WEIGHT] == 1.0).all()
     assert (outputs[:, :2] == free_run(member, U)[0][:, :2]).all()
+
+
+def test_any_robot_has_it() -> None:
+    robot = Robot.preset("antagonist")
+    names, outputs = robot.set_points, robot.outputs.names
+    rng = np.random.default_rng(2)
+    U = np.repeat(rng.uniform(-2.0, 2.0, (60, len(names))), 10, axis=0)
+    Y = np.zeros((600, len(outputs)))
+    for k in range(599):
+        Y[k + 1] = 0.9 * Y[k] + 0.01 * (U[max(k - 3, 0), 0] - U[max(k - 3, 0), 1])
+    channels = dict(zip(names, U.T, strict=True)) | dict(zip(outputs, Y.T, strict=True))
+    recording = Recording(TS * np.arange(600), TS, channels, robot=robot)
+    member = OutputError(nf=1, nb=1, delay=0.06).fit(recording)
+    model = Guarded(of="play").around(
+        Base(member, np.full(len(outputs), SIGMA), np.array([90.0])), [member] * 2, recording
+    )
+    check_arrays("guarded", model.arrays)
+    assert (free_run(model, U[:50])[0] == free_run(member, U[:50])[0]).all()
 
 
 def test_members_far_apart_leave_the_output_to_the_base() -> None:
@@ -183,6 +203,42 @@ def test_play_is_guarded_by_name_and_a_robot_may_have_it() -> None:
     assert model.training_rows.size == 1200
     assert model.settings["of"] == "play"
     check_arrays("guarded", model.arrays)
+
+
+@pytest.mark.slow
+def test_processes_change_no_result() -> None:
+    jobs = [Job(kind, fitted_base, (kind, short_neck())) for kind in ("rls", "oe")]
+    here, there = done(jobs, 1, silent), done(jobs, 2, silent)
+    for one, other in zip(here, there, strict=True):
+        assert (one.error == other.error).all()
+        assert all((one.model.arrays[name] == array).all() for name, array in other.model.arrays.items())
+
+
+@pytest.mark.slow
+def test_its_derivative_is_what_differences_say() -> None:
+    model = guarded([line(g) for g in (0.9, 1.0, 1.3)])
+    arrays, runtime = tuple(model.arrays.values()), plain(model)
+    parameters, x = np.zeros(len(model.block().parameters)), np.zeros(runtime.state_size(arrays))
+    y, u = np.zeros(5), np.full(8, np.nan)
+    runtime.initialise(arrays, parameters, x, y)
+    for row in UNSEEN.set_points[:60]:
+        u[:3] = row
+        runtime.step(arrays, parameters, x, u, y)
+    rng = np.random.default_rng(0)
+    X, U, Y = rng.standard_normal((x.size, 4)), np.zeros((8, 4)), np.zeros((5, 4))
+    U[:3] = rng.standard_normal((3, 4))
+    X[np.abs(x) > 1e3] = 0.0  # generators of random numbers
+    moved, rows, out = x.copy(), X.copy(), y.copy()
+    load_tangent(model.block().runtime, compiled=False)(arrays, parameters, moved, u, out, rows, U, Y, 4)
+    for d in range(4):
+
+        def run(h: float, d: int = d) -> Matrix:
+            state, outputs = x + h * X[:, d], y.copy()
+            runtime.step(arrays, parameters, state, u + h * U[:, d], outputs)
+            return outputs
+
+        # Central differences: h^2 of curvature and eps / h of rounding are about 1e-9.
+        np.testing.assert_allclose(Y[:, d], (run(1e-6) - run(-1e-6)) / 2e-6, rtol=1e-5, atol=1e-6)
 
 
 def test_what_cannot_be_is_refused(fitted: Model) -> None:

@@ -41,6 +41,7 @@ _ROBOTS = (
     "softneck.identification.structured._greybox_runtime",
     "softneck.identification.uncertainty._residual_runtime",
     "softneck.identification.uncertainty._ensemble_runtime",
+    "softneck.identification.uncertainty._guarded_runtime",
     "softneck.identification.networks._nn_runtime",
     "softneck.identification.networks._nss_observed_runtime",
     "softneck.identification.linear._affine_runtime",
