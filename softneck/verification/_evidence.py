@@ -269,9 +269,7 @@ def _tell(evidence: Evidence, controller: ControllerUnderTest, asked: Requiremen
         metrics[f"neck.{name}"] = Values(values, describe)
     if np.isnan(metrics["neck.slack_s"].values).any():
         del metrics["neck.slack_s"]
-        absent["neck.slack_s"] = (
-            "a plant tells no tensions; give a NECK, a file or a preset by its name"
-        )
+        absent["neck.slack_s"] = "a plant tells no tensions; give a NECK, a file or a preset by its name"
         return
     # What a heavier payload leaves of the pretension is no matter of the controller's.
     light = [k for k, run in enumerate(evidence.necks) if run.payload <= asked.neck["taut_up_to_kg"]]
