@@ -73,6 +73,8 @@ def command(
     as_json: bool,
 ) -> None:
     """Identify a model of KIND from one or more recordings."""
+    from softneck.signals.quality._poor_excitation import poor_excitation
+
     if kind == "auto":
         if settings:
             raise SettingsError("--set: `auto` takes no settings; name the kind that they are for.")
@@ -94,6 +96,9 @@ def command(
     whole = read_together(recordings, robot)
     # All of it to train on leaves nothing to hold out.
     head, tail = (whole, None) if train == 1.0 else whole.split(train)
+    poor = poor_excitation(head)
+    for line in poor:
+        note(line)
     found = run_search(estimator, head, options, quiet=as_json)
     with progress(f"identify {kind}", quiet=as_json) as report:
         model = found.model if found is not None else estimator.fit(head, progress=report)
@@ -104,7 +109,7 @@ def command(
     if found is not None and plot is not None:
         write_plot(found, plot, force=force)
     if as_json:
-        print_json(_facts(path, model, held_out, found))
+        print_json({**_facts(path, model, held_out, found), "excitation": poor})
     else:
         _print(path, model, held_out, found)
     if found is not None and found.interrupted:

@@ -68,16 +68,22 @@ def command(
     Those are nonlinear MODELs, NECKs (a neck file, or a preset by its name) and FMUs: on them margins are found by
     experiment too. Without any the preset of the requirements is shown, which is a foreign plant and does not decide.
 
+    Of another robot on the virtual plant that its robot.toml names, if it does.
+
     Writes a certificate: each requirement with its value, limit and worst plant, and the hashes of all files read;
     beside it a loop file for every worst plant, for `softneck simulate`. Exit code 1 if a requirement does not hold.
     """
+    from softneck.estimation._axis import robot_of
     from softneck.verification import read_requirements, verify
+    from softneck.verification._neck_loops import neck_file_of
 
     path, replace = target(output, f"certificates/{controller.stem}{CERTIFICATE_ENDING}", force=force, ending=".json")
     refuse_existing(path, force=replace)
     if html is not None:
         refuse_existing(html, force=force)
-    asked = read_requirements(requirements)
+    judged = load_of(controller, robot, role="controller")
+    whose = robot_of(judged)
+    asked = read_requirements(requirements, robot=whose)
     things, eyes = _opened(plants, robot), None if observer is None else load_of(observer, robot, role="observer")
     files = {
         "controller": controller,
@@ -85,9 +91,8 @@ def command(
     }
     files |= {} if requirements is None else {"requirements": requirements}
     files |= {} if observer is None else {"observer": observer}
-    neck_file = Path(str(asked.neck["preset"]))
+    neck_file = neck_file_of(whose, asked)
     files |= {"neck": neck_file} if neck_file.suffix == ".toml" else {}
-    judged = load_of(controller, robot, role="controller")
     with progress("verify", quiet=as_json) as report:
         found = verify(
             judged, things, asked, order=order, observer=eyes, progress=report,

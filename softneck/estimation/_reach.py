@@ -13,10 +13,9 @@ from softneck.robot import Robot
 from ._axis import AxisPlant
 from ._forms import Reach
 
-_WHAT = "an observer"
 _NECK = Reach()
 # The paper's neck reaches 40 of the 63 deg that its static gain makes of all motors at their ends.
-_REACHED = 0.64
+REACHED = 0.64
 # Motors at random, each level for so many samples: what tells how far and how fast a nonlinear model goes.
 _LEVELS, _HELD = 60, 50
 
@@ -27,9 +26,9 @@ def linear_reach(plants: Sequence[AxisPlant], robot: Robot, weights: Matrix) -> 
     Raises:
         SettingsError: the robot does not say where its set-points end.
     """
-    low, high = _ends(robot)
+    low, high = motor_ends(robot, "an observer")
     most = np.abs(weights) @ (0.5 * (high - low))
-    spans = [_REACHED * abs(plant.static_gain) * float(v) for plant, v in zip(plants, most, strict=True)]
+    spans = [REACHED * abs(plant.static_gain) * float(v) for plant, v in zip(plants, most, strict=True)]
     # The neck goes as far as it reaches in a second.
     rate = max(span / plant.stretch for span, plant in zip(spans, plants, strict=True))
     return _reach(max(spans), rate)
@@ -61,11 +60,12 @@ def _reach(span: float, rate: float) -> Reach:
     return Reach(start=span, held=span / 3.0, rate=rate, bias=rate * _NECK.bias / _NECK.rate)
 
 
-def _ends(robot: Robot) -> tuple[Vector, Vector]:
+def motor_ends(robot: Robot, what: str) -> tuple[Vector, Vector]:
+    """Return the lowest and highest set-points (motors,) in SI; raise SettingsError where `what` finds none."""
     motors, factor = robot.motors, to_si(robot.motors.unit)[0]
     if motors.setpoint_min is None or motors.setpoint_max is None:
         raise SettingsError(
-            f"robot `{robot.name}` gives no `motors.setpoint_min` and `motors.setpoint_max`, which {_WHAT} needs to "
+            f"robot `{robot.name}` gives no `motors.setpoint_min` and `motors.setpoint_max`, which {what} needs to "
             "know how far its outputs go; add them."
         )
     return factor * np.array(motors.setpoint_min), factor * np.array(motors.setpoint_max)

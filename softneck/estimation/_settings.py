@@ -242,8 +242,8 @@ class KalmanSettings:
                 told = preset.noise_std if preset is not None else factor * float(robot.require("noise_std", _WHAT))
                 if not told > 0.0:
                     raise SettingsError(
-                        f"robot `{robot.name}` gives `sensor.noise_std` = 0, and {_WHAT} needs a positive one; raise it, "
-                        f"or give `{name}`."
+                        f"robot `{robot.name}` gives `sensor.noise_std` = 0, and {_WHAT} needs a positive one; raise "
+                        f"it, or give `{name}`."
                     )
                 levels.append(told)
             elif preset is not None:

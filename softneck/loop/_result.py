@@ -168,7 +168,7 @@ def _axis(result: LoopResult, axis: str, angle: str) -> dict[str, float | None]:
         response = (y[k:] - low) / (high - low)
         shape = _step_shape(_held(response), result.sample_time)
     size, since = np.abs(error[known]), result.time[known] - result.time[first]
-    unit, factor = _shown_unit(result.robot)
+    unit, factor = shown_unit(result.robot)
     return {
         **shape,
         f"rms_error_{unit}": _rms(error, factor),
@@ -220,7 +220,7 @@ def _step_shape(y: Vector, sample_time: float) -> dict[str, float | None]:
     }
 
 
-def _shown_unit(robot: Robot) -> tuple[str, float | None]:
+def shown_unit(robot: Robot) -> tuple[str, float | None]:
     """Return the unit of errors as the end of a name, and its factor to SI; of angles deg, and None."""
     factor, si = to_si(robot.outputs.display_unit)
     return ("deg", None) if si == "rad" else (_word(robot.outputs.display_unit), factor)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ._evidence import Evidence, LinearEvidence
 from ._linear import LinearLaw
-from ._plants import AXES, Plants
+from ._plants import Plants
 
 # Methods that compute the same number agree within this part; the grid is 3 % wide and its peaks are flat.
 _SAME = 0.02
@@ -78,7 +78,7 @@ def _stability(part: LinearEvidence, count: int) -> Agreement:
 
 def _peaks(part: LinearEvidence, count: int) -> list[Agreement]:
     rows = []
-    disks = np.minimum(part.margins["pitch.disk_margin"], part.margins["roll.disk_margin"])
+    disks = np.min([part.margins[f"{axis}.disk_margin"] for axis in part.plants.axes], axis=0)
     if part.found is not None and disks.size > count:
         grid, found = float(disks[:count].min()), float(disks[count:].min())
         agree = abs(found - grid) <= _SAME * max(grid, found, 1e-9)
@@ -93,7 +93,7 @@ def _peaks(part: LinearEvidence, count: int) -> list[Agreement]:
     bounds = [row.worst_sensitivity for items in part.structured for row in items]
     bounds = [bound for bound in bounds if not math.isnan(bound)]
     if bounds:
-        peak = float(max(part.margins["pitch.sensitivity"].max(), part.margins["roll.sensitivity"].max()))
+        peak = max(float(part.margins[f"{axis}.sensitivity"].max()) for axis in part.plants.axes)
         agree = peak <= max(bounds) * (1.0 + _SAME)
         note = "a lower and an upper bound of the worst plant's" if agree else "a sample exceeds the bound: report it"
         rows.append(
@@ -110,7 +110,7 @@ def _classical(part: LinearEvidence) -> list[Agreement]:
     if part.law.coupled or np.any(part.plants.cross != 0.0):
         return []
     rows = []
-    for i, axis in enumerate(AXES):
+    for i, axis in enumerate(part.plants.axes):
         stable = part.margins["stability.radius"] < 1.0
         if not stable.any():
             continue

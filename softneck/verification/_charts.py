@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
-from softneck.core import Vector
+from softneck.core import Vector, to_si
+from softneck.loop._result import shown_unit
 from softneck.plots import Chart, Curve, Level, Panel
 from softneck.plots._style import BLUE, GREEN, GREY, ORANGE
+from softneck.robot import Robot
 
 from ._evidence import Evidence, LinearEvidence
 from ._linear import inverse, loops
-from ._neck_loops import NeckRun
-from ._plants import AXES, QUANTITIES
+from ._neck_loops import NeckRun, direction
+from ._plants import QUANTITIES, Plants
 from ._steps import Steps
 
 RED, PURPLE = "#D55E00", "#CC79A7"
+# Of 1 to 8 motors.
+SERIES = (BLUE, ORANGE, GREEN, PURPLE, RED, GREY, "#56B4E9", "#F0E442")
 # Responses that an envelope is taken over; more would not be seen.
 _MOST = 240
 _FREQUENCY = "frequency [rad/s]"
 _CAPTION = f"Band: an even choice of up to {_MOST} plants; black: nominal; red: the plant with the least disk margin."
+# What no robot's numbers in SI reach: pressures have some 1e6 Pa.
+_LARGEST = 1e9
 # Disk margins are shown in five colours between these.
 _LEVELS = ((0.0, RED), (0.3, ORANGE), (0.5, PURPLE), (0.7, BLUE), (0.9, GREEN))
 
@@ -30,10 +35,10 @@ def frequency_charts(part: LinearEvidence, w: Vector) -> list[Chart]:
     """Return Bode envelopes of the open loops, the gang of four of each axis, and their sensitivities."""
     rows = _chosen(part)
     P, L = loops(part.plants.take(rows), part.law, w)
-    S = inverse(np.eye(2) + L)
+    S = inverse(np.eye(len(part.plants.axes)) + L)
     PS, CS = S @ P, -part.law.feedback(w) @ S
     charts = [_bode(part, rows, S, w)]
-    for i, axis in enumerate(AXES):
+    for i, axis in enumerate(part.plants.axes):
         own = S[..., i, i]
         gang = {
             "|S|, from load at the angle": np.abs(own), "|T|, from reference to angle": np.abs(1.0 - own),
@@ -55,7 +60,7 @@ def _chosen(part: LinearEvidence) -> np.ndarray:
     """Return the rows that are drawn: the first, an even choice, and the worst ones."""
     n = len(part.plants)
     rows = np.unique(np.linspace(0, n - 1, min(n, _MOST)).astype(int))
-    worst = [int(np.argmin(part.margins[f"{axis}.disk_margin"])) for axis in AXES]
+    worst = [int(np.argmin(part.margins[f"{axis}.disk_margin"])) for axis in part.plants.axes]
     return np.unique(np.concatenate([[0], rows, worst]))
 
 
@@ -65,7 +70,7 @@ def _worst_in(part: LinearEvidence, rows: np.ndarray, metric: str) -> int:
 
 def _bode(part: LinearEvidence, rows: np.ndarray, S: np.ndarray, w: Vector) -> Chart:
     panels = []
-    for i, axis in enumerate(AXES):
+    for i, axis in enumerate(part.plants.axes):
         L = 1.0 / S[..., i, i] - 1.0
         worst = _worst_in(part, rows, f"{axis}.disk_margin")
         phase = np.degrees(np.unwrap(np.angle(L), axis=1))
@@ -98,12 +103,20 @@ def _envelope(
     return Panel(curves, label, levels=levels, log_x=True, log_y=log, y_range=y_range)
 
 
-def margin_map(part: LinearEvidence) -> Chart:
+def gain_unit(robot: Robot) -> tuple[str, float]:
+    """Return in which unit static gains are shown, and its factor from SI."""
+    motors = 1.0 if robot.is_neck else to_si(robot.motors.unit)[0]
+    unit, factor = shown_unit(robot)
+    return f"{unit}/{robot.motors.unit}", motors * (math.degrees(1.0) if factor is None else 1.0 / factor)
+
+
+def margin_map(part: LinearEvidence, robot: Robot) -> Chart:
     """Return where in gain, pole and dead time the disk margin is small, of each axis."""
     panels = []
-    scale = np.array([math.degrees(1.0), 1.0, 1e3])
-    units = ("static gain [deg/rad]", "pole [1/s]", "dead time [ms]")
-    for i, axis in enumerate(AXES):
+    unit, factor = gain_unit(robot)
+    scale = np.array([factor, 1.0, 1e3])
+    units = (f"static gain [{unit}]", "pole [1/s]", "dead time [ms]")
+    for i, axis in enumerate(part.plants.axes):
         margins, numbers = part.margins[f"{axis}.disk_margin"], part.plants.numbers[:, i] * scale
         for x, y in ((0, 2), (0, 1)):
             curves = []
@@ -166,7 +179,7 @@ def gap_chart(part: LinearEvidence) -> Chart:
     """Return the nu-gaps of all plants, sorted, beside the controller's margin."""
     panels = []
     for pair in part.gaps:
-        for axis, found in zip(AXES, pair, strict=True):
+        for axis, found in zip(part.plants.axes, pair, strict=True):
             share = np.linspace(0.0, 100.0, found.gap.size)
             curve = Curve(share, np.sort(found.gap), "nu-gap to the nominal", BLUE)
             panels.append(Panel([curve], axis, levels=(Level(found.margin, "margin b of the nominal loop", RED),)))
@@ -176,38 +189,44 @@ def gap_chart(part: LinearEvidence) -> Chart:
     )  # fmt: skip
 
 
-def step_chart(steps: Steps, names: Sequence[str]) -> Chart:
+def step_chart(steps: Steps, plants: Plants, robot: Robot) -> Chart:
     """Return the steps of all plants, the worst drawn through, and what its motors did."""
     t = steps.time
     panels = []
     finite: np.ndarray = np.asarray(np.isfinite(steps.angles).all(axis=2))
     worst = int(np.argmax(steps.metrics["overshoot_pct"]))
     axis_of = int(steps.worse["overshoot_pct"][worst])
-    for i, axis in enumerate(AXES):
-        y = np.degrees(steps.angles[i][finite[i]]) if finite[i].any() else np.zeros((1, t.size))
+    unit, factor = shown_unit(robot)
+
+    def shown(y: np.ndarray) -> np.ndarray:
+        return np.degrees(y) if factor is None else y / factor
+
+    for i, axis in enumerate(plants.axes):
+        y = shown(steps.angles[i][finite[i]]) if finite[i].any() else np.zeros((1, t.size))
         row = worst if i == axis_of else int(np.argmax(np.where(finite[i], np.max(steps.angles[i], axis=1), -np.inf)))
         settling = int(np.argmax(steps.metrics["load_rms_deg"]))
         curves = [
             Curve(t, y.min(axis=0), "all plants", "#56B4E9", "band", upper=y.max(axis=0)),
-            Curve(t, np.degrees(_drawable(steps.angles[i, settling])), "worst under the load", ORANGE),
-            Curve(t, np.degrees(_drawable(steps.angles[i, row])), "worst overshoot", RED, width=1.2),
-            Curve(t, np.degrees(_drawable(steps.angles[i, 0])), "nominal", "black", width=1.2),
+            Curve(t, shown(_drawable(steps.angles[i, settling])), "worst under the load", ORANGE),
+            Curve(t, shown(_drawable(steps.angles[i, row])), "worst overshoot", RED, width=1.2),
+            Curve(t, shown(_drawable(steps.angles[i, 0])), "nominal", "black", width=1.2),
         ]
-        panels.append(Panel(curves, f"{axis} [deg]"))
+        panels.append(Panel(curves, f"{axis} [{unit}]"))
+    per = 1.0 if robot.is_neck else to_si(robot.motors.unit)[0]
     motors = [
-        Curve(t, _drawable(steps.motors[axis_of, worst, :, j]), f"motor {j + 1}", colour, "step")
-        for j, colour in enumerate((BLUE, ORANGE, GREEN))
+        Curve(t, _drawable(steps.motors[axis_of, worst, :, j]) / per, f"motor {j + 1}", colour, "step")
+        for j, colour in zip(range(len(robot.motors.names)), SERIES, strict=False)
     ]
-    panels.append(Panel(motors, "set-point [rad]", title=f"motors on {names[worst]}"))
+    panels.append(Panel(motors, f"set-point [{robot.motors.unit}]", title=f"motors on {plants.names[worst]}"))
     return Chart("Steps against every plant, then a load", panels, row_height=2.6)
 
 
 def _drawable(y: Vector) -> Vector:
     """Return `y` without what is too large to draw."""
-    return np.where(np.isfinite(y) & (np.abs(y) < 1e3), y, np.nan)
+    return np.where(np.isfinite(y) & (np.abs(y) < _LARGEST), y, np.nan)
 
 
-def neck_chart(evidence: Evidence) -> Chart:
+def neck_chart(evidence: Evidence, robot: Robot) -> Chart:
     """Return all loops over the virtual neck: the way along the step, the worst overshoot drawn through."""
     runs = [run for run in evidence.necks if run.result is not None]
     if not runs:
@@ -223,11 +242,13 @@ def neck_chart(evidence: Evidence) -> Chart:
         Curve(t, along[id(worst)], f"largest overshoot: {worst.name}", RED, width=1.2),
         Curve(t, table[0], runs[0].name, "black", width=1.2),
     ]
-    return Chart("Steps of the virtual neck", [Panel(curves, "true angle along the step [deg]")], row_height=3.4)
+    what = "virtual neck" if robot.is_neck else f"virtual {robot.name}"
+    return Chart(f"Steps of the {what}", [Panel(curves, "true angle along the step [deg]")], row_height=3.4)
 
 
 def _along(run: NeckRun) -> Vector:
     if run.result is None:
         return np.zeros(0)
-    c, s = math.cos(run.orientation), math.sin(run.orientation)
-    return np.degrees(c * run.result.angle("pitch") + s * run.result.angle("roll"))
+    robot = run.result.robot
+    shares = zip(direction(run.orientation, robot), robot.outputs.names, strict=True)
+    return np.degrees(np.sum([share * run.result.angle(name) for share, name in shares], axis=0))

@@ -9,7 +9,7 @@ import numpy as np
 from softneck.core import Vector
 
 from ._linear import LinearLaw, margins
-from ._plants import AXES, QUANTITIES, Plants, UncertainNeck, make_plants
+from ._plants import QUANTITIES, Plants, UncertainNeck, make_plants
 
 # Two-sided 95 %.
 _REACH = 1.96
@@ -43,16 +43,16 @@ def intervals(neck: UncertainNeck, law: LinearLaw, w: Vector, *, extra: int) -> 
     if any(box.std is None or not np.isfinite(box.std).any() for box in neck.axes):
         return []
     found = _around(neck, law, w, extra, np.stack([box.nominal for box in neck.axes]), _median(neck), "nominal")
-    for i, axis in enumerate(AXES):
+    for i, axis in enumerate(neck.names):
         box = neck.axes[i]
         numbers = np.tile(np.stack([other.nominal for other in neck.axes]), (box.samples.shape[0], 1, 1))
         numbers[:, i] = box.samples
         values = margins(_plants(neck, numbers, extra), law, w)[f"{axis}.disk_margin"]
         worst = int(np.argmin(values))
-        std = np.zeros((2, 3))
+        std = np.zeros((len(neck.axes), 3))
         std[i] = np.nan_to_num(box.std[worst])  # pyright: ignore[reportOptionalSubscript]
         rows = _around(neck, law, w, extra, numbers[worst], std, f"worst sample of {axis} ({worst})")
-        found += [row for row in rows if row.metric.startswith(axis)]
+        found += [row for row in rows if row.metric.startswith(f"{axis}.")]
     return found
 
 
@@ -64,7 +64,7 @@ def _around(
     neck: UncertainNeck, law: LinearLaw, w: Vector, extra: int, numbers: np.ndarray, std: np.ndarray, name: str
 ) -> list[MarginInterval]:
     tried = [numbers]
-    for i in (0, 1):
+    for i in range(len(neck.axes)):
         for k in range(3):
             for sign in (-1.0, 1.0):
                 moved = numbers.copy()
@@ -74,7 +74,7 @@ def _around(
                 tried.append(moved)
     table = margins(_plants(neck, np.array(tried), extra), law, w)
     rows = []
-    for i, axis in enumerate(AXES):
+    for i, axis in enumerate(neck.names):
         for metric in _METRICS:
             values = table[f"{axis}.{metric}"]
             pairs = values[1 + 6 * i : 7 + 6 * i].reshape(3, 2)

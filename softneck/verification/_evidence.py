@@ -10,15 +10,16 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Progress, Vector
+from softneck.loop._result import shown_unit
 from softneck.runtime import Block
 
 from ._confidence import MarginInterval, intervals
 from ._experiments import Crossing, LoopUnderTest, crossing_facts, crossing_values, crossings
 from ._laws import ControllerUnderTest
 from ._linear import Gaps, LinearLaw, gaps, judged, margins
-from ._neck_loops import STEP_AT, NeckRun, neck_changes, run_necks
+from ._neck_loops import STEP_AT, NeckRun, direction, neck_changes, no_virtual_plant, run_necks
 from ._own_plants import OwnPlant
-from ._plants import AXES, Plants, UncertainNeck, all_plants, join, nominal_plants
+from ._plants import Plants, UncertainNeck, all_plants, join, nominal_plants
 from ._requirements import Requirements
 from ._search import SearchResult, search
 from ._steps import Steps, StepTest, run_steps
@@ -59,7 +60,7 @@ class LinearEvidence:
         margins: name -> (n,).
         found: by the search; None where it was switched off.
         structured: by neck.
-        gaps: by neck: pitch and roll.
+        gaps: by neck, of each axis.
         intervals: of the margins.
         delays: rows of (samples added, largest radius, least disk margin, largest sensitivity).
     """
@@ -70,7 +71,7 @@ class LinearEvidence:
     margins: dict[str, Vector]
     found: SearchResult | None
     structured: list[list[StructuredResult]]
-    gaps: list[tuple[Gaps, Gaps]]
+    gaps: list[tuple[Gaps, ...]]
     intervals: list[MarginInterval]
     delays: np.ndarray
 
@@ -138,14 +139,15 @@ def gather(
     progress(0.5, "steps against every plant")
     stepped = join([plants, *(part.plants.take(np.arange(len(plants), len(part.plants))) for part in linear)])
     test = StepTest(
-        step=math.radians(asked.step["size_deg"]), duration=float(asked.step["duration_s"]),
-        noise=math.radians(asked.step["noise_deg"]), load=float(asked.step["load_rad"]), seed=seed,
+        step=asked.si(asked.step["size_deg"]), duration=float(asked.step["duration_s"]),
+        noise=asked.si(asked.step["noise_deg"]), load=asked.motor_si(float(asked.step["load_rad"])), seed=seed,
     )  # fmt: skip
-    steps = run_steps(stepped, controller.block, test)
+    steps = run_steps(stepped, controller.block, test, robot=controller.robot, weights=sources[0].weights)
+    why = no_virtual_plant(controller.robot, asked)
     runs = run_necks(
-        controller.block, asked.neck, order=controller.order, observer=observer, seed=seed,
+        controller.block, asked, order=controller.order, observer=observer, seed=seed,
         progress=lambda done, text: progress(0.6 + 0.2 * done, text), own=own,
-    ) if asked.neck["necks"] or own else []  # fmt: skip
+    ) if own or not why else []  # fmt: skip
     payloads = sorted({float(kg) for kg in (min(asked.neck["payloads_kg"]), max(asked.neck["payloads_kg"]))})
     loops = [
         LoopUnderTest(
@@ -159,11 +161,15 @@ def gather(
     ]  # fmt: skip
     found = crossings(loops, progress=lambda done, text: progress(0.8 + 0.2 * done, text)) if loops else []
     tested = [
-        item for law in controller.laws.values() for item in tested_axes(families or {}, law, AXES, controller.extra)
+        item
+        for law in controller.laws.values()
+        for item in tested_axes(families or {}, law, plants.axes, controller.extra)
     ]
     evidence = Evidence(
         plants, w, linear, steps, stepped, runs, foreign=_foreign(asked, own), tested=tested, crossings=found
     )
+    if why and not own:
+        evidence.not_computed["neck"] = why
     _tell(evidence, controller, asked, observer is not None)
     progress(1.0, "done")
     return evidence
@@ -177,20 +183,19 @@ def _linear(
     found = search(necks, law, w, extra=extra, generations=generations, seed=seed) if generations else None
     tried = plants if found is None else join([plants, found.plants.later(extra)])
     table = margins(tried, law, w)
-    drawn = np.random.default_rng(seed).uniform(-1.0, 1.0, (_SCALED, 2, 3))
+    drawn = np.random.default_rng(seed).uniform(-1.0, 1.0, (_SCALED, len(plants.axes), 3))
     drawn[: _SCALED // 3] = np.sign(drawn[: _SCALED // 3])
     wanted = any(item.metric == "robust.sensitivity" for item in asked.bounds)
     parts = [structured(neck, law, extra=extra, drawn=drawn, performance=wanted or detailed) for neck in necks]
     nominals = [plant.later(extra) for plant in nominal_plants(necks)]
     distances = []
     for source, nominal in enumerate(nominals):
-        first, second = gaps(nominal, tried.take(np.flatnonzero(tried.source == source)), law, w)
-        distances.append((first, second))
-    ratio = np.zeros((2, len(tried)))
-    for source, pair in enumerate(distances):
-        for i in (0, 1):
-            ratio[i, tried.source == source] = pair[i].ratio
-    table |= {f"{axis}.nu_gap_ratio": ratio[i] for i, axis in enumerate(AXES)}
+        distances.append(gaps(nominal, tried.take(np.flatnonzero(tried.source == source)), law, w))
+    ratio = np.zeros((len(plants.axes), len(tried)))
+    for source, each in enumerate(distances):
+        for i, found_gaps in enumerate(each):
+            ratio[i, tried.source == source] = found_gaps.ratio
+    table |= {f"{axis}.nu_gap_ratio": ratio[i] for i, axis in enumerate(plants.axes)}
     spread = [row for neck in necks for row in intervals(neck, law, w, extra=extra)] if detailed else []
     return LinearEvidence(name, law, tried, table, found, parts, distances, spread, _delays(plants, law, w))
 
@@ -200,14 +205,16 @@ def _delays(plants: Plants, law: LinearLaw, w: Vector) -> np.ndarray:
     few = plants.take(np.arange(min(_DELAY_PLANTS, len(plants))))
     for samples in range(_DELAYS):
         table = margins(few.later(samples), law, w)
-        disks = np.minimum(table["pitch.disk_margin"], table["roll.disk_margin"])
-        peaks = np.maximum(table["pitch.sensitivity"], table["roll.sensitivity"])
+        disks = np.min([table[f"{axis}.disk_margin"] for axis in plants.axes], axis=0)
+        peaks = np.max([table[f"{axis}.sensitivity"] for axis in plants.axes], axis=0)
         rows.append([samples, table["stability.radius"].max(), disks.min(), peaks.max()])
     return np.array(rows)
 
 
 def _foreign(asked: Requirements, own: Sequence[OwnPlant]) -> bool:
     """Return whether the necks in the loops are presets that nobody asked to decide; a neck file is the user's own."""
+    if not asked.robot.is_neck and "preset" not in asked.own.get("neck", {}):
+        return False  # its own file says what stands for it
     return not (own or asked.neck["decides"] or str(asked.neck["preset"]).endswith(".toml"))
 
 
@@ -261,14 +268,13 @@ def _tell(evidence: Evidence, controller: ControllerUnderTest, asked: Requiremen
         )
     _tell_data(evidence)
     for name, values in evidence.steps.metrics.items():
-        metrics[f"step.{name}"] = Values(values, _step_describer(evidence, name))
+        metrics[f"step.{asked.name_of(name)}"] = Values(values, _step_describer(evidence, name))
     if not evidence.necks:
-        absent["neck"] = "no loops over the virtual neck were asked for (necks = 0)"
         return
     describe = _neck_describer(evidence, controller, asked)
     for name in evidence.necks[0].metrics:
         values = np.array([run.metrics[name] for run in evidence.necks])
-        metrics[f"neck.{name}"] = Values(values, describe)
+        metrics[f"neck.{asked.name_of(name)}"] = Values(values, describe)
     if np.isnan(metrics["neck.slack_s"].values).any():
         del metrics["neck.slack_s"]
         absent["neck.slack_s"] = "a plant tells no tensions; give a NECK, a file or a preset by its name"
@@ -296,10 +302,11 @@ def _tell_linear(evidence: Evidence, part: LinearEvidence) -> None:
         worst = count + int(np.argmax(radius[count:]))
         _add(evidence, "stability.searched_radius", Values(met, lambda _: describe(worst)))
     for name, values in table.items():
-        _add(evidence, name, Values(values, _with_axis(describe, name)))
-    smaller = {name.partition(".")[2] for name in table if name.startswith("pitch.")}
+        _add(evidence, name, Values(values, _with_axis(describe, name, part.plants.axes)))
+    axes = part.plants.axes
+    smaller = {name.partition(".")[2] for name in table if name.startswith(f"{axes[0]}.")}
     for name in smaller:
-        for axis in AXES:
+        for axis in axes:
             _add(evidence, f"axes.{name}", evidence_of(part, f"{axis}.{name}", describe))
     for rows in part.structured:
         for row in rows:
@@ -311,7 +318,7 @@ def _tell_linear(evidence: Evidence, part: LinearEvidence) -> None:
 
 def evidence_of(part: LinearEvidence, name: str, describe: Describe) -> Values:
     """Return the values of one margin with a describer that knows its axis."""
-    return Values(part.margins[name], _with_axis(describe, name))
+    return Values(part.margins[name], _with_axis(describe, name, part.plants.axes))
 
 
 def _add(evidence: Evidence, name: str, more: Values) -> None:
@@ -328,16 +335,16 @@ def _add(evidence: Evidence, name: str, more: Values) -> None:
     evidence.metrics[name] = Values(np.concatenate([before.values, more.values]), describe)
 
 
-def _with_axis(describe: Describe, name: str) -> Describe:
+def _with_axis(describe: Describe, name: str, axes: tuple[str, ...]) -> Describe:
     axis = name.partition(".")[0]
-    return lambda row: {**describe(row), "axis": axis if axis in AXES else "both"}
+    return lambda row: {**describe(row), "axis": axis if axis in axes else "both"}
 
 
 def plant_facts(plants: Plants, row: int) -> dict[str, Any]:
     """Return one plant as JSON values."""
     axes = {
         axis: dict(zip(("static_gain_rad_per_rad", "pole_per_s", "dead_time_s"), numbers.tolist(), strict=True))
-        for axis, numbers in zip(AXES, plants.numbers[row], strict=True)
+        for axis, numbers in zip(plants.axes, plants.numbers[row], strict=True)
     }
     return {
         "kind": "linear", "name": plants.names[row], **axes, "cross": plants.cross[row].tolist(),
@@ -359,18 +366,19 @@ def _structured_describer(row: StructuredResult, point: str) -> Describe:
 
 def _step_describer(evidence: Evidence, name: str) -> Describe:
     worse = evidence.steps.worse[name]
-    return lambda row: {**plant_facts(evidence.stepped, row), "axis": AXES[int(worse[row])]}
+    return lambda row: {**plant_facts(evidence.stepped, row), "axis": evidence.stepped.axes[int(worse[row])]}
 
 
 def _neck_describer(evidence: Evidence, controller: ControllerUnderTest, asked: Requirements) -> Describe:
     def describe(row: int) -> dict[str, Any]:
         run = evidence.necks[row]
         size = float(asked.neck["size_deg"])
-        parameters = {} if run.parameters is None else neck_changes(run.parameters)
+        parameters = {} if run.parameters is None else neck_changes(run.parameters, controller.robot)
         return {
             "kind": "own" if run.parameters is None else "neck", "name": run.name, "parameters": parameters,
             "payload_kg": run.payload,
-            "pitch_deg": size * math.cos(run.orientation), "roll_deg": size * math.sin(run.orientation),
+            **{f"{name}_{shown_unit(controller.robot)[0]}": size * share for name, share in
+               zip(controller.robot.outputs.names, direction(run.orientation, controller.robot), strict=True)},
             "seed": run.seed, "at_s": STEP_AT, "duration_s": STEP_AT + float(asked.neck["duration_s"]),
             "sample_time_s": controller.block.sample_time, "order": controller.order,
         }  # fmt: skip

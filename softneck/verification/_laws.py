@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from softneck.core import SettingsError, require_one_of
+from softneck.estimation._axis import robot_of
 from softneck.loop._loop import ORDERS
+from softneck.robot import Robot
 from softneck.runtime import Block
 
 from ._linear import LinearLaw
@@ -19,6 +21,7 @@ class ControllerUnderTest:
 
     Attributes:
         block: what runs.
+        robot: whose it is.
         laws: name -> linear form: one named "" of a linear controller, one for each frozen point of another.
         order: of the loop.
         extra: samples that the order adds to the plant's delay.
@@ -26,6 +29,7 @@ class ControllerUnderTest:
     """
 
     block: Block
+    robot: Robot
     laws: Mapping[str, LinearLaw]
     order: str
     extra: int
@@ -62,16 +66,17 @@ def judge(controller: Any, *, order: str | None, observer: bool) -> ControllerUn
     else:
         extra = 1 + int(observer)
     laws, why = _laws(controller)
-    return ControllerUnderTest(block, laws, chosen, extra, why)
+    return ControllerUnderTest(block, robot_of(controller), laws, chosen, extra, why)
 
 
 def _laws(controller: Any) -> tuple[dict[str, LinearLaw], str]:
+    robot = robot_of(controller)
     for name in ("ss", "to_lti"):
         if hasattr(controller, name):
-            return {"": LinearLaw.of(getattr(controller, name)())}, ""
+            return {"": LinearLaw.of(getattr(controller, name)(), robot)}, ""
     if hasattr(controller, "ss_at") and hasattr(controller, "points"):
         points = controller.points()
-        return {name: LinearLaw.of(controller.ss_at(point)) for name, point in points.items()}, ""
+        return {name: LinearLaw.of(controller.ss_at(point), robot) for name, point in points.items()}, ""
     return (
         {},
         f"the controller {controller.block().kind} has no linear form (`ss()`, or `ss_at(point)` with `points()`)",

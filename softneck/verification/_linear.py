@@ -13,10 +13,12 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector
 from softneck.design.robust._mu import two_scalars
+from softneck.identification.models._linear_systems import redefined_input
+from softneck.robot import Robot
 
-from ._plants import Plants
+from ._plants import Plants, mixing
 
-# Margins that are better large, and better small; of each axis, and of both together.
+# Margins that are better large, and better small; of each axis, and of all together.
 LARGE = ("disk_margin", "gain_margin", "phase_margin_deg", "delay_margin_ms")
 SMALL = ("sensitivity", "complementary", "control_sensitivity")
 MIMO = "mimo_disk_margin"
@@ -30,9 +32,9 @@ class LinearLaw:
 
     Attributes:
         A: (n, n).
-        Br, By: (n, 2).
-        C: (2, n).
-        Dr, Dy: (2, 2).
+        Br, By: (n, axes).
+        C: (axes, n).
+        Dr, Dy: (axes, axes).
         sample_time: [s].
     """
 
@@ -45,8 +47,10 @@ class LinearLaw:
     sample_time: float
 
     @classmethod
-    def of(cls, system: Any) -> LinearLaw:
+    def of(cls, system: Any, robot: Robot | None = None) -> LinearLaw:
         """Return it of a system from (pitch_reference, roll_reference, pitch, roll) to (theta_i, phi_i).
+
+        Of another robot than the neck from its outputs to their inputs, such as (x_reference, x) to (x_input).
 
         Raises:
             SettingsError: other channels or not discrete.
@@ -57,7 +61,11 @@ class LinearLaw:
             raise SettingsError(
                 f"the controller's linear form is a {type(system).__name__}, not a python-control system."
             )
-        wanted = (["pitch_reference", "roll_reference", "pitch", "roll"], ["theta_i", "phi_i"])
+        whose = Robot.preset() if robot is None else robot
+        names = whose.outputs.names
+        wanted = (
+            [*(f"{name}_reference" for name in names), *names], [redefined_input(whose, name) for name in names]
+        )  # fmt: skip
         given = (list(system.input_labels), list(system.output_labels))
         if given != wanted:
             raise SettingsError(
@@ -68,28 +76,30 @@ class LinearLaw:
         if form.dt in (0, None) or isinstance(form.dt, bool):
             raise SettingsError("the controller's linear form must be discrete, with its sample time as dt.")
         A, B, C, D = (np.asarray(item, dtype=np.float64) for item in (form.A, form.B, form.C, form.D))
-        return cls(A, B[:, :2], B[:, 2:], C, D[:, :2], D[:, 2:], float(form.dt))
+        m = len(names)
+        return cls(A, B[:, :m], B[:, m:], C, D[:, :m], D[:, m:], float(form.dt))
 
     def feedback(self, frequency: Vector) -> np.ndarray:
-        """Return Ky (m, 2, 2) at `frequency` [rad/s]."""
+        """Return Ky (m, axes, axes) at `frequency` [rad/s]."""
         return self._response(frequency, self.By, self.Dy)
 
     def forward(self, frequency: Vector) -> np.ndarray:
-        """Return the way from the reference (m, 2, 2)."""
+        """Return the way from the reference (m, axes, axes)."""
         return self._response(frequency, self.Br, self.Dr)
 
     @property
     def coupled(self) -> bool:
-        """Whether one axis' angle moves the other's input."""
+        """Whether one axis' angle moves another's input."""
         Ky = np.abs(self.feedback(np.geomspace(0.1, math.pi / self.sample_time, 20)))
         # 1e-9: rounding of an allocation that is diagonal.
-        return bool((Ky[:, 0, 1] + Ky[:, 1, 0]).max() > 1e-9 * Ky.max())
+        others = Ky[:, ~np.eye(Ky.shape[1], dtype=bool)].sum(axis=1)
+        return bool(others.max() > 1e-9 * Ky.max())
 
     def _response(self, frequency: Vector, B: Matrix, D: Matrix) -> np.ndarray:
         z = np.exp(1j * frequency * self.sample_time)
         n = self.A.shape[0]
         if n == 0:
-            return np.broadcast_to(D.astype(complex), (z.size, 2, 2))
+            return np.broadcast_to(D.astype(complex), (z.size, *D.shape))
         inner = np.linalg.solve(z[:, None, None] * np.eye(n) - self.A, np.broadcast_to(B, (z.size, *B.shape)))
         return self.C @ inner + D
 
@@ -112,19 +122,18 @@ def radii(plants: Plants, law: LinearLaw) -> Vector:
 
 
 def _plant_matrices(plants: Plants) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return A (n, N, N), B (n, N, 2), C (n, 2, N): observable form of each axis behind a line of its delay."""
-    n, q = len(plants), plants.numerator.shape[2] - 1
+    """Return A (n, N, N), B (n, N, axes), C (n, axes, N): observable form of each axis behind a line of its delay."""
+    n, m, q = len(plants), len(plants.axes), plants.numerator.shape[2] - 1
     D = int(plants.delay.max(initial=0))
     size = q + D
-    A, B, C = np.zeros((n, 2 * size, 2 * size)), np.zeros((n, 2 * size, 2)), np.zeros((n, 2, 2 * size))
-    rows = np.arange(n)
-    for i in (0, 1):
+    A, B, C = np.zeros((n, m * size, m * size)), np.zeros((n, m * size, m)), np.zeros((n, m, m * size))
+    rows, X = np.arange(n), mixing(plants.cross, m)
+    for i in range(m):
         at = i * size
         own = slice(at, at + q)
         A[:, own, at] = -plants.denominator[:, i, 1:]
         A[:, at + np.arange(q - 1), at + 1 + np.arange(q - 1)] = 1.0
-        source = np.zeros((n, 2))
-        source[:, i], source[:, 1 - i] = 1.0, plants.cross[:, i]
+        source = X[:, i]
         b = plants.numerator[:, i, 1:]
         delay = plants.delay[:, i]
         # The input comes from the end of the delay line, or straight from the controller where there is none.
@@ -140,16 +149,16 @@ def _plant_matrices(plants: Plants) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def loops(plants: Plants, law: LinearLaw, w: Vector) -> tuple[np.ndarray, np.ndarray]:
-    """Return the plants P and the open loops at their outputs -P Ky, both (n, m, 2, 2)."""
+    """Return the plants P and the open loops at their outputs -P Ky, both (n, m, axes, axes)."""
     G = plants.response(w)
-    P = np.empty((len(plants), w.size, 2, 2), dtype=complex)
-    P[:, :, 0, 0], P[:, :, 1, 1] = G[:, 0], G[:, 1]
-    P[:, :, 0, 1], P[:, :, 1, 0] = plants.cross[:, :1] * G[:, 0], plants.cross[:, 1:] * G[:, 1]
+    P = mixing(plants.cross, G.shape[1])[:, None] * np.swapaxes(G, 1, 2)[..., None]
     return P, -P @ law.feedback(w)
 
 
 def inverse(M: np.ndarray) -> np.ndarray:
-    """Return the inverses of 2 x 2 matrices (..., 2, 2)."""
+    """Return the inverses of small matrices (..., axes, axes); those of 2 x 2 are written out."""
+    if M.shape[-1] != 2:
+        return np.linalg.inv(M)
     a, b, c, d = M[..., 0, 0], M[..., 0, 1], M[..., 1, 0], M[..., 1, 1]
     found = np.empty_like(M)
     found[..., 0, 0], found[..., 0, 1], found[..., 1, 0], found[..., 1, 1] = d, -b, -c, a
@@ -175,11 +184,11 @@ def margins(plants: Plants, law: LinearLaw, w: Vector, radius: Vector | None = N
 
 def _margins(plants: Plants, law: LinearLaw, w: Vector) -> dict[str, Vector]:
     P, L = loops(plants, law, w)
-    eye = np.eye(2)
+    eye = np.eye(len(plants.axes))
     S = inverse(eye + L)
     CS = -law.feedback(w) @ S
     found: dict[str, Vector] = {}
-    for i, axis in enumerate(("pitch", "roll")):
+    for i, axis in enumerate(plants.axes):
         own = S[..., i, i]
         found[f"{axis}.sensitivity"] = np.abs(own).max(axis=1)
         found[f"{axis}.complementary"] = np.abs(1.0 - own).max(axis=1)
@@ -189,9 +198,20 @@ def _margins(plants: Plants, law: LinearLaw, w: Vector) -> dict[str, Vector]:
         for name, values in classical(1.0 / own - 1.0, w).items():
             found[f"{axis}.{name}"] = values
     at_input = inverse(eye - law.feedback(w) @ P)
-    sizes = [two_scalars(M - 0.5 * eye).max(axis=1) for M in (S, at_input)]
+    sizes = [_scalars(M - 0.5 * eye).max(axis=1) for M in (S, at_input)]
     found["mimo.disk_margin"] = 1.0 / np.maximum(*sizes)
     return found
+
+
+def _scalars(M: np.ndarray) -> np.ndarray:
+    """Return the structured singular value (...) of M (..., m, m) for m complex scalars: exact up to two of them.
+
+    Of more the spectral radius of |M|, which no diagonal scaling makes less safe (Safonov 1982): a margin that is true
+    or too small.
+    """
+    if M.shape[-1] == 2:
+        return two_scalars(M)
+    return np.abs(np.linalg.eigvals(np.abs(M))).max(axis=-1)
 
 
 def classical(L: np.ndarray, w: Vector) -> dict[str, Vector]:
@@ -239,8 +259,8 @@ class Gaps:
         return self.gap / self.margin if self.margin > 0.0 else np.full(self.gap.size, math.inf)
 
 
-def gaps(nominal: Plants, plants: Plants, law: LinearLaw, w: Vector) -> tuple[Gaps, Gaps]:
-    """Return the gaps of pitch and roll between one nominal plant and all others, axes taken alone.
+def gaps(nominal: Plants, plants: Plants, law: LinearLaw, w: Vector) -> tuple[Gaps, ...]:
+    """Return the gaps of each axis between one nominal plant and all others, axes taken alone.
 
     Args:
         nominal: one plant.
@@ -249,7 +269,8 @@ def gaps(nominal: Plants, plants: Plants, law: LinearLaw, w: Vector) -> tuple[Ga
         w: (m,) frequencies [rad/s] up to Nyquist.
     """
     Ky = law.feedback(w)
-    return tuple(_axis(nominal.response(w)[0, i], plants.response(w)[:, i], -Ky[:, i, i]) for i in (0, 1))  # pyright: ignore[reportReturnType]
+    P1, P2 = nominal.response(w)[0], plants.response(w)
+    return tuple(_axis(P1[i], P2[:, i], -Ky[:, i, i]) for i in range(len(P1)))
 
 
 def _axis(P1: np.ndarray, P2: np.ndarray, C: np.ndarray) -> Gaps:

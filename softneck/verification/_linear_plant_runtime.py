@@ -1,4 +1,4 @@
-"""Two axes with cross gains, each a transfer function behind its delay, motors where they were told to be."""
+"""Some axes with cross gains, each a transfer function behind its delay, motors where they were told to be."""
 
 import numpy as np
 
@@ -13,13 +13,13 @@ def linear_plant_line(delay: np.ndarray) -> int:
 
 
 class LinearPlantArrays(Arrays):
-    """Transfer functions of pitch and roll from redefined inputs."""
+    """Transfer functions of pitch and roll from redefined inputs, or of another robot's outputs."""
 
-    numerator = array("2, q", "b of each axis, highest power first; begins with 0")
-    denominator = array("2, q", "a of each axis; begins with 1")
-    delay = array("2", "samples beyond the first until an input acts")
-    cross = array("2", "what of the other axis' input is added to an axis' own")
-    T = array("3, 3", "of Eq. 9-11: motors to redefined inputs")
+    numerator = array("axes, q", "b of each axis, highest power first; begins with 0")
+    denominator = array("axes, q", "a of each axis; begins with 1")
+    delay = array("axes", "samples beyond the first until an input acts")
+    mixed = array("axes, axes", "ones, and what of the other axes' inputs is added to an axis' own")
+    T = array("references, motors", "of Eq. 9-11: motors to redefined inputs")
     line = value("delay", function=linear_plant_line)
 
 
@@ -27,8 +27,8 @@ class LinearPlantState(StateVector):
     """What each axis remembers."""
 
     random = cells("6", "generator of the measurement noise")
-    x = cells("2, q", "observable form of each axis, its angle first [rad]; the last entry stays zero")
-    u = cells("2, line", "inputs of each axis, newest first [rad]")
+    x = cells("axes, q", "observable form of each axis, its angle first [rad]; the last entry stays zero")
+    u = cells("axes, line", "inputs of each axis, newest first [rad]")
 
 
 def initialise(p: LinearPlantArrays, parameters: np.ndarray, x: LinearPlantState, outputs: np.ndarray) -> None:
@@ -37,8 +37,8 @@ def initialise(p: LinearPlantArrays, parameters: np.ndarray, x: LinearPlantState
     random_seed(x.random, parameters[1])
     outputs[:] = 0.0
     if parameters[0] > 0.0:
-        for axis in range(2):
-            outputs[2 + axis] = parameters[0] * random_normal(x.random)
+        for axis in range(p.axes):
+            outputs[p.axes + axis] = parameters[0] * random_normal(x.random)
 
 
 def step(
@@ -49,17 +49,21 @@ def step(
     inputs: motor_setpoint_1..3, load_pitch, load_roll. parameters: noise_std [rad], noise_seed.
     outputs: pitch, roll, pitch_measured, roll_measured, motor_position_1..3.
     """
-    tilt = np.dot(p.T, inputs[:3])  # Eq. 9-11
-    for axis in range(2):
+    tilt = np.dot(p.T, inputs[: p.motors])  # Eq. 9-11
+    for axis in range(p.axes):
         held, own = x.u[axis], x.x[axis]
         for j in range(p.line - 1, 0, -1):
             held[j] = held[j - 1]
-        # The other axis' input leaks in; a load acts as an input does, before the dead time.
-        held[0] = tilt[axis] + p.cross[axis] * tilt[1 - axis] + inputs[3 + axis]
+        # The other axes' inputs leak in; a load acts as an input does, before the dead time.
+        total = tilt[axis]
+        for other in range(p.axes):
+            if other != axis:
+                total += p.mixed[axis, other] * tilt[other]
+        held[0] = total + inputs[p.motors + axis]
         axis_advance(own, p.numerator[axis], p.denominator[axis], held[int(p.delay[axis])])
         outputs[axis] = own[0]
-        outputs[2 + axis] = own[0]
+        outputs[p.axes + axis] = own[0]
         if parameters[0] > 0.0:
-            outputs[2 + axis] += parameters[0] * random_normal(x.random)
+            outputs[p.axes + axis] += parameters[0] * random_normal(x.random)
     # No drives between: set-points are reached at once.
-    outputs[4:7] = inputs[:3]
+    outputs[2 * p.axes : 2 * p.axes + p.motors] = inputs[: p.motors]

@@ -1,21 +1,24 @@
-"""Loops over the user's own plants, or over the virtual neck and plausible ones around it."""
+"""Loops over the user's own plants, or over a robot's virtual plant and plausible ones around it."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 
 from softneck.core import DataError, Progress, SettingsError
 from softneck.loop import BlockPart, Loop, LoopResult, StepReference, metrics, run_loop
-from softneck.plant import NeckParameters
+from softneck.loop._robot_references import RobotReference
+from softneck.plant import NeckParameters, VirtualNeck
+from softneck.robot import Robot
 from softneck.runtime import Block
 
 from ._own_plants import OwnPlant, own_plant
+from ._requirements import Requirements, metric_ends
 
 # When the step comes [s]: after the controller took over the motors.
 STEP_AT = 0.5
@@ -48,9 +51,43 @@ class NeckRun:
     result: LoopResult | None
 
 
+def no_virtual_plant(robot: Robot, asked: Requirements) -> str:
+    """Return why there are no loops over a virtual plant; "" where there are."""
+    if not asked.neck["necks"]:
+        return "no loops over the virtual neck were asked for (necks = 0)"
+    try:
+        virtual_plant(robot, asked)
+    except SettingsError as error:
+        if robot.is_neck or "preset" in asked.own.get("neck", {}):
+            raise
+        return f"no virtual plant stands for `{robot.name}`: {error}"
+    return ""
+
+
+def virtual_plant(robot: Robot, asked: Requirements) -> tuple[str, VirtualNeck]:
+    """Return the virtual plant that is asked for, of another robot its own where nobody says otherwise, by its name."""
+    if robot.is_neck:
+        return str(asked.neck["preset"]), VirtualNeck(NeckParameters.preset(str(asked.neck["preset"])))
+    given = asked.own.get("neck", {}).get("preset")
+    plant = VirtualNeck.of(robot, None if given is None else NeckParameters.preset(str(given)))
+    return str(robot.neck if given is None else given), plant
+
+
+def neck_file_of(robot: Robot, asked: Requirements) -> Path:
+    """Return what names the physics of the loops: a preset or a neck file."""
+    if robot.is_neck or "preset" in asked.own.get("neck", {}):
+        return Path(str(asked.neck["preset"]))
+    return (robot.folder or Path()) / str(robot.neck)
+
+
+def direction(orientation: float, robot: Robot) -> tuple[float, ...]:
+    """Return the share of each output in a step of an orientation [rad]."""
+    return (math.cos(orientation), math.sin(orientation))[: len(robot.outputs.names)]
+
+
 def run_necks(
     controller: Block,
-    table: Mapping[str, Any],
+    asked: Requirements,
     *,
     order: str,
     observer: Block | None,
@@ -63,31 +100,47 @@ def run_necks(
     Raises:
         SettingsError: controller and observer that do not fit the neck.
     """
-    plants = own or _presets(table, seed)
+    table, robot = asked.neck, asked.robot
+    plants = own or _virtual(asked, seed)
+    # One output bends in one plane: other orientations are the same step, or none.
+    angles = table["orientations_deg"] if len(robot.outputs.names) > 1 else [0.0]
     cases = [
         (plant, payload, angle) for plant in plants
-        for payload in (table["payloads_kg"] if plant.payload else (0.0,)) for angle in table["orientations_deg"]
+        for payload in (table["payloads_kg"] if plant.payload else (0.0,)) for angle in angles
     ]  # fmt: skip
     runs = []
     for number, (plant, payload, angle) in enumerate(cases):
         name = f"{plant.name}, {payload:g} kg, {angle:g} deg"
         progress(number / len(cases), name)
-        loop = _loop(controller, plant, float(payload), math.radians(angle), table, order, observer, seed + number)
+        loop = _loop(controller, plant, float(payload), math.radians(angle), asked, order, observer, seed + number)
         values, result = _judge(loop)
         runs.append(NeckRun(name, plant.parameters, float(payload), math.radians(angle), seed + number, values, result))
     return runs
 
 
-def _presets(table: Mapping[str, Any], seed: int) -> list[OwnPlant]:
-    """Return the preset of the table [neck] and plausible necks around it."""
-    preset = NeckParameters.preset(str(table["preset"]))
+def _virtual(asked: Requirements, seed: int) -> list[OwnPlant]:
+    """Return the virtual plant that the table [neck] asks for and plausible ones around it."""
+    table = asked.neck
+    base, plant = virtual_plant(asked.robot, asked)
     rng = np.random.default_rng(seed)
     spread = table["spread_pct"] / 100.0
     count = int(table["necks"])
-    necks = [preset, *(preset.sample(rng, spread=spread) for _ in range(count - 1))][:count]
+    necks = [plant.parameters, *(_near(plant, rng, spread) for _ in range(count - 1))][:count]
     return [
-        own_plant(neck, table["preset"] if k == 0 else f"{table['preset']} varied {k}") for k, neck in enumerate(necks)
+        own_plant(VirtualNeck(neck, asked.robot), base if k == 0 else f"{base} varied {k}")
+        for k, neck in enumerate(necks)
     ]
+
+
+def _near(plant: VirtualNeck, rng: np.random.Generator, spread: float) -> NeckParameters:
+    """Return a plausible neck around a robot's that its tendons do not buckle."""
+    for _ in range(100):
+        found = plant.parameters.sample(rng, spread=spread)
+        try:
+            return VirtualNeck(found, plant.robot).parameters
+        except SettingsError:
+            continue
+    raise SettingsError(f"no plausible neck within a spread of {spread:g} holds its tendons; lower `spread_pct`.")
 
 
 def _loop(
@@ -95,19 +148,25 @@ def _loop(
     plant: OwnPlant,
     payload: float,
     orientation: float,
-    table: Mapping[str, Any],
+    asked: Requirements,
     order: str,
     observer: Block | None,
     seed: int,
 ) -> Loop:
-    size = math.radians(table["size_deg"])
+    size, robot = asked.si(float(asked.neck["size_deg"])), asked.robot
+    ends = tuple(size * share for share in direction(orientation, robot))
+    reference = (
+        StepReference(pitch=ends[0], roll=ends[1], at=STEP_AT) if robot.is_neck
+        else RobotReference(kind="step", values=ends, at=STEP_AT)
+    )  # fmt: skip
     return Loop(
         plant=plant.make(seed, controller.sample_time),
         controller=BlockPart(controller),
         observer=None if observer is None else BlockPart(observer),
-        reference=StepReference(pitch=size * math.cos(orientation), roll=size * math.sin(orientation), at=STEP_AT),
-        duration=STEP_AT + float(table["duration_s"]),
+        reference=reference,
+        duration=STEP_AT + float(asked.neck["duration_s"]),
         order=order,
+        robot=robot,
         plant_inputs={"payload": payload} if plant.payload else {},
         # Nobody knows the step before it comes: a predictive controller sees the reference of now as that of later.
         connections={
@@ -124,24 +183,25 @@ def _judge(loop: Loop) -> tuple[dict[str, float], LoopResult | None]:
     except DataError:
         # Numbers overflowed: the loop is not stable, whatever its margins say.
         return dict.fromkeys((*_AXIS, *_MOTORS), math.inf), None
-    table = metrics(result)
-    sizes = {axis: float(np.abs(result[f"{axis}_reference"]).max()) for axis in ("pitch", "roll")}
+    table, robot = metrics(result), result.robot
+    names = metric_ends(robot)
+    sizes = {axis: float(np.abs(result[f"{axis}_reference"]).max()) for axis in robot.outputs.names}
     stepped = [axis for axis, size in sizes.items() if size > _SMALL * max(sizes.values())]
     values = {}
     for name in _AXIS:
-        found = [table[axis][name] for axis in stepped]
+        found = [table[axis][names(name)] for axis in stepped]
         values[name] = (
             math.inf if any(value is None for value in found) else max(float(value or 0.0) for value in found)
         )
-    told = {name: table["motors"][name] for name in _MOTORS}
+    told = {name: table["motors"][names(name)] for name in _MOTORS}
     # A plant that tells no tension says nothing of slack tendons.
     values |= {name: math.nan if value is None else float(value) for name, value in told.items()}
     return values, result
 
 
-def neck_changes(parameters: NeckParameters) -> dict[str, float]:
-    """Return the parameters of a neck that differ from the preset `paper`."""
-    plain = NeckParameters.paper()
+def neck_changes(parameters: NeckParameters, robot: Robot) -> dict[str, float]:
+    """Return the parameters of a robot's neck that differ from the preset `paper` standing for it."""
+    plain = NeckParameters.paper() if robot.is_neck else VirtualNeck.of(robot, NeckParameters.paper()).parameters
     names = [item.name for item in dataclasses.fields(parameters)]
     return {name: getattr(parameters, name) for name in names if getattr(parameters, name) != getattr(plain, name)}
 

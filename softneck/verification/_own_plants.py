@@ -54,7 +54,7 @@ def own_plant(thing: Any, name: str) -> OwnPlant:
     """
     if isinstance(thing, NeckParameters | VirtualNeck):
         neck = thing if isinstance(thing, VirtualNeck) else VirtualNeck(thing)
-        still = VirtualNeck(neck.parameters.without_noise())
+        still = VirtualNeck(neck.parameters.without_noise(), neck.robot)
         return OwnPlant(
             name=name, payload=True, parameters=neck.parameters,
             make=lambda seed, Ts: BlockPart(neck.block(noise_seed=seed, sample_time=Ts)),

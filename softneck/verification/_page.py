@@ -9,9 +9,18 @@ import numpy as np
 
 from softneck.plots import Section, Table, page
 
-from ._charts import delay_sensitivity, frequency_charts, gap_chart, margin_map, mu_charts, neck_chart, step_chart
+from ._charts import (
+    delay_sensitivity,
+    frequency_charts,
+    gain_unit,
+    gap_chart,
+    margin_map,
+    mu_charts,
+    neck_chart,
+    step_chart,
+)
 from ._evidence import LinearEvidence
-from ._plants import AXES
+from ._plants import mixing
 from ._verify import Verdict, Verification
 
 _BOUNDS = {"min": ">=", "max": "<=", "below": "<"}
@@ -19,10 +28,12 @@ _BOUNDS = {"min": ">=", "max": "<=", "below": "<"}
 
 def verdict_table(found: Verification) -> Table:
     """Return the requirements with value, limit, verdict and worst plant."""
+    axes = found.controller.robot.outputs.names
     rows = [
         [
             verdict.requirement.metric, number(verdict.value),
-            f"{_BOUNDS[verdict.requirement.bound]} {verdict.requirement.limit:g}", _word(verdict), _plant(verdict),
+            f"{_BOUNDS[verdict.requirement.bound]} {verdict.requirement.limit:g}", _word(verdict),
+            _plant(verdict, axes),
         ]
         for verdict in found.verdicts
     ]  # fmt: skip
@@ -44,11 +55,11 @@ def _word(verdict: Verdict) -> str:
     return {True: "holds", False: "fails", None: "not computed"}[verdict.holds]
 
 
-def _plant(verdict: Verdict) -> str:
+def _plant(verdict: Verdict, axes: tuple[str, ...]) -> str:
     if verdict.note:
         return verdict.note.removeprefix("not computed: ")
     worst = verdict.worst
-    where = f", {worst['axis']}" if worst.get("axis") in AXES else ""
+    where = f", {worst['axis']}" if worst.get("axis") in axes else ""
     point = f" (frozen at {worst['frozen_point']})" if worst.get("frozen_point") else ""
     return f"{worst.get('name', '')}{where}{point}"
 
@@ -60,18 +71,20 @@ def verification_page(found: Verification, controller: str, certificate: str = "
         found: the verification.
         controller, certificate: names of their files, for the title and the text.
     """
-    evidence = found.evidence
+    evidence, robot = found.evidence, found.controller.robot
+    first, *others = robot.outputs.names
     sections = [_first(found, certificate), _methods(found)]
     for part in evidence.linear:
         sections += _linear_sections(found, part)
-    stepped = step_chart(evidence.steps, evidence.stepped.names)
+    stepped = step_chart(evidence.steps, evidence.stepped, robot)
+    each = f" and, in a run of its own, of {' and '.join(others)}" if others else ""
     text = [
         "The controller's own runtime with all its limits, against every plant with its delay and noisy angles: a step "
-        "of pitch and, in a run of its own, of roll; half way a load is added to the plant's input."
+        f"of {first}{each}; half way a load is added to the plant's input."
     ]
     sections.append(Section("Steps", text=text, tables=[_spread(found, "step")], charts=[stepped]))
     if evidence.necks:
-        charts = [neck_chart(evidence)] if any(run.result is not None for run in evidence.necks) else []
+        charts = [neck_chart(evidence, robot)] if any(run.result is not None for run in evidence.necks) else []
         sections.append(Section("Virtual neck", tables=[_spread(found, "neck"), _runs(found)], charts=charts))
     sections.append(_plants(found))
     words = "holds" if found.holds else "does not hold"
@@ -103,7 +116,7 @@ def _methods(found: Verification) -> Section:
 
 def _linear_sections(found: Verification, part: LinearEvidence) -> list[Section]:
     title = f" at {part.name}" if part.name else ""
-    evidence, Ts = found.evidence, part.plants.sample_time
+    evidence, Ts, robot = found.evidence, part.plants.sample_time, found.controller.robot
     mu = [
         [
             neck.name, row.axes, f"{row.mu:.3f}", f"{row.lower.max():.3f}",
@@ -116,7 +129,8 @@ def _linear_sections(found: Verification, part: LinearEvidence) -> list[Section]
     sections = [
         Section(
             f"Frequency responses{title}",
-            tables=[_margin_table(part)], charts=[*frequency_charts(part, evidence.frequency), margin_map(part)],
+            tables=[_margin_table(part)],
+            charts=[*frequency_charts(part, evidence.frequency), margin_map(part, robot)],
         ),
         Section(
             f"Structured singular value{title}", tables=[Table("Bounds", head, mu, text=2)], charts=mu_charts(part)
@@ -173,16 +187,23 @@ def _runs(found: Verification) -> Table:
 
 def _plants(found: Verification) -> Section:
     rows = []
+    unit, factor = gain_unit(found.controller.robot)
+    digits = "2f" if found.controller.robot.is_neck else "4g"
     for neck in found.necks:
-        for axis, box in zip(AXES, neck.axes, strict=True):
+        for axis, box in zip(neck.names, neck.axes, strict=True):
             for title, values in (("least", box.low), ("nominal", box.nominal), ("largest", box.high)):
-                numbers = [f"{math.degrees(values[0]):.2f}", f"{values[1]:.2f}", f"{1e3 * values[2]:.0f}"]
+                numbers = [f"{factor * values[0]:.{digits}}", f"{values[1]:.2f}", f"{1e3 * values[2]:.0f}"]
                 rows.append([neck.name, axis, title, *numbers])
-    head = ["source", "axis", "", "static gain [deg/rad]", "pole [1/s]", "dead time [ms]"]
+    head = ["source", "axis", "", f"static gain [{unit}]", "pole [1/s]", "dead time [ms]"]
     cross = [
         f"{neck.name}: phi_i into pitch {neck.cross[0]:+.3f} of theta_i's gain, theta_i into roll {neck.cross[1]:+.3f}."
-        for neck in found.necks
-    ]
+        for neck in found.necks if neck.robot.is_neck
+    ] + [
+        f"{neck.name}: the input of {other} into {axis} {neck_mixing[i, j]:+.3f} of its own gain."
+        for neck in found.necks if not neck.robot.is_neck
+        for neck_mixing in [mixing(neck.cross, len(neck.names))]
+        for i, axis in enumerate(neck.names) for j, other in enumerate(neck.names) if i != j
+    ]  # fmt: skip
     files = [[role, path, digest] for role, (path, digest) in found.files.items()]
     tables = [Table("Boxes", head, rows, text=3)]
     if files:

@@ -1,4 +1,4 @@
-"""What the neck may be: a box of static gain, pole and dead time for each axis, and plants drawn from it.
+"""What a robot may be: a box of static gain, pole and dead time for each axis, and plants drawn from it.
 
 An axis is `K p exp(-L s)/(s + p)` behind a zero-order hold, sampled exactly for every dead time L, also between
 samples, times dynamics that are certain (of a model of higher order, all but its slowest pole).
@@ -9,18 +9,21 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector
 from softneck.estimation import AxisPlant, axis_plant
+from softneck.estimation._axis import directions_of, robot_of
+from softneck.robot import Robot
+from softneck.robot._redefined import redefinition_of
 
-AXES = ("pitch", "roll")
 QUANTITIES = ("static gain", "pole", "dead time")
 # A pole that does not count: so fast [1/s] that a sample is over before it shows.
 _NO_POLE = 1e4
+_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -60,16 +63,26 @@ class UncertainNeck:
     Attributes:
         name: of its file.
         sample_time: [s].
-        axes: pitch and roll.
-        cross: (2,) phi_i into pitch as a part of theta_i's gain, and theta_i into roll as a part of phi_i's.
+        axes: one for each output: pitch and roll.
+        cross: (m (m - 1),) what of the other axes' inputs acts on each axis, as a part of its own gain, axis by axis:
+            of a neck phi_i into pitch, and theta_i into roll.
         kind: "family" or "model".
+        robot: whose plant it is.
+        weights: (m, motors) of the motors in each axis's input; None for a neck, whose are Eq. 9, 10.
     """
 
     name: str
     sample_time: float
-    axes: tuple[AxisBox, AxisBox]
+    axes: tuple[AxisBox, ...]
     cross: Vector
     kind: str
+    robot: Robot = field(default_factory=Robot.preset)
+    weights: Matrix | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the axes: the robot's outputs."""
+        return self.robot.outputs.names
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,12 +91,13 @@ class Plants:
 
     Attributes:
         sample_time: [s].
-        numbers: (n, 2, 3) static gain, pole, dead time of pitch and roll.
-        cross: (n, 2).
+        numbers: (n, axes, 3) static gain, pole, dead time of every axis.
+        cross: (n, axes (axes - 1)).
         names: of each.
         source: (n,) number of the neck that each comes from.
-        numerator, denominator: (n, 2, q) highest power first, monic; the numerator's first is 0.
-        delay: (n, 2) samples besides.
+        numerator, denominator: (n, axes, q) highest power first, monic; the numerator's first is 0.
+        delay: (n, axes) samples besides.
+        axes: names of the axes.
     """
 
     sample_time: float
@@ -94,6 +108,7 @@ class Plants:
     numerator: np.ndarray
     denominator: np.ndarray
     delay: np.ndarray
+    axes: tuple[str, ...] = ("pitch", "roll")
 
     def __len__(self) -> int:
         return len(self.names)
@@ -104,18 +119,15 @@ class Plants:
         names = tuple(self.names[int(row)] for row in rows)
         return Plants(
             self.sample_time, self.numbers[rows], self.cross[rows], names, self.source[rows], self.numerator[rows],
-            self.denominator[rows], self.delay[rows],
+            self.denominator[rows], self.delay[rows], self.axes,
         )  # fmt: skip
 
     def later(self, samples: int) -> Plants:
-        """Return the same with `samples` of delay more on both axes, as a loop's order adds."""
-        return Plants(
-            self.sample_time, self.numbers, self.cross, self.names, self.source, self.numerator, self.denominator,
-            self.delay + samples,
-        )  # fmt: skip
+        """Return the same with `samples` of delay more on all axes, as a loop's order adds."""
+        return replace(self, delay=self.delay + samples)
 
     def response(self, frequency: Vector) -> np.ndarray:
-        """Return the exact complex response (n, 2, m) of both axes at `frequency` [rad/s], without cross gains."""
+        """Return the exact complex response (n, axes, m) of all axes at `frequency` [rad/s], without cross gains."""
         z = np.exp(1j * frequency * self.sample_time)
         powers = z[None, :] ** np.arange(self.numerator.shape[2] - 1, -1, -1)[:, None]
         return (self.numerator @ powers) / (self.denominator @ powers) * z ** -self.delay[:, :, None].astype(float)
@@ -127,8 +139,8 @@ def neck_of_family(family: Any, name: str) -> UncertainNeck:
     Raises:
         SettingsError: it has no samples.
     """
-    boxes = []
-    for axis in AXES:
+    boxes, names = [], tuple(family.axes)
+    for axis in names:
         found = family.axes[axis]
         used = found.used > 0.5
         if not used.any():
@@ -140,11 +152,25 @@ def neck_of_family(family: Any, name: str) -> UncertainNeck:
                 samples=found.samples[used], std=found.std[used][:, :3],
             )
         )  # fmt: skip
-    own = [family.axes[axis].nominal[0] for axis in AXES]
-    cross = np.nan_to_num(np.array([family.cross[0, 1] / own[0], family.cross[1, 0] / own[1]]))
+    own = np.array([family.axes[axis].nominal[0] for axis in names])
+    cross = np.nan_to_num(between(family.cross[:, : len(names)] / own[:, None]))
     return UncertainNeck(
-        name=name, sample_time=family.sample_time, axes=(boxes[0], boxes[1]), cross=cross, kind="family"
-    )
+        name=name, sample_time=family.sample_time, axes=tuple(boxes), cross=cross, kind="family",
+        robot=robot_of(family), weights=getattr(family, "directions", None),
+    )  # fmt: skip
+
+
+def between(matrix: Matrix) -> Vector:
+    """Return the entries of a matrix (m, m) beside its diagonal (m (m - 1),), row by row."""
+    return np.asarray(matrix)[~np.eye(len(matrix), dtype=bool)]
+
+
+def mixing(cross: np.ndarray, axes: int) -> np.ndarray:
+    """Return X (..., m, m) with which the inputs v of all axes act as X v: ones, and `cross` (..., m (m - 1))."""
+    X = np.zeros((*cross.shape[:-1], axes, axes))
+    X[..., np.eye(axes, dtype=bool)] = 1.0
+    X[..., ~np.eye(axes, dtype=bool)] = cross
+    return X
 
 
 def neck_of_model(model: Any, name: str, spread: Mapping[str, float]) -> UncertainNeck:
@@ -153,17 +179,24 @@ def neck_of_model(model: Any, name: str, spread: Mapping[str, float]) -> Uncerta
     Raises:
         SettingsError: a model that is not linear, discrete and stable.
     """
-    plants = []
-    for axis in AXES:
+    plants, robot = [], robot_of(model)
+    names = robot.outputs.names
+    for axis in names:
         try:
             plants.append(axis_plant(model, axis))
         except SettingsError as error:
             raise SettingsError(f"{name}: {error}") from error
-    if not math.isclose(plants[0].sample_time, plants[1].sample_time, rel_tol=1e-9):
-        raise SettingsError(f"{name}: pitch and roll have different sample times.")
-    first, second = (_axis_of(plant, spread) for plant in plants)
-    cross = np.array([_cross_gain(model, axis, plant) for axis, plant in zip(AXES, plants, strict=True)])
-    return UncertainNeck(name=name, sample_time=plants[0].sample_time, axes=(first, second), cross=cross, kind="model")
+    if not all(math.isclose(plants[0].sample_time, plant.sample_time, rel_tol=1e-9) for plant in plants):
+        raise SettingsError(f"{name}: {' and '.join(names)} have different sample times.")
+    weights = None if robot.is_neck else directions_of(model)
+    if weights is None:
+        cross = np.array([_cross_gain(model, axis, plant) for axis, plant in zip(names, plants, strict=True)])
+    else:
+        cross = _cross_gains(model, plants, weights)
+    return UncertainNeck(
+        name=name, sample_time=plants[0].sample_time, axes=tuple(_axis_of(plant, spread) for plant in plants),
+        cross=cross, kind="model", robot=robot, weights=weights,
+    )  # fmt: skip
 
 
 def _axis_of(plant: AxisPlant, spread: Mapping[str, float]) -> AxisBox:
@@ -198,19 +231,30 @@ def _cross_gain(model: Any, axis: str, plant: AxisPlant) -> float:
     return value / plant.static_gain if math.isfinite(value) else 0.0
 
 
+def _cross_gains(model: Any, plants: list[AxisPlant], weights: Matrix) -> Vector:
+    """Return them of another robot's model, from what each motor does in steady state."""
+    robot = model.robot
+    inverse = redefinition_of(weights, robot.outputs.names)[1][:, :-1]
+    gains = np.atleast_2d(np.real(model.ss().dcgain()))
+    cross = between(gains @ inverse / np.array([[plant.static_gain] for plant in plants]))
+    # What rounding leaves of axes that do not meet.
+    return np.where(np.abs(cross) < _ROUNDING, 0.0, np.nan_to_num(cross))
+
+
 def make_plants(neck: UncertainNeck, numbers: np.ndarray, names: list[str], *, source: int = 0) -> Plants:
-    """Return plants of `neck` with `numbers` (n, 2, 3), sampled exactly."""
+    """Return plants of `neck` with `numbers` (n, axes, 3), sampled exactly."""
     Ts = neck.sample_time
     parts = [_sampled(numbers[:, i], box.rest, Ts) for i, box in enumerate(neck.axes)]
     q = max(part[0].shape[1] for part in parts)
     padded = [[np.pad(p, ((0, 0), (0, q - p.shape[1]))) for p in part[:2]] for part in parts]
     # Zeros behind both polynomials of an axis are poles and zeros at 0 that cancel.
-    numerator, denominator = (np.stack([padded[0][k], padded[1][k]], axis=1) for k in (0, 1))
+    numerator, denominator = (np.stack([part[k] for part in padded], axis=1) for k in (0, 1))
     delay = np.stack([part[2] for part in parts], axis=1)
     n = numbers.shape[0]
     return Plants(
-        Ts, numbers, np.tile(neck.cross, (n, 1)), tuple(names), np.full(n, source), numerator, denominator, delay
-    )
+        Ts, numbers, np.tile(neck.cross, (n, 1)), tuple(names), np.full(n, source), numerator, denominator, delay,
+        neck.names,
+    )  # fmt: skip
 
 
 def _sampled(numbers: Matrix, rest: tuple[Vector, Vector], Ts: float) -> tuple[Matrix, Matrix, np.ndarray]:
@@ -244,7 +288,8 @@ def nominal_plants(necks: list[UncertainNeck]) -> list[Plants]:
 def all_plants(necks: list[UncertainNeck], count: int, seed: int) -> Plants:
     """Return nominals, corners, identified samples and, up to `count` in all, plants from inside the boxes.
 
-    Corners of pitch stand beside the same of roll, and beside the opposite ones. Inside, a Latin hypercube.
+    Corners of pitch stand beside the same of roll, and beside the opposite ones; of more axes every other one is
+    opposite. Inside, a Latin hypercube.
     """
     share = max(1, count // len(necks))
     return join([_of_neck(neck, share, seed + i, i) for i, neck in enumerate(necks)])
@@ -253,22 +298,26 @@ def all_plants(necks: list[UncertainNeck], count: int, seed: int) -> Plants:
 def _of_neck(neck: UncertainNeck, count: int, seed: int, source: int) -> Plants:
     from scipy.stats import qmc
 
+    m = len(neck.axes)
     numbers: list[np.ndarray] = [np.stack([box.nominal for box in neck.axes])]
     names = [f"{neck.name}: nominal"]
     signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-    for first, opposite in itertools.product(range(8), (False, True)):
-        chosen = (signs[first], signs[7 - first] if opposite else signs[first])
+    for first, opposite in itertools.product(range(8), (False, True) if m > 1 else (False,)):
+        chosen = [signs[7 - first] if opposite and i % 2 else signs[first] for i in range(m)]
         numbers.append(np.stack([_corner(box, s) for box, s in zip(neck.axes, chosen, strict=True)]))
         texts = ["".join("+" if value > 0 else "-" for value in s) for s in chosen]
-        names.append(f"{neck.name}: corner {texts[0]} of pitch, {texts[1]} of roll")
+        told = ", ".join(f"{text} of {axis}" for text, axis in zip(texts, neck.names, strict=True))
+        names.append(f"{neck.name}: corner {told}")
     sizes = [box.samples.shape[0] for box in neck.axes]
     for k in range(max(sizes)):
         rows = [k % size for size in sizes]
         numbers.append(np.stack([box.samples[row] for box, row in zip(neck.axes, rows, strict=True)]))
-        names.append(f"{neck.name}: sample {rows[0]} of pitch, {rows[1]} of roll")
+        told = ", ".join(f"{row} of {axis}" for row, axis in zip(rows, neck.names, strict=True))
+        names.append(f"{neck.name}: sample {told}")
     inside = max(0, count - len(numbers))
     if inside:
-        drawn = qmc.LatinHypercube(d=6, rng=np.random.default_rng(seed)).random(inside).reshape(inside, 2, 3)
+        drawn = qmc.LatinHypercube(d=3 * m, rng=np.random.default_rng(seed)).random(inside)
+        drawn = drawn.reshape(inside, m, 3)
         low, high = (np.stack([getattr(box, end) for box in neck.axes]) for end in ("low", "high"))
         numbers += list(low + drawn * (high - low))
         names += [f"{neck.name}: inside {k}" for k in range(inside)]
@@ -296,4 +345,5 @@ def join(parts: list[Plants]) -> Plants:
         stacked("numerator"),
         stacked("denominator"),
         np.concatenate([part.delay for part in parts]),
+        parts[0].axes,
     )

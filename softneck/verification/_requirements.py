@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from softneck.core import FileFormatError, SettingsError, require_between, require_whole
+from softneck.core import FileFormatError, SettingsError, require_between, require_whole, to_si
+from softneck.loop._result import shown_unit
+from softneck.robot import Robot
 
 from ._linear import LARGE, SMALL
 from ._steps import METRICS
@@ -27,17 +29,49 @@ _NECK_METRICS = (
     "limit_violation_s",
     "slack_s",
 )
-#: Names of all metrics that a requirement can be about.
-METRIC_NAMES = (
-    "stability.radius",
-    "stability.searched_radius",
-    *(f"{axis}.{name}" for axis in ("axes", "pitch", "roll") for name in _AXIS_METRICS),
-    "mimo.disk_margin",
-    "robust.mu",
-    "robust.sensitivity",
-    *(f"step.{name}" for name in METRICS),
-    *(f"neck.{name}" for name in _NECK_METRICS),
-)
+_NECK = Robot.preset("neck")
+
+
+def metric_names(robot: Robot) -> tuple[str, ...]:
+    """Return the names of all metrics that a requirement of a robot can be about."""
+    shown = _Names(robot)
+    return (
+        "stability.radius",
+        "stability.searched_radius",
+        *(f"{axis}.{name}" for axis in ("axes", *robot.outputs.names) for name in _AXIS_METRICS),
+        "mimo.disk_margin",
+        "robust.mu",
+        "robust.sensitivity",
+        *(f"step.{shown.of(name)}" for name in METRICS),
+        *(f"neck.{shown.of(name)}" for name in _NECK_METRICS),
+    )
+
+
+def metric_ends(robot: Robot) -> Callable[[str], str]:
+    """Return what turns the end of a neck's metric into that of a robot's."""
+    return _Names(robot).of
+
+
+@dataclass(frozen=True, slots=True)
+class _Names:
+    """What a neck's deg and rad at the end of a name are of another robot."""
+
+    robot: Robot
+
+    def of(self, name: str) -> str:
+        """Return a neck's name as this robot's: `load_rms_mm` for `load_rms_deg`, `max_bar` for `max_rad`."""
+        return self._ended(self._ended(name, "_deg", shown_unit(self.robot)[0]), "_rad", self.robot.motors.unit)
+
+    def key(self, name: str) -> str:
+        """Return a neck's key as this robot's; an orientation is an angle of any robot's."""
+        return name if name == "orientations_deg" else self.of(name)
+
+    def _ended(self, name: str, end: str, unit: str) -> str:
+        return name.removesuffix(end) + "_" + unit.replace("/", "_") if name.endswith(end) else name
+
+
+#: Of a neck.
+METRIC_NAMES = metric_names(_NECK)
 # What no loop can do: least or largest value of a metric.
 _POSSIBLE = {"sensitivity": (1.0, math.inf), "disk_margin": (0.0, 2.0), "gain_margin": (1.0, math.inf)}
 _BOUNDS = ("min", "max", "below")
@@ -73,6 +107,12 @@ class Requirement:
     limit: float
     asked: bool
 
+    def stretched(self, time: float, size: float, robot: Robot) -> Requirement:
+        """Return it with its limit for another robot's time and size."""
+        group, _, name = self.metric.partition(".")
+        sized = group in ("step", "neck") and name.endswith("_" + shown_unit(robot)[0])
+        return replace(self, limit=self.limit * (size if sized else time if name.endswith(("_s", "_ms")) else 1.0))
+
     def holds(self, value: float) -> bool:
         """Return whether `value` keeps it; NaN does not."""
         if self.bound == "min":
@@ -86,7 +126,11 @@ class Requirements:
 
     Attributes:
         bounds: in the order of the file.
-        uncertainty, sampling, step, neck: the tables of the file.
+        uncertainty, sampling, step, neck: the tables of the file; keys that end in `_deg` or `_rad` hold what they hold
+            of a neck, or numbers in the units of another robot's outputs and motors.
+        robot: whose controller is judged.
+        own: what the user's file says.
+        scale: time and size of another robot over the neck's, by which the defaults are stretched.
     """
 
     bounds: tuple[Requirement, ...]
@@ -94,10 +138,66 @@ class Requirements:
     sampling: Mapping[str, Any]
     step: Mapping[str, Any]
     neck: Mapping[str, Any]
+    robot: Robot = _NECK
+    own: Mapping[str, Any] = field(default_factory=dict)
+    scale: tuple[float, float] = (1.0, 1.0)
+
+    def name_of(self, name: str) -> str:
+        """Return what a neck's metric such as `load_rms_deg` is called of the robot."""
+        return _Names(self.robot).of(name)
+
+    def si(self, value: float) -> float:
+        """Return an angle in deg in rad, or another robot's output in its display unit in SI."""
+        factor = shown_unit(self.robot)[1]
+        return math.radians(value) if factor is None else factor * value
+
+    def motor_si(self, value: float) -> float:
+        """Return a number in the unit of the motors in SI; of a neck it is rad."""
+        return to_si(self.robot.motors.unit)[0] * value
+
+    def table(self, name: str) -> dict[str, Any]:
+        """Return a table by the robot's names of its keys."""
+        return {_Names(self.robot).key(key): value for key, value in getattr(self, name).items()}
+
+    def of_robot(self, robot: Robot) -> Requirements:
+        """Return them as asked of another robot than the one they were read for."""
+        return self if robot.hash == self.robot.hash else make_requirements(self.own, robot=robot)
+
+    def scaled(self, time: float, size: float, load: float, noise: float | None) -> Requirements:
+        """Return them with the defaults stretched to another robot: what the user's file says stays.
+
+        Args:
+            time: over the neck's time constant.
+            size: of outputs, over the neck's, in the display unit for deg.
+            load: at the plant's input, in the unit of the motors.
+            noise: of the sensor in the display unit; None for the neck's by `size`.
+        """
+        said = {name: self.own.get(name, {}) for name in _NUMBERS}
+        known = _Names(self.robot)
+
+        def with_free(name: str, **defaults: float) -> dict[str, Any]:
+            free = {key: value for key, value in defaults.items() if known.key(key) not in said[name]}
+            return {**getattr(self, name), **free}
+
+        step, neck, size_deg = self.step, self.neck, size * self.step["size_deg"]
+        quiet = size * step["noise_deg"] if noise is None else noise
+        return replace(
+            self,
+            bounds=tuple(item if item.asked else item.stretched(time, size, self.robot) for item in self.bounds),
+            uncertainty=with_free("uncertainty", delay_ms=time * self.uncertainty["delay_ms"]),
+            step=with_free(
+                "step", size_deg=size_deg, duration_s=time * step["duration_s"], noise_deg=quiet, load_rad=load
+            ),
+            neck=with_free("neck", size_deg=size * neck["size_deg"], duration_s=time * neck["duration_s"]),
+            scale=(time, size),
+        )
 
 
-def read_requirements(path: str | Path | None = None) -> Requirements:
+def read_requirements(path: str | Path | None = None, *, robot: Robot = _NECK) -> Requirements:
     """Return the defaults, with what the file at `path` says instead.
+
+    Of another robot than the neck keys and metrics in deg are in its outputs' display unit and called by it, such as
+    `size_mm` and `step.load_rms_mm`; angles stay in deg.
 
     Raises:
         FileFormatError: no such file, no TOML, another version.
@@ -105,17 +205,17 @@ def read_requirements(path: str | Path | None = None) -> Requirements:
     """
     defaults = _read(DEFAULT_FILE)
     if path is None:
-        return _requirements(defaults, {})
+        return _requirements(defaults, {}, robot)
     table = _read(Path(path))
     try:
-        return _requirements(defaults, table)
+        return _requirements(defaults, table, robot)
     except SettingsError as error:
         raise SettingsError(f"{path}: {error}") from error
 
 
-def make_requirements(table: Mapping[str, Any]) -> Requirements:
+def make_requirements(table: Mapping[str, Any], *, robot: Robot = _NECK) -> Requirements:
     """Return the defaults with what a table like a requirements file says instead."""
-    return _requirements(_read(DEFAULT_FILE), {"version": VERSION, **table})
+    return _requirements(_read(DEFAULT_FILE), {"version": VERSION, **table}, robot)
 
 
 def _read(source: Path) -> dict[str, Any]:
@@ -135,26 +235,40 @@ def _read(source: Path) -> dict[str, Any]:
     return table
 
 
-def _requirements(defaults: Mapping[str, Any], own: Mapping[str, Any]) -> Requirements:
+def _requirements(defaults: Mapping[str, Any], own: Mapping[str, Any], robot: Robot) -> Requirements:
     known = ("version", *_NUMBERS, "require")
     for key in own:
         if key not in known:
             raise SettingsError(f"unknown table `{key}` of a requirements file; it has {', '.join(known[1:])}.")
-    tables = {name: _table(name, defaults[name], own.get(name, {})) for name in _NUMBERS}
-    bounds = _bounds(defaults["require"], own.get("require", {}))
-    _refuse_contradictions(bounds)
+    shown = _Names(robot)
+    tables = {name: _table(name, defaults[name], own.get(name, {}), shown) for name in _NUMBERS}
+    bounds = _bounds({_shown(metric, shown): entry for metric, entry in defaults["require"].items()},
+                     own.get("require", {}), robot)  # fmt: skip
+    _refuse_contradictions(bounds, robot)
     _refuse_weak(bounds, tables)
-    return Requirements(bounds, **tables)
+    return replace(Requirements(bounds, **tables), robot=robot, own=dict(own))
 
 
-def _table(name: str, defaults: Mapping[str, Any], own: Any) -> dict[str, Any]:
+def _shown(metric: str, shown: _Names) -> str:
+    group, _, name = metric.partition(".")
+    return f"{group}.{shown.of(name)}" if group in ("step", "neck") else metric
+
+
+def _table(name: str, defaults: Mapping[str, Any], own: Any, shown: _Names) -> dict[str, Any]:
     if not isinstance(own, Mapping):
         raise SettingsError(f"`{name}` must be a table: [{name}].")
-    for key, value in own.items():
-        if key not in defaults:
-            raise SettingsError(f"unknown key `{key}` of [{name}]; it takes {', '.join(defaults)}.")
+    inside = {shown.key(key): key for key in defaults}
+    found = dict(defaults)
+    for given, value in own.items():
+        if given not in inside:
+            raise SettingsError(f"unknown key `{given}` of [{name}]; it takes {', '.join(inside)}.")
+        key = inside[given]
+        found[key] = value
         if key in _NUMBERS[name]:
-            _check_number(f"[{name}] {key}", value, *_NUMBERS[name][key], whole=key in _WHOLE)
+            low, high, unit = _NUMBERS[name][key]
+            if key != given:  # another unit than the neck's has other borders
+                low, high, unit = -math.inf if low < 0.0 else 0.0, math.inf, given.rpartition("_")[2]
+            _check_number(f"[{name}] {given}", value, low, high, unit, whole=key in _WHOLE)
         elif isinstance(defaults[key], list):
             _check_list(f"[{name}] {key}", value, 5.0 if key == "payloads_kg" else 360.0)
         elif isinstance(defaults[key], bool):
@@ -162,7 +276,7 @@ def _table(name: str, defaults: Mapping[str, Any], own: Any) -> dict[str, Any]:
                 raise SettingsError(f"`[{name}] {key}` must be true or false; got {value!r}.")
         elif not isinstance(value, str):
             raise SettingsError(f"`[{name}] {key}` must be a text; got {value!r}.")
-    return {**defaults, **own}
+    return found
 
 
 def _check_number(name: str, value: Any, low: float, high: float, unit: str, *, whole: bool) -> None:
@@ -180,12 +294,13 @@ def _check_list(name: str, value: Any, largest: float) -> None:
         _check_number(name, number, 0.0, largest, "", whole=False)
 
 
-def _bounds(defaults: Mapping[str, Any], own: Any) -> tuple[Requirement, ...]:
+def _bounds(defaults: Mapping[str, Any], own: Any, robot: Robot) -> tuple[Requirement, ...]:
     if not isinstance(own, Mapping):
         raise SettingsError("`require` must be a table: [require].")
+    names = metric_names(robot)
     for metric in own:
-        if metric not in METRIC_NAMES:
-            raise SettingsError(f"unknown metric `{metric}`; [require] takes {', '.join(METRIC_NAMES)}.")
+        if metric not in names:
+            raise SettingsError(f"unknown metric `{metric}`; [require] takes {', '.join(names)}.")
     found = []
     for metric, entry in {**defaults, **own}.items():
         if entry is False:
@@ -203,13 +318,14 @@ def _bounds(defaults: Mapping[str, Any], own: Any) -> tuple[Requirement, ...]:
     return tuple(found)
 
 
-def _refuse_contradictions(bounds: tuple[Requirement, ...]) -> None:
+def _refuse_contradictions(bounds: tuple[Requirement, ...], robot: Robot) -> None:
     low: dict[str, float] = {}
     high: dict[str, float] = {}
     for item in bounds:
         # What the worse axis keeps, both keep.
         group, _, name = item.metric.partition(".")
-        for metric in (f"pitch.{name}", f"roll.{name}") if group == "axes" else (item.metric,):
+        both = [f"{axis}.{name}" for axis in robot.outputs.names]
+        for metric in both if group == "axes" else (item.metric,):
             if item.bound == "min":
                 low[metric] = max(low.get(metric, -math.inf), item.limit)
             else:
@@ -226,7 +342,7 @@ def _refuse_contradictions(bounds: tuple[Requirement, ...]) -> None:
         rise, settling = low.get(f"{group}.rise_s", 0.0), high.get(f"{group}.settling_s", math.inf)
         if rise > settling:
             raise SettingsError(f"`{group}` cannot rise in {rise:g} s or more and settle within {settling:g} s.")
-    for axis in ("pitch", "roll"):
+    for axis in robot.outputs.names:
         _refuse_margins(axis, low, high)
 
 

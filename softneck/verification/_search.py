@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,7 +38,7 @@ def search(
 ) -> SearchResult:
     """Return the plants inside the boxes with the smallest disk margin, unstable ones first.
 
-    Differential evolution (Storn and Price 1997) over gain, pole and dead time of each axis alone, or of both where
+    Differential evolution (Storn and Price 1997) over gain, pole and dead time of each axis alone, or of all where
     the axes are coupled by the plant or the controller.
 
     Args:
@@ -52,17 +52,28 @@ def search(
     worst: list[Plants] = []
     largest, count = 0.0, 0
     for source, neck in enumerate(necks):
-        whole = law.coupled or bool(np.any(neck.cross != 0.0))
-        for axes in [(0, 1)] if whole else [(0,), (1,)]:
+        for axes in axes_together(neck, law):
             task = _Task(neck, source, axes, law, w, extra)
             found = _evolve(task.badness, 3 * len(axes), generations, seed)
-            worst.append(task.plants(found.reshape(1, -1), f"worst that a search found ({_axes(axes)})"))
+            worst.append(task.plants(found.reshape(1, -1), f"worst that a search found ({_axes(neck, axes)})"))
             largest, count = max(largest, task.radius), count + task.count
     return SearchResult(join(worst), largest, count)
 
 
-def _axes(axes: tuple[int, ...]) -> str:
-    return "both axes" if len(axes) == 2 else ("pitch", "roll")[axes[0]]
+def axes_together(neck: UncertainNeck, law: LinearLaw) -> list[tuple[int, ...]]:
+    """Return which axes are judged together: all where plant or controller couple them, else each alone."""
+    every = tuple(range(len(neck.axes)))
+    whole = law.coupled or bool(np.any(neck.cross != 0.0))
+    return [every] if whole else [(i,) for i in every]
+
+
+def together(neck: UncertainNeck, axes: Sequence[int]) -> str:
+    """Return what axes that are judged together are called."""
+    return neck.names[axes[0]] if len(axes) == 1 else "both" if len(axes) == 2 else "all"
+
+
+def _axes(neck: UncertainNeck, axes: tuple[int, ...]) -> str:
+    return neck.names[axes[0]] if len(axes) == 1 else f"{together(neck, axes)} axes"
 
 
 class _Task:
@@ -87,7 +98,7 @@ class _Task:
         plants = self.plants(x.T).later(self.extra)
         size = radii(plants, self.law)
         self.radius, self.count = max(self.radius, float(size.max())), self.count + len(plants)
-        S = inverse(np.eye(2) + loops(plants, self.law, self.w)[1])
+        S = inverse(np.eye(len(self.neck.axes)) + loops(plants, self.law, self.w)[1])
         peaks = np.stack([np.abs(2.0 * S[..., i, i] - 1.0).max(axis=1) for i in self.axes]).max(axis=0)
         # Beyond stability the radius leads on; before it the peak does, which is infinite on the border.
         return -np.where(size >= 1.0, _UNSTABLE * size, np.minimum(peaks, _UNSTABLE))

@@ -11,18 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, Vector
-from softneck.loop._result import SETTLING_BAND
+from softneck.core import Matrix, SettingsError, Vector, to_si
+from softneck.loop._result import SETTLING_BAND, shown_unit
+from softneck.robot import Robot
+from softneck.robot._redefined import redefinition_of
 from softneck.runtime import Block, load_functions
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
-from ._plants import Plants
+from ._plants import Plants, mixing
 
 _RUNTIME = "softneck.verification._sweep_runtime"
-_PORTS = (
-    "pitch_reference", "roll_reference", "cocontraction_reference", "pitch", "roll",
-    "motor_position_1", "motor_position_2", "motor_position_3", "healthy", "enabled",
-)  # fmt: skip
 METRICS = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "load_rms_deg", "coupling_deg")
 # As the lab and `softneck.loop` measure a rise, and the part of the time in which all is settled.
 _RISE, _STEADY_PART = (0.1, 0.9), 0.25
@@ -30,7 +28,7 @@ _RISE, _STEADY_PART = (0.1, 0.9), 0.25
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepTest:
-    """A step of one axis after the other, then a load.
+    """A step of one axis after the other, then a load; of another robot in SI for rad.
 
     Attributes:
         step: size [rad].
@@ -49,14 +47,15 @@ class StepTest:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Steps:
-    """What all plants did, of the step in pitch and of that in roll.
+    """What all plants did, of the step in each axis; of another robot in SI for rad.
 
     Attributes:
         time: (rows,) [s].
-        angles: (2, n, rows) the stepped angle [rad].
-        motors: (2, n, rows, 3) set-points [rad].
-        metrics: name -> (n,) the worse of both axes; inf where a level is never reached or numbers overflow.
-        worse: name -> (n,) 0 where pitch is that one, 1 where roll is.
+        angles: (axes, n, rows) the stepped angle [rad].
+        motors: (axes, n, rows, motors) set-points [rad].
+        metrics: name -> (n,) the worst of all axes, in deg or the robot's display unit; inf where a level is never
+            reached or numbers overflow.
+        worse: name -> (n,) the axis that is it.
     """
 
     time: Vector
@@ -66,19 +65,23 @@ class Steps:
     worse: dict[str, np.ndarray]
 
 
-def check_ports(block: Block) -> None:
-    """Raise SettingsError unless `block` is a controller of the neck's channels."""
+def check_ports(block: Block, robot: Robot) -> None:
+    """Raise SettingsError unless `block` is a controller of the robot's channels."""
     inputs, outputs = {port.name for port in block.inputs}, {port.name for port in block.outputs}
-    missing = [name for name in ("pitch_reference", "roll_reference", "pitch", "roll") if name not in inputs]
-    missing += [f"motor_setpoint_{j}" for j in (1, 2, 3) if f"motor_setpoint_{j}" not in outputs]
+    names = robot.outputs.names
+    missing = [name for name in (*(f"{name}_reference" for name in names), *names) if name not in inputs]
+    missing += [name for name in robot.set_points if name not in outputs]
     if missing:
         raise SettingsError(
             f"the controller {block.kind} has no channel `{missing[0]}`; softneck verifies controllers from "
-            "pitch, roll and their references to motor_setpoint_1..3."
+            f"{', '.join(names)} and their references to motor_setpoint_1..{len(robot.set_points)}."
         )
 
 
-def run_steps(plants: Plants, block: Block, test: StepTest, *, workers: int | None = None) -> Steps:
+def run_steps(
+    plants: Plants, block: Block, test: StepTest, *, workers: int | None = None, robot: Robot | None = None,
+    weights: Matrix | None = None,
+) -> Steps:  # fmt: skip
     """Return the responses of all plants.
 
     Args:
@@ -86,23 +89,31 @@ def run_steps(plants: Plants, block: Block, test: StepTest, *, workers: int | No
         block: the controller.
         test: what is asked.
         workers: threads; all cores where None.
+        robot: whose they are; None for a neck.
+        weights: (axes, motors) of another robot's motors in each axis's input.
     """
+    whose = Robot.preset() if robot is None else robot
+    T = redefinition_matrix(np.asarray(TENDON_ANGLES))
+    if weights is not None:
+        T = redefinition_of(weights, whose.outputs.names)[0]
+    m, around = len(plants.axes), _middle(whose)
     Ts = plants.sample_time
     half = round(test.duration / Ts)
     rows = 2 * half
     rng = np.random.default_rng(test.seed)
-    noise = test.noise * rng.standard_normal((rows, 2))
+    noise = test.noise * rng.standard_normal((rows, m))
     angles, motors, other = [], [], []
-    for axis in (0, 1):
-        signals = np.zeros((rows, 7))
-        signals[:, axis] = test.step
-        signals[:, 3:5] = noise
-        signals[half:, 5 + axis] = test.load
-        y, P = _run(plants, block, signals, workers or os.cpu_count() or 1)
+    for axis in range(m):
+        signals = np.zeros((rows, 3 * m + 1))
+        signals[:, :m] = around
+        signals[:, axis] += test.step
+        signals[:, m + 1 : 2 * m + 1] = around + noise
+        signals[half:, 2 * m + 1 + axis] = test.load
+        y, P = _run(plants, block, signals, T, whose, workers or os.cpu_count() or 1)
         angles.append(y[:, :, axis])
-        other.append(y[:, :half, 1 - axis])
+        other.append(np.delete(y[:, :half], axis, axis=2))
         motors.append(P)
-    parts = [_metrics(angles[i], other[i], test, half, Ts) for i in (0, 1)]
+    parts = [_metrics(angles[i], other[i], test, half, Ts, shown_unit(whose)[1]) for i in range(m)]
     table = {name: np.stack([part[name] for part in parts]) for name in METRICS}
     return Steps(
         np.arange(rows) * Ts,
@@ -113,26 +124,41 @@ def run_steps(plants: Plants, block: Block, test: StepTest, *, workers: int | No
     )
 
 
-def _run(plants: Plants, block: Block, signals: Matrix, workers: int) -> tuple[np.ndarray, np.ndarray]:
+def _middle(robot: Robot) -> Vector:
+    """Return around which outputs steps are made: no reference goes where the robot's outputs may not."""
+    low, high = robot.outputs.min, robot.outputs.max
+    if low is None or high is None:
+        return np.zeros(len(robot.outputs.names))
+    return 0.5 * to_si(robot.outputs.unit)[0] * (np.array(low) + np.array(high))
+
+
+def _run(
+    plants: Plants, block: Block, signals: Matrix, T: Matrix, robot: Robot, workers: int
+) -> tuple[np.ndarray, np.ndarray]:
     functions: Any = load_functions(f"{_RUNTIME}({block.runtime}:{len(block.arrays)})")
-    T = redefinition_matrix(np.asarray(TENDON_ANGLES))
+    axes, set_points = robot.outputs.names, robot.set_points
     arrays = (T, *block.arrays)
     parameters = block.initial_state().parameters
     names = [port.name for port in block.inputs]
-    places = np.array([names.index(name) if name in names else -1 for name in _PORTS])
+    ports = (
+        *(f"{axis}_reference" for axis in axes), "cocontraction_reference", *axes, *robot.motor_positions, "healthy",
+        "enabled",
+    )  # fmt: skip
+    places = np.array([names.index(name) if name in names else -1 for name in ports])
     outputs = [port.name for port in block.outputs]
-    outputs_at = np.array([*(outputs.index(f"motor_setpoint_{j}") for j in (1, 2, 3)), len(outputs)])
+    outputs_at = np.array([*(outputs.index(name) for name in set_points), len(outputs)])
     start = np.array([port.start for port in block.inputs])
-    for axis, name in enumerate(("pitch", "roll")):
+    for axis, name in enumerate(axes):
         if f"{name}_reference_ahead" in names:  # of a predictive one; the step is there from the start
             start[names.index(f"{name}_reference_ahead")] = signals[0, axis]
     n, rows = len(plants), signals.shape[0]
-    angles, motors = np.empty((n, rows, 2)), np.empty((n, rows, 3))
+    angles, motors = np.empty((n, rows, len(axes))), np.empty((n, rows, len(set_points)))
+    mixed = mixing(plants.cross, len(axes))
 
     def part(chosen: slice) -> None:
         functions.sweep_run(
             arrays, parameters, start, places, outputs_at, plants.numerator[chosen], plants.denominator[chosen],
-            plants.delay[chosen], plants.cross[chosen], signals, angles[chosen], motors[chosen],
+            plants.delay[chosen], mixed[chosen], signals, angles[chosen], motors[chosen],
         )  # fmt: skip
 
     borders = np.linspace(0, n, min(workers, n) + 1).astype(int)
@@ -143,10 +169,20 @@ def _run(plants: Plants, block: Block, signals: Matrix, workers: int) -> tuple[n
     return angles, motors
 
 
-def _metrics(y: Matrix, other: Matrix, test: StepTest, half: int, Ts: float) -> Mapping[str, Vector]:
-    """Return the metrics (n,) of one axis: of the step before the load, of the load's effect, of the other axis."""
+def _metrics(
+    y: Matrix, other: np.ndarray, test: StepTest, half: int, Ts: float, factor: float | None = None
+) -> Mapping[str, Vector]:
+    """Return the metrics (n,) of one axis: of the step before the load, of the load's effect, of the other axes.
+
+    `factor` from the display unit to SI; None for deg.
+    """
     first = y[:, :half] / test.step
+    other = other.reshape(len(y), -1)
     finite: np.ndarray = np.asarray(np.isfinite(y).all(axis=1) & np.isfinite(other).all(axis=1))
+
+    def shown(values: np.ndarray) -> np.ndarray:
+        return np.degrees(values) if factor is None else values / factor
+
     first = np.where(finite[:, None], first, 0.0)
     rise = [np.where((first >= level).any(axis=1), (first >= level).argmax(axis=1), np.inf) for level in _RISE]
     outside = np.abs(first - 1.0) >= SETTLING_BAND
@@ -161,8 +197,8 @@ def _metrics(y: Matrix, other: Matrix, test: StepTest, half: int, Ts: float) -> 
                 np.isfinite(rise[1]), (rise[1] - np.where(np.isfinite(rise[0]), rise[0], 0.0)) * Ts, np.inf
             ),
             "settling_s": np.where(settled < half, settled * Ts, np.inf),
-            "steady_rms_deg": np.degrees(np.sqrt((steady**2).mean(axis=1))),
-            "load_rms_deg": np.degrees(np.sqrt(((tail[:, half:] - test.step) ** 2).mean(axis=1))),
-            "coupling_deg": np.degrees(np.abs(other).max(axis=1)),
+            "steady_rms_deg": shown(np.sqrt((steady**2).mean(axis=1))),
+            "load_rms_deg": shown(np.sqrt(((tail[:, half:] - test.step) ** 2).mean(axis=1))),
+            "coupling_deg": shown(np.abs(other).max(axis=1, initial=0.0)),
         }
     return {name: np.where(finite, values, np.inf) for name, values in found.items()}

@@ -21,7 +21,8 @@ from softneck.design.robust._mu import Structure, mu_lower, mu_upper
 from softneck.design.robust._robustness import worst_gains
 
 from ._linear import LinearLaw, radii
-from ._plants import UncertainNeck, make_plants
+from ._plants import UncertainNeck, make_plants, mixing
+from ._search import axes_together, together
 
 # Dead times and poles of a box that its weight is taken over.
 _DELAYS, _POLES = 15, 5
@@ -38,7 +39,7 @@ class StructuredResult:
     """Bounds over frequency, and what sampling says beside them.
 
     Attributes:
-        axes: "pitch", "roll", or "both" where they are coupled.
+        axes: "pitch", "roll", or "both" (of more than two "all") where they are coupled.
         frequency: (m,) [rad/s].
         upper, lower: (m,) bounds of mu for stability; the lower one is found around the peak only, 0 elsewhere.
         sampled: 1 / the least scale of the box at which a sampled plant was unstable; 0 where none was.
@@ -69,17 +70,16 @@ def structured(
         neck: with its box.
         law: the controller's linear form.
         extra: samples of delay that the loop's order adds.
-        drawn: (n, 2, 3) from -1 to 1 across the box, scaled up to find instability.
+        drawn: (n, axes, 3) from -1 to 1 across the box, scaled up to find instability.
         performance: whether the worst sensitivity is bounded too.
     """
     Ts = neck.sample_time
     w = np.geomspace(0.05, math.pi / Ts, _FREQUENCIES)
-    whole = law.coupled or bool(np.any(neck.cross != 0.0))
     results = []
-    for axes in [(0, 1)] if whole else [(0,), (1,)]:
+    for axes in axes_together(neck, law):
         M, blocks = interconnection(neck, law, w, axes, extra)
         sampled, scale = _sampled(neck, law, axes, extra, drawn)
-        name = "both" if whole else ("pitch", "roll")[axes[0]]
+        name = together(neck, axes)
         if not _middle_is_stable(neck, law, axes, extra):
             # The bound grows the box from a stable middle; without one there is nothing to grow.
             never = np.full(w.size, math.inf)
@@ -121,7 +121,7 @@ def interconnection(
     """Return M (m, rows, columns) over `w` [rad/s] and its blocks; `judged` adds the sensitivity of that axis last."""
     n = len(axes)
     parts = [_axis(neck.axes[i], w, neck.sample_time, extra) for i in axes]
-    X = np.eye(n) if n == 1 else np.array([[1.0, neck.cross[0]], [neck.cross[1], 1.0]])
+    X = np.eye(n) if n == 1 else mixing(neck.cross, n)
     Ky = law.feedback(w)[:, list(axes)][:, :, list(axes)]
     V = X @ Ky
     m = w.size
@@ -204,7 +204,7 @@ def _sampled(
 ) -> tuple[float, float]:
     """Return 1 / the least scale of the box at which a drawn plant is unstable (0 for none), and the largest tried."""
     middle, widths = (np.stack([getattr(box, name) for box in neck.axes]) for name in ("middle", "widths"))
-    held = np.zeros((2, 3))
+    held = np.zeros((len(neck.axes), 3))
     held[list(axes)] = 1.0
     # Gains and poles keep their sign, dead times stay above zero: beyond that the box means nothing.
     room = np.where(held * widths > 0.0, 0.98 * np.abs(middle) / np.maximum(widths, 1e-12), math.inf)

@@ -14,7 +14,7 @@ from softneck.verification._axis_runtime import axis_advance
 class SweepArrays(Arrays):
     """What stands between controller and plants; the arrays of the controller follow."""
 
-    T = array("3, 3", "of Eq. 9-11: motors to redefined inputs")
+    T = array("references, motors", "of Eq. 9-11: motors to redefined inputs")
 
 
 def sweep_run(
@@ -26,49 +26,54 @@ def sweep_run(
     numerator: np.ndarray,
     denominator: np.ndarray,
     delay: np.ndarray,
-    cross: np.ndarray,
+    mixed: np.ndarray,
     signals: np.ndarray,
     angles: np.ndarray,
     motors: np.ndarray,
 ) -> None:
-    """Run every plant; fill `angles` (n, time, 2) and `motors` (n, time, 3).
+    """Run every plant; fill `angles` (n, time, axes) and `motors` (n, time, motors).
 
     start: the controller's inputs where nobody sets them.
-    places: (10,) where in them stand the three references, both angles, three motors, healthy, enabled; -1: nowhere.
-    outputs_at: (3,) where the set-points stand in its outputs, and their number behind them.
-    numerator, denominator (n, 2, q), delay (n, 2), cross (n, 2): of the plants.
-    signals: (time, 7) pitch, roll and co-contraction reference, noise of both angles, load on both plants' inputs.
+    places: where in them stand the references, all angles, all motors, healthy, enabled; -1: nowhere.
+    outputs_at: (motors + 1,) where the set-points stand in its outputs, and the number of all outputs behind them.
+    numerator, denominator (n, axes, q), delay (n, axes), mixed (n, axes, axes): of the plants.
+    signals: (time, 3 axes + 1) references, the last of co-contraction, noise of all angles, load on all inputs.
     """
-    n, rows, q = numerator.shape[0], signals.shape[0], numerator.shape[2]
+    n, m, q = numerator.shape[0], numerator.shape[1], numerator.shape[2]
+    rows, count = signals.shape[0], outputs_at.shape[0] - 1
     state = np.empty(member_size(p, 0))
     inputs = start.copy()
-    outputs = np.zeros(outputs_at[3])
-    values = np.empty(10)
-    held = np.zeros(3)
+    outputs = np.zeros(outputs_at[count])
+    values = np.empty(places.shape[0])
+    held = np.zeros(count)
     for i in range(n):
         member_initialise(p, 0, parameters, state, outputs)
-        x = np.zeros((2, q))
-        u = np.zeros((rows, 2))  # inputs v of all rows: a delay is an index back
+        x = np.zeros((m, q))
+        u = np.zeros((rows, m))  # inputs v of all rows: a delay is an index back
         held[:] = 0.0
         for k in range(rows):
-            values[:3] = signals[k, :3]
-            for axis in range(2):
+            values[: m + 1] = signals[k, : m + 1]
+            for axis in range(m):
                 # Sequential: the controller sees the angle of t_k before its set-points move the plant on to t_k+1.
                 angles[i, k, axis] = x[axis, 0]
-                values[3 + axis] = x[axis, 0] + signals[k, 3 + axis]
-            values[5:8] = held
+                values[m + 1 + axis] = x[axis, 0] + signals[k, m + 1 + axis]
+            values[2 * m + 1 : 2 * m + 1 + count] = held
             # Healthy and enabled.
-            values[8:] = 1.0
-            for j in range(10):
+            values[2 * m + 1 + count :] = 1.0
+            for j in range(places.shape[0]):
                 if places[j] >= 0:
                     inputs[places[j]] = values[j]
             member_step(p, 0, parameters, state, inputs, outputs)
-            for j in range(3):
+            for j in range(count):
                 held[j] = outputs[outputs_at[j]]
                 motors[i, k, j] = held[j]
             tilt = np.dot(p.T, held)
-            u[k, 0] = tilt[0] + cross[i, 0] * tilt[1] + signals[k, 5]
-            u[k, 1] = tilt[1] + cross[i, 1] * tilt[0] + signals[k, 6]
-            for axis in range(2):
+            for axis in range(m):
+                total = tilt[axis]
+                for other in range(m):
+                    if other != axis:
+                        total += mixed[i, axis, other] * tilt[other]
+                u[k, axis] = total + signals[k, 2 * m + 1 + axis]
+            for axis in range(m):
                 row = k - delay[i, axis]  # before the run the plant was at rest
                 axis_advance(x[axis], numerator[i, axis], denominator[i, axis], u[row, axis] if row >= 0 else 0.0)

@@ -14,6 +14,7 @@ import numpy as np
 from softneck.core import DataError, Progress, SettingsError, silent
 from softneck.core._certificate import certificate_contents
 from softneck.estimation._axis import robot_of
+from softneck.signals.recording._recording import require_same_robot
 
 from ._agreement import Agreement, agreements
 from ._evidence import Evidence, gather, worst_row
@@ -21,8 +22,9 @@ from ._experiments import crossing_values
 from ._laws import ControllerUnderTest, judge
 from ._neck_loops import check_blocks
 from ._own_plants import is_own_plant, own_plant
-from ._plants import AXES, UncertainNeck, neck_of_family, neck_of_model
+from ._plants import UncertainNeck, neck_of_family, neck_of_model
 from ._requirements import Requirement, Requirements, read_requirements
+from ._scale import scaled
 from ._steps import check_ports
 from ._worst import write_linear, write_neck
 
@@ -147,13 +149,21 @@ class Verification:
             "nu_gap": [
                 {"source": neck.name, "axis": axis, "largest_gap": pair[i].gap.max(), "margin": pair[i].margin}
                 for part in evidence.linear[:1] for neck, pair in zip(self.necks, part.gaps, strict=True)
-                for i, axis in enumerate(AXES)
+                for i, axis in enumerate(neck.names)
             ],
             "settings": {
-                name: dict(getattr(self.requirements, name)) for name in ("uncertainty", "sampling", "step", "neck")
+                name: self.requirements.table(name) for name in ("uncertainty", "sampling", "step", "neck")
             },
+            **self._robot(),
         }  # fmt: skip
         return certificate_contents("verify", holds=self.holds, files=self.files, more=plain(more))
+
+    def _robot(self) -> dict[str, Any]:
+        """Return of another robot than the neck who it is, and by what the defaults were stretched to it."""
+        robot, (time, size) = self.controller.robot, self.requirements.scale
+        if robot.is_neck:
+            return {}
+        return {"robot": {"name": robot.name, "hash": robot.hash}, "scale": {"time": time, "size": size}}
 
     def write_worst(
         self, folder: str | Path, *, controller: str | Path, observer: str | Path | None = None, force: bool = False
@@ -166,20 +176,23 @@ class Verification:
             force: replace what stands there.
         """
         target, files = Path(folder), {}
+        axes = self.controller.robot.outputs.names
         for number, verdict in enumerate(self.verdicts):
             worst, name = dict(verdict.worst), verdict.requirement.metric.replace(".", "_")
             if worst.get("kind") == "linear":
                 facts = {
                     "name": worst["name"], "numerator": worst["numerator"], "denominator": worst["denominator"],
                     "delay": worst["delay_samples"], "cross": worst["cross"], "sample_time": worst["sample_time_s"],
-                    "axis": 1 if worst["axis"] == "roll" else 0,
+                    "axis": axes.index(worst["axis"]) if worst["axis"] in axes else 0,
                 }  # fmt: skip
                 files[number] = write_linear(
-                    target, name, facts, controller=Path(controller), step=self.requirements.step, force=force
-                )
+                    target, name, facts, controller=Path(controller), asked=self.requirements,
+                    weights=self.necks[0].weights, force=force,
+                )  # fmt: skip
             elif worst.get("kind") == "neck":
                 seen = None if observer is None else Path(observer)
-                files[number] = write_neck(target, name, worst, controller=Path(controller), observer=seen, force=force)
+                files[number] = write_neck(target, name, worst, controller=Path(controller), observer=seen, force=force,
+                                           robot=self.controller.robot)  # fmt: skip
         return files
 
 
@@ -229,17 +242,23 @@ def verify(
 
     Raises:
         SettingsError: another sample time, other channels, no plants.
+        DataError: controller, plants and observer of two robots.
     """
     begin = time.perf_counter()
-    asked = read_requirements() if requirements is None else requirements
-    for thing in (controller, *_named(plants).values(), *(() if observer is None else (observer,))):
-        robot_of(thing).require_neck("verification")
-    own = {name: thing for name, thing in _named(plants).items() if is_own_plant(thing)}
-    linear = {name: thing for name, thing in _named(plants).items() if name not in own}
+    robot, named = robot_of(controller), _named(plants)
+    for what, thing in (*named.items(), *(() if observer is None else (("observer", observer),))):
+        require_same_robot(robot_of(thing), robot, f"the controller and {what}")
+    asked = read_requirements(robot=robot) if requirements is None else requirements.of_robot(robot)
+    own = {name: thing for name, thing in named.items() if is_own_plant(thing)}
+    if own:
+        robot.require_neck(f"a margin by experiment, on {next(iter(own))},")
+    linear = {name: thing for name, thing in named.items() if name not in own}
+    if not robot.is_neck:
+        asked = scaled(asked, sources_of(linear, asked))
     necks = sources_of(linear, asked)
     eyes = None if observer is None else observer.block()
     judged = judge(controller, order=order, observer=observer is not None)
-    check_ports(judged.block)
+    check_ports(judged.block, robot)
     check_blocks(judged.block, eyes)
     for neck in necks:
         if not math.isclose(neck.sample_time, judged.block.sample_time, rel_tol=1e-6):
@@ -276,7 +295,7 @@ def _verdict(item: Requirement, evidence: Evidence) -> Verdict:
     values = evidence.metrics.get(item.metric)
     if values is None:
         group = item.metric.partition(".")[0]
-        group = "axes" if group in AXES else group
+        group = "axes" if group in evidence.plants.axes else group
         why = evidence.not_computed.get(item.metric, evidence.not_computed.get(group, "it was not computed"))
         note = f"not computed: {why}"
         return Verdict(item, None, False if item.asked else None, {}, note)
@@ -293,15 +312,16 @@ def _verdict(item: Requirement, evidence: Evidence) -> Verdict:
 
 _FOREIGN = "foreign plant: a preset does not decide; give a plant of yours that steps, or ask for it (`[neck] decides`)"
 # What is about the loop's response, which the data may not reach.
-_LINEAR_GROUPS = ("stability", "axes", "mimo", "robust", *AXES)
+_LINEAR_GROUPS = ("stability", "axes", "mimo", "robust")
 
 
 def _unsupported(item: Requirement, evidence: Evidence) -> str:
     """Return why the data do not support a linear requirement: the loop may cross above their band; else ""."""
     group = item.metric.partition(".")[0]
-    if group not in _LINEAR_GROUPS:
+    axes = evidence.plants.axes
+    if group not in (*_LINEAR_GROUPS, *axes):
         return ""
-    reasons = [part.why() for part in evidence.tested if group not in AXES or part.axis == group]
+    reasons = [part.why() for part in evidence.tested if group not in axes or part.axis == group]
     return next((reason for reason in reasons if reason), "")
 
 
@@ -315,7 +335,7 @@ def validity(evidence: Evidence, tested: Mapping[str, Any]) -> dict[str, Any]:
         return None if values is None else factor * float(np.min(values))
 
     def linear(name: str) -> Any:
-        parts = [part.margins[f"{axis}.{name}"].min() for part in evidence.linear for axis in AXES]
+        parts = [part.margins[f"{axis}.{name}"].min() for part in evidence.linear for axis in part.plants.axes]
         return [*parts, *(part.margins[name] for part in evidence.tested if name in part.margins)] or None
 
     return {
@@ -340,9 +360,9 @@ def _box(neck: UncertainNeck) -> dict[str, Any]:
     return {
         axis: {
             "nominal": box.nominal, "low": box.low, "high": box.high, "samples": box.samples.shape[0],
-            "unit": ["rad/rad", "1/s", "s"],
+            "unit": ["rad/rad" if neck.robot.is_neck else "SI", "1/s", "s"],
         }
-        for axis, box in zip(AXES, neck.axes, strict=True)
+        for axis, box in zip(neck.names, neck.axes, strict=True)
     }  # fmt: skip
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,10 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import SettingsError, atomic_write
+from softneck.core import Matrix, SettingsError, atomic_write, to_si
+from softneck.loop._result import shown_unit
 from softneck.plant import NeckParameters, VirtualNeck
+from softneck.robot import Robot
+from softneck.robot._redefined import redefinition_of
 from softneck.runtime import Block, Port
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
+
+from ._plants import mixing
+from ._requirements import Requirements
 
 _RUNTIME = "softneck.verification._linear_plant_runtime"
 
@@ -25,13 +30,13 @@ from softneck.verification import linear_plant
 
 
 def plant():
-    """Return it as a block: y(z) = z^-delay numerator/denominator u(z) of pitch (from theta_i) and roll (phi_i)."""
+    """Return it as a block: y(z) = z^-delay numerator/denominator u(z) of {axes}."""
     return linear_plant(
         numerator={numerator},
         denominator={denominator},
         delay={delay},
         cross={cross},
-        sample_time={sample_time!r},
+        sample_time={sample_time!r},{more}
     )
 '''
 _LOOP = """# Written by `softneck verify`: {title}.
@@ -49,8 +54,7 @@ file = {controller}
 
 [reference]
 kind = "step"
-pitch_deg = {pitch!r}
-roll_deg = {roll!r}
+{wanted}
 at_s = {at:g}
 """
 
@@ -62,43 +66,55 @@ def linear_plant(
     delay: Sequence[int],
     cross: Sequence[float] = (0.0, 0.0),
     sample_time: float = 0.02,
+    robot: Mapping[str, Any] | None = None,
+    directions: ArrayLike | None = None,
 ) -> Block:
-    """Return two linear axes as a plant for loops, with noise on the measured angles and a load on each input.
+    """Return linear axes as a plant for loops, with noise on the measured angles and a load on each input.
 
     Args:
-        numerator: (2, q) of pitch and roll, highest power of z first; the first of each is 0.
-        denominator: (2, q) monic.
+        numerator: (outputs, q) of pitch and roll, highest power of z first; the first of each is 0.
+        denominator: (outputs, q) monic.
         delay: samples besides, of each axis.
-        cross: phi_i into pitch as a part of theta_i's effect, and theta_i into roll.
+        cross: phi_i into pitch as a part of theta_i's effect, and theta_i into roll; of m outputs m (m - 1), axis by
+            axis.
         sample_time: [s].
+        robot: the tables of another robot than the neck.
+        directions: (outputs, motors) weights of its motors in each axis's input.
 
     Raises:
         SettingsError: shapes that do not fit, a direct way from input to angle, a negative delay.
     """
     above, below = (np.atleast_2d(np.asarray(item, dtype=np.float64)) for item in (numerator, denominator))
-    if above.shape != below.shape or above.shape[0] != 2:
+    whose = Robot.preset() if robot is None else Robot.from_dict(robot)
+    names = whose.outputs.names
+    m = len(names)
+    if above.shape != below.shape or above.shape[0] != m:
         raise SettingsError(
-            f"`numerator` and `denominator` must have one shape (2, q); got {above.shape}, {below.shape}."
+            f"`numerator` and `denominator` must have one shape ({m}, q); got {above.shape}, {below.shape}."
         )
     if np.any(above[:, 0] != 0.0) or np.any(below[:, 0] != 1.0):
         raise SettingsError("`numerator` must begin with 0 and `denominator` with 1: the input acts one sample later.")
     if min(delay) < 0:
         raise SettingsError(f"`delay` must not be negative; got {list(delay)}.")
-    motors = [Port(name=f"motor_setpoint_{j}", unit="rad", description=f"set-point of motor {j}") for j in (1, 2, 3)]
-    loads = [
-        Port(name=f"load_{axis}", unit="rad", description=f"added to the input of {axis}") for axis in ("pitch", "roll")
+    T = redefinition_matrix(np.asarray(TENDON_ANGLES))
+    if directions is not None:
+        T = redefinition_of(np.asarray(directions, dtype=np.float64), names)[0]
+    unit, motor = to_si(whose.outputs.unit)[1], to_si(whose.motors.unit)[1]
+    motors = [
+        Port(name=name, unit=motor, description=f"set-point of motor {j}") for j, name in enumerate(whose.set_points, 1)
     ]
-    angles = [Port(name=name, unit="rad") for name in ("pitch", "roll", "pitch_measured", "roll_measured")]
-    positions = [Port(name=f"motor_position_{j}", unit="rad") for j in (1, 2, 3)]
+    loads = [Port(name=f"load_{axis}", unit=motor, description=f"added to the input of {axis}") for axis in names]
+    angles = [Port(name=name, unit=unit) for name in (*names, *(f"{axis}_measured" for axis in names))]
+    positions = [Port(name=name, unit=motor) for name in whose.motor_positions]
     return Block(
         kind="linear_plant", role="plant", runtime=_RUNTIME, sample_time=sample_time,
         arrays=(
-            above, below, np.asarray(delay, dtype=np.float64), np.asarray(cross, dtype=np.float64),
-            redefinition_matrix(np.asarray(TENDON_ANGLES)),
+            above, below, np.asarray(delay, dtype=np.float64), mixing(np.asarray(cross[: m * (m - 1)], float), m), T,
         ),
         inputs=(*motors, *loads), outputs=(*angles, *positions),
         parameters=(
-            Port(name="noise_std", unit="rad", description="noise of the measured angles", minimum=0.0, maximum=0.2),
+            Port(name="noise_std", unit=unit, description="noise of the measured angles", minimum=0.0,
+                 maximum=0.2 if unit == "rad" else None),
             Port(name="noise_seed", description="seed of that noise", minimum=0.0),
         ),
     )  # fmt: skip
@@ -110,8 +126,9 @@ def virtual_neck() -> Block:
 
 
 def write_linear(
-    folder: Path, name: str, worst: Mapping[str, Any], *, controller: Path, step: Mapping[str, Any], force: bool
-) -> Path:
+    folder: Path, name: str, worst: Mapping[str, Any], *, controller: Path, asked: Requirements,
+    weights: Matrix | None = None, force: bool
+) -> Path:  # fmt: skip
     """Write `name.toml` and the plant beside it; return the loop file.
 
     Args:
@@ -119,17 +136,25 @@ def write_linear(
         name: of the loop file.
         worst: name, numerator, denominator, delay, cross, sample_time and axis (0 pitch, 1 roll) of the plant.
         controller: its file.
-        step: the table [step] of the requirements.
+        asked: the requirements.
+        weights: (outputs, motors) of another robot's directions.
         force: replace what stands there.
     """
-    text = _PLANT.format(**{**worst, "name": str(worst["name"]).replace("\\", "/").replace('"', "'")})
+    robot, step = asked.robot, asked.step
+    axes, more = "pitch (from theta_i) and roll (phi_i)", ""
+    if weights is not None:
+        axes = f"{', '.join(robot.outputs.names)} from their inputs"
+        more = f"\n        robot={robot.as_dict()!r},\n        directions={np.asarray(weights).tolist()!r},"
+    named = {**worst, "name": str(worst["name"]).replace("\\", "/").replace('"', "'")}
+    text = _PLANT.format(**named, axes=axes, more=more)
     # Modules of one name are imported once: another plant needs another name.
     module = f"plant_{hashlib.sha256(text.encode()).hexdigest()[:10]}"
     _write(folder / f"{module}.py", text, force=True)
     size = float(step["size_deg"])
-    angles = (size, 0.0) if worst["axis"] == 0 else (0.0, size)
-    noise = f"noise_std = {math.radians(step['noise_deg'])!r}"
+    angles = tuple(size if i == worst["axis"] else 0.0 for i in range(len(robot.outputs.names)))
+    noise = f"noise_std = {asked.si(step['noise_deg'])!r}"
     text = _loop(
+        robot,
         folder, f"{name}.toml", title=f"{name} on {worst['name']}, with a step", plant=f'python = "{module}:plant"',
         parameters=noise, controller=controller, observer=None, angles=angles, at=0.0,
         duration=float(step["duration_s"]), sample_time=float(worst["sample_time"]), order="sequential",
@@ -139,14 +164,17 @@ def write_linear(
 
 
 def write_neck(
-    folder: Path, name: str, worst: Mapping[str, Any], *, controller: Path, observer: Path | None, force: bool
-) -> Path:
+    folder: Path, name: str, worst: Mapping[str, Any], *, controller: Path, observer: Path | None, force: bool,
+    robot: Robot | None = None,
+) -> Path:  # fmt: skip
     """Write `name.toml`, a loop over the virtual neck; `worst` is what the certificate says of that run."""
+    whose = Robot.preset() if robot is None else robot
+    unit = shown_unit(whose)[0]
     values = {**worst["parameters"], "payload": worst["payload_kg"], "noise_seed": float(worst["seed"])}
     text = _loop(
-        folder, f"{name}.toml", title=f"{name} on {worst['name']}", plant='neck = "paper"',
+        whose, folder, f"{name}.toml", title=f"{name} on {worst['name']}", plant='neck = "paper"',
         parameters=", ".join(f"{key} = {float(value)!r}" for key, value in values.items()), controller=controller,
-        observer=observer, angles=(worst["pitch_deg"], worst["roll_deg"]), at=worst["at_s"],
+        observer=observer, angles=tuple(worst[f"{axis}_{unit}"] for axis in whose.outputs.names), at=worst["at_s"],
         duration=worst["duration_s"], sample_time=worst["sample_time_s"], order=worst["order"],
     )  # fmt: skip
     _write(folder / f"{name}.toml", text, force=force)
@@ -154,13 +182,17 @@ def write_neck(
 
 
 def _loop(
-    folder: Path, name: str, *, title: str, controller: Path, observer: Path | None, angles: tuple[float, float],
-    **values: Any,
+    robot: Robot, folder: Path, name: str, *, title: str, controller: Path, observer: Path | None,
+    angles: tuple[float, ...], **values: Any,
 ) -> str:  # fmt: skip
+    unit = shown_unit(robot)[0]
     seen = "" if observer is None else f"\n[observer]\nfile = {_quoted(observer, folder)}\n"
     return _LOOP.format(
         name=name, title=title.replace("\n", " "), controller=_quoted(controller, folder), observer=seen,
-        pitch=float(angles[0]), roll=float(angles[1]), **values,
+        wanted="\n".join(
+            f"{axis}_{unit} = {float(angle)!r}" for axis, angle in zip(robot.outputs.names, angles, strict=True)
+        ),
+        **values,
     )  # fmt: skip
 
 

@@ -20,7 +20,6 @@ from softneck.loop._faults import make_fault
 from softneck.plant import VirtualNeck
 from softneck.robot import Robot
 from softneck.signals import signal
-from softneck.verification import verify
 
 TS, POLE, DELAY = 0.02, 0.9, 3
 # Three lengths that four chambers move; nobody told their directions, and they are 50 mm long at rest.
@@ -184,9 +183,3 @@ def test_keys_of_studies_and_faults_know_the_robot() -> None:
 def test_kinds_that_take_necks_only_say_so(kind: str) -> None:
     with pytest.raises(SettingsError, match=r"takes necks only so far, not robot `antagonist`"):
         design_controller(kind, plant(Robot.preset("antagonist")))
-
-
-def test_verification_takes_necks_only_and_says_so() -> None:
-    model = plant(Robot.preset("trunk4"))
-    with pytest.raises(SettingsError, match="verification takes necks only so far, not robot `trunk4`"):
-        verify(PiSettings().design(model), model)

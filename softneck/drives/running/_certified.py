@@ -74,7 +74,7 @@ def require_certified(
             f"{drives}, simulate it again, {_OVERRIDE}"
         )
     verified = _covering("verify", certificates, controller, [controller])
-    _require_minimum(verified)
+    _require_minimum(verified, robot or NECK)
     simulated = _covering("simulate", certificates, loop, files_that_act(setup, controller, drives))
     for found in (verified, simulated):
         _require_robot(found, robot or NECK)
@@ -110,7 +110,8 @@ def _covering(kind: str, given: Sequence[Path], item: Path, files: Sequence[Path
 
 def _require_robot(found: Certificate, robot: Robot) -> None:
     """Raise CheckFailedError unless a certificate is of `robot`: by the hash in it, or of a neck without one."""
-    said = str(found.contents.get("robot", NECK.hash))
+    whose = found.contents.get("robot")
+    said = str(whose.get("hash")) if isinstance(whose, dict) else NECK.hash
     if said != robot.hash:
         raise CheckFailedError(
             f"{found.path}: is of the robot with the hash {said[:8]}, the drives move {robot.label()}; certify the "
@@ -118,10 +119,17 @@ def _require_robot(found: Certificate, robot: Robot) -> None:
         )
 
 
-def _require_minimum(found: Certificate) -> None:
-    """Raise CheckFailedError unless the certificate shows all of `ARMING`, at least as strictly as the defaults ask."""
-    defaults = {item.metric: item for item in read_requirements().bounds}
-    for metric, what in ARMING.items():
+def _require_minimum(found: Certificate, robot: Robot) -> None:
+    """Raise CheckFailedError unless the certificate shows all of `ARMING`, at least as strictly as the defaults ask.
+
+    Of another robot the defaults are those that `verify` stretched to it, by what stands in the certificate.
+    """
+    asked = read_requirements(robot=robot)
+    scale = found.contents.get("scale") or {"time": 1.0, "size": 1.0}
+    bounds = [item.stretched(float(scale["time"]), float(scale["size"]), robot) for item in asked.bounds]
+    defaults = {item.metric: item for item in bounds}
+    for neck_metric, what in ARMING.items():
+        metric = asked.name_of(neck_metric)
         least = defaults[metric]
         rows = [row for row in found.rows if row.get("metric") == metric]
         if not rows:
@@ -157,7 +165,7 @@ def require_same_again(loop: Loop, certificate: Certificate) -> float:
     for name, expected in trace.items():
         if name == "row":
             continue
-        values = again.angle(name) if name in ("pitch", "roll") else again[name]
+        values = again.angle(name) if name in loop.robot.outputs.names else again[name]
         for row, value in zip(trace["row"], expected, strict=True):
             if value is not None and row < len(values) and not abs(values[row] - value) <= SAME:
                 raise CheckFailedError(

@@ -1,0 +1,147 @@
+"""Verification of other robots: one, two and three outputs, their units, their own virtual plant, and their files."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from softneck.core import DataError, SettingsError
+from softneck.cosim import load_loop, simulate
+from softneck.design import design_controller
+from softneck.robot import Robot
+from softneck.verification import make_requirements, verify
+from softneck.verification._linear import LinearLaw, judged, margins, radii
+from softneck.verification._plants import all_plants, between, mixing, neck_of_model
+from softneck.verification._requirements import read_requirements
+from softneck.verification._steps import StepTest, run_steps
+from softneck.verification._verify import sources_of
+from tests.design.test_robots import BELLOWS, LEARNED, plant
+
+FEW: dict[str, Any] = {"sampling": {"plants": 12, "search_generations": 0}, "neck": {"necks": 0}}
+NONE = {"gain": 0.0, "pole": 0.0, "delay": 0.0}
+
+
+@pytest.mark.parametrize("outputs", [1, 2, 3])
+def test_margins_of_axes_apart_are_those_of_each_alone(outputs: int) -> None:
+    """One plant on each axis: the margins of an antagonist are those of a trunk's pitch and of a length of four."""
+    robot = (Robot.preset("antagonist"), Robot.preset("trunk4"), BELLOWS)[outputs - 1]
+    model = plant(robot, gain=0.08 if outputs < 3 else 1e-7)
+    source = neck_of_model(model, "m", NONE)
+    assert not source.cross.any()
+    plants = all_plants([source], 1, 0)
+    # v = K (r - y), K of half a rad of input for one of output at a static gain of one.
+    K = 0.5 / (0.08 if outputs < 3 else 1e-7)
+    one = np.eye(outputs)
+    law = LinearLaw(
+        np.zeros((0, 0)),
+        np.zeros((0, outputs)),
+        np.zeros((0, outputs)),
+        np.zeros((outputs, 0)),
+        K * one,
+        -K * one,
+        0.02,
+    )
+    w = judged(0.02)
+    table = margins(plants, law, w)
+    # L = 0.5 * 0.1 z^-4 / (1 - 0.9 z^-1), whatever the units.
+    z = np.exp(1j * w * 0.02)
+    L = 0.05 * z**-3 / (z - 0.9)
+    for axis in robot.outputs.names:
+        assert table[f"{axis}.sensitivity"][0] == pytest.approx(np.abs(1.0 / (1.0 + L)).max(), rel=1e-9)
+    # Loops that do not meet have the disk margin of each.
+    assert table["mimo.disk_margin"][0] == pytest.approx(table[f"{robot.outputs.names[0]}.disk_margin"][0], rel=1e-9)
+
+
+def test_the_radius_of_coupled_axes_is_that_of_the_whole_system() -> None:
+    robot = BELLOWS
+    model = plant(robot, gain=1e-7)
+    source = neck_of_model(model, "m", NONE)
+    from dataclasses import replace
+
+    X = np.array([[1.0, 0.2, 0.0], [-0.1, 1.0, 0.3], [0.05, 0.0, 1.0]])
+    np.testing.assert_array_equal(mixing(between(X), 3), X)
+    plants = all_plants([replace(source, cross=between(X))], 1, 0)
+    K = -2e6 * np.eye(3)
+    law = LinearLaw(
+        np.zeros((0, 0)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((3, 0)), -K, K, 0.02
+    )  # fmt: skip
+    # y+ = 0.9 y + 0.1 g X v(k - 3), v = K y, as one companion matrix.
+    A = np.zeros((12, 12))
+    A[:3, :3], A[:3, 9:] = 0.9 * np.eye(3), 0.1 * 1e-7 * X @ K
+    for i in range(3):
+        A[3 + 3 * i : 6 + 3 * i, 3 * i : 3 + 3 * i] = np.eye(3)
+    assert radii(plants, law)[0] == pytest.approx(np.abs(np.linalg.eigvals(A)).max(), rel=1e-9)
+
+
+@pytest.mark.slow
+def test_a_verified_robot_holds_on_its_own_virtual_plant_and_says_who_it_is(tmp_path: Path) -> None:
+    robot = Robot.preset("antagonist")
+    model = plant(robot)
+    controller = design_controller("pi", model)
+    controller.save(tmp_path / "pi.npz")
+    table = {**FEW, "neck": {"necks": 1, "payloads_kg": [0.0]}}
+    found = verify(controller, model, make_requirements(table, robot=robot))
+    assert found.holds, found.failed
+    assert [run.name for run in found.evidence.necks] == ["paper, 0 kg, 0 deg"]
+    contents = found.contents()
+    assert contents["robot"] == {"name": "antagonist", "hash": robot.hash}
+    values = {row["metric"]: row["value"] for row in contents["requirements"]}
+    files = found.write_worst(tmp_path, controller=tmp_path / "pi.npz")
+    for number, metric in ((9, "step.overshoot_pct"), (12, "neck.overshoot_pct")):
+        assert found.verdicts[number].requirement.metric == metric
+        result = simulate(files[number])
+        # The same loop again; noise of the step test is drawn for all plants alike, that of a loop by its seed.
+        assert result.metrics["pitch"]["overshoot_pct"] == pytest.approx(values[metric], abs=1.5)
+    assert load_loop(files[9]).loop.robot.hash == robot.hash
+
+
+@pytest.mark.slow
+def test_defaults_are_stretched_to_the_robot_and_what_is_asked_stays() -> None:
+    model = plant(BELLOWS, gain=1e-7)
+    asked = make_requirements({**FEW, "step": {"size_mm": 3.0}, "require": {"step.settling_s": {"max": 1.5}}},
+                              robot=BELLOWS)  # fmt: skip
+    controller = design_controller("pi", model, slew_limit=10.0)
+    found = verify(controller, model, asked)
+    limits = {item.requirement.metric: item.requirement.limit for item in found.verdicts}
+    assert limits["step.settling_s"] == 1.5
+    time, size = found.requirements.scale
+    # A pole of 0.9 at 20 ms over the neck's 0.2 s.
+    assert time == pytest.approx(-0.02 / math.log(0.9) / 0.2)
+    # The directions sum to 1.4, 1.4 and 2 of 1.5 bar, by 1e-7 m/Pa: 0.64 of the least are 13 mm. The robot may go 10 mm
+    # from the middle of its range; over the neck's 40 deg, in mm.
+    assert size == pytest.approx(10.0 / 40.0)
+    assert limits["step.load_rms_mm"] == pytest.approx(2.0 * size)
+    assert found.requirements.si(found.requirements.step["size_deg"]) == pytest.approx(3e-3)
+    verdicts = {item.requirement.metric: item for item in found.verdicts}
+    assert verdicts["step.settling_s"].holds, verdicts["step.settling_s"]
+    assert verdicts["step.load_rms_mm"].value is not None
+    assert "necks = 0" in verdicts["neck.slack_s"].note
+    assert set(found.contents()["settings"]["step"]) == {"size_mm", "duration_s", "noise_mm", "load_bar"}
+
+
+def test_steps_of_a_robot_are_those_of_its_equations() -> None:
+    model = plant(BELLOWS, gain=1e-7)
+    controller = design_controller("pi", model, slew_limit=10.0)
+    plants = all_plants(sources_of({"m": model}, make_requirements(FEW, robot=BELLOWS)), 1, 0).take([0])
+    test = StepTest(step=1e-3, duration=2.0, noise=0.0, load=0.0, seed=0)
+    steps = run_steps(plants, controller.block(), test, robot=BELLOWS, weights=LEARNED)
+    for i in range(3):
+        P, y = steps.motors[i, 0], 0.0
+        v = P @ LEARNED[i]
+        assert P.min() >= 0.0
+        for k in range(steps.time.size):
+            assert steps.angles[i, 0, k] == pytest.approx(y, abs=1e-12)
+            y = 0.9 * y + 0.1 * 1e-7 * (v[k - 3] if k >= 3 else 0.0)
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    one, two = (plant(Robot.preset(name)) for name in ("antagonist", "trunk4"))
+    with pytest.raises(DataError, match="the controller and plant of two robots cannot be used together: `antagonist`"):
+        verify(design_controller("pi", one), two)
+    with pytest.raises(SettingsError, match="unknown key `size_deg` of \\[step\\]; it takes size_mm"):
+        make_requirements({"step": {"size_deg": 3.0}}, robot=BELLOWS)
+    assert {item.metric for item in read_requirements(robot=BELLOWS).bounds} >= {"step.load_rms_mm", "neck.slack_s"}
