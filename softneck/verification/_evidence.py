@@ -154,6 +154,8 @@ def gather(
             name=f"{plant.name}, {kg:g} kg" if plant.payload else plant.name, controller=controller.block,
             plant=lambda plant=plant: plant.quiet(controller.block.sample_time), observer=observer,
             order=controller.order, inputs={"payload": kg} if plant.payload else {},
+            # Each axis alone with the light payload; with the heavy one both at once, which is the harder test.
+            axes=("pitch", "roll", "both") if kg == payloads[0] or not plant.payload else ("both",),
         )
         for plant in own for kg in (payloads if plant.payload else (0.0,))
     ]  # fmt: skip

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, cast
 
 from softneck.core import SettingsError, SoftneckError
 from softneck.loop import BlockPart, Part
@@ -60,15 +61,11 @@ def own_plant(thing: Any, name: str) -> OwnPlant:
             quiet=lambda Ts: BlockPart(still.block(sample_time=Ts)),
         )  # fmt: skip
     if callable(thing) and not hasattr(thing, "block"):
-        part = thing()
-        make: Callable[[], Part] = thing
+        make = cast("Callable[[], Part]", thing)
     else:
-        block: Block = thing if isinstance(thing, Block) else thing.block()
-        part = BlockPart(block)
-
-        def make() -> Part:
-            return BlockPart(block)
-
+        block: Block = thing if isinstance(thing, Block) else cast("Any", thing).block()
+        make = partial(BlockPart, block)
+    part = make()
     names = [port.name for port in part.outputs]
     part.close()
     if part.role != "plant" or "pitch" not in names or "roll" not in names:

@@ -135,12 +135,12 @@ def _largest_ratio(L: np.ndarray, r: Vector, a: float, b: float) -> Vector:
 
 def _gain_ratio(L: np.ndarray, W: Vector) -> Vector:
     """Return the least factor, up or down, that brings a point of the disk onto -1: `1 + 2 k Re L + k^2 q = 0`."""
-    q = np.abs(L) ** 2 * (1.0 - W**2)
-    root = np.sqrt(np.maximum(L.real**2 - q, 0.0))
-    real = L.real**2 >= q
+    q, along = np.abs(L) ** 2 * (1.0 - W**2), np.real(L)
+    root = np.sqrt(np.maximum(along**2 - q, 0.0))
+    real = along**2 >= q
     ratios = []
     for sign in (-1.0, 1.0):
-        k = (-L.real + sign * root) / np.where(q == 0.0, 1e-300, q)
+        k = (-along + sign * root) / np.where(q == 0.0, 1e-300, q)
         ratios.append(np.where(real & (k > 0.0), np.maximum(k, 1.0 / np.maximum(k, 1e-300)), math.inf))
     return np.minimum(*ratios)
 

@@ -13,7 +13,7 @@ from .held_out import HELD_OUT
 from .necks import CHOOSING, NECKS
 
 # What only shows: it prints what each neck is like, and chooses nothing.
-SHOWS = {"benchmarks/foreign_necks.py", "benchmarks/baseline.py"}
+SHOWS = {"benchmarks/foreign_necks.py", "benchmarks/baseline.py", "benchmarks/promises.py"}
 SCRIPTS = [
     path
     for folder in ("benchmarks", "softneck")

@@ -128,7 +128,11 @@ def test_the_virtual_neck_stands_less_than_its_linear_model_and_coarse_is_quick(
     # Issue 29: under 3 s of processor time, to tune with.
     assert time.process_time() - begin < 3.0
     up = min(item.value for item in coarse if item.what == "gain_up")
-    fine = min(item.value for item in _group(loop, "both", "gain_up", False))
+    begin = time.process_time()
+    full = crossings([loop])
+    # Issue 29: under 20 s of processor time for one controller.
+    assert time.process_time() - begin < 20.0
+    fine = min(item.value for item in full if item.axes == "both" and item.what == "gain_up")
     assert 1.2 < fine < 20.0
     # Coarse: the last of a ladder of sqrt(2) that was calm, in one posture.
     assert up / math.sqrt(2.0) <= fine * 1.01
