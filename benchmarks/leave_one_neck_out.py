@@ -24,7 +24,10 @@ from threadpoolctl import threadpool_limits
 import softneck
 from softneck.core import Vector
 from softneck.estimation import KalmanSettings
-from softneck.identification import INFINITE, OutputError, Rls, validate
+from softneck.identification import INFINITE, Model, OutputError, Rls, validate
+from softneck.identification.models._arrays import members
+from softneck.identification.uncertainty._guarded import Guarded
+from softneck.identification.uncertainty._guarded_base import Base
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.signals import Excitation, Recording, signal
 from tests.foreign_necks.choosing import choice, leave_one_out
@@ -97,11 +100,29 @@ def observed(run: Run, candidates: list[Any]) -> Vector:
     return np.array(found)
 
 
+def blended(run: Run, candidates: list[Any]) -> Vector:
+    """Return as `free_run` does what guarded models are worth that differ in how they blend: trained only once."""
+    train = run(signal("eq22"), 1).rows(0, 7000)
+    tests = [run(signal(name), number) for number, name in enumerate(TESTS, start=2)]
+    first = candidates[0].fit(train)
+    parts = [Model(kind=kind, sample_time=first.sample_time, arrays=own) for kind, own in members(first.arrays)]
+    base = Base(parts[0], first.arrays["sigma"], np.array(first.findings["base_fit_left_out"]))
+    found = []
+    for settings in candidates:
+        model = settings.around(base, parts[1:], train)
+        fits = [fit for test in tests for fit in validate(model, test, horizons=(INFINITE,)).fits[INFINITE].values()]
+        found.append(np.mean([2.0 if fit is None else min(2.0, 1.0 - fit / 100.0) for fit in fits]))
+    return np.array(found)
+
+
 _DEGREES = (0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0)
 QUESTIONS = {
     "rls.forgetting": Question("forgetting", (0.99, 0.995, 0.998, 0.999, 0.9995, 0.9998, 1.0), Rls(), free_run),
     "rls.nb": Question("nb", (1, 2, 3, 5), Rls(), free_run),
     "oe.nf": Question("nf", (1, 2, 3), OutputError(), free_run),
+    # Networks by `nss`, which trains a little faster than `nn`; minutes a specimen.
+    "guarded.agreement": Question("agreement", (0.05, 0.1, 0.25, 0.5, 1.0), Guarded(of="nss", workers=1), blended),
+    "guarded.unseen": Question("unseen", (0.025, 0.05, 0.1, 0.2, 0.4, 0.8), Guarded(of="nss", workers=1), blended),
     "observer.model_noise_std": Question(
         "model_noise_std", tuple(np.radians(_DEGREES).tolist()), KalmanSettings(), observed
     ),

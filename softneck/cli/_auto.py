@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,10 +18,12 @@ from .shared._validate_table import with_fit
 if TYPE_CHECKING:
     from softneck.identification import Choice, Model
     from softneck.identification.selection._auto import KindTrial
+    from softneck.robot import Robot
     from softneck.signals import Recording
 
 
-_HEAD = ["kind", "free run", "one step", "persistence", "trained in", "size", ""]
+_HEAD = ["kind", "worst", "of", "all of them", "rows held out", "cold", "tried in", "found", ""]
+_TITLE = "Free-run fit [%] over what was left out, mean of {names}; +- one standard error"
 
 _LINEAR = "`design` and `observer` take linear models: the best of them, {kind}, is in {path}"
 
@@ -32,6 +35,7 @@ def identify_auto(
     train: float,
     refit_all: bool,
     seed: int | None,
+    robot: str | None,
     html: Path | None,
     force: bool,
     as_json: bool,
@@ -49,7 +53,7 @@ def identify_auto(
         refuse_existing(file, force=overwrite)
     if html is not None:
         refuse_existing(html, force=force)
-    parts = [read_recording(source) for source in recordings]
+    parts = [read_recording(source, robot=robot) for source in recordings]
     head, tail, other = _split(parts, train)
     with progress("identify auto", quiet=as_json) as report:
         choice = choose(head, tail, other_excitation=other, seed=seed or 0, progress=report)
@@ -70,8 +74,7 @@ def identify_auto(
         facts = _facts(choice, path)
         print_json({**facts, "linear_model": None if linear is None else str(linear_path), "refit": refit_all})
         return
-    names = "/".join(parts[0].robot.outputs.names)
-    print_table(f"Fit [%] on the rows held out, {names}", _HEAD, _rows(choice))
+    print_table(_title(parts[0].robot), _HEAD, _rows(choice))
     click.echo(f"{choice.why}\n{path}\n{models[0].summary()}")
     for remark in [*said, *choice.remarks, *([REFITTED] if refit_all else [])]:
         note(remark)
@@ -105,23 +108,30 @@ def _split(parts: list[Recording], train: float) -> tuple[Recording, Recording, 
     return head, tail, False
 
 
+def _title(robot: Robot) -> str:
+    return _TITLE.format(names=" and ".join(robot.outputs.names))
+
+
 def _rows(choice: Choice) -> list[list[str]]:
     return [_row(one, one is choice.chosen) for one in choice.ranking]
 
 
 def _row(one: KindTrial, chosen: bool) -> list[str]:
-    from softneck.identification import INFINITE
+    from softneck.identification.selection._auto import COLD, HOLD_OUT
 
-    if one.judged is None or one.model is None:
-        return [one.kind, "-", "-", "-", f"{one.seconds:.1f} s", "-", one.failure[:60]]
-    fits, held = one.judged.fits, one.judged.persistence["1"]
-    size = sum(array.size for array in one.model.arrays.values())
+    if one.model is None:
+        return [one.kind, *["-"] * 5, f"{one.seconds:.1f} s", "-", one.failure[:60]]
+    scores, error = one.scores, one.errors.get(one.worst)
     return [
         one.kind,
-        *("/".join(percent(fit) for fit in table.values()) for table in (fits[INFINITE], fits["1"], held)),
+        percent(one.fit) + ("" if error is None else f" +- {error:.1f}"),
+        one.worst,
+        f"{percent(one.fit)}..{percent(max(scores.values()))}",
+        percent(scores[HOLD_OUT]),
+        percent(scores[COLD]) if COLD in scores else "-",
         f"{one.seconds:.1f} s",
-        f"{size} numbers",
-        "chosen" if chosen else "",
+        f"{one.numbers} numbers",
+        "chosen" if chosen else "" if one.whole else "stopped early",
     ]
 
 
@@ -136,6 +146,12 @@ def _facts(choice: Choice, path: Path) -> dict:
                 "kind": one.kind,
                 "seconds": one.seconds,
                 "failure": one.failure or None,
+                "fit": _finite(one.fit),
+                "worst": one.worst or None,
+                "scores": {name: _finite(fit) for name, fit in one.scores.items()},
+                "standard_errors": dict(one.errors),
+                "numbers": one.numbers,
+                "stopped_early": one.model is not None and not one.whole,
                 "hold_out": None if one.judged is None else one.judged.as_dict(),
             }
             for one in choice.ranking
@@ -143,15 +159,21 @@ def _facts(choice: Choice, path: Path) -> dict:
     }
 
 
+def _finite(fit: float) -> float | None:
+    """Return what JSON can hold."""
+    return fit if isfinite(fit) else None
+
+
 def _page(choice: Choice) -> str:
     from softneck.plots import Section, Table, page, validation_figure
 
-    judged = next((one.judged for one in choice.ranking if one.judged is not None), None)
-    names = () if judged is None else judged.robot.outputs.names
-    table = Table(f"Fit [%] on the rows held out, {'/'.join(names)}", _HEAD, _rows(choice))
-    sections = [Section("Which model", text=[choice.why, *choice.remarks], tables=[table])]
+    table = Table(_title(_model(choice).robot), _HEAD, _rows(choice))
+    names = list(dict.fromkeys(name for one in choice.ranking for name in one.scores))
+    each = [[one.kind, *(percent(one.scores.get(name)) for name in names)] for one in choice.ranking]
+    all_scores = Table("Free-run fit [%] over each part that was left out", ["kind", *names], each)
+    sections = [Section("Which model", text=[choice.why, *choice.remarks], tables=[table, all_scores])]
     for one in choice.ranking:
-        if one.judged is None or (one is not choice.chosen and one is not choice.ranking[0]):
+        if one.judged is None or one is not choice.chosen:
             continue
         curves = {"free run": one.judged.free_run}
         figure = validation_figure(one.judged.time, one.judged.measured, curves, one.kind, robot=one.judged.robot)

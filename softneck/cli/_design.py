@@ -12,6 +12,7 @@ from softneck.core._kinds import fitting, kinds_of
 
 from .shared._console import percent, print_json, progress
 from .shared._options import apply_settings, force_option, json_option, output_option, set_option, target
+from .shared._robot import load_of, robot_option
 
 _KINDS = "\n".join(f"  {name:9} {KINDS[name].summary}" for name in kinds_of("controller"))
 
@@ -31,6 +32,7 @@ _LEAST_FIT = 30.0
 @output_option("controller", "CONTROLLER")
 @click.option("--any-fit", is_flag=True, help=f"Also on a model whose free run has a fit below {_LEAST_FIT:g} %.")
 @click.option("--mat", type=click.Path(path_type=Path), metavar="FILE.mat", help="Write it for MATLAB as well.")
+@robot_option
 @set_option
 @force_option
 @json_option
@@ -40,6 +42,7 @@ def command(
     output: Path | None,
     any_fit: bool,
     mat: Path | None,
+    robot: str | None,
     settings: tuple[str, ...],
     force: bool,
     as_json: bool,
@@ -51,7 +54,7 @@ def command(
     if mat is not None:
         target(mat, "", force=force, ending=".mat")
         refuse_existing(mat, force=force)
-    plants = [_linear(model, any_fit=any_fit) for model in models]
+    plants = [_linear(model, robot, any_fit=any_fit) for model in models]
     with progress(f"design {kind}", quiet=as_json):
         controller = apply_settings(resolve(entry.settings), settings).design(plants[0] if len(plants) == 1 else plants)
     controller.save(path, force=replace)
@@ -65,9 +68,9 @@ def command(
     click.echo(f"{path}\n{controller.summary()}")
 
 
-def _linear(path: Path, *, any_fit: bool) -> Any:
+def _linear(path: Path, robot: str | None, *, any_fit: bool) -> Any:
     """Open a model or a family."""
-    thing = load(path)
+    thing = load_of(path, robot)
     if not hasattr(thing, "tf"):
         return load(path, role="model")  # which says what it is
     with fitting(path):

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from softneck.core import refuse_existing
+from softneck.core import CheckFailedError, file_hash, refuse_existing
 
 from .shared._console import print_json, progress
 from .shared._options import apply_settings, force_option, json_option, output_option, set_option, target
+from .shared._robot import robot_option
 
 if TYPE_CHECKING:
     from softneck.identification import Family
@@ -26,18 +27,33 @@ _SCOPES = ("windows", "operating points", "recordings")
 @click.argument("recordings", nargs=-1, required=True, type=click.Path(path_type=Path))
 @output_option("family", "FAMILY")
 @set_option
+@click.option(
+    "--test",
+    "tests",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    metavar="REC",
+    help="Recording that the family is not fitted to, and judged by: where it needs more than the weight. Repeatable.",
+)
 @click.option("--html", type=click.Path(path_type=Path), help="Write a page with maps and the weight.")
+@robot_option
 @force_option
 @json_option
 def command(
     recordings: tuple[Path, ...],
     output: Path | None,
     settings: tuple[str, ...],
+    tests: tuple[Path, ...],
     html: Path | None,
+    robot: str | None,
     force: bool,
     as_json: bool,
 ) -> None:
-    """Fit local models over windows, operating points and RECORDINGS (payloads); wrap them into an uncertain plant."""
+    """Fit local models over windows, operating points and RECORDINGS (payloads); wrap them into an uncertain plant.
+
+    It is tested against the recordings: a weight covers the frequency responses that they show, at every amplitude and
+    payload among them, in the band that they excite. Exit code 1 if a recording of --test needs more than the weight.
+    """
     from softneck.identification import FamilySettings
     from softneck.plots import write_page
     from softneck.signals import read_recording
@@ -47,19 +63,26 @@ def command(
     refuse_existing(path, force=replace)
     if html is not None:
         refuse_existing(html, force=force)
-    parts = [read_recording(source) for source in recordings]
+    parts = [read_recording(source, robot=robot) for source in recordings]
     if html is not None:
         for source, part in zip(recordings, parts, strict=True):
             part.robot.require_neck(f"{source}: `--html` of `family`")
+    judges = [read_recording(source) for source in tests]
     with progress("family", quiet=as_json) as report:
-        family = chosen.fit(parts, progress=report)
+        family = chosen.fit(parts, names=[str(source) for source in recordings], progress=report)
+    family.findings["files"] = {str(source): file_hash(source) for source in recordings}
+    lines, needed = family.invalidated_by(judges, [str(source) for source in tests]) if judges else ([], {})
     family.save(path, force=replace)
     if html is not None:
         write_page(html, _page(family, [source.stem for source in recordings]), force=force)
     if as_json:
-        print_json(_facts(path, family))
-        return
-    click.echo(f"{path}\n{family.summary()}")
+        print_json({**_facts(path, family), **({"test": {"lines": lines, "needed": needed}} if judges else {})})
+    else:
+        click.echo("\n".join([str(path), family.summary(), *lines]))
+    if lines:
+        raise CheckFailedError(f"{lines[0]}; record more of that for the family, or say why it does not count.")
+    if judges and not as_json:
+        click.echo("not invalidated by --test (which does not say that the family explains it)")
 
 
 def _facts(path: Path, family: Family) -> dict[str, Any]:
@@ -85,8 +108,18 @@ def _facts(path: Path, family: Family) -> dict[str, Any]:
         "compression": _named(family.compression),
         "settings": family.settings,
         "findings": family.findings,
+        "band_rad_s": {name: family.band(name) for name in family.axes},
+        "measured": {name: _measured(found) for name, found in family.measured.items()},
         "summary": family.summary(),
     }
+
+
+def _measured(found: Any) -> dict[str, Any]:
+    return {
+        "poles": found.model.a.size, "dead_time_s": found.model.delay, "held_out_rms": found.held_out,
+        "frequency_rad_s": found.frequency, "weight": found.weight, "bands_rad_s": found.borders,
+        "needed": found.needed,
+    }  # fmt: skip
 
 
 def _named(numbers: np.ndarray) -> dict[str, float]:

@@ -14,6 +14,7 @@ from softneck.fmu.compiled._platforms import PLATFORMS
 from .shared._console import print_json, progress
 from .shared._neck import load_neck
 from .shared._options import force_option, json_option, output_option, read_together, target
+from .shared._robot import load_of, robot_option
 
 if TYPE_CHECKING:
     from softneck.fmu.describe._describe import Buildable
@@ -51,11 +52,12 @@ if TYPE_CHECKING:
     metavar="NAME",
     help=f"Build a compiled FMU only for these platforms: {', '.join(PLATFORMS)}.  [default: all that are built]",
 )
+@robot_option
 @force_option
 @json_option
 def command(
     file: str | None, output: Path | None, folder: Path | None, data: tuple[Path, ...],
-    backend: str, fmi: str, platforms: tuple[str, ...], force: bool, as_json: bool,
+    backend: str, fmi: str, platforms: tuple[str, ...], robot: str | None, force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Package FILE as a Co-Simulation FMU of FMI 2.0 or 3.0.
 
@@ -70,12 +72,14 @@ def command(
     origin = ""
     jobs, replace = _what(file, folder, output, force=force)
     # All are read before any is written: one bad file stops the command with nothing done.
-    things = [(source, open_buildable(source), path) for source, path in jobs if folder is None or _can_be_fmu(source)]
+    things = [
+        (source, open_buildable(source, robot), path) for source, path in jobs if folder is None or _can_be_fmu(source)
+    ]
     built, left_out = [], [str(source) for source, _ in jobs if source not in {source for source, _, _ in things}]
     with progress("build FMU", quiet=as_json) as report:
         for number, (source, thing, path) in enumerate(things):
             report(number / len(things), path.name)
-            judged = _judge(thing, source, data) if data else None
+            judged = _judge(thing, source, data, robot) if data else None
             block, info = thing.block(), fmu_info(thing, validation=judged)
             if backend == "compiled":
                 origin = build_compiled_fmu(block, path, info=info, force=replace, fmi=int(fmi), platforms=platforms)
@@ -93,15 +97,15 @@ def command(
         click.echo(f"left out: {source}, which is not a model, observer or controller")
 
 
-def open_buildable(source: str | Path) -> Buildable:
-    """Return what `source` names: a softneck file, a neck or a robot by its file or preset."""
+def open_buildable(source: str | Path, robot: str | None = None) -> Buildable:
+    """Return what `source` names: a softneck file of the robot, a neck or a robot by its file or preset."""
     from softneck.cosim.loops._loop_file import is_loop_file, reference_of
     from softneck.plant import VirtualNeck
     from softneck.robot import Robot
     from softneck.robot._file import PRESETS
 
     if Path(source).suffix == ".npz":
-        thing = load(source)
+        thing = load_of(Path(source), robot)
         if not hasattr(thing, "block"):
             raise FileFormatError(f"{source}: is not a model, observer or controller, so no FMU can be built from it.")
         return thing
@@ -123,14 +127,14 @@ def _can_be_fmu(source: str | Path) -> bool:
     return Path(source).suffix != ".npz" or hasattr(load(source), "block")
 
 
-def _judge(thing: Buildable, source: str | Path, data: tuple[Path, ...]) -> Validation | None:
+def _judge(thing: Buildable, source: str | Path, data: tuple[Path, ...], robot: str | None) -> Validation | None:
     """Return the scores of a model on recordings as one, each run of its own; None for what is not a model."""
     from softneck.identification import Model, validate
 
     if not isinstance(thing, Model):
         return None
     names = (Path(source).name, ", ".join(path.name for path in data))
-    return validate(thing, read_together(data), names=names)
+    return validate(thing, read_together(data, robot), names=names)
 
 
 def _what(

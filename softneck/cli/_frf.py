@@ -12,6 +12,7 @@ from softneck.core import DataError, refuse_existing
 
 from .shared._console import print_json, progress
 from .shared._options import force_option, json_option, output_option, target
+from .shared._robot import load_of, robot_option
 
 if TYPE_CHECKING:
     from softneck.identification import Family, FrequencyResponse, Model
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     "--model", "models", multiple=True, type=click.Path(path_type=Path), help="Model or family to draw beside."
 )
 @click.option("--html", type=click.Path(path_type=Path), help="Write a page with Bode plots.")
+@robot_option
 @force_option
 @json_option
 def command(
@@ -36,6 +38,7 @@ def command(
     source: str,
     models: tuple[Path, ...],
     html: Path | None,
+    robot: str | None,
     force: bool,
     as_json: bool,
 ) -> None:
@@ -45,7 +48,6 @@ def command(
     gives the describing function; any other excitation, and a closed loop with its reference, is taken by local
     polynomials. It holds for inputs of the size that was played.
     """
-    from softneck.core._kinds import load
     from softneck.identification import frequency_response
     from softneck.plots import write_page
     from softneck.signals import read_recording
@@ -54,8 +56,8 @@ def command(
     refuse_existing(path, force=replace)
     if html is not None:
         refuse_existing(html, force=force)
-    beside = {str(file): load(file) for file in models}
-    parts = [read_recording(file) for file in recordings]
+    beside = {str(file): load_of(file, robot) for file in models}
+    parts = [read_recording(file, robot=robot) for file in recordings]
     with progress("frf", quiet=as_json):
         found = frequency_response(parts, source=source)
     curves = {name: _curve(found, thing, name) for name, thing in beside.items()}

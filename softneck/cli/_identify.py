@@ -23,6 +23,7 @@ from ._search import (
 )
 from .shared._console import note, percent, print_json, progress
 from .shared._options import apply_settings, force_option, json_option, output_option, read_together, set_option, target
+from .shared._robot import robot_option
 from .shared._validate_table import useless, with_fit
 
 if TYPE_CHECKING:
@@ -46,6 +47,7 @@ _KINDS += "\n  auto     tries them all and takes the best in free run"
 @click.option("--html", type=click.Path(path_type=Path), help="With KIND auto: write a page with the ranking.")
 @click.option("--refit", is_flag=True, help="With KIND auto: train the chosen kind again, on all rows; judged before.")
 @click.option("--seed", type=int, help="Seed of kinds that start at random.")
+@robot_option
 @set_option
 @search_option
 @hold_out_option
@@ -61,6 +63,7 @@ def command(
     html: Path | None,
     refit: bool,
     seed: int | None,
+    robot: str | None,
     settings: tuple[str, ...],
     searches: tuple[str, ...],
     hold_out: Path | None,
@@ -70,12 +73,15 @@ def command(
     as_json: bool,
 ) -> None:
     """Identify a model of KIND from one or more recordings."""
+    from softneck.signals.quality._poor_excitation import poor_excitation
+
     if kind == "auto":
         if settings:
             raise SettingsError("--set: `auto` takes no settings; name the kind that they are for.")
         identify_auto(
-            recordings, output, train=train, refit_all=refit, seed=seed, html=html, force=force, as_json=as_json
-        )
+            recordings, output, train=train, refit_all=refit, seed=seed, robot=robot, html=html, force=force,
+            as_json=as_json,
+        )  # fmt: skip
         return
     _refuse_options_of_auto(kind, html=html is not None, refit=refit)
     entry = find_kind(kind, "model")
@@ -87,9 +93,12 @@ def command(
     refuse_existing(path, force=replace)
     if plot is not None:
         refuse_existing(plot, force=force)
-    whole = read_together(recordings)
+    whole = read_together(recordings, robot)
     # All of it to train on leaves nothing to hold out.
     head, tail = (whole, None) if train == 1.0 else whole.split(train)
+    poor = poor_excitation(head)
+    for line in poor:
+        note(line)
     found = run_search(estimator, head, options, quiet=as_json)
     with progress(f"identify {kind}", quiet=as_json) as report:
         model = found.model if found is not None else estimator.fit(head, progress=report)
@@ -100,7 +109,7 @@ def command(
     if found is not None and plot is not None:
         write_plot(found, plot, force=force)
     if as_json:
-        print_json(_facts(path, model, held_out, found))
+        print_json({**_facts(path, model, held_out, found), "excitation": poor})
     else:
         _print(path, model, held_out, found)
     if found is not None and found.interrupted:

@@ -28,6 +28,7 @@ _COMMANDS = {
     "identify": ("_identify", "Identify a model from recordings."),
     "validate": ("_validate", "Validate models on rows that they were not trained on."),
     "reproduce-paper": ("_reproduce_paper", "Reproduce the paper on the virtual neck, our numbers beside its own."),
+    "calibrate": ("_calibrate", "Fit the virtual neck to recordings or to a grey box."),
     "frf": ("_frf", "Estimate a frequency response with confidence, coherence and the band that the data support."),
     "family": ("_family", "Fit an uncertain linear plant over inclinations and payloads."),
     "fmu": ("_fmu", "Package models, observers, controllers or the virtual neck as FMUs."),

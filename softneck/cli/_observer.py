@@ -11,6 +11,7 @@ from softneck.core import SettingsError, find_kind, refuse_existing, resolve, to
 
 from .shared._console import print_json
 from .shared._options import apply_settings, force_option, json_option, output_option, set_option, target
+from .shared._robot import load_of, robot_option
 
 if TYPE_CHECKING:
     from softneck.estimation._noise import NoiseFit
@@ -34,6 +35,7 @@ _FITTED = 0.7
     "measurement. May be given several times.",
 )
 @click.option("--gyro", is_flag=True, help="Driven by the gyro's rates, with their bias as a state (form=gyro).")
+@robot_option
 @set_option
 @force_option
 @json_option
@@ -43,6 +45,7 @@ def command(
     sensor: str | None,
     data: tuple[Path, ...],
     gyro: bool,
+    robot: str | None,
     settings: tuple[str, ...],
     force: bool,
     as_json: bool,
@@ -51,7 +54,6 @@ def command(
 
     Three forms: the model with a disturbance on each axis (default), --gyro, and --set form=kinematic.
     """
-    from softneck.identification import load_model
 
     kind = find_kind("kalman", "observer")
     path, replace = target(output, "observers/kalman.npz", force=force, ending=".npz")
@@ -59,11 +61,11 @@ def command(
     if gyro and any(setting.replace(" ", "").startswith("form=") for setting in settings):
         raise SettingsError("--gyro is the same as --set form=gyro; give only one of them.")
     chosen = apply_settings(resolve(kind.settings), settings, sensor=sensor, form="gyro" if gyro else None)
-    observer = chosen.design(load_model(model))
+    observer = chosen.design(load_of(model, robot, role="model"))
     told: dict[str, Any] = {}
     lines: list[str] = []
     if data:
-        fit, kept, lines = _fitted(observer, data, fixed=() if sensor is None else (observer.noise_names[0],))
+        fit, kept, lines = _fitted(observer, data, robot, fixed=() if sensor is None else (observer.noise_names[0],))
         observer = fit.observer if kept else observer
         told = {"fit": {"rows": fit.rows, "outliers": fit.outliers, "log_likelihood": list(fit.log_likelihood),
                         "at_bound": list(fit.at_bound), "kept": kept}}  # fmt: skip
@@ -76,14 +78,16 @@ def command(
     click.echo("\n".join([str(path), observer.summary(), *lines]))
 
 
-def _fitted(observer: Any, data: tuple[Path, ...], *, fixed: tuple[str, ...]) -> tuple[NoiseFit, bool, list[str]]:
+def _fitted(
+    observer: Any, data: tuple[Path, ...], robot: str | None, *, fixed: tuple[str, ...]
+) -> tuple[NoiseFit, bool, list[str]]:
     """Return noise levels fitted to the first part of each run, whether the rest speaks for them, and what to say."""
     # Imported here: `softneck --help` must not wait for scipy's optimisers.
     from softneck.estimation import consistency, fit_noise
     from softneck.estimation._consistency import bridging_error
     from softneck.signals import concatenate, read_recording
 
-    recordings = [read_recording(path) for path in data]
+    recordings = [read_recording(path, robot=robot) for path in data]
     parts = [recording.split(_FITTED) for recording in recordings]
     fit = fit_noise(observer, [head for head, _ in parts], fixed=fixed)
     held_out = concatenate([tail for _, tail in parts])

@@ -121,7 +121,9 @@ def print_search(found: Search) -> None:
         if trial in trials[:_MOST_ROWS] or trial is found.chosen
     ]
     head = ["settings", "free run", "one step", "size", "time [s]", "no fit because"]
-    print_table(f"{len(trials)} settings on the hold-out, fit [%] pitch/roll", head, rows)
+    print_table(
+        f"{len(trials)} settings on the hold-out, fit [%] {'/'.join(found.train.robot.outputs.names)}", head, rows
+    )
     if len(rows) < len(trials):
         click.echo(f"the {len(trials) - len(rows)} worst are left out here; the model's findings hold all")
 
@@ -130,7 +132,8 @@ def write_plot(found: Search, path: Path, *, force: bool) -> None:
     """Write the cost curves as PNG."""
     from softneck.plots import search_figure
 
-    figure = search_figure(found.curves, "Settings tried, judged by free run on the hold-out", best=found.best)
+    figure = search_figure(found.curves, "Settings tried, judged by free run on the hold-out", best=found.best,
+                           names=found.train.robot.outputs.names)  # fmt: skip
     with atomic_write(path, force=force) as temporary:
         figure.savefig(temporary, format="png", dpi=120)
 

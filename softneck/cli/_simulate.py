@@ -12,6 +12,7 @@ from softneck.core import CheckFailedError, SettingsError, refuse_existing, writ
 
 from .shared._console import print_json, print_table, progress
 from .shared._options import force_option, json_option, output_option, target, trust_option
+from .shared._robot import robot_option
 
 if TYPE_CHECKING:
     from softneck.cosim import Result
@@ -26,12 +27,13 @@ if TYPE_CHECKING:
     help="Write a certificate of the limits that held, with the hashes of all files; `drives run` asks for it.",
 )
 @click.option("--html", type=click.Path(path_type=Path), help="Write a page with plots, and beside it the neck in 3-D.")
+@robot_option
 @trust_option
 @force_option
 @json_option
 def command(
-    loop_file: Path, output: Path | None, certificate: Path | None, html: Path | None, trust: bool, force: bool,
-    as_json: bool,
+    loop_file: Path, output: Path | None, certificate: Path | None, html: Path | None, robot: str | None, trust: bool,
+    force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Close the loop that LOOP.toml describes; exit code 1 if one of its limits does not hold."""
     from softneck.cosim import load_loop, simulate
@@ -48,7 +50,7 @@ def command(
         if extra is not None:
             refuse_existing(extra, force=force)
     require_trusted(loop_file, trust=trust)
-    setup = load_loop(loop_file)
+    setup = load_loop(loop_file, robot=robot)
     if html is not None:
         setup.loop.robot.require_neck(f"{loop_file}: `--html` of a loop")
     if certificate is not None and not setup.limits:

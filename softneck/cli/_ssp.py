@@ -10,6 +10,7 @@ from softneck.core import file_hash
 
 from .shared._console import note, print_json, progress
 from .shared._options import force_option, json_option, output_option, target
+from .shared._robot import robot_option
 
 
 @click.command("ssp", epilog="Example: softneck ssp build/demo/loops/pitch_step.toml -o pitch_step.ssp")
@@ -22,9 +23,10 @@ from .shared._options import force_option, json_option, output_option, target
     show_default=True,
     help="What runs in its FMUs: a C library that needs nothing, or Python and numpy of the host.",
 )
+@robot_option
 @force_option
 @json_option
-def command(loop_file: Path, output: Path | None, backend: str, force: bool, as_json: bool) -> None:
+def command(loop_file: Path, output: Path | None, backend: str, robot: str | None, force: bool, as_json: bool) -> None:
     """Write the loop of LOOP.toml as an SSP 1.0 archive: plant, observer, controller and reference FMUs.
 
     Masters that read it set all inputs and then step all: they compute what `order = "jacobi"` does.
@@ -33,7 +35,7 @@ def command(loop_file: Path, output: Path | None, backend: str, force: bool, as_
 
     path, replace = target(output, f"ssp/{loop_file.stem}.ssp", force=force)
     with progress("ssp", quiet=as_json):
-        setup = load_loop(loop_file)
+        setup = load_loop(loop_file, robot=robot)
         write_ssp(setup, path, force=replace, compiled=backend == "compiled")
     if as_json:
         print_json({"ssp": str(path), "sha256": file_hash(path), "parts": [*setup.loop.parts, "reference"]})

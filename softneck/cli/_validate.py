@@ -11,6 +11,7 @@ from softneck.core import CheckFailedError, SettingsError, refuse_existing
 
 from .shared._console import print_json, print_table, progress
 from .shared._options import force_option, json_option, read_together
+from .shared._robot import load_of, robot_option
 from .shared._validate_table import fit_table, remarks, useless
 
 if TYPE_CHECKING:
@@ -38,6 +39,13 @@ _NOTE = (
     show_default=True,
     help="Free run from set-points alone, or with logged motor positions as the paper does.",
 )
+@click.option(
+    "--initial",
+    type=click.Choice(["warm", "cold"]),
+    default="warm",
+    show_default=True,
+    help="Free run from 25 measured samples, or from the first row only as an FMU starts.",
+)
 @click.option("--include-training", is_flag=True, help="Also score rows that the model was trained on.")
 @click.option(
     "--training",
@@ -46,6 +54,7 @@ _NOTE = (
     help="What the models were trained on, to report how novel the data is.",
 )
 @click.option("--html", type=click.Path(path_type=Path), help="Write a page with plots.")
+@robot_option
 @force_option
 @json_option
 def command(
@@ -53,9 +62,11 @@ def command(
     data: tuple[Path, ...],
     horizon: str,
     motors: str,
+    initial: str,
     include_training: bool,
     training: tuple[Path, ...],
     html: Path | None,
+    robot: str | None,
     force: bool,
     as_json: bool,
 ) -> None:
@@ -63,17 +74,17 @@ def command(
 
     Exit code 1 if a free run diverges or a fit is below -100 %.
     """
-    from softneck.identification import Rules, compare, load_model
+    from softneck.identification import Rules, compare
     from softneck.plots import write_page
     from softneck.signals import read_recording
 
     horizons = _horizons(horizon)
     if html is not None:
         refuse_existing(html, force=force)
-    loaded = {str(path): load_model(path) for path in models}
-    recordings = {str(path): read_recording(path) for path in data}
-    rules = Rules(horizons, motors, include_training)
-    known = read_together(training) if training else None
+    loaded = {str(path): load_of(path, robot, role="model") for path in models}
+    recordings = {str(path): read_recording(path, robot=robot) for path in data}
+    rules = Rules(horizons, motors, include_training, initial)
+    known = read_together(training, robot) if training else None
     with progress("validate", quiet=as_json) as report:
         comparison = compare(loaded, recordings, rules=rules, training=known, progress=report)
     results = list(comparison.validations)

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from softneck.core import CheckFailedError, SettingsError, file_hash, load, refuse_existing, write_certificate
+from softneck.core import CheckFailedError, SettingsError, file_hash, refuse_existing, write_certificate
 from softneck.core._certificate import CERTIFICATE_ENDING
 from softneck.loop._loop import ORDERS
 
 from .shared._console import print_json, print_table, progress
 from .shared._options import force_option, json_option, output_option, target
+from .shared._robot import load_of, robot_option
 
 if TYPE_CHECKING:
     from softneck.verification import Verification
@@ -34,7 +36,7 @@ def _print_requirements(context: click.Context, _: click.Parameter, value: bool)
     epilog="Example: softneck verify pi.npz neck_family.npz -o pi.certificate.json --html pi.html",
 )
 @click.argument("controller", type=_PATH)
-@click.argument("plants", metavar="MODEL|FAMILY...", nargs=-1, required=True, type=_PATH)
+@click.argument("plants", metavar="MODEL|FAMILY|NECK|FMU...", nargs=-1, required=True, type=_PATH)
 @click.option("--requirements", type=_PATH, metavar="TOML", help="What must hold, where it differs from the defaults.")
 @click.option(
     "--print-requirements", is_flag=True, is_eager=True, expose_value=False, callback=_print_requirements,
@@ -44,6 +46,7 @@ def _print_requirements(context: click.Context, _: click.Parameter, value: bool)
 @click.option(
     "--order", type=click.Choice(ORDERS), help="Order of the loop. [default: that of the controller's design]"
 )
+@robot_option
 @output_option("certificate", "CERTIFICATE")
 @click.option("--html", type=_PATH, help="Write a page with the verdict, and all behind it in plots.")
 @force_option
@@ -54,12 +57,16 @@ def command(
     requirements: Path | None,
     observer: Path | None,
     order: str | None,
+    robot: str | None,
     output: Path | None,
     html: Path | None,
     force: bool,
     as_json: bool,
 ) -> None:
-    """Verify CONTROLLER on every plant of the linear MODELs and FAMILYs and on the virtual neck.
+    """Verify CONTROLLER on every plant of the linear MODELs and FAMILYs, and in loops over plants that step.
+
+    Those are nonlinear MODELs, NECKs (a neck file, or a preset by its name) and FMUs: on them margins are found by
+    experiment too. Without any the preset of the requirements is shown, which is a foreign plant and does not decide.
 
     Of another robot on the virtual plant that its robot.toml names, if it does.
 
@@ -74,14 +81,17 @@ def command(
     refuse_existing(path, force=replace)
     if html is not None:
         refuse_existing(html, force=force)
-    judged = load(controller, role="controller")
-    robot = robot_of(judged)
-    asked = read_requirements(requirements, robot=robot)
-    things, eyes = _opened(plants), None if observer is None else load(observer, role="observer")
-    files = {"controller": controller, **{f"plant {k}": item for k, item in enumerate(plants, start=1)}}
+    judged = load_of(controller, robot, role="controller")
+    whose = robot_of(judged)
+    asked = read_requirements(requirements, robot=whose)
+    things, eyes = _opened(plants, robot), None if observer is None else load_of(observer, robot, role="observer")
+    files = {
+        "controller": controller,
+        **{f"plant {k}": item for k, item in enumerate(plants, start=1) if item.is_file()},
+    }
     files |= {} if requirements is None else {"requirements": requirements}
     files |= {} if observer is None else {"observer": observer}
-    neck_file = neck_file_of(robot, asked)
+    neck_file = neck_file_of(whose, asked)
     files |= {"neck": neck_file} if neck_file.suffix == ".toml" else {}
     with progress("verify", quiet=as_json) as report:
         found = verify(
@@ -103,12 +113,23 @@ def command(
         raise CheckFailedError(f"{controller}: {len(found.failed)} requirement(s) do not hold: {listed}.")
 
 
-def _opened(plants: tuple[Path, ...]) -> dict[str, Any]:
+def _opened(plants: tuple[Path, ...], robot: str | None) -> dict[str, Any]:
+    from softneck.cosim import FmuPart
+    from softneck.plant import NeckParameters
+    from softneck.plant._presets import PRESETS
+
     things: dict[str, Any] = {}
     for item in plants:
-        thing = load(item)
-        if not hasattr(thing, "tf"):
-            raise SettingsError(f"{item}: a linear MODEL or a FAMILY is needed; this is a {type(thing).__name__}.")
+        if item.suffix == ".fmu":
+            thing: Any = partial(FmuPart, item, role="plant")
+        elif item.suffix == ".toml" or (str(item) in PRESETS and not item.exists()):
+            thing = NeckParameters.preset(str(item))
+        else:
+            thing = load_of(item, robot)
+            if not hasattr(thing, "tf"):
+                raise SettingsError(
+                    f"{item}: a MODEL, FAMILY, NECK or FMU is needed; this is a {type(thing).__name__}."
+                )
         things[item.name if item.name not in things else str(item)] = thing
     return things
 

@@ -84,7 +84,7 @@ class VirtualNeck:
 
     def __post_init__(self) -> None:
         if not self.robot.is_neck:
-            _check_robot(self.robot)
+            require_tendons(self.robot)
             self.parameters.check_buckling(len(self.robot.motors.names))
 
     @classmethod
@@ -100,7 +100,7 @@ class VirtualNeck:
         Raises:
             SettingsError: the robot names no plant, or one of its values is not of a tendon-driven robot.
         """
-        _check_robot(robot)
+        require_tendons(robot)
         if neck is None:
             name = robot.require("neck", "the virtual plant")
             inside = robot.folder is not None and name not in PRESETS
@@ -207,15 +207,15 @@ def _ranges(robot: Robot, limit: float) -> Matrix:
     return np.column_stack([low, high])
 
 
-def _check_robot(robot: Robot) -> None:
-    """Raise SettingsError unless tendons on winches bend the robot."""
-    for what, unit in (("motors", robot.motors.unit), ("outputs", robot.outputs.unit)):
+def require_tendons(robot: Robot, what: str = "the virtual plant") -> None:
+    """Raise SettingsError of `what` unless tendons on winches bend the robot."""
+    for part, unit in (("motors", robot.motors.unit), ("outputs", robot.outputs.unit)):
         if to_si(unit)[1] != "rad":
             raise SettingsError(
-                f"the virtual plant has {what} in rad or deg, and `{what}.unit` of robot {robot.label()} is {unit}."
+                f"{what} has {part} in rad or deg, and `{part}.unit` of robot {robot.label()} is {unit}."
             )
     if robot.directions.kind != "tendons":
         raise SettingsError(
-            f"the virtual plant must know where tendons stand, and `directions` of robot {robot.label()} are "
+            f"{what} must know where tendons stand, and `directions` of robot {robot.label()} are "
             f'"{robot.directions.kind}"; write kind = "tendons" and angles_deg.'
         )

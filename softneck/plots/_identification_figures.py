@@ -153,13 +153,20 @@ def _unwrapped(response: np.ndarray, known: np.ndarray) -> np.ndarray:
 _DEPTH = 25.0
 
 
-def search_figure(curves: Mapping[str, Sequence[Sequence[Any]]], title: str, *, best: Mapping[str, Any]) -> Figure:
+def search_figure(
+    curves: Mapping[str, Sequence[Sequence[Any]]],
+    title: str,
+    *,
+    best: Mapping[str, Any],
+    names: Sequence[str] = ("pitch", "roll"),
+) -> Figure:
     """Draw for each varied setting its best free-run fit at each value, beside the one-step fit.
 
     Args:
-        curves: setting -> rows (value, free-run fit of pitch, of roll, one-step fit of both) [%], None: no fit.
+        curves: setting -> rows (value, free-run fit of each output, one-step fit of each) [%], None: no fit.
         title: of the figure.
         best: setting -> the chosen value.
+        names: of the outputs.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -167,18 +174,18 @@ def search_figure(curves: Mapping[str, Sequence[Sequence[Any]]], title: str, *, 
     figure = Figure(figsize=(10.0, 2.6 * len(curves) + 0.4), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(len(curves), 1, squeeze=False)[:, 0]
-    fits = [fit for rows in curves.values() for row in rows for fit in row[1:3] if fit is not None]
+    fits = [fit for rows in curves.values() for row in rows for fit in row[1 : 1 + len(names)] if fit is not None]
     for ax, (name, rows) in zip(axes, curves.items(), strict=True):
         ax.grid(alpha=0.3)
         ax.spines[["top", "right"]].set_visible(False)
         # Values may be lags or names: they stand side by side in the order given.
         places = range(len(rows))
-        for column, colour, style, text in (
-            (1, BLUE, "o-", "pitch, free run"),
-            (2, ORANGE, "o-", "roll, free run"),
-            (3, BLUE, ":", "pitch, one step"),
-            (4, ORANGE, ":", "roll, one step"),
-        ):
+        drawn = zip(names, (BLUE, ORANGE, GREEN, RED), strict=False)
+        lines = [(axis, name, colour) for axis, (name, colour) in enumerate(drawn, start=1)]
+        for column, colour, style, text in [
+            *((axis, colour, "o-", f"{name}, free run") for axis, name, colour in lines),
+            *((axis + len(names), colour, ":", f"{name}, one step") for axis, name, colour in lines),
+        ]:
             heights = [float("nan") if row[column] is None else row[column] for row in rows]
             ax.plot(places, heights, style, ms=4, lw=1.2, color=colour, label=text)
         values = [str(row[0]) for row in rows]

@@ -124,6 +124,11 @@ class Robot:
         weights = self.directions.weights()
         return None if weights is None else weights[: len(self.outputs.names)]
 
+    def in_header(self) -> dict[str, Any]:
+        """Return what the header of a model's file says of its robot: nothing where it is the neck as we know it."""
+        table = self.as_dict()
+        return {} if table == Robot.preset("neck").as_dict() else {"robot": table}
+
     def require(self, key: str, what: str) -> Any:
         """Return a value that `what` (such as "softneck record") needs.
 

@@ -53,12 +53,13 @@ def prefixed(text: str, prefix: str) -> str:
     return ast.unparse(_Prefix(names - _SHARED, prefix).visit(tree)) + "\n\n"
 
 
-def member_calls(counts: list[int], own: int, *, tangents: bool = False) -> str:
+def member_calls(counts: list[int], own: int, *, texts: list[int] | None = None, tangents: bool = False) -> str:
     """Return the functions of `_members_runtime` for members that read so many arrays, behind `own` others.
 
     Args:
         counts: arrays of each member.
         own: arrays before them.
+        texts: number of the text that each runs; None gives each its own.
         tangents: the members have a function `step_tangent`.
     """
     lines = ["", "def member_count():", f"    return {len(counts)}", ""]
@@ -69,7 +70,8 @@ def member_calls(counts: list[int], own: int, *, tangents: bool = False) -> str:
             # Constant borders: a compiler knows the type of each array then.
             part = f"arrays[{start}:{start + count}]"
             result = "return " if returns else ""
-            lines += [f"    if member == {member}:", f"        {result}m{member}_{name}({part}{arguments})"]
+            text = member if texts is None else texts[member]
+            lines += [f"    if member == {member}:", f"        {result}m{text}_{name}({part}{arguments})"]
             start += count
         lines += ["    return 0" if returns else "    return None", ""]
     return "\n".join(lines) + "\n"
@@ -120,13 +122,14 @@ class _Piece:
 
 
 @cache
-def bundle(runtime: str, *, loops: bool = True, skip: tuple[str, ...] = ()) -> str:
+def bundle(runtime: str, *, loops: bool = True, skip: tuple[str, ...] = (), linked: bool = False) -> str:
     """Return the source text of runtime module `runtime` with all it needs.
 
     Args:
         runtime: dotted name, with members in brackets.
         loops: add the loops over `step`; false for a module of plain functions.
         skip: functions to leave out, which the caller writes otherwise.
+        linked: take the members' functions from where they are compiled already (see `load_runtime`), not their text.
 
     Raises:
         SettingsError: a module imports what a runtime must not, or two define the same name.
@@ -135,12 +138,18 @@ def bundle(runtime: str, *, loops: bool = True, skip: tuple[str, ...] = ()) -> s
     outer, sizes = _sizes(outer)
     order: list[str] = []
     _collect(outer, order)
-    texts = [bundle(member, loops=False) for member, _ in members]
     tangents = any(_asks_for_tangents(module) for module in order)
-    texts = [prefixed(with_tangent(text) if tangents else text, f"m{i}_") for i, text in enumerate(texts)]
+    # Members of one runtime share its text: what is compiled once need not be compiled for each of them.
+    names = [member for member, _ in members]
+    homes = [names.index(name) for name in names]
+    plain = {i: bundle(names[i], loops=False) for i in dict.fromkeys(homes)}
+    if linked:
+        texts = [_link(names[i], content_name(text), f"m{i}_") for i, text in plain.items()]
+    else:
+        texts = [prefixed(with_tangent(text) if tangents else text, f"m{i}_") for i, text in plain.items()]
     if members and _MEMBERS in order:
         order.remove(_MEMBERS)
-        texts.append(member_calls([count for _, count in members], own_arrays(outer), tangents=tangents))
+        texts.append(member_calls([count for _, count in members], own_arrays(outer), texts=homes, tangents=tangents))
     found = {module: [piece for piece in _pieces(module, sizes) if not set(skip) & piece.names] for module in order}
     home = next((module for module in order if _defines(found[module], "step")), None)
     if home is not None and not any(_defines(pieces, "state_size") for pieces in found.values()):
@@ -157,6 +166,14 @@ def bundle(runtime: str, *, loops: bool = True, skip: tuple[str, ...] = ()) -> s
 def content_name(text: str, prefix: str = "softneck") -> str:
     """Return a module name that the content of `text` decides."""
     return f"{prefix}_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
+
+
+def _link(runtime: str, content: str, prefix: str) -> str:
+    """Return lines that take a member's functions from its own module, whose content's name is among them."""
+    functions = ("state_size", "initialise", "step")
+    lines = [f'{prefix}linked = load_runtime("{runtime}")', f'{prefix}content = "{content}"']
+    lines += [f"{prefix}{name} = {prefix}linked.{name}" for name in functions]
+    return "\n".join(["from softneck.runtime import load_runtime", "", *lines, f"del load_runtime, {prefix}linked", ""])
 
 
 def sized(runtime: str, motors: int, outputs: int) -> str:

@@ -74,7 +74,9 @@ def load_tangent(module: str, *, compiled: bool = True) -> Callable[..., None]:
 
 @cache
 def _runtime(module: str, compiled: bool) -> Runtime:
-    namespace = _import_text(bundle(module), compiled=compiled)
+    # Members are linked where they are compiled already: six models in one text would take minutes.
+    linked = compiled and have_numba() and "(" in module
+    namespace = _import_text(bundle(module, linked=linked), compiled=compiled)
     done = compiled and _compile(namespace)
     names = ("state_size", "initialise", "step", "run_steps", "run_horizon")
     return Runtime(*(getattr(namespace, name) for name in names), compiled=done)

@@ -14,14 +14,17 @@ from softneck.loop._result import shown_unit
 from softneck.runtime import Block
 
 from ._confidence import MarginInterval, intervals
+from ._experiments import Crossing, LoopUnderTest, crossing_facts, crossing_values, crossings
 from ._laws import ControllerUnderTest
 from ._linear import Gaps, LinearLaw, gaps, judged, margins
 from ._neck_loops import STEP_AT, NeckRun, direction, neck_changes, no_virtual_plant, run_necks
+from ._own_plants import OwnPlant
 from ._plants import Plants, UncertainNeck, all_plants, join, nominal_plants
 from ._requirements import Requirements
 from ._search import SearchResult, search
 from ._steps import Steps, StepTest, run_steps
 from ._structured import StructuredResult, structured
+from ._tested import TestedAxis, tested_axes
 
 # Samples of delay that are added to see how the loop stands it.
 _DELAYS = 9
@@ -85,6 +88,9 @@ class Evidence:
         necks: loops over the virtual neck.
         metrics: name -> values.
         not_computed: metric or check -> why.
+        foreign: whether `necks` are not the user's own plants.
+        tested: what the data support, of each axis of each family that was tested against them.
+        crossings: margins by experiment on the user's own plants.
     """
 
     plants: Plants
@@ -95,6 +101,9 @@ class Evidence:
     necks: list[NeckRun]
     metrics: dict[str, Values] = field(default_factory=dict)
     not_computed: dict[str, str] = field(default_factory=dict)
+    foreign: bool = True
+    tested: list[TestedAxis] = field(default_factory=list)
+    crossings: list[Crossing] = field(default_factory=list)
 
 
 def gather(
@@ -104,8 +113,20 @@ def gather(
     *,
     observer: Block | None,
     progress: Progress,
+    families: Mapping[str, Any] | None = None,
+    own: Sequence[OwnPlant] = (),
 ) -> Evidence:
-    """Compute all evidence; what the requirements do not need is computed too, where it is cheap."""
+    """Compute all evidence; what the requirements do not need is computed too, where it is cheap.
+
+    Args:
+        controller: that is judged.
+        necks: sources of linear plants.
+        asked: the requirements.
+        observer: of loops over plants that step.
+        progress: called now and then.
+        families: by name, those whose weight over the data is asked.
+        own: the user's plants that step.
+    """
     sources = list(necks)
     seed = int(asked.sampling["seed"])
     base = all_plants(sources, int(asked.sampling["plants"]), seed)
@@ -125,10 +146,27 @@ def gather(
     why = no_virtual_plant(controller.robot, asked)
     runs = run_necks(
         controller.block, asked, order=controller.order, observer=observer, seed=seed,
-        progress=lambda done, text: progress(0.6 + 0.4 * done, text),
-    ) if not why else []  # fmt: skip
-    evidence = Evidence(plants, w, linear, steps, stepped, runs)
-    if why:
+        progress=lambda done, text: progress(0.6 + 0.2 * done, text), own=own,
+    ) if own or not why else []  # fmt: skip
+    payloads = sorted({float(kg) for kg in (min(asked.neck["payloads_kg"]), max(asked.neck["payloads_kg"]))})
+    loops = [
+        LoopUnderTest(
+            name=f"{plant.name}, {kg:g} kg" if plant.payload else plant.name, controller=controller.block,
+            plant=lambda plant=plant: plant.quiet(controller.block.sample_time), observer=observer,
+            order=controller.order, inputs={"payload": kg} if plant.payload else {},
+        )
+        for plant in own for kg in (payloads if plant.payload else (0.0,))
+    ]  # fmt: skip
+    found = crossings(loops, progress=lambda done, text: progress(0.8 + 0.2 * done, text)) if loops else []
+    tested = [
+        item
+        for law in controller.laws.values()
+        for item in tested_axes(families or {}, law, plants.axes, controller.extra)
+    ]
+    evidence = Evidence(
+        plants, w, linear, steps, stepped, runs, foreign=_foreign(asked, own), tested=tested, crossings=found
+    )
+    if why and not own:
         evidence.not_computed["neck"] = why
     _tell(evidence, controller, asked, observer is not None)
     progress(1.0, "done")
@@ -171,6 +209,41 @@ def _delays(plants: Plants, law: LinearLaw, w: Vector) -> np.ndarray:
     return np.array(rows)
 
 
+def _foreign(asked: Requirements, own: Sequence[OwnPlant]) -> bool:
+    """Return whether the necks in the loops are presets that nobody asked to decide; a neck file is the user's own."""
+    if not asked.robot.is_neck and "preset" not in asked.own.get("neck", {}):
+        return False  # its own file says what stands for it
+    return not (own or asked.neck["decides"] or str(asked.neck["preset"]).endswith(".toml"))
+
+
+def _tell_data(evidence: Evidence) -> None:
+    """Add the margins that the data support, and those by experiment."""
+    for item in evidence.tested:
+        for name, value in item.margins.items():
+            about = _tested_describer(item, name)
+            for group in (item.axis, "axes"):
+                _add(evidence, f"{group}.{name}", Values(np.array([value]), about))
+        _add(evidence, "robust.mu", Values(np.array([item.mu]), _tested_describer(item, "mu")))
+    if not evidence.tested:
+        evidence.not_computed["the band of the data"] = (
+            "no FAMILY was given that is tested against data; all linear checks are about models alone"
+        )
+    for name, (values, behind) in crossing_values(evidence.crossings).items():
+        _add(evidence, name, Values(values, lambda row, behind=behind: crossing_facts(behind[row])))
+    if not evidence.crossings:
+        evidence.not_computed["margins by experiment"] = (
+            "no plant of yours that steps was given (a nonlinear MODEL, a NECK, an FMU)"
+        )
+
+
+def _tested_describer(item: TestedAxis, name: str) -> Describe:
+    facts = {
+        "kind": "data", "name": f"{item.source}: the weight over its recordings", "axis": item.axis,
+        "frequency_rad_s": item.at[name], "band_rad_s": list(item.band),
+    }  # fmt: skip
+    return lambda _: dict(facts)
+
+
 def _tell(evidence: Evidence, controller: ControllerUnderTest, asked: Requirements, observer: bool) -> None:
     """Fill metrics and what was not computed."""
     metrics, absent = evidence.metrics, evidence.not_computed
@@ -191,6 +264,7 @@ def _tell(evidence: Evidence, controller: ControllerUnderTest, asked: Requiremen
         absent["stability between frozen points"] = (
             "linear checks hold at frozen points; motion between them is simulated"
         )
+    _tell_data(evidence)
     for name, values in evidence.steps.metrics.items():
         metrics[f"step.{asked.name_of(name)}"] = Values(values, _step_describer(evidence, name))
     if not evidence.necks:
@@ -199,6 +273,10 @@ def _tell(evidence: Evidence, controller: ControllerUnderTest, asked: Requiremen
     for name in evidence.necks[0].metrics:
         values = np.array([run.metrics[name] for run in evidence.necks])
         metrics[f"neck.{asked.name_of(name)}"] = Values(values, describe)
+    if np.isnan(metrics["neck.slack_s"].values).any():
+        del metrics["neck.slack_s"]
+        absent["neck.slack_s"] = "a plant tells no tensions; give a NECK, a file or a preset by its name"
+        return
     # What a heavier payload leaves of the pretension is no matter of the controller's.
     light = [k for k, run in enumerate(evidence.necks) if run.payload <= asked.neck["taut_up_to_kg"]]
     if light:
@@ -293,8 +371,9 @@ def _neck_describer(evidence: Evidence, controller: ControllerUnderTest, asked: 
     def describe(row: int) -> dict[str, Any]:
         run = evidence.necks[row]
         size = float(asked.neck["size_deg"])
+        parameters = {} if run.parameters is None else neck_changes(run.parameters, controller.robot)
         return {
-            "kind": "neck", "name": run.name, "parameters": neck_changes(run.parameters, controller.robot),
+            "kind": "own" if run.parameters is None else "neck", "name": run.name, "parameters": parameters,
             "payload_kg": run.payload,
             **{f"{name}_{shown_unit(controller.robot)[0]}": size * share for name, share in
                zip(controller.robot.outputs.names, direction(run.orientation, controller.robot), strict=True)},

@@ -1,9 +1,10 @@
-"""Loops over a robot's virtual plant: the preset and plausible ones around it, at every payload and orientation."""
+"""Loops over the user's own plants, or over a robot's virtual plant and plausible ones around it."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from softneck.plant import NeckParameters, VirtualNeck
 from softneck.robot import Robot
 from softneck.runtime import Block
 
+from ._own_plants import OwnPlant, own_plant
 from ._requirements import Requirements, metric_ends
 
 # When the step comes [s]: after the controller took over the motors.
@@ -28,11 +30,11 @@ _SMALL = 0.05
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NeckRun:
-    """One loop over the virtual neck.
+    """One loop over an own plant or the virtual neck.
 
     Attributes:
         name: "paper, 0.5 kg, 45 deg".
-        parameters: the neck's.
+        parameters: the neck's; None of a plant that is no virtual neck.
         payload: [kg].
         orientation: of the step [rad].
         seed: of the sensor's noise.
@@ -41,7 +43,7 @@ class NeckRun:
     """
 
     name: str
-    parameters: NeckParameters
+    parameters: NeckParameters | None
     payload: float
     orientation: float
     seed: int
@@ -91,35 +93,43 @@ def run_necks(
     observer: Block | None,
     seed: int,
     progress: Progress,
+    own: Sequence[OwnPlant] = (),
 ) -> list[NeckRun]:
-    """Return all runs that the table [neck] of the requirements asks for.
+    """Return all runs that the table [neck] of the requirements asks for, over the user's own plants if there are any.
 
     Raises:
         SettingsError: controller and observer that do not fit the neck.
     """
     table, robot = asked.neck, asked.robot
-    base, plant = virtual_plant(robot, asked)
-    preset = plant.parameters
-    rng = np.random.default_rng(seed)
-    spread = table["spread_pct"] / 100.0
-    count = int(table["necks"])
-    necks = [preset, *(_near(plant, rng, spread) for _ in range(count - 1))][:count]
+    plants = own or _virtual(asked, seed)
     # One output bends in one plane: other orientations are the same step, or none.
     angles = table["orientations_deg"] if len(robot.outputs.names) > 1 else [0.0]
     cases = [
-        (k, payload, angle) for k in range(len(necks)) for payload in table["payloads_kg"]
-        for angle in angles
+        (plant, payload, angle) for plant in plants
+        for payload in (table["payloads_kg"] if plant.payload else (0.0,)) for angle in angles
     ]  # fmt: skip
     runs = []
-    for number, (k, payload, angle) in enumerate(cases):
-        title = base if k == 0 else f"{base} varied {k}"
-        name = f"{title}, {payload:g} kg, {angle:g} deg"
+    for number, (plant, payload, angle) in enumerate(cases):
+        name = f"{plant.name}, {payload:g} kg, {angle:g} deg"
         progress(number / len(cases), name)
-        virtual = VirtualNeck(necks[k], robot)
-        loop = _loop(controller, virtual, float(payload), math.radians(angle), asked, order, observer, seed + number)
+        loop = _loop(controller, plant, float(payload), math.radians(angle), asked, order, observer, seed + number)
         values, result = _judge(loop)
-        runs.append(NeckRun(name, necks[k], float(payload), math.radians(angle), seed + number, values, result))
+        runs.append(NeckRun(name, plant.parameters, float(payload), math.radians(angle), seed + number, values, result))
     return runs
+
+
+def _virtual(asked: Requirements, seed: int) -> list[OwnPlant]:
+    """Return the virtual plant that the table [neck] asks for and plausible ones around it."""
+    table = asked.neck
+    base, plant = virtual_plant(asked.robot, asked)
+    rng = np.random.default_rng(seed)
+    spread = table["spread_pct"] / 100.0
+    count = int(table["necks"])
+    necks = [plant.parameters, *(_near(plant, rng, spread) for _ in range(count - 1))][:count]
+    return [
+        own_plant(VirtualNeck(neck, asked.robot), base if k == 0 else f"{base} varied {k}")
+        for k, neck in enumerate(necks)
+    ]
 
 
 def _near(plant: VirtualNeck, rng: np.random.Generator, spread: float) -> NeckParameters:
@@ -135,7 +145,7 @@ def _near(plant: VirtualNeck, rng: np.random.Generator, spread: float) -> NeckPa
 
 def _loop(
     controller: Block,
-    neck: VirtualNeck,
+    plant: OwnPlant,
     payload: float,
     orientation: float,
     asked: Requirements,
@@ -143,21 +153,21 @@ def _loop(
     observer: Block | None,
     seed: int,
 ) -> Loop:
-    size, robot = asked.si(float(asked.neck["size_deg"])), neck.robot
+    size, robot = asked.si(float(asked.neck["size_deg"])), asked.robot
     ends = tuple(size * share for share in direction(orientation, robot))
     reference = (
         StepReference(pitch=ends[0], roll=ends[1], at=STEP_AT) if robot.is_neck
         else RobotReference(kind="step", values=ends, at=STEP_AT)
     )  # fmt: skip
     return Loop(
-        plant=BlockPart(neck.block(noise_seed=seed, sample_time=controller.sample_time)),
+        plant=plant.make(seed, controller.sample_time),
         controller=BlockPart(controller),
         observer=None if observer is None else BlockPart(observer),
         reference=reference,
         duration=STEP_AT + float(asked.neck["duration_s"]),
         order=order,
         robot=robot,
-        plant_inputs={"payload": payload},
+        plant_inputs={"payload": payload} if plant.payload else {},
         # Nobody knows the step before it comes: a predictive controller sees the reference of now as that of later.
         connections={
             f"controller.{port.name}": f"reference.{port.name.removesuffix('_ahead')}"
@@ -183,7 +193,9 @@ def _judge(loop: Loop) -> tuple[dict[str, float], LoopResult | None]:
         values[name] = (
             math.inf if any(value is None for value in found) else max(float(value or 0.0) for value in found)
         )
-    values |= {name: float(table["motors"][names(name)] or 0.0) for name in _MOTORS}
+    told = {name: table["motors"][names(name)] for name in _MOTORS}
+    # A plant that tells no tension says nothing of slack tendons.
+    values |= {name: math.nan if value is None else float(value) for name, value in told.items()}
     return values, result
 
 

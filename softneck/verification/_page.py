@@ -50,6 +50,8 @@ def number(value: Any) -> str:
 
 
 def _word(verdict: Verdict) -> str:
+    if verdict.holds is None and verdict.value is not None:
+        return "does not decide"
     return {True: "holds", False: "fails", None: "not computed"}[verdict.holds]
 
 

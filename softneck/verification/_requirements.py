@@ -245,6 +245,7 @@ def _requirements(defaults: Mapping[str, Any], own: Mapping[str, Any], robot: Ro
     bounds = _bounds({_shown(metric, shown): entry for metric, entry in defaults["require"].items()},
                      own.get("require", {}), robot)  # fmt: skip
     _refuse_contradictions(bounds, robot)
+    _refuse_weak(bounds, tables)
     return replace(Requirements(bounds, **tables), robot=robot, own=dict(own))
 
 
@@ -270,6 +271,9 @@ def _table(name: str, defaults: Mapping[str, Any], own: Any, shown: _Names) -> d
             _check_number(f"[{name}] {given}", value, low, high, unit, whole=key in _WHOLE)
         elif isinstance(defaults[key], list):
             _check_list(f"[{name}] {key}", value, 5.0 if key == "payloads_kg" else 360.0)
+        elif isinstance(defaults[key], bool):
+            if not isinstance(value, bool):
+                raise SettingsError(f"`[{name}] {key}` must be true or false; got {value!r}.")
         elif not isinstance(value, str):
             raise SettingsError(f"`[{name}] {key}` must be a text; got {value!r}.")
     return found
@@ -340,6 +344,40 @@ def _refuse_contradictions(bounds: tuple[Requirement, ...], robot: Robot) -> Non
             raise SettingsError(f"`{group}` cannot rise in {rise:g} s or more and settle within {settling:g} s.")
     for axis in robot.outputs.names:
         _refuse_margins(axis, low, high)
+
+
+# Metrics that no loop has less of, or more of: a bound there always holds.
+_ALWAYS_AT_LEAST = {"gain_margin": 1.0, "sensitivity": 1.0}
+_ALWAYS_AT_MOST = {"disk_margin": 2.0, "phase_margin_deg": 180.0}
+# By the small gain theorem and by definition: what is not below 1 is not stable.
+_STABILITY = ("stability.radius", "stability.searched_radius", "robust.mu")
+
+
+def _refuse_weak(bounds: tuple[Requirement, ...], tables: Mapping[str, Mapping[str, Any]]) -> None:
+    """Refuse what would hold whatever the controller does, and what is probably another unit."""
+    for key in ("gain_pct", "pole_pct"):
+        if 0.0 < (value := float(tables["uncertainty"][key])) < 1.0:
+            raise SettingsError(
+                f"`[uncertainty] {key}` = {value:g} is less than one percent; a fraction? Write {100 * value:g}."
+            )
+    for item in bounds:
+        name = item.metric.rpartition(".")[2]
+        always = (
+            item.limit <= _ALWAYS_AT_LEAST.get(name, 0.0)
+            if item.bound == "min"
+            else item.limit >= _ALWAYS_AT_MOST.get(name, math.inf)
+        )
+        if always or (item.metric in _STABILITY and item.limit > 1.0):
+            raise SettingsError(
+                f"`{item.metric}` {item.bound} {item.limit:g} "
+                + ("allows unstable loops; 1 is the limit." if not always else "always holds, so it says nothing.")
+            )
+        group, _, name = item.metric.partition(".")
+        if name == "settling_s" and item.bound != "min" and item.limit > float(tables[group]["duration_s"]):
+            raise SettingsError(
+                f"`[{group}] duration_s` = {tables[group]['duration_s']:g} is shorter than the settling time that "
+                f"`{item.metric}` allows ({item.limit:g} s); nobody would see whether it settles."
+            )
 
 
 def _refuse_margins(axis: str, low: Mapping[str, float], high: Mapping[str, float]) -> None:

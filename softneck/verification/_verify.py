@@ -18,8 +18,10 @@ from softneck.signals.recording._recording import require_same_robot
 
 from ._agreement import Agreement, agreements
 from ._evidence import Evidence, gather, worst_row
+from ._experiments import crossing_values
 from ._laws import ControllerUnderTest, judge
 from ._neck_loops import check_blocks
+from ._own_plants import is_own_plant, own_plant
 from ._plants import UncertainNeck, neck_of_family, neck_of_model
 from ._requirements import Requirement, Requirements, read_requirements
 from ._scale import scaled
@@ -36,7 +38,7 @@ class Verdict:
         value: of the worst plant; inf where a level is never reached, None where it was not computed.
         holds: None where it was not computed and only the defaults ask for it.
         worst: the plant behind the value, as JSON values.
-        note: why it was not computed.
+        note: why it was not computed, or why it does not decide or hold.
     """
 
     requirement: Requirement
@@ -60,6 +62,7 @@ class Verification:
         files: role -> (path, SHA-256) of every file read.
         observer: whether the loops over the virtual neck had one.
         wall_time: [s].
+        tested: by the names of families, what each says of the recordings that it was tested against.
     """
 
     verdicts: list[Verdict]
@@ -71,6 +74,7 @@ class Verification:
     files: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     observer: bool = False
     wall_time: float = 0.0
+    tested: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def holds(self) -> bool:
@@ -96,7 +100,7 @@ class Verification:
             if self.failed
             else f"all {count} requirements hold"
         )
-        absent = sum(verdict.holds is None for verdict in self.verdicts)
+        absent = sum(verdict.value is None for verdict in self.verdicts)
         text += f", {absent} of them not computed" if absent else ""
         return (
             f"{text}; {len(self.evidence.plants)} plants, {len(self.evidence.necks)} loops over the virtual neck, "
@@ -135,6 +139,8 @@ class Verification:
                 ],
             },
             "virtual_neck_loops": len(evidence.necks),
+            "foreign_plants": evidence.foreign,
+            **validity(evidence, self.tested),
             "delay_sensitivity": [
                 dict(zip(("samples_added", "spectral_radius", "disk_margin", "sensitivity"), row, strict=True))
                 for part in evidence.linear[:1] for row in part.delays
@@ -239,13 +245,17 @@ def verify(
         DataError: controller, plants and observer of two robots.
     """
     begin = time.perf_counter()
-    robot = robot_of(controller)
-    for what, thing in (*_named(plants).items(), *(() if observer is None else (("observer", observer),))):
+    robot, named = robot_of(controller), _named(plants)
+    for what, thing in (*named.items(), *(() if observer is None else (("observer", observer),))):
         require_same_robot(robot_of(thing), robot, f"the controller and {what}")
     asked = read_requirements(robot=robot) if requirements is None else requirements.of_robot(robot)
+    own = {name: thing for name, thing in named.items() if is_own_plant(thing)}
+    if own:
+        robot.require_neck(f"a margin by experiment, on {next(iter(own))},")
+    linear = {name: thing for name, thing in named.items() if name not in own}
     if not robot.is_neck:
-        asked = scaled(asked, sources_of(_named(plants), asked))
-    necks = sources_of(_named(plants), asked)
+        asked = scaled(asked, sources_of(linear, asked))
+    necks = sources_of(linear, asked)
     eyes = None if observer is None else observer.block()
     judged = judge(controller, order=order, observer=observer is not None)
     check_ports(judged.block, robot)
@@ -256,7 +266,10 @@ def verify(
                 f"the controller has a sample time of {judged.block.sample_time:g} s, {neck.name} one of "
                 f"{neck.sample_time:g} s; design it on a model of its own sample time."
             )
-    evidence = gather(judged, necks, asked, observer=eyes, progress=progress)
+    evidence = gather(
+        judged, necks, asked, observer=eyes, progress=progress, families=linear,
+        own=[own_plant(thing, name) for name, thing in own.items()],
+    )  # fmt: skip
     return Verification(
         verdicts=[_verdict(item, evidence) for item in asked.bounds],
         evidence=evidence,
@@ -267,6 +280,7 @@ def verify(
         files=dict(files or {}),
         observer=observer is not None,
         wall_time=time.perf_counter() - begin,
+        tested={name: thing.findings["tested"] for name, thing in linear.items() if getattr(thing, "measured", {})},
     )
 
 
@@ -287,7 +301,59 @@ def _verdict(item: Requirement, evidence: Evidence) -> Verdict:
         return Verdict(item, None, False if item.asked else None, {}, note)
     row = worst_row(evidence.metrics, item.metric, item.bound)
     value = float(values.values[row])
-    return Verdict(item, value, item.holds(value), plain(values.describe(row)))
+    worst = plain(values.describe(row))
+    why = _unsupported(item, evidence)
+    if why:
+        return Verdict(item, value, False, worst, why)
+    if item.metric.startswith("neck.") and evidence.foreign and not item.asked:
+        return Verdict(item, value, None, worst, _FOREIGN)
+    return Verdict(item, value, item.holds(value), worst)
+
+
+_FOREIGN = "foreign plant: a preset does not decide; give a plant of yours that steps, or ask for it (`[neck] decides`)"
+# What is about the loop's response, which the data may not reach.
+_LINEAR_GROUPS = ("stability", "axes", "mimo", "robust")
+
+
+def _unsupported(item: Requirement, evidence: Evidence) -> str:
+    """Return why the data do not support a linear requirement: the loop may cross above their band; else ""."""
+    group = item.metric.partition(".")[0]
+    axes = evidence.plants.axes
+    if group not in (*_LINEAR_GROUPS, *axes):
+        return ""
+    reasons = [part.why() for part in evidence.tested if group not in axes or part.axis == group]
+    return next((reason for reason in reasons if reason), "")
+
+
+def validity(evidence: Evidence, tested: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a certificate says of where it is valid (band, amplitudes, confidence, recordings), and margins."""
+    bands = np.array([part.band for part in evidence.tested])
+    amplitudes = [size for item in tested.values() for size in item["amplitude"] if size > 0.0]
+    simulated = crossing_values(evidence.crossings)
+
+    def least(values: Any, factor: float = 1.0) -> float | None:
+        return None if values is None else factor * float(np.min(values))
+
+    def linear(name: str) -> Any:
+        parts = [part.margins[f"{axis}.{name}"].min() for part in evidence.linear for axis in part.plants.axes]
+        return [*parts, *(part.margins[name] for part in evidence.tested if name in part.margins)] or None
+
+    return {
+        "band_rad_s": [bands[:, 0].max(), bands[:, 1].min()] if len(bands) else None,
+        "amplitude_rad": [min(amplitudes), max(amplitudes)] if amplitudes else None,
+        "confidence_level": min((item["confidence"] for item in tested.values()), default=None),
+        "recordings": [
+            {"family": family, "name": name, "sha256": digest}
+            for family, item in tested.items() for name, digest in zip(item["names"], item["sha256"], strict=True)
+        ],
+        "margins": {
+            "linear": {"gain_ratio": least(linear("gain_margin")), "delay_s": least(linear("delay_margin_ms"), 1e-3)},
+            "simulated": {
+                "gain_ratio": least(simulated.get("axes.gain_margin", (None,))[0]),
+                "delay_s": least(simulated.get("axes.delay_margin_ms", (None,))[0], 1e-3),
+            },
+        },
+    }  # fmt: skip
 
 
 def _box(neck: UncertainNeck) -> dict[str, Any]:

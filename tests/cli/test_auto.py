@@ -25,7 +25,8 @@ def test_auto_ranks_explains_and_saves(call: Call, recording: Path) -> None:
     said = call("identify", "auto", recording, "-o", "best.npz", "--html", "why.html")
     assert said.code == 0, said.err
     assert "chosen" in said.out
-    assert "free run" in said.out
+    assert "Free-run fit" in said.out
+    assert "+-" in said.out
     assert "last one is held out" in " ".join(said.err.split())
     assert load("best.npz").kind in ("rls", "play")
     assert "Which model" in Path("why.html").read_text()
@@ -63,7 +64,13 @@ def test_auto_prints_one_json_object_and_holds_out_the_last_of_several(call: Cal
     assert facts["model"] == "build/models/auto.npz"
     assert facts["remarks"] == []
     assert facts["chosen"] in [entry["kind"] for entry in facts["ranking"]]
-    assert facts["ranking"][0]["hold_out"]["rows_scored"] == 275
+    chosen = next(entry for entry in facts["ranking"] if entry["kind"] == facts["chosen"])
+    assert chosen["hold_out"]["rows_scored"] == 275
+    assert chosen["fit"] == min(chosen["scores"].values())
+    assert {"largest motions", "other excitation", "trained on the other", "hold-out", "cold start"} <= set(
+        chosen["scores"]
+    )
+    assert not chosen["stopped_early"]
 
 
 def test_auto_trains_the_chosen_kind_on_all_rows_and_says_so(call: Call, recording: Path) -> None:

@@ -37,6 +37,8 @@ from softneck.identification import (
     Subspace,
     combine,
 )
+from softneck.identification.uncertainty._guarded import Guarded
+from softneck.identification.uncertainty._guarded_base import Base
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import Block, load_runtime
 from softneck.signals import Recording, redefine, signal
@@ -112,6 +114,12 @@ def _any() -> Block:
 def _ensemble() -> Block:
     play = Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording())
     return combine([play, Rls().fit(recording())]).block()
+
+
+def _guarded() -> Block:
+    members = [Play(rate=rate, widths=(0.2,), degree=3, ridge=1e-4).fit(recording()) for rate in (10.0, 15.0)]
+    base = Base(Rls().fit(recording()), np.full(2, 0.01), np.full(2, 90.0))
+    return Guarded(of="play").around(base, members, recording()).block()
 
 
 def _nn() -> Block:
@@ -200,6 +208,7 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
         ["pitch", "roll", "pitch_lower", "pitch_upper", "roll_lower", "roll_upper"],
         _MODEL,
     ),
+    "guarded": (_guarded, MOTORS, ["pitch", "roll", "motor_position_1"], _MODEL),
     "nss": (_nss, MOTORS, ["pitch", "roll", "motor_position_3"], _MODEL),
     "nn": (_nn, MOTORS, ["pitch", "roll", "motor_position_3"], _MODEL),
     "neck": (
@@ -255,7 +264,7 @@ NATIVE = [kind for kind in KINDS if kind != "nmpc"]
 
 
 # Those whose runtimes take longest to compile.
-HEAVY = ("ensemble", "any", "nmpc")
+HEAVY = ("ensemble", "guarded", "any", "nmpc")
 # One of each sort, for tests that take long with every kind: models, one of them with bounds, an observer, a
 # controller, the neck.
 SHORT = ("rls", "nlsm", "kalman", "pi", "neck")

@@ -111,4 +111,10 @@ def test_a_set_point_that_the_model_never_saw_is_said_once(
         for value in (60.0, 1e300, 60.0):
             fmu.set(motor_setpoint_1=value)
             fmu.fmu.doStep(0.0, 0.0)
-        assert fmu.log == [(1, f"Neck: motor_setpoint_1 = 60 is outside {low:g} to {high:g} rad.")]
+        said = f"Neck: motor_setpoint_1 = 60 is outside {low:g} to {high:g} rad. Is it in degrees?"
+        assert fmu.log == [(1, said)]
+        # A little further than it was trained is no sign of degrees.
+        near = stated["motor_setpoint_2"][1] + 0.1
+        fmu.set(motor_setpoint_2=near)
+        assert "Is it" not in fmu.log[-1][1]
+        assert len(fmu.log) == 2

@@ -21,11 +21,23 @@ from softneck.fmu import build_compiled_fmu, build_fmu, fmu_info
 from softneck.fmu.compiled._model_file import node_of
 from softneck.fmu.describe._modelled_drives import with_modelled_drives
 from softneck.fmu.describe._terminals_and_icons import terminals
-from softneck.identification import Model, NeuralStateSpace, OutputError, Play, validate
+from softneck.identification import (
+    Ensemble,
+    GreyBox,
+    Model,
+    NeuralStateSpace,
+    OutputError,
+    Play,
+    Residual,
+    SetMembership,
+    validate,
+)
 from softneck.plant import VirtualNeck
 from softneck.robot import Robot
 from softneck.runtime import Block, Port, load_runtime
 from softneck.signals import Recording
+
+from ..data import slow_but
 
 TS = 0.02
 ROWS = 500
@@ -56,6 +68,47 @@ def recording(chambers: bool) -> Recording:
     y += 1e-4 * rng.standard_normal(y.shape)
     channels = dict(zip((*robot.set_points, *robot.outputs.names), (*scale * u.T, *y.T), strict=True))
     return Recording(np.arange(ROWS) * TS, TS, channels, robot=robot)
+
+
+@cache
+def trunk() -> Recording:
+    """First-order answers of two angles to four tendons."""
+    robot, rng = Robot.preset("trunk4"), np.random.default_rng(1)
+    W, u = robot.weights(), np.repeat(rng.uniform(-2.0, 2.0, (ROWS // 20, 4)), 20, axis=0)
+    assert W is not None
+    y = np.zeros((ROWS, 2))
+    for k in range(ROWS - 1):
+        y[k + 1] = 0.8 * y[k] + 0.02 * W @ u[k]
+    y += 1e-3 * rng.standard_normal(y.shape)
+    channels = dict(zip((*robot.set_points, *robot.outputs.names), (*u.T, *y.T), strict=True))
+    return Recording(np.arange(ROWS) * TS, TS, channels, robot=robot)
+
+
+# Few numbers and steps: what an FMU says is to be what its model says, however good that is.
+EVERY_KIND: dict[str, Any] = {
+    "paper_eq21": SetMembership(epsilon=3e-3, output_weight=3.0),
+    "nlsm": SetMembership(form="residual", epsilon=3e-3, output_weight=5.0),
+    "residual": Residual(base="oe", epsilon=3e-3),
+    "ensemble": Ensemble(members=("rls", "oe")),
+    "greybox": GreyBox(evaluations=1, sensor_delay=1),
+}
+
+
+@pytest.mark.parametrize("backend", ["python", pytest.param("compiled", marks=native)])
+@pytest.mark.parametrize("name", slow_but(["antagonist", "trunk4"], ["antagonist"], ["trunk4"]))
+@pytest.mark.parametrize("kind", slow_but(EVERY_KIND, ["nlsm"], ["paper_eq21", "residual", "ensemble", "greybox"]))
+def test_an_fmu_of_any_kind_runs_free_as_its_model(kind: str, name: str, backend: str, tmp_path: Path) -> None:
+    rec = trunk() if name == "trunk4" else recording(False)
+    chosen: Model = EVERY_KIND[kind].fit(rec)
+    path = built(chosen.block(), tmp_path / "Kind.fmu", backend, 2)
+    inputs = {motor: rec.channels[motor][:80] for motor in rec.robot.set_points}
+    found = drive_fmu(path, inputs, parameters={"use_measurement": 0.0})
+    rows = np.full((80, len(chosen.block().inputs)), np.nan)
+    rows[:, : len(rec.robot.set_points)] = rec.set_points[:80]
+    state = chosen.initial_state(use_measurement=0.0)
+    expected = np.vstack([state.outputs, chosen.block().run(state, rows)[1][:-1]])
+    # The same operations by another compiler; a search among points answers to rounding.
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
 
 
 @cache

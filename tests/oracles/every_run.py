@@ -140,7 +140,7 @@ def verify_run(folder: Path) -> np.ndarray:
     load = find("core:load")
     quick = {
         "sampling": {"plants": 40, "search_generations": 3},
-        "neck": {"necks": 1, "payloads_kg": [0.0], "orientations_deg": [0.0], "duration_s": 2.0},
+        "neck": {"necks": 1, "payloads_kg": [0.0], "orientations_deg": [0.0], "duration_s": 2.5},
     }
     plants = {"model": load(folder / "rls.npz"), "family": load(folder / "family.npz")}
     found = verify(load(folder / "pi.npz"), plants, make_requirements(quick), observer=load(folder / "kalman.npz"))

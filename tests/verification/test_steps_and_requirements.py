@@ -120,8 +120,10 @@ def test_a_bound_holds_at_its_limit_except_below() -> None:
     ],
 )  # fmt: skip
 def test_numbers_of_the_tables_have_their_ranges(table: str, key: str, low: float, high: float) -> None:
+    # A short run is no test of settling, which is refused by itself.
+    free = {"step.settling_s": False, "neck.settling_s": False} if key == "duration_s" else {}
     for value in (low, high):
-        assert getattr(make_requirements({table: {key: value}}), table)[key] == value
+        assert getattr(make_requirements({table: {key: value}, "require": free}), table)[key] == value
     step = 1 if isinstance(low, int) else 1e-6
     for wrong in (low - step, high + step, True, "1"):
         with pytest.raises(SettingsError):

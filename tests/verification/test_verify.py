@@ -40,7 +40,8 @@ search_generations = 3
 necks = 1
 payloads_kg = [0.0]
 orientations_deg = [0.0]
-duration_s = 2.0
+duration_s = 2.5
+decides = true
 [require]
 "axes.sensitivity" = {{ max = {sensitivity} }}
 """
@@ -74,6 +75,7 @@ def test_a_good_controller_holds(held: Verification) -> None:
 def test_taut_tendons_are_asked_for_up_to_the_payload_that_leaves_a_pretension() -> None:
     """Of the runs over the virtual neck those with light payloads count; without any the metric is not computed."""
     few = {"sampling": {"plants": 1, "search_generations": 0}, "step": {"duration_s": 0.4}}
+    few["require"] = {"step.settling_s": False, "neck.settling_s": False}
     asked = {"payloads_kg": [0.0, 1.0], "taut_up_to_kg": 0.5, "duration_s": 1.0}
     found = verify(pi(), linear_neck(), make_requirements({**few, "neck": {**QUICK["neck"], **asked}}))
     slack = [run.metrics["slack_s"] for run in found.evidence.necks]
@@ -257,6 +259,14 @@ def test_bad_input_is_told_in_words(files: dict[str, Path]) -> None:
 @pytest.mark.parametrize(
     ("text", "match"),
     [
+        ("version = 1\n[uncertainty]\ngain_pct = 0.2", "less than one percent; a fraction"),
+        ('version = 1\n[require]\n"axes.disk_margin" = { min = 0.0 }', "always holds"),
+        ('version = 1\n[require]\n"axes.gain_margin" = { min = 1.0 }', "always holds"),
+        ('version = 1\n[require]\n"axes.sensitivity" = { min = 1.0 }', "always holds"),
+        ('version = 1\n[require]\n"stability.radius" = { below = 1.5 }', "allows unstable loops"),
+        ("version = 1\n[step]\nduration_s = 1.0", "shorter than the settling time"),
+        ("version = 1\n[neck]\nduration_s = 2.0", r"`\[neck\] duration_s` = 2 is shorter than the settling time"),
+        ('version = 1\n[neck]\ndecides = "yes"', "must be true or false"),
         ("", "must say `version = 1`"),
         ("version = 2", "it says 2"),
         ("version = 1\n[what]", "unknown table `what`"),

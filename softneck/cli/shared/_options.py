@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from softneck.signals import Recording
 
 
-def read_together(paths: Sequence[Path]) -> Recording:
-    """Read recordings as runs of one.
+def read_together(paths: Sequence[Path], robot: str | None = None) -> Recording:
+    """Read recordings as runs of one; `robot` is as `read_recording` takes it.
 
     Raises:
         DataError: their sample times or robots differ; the line names two that do.
@@ -27,7 +27,7 @@ def read_together(paths: Sequence[Path]) -> Recording:
     from softneck.signals import concatenate, read_recording
     from softneck.signals.recording._recording import require_same_robot
 
-    recordings = [read_recording(path) for path in paths]
+    recordings = [read_recording(path, robot=robot) for path in paths]
     for path, recording in zip(paths, recordings, strict=True):
         if not math.isclose(recording.sample_time, recordings[0].sample_time, rel_tol=1e-6):
             raise DataError(

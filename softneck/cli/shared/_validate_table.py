@@ -61,6 +61,15 @@ def remarks(r: Validation) -> list[str]:
     lines = [f"{who}: {r.rows_scored} rows judged, {r.rows_left_out} left out as the model was trained on them"]
     lost = [entry for entry in r.per_run if entry["diverged"] is not None]
     lines += [f"{who}: the free run of run {e['run']} diverged at {e['diverged']:.2f} s" for e in lost]
+    if "inf" in r.fits:
+        lines.append(
+            f"{who}: free run {_pair(r.cold_fits.values())} % from the first row only (cold, as an FMU starts)"
+        )
+    lines += [
+        f"{who}: free run {'  '.join(map(_interval, table.values()))} % over {what} of these rows, least..largest"
+        for what, table in r.spread.items()
+        if any(table.values()) and not lost
+    ]
     if any(fit is not None for fit in r.noise_ceiling.values()):
         lines.append(f"{who}: repeats allow a perfect model {_pair(r.noise_ceiling.values())} % (noise ceiling)")
     lines.append(f"{who}: {_residuals(r)}")

@@ -46,8 +46,12 @@ _TOP = (
 _SAME_SAMPLE_TIME = 1e-6
 
 
-def load_loop(path: str | Path) -> LoopSetup:
+def load_loop(path: str | Path, *, robot: str | None = None) -> LoopSetup:
     """Read a loop file and open all it names; relative paths start at the file's folder.
+
+    Args:
+        path: of the file.
+        robot: a preset or a robot file, in the place of the file's `robot`; every part must be of it.
 
     Raises:
         FileFormatError: no such file or no TOML.
@@ -56,7 +60,7 @@ def load_loop(path: str | Path) -> LoopSetup:
     source = Path(path)
     table = read_toml(source)
     try:
-        return _setup(table, source)
+        return _setup(table if robot is None else {**table, "robot": find_robot(robot)}, source)
     except SoftneckError as error:
         if str(error).startswith(str(source)):
             raise

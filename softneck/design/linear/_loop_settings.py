@@ -101,15 +101,24 @@ class LoopSettings:
         if not robot.is_neck:
             given = {name: getattr(self, name) for name in LIMITS}
             return robot_limits(robot, {key: v for key, v in given.items() if not isinstance(v, NeckDefault)})
-        return ControllerLimits(
-            position_limit=self.position_limit,
-            slew_limit=self.slew_limit,
-            lead_limit=self.lead_limit,
-            least_position=self.least_position,
-            least_cocontraction=self.least_cocontraction,
-        )
+        stricter = _stricter(robot, {name: getattr(self, name) for name in LIMITS})
+        return ControllerLimits(**stricter)
 
     @property
     def extra_delay(self) -> int:
         """Samples that the loop's order adds to the plant's delay."""
         return 0 if self.order == "sequential" else 1 + int(self.observer)
+
+
+def _stricter(neck: Robot, limits: dict[str, float]) -> dict[str, float]:
+    """Return the limits with those of the neck's own file, where these are stricter than a default."""
+    motors = neck.motors
+    files = {"slew_limit": motors.rate_limit, "position_limit": motors.setpoint_max}
+    for name, values in files.items():
+        if values is not None and isinstance(limits[name], NeckDefault):
+            limits[name] = min(limits[name], *values)
+    lowest = -limits["position_limit"] if motors.setpoint_min is None else max(motors.setpoint_min)
+    # Down to the same limit there is no need of a rule.
+    if lowest > -limits["position_limit"] and isinstance(limits["least_position"], NeckDefault):
+        limits["least_position"] = max(limits["least_position"], lowest)
+    return limits

@@ -141,7 +141,7 @@ def uncertain_plant(source: Any) -> UncertainPlant:
         )
     robot = robot_of(source)
     joined = _joined({axis: _of_model(source, axis) for axis in robot.outputs.names})
-    return joined if robot.is_neck else replace(joined, robot=robot, weights=directions_of(source))
+    return replace(joined, robot=robot, weights=None if robot.is_neck else directions_of(source))
 
 
 def _of_model(model: Any, axis: str) -> list[AxisPlant]:

@@ -11,10 +11,10 @@ from softneck.core import Matrix
 from ..models._arrays import within
 
 
-def no_base() -> dict[str, Matrix]:
+def no_base(motors: int = 3, outputs: int = 2) -> dict[str, Matrix]:
     """Return the arrays of a set that stands alone."""
-    empty = np.zeros((2, 0))
-    return {"redefinition": np.zeros((3, 3)), "a": empty, "b": empty, "delay": np.zeros(2)}
+    empty = np.zeros((outputs, 0))
+    return {"redefinition": np.zeros((3, motors)), "a": empty, "b": empty, "delay": np.zeros(outputs)}
 
 
 def check_rls(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:

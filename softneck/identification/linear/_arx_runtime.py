@@ -28,7 +28,7 @@ def arx_output(
     for j in range(b.shape[0]):
         # Eq. 9 or 10 of u(k+1-delay-j).
         redefined = 0.0
-        for motor in range(3):
+        for motor in range(p.motors):
             redefined += redefinition[axis, motor] * x.u[delay + j, motor]
         y += b[j] * redefined
     return y

@@ -151,6 +151,10 @@ class Rls:
         found = {"delay_curve": curves, "condition_number": numbers, "parameter_std": stds}
         if not neck:
             thetas = [np.concatenate(pair) for pair in zip(a, b, strict=True)]
+            numbers_of = zip(directions.names, a, b, delays, strict=True)
+            found["transfer_functions"] = {
+                name: {"a": f.tolist(), "b": g.tolist(), "delay": int(d)} for name, f, g, d in numbers_of
+            }
             return axes_arrays(self, directions, thetas, [int(d) for d in delays], drive.array), found
         history = max(self.na, max(delays) + self.nb, drive.delay.max())
         arrays = {

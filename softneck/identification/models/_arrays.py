@@ -17,7 +17,9 @@ from softneck.runtime._layout import Arrays, StateVector
 
 from ._linear_systems import AFFINE, STATE_SPACE
 
-COMPOSED = ("residual", "ensemble")
+COMPOSED = ("residual", "ensemble", "guarded")
+# A base and one other at least.
+_LEAST_MEMBERS = {"guarded": 2}
 # Of `nss` where the state is corrected by what is measured.
 OBSERVED_NSS = "softneck.identification.networks._nss_observed_runtime"
 
@@ -100,6 +102,11 @@ def set_now(kind: str, arrays: Mapping[str, Matrix], values: Vector, m: Vector, 
 _LONGEST_HISTORY = 60_000
 
 
+def memory_array(seconds: float, sample_time: float) -> Vector:
+    """Return the array `memory` of a model's file: samples in so many seconds, as far as a file goes."""
+    return np.array([float(min(np.ceil(seconds / sample_time), _LONGEST_HISTORY))])
+
+
 def check_arrays(kind: str, arrays: Mapping[str, Matrix]) -> None:
     """Raise FileFormatError unless the arrays are finite, in order, and of shapes that fit each other."""
     if kind in COMPOSED:
@@ -118,7 +125,7 @@ def _check_composed(kind: str, arrays: Mapping[str, Matrix]) -> None:
     own, parts = own_arrays(arrays), members(arrays)
     if tuple(arrays)[: len(own)] != names:
         raise FileFormatError(f"a model of kind {kind} starts with the arrays {', '.join(names)}.")
-    if len(parts) < 1 or (kind == "residual" and len(parts) != 1):
+    if len(parts) < _LEAST_MEMBERS.get(kind, 1) or (kind == "residual" and len(parts) != 1):
         raise FileFormatError(f"a model of kind {kind} cannot have {len(parts)} members.")
     _check_numbers(kind, own, KINDS[kind].runtime)
     for member, part in parts:

@@ -25,6 +25,8 @@ _TRIED = 40
 _DEAD_TIME, _DEAD_TIMES = 1.5, 20
 # Standard deviation of a neck's redefined inputs under its usual excitations [rad].
 _NECK_SIZE = 2.0
+# What a motor and an output of a neck move by [rad], for which the weights of norms were chosen.
+_NECK_MOTOR, _NECK_OUTPUT = 2.0, 0.2
 # Motors whose filtered motions repeat each other to this share are told apart by nothing: the least weights are taken.
 _ALIKE = 1e-6
 
@@ -81,6 +83,23 @@ class Directions:
             "directions": self.weights.tolist(),
             "directions_from": "data" if self.learned else "robot",
         }
+
+
+def regressor_units(recording: Recording, table: Matrix) -> Vector:
+    """Return by what each component (n,) of a regressor is multiplied to move as much as that of a neck; a neck's by 1.
+
+    Args:
+        recording: of the robot.
+        table: (n, 3) source (0 own output, 1 set-points, 2 motors, 3 outputs), channel and lag of each.
+    """
+    if recording.robot.is_neck:
+        return np.ones(len(table))
+    motors, outputs = recording.set_points.std(axis=0), np.nanstd(recording.outputs, axis=0)
+    moved = np.where(motors > 0.0, motors, _NECK_MOTOR)  # a motor that never moves has no say
+    own = float(outputs.mean())  # one norm for the outputs of all axes
+    sizes = {0: [_NECK_OUTPUT / own] * len(outputs), 1: _NECK_MOTOR / moved, 2: _NECK_MOTOR / moved,
+             3: _NECK_OUTPUT / outputs}  # fmt: skip
+    return np.array([sizes[int(source)][int(channel)] for source, channel, _ in table])
 
 
 def directions_of(recording: Recording, motors: list[Matrix]) -> Directions:

@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, Vector
+from softneck.core import DataError, Matrix, Vector, to_si
+from softneck.robot import Robot
 from softneck.signals import Recording, concatenate
+from softneck.signals.quality._poor_excitation import independent_motions
 
 from ._model import WARM_UP, Model
 from ._ports import trained_set_points
@@ -22,7 +24,9 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 # Kinds that take any robot.
-ANY_ROBOT = ("rls", "oe", "srivc", "subspace", "play", "nss", "nn", "ensemble")
+ANY_ROBOT = (
+    "rls", "oe", "srivc", "subspace", "play", "nss", "nn", "ensemble", "nlsm", "residual", "greybox", "guarded",
+)  # fmt: skip
 # Less than 2 s at 20 ms says nothing about a neck with a time constant of 0.2 s.
 MIN_ROWS = 100
 
@@ -143,12 +147,15 @@ def one_recording(recordings: Recording | list[Recording]) -> Recording:
     return concatenate(recordings if isinstance(recordings, list) else [recordings])
 
 
-def training_recording(recordings: Recording | list[Recording], *, any_robot: bool = False) -> Recording:
+def training_recording(
+    recordings: Recording | list[Recording], *, any_robot: bool = False, all_motors: bool = False
+) -> Recording:
     """Return all runs as one recording to identify from.
 
     Args:
         recordings: of one robot and sample time.
         any_robot: whether the kind takes other robots than the neck.
+        all_motors: whether the kind learns what each motor does, and so cannot cope with motors that move as one.
 
     Raises:
         DataError: too short, without excitation, or with an output that never moves.
@@ -158,7 +165,20 @@ def training_recording(recordings: Recording | list[Recording], *, any_robot: bo
     if not any_robot:
         recording.robot.require_neck(f"this kind of model ({', '.join(ANY_ROBOT)} take any robot)")
     check_training(recording)
+    outputs, motions = len(recording.robot.outputs.names), independent_motions(recording)
+    if all_motors and motions < outputs:
+        raise DataError(
+            f"the motors move along {motions} direction(s) for {outputs} outputs, and this kind learns what each motor "
+            "does: it would be wrong elsewhere. Record with all motors moving independently (`eq22`, `mixed`), or take "
+            "`oe`."
+        )
     return recording
+
+
+def in_display_unit(robot: Robot, values: Vector) -> Vector:
+    """Return what is in the SI unit of the outputs in that in which people see them."""
+    unit = robot.outputs.display_unit
+    return np.degrees(values) if unit == "deg" else values / to_si(unit)[0]
 
 
 def fitted_model(

@@ -263,7 +263,7 @@ class Model:
             "arrays": list(self.arrays),
             "settings": dict(self.settings),
             "findings": dict(self.findings),
-            **({} if self.robot.is_neck else {"robot": self.robot.as_dict()}),
+            **self.robot.in_header(),
         }
         write_archive(path, header, {**self.arrays, "training_rows": self.training_rows}, force=force)
 

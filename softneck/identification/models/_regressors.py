@@ -85,7 +85,7 @@ def motor_signals(recording: Recording, drive: DriveModel, *, again: bool = Fals
         return recording
     runs = [drive.simulate(run.set_points, run.set_points[0]) for run in recording.runs()]
     positions = np.concatenate(runs)
-    return recording.with_channels(**{f"motor_position_{j + 1}": positions[:, j] for j in range(3)})
+    return recording.with_channels(**dict(zip(recording.robot.motor_positions, positions.T, strict=True)))
 
 
 def regression(recording: Recording, table: Matrix, axis: int) -> tuple[Matrix, Vector]:

@@ -113,7 +113,7 @@ class Network:
         Raises:
             DataError: too short, constant, or fewer rows than weights.
         """
-        recording = training_recording(recordings, any_robot=True)
+        recording = training_recording(recordings, any_robot=True, all_motors=True)
         drive = fit_loaded_drive(recording)
         directions = directions_of(recording, [drive.simulate(r.set_points, drive_start(r)) for r in recording.runs()])
         # In the time of a neck: windows and memories go by the robot's time constant.

@@ -13,6 +13,7 @@ from softneck.core import DataError, Matrix, Progress, require_positive, require
 from softneck.runtime import load_functions
 from softneck.signals import Recording
 
+from ..models._arrays import memory_array
 from ..models._directions import directions_of
 from ..models._drive import drive_start, fit_loaded_drive
 from ..models._error_feedback import BEYOND, fit_echo
@@ -93,7 +94,7 @@ class NeuralStateSpace:
         """
         from threadpoolctl import threadpool_limits
 
-        recording = training_recording(recordings, any_robot=True)
+        recording = training_recording(recordings, any_robot=True, all_motors=True)
         progress(0.0, "drives and linear model")
         drive = fit_loaded_drive(recording)
         with threadpool_limits(limits=1):
@@ -264,7 +265,7 @@ def _arrays(
         "c": scales.middle + scales.outputs * (weights["c"] - weights["C"] @ x),
         "range": limits,
         "echo": np.zeros((shape.outputs, 1)),
-        "memory": np.array([float(np.ceil(_MEMORY / trained.sample_time))]),
+        "memory": memory_array(_MEMORY, trained.sample_time),
     }
     if not recording.robot.is_neck:
         return {**arrays, "gain": gain / scales.outputs}

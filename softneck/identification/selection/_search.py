@@ -14,6 +14,7 @@ import numpy as np
 
 from softneck.core import DataError, Progress, SettingsError, require_one_of, require_whole, silent
 from softneck.signals import Recording
+from softneck.signals.recording._recording import require_same_robot
 
 from ..models._fitting import known_rows, row_hashes
 from ..models._model import WARM_UP, Model
@@ -80,9 +81,11 @@ class Search:
     def curves(self) -> dict[str, list[list[Any]]]:
         """Each varied setting -> rows (value, free-run fit of pitch, of roll, one-step fit of both).
 
-        A row is the best trial with that value, whatever the others are; fits are None where none ran free.
+        A row is the best trial with that value, whatever the others are; fits are None where none ran free. Of another
+        robot those of its outputs, all in free run first.
         """
-        return {name: [_curve_row(self.trials, name, value) for value in values] for name, values in self.vary.items()}
+        axes = self.train.robot.outputs.names
+        return {name: [_curve_row(self.trials, name, v, axes) for v in values] for name, values in self.vary.items()}
 
     @cached_property
     def model(self) -> Model:
@@ -156,9 +159,9 @@ def search(
 
     Raises:
         SettingsError: an unknown field, nothing to vary, or too many trials.
-        DataError: a hold-out that is too short or holds training rows, or no trial can run free.
+        DataError: a hold-out of another robot, that is too short or holds training rows, or no trial can run free.
     """
-    train.robot.require_neck("a search over settings")
+    require_same_robot(hold_out.robot, train.robot, "the recordings of a search")
     require_one_of("strategy", strategy, STRATEGIES)
     require_one_of("rule", rule, RULES)
     require_whole("workers", workers, 1, 256)
@@ -259,11 +262,11 @@ def _continues(train: Recording, hold_out: Recording) -> bool:
     return False
 
 
-def _curve_row(trials: Sequence[Trial], name: str, value: Any) -> list[Any]:
+def _curve_row(trials: Sequence[Trial], name: str, value: Any, axes: Sequence[str]) -> list[Any]:
     there = [trial for trial in trials if trial.settings[name] == value]
     best = max(there, key=lambda trial: trial.score, default=None)
     if best is None:
-        return [_cell(value), None, None, None, None]
+        return [_cell(value), *[None] * (2 * len(axes))]
     return [_cell(value), *best.free_run.values(), *best.one_step.values()]
 
 

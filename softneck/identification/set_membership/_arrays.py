@@ -32,9 +32,10 @@ def check_set(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
 
 
 def _slopes(arrays: Mapping[str, Matrix]) -> Vector:
-    """Return the climb (2,) of the values' plane of each axis, less than the cones'."""
+    """Return the climb (outputs,) of the values' plane of each axis, less than the cones'."""
     nodes = arrays["nodes"]
-    slopes = nodes[:, 0, 0] if nodes.ndim == 3 and nodes.shape[0] == 2 and nodes.size else np.full(2, -1.0)
+    axes = len(arrays["bounds"])
+    slopes = nodes[:, 0, 0] if nodes.ndim == 3 and len(nodes) == axes and nodes.size else np.full(axes, -1.0)
     if not ((slopes >= 0.0) & ((slopes < arrays["bounds"][:, 0]) | (slopes == 0.0))).all():
         raise FileFormatError("its array `nodes` is not the tree over its points; identify the model again.")
     return slopes

@@ -12,6 +12,7 @@ from softneck.runtime import load_functions
 from softneck.runtime._compile import have_numba
 from softneck.signals import Recording
 
+from ..models._fitting import in_display_unit
 from ._forest import PointTree
 from ._trees import tree_nodes, tree_order
 
@@ -175,8 +176,8 @@ def require_feasible(
         recording: what the set was made of.
         table: the regressor, rows (source, channel, lag).
         data: scaled regressors (n, N) and targets (N,) of each axis, in the recording's order.
-        gamma: (2,) the least; beyond 1e100 there is none.
-        epsilon: (2,) [rad].
+        gamma: (outputs,) the least; beyond 1e100 there is none.
+        epsilon: (outputs,) [rad].
     """
     if gamma.max() <= 1e100:
         return
@@ -184,15 +185,17 @@ def require_feasible(
     points, values = data[axis]
     j, k = sorted(least_gammas(points, values, epsilon[axis : axis + 1])[1][0].tolist())
     rows = _rows_of(recording, table, axis, values.size)
-    name, rise = ("pitch", "roll")[axis], float(np.degrees(abs(values[j] - values[k])))
+    name, unit = recording.robot.outputs.names[axis], recording.robot.outputs.display_unit
+    tried = in_display_unit(recording.robot, epsilon)
+    rise = float(in_display_unit(recording.robot, np.abs(values[j] - values[k])))
     where = f"samples {j} and {k} of the set"
     if rows is not None:
         where = " and ".join(
             f"row {row} (run {recording.run[row]}, {recording.time[row]:.6g} s)" for row in (rows[j], rows[k])
         )
     raise DataError(
-        f"epsilon {np.degrees(epsilon).round(4).tolist()} deg is below the noise: equal regressors have outputs "
-        f"further apart, so no function fits the data. {where} differ by {rise:.4g} deg in {name} and by nothing in "
+        f"epsilon {tried.round(4).tolist()} {unit} is below the noise: equal regressors have outputs "
+        f"further apart, so no function fits the data. {where} differ by {rise:.4g} {unit} in {name} and by nothing in "
         "the regressor. Set `epsilon` higher."
     )
 

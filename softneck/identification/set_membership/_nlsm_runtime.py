@@ -7,14 +7,15 @@ the set adds to them is never fed back, and what is measured moves the base alon
 import numpy as np
 
 from softneck.identification.linear._arx_runtime import arx_output
+from softneck.identification.models._feedforward_runtime import echo_rest
 from softneck.identification.models._histories_runtime import (
     NarxArrays,
     NarxState,
-    narx_advance,
+    narx_forward,
     narx_observe,
     narx_regressor,
+    narx_rest,
 )
-from softneck.identification.models._narx_runtime import initialise as initialise
 from softneck.identification.set_membership._principal_tree_runtime import slant_bounds
 from softneck.runtime._compiled_runtime import COMPILED
 from softneck.runtime._layout import array
@@ -25,15 +26,27 @@ class NlsmArrays(NarxArrays):
 
     table = array("n, 3", "regressors: source, channel and lag of each (see `narx_regressor`)")
     scale = array("n", "what each regressor is multiplied by")
-    points = array("2, n, rows", "W: scaled regressors of the record, for each axis")
-    values = array("2, rows", "y(k+1) there, less the base [rad]")
-    bounds = array("2, 2", "gamma [rad] and epsilon [rad] of each axis (Eq. 15-17)")
-    nodes = array("2, branches, columns", "tree over the points (see `_principal_tree_runtime`)")
-    frame = array("2, directions, n", "directions of the tree")
-    redefinition = array("3, 3", "T of Eq. 9-11, for the base")
-    a = array("2, na", "of the base's outputs, newest first")
-    b = array("2, nb", "of its redefined inputs, newest first")
-    delay = array("2", "dead time of each axis [samples]")
+    points = array("outputs, n, rows", "W: scaled regressors of the record, for each axis")
+    values = array("outputs, rows", "y(k+1) there, less the base [rad]")
+    bounds = array("outputs, 2", "gamma [rad] and epsilon [rad] of each axis (Eq. 15-17)")
+    nodes = array("outputs, branches, columns", "tree over the points (see `_principal_tree_runtime`)")
+    frame = array("outputs, directions, n", "directions of the tree")
+    redefinition = array("c, motors", "T of Eq. 9-11, for the base; of another robot a row for each output")
+    a = array("outputs, na", "of the base's outputs, newest first")
+    b = array("outputs, nb", "of its redefined inputs, newest first")
+    delay = array("outputs", "dead time of each axis [samples]")
+
+
+def initialise(p: NlsmArrays, parameters: np.ndarray, x: NarxState, outputs: np.ndarray) -> None:
+    """Rest: motors at zero, outputs at their start values for ever."""
+    narx_rest(p, parameters, x, outputs)
+    # Of another robot than a neck the base is zero at rest and the outputs need not be: the set adds where they are.
+    if p.nb > 0 and p.c == p.outputs:
+        for axis in range(p.outputs):
+            total = 0.0
+            for k in range(p.rows):
+                total += p.values[axis, k]
+            echo_rest(p, x, axis, total / p.rows)
 
 
 def nlsm_bounds(
@@ -61,21 +74,22 @@ def nlsm_query(p: NlsmArrays, axis: int, w: np.ndarray) -> tuple[float, float]:
 
 
 def step(p: NlsmArrays, parameters: np.ndarray, x: NarxState, inputs: np.ndarray, outputs: np.ndarray) -> None:
-    """Advance by one sample; the bounds of pitch and roll follow the motor positions in `outputs`."""
+    """Advance by one sample; the bounds of the outputs follow the motor positions in `outputs`."""
     narx_observe(p, parameters, x, inputs)
     regressor = np.empty(p.n)
-    angles = np.empty(2)
-    for axis in range(2):
+    ahead = np.empty(p.outputs)
+    bounds = p.outputs + p.motors
+    for axis in range(p.outputs):
         narx_regressor(p, p.table, x, axis, regressor)  # Eq. 21, or the lags asked for
         low, high = nlsm_query(p, axis, regressor * p.scale)
         # Without a base a and b are empty and this is zero.
         base = arx_output(p, p.redefinition, p.a[axis], p.b[axis], int(p.delay[axis]), x, axis)
         # The central estimate (Eq. 18).
         middle = 0.5 * (low + high)
-        angles[axis] = base + middle
-        outputs[5 + 2 * axis] = base + low
-        outputs[6 + 2 * axis] = base + high
+        ahead[axis] = base + middle
+        outputs[bounds + 2 * axis] = base + low
+        outputs[bounds + 2 * axis + 1] = base + high
         # `narx_observe` takes this off again: with a base the histories hold the base alone.
         if p.nb > 0:
             x.added[axis] = middle
-    narx_advance(p, parameters, x, angles[0], angles[1], outputs)
+    narx_forward(p, parameters, x, ahead, outputs)

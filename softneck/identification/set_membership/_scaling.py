@@ -9,8 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from softneck.core import DataError, Matrix, Progress, SettingsError, Vector
+from softneck.robot import Robot
 from softneck.signals import Recording
 
+from ..models._fitting import in_display_unit
 from ._regressor import Data, Ground, gammas
 
 RULES = ("auto", "none", "std")
@@ -48,16 +50,16 @@ def ruled_scale(rule: str | tuple[float, ...], table: Matrix, data: Data) -> Vec
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScaleTrial:
-    """One scale and epsilon (2,), and what the free run over the hold-out says of them.
+    """One scale and epsilon (outputs,), and what the free run over the hold-out says of them.
 
     Attributes:
         output_weight, motor_weight: of the scale, or None.
         scale: (n,).
-        epsilon: (2,) [rad].
-        score: sum of both axes' fits [%]; -inf where it left all bounds.
+        epsilon: (outputs,) [rad].
+        score: sum of all axes' fits [%]; -inf where it left all bounds.
         coverage: part of the samples within f_l and f_u.
         width: mean of f_u - f_l [rad].
-        slope: the lesser gamma of both axes; 0: the set is a constant, as epsilon swallowed all there was to learn.
+        slope: the least gamma of all axes; 0: the set is a constant, as epsilon swallowed all there was to learn.
     """
 
     output_weight: float | None
@@ -69,11 +71,11 @@ class ScaleTrial:
     width: float
     slope: float
 
-    @property
-    def judgement(self) -> list[float | None]:
-        """Score, coverage and width [deg] as JSON values; None for what left all bounds."""
-        values = (self.score, self.coverage, float(np.degrees(self.width)))
-        return [value if np.isfinite(value) else None for value in values]
+    def row(self, robot: Robot) -> list[float | None]:
+        """Weights, first epsilon, score, coverage and width as JSON values in the unit shown; None for none."""
+        epsilon, width = in_display_unit(robot, np.array([self.epsilon[0], self.width])).tolist()
+        judged = [value if np.isfinite(value) else None for value in (self.score, self.coverage, width)]
+        return [self.output_weight, self.motor_weight, epsilon, *judged]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,7 +85,7 @@ class HoldOut:
     Attributes:
         ground, data: of the first part.
         tail: the last part.
-        epsilons: (2,) each, tried with every scale.
+        epsilons: (outputs,) each, tried with every scale.
         narrow: among equally good ones take the narrowest bounds that cover the hold-out.
     """
 
@@ -125,7 +127,8 @@ class HoldOut:
         return tried
 
     def _weights(self, weights: tuple[float, float]) -> list[ScaleTrial]:
-        return list(self._scale(grouped_scale(self.ground.table, *weights), *weights))
+        scale = grouped_scale(self.ground.table, *weights) * self.ground.units
+        return list(self._scale(scale, *weights))
 
     def _scale(self, scale: Vector, output: float | None, motor: float | None) -> Iterator[ScaleTrial]:
         for epsilon, gamma in zip(self.epsilons, gammas(self.data, scale, self.epsilons), strict=True):

@@ -21,10 +21,12 @@ from softneck.core import (
     resolve,
     silent,
 )
+from softneck.robot import Robot
 from softneck.signals import Recording
 
+from ..models._directions import directions_of, regressor_units
 from ..models._drive import DriveModel, fit_drive
-from ..models._fitting import fitted_model, training_recording
+from ..models._fitting import fitted_model, in_display_unit, training_recording
 from ..models._model import WARM_UP, Model
 from ..models._regressors import lag_table
 from ._cones import usual_width
@@ -33,18 +35,18 @@ from ._gamma import require_feasible
 from ._regressor import Ground, gammas, residual_lags, scaled
 from ._scaling import RULES, HoldOut, ScaleTrial, grouped_scale, ruled_scale
 
-_FINDING = "usual_half_width_deg"
+_FINDING = "usual_half_width"
 # As `Cones.usual`.
 _QUANTILE = 0.99
 
 
-def usual_widths(data: Sequence[tuple[Matrix, Vector]], gamma: Vector, epsilon: Vector) -> dict[str, list[float]]:
-    """Return the finding: each axis' half-width [deg] that 99 % of the training rows stay below, see `Cones.usual`.
+def usual_widths(data: Sequence[tuple[Matrix, Vector]], gamma: Vector, epsilon: Vector) -> Vector:
+    """Return each axis' half-width [rad] that 99 % of the training rows stay below, see `Cones.usual`.
 
     Args:
         data: scaled regressors (n, N) and targets (N,) of each axis, in order of time.
-        gamma: (2,).
-        epsilon: (2,) [rad].
+        gamma: (outputs,).
+        epsilon: (outputs,) [rad].
     """
     widths = []
     for axis, (points, values) in enumerate(data):
@@ -52,38 +54,44 @@ def usual_widths(data: Sequence[tuple[Matrix, Vector]], gamma: Vector, epsilon: 
         # Half a second on either side is the same motion; less where there is hardly more than that.
         usual = (min(WARM_UP, values.size // 8), _QUANTILE)
         widths.append(epsilon[axis] + usual_width(tree, 0, gamma[axis : axis + 1], usual, all_cores()))
-    return {_FINDING: np.degrees(widths).tolist()}
+    return np.array(widths)
 
 
 def knows_what_it_saw(model: Model) -> bool:
     """Return whether `outside_seen` can judge by this model."""
-    return _FINDING in model.findings
+    return _finding(model.robot) in model.findings
+
+
+def _finding(robot: Robot) -> str:
+    return f"{_FINDING}_{robot.outputs.display_unit}"
 
 
 def outside_seen(model: Model, outputs: Matrix) -> np.ndarray:
-    """Return (rows, 2) whether the bounds of pitch and of roll are wider than the training data's usually are.
+    """Return (rows, outputs) whether the bounds of each output are wider than the training data's usually are.
 
     Args:
         model: of kind `nlsm`.
-        outputs: (rows, 9) what `model.simulate` or `model.predict` returned.
+        outputs: (rows, 9 of a neck) what `model.simulate` or `model.predict` returned.
 
     Raises:
         SettingsError: a model without bounds, or one identified before this was learned.
     """
     if not knows_what_it_saw(model):
         raise SettingsError("only a model of kind nlsm knows what it has seen; identify one (again).")
-    if outputs.ndim != 2 or outputs.shape[1] != 9:
-        raise DataError(f"`outputs` must be (rows, 9), as a model of kind nlsm returns; got {outputs.shape}.")
-    half = 0.5 * (outputs[:, [6, 8]] - outputs[:, [5, 7]])
-    return half > np.radians(model.findings[_FINDING])
+    first, axes = len(model.robot.outputs.names) + len(model.robot.motors.names), len(model.robot.outputs.names)
+    if outputs.ndim != 2 or outputs.shape[1] != first + 2 * axes:
+        columns = first + 2 * axes
+        raise DataError(f"`outputs` must be (rows, {columns}), as a model of kind nlsm returns; got {outputs.shape}.")
+    half = 0.5 * (outputs[:, first + 1 :: 2] - outputs[:, first::2])
+    return in_display_unit(model.robot, half) > np.array(model.findings[_finding(model.robot)])
 
 
 FORMS = ("paper_eq21", "lags", "residual")
 _MOTORS = ("measured", "simulated")
 # Kinds whose arrays hold `a`, `b`, `delay` over the redefined set-points, as the runtime runs them.
 _BASES = tuple(name for name in ("rls", "oe") if name in KINDS)
-# Eq. 21: y(k-1); u_i(k-2), u_i(k-3); M_i(k-3).
-_EQ21_LAGS = ((1,), (2, 3), (3,))
+# Eq. 21: y(k-1); u_i(k-2), u_i(k-3); M_i(k-3) at the neck's 20 ms; of another robot u and M so far apart by its time.
+_EQ21_APART = 0.02
 # A lag is a sample; a minute at 1 ms is the longest history a file may hold.
 _LONGEST_LAG = 60_000
 # Free run of form `residual` hardly depends on it, the width of its bounds does: below what the base and the last
@@ -114,13 +122,14 @@ class SetMembership:
             signals on what the free run of a linear base leaves over, where nothing is fed back and so nothing drifts.
         output_lags, setpoint_lags, motor_lags: lags [samples] in the regressor, of the output (both outputs of the
             base in form "residual"), of all set-points and of all motor positions; None takes the form's own. Not
-            for "paper_eq21", whose lags are Eq. 21's.
+            for "paper_eq21", whose lags are Eq. 21's; those of u and M go by another robot's time constant.
         scale: weights of the regressor's components in the norm of Eq. 16: "auto" chooses one for outputs and one
             for motors by free run on the last fifth of the training rows; "none" takes SI units as they are; "std"
-            divides each by its standard deviation (a trap, see docs); or a vector as long as the regressor.
+            divides each by its standard deviation (a trap, see docs); or a vector as long as the regressor. Weights
+            of another robot are for components that move as much as a neck's.
         output_weight: weight of the outputs, all others having 1: the scale without a choice.
-        epsilon: noise bound of Eq. 15 [rad]; None chooses it by the same free run (form "residual": so that the
-            bounds are narrowest among equal fits).
+        epsilon: noise bound of Eq. 15 [rad, or the SI unit of the outputs]; None chooses it by the same free run
+            (form "residual": so that the bounds are narrowest among equal fits).
         motors: whose positions M the set is made of: "measured", logged ones where there are any, or "simulated",
             the drive model's, as in every free run. None: "simulated" for form "residual", else "measured".
         base: linear kind of one pole that form "residual" stands on.
@@ -163,54 +172,74 @@ class SetMembership:
             DataError: too short, constant, or `epsilon` so small that no function fits the data.
             SettingsError: a `scale` of another length than the regressor.
         """
-        recording = training_recording(recordings)
-        noise = np.array([noise_level(recording, axis) for axis in range(2)])
+        recording = training_recording(recordings, any_robot=True)
+        robot = recording.robot
+        noise = noise_levels(recording)
         drive = fit_drive(recording)
-        ground = self._ground(recording, drive)
+        directions = directions_of(recording, [run.set_points for run in recording.runs()])
+        # In the time of a neck: lags go by the robot's time constant.
+        necks = recording.sample_time / directions.stretch
+        ground = self._ground(recording, drive, necks)
         data = ground.data(recording)
-        chosen, tried = self._choose(ground, recording, noise, progress)
+        chosen, tried = self._choose(ground, recording, noise, necks, progress)
         scale = chosen.scale if chosen.scale.size else ruled_scale(self.scale, ground.table, data)
         gamma = gammas(data, scale, [chosen.epsilon])[0]
         sets = [(scaled(X, scale), y) for X, y in data]
         require_feasible(recording, ground.table, sets, gamma, chosen.epsilon)
         arrays = ground.arrays(data, scale, gamma, chosen.epsilon)
         progress(1.0, "done")
-        findings = {"form": self.form, "noise_deg": np.degrees(noise).tolist(), **_findings(chosen, tried, scale)}
+        unit = robot.outputs.display_unit
+        findings = {"form": self.form, f"noise_{unit}": in_display_unit(robot, noise).tolist()}
+        findings |= _findings(chosen, tried, scale, robot)
         findings |= {"gamma": gamma.tolist(), "points": int(arrays["values"].shape[1])}
-        findings |= usual_widths(sets, gamma, chosen.epsilon)
+        findings[_finding(robot)] = in_display_unit(robot, usual_widths(sets, gamma, chosen.epsilon)).tolist()
+        if not robot.is_neck:
+            findings |= directions.findings()
         return fitted_model("nlsm", self, recording, arrays=arrays, findings=findings)
 
-    def _ground(self, recording: Recording, drive: DriveModel) -> Ground:
-        """Return the set's ground; the base of form `residual` is identified on `recording`."""
+    def _ground(self, recording: Recording, drive: DriveModel, necks: float) -> Ground:
+        """Return the set's ground; the base of form `residual` is identified on `recording`.
+
+        Args:
+            recording: to identify from.
+            drive: of its motors.
+            necks: sample time by the robot's time constant over the neck's [s].
+        """
         residual = self.form == "residual"
         if residual:
-            own = residual_lags(recording.sample_time)
+            own = residual_lags(necks, recording)
             preset = (own, (), own)
         else:
-            preset = _EQ21_LAGS
+            apart = 1 if recording.robot.is_neck else max(round(_EQ21_APART / necks), 1)
+            preset = ((1,), (1 + apart, 1 + 2 * apart), (1 + 2 * apart,))
         given = (self.output_lags, self.setpoint_lags, self.motor_lags)
         lags = [known if lag is None else lag for lag, known in zip(given, preset, strict=True)]
+        sizes = len(drive.pole), recording.outputs.shape[1]
+        table = lag_table(*lags, both_outputs=residual, sizes=sizes)
         return Ground(
-            table=lag_table(*lags, both_outputs=residual),
+            table=table,
             drive=drive,
             base=resolve(find_kind(self.base, "model").settings)().fit(recording) if residual else None,
             measured=(self.motors or ("simulated" if residual else "measured")) == "measured",
+            units=regressor_units(recording, table),
         )
 
     def _choose(
-        self, ground: Ground, recording: Recording, noise: Vector, progress: Progress
+        self, ground: Ground, recording: Recording, noise: Vector, necks: float, progress: Progress
     ) -> tuple[ScaleTrial, list[ScaleTrial]]:
         """Return scale and epsilon, and all that were tried; an empty scale is left to `ruled_scale`."""
         table = ground.table
         if self.epsilon is not None:
-            epsilons = [np.full(2, self.epsilon)]
+            epsilons = [np.full(noise.size, self.epsilon)]
         elif self.form == "residual":
             epsilons = [sigmas * noise for sigmas in _RESIDUAL_SIGMAS]
         else:
             epsilons = [sigmas * noise for sigmas in _EPSILON_SIGMAS]
         weighted = self.output_weight is not None
         if len(epsilons) == 1 and (weighted or self.scale != "auto"):
-            scale = np.zeros(0) if self.output_weight is None else grouped_scale(table, self.output_weight)
+            scale = np.zeros(0)
+            if self.output_weight is not None:
+                scale = grouped_scale(table, self.output_weight) * ground.units
             return ScaleTrial(self.output_weight, None, scale, epsilons[0], np.nan, np.nan, np.nan, np.nan), []
         head, tail = recording.split(1.0 - _HOLD_OUT)
         if len(tail) <= 2 * WARM_UP:
@@ -219,7 +248,7 @@ class SetMembership:
                 "output_weight."
             )
         # The drives are known from all rows: they are no part of what is chosen.
-        first = self._ground(head, ground.drive)
+        first = self._ground(head, ground.drive, necks)
         hold_out = HoldOut(first, first.data(head), tail, epsilons, narrow=self.form == "residual")
         if self.scale != "auto":
             tried = hold_out.fixed(ruled_scale(self.scale, table, hold_out.data))
@@ -262,8 +291,13 @@ def _checked_scale(scale: Any) -> tuple[float, ...]:
     return tuple(values.tolist())
 
 
+def noise_levels(recording: Recording) -> Vector:
+    """Return `noise_level` of each output (outputs,)."""
+    return np.array([noise_level(recording, axis) for axis in range(recording.outputs.shape[1])])
+
+
 def noise_level(recording: Recording, axis: int) -> float:
-    """Return the standard deviation [rad] of white noise on one output, from its third differences.
+    """Return the standard deviation of white noise on one output in its SI unit, from its third differences.
 
     A motion of 4 rad/s sampled at 20 ms leaves almost nothing there; the median is not moved by jerks.
     """
@@ -272,17 +306,16 @@ def noise_level(recording: Recording, axis: int) -> float:
     d = d[np.isfinite(d)]
     # 20 = 1 + 9 + 9 + 1, squares of the binomials; 0.6745 is the quartile of a standard normal.
     sigma = float(np.median(np.abs(d))) / 0.6745 / np.sqrt(20.0)
-    return max(sigma, 1e-7)  # a noise-free simulation: rounding is left
+    # A noise-free simulation: rounding is left, of 1e-7 rad beside a neck's motion.
+    return max(sigma, 1e-7 if recording.robot.is_neck else 1e-6 * float(np.nanstd(recording.outputs[:, axis])))
 
 
-def _findings(chosen: ScaleTrial, tried: list[ScaleTrial], scale: Vector) -> dict[str, Any]:
+def _findings(chosen: ScaleTrial, tried: list[ScaleTrial], scale: Vector, robot: Robot) -> dict[str, Any]:
     weights = {"output_weight": chosen.output_weight, "motor_weight": chosen.motor_weight}
     return {
-        "epsilon_deg": np.degrees(chosen.epsilon).tolist(),
+        f"epsilon_{robot.outputs.display_unit}": in_display_unit(robot, chosen.epsilon).tolist(),
         **{name: weight for name, weight in weights.items() if weight is not None},
         "scale": scale.tolist(),
-        # Rows: both weights, epsilon of pitch [deg], sum of both fits [%], coverage, mean width [deg].
-        "hold_out_curve": [
-            [t.output_weight, t.motor_weight, float(np.degrees(t.epsilon[0])), *t.judgement] for t in tried
-        ],
+        # Rows: both weights, epsilon of the first output [deg], sum of all fits [%], coverage, mean width [deg].
+        "hold_out_curve": [one.row(robot) for one in tried],
     }

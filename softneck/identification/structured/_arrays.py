@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softneck.core import FileFormatError, Matrix, Vector
+from softneck.core import FileFormatError, Matrix
 
 from ..models._arrays import within
 
@@ -34,6 +34,11 @@ class Number:
     spread: float
     positive: bool
     about: str
+
+    @property
+    def is_rate(self) -> bool:
+        """Whether it is by the second."""
+        return self.unit in ("1/s", "1/(rad s)", "1/(rad^2 s)")
 
     def encode(self, value: float) -> float:
         """Return what the search moves."""
@@ -64,9 +69,8 @@ NUMBERS = (
 )
 
 
-def decode(x: Vector) -> Vector:
-    """Return the numbers of what the search moved."""
-    return np.array([number.decode(value) for number, value in zip(NUMBERS, x, strict=True)])
+# Those that have no meaning where the link bends in one plane.
+ACROSS = ("asymmetry", "rest_roll", "twist")
 
 
 def check_play(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
@@ -80,7 +84,13 @@ def check_greybox(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> Non
     within(np.array([sizes["p"]]), 1, sizes["H"], "the length of the echo")
     within(arrays["drive"][:, 1], 1, sizes["H"], "a drive's delay")
     within(arrays["sensor"][:1], 0, 1000, "the sensor's dead time")
-    for number, value in zip(NUMBERS, arrays["neck"], strict=True):
+    numbers, tendons = np.split(arrays["neck"], [len(NUMBERS)])
+    neck = (sizes["motors"], sizes["outputs"]) == (3, 2) and not tendons.size
+    if not neck and tendons.size != 1 + 2 * sizes["motors"]:
+        raise FileFormatError(f"its array `neck` has {arrays['neck'].size} numbers, which do not fit its tendons.")
+    if np.abs(tendons).max(initial=0.0) > 1.0 or not (tendons[:1] > 0.0).all():
+        raise FileFormatError("the directions of its tendons in its array `neck` are not of length 1.")
+    for number, value in zip(NUMBERS, numbers, strict=True):
         # A thousandth for the rounding of logarithms.
         margin = 1e-3 * max(abs(number.low), abs(number.high))
         if not number.low - min(margin, 0.1 * abs(number.low)) <= value <= number.high + margin:

@@ -1,4 +1,8 @@
-"""Kind `greybox`: the equations of a tendon-driven neck with unknown numbers, fitted by the error of its free run."""
+"""Kind `greybox`: the equations of a tendon-driven neck with unknown numbers, fitted by the error of its free run.
+
+Those of a robot with other tendons are the same; its rates and dead times are in the time of a neck, so that their
+ranges hold for it. With one output it bends in one plane. What hangs on it is in its stiffness and pretension.
+"""
 
 from __future__ import annotations
 
@@ -9,15 +13,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from softneck.core import DataError, Matrix, Progress, Vector, require_whole, silent
+from softneck.plant._neck import require_tendons
+from softneck.robot import Robot
 from softneck.runtime import load_functions
 from softneck.signals import Recording
 
+from ..models._arrays import memory_array
+from ..models._directions import Directions, directions_of
 from ..models._drive import drive_start, fit_loaded_drive
 from ..models._error_feedback import fit_echo
 from ..models._fitting import row_hashes, training_recording
 from ..models._model import Model
 from ..models._ports import trained_set_points
-from ._arrays import NUMBERS, decode
+from ..models._state_space import history_array
+from ._arrays import ACROSS, NUMBERS, Number
 
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
@@ -28,9 +37,11 @@ _FUNCTIONS = "softneck.identification.structured._greybox_fit_runtime"
 _MOTOR_WEIGHT = 0.05
 # How much a number a spread away from its guess counts, as an error [rad] of one row: next to nothing.
 _PRIOR = 0.005
-# The start is unknown for so long [s], a held input is forgotten after so long.
+# The start is unknown for so long [s of a neck's time], a held input is forgotten after so long.
 _SETTLED, _MEMORY = 0.5, 3.0
 _DELAYS = (2, 1, 3, 4)
+# Of a slower robot they are in the neck's samples [s].
+_NECK_SAMPLE = 0.02
 _TYPICAL_DRIVE_DELAY = 0.08
 _THIN = 2
 _ECHO = 8
@@ -45,7 +56,8 @@ class GreyBox:
 
     Attributes:
         evaluations: at most so many steps of Gauss-Newton for each dead time.
-        sensor_delay: dead time of the inclinometer in samples; None tries 1 to 4.
+        sensor_delay: dead time of the inclinometer in samples; None tries 1 to 4, of a slower robot as
+            many more.
     """
 
     evaluations: int = 40
@@ -65,14 +77,17 @@ class GreyBox:
 
         Raises:
             DataError: too short or constant.
+            SettingsError: a robot that no tendons on winches bend.
         """
-        recording = training_recording(recordings)
+        recording = training_recording(recordings, any_robot=True)
+        if not recording.robot.is_neck:
+            require_tendons(recording.robot, "kind `greybox`")
         problem = _FitProblem.of(recording)
-        delays = _DELAYS if self.sensor_delay is None else (self.sensor_delay,)
+        delays = problem.delays() if self.sensor_delay is None else (self.sensor_delay,)
         best: tuple[float, int, Vector] | None = None
-        start = np.array([number.encode(number.guess) for number in NUMBERS])
+        start = np.array([number.encode(number.guess) for number in problem.numbers])
         interrupted = False
-        tell = _SearchProgress(progress, len(delays) * self.evaluations * (len(NUMBERS) + 1))
+        tell = _SearchProgress(progress, len(delays) * self.evaluations * (len(start) + 1))
         for delay in delays:
             tell.what = f"dead time {delay}"
             try:
@@ -96,17 +111,32 @@ class GreyBox:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _FitProblem:
-    """All runs as arrays; the drives' dead times are known beforehand."""
+    """All runs as arrays; the drives' dead times are known beforehand.
+
+    Attributes:
+        sample_time: in the time of a neck [s].
+        runs: set-points, start, motor positions and outputs of each.
+        drive: (motors, 2) pole and delay.
+        logged: whether motor positions were.
+        numbers: those that are searched; with one output not those across.
+        tendons: what stands behind the numbers; nothing of a neck.
+        directions: of the robot.
+    """
 
     sample_time: float
     runs: list[tuple[Matrix, Vector, Matrix, Matrix]]
     drive: Matrix
     logged: bool
+    numbers: tuple[Number, ...]
+    tendons: Vector
+    directions: Directions
 
     @classmethod
     def of(cls, recording: Recording) -> _FitProblem:
-        Ts = recording.sample_time
         drive = fit_loaded_drive(recording).drive.copy()
+        motors = [run.set_points for run in recording.runs()]
+        directions = directions_of(recording, motors)
+        Ts = recording.sample_time / directions.stretch
         if not recording.has_motor_positions:
             drive[:, 1] = max(round(_TYPICAL_DRIVE_DELAY / Ts), 1)
         drive[:, 1] = np.maximum(drive[:, 1], 1.0)
@@ -114,7 +144,20 @@ class _FitProblem:
             (np.ascontiguousarray(run.set_points), drive_start(run), run.motor_positions, run.outputs)
             for run in recording.runs()
         ]
-        return cls(Ts, runs, drive, recording.has_motor_positions)
+        across = ACROSS if recording.outputs.shape[1] == 1 else ()
+        numbers = tuple(number for number in NUMBERS if number.name not in across)
+        return cls(Ts, runs, drive, recording.has_motor_positions, numbers, _tendons(recording.robot), directions)
+
+    def delays(self) -> tuple[int, ...]:
+        """Return the sensor's dead times to try [samples], the likeliest first."""
+        # A sensor is not faster for a robot that is.
+        samples = max(_NECK_SAMPLE / self.sample_time, 1.0) if self.tendons.size else 1.0
+        return tuple(dict.fromkeys(round(delay * samples) for delay in _DELAYS))
+
+    def decode(self, x: Vector) -> Vector:
+        """Return all numbers of what the search moved, then the tendons."""
+        found = {number.name: number.decode(value) for number, value in zip(self.numbers, x, strict=True)}
+        return np.array([*(found.get(number.name, number.guess) for number in NUMBERS), *self.tendons])
 
     def simulate(self, numbers: Vector, delay: int) -> list[tuple[Matrix, Matrix]]:
         """Return motors and outputs of all runs."""
@@ -131,10 +174,10 @@ class _FitProblem:
     def errors(self, x: Vector, delay: int) -> Vector:
         """Return the errors that are minimised: of tilts, of motors, and of the numbers against their guesses."""
         skip = round(_SETTLED / self.sample_time)
-        guess = np.array([number.encode(number.guess) for number in NUMBERS])
-        spread = np.array([number.spread for number in NUMBERS])
+        guess = np.array([number.encode(number.guess) for number in self.numbers])
+        spread = np.array([number.spread for number in self.numbers])
         parts = [_PRIOR * (x - guess) / spread]
-        for (M, Y), (_, _, m, y) in zip(self.simulate(decode(x), delay), self.runs, strict=True):
+        for (M, Y), (_, _, m, y) in zip(self.simulate(self.decode(x), delay), self.runs, strict=True):
             parts.append((Y - y)[skip::_THIN].ravel())
             if self.logged:
                 parts.append(_MOTOR_WEIGHT * (M - m)[skip::_THIN].ravel())
@@ -144,8 +187,8 @@ class _FitProblem:
         """Return scipy's result of a trust-region Gauss-Newton from `start`."""
         from scipy.optimize import least_squares
 
-        low = np.array([number.encode(number.low) for number in NUMBERS])
-        high = np.array([number.encode(number.high) for number in NUMBERS])
+        low = np.array([number.encode(number.low) for number in self.numbers])
+        high = np.array([number.encode(number.high) for number in self.numbers])
 
         def errors(x: Vector) -> Vector:
             e = self.errors(x, delay)
@@ -154,6 +197,17 @@ class _FitProblem:
 
         inside = np.clip(start, low + 1e-6 * (high - low), high - 1e-6 * (high - low))
         return least_squares(errors, inside, bounds=(low, high), x_scale="jac", max_nfev=evaluations, xtol=1e-5)
+
+
+def _tendons(robot: Robot) -> Vector:
+    """Return share, cosines and sines of the tendons as the equations read them; nothing of a neck."""
+    if robot.is_neck:
+        return np.zeros(0)
+    axes, weights = len(robot.outputs.names), robot.directions.weights()
+    e = np.zeros((2, len(robot.motors.names)))
+    e[:axes] = 0.0 if weights is None else weights[:axes]
+    largest = float(np.linalg.norm(e, 2)) ** 2
+    return np.concatenate([[min(largest / e.shape[1], 1.0)], e.ravel()])
 
 
 class _SearchProgress:
@@ -174,32 +228,35 @@ class _SearchProgress:
 
 
 def _model(settings: GreyBox, problem: _FitProblem, recording: Recording, delay: int, x: Vector) -> Model:
-    numbers = decode(x)
+    numbers, outputs = problem.decode(x), recording.outputs.shape[1]
     skip = round(_SETTLED / problem.sample_time)
     errors = [y - Y for (_, Y), (_, _, _, y) in zip(problem.simulate(numbers, delay), problem.runs, strict=True)]
     for error in errors:
         error[:skip] = np.nan
-    echo = np.array([fit_echo([error[:, axis] for error in errors], _ECHO) for axis in range(2)])
-    drive = np.column_stack([np.full(3, np.exp(-numbers[0] * problem.sample_time)), problem.drive[:, 1]])
+    echo = np.array([fit_echo([error[:, axis] for error in errors], _ECHO) for axis in range(outputs)])
+    pole = np.exp(-numbers[0] * problem.sample_time)
+    drive = np.column_stack([np.full(len(problem.drive), pole), problem.drive[:, 1]])
     arrays = {
-        "history": np.array([float(max(_ECHO, drive[:, 1].max()))]),
+        "history": history_array(int(max(_ECHO, drive[:, 1].max())), outputs),
         "drive": drive,
         "neck": numbers,
         "sensor": np.array([float(delay), problem.sample_time]),
         "echo": echo,
-        "memory": np.array([np.ceil(_MEMORY / problem.sample_time)]),
+        "memory": memory_array(_MEMORY, problem.sample_time),
     }
     return Model(
         kind="greybox",
-        sample_time=problem.sample_time,
+        sample_time=recording.sample_time,
         arrays=arrays,
         settings={"evaluations": settings.evaluations, "sensor_delay": settings.sensor_delay},
         findings={
             "sensor_delay": delay,
             "numbers": _table(problem, x, delay, errors),
+            **({} if recording.robot.is_neck else problem.directions.findings()),
             **trained_set_points(recording),
         },
         training_rows=row_hashes(recording),
+        robot=recording.robot,
     )
 
 
@@ -215,13 +272,16 @@ def _table(problem: _FitProblem, x: Vector, delay: int, errors: Sequence[Matrix]
     covariance = np.linalg.pinv(J.T @ J) * float(e @ e) / max(e.size - x.size, 1) * _colour(errors)
     half = 1.96 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     rows = []
-    for i, number in enumerate(NUMBERS):
+    for i, number in enumerate(problem.numbers):
         value, low, high = (number.decode(x[i] + shift) for shift in (0.0, -half[i], half[i]))
+        # From the time of a neck.
+        speed = 1.0 / problem.directions.stretch if number.is_rate else 1.0
         at_bound = min(value - number.low, number.high - value) < 1e-3 * (number.high - number.low) * 0.01
         rows.append(
             {
-                "name": number.name, "unit": number.unit, "value": value, "low": max(low, number.low),
-                "high": min(high, number.high), "at_bound": bool(at_bound), "about": number.about,
+                "name": number.name, "unit": number.unit, "value": speed * value,
+                "low": speed * max(low, number.low), "high": speed * min(high, number.high),
+                "at_bound": bool(at_bound), "about": number.about,
             }
         )  # fmt: skip
     return rows

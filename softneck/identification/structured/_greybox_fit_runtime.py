@@ -16,24 +16,25 @@ def neck_run(
     motors: np.ndarray,
     outputs: np.ndarray,
 ) -> None:
-    """Fill `motors` (time, 3) and `outputs` (time, 2) for set-points `targets` (time, 3), standing at `start` before.
+    """Fill `motors` (time, motors) and `outputs` (time, outputs) for set-points `targets`, standing at `start` before.
 
-    `delay` (3,) is that of the drives in samples, `lines` the sensor's; `settle` samples of rest come first.
+    `delay` (motors,) is that of the drives in samples, `lines` the sensor's; `settle` samples of rest come first.
     """
     x = np.zeros(7 + 2 * lines)
     m = start.copy()
-    held = np.empty(3)
+    held = np.empty(m.shape[0])
+    axes = outputs.shape[1]
     # Under set-points that stay: a run begins at rest, as its recording is taken to.
     for _ in range(settle):
         neck_advance(neck, sample_time, start, m, x)  # pyright: ignore[reportArgumentType]
         neck_sense(neck, sample_time, x)  # pyright: ignore[reportArgumentType]
     motors[0] = m
-    outputs[0] = x[5:7]
+    outputs[0] = x[5 : 5 + axes]
     for k in range(targets.shape[0] - 1):
-        for j in range(3):
+        for j in range(m.shape[0]):
             back = k + 1 - int(delay[j])
             held[j] = targets[back, j] if back >= 0 else start[j]
         neck_advance(neck, sample_time, held, m, x)  # pyright: ignore[reportArgumentType]
         neck_sense(neck, sample_time, x)  # pyright: ignore[reportArgumentType]
         motors[k + 1] = m
-        outputs[k + 1] = x[5:7]
+        outputs[k + 1] = x[5 : 5 + axes]

@@ -10,7 +10,7 @@ from softneck.identification.models._feedforward_runtime import echo_added, echo
 from softneck.identification.models._histories_runtime import (
     NarxArrays,
     NarxState,
-    narx_advance,
+    narx_forward,
     narx_observe,
     narx_rest,
 )
@@ -21,9 +21,9 @@ from softneck.runtime._layout import array, cells, value
 class GreyBoxArrays(NarxArrays):
     """The numbers of the equations, and what stands around them."""
 
-    neck = array("16", "numbers of the equations, in the order of NECK_*")
-    sensor = array("2", "dead time [samples], and sample time [s]")
-    echo = array("2, p", "of what was measured above the equations, newest first")
+    neck = array("numbers", "of the equations, in the order of NECK_*; of another robot its tendons behind them")
+    sensor = array("2", "dead time [samples], and sample time in the time of a neck [s]")
+    echo = array("outputs, p", "of what was measured above the equations, newest first")
     memory = array("1", "samples after which a held start has settled")
     dead = value("sensor", 0)
 
@@ -37,12 +37,12 @@ class GreyBoxState(NarxState):
 def initialise(p: GreyBoxArrays, parameters: np.ndarray, x: GreyBoxState, outputs: np.ndarray) -> None:
     """Rest: motors at zero, the neck settled; what the start is above that is remembered as measured."""
     narx_rest(p, parameters, x, outputs)
-    m = np.zeros(3)
+    m = np.zeros(p.motors)
     for _ in range(int(p.memory[0])):
-        neck_advance(p.neck, p.sensor[1], np.zeros(3), m, x.neck)
+        neck_advance(p.neck, p.sensor[1], np.zeros(p.motors), m, x.neck)
         # The sensor settles with the neck: its dead time holds the tilt at rest.
         neck_sense(p.neck, p.sensor[1], x.neck)
-    for axis in range(2):
+    for axis in range(p.outputs):
         echo_rest(p, x, axis, greybox_angle(x.neck, axis))
 
 
@@ -56,16 +56,16 @@ def step(p: GreyBoxArrays, parameters: np.ndarray, x: GreyBoxState, inputs: np.n
     narx_observe(p, parameters, x, inputs)
     # From measured positions where there are any; a copy, as histories do not change.
     m = x.m[0].copy()
-    targets = np.empty(3)
-    for j in range(3):
+    targets = np.empty(p.motors)
+    for j in range(p.motors):
         targets[j] = x.u[int(p.drive[j, 1]) - 1, j]  # u(k+1-d); d >= 1 for this kind
     neck_advance(p.neck, p.sensor[1], targets, m, x.neck)
     neck_sense(p.neck, p.sensor[1], x.neck)
-    angles = np.empty(2)
-    for axis in range(2):
-        angles[axis] = echo_added(p, p.echo, x, axis, greybox_angle(x.neck, axis))
-    narx_advance(p, parameters, x, angles[0], angles[1], outputs)
-    # The equations move the motors, stalls among them; the lag of `narx_advance` does not.
-    for j in range(3):
+    ahead = np.empty(p.outputs)
+    for axis in range(p.outputs):
+        ahead[axis] = echo_added(p, p.echo, x, axis, greybox_angle(x.neck, axis))
+    narx_forward(p, parameters, x, ahead, outputs)
+    # The equations move the motors, stalls among them; the lag of `narx_forward` does not.
+    for j in range(p.motors):
         x.motors[j] = m[j]
-        outputs[2 + j] = m[j]
+        outputs[p.outputs + j] = m[j]

@@ -1,13 +1,15 @@
-"""The equations of kind `greybox`: a bent link between three tendons, whose drives stall, seen by a slow sensor.
+"""The equations of kind `greybox`: a bent link between tendons, whose drives stall, seen by a slow sensor.
 
 Lengths of tendon are in radians of motor, tensions in radians of stretch, so that no stiffness appears twice.
 
 - drive: m_j lags its delayed set-point, and stops where its tension reaches `pull_limit`;
 - stretch: x_j = pretension + m_j - lever (e_j . b) - s, tension T_j = max(0, x_j): a tendon only pulls;
 - bend: b' = gain sum T_j e_j - stiffness (1 +- asymmetry) (b - rest) - stiffening |b|^2 b - friction z;
-- compression: s' = axial_rate (compliance (sum T_j - 3 pretension) - s);
+- compression: s' = axial_rate (compliance (sum (T_j - pretension)) - s);
 - hysteresis (Dahl): z' = b' - |b'| z / friction_angle, so |z| <= friction_angle;
 - tilt: pitch = atan2(sin|b| b_1/|b|, cos|b|), roll likewise, through a dead time and a first-order lag.
+
+e_j points to tendon j: of a neck 120 deg apart, of another robot as its file says; with one output all lie in a plane.
 
 Bend and compression are taken half implicitly (Rosenbrock, one stage), stable for any rates, and |b| is kept below
 1.2 rad: no input moves the output further.
@@ -36,6 +38,10 @@ NECK_FRICTION_ANGLE = 13
 NECK_TWIST = 14
 NECK_SENSOR_RATE = 15
 NECK_SIZE = 16
+# Behind them, of another robot than the neck: the largest part of sum e_j e_j' for each tendon, then the cosines and
+# the sines of the tendons' angles; with one output the sines are zero.
+NECK_SHARE = 16
+NECK_TENDONS = 17
 NECK_STATES = 7
 # A stalled drive gives way as the bend does: 4 ms at 20 ms follow that closely enough.
 _SUBSTEPS = 5
@@ -52,30 +58,44 @@ class NeckState(StateVector):
     tilts = rest("the dead time's line: tilts of pitch, newest first, then those of roll [rad]")
 
 
+def neck_cosine(neck: np.ndarray, j: int) -> float:
+    """Return e_j along the first axis, as mounted."""
+    if neck.shape[0] == NECK_SIZE:
+        return math.cos(neck[NECK_TWIST] + 2.0943951023931953 * j)  # 120 deg apart (Eq. 5)
+    sine = NECK_TENDONS + (neck.shape[0] - NECK_TENDONS) // 2
+    return math.cos(neck[NECK_TWIST]) * neck[NECK_TENDONS + j] - math.sin(neck[NECK_TWIST]) * neck[sine + j]
+
+
+def neck_sine(neck: np.ndarray, j: int) -> float:
+    """Return e_j along the second axis, as mounted."""
+    if neck.shape[0] == NECK_SIZE:
+        return math.sin(neck[NECK_TWIST] + 2.0943951023931953 * j)
+    sine = NECK_TENDONS + (neck.shape[0] - NECK_TENDONS) // 2
+    return math.sin(neck[NECK_TWIST]) * neck[NECK_TENDONS + j] + math.cos(neck[NECK_TWIST]) * neck[sine + j]
+
+
 def neck_limit(neck: np.ndarray, x: NeckState, j: int) -> float:
     """Return the motor position at which tendon j reaches the pull limit."""
-    angle = neck[NECK_TWIST] + 2.0943951023931953 * j  # 120 deg apart (Eq. 5), as mounted
-    toward = math.cos(angle) * x.b[0] + math.sin(angle) * x.b[1]
+    toward = neck_cosine(neck, j) * x.b[0] + neck_sine(neck, j) * x.b[1]
     # x_j = pull_limit, solved for m_j.
     return neck[NECK_PULL_LIMIT] - neck[NECK_PRETENSION] + neck[NECK_LEVER] * toward + x.s
 
 
 def neck_advance(neck: np.ndarray, sample_time: float, targets: np.ndarray, m: np.ndarray, x: NeckState) -> None:
-    """Move the motors `m` (3,) towards `targets` (3,), and bend, hysteresis and compression in `x`, by one sample."""
+    """Move the motors `m` (motors,) towards `targets`, and bend, hysteresis and compression in `x`, by one sample."""
     dt = sample_time / _SUBSTEPS
     keep = math.exp(-neck[NECK_DRIVE_RATE] * dt)  # exact for a target that is held
     for _ in range(_SUBSTEPS):
-        for j in range(3):
+        for j in range(m.shape[0]):
             # Where the neck moves away a stalled drive gives way: the limit may fall below m.
             m[j] = min(keep * m[j] + (1.0 - keep) * targets[j], neck_limit(neck, x, j))
         pull0 = 0.0
         pull1 = 0.0
         total = 0.0
         taut = 0
-        for j in range(3):
-            angle = neck[NECK_TWIST] + 2.0943951023931953 * j
-            c = math.cos(angle)
-            s = math.sin(angle)
+        for j in range(m.shape[0]):
+            c = neck_cosine(neck, j)
+            s = neck_sine(neck, j)
             stretch = neck[NECK_PRETENSION] + m[j] - neck[NECK_LEVER] * (c * x.b[0] + s * x.b[1]) - x.s
             if stretch > 0.0:  # a slack tendon neither pulls nor adds to `rate`
                 pull0 += stretch * c
@@ -92,7 +112,10 @@ def neck_advance(neck: np.ndarray, sample_time: float, targets: np.ndarray, m: n
         )
         # Minus the slope of f over b, one number for both directions: the cube's at its steepest, and half of each taut
         # tendon, as e e' of all three add up to 3/2.
-        rate = neck[NECK_STIFFNESS] + 3.0 * loss + 0.5 * taut * neck[NECK_GAIN] * neck[NECK_LEVER] + neck[NECK_FRICTION]
+        share = 0.5 if neck.shape[0] == NECK_SIZE else neck[NECK_SHARE]
+        rate = (
+            neck[NECK_STIFFNESS] + 3.0 * loss + share * taut * neck[NECK_GAIN] * neck[NECK_LEVER] + neck[NECK_FRICTION]
+        )
         d0 = dt * f0 / (1.0 + dt * rate)  # one stage: (1 + dt rate) d = dt f
         d1 = dt * f1 / (1.0 + dt * rate)
         x.b[0] += d0
@@ -107,7 +130,7 @@ def neck_advance(neck: np.ndarray, sample_time: float, targets: np.ndarray, m: n
         x.z[0] = (x.z[0] + d0) / forget
         x.z[1] = (x.z[1] + d1) / forget
         axial = neck[NECK_AXIAL_RATE]
-        rise = axial * (neck[NECK_COMPLIANCE] * (total - 3.0 * neck[NECK_PRETENSION]) - x.s)
+        rise = axial * (neck[NECK_COMPLIANCE] * (total - m.shape[0] * neck[NECK_PRETENSION]) - x.s)
         # Its slope again: s itself, and each taut tendon, which gets looser as the link gives way.
         x.s += dt * rise / (1.0 + dt * axial * (1.0 + neck[NECK_COMPLIANCE] * taut))
 

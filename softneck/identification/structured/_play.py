@@ -9,6 +9,7 @@ import numpy as np
 from softneck.core import DataError, Matrix, Progress, require_positive, require_whole, silent
 from softneck.signals import Recording
 
+from ..models._arrays import memory_array
 from ..models._directions import directions_of
 from ..models._drive import LoadedDrive, drive_start, fit_loaded_drive
 from ..models._error_feedback import BEYOND, fit_echo
@@ -89,7 +90,7 @@ class Play:
         Raises:
             DataError: too short, constant, or fewer rows than terms.
         """
-        recording = training_recording(recordings, any_robot=True)
+        recording = training_recording(recordings, any_robot=True, all_motors=True)
         progress(0.0, "drives")
         drive = fit_loaded_drive(recording)
         directions = directions_of(recording, [drive.simulate(r.set_points, drive_start(r)) for r in recording.runs()])
@@ -172,5 +173,5 @@ def _arrays(data: Data, drive: LoadedDrive, form: PlayStructure, weight: float, 
         "weights": W,
         "range": limits,
         "echo": echo,
-        "memory": np.array([float(np.ceil(_MEMORY * data.stretch / data.sample_time))]),
+        "memory": memory_array(_MEMORY * data.stretch, data.sample_time),
     }

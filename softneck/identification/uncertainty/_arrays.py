@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from softneck.core import Matrix
+import numpy as np
+
+from softneck.core import FileFormatError, Matrix
 
 from ..models._arrays import within
 from ..set_membership._arrays import check_set
@@ -12,5 +14,12 @@ from ..set_membership._arrays import check_set
 
 def check_residual(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
     within(arrays["table"][:, 0], 2, 3, "a regressor's source")
-    # Its runtime is written for the neck.
-    check_set(arrays, {**sizes, "motors": 3, "outputs": 2})
+    check_set(arrays, sizes)
+
+
+def check_guarded(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
+    within(np.array([sizes["points"]]), 1, np.inf, "the number of points that were seen")
+    low = {"sigma": np.nextafter(0.0, 1.0), "slope": 0.0, "fading": np.nextafter(0.0, 1.0), "reach": 0.0}
+    for name, least in low.items():
+        if (arrays[name] < least).any():
+            raise FileFormatError(f"its array `{name}` must be {'positive' if least else '0 or positive'}.")

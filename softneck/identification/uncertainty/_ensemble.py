@@ -22,8 +22,8 @@ class Ensemble:
     """Median of the free runs of several kinds; `pitch_lower` and `pitch_upper` are the least and the largest.
 
     Attributes:
-        members: kinds, each with its default settings; one named twice is trained with another seed. For another robot
-            than the neck `nss` stands for `greybox`, which knows necks only.
+        members: kinds, each with its default settings; one named twice is trained with another seed. For a robot
+            without tendons `nss` stands for `greybox`, which bends by them.
         seed: of the first member that starts at random; the next have the next seeds.
     """
 
@@ -48,7 +48,7 @@ class Ensemble:
         """
         recording = one_recording(recordings)
         models = []
-        known = {} if recording.robot.is_neck else {"greybox": "nss"}
+        known = {} if recording.robot.directions.kind == "tendons" else {"greybox": "nss"}
         members = tuple(known.get(kind, kind) for kind in self.members)
         for number, kind in enumerate(members):
             part = _part(progress, number, len(members), kind)

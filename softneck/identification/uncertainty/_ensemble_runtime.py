@@ -5,28 +5,10 @@ Each member runs free on its own outputs; a median of bounded numbers is bounded
 
 import numpy as np
 
-from softneck.runtime._layout import Arrays, StateVector, array, cells, rest, value
+from softneck.identification.uncertainty._composed_runtime import ComposedArrays, composed_median
+from softneck.runtime._layout import StateVector, cells, rest
 from softneck.runtime._members_runtime import member_count, member_initialise, member_size, member_step
 from softneck.runtime._random_runtime import random_normal, random_seed
-
-
-def ensemble_outputs(history: np.ndarray) -> int:
-    """Return the number of outputs: the neck's two where none is said."""
-    return int(history[1]) if history.shape[0] > 1 else 2
-
-
-def ensemble_motors(history: np.ndarray) -> int:
-    """Return the number of motors: the neck's three where none is said."""
-    return int(history[2]) if history.shape[0] > 2 else 3
-
-
-class EnsembleArrays(Arrays):
-    """Those of the members follow."""
-
-    history = array("sizes", "H: how many samples of each signal are kept; and outputs and motors, if not a neck's")
-    memory = array("1", "samples after which a held start has settled")
-    outputs = value("history", function=ensemble_outputs, written=True)
-    motors = value("history", function=ensemble_motors, written=True)
 
 
 class EnsembleState(StateVector):
@@ -36,7 +18,7 @@ class EnsembleState(StateVector):
     members = rest("states of the members")
 
 
-def state_size(p: EnsembleArrays) -> int:
+def state_size(p: ComposedArrays) -> int:
     """Return the length of the state vector."""
     size = EnsembleState.size(p)
     for i in range(member_count()):
@@ -44,7 +26,7 @@ def state_size(p: EnsembleArrays) -> int:
     return size
 
 
-def initialise(p: EnsembleArrays, parameters: np.ndarray, x: EnsembleState, outputs: np.ndarray) -> None:
+def initialise(p: ComposedArrays, parameters: np.ndarray, x: EnsembleState, outputs: np.ndarray) -> None:
     """Rest: as the members rest."""
     bounds = p.outputs + p.motors
     own = np.zeros(bounds + 2 * p.outputs)
@@ -62,7 +44,7 @@ def initialise(p: EnsembleArrays, parameters: np.ndarray, x: EnsembleState, outp
         outputs[bounds + 2 * axis + 1] = own[axis]
 
 
-def step(p: EnsembleArrays, parameters: np.ndarray, x: EnsembleState, inputs: np.ndarray, outputs: np.ndarray) -> None:
+def step(p: ComposedArrays, parameters: np.ndarray, x: EnsembleState, inputs: np.ndarray, outputs: np.ndarray) -> None:
     """Advance by one sample; the bounds of the outputs follow the motor positions in `outputs`."""
     # Behind `use_measurement` stands `noise_std`: noise comes once, on the median, from this kind's generator.
     quiet = parameters.copy()
@@ -84,8 +66,7 @@ def step(p: EnsembleArrays, parameters: np.ndarray, x: EnsembleState, inputs: np
         at += size
     for axis in range(p.outputs):
         inorder = np.sort(angles[axis])
-        # Of an even number the mean of the middle two.
-        outputs[axis] = 0.5 * (inorder[(count - 1) // 2] + inorder[count // 2])
+        outputs[axis] = composed_median(inorder)
         outputs[bounds + 2 * axis] = inorder[0]
         outputs[bounds + 2 * axis + 1] = inorder[count - 1]
     if parameters[p.outputs + 1] > 0.0:

@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import FileFormatError, Matrix, SettingsError, Vector, require_one_of, write_archive
+from softneck.core import DataError, FileFormatError, Matrix, SettingsError, Vector, require_one_of, write_archive
 from softneck.robot import Robot
+from softneck.signals import Recording, redefinition_matrix
+from softneck.signals.recording._recording import require_same_robot
 
 from ..linear._srivc_fit import Continuous
+from ..models._directions import Directions
 from ._lpv import Lpv
+from ._measured import (
+    AxisMeasured,
+    axis_points,
+    axis_runs,
+    judge_records,
+    measured_responses,
+    needed_lines,
+    response_of,
+)
 
 if TYPE_CHECKING:
     import control
@@ -64,6 +77,7 @@ class Family:
         settings, findings: what was asked and what was found.
         robot: whose plant it is; its outputs and motors in their SI units where a neck's are in rad.
         directions: (outputs, motors) weights of the motors in each axis's input; None for a neck, whose are Eq. 9, 10.
+        measured: by the names of the outputs, what the recordings themselves show of it; empty in files of before.
     """
 
     sample_time: float
@@ -77,6 +91,7 @@ class Family:
     findings: dict[str, Any] = field(default_factory=dict)
     robot: Robot = field(default_factory=Robot.preset)
     directions: Matrix | None = None
+    measured: dict[str, AxisMeasured] = field(default_factory=dict)
 
     def nominal(self, output: str) -> Continuous:
         """Return the nominal plant of an axis, `K exp(-L s)/(s + p)`."""
@@ -111,6 +126,50 @@ class Family:
         errors = relative_errors(axis.samples[axis.used > 0.5], axis.nominal, w, self.sample_time)
         return float(np.max(errors / W))
 
+    def band(self, output: str) -> tuple[float, float] | None:
+        """Return the least and largest frequency that the data support [rad/s]; None where they were not asked."""
+        self._axis(output)
+        found = self.measured.get(output)
+        return None if found is None else found.band
+
+    def invalidated_by(
+        self, recordings: Sequence[Recording], names: Sequence[str]
+    ) -> tuple[list[str], dict[str, Matrix]]:
+        """Return where whole recordings need more than the weight, in words, and of each axis how many times it.
+
+        Args:
+            recordings: of the same robot and sample time, others than those that the family was fitted to.
+            names: of each.
+
+        Returns:
+            a line for each axis and recording; (recordings, bands) of each axis, NaN where a recording does not
+            excite the band. What is 1 or less does not invalidate the family, and is not thereby explained by it.
+
+        Raises:
+            DataError: another robot or sample time, or a family that was not tested against data.
+        """
+        if not self.measured:
+            raise DataError(
+                "the family was not tested against data, so it has no weight to compare with; fit it again."
+            )
+        for part in recordings:
+            require_same_robot(part.robot, self.robot, "family and recordings")
+            if abs(part.sample_time - self.sample_time) > 1e-6 * self.sample_time:
+                raise DataError(f"the family is at {self.sample_time:g} s, a recording at {part.sample_time:g} s.")
+        source = str(self.settings.get("source", "set_points"))
+        weights = redefinition_matrix()[:2] if self.directions is None else self.directions
+        directions = Directions(self.robot.outputs.names, weights, np.ones(len(weights)), learned=False)
+        responses, why = measured_responses(recordings, source)
+        lines, table = list(why), {}
+        for axis, name in enumerate(self.axes):
+            if name in self.measured:
+                points = axis_points(responses, axis, directions, float(self.findings["tested"]["confidence"]))
+                runs = axis_runs(recordings, directions, source, axis)
+                judged = judge_records(runs, self.measured[name], points, self.sample_time)
+                table[name] = judged
+                lines += needed_lines(replace(self.measured[name], needed=judged), names, name)
+        return lines, table
+
     def summary(self) -> str:
         """Return a few lines, in degrees; of another robot in the SI units of its channels."""
         if not self.robot.is_neck:
@@ -136,10 +195,31 @@ class Family:
             lines.append(f"compression: G_delta(s) = exp(-{L:.3f} s) {1e3 * K * p:.3f}/(s + {p:.2f}) mm/rad")
         else:
             lines.append("compression: not recorded or not excited, so there is no G_delta")
+        lines += self._measured_lines()
         for key in ("free_run_fit", "caution"):
             if key in self.findings:
                 lines.append(f"{key}: {self.findings[key]}")
         return "\n".join(lines)
+
+    def _measured_lines(self) -> list[str]:
+        """Return what the recordings themselves say, or that they were not asked."""
+        told = self.findings.get("tested", {})
+        lines = []
+        for name in self.axes:
+            found = self.measured.get(name)
+            if found is None:
+                lines.append(f"{name}: not tested against data{''.join(f'; {why}' for why in told.get('why', [])[:1])}")
+                continue
+            low, high = found.band
+            poles = ", ".join(f"{-root.real:.3g}" for root in np.roots(np.concatenate([[1.0], found.model.a])))
+            lines.append(
+                f"{name}: the data excite {low:.2g} to {high:.2g} rad/s; there every response measured is within the "
+                f"weight (at most {found.weight.max():.2g}) of poles at {poles} 1/s behind "
+                f"{1e3 * found.model.delay:.0f} ms, each circle with {100 * told.get('confidence', 0.95):.3g} % "
+                "confidence; nothing is known above"
+            )
+            lines += needed_lines(found, told.get("names", []), name)
+        return lines
 
     def _plain_lines(self) -> list[str]:
         lines = [
@@ -155,6 +235,7 @@ class Family:
                 f"{int(axis.used.sum())} samples, |G/G0 - 1| at most {axis.envelope.max():.2f}, by the weight covered "
                 f"to {self.covered(name):.3f}"
             )
+        lines += self._measured_lines()
         return [*lines, f"caution: {self.findings.get('caution', '')}"]
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
@@ -175,10 +256,12 @@ class Family:
             "settings": self.settings,
             "findings": self.findings,
             "lpv_source": None if self.lpv is None else self.lpv.source,
-            **({} if self.robot.is_neck else {"robot": self.robot.as_dict()}),
+            **self.robot.in_header(),
         }
         if self.directions is not None:
             arrays["directions"] = self.directions
+        for name, found in self.measured.items():
+            arrays |= {f"{name}_measured_{key}": value for key, value in found.arrays().items()}
         write_archive(path, header, arrays, force=force)
 
     @classmethod
@@ -197,6 +280,13 @@ class Family:
         weights = arrays.get("directions")
         if not robot.is_neck and (weights is None or weights.shape != (len(axes), len(robot.motors.names))):
             raise FileFormatError("its array `directions` is not of outputs x motors.")
+        measured = {}
+        for name in robot.outputs.names:
+            own = f"{name}_measured_"
+            parts = {key.removeprefix(own): value for key, value in arrays.items() if key.startswith(own)}
+            if parts:
+                names = header["findings"].get("tested", {}).get("names", [])
+                measured[name] = AxisMeasured.from_arrays(parts, len(names))
         lpv = None
         if header["lpv_source"] is not None:
             parts = {key: arrays[f"lpv_{key}"] for key in ("knots", "gains", "poles", "delays")}
@@ -216,6 +306,7 @@ class Family:
             findings=header["findings"],
             robot=robot,
             directions=weights,
+            measured=measured,
         )
 
     def _axis(self, output: str) -> AxisFamily:
@@ -247,14 +338,8 @@ def one_pole(numbers: Vector) -> Continuous:
 
 def relative_errors(samples: Matrix, nominal: Vector, frequency: Vector, sample_time: float) -> Matrix:
     """Return `|G/G0 - 1|` (n, m) of all samples at `frequency` [rad/s], inputs held between samples."""
-    G0 = _response(one_pole(nominal), frequency, sample_time)
-    return np.array([np.abs(_response(one_pole(row), frequency, sample_time) / G0 - 1.0) for row in samples])
-
-
-def _response(model: Continuous, frequency: Vector, sample_time: float) -> np.ndarray:
-    a, b, d = model.sampled(sample_time)
-    z = np.exp(1j * frequency * sample_time)
-    return np.polyval(b, z) / np.polyval(np.concatenate([[1.0], a]), z) * z ** (a.size - b.size - d)
+    G0 = response_of(one_pole(nominal), frequency, sample_time)
+    return np.array([np.abs(response_of(one_pole(row), frequency, sample_time) / G0 - 1.0) for row in samples])
 
 
 def _cross_line(cross: Matrix) -> str:

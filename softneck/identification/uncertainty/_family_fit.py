@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,19 @@ from ._envelope import envelope_weight
 from ._family import AXES, SCOPES, AxisFamily, Family, one_pole, relative_errors
 from ._local_models import Local, Window, axis_inputs, fit_local, windows
 from ._lpv import Lpv, fit_lpv
+from ._measured import (
+    AxisMeasured,
+    axis_points,
+    axis_runs,
+    band_borders,
+    covering_weight,
+    digest,
+    judge_records,
+    measured_responses,
+    middle_model,
+    raised,
+)
+from ._order import choose_order
 
 _RUNS_NEEDED = 100
 
@@ -132,6 +145,7 @@ class FamilySettings:
         source: "set_points", or "positions" of the motors.
         lpv_knots: fit an interpolation of gain and pole over so many inclinations, judged in free run on the last
             30 % of each run; 0 for none.
+        confidence: of each circle of the measured frequency responses that the weight of the data covers.
     """
 
     window: float = 8.0
@@ -143,6 +157,7 @@ class FamilySettings:
     max_delay: float = 0.3
     source: str = "set_points"
     lpv_knots: int = 0
+    confidence: float = 0.95
 
     def __post_init__(self) -> None:
         require_between("window", self.window, 1.0, 1000.0, "s")
@@ -153,9 +168,21 @@ class FamilySettings:
         require_positive("max_delay", self.max_delay, "s")
         require_one_of("source", self.source, SOURCES)
         require_whole("lpv_knots", self.lpv_knots, 0, 12)
+        require_between("confidence", self.confidence, 0.5, 0.9999)
 
-    def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Family:
+    def fit(
+        self,
+        recordings: Recording | list[Recording],
+        *,
+        names: Sequence[str] | None = None,
+        progress: Progress = silent,
+    ) -> Family:
         """Return the family of one or several recordings of one sample time.
+
+        Args:
+            recordings: of one robot.
+            names: of the recordings, for messages; "recording 1" and so on if not given.
+            progress: called now and then.
 
         Raises:
             DataError: too short, other sample times, or too few local models that say enough.
@@ -195,6 +222,8 @@ class FamilySettings:
         if robot.is_neck:
             squeezed = fit_compression(parts, SrivcFitOptions(sample_time=sample_time, offset=True), self.source)
         lpv, fits = self._lpv(parts, axes, sample_time) if self.lpv_knots > 0 else (None, {})
+        progress(0.9, "frequency responses")
+        measured, tested = self._measured(search, parts, directions, nominal, names)
         progress(1.0, "done")
         return Family(
             sample_time=sample_time,
@@ -210,12 +239,66 @@ class FamilySettings:
                 "windows": len(cut),
                 "windows_that_said_too_little": dropped,
                 "caution": _CAUTION,
+                "tested": tested,
                 **({} if robot.is_neck else directions.findings()),
                 **fits,
             },
             robot=robot,
             directions=None if robot.is_neck else directions.weights,
+            measured=measured,
         )
+
+    def _measured(
+        self,
+        search: SrivcFitOptions,
+        parts: list[Recording],
+        directions: Directions,
+        nominal: Sequence[Continuous],
+        names: Sequence[str] | None,
+    ) -> tuple[dict[str, AxisMeasured], dict[str, Any]]:
+        """Return what the recordings show of each axis, and what the findings say of that."""
+        named = list(names) if names is not None else [f"recording {k + 1}" for k in range(len(parts))]
+        if len(named) != len(parts):
+            raise DataError(f"{len(named)} names were given for {len(parts)} recordings; give one for each.")
+        responses, why = measured_responses(parts, self.source)
+        found = {}
+        for axis, name in enumerate(directions.names):
+            points = axis_points(responses, axis, directions, self.confidence)
+            # One frequency is no band.
+            if points.size and points[:, 1].max() > 1.1 * points[:, 1].min():
+                found[name] = self._measured_axis(search, parts, directions, axis, points, nominal[axis])
+            else:
+                why.append(f"{name}: no band of its response is known within 30 %; record `multisine --band 0.5,25`")
+        amplitudes = [[] if response is None else response.amplitude.tolist() for response in responses]
+        tested = {
+            "confidence": self.confidence, "names": named, "sha256": [digest(part) for part in parts],
+            "amplitude": [max(sizes, default=0.0) for sizes in amplitudes], "why": why,
+        }  # fmt: skip
+        return found, tested
+
+    def _measured_axis(
+        self,
+        search: SrivcFitOptions,
+        parts: list[Recording],
+        directions: Directions,
+        axis: int,
+        points: Matrix,
+        near: Continuous,
+    ) -> AxisMeasured:
+        Ts = search.sample_time
+        runs = axis_runs(parts, directions, self.source, axis)
+        model, held_out = choose_order(search, [run for part in runs for run in part], near)
+        if model is None:
+            raise DataError(f"{directions.names[axis]}: no model of one to three poles fits; record with more motion.")
+        model = middle_model(model, points, Ts, search.max_delay)
+        frequency, weight = covering_weight(model, points, Ts)
+        borders = band_borders(float(frequency[0]), float(frequency[-1]))
+        first = AxisMeasured(
+            model=model, held_out=held_out, points=points, frequency=frequency, weight=weight, borders=borders,
+            needed=np.zeros((0, borders.size - 1)),
+        )  # fmt: skip
+        cover = raised(replace(first, needed=judge_records(runs, first, points, Ts)))
+        return replace(cover, needed=judge_records(runs, cover, points, Ts))
 
     def _local_models(
         self, search: SrivcFitOptions, cut: Sequence[Window], axis: int, recordings: int, slow: float

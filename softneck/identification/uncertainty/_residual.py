@@ -20,19 +20,22 @@ from softneck.core import (
 from softneck.signals import Recording
 
 from ..models._arrays import COMPOSED, memory_of, prefixed_arrays
-from ..models._fitting import row_hashes, training_recording
+from ..models._directions import directions_of, regressor_units
+from ..models._fitting import in_display_unit, row_hashes, training_recording
 from ..models._model import WARM_UP, Model
 from ..models._ports import trained_set_points
 from ..models._regressors import lag_table
 from ..models._scores import nrmse_fit
 from ..set_membership._regressor import gammas, residual_lags, residual_rows, scaled, set_arrays
-from ..set_membership._set_membership import noise_level
+from ..set_membership._set_membership import noise_levels
 from ._ensemble import seeded
 
 # Of the noise: below what the base and the last 0.8 s leave unexplained, gamma and the bounds' width grow a
 # hundredfold; the fit hardly feels it.
 _SIGMAS = (4.0, 8.0, 16.0, 32.0)
 _HOLD_OUT = 0.2
+# What a base found that is said of the whole.
+_TAKEN = ("remark", "interrupted", "time_constants_s", "directions", "directions_from")
 # Fits [points] that are alike.
 _ALIKE = 0.5
 # A radian of motor tilts the neck by about 0.2 rad: 5 makes the two equal in the norm.
@@ -45,9 +48,10 @@ class Residual:
 
     Attributes:
         base: kind, with its default settings.
-        epsilon: noise bound [rad]; None takes 4, 8, 16 or 32 standard deviations of the noise,
-            whichever gives the narrowest bounds among equal fits.
-        angle_weight: weight of the base's angles in the regressor's norm, motors having 1.
+        epsilon: noise bound [rad, or the SI unit of the outputs]; None takes 4, 8, 16 or 32 standard deviations of
+            the noise, whichever gives the narrowest bounds among equal fits.
+        angle_weight: weight of the base's outputs in the regressor's norm, motors having 1; of another robot where
+            both move as much as a neck's.
         seed: of a base that starts at random.
     """
 
@@ -71,7 +75,7 @@ class Residual:
         Raises:
             DataError: what the base raises, or `epsilon` so small that no function fits the residual.
         """
-        recording = training_recording(recordings)
+        recording = training_recording(recordings, any_robot=True)
         base = seeded(self.base, self.seed).fit(recording, progress=lambda done, what: progress(0.9 * done, what))
         progress(0.9, "set membership on what it leaves over")
         model = self.on(base, recording)
@@ -80,16 +84,16 @@ class Residual:
 
     def on(self, base: Model, recording: Recording) -> Model:
         """Return a set over the residual of a base that is there already."""
-        noise = np.array([noise_level(recording, axis) for axis in range(2)])
-        given = self.epsilon
-        epsilon = self._narrowest(base, recording, noise) if given is None else np.full(2, given)
+        noise, given = noise_levels(recording), self.epsilon
+        epsilon = self._narrowest(base, recording, noise) if given is None else np.full(noise.size, given)
+        robot = recording.robot
         arrays, gamma = self._arrays(base, recording, epsilon)
         findings = {
             "base": base.kind,
-            "epsilon_deg": np.degrees(epsilon).tolist(),
+            f"epsilon_{robot.outputs.display_unit}": in_display_unit(robot, epsilon).tolist(),
             "gamma": gamma.tolist(),
             "points": int(arrays["values"].shape[1]),
-            **{key: value for key, value in base.findings.items() if key in ("remark", "interrupted")},
+            **{key: value for key, value in base.findings.items() if key in _TAKEN},
             **trained_set_points(recording, base.findings),
         }
         return Model(
@@ -99,36 +103,42 @@ class Residual:
             settings={**asdict(self), "base": base.kind},
             findings=findings,
             training_rows=np.unique(np.concatenate([base.training_rows, row_hashes(recording)])),
+            robot=robot,
         )
 
     def _narrowest(self, base: Model, recording: Recording, noise: Vector) -> Vector:
-        """Return the epsilon (2,) whose bounds are narrowest over the last fifth of each run, among equal fits."""
+        """Return the epsilon (outputs,) of the narrowest bounds over the last fifth of each run, among equal fits."""
         head, tail = recording.split(1.0 - _HOLD_OUT)
         if len(tail) <= 2 * WARM_UP:
             return _SIGMAS[0] * noise
         found: list[tuple[float, float, Vector]] = []
+        lower = noise.size + recording.set_points.shape[1] + 2 * np.arange(noise.size)
         for sigmas in _SIGMAS:
             arrays, _ = self._arrays(base, head, sigmas * noise)
-            Y = Model(kind="residual", sample_time=head.sample_time, arrays=arrays).simulate(tail)[WARM_UP:]
-            fit = sum(nrmse_fit(tail.outputs[WARM_UP:, axis], Y[:, axis]) for axis in range(2)) / 2.0
-            found.append((fit, float(np.mean(Y[:, [6, 8]] - Y[:, [5, 7]])), sigmas * noise))
+            model = Model(kind="residual", sample_time=head.sample_time, arrays=arrays, robot=recording.robot)
+            Y = model.simulate(tail)[WARM_UP:]
+            fit = sum(nrmse_fit(tail.outputs[WARM_UP:, axis], Y[:, axis]) for axis in range(noise.size)) / noise.size
+            found.append((fit, float(np.mean(Y[:, lower + 1] - Y[:, lower])), sigmas * noise))
         best = max(fit for fit, _, _ in found)
         return min((entry for entry in found if entry[0] >= best - _ALIKE), key=lambda entry: entry[1])[2]
 
     def _arrays(self, base: Model, recording: Recording, epsilon: Vector) -> tuple[dict[str, Matrix], Vector]:
-        lags = residual_lags(recording.sample_time)
-        table = lag_table(lags, (), lags, both_outputs=True)
-        scale = np.where(table[:, 0] == 3, self.angle_weight, 1.0)
-        rows = [residual_rows(recording, base, table, axis) for axis in range(2)]
+        directions = directions_of(recording, [run.set_points for run in recording.runs()])
+        lags = residual_lags(recording.sample_time / directions.stretch, recording)
+        sizes = recording.set_points.shape[1], recording.outputs.shape[1]
+        table = lag_table(lags, (), lags, both_outputs=True, sizes=sizes)
+        scale = np.where(table[:, 0] == 3, self.angle_weight, 1.0) * regressor_units(recording, table)
+        rows = [residual_rows(recording, base, table, axis) for axis in range(sizes[1])]
         points = [(scaled(X, scale), y) for X, y in rows]
         gamma = gammas(rows, scale, [epsilon])[0]
         if gamma.max() > 1e100:
+            tried, unit = in_display_unit(recording.robot, epsilon), recording.robot.outputs.display_unit
             raise DataError(
-                f"epsilon {np.degrees(epsilon).round(4).tolist()} deg is below the noise: equal regressors have "
+                f"epsilon {tried.round(4).tolist()} {unit} is below the noise: equal regressors have "
                 "residuals further apart. Set `epsilon` higher."
             )
         arrays = {
-            "history": np.array([float(table[:, 2].max())]),
+            "history": np.array([float(table[:, 2].max()), *([] if recording.robot.is_neck else sizes[::-1])]),
             "memory": np.array([float(memory_of(base.arrays))]),
             "table": table,
             "scale": scale,

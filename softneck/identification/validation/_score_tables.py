@@ -54,6 +54,9 @@ def _range(measured: Matrix, least: float) -> tuple[Vector, float]:
     return middle, float(max(widths))
 
 
+# Blocks over which the spread of a fit is shown: eight say how they differ, and 2 s are ten time constants of a neck.
+_MOST_BLOCKS, _LEAST_BLOCK = 8, 100
+
 #: The name of the free run among the horizons of a validation.
 INFINITE = "inf"
 
@@ -116,6 +119,43 @@ def run_tables(
             }
         )
     return entries
+
+
+def spread_tables(rows: Rows, free: Matrix, parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return between which fits [%] the free run lies: over the stretches judged, and over blocks of equal length.
+
+    A block's error is compared with the motion of all rows, as one that stands still has none of its own.
+
+    Args:
+        rows: those judged.
+        free: (time, outputs) the free run.
+        parts: of `run_tables`.
+    """
+    runs = {axis: [part["fits"][INFINITE][axis] for part in parts] for axis in rows.names}
+    squares = (rows.measured - free) ** 2
+    there = np.flatnonzero(np.isfinite(squares).any(axis=1))
+    blocks = (
+        np.array_split(there, min(_MOST_BLOCKS, there.size // _LEAST_BLOCK)) if there.size >= 2 * _LEAST_BLOCK else []
+    )
+    spread = [float(np.nanstd(y)) if np.isfinite(y).any() else 0.0 for y in rows.measured.T]
+    found = {
+        axis: [
+            100.0 * (1.0 - float(np.sqrt(np.nanmean(squares[block, i]))) / spread[i])
+            for block in blocks
+            if spread[i] > 0.0 and np.isfinite(squares[block, i]).any()
+        ]
+        for i, axis in enumerate(rows.names)
+    }
+    return {
+        "runs": {axis: _ends(fits) for axis, fits in runs.items()},
+        "blocks": {axis: _ends(fits) for axis, fits in found.items()},
+    }
+
+
+def _ends(fits: Sequence[float | None]) -> list[float] | None:
+    """Return the least and the largest; None of fewer than two, or where one diverged."""
+    known = [fit for fit in fits if fit is not None]
+    return [min(known), max(known)] if len(known) == len(fits) > 1 else None
 
 
 def interval_tables(

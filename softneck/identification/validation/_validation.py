@@ -12,7 +12,7 @@ from softneck.core import DataError, Matrix, Vector, require_one_of
 from softneck.robot import Robot
 from softneck.signals import Recording
 
-from ..models._model import Model
+from ..models._model import WARM_UP, Model
 from ._baselines import Baselines, baselines
 from ._horizons import predict
 from ._novelty import Novelty, novelty
@@ -26,6 +26,7 @@ from ._score_tables import (
     outside_table,
     run_tables,
     score_tables,
+    spread_tables,
 )
 from ._scored_rows import Rows, ScoredStretch, pooled, unseen_stretches
 
@@ -53,6 +54,10 @@ class Validation:
         noise_ceiling: axis -> fit [%] of a perfect model; None where no set-points were repeated.
         per_run: the same scores for each stretch of rows that follow each other, with its `stretch`, `run`,
             `start_s`, `rows_scored` and `diverged`.
+        cold_fits: fit [%] of a free run that knows the first row only, as an FMU starts, on the same rows; None where
+            it diverged.
+        spread: "runs" and "blocks" -> axis -> least and largest fit [%] of the free run over stretches of rows, and
+            over up to eight blocks of equal length; None where there is one alone.
         diverged: time [s] at which the first free run left the data's range, or None.
         residual_tests: of the one-step errors; `white` and `uncorrelated` are their verdicts.
         novelty: how far the judged rows lie from the training rows, where these are known.
@@ -81,6 +86,8 @@ class Validation:
     best_linear: Scores
     noise_ceiling: dict[str, float | None]
     per_run: list[dict[str, Any]]
+    cold_fits: dict[str, float | None]
+    spread: dict[str, dict[str, list[float] | None]]
     diverged: float | None
     residual_tests: ResidualTests
     novelty: Novelty | None
@@ -134,6 +141,8 @@ class Validation:
             "worst_time_s": self.worst_time,
             "r2": self.r2,
             "diverged": self.diverged,
+            "cold_fits": self.cold_fits,
+            "spread": self.spread,
             "residuals": {
                 "white": self.white,
                 "uncorrelated_with_inputs": self.uncorrelated,
@@ -158,9 +167,11 @@ class Rules:
     horizons: tuple[int | str, ...] = _HORIZONS
     motors: str = "simulated"
     include_training: bool = False
+    initial: str = "warm"
 
     def __post_init__(self) -> None:
         require_one_of("motors", self.motors, ("simulated", "measured"))
+        require_one_of("initial", self.initial, ("warm", "cold"))
         for horizon in self.horizons:
             if horizon != INFINITE and (not isinstance(horizon, int) or horizon < 1):
                 raise DataError(f"a horizon is a number of samples from 1, or `inf`; got {horizon!r}.")
@@ -174,12 +185,14 @@ def validate(
     horizons: Sequence[int | str] = _HORIZONS,
     motors: str = "simulated",
     include_training: bool = False,
+    initial: str = "warm",
     training: Recording | None = None,
 ) -> Validation:
     """Judge a model on the rows of a recording that it was not trained on.
 
     Each stretch of unseen rows starts from 25 measured samples, which are not scored. A free run then has the
-    set-points alone, or the logged motor positions as well (`motors="measured"`).
+    set-points alone, or the logged motor positions as well (`motors="measured"`). `cold_fits` are of a free run that
+    had the first row only.
 
     Args:
         model: of any kind.
@@ -188,13 +201,14 @@ def validate(
         horizons: samples ahead; "inf" is the free run.
         motors: "simulated" or "measured".
         include_training: whether rows that the model was trained on are judged too.
+        initial: "warm", or "cold": then the free run itself has the first row only.
         training: what the model was trained on, for `novelty`.
 
     Raises:
         DataError: nothing is left to judge, another sample time, no motor positions to measure, or a horizon longer
             than every stretch.
     """
-    rules = Rules(tuple(horizons), motors, include_training)
+    rules = Rules(tuple(horizons), motors, include_training, initial)
     check_training_data(model, training)
     parts = judged_parts(model, recording, rules)
     return judge(model, parts, rules, names=names, training=training)
@@ -263,6 +277,7 @@ def judge(
     free = outputs.get(INFINITE, np.full((rows.time.size, axes), np.nan))
     lower, upper = free_run_bounds(free, rows.robot)
     coverage, width = coverage_tables(rows, rows.measured, lower, upper)
+    per_run = run_tables(parts.stretches, rows, measured, predicted, lost)
     return Validation(
         model=names[0],
         data=names[1],
@@ -274,7 +289,9 @@ def judge(
         intervals=interval_tables(rows, measured, predicted, model.sample_time, lost=first is not None),
         best_linear=parts.baselines.best_linear,
         noise_ceiling=parts.baselines.noise_ceiling,
-        per_run=run_tables(parts.stretches, rows, measured, predicted, lost),
+        per_run=per_run,
+        cold_fits=_cold_fits(model, parts, rules) if INFINITE in outputs else dict.fromkeys(rows.names),
+        spread=spread_tables(rows, free[:, :axes], per_run) if INFINITE in outputs else {},
         diverged=first,
         residual_tests=tests,
         novelty=novelty(model, parts.stretches, training) if rows.robot.is_neck else None,
@@ -292,13 +309,26 @@ def judge(
     )
 
 
+def _cold_fits(model: Model, parts: Parts, rules: Rules) -> dict[str, float | None]:
+    """Return the fit [%] of each output in free run from the first row of each stretch; None where it diverged."""
+    rows = parts.rows
+    free = np.concatenate([model.simulate(s.recording, motors=rules.motors, warm_up=0) for s in parts.stretches])
+    free = free[:, : len(rows.names)]
+    lost = divergence(rows.time, rows.stretch, free, rows.measured, neck=rows.robot.is_neck)
+    measured = {INFINITE: rows.measured}
+    gone = any(t is not None for t in lost)
+    return score_tables(rows, rows.time, measured, {INFINITE: free}, lost=gone)["fits"][INFINITE]
+
+
 def _predictions(model: Model, parts: Parts, rules: Rules) -> dict[str, Matrix]:
     """Return horizon -> outputs (time, n_out) of all stretches; one step ahead always, for the residual tests."""
     runs = [stretch.recording for stretch in parts.stretches]
     result: dict[str, Matrix] = {}
     for horizon in dict.fromkeys((1, *rules.horizons)):
         if horizon == INFINITE:
-            result[INFINITE] = np.concatenate([model.simulate(run, motors=rules.motors) for run in runs])
+            warm_up = WARM_UP if rules.initial == "warm" else 0
+            free = [model.simulate(run, motors=rules.motors, warm_up=warm_up) for run in runs]
+            result[INFINITE] = np.concatenate(free)
         else:
             k = int(horizon)
             result[str(k)] = predict(model, runs, k, motors=rules.motors, stride=parts.rows.stride(k))

@@ -11,9 +11,11 @@ import pytest
 from softneck.core import DataError, SettingsError, load
 from softneck.identification import INFINITE, Model, Rls, Search, SetMembership, search, validate
 from softneck.identification.models._fitting import row_hashes
+from softneck.identification.selection._trials import _diverged
+from softneck.robot import Robot
 from softneck.signals import Recording
 
-from ...data import Truth, neck_recording
+from ...data import Truth, first_order, neck_recording
 
 # Both axes with one dead time of 3 samples, which a search can find.
 TRUTH = Truth(delay=(3, 3))
@@ -36,6 +38,30 @@ def test_each_trial_is_the_fit_that_a_user_makes_by_hand(found: Search) -> None:
         assert trial.free_run == judged.fits[INFINITE]
         assert trial.one_step == judged.fits["1"]
         assert trial.size == trial.settings["na"] + 1
+
+
+def test_a_search_is_of_any_robot_and_of_one() -> None:
+    finger, antagonist = Robot.preset("finger"), Robot.preset("antagonist")
+    train, hold_out = (one.split(0.6)[part] for part, one in enumerate([one_pole(finger)] * 2))
+    done = search(Rls(), {"na": [1, 2], "delay": [0.02, 0.06]}, train, hold_out)
+    assert done.best == {"na": 1, "delay": 0.06}
+    assert list(done.chosen.free_run) == ["pitch"]
+    assert [len(row) for row in done.curves["na"]] == [3, 3]
+    assert done.model.robot.hash == finger.hash
+    # What runs away does so by the range that was measured, in whatever unit.
+    assert _diverged(hold_out, np.full((len(hold_out), 1), 1e6), hold_out.outputs) == hold_out.time[0]
+    with pytest.raises(DataError, match="the recordings of a search of two robots"):
+        search(Rls(), {"na": [1]}, train, one_pole(antagonist))
+
+
+def one_pole(robot: Robot) -> Recording:
+    """`TRUTH` along one direction."""
+    U = np.repeat(np.random.default_rng(2).uniform(-2.0, 2.0, (60, len(robot.motors.names))), 10, axis=0)
+    weights = robot.weights()
+    assert weights is not None
+    y = first_order(U @ weights[0], 0.88, 0.011, 3) + 5e-4 * np.random.default_rng(3).standard_normal(len(U))
+    channels = dict(zip(robot.set_points, U.T, strict=True)) | {"pitch": y}
+    return Recording(0.02 * np.arange(len(U)), 0.02, channels, robot=robot)
 
 
 def test_the_dead_time_that_made_the_data_is_found(found: Search) -> None:

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import statsmodels.api as sm
 
+from softneck.core import load
 from softneck.identification import INFINITE, GreyBox, Model, validate
 from softneck.identification.structured._arrays import NUMBERS
 from softneck.identification.structured._greybox import INTERRUPTED, _table
 from softneck.plant import NeckParameters, VirtualNeck, record
+from softneck.robot import Robot
 from softneck.runtime import load_functions
 from softneck.signals import SET_POINTS, Recording, signal
 from softneck.signals.recording._channels import MOTOR_POSITIONS
@@ -118,6 +122,9 @@ def test_the_numbers_behind_its_own_equations_are_found(fitted: Model, truth: np
 class _Line:
     """A problem whose errors are linear in what is searched, so that least squares says all about it."""
 
+    numbers = NUMBERS
+    directions = SimpleNamespace(stretch=1.0)
+
     def __init__(self) -> None:
         rng = np.random.default_rng(0)
         self.A = rng.standard_normal((400, len(NUMBERS)))
@@ -126,6 +133,39 @@ class _Line:
     def errors(self, x: np.ndarray, delay: int) -> np.ndarray:
         del delay
         return self.A @ (x - np.array([number.encode(number.guess) for number in NUMBERS])) - self.noise
+
+
+def tendons_of(*degrees: float, axes: int = 2) -> np.ndarray:
+    """What stands behind the numbers for tendons at these angles, by its definition."""
+    e = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)) * (axes > 1)])
+    return np.concatenate([[np.linalg.eigvalsh(e @ e.T).max() / len(degrees)], *e])
+
+
+def run_tendons(numbers: np.ndarray, U: np.ndarray, axes: int) -> np.ndarray:
+    M, Y = np.empty(U.shape), np.empty((len(U), axes))
+    FUNCTIONS.neck_run(numbers, TS, np.full(U.shape[1], 3.0), 2, 50, U, U[0].copy(), M, Y)
+    return Y
+
+
+def test_tendons_where_those_of_a_neck_are_bend_as_a_neck() -> None:
+    numbers = GUESS.copy()
+    numbers[NAMES.index("twist")] = 0.1
+    U = np.ascontiguousarray(signal("eq22").set_points[:200])
+    at = np.concatenate([numbers, tendons_of(0.0, 120.0, 240.0)])
+    # Sines of sums in two ways: rounding along 200 samples.
+    np.testing.assert_allclose(run_tendons(at, U, 2), run(numbers, U)[1], rtol=0, atol=1e-12)
+
+
+def test_a_robot_of_one_output_bends_in_its_plane_as_one_with_two_tendons_there() -> None:
+    u = signal("eq22").set_points[:200, :1]
+    pair = np.ascontiguousarray(np.column_stack([u, -u]))
+    one = run_tendons(np.concatenate([GUESS, tendons_of(0.0, 180.0, axes=1)]), pair, 1)
+    both = run_tendons(np.concatenate([GUESS, tendons_of(0.0, 180.0)]), pair, 2)
+    # Rounding of sin 180 deg.
+    np.testing.assert_allclose(both, np.column_stack([one, np.zeros(200)]), rtol=0, atol=1e-12)
+    # Mirrored motors bend the other way: what is between two tendons is symmetric.
+    other = run_tendons(np.concatenate([GUESS, tendons_of(0.0, 180.0, axes=1)]), np.ascontiguousarray(pair[:, ::-1]), 1)
+    np.testing.assert_allclose(other, -one, rtol=0, atol=1e-12)
 
 
 def test_intervals_of_a_linear_problem_are_those_of_ordinary_least_squares() -> None:
@@ -183,3 +223,23 @@ def test_the_figures_of_the_issue_on_the_virtual_neck() -> None:
     for name, least in {"validation": 96.0, "steps": 92.5, "sine": 93.0, "rotation": 93.0}.items():
         fits = validate(model, made[name], horizons=(INFINITE,)).fits[INFINITE]
         assert min(fit or 0.0 for fit in fits.values()) >= least, name
+
+
+@pytest.mark.slow
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", ["antagonist", "trunk4"])
+def test_a_virtual_robot_with_a_payload_is_followed_by_the_equations_of_its_tendons(name: str, tmp_path: Path) -> None:
+    robot = Robot.preset(name)
+    train, test = (
+        record(signal(kind, duration=duration, seed=seed, robot=robot), VirtualNeck.of(robot), payload=0.2, seed=seed)
+        for kind, duration, seed in (("mixed", 40.0, 1), ("aprbs", 20.0, 5))
+    )
+    model = GreyBox(evaluations=25, sensor_delay=3).fit(train)
+    # The neck itself, from as little and judged by as large motions: 93/93 %.
+    assert all((fit or 0.0) > 85.0 for fit in validate(model, test).fits[INFINITE].values())
+    known = {row["name"] for row in model.findings["numbers"]}
+    assert ("twist" in known) is (name == "trunk4")
+    # 7.5 mm of winch for some 50 mm of tendon radius.
+    assert {row["name"]: row["value"] for row in model.findings["numbers"]}["lever"] == pytest.approx(6.7, rel=0.15)
+    model.save(tmp_path / "m.npz")
+    np.testing.assert_array_equal(load(tmp_path / "m.npz").simulate(test), model.simulate(test))

@@ -250,7 +250,11 @@ static void sn_warn_outside(sn_instance *s, uint32_t i, double value)
 {
     const sn_port *port = &s->model.ports[i];
     size_t n = strlen(port->name);
-    int angle = n > 10 && strcmp(port->name + n - 10, "_reference") == 0 && strcmp(port->unit, "rad") == 0;
+    /* A set-point just outside of what was trained is in rad all the same. */
+    int far = fabs(value) > 2.0 * (port->high > -port->low ? port->high : -port->low);
+    int asked = (n > 10 && strcmp(port->name + n - 10, "_reference") == 0) ||
+                (strncmp(port->name, "motor_setpoint_", 15) == 0 && far);
+    int angle = asked && strcmp(port->unit, "rad") == 0;
     if (s->warned[i])
         return;
     s->warned[i] = 1;

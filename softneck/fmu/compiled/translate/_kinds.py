@@ -24,6 +24,7 @@ _NECKS = (
     "softneck.identification.structured._greybox_runtime",
     "softneck.identification.uncertainty._residual_runtime",
     "softneck.identification.uncertainty._ensemble_runtime",
+    "softneck.identification.uncertainty._guarded_runtime",
     "softneck.plant._neck_runtime",
     "softneck.estimation._kalman_runtime",
     "softneck.estimation._steady_kalman_runtime",
@@ -36,6 +37,10 @@ _NECKS = (
 )
 # Those that robots of other sizes have; once more for all of these, so that the neck's know their sizes beforehand.
 _ROBOTS = (
+    "softneck.identification.set_membership._nlsm_runtime",
+    "softneck.identification.structured._greybox_runtime",
+    "softneck.identification.uncertainty._residual_runtime",
+    "softneck.identification.uncertainty._ensemble_runtime",
     "softneck.identification.networks._nn_runtime",
     "softneck.identification.networks._nss_observed_runtime",
     "softneck.identification.linear._affine_runtime",

@@ -1,0 +1,118 @@
+"""Print how well `identify auto` predicts: its scores beside what the kinds are then worth on tests it never saw.
+
+`python benchmarks/predicts.py [--necks NECK...] [--seed N] [--workers N] [--fresh]`
+
+On each neck `choose` gets 140 s of Eq. 22, the last 30 % held out. What a kind is truly worth is its worst axis of
+steps, sine and rotation in free run, trained with its defaults on the whole 140 s: from `benchmarks/baseline.py`, which
+computes what is not kept. Printed for each neck: the rank correlation (Spearman) over the kinds between the scores and
+the truth, that of the hold-out alone, and the regret: the best kind's worst axis less that of the chosen model.
+Choices are kept in `build/predicts`; they are of the code that made them: use --fresh after a change.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from scipy.stats import rankdata
+from threadpoolctl import threadpool_limits
+
+from benchmarks.baseline import Job, compute, records_of_tests, training
+from softneck.identification import INFINITE, Model, SetMembership, choose, validate
+from tests.foreign_necks.kept import keep, kept_lines
+from tests.foreign_necks.necks import CHOOSING
+
+SHOWN = (*CHOOSING, "paper", "rough")
+OUT = Path("build/predicts")
+# What is judged; `residual` and `ensemble` are made of these, and the baseline has the paper's form of `nlsm`.
+KINDS = ("rls", "oe", "subspace", "greybox", "play", "nn", "nss")
+OTHER_FORM = "nlsm"
+
+
+def worst_axis(model: Model, neck: str, seed: int) -> float:
+    """Return the least free-run fit [%] over the tests and axes; -100 where one diverged."""
+    judged = [validate(model, test, horizons=(INFINITE,)) for test in records_of_tests(neck, seed)]
+    return _least(fit for test in judged for fit in test.fits[INFINITE].values())
+
+
+def _least(fits: Any) -> float:
+    return min(-100.0 if fit is None else max(fit, -100.0) for fit in fits)
+
+
+def chosen(neck: str, seed: int) -> dict[str, Any]:
+    """Return the scores of all kinds, what `auto` took and what that is worth, and the processor time [s]."""
+    whole = training(neck, seed)
+    head, tail = whole.split(0.7)
+    with threadpool_limits(1):
+        begin = time.process_time()
+        choice = choose(head, tail, seed=seed)
+        seconds = time.process_time() - begin
+        return {
+            "scores": {one.kind: one.fit for one in choice.ranking if one.fit > float("-inf")},
+            "hold_out": {one.kind: one.hold_out_fit for one in choice.ranking if one.fit > float("-inf")},
+            "chosen": choice.chosen.kind,
+            "worth": worst_axis(cast(Model, choice.chosen.model), neck, seed),
+            "form": worst_axis(SetMembership(form="residual").fit(whole), neck, seed),
+            "seconds": seconds,
+        }
+
+
+def choices(necks: list[str], seed: int, workers: int, *, fresh: bool) -> dict[str, dict[str, Any]]:
+    """Return what `chosen` finds on each neck; what an earlier run has computed is read."""
+    kept = OUT / f"seed{seed}.jsonl"
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    if fresh:
+        kept.unlink(missing_ok=True)
+    known = {line["neck"]: line["found"] for line in kept_lines(kept)}
+    missing = [neck for neck in necks if neck not in known]
+    with ProcessPoolExecutor(min(workers, max(1, len(missing))), mp_context=get_context("spawn")) as pool:
+        jobs = {pool.submit(chosen, neck, seed): neck for neck in missing}
+        for job in as_completed(jobs):
+            known[jobs[job]] = job.result()
+            keep(kept, {"neck": jobs[job], "found": job.result()})
+    return {neck: known[neck] for neck in necks}
+
+
+def _rank_correlation(a: list[float], b: list[float]) -> float:
+    return float(np.corrcoef(rankdata(a), rankdata(b))[0, 1])
+
+
+def main() -> None:
+    """Read the command line, compute what is missing, and print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--necks", nargs="+", choices=SHOWN, default=list(SHOWN))
+    parser.add_argument("--seed", type=int, default=0, help="of noise and of kinds that start at random (0)")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes (all cores)")
+    parser.add_argument("--fresh", action="store_true", help="choose again; the baseline stays")
+    wanted = parser.parse_args()
+    jobs = [Job("models", neck, kind, wanted.seed) for neck in wanted.necks for kind in KINDS]
+    truths = {
+        job: _least(np.ravel(found["fits"]).tolist())
+        for job, found in compute(jobs, wanted.workers, fresh=False).items()
+    }
+    found = choices(wanted.necks, wanted.seed, wanted.workers, fresh=wanted.fresh)
+    print(f"\n{'neck':8} {'rho':>6} {'hold-out':>9} {'chosen':>9} {'worth':>6} {'best':>9} {'regret':>7} {'cpu s':>6}")
+    rhos = []
+    for neck, one in found.items():
+        truth = {job.kind: fit for job, fit in truths.items() if job.neck == neck} | {OTHER_FORM: one["form"]}
+        kinds = [kind for kind in truth if kind in one["scores"]]
+        worth = [truth[kind] for kind in kinds]
+        rho, held = (_rank_correlation([one[what][kind] for kind in kinds], worth) for what in ("scores", "hold_out"))
+        best = max(truth, key=lambda kind: truth[kind])
+        rhos.append(rho)
+        print(
+            f"{neck:8} {rho:6.2f} {held:9.2f} {one['chosen']:>9} {one['worth']:6.1f} {best:>9} "
+            f"{truth[best] - one['worth']:7.1f} {one['seconds']:6.0f}"
+        )
+        print("         " + ", ".join(f"{kind} {one['scores'][kind]:.0f} ({truth[kind]:.0f})" for kind in kinds))
+    print(f"rank correlation: median {np.median(rhos):.2f}, {min(rhos):.2f} to {max(rhos):.2f} over {len(rhos)} necks")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,184 @@
+"""What a kind is judged by before it is chosen: trainings with something left out, each judged on what was.
+
+Of the record that kinds begin with, the largest and the fastest motions are blanked, and what follows the rows they are
+trained on is held out: a block in time says how a kind interpolates, blocks by *region of the inputs* how it goes on
+where they end. Blanked outputs are missed samples to every kind; the set-points stay, so that no memory is cut. Then
+several runs or recordings are left out one after the other (leave one excitation out).
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from softneck.core import Matrix, Vector
+from softneck.signals import Recording, concatenate
+
+from ..models._arrays import members
+from ..models._fitting import MIN_ROWS
+from ..models._model import WARM_UP, Model
+from ..models._scores import nrmse_fit
+from ._trials import standard_error
+
+# Kinds are compared on so many rows (40 s of Eq. 22); the chosen one is trained on all.
+SCREENED_ROWS = 2000
+# Part of the rows that each region takes, and how far it reaches into what lies before and after [s].
+_REGION, _WIDEN = 0.12, 0.2
+# Over how long a motion is fast or slow [s].
+_MOVED_OVER = 0.5
+# Runs are left out in so many groups at most; a group of fewer rows says nothing of a free run.
+_MOST_GROUPS, _LEAST_ROWS = 3, 10 * WARM_UP
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judged:
+    """Rows that a training did not see.
+
+    Attributes:
+        name: what was left out, for people.
+        recording: to run free over.
+        rows: (time,) which of it count.
+    """
+
+    name: str
+    recording: Recording
+    rows: np.ndarray
+
+    def fit(self, model: Model) -> tuple[float, float]:
+        """Return the mean over the outputs of the free-run fit and its standard error over blocks [%].
+
+        -inf and NaN where the free run is no number.
+        """
+        y = np.where(self.rows[:, None], self.recording.outputs, np.nan)
+        free = simulated(model, self.recording)
+        fits = [nrmse_fit(y[:, i], free[:, i]) for i in range(y.shape[1])]
+        moved = np.isfinite(fits)
+        if not np.isfinite(free).all() or not moved.any():
+            return float("-inf"), float("nan")
+        return float(np.mean(np.array(fits)[moved])), standard_error(y[:, moved], free[:, moved])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fold:
+    """One training, and what it is judged on."""
+
+    train: Recording
+    judged: tuple[Judged, ...]
+
+
+def simulated(model: Model, recording: Recording, warm_up: int = WARM_UP) -> Matrix:
+    """Return the outputs (time, outputs) of a free run.
+
+    An ensemble's is the median of its members', one by one: it compiles for each combination of kinds.
+    """
+    if model.kind != "ensemble":
+        return model.simulate(recording, warm_up=warm_up)[:, : len(model.robot.outputs.names)]
+    parts = [
+        Model(kind=kind, sample_time=model.sample_time, arrays=arrays, robot=model.robot)
+        for kind, arrays in members(model.arrays)
+    ]
+    return np.median([simulated(part, recording, warm_up) for part in parts], axis=0)
+
+
+def folds(train: Recording, hold_out: Recording, *, other_excitation: bool) -> list[Fold]:
+    """Return the trainings with something left out, the one that all kinds begin with first.
+
+    Args:
+        train: all rows to train on.
+        hold_out: shown to no training but those that leave `train` out.
+        other_excitation: whether `hold_out` is another experiment.
+    """
+    head, tail = _thinned(train)
+    blanked, judged = _blanked(head)
+    if tail is not None:
+        judged.append(everything("later block", tail))
+    if other_excitation:
+        judged.append(everything("other excitation", hold_out))
+    found = [Fold(blanked, tuple(judged))] if judged else []
+    for number, (group, others) in enumerate(_groups(train), start=1):
+        found.append(Fold(_thinned(others)[0], (everything(f"excitation {number}", group),)))
+    if other_excitation and len(hold_out) >= _LEAST_ROWS:
+        found.append(Fold(_thinned(hold_out)[0], (everything("trained on the other", head),)))
+    return found
+
+
+def _thinned(recording: Recording) -> tuple[Recording, Recording | None]:
+    """Return the beginnings of all runs, `SCREENED_ROWS` in all, and what follows; None where that is too little."""
+    share = SCREENED_ROWS / len(recording)
+    if share >= 1.0:
+        return recording, None
+    head, tail = recording.split(share)
+    return head, tail if any(len(run) >= _LEAST_ROWS for run in tail.runs()) else None
+
+
+def _groups(train: Recording) -> list[tuple[Recording, Recording]]:
+    """Return groups of runs that follow each other, each with all the others; none of a single run."""
+    runs = train.runs()
+    if len(runs) < 2:
+        return []
+    edges = np.linspace(0, len(runs), min(len(runs), _MOST_GROUPS) + 1).round().astype(int).tolist()
+    found = []
+    for start, stop in itertools.pairwise(edges):
+        group, others = list(runs[start:stop]), [*runs[:start], *runs[stop:]]
+        if min(sum(map(len, part)) for part in (group, others)) >= _LEAST_ROWS:
+            found.append((concatenate(group), concatenate(others)))
+    return found
+
+
+def everything(name: str, recording: Recording) -> Judged:
+    """Return all rows of a recording but those that align each run."""
+    return Judged(name, recording, _scored(recording))
+
+
+def _scored(recording: Recording) -> np.ndarray:
+    """Return (time,) without what aligns each run."""
+    return np.concatenate([np.arange(len(run)) >= WARM_UP for run in recording.runs()])
+
+
+def _blanked(recording: Recording) -> tuple[Recording, list[Judged]]:
+    """Return the recording without its largest and fastest motions, and those; as it was where too little is left."""
+    far, fast = (_widened(recording, size) for size in (_sizes(recording), _speeds(recording)))
+    rest = ~(far | fast)
+    Y = np.where(rest[:, None], recording.outputs, np.nan)
+    if np.isfinite(Y).sum(axis=0).min() < 2 * MIN_ROWS:
+        return recording, []
+    scored = _scored(recording)
+    judged = [Judged("largest motions", recording, far & scored), Judged("fastest motions", recording, fast & scored)]
+    names = recording.robot.outputs.names
+    return recording.with_channels(**dict(zip(names, Y.T, strict=True))), judged
+
+
+def _widened(recording: Recording, size: Vector) -> np.ndarray:
+    """Return (time,) the rows with the largest `size`, and those near them in their run."""
+    reach = round(_WIDEN / recording.sample_time)
+    inside = size > np.quantile(size, 1.0 - _REGION)
+    near = np.ones(2 * reach + 1)
+    parts = np.split(inside, np.cumsum([len(run) for run in recording.runs()])[:-1])
+    return np.concatenate([np.convolve(part, near)[reach : reach + part.size] > 0 for part in parts])
+
+
+def _sizes(recording: Recording) -> Vector:
+    """Return how far the set-points are from their mean (time,), in standard deviations."""
+    return np.linalg.norm(_scaled(recording), axis=1)
+
+
+def _speeds(recording: Recording) -> Vector:
+    """Return how much the set-points change in half a second around each row (time,)."""
+    span = max(round(_MOVED_OVER / recording.sample_time), 1)
+    found, start = np.zeros(len(recording)), 0
+    U = _scaled(recording)
+    for run in recording.runs():
+        u = U[start : start + len(run)]
+        if len(u) > span:
+            middle = start + span // 2
+            found[middle : middle + len(u) - span] = np.linalg.norm(u[span:] - u[:-span], axis=1)
+        start += len(u)
+    return found
+
+
+def _scaled(recording: Recording) -> np.ndarray:
+    U = recording.set_points - recording.set_points.mean(axis=0)
+    spread = U.std(axis=0)
+    return U / np.where(spread > 0.0, spread, 1.0)

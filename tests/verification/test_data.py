@@ -1,0 +1,200 @@
+"""What the data support: margins over the weight of a tested family, its band, own plants, and the worst plant."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from softneck.core import SettingsError
+from softneck.identification import Family
+from softneck.identification.linear._srivc_fit import Continuous
+from softneck.identification.uncertainty._measured import AxisMeasured, band_borders, response_of
+from softneck.plant import NeckParameters
+from softneck.verification import Verification, make_requirements, verify
+from softneck.verification._evidence import Values, worst_row
+from softneck.verification._experiments import Crossing
+from softneck.verification._linear import LinearLaw, margins
+from softneck.verification._own_plants import is_own_plant, own_plant
+from softneck.verification._tested import axis_on_data
+
+from .necks import PAPER, QUICK, TS, family, linear_neck, pi
+
+MODEL = Continuous(a=np.array([PAPER[1]]), b=np.array([PAPER[0] * PAPER[1]]), delay=float(PAPER[2]))
+LAW = LinearLaw.of(pi().ss())
+QUIET = {**QUICK, "neck": {"necks": 0}}
+
+
+def measured(*, weight: float = 0.3, low: float = 0.3, high: float = 25.0) -> AxisMeasured:
+    w, borders = np.geomspace(low, high, 20), band_borders(low, high)
+    return AxisMeasured(
+        model=MODEL, held_out=np.zeros(3), points=np.zeros((0, 5)), frequency=w, weight=np.full(20, weight),
+        borders=borders, needed=np.zeros((2, borders.size - 1)),
+    )  # fmt: skip
+
+
+def on_data(**values: float) -> Family:
+    found = {"confidence": 0.95, "names": ["small.csv", "large.csv"], "sha256": ["a", "b"], "amplitude": [0.3, 2.5]}
+    plain = family()
+    both = {axis: measured(**values) for axis in ("pitch", "roll")}
+    return replace(plain, measured=both, findings={**plain.findings, "tested": {**found, "why": []}})
+
+
+def test_margins_of_a_disk_are_those_of_its_worst_points() -> None:
+    """Closed forms against a thousand points of each disk."""
+    item = axis_on_data(measured(), LAW, 0, source="f", name="pitch", extra=0)
+    w = np.geomspace(0.3, 25.0, 400)
+    L0 = -LAW.feedback(w)[:, 0, 0] * response_of(MODEL, w, TS)
+    D = 0.3 * np.exp(1j * np.linspace(0.0, 2.0 * math.pi, 1000))[:, None]
+    L = L0 * (1.0 + D)
+    S = 1.0 / (1.0 + L)
+    # Five times fewer frequencies and the half steps that the disks are widened by: up to half a percent.
+    assert item.margins["sensitivity"] == pytest.approx(np.abs(S).max(), rel=0.01)
+    assert item.margins["complementary"] == pytest.approx(np.abs(1.0 - S).max(), rel=0.01)
+    assert item.margins["disk_margin"] == pytest.approx(2.0 / np.abs(2.0 * S - 1.0).max(), rel=0.01)
+    assert item.mu == pytest.approx(0.3 * np.abs(L0 / (1.0 + L0)).max(), rel=0.01)
+    # The delay and the gain that bring some point of some disk onto -1; both grids leave a percent.
+    k = np.geomspace(1.0, 6.0, 2000)[:, None]
+    onto = (np.abs(1.0 + k * L0) <= k * 0.3 * np.abs(L0)).any(axis=1)
+    edge = 1.0 / (1.3 * abs(L0[-1]))
+    assert item.margins["gain_margin"] == pytest.approx(min(float(k[int(np.argmax(onto)), 0]), edge), rel=0.01)
+    late = np.linspace(0.0, 0.5, 4000)[:, None]
+    onto = (np.abs(1.0 + L0 * np.exp(-1j * w * late)) <= 0.3 * np.abs(L0)).any(axis=1)
+    assert item.margins["delay_margin_ms"] == pytest.approx(1e3 * float(late[int(np.argmax(onto)), 0]), rel=0.01)
+
+
+def test_without_uncertainty_the_margins_are_those_of_the_plant() -> None:
+    from softneck.verification._linear import judged
+    from softneck.verification._plants import neck_of_model, nominal_plants
+
+    plant = nominal_plants([neck_of_model(linear_neck(), "m", {"gain": 0.0, "pole": 0.0, "delay": 0.0})])[0]
+    exact = margins(plant, LAW, judged(TS, 4000))
+    item = axis_on_data(measured(weight=1e-9, high=100.0), LAW, 0, source="f", name="pitch", extra=0)
+    for name in ("sensitivity", "disk_margin", "gain_margin", "phase_margin_deg", "delay_margin_ms"):
+        # 400 frequencies over two decades and a half: 1.5 % apart, at crossings half of that.
+        assert item.margins[name] == pytest.approx(exact[f"pitch.{name}"][0], rel=0.02), name
+
+
+def test_a_weight_that_may_hold_an_unstable_loop_leaves_no_margin() -> None:
+    item = axis_on_data(measured(weight=1.5, high=100.0), LAW, 0, source="f", name="pitch", extra=0)
+    assert item.mu >= 1.0
+    assert item.margins["gain_margin"] == 1.0
+    assert item.margins["sensitivity"] == math.inf
+
+
+def test_a_gain_margin_ends_where_the_band_does() -> None:
+    wide = axis_on_data(measured(weight=0.01, high=100.0), LAW, 0, source="f", name="pitch", extra=0)
+    narrow = axis_on_data(measured(weight=0.01, high=1.3 * wide.crossover), LAW, 0, source="f", name="pitch", extra=0)
+    # The loop falls about as 1/w at its crossover: 1.3 times the gain moves it to the band's end.
+    assert narrow.margins["gain_margin"] == pytest.approx(1.3, rel=0.1)
+    assert wide.margins["gain_margin"] > 2.0
+    beyond = axis_on_data(measured(weight=0.01, high=0.7 * wide.crossover), LAW, 0, source="f", name="pitch", extra=0)
+    assert beyond.margins == {}
+    assert "not supported by the data: f excites pitch from 0.3 to" in beyond.why()
+    assert "record `multisine --band" in beyond.why()
+
+
+@pytest.fixture(scope="module")
+def supported() -> Verification:
+    return verify(pi(), {"f.npz": on_data(weight=0.15)}, make_requirements(QUIET))
+
+
+@pytest.mark.slow
+def test_the_certificate_says_where_it_is_valid(supported: Verification) -> None:
+    said = supported.contents()
+    assert said["band_rad_s"] == pytest.approx([0.3, 25.0])
+    assert said["amplitude_rad"] == [0.3, 2.5]
+    assert said["confidence_level"] == 0.95
+    assert [row["name"] for row in said["recordings"]] == ["small.csv", "large.csv"]
+    assert said["margins"]["simulated"] == {"gain_ratio": None, "delay_s": None}
+    rows = {row["metric"]: row["value"] for row in said["requirements"]}
+    assert said["margins"]["linear"]["gain_ratio"] == rows["axes.gain_margin"]
+    assert 1e3 * said["margins"]["linear"]["delay_s"] == pytest.approx(rows["axes.delay_margin_ms"])
+
+
+@pytest.mark.slow
+def test_each_verdict_is_the_worst_of_all_plants(supported: Verification) -> None:
+    """A mutant that judged the best one lived."""
+    evidence = supported.evidence
+    for verdict in supported.verdicts:
+        if verdict.value is None:
+            continue
+        values = evidence.metrics[verdict.requirement.metric].values
+        assert verdict.value == (values.min() if verdict.requirement.bound == "min" else values.max())
+        assert verdict.holds is verdict.requirement.holds(verdict.value)
+    part = evidence.linear[0]
+    everywhere = margins(part.plants, part.law, evidence.frequency)
+    for name, worst in (("sensitivity", max), ("disk_margin", min), ("gain_margin", min), ("delay_margin_ms", min)):
+        alone = [everywhere[f"{axis}.{name}"] for axis in ("pitch", "roll")]
+        data = [item.margins[name] for item in evidence.tested]
+        values = evidence.metrics[f"axes.{name}"].values
+        expected = worst([*np.concatenate(alone), *data])
+        assert worst(values) == pytest.approx(expected, rel=1e-12), name
+        assert values.size == 2 * len(part.plants) + len(data)
+
+
+@pytest.mark.parametrize(("bound", "row"), [("min", 1), ("max", 2), ("below", 2)])
+def test_the_worst_row_is_the_least_for_min_and_the_largest_for_others(bound: str, row: int) -> None:
+    values = Values(np.array([2.0, 1.0, 3.0]), lambda k: {"name": str(k)})
+    assert worst_row({"m": values}, "m", bound) == row
+    assert worst_row({"m": Values(np.array([2.0, np.nan, 3.0]), values.describe)}, "m", bound) == 1
+
+
+@pytest.mark.slow
+def test_what_crosses_beyond_the_band_is_not_supported_and_not_held() -> None:
+    found = verify(pi(), {"eq22.npz": on_data(high=2.0)}, make_requirements(QUIET))
+    rows = {row["metric"]: row for row in found.contents()["requirements"]}
+    for metric in ("axes.gain_margin", "axes.disk_margin", "robust.mu", "stability.radius"):
+        assert rows[metric]["holds"] is False
+        assert "not supported by the data" in rows[metric]["note"]
+    assert rows["step.overshoot_pct"]["holds"] is True
+    assert not found.holds
+
+
+@pytest.mark.slow
+def test_margins_by_experiment_stand_beside_the_linear_ones_and_the_smaller_is_certified(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    told = [
+        Crossing("own", "both", "gain_up", 0.02, (0.0, 0.0), 1.3, 0.0),
+        Crossing("own", "pitch", "delay", 0.02, (0.0, 0.0), 0.9, 0.0),
+    ]
+    monkeypatch.setattr("softneck.verification._evidence.crossings", lambda loops, **_: told if loops else [])
+    things: dict[str, Any] = {"m": linear_neck(), "own": NeckParameters.paper()}
+    few = {"payloads_kg": [0.0], "orientations_deg": [0.0], "duration_s": 2.5}
+    found = verify(pi(), things, make_requirements({**QUICK, "neck": few}))
+    rows = {row["metric"]: row for row in found.contents()["requirements"]}
+    assert (rows["axes.gain_margin"]["value"], rows["axes.gain_margin"]["holds"]) == (1.3, False)
+    assert rows["axes.gain_margin"]["worst"]["kind"] == "experiment"
+    # The delay of the experiment is longer than that of the model.
+    assert rows["axes.delay_margin_ms"]["value"] < 900.0
+    both = found.contents()["margins"]
+    assert both["simulated"] == {"gain_ratio": 1.3, "delay_s": 0.9}
+    assert both["linear"]["gain_ratio"] > 1.3
+    # On the user's own plant neck.* decides, and one run is enough: one payload, one orientation.
+    assert [run.name for run in found.evidence.necks] == ["own, 0 kg, 0 deg"]
+    assert rows["neck.overshoot_pct"]["holds"] is not None
+
+
+@pytest.mark.slow
+def test_a_preset_is_a_foreign_plant_that_decides_only_where_it_is_asked() -> None:
+    few = {**QUICK["neck"], "decides": False}
+    asked = {"neck.overshoot_pct": {"max": 0.001}}
+    found = verify(pi(), linear_neck(), make_requirements({**QUICK, "neck": few}))
+    rows = {row["metric"]: row for row in found.contents()["requirements"]}
+    assert (rows["neck.overshoot_pct"]["holds"], "foreign plant" in rows["neck.overshoot_pct"]["note"]) == (None, True)
+    assert rows["neck.overshoot_pct"]["value"] is not None
+    assert found.contents()["foreign_plants"] is True
+    strict = verify(pi(), linear_neck(), make_requirements({**QUICK, "neck": few, "require": asked}))
+    assert "neck.overshoot_pct" in [v.requirement.metric for v in strict.failed]
+
+
+def test_what_steps_is_told_from_what_is_linear() -> None:
+    assert is_own_plant(NeckParameters.paper())
+    assert not is_own_plant(linear_neck())
+    assert not is_own_plant(family())
+    with pytest.raises(SettingsError, match="c: is no plant with the outputs pitch and roll"):
+        own_plant(pi().block(), "c")
