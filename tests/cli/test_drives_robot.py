@@ -86,6 +86,53 @@ def test_two_motors_are_zeroed_jogged_recorded_replayed_and_identified(call: Cal
     assert "`trunk4`" in other.err
 
 
+REQUIREMENTS = """version = 1
+[sampling]
+plants = 12
+search_generations = 0
+[neck]
+necks = 1
+payloads_kg = [0.0]
+[require]
+"stability.searched_radius" = false
+"""
+LOOP = """duration_s = 2.0
+drives = "drives.toml"
+plant = { neck = "paper" }
+observer = { file = "observer.npz" }
+controller = { file = "pi.npz" }
+reference = { kind = "step", pitch_deg = 5, at_s = 0.5 }
+limits = { "pitch.overshoot_pct" = 15.0 }
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.nightly
+def test_two_motors_run_what_was_identified_designed_verified_and_simulated(files: Path, call: Call) -> None:
+    """From a recording of the virtual robot to the simulated drives, without an override."""
+    (files / "requirements.toml").write_text(REQUIREMENTS, encoding="utf-8")
+    (files / "loop.toml").write_text(LOOP, encoding="utf-8")
+    steps = (
+        ("record", "aprbs", "-o", "rec.csv", "--duration", "20"),
+        ("identify", "oe", "rec.csv", "-o", "m.npz"),
+        ("observer", "m.npz", "-o", "observer.npz"),
+        ("design", "pi", "m.npz", "-o", "pi.npz"),
+        ("verify", "pi.npz", "m.npz", "--observer", "observer.npz", "--requirements", "requirements.toml", "-o",
+         "pi.certificate.json", "--html", "verify.html"),
+        ("simulate", "loop.toml", "--certificate", "loop.certificate.json"),
+        ("drives", "zero", "--simulated", "--drives", "drives.toml"),
+    )  # fmt: skip
+    for step in steps:
+        said = call(*step)
+        assert said.code == 0, said
+    certificate = json.loads((files / "pi.certificate.json").read_text(encoding="utf-8"))
+    assert certificate["robot"]["name"] == "bench"
+    run = ("drives", "run", "pi.npz", "--loop", "loop.toml", "--simulated", "--drives", "drives.toml")
+    given = ("--certificate", "pi.certificate.json", "--certificate", "loop.certificate.json")
+    said = call(*run, *given, "--json")
+    assert said.code == 0, said
+
+
 def test_a_motor_that_the_robot_does_not_have(call: Call) -> None:
     said = call("drives", "jog", "3", "--simulated", "--robot", "antagonist")
     assert said.code == 2

@@ -179,7 +179,54 @@ def test_keys_of_studies_and_faults_know_the_robot() -> None:
         make_fault("motor_stuck", {"motor": 3}, model.robot)
 
 
-@pytest.mark.parametrize("kind", ["adaptive", "mpc", "scheduled"])
+@pytest.mark.parametrize("kind", ["mpc", "scheduled"])
 def test_kinds_that_take_necks_only_say_so(kind: str) -> None:
     with pytest.raises(SettingsError, match=r"takes necks only so far, not robot `antagonist`"):
         design_controller(kind, plant(Robot.preset("antagonist")))
+
+
+def test_an_adaptive_controller_does_the_same_in_all_units() -> None:
+    """Gains ten thousand times smaller and motors that go further by as much: the same loop, learning included."""
+    wide = Robot.from_dict({
+        **Robot.preset("antagonist").as_dict(),
+        "motors": {"names": ["a", "b"], "unit": "rad", "setpoint_min": -6e4, "setpoint_max": 6e4, "rate_limit": 156e3},
+    })  # fmt: skip
+    results = []
+    for robot, gain in ((Robot.preset("antagonist"), 0.08), (wide, 8e-6)):
+        controller = design_controller("adaptive", plant(robot, gain=gain))
+        # The plant is 1.4 times as strong as the one that it starts from.
+        results.append(closed(plant(robot, gain=1.4 * gain), controller, pitch_deg=6.0))
+    few, many = results
+    np.testing.assert_allclose(many["pitch"], few["pitch"], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(many["motor_setpoint_1"], 1e4 * few["motor_setpoint_1"], rtol=1e-6, atol=1e-4)
+    assert few.metrics["pitch"]["overshoot_pct"] < 15.0
+    assert abs(few["pitch"][-1] - math.radians(6.0)) < math.radians(0.05)
+
+
+def test_an_adaptive_controller_learns_what_its_robot_is() -> None:
+    robot = Robot.preset("trunk4")
+    controller = design_controller("adaptive", plant(robot))
+    result = simulate({
+        "duration_s": 20.0, "plant": plant(robot, gain=0.1), "controller": controller,
+        "reference": {"kind": "rotation", "inclination_deg": 10, "rise_s": 2.0},
+    })  # fmt: skip
+    assert result.metrics["pitch"]["rms_error_deg"] < 10.0
+    assert "rad, pole" in controller.summary()
+
+
+def test_a_controller_of_ones_own_is_named_by_the_robots_outputs() -> None:
+    import control
+
+    model = plant(BELLOWS, gain=1e-7)
+    K = control.ss(control.tf([2e6, -1.9e6], [1.0, -1.0], TS))
+    given = K.copy()
+    given.update_names(inputs=["x_error"], outputs=["x_input"])
+    made = design_controller("custom", model, controller={"x": given, "y": K, "z": K}, slew_limit=10.0)
+    assert made.robot.hash == BELLOWS.hash
+    pi = design_controller("pi", model, slew_limit=10.0)
+    assert list(made.ss().input_labels) == list(pi.ss().input_labels)
+    z = np.exp(1j * np.geomspace(0.5, 100.0, 10) * TS)
+    for i in range(3):
+        np.testing.assert_allclose(made.ss()(z)[i, 3 + i], -K(z), rtol=1e-9)
+    with pytest.raises(SettingsError, match="`controller` must be given for x and y and z; got pitch, roll"):
+        design_controller("custom", model, controller={"pitch": K, "roll": K}, slew_limit=10.0)

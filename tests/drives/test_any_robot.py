@@ -405,12 +405,13 @@ def test_a_loop_of_another_robot_is_refused() -> None:
 
 
 def test_a_certificate_of_another_robot_arms_nothing(tmp_path: Path) -> None:
-    def certificate(**contents: str) -> Certificate:
+    def certificate(**contents: dict[str, str]) -> Certificate:
         return Certificate(path=tmp_path / "c.json", kind="verify", holds=True, files={}, contents=contents)
 
     trunk, neck = Robot.preset("trunk4"), Robot.preset()
     _require_robot(certificate(), neck)
-    _require_robot(certificate(robot=trunk.hash), trunk)
-    for found, moved in ((certificate(), trunk), (certificate(robot=trunk.hash), neck)):
+    of_trunk = {"name": "trunk4", "hash": trunk.hash}
+    _require_robot(certificate(robot=of_trunk), trunk)
+    for found, moved in ((certificate(), trunk), (certificate(robot=of_trunk), neck)):
         with pytest.raises(CheckFailedError, match=f"the drives move `{moved.name}`"):
             _require_robot(found, moved)

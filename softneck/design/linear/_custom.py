@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from softneck.core import DataError, SettingsError
-from softneck.estimation._axis import AXES
 
 from ..plants._uncertain import UncertainAxis, UncertainPlant
 from ._assembly import AxisController
@@ -28,9 +27,9 @@ class CustomSettings(AxisSettings):
     Reference filter, order and conditioning, with limits and loop, are those of `AxisSettings`.
 
     Attributes:
-        controller: K of `v = K (r - y)`, or a system of two inputs, reference and angle, `v = K (r, y)`; one for both
-            axes, or a mapping of "pitch" and "roll" to one each. Inputs named `pitch_reference` and `pitch` are found
-            by name, in any order.
+        controller: K of `v = K (r - y)`, or a system of two inputs, reference and angle, `v = K (r, y)`; one for
+            both axes, or a mapping of "pitch" and "roll" (or another robot's outputs) to one each. Inputs named
+            `pitch_reference` and `pitch` are found by name, in any order.
     """
 
     KIND: ClassVar[str] = "custom"
@@ -39,15 +38,14 @@ class CustomSettings(AxisSettings):
 
     def __post_init__(self) -> None:
         AxisSettings.__post_init__(self)
-        if isinstance(self.controller, Mapping) and set(self.controller) != set(AXES):
-            raise SettingsError(
-                f"`controller` must be given for pitch and roll; got {', '.join(map(str, self.controller)) or 'none'}."
-            )
-        for name in AXES:
-            _require_system(self._of(name))
+        for system in self.controller.values() if isinstance(self.controller, Mapping) else (self.controller,):
+            _require_system(system)
 
     def _designed(self, uncertain: UncertainPlant) -> LinearController:
-        uncertain.robot.require_neck("a controller of one's own")
+        names = uncertain.names
+        if isinstance(self.controller, Mapping) and set(self.controller) != set(names):
+            given = ", ".join(map(str, self.controller)) or "none"
+            raise SettingsError(f"`controller` must be given for {' and '.join(names)}; got {given}.")
         return AxisSettings._designed(self, uncertain)
 
     def _of(self, name: str) -> Any:
@@ -108,8 +106,9 @@ def _of_two(K: Any, name: str) -> AxisController:
             "Rename them with `system.update_names(inputs=...)`."
         )
     output = K.output_labels[0]
-    if not output.startswith("y[") and output != _INPUTS[name]:
-        raise SettingsError(f"the output of the controller of {name} is {output}; it must be {_INPUTS[name]}.")
+    known = _INPUTS.get(name, f"{name}_input")
+    if not output.startswith("y[") and output not in (known, f"{name}_input"):
+        raise SettingsError(f"the output of the controller of {name} is {output}; it must be {known}.")
     system: Any = control.ss(K)
     A, B, C, D = (np.asarray(part, dtype=np.float64) for part in (system.A, system.B, system.C, system.D))
     Br, By = B[:, order[:1]], B[:, order[1:]]

@@ -4,32 +4,42 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, Vector, require_between
+from softneck.core import Matrix, SettingsError, Vector, require_between, to_si
 from softneck.estimation import AxisPlant, axis_plant
-from softneck.estimation._axis import HasTransferFunctions, robot_of
+from softneck.estimation._axis import HasTransferFunctions, directions_of, robot_of
+from softneck.estimation._forms import Reach
+from softneck.estimation._reach import linear_reach
+from softneck.robot import Robot
+from softneck.robot._neck_default import NeckDefault
 from softneck.runtime import Port
 
 from ..linear._assembly import assemble, pi_axis
 from ..linear._linear_parts_runtime import LinearArrays
 from ..linear._loop_settings import LoopSettings
-from ..linear._margins import frequencies
+from ..linear._margins import LOWEST, frequencies
+from ..linear._ports import ControllerLimits
+from ..plants._uncertain import UncertainPlant, uncertain_plant
 from ._adaptive_runtime import AdaptiveArrays
-from ._operating_points import AXES
 from ._varying import RUNTIMES, VaryingController
 
 # Sizes of the loop kappa z^-d / (z - 1) that are tried, 1 % apart.
 _SIZES = np.geomspace(1e-3, 1.0, 695)
+# The paper's static gain [rad/rad], 27.69 / 5.293 deg/rad (Eq. 31).
+_NECK_GAIN = math.radians(27.69 / 5.293)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AdaptiveSettings(LoopSettings):
     """Online recursive least squares and a redesign in every sample, with what keeps it safe.
 
-    Limits, the order of the loop and what is doubted of the plant are those of `LoopSettings`.
+    Limits, the order of the loop and what is doubted of the plant are those of `LoopSettings`. The defaults are the
+    neck's: of another robot seconds go by its slowest pole, and what is in rad by how far its outputs go. What is given
+    counts as for a plant with the neck's static gain and reach.
 
     Attributes:
         max_sensitivity: bound on Ms of the loop that every redesign makes, with its delay in full.
@@ -60,14 +70,14 @@ class AdaptiveSettings(LoopSettings):
     dead_zone: float = math.radians(0.02)
     excitation: float = 0.05
     # The neck's own pole, and about the crossover.
-    band: float = 5.0
+    band: float = NeckDefault(5.0)
     gain_range: float = 0.5
     pole_range: float = 2.0
     distrust: float = 1.5
-    gain_rate: float = 1.0
-    reference_time: float = 0.06
-    leak_time: float = 3.0
-    lead_limit: float = 0.8
+    gain_rate: float = NeckDefault(1.0)
+    reference_time: float = NeckDefault(0.06)
+    leak_time: float = NeckDefault(3.0)
+    lead_limit: float = NeckDefault(0.8)
 
     def __post_init__(self) -> None:
         LoopSettings.__post_init__(self)
@@ -96,40 +106,65 @@ class AdaptiveSettings(LoopSettings):
             raise SettingsError(
                 f"adaptive control starts from one model or a family; got {len(model)} models. Name one."
             )
-        robot_of(model).require_neck("adaptive control")
-        plants = [self._plant(model, axis) for axis in AXES]
+        robot = robot_of(model)
+        if robot.is_neck:
+            return self._designed(model, robot, self.neck_redefinition(), np.ones(len(robot.outputs.names)), 1.0)
+        uncertain = uncertain_plant(model)
+        asked = self.of_robot(uncertain)
+        nominal = [axis.nominal for axis in uncertain.axes.values()]
+        # Inputs in such a unit that every static gain has the neck's size: what learns need not know the robot's units.
+        units = np.array([_NECK_GAIN / abs(plant.static_gain) for plant in nominal])
+        T, inverse = asked.redefinition(uncertain)
+        T, inverse = T.copy(), inverse.copy()
+        T[:-1] /= units[:, None]
+        inverse[:, :-1] *= units
+        size = linear_reach(nominal, robot, directions_of(model)).start / Reach().start
+        return asked._designed(model, robot, (T, inverse), units, size)
+
+    def _others(self, plant: UncertainPlant) -> dict[str, Any]:
+        stretch = max(axis.nominal.stretch for axis in plant.axes.values())
+        usual = {"band": 1.0, "gain_rate": 1.0, "reference_time": -1.0, "leak_time": -1.0}
+        stretched = {name: float(getattr(self, name)) * stretch ** (-power) for name, power in usual.items()}
+        return {**LoopSettings._others(self, plant), **stretched}
+
+    def _designed(
+        self, model: HasTransferFunctions, robot: Robot, redefinition: tuple[Matrix, Matrix], units: Vector, size: float
+    ) -> VaryingController:
+        """Return the controller: `units` of the inputs (axes,), and how far the outputs go over the neck's."""
+        names = robot.outputs.names
+        plants = [self._plant(model, axis, unit) for axis, unit in zip(names, units.tolist(), strict=True)]
         Ts = plants[0].sample_time
-        if not math.isclose(Ts, plants[1].sample_time, rel_tol=1e-9):
-            raise SettingsError(
-                f"pitch and roll have different sample times, {Ts:g} s and {plants[1].sample_time:g} s."
-            )
+        if not all(math.isclose(Ts, plant.sample_time, rel_tol=1e-9) for plant in plants):
+            each = " and ".join(f"{plant.sample_time:g} s" for plant in plants)
+            raise SettingsError(f"{' and '.join(names)} have different sample times, {each}.")
         delays = [plant.delay + self.extra_delay for plant in plants]
         kappas = [self._loop(plant, delay) for plant, delay in zip(plants, delays, strict=True)]
         worst = [
             self._box_sensitivity(axis, plant, delay, kappa)
-            for axis, plant, delay, kappa in zip(AXES, plants, delays, kappas, strict=True)
+            for axis, plant, delay, kappa in zip(names, plants, delays, kappas, strict=True)
         ]
         found = {
-            axis: {"static_gain": plant.static_gain, "pole": _pole(plant), "kappa": kappa, "largest_ms_nominal": ms,
-                   "dead_time_s": delay * Ts}
-            for axis, plant, kappa, ms, delay in zip(AXES, plants, kappas, worst, delays, strict=True)
+            axis: {"static_gain": plant.static_gain / float(unit), "pole": _pole(plant), "kappa": kappa,
+                   "largest_ms_nominal": ms, "dead_time_s": delay * Ts}
+            for axis, plant, kappa, ms, delay, unit in zip(names, plants, kappas, worst, delays, units, strict=True)
         }  # fmt: skip
         return VaryingController(
             kind="adaptive",
             runtime=RUNTIMES["adaptive"],
             sample_time=Ts,
-            arrays=self._arrays(plants, delays, kappas),
-            limits=self.limits(),
+            arrays=self._arrays(plants, delays, kappas, self.limits(robot), redefinition, size),
+            limits=self.limits(robot),
             order=self.order,
             parameters=(
                 Port(name="adapt", description="1: learn; 0: nominal gains", start=1.0, minimum=0.0, maximum=1.0),
             ),
-            lines=tuple(_line(axis, values) for axis, values in found.items()),
+            lines=tuple(_line(axis, values, robot) for axis, values in found.items()),
             design={"settings": asdict(self), "extra_delay": self.extra_delay, **found},
         )
 
-    def _plant(self, model: HasTransferFunctions, axis: str) -> AxisPlant:
+    def _plant(self, model: HasTransferFunctions, axis: str, unit: float) -> AxisPlant:
         plant = axis_plant(model, axis)
+        plant = replace(plant, numerator=unit * plant.numerator)
         if plant.order != 1 or plant.denominator[1] >= 0.0:
             raise SettingsError(
                 f"{axis}: adaptive control takes a plant of one pole and a dead time; this one is of order "
@@ -159,7 +194,7 @@ class AdaptiveSettings(LoopSettings):
     def _box_sensitivity(self, axis: str, plant: AxisPlant, delay: int, kappa: float) -> float:
         """Return the largest Ms of the nominal gains at the corners of the box; refuse an unstable one."""
         a0, b0 = -float(plant.denominator[1]), float(plant.numerator[0])
-        w = frequencies(plant.sample_time)
+        w = frequencies(plant.sample_time, lowest=LOWEST / plant.stretch)
         z = np.exp(1j * w * plant.sample_time)
         worst = 0.0
         low, high, weak, strong = self._box(plant)
@@ -185,21 +220,25 @@ class AdaptiveSettings(LoopSettings):
         gains = sorted((K * (1.0 - self.gain_range), K * (1.0 + self.gain_range)))
         return np.array([a**self.pole_range, a ** (1.0 / self.pole_range), *gains])
 
-    def _arrays(self, plants: list[AxisPlant], delays: list[int], kappas: list[float]) -> dict[str, Matrix]:
+    def _arrays(
+        self, plants: list[AxisPlant], delays: list[int], kappas: list[float], limits: ControllerLimits,
+        redefinition: tuple[Matrix, Matrix], size: float,
+    ) -> dict[str, Matrix]:  # fmt: skip
         """Return the arrays of the runtime by name."""
         Ts = plants[0].sample_time
-        time = self.reference_time
         common = assemble(
-            (pi_axis(1.0, 1.0, Ts), pi_axis(1.0, 1.0, Ts)),
-            reference_times=(time, time, time),
-            redefinition=self.neck_redefinition(),
-            constants=self.limits().constants(Ts),
+            [pi_axis(1.0, 1.0, Ts)] * len(plants),
+            reference_times=(self.reference_time,) * (len(plants) + 1),
+            redefinition=redefinition,
+            constants=limits.constants(Ts),
         )
+        # Inputs and outputs have the neck's ratio: a covariance goes by 1 / size^2.
         guards = [
-            self.forgetting, self.covariance_bound, self.dead_zone,
-            max(-float(plant.denominator[1]) for plant in plants) ** (1.0 / (2.0 * self.pole_range)), self.excitation,
-            math.exp(-self.band * Ts), self.distrust, min(self.gain_rate * Ts, 0.5), Ts / self.leak_time,
-            min(self.start_covariance, 0.5 * self.covariance_bound),
+            self.forgetting, self.covariance_bound / size**2, self.dead_zone * size,
+            max(-float(plant.denominator[1]) for plant in plants) ** (1.0 / (2.0 * self.pole_range)),
+            self.excitation * size, math.exp(-self.band * Ts), self.distrust, min(self.gain_rate * Ts, 0.5),
+            Ts / self.leak_time,
+            min(self.start_covariance, 0.5 * self.covariance_bound) / size**2,
         ]  # fmt: skip
         arrays = dict(zip(LinearArrays.names(), common, strict=True)) | {
             "nominal": np.array([[-plant.denominator[1], plant.numerator[0]] for plant in plants]),
@@ -215,10 +254,13 @@ def _pole(plant: AxisPlant) -> float:
     return -math.log(-float(plant.denominator[1])) / plant.sample_time
 
 
-def _line(axis: str, found: dict[str, float]) -> str:
-    gain = math.degrees(found["static_gain"])
+def _line(axis: str, found: dict[str, float], robot: Robot) -> str:
+    gain, unit = math.degrees(found["static_gain"]), "deg/rad"
+    if not robot.is_neck:
+        per, unit = to_si(robot.outputs.display_unit)[0], f"{robot.outputs.display_unit}/{robot.motors.unit}"
+        gain = found["static_gain"] / per * to_si(robot.motors.unit)[0]
     return (
-        f"  {axis}: starts from {gain:.3g} deg/rad, pole {found['pole']:.3g} 1/s, dead time "
+        f"  {axis}: starts from {gain:.3g} {unit}, pole {found['pole']:.3g} 1/s, dead time "
         f"{1e3 * found['dead_time_s']:g} ms; kappa {found['kappa']:.3g}; largest Ms of the nominal gains in the box "
         f"{found['largest_ms_nominal']:.3g}"
     )

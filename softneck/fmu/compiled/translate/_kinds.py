@@ -50,6 +50,7 @@ _ROBOTS = (
     "softneck.estimation._kalman_runtime",
     "softneck.estimation._steady_kalman_runtime",
     "softneck.design.linear._linear_controller_runtime",
+    "softneck.design.varying._adaptive_runtime",
     "softneck.loop._reference_runtime",
 )
 RUNTIMES = (*_NECKS, *(f"{module}@{ANY_SIZE}" for module in _ROBOTS))
