@@ -47,6 +47,8 @@ ALIKE = 0.5
 # Below this [%] no kind has understood the recording.
 _POOR = 70.0
 _MOST_MEMBERS = 3
+# So many kinds are trained on all rows at most, before the better of them is taken.
+_MOST_TRAINED = 2
 EXAM, HOLD_OUT, COLD = "agreement", "hold-out", "cold start"
 REFITTED = "trained on all rows after the choice; its scores are those of the model before, which had not seen them all"
 # What is in a model file but was not found from data: sizes, tables, copies of rows in another order.
@@ -264,7 +266,10 @@ class _Race:
             if one.model is not None and one.kind not in self._free:
                 self._free[one.kind] = free_runs(one.model, self._motions)
                 self._worth[one.kind] = one.fit
-        voters = {kind: fit for kind, fit in self._worth.items() if kind not in _MADE_OF_OTHERS}
+        # Linear kinds share their bias: the best of them has a vote, or they would outvote what bends.
+        linear = sorted((kind for kind in self._worth if kind in LINEAR), key=lambda kind: -self._worth[kind])
+        silent_ones = (*_MADE_OF_OTHERS, *linear[1:])
+        voters = {kind: fit for kind, fit in self._worth.items() if kind not in silent_ones}
         for kind, fit in agreement(self._free, voters).items():
             self.tried[kind] = _with(self.tried[kind], {EXAM: (fit, float("nan"))})
 
@@ -290,12 +295,17 @@ class _Race:
 
     def trained(self, progress: Progress) -> KindTrial:
         """Train the best on all rows, and the next one where the best then falls behind it; return the one to take."""
+        trained = 0
         while True:
             best = self._simplest_of_the_best()
             if best.whole:
                 return best
+            done = [one for one in self.ranking() if one.whole and one.fit > float("-inf")]
+            if trained >= _MOST_TRAINED and done:
+                return done[0]
             progress(0.0, f"{best.kind} on all rows to train on")
             self.whole(best.kind)
+            trained += 1
 
     def train_linear(self, chosen: KindTrial) -> None:
         """Train the best linear kind on all rows where the chosen one is not linear."""
