@@ -56,8 +56,8 @@ class Calibration:
         """Return a neck file."""
         plain = NeckParameters.preset(self.start)
         lines = [
-            "# Written by `softneck calibrate`: fitted in free run from set-points. On the last 30 % of each run, which",
-            f"# it was not fitted to, it follows pitch and roll to {self.worst:.1f} % or better.",
+            "# Written by `softneck calibrate`: fitted in free run from set-points. On the last 30 % of each run,",
+            f"# which it was not fitted to, it follows pitch and roll to {self.worst:.1f} % or better.",
             f'preset = "{self.start}"',
         ]
         for item in dataclasses.fields(self.neck):
