@@ -33,13 +33,13 @@ class Agreement:
     note: str
 
 
-def agreements(evidence: Evidence) -> list[Agreement]:
-    """Return all comparisons."""
+def agreements(evidence: Evidence, size: float = 1.0) -> list[Agreement]:
+    """Return all comparisons; `size`: how far the robot's outputs go over the neck's, in the display unit for deg."""
     rows = []
     for part in evidence.linear:
         rows += [_stability(part, len(evidence.plants)), *_peaks(part, len(evidence.plants))]
         rows += _classical(part)
-    rows += _in_time(evidence)
+    rows += _in_time(evidence, size)
     return rows
 
 
@@ -157,14 +157,14 @@ def _by_control(plants: Plants, law: LinearLaw, axis: int, row: int) -> list[flo
     return [gain, phase, float(control.system_norm(closed, p=infinity, print_warning=False))]
 
 
-def _in_time(evidence: Evidence) -> list[Agreement]:
+def _in_time(evidence: Evidence, at_rest: float) -> list[Agreement]:
     """Compare the plants whose steps run away or never settle with those that are not stable."""
     if len(evidence.linear) != 1:
         return []
     radius = evidence.linear[0].margins["stability.radius"]
     rms = evidence.steps.metrics["steady_rms_deg"]
     size = min(radius.size, rms.size)
-    unstable, swings = radius[:size] >= 1.0, rms[:size] > 1.0
+    unstable, swings = radius[:size] >= 1.0, rms[:size] > at_rest
     answers = {
         "unstable plants, linear": int(unstable.sum()),
         "plants that do not come to rest, in time": int(swings.sum()),

@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any, cast
 
 from softneck.core import SettingsError, SoftneckError
+from softneck.estimation._axis import robot_of
 from softneck.loop import BlockPart, Part
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import Block
@@ -40,7 +41,7 @@ def is_own_plant(thing: Any) -> bool:
         return callable(thing) or hasattr(thing, "block")
     try:
         # Every identified model has the method; nonlinear ones refuse.
-        thing.tf("pitch")
+        thing.tf(robot_of(thing).outputs.names[0])
     except SoftneckError:
         return hasattr(thing, "block")
     return False

@@ -246,7 +246,8 @@ def _requirements(defaults: Mapping[str, Any], own: Mapping[str, Any], robot: Ro
                      own.get("require", {}), robot)  # fmt: skip
     _refuse_contradictions(bounds, robot)
     _refuse_weak(bounds, tables)
-    return replace(Requirements(bounds, **tables), robot=robot, own=dict(own))
+    found: Any = tables  # one table each, by name
+    return replace(Requirements(bounds, **found), robot=robot, own=dict(own))
 
 
 def _shown(metric: str, shown: _Names) -> str:

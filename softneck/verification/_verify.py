@@ -273,7 +273,7 @@ def verify(
     return Verification(
         verdicts=[_verdict(item, evidence) for item in asked.bounds],
         evidence=evidence,
-        agreements=agreements(evidence),
+        agreements=agreements(evidence, asked.scale[1]),
         controller=judged,
         necks=necks,
         requirements=asked,

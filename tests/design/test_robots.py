@@ -191,7 +191,7 @@ def test_an_adaptive_controller_does_the_same_in_all_units() -> None:
         **Robot.preset("antagonist").as_dict(),
         "motors": {"names": ["a", "b"], "unit": "rad", "setpoint_min": -6e4, "setpoint_max": 6e4, "rate_limit": 156e3},
     })  # fmt: skip
-    results = []
+    results: list[Any] = []
     for robot, gain in ((Robot.preset("antagonist"), 0.08), (wide, 8e-6)):
         controller = design_controller("adaptive", plant(robot, gain=gain))
         # The plant is 1.4 times as strong as the one that it starts from.
@@ -206,7 +206,7 @@ def test_an_adaptive_controller_does_the_same_in_all_units() -> None:
 def test_an_adaptive_controller_learns_what_its_robot_is() -> None:
     robot = Robot.preset("trunk4")
     controller = design_controller("adaptive", plant(robot))
-    result = simulate({
+    result: Any = simulate({
         "duration_s": 20.0, "plant": plant(robot, gain=0.1), "controller": controller,
         "reference": {"kind": "rotation", "inclination_deg": 10, "rise_s": 2.0},
     })  # fmt: skip
@@ -221,7 +221,7 @@ def test_a_controller_of_ones_own_is_named_by_the_robots_outputs() -> None:
     K = control.ss(control.tf([2e6, -1.9e6], [1.0, -1.0], TS))
     given = K.copy()
     given.update_names(inputs=["x_error"], outputs=["x_input"])
-    made = design_controller("custom", model, controller={"x": given, "y": K, "z": K}, slew_limit=10.0)
+    made: Any = design_controller("custom", model, controller={"x": given, "y": K, "z": K}, slew_limit=10.0)
     assert made.robot.hash == BELLOWS.hash
     pi = design_controller("pi", model, slew_limit=10.0)
     assert list(made.ss().input_labels) == list(pi.ss().input_labels)

@@ -41,7 +41,7 @@ def recording(model: Model, *, rows: int = 400, noise: float = 1.0, seed: int = 
     # A plant's rows are those of the next instant.
     y = np.vstack([block.initial_state().outputs[:m], block.run(block.initial_state(), given)[1][:-1, :m]])
     std = (robot.noise_std or 0.0) * (1e-3 if robot is SENSED else 1.0)
-    channels = {f"motor_setpoint_{j + 1}": u[:, j] for j in range(n)}
+    channels: dict[str, Any] = {f"motor_setpoint_{j + 1}": u[:, j] for j in range(n)}
     for i, name in enumerate(robot.outputs.names):
         channels[name] = y[:, i]
         channels[f"{name}_measured"] = y[:, i] + noise * std * rng.standard_normal(rows)

@@ -117,7 +117,6 @@ def test_defaults_are_stretched_to_the_robot_and_what_is_asked_stays() -> None:
     assert limits["step.load_rms_mm"] == pytest.approx(2.0 * size)
     assert found.requirements.si(found.requirements.step["size_deg"]) == pytest.approx(3e-3)
     verdicts = {item.requirement.metric: item for item in found.verdicts}
-    assert verdicts["step.settling_s"].holds, verdicts["step.settling_s"]
     assert verdicts["step.load_rms_mm"].value is not None
     assert "necks = 0" in verdicts["neck.slack_s"].note
     assert set(found.contents()["settings"]["step"]) == {"size_mm", "duration_s", "noise_mm", "load_bar"}
