@@ -10,3 +10,9 @@ class NeckDefault(float):
     """
 
     __slots__ = ()
+
+
+class NeckCount(int):
+    """The same of whole numbers."""
+
+    __slots__ = ()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,8 @@ from softneck import identify, load, record
 from softneck.core import SettingsError
 from softneck.cosim import make_loop, simulate
 from softneck.cosim.loops._loop_table import check_key
-from softneck.design import PiSettings, design_controller
+from softneck.design import MpcSettings, PiSettings, design_controller
+from softneck.design.plants._uncertain import uncertain_plant
 from softneck.identification import Model
 from softneck.identification.models._state_space import lss_arrays
 from softneck.loop._faults import make_fault
@@ -179,10 +181,97 @@ def test_keys_of_studies_and_faults_know_the_robot() -> None:
         make_fault("motor_stuck", {"motor": 3}, model.robot)
 
 
-@pytest.mark.parametrize("kind", ["mpc", "scheduled"])
-def test_kinds_that_take_necks_only_say_so(kind: str) -> None:
+def test_kinds_that_take_necks_only_say_so() -> None:
     with pytest.raises(SettingsError, match=r"takes necks only so far, not robot `antagonist`"):
-        design_controller(kind, plant(Robot.preset("antagonist")))
+        design_controller("scheduled", plant(Robot.preset("antagonist")))
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ({"tightening": True}, "predictive control with `tightening` takes necks only so far, not robot `antagonist`"),
+        ({"minimum_tautness": 0.1}, "`minimum_tautness` of robot `antagonist` needs tendons at known angles"),
+    ],
+)
+def test_what_predictive_control_has_for_necks_only_is_refused(setting: dict[str, Any], said: str) -> None:
+    with pytest.raises(SettingsError, match=said):
+        design_controller("mpc", plant(Robot.preset("antagonist")), **setting)
+
+
+@pytest.mark.parametrize("sample_time", [TS, 4.0])
+def test_a_predictive_controller_looks_as_far_as_its_robot_is_slow(sample_time: float) -> None:
+    """The same rows are the same problem, however long a sample takes."""
+    slow = replace(plant(BELLOWS), sample_time=sample_time)
+    asked = MpcSettings()._of_robot(uncertain_plant(slow))
+    # 0.6 s of a neck's 0.2 s: three time constants of -1 / log(0.9) = 9.5 samples.
+    assert (asked.horizon, asked.moves) == (28, 10)
+    assert asked.reference_time == pytest.approx(-sample_time / math.log(POLE))
+    given = MpcSettings(horizon=20, moves=5)._of_robot(uncertain_plant(slow))
+    assert (given.horizon, given.moves) == (20, 5)
+
+
+@pytest.mark.slow
+def test_a_predictive_controller_does_the_same_in_all_units(tmp_path: Path) -> None:
+    """It settles within the motors' range and rate, after a file as before, and so do gains ten thousand times less."""
+    wide = Robot.from_dict({
+        **Robot.preset("antagonist").as_dict(),
+        "motors": {"names": ["a", "b"], "unit": "rad", "setpoint_min": -6e4, "setpoint_max": 6e4, "rate_limit": 15e4},
+    })  # fmt: skip
+    near = Robot.from_dict({
+        **Robot.preset("antagonist").as_dict(),
+        "motors": {"names": ["a", "b"], "unit": "rad", "setpoint_min": -6, "setpoint_max": 6, "rate_limit": 15},
+    })  # fmt: skip
+    results: list[Any] = []
+    for robot, gain in ((near, 0.08), (wide, 8e-6)):
+        model = plant(robot, gain=gain)
+        controller = design_controller("mpc", model, bandwidth=6.0)
+        controller.save(tmp_path / f"{gain}.npz")
+        results.append(closed(model, load(tmp_path / f"{gain}.npz"), pitch_deg=6.0))
+    few, many = results
+    # The solver ends at 1e-10 of a motor's range.
+    np.testing.assert_allclose(many["pitch"], few["pitch"], atol=1e-8)
+    np.testing.assert_allclose(many["motor_setpoint_1"], 1e4 * few["motor_setpoint_1"], atol=1e-3)
+    assert few.metrics["pitch"]["overshoot_pct"] < 2.0
+    assert few.metrics["pitch"]["settling_s"] < 1.5
+    assert abs(few["pitch"][-1] - math.radians(6.0)) < math.radians(0.01)
+    assert np.abs(np.diff(few["motor_setpoint_1"])).max() <= 15.0 * TS * (1.0 + 1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.nightly
+def test_a_predictive_controller_of_four_chambers_keeps_their_pressures() -> None:
+    """Three lengths around 30 mm, from the edge of the range on: no pressure below zero."""
+    model = plant(BELLOWS, gain=1e-7, rest=0.03)
+    controller = design_controller("mpc", model, slew_limit=10.0, bandwidth=6.0)
+    assert "set-points 0 to 3 bar, slew 10 bar/s" in controller.summary()
+    result = closed(model, controller, duration=6.0, x=41.0, y_mm=43.0, z=49.0, at_s=0.0, cocontraction=1.0)
+    for name in ("x", "y", "z"):
+        assert result.metrics[name]["steady_rms_mm"] < 0.05
+    P = np.column_stack([result[f"motor_setpoint_{j}"] for j in range(1, 5)])
+    assert P.min() >= 0.0
+    assert P.max() <= 3e5
+    assert np.abs(np.diff(P, axis=0)).max() <= 1e6 * TS * (1.0 + 1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", ["antagonist", "trunk4"])
+def test_a_predictive_controller_over_the_virtual_plant(name: str) -> None:
+    """Recorded, identified, designed and closed over the physics that stands for the robot."""
+    robot = Robot.preset(name)
+    recording = record(signal("aprbs", duration=40.0, robot=robot), VirtualNeck.of(robot), seed=1)
+    controller = design_controller("mpc", identify("oe", recording), bandwidth=5.0)
+    result: Any = simulate({"duration_s": 6.0, "plant": "paper", "controller": controller,
+                            "reference": {"kind": "step", "at_s": 1.0, "pitch_deg": 8.0}})  # fmt: skip
+    found = result.metrics["pitch"]
+    # The gain of a line through large moves is some 20 % off for small ones.
+    assert float(found["overshoot_pct"] or 0.0) < 25.0
+    assert found["steady_rms_deg"] == pytest.approx(0.0, abs=0.3)
+    P = np.column_stack([result[channel] for channel in robot.set_points])
+    assert np.abs(P).max() <= 6.0
+    if name == "trunk4":
+        # The pattern that neither tilts nor co-contracts is held at zero.
+        assert np.abs(P @ np.array([1.0, -1.0, 1.0, -1.0])).max() < 0.05
 
 
 def test_an_adaptive_controller_does_the_same_in_all_units() -> None:

@@ -16,7 +16,7 @@ from fmpy.validation import validate_fmu
 
 from softneck.core import Matrix, SettingsError
 from softneck.cosim.parts._free_run import drive_fmu
-from softneck.design import PiSettings
+from softneck.design import MpcSettings, PiSettings
 from softneck.fmu import build_compiled_fmu, build_fmu, fmu_info
 from softneck.fmu.compiled._model_file import node_of
 from softneck.fmu.describe._modelled_drives import with_modelled_drives
@@ -207,9 +207,11 @@ def test_a_robot_s_virtual_plant_is_an_fmu(backend: str, fmi: int, tmp_path: Pat
 
 
 @pytest.mark.parametrize(("backend", "fmi"), BACKENDS[1:])
-def test_a_controller_of_two_motors_is_an_fmu(backend: str, fmi: int, tmp_path: Path) -> None:
-    controller = PiSettings().design(model("oe", False)).block()
-    path = built(controller, tmp_path / "Pi.fmu", backend, fmi)
+@pytest.mark.parametrize("kind", slow_but(["pi", "mpc"], ["pi"], ["mpc"]))
+def test_a_controller_of_two_motors_is_an_fmu(kind: str, backend: str, fmi: int, tmp_path: Path) -> None:
+    settings: dict[str, Any] = {"pi": PiSettings(), "mpc": MpcSettings(bandwidth=5.0, horizon=8, moves=3)}
+    controller = settings[kind].design(model("oe", False)).block()
+    path = built(controller, tmp_path / "Controller.fmu", backend, fmi)
     rng = np.random.default_rng(1)
     inputs = {"pitch_reference": np.full(80, 0.1), "pitch": 0.02 * rng.standard_normal(80)}
     inputs |= {f"motor_position_{j}": 0.1 * rng.standard_normal(80) for j in (1, 2)}

@@ -12,6 +12,7 @@ from softneck.core import Matrix, Vector
 from . import _mpc_state_runtime as rt
 from ._disturbance import MeasuredDisturbance
 from ._prediction import Matrices, Problem, disturbance_pole, padded, rest_states
+from ._scale import Scale
 
 # Radians: a motor resolves 1.3e-4 rad, a soft limit is judged at 1e-6.
 _TOLERANCE = 1e-10
@@ -28,6 +29,7 @@ class Tuning:
         budget: iterations that the solver may take.
         coast: samples without measurement until the motors are held.
         disturbances: that are measured.
+        scale: of another robot than the neck.
     """
 
     trust: float
@@ -36,12 +38,13 @@ class Tuning:
     budget: int = 100
     coast: int = 25
     disturbances: tuple[MeasuredDisturbance, ...] = ()
+    scale: Scale | None = None
 
 
 def assemble(problem: Problem, found: Matrices, tuning: Tuning) -> tuple[Matrix, ...]:
     """Return the arrays in the order of `MpcArrays`."""
     p, n = problem, problem.order
-    plants = [scenario.axis(i) for scenario in p.scenarios for i in range(2)]
+    plants = [plant for scenario in p.scenarios for plant in scenario.axes]
     Ts = plants[0].sample_time
     AH = np.linalg.solve(found.H, found.A.T).T
     angle_at = 4.0
@@ -49,9 +52,10 @@ def assemble(problem: Problem, found: Matrices, tuning: Tuning) -> tuple[Matrix,
         Ts, p.rows, len(p.scenarios), n, p.dead_time, len(p.starts), p.slacks, tuning.preview,
         min(round(tuning.reference_time / Ts), tuning.preview), len(tuning.disturbances), tuning.budget, _TOLERANCE,
         tuning.coast, angle_at, angle_at + float(p.angles), 0.0, 0.0,
+        *(() if tuning.scale is None else tuning.scale.numbers()),
     ])  # fmt: skip
     keep = math.exp(-Ts / tuning.reference_time) if tuning.reference_time > 0.0 else 0.0
-    disturbances = np.zeros((max(1, len(tuning.disturbances)), 3))
+    disturbances = np.zeros((max(1, len(tuning.disturbances)), p.outputs + 1))
     for row, item in zip(disturbances, tuning.disturbances, strict=False):
         row[:] = item.pitch, item.roll, math.exp(-Ts / item.time) if item.time > 0.0 else 0.0
     poles = np.array([disturbance_pole(plant, p.disturbance_time) for plant in plants])
@@ -63,7 +67,7 @@ def assemble(problem: Problem, found: Matrices, tuning: Tuning) -> tuple[Matrix,
         "rest": np.array([rest_states(plant, n) for plant in plants]),
         "delays": np.array([float(plant.delay) for plant in plants]),
         "disturbances": disturbances,
-        "filters": np.full(3, keep),
+        "filters": np.full(p.outputs + 1, keep),
         "T": p.T,
         "starts": np.array(p.starts, dtype=np.float64),
         "K": -np.linalg.solve(found.H, found.F),
@@ -124,7 +128,7 @@ def with_filter(arrays: tuple[Matrix, ...], reference_time: float) -> tuple[Matr
     Ts = float(constants[rt.MPC_TS])
     keep = math.exp(-Ts / reference_time) if reference_time > 0.0 else 0.0
     constants[rt.MPC_LEAD] = min(round(reference_time / Ts), constants[rt.MPC_AHEAD])
-    return _with(arrays, constants=constants, filters=np.full(3, keep))
+    return _with(arrays, constants=constants, filters=np.full_like(rt.MpcArrays(arrays).filters, keep))
 
 
 def _with(arrays: tuple[Matrix, ...], **changed: Matrix) -> tuple[Matrix, ...]:

@@ -4,28 +4,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import FileFormatError, Matrix, Vector, write_archive
+from softneck.core import FileFormatError, Matrix, Vector, to_si, write_archive
+from softneck.robot import Robot
 from softneck.runtime import Block, Port, State
 
-from ..linear._ports import MAX_MOTOR, controller_inputs, controller_outputs, limit_ports
+from ..linear._controller import robot_in
+from ..linear._ports import MAX_MOTOR, ControllerLimits, controller_inputs, controller_outputs, limit_ports
 from . import _mpc_state_runtime as rt
 from ._disturbance import MeasuredDisturbance
 from ._lti import lti
 from ._part import MpcPart
 from ._program import MpcInfo, MpcProgram, explain
+from ._scale import runtime_of
 
 if TYPE_CHECKING:
     import control
-
-
-_RUNTIME = "softneck.design.predictive._mpc_runtime"
 
 
 # Half the digits of a double.
@@ -36,7 +36,7 @@ _SEEN = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class MpcController:
-    """A linear predictive controller of pitch and roll; `MpcSettings.design` makes it.
+    """A linear predictive controller of all outputs; `MpcSettings.design` makes it.
 
     Attributes:
         sample_time: [s].
@@ -47,6 +47,7 @@ class MpcController:
         disturbances: that are measured.
         order: of the loop it is for.
         design: JSON values: the settings and what was found.
+        robot: whose controller it is; of another than the neck all limits are in SI.
     """
 
     sample_time: float
@@ -60,37 +61,37 @@ class MpcController:
     disturbances: tuple[MeasuredDisturbance, ...]
     order: str
     design: Mapping[str, Any]
+    robot: Robot = field(default_factory=Robot.preset)
 
     kind = "mpc"
 
     def block(self) -> Block:
         """Return the controller as a block of role "controller"."""
         ahead = tuple(
-            Port(name=f"{axis}_reference_ahead", unit="rad", minimum=-rt.MPC_REFERENCE_LIMIT,
-                 maximum=rt.MPC_REFERENCE_LIMIT, description=f"wanted {axis} {self.preview:g} s from now")
-            for axis in ("pitch", "roll")
+            replace(port, name=f"{port.name}_ahead", description=f"{port.description} {self.preview:g} s from now")
+            for port in controller_inputs(self.robot)[: len(self.robot.outputs.names)]
         ) if self.preview > 0.0 else ()  # fmt: skip
         measured = tuple(
             Port(name=item.name, unit=item.unit, description="measured disturbance") for item in self.disturbances
         )
-        limits = limit_ports((self.position_limit, self.slew_limit, self.lead_limit, self.least_position, -MAX_MOTOR))[
-            :4
-        ]
+        starts = (self.position_limit, self.slew_limit, self.lead_limit, self.least_position, -MAX_MOTOR)
+        limits, neck = limit_ports(starts, self.robot)[:4], self.robot.is_neck
         soft: tuple[Port, ...] = ()
         if self.angle_limit is not None:
-            soft += (Port(name="angle_limit", unit="rad", start=self.angle_limit, minimum=0.01, maximum=0.8),)
+            angle = Port(name="angle_limit", unit="rad", start=self.angle_limit, minimum=0.01, maximum=0.8)
+            unit = to_si(self.robot.outputs.unit)[1]
+            soft += (angle if neck else replace(angle, unit=unit, minimum=0.0, maximum=None),)
         if self.minimum_tautness is not None:
-            soft += (
-                Port(name="minimum_tautness", unit="rad", start=self.minimum_tautness, minimum=-12.0, maximum=6.0),
-            )
+            taut = Port(name="minimum_tautness", unit="rad", start=self.minimum_tautness, minimum=-12.0, maximum=6.0)
+            soft += (taut if neck else replace(taut, unit=limits[0].unit, minimum=None, maximum=None),)
         return Block(
             kind="mpc",
             role="controller",
-            runtime=_RUNTIME,
+            runtime=runtime_of(self.arrays),
             sample_time=self.sample_time,
             arrays=self.arrays,
-            inputs=(*controller_inputs(), *ahead, *measured),
-            outputs=controller_outputs(),
+            inputs=(*controller_inputs(self.robot), *ahead, *measured),
+            outputs=controller_outputs(self.robot),
             parameters=(*limits, *soft),
         )
 
@@ -109,7 +110,7 @@ class MpcController:
 
     def ss(self) -> control.StateSpace:
         """Return it without limits, from (pitch_reference, roll_reference, pitch, roll) to (theta_i, phi_i)."""
-        return lti(self.arrays)
+        return lti(self.arrays, self.robot)
 
     def to_lti(self) -> control.StateSpace:
         """Return `ss()`: the controller while no limit is active."""
@@ -117,7 +118,7 @@ class MpcController:
 
     def info(self, state: State) -> MpcInfo:
         """Return what the sample that led to `state` decided: prediction, active limits, iterations."""
-        return explain(self.arrays, state.values)
+        return explain(self.arrays, state.values, self.robot.outputs.names)
 
     def program(self) -> MpcProgram:
         """Return the QP outside of the block: as CasADi functions, solved by daqp."""
@@ -143,22 +144,37 @@ class MpcController:
         lines = [
             f"mpc controller, {self.sample_time * 1e3:g} ms, {self.order} order, {d.get('extra_delay', 0)} samples of "
             "delay added to the plant for it",
-            f"  {a.H.shape[0]} unknowns ({int(q[rt.MPC_MOVES])} moves of 3 motors, {int(q[rt.MPC_SLACKS])} "
-            f"slacks), {a.kinds.shape[0]} rows, horizon {settings.get('horizon')} samples after the dead time, "
+            f"  {a.H.shape[0]} unknowns ({int(q[rt.MPC_MOVES])} moves of {a.T.shape[1]} motors, "
+            f"{int(q[rt.MPC_SLACKS])} slacks), {a.kinds.shape[0]} rows, "
+            f"horizon {settings.get('horizon')} samples after the dead time, "
             f"{int(q[rt.MPC_SCENARIOS])} scenario(s)",
-            f"  limits: |P| <= {self.position_limit:g} rad, slew {self.slew_limit:g} rad/s, "
-            f"lead {self.lead_limit:g} rad"
-            + ("" if self.angle_limit is None else f", |angle| <= {np.degrees(self.angle_limit):.3g} deg (soft)")
-            + ("" if self.minimum_tautness is None else f", tautness >= {self.minimum_tautness:g} rad (soft)"),
+            self._limits_line(),
             f"  bandwidth {d.get('bandwidth_rad_s', 0.0):.3g} rad/s, "
             f"observer {d.get('observer_bandwidth_rad_s', 0.0):.3g} rad/s, reference filter "
             f"{d.get('reference_time_s', 0.0):.3g} s; Ms "
             + " and ".join(f"{value:.3g}" for value in d.get("sensitivity", []))
-            + " (as identified, small moves)",
+            + (" (as identified, small moves)" if self.robot.is_neck else " (as identified)"),
         ]
         if d.get("worst_sensitivity") is not None:
             lines.append(f"  Ms at most {d['worst_sensitivity']:.3g} over samples of the family")
         return "\n".join(lines + [f"  review: {line}" for line in self.review()])
+
+    def _limits_line(self) -> str:
+        """Return a line on the limits, of another robot in the units of its file."""
+        if self.robot.is_neck:
+            line = (
+                f"  limits: |P| <= {self.position_limit:g} rad, slew {self.slew_limit:g} rad/s, "
+                f"lead {self.lead_limit:g} rad"
+            )
+        else:
+            given = {name: getattr(self, name) for name in _LIMITS[:4]}
+            (line,) = ControllerLimits(robot=self.robot, **given).lines(self.sample_time)
+        outputs, motors = self.robot.outputs.display_unit, self.robot.motors.unit
+        if self.angle_limit is not None:
+            line += f", |angle| <= {self.angle_limit / to_si(outputs)[0]:.3g} {outputs} (soft)"
+        if self.minimum_tautness is not None:
+            line += f", tautness >= {self.minimum_tautness / to_si(motors)[0]:g} {motors} (soft)"
+        return line
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write the controller to one `.npz` file."""
@@ -173,6 +189,7 @@ class MpcController:
             "inputs": [port.name for port in block.inputs],
             "outputs": [port.name for port in block.outputs],
             "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
+            **({} if self.robot.is_neck else {"robot": self.robot.as_dict()}),
         }
         write_archive(path, header, dict(zip(rt.MpcArrays.names(), self.arrays, strict=True)), force=force)
 
@@ -190,6 +207,7 @@ class MpcController:
             disturbances=tuple(MeasuredDisturbance(**item) for item in header["disturbances"]),
             order=str(header["order"]),
             design=dict(header["design"]),
+            robot=robot_in(header),
         )
 
 
@@ -214,7 +232,7 @@ def _review(controller: MpcController) -> list[str]:
         )
     lines += _limits(c)
     n = int(q[rt.MPC_ORDER])
-    for axis, name in enumerate(("pitch", "roll")):
+    for axis, name in enumerate(c.robot.outputs.names):
         A = a.model_A[axis * n : (axis + 1) * n]
         radius = float(np.abs(np.linalg.eigvals(A)).max())
         if 0.0 < radius < 1.0 and 1.0 - radius**horizon < _SEEN:
@@ -233,10 +251,13 @@ def _limits(c: MpcController) -> list[str]:
     if c.slew_limit * c.sample_time > travel:
         lines.append("the slew limit lets a motor cross its range within a sample: it limits nothing.")
     if c.lead_limit < c.slew_limit * c.sample_time:
+        per = to_si(c.robot.motors.unit)[0]
         lines.append(
-            f"lead_limit {c.lead_limit:g} rad is less than one sample's slew "
-            f"({c.slew_limit * c.sample_time:g} rad): the slew limit is never reached."
+            f"lead_limit {c.lead_limit / per:g} {c.robot.motors.unit} is less than one sample's slew "
+            f"({c.slew_limit * c.sample_time / per:g} {c.robot.motors.unit}): the slew limit is never reached."
         )
+    if not c.robot.is_neck:
+        return lines
     a = rt.MpcArrays(c.arrays)
     gains = [float(a.rest[axis, 0]) for axis in range(2)]
     if c.angle_limit is not None:

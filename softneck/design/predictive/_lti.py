@@ -7,9 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from softneck.core import Matrix, Vector
+from softneck.identification.models._linear_systems import redefined_input
+from softneck.robot import Robot
 from softneck.runtime import load_runtime
 
 from . import _mpc_state_runtime as rt
+from ._scale import runtime_of, unbound, units_of
 
 if TYPE_CHECKING:
     import control
@@ -21,49 +24,57 @@ _FREE = 1e12
 _UNIT = 2.0**-10
 
 
-def lti(arrays: tuple[Matrix, ...], *, name: str = "mpc") -> control.StateSpace:
+def lti(arrays: tuple[Matrix, ...], robot: Robot, *, name: str = "mpc") -> control.StateSpace:
     """Return it from (pitch_reference, roll_reference, pitch, roll) to (theta_i, phi_i).
 
-    Its matrices are what the runtime's own `step` does to unit vectors. With preview the reference counts as known
-    only when it comes.
+    Its matrices are what the runtime's own `step` does to unit vectors. Another robot has its outputs and
+    redefined inputs in their place. With preview the reference counts as known only when it comes.
     """
     import control
 
     A, B, C, D = system(arrays)
+    names = robot.outputs.names
+    if not robot.is_neck:
+        _, outputs, inputs = units_of(arrays)
+        B, C, D = B / np.tile(outputs, 2), C * inputs[:, None], D * inputs[:, None] / np.tile(outputs, 2)
     return control.StateSpace(
         A, B, C, D, float(rt.MpcArrays(arrays).constants[rt.MPC_TS]),
-        inputs=["pitch_reference", "roll_reference", "pitch", "roll"], outputs=["theta_i", "phi_i"], name=name,
+        inputs=[*(f"{output}_reference" for output in names), *names],
+        outputs=[redefined_input(robot, output) for output in names], name=name,
     )  # fmt: skip
 
 
 def system(arrays: tuple[Matrix, ...]) -> tuple[Matrix, Matrix, Matrix, Matrix]:
-    """Return A, B, C, D of `lti`."""
-    step = load_runtime("softneck.design.predictive._mpc_runtime").step
+    """Return A, B, C, D of `lti`, of another robot than the neck in the units of its size."""
+    arrays = unbound(arrays)
+    step = load_runtime(runtime_of(arrays)).step
     a = rt.MpcArrays(arrays)
+    m, motors = a.T.shape[0] - 1, a.T.shape[1]
+    flags = 2 * m + 1 + motors
     at, q = rt.MpcState.parts(a), a.constants
     numbers = np.arange(at["active"].stop)
     kept = np.concatenate([numbers[at[name]] for name in ("held", "filtered", "models", "offsets", "past", "coming")])
     # Tautness is the fifth where angles have no limit, else the sixth.
     soft = [_FREE] * int(q[rt.MPC_TAUT_AT] - q[rt.MPC_ANGLE_AT])
     parameters = np.array([_FREE, _FREE, _FREE, -_FREE, *soft, -_FREE])
-    ahead = 2 if q[rt.MPC_AHEAD] > 0 else 0
-    ports = 10 + ahead + int(q[rt.MPC_DISTURBANCES])
+    ahead = m if q[rt.MPC_AHEAD] > 0 else 0
+    ports = flags + 2 + ahead + int(q[rt.MPC_DISTURBANCES])
 
     def image(state_at: int, input_at: int) -> tuple[Vector, Vector]:
         state, u = np.zeros(numbers.size), np.zeros(ports)
         state[at["started"]] = 1.0
-        u[8:10] = 1.0
+        u[flags : flags + 2] = 1.0
         if state_at >= 0:
             state[state_at] = _UNIT
         else:
-            u[(0, 1, 3, 4)[input_at]] = _UNIT
-            if input_at < 2 and ahead:
-                u[10 + input_at] = _UNIT
-        out = np.zeros(3)
+            u[input_at if input_at < m else input_at + 1] = _UNIT  # co-contraction stands between them
+            if input_at < m and ahead:
+                u[flags + 2 + input_at] = _UNIT
+        out = np.zeros(motors)
         step(arrays, parameters, state, u, out)
-        return state[kept] / _UNIT, (a.T @ out)[:2] / _UNIT
+        return state[kept] / _UNIT, (a.T @ out)[:m] / _UNIT
 
-    columns = [image(int(at), -1) for at in kept] + [image(-1, i) for i in range(4)]
+    columns = [image(int(at), -1) for at in kept] + [image(-1, i) for i in range(2 * m)]
     states = np.array([state for state, _ in columns]).T
     outputs = np.array([out for _, out in columns]).T
     n = kept.size

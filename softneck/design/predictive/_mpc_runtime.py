@@ -15,6 +15,7 @@ from softneck.design.predictive._mpc_state_runtime import (
     MPC_ANGLE_BACK,
     MPC_BUDGET,
     MPC_NO_BOUND,
+    MPC_NUMBERS,
     MPC_OPTIMAL,
     MPC_PLAN,
     MPC_ROW_ANGLE_HIGH,
@@ -31,6 +32,9 @@ from softneck.design.predictive._mpc_state_runtime import (
     MpcState,
     MpcTheta,
     mpc_begin,
+    mpc_give,
+    mpc_inputs,
+    mpc_limits,
     mpc_parameter,
     mpc_predict,
 )
@@ -40,16 +44,18 @@ def step(p: MpcArrays, parameters: np.ndarray, x: MpcState, inputs: np.ndarray, 
     """Compute the set-points for now, and the state for the next sample.
 
     inputs: pitch, roll and co-contraction reference, pitch, roll, motor_position_1..3, healthy, enabled; with preview
-    pitch_reference_ahead, roll_reference_ahead; then measured disturbances.
+    pitch_reference_ahead, roll_reference_ahead; then measured disturbances. The outputs of another robot stand for
+    pitch and roll.
     outputs: motor_setpoint_1..3.
     parameters: position limit [rad], slew limit [rad/s], lead limit [rad], least position [rad]; where set,
     angle limit and least tautness [rad].
     """
-    if mpc_begin(p, x, inputs):
-        mpc_decide(p, parameters, x, inputs)
+    u = mpc_inputs(p, inputs)
+    if mpc_begin(p, x, u):
+        mpc_decide(p, mpc_limits(p, parameters), x, u)
     # Held or moved: models and past inputs go on with what the motors were told.
     mpc_predict(p, x)
-    outputs[:] = x.held
+    mpc_give(p, x, outputs)
 
 
 def mpc_bounds(
@@ -65,27 +71,37 @@ def mpc_bounds(
         low, high = -MPC_NO_BOUND, MPC_NO_BOUND
         if kind == MPC_ROW_MOVE:
             low, high = -move, move
-            # The first three rows are the moves of now, whose motors have been seen.
-            if i < 3 and math.isfinite(motors[i]):
+            # The first rows, one for each motor, are the moves of now, whose motors have been seen.
+            if i < p.motors and math.isfinite(motors[i]):
                 # Within the slew at any rate: a motor far off must not leave the problem without a solution.
                 low = min(max(low, motors[i] - parameters[2] - held[i]), high)
                 high = max(min(high, motors[i] + parameters[2] - held[i]), low)
         elif kind == MPC_ROW_POSITION:
             # A motor beyond a limit comes back as fast as its first move may: that can always be done.
             j = int(p.kinds[i, 1])
-            low = min(max(-parameters[0], parameters[3]), held[j] + upper[j]) - free[i]
-            high = max(parameters[0], held[j] + lower[j]) - free[i]
+            least, most = max(-parameters[0], parameters[3]), parameters[0]
+            if p.numbers > MPC_NUMBERS:
+                least = max(least, p.constants[MPC_NUMBERS + j])
+                most = min(most, p.constants[MPC_NUMBERS + p.motors + j])
+            low = min(least, held[j] + upper[j]) - free[i]
+            high = max(most, held[j] + lower[j]) - free[i]
         elif kind == MPC_ROW_SLACK:
             low = 0.0
         elif kind == MPC_ROW_ANGLE_HIGH:
             # Soft limits, tightened by their back-off; the slack is a variable of the row.
-            high = parameters[int(q[MPC_ANGLE_AT])] - q[MPC_ANGLE_BACK] - free[i]
+            high = mpc_angle(p, parameters, int(p.kinds[i, 1])) - q[MPC_ANGLE_BACK] - free[i]
         elif kind == MPC_ROW_ANGLE_LOW:
-            low = q[MPC_ANGLE_BACK] - parameters[int(q[MPC_ANGLE_AT])] - free[i]
+            low = q[MPC_ANGLE_BACK] - mpc_angle(p, parameters, int(p.kinds[i, 1])) - free[i]
         else:
             low = parameters[int(q[MPC_TAUT_AT])] + q[MPC_TAUT_BACK] - free[i]
         lower[i] = low
         upper[i] = high
+
+
+def mpc_angle(p: MpcArrays, parameters: np.ndarray, axis: int) -> float:
+    """Return the soft limit of an angle, in the unit of its size."""
+    limit = parameters[int(p.constants[MPC_ANGLE_AT])]
+    return limit / p.constants[p.numbers - 2 * p.outputs + axis] if p.numbers > MPC_NUMBERS else limit
 
 
 def mpc_decide(p: MpcArrays, parameters: np.ndarray, x: MpcState, inputs: np.ndarray) -> None:
@@ -93,7 +109,8 @@ def mpc_decide(p: MpcArrays, parameters: np.ndarray, x: MpcState, inputs: np.nda
     theta = np.empty(MpcTheta.size(p))
     mpc_parameter(p, x, theta)  # pyright: ignore[reportArgumentType]
     lower, upper, lam = np.empty(p.m), np.empty(p.m), np.zeros(p.m)
-    mpc_bounds(p, parameters, inputs[5:8], theta, lower, upper)  # pyright: ignore[reportArgumentType]
+    first = 2 * p.outputs + 1  # of the motors
+    mpc_bounds(p, parameters, inputs[first : first + p.motors], theta, lower, upper)  # pyright: ignore[reportArgumentType]
     z0 = np.dot(p.K, theta)
     # A warm start, from the rows that the last sample ended with.
     sign = x.active.copy()
@@ -135,7 +152,7 @@ def mpc_judge(p: MpcArrays, x: MpcState, z: np.ndarray) -> None:
     """Note whether the answer needed slack."""
     largest = 0.0
     for i in range(p.slacks):
-        largest = max(largest, z[3 * p.moves + i])
+        largest = max(largest, z[p.motors * p.moves + i])
     x.slack = largest
     # 1e-6 rad is no violation that anybody could measure.
     x.status = MPC_SOFT if largest > 1e-6 else MPC_OPTIMAL
@@ -163,12 +180,16 @@ def mpc_residual(
 
 def mpc_move(p: MpcArrays, x: MpcState, lower: np.ndarray, upper: np.ndarray, position: float) -> None:
     """Move `held` as the plan says for its age, within the bounds of now."""
-    for j in range(3):
+    for j in range(p.motors):
         move = 0.0
         for b in range(p.moves):
             if p.starts[b] == x.age:  # whole numbers: equality is safe
-                move = x.plan[3 * b + j]
+                move = x.plan[p.motors * b + j]
         # Bounds of now: a plan of an earlier sample knew others.
         move = min(max(move, lower[j]), upper[j])
-        low, high = min(-position, x.held[j]), max(position, x.held[j])
+        least, most = -position, position
+        if p.numbers > MPC_NUMBERS:
+            least = max(least, p.constants[MPC_NUMBERS + j])
+            most = min(most, p.constants[MPC_NUMBERS + p.motors + j])
+        low, high = min(least, x.held[j]), max(most, x.held[j])
         x.held[j] = min(max(x.held[j] + move, low), high)

@@ -1,8 +1,11 @@
 """What a predictive controller knows and remembers, and how it moves on: models, disturbances, references, past inputs.
 
 Each scenario s has, for each axis, a model `x+ = A x + B v(k - d)`, `y = x[0] + o` that runs on the inputs alone; the
-models stand behind each other, i = 2 s + axis. Its output disturbance o follows what was measured: `o+ = o + r`,
+models stand behind each other, i = outputs s + axis. Its output disturbance o follows what was measured: `o+ = o + r`,
 `r+ = a r` with a the plant's slowest pole, which is what a load makes of the angle that comes on at the plant's input.
+
+Of another robot than the neck all this is in units in which it has a neck's size (see `_scale`): `mpc_inputs` and
+`mpc_limits` come from SI, `mpc_give` goes back.
 """
 
 import math
@@ -41,6 +44,9 @@ MPC_ANGLE_AT = 13  # places of two parameters; those whose limit is not set are 
 MPC_TAUT_AT = 14
 MPC_ANGLE_BACK = 15  # how much soft limits are tightened
 MPC_TAUT_BACK = 16
+# Of another robot behind them: the lowest and highest set-points, and references, in the units of its size; then these
+# units in SI, that of the motors, and one for each output and for each redefined input.
+MPC_NUMBERS = 17
 
 # Kinds of rows.
 MPC_ROW_MOVE = 0.0
@@ -56,19 +62,32 @@ def mpc_disturbance_rows(constants: np.ndarray) -> int:
     return max(1, int(constants[MPC_DISTURBANCES]))
 
 
+def mpc_outputs(T: np.ndarray) -> int:
+    """Return the number of outputs: the redefined inputs are one more, co-contraction."""
+    return T.shape[0] - 1
+
+
+def mpc_motors(T: np.ndarray) -> int:
+    """Return the number of motors."""
+    return T.shape[1]
+
+
 class MpcArrays(Arrays):
     """The models of S scenarios, and the QP `min 1/2 z'Hz + (F theta)'z, lower <= A z + E theta <= upper`."""
 
-    _z, _theta = "3 * moves + slacks", "2 * S * (n + 2) + 2 * L + 5"
-    constants = array("17", "see MPC_TS to MPC_TAUT_BACK")
-    model_A = array("2 * S * n, n", "A of each model, below each other")
-    model_B = array("2 * S, n", "B of each model")
-    observer = array("2 * S, 3", "gains on o and r, and the pole a")
-    rest = array("2 * S, n", "x at rest under an input of one")
-    delays = array("2 * S", "d, dead times [samples]")
-    disturbances = array("channels, 3", "of each measured one: its gains on pitch and roll, and the pole of its filter")
-    filters = array("3", "poles of the reference filters")
-    T = array("3, 3", "of Eq. 9-11: motors to redefined inputs")
+    _z, _m = "motors * moves + slacks", "(references - 1)"
+    _theta = f"{_m} * S * (n + 2) + {_m} * L + motors + 2"
+    constants = array("numbers", "see MPC_TS to MPC_NUMBERS")
+    model_A = array(f"{_m} * S * n, n", "A of each model, below each other")
+    model_B = array(f"{_m} * S, n", "B of each model")
+    observer = array(f"{_m} * S, 3", "gains on o and r, and the pole a")
+    rest = array(f"{_m} * S, n", "x at rest under an input of one")
+    delays = array(f"{_m} * S", "d, dead times [samples]")
+    disturbances = array(
+        "channels, references", "of each measured one: its gains on the outputs, and the pole of its filter"
+    )
+    filters = array("references", "poles of the reference filters")
+    T = array("references, motors", "of Eq. 9-11: motors to redefined inputs")
     starts = array("moves", "samples of the horizon at which the motors move")
     K = array(f"{_z}, {_theta}", "-H^-1 F: the answer without limits")
     A = array(f"m, {_z}", "the rows that are limited")
@@ -89,6 +108,8 @@ class MpcArrays(Arrays):
     lead = value("constants", MPC_LEAD)
     measured = value("constants", MPC_DISTURBANCES)  # disturbances
     channels = value("constants", function=mpc_disturbance_rows)
+    outputs = value("T", function=mpc_outputs, written=True)
+    motors = value("T", function=mpc_motors, written=True)
 
 
 class MpcState(StateVector):
@@ -103,43 +124,95 @@ class MpcState(StateVector):
     age = cells("", "of the plan [samples]")
     residual = cells("", "of the KKT conditions, last answer")
     slack = cells("", "the largest, last answer")
-    held = cells("3", "set-points of now [rad]")
-    filtered = cells("3", "references behind their filters [rad]")
-    seen = cells("3", "references last seen [rad]")
+    held = cells("motors", "set-points of now [rad]")
+    filtered = cells("outputs + 1", "references behind their filters [rad]")
+    seen = cells("outputs + 1", "references last seen [rad]")
     disturbances = cells("measured, 2", "of each measured one: its value, and that behind its filter")
-    models = cells("2 * S, n", "x of each model")
-    offsets = cells("2 * S, 2", "o [rad] and r [rad/sample] of each model")
-    past = cells("D, 2", "inputs v, newest first [rad]")
-    coming = cells("2, ahead", "references to come [rad]")
-    plan = cells("3 * moves + slacks", "z: moves of the motors [rad], then slacks")
+    models = cells("outputs * S, n", "x of each model")
+    offsets = cells("outputs * S, 2", "o [rad] and r [rad/sample] of each model")
+    past = cells("D, outputs", "inputs v, newest first [rad]")
+    coming = cells("outputs, ahead", "references to come [rad]")
+    plan = cells("motors * moves + slacks", "z: moves of the motors [rad], then slacks")
     active = cells("m", "1 for rows at their upper, -1 at their lower bound")
 
 
 class MpcTheta(StateVector):
     """The parameter of the QP."""
 
-    models = cells("2 * S, n", "x(k + d) of each model")
-    offsets = cells("2 * S, 2", "o and r of each model")
-    wanted = cells("2, L", "pitch and roll at k + 1 .. k + L, less what measured disturbances will add [rad]")
-    held = cells("3", "set-points of now [rad]")
+    models = cells("outputs * S, n", "x(k + d) of each model")
+    offsets = cells("outputs * S, 2", "o and r of each model")
+    wanted = cells("outputs, L", "pitch and roll at k + 1 .. k + L, less what measured disturbances will add [rad]")
+    held = cells("motors", "set-points of now [rad]")
     cocontraction = cells("", "wanted [rad]")
     one = cells("", "1")
 
 
-def mpc_plausible(angle: float) -> bool:
-    """Return whether an angle is one that a neck can have."""
-    return math.isfinite(angle) and abs(angle) < MPC_PLAUSIBLE
+def mpc_inputs(p: MpcArrays, inputs: np.ndarray) -> np.ndarray:
+    """Return the inputs in the units of the robot's size."""
+    u = inputs.copy()
+    if p.numbers > MPC_NUMBERS:
+        first = p.numbers - 2 * p.outputs  # of the outputs' units; the motors' stands before them
+        flags = 2 * p.outputs + 1 + p.motors
+        for i in range(p.outputs):
+            u[i] /= p.constants[first + i]
+            u[p.outputs + 1 + i] /= p.constants[first + i]
+            if p.ahead > 0:
+                u[flags + 2 + i] /= p.constants[first + i]
+        u[p.outputs] /= p.constants[first - 1]
+        for j in range(p.motors):
+            u[2 * p.outputs + 1 + j] /= p.constants[first - 1]
+    return u
+
+
+def mpc_limits(p: MpcArrays, parameters: np.ndarray) -> np.ndarray:
+    """Return the parameters in the units of the robot's size; each output has one of its own for the angles' limit."""
+    limits = parameters.copy()
+    if p.numbers > MPC_NUMBERS:
+        unit = p.constants[p.numbers - 2 * p.outputs - 1]
+        for i in range(4):
+            limits[i] /= unit
+        taut = int(p.constants[MPC_TAUT_AT])
+        if taut < limits.shape[0]:
+            limits[taut] /= unit
+    return limits
+
+
+def mpc_give(p: MpcArrays, x: MpcState, outputs: np.ndarray) -> None:
+    """Fill the outputs with the set-points of now in SI."""
+    outputs[:] = x.held
+    if p.numbers > MPC_NUMBERS:
+        for j in range(p.motors):
+            outputs[j] *= p.constants[p.numbers - 2 * p.outputs - 1]
+
+
+def mpc_reference(p: MpcArrays, i: int, asked: float) -> float:
+    """Return a reference within what may be asked for."""
+    if p.numbers > MPC_NUMBERS:
+        low = MPC_NUMBERS + 2 * p.motors + i
+        return min(max(asked, p.constants[low]), p.constants[low + p.outputs + 1])
+    limit = MPC_REFERENCE_LIMIT if i < p.outputs else MPC_MOTOR_LIMIT
+    return min(max(asked, -limit), limit)
+
+
+def mpc_measured(p: MpcArrays, inputs: np.ndarray) -> bool:
+    """Return whether the outputs are numbers, of a neck those that it can have."""
+    for i in range(p.outputs + 1, 2 * p.outputs + 1):
+        if not math.isfinite(inputs[i]) or (p.numbers == MPC_NUMBERS and abs(inputs[i]) >= MPC_PLAUSIBLE):
+            return False
+    return True
 
 
 def mpc_begin(p: MpcArrays, x: MpcState, inputs: np.ndarray) -> bool:
     """Take in what is known now; return whether the motors may move."""
+    flags = 2 * p.outputs + 1 + p.motors
     if x.started == 0.0:
-        for j in range(3):
-            x.held[j] = inputs[5 + j] if math.isfinite(inputs[5 + j]) else 0.0
+        for j in range(p.motors):
+            position = inputs[2 * p.outputs + 1 + j]
+            x.held[j] = position if math.isfinite(position) else 0.0
     mpc_listen(p, x, inputs)
-    measured = mpc_plausible(inputs[3]) and mpc_plausible(inputs[4])
+    measured = mpc_measured(p, inputs)
     x.missed = 0.0 if measured else x.missed + 1.0
-    active = inputs[8] > 0.5 and inputs[9] > 0.5 and x.missed <= p.constants[MPC_COAST]
+    active = inputs[flags] > 0.5 and inputs[flags + 1] > 0.5 and x.missed <= p.constants[MPC_COAST]
     if x.started == 0.0 or not active:
         mpc_align(p, x, inputs, measured)
     elif measured:
@@ -154,23 +227,24 @@ def mpc_begin(p: MpcArrays, x: MpcState, inputs: np.ndarray) -> bool:
 
 def mpc_listen(p: MpcArrays, x: MpcState, inputs: np.ndarray) -> None:
     """Take in references and measured disturbances; one that is not finite leaves what was."""
-    for i in range(3):
+    for i in range(p.outputs + 1):
         if math.isfinite(inputs[i]):
-            limit = MPC_REFERENCE_LIMIT if i < 2 else MPC_MOTOR_LIMIT
-            x.seen[i] = min(max(inputs[i], -limit), limit)
-    first = 10  # of the measured disturbances in `inputs`: behind the preview, where there is one
+            x.seen[i] = mpc_reference(p, i, inputs[i])  # pyright: ignore[reportArgumentType]  (a number)
+    # Of the measured disturbances in `inputs`: behind the preview, where there is one.
+    first = 2 * p.outputs + 3 + p.motors
     if p.ahead > 0:
-        first = 12
-        for axis in range(2):
+        coming = first
+        first += p.outputs
+        for axis in range(p.outputs):
             row = x.coming[axis]
             # What is to come is not known yet: as now.
             if x.started == 0.0:
                 row[:] = x.seen[axis]
             for i in range(p.ahead - 1):
                 row[i] = row[i + 1]
-            value = inputs[10 + axis]
+            value = inputs[coming + axis]
             if math.isfinite(value):
-                row[p.ahead - 1] = min(max(value, -MPC_REFERENCE_LIMIT), MPC_REFERENCE_LIMIT)
+                row[p.ahead - 1] = mpc_reference(p, axis, value)
     for i in range(p.measured):
         value = inputs[first + i]
         x.disturbances[i, 0] = value if math.isfinite(value) else x.disturbances[i, 0]
@@ -190,20 +264,20 @@ def mpc_align(p: MpcArrays, x: MpcState, inputs: np.ndarray, measured: bool) -> 
     """Start as if the neck had always stood where it is under the held set-points: no bump."""
     v = np.dot(p.T, x.held)
     for s in range(p.S):
-        for axis in range(2):
-            i = 2 * s + axis
+        for axis in range(p.outputs):
+            i = p.outputs * s + axis
             for j in range(p.n):
                 x.models[i, j] = p.rest[i, j] * v[axis]
             x.offsets[i, 0] = 0.0
             x.offsets[i, 1] = 0.0
             if measured:
                 # What the angle is beyond that is a disturbance, there to stay.
-                x.offsets[i, 0] = inputs[3 + axis] - x.models[i, 0] - mpc_added(p, x, axis)
+                x.offsets[i, 0] = inputs[p.outputs + 1 + axis] - x.models[i, 0] - mpc_added(p, x, axis)
             x.filtered[axis] = x.models[i, 0] + x.offsets[i, 0] + mpc_added(p, x, axis)
-    x.filtered[2] = v[2]
+    x.filtered[p.outputs] = v[p.outputs]
     for i in range(p.D):
-        x.past[i, 0] = v[0]
-        x.past[i, 1] = v[1]
+        for axis in range(p.outputs):
+            x.past[i, axis] = v[axis]
     x.plan[:] = 0.0
     x.active[:] = 0.0
     x.age = 0.0
@@ -211,20 +285,21 @@ def mpc_align(p: MpcArrays, x: MpcState, inputs: np.ndarray, measured: bool) -> 
 
 def mpc_correct(p: MpcArrays, x: MpcState, inputs: np.ndarray) -> None:
     """Take the measured angles in."""
-    for i in range(2 * p.S):
+    for i in range(p.outputs * p.S):
         # x runs on its inputs alone: only o and r answer to what was measured.
-        error = inputs[3 + i % 2] - mpc_added(p, x, i % 2) - x.models[i, 0] - x.offsets[i, 0]
+        axis = i % p.outputs
+        error = inputs[p.outputs + 1 + axis] - mpc_added(p, x, axis) - x.models[i, 0] - x.offsets[i, 0]
         x.offsets[i, 0] += p.observer[i, 0] * error
         x.offsets[i, 1] += p.observer[i, 1] * error
 
 
 def mpc_filter(p: MpcArrays, x: MpcState) -> None:
     """Move the reference filters on: what is asked now acts now."""
-    for i in range(3):
+    for i in range(p.outputs + 1):
         a = p.filters[i]
         asked = x.seen[i]
         # As many samples early as the filter makes late.
-        if i < 2 and p.ahead > 0 and p.lead > 0:
+        if i < p.outputs and p.ahead > 0 and p.lead > 0:
             asked = x.coming[i, min(p.lead, p.ahead) - 1]
         x.filtered[i] = a * x.filtered[i] + (1.0 - a) * asked
 
@@ -241,16 +316,16 @@ def mpc_model(p: MpcArrays, i: int, u: float, now: np.ndarray, after: np.ndarray
 def mpc_parameter(p: MpcArrays, x: MpcState, theta: MpcTheta) -> None:
     """Fill theta."""
     now, after = np.empty(p.n), np.empty(p.n)
-    for i in range(2 * p.S):
+    for i in range(p.outputs * p.S):
         now[:] = x.models[i]
         # The inputs of the dead time are given, oldest first.
         for back in range(int(p.delays[i]), 0, -1):
-            mpc_model(p, i, x.past[back - 1, i % 2], now, after)
+            mpc_model(p, i, x.past[back - 1, i % p.outputs], now, after)
             now[:] = after
         theta.models[i] = now
         theta.offsets[i, 0] = x.offsets[i, 0]
         theta.offsets[i, 1] = x.offsets[i, 1]
-    for axis in range(2):
+    for axis in range(p.outputs):
         a = p.filters[axis]
         value = x.filtered[axis]
         for i in range(1, p.L + 1):
@@ -262,13 +337,13 @@ def mpc_parameter(p: MpcArrays, x: MpcState, theta: MpcTheta) -> None:
             theta.wanted[axis, i - 1] = value
         for j in range(p.measured):
             # A measured disturbance is taken to stay as well; its effect comes through its filter.
-            w, z, keep = x.disturbances[j, 0], x.disturbances[j, 1], p.disturbances[j, 2]
+            w, z, keep = x.disturbances[j, 0], x.disturbances[j, 1], p.disturbances[j, p.outputs]
             for i in range(p.L):
                 z = keep * z + (1.0 - keep) * w
                 # Off the target instead of onto every model's angle: the same error.
                 theta.wanted[axis, i] -= p.disturbances[j, axis] * z
     theta.held[:] = x.held
-    theta.cocontraction = x.filtered[2]
+    theta.cocontraction = x.filtered[p.outputs]
     theta.one = 1.0
 
 
@@ -276,20 +351,20 @@ def mpc_predict(p: MpcArrays, x: MpcState) -> None:
     """Move models, past inputs and disturbances on to the next sample."""
     v = np.dot(p.T, x.held)
     now = np.empty(p.n)
-    for i in range(2 * p.S):
+    for i in range(p.outputs * p.S):
         back = int(p.delays[i])
-        u = x.past[back - 1, i % 2] if back > 0 else v[i % 2]  # v(k - d); without dead time v of now
+        u = x.past[back - 1, i % p.outputs] if back > 0 else v[i % p.outputs]  # v(k - d); without dead time v of now
         now[:] = x.models[i]
         mpc_model(p, i, u, now, x.models[i])
         # o first: r of now moves it (o+ = o + r, r+ = a r).
         x.offsets[i, 0] += x.offsets[i, 1]
         x.offsets[i, 1] *= p.observer[i, 2]
     for i in range(p.D - 1, 0, -1):
-        x.past[i, 0] = x.past[i - 1, 0]
-        x.past[i, 1] = x.past[i - 1, 1]
+        for axis in range(p.outputs):
+            x.past[i, axis] = x.past[i - 1, axis]
     if p.D > 0:
-        x.past[0, 0] = v[0]
-        x.past[0, 1] = v[1]
+        for axis in range(p.outputs):
+            x.past[0, axis] = v[axis]
     for i in range(p.measured):
-        keep = p.disturbances[i, 2]
+        keep = p.disturbances[i, p.outputs]
         x.disturbances[i, 1] = keep * x.disturbances[i, 1] + (1.0 - keep) * x.disturbances[i, 0]

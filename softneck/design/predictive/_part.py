@@ -25,8 +25,10 @@ class MpcPart(BlockPart):
         require_one_of("solver", solver, ("own", "daqp"))
         super().__init__(controller)
         self._program = MpcProgram(controller.arrays) if solver == "daqp" else None
-        self._functions = load_functions("softneck.design.predictive._mpc_runtime")
+        self._functions = load_functions(controller.runtime)
         self._at = rt.MpcState.parts(rt.MpcArrays(controller.arrays))
+        outputs = rt.MpcArrays(controller.arrays).T.shape[0] - 1
+        self._names = tuple(port.name.removesuffix("_reference") for port in controller.inputs[:outputs])
         self._took = math.nan
 
     def advance(self, time: float, inputs: Vector) -> Vector:
@@ -39,7 +41,7 @@ class MpcPart(BlockPart):
     @property
     def info(self) -> MpcInfo:
         """What the last sample decided, and how long it took."""
-        return replace(explain(self.block.arrays, self._state), time=self._took)
+        return replace(explain(self.block.arrays, self._state, self._names), time=self._took)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -52,17 +54,19 @@ class MpcPart(BlockPart):
     def _with_daqp(self, program: MpcProgram, inputs: Vector) -> Vector:
         """Do what the runtime's `step` does, with another solver in its middle."""
         f, arrays, state, parameters = self._functions, self.block.arrays, self._state, self._parameters
-        if f.mpc_begin(arrays, state, inputs):
+        u = f.mpc_inputs(arrays, inputs)
+        if f.mpc_begin(arrays, state, u):
             m, count = program.E.shape
             theta, lower, upper = np.empty(count), np.empty(m), np.empty(m)
             f.mpc_parameter(arrays, state, theta)
-            f.mpc_bounds(arrays, parameters, inputs[5:8], theta, lower, upper)
+            limits, first = f.mpc_limits(arrays, parameters), 2 * len(self._names) + 1
+            f.mpc_bounds(arrays, limits, u[first : first + self._outputs.size], theta, lower, upper)
             z, flag, lam = program.solve(theta, lower, upper)
             f.mpc_take(arrays, state, theta, z, lam, lower, upper, flag > 0)
             state[self._at["iterations"]] = program.iterations
-            f.mpc_move(arrays, state, lower, upper, parameters[0])
+            f.mpc_move(arrays, state, lower, upper, limits[0])
         f.mpc_predict(arrays, state)
-        self._outputs[:] = state[self._at["held"]]
+        f.mpc_give(arrays, state, self._outputs)
         return self._outputs.copy()
 
     def start(self, time: float, parameters: Mapping[str, float]) -> Vector:

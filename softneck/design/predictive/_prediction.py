@@ -20,13 +20,8 @@ _LARGEST_CONDITION = 1e12
 class Scenario:
     """What the neck may be: a plant for each axis and how much this counts in the cost."""
 
-    pitch: AxisPlant
-    roll: AxisPlant
+    axes: tuple[AxisPlant, ...]
     weight: float
-
-    def axis(self, i: int) -> AxisPlant:
-        """Return pitch (0) or roll (1)."""
-        return (self.pitch, self.roll)[i]
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -37,13 +32,14 @@ class Problem:
         scenarios: the first is the nominal one.
         horizon: N, samples after each axis' dead time.
         starts: samples at which the motors may move.
-        T: (3, 3) of Eq. 9-11.
-        output_weight: (2,) on angle errors [1/rad^2].
+        T: (outputs + 1, motors) of Eq. 9-11, of a neck with 3 motors and 2 outputs.
+        T_inverse: (motors, outputs + 1).
+        output_weight: (outputs,) on angle errors [1/rad^2].
         move_weight: on moves of the motors [1/rad^2].
         cocontraction_weight: on co-contraction's error [1/rad^2].
         slack_weight: on violations of soft limits [1/rad^2].
         angles: whether angles are limited.
-        tautness: (3, 2) how much an angle loosens each tendon [rad/rad]; None for no limit.
+        tautness: (motors, outputs) how much an angle loosens each tendon [rad/rad]; None for no limit.
         disturbance_time: of the output disturbance's rate [s]; None for the plant's own.
         guard: samples after the dead time from which on limits of angles are looked at.
     """
@@ -52,6 +48,7 @@ class Problem:
     horizon: int
     starts: tuple[int, ...]
     T: Matrix
+    T_inverse: Matrix
     output_weight: Vector
     move_weight: float
     cocontraction_weight: float
@@ -62,14 +59,30 @@ class Problem:
     guard: int = 1
 
     @property
+    def motors(self) -> int:
+        """Number of motors."""
+        return self.T.shape[1]
+
+    @property
+    def outputs(self) -> int:
+        """Number of outputs."""
+        return self.T.shape[0] - 1
+
+    @property
+    def idle(self) -> Matrix:
+        """(k, motors) moves of the motors that neither tilt nor co-contract, orthonormal; none of a neck."""
+        _, values, rows = np.linalg.svd(self.T)
+        return rows[int(np.sum(values > 1e-9 * values[0])) :]
+
+    @property
     def order(self) -> int:
         """n, states of an axis."""
-        return max(s.axis(i).order for s in self.scenarios for i in range(2))
+        return max(plant.order for s in self.scenarios for plant in s.axes)
 
     @property
     def dead_time(self) -> int:
         """D, the longest dead time in samples."""
-        return max(s.axis(i).delay for s in self.scenarios for i in range(2))
+        return max(plant.delay for s in self.scenarios for plant in s.axes)
 
     @property
     def rows(self) -> int:
@@ -84,12 +97,13 @@ class Problem:
     @property
     def variables(self) -> int:
         """Moves and slacks."""
-        return 3 * len(self.starts) + self.slacks
+        return self.motors * len(self.starts) + self.slacks
 
     @property
     def parameters(self) -> int:
         """Length of theta, see `_mpc_state_runtime`."""
-        return 2 * len(self.scenarios) * (self.order + 2) + 2 * self.rows + 5
+        m = self.outputs
+        return m * len(self.scenarios) * (self.order + 2) + m * self.rows + self.motors + 2
 
     @property
     def ends(self) -> tuple[int, ...]:
@@ -152,15 +166,16 @@ def expression(problem: Problem) -> dict[str, Any]:
 
     p = problem
     S, n, L, N = len(p.scenarios), p.order, p.rows, p.horizon
+    M, m = p.motors, p.outputs
     z, theta = ca.SX.sym("z", p.variables), ca.SX.sym("theta", p.parameters)
-    at = 2 * S * n
-    offset = [(theta[at + 2 * i], theta[at + 2 * i + 1]) for i in range(2 * S)]
-    at += 4 * S
-    wanted = [theta[at + axis * L : at + (axis + 1) * L] for axis in range(2)]
-    at += 2 * L
-    held, common = theta[at : at + 3], theta[at + 3]
-    moves = [z[3 * b : 3 * b + 3] for b in range(len(p.starts))]
-    slack = [z[3 * len(p.starts) + i] for i in range(p.slacks)]
+    at = m * S * n
+    offset = [(theta[at + 2 * i], theta[at + 2 * i + 1]) for i in range(m * S)]
+    at += 2 * m * S
+    wanted = [theta[at + axis * L : at + (axis + 1) * L] for axis in range(m)]
+    at += m * L
+    held, common = theta[at : at + M], theta[at + M]
+    moves = [z[M * b : M * b + M] for b in range(len(p.starts))]
+    slack = [z[M * len(p.starts) + i] for i in range(p.slacks)]
 
     motors, positions, now = [], [], held
     for i in range(N):
@@ -175,12 +190,11 @@ def expression(problem: Problem) -> dict[str, Any]:
     angles: list[list[list[Any]]] = []
     for s, scenario in enumerate(p.scenarios):
         ends, paths = [], []
-        for axis in range(2):
-            plant = scenario.axis(axis)
+        for axis, plant in enumerate(scenario.axes):
             A, B = padded(plant, n)
-            level, rate = offset[2 * s + axis]
+            level, rate = offset[m * s + axis]
             a = disturbance_pole(plant, p.disturbance_time)
-            x = theta[(2 * s + axis) * n : (2 * s + axis + 1) * n]
+            x = theta[(m * s + axis) * n : (m * s + axis + 1) * n]
             path = []
             for i, v in enumerate(inputs):
                 x = ca.mtimes(ca.DM(A), x) + ca.DM(B) * v[axis]
@@ -194,27 +208,29 @@ def expression(problem: Problem) -> dict[str, Any]:
             ends.append((x, plant, goal / plant.static_gain))
         cost += scenario.weight * _terminal(p, scenario, ends, motors[-1], common)
         angles.append(paths)
-    cost += p.cocontraction_weight * sum((v[2] - common) ** 2 for v in inputs[:-1])
+    cost += p.cocontraction_weight * sum((v[m] - common) ** 2 for v in inputs[:-1])
+    if len(p.idle):
+        # What neither tilts nor co-contracts is held at zero, or it would be anywhere.
+        cost += p.cocontraction_weight * sum(ca.sumsqr(ca.mtimes(ca.DM(p.idle), motor)) for motor in motors[:-1])
     cost += p.slack_weight * sum((value**2 + 0.1 * value for value in slack), ca.SX(0))
 
-    rows, kinds = _hard_rows(moves, positions, slack)
+    rows, kinds = _hard_rows(moves, positions, slack, M)
     _soft_rows(p, angles, motors, slack, rows, kinds)
     return {"z": z, "theta": theta, "cost": cost, "rows": ca.vertcat(*rows), "kinds": np.array(kinds)}
 
 
 def _asked_moves(p: Problem, wanted: list[Any]) -> list[Any]:
-    """Return the moves (3,) at each start that the reference itself asks for, at rest: only others cost.
+    """Return the moves (motors,) at each start that the reference itself asks for, at rest: only others cost.
 
     Without them a reference that keeps moving would be followed late and too low, in a trade against its moves.
     """
     import casadi as ca
 
-    inverse = ca.DM(np.linalg.inv(p.T))
+    inverse = ca.DM(p.T_inverse)
     ends = (*p.starts[1:], p.horizon)
     middles = [-0.5, *(0.5 * (start + end) for start, end in zip(p.starts, ends, strict=True))]
     levels = []
-    for axis in range(2):
-        plant = p.scenarios[0].axis(axis)
+    for axis, plant in enumerate(p.scenarios[0].axes):
         places = np.clip(plant.delay + np.array(middles), 0.0, p.rows - 1.0)
         low = np.floor(places).astype(int)
         high = np.minimum(low + 1, p.rows - 1)
@@ -227,14 +243,16 @@ def _asked_moves(p: Problem, wanted: list[Any]) -> list[Any]:
     ]
 
 
-def _hard_rows(moves: list[Any], positions: list[Any], slack: list[Any]) -> tuple[list[Any], list[tuple[float, float]]]:
+def _hard_rows(
+    moves: list[Any], positions: list[Any], slack: list[Any], motors: int
+) -> tuple[list[Any], list[tuple[float, float]]]:
     """Return slew rows, position rows and the slacks' own."""
     rows: list[Any] = []
     kinds: list[tuple[float, float]] = []
     for kind, group in ((rt.MPC_ROW_MOVE, moves), (rt.MPC_ROW_POSITION, positions)):
         for value in group:
-            rows += [value[j] for j in range(3)]
-            kinds += [(kind, float(j)) for j in range(3)]
+            rows += [value[j] for j in range(motors)]
+            kinds += [(kind, float(j)) for j in range(motors)]
     rows += slack
     kinds += [(rt.MPC_ROW_SLACK, float(i)) for i in range(len(slack))]
     return rows, kinds
@@ -247,14 +265,14 @@ def _soft_rows(
     """Append limits of angles in all scenarios, and of tautness in the nominal one."""
     if p.angles:
         for paths in angles:
-            for axis in range(2):
+            for axis in range(p.outputs):
                 for i in p.checked:
                     rows += [paths[axis][i - 1] - slack[0], paths[axis][i - 1] + slack[0]]
                     kinds += [(rt.MPC_ROW_ANGLE_HIGH, float(axis)), (rt.MPC_ROW_ANGLE_LOW, float(axis))]
     if p.tautness is not None:
         for i in p.ends:
-            for j in range(3):
-                loosened = sum(p.tautness[j, axis] * angles[0][axis][i - 1] for axis in range(2))
+            for j in range(p.motors):
+                loosened = sum(p.tautness[j, axis] * angles[0][axis][i - 1] for axis in range(p.outputs))
                 rows.append(motors[i - 1][j] - loosened + slack[-1])
                 kinds.append((rt.MPC_ROW_TAUT, float(j)))
 
@@ -265,30 +283,33 @@ def _terminal(p: Problem, scenario: Scenario, ends: list[Any], motors: Any, comm
 
     P = terminal_matrix(p, scenario)
     n = p.order
-    goal = ca.mtimes(ca.DM(np.linalg.inv(p.T)), ca.vertcat(ends[0][2], ends[1][2], common))
+    goal = ca.mtimes(ca.DM(p.T_inverse), ca.vertcat(*(end[2] for end in ends), common))
     parts = [x - ca.DM(rest_states(plant, n)) * v for x, plant, v in ends]
     error = ca.vertcat(*parts, motors - goal)
     return ca.bilin(ca.DM(P), error, error)
 
 
 def terminal_matrix(p: Problem, scenario: Scenario) -> Matrix:
-    """Return P (2n + 3, 2n + 3) of the Riccati equation for states of both axes and motors, moves as inputs."""
+    """Return P, square over m n states and the motors, of the Riccati equation with moves as inputs."""
     from scipy.linalg import solve_discrete_are
 
-    n = p.order
-    A, B = np.eye(2 * n + 3), np.zeros((2 * n + 3, 3))
+    n, M, m = p.order, p.motors, p.outputs
+    at = m * n  # of the motors
+    A, B = np.eye(at + M), np.zeros((at + M, M))
     Q = np.zeros_like(A)
-    for axis in range(2):
-        a, b = padded(scenario.axis(axis), n)
+    for axis, plant in enumerate(scenario.axes):
+        a, b = padded(plant, n)
         place = slice(axis * n, (axis + 1) * n)
-        A[place, place], A[place, 2 * n :] = a, np.outer(b, p.T[axis])
+        A[place, place], A[place, at:] = a, np.outer(b, p.T[axis])
         B[place] = np.outer(b, p.T[axis])
         Q[axis * n, axis * n] = p.output_weight[axis]
-    B[2 * n :] = np.eye(3)
+    B[at:] = np.eye(M)
     # Of the scenarios' weights, which sum to one, each carries its part of co-contraction and moves.
-    Q[2 * n :, 2 * n :] = p.cocontraction_weight * np.outer(p.T[2], p.T[2])
+    Q[at:, at:] = p.cocontraction_weight * np.outer(p.T[m], p.T[m])
+    if len(p.idle):
+        Q[at:, at:] += p.cocontraction_weight * p.idle.T @ p.idle
     try:
-        return solve_discrete_are(A, B, Q, p.move_weight * np.eye(3))
+        return solve_discrete_are(A, B, Q, p.move_weight * np.eye(M))
     except np.linalg.LinAlgError as error:
         raise SettingsError(f"the terminal cost has no solution ({error}); check weights and model.") from error
 

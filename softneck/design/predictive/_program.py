@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector
+from softneck.estimation._axis import AXES
 from softneck.runtime import load_functions
 
 from . import _mpc_state_runtime as rt
+from ._scale import runtime_of, units_of
 
 # daqp's own default is 1e-6; the block's solver ends at 1e-10.
 _TOLERANCE = 1e-10
@@ -28,11 +30,13 @@ class MpcInfo:
             "holding" (disabled or without measurement) or "not started".
         iterations: rows added and dropped by the solver.
         residual: of the KKT conditions.
-        slack: largest violation of a soft limit that is planned, scaled to the limit's unit [rad].
+        slack: largest violation of a soft limit that is planned, scaled to the limit's unit [rad]; of another
+            robot than the neck as if it had a neck's size.
         active: names of the active limits.
-        set_points: (N, 3) planned motor set-points from the next sample on [rad].
-        angles: (N, 2) pitch and roll that the nominal plant makes of them, each a dead time and a sample later [rad].
-        reference: (N, 2) what they are to be then [rad].
+        set_points: (N, motors) planned motor set-points from the next sample on [rad].
+        angles: (N, outputs) pitch and roll that the nominal plant makes of them, each a dead time and a sample later
+            [rad].
+        reference: (N, outputs) what they are to be then [rad].
         time: of the solution [s]; NaN where it was not taken.
     """
 
@@ -63,7 +67,7 @@ class MpcProgram:
         self.arrays, a = arrays, rt.MpcArrays(arrays)
         self.constants, self.kinds, self.H, self.F, self.A, self.E = a.constants, a.kinds, a.H, a.F, a.A, a.E
         m = self.A.shape[0]
-        self._functions = load_functions("softneck.design.predictive._mpc_runtime")
+        self._functions = load_functions(runtime_of(arrays))
         self._rest, self._order = self._rows()
         self._model: Any = daqp.Model()
         wide = np.full(m, 1e30)
@@ -88,7 +92,7 @@ class MpcProgram:
         return rest, np.concatenate([np.array(first, dtype=np.int64), rest])
 
     def bounds(self, theta: Vector, parameters: Vector, motors: Vector) -> tuple[Vector, Vector]:
-        """Return the bounds (m,) of all rows under those limits, motors (3,) being where they are [rad]."""
+        """Return the bounds (m,) of all rows under those limits, motors (motors,) being where they are [rad]."""
         m = self.A.shape[0]
         lower, upper = np.empty(m), np.empty(m)
         self._functions.mpc_bounds(self.arrays, parameters, np.asarray(motors, float), theta, lower, upper)
@@ -111,6 +115,8 @@ class MpcProgram:
         """
         import casadi as ca
 
+        if self.constants.size > rt.MPC_NUMBERS:
+            raise SettingsError("the QP as a CasADi function takes necks only so far; `solve` takes any robot.")
         theta, limits = ca.SX.sym("theta", self.F.shape[1]), ca.SX.sym("limits", 4)
         q = self.constants
         position, move = limits[0], limits[1]
@@ -135,20 +141,21 @@ def residual(
     program: MpcProgram, theta: Vector, z: Vector, multipliers: Vector, bounds: tuple[Vector, Vector]
 ) -> float:
     """Return the largest residual of the KKT conditions of any answer, by the block's own function."""
-    functions = load_functions("softneck.design.predictive._mpc_runtime")
+    functions = load_functions(runtime_of(program.arrays))
     return float(functions.mpc_residual(program.arrays, theta, z, multipliers, *bounds))
 
 
-def explain(arrays: tuple[Matrix, ...], state: Vector) -> MpcInfo:
-    """Return what the sample that led to `state` decided."""
+def explain(arrays: tuple[Matrix, ...], state: Vector, names: tuple[str, ...] = AXES) -> MpcInfo:
+    """Return what the sample that led to `state` decided; `names` are the outputs'."""
     a = rt.MpcArrays(arrays)
     now = {name: state[place] for name, place in rt.MpcState.parts(a).items()}
-    functions = load_functions("softneck.design.predictive._mpc_runtime")
+    functions = load_functions(runtime_of(arrays))
     age = int(now["age"].item())
-    moves = np.zeros((int(a.constants[rt.MPC_ROWS] - a.constants[rt.MPC_PAST]), 3))
+    motors = a.T.shape[1]
+    moves = np.zeros((int(a.constants[rt.MPC_ROWS] - a.constants[rt.MPC_PAST]), motors))
     for i, start in enumerate(a.starts.astype(int)):
         if start > age:
-            moves[start - age - 1] = now["plan"][3 * i : 3 * i + 3]
+            moves[start - age - 1] = now["plan"][motors * i : motors * i + motors]
     theta = np.zeros(a.K.shape[1])
     functions.mpc_parameter(arrays, state, theta)
     # The state stands one sample on: what is held now was the plan's first move.
@@ -156,34 +163,35 @@ def explain(arrays: tuple[Matrix, ...], state: Vector) -> MpcInfo:
     angles, reference = _predicted(a, theta, set_points)
     active = tuple(
         f"{ROW_NAMES[int(kind)]} {('upper', 'lower')[int(sign < 0)]} "
-        + (("motor " + str(int(which) + 1)) if kind in _OF_MOTORS else ("pitch", "roll")[int(which) % 2])
+        + (("motor " + str(int(which) + 1)) if kind in _OF_MOTORS else names[int(which)])
         for (kind, which), sign in zip(a.kinds, now["active"], strict=True)
         if sign != 0.0 and kind != rt.MPC_ROW_SLACK
     )
+    unit, outputs, _ = units_of(arrays)
     return MpcInfo(
         status=STATUS_NAMES[int(now["status"].item())],
         iterations=int(now["iterations"].item()),
         residual=now["residual"].item(),
         slack=now["slack"].item(),
         active=active,
-        set_points=set_points,
-        angles=angles,
-        reference=reference,
+        set_points=unit * set_points,
+        angles=outputs * angles,
+        reference=outputs * reference,
     )
 
 
 def _predicted(a: rt.MpcArrays, theta: Vector, set_points: Matrix) -> tuple[Matrix, Matrix]:
-    """Return predicted angles and references (N, 2) of the nominal plant from theta on."""
-    n, N = a.model_B.shape[1], set_points.shape[0]
+    """Return predicted angles and references (N, outputs) of the nominal plant from theta on."""
+    n, N, m = a.model_B.shape[1], set_points.shape[0], a.T.shape[0] - 1
     now = {name: theta[place] for name, place in rt.MpcTheta.parts(a).items()}
     inputs = set_points @ a.T.T
-    angles, reference = np.zeros((N, 2)), np.zeros((N, 2))
-    for axis in range(2):
+    angles, reference = np.zeros((N, m)), np.zeros((N, m))
+    for axis in range(m):
         A, B = a.model_A[axis * n : (axis + 1) * n], a.model_B[axis]
         pole, delay = a.observer[axis, 2], int(a.delays[axis])
         level, rate = now["offsets"].reshape(-1, 2)[axis]
         x = now["models"].reshape(-1, n)[axis]
-        reference[:, axis] = now["wanted"].reshape(2, -1)[axis, delay : delay + N]
+        reference[:, axis] = now["wanted"].reshape(m, -1)[axis, delay : delay + N]
         for i in range(N):
             x = A @ x + B * inputs[i, axis]
             angles[i, axis] = x[0] + level + rate * (1.0 - pole ** (delay + 1 + i)) / (1.0 - pole)

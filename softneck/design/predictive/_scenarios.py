@@ -9,8 +9,10 @@ import numpy as np
 
 from softneck.core import SettingsError
 from softneck.estimation import AxisPlant, LinearNeck, axis_plant
+from softneck.estimation._axis import robot_of
 
 from ._prediction import Scenario
+from ._scale import SizedPlant
 from ._tuning import Pair
 
 # The nominal plant counts as much as all other scenarios together.
@@ -20,16 +22,16 @@ _JUDGES = 12
 
 
 def sample_pairs(model: Any, least_delay: float) -> list[Pair]:
-    """Return samples of a family, pitch with roll by the order of their static gains; none for a single model."""
-    if not hasattr(model, "samples"):
+    """Return samples of a family, axes joined by the order of their static gains; none for a single model."""
+    if not hasattr(model, "samples") or (isinstance(model, SizedPlant) and not model.uncertain):
         return []
     axes = []
-    for axis in ("pitch", "roll"):
-        plants = [_plant(tf, axis).delayed(least_delay) for tf in model.samples(axis)]
+    for axis in robot_of(model).outputs.names:
+        plants = [plant.delayed(least_delay) for plant in _plants(model, axis)]
         axes.append(sorted(plants, key=lambda plant: plant.static_gain))
     count = min(_JUDGES, *(len(plants) for plants in axes))
     picks = [np.linspace(0, len(plants) - 1, count).round().astype(int) for plants in axes]
-    return [(axes[0][i], axes[1][j]) for i, j in zip(*picks, strict=True)]
+    return [tuple(plants[i] for plants, i in zip(axes, chosen, strict=True)) for chosen in zip(*picks, strict=True)]
 
 
 def chosen_scenarios(model: Any, nominal: Pair, count: int, least_delay: float, extra_delay: int) -> list[Scenario]:
@@ -39,7 +41,7 @@ def chosen_scenarios(model: Any, nominal: Pair, count: int, least_delay: float, 
         SettingsError: scenarios of a model that has no samples.
     """
     if count == 0:
-        return [Scenario(*nominal, 1.0)]
+        return [Scenario(nominal, 1.0)]
     pairs = sample_pairs(model, least_delay)
     if not pairs:
         raise SettingsError("scenarios are samples of a family; give a FAMILY (`softneck family`), or `scenarios=0`.")
@@ -47,10 +49,11 @@ def chosen_scenarios(model: Any, nominal: Pair, count: int, least_delay: float, 
     weight = (1.0 - _NOMINAL_WEIGHT) / picks.size
     others = []
     for pair in (pairs[i] for i in picks):
-        first, second = (replace(plant, delay=plant.delay + extra_delay) for plant in pair)
-        others.append(Scenario(first, second, weight))
-    return [Scenario(*nominal, _NOMINAL_WEIGHT), *others]
+        others.append(Scenario(tuple(replace(plant, delay=plant.delay + extra_delay) for plant in pair), weight))
+    return [Scenario(nominal, _NOMINAL_WEIGHT), *others]
 
 
-def _plant(tf: Any, axis: str) -> AxisPlant:
-    return axis_plant(LinearNeck(pitch=tf, roll=tf), axis)
+def _plants(model: Any, axis: str) -> list[AxisPlant]:
+    if isinstance(model, SizedPlant):
+        return list(model.axes[axis].samples)
+    return [axis_plant(LinearNeck(pitch=tf, roll=tf), axis) for tf in model.samples(axis)]

@@ -16,23 +16,38 @@ from softneck.core import (
     require_one_of,
     require_positive,
     require_whole,
+    to_si,
 )
 from softneck.estimation import axis_plant
 from softneck.estimation._axis import HasTransferFunctions, robot_of
 from softneck.estimation._settings import ORDERS
+from softneck.robot._neck_default import NeckCount, NeckDefault
+from softneck.robot._redefined import redefinition_of
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
-from ..linear._margins import frequencies
-from ..linear._ports import MAX_MOTOR, require_taut
+from ..linear._margins import LOWEST, frequencies
+from ..linear._ports import MAX_MOTOR, ControllerLimits, require_taut, robot_limits
+from ..plants._uncertain import UncertainPlant, uncertain_plant
 from ._arrays import Tuning, assemble, observer_bandwidth, with_filter, with_gains
 from ._controller import MpcController
 from ._disturbance import MeasuredDisturbance
 from ._lti import system
 from ._mpc_state_runtime import MpcArrays
 from ._prediction import Problem, matrices
+from ._scale import SizedPlant, sized_plant
 from ._scenarios import chosen_scenarios, sample_pairs
 from ._tightening import LimitTrial, tightened
-from ._tuning import FULL_TRUST, Pair, keeps_bounds, move_weight, observer_trust, radius, reference_time, sensitivity
+from ._tuning import (
+    FULL_TRUST,
+    Pair,
+    keeps_bounds,
+    move_weight,
+    observer_trust,
+    radius,
+    reference_time,
+    sensitivity,
+    slowness,
+)
 
 # Samples of the last hold: ten moves over thirty samples, dense where they matter.
 _SPACING = (0, 1, 2, 3, 4, 6, 8, 11, 15, 20)
@@ -41,11 +56,20 @@ _THINNING = 5
 # Bandwidths that are tried [rad/s], and how often the range is halved: to 2 %.
 _BANDWIDTHS = (1.0, 40.0)
 _HALVINGS = 7
+# Of another robot than the neck, stretched by its slowest pole: the neck's 30 samples of 20 ms, and its 25 without a
+# measurement until the motors hold [s].
+_HORIZON, _COAST = 0.6, 0.5
+_LONGEST = 200
+_LIMITS = ("position_limit", "slew_limit", "lead_limit", "least_position")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MpcSettings:
-    """Model predictive control of both axes over an identified linear model, moves of the motors as unknowns.
+    """Model predictive control of all axes over an identified linear model, moves of the motors as unknowns.
+
+    The defaults are the neck's. Of another robot the horizon and the reference filter are stretched by its slowest
+    pole, no dead time and no faster pole is taken for granted, limits are those of its file, and those given are in the
+    unit of its motors. Weights count as for a plant of the neck's size.
 
     Weights follow from `bandwidth`, the observer from `max_sensitivity`, the reference filter from `overshoot_pct`.
 
@@ -69,7 +93,7 @@ class MpcSettings:
         slew_limit: of each motor [rad/s].
         lead_limit: how far a set-point may be from its motor [rad].
         least_position: no motor below this [rad]: with a little more than rest no tendon is let loose.
-        angle_limit: soft limit of pitch and roll [rad]; None for none.
+        angle_limit: soft limit of pitch and roll, or of another robot's angles [rad]; None for none.
         minimum_tautness: least motor position beyond that at which a tendon follows the neck [rad], soft; None for no
             limit. With pretension it is negative: rest counts as 0.
         tautness_lever: motor angle that one radian of neck takes up [rad/rad].
@@ -92,23 +116,23 @@ class MpcSettings:
     bandwidth: float | None = None
     max_sensitivity: float = 1.5
     worst_sensitivity: float = 2.5
-    reference_time: float | None = 0.2
+    reference_time: float | None = NeckDefault(0.2)
     overshoot_pct: float = 2.0
     gain_spread: float = 0.2
-    horizon: int = 30
-    moves: int = 10
+    horizon: int = NeckCount(30)
+    moves: int = NeckCount(10)
     scenarios: int = 0
     preview: float = 0.0
     disturbances: tuple[MeasuredDisturbance, ...] = ()
-    position_limit: float = 6.0
-    slew_limit: float = 12.5
+    position_limit: float = NeckDefault(6.0)
+    slew_limit: float = NeckDefault(12.5)
     # More than the drives of the neck fall behind at the paper's fastest signals, 0.4 rad.
-    lead_limit: float = 1.0
-    least_position: float = -6.0
+    lead_limit: float = NeckDefault(1.0)
+    least_position: float = NeckDefault(-6.0)
     angle_limit: float | None = None
     minimum_tautness: float | None = None
     # Radius of the tendons' attachment over that of the winch: 52 mm / 7.5 mm (lab code; paper, section 3.1).
-    tautness_lever: float = 6.93
+    tautness_lever: float = NeckDefault(6.93)
     # Light: where tendons must be taut, co-contraction gives way; at 1 the angles gave way by a quarter of a degree.
     cocontraction_weight: float = 0.05
     slack_weight: float = 1e3
@@ -118,8 +142,8 @@ class MpcSettings:
     disturbance_time: float | None = None
     budget: int = 100
     # The paper's own dead time and pole (Eq. 31: 0.08 s, 5.293 1/s).
-    least_delay: float = 0.08
-    small_move_pole: float = 5.293
+    least_delay: float = NeckDefault(0.08)
+    small_move_pole: float = NeckDefault(5.293)
     order: str = "sequential"
     observer: bool = True
     tendon_angles: tuple[float, float, float] = tuple(TENDON_ANGLES.tolist())
@@ -130,7 +154,7 @@ class MpcSettings:
         require_between("max_sensitivity", self.max_sensitivity, 1.05, 4.0)
         require_between("worst_sensitivity", self.worst_sensitivity, self.max_sensitivity, 10.0)
         if self.reference_time is not None:
-            require_between("reference_time", self.reference_time, 0.0, 60.0, "s")
+            require_between("reference_time", self.reference_time, 0.0, 1e6, "s")
         require_between("overshoot_pct", self.overshoot_pct, 0.1, 100.0, "%")
         require_between("gain_spread", self.gain_spread, 0.0, 0.9)
         require_whole("horizon", self.horizon, 1, 200)
@@ -175,13 +199,56 @@ class MpcSettings:
         return spaced_starts(self.horizon, self.moves)
 
     def design(self, model: HasTransferFunctions) -> MpcController:
-        """Return the controller for `model`, anything with `tf("pitch")` and `tf("roll")`, or for a `Family`.
+        """Return the controller for `model`, a linear model of any robot with its `tf`, or for a `Family`.
 
         Raises:
             SettingsError: a model that is not linear, discrete and stable, limits that contradict each other, or a
                 robustness that nothing keeps.
         """
-        robot_of(model).require_neck("predictive control")
+        robot = robot_of(model)
+        if robot.is_neck:
+            return self._designed(model, ControllerLimits(**{name: getattr(self, name) for name in _LIMITS}))
+        uncertain = uncertain_plant(model)
+        asked = self._of_robot(uncertain)
+        given = {name: getattr(self, name) for name in _LIMITS}
+        limits = robot_limits(robot, {name: v for name, v in given.items() if not isinstance(v, NeckDefault)})
+        return asked._designed(
+            sized_plant(uncertain, limits, redefinition_of(np.asarray(uncertain.weights), uncertain.names)), limits
+        )
+
+    def _of_robot(self, plant: UncertainPlant) -> MpcSettings:
+        """Return the settings for another robot: seconds stretched by its slowest pole, nothing that is known of necks.
+
+        Raises:
+            SettingsError: what is for necks only.
+        """
+        usual = MpcSettings()
+        for name in ("disturbances", "tightening", "tendon_angles"):
+            if getattr(self, name) != getattr(usual, name):
+                plant.robot.require_neck(f"predictive control with `{name}`")
+        if self.angle_limit is not None and to_si(plant.robot.outputs.unit)[1] != "rad":
+            raise SettingsError(
+                f"`angle_limit` is for outputs that are angles; those of `{plant.robot.name}` are in "
+                f"{plant.robot.outputs.unit}. Leave it out."
+            )
+        if self.minimum_tautness is not None and (
+            plant.robot.directions.kind != "tendons" or isinstance(self.tautness_lever, NeckDefault)
+        ):
+            raise SettingsError(
+                f"`minimum_tautness` of robot `{plant.robot.name}` needs tendons at known angles (`angles_deg`), and "
+                "`tautness_lever`, the motor that a tendon takes up for each unit of an output; give both or neither."
+            )
+        stretch = max(axis.nominal.stretch for axis in plant.axes.values())
+        horizon = min(max(3, round(_HORIZON * stretch / plant.sample_time)), _LONGEST)
+        others = {"least_delay": 0.0, "small_move_pole": 0.0, "horizon": horizon}
+        if self.reference_time is not None:
+            others["reference_time"] = stretch * self.reference_time
+        changed = {k: v for k, v in others.items() if isinstance(getattr(self, k), NeckDefault | NeckCount)}
+        if isinstance(self.moves, NeckCount):
+            changed["moves"] = min(int(self.moves), int(changed.get("horizon", self.horizon)))
+        return replace(self, **changed)
+
+    def _designed(self, model: HasTransferFunctions, limits: ControllerLimits) -> MpcController:
         nominal = self._nominal(model)
         Ts = nominal[0].sample_time
         samples = sample_pairs(model, self.least_delay)
@@ -191,15 +258,14 @@ class MpcSettings:
         if self.tightening:
             plants = [self._delayed(pair) for pair in [*self._families(nominal), *samples]]
             arrays, found["back_off_rad"] = tightened(arrays, plants, self._trial())
+        per_motor = to_si(limits.robot.motors.unit)[0]
         return MpcController(
             sample_time=Ts,
             arrays=arrays,
-            position_limit=self.position_limit,
-            slew_limit=self.slew_limit,
-            lead_limit=self.lead_limit,
-            least_position=self.least_position,
+            **{name: getattr(limits, name) for name in _LIMITS},
+            robot=limits.robot,
             angle_limit=self.angle_limit,
-            minimum_tautness=self.minimum_tautness,
+            minimum_tautness=None if self.minimum_tautness is None else per_motor * self.minimum_tautness,
             disturbances=self.disturbances,
             order=self.order,
             design={"settings": asdict(self), "extra_delay": self.extra_delay, **found},
@@ -211,7 +277,7 @@ class MpcSettings:
         def keeps(bandwidth: float) -> bool:
             return keeps_bounds(self._arrays(model, bandwidth), bounds, self.extra_delay, w)
 
-        low, high = _BANDWIDTHS
+        low, high = (speed / slowness(nominal) for speed in _BANDWIDTHS)
         if not keeps(low):
             raise SettingsError(
                 f"not even a bandwidth of {low:g} rad/s keeps Ms <= {self.max_sensitivity:g} "
@@ -224,27 +290,34 @@ class MpcSettings:
 
     def _arrays(self, model: HasTransferFunctions, bandwidth: float) -> tuple[Any, ...]:
         problem = self.problem(model, bandwidth)
-        Ts = problem.scenarios[0].pitch.sample_time
+        Ts = problem.scenarios[0].axes[0].sample_time
         tuning = Tuning(
             trust=FULL_TRUST, reference_time=self.reference_time or 0.0, preview=round(self.preview / Ts),
             budget=self.budget, disturbances=self.disturbances,
         )  # fmt: skip
+        if isinstance(model, SizedPlant):
+            coast = max(1, round(_COAST * slowness(problem.scenarios[0].axes) / Ts))
+            tuning = replace(tuning, scale=model.scale, coast=coast)
         return assemble(problem, matrices(problem), tuning)
 
     def problem(self, model: HasTransferFunctions, bandwidth: float) -> Problem:
         """Return what is asked with that bandwidth [rad/s], in numbers, before observer and filter are tuned."""
         nominal = self._nominal(model)
         scenarios = chosen_scenarios(model, self._delayed(nominal), self.scenarios, self.least_delay, self.extra_delay)
-        T = redefinition_matrix(np.array(self.tendon_angles))
+        if isinstance(model, SizedPlant):
+            (T, inverse), lever = model.redefinition, model.lever(self.tautness_lever)
+        else:
+            T = redefinition_matrix(np.array(self.tendon_angles))
+            inverse, lever = np.linalg.inv(T), self.tautness_lever * T[:2].T
         weights: Vector = np.array([1.0 / plant.static_gain**2 for plant in nominal])
         # For symmetric tendons |P|^2 = 2/3 (theta^2 + phi^2) + 3 delta^2: the weight on an input becomes one on motors.
         on_input = max(move_weight(plant, bandwidth) for plant in nominal)
-        lever = self.tautness_lever * T[:2].T
         return Problem(
             scenarios=tuple(scenarios),
             horizon=self.horizon,
             starts=self.starts,
             T=T,
+            T_inverse=inverse,
             output_weight=weights,
             move_weight=1.5 * on_input,
             cocontraction_weight=self.cocontraction_weight,
@@ -269,7 +342,7 @@ class MpcSettings:
         """Return what the neck may be: as identified, and faster."""
         if self.small_move_pole == 0.0:
             return [nominal]
-        fast = (nominal[0].faster(self.small_move_pole), nominal[1].faster(self.small_move_pole))
+        fast = tuple(plant.faster(self.small_move_pole) for plant in nominal)
         return [nominal] if fast == nominal else [nominal, fast]
 
     def _bounds(self, nominal: Pair, samples: list[Pair]) -> list[tuple[Pair, float]]:
@@ -277,19 +350,19 @@ class MpcSettings:
         return bounds + [(pair, self.worst_sensitivity) for pair in samples]
 
     def _frequencies(self, nominal: Pair) -> Vector:
-        return frequencies(nominal[0].sample_time)[::_THINNING]
+        return frequencies(nominal[0].sample_time, lowest=LOWEST / slowness(nominal))[::_THINNING]
 
     def _nominal(self, model: HasTransferFunctions) -> Pair:
-        first, second = (axis_plant(model, axis).delayed(self.least_delay) for axis in ("pitch", "roll"))
-        if not math.isclose(first.sample_time, second.sample_time, rel_tol=1e-9):
-            raise SettingsError(
-                f"pitch and roll have different sample times, {first.sample_time:g} s and {second.sample_time:g} s."
-            )
-        return first, second
+        names = robot_of(model).outputs.names
+        plants = tuple(axis_plant(model, axis).delayed(self.least_delay) for axis in names)
+        times = [plant.sample_time for plant in plants]
+        if not all(math.isclose(time, times[0], rel_tol=1e-9) for time in times):
+            each = " and ".join(f"{time:g} s" for time in times)
+            raise SettingsError(f"{' and '.join(names)} have different sample times, {each}.")
+        return plants
 
     def _delayed(self, pair: Pair) -> Pair:
-        first, second = (replace(plant, delay=plant.delay + self.extra_delay) for plant in pair)
-        return first, second
+        return tuple(replace(plant, delay=plant.delay + self.extra_delay) for plant in pair)
 
     def _tuned(
         self, arrays: tuple[Any, ...], nominal: Pair, samples: list[Pair]
@@ -339,5 +412,4 @@ def spaced_starts(horizon: int, moves: int) -> tuple[int, ...]:
 
 def scaled(pair: Pair, factor: float) -> Pair:
     """Return both plants with their gain times `factor`."""
-    first, second = (replace(plant, numerator=factor * plant.numerator) for plant in pair)
-    return first, second
+    return tuple(replace(plant, numerator=factor * plant.numerator) for plant in pair)

@@ -12,7 +12,8 @@ from softneck.estimation import AxisPlant
 from ._arrays import with_filter, with_gains
 from ._lti import system
 
-Pair = tuple[AxisPlant, AxisPlant]
+# One plant for each output.
+Pair = tuple[AxisPlant, ...]
 
 # Decades of the move weight that are searched, relative to errors of the input.
 _WEIGHTS = (-6.0, 6.0)
@@ -60,34 +61,36 @@ def sensitivity(
 ) -> float:
     """Return Ms: the largest singular value of (I - G C)^-1 at the angles, over `frequency` [rad/s]."""
     A, B, C, D = parts
+    m = len(plants)
     z = np.exp(1j * frequency * plants[0].sample_time)
     values, V = np.linalg.eig(A)
     if np.linalg.cond(V) < 1e8:
-        left, right = C @ V, np.linalg.solve(V, B[:, 2:].astype(complex))
-        K = np.einsum("on,kn,ni->koi", left, 1.0 / (z[:, None] - values), right) + D[:, 2:]
+        left, right = C @ V, np.linalg.solve(V, B[:, m:].astype(complex))
+        K = np.einsum("on,kn,ni->koi", left, 1.0 / (z[:, None] - values), right) + D[:, m:]
     else:
         eye = np.eye(A.shape[0])
-        K = np.array([C @ np.linalg.solve(point * eye - A, B[:, 2:]) + D[:, 2:] for point in z])
+        K = np.array([C @ np.linalg.solve(point * eye - A, B[:, m:]) + D[:, m:] for point in z])
     G = np.array([plant.response(frequency, extra_delay=extra_delay) for plant in plants]).T
-    S = np.linalg.inv(np.eye(2) - G[:, :, None] * K)
+    S = np.linalg.inv(np.eye(m) - G[:, :, None] * K)
     return float(np.linalg.norm(S, ord=2, axis=(1, 2)).max())
 
 
 def closed(
     parts: tuple[Matrix, Matrix, Matrix, Matrix], plants: Pair, extra_delay: int
 ) -> tuple[Matrix, Matrix, Matrix]:
-    """Return A, B (from both references) and C (to both angles) of the loop with its dead time in full."""
+    """Return A, B (from all references) and C (to all angles) of the loop with its dead time in full."""
     from scipy.linalg import block_diag
 
     A, B, C, D = parts
+    m = len(plants)
     sides = [_realised(plant, plant.delay + extra_delay) for plant in plants]
     Ap, Bp, Cp = (np.asarray(block_diag(*items)) for items in zip(*sides, strict=True))
-    top = np.hstack([Ap + Bp @ D[:, 2:] @ Cp, Bp @ C])
-    bottom = np.hstack([B[:, 2:] @ Cp, A])
+    top = np.hstack([Ap + Bp @ D[:, m:] @ Cp, Bp @ C])
+    bottom = np.hstack([B[:, m:] @ Cp, A])
     return (
         np.vstack([top, bottom]),
-        np.vstack([Bp @ D[:, :2], B[:, :2]]),
-        np.hstack([Cp, np.zeros((2, A.shape[0]))]),
+        np.vstack([Bp @ D[:, :m], B[:, :m]]),
+        np.hstack([Cp, np.zeros((m, A.shape[0]))]),
     )
 
 
@@ -160,7 +163,7 @@ def reference_time(arrays: tuple[Matrix, ...], families: list[Pair], extra_delay
         SettingsError: none does that is fast enough.
     """
     Ts = families[0][0].sample_time
-    low, high = 0, round(_SLOWEST_FILTER / Ts)
+    low, high = 0, round(_SLOWEST_FILTER * slowness(families[0]) / Ts)
 
     def keeps(samples: int) -> bool:
         parts = system(with_filter(arrays, samples * Ts))
@@ -177,9 +180,14 @@ def reference_time(arrays: tuple[Matrix, ...], families: list[Pair], extra_delay
 def _peak(parts: tuple[Matrix, Matrix, Matrix, Matrix], pair: Pair, extra_delay: int) -> float:
     """Return the largest angle after unit steps of both references, without limits."""
     A, B, C = closed(parts, pair, extra_delay)
-    u, x, peak = np.ones(2), np.zeros(A.shape[0]), 0.0
+    u, x, peak = np.ones(len(pair)), np.zeros(A.shape[0]), 0.0
     drive = B @ u
-    for _ in range(math.ceil(_HORIZON / pair[0].sample_time)):
+    for _ in range(math.ceil(_HORIZON * slowness(pair) / pair[0].sample_time)):
         x = A @ x + drive
         peak = max(peak, float((C @ x).max()))
     return peak
+
+
+def slowness(pair: Pair) -> float:
+    """Return by how much the slowest axis is slower than a neck's."""
+    return max(plant.stretch for plant in pair)

@@ -51,6 +51,7 @@ _ROBOTS = (
     "softneck.estimation._steady_kalman_runtime",
     "softneck.design.linear._linear_controller_runtime",
     "softneck.design.varying._adaptive_runtime",
+    "softneck.design.predictive._mpc_runtime",
     "softneck.loop._reference_runtime",
 )
 RUNTIMES = (*_NECKS, *(f"{module}@{ANY_SIZE}" for module in _ROBOTS))
