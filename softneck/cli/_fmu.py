@@ -61,9 +61,9 @@ def command(
 ) -> None:  # fmt: skip
     """Package FILE as a Co-Simulation FMU of FMI 2.0 or 3.0.
 
-    FILE is a model, observer or controller (.npz), a neck parameter file (.toml), a neck preset (paper, lab, rough),
-    a robot file or preset, whose virtual plant it becomes, or a loop file, from whose [reference] a reference FMU is
-    built.
+    FILE is a model, observer or controller (.npz), a neck parameter file (.toml), a neck preset (paper, lab, rough,
+    trunk), a robot file or preset, whose virtual plant it becomes, or a loop file, from whose [reference] a reference
+    FMU is built.
     """
     from softneck.fmu import build_compiled_fmu, build_fmu, fmu_info
 
@@ -112,7 +112,7 @@ def open_buildable(source: str | Path, robot: str | None = None) -> Buildable:
     if Path(source).suffix not in ("", ".toml"):
         raise FileFormatError(
             f"{source}: no FMU can be built from a `{Path(source).suffix}` file; give a model, controller or observer "
-            "(.npz), a neck, robot or loop file (.toml), or a preset (paper, lab, rough)."
+            "(.npz), a neck, robot or loop file (.toml), or a preset (paper, lab, rough, trunk)."
         )
     if str(source) in PRESETS:
         return VirtualNeck.of(Robot.preset(str(source)))

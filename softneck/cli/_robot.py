@@ -77,10 +77,12 @@ def _robot(file: str | None) -> Robot:
 
 
 def _check_files(robot: Robot) -> None:
+    from softneck.plant._presets import PRESETS
+
     from .shared._neck import load_neck
 
     folder = robot.folder or Path()
     if robot.neck is not None:
-        load_neck(robot.neck if robot.neck in ("paper", "lab") else str(folder / robot.neck))
+        load_neck(robot.neck if robot.neck in PRESETS else str(folder / robot.neck))
     if robot.drives is not None and not (folder / robot.drives).is_file():
         raise SettingsError(f"`drives.file`: {folder / robot.drives}: no such file.")

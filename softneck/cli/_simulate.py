@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     type=click.Path(path_type=Path),
     help="Write a certificate of the limits that held, with the hashes of all files; `drives run` asks for it.",
 )
-@click.option("--html", type=click.Path(path_type=Path), help="Write a page with plots, and beside it the neck in 3-D.")
+@click.option("--html", type=click.Path(path_type=Path), help="Write a page with plots, and beside it a neck in 3-D.")
 @robot_option
 @trust_option
 @force_option
@@ -45,14 +45,14 @@ def command(
     path, replace = target(output, f"results/{loop_file.stem}.csv", force=force)
     recording_suffix(path)
     refuse_existing(path, force=replace)
-    view = html.with_name(f"{html.stem}_3d.html") if html is not None else None
-    for extra in (certificate, html, view):
+    for extra in (certificate, html):
         if extra is not None:
             refuse_existing(extra, force=force)
     require_trusted(loop_file, trust=trust)
     setup = load_loop(loop_file, robot=robot)
-    if html is not None:
-        setup.loop.robot.require_neck(f"{loop_file}: `--html` of a loop")
+    view = html.with_name(f"{html.stem}_3d.html") if html is not None and setup.loop.robot.is_neck else None
+    if view is not None:
+        refuse_existing(view, force=force)
     if certificate is not None and not setup.limits:
         raise SettingsError(
             f"{loop_file}: has no [limits], so a certificate would show nothing; state some, such as "
@@ -63,8 +63,9 @@ def command(
     write_recording(path, result.recording(), force=replace)
     if certificate is not None:
         write_certificate(certificate, result.certificate(), force=force)
-    if html is not None and view is not None:
+    if view is not None:
         write_page(view, neck_view(result.recording(), title=f"Loop {loop_file.stem}"), force=force)
+    if html is not None:
         write_page(html, _page(loop_file.stem, result, view), force=force)
     if as_json:
         print_json(result.report())
@@ -97,12 +98,17 @@ def _limits(result: Result) -> tuple[list[str], list[list[str]]]:
     return ["metric", "limit", "value", "verdict"], rows
 
 
-def _page(name: str, result: Result, view: Path) -> str:
+def _page(name: str, result: Result, view: Path | None) -> str:
     from softneck.plots import Section, Table, page
     from softneck.plots._charts import loop_chart
 
     tables = [Table("Limits", *_limits(result)), Table("Metrics", *_metrics(result))]
-    chart = loop_chart(result.signals.time, result.signals.signals, name)
-    words = f"Order {result.order}, metrics of the {result.angle} angle, {result.real_time_factor:.0f} times real time."
-    link = Markup('<a href="{}">The neck in 3-D</a>').format(view.name)
-    return page(f"Loop {name}", [Section("Result", text=[words, link], tables=tables, charts=[chart])])
+    chart = loop_chart(result.signals.time, result.signals.signals, name, robot=result.robot)
+    what = "angle" if result.robot.is_neck else "output"
+    words = (
+        f"Order {result.order}, metrics of the {result.angle} {what}, {result.real_time_factor:.0f} times real time."
+    )
+    text = [words]
+    if view is not None:
+        text.append(Markup('<a href="{}">The neck in 3-D</a>').format(view.name))
+    return page(f"Loop {name}", [Section("Result", text=text, tables=tables, charts=[chart])])

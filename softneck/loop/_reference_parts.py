@@ -8,17 +8,12 @@ from dataclasses import fields, replace
 
 import numpy as np
 
-from softneck.core import DataError, SettingsError, Vector, require_positive
+from softneck.core import DataError, SettingsError, Vector, require_positive, to_si
 from softneck.robot import Robot
 from softneck.runtime import Block, Port
 
 from ._references import RampReference, RecordingReference, Reference, RotationReference, SineReference, StepReference
-from ._wiring import REFERENCE_PORTS, reference_ports
-
-_AHEAD_PORTS = tuple(
-    Port(name=f"{axis}_reference_ahead", unit="rad", description=f"wanted {axis}, `ahead` from now")
-    for axis in ("pitch", "roll")
-)
+from ._wiring import reference_ports
 
 
 class AheadReference:
@@ -26,13 +21,21 @@ class AheadReference:
 
     role = "reference"
 
-    def __init__(self, reference: Reference, ahead: float, *, sample_time: float = 0.02) -> None:
-        """Adapt `reference`, a function of time; `ahead` [s] is the controller's `preview`."""
+    def __init__(
+        self, reference: Reference, ahead: float, *, sample_time: float = 0.02, robot: Robot | None = None
+    ) -> None:
+        """Adapt `reference`, a function of time; `ahead` [s] is the controller's `preview`, `robot` None a neck."""
         require_positive("ahead", ahead, "s")
         require_positive("sample_time", sample_time, "s")
         self.reference, self.ahead, self.sample_time = reference, ahead, sample_time
         self.inputs: tuple[Port, ...] = ()
-        self.outputs: tuple[Port, ...] = (*REFERENCE_PORTS, *_AHEAD_PORTS)
+        whose = Robot.preset() if robot is None else robot
+        unit, self._count = to_si(whose.outputs.unit)[1], len(whose.outputs.names)
+        self.outputs: tuple[Port, ...] = (
+            *reference_ports(whose),
+            *(Port(name=f"{name}_reference_ahead", unit=unit, description=f"wanted {name}, `ahead` from now")
+              for name in whose.outputs.names),
+        )  # fmt: skip
 
     def start(self, time: float, parameters: Mapping[str, float]) -> Vector:
         """Return what holds at `time` [s]; it has no parameters."""
@@ -57,7 +60,7 @@ class AheadReference:
             raise DataError("a reference ahead has no state; this one is of another part.")
 
     def _at(self, time: float) -> Vector:
-        return np.array([*self.reference(time), 1.0, *self.reference(time + self.ahead)[:2]])
+        return np.array([*self.reference(time), 1.0, *self.reference(time + self.ahead)[: self._count]])
 
 
 _KINDS: tuple[type, ...] = (StepReference, RampReference, SineReference, RotationReference)

@@ -64,9 +64,6 @@ _STEADY_PART = 0.25
 
 _AXIS = ("rise_s", "settling_s", "overshoot_pct", "rms_error_deg", "iae", "ise", "itae", "steady_rms_deg")
 _MOTORS = ("max_rad", "max_rate_rad_s", "effort", "total_variation_rad", "limit_violation_s", "slack_s")
-# All metrics, named as in [limits].
-METRICS = (*(f"{axis}.{name}" for axis in ("pitch", "roll") for name in _AXIS), *(f"motors.{name}" for name in _MOTORS))
-
 Metrics = dict[str, dict[str, float | None]]
 
 
@@ -112,6 +109,14 @@ def metrics(result: LoopResult, *, angle: str = "true") -> Metrics:
             "slack_s": _slack(result),
         },
     }
+
+
+def metric_names(robot: Robot) -> tuple[str, ...]:
+    """Return the names of all metrics of a robot's loops, as in [limits]."""
+    unit, motor = shown_unit(robot)[0], _word(robot.motors.unit)
+    ends = [name.removesuffix("_deg") + f"_{unit}" if name.endswith("_deg") else name for name in _AXIS]
+    moved = [name.replace("_rad", f"_{motor}") for name in _MOTORS]
+    return (*(f"{axis}.{end}" for axis in robot.outputs.names for end in ends), *(f"motors.{name}" for name in moved))
 
 
 def _beyond(P: np.ndarray, robot: Robot) -> np.ndarray:

@@ -98,8 +98,8 @@ def calibrate(
         for recording, kg in zip(recordings, payloads, strict=True) for run in recording.runs()
     ]  # fmt: skip
     fixed = dict(known or {})
-    # Whichever preset is nearest already.
-    starts = {name: _with(NeckParameters.preset(name), fixed) for name in PRESETS}
+    # Whichever preset of a neck is nearest already.
+    starts = {name: _with(NeckParameters.preset(name), fixed) for name in PRESETS if name != "trunk"}
     start = min(starts, key=lambda name: _cost(runs, starts[name]))
     names = [name for name in (*_BY_LOGARITHM, *_BY_STEPS) if name not in fixed]
     neck = _search(runs, starts[start], names, evaluations, progress)

@@ -154,7 +154,7 @@ class NeckParameters:
 
     @classmethod
     def preset(cls, name: str) -> NeckParameters:
-        """Return the preset `paper`, `lab` or `rough`, or the neck of the TOML file of that name."""
+        """Return the preset `paper`, `lab`, `rough` or `trunk`, or the neck of the TOML file of that name."""
         return cls(**PRESETS[name]) if name in PRESETS else cls.from_toml(name)
 
     @classmethod

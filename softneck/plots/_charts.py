@@ -176,40 +176,48 @@ def _range_for(measured: Vector, curves: list[Curve], least: float) -> tuple[flo
     return (low - 0.5 * room, high + 0.5 * room) if far > max(abs(low), abs(high)) + 2.0 * room else None
 
 
-def loop_chart(time: Vector, signals: Mapping[str, Vector], title: str, *, caption: str = "") -> Chart:
-    """Describe a closed loop: reference, true, measured and estimated angles, motors, tensions where there are any.
+def loop_chart(
+    time: Vector, signals: Mapping[str, Vector], title: str, *, caption: str = "", robot: Robot = NECK
+) -> Chart:
+    """Describe a closed loop: reference, true, measured and estimated outputs, motors, tensions where there are any.
 
     Args:
         time: (time,) [s].
-        signals: name -> (time,): pitch, roll (with _reference, _measured, _estimate), motor_setpoint_1..3,
-            motor_position_1..3 [rad], tension_1..3 [N].
+        signals: name -> (time,) in SI: the outputs, of a neck pitch and roll (with _reference, _measured, _estimate),
+            motor_setpoint_1..n, motor_position_1..n, tension_1..n [N].
         title: of the chart.
         caption: for under the chart.
+        robot: whose loop it is; outputs are drawn in its display unit, motors in their unit.
     """
-    panels = [_angle_panel(time, signals, axis) for axis in NECK.outputs.names]
-    motors = []
-    for j, colour in enumerate(MOTOR_COLOURS, start=1):
-        motors.append(Curve(time, signals[f"motor_setpoint_{j}"], f"set-point {j}", colour, "step"))
-        if f"motor_position_{j}" in signals:
-            motors.append(Curve(time, signals[f"motor_position_{j}"], f"position {j}", colour, "dashed", 0.8))
-    panels.append(Panel(motors, "motor [rad]"))
+    panels = [_output_panel(time, signals, name, robot) for name in robot.outputs.names]
+    motors, unit = [], robot.motors.unit
+    colours = MOTOR_COLOURS if robot.is_neck else ALL_MOTOR_COLOURS
+    for j, (name, position) in enumerate(zip(robot.set_points, robot.motor_positions, strict=True)):
+        motors.append(Curve(time, signals[name] / to_si(unit)[0], f"set-point {j + 1}", colours[j], "step"))
+        if position in signals:
+            measured = signals[position] / to_si(unit)[0]
+            motors.append(Curve(time, measured, f"position {j + 1}", colours[j], "dashed", 0.8))
+    panels.append(Panel(motors, f"motor [{unit}]"))
     if "tension_1" in signals:
-        pulls = [Curve(time, signals[f"tension_{j}"], f"tendon {j}", MOTOR_COLOURS[j - 1]) for j in (1, 2, 3)]
+        pulls = [
+            Curve(time, signals[f"tension_{j}"], f"tendon {j}", colours[j - 1])
+            for j in range(1, len(robot.motors.names) + 1) if f"tension_{j}" in signals
+        ]  # fmt: skip
         panels.append(Panel(pulls, "tension [N]"))
     return Chart(title, panels, caption=caption)
 
 
-def _angle_panel(time: Vector, signals: Mapping[str, Vector], axis: str) -> Panel:
+def _output_panel(time: Vector, signals: Mapping[str, Vector], name: str, robot: Robot) -> Panel:
     looks_of = (
         ("_lower", GREY, 0.7), ("_upper", GREY, 0.7), ("_measured", GREEN, 0.6), ("", BLUE, 1.4),
         ("_estimate", ORANGE, 0.9), ("_reference", BLACK, 1.0),
     )  # fmt: skip
     curves = [
-        Curve(time, np.degrees(signals[f"{axis}{end}"]), end.strip("_") or "true", colour, width=width)
+        Curve(time, shown(signals[f"{name}{end}"], robot), end.strip("_") or "true", colour, width=width)
         for end, colour, width in looks_of
-        if f"{axis}{end}" in signals
+        if f"{name}{end}" in signals
     ]
-    return Panel(curves, f"{axis} [deg]")
+    return Panel(curves, f"{name} [{robot.outputs.display_unit}]")
 
 
 def delay_chart(curves: Mapping[str, list[list[float]]], title: str, *, caption: str = "") -> Chart:

@@ -215,7 +215,7 @@ def _loops(project: Project) -> Section | None:
             verdict = "holds" if row["holds"] else "fails"
             limits.append([name, row["metric"], _cell(row["value"]), _cell(row["limit"]), verdict])
         if len(charts) < _MOST_CHARTS:
-            charts.append(loop_chart(result.signals.time, result.signals.signals, name))
+            charts.append(loop_chart(result.signals.time, result.signals.signals, name, robot=result.robot))
     head = ["loop", "overshoot [%]", "settling [s]", "rms error [deg]", "largest set-point [rad]"]
     tables = [Table("Loops, pitch/roll", head, metrics)]
     if limits:

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 # Numbers that varied, at most so many panels: those that matter most.
 _MOST_PANELS = 6
 _SHOWN = 10
-_KEY_METRICS = ("rise_s", "settling_s", "overshoot_pct", "rms_error_deg")
+# The error ends in the unit of the output.
+_KEY_METRICS = ("rise_s", "settling_s", "overshoot_pct", "rms_error_")
 
 
 def study_page(description: Mapping[str, Any], runs: pd.DataFrame) -> str:
@@ -101,7 +102,8 @@ def _ranking(runs: pd.DataFrame, keys: list[str], objectives: list[str]) -> Sect
 
 
 def _trade(runs: pd.DataFrame, vary: Mapping[str, Any], objectives: list[str]) -> Section:
-    pair = (objectives[0], objectives[1] if len(objectives) > 1 else "motors.total_variation_rad")
+    moved = next(name for name in runs.columns if name.startswith("motors.total_variation_"))
+    pair = (objectives[0], objectives[1] if len(objectives) > 1 else moved)
     front = pareto_front(runs, pair)
     charts: list[Chart] = []
     if len(front):
@@ -117,7 +119,8 @@ def _trade(runs: pd.DataFrame, vary: Mapping[str, Any], objectives: list[str]) -
 
 def _spread(runs: pd.DataFrame, vary: Mapping[str, Any], objectives: list[str]) -> Section:
     axis = objectives[0].partition(".")[0]
-    wanted = [*objectives, *(f"{axis}.{name}" for name in _KEY_METRICS)]
+    keys = tuple(f"{axis}.{name}" for name in _KEY_METRICS)
+    wanted = [*objectives, *(name for name in runs.columns if name.startswith(keys))]
     metrics = [name for name in dict.fromkeys(wanted) if np.isfinite(runs[name].to_numpy(float)).any()]
     values = {metric: {name: part[metric].to_numpy(float) for name, part in _split(runs, vary)} for metric in metrics}
     return Section("Distributions", charts=[distribution_chart(values, "How the metrics are spread")])

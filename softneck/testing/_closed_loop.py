@@ -108,7 +108,7 @@ class Outcome:
 
     def _save_plot(self) -> None:
         signals = self.result.signals
-        figure = chart_figure(loop_chart(signals.time, signals.signals, self.plot.stem))
+        figure = chart_figure(loop_chart(signals.time, signals.signals, self.plot.stem, robot=signals.robot))
         self.plot.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(self.plot, force=True) as temporary:
             figure.savefig(temporary, format="png")

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, to_si
+from softneck.design.linear._ports import motor_ranges
 from softneck.loop._result import SETTLING_BAND, shown_unit
 from softneck.robot import Robot
 from softneck.robot._redefined import redefinition_of
@@ -97,19 +98,26 @@ def run_steps(
     if weights is not None:
         T = redefinition_of(weights, whose.outputs.names)[0]
     m, around = len(plants.axes), _middle(whose)
+    before = T @ _middle_motors(whose, block)
     Ts = plants.sample_time
     half = round(test.duration / Ts)
     rows = 2 * half
+    # Motors begin at zero: those that work around something else are first brought there, before what is judged.
+    first = rows if before.any() else 0
     rng = np.random.default_rng(test.seed)
     noise = test.noise * rng.standard_normal((rows, m))
     angles, motors, other = [], [], []
     for axis in range(m):
-        signals = np.zeros((rows, 3 * m + 1))
-        signals[:, :m] = around
-        signals[:, axis] += test.step
-        signals[:, m + 1 : 2 * m + 1] = around + noise
-        signals[half:, 2 * m + 1 + axis] = test.load
+        signals = np.zeros((first + rows, 3 * m + 1))
+        signals[:, :m], signals[:, m] = around, before[m]
+        signals[first:, axis] += test.step
+        signals[:, m + 1 : 2 * m + 1] = around
+        signals[first:, m + 1 : 2 * m + 1] += noise
+        # The plants are linear around there.
+        signals[:, 2 * m + 1 :] -= before[:m]
+        signals[first + half :, 2 * m + 1 + axis] += test.load
         y, P = _run(plants, block, signals, T, whose, workers or os.cpu_count() or 1)
+        y, P = y[:, first:], P[:, first:]
         angles.append(y[:, :, axis])
         other.append(np.delete(y[:, :half], axis, axis=2))
         motors.append(P)
@@ -130,6 +138,13 @@ def _middle(robot: Robot) -> Vector:
     if low is None or high is None:
         return np.zeros(len(robot.outputs.names))
     return 0.5 * to_si(robot.outputs.unit)[0] * (np.array(low) + np.array(high))
+
+
+def _middle_motors(robot: Robot, block: Block) -> Vector:
+    """Return around which set-points (motors,) steps are made: from one end of their range motors go only one way."""
+    limits = {port.name: port.start for port in block.parameters}
+    ranges = None if robot.is_neck else motor_ranges(robot, limits.get("position_limit"))
+    return np.zeros(len(robot.set_points)) if ranges is None else 0.5 * (ranges[0] + ranges[1])
 
 
 def _run(

@@ -10,6 +10,7 @@ import pytest
 
 from softneck.robot import Robot
 from softneck.signals import read_recording
+from tests.design.test_robots import BELLOWS, plant
 
 from .conftest import Call
 
@@ -107,6 +108,24 @@ def test_fmus_and_pages_of_a_tank(call: Call, log: Path, tmp_path: Path) -> None
     assert call("validate", "m.npz", "--data", "rec.csv", "--html", "v.html").code == 0
     assert "motor_setpoint_2" in (tmp_path / "q.html").read_text(encoding="utf-8")
     assert "errors in mm, level" in (tmp_path / "v.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_the_page_of_a_loop_has_a_panel_for_each_output_in_its_unit(call: Call, tmp_path: Path) -> None:
+    plant(BELLOWS, gain=1e-7, rest=0.03).save(tmp_path / "m.npz")
+    assert call("design", "pi", "m.npz", "-o", "c.npz", "--set", "slew_limit=10", "--any-fit").code == 0
+    (tmp_path / "loop.toml").write_text(
+        'duration_s = 2.0\nplant = { model = "m.npz" }\ncontroller = { file = "c.npz" }\n'
+        '[reference]\nkind = "step"\nx = 41.0\ny = 43.0\nz = 49.0\n'
+    )
+    said = call("simulate", "loop.toml", "--html", "loop.html")
+    assert said.code == 0, said.err
+    page = (tmp_path / "loop.html").read_text(encoding="utf-8")
+    for label in ("x [mm]", "y [mm]", "z [mm]", "motor [bar]", "set-point 4", "z.rms_error_mm", "the true output"):
+        assert label in page, label
+    # A neck is what the 3-D view draws.
+    assert not (tmp_path / "loop_3d.html").exists()
+    assert "3-D" not in page
 
 
 @pytest.mark.slow

@@ -27,12 +27,18 @@ from softneck.cosim import (
     worst_runs,
 )
 from softneck.cosim.loops._loop_table import loop_table
-from softneck.cosim.studies._store import Store
+from softneck.cosim.studies._store import Store, read_description
 from softneck.cosim.studies._study_results import write_worst
 from softneck.cosim.studies._study_run import failed_row
 from softneck.loop import StepReference
 from softneck.loop._faults import make_fault
-from softneck.loop._result import METRICS
+from softneck.loop._result import metric_names
+from softneck.report import study_page
+from softneck.robot import Robot
+from softneck.robot._file import preset_text
+from softneck.runtime import Port
+
+from .study_parts import Gain, Lag
 
 LOOP = """
 duration_s = 1.0
@@ -71,6 +77,9 @@ def place(tmp_path: Path) -> Path:
     (tmp_path / "loop.toml").write_text(LOOP)
     (tmp_path / "study.toml").write_text(STUDY)
     return tmp_path
+
+
+METRICS = metric_names(Robot.preset())
 
 
 def numbers(runs: Any) -> pd.DataFrame:
@@ -200,7 +209,7 @@ def test_many_small_files_are_joined(place: Path) -> None:
     made = make_study(place / "loop.toml", vary={"plant.parameters.pole": {"uniform": [0.8, 0.9]}}, runs=250)
     store = Store(made, place / "out")
     for run in range(250):
-        store.add([failed_row(made.points[run], "not run")])
+        store.add([failed_row(made.points[run], "not run", METRICS)])
     assert len(list((place / "out" / "runs.parts").glob("*.parquet"))) < 110
     assert read_runs(place / "out")["run"].tolist() == list(range(250))
     assert store.finish()["run"].tolist() == list(range(250))
@@ -368,3 +377,67 @@ def test_parts_vary_by_their_files(folder: Path) -> None:
         assert runs.loc[run, "pitch.iae"] == simulate(made.setup(run)).metrics["pitch"]["iae"], run
     with pytest.raises(FileFormatError, match="there is no file"):
         study(make_study(loop, vary={"controller.file": ["pi.npz", "none.npz"]}, folder=folder), workers=0)
+
+
+class Tank(Lag):
+    """Of the robot below: its level follows the first of two pressures."""
+
+    inputs = tuple(Port(name=f"motor_setpoint_{j}", unit="Pa") for j in (1, 2))
+    outputs = (Port(name="level", unit="m"),)
+
+    def start(self, time_s: float, parameters: Any) -> np.ndarray:
+        super().start(time_s, {"gain": 1e-7, **parameters})
+        return np.zeros(1)
+
+    def advance(self, time_s: float, inputs: np.ndarray) -> np.ndarray:
+        return super().advance(time_s, inputs)[:1]
+
+
+class Valve(Gain):
+    """The first pressure is the gain times the error of the level."""
+
+    inputs = (Port(name="level_reference", unit="m"), Port(name="level", unit="m"))
+    outputs = Tank.inputs
+
+    def start(self, time_s: float, parameters: Any) -> np.ndarray:
+        return super().start(time_s, {"gain": 4e6, **parameters})[:2]
+
+    def advance(self, time_s: float, inputs: np.ndarray) -> np.ndarray:
+        return super().advance(time_s, inputs)[:2]
+
+
+def test_a_study_goes_by_the_outputs_and_units_of_its_robot(tmp_path: Path) -> None:
+    tank = Robot.from_dict({
+        "name": "tank", "motors": {"names": ["a", "b"], "unit": "bar"}, "outputs": {"names": ["level"], "unit": "mm"},
+        "directions": {"kind": "identified"},
+    })  # fmt: skip
+    loop = {
+        "duration_s": 1.0, "plant": Tank(), "controller": Valve(), "robot": tank,
+        "reference": {"kind": "step", "level": 43.0}, "limits": {"level.rms_error_mm": 50.0},
+    }  # fmt: skip
+    made = make_study(loop, vary={"reference.level": {"grid": [41.0, 44.0]}})
+    assert made.objectives == ("level.rms_error_mm", "motors.total_variation_bar")
+    runs: Any = study(made, workers=0, output=tmp_path / "out")
+    assert (runs["error"] == "").all()
+    for run in (0, 1):
+        for group, table in simulate(made.setup(run)).metrics.items():
+            for name, value in table.items():
+                found = runs.loc[run, f"{group}.{name}"]
+                assert found == value or (value is None and np.isnan(found)), name
+    # What goes by the step is as large a part of each; what is in mm goes with it.
+    assert runs.loc[0, "level.rms_error_mm"] / 41.0 == pytest.approx(runs.loc[1, "level.rms_error_mm"] / 44.0)
+    assert not {"pitch.rms_error_deg", "motors.max_rad"} & set(runs.columns)
+    page = study_page(read_description(tmp_path / "out"), runs)
+    assert "level.overshoot_pct" in page
+    with pytest.raises(SettingsError, match=r"`pitch.rms_error_deg` is not a metric .*level.rise_s.*motors.max_bar"):
+        make_study(loop, vary={}, objectives=["pitch.rms_error_deg"])
+
+
+def test_a_study_of_fmus_is_of_the_robot_beside_its_loop(tmp_path: Path) -> None:
+    """Their loop file alone is of that robot as well."""
+    (tmp_path / "robot.toml").write_text(preset_text("antagonist"))
+    parts = 'duration_s = 1.0\nplant = { fmu = "p.fmu" }\ncontroller = { fmu = "c.fmu" }\n'
+    (tmp_path / "loop.toml").write_text(parts + '[reference]\nkind = "step"\npitch_deg = 5.0\n')
+    made = make_study(tmp_path / "loop.toml", vary={})
+    assert made.loop["robot"] == "robot.toml"
+    assert not [name for name in made.metrics if name.startswith("roll")]

@@ -19,6 +19,8 @@ from softneck.design.plants._uncertain import uncertain_plant
 from softneck.identification import Model
 from softneck.identification.models._state_space import lss_arrays
 from softneck.loop._faults import make_fault
+from softneck.loop._reference_parts import AheadReference
+from softneck.loop._robot_references import robot_reference
 from softneck.plant import VirtualNeck
 from softneck.robot import Robot
 from softneck.signals import signal
@@ -96,6 +98,24 @@ def test_an_antagonist_follows_a_step_and_its_tendons_share_the_pull() -> None:
     recording = result.recording()
     assert recording.robot.hash == model.robot.hash
     assert recording.set_points.shape[1] == 2
+
+
+def test_a_reference_is_known_ahead_by_the_outputs_of_its_robot() -> None:
+    model = plant(Robot.preset("antagonist"))
+    result = closed(model, design_controller("pi", model), duration=1.0, pitch_deg=6.0, ahead_s=0.3)
+    known = np.degrees(result["pitch_reference_ahead"])
+    # The step at 0.5 s, fifteen samples earlier.
+    np.testing.assert_allclose(known[:-15], np.degrees(result["pitch_reference"])[15:], atol=1e-12)
+    assert (known[9], known[10]) == pytest.approx((0.0, 6.0))
+    assert "roll_reference_ahead" not in result.signals.signals
+    told = robot_reference("ramp", {"x": 41.0, "z_mm": 45.0, "rise_s": 1.0}, BELLOWS)
+    part = AheadReference(told, 0.5, robot=BELLOWS)
+    names = [port.name for port in part.outputs]
+    assert names[:5] == ["x_reference", "y_reference", "z_reference", "cocontraction_reference", "enabled"]
+    assert [(port.name, port.unit) for port in part.outputs[5:]] == [(f"{n}_reference_ahead", "m") for n in "xyz"]
+    assert part.start(0.25, {}).tolist() == pytest.approx(
+        [0.25 * 0.041, 0.0, 0.25 * 0.045, 0.0, 1.0, 0.75 * 0.041, 0.0, 0.75 * 0.045]
+    )
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import pytest
 from fmpy.validation import validate_fmu
 
 from softneck.core import Matrix, SettingsError
+from softneck.cosim import make_loop
 from softneck.cosim.parts._free_run import drive_fmu
 from softneck.design import MpcSettings, PiSettings
 from softneck.fmu import build_compiled_fmu, build_fmu, fmu_info
@@ -38,6 +39,7 @@ from softneck.runtime import Block, Port, load_runtime
 from softneck.signals import Recording
 
 from ..data import slow_but
+from ..design.test_robots import plant as lag
 
 TS = 0.02
 ROWS = 500
@@ -249,3 +251,18 @@ def _controller(motors: int, outputs: int) -> Block:
         arrays=(), inputs=tuple(Port(name=name, unit="rad") for name in inputs),
         outputs=tuple(Port(name=f"motor_setpoint_{j + 1}", unit="rad") for j in range(motors)),
     )  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("backend", "fmi"), BACKENDS)
+def test_a_controller_and_another_robot_s_fmu_are_refused_in_a_line_that_names_both(
+    backend: str, fmi: int, tmp_path: Path
+) -> None:
+    ours, other = (lag(Robot.preset(name)) for name in ("antagonist", "trunk4"))
+    build: Any = build_fmu if backend == "python" else partial(build_compiled_fmu, fmi=fmi)
+    for name, model in (("ours", ours), ("other", other)):
+        build(model.block(), tmp_path / f"{name}.fmu", info=fmu_info(model))
+    table = {"duration_s": 0.1, "controller": PiSettings().design(ours), "reference": {"kind": "step", "pitch_deg": 3}}
+    make_loop({**table, "plant": tmp_path / "ours.fmu"}).loop.close()
+    with pytest.raises(SettingsError, match=r"\[plant\] is an FMU of robot `trunk4` .* and the loop of .*`antagonist`"):
+        make_loop({**table, "plant": tmp_path / "other.fmu"})

@@ -29,7 +29,7 @@ def test_every_parameter_has_unit_range_text_and_source() -> None:
         assert about["unit"]
         assert len(about["text"]) > 5
         assert len(about["source"]) > 3
-        for preset in ("paper", "lab", "rough"):
+        for preset in ("paper", "lab", "rough", "trunk"):
             assert about["low"] <= getattr(NeckParameters.preset(preset), name) <= about["high"]
 
 
@@ -63,7 +63,7 @@ def test_a_file_overrides_a_preset(tmp_path: Path) -> None:
         ("stiffness = 1.0\n", "`stiffness` is not a parameter of the neck"),
         ("winch_radius = -1\n", r"neck.toml: `winch_radius` must be between"),
         ("winch_radius = [1]\n", r"`winch_radius` must be a number \[m\]"),
-        ('preset = "v3"\n', "`preset` must be one of paper, lab, rough; got 'v3'"),
+        ('preset = "v3"\n', "`preset` must be one of paper, lab, rough, trunk; got 'v3'"),
         ("winch_radius = \n", "is not valid TOML"),
         ("\x80", "is not valid TOML"),
     ],

@@ -237,3 +237,16 @@ def test_set_points_beyond_the_robot_s_range_are_refused() -> None:
         record(Excitation("mine", np.array([0.0, 0.02]), P), pulls)
     with pytest.raises(DataError, match=r"shape \(time, 2\)"):
         record(Excitation("mine", np.array([0.0, 0.02]), np.zeros((2, 3))), pulls)
+
+
+def test_the_trunk_bends_as_necks_worth_having_do() -> None:
+    """3 rad on one tendon bend it by 12 to 18 deg (docs/theory/foreign_necks.md), and its winch gets there."""
+    robot = Robot.preset("trunk4")
+    block = VirtualNeck.of(robot).block()
+    inputs, outputs = ([port.name for port in ports] for ports in (block.inputs, block.outputs))
+    # Damped motions end within a second; the loop of the winch needs another.
+    rows = np.tile([np.nan if port.missing else port.start for port in block.inputs], (150, 1))
+    rows[:, [inputs.index(name) for name in robot.set_points]] = [3.0, 0.0, 0.0, 0.0]
+    y = block.run(block.initial_state(), rows)[1]
+    assert 12.0 < np.degrees(y[-1, outputs.index("pitch")] - y[0, outputs.index("pitch")]) < 18.0
+    assert y[-1, outputs.index("motor_position_1")] == pytest.approx(3.0, abs=0.01)

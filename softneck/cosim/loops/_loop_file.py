@@ -131,6 +131,7 @@ def _setup(table: Mapping[str, Any], source: Path, opened: dict[Any, Any] | None
     if "drives" in table:
         opener.drives(table["drives"])
     robot = opener.robot(table.get("robot"), None if source.is_dir() else source)
+    _check_fmus(parts, robot)
     parts["plant"] = opener.plant_of(robot, parts["plant"])
     reference = opener.reference(table["reference"], parts["controller"].sample_time, robot)
     if isinstance(reference, FmuPart | IsolatedPart):
@@ -157,6 +158,17 @@ def _setup(table: Mapping[str, Any], source: Path, opened: dict[Any, Any] | None
     _check_sample_time(loop, table.get("sample_time_s"))
     limits = numbers("[limits]", table.get("limits", {}))
     return LoopSetup(loop=loop, limits=limits, files=dict(opener.files), angle=table.get("angle", "true"))
+
+
+def _check_fmus(parts: Mapping[str, Part], robot: Robot) -> None:
+    """Raise SettingsError where an FMU of ours says that it is of another robot; foreign ones say nothing."""
+    for name, part in parts.items():
+        whose, told = part.robot_told if isinstance(part, FmuPart | IsolatedPart) else ("", "")
+        if told and told != robot.hash:
+            raise SettingsError(
+                f"[{name}] is an FMU of robot `{whose}` ({told[:8]}) and the loop of robot {robot.label()}; a loop is "
+                "of one. Where its parts do not say it, `robot` does."
+            )
 
 
 def _constants(

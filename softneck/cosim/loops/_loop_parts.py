@@ -86,12 +86,12 @@ class PartOpener:
     def reference(self, table: Any, sample_time: float = 0.02, robot: Robot = _NECK) -> Reference | Part:
         """Return what the table [reference] describes; with `ahead_s` a part that tells it so long before."""
         if isinstance(table, dict) and "ahead_s" in table:
-            robot.require_neck("[reference] ahead_s")
             rest = {key: value for key, value in table.items() if key != "ahead_s"}
-            made = self.reference(rest)
+            made = self.reference(rest, sample_time, robot)
             if hasattr(made, "advance"):
                 raise SettingsError("[reference] ahead_s: an FMU cannot be asked what it will say; leave it out.")
-            return AheadReference(made, number("[reference] ahead_s", table["ahead_s"]), sample_time=sample_time)  # pyright: ignore[reportArgumentType]
+            ahead = number("[reference] ahead_s", table["ahead_s"])
+            return AheadReference(made, ahead, sample_time=sample_time, robot=robot)  # pyright: ignore[reportArgumentType]
         if isinstance(table, dict) and OBJECT in table:
             given: Any = table[OBJECT]
             part: Any = given if callable(given) else _part_of("reference", given)

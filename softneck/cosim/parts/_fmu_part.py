@@ -47,6 +47,7 @@ class FmuPart:
         role: "plant", "observer", "controller" or "reference".
         native_names: our name -> the FMU's, where the mapping renames.
         units: our name -> unit, as the caller gave them.
+        robot_told: name and hash of the robot that the FMU says it is of, "" where it says none.
         messages: the last lines of the FMU's log, as (status, text).
     """
 
@@ -78,6 +79,7 @@ class FmuPart:
             _check_platform(self._description, folder)
         self.native_names = {ours: theirs for theirs, ours in (names or {}).items()}
         self.units = dict(units or {})
+        self.robot_told = self._description.annotation.robot
         self.role = role or self._description.annotation.role
         if not self.role:
             raise SettingsError(f"{self.path}: say its role in the loop ({', '.join(_ROLES)}).")

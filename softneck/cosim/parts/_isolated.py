@@ -57,6 +57,7 @@ class IsolatedPart:
         """Read the FMU's description; the child starts with `start`. Arguments and errors are those of `FmuPart`."""
         require_positive("timeout", timeout, "s")
         described = FmuPart(path, role=role, sample_time=sample_time, names=names, units=units)
+        self.robot_told = described.robot_told
         self.path, self.role, self.sample_time = described.path, described.role, described.sample_time
         self.inputs, self.outputs, self.parameters = described.inputs, described.outputs, described.parameters
         self.native_names, self.units, self.timeout = described.native_names, described.units, timeout

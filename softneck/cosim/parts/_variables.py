@@ -50,11 +50,13 @@ class Annotation:
     Attributes:
         kind, role: of the block, "" for foreign FMUs.
         missing: names of variables whose NaN means "not measured".
+        robot: name and hash of the robot that it is of, "" for necks and foreign FMUs.
     """
 
     kind: str = ""
     role: str = ""
     missing: frozenset[str] = frozenset()
+    robot: tuple[str, str] = ("", "")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,7 +156,8 @@ def _annotation(folder: Path) -> Annotation:
     block = next((found for found in map(root.find, places) if found is not None), None)  # FMI 2.0, FMI 3.0
     if block is None:
         return Annotation()
-    return Annotation(block.get("kind", ""), block.get("role", ""), frozenset(block.get("missing", "").split()))
+    robot = (block.get("robot", ""), block.get("robotHash", ""))
+    return Annotation(block.get("kind", ""), block.get("role", ""), frozenset(block.get("missing", "").split()), robot)
 
 
 def _number(text: Any, default: Any) -> Any:

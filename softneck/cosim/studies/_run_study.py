@@ -142,7 +142,7 @@ class _Work:
 
     def _submit(self, runs: list[int]) -> None:
         points = [self._study.points[run] for run in runs]
-        chunk = Chunk(self._digest, self._study.loop, self._study.folder, points)
+        chunk = Chunk(self._digest, self._study.loop, self._study.folder, points, self._study.metrics)
         try:
             self._out[self._crew.submit(run_chunk, chunk)] = runs
         except BrokenExecutor:
@@ -165,9 +165,10 @@ class _Work:
             if len(runs) > 1:
                 self._suspects.extend(runs)
             else:
-                self._write(
-                    [failed_row(self._study.points[runs[0]], f"its worker failed: {type(error).__name__}: {error}")]
-                )
+                self._write([self._failed_row(runs[0], f"its worker failed: {type(error).__name__}: {error}")])
+
+    def _failed_row(self, run: int, message: str) -> Row:
+        return failed_row(self._study.points[run], message, self._study.metrics)
 
     def _died(self, runs: list[int]) -> None:
         """Try the runs of a worker that died again, each alone; give up on one that was alone already."""
@@ -176,7 +177,7 @@ class _Work:
             self._deaths[run] = self._deaths.get(run, 0) + int(alone)
             if self._deaths[run] >= _TRIALS:
                 message = f"its worker process died {_TRIALS} times with it alone"
-                self._write([failed_row(self._study.points[run], message)])
+                self._write([self._failed_row(run, message)])
             else:
                 self._suspects.append(run)
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 from softneck import __version__
 from softneck.core import FileFormatError, OutputFileError, SettingsError, atomic_write
-from softneck.loop._result import METRICS
 
 from ._study import Study
 from ._vary import Vary
@@ -43,7 +42,7 @@ class Store:
             OutputFileError: the folder holds a study and neither `resume` nor `force` is given.
             SettingsError: `resume` in a folder of another study, or of none.
         """
-        self.folder, self._schema = folder, schema(study.vary)
+        self.folder, self._schema = folder, schema(study.vary, study.metrics)
         self._parts = folder / _PARTS
         if (folder / DESCRIPTION).exists() and not (resume or force):
             raise OutputFileError(f"{folder}: holds a study already; --resume continues it, --force replaces it.")
@@ -120,13 +119,13 @@ class Store:
         )
 
 
-def schema(vary: Mapping[str, Vary]) -> pa.Schema:
+def schema(vary: Mapping[str, Vary], metrics: Sequence[str]) -> pa.Schema:
     """Return the columns of a study's runs with their types."""
     import pyarrow as pa
 
     fields = [("run", pa.int64()), ("sample", pa.int64()), ("seed", pa.int64())]
     fields += [(key, _type_of(item)) for key, item in vary.items()]
-    fields += [(metric, pa.float64()) for metric in METRICS]
+    fields += [(metric, pa.float64()) for metric in metrics]
     return pa.schema([*fields, ("holds", pa.bool_()), ("error", pa.string()), ("seconds", pa.float64())])
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -12,11 +13,14 @@ from typing import Any
 
 from softneck.core import FileFormatError, SettingsError, SoftneckError, file_hash
 from softneck.loop import Loop, LoopRun
-from softneck.loop._result import METRICS
+from softneck.loop._result import metric_names, shown_unit
+from softneck.loop._robot_references import reference_key
+from softneck.robot import Robot
+from softneck.robot._search import robot_file_of
 from softneck.runtime import Block
 
 from ..loops._loop_file import LoopSetup, make_loop, normal_table
-from ..loops._loop_parts import OBJECT
+from ..loops._loop_parts import OBJECT, SOURCES, PartOpener
 from ..loops._loop_table import check_key, loop_table, set_sources, settable, with_values
 from ..loops._loop_values import read_toml
 from ._vary import StudyPoints, Vary, flattened, make_vary
@@ -53,12 +57,17 @@ class Study:
         if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
             raise SettingsError(f"`seed` must be a whole number that is not negative; got {self.seed!r}.")
         for metric in self.objectives:
-            if metric not in METRICS:
+            if metric not in self.metrics:
                 raise SettingsError(
-                    f"`{metric}` is not a metric that can be an objective; use some of {', '.join(METRICS)}."
+                    f"`{metric}` is not a metric that can be an objective; use some of {', '.join(self.metrics)}."
                 )
         if not self.objectives:
             raise SettingsError("`objectives` is empty; name at least one metric.")
+
+    @cached_property
+    def metrics(self) -> tuple[str, ...]:
+        """The names of all that a run is judged by."""
+        return metric_names(_robot_of(self.loop, self.vary, self.folder))
 
     @cached_property
     def points(self) -> StudyPoints:
@@ -144,10 +153,10 @@ def make_study(
     """
     table, start = _opened(loop)
     chosen = {key: make_vary(key, given) for key, given in flattened(vary)}
-    limits = table.get("limits", {})
+    start = Path(folder) if folder else start
     return Study(
-        loop=table, vary=chosen, runs=runs, seed=seed, sampling=sampling, folder=Path(folder) if folder else start,
-        objectives=tuple(objectives) if objectives else _objectives(table, limits), name=name,
+        loop=table, vary=chosen, runs=runs, seed=seed, sampling=sampling, folder=start, name=name,
+        objectives=tuple(objectives) if objectives else _objectives(table, _robot_of(table, chosen, start)),
     )  # fmt: skip
 
 
@@ -191,7 +200,7 @@ def _opened(loop: Source) -> tuple[Mapping[str, Any], Path]:
         path = Path(loop)
         if not path.is_file():
             raise FileFormatError(f"there is no loop file {path}.")
-        return read_toml(path), path.parent.resolve()
+        return _with_robot(read_toml(path), path), path.parent.resolve()
     if isinstance(loop, Loop | LoopSetup):
         return loop_table(loop), Path.cwd()
     if not isinstance(loop, Mapping):
@@ -199,14 +208,45 @@ def _opened(loop: Source) -> tuple[Mapping[str, Any], Path]:
     return normal_table(loop), Path.cwd()
 
 
-def _objectives(table: Mapping[str, Any], limits: Mapping[str, float]) -> tuple[str, ...]:
+def _with_robot(table: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Return a loop file's table with the robot beside it where no part can say whose it is: runs know no file."""
+    file = robot_file_of(path)
+    parts = [*(table.get(name) for name in SOURCES), *table.get("part", [])]
+    if file is None or "robot" in table or any({"model", "file"} & set(part or ()) for part in parts):
+        return table
+    return {**table, "robot": os.path.relpath(file, path.resolve().parent / str(table.get("folder", ".")))}
+
+
+def _robot_of(table: Mapping[str, Any], vary: Mapping[str, Vary], folder: Path) -> Robot:
+    """Return whose loop it is, as the table and its first files say; what is wrong with them `Study.check` says."""
+    opener = PartOpener(folder / str(table.get("folder", ".")))
+    try:
+        made = with_values(table, {key: vary[key].values[0] for key in vary if set_sources(key)})
+        for name in SOURCES:
+            if {"model", "file", OBJECT} & set(made.get(name, ())):
+                opener.part(name, made[name])
+        return opener.robot(table.get("robot"), None)
+    except (SoftneckError, OSError, TypeError):
+        return Robot.preset()
+
+
+def _objectives(table: Mapping[str, Any], robot: Robot) -> tuple[str, ...]:
+    """Return the error of the first output that the reference is about, or else the limits, and the motors' moves."""
     reference = table.get("reference", {})
-    stated = {
-        key.partition("_")[0] for key, value in reference.items() if value and key.startswith(("pitch_", "roll_"))
-    }
-    limited = {name.partition(".")[0] for name in limits} & {"pitch", "roll"}
-    axis = "roll" if "roll" in (stated or limited) and "pitch" not in (stated or limited) else "pitch"
-    return (f"{axis}.rms_error_deg", "motors.total_variation_rad")
+    stated = {_asked(reference, key, robot) for key, value in reference.items() if value and key != "kind"}
+    limited = {name.partition(".")[0] for name in table.get("limits", {})}
+    names = robot.outputs.names
+    axis = next((name for asked in (stated, limited) for name in names if name in asked), names[0])
+    moved = next(name for name in metric_names(robot) if name.startswith("motors.total_variation_"))
+    return (f"{axis}.rms_error_{shown_unit(robot)[0]}", moved)
+
+
+def _asked(reference: Mapping[str, Any], key: str, robot: Robot) -> str:
+    """Return the output that a key of [reference] is about; "" where it is about something else."""
+    try:
+        return reference_key(str(reference.get("kind")), key, robot)[0]
+    except (KeyError, SettingsError):
+        return ""
 
 
 def _texts(value: Any) -> list[str]:

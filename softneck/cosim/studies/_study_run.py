@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import SoftneckError
-from softneck.loop._result import METRICS
 
 from ..loops._loop_file import make_loop
 from ..loops._loop_table import with_values
@@ -30,12 +29,14 @@ class Chunk:
         loop: its table.
         folder: where relative paths start.
         points: what to run.
+        metrics: the names of all that a run is judged by.
     """
 
     digest: str
     loop: Mapping[str, Any]
     folder: Path
     points: Sequence[Point]
+    metrics: Sequence[str]
 
 
 def run_chunk(chunk: Chunk) -> list[Row]:
@@ -47,7 +48,7 @@ def run_point(chunk: Chunk, point: Point) -> Row:
     """Return the row of one run: number, sample, seed, labels, metrics, whether limits hold, error, seconds."""
     begin = time.perf_counter()
     row: Row = {"run": point.run, "sample": point.sample, "seed": point.seed, **point.labels}
-    row |= dict.fromkeys(METRICS)
+    row |= dict.fromkeys(chunk.metrics)
     row |= {"holds": None, "error": ""}
     try:
         row |= _judged(chunk, point)
@@ -68,10 +69,10 @@ def release(digest: str) -> None:
     opened.clear()
 
 
-def failed_row(point: Point, error: str) -> Row:
+def failed_row(point: Point, error: str, metrics: Sequence[str]) -> Row:
     """Return the row of a run that no process could finish."""
     row: Row = {"run": point.run, "sample": point.sample, "seed": point.seed, **point.labels}
-    return row | dict.fromkeys(METRICS) | {"holds": False, "error": error, "seconds": None}
+    return row | dict.fromkeys(metrics) | {"holds": False, "error": error, "seconds": None}
 
 
 def _judged(chunk: Chunk, point: Point) -> Row:

@@ -47,7 +47,7 @@ def model_description3(block: Block, info: FmuInfo, identity: Identity) -> bytes
     SubElement(root, "DefaultExperiment", times)
     _variables(root, block)
     _structure(root, block)
-    _annotation(root, block)
+    _annotation(root, block, info)
     indent(root)
     return b'<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="utf-8") + b"\n"
 
@@ -92,8 +92,10 @@ def _structure(root: Element, block: Block) -> None:
             SubElement(structure, tag, valueReference=str(n_in + i), dependencies=known)
 
 
-def _annotation(root: Element, block: Block) -> None:
+def _annotation(root: Element, block: Block, info: FmuInfo) -> None:
     missing = [port.name for port in (*block.inputs, *block.outputs, *block.parameters) if port.missing]
     facts = {"kind": block.kind, "role": block.role, "sampleTime": repr(float(block.sample_time))}
+    if info.robot is not None:
+        facts |= {"robot": info.robot[0], "robotHash": info.robot[1]}
     note = SubElement(SubElement(root, "Annotations"), "Annotation", type="softneck")
     SubElement(note, "Block", facts | {"missing": " ".join(missing)})

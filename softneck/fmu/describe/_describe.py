@@ -76,6 +76,7 @@ def fmu_info(
         parts += ["<h2>Scores</h2>", _fits(validation), _free_run(validation)]
     elif hasattr(thing, "training_rows") and not scores:
         parts.append("<h2>Scores</h2><p>None were given when this FMU was built (softneck fmu --data).</p>")
+    robot: Any = getattr(thing, "robot", None)
     limits = _KIND_LIMITS.get(block.kind, _LIMITS.get(block.role, ""))
     if limits:
         parts.append(f"<h2>What it is not good for</h2><p>{limits}</p>")
@@ -85,6 +86,7 @@ def fmu_info(
         license="BSD-3-Clause (runtime); the model is its author's",
         documentation="\n".join(parts),
         stop_time=stop_time,
+        robot=None if robot is None or robot.is_neck else (robot.name, robot.hash),
     )
 
 

@@ -66,7 +66,7 @@ def model_description(block: Block, info: FmuInfo, identity: Identity) -> bytes:
         SubElement(categories, "Category", name=name, description=text)
     times = {"startTime": "0", "stopTime": repr(float(info.stop_time)), "stepSize": repr(float(block.sample_time))}
     SubElement(root, "DefaultExperiment", times)
-    _annotation(root, block)
+    _annotation(root, block, info)
     _variables(root, block)
     _structure(root, block)
     indent(root)
@@ -145,10 +145,12 @@ def add_unit_definitions(root: Element, block: Block) -> None:
             SubElement(unit, "DisplayUnit", name=display, factor=repr(factor))
 
 
-def _annotation(root: Element, block: Block) -> None:
+def _annotation(root: Element, block: Block, info: FmuInfo) -> None:
     # For our own tools: FMI has no place for the role, nor for "NaN means not measured".
     missing = [port.name for port in (*block.inputs, *block.outputs, *block.parameters) if port.missing]
     facts = {"kind": block.kind, "role": block.role, "sampleTime": repr(float(block.sample_time))}
+    if info.robot is not None:
+        facts |= {"robot": info.robot[0], "robotHash": info.robot[1]}
     tool = SubElement(SubElement(root, "VendorAnnotations"), "Tool", name="softneck")
     SubElement(tool, "Block", facts | {"missing": " ".join(missing)})
 

@@ -6,7 +6,7 @@ The page says what the model is, its variables, its timing, and what the host mu
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from html import escape
 
 from softneck.runtime import Block, Port
@@ -27,6 +27,7 @@ class FmuInfo:
         documentation: HTML that goes into the body of `documentation/index.html`: how the model was
             identified, its scores, what it is not good for.
         stop_time: of the default experiment [s].
+        robot: name and hash of another robot than the neck, for loops to refuse parts of two.
     """
 
     description: str = ""
@@ -36,6 +37,7 @@ class FmuInfo:
     copyright: str = ""
     documentation: str = ""
     stop_time: float = 10.0
+    robot: tuple[str, str] | None = field(default=None, repr=False)  # which an FMU's GUID is made of
 
 
 # What the slave's syntax needs.
