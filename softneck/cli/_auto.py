@@ -17,7 +17,7 @@ from .shared._validate_table import with_fit
 
 if TYPE_CHECKING:
     from softneck.identification import Choice, Model
-    from softneck.identification.selection._auto import KindTrial
+    from softneck.identification.selection._kind_trial import KindTrial
     from softneck.robot import Robot
     from softneck.signals import Recording
 
@@ -117,7 +117,7 @@ def _rows(choice: Choice) -> list[list[str]]:
 
 
 def _row(one: KindTrial, chosen: bool) -> list[str]:
-    from softneck.identification.selection._auto import COLD, HOLD_OUT
+    from softneck.identification.selection._kind_trial import COLD, HOLD_OUT
 
     if one.model is None:
         return [one.kind, *["-"] * 5, f"{one.seconds:.1f} s", "-", one.failure[:60]]

@@ -96,9 +96,6 @@ def command(
     whole = read_together(recordings, robot)
     # All of it to train on leaves nothing to hold out.
     head, tail = (whole, None) if train == 1.0 else whole.split(train)
-    poor = poor_excitation(head)
-    for line in poor:
-        note(line)
     found = run_search(estimator, head, options, quiet=as_json)
     with progress(f"identify {kind}", quiet=as_json) as report:
         model = found.model if found is not None else estimator.fit(head, progress=report)
@@ -108,10 +105,12 @@ def command(
     model.save(path, force=replace)
     if found is not None and plot is not None:
         write_plot(found, plot, force=force)
+    poor = poor_excitation(head)
     if as_json:
         print_json({**_facts(path, model, held_out, found), "excitation": poor})
     else:
         _print(path, model, held_out, found)
+        click.echo("\n".join(poor), nl=bool(poor))
     if found is not None and found.interrupted:
         raise KeyboardInterrupt  # what was done is kept, and the exit code says that it is not all
     why = None if held_out is None else useless(held_out)

@@ -129,7 +129,8 @@ def bundle(runtime: str, *, loops: bool = True, skip: tuple[str, ...] = (), link
         runtime: dotted name, with members in brackets.
         loops: add the loops over `step`; false for a module of plain functions.
         skip: functions to leave out, which the caller writes otherwise.
-        linked: take the members' functions from where they are compiled already (see `load_runtime`), not their text.
+        linked: take the members' functions from where they are compiled already (see `load_runtime`), not their text;
+            but for derivatives, which are made of the text.
 
     Raises:
         SettingsError: a module imports what a runtime must not, or two define the same name.
@@ -143,7 +144,7 @@ def bundle(runtime: str, *, loops: bool = True, skip: tuple[str, ...] = (), link
     names = [member for member, _ in members]
     homes = [names.index(name) for name in names]
     plain = {i: bundle(names[i], loops=False) for i in dict.fromkeys(homes)}
-    if linked:
+    if linked and not tangents:
         texts = [_link(names[i], content_name(text), f"m{i}_") for i, text in plain.items()]
     else:
         texts = [prefixed(with_tangent(text) if tangents else text, f"m{i}_") for i, text in plain.items()]

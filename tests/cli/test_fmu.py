@@ -105,7 +105,7 @@ def test_a_model_of_another_version_is_refused(call: Call, rls_file: Path) -> No
 
 
 def test_what_has_no_block_is_no_fmu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("softneck.cli._fmu.load", lambda _path: object())
+    monkeypatch.setattr("softneck.cli._fmu.load_of", lambda _path, _robot: object())
     with pytest.raises(FileFormatError, match="no FMU can be built from it"):
         open_buildable(tmp_path / "family.npz")
 

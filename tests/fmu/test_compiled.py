@@ -94,7 +94,8 @@ def test_fmus_keep_compiled_code_where_softneck_does() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "cost"), [("rls", "light"), ("kalman", "light"), ("nn", "middling"), ("nlsm", "heavy"), ("neck", "heavy")]
+    ("kind", "cost"),
+    [("rls", "light"), ("kalman", "middling"), ("nn", "middling"), ("nlsm", "heavy"), ("neck", "heavy")],
 )
 def test_the_cost_decides_what_is_compiled(kind: str, cost: str) -> None:
     from softneck.fmu.describe._cost import plain_cost

@@ -102,7 +102,7 @@ class LoopSettings:
             given = {name: getattr(self, name) for name in LIMITS}
             return robot_limits(robot, {key: v for key, v in given.items() if not isinstance(v, NeckDefault)})
         stricter = _stricter(robot, {name: getattr(self, name) for name in LIMITS})
-        return ControllerLimits(**stricter)
+        return ControllerLimits(robot=robot, **stricter)
 
     @property
     def extra_delay(self) -> int:

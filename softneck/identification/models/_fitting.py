@@ -166,7 +166,7 @@ def training_recording(
         recording.robot.require_neck(f"this kind of model ({', '.join(ANY_ROBOT)} take any robot)")
     check_training(recording)
     outputs, motions = len(recording.robot.outputs.names), independent_motions(recording)
-    if all_motors and motions < outputs:
+    if all_motors and motions < min(outputs, len(recording.robot.motors.names)):
         raise DataError(
             f"the motors move along {motions} direction(s) for {outputs} outputs, and this kind learns what each motor "
             "does: it would be wrong elsewhere. Record with all motors moving independently (`eq22`, `mixed`), or take "

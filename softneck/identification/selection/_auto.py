@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from ..uncertainty._residual import Residual
 from ..validation._score_tables import INFINITE
 from ..validation._validation import Rules, Validation, judge, judged_parts
 from ._exam import agreement, exams, free_runs
+from ._kind_trial import EXAM, HOLD_OUT, KindTrial
 from ._left_out import Fold, everything, folds
 
 # From what can be read to what cannot: of kinds that hold as many numbers the first is taken. `_MADE_OF_OTHERS` come
@@ -49,64 +50,7 @@ _POOR = 70.0
 _MOST_MEMBERS = 3
 # So many kinds are trained on all rows at most, before the better of them is taken.
 _MOST_TRAINED = 2
-EXAM, HOLD_OUT, COLD = "agreement", "hold-out", "cold start"
 REFITTED = "trained on all rows after the choice; its scores are those of the model before, which had not seen them all"
-# What is in a model file but was not found from data: sizes, tables, copies of rows in another order.
-_NOT_FOUND = ("history", "memory", "table", "redefinition", "nodes", "frame", "scale", "input_scale", "output_scale",
-              "range", "widths", "source")  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class KindTrial:
-    """One kind that was tried.
-
-    Attributes:
-        kind: its name.
-        seconds: of training.
-        model: None where it failed.
-        judged: on the rows held out; None where it failed or was stopped before it was trained on all rows.
-        failure: why it failed; empty otherwise.
-        left_out: what was left out of a training -> free-run fit on it [%], the mean of the outputs; "agreement" is
-            that with the other kinds on motions that nobody recorded.
-        errors: the same names -> standard error [%], over blocks of 2 s; "agreement" has none.
-        whole: whether `model` was trained on all rows; the others were stopped before that.
-    """
-
-    kind: str
-    seconds: float
-    model: Model | None = None
-    judged: Validation | None = None
-    failure: str = ""
-    left_out: Mapping[str, float] = field(default_factory=dict)
-    errors: Mapping[str, float] = field(default_factory=dict)
-    whole: bool = True
-
-    @property
-    def scores(self) -> dict[str, float]:
-        """What it is judged by -> mean free-run fit of the outputs [%]; -inf where it failed or diverged."""
-        if self.model is None or self.judged is None:
-            return dict(self.left_out)
-        return {**self.left_out, HOLD_OUT: _mean(self.judged.fits[INFINITE]), COLD: _mean(self.judged.cold_fits)}
-
-    @property
-    def fit(self) -> float:
-        """The least of `scores` [%], by which kinds are ranked; -inf where it failed or diverged."""
-        return min(self.scores.values(), default=float("-inf"))
-
-    @property
-    def worst(self) -> str:
-        """The name of the least score; empty where there is none."""
-        return min(self.scores, key=lambda name: self.scores[name], default="")
-
-    @property
-    def hold_out_fit(self) -> float:
-        """Mean free-run fit on the rows held out [%]; -inf where it failed or diverged."""
-        return self.scores.get(HOLD_OUT, float("-inf"))
-
-    @property
-    def numbers(self) -> int:
-        """How many numbers of the model were found from data."""
-        return 0 if self.model is None else numbers_of(self.model)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,16 +75,6 @@ class Choice:
 def kinds_to_try() -> tuple[str, ...]:
     """Return the kinds that `choose` can try."""
     return tuple(kind for kind in _SIMPLE_FIRST if kind in KINDS)
-
-
-def numbers_of(model: Model) -> int:
-    """Return how many numbers of a model were found from data; a set's points are, what finds them is not."""
-    parts = members(model.arrays)
-    inner = [Model(kind=kind, sample_time=model.sample_time, arrays=part) for kind, part in parts]
-    if model.kind == "ensemble":
-        return sum(numbers_of(part) for part in inner)
-    own = sum(values.size for name, values in model.arrays.items() if name not in _NOT_FOUND and "." not in name)
-    return own + sum(numbers_of(part) for part in inner)
 
 
 def choose(
@@ -388,11 +322,6 @@ def _anew(model: Model, train: Recording, seed: int, progress: Progress = silent
     if model.kind == "residual":
         return Residual().on(made_of[0], train)
     return combine(made_of) if model.kind == "ensemble" else _settings(model.kind, seed, {}).fit(train)
-
-
-def _mean(fits: Mapping[str, float | None]) -> float:
-    known = [fit for fit in fits.values() if fit is not None]
-    return float(np.mean(known)) if known and len(known) == len(fits) else float("-inf")
 
 
 def _word(kind: str, tried: list[KindTrial]) -> str:

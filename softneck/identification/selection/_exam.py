@@ -55,7 +55,7 @@ def agreement(runs: Mapping[str, Sequence[Matrix]], worth: Mapping[str, float]) 
 
     Args:
         runs: name -> `free_runs`.
-        worth: name of those that vote -> fit on rows left out [%], by which they weigh.
+        worth: name of those that vote -> fit on rows left out [%]; they weigh by the inverse square of what is missing.
 
     Returns:
         Name -> fit [%], the mean of the outputs; nothing where fewer than three that vote run free.
@@ -63,7 +63,7 @@ def agreement(runs: Mapping[str, Sequence[Matrix]], worth: Mapping[str, float]) 
     there = [name for name in worth if np.isfinite(worth[name]) and all(np.isfinite(y).all() for y in runs[name])]
     if len(there) < _LEAST_VOTES:
         return {}
-    weights = np.array([1.0 / max(100.0 - worth[name], _LEAST_ERROR) for name in there])
+    weights = np.array([1.0 / max(100.0 - worth[name], _LEAST_ERROR) ** 2 for name in there])
     middles = [weighted_median(np.array(free), weights) for free in zip(*(runs[name] for name in there), strict=True)]
     return {name: min(map(_fit, middles, free)) for name, free in runs.items()}
 

@@ -19,7 +19,7 @@ from softneck.core import (
     require_whole,
     silent,
 )
-from softneck.signals import Recording, concatenate, redefine
+from softneck.signals import Recording, concatenate
 
 from ..linear._oe import SOURCES
 from ..linear._srivc_fit import Continuous, SrivcFitOptions
@@ -27,7 +27,7 @@ from ..models._directions import Directions, directions_of
 from ..models._fitting import check_training
 from ._envelope import envelope_weight
 from ._family import AXES, SCOPES, AxisFamily, Family, one_pole, relative_errors
-from ._local_models import Local, Window, axis_inputs, fit_local, windows
+from ._local_models import Local, Window, axis_inputs, fit_compression, fit_local, unit_response, windows
 from ._lpv import Lpv, fit_lpv
 from ._measured import (
     AxisMeasured,
@@ -73,7 +73,7 @@ def cross_gains(
                 if there.sum() < _RUNS_NEEDED:
                     continue
                 U = axis_inputs(run, directions, source)
-                X = np.column_stack([_unit_response(nominal[axis], u, run.sample_time) for u in U.T])[there]
+                X = np.column_stack([unit_response(nominal[axis], u, run.sample_time) for u in U.T])[there]
                 parts.append(X - X.mean(axis=0))
                 targets.append(y[there] - y[there].mean())
         if not parts:
@@ -85,34 +85,6 @@ def cross_gains(
         covariance = np.linalg.pinv(X[:, moved].T @ X[:, moved]) * float(e @ e) / max(y.size - channels, 1)
         gains[axis, moved], stds[axis, moved] = theta, np.sqrt(np.diag(covariance))
     return gains, stds
-
-
-def fit_compression(recordings: Sequence[Recording], search: SrivcFitOptions, source: str) -> Continuous | None:
-    """Return G_delta from delta_i [rad] to compression [m], None where it was not logged or not excited."""
-    runs: list[tuple[Vector, Vector]] = []
-    for recording in recordings:
-        for run in recording.runs():
-            if "compression" not in run.channels:
-                continue
-            U = redefine(run.motor_positions if source == "positions" else run.set_points)
-            # In millimetres the numbers are of the order of one.
-            runs.append((np.ascontiguousarray(U[:, 2]), 1e3 * run.channels["compression"]))
-    if not runs or max(float(u.std()) for u, _ in runs) < 0.05:
-        return None
-    fits = [fit for pole in (5.0, 1.5, 15.0) if (fit := search.start(runs, pole, 0.1)) is not None]
-    if not fits:
-        return None
-    best = min(fits, key=lambda fit: fit.cost).model
-    return Continuous(a=best.a, b=1e-3 * best.b, delay=best.delay)
-
-
-def _unit_response(model: Continuous, u: Vector, sample_time: float) -> Vector:
-    """Return the response to `u` of the model scaled to a static gain of one, from rest at u(0)."""
-    from scipy.signal import lfilter
-
-    scaled = Continuous(a=model.a, b=model.a[-1:], delay=model.delay)
-    a, b, d = scaled.sampled(sample_time)
-    return u[0] + np.asarray(lfilter(np.concatenate([np.zeros(1 + d), b]), np.concatenate([[1.0], a]), u - u[0]))
 
 
 _FREQUENCIES = 100

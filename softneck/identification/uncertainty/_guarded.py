@@ -23,6 +23,7 @@ from softneck.signals import Recording
 
 from ..models._arrays import COMPOSED, memory_of, prefixed_arrays
 from ..models._fitting import row_hashes, training_recording
+from ..models._jobs import Job, done
 from ..models._model import Model
 from ..models._ports import trained_set_points
 from ..networks._network import Network
@@ -30,7 +31,6 @@ from ..networks._state_space_network import NeuralStateSpace
 from ..set_membership._set_membership import SetMembership
 from ..structured._play import Play
 from ._guarded_base import BASES, Base, base_or_reason, fitted_base
-from ._guarded_jobs import Job, done
 from ._left_out import left_out
 
 OF = ("nn", "nss", "play", "nlsm")

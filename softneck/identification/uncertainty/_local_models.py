@@ -230,3 +230,31 @@ def _correlation_time(errors: Sequence[Vector], lags: int) -> float:
             break
         total += 2.0 * r
     return total
+
+
+def fit_compression(recordings: Sequence[Recording], search: SrivcFitOptions, source: str) -> Continuous | None:
+    """Return G_delta from delta_i [rad] to compression [m], None where it was not logged or not excited."""
+    runs: list[tuple[Vector, Vector]] = []
+    for recording in recordings:
+        for run in recording.runs():
+            if "compression" not in run.channels:
+                continue
+            U = redefine(run.motor_positions if source == "positions" else run.set_points)
+            # In millimetres the numbers are of the order of one.
+            runs.append((np.ascontiguousarray(U[:, 2]), 1e3 * run.channels["compression"]))
+    if not runs or max(float(u.std()) for u, _ in runs) < 0.05:
+        return None
+    fits = [fit for pole in (5.0, 1.5, 15.0) if (fit := search.start(runs, pole, 0.1)) is not None]
+    if not fits:
+        return None
+    best = min(fits, key=lambda fit: fit.cost).model
+    return Continuous(a=best.a, b=1e-3 * best.b, delay=best.delay)
+
+
+def unit_response(model: Continuous, u: Vector, sample_time: float) -> Vector:
+    """Return the response to `u` of the model scaled to a static gain of one, from rest at u(0)."""
+    from scipy.signal import lfilter
+
+    scaled = Continuous(a=model.a, b=model.a[-1:], delay=model.delay)
+    a, b, d = scaled.sampled(sample_time)
+    return u[0] + np.asarray(lfilter(np.concatenate([np.zeros(1 + d), b]), np.concatenate([[1.0], a]), u - u[0]))

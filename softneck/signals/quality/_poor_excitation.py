@@ -37,11 +37,13 @@ def poor_excitation(recording: Recording) -> tuple[str, ...]:
     if spans.max() >= 1e-9 and changes < _FEW_CHANGES:
         said.append(f"the set-points change in {changes} rows only: a model is guesswork between them. Record `mixed`.")
     outputs = recording.robot.outputs.names
-    if independent_motions(recording) < len(outputs):
+    if independent_motions(recording) < min(len(outputs), len(spans)):
         said.append(
             f"the motors move along {independent_motions(recording)} direction(s) for {len(outputs)} outputs: how they "
             "add up elsewhere cannot be learned. Move all of them independently, as `eq22` and `mixed` do."
         )
+    if len(recording) < _FEW_ROWS or changes < _FEW_CHANGES:
+        return tuple(said)  # too little to tell what an output follows
     said += [
         f"`{name}` does not follow the motors (they explain {100.0 * max(share, 0.0):.0f} % of its variance): no model "
         "of set-points will predict it. Look for drift, a wrong column, or an output that nothing moves."
@@ -88,5 +90,5 @@ def _halves(odd: np.ndarray, there: np.ndarray) -> list[np.ndarray]:
 def _lagged(U: Matrix) -> Matrix:
     """Return the set-points of now and before (time, lags * motors), the first where there were none."""
     return np.column_stack(
-        [np.vstack([np.repeat(U[:1], min(lag, len(U)), axis=0), U[: len(U) - lag]]) for lag in _LAGS]
+        [np.vstack([np.repeat(U[:1], min(lag, len(U)), axis=0), U[: max(len(U) - lag, 0)]]) for lag in _LAGS]
     )

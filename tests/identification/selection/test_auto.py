@@ -10,18 +10,9 @@ import pytest
 from softneck.core import DataError, SettingsError
 from softneck.identification import Choice, Network, Play, Rls, SetMembership, choose, refit
 from softneck.identification.models._fitting import known_rows, row_hashes
-from softneck.identification.selection._auto import (
-    ALIKE,
-    COLD,
-    EXAM,
-    HOLD_OUT,
-    REFITTED,
-    KindTrial,
-    _Race,
-    kinds_to_try,
-    numbers_of,
-)
+from softneck.identification.selection._auto import ALIKE, REFITTED, _Race, kinds_to_try
 from softneck.identification.selection._exam import agreement, exams, weighted_median
+from softneck.identification.selection._kind_trial import COLD, EXAM, HOLD_OUT, KindTrial, numbers_of
 from softneck.identification.selection._left_out import folds
 from softneck.identification.uncertainty._ensemble import combine
 from softneck.signals import Recording, concatenate

@@ -12,9 +12,9 @@ import softneck
 from softneck.core import DataError, FileFormatError, Matrix, SettingsError, silent
 from softneck.identification import Model, Network, OutputError, Rls
 from softneck.identification.models._arrays import check_arrays
+from softneck.identification.models._jobs import Job, done
 from softneck.identification.uncertainty._guarded import Guarded, _covering, _least_missing
 from softneck.identification.uncertainty._guarded_base import Base, fitted_base
-from softneck.identification.uncertainty._guarded_jobs import Job, done
 from softneck.identification.uncertainty._left_out import left_out, left_out_error
 from softneck.robot import Robot
 from softneck.runtime import load_runtime

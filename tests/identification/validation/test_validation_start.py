@@ -144,7 +144,7 @@ def test_a_cold_start_knows_the_first_row_only_and_is_scored_on_the_same_rows(mo
     y, yhat = recording.outputs[there], np.array(cold)[there]
     error = np.linalg.norm(y - yhat, axis=0) / np.linalg.norm(y - y.mean(axis=0), axis=0)
     # The same sums in another order.
-    np.testing.assert_allclose(list(result.cold_fits.values()), 100.0 * (1.0 - error), atol=1e-9)
+    np.testing.assert_allclose(np.array(list(result.cold_fits.values()), dtype=float), 100.0 * (1.0 - error), atol=1e-9)
     assert result.as_dict()["cold_fits"] == result.cold_fits
     asked = validate(model, recording, initial="cold")
     assert asked.fits["inf"] == result.cold_fits
@@ -162,6 +162,8 @@ def test_the_spread_over_blocks_shows_where_a_free_run_goes_wrong(models: dict[s
     # One of eight blocks of 100 rows is off by 0.1 rad; the others are as they were.
     rows = slice(WARM_UP + 300, WARM_UP + 400)
     result = validate(models["rls"], with_outputs(recording, rows, 0.1))
+    assert fine is not None
+    assert result.spread["blocks"]["pitch"] is not None
     low, high = result.spread["blocks"]["pitch"]
     assert low < fine[0] - 30.0
     assert high > fine[1] - 5.0  # the motion that errors are divided by grows a little
