@@ -209,7 +209,7 @@ def test_a_robot_s_virtual_plant_is_an_fmu(backend: str, fmi: int, tmp_path: Pat
 
 
 @pytest.mark.parametrize(("backend", "fmi"), BACKENDS[1:])
-@pytest.mark.parametrize("kind", slow_but(["pi", "mpc"], ["pi"], ["mpc"]))
+@pytest.mark.parametrize("kind", slow_but(["pi", "mpc"], ["pi"], nightly=["mpc"]))
 def test_a_controller_of_two_motors_is_an_fmu(kind: str, backend: str, fmi: int, tmp_path: Path) -> None:
     settings: dict[str, Any] = {"pi": PiSettings(), "mpc": MpcSettings(bandwidth=5.0, horizon=8, moves=3)}
     controller = settings[kind].design(model("oe", False)).block()

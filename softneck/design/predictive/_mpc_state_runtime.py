@@ -222,7 +222,7 @@ def mpc_begin(p: MpcArrays, x: MpcState, inputs: np.ndarray) -> bool:
         mpc_filter(p, x)
     else:
         x.status = MPC_HOLDING
-    return active
+    return active  # pyright: ignore[reportReturnType]  (of numbers)
 
 
 def mpc_listen(p: MpcArrays, x: MpcState, inputs: np.ndarray) -> None:
@@ -244,7 +244,7 @@ def mpc_listen(p: MpcArrays, x: MpcState, inputs: np.ndarray) -> None:
                 row[i] = row[i + 1]
             value = inputs[coming + axis]
             if math.isfinite(value):
-                row[p.ahead - 1] = mpc_reference(p, axis, value)
+                row[p.ahead - 1] = mpc_reference(p, axis, value)  # pyright: ignore[reportArgumentType]
     for i in range(p.measured):
         value = inputs[first + i]
         x.disturbances[i, 0] = value if math.isfinite(value) else x.disturbances[i, 0]
