@@ -13,6 +13,7 @@ from softneck.core import DataError, SettingsError
 from softneck.design import makeweight, ucover, uncertain_plant
 from softneck.design.robust._bilinear import drawn_out, to_continuous, to_discrete
 from softneck.estimation import LinearNeck
+from softneck.robot import Robot
 
 from ..oracles.bake_off import bake_off_neck, bake_off_plant, bake_off_plants, bake_off_samples
 
@@ -170,3 +171,27 @@ def test_a_list_of_models_is_their_samples() -> None:
     assert plant.axis("roll").samples[1].static_gain == pytest.approx(
         1.1 * plant.axis("roll").nominal.static_gain, rel=1e-12
     )
+
+
+def test_a_family_of_outputs_of_any_name_has_its_samples() -> None:
+    lag = control.TransferFunction([0.1], [1.0, -0.9], 0.02)
+    robot = Robot.from_dict({
+        "name": "slide", "motors": {"names": ["a"], "unit": "V"}, "outputs": {"names": ["x"], "unit": "mm"},
+        "directions": {"kind": "matrix", "matrix": [[1.0]]},
+    })  # fmt: skip
+
+    class Slides:
+        sample_time, directions = 0.02, np.eye(1)
+
+        def __init__(self) -> None:
+            self.robot = robot
+
+        def tf(self, _output: str, /) -> control.TransferFunction:
+            return lag
+
+        def samples(self, _output: str) -> list[control.TransferFunction]:
+            return [lag, 2.0 * lag]
+
+    plant = uncertain_plant(Slides())
+    assert plant.names == ("x",)
+    assert [round(item.static_gain, 12) for item in plant.axis("x").samples] == [1.0, 1.0, 2.0]

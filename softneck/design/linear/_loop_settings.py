@@ -101,7 +101,7 @@ class LoopSettings:
         if not robot.is_neck:
             given = {name: getattr(self, name) for name in LIMITS}
             return robot_limits(robot, {key: v for key, v in given.items() if not isinstance(v, NeckDefault)})
-        stricter = _stricter(robot, {name: getattr(self, name) for name in LIMITS})
+        stricter = stricter_limits(robot, {name: getattr(self, name) for name in LIMITS})
         return ControllerLimits(robot=robot, **stricter)
 
     @property
@@ -110,7 +110,7 @@ class LoopSettings:
         return 0 if self.order == "sequential" else 1 + int(self.observer)
 
 
-def _stricter(neck: Robot, limits: dict[str, float]) -> dict[str, float]:
+def stricter_limits(neck: Robot, limits: dict[str, float]) -> dict[str, float]:
     """Return the limits with those of the neck's own file, where these are stricter than a default."""
     motors = neck.motors
     files = {"slew_limit": motors.rate_limit, "position_limit": motors.setpoint_max}

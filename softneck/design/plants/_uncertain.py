@@ -197,7 +197,8 @@ def _plant(system: Any, axis: str, what: str) -> AxisPlant:
     tf: Any = _polynomials(system) if isinstance(system, control.StateSpace) else system
     neck = LinearNeck(pitch=tf, roll=tf)
     try:
-        return axis_plant(neck, axis)
+        # It knows the outputs of a neck alone, of which any stands for another robot's.
+        return axis_plant(neck, axis if axis in AXES else AXES[0])
     except SoftneckError as error:
         raise type(error)(f"{what}: {error}") from error
 

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import Matrix, Vector
+from softneck.core import Matrix, SettingsError, Vector, to_si
 from softneck.robot import Robot
+from softneck.robot._neck_default import NeckDefault
 from softneck.runtime._bundle import sized
 
 from ..linear._ports import ControllerLimits
@@ -140,3 +141,23 @@ def unbound(arrays: tuple[Matrix, ...]) -> tuple[Matrix, ...]:
     free = [*[-_FREE] * motors, *[_FREE] * motors, *[-_FREE] * (m + 1), *[_FREE] * (m + 1)]
     constants = np.concatenate([a.constants[: rt.MPC_NUMBERS], free, np.ones(2 * m + 1)])
     return tuple(constants if name == "constants" else item for name, item in zip(a.names(), arrays, strict=True))
+
+
+def refuse_what_is_for_necks(settings: Any, robot: Robot) -> None:
+    """Raise SettingsError for settings of `MpcSettings` that mean nothing for another robot than the neck."""
+    usual = type(settings)()
+    for name in ("disturbances", "tightening", "tendon_angles"):
+        if getattr(settings, name) != getattr(usual, name):
+            robot.require_neck(f"predictive control with `{name}`")
+    if settings.angle_limit is not None and to_si(robot.outputs.unit)[1] != "rad":
+        raise SettingsError(
+            f"`angle_limit` is for outputs that are angles; those of `{robot.name}` are in "
+            f"{robot.outputs.unit}. Leave it out."
+        )
+    if settings.minimum_tautness is not None and (
+        robot.directions.kind != "tendons" or isinstance(settings.tautness_lever, NeckDefault)
+    ):
+        raise SettingsError(
+            f"`minimum_tautness` of robot `{robot.name}` needs tendons at known angles (`angles_deg`), and "
+            "`tautness_lever`, the motor that a tendon takes up for each unit of an output; give both or neither."
+        )

@@ -25,6 +25,7 @@ from softneck.robot._neck_default import NeckCount, NeckDefault
 from softneck.robot._redefined import redefinition_of
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
+from ..linear._loop_settings import stricter_limits
 from ..linear._margins import LOWEST, frequencies
 from ..linear._ports import MAX_MOTOR, ControllerLimits, require_taut, robot_limits
 from ..plants._uncertain import UncertainPlant, uncertain_plant
@@ -34,7 +35,7 @@ from ._disturbance import MeasuredDisturbance
 from ._lti import system
 from ._mpc_state_runtime import MpcArrays
 from ._prediction import Problem, matrices
-from ._scale import SizedPlant, sized_plant
+from ._scale import SizedPlant, refuse_what_is_for_necks, sized_plant
 from ._scenarios import chosen_scenarios, sample_pairs
 from ._tightening import LimitTrial, tightened
 from ._tuning import (
@@ -47,7 +48,7 @@ from ._tuning import (
     reference_time,
     sensitivity,
     slowness,
-)
+)  # fmt: skip
 
 # Samples of the last hold: ten moves over thirty samples, dense where they matter.
 _SPACING = (0, 1, 2, 3, 4, 6, 8, 11, 15, 20)
@@ -207,14 +208,13 @@ class MpcSettings:
         """
         robot = robot_of(model)
         if robot.is_neck:
-            return self._designed(model, ControllerLimits(**{name: getattr(self, name) for name in _LIMITS}))
+            own = stricter_limits(robot, {name: getattr(self, name) for name in _LIMITS})
+            return self._designed(model, ControllerLimits(**own))
         uncertain = uncertain_plant(model)
-        asked = self._of_robot(uncertain)
         given = {name: getattr(self, name) for name in _LIMITS}
         limits = robot_limits(robot, {name: v for name, v in given.items() if not isinstance(v, NeckDefault)})
-        return asked._designed(
-            sized_plant(uncertain, limits, redefinition_of(np.asarray(uncertain.weights), uncertain.names)), limits
-        )
+        T = redefinition_of(np.asarray(uncertain.weights), uncertain.names)
+        return self._of_robot(uncertain)._designed(sized_plant(uncertain, limits, T), limits)
 
     def _of_robot(self, plant: UncertainPlant) -> MpcSettings:
         """Return the settings for another robot: seconds stretched by its slowest pole, nothing that is known of necks.
@@ -222,22 +222,7 @@ class MpcSettings:
         Raises:
             SettingsError: what is for necks only.
         """
-        usual = MpcSettings()
-        for name in ("disturbances", "tightening", "tendon_angles"):
-            if getattr(self, name) != getattr(usual, name):
-                plant.robot.require_neck(f"predictive control with `{name}`")
-        if self.angle_limit is not None and to_si(plant.robot.outputs.unit)[1] != "rad":
-            raise SettingsError(
-                f"`angle_limit` is for outputs that are angles; those of `{plant.robot.name}` are in "
-                f"{plant.robot.outputs.unit}. Leave it out."
-            )
-        if self.minimum_tautness is not None and (
-            plant.robot.directions.kind != "tendons" or isinstance(self.tautness_lever, NeckDefault)
-        ):
-            raise SettingsError(
-                f"`minimum_tautness` of robot `{plant.robot.name}` needs tendons at known angles (`angles_deg`), and "
-                "`tautness_lever`, the motor that a tendon takes up for each unit of an output; give both or neither."
-            )
+        refuse_what_is_for_necks(self, plant.robot)
         stretch = max(axis.nominal.stretch for axis in plant.axes.values())
         horizon = min(max(3, round(_HORIZON * stretch / plant.sample_time)), _LONGEST)
         others = {"least_delay": 0.0, "small_move_pole": 0.0, "horizon": horizon}
