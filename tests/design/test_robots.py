@@ -336,6 +336,6 @@ def test_a_controller_of_ones_own_is_named_by_the_robots_outputs() -> None:
     assert list(made.ss().input_labels) == list(pi.ss().input_labels)
     z = np.exp(1j * np.geomspace(0.5, 100.0, 10) * TS)
     for i in range(3):
-        np.testing.assert_allclose(made.ss()(z)[i, 3 + i], -K(z), rtol=1e-9)
+        np.testing.assert_allclose(made.ss()(z)[i, 3 + i], -np.asarray(K(z)), rtol=1e-9)
     with pytest.raises(SettingsError, match="`controller` must be given for x and y and z; got pitch, roll"):
         design_controller("custom", model, controller={"pitch": K, "roll": K}, slew_limit=10.0)

@@ -209,7 +209,7 @@ class MpcSettings:
         robot = robot_of(model)
         if robot.is_neck:
             own = stricter_limits(robot, {name: getattr(self, name) for name in _LIMITS})
-            return self._designed(model, ControllerLimits(**own))
+            return self._designed(model, ControllerLimits(robot=robot, **own))
         uncertain = uncertain_plant(model)
         given = {name: getattr(self, name) for name in _LIMITS}
         limits = robot_limits(robot, {name: v for name, v in given.items() if not isinstance(v, NeckDefault)})
