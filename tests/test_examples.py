@@ -46,6 +46,7 @@ def test_the_planned_trajectory_prints_what_the_docs_show(capsys: pytest.Capture
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_taut_tendons_make_every_kind_hold(capsys: pytest.CaptureFixture[str]) -> None:
     runpy.run_path(str(ROOT / "benchmarks" / "taut_tendons.py"), run_name="__main__")
     before, after = capsys.readouterr().out.split("co-contraction at least")

@@ -156,7 +156,7 @@ def answers(controller: NmpcController, p: NonlinearProblem, a: Asked, z: np.nda
 
 
 # Derivatives by differences and another solver: nothing of what the controller computes with.
-@pytest.mark.parametrize("kind", slow_but(["nn", "play", "nss"], ["nn"]))
+@pytest.mark.parametrize("kind", slow_but(["nn", "play", "nss"], ["nn"], ["nss"]))
 @pytest.mark.parametrize("angle_limit", slow_but([None, 0.1], [0.1]))
 def test_each_sample_is_the_quadratic_program_of_differences(
     kind: str, angle_limit: float | None, models: dict[str, Model]
