@@ -61,8 +61,9 @@ def loop_margins(loop: control.TransferFunction, *, lowest: float = LOWEST) -> M
     radius = float(np.abs(poles).max(initial=0.0))
     if radius >= 1.0:
         raise SettingsError(f"the closed loop is not stable (spectral radius {radius:.4f}); ask for less.")
-    # It looks at the integrator's own frequency, zero, as well.
-    with warnings.catch_warnings(), np.errstate(divide="ignore", invalid="ignore"):
+    with warnings.catch_warnings():
+        # It looks at the integrator's own frequency, zero, as well.
+        warnings.filterwarnings("ignore", "(divide by zero|invalid value)", RuntimeWarning)
         # It says that polynomials of this order are inaccurate and that it takes the frequency response instead.
         warnings.filterwarnings("ignore", "stability_margins: Falling back", UserWarning)
         gain, phase, _, _, crossover, _ = control.stability_margins(loop)
