@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import control
@@ -21,6 +22,7 @@ from softneck.design import (
     PiSettings,
     ScheduledSettings,
 )
+from softneck.robot import Robot
 
 _K = control.TransferFunction([4.0, -3.5], [1.0, -1.0], 0.02)
 
@@ -66,3 +68,21 @@ def test_the_order_of_the_loop_adds_the_samples_of_controller_and_observer(make:
 def test_every_kind_refuses_the_same(make: Callable[..., Any], settings: dict[str, Any], match: str) -> None:
     with pytest.raises(SettingsError, match=match):
         make(**settings)
+
+
+def test_limits_of_a_necks_own_file_hold_where_they_are_stricter() -> None:
+    preset = Robot.preset("neck")
+    own = replace(preset, motors=replace(preset.motors, setpoint_max=(4.0,) * 3, rate_limit=(5.0,) * 3))
+    lag = control.TransferFunction([0.009], [1.0, -0.9, 0.0], 0.02)
+
+    class OwnNeck:
+        robot, sample_time = own, 0.02
+
+        def tf(self, _output: str, /) -> control.TransferFunction:
+            return lag
+
+    settings = ScheduledSettings(inclinations=(0.05, 0.3))
+    limits = settings.design([OwnNeck(), OwnNeck()]).limits
+    assert (limits.position_limit, limits.slew_limit) == (4.0, 5.0)
+    given = replace(settings, slew_limit=9.0).limits(own)
+    assert (given.position_limit, given.slew_limit) == (4.0, 9.0)

@@ -104,7 +104,8 @@ class ScheduledSettings(LoopSettings):
             SettingsError: fewer than two operating points, no gains that keep the robustness, or a loop between two
                 points that does not keep it.
         """
-        for item in plant if isinstance(plant, Sequence) else (plant,):
+        items = plant if isinstance(plant, Sequence) else (plant,)
+        for item in items:
             robot_of(item).require_neck("scheduling over the inclination")
         points = [self._with_doubt(point) for point in self._points(plant)]
         sample_time = points[0].plants[0][0].sample_time
@@ -120,7 +121,7 @@ class ScheduledSettings(LoopSettings):
             runtime=RUNTIMES["scheduled"],
             sample_time=sample_time,
             arrays=arrays,
-            limits=self.limits(),
+            limits=self.limits(robot_of(items[0])),
             order=self.order,
             lines=tuple(_lines(points, gains, found)),
             design={
