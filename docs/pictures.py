@@ -48,7 +48,8 @@ def _consistency_figure(factor: float) -> Figure:
     b = np.radians(27.69) / 5.293 * (1.0 - pole)
     axis = control.TransferFunction([b], [1.0, -pole, 0.0, 0.0, 0.0, 0.0], period)
     P, rng = signal("eq22").set_points[:rows], np.random.default_rng(5)
-    levels = KalmanSettings(measurement_noise_std=np.radians(0.1), model_noise_std=np.radians(0.05))
+    degrees = {"measurement_noise_std": 0.1, "model_noise_std": 0.05, "disturbance_noise_std": 0.02}
+    levels = KalmanSettings(sensor_delay=0.0, **{name: np.radians(level) for name, level in degrees.items()})
     channels = {f"motor_setpoint_{j + 1}": P[:, j] for j in range(3)}
     for name, u in zip(("pitch", "roll"), redefine(P)[:, :2].T, strict=True):
         # What the filter takes the neck for: a model with noise of its own, and a disturbance that walks.

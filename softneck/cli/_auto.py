@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _HEAD = ["kind", "worst", "of", "all of them", "rows held out", "cold", "tried in", "found", ""]
 _TITLE = "Free-run fit [%] over what was left out, mean of {names}; +- one standard error"
 
-_LINEAR = "`design` and `observer` take linear models: the best of them, {kind}, is in {path}"
+_LINEAR = "`design` of most kinds takes linear models: the best of them, {kind}, is in {path}"
 
 
 def identify_auto(
@@ -35,6 +35,7 @@ def identify_auto(
     train: float,
     refit_all: bool,
     seed: int | None,
+    tolerance: float | None,
     robot: str | None,
     html: Path | None,
     force: bool,
@@ -42,6 +43,7 @@ def identify_auto(
 ) -> None:
     """Try the kinds, save the chosen model, and explain."""
     from softneck.identification import choose, refit
+    from softneck.identification.models._validity import with_tolerance
     from softneck.identification.selection._auto import REFITTED
     from softneck.plots import write_page
     from softneck.signals import read_recording
@@ -65,6 +67,8 @@ def identify_auto(
         if refit_all:
             with progress(f"identify {taken.chosen.kind} on all rows", quiet=as_json) as report:
                 model = refit(taken, parts, progress=report)
+        if tolerance is not None:
+            model = with_tolerance(model, tolerance)
         models.append(with_fit(model, taken.chosen.judged))
         models[-1].save(file, force=overwrite)
     said = [] if linear is None else [_LINEAR.format(kind=linear.chosen.kind, path=linear_path)]

@@ -30,7 +30,10 @@ _PLAYED = 60.0
 )
 @click.argument("sources", metavar="REC...|GREYBOX", nargs=-1, required=True, type=click.Path(path_type=Path))
 @output_option("neck file", "NECK.toml")
-@click.option("--payload", "payloads", multiple=True, type=float, help="Of each recording in turn [kg]. [default: 0]")
+@click.option(
+    "--payload", "payloads", multiple=True, type=float,
+    help="Of each recording in turn [kg]. [default: what its column `payload` says, else 0]",
+)  # fmt: skip
 @click.option("--evaluations", default=30, show_default=True, help="Steps of the search.")
 @force_option
 @json_option
@@ -48,11 +51,12 @@ def command(
     last 30 % of each run, which it was not fitted to, follows pitch and roll to 85 %; else the exit code is 1.
     """
     from softneck.plant._calibration import calibrate
+    from softneck.signals.recording._conditions import conditions
 
     path, replace = target(output, "necks/neck.toml", force=force, ending=".toml")
     refuse_existing(path, force=replace)
     parts = [_recording(source) for source in sources]
-    given = payloads or (0.0,) * len(parts)
+    given = payloads or tuple(max(conditions(part)["payload_kg"]) for part in parts)
     if len(given) != len(parts):
         raise SettingsError(
             f"{len(given)} payloads were given for {len(parts)} recordings; give one for each, in turn."

@@ -64,9 +64,6 @@ def command(
     if html is not None:
         refuse_existing(html, force=force)
     parts = [read_recording(source, robot=robot) for source in recordings]
-    if html is not None:
-        for source, part in zip(recordings, parts, strict=True):
-            part.robot.require_neck(f"{source}: `--html` of `family`")
     judges = [read_recording(source) for source in tests]
     with progress("family", quiet=as_json) as report:
         family = chosen.fit(parts, names=[str(source) for source in recordings], progress=report)
@@ -128,7 +125,9 @@ def _named(numbers: np.ndarray) -> dict[str, float]:
 
 def _page(family: Family, names: list[str]) -> str:
     from softneck.plots import Section, Table, cover_figure, local_map_figure, page
+    from softneck.plots._identification_figures import shown_gain
 
+    unit, gain, _ = shown_gain(family.robot)
     sections = [Section("The plant", text=family.summary().splitlines())]
     for name, axis in family.axes.items():
         figures = []
@@ -140,12 +139,12 @@ def _page(family: Family, names: list[str]) -> str:
                     groups[recording] = (axis.where[row, 3], axis.samples[row], axis.std[row])
             if groups:
                 title = f"{name}: {what}"
-                figures.append((title, local_map_figure(groups, title)))
+                figures.append((title, local_map_figure(groups, title, family.robot)))
         title = f"{name}: the weight over its samples"
         figures.append((title, cover_figure(family.frequency, *_cover(family, name), title)))
-        head = ["", "static gain [deg/rad]", "pole [1/s]", "dead time [ms]"]
-        rows = [[label, *_numbers(row)] for label, row in zip(("least", "largest"), axis.box, strict=True)]
-        rows.append(["nominal", *_numbers(axis.nominal)])
+        head = ["", f"static gain [{unit}]", "pole [1/s]", "dead time [ms]"]
+        rows = [[label, *_numbers(row, gain)] for label, row in zip(("least", "largest"), axis.box, strict=True)]
+        rows.append(["nominal", *_numbers(axis.nominal, gain)])
         sections.append(Section(name, tables=[Table("Box", head, rows)], figures=figures))
     return page("Family of linear models", sections)
 
@@ -156,5 +155,6 @@ def _cover(family: Family, name: str) -> tuple[np.ndarray, np.ndarray]:
     return family.errors(name), np.abs(np.polyval(above, s) / np.polyval(below, s))
 
 
-def _numbers(row: np.ndarray) -> list[str]:
-    return [f"{np.degrees(row[0]):.2f}", f"{row[1]:.2f}", f"{1e3 * row[2]:.0f}"]
+def _numbers(row: np.ndarray, gain: float) -> list[str]:
+    static = gain * row[0]
+    return [f"{static:.2f}" if abs(static) >= 0.1 else f"{static:.3g}", f"{row[1]:.2f}", f"{1e3 * row[2]:.0f}"]

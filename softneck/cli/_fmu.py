@@ -119,7 +119,7 @@ def open_buildable(source: str | Path, robot: str | None = None) -> Buildable:
     if _has_keys(Path(source), {"motors", "outputs", "directions", "extends"}):
         return VirtualNeck.of(Robot.read(source))
     if is_loop_file(Path(source)):
-        return reference_of(Path(source))
+        return reference_of(Path(source), robot=robot)
     return VirtualNeck(load_neck(str(source)))
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from softneck.core import KINDS, CheckFailedError, SettingsError, find_kind, refuse_existing, resolve
+from softneck.core import KINDS, CheckFailedError, SettingsError, find_kind, refuse_existing, require_positive, resolve
 from softneck.core._kinds import kinds_of
 
 from ._auto import identify_auto
@@ -22,7 +23,16 @@ from ._search import (
     write_plot,
 )
 from .shared._console import note, percent, print_json, progress
-from .shared._options import apply_settings, force_option, json_option, output_option, read_together, set_option, target
+from .shared._options import (
+    apply_settings,
+    force_option,
+    json_option,
+    output_option,
+    read_together,
+    set_option,
+    target,
+    tolerance_option,
+)
 from .shared._robot import robot_option
 from .shared._validate_table import useless, with_fit
 
@@ -47,6 +57,7 @@ _KINDS += "\n  auto     tries them all and takes the best in free run"
 @click.option("--html", type=click.Path(path_type=Path), help="With KIND auto: write a page with the ranking.")
 @click.option("--refit", is_flag=True, help="With KIND auto: train the chosen kind again, on all rows; judged before.")
 @click.option("--seed", type=int, help="Seed of kinds that start at random.")
+@tolerance_option
 @robot_option
 @set_option
 @search_option
@@ -63,6 +74,7 @@ def command(
     html: Path | None,
     refit: bool,
     seed: int | None,
+    tolerance: float | None,
     robot: str | None,
     settings: tuple[str, ...],
     searches: tuple[str, ...],
@@ -73,14 +85,17 @@ def command(
     as_json: bool,
 ) -> None:
     """Identify a model of KIND from one or more recordings."""
+    from softneck.identification.models._validity import with_tolerance
     from softneck.signals.quality._poor_excitation import poor_excitation
 
+    if tolerance is not None:
+        require_positive("--tolerance", tolerance)
     if kind == "auto":
         if settings:
             raise SettingsError("--set: `auto` takes no settings; name the kind that they are for.")
         identify_auto(
-            recordings, output, train=train, refit_all=refit, seed=seed, robot=robot, html=html, force=force,
-            as_json=as_json,
+            recordings, output, train=train, refit_all=refit, seed=seed, tolerance=tolerance, robot=robot, html=html,
+            force=force, as_json=as_json,
         )  # fmt: skip
         return
     _refuse_options_of_auto(kind, html=html is not None, refit=refit)
@@ -99,6 +114,8 @@ def command(
     found = run_search(estimator, head, options, quiet=as_json)
     with progress(f"identify {kind}", quiet=as_json) as report:
         model = found.model if found is not None else estimator.fit(head, progress=report)
+    if tolerance is not None:
+        model = with_tolerance(model, tolerance)
     with progress("hold-out", quiet=as_json):
         held_out = _hold_out(model, tail)
     model = with_fit(model, held_out)
@@ -107,7 +124,8 @@ def command(
         write_plot(found, plot, force=force)
     poor = poor_excitation(head)
     if as_json:
-        print_json({**_facts(path, model, held_out, found), "excitation": poor})
+        facts = {"excitation": poor, "guarded_form": _guarded_form(kind, recordings)}
+        print_json(_facts(path, model, held_out, found) | facts)
     else:
         _print(path, model, held_out, found)
         click.echo("\n".join(poor), nl=bool(poor))
@@ -119,6 +137,15 @@ def command(
             f"{path}: no model of the rows held out: {why}. Try another kind or settings, or record longer; "
             "`softneck identify auto` compares kinds."
         )
+
+
+def _guarded_form(kind: str, recordings: tuple[Path, ...]) -> str | None:
+    """Return the command that trains the guarded form of a learned kind, None where there is none."""
+    from softneck.identification.uncertainty._guarded import OF
+
+    if kind not in OF:
+        return None
+    return shlex.join(["softneck", "identify", "guarded", *map(str, recordings), "--set", f"of={kind}"])
 
 
 def _refuse_options_of_auto(kind: str, *, html: bool, refit: bool) -> None:

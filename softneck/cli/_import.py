@@ -56,7 +56,7 @@ def command(
     """
     from softneck.robot import find_robot
     from softneck.signals import import_log, read_layout, write_recording
-    from softneck.signals.recording._files import recording_suffix
+    from softneck.signals.recording._files import recording_suffix, said_robot
 
     if log.suffix.lower() == ".mcap":
         _run_log(log, output, force=force, as_json=as_json, layout=guess or layout_file is not None)
@@ -66,6 +66,10 @@ def command(
     if robot_out is not None:
         if guess or layout_file is not None or robot is not None:
             raise SettingsError("--robot-out guesses robot and layout; leave out --guess, --layout and --robot.")
+        if robot_out.suffix.lower() != ".toml":
+            raise SettingsError(f"{robot_out}: must end in `.toml`, by which softneck recognises the file.")
+        if (said := said_robot(log, log.suffix.lower())) is not None:
+            raise SettingsError(f"{log}: is a recording of robot {said.label()} already, which commands take as it is.")
         guess = True
     if guess == (layout_file is not None):
         what = "both were given" if guess else "neither was given"

@@ -177,26 +177,20 @@ def _describe(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dic
 
 def _recording(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dict[str, Any]:
     """Return what a recording holds and its quality, and write the page."""
+    from softneck.identification.models._directions import bandwidth_of
     from softneck.signals import assess_quality, read_recording
 
     quick = html is None and file.stat().st_size < _LARGE
     with progress("info", quiet=quiet or quick) as report:
         report(0.0, "reading")
         recording = read_recording(file)
-        neck = recording.robot.is_neck
         report(0.6, "checking")
-        found = assess_quality(recording) if neck else None
+        found = assess_quality(recording, bandwidth=bandwidth_of(recording))
         if html is not None:
             from softneck.plots import quality_page, write_page  # matplotlib takes a while to import
-            from softneck.plots._recording_page import recording_page
 
             report(0.8, "drawing")
-            drawn = (
-                recording_page(recording, file.name)
-                if found is None
-                else quality_page(recording, found, f"Quality of {file.name}")
-            )
-            write_page(html, drawn, force=force)
+            write_page(html, quality_page(recording, found, f"Quality of {file.name}"), force=force)
     return {
         "type": "recording",
         "rows": len(recording),
@@ -205,7 +199,7 @@ def _recording(file: Path, html: Path | None, *, force: bool, quiet: bool) -> di
         "sample_time_s": recording.sample_time,
         "channels": ", ".join(recording.channels),
         **({} if html is None else {"html": str(html)}),
-        **({} if neck else {"robot": recording.robot.label()}),
+        **({} if recording.robot.is_neck else {"robot": recording.robot.label()}),
         "quality": found,
     }
 

@@ -23,7 +23,8 @@ _COMMANDS = {
     "doctor": ("_doctor", "Say which parts of this machine work."),
     "info": ("_info", "Say what a file is."),
     "robot": ("_robot", "Say what the robot is: show, start or check a robot.toml."),
-    "record": ("_record", "Record a signal on the virtual neck."),
+    "record": ("experiments._record", "Record a signal on the virtual neck."),
+    "excite": ("experiments._excite", "Design what to record next: motions on which the members of a model disagree."),
     "import": ("_import", "Turn any logger's table into a recording, by a layout file."),
     "identify": ("_identify", "Identify a model from recordings."),
     "validate": ("_validate", "Validate models on rows that they were not trained on."),
@@ -76,8 +77,15 @@ def group() -> None:
     """
 
 
+# Products of our small matrices end sooner than threads wake up: these only wait for each other. Networks are trained
+# with one thread of their own anyway.
+_BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and exit with its code."""
+    for name in _BLAS_THREADS:  # read where numpy is imported, which no command has done yet
+        os.environ.setdefault(name, "1")
     sys.exit(run(arguments))
 
 

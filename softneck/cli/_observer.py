@@ -1,4 +1,4 @@
-"""softneck observer: a Kalman filter from a saved linear model and a sensor preset."""
+"""softneck observer: a filter from a saved model and a sensor preset."""
 
 from __future__ import annotations
 
@@ -14,10 +14,7 @@ from .shared._options import apply_settings, force_option, json_option, output_o
 from .shared._robot import load_of, robot_option
 
 if TYPE_CHECKING:
-    from softneck.estimation._noise import NoiseFit
-
-# Part of each run to fit the levels to; the rest checks them.
-_FITTED = 0.7
+    from softneck.estimation._fitted import FittedObserver
 
 
 @click.command("observer", epilog="Example: softneck observer rls.npz -o observer.npz --sensor paper")
@@ -50,9 +47,10 @@ def command(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Build a Kalman filter over the linear MODEL.
+    """Build a filter over the identified MODEL.
 
-    Three forms: the model with a disturbance on each axis (default), --gyro, and --set form=kinematic.
+    The form follows from the model: a Kalman filter over a linear one, with a disturbance on each axis; of a nonlinear
+    one the free run, with a disturbance. Others: --gyro, and --set form=kinematic.
     """
 
     kind = find_kind("kalman", "observer")
@@ -64,47 +62,47 @@ def command(
     observer = chosen.design(load_of(model, robot, role="model"))
     told: dict[str, Any] = {}
     lines: list[str] = []
+    if data and observer.form == "nonlinear":
+        raise SettingsError("--data fits filters over linear models; leave it out, or give the levels by --set.")
     if data:
-        fit, kept, lines = _fitted(observer, data, robot, fixed=() if sensor is None else (observer.noise_names[0],))
-        observer = fit.observer if kept else observer
+        given = any(setting.replace(" ", "").startswith("sensor_delay=") for setting in settings)
+        fixed = () if sensor is None else (observer.noise_names[0],)
+        found, lines = _fitted(observer, data, robot, fixed=fixed, delay=not given)
+        observer, fit = found.observer, found.fit
         told = {"fit": {"rows": fit.rows, "outliers": fit.outliers, "log_likelihood": list(fit.log_likelihood),
-                        "at_bound": list(fit.at_bound), "kept": kept}}  # fmt: skip
+                        "at_bound": list(fit.at_bound), "not_told": list(found.untold), "held_out": found.checks,
+                        "kept": found.kept != "default", "what": found.kept}}  # fmt: skip
     observer.save(path, force=replace)
     if as_json:
         noise = dict(zip(observer.noise_names, observer.noise, strict=True))
-        summary = {"observer": str(path), "kind": kind.name, "form": observer.form, "noise": noise}
+        summary = {"observer": str(path), "kind": observer.block().kind, "form": observer.form, "noise": noise}
         print_json({**summary, **told, "summary": observer.summary()})
         return
     click.echo("\n".join([str(path), observer.summary(), *lines]))
 
 
 def _fitted(
-    observer: Any, data: tuple[Path, ...], robot: str | None, *, fixed: tuple[str, ...]
-) -> tuple[NoiseFit, bool, list[str]]:
-    """Return noise levels fitted to the first part of each run, whether the rest speaks for them, and what to say."""
+    observer: Any, data: tuple[Path, ...], robot: str | None, *, fixed: tuple[str, ...], delay: bool
+) -> tuple[FittedObserver, list[str]]:
+    """Return what the recordings make of the observer, and what to say of it."""
     # Imported here: `softneck --help` must not wait for scipy's optimisers.
-    from softneck.estimation import consistency, fit_noise
-    from softneck.estimation._consistency import bridging_error
-    from softneck.signals import concatenate, read_recording
+    from softneck.estimation import consistency
+    from softneck.estimation._fitted import fitted_observer
+    from softneck.signals import read_recording
 
     recordings = [read_recording(path, robot=robot) for path in data]
-    parts = [recording.split(_FITTED) for recording in recordings]
-    fit = fit_noise(observer, [head for head, _ in parts], fixed=fixed)
-    held_out = concatenate([tail for _, tail in parts])
+    found = fitted_observer(observer, recordings, fixed=fixed, delay=delay)
     unit = observer.robot.outputs.display_unit
-    default, fitted = (bridging_error(item, held_out) / to_si(unit)[0] for item in (observer, fit.observer))
-    kept = fitted < default
-    before, after = fit.log_likelihood
+    before, after = found.fit.log_likelihood
     lines = [
-        f"  noise from {fit.rows} measurements, {fit.outliers} outliers left out; "
+        f"  noise from {found.fit.rows} measurements, {found.fit.outliers} outliers left out; "
         f"log likelihood of each {before:.2f} -> {after:.2f}"
     ]
-    if fit.at_bound:
-        lines.append(f"  not determined by the data: {', '.join(fit.at_bound)}")
-    verdict = "kept" if kept else "not better, so the default levels are kept"
-    lines.append(f"  gaps of 5 samples over {len(held_out)} rows held out: {default:.3f} {unit} RMS by the default "
-                 f"{fitted:.3f} by the fitted levels: {verdict}")  # fmt: skip
+    if found.untold:
+        lines.append(f"  not told by the data: {', '.join(found.untold)}")
+    errors = ", ".join(f"{name} {error / to_si(unit)[0]:.3f}" for name, error in found.checks.items())
+    verdict = "no better, so the defaults are kept" if found.kept == "default" else f"{found.kept} kept"
+    lines.append(f"  error [{unit}] of the look ahead on {found.rows} rows held out: {errors}: {verdict}")
     for path, recording in zip(data, recordings, strict=True):
-        taken = fit.observer if kept else observer
-        lines += [f"  {path.name}: {line}" for line in consistency(taken, recording).summary().splitlines()]
-    return fit, kept, lines
+        lines += [f"  {path.name}: {line}" for line in consistency(found.observer, recording).summary().splitlines()]
+    return found, lines

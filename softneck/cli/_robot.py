@@ -61,7 +61,7 @@ def new(file: Path, preset: str, force: bool, as_json: bool) -> None:
 @click.argument("file", required=False, metavar="[FILE]")
 @json_option
 def check(file: str | None, as_json: bool) -> None:
-    """Check FILE and the files that it names; exit code 2 where something is wrong."""
+    """Check FILE and the files that it names, and that they fit; exit code 2 where something is wrong."""
     robot = _robot(file)
     _check_files(robot)
     if as_json:
@@ -77,12 +77,18 @@ def _robot(file: str | None) -> Robot:
 
 
 def _check_files(robot: Robot) -> None:
+    from softneck.plant import VirtualNeck
     from softneck.plant._presets import PRESETS
 
     from .shared._neck import load_neck
 
     folder = robot.folder or Path()
     if robot.neck is not None:
-        load_neck(robot.neck if robot.neck in PRESETS else str(folder / robot.neck))
-    if robot.drives is not None and not (folder / robot.drives).is_file():
-        raise SettingsError(f"`drives.file`: {folder / robot.drives}: no such file.")
+        # The file is there and holds a neck, and the robot is one that tendons on winches bend.
+        VirtualNeck.of(robot, load_neck(robot.neck if robot.neck in PRESETS else str(folder / robot.neck)))
+    if robot.drives is not None:
+        from softneck.drives import load_drives
+
+        if not (folder / robot.drives).is_file():
+            raise SettingsError(f"`drives.file`: {folder / robot.drives}: no such file.")
+        load_drives(folder / robot.drives, robot)

@@ -1,4 +1,4 @@
-"""softneck simulate: a closed loop over FMUs and files, judged against its limits."""
+"""softneck simulate: a closed loop over FMUs and files, or an SSP archive, judged against its limits."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 from markupsafe import Markup
 
-from softneck.core import CheckFailedError, SettingsError, refuse_existing, write_certificate
+from softneck.core import CheckFailedError, SettingsError, atomic_write, refuse_existing, write_certificate
 
 from .shared._console import print_json, print_table, progress
 from .shared._options import force_option, json_option, output_option, target, trust_option
@@ -16,17 +16,20 @@ from .shared._robot import robot_option
 
 if TYPE_CHECKING:
     from softneck.cosim import Result
+    from softneck.loop._system import System
 
 
 @click.command("simulate", epilog="Example: softneck simulate build/demo/loops/pitch_step.toml --html loop.html")
-@click.argument("loop_file", metavar="LOOP.toml", type=click.Path(path_type=Path))
+@click.argument("loop_file", metavar="LOOP.toml|X.ssp", type=click.Path(path_type=Path))
 @output_option("recording of the run", "REC")
 @click.option(
     "--certificate",
     type=click.Path(path_type=Path),
     help="Write a certificate of the limits that held, with the hashes of all files; `drives run` asks for it.",
 )
-@click.option("--html", type=click.Path(path_type=Path), help="Write a page with plots, and beside it a neck in 3-D.")
+@click.option(
+    "--html", type=click.Path(path_type=Path), help="Write a page with plots, and beside it the robot in 3-D."
+)
 @robot_option
 @trust_option
 @force_option
@@ -35,10 +38,17 @@ def command(
     loop_file: Path, output: Path | None, certificate: Path | None, html: Path | None, robot: str | None, trust: bool,
     force: bool, as_json: bool,
 ) -> None:  # fmt: skip
-    """Close the loop that LOOP.toml describes; exit code 1 if one of its limits does not hold."""
-    from softneck.cosim import load_loop, simulate
+    """Close the loop that LOOP.toml describes; exit code 1 if one of its limits does not hold.
+
+    X.ssp: an SSP 1.0 or 2.0 archive of FMUs for co-simulation, of any tool. A closed loop in it is judged like any
+    other; the signals of other systems are named part.output in the result.
+    """
+    from softneck.cosim import load_loop, load_ssp
+    from softneck.cosim.loops._simulate import run_setup
     from softneck.cosim.loops._trust import require_trusted
+    from softneck.loop._system import System
     from softneck.plots import neck_view, write_page
+    from softneck.plots._neck3d import not_drawn
     from softneck.signals import write_recording
     from softneck.signals.recording._files import recording_suffix
 
@@ -48,9 +58,16 @@ def command(
     for extra in (certificate, html):
         if extra is not None:
             refuse_existing(extra, force=force)
-    require_trusted(loop_file, trust=trust)
-    setup = load_loop(loop_file, robot=robot)
-    view = html.with_name(f"{html.stem}_3d.html") if html is not None and setup.loop.robot.is_neck else None
+    if loop_file.suffix == ".ssp" and robot is None:
+        setup = load_ssp(loop_file)
+        if isinstance(setup, System):
+            _simulate_system(setup, loop_file, path, certificate, html, force=replace, as_json=as_json)
+            return
+    else:
+        if loop_file.suffix != ".ssp":
+            require_trusted(loop_file, trust=trust)
+        setup = load_loop(loop_file, robot=robot)
+    view = html.with_name(f"{html.stem}_3d.html") if html is not None and not not_drawn(setup.loop.robot) else None
     if view is not None:
         refuse_existing(view, force=force)
     if certificate is not None and not setup.limits:
@@ -59,7 +76,9 @@ def command(
             '"pitch.overshoot_pct" = 10.0.'
         )
     with progress("simulate", quiet=as_json) as report:
-        result = simulate(setup, report=lambda done: report(done, loop_file.name))
+        result = run_setup(setup, report=lambda done: report(done, loop_file.name))
+    for remark in result.remarks:
+        click.echo(f"warning: {remark}", err=True)
     write_recording(path, result.recording(), force=replace)
     if certificate is not None:
         write_certificate(certificate, result.certificate(), force=force)
@@ -74,6 +93,26 @@ def command(
     failed = [row["metric"] for row in result.limits if not row["holds"]]
     if failed:
         raise CheckFailedError(f"{loop_file}: {len(failed)} limit(s) do not hold: {', '.join(failed)}.")
+
+
+def _simulate_system(
+    system: System, source: Path, path: Path, certificate: Path | None, html: Path | None, *, force: bool, as_json: bool
+) -> None:
+    """Run FMUs that are no closed loop; the result is a table of all their outputs."""
+    from softneck.cosim.loops._simulate import run_setup
+
+    if certificate is not None or html is not None:
+        raise SettingsError(f"{source}: is no closed loop, of which alone there are pages and certificates.")
+    if path.suffix != ".csv":
+        raise SettingsError(f"{path}: the outputs of a system that is no closed loop go to a .csv file.")
+    with progress("simulate", quiet=as_json) as report:
+        result = run_setup(system, report=lambda done: report(done, source.name))
+    with atomic_write(path, force=force) as temporary:
+        result.frame.to_csv(temporary, index=False)
+    if as_json:
+        print_json(result.report())
+        return
+    click.echo(f"{path}: {len(result.signals.signals)} signals, {result.real_time_factor:.0f} times real time")
 
 
 def _print(path: Path, result: Result) -> None:
@@ -101,6 +140,7 @@ def _limits(result: Result) -> tuple[list[str], list[list[str]]]:
 def _page(name: str, result: Result, view: Path | None) -> str:
     from softneck.plots import Section, Table, page
     from softneck.plots._charts import loop_chart
+    from softneck.plots._neck3d import not_drawn
 
     tables = [Table("Limits", *_limits(result)), Table("Metrics", *_metrics(result))]
     chart = loop_chart(result.signals.time, result.signals.signals, name, robot=result.robot)
@@ -110,5 +150,9 @@ def _page(name: str, result: Result, view: Path | None) -> str:
     )
     text = [words]
     if view is not None:
-        text.append(Markup('<a href="{}">The neck in 3-D</a>').format(view.name))
+        text.append(
+            Markup('<a href="{}">The {} in 3-D</a>').format(view.name, "neck" if result.robot.is_neck else "robot")
+        )
+    else:
+        text.append(not_drawn(result.robot))
     return page(f"Loop {name}", [Section("Result", text=text, tables=tables, charts=[chart])])

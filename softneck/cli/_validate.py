@@ -10,7 +10,7 @@ import click
 from softneck.core import CheckFailedError, SettingsError, refuse_existing
 
 from .shared._console import print_json, print_table, progress
-from .shared._options import force_option, json_option, read_together
+from .shared._options import force_option, json_option, read_together, tolerance_option
 from .shared._robot import load_of, robot_option
 from .shared._validate_table import fit_table, remarks, useless
 
@@ -54,6 +54,7 @@ _NOTE = (
     help="What the models were trained on, to report how novel the data is.",
 )
 @click.option("--html", type=click.Path(path_type=Path), help="Write a page with plots.")
+@tolerance_option
 @robot_option
 @force_option
 @json_option
@@ -66,6 +67,7 @@ def command(
     include_training: bool,
     training: tuple[Path, ...],
     html: Path | None,
+    tolerance: float | None,
     robot: str | None,
     force: bool,
     as_json: bool,
@@ -83,7 +85,7 @@ def command(
         refuse_existing(html, force=force)
     loaded = {str(path): load_of(path, robot, role="model") for path in models}
     recordings = {str(path): read_recording(path, robot=robot) for path in data}
-    rules = Rules(horizons, motors, include_training, initial)
+    rules = Rules(horizons, motors, include_training, initial, tolerance)
     known = read_together(training, robot) if training else None
     with progress("validate", quiet=as_json) as report:
         comparison = compare(loaded, recordings, rules=rules, training=known, progress=report)

@@ -121,7 +121,8 @@ def _opened(plants: tuple[Path, ...], robot: str | None) -> dict[str, Any]:
     things: dict[str, Any] = {}
     for item in plants:
         if item.suffix == ".fmu":
-            thing: Any = partial(FmuPart, item, role="plant")
+            # FMUs are loaded in several threads, each of which works in the FMU's own folder for a moment.
+            thing: Any = partial(FmuPart, item.absolute(), role="plant")
         elif item.suffix == ".toml" or (str(item) in PRESETS and not item.exists()):
             thing = NeckParameters.preset(str(item))
         else:

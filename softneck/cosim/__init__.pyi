@@ -1,4 +1,5 @@
 from .loops._loop_file import load_loop as load_loop
+from .loops._loop_file import load_ssp as load_ssp
 from .loops._loop_file import make_loop as make_loop
 from .loops._result import Result as Result
 from .loops._simulate import Loop as Loop
@@ -10,7 +11,6 @@ from .parts._isolated import IsolatedPart as IsolatedPart
 from .ssp._write import write_ssp as write_ssp
 from .studies._run_study import study as study
 from .studies._store import read_runs as read_runs
-from .studies._study import Study as Study
 from .studies._study import load_study as load_study
 from .studies._study import make_study as make_study
 from .studies._study_results import grouped as grouped

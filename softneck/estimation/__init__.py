@@ -1,4 +1,4 @@
-"""Observers: Kalman filters over linear models, unscented ones over nonlinear models.
+"""Observers: Kalman filters over linear models, free runs with a disturbance over nonlinear ones.
 
 filterpy designs and judges; our runtimes run in loops and FMUs.
 May import `identification` and below.

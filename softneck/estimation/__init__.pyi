@@ -4,8 +4,6 @@ from ._axis import axis_plant as axis_plant
 from ._consistency import consistency as consistency
 from ._kalman import KalmanObserver as KalmanObserver
 from ._noise import fit_noise as fit_noise
+from ._nonlinear import NonlinearObserver as NonlinearObserver
 from ._offline import Estimates as Estimates
 from ._settings import KalmanSettings as KalmanSettings
-from ._ukf import UkfObserver as UkfObserver
-from ._ukf import ukf as ukf
-from ._ukf_part import UkfPart as UkfPart

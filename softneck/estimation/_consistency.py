@@ -13,8 +13,9 @@ from softneck.core import DataError, Vector
 from softneck.signals import Recording
 
 from ._kalman import KalmanObserver
-from ._offline import Estimates
-from ._ukf import UkfObserver
+from ._noise import outliers
+from ._nonlinear import NonlinearObserver
+from ._offline import Estimates, measured_names
 
 # Samples averaged for a curve that shows where a filter is too sure: half a second at 100 Hz.
 _WINDOW = 50
@@ -81,7 +82,7 @@ class Consistency:
 
 
 def consistency(
-    observer: KalmanObserver | UkfObserver, recording: Recording, *, level: float = 0.95, settle: int = 50
+    observer: KalmanObserver | NonlinearObserver, recording: Recording, *, level: float = 0.95, settle: int = 50
 ) -> Consistency:
     """Return NIS, and NEES where the recording knows the true angles beside the measured ones.
 
@@ -115,7 +116,11 @@ def consistency(
 
 
 def _nees(
-    observer: KalmanObserver | UkfObserver, recording: Recording, estimates: Estimates, counts: np.ndarray, level: float
+    observer: KalmanObserver | NonlinearObserver,
+    recording: Recording,
+    estimates: Estimates,
+    counts: np.ndarray,
+    level: float,
 ) -> Squares | None:
     names = recording.robot.outputs.names
     if not all(f"{axis}_measured" in recording.channels for axis in names):
@@ -175,29 +180,39 @@ _PERIOD, _GAP = 25, 5
 _SETTLE = 50
 
 
-def bridging_error(observer: KalmanObserver, recording: Recording) -> float:
-    """Return the RMS [SI] between outputs measured in gaps of five samples and what the filter says without them.
+def look_ahead_error(observer: KalmanObserver, recording: Recording, late: float | None = None) -> float:
+    """Return the RMS [SI] between what the filter says is now and what its sensor, being late, says of it later.
 
-    Likelihood rewards levels that trust any measurement where the model is wrong; a gap shows what they cost.
+    Of every 25 samples five are withheld from the filter. Likelihood rewards levels that trust any measurement where
+    the model is wrong; a gap, and the way from the measurement to now, show what they cost. Outliers are not asked.
 
     Args:
         observer: the filter.
         recording: of its sample time; best rows that its noise levels were not fitted to.
+        late: how late the sensor is [s]; None: as late as the filter thinks.
 
     Raises:
         DataError: no gap fits into the runs.
     """
-    row = np.concatenate([np.arange(len(run)) for run in recording.runs()])
-    gap = (row >= _SETTLE) & (row % _PERIOD >= _PERIOD - _GAP)
-    # As `measured_angles` takes them: beside a column of the measurement, `pitch` is the truth.
-    axes = recording.robot.outputs.names
-    kind = "_measured" if {f"{axis}_measured" for axis in axes} <= set(recording.channels) else ""
-    names = [f"{axis}{kind}" for axis in axes]
-    measured = np.column_stack([recording.channels[name] for name in names])
-    judged = gap & np.isfinite(measured).all(axis=1)
-    if not judged.any():
+    late = (observer.lead if late is None else late) / observer.sample_time
+    names = measured_names(recording)
+    squares = []
+    for run in recording.runs():
+        row = np.arange(len(run))
+        gap = (row >= _SETTLE) & (row % _PERIOD >= _PERIOD - _GAP)
+        z = np.column_stack([run.channels[name] for name in names])
+        spoilt = outliers(z)
+        hidden = {name: np.where(gap, np.nan, run.channels[name]) for name in names}
+        told = observer.estimate(replace(run, channels={**run.channels, **hidden})).outputs
+        clean = np.where(spoilt[:, None], np.nan, z)
+        # What is measured `late` samples on, between samples by a straight line.
+        whole, part = int(late), late - int(late)
+        ahead = [np.vstack([clean[n:], np.full((n, clean.shape[1]), np.nan)])[: len(clean)] for n in (whole, whole + 1)]
+        error = told - (ahead[0] if part == 0.0 else (1.0 - part) * ahead[0] + part * ahead[1])
+        # A sensor that is not late says nothing but what the filter has seen, outside of the gaps.
+        asked = (gap if late < 1.0 else row >= _SETTLE) & np.isfinite(error).all(axis=1)
+        squares.append(error[asked] ** 2 if gap.any() else error[:0])
+    judged = np.concatenate(squares)
+    if not judged.size:
         raise DataError(f"runs of more than {_SETTLE + _PERIOD} rows are needed to check a filter; record longer.")
-    angles = {name: np.where(gap, np.nan, recording.channels[name]) for name in names}
-    hidden = replace(recording, channels={**recording.channels, **angles})
-    error = observer.estimate(hidden).aligned[judged] - measured[judged]
-    return float(np.sqrt((error**2).mean()))
+    return float(np.sqrt(judged.mean()))

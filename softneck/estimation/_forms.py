@@ -1,4 +1,4 @@
-"""The three forms of the filter: what its states are, what drives them, which noises it has; and its steady state."""
+"""The forms of the filter: what its states are, what drives them, which noises it has; and its steady state."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from softneck.robot import Robot
 from ._axis import AxisPlant
 from ._kalman_parts_runtime import KALMAN_DIVIDER, KalmanArrays
 
-FORMS = ("model", "kinematic", "gyro")
-# Name and unit of the noise levels (standard deviations): of the measurement, then of the two process noises.
+FORMS = ("model", "kinematic", "gyro", "nonlinear")
+# Name and unit of the noise levels (standard deviations): of the measurement, then of the two process noises;
+# a nonlinear model's second is a part of its motion.
 NOISES: dict[str, tuple[tuple[str, str], ...]] = {
     "model": (("measurement_noise_std", "rad"), ("model_noise_std", "rad"), ("disturbance_noise_std", "rad")),
     "kinematic": (
@@ -24,6 +25,7 @@ NOISES: dict[str, tuple[tuple[str, str], ...]] = {
         ("angle_noise_std", "rad"),
     ),
     "gyro": (("measurement_noise_std", "rad"), ("gyro_noise_std", "rad/s"), ("bias_noise_std", "rad/s")),
+    "nonlinear": (("measurement_noise_std", "rad"), ("rest_noise_std", "rad"), ("motion_noise_ratio", "")),
 }
 STATES = {"model": "model and disturbance", "kinematic": "angle and rate", "gyro": "angle and gyro bias"}
 

@@ -40,6 +40,10 @@ if TYPE_CHECKING:
 _RUNTIME = "softneck.estimation._kalman_runtime"
 _STEADY = "softneck.estimation._steady_kalman_runtime"
 _NECK = Robot.preset("neck")
+# Where the sensor's delay comes from, as the summary says it.
+_SOURCES = {"given": "as given", "sensor": "of the sensor", "robot": "of the robot's file; set-points and angles alone "
+            "tell only the sum of drive and sensor delay", "gyro": "behind the gyro's rates",
+            "motor positions": "the most that motor positions allow"}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -56,6 +60,7 @@ class KalmanObserver:
         order: of the loop it is for.
         gate_level: chi-square level of the gate.
         robot: whose outputs it estimates.
+        delay_source: where the sensor's delay comes from: "given", "sensor", "robot", "gyro", "motor positions".
     """
 
     form: str = "model"
@@ -66,6 +71,7 @@ class KalmanObserver:
     order: str
     gate_level: float
     robot: Robot = _NECK
+    delay_source: str = "given"
 
     def __post_init__(self) -> None:
         for name in ("first_noise", "second_noise", "P0", "PF"):
@@ -95,6 +101,22 @@ class KalmanObserver:
     def lead(self) -> float:
         """How far the estimate runs ahead of the measurement [s]: the sensor's delay."""
         return float(self._named.constants[KALMAN_LEAD]) * self.sample_time
+
+    @property
+    def constants(self) -> Vector:
+        """See KALMAN_* of `_kalman_parts_runtime`."""
+        return self._named.constants
+
+    @property
+    def directions(self) -> Matrix:
+        """Weights (outputs, sources) of what drives it: of the motors, or of the gyro's rates."""
+        return self._named.sources
+
+    def with_constants(self, constants: Vector) -> KalmanObserver:
+        """Return the same filter with other constants; gains do not depend on delays."""
+        names = KalmanArrays.names()
+        place = names.index("constants")
+        return dataclasses.replace(self, arrays=(*self.arrays[:place], constants, *self.arrays[place + 1 :]))
 
     def with_noise(self, noise: Sequence[float], *, sensor: str = "none") -> KalmanObserver:
         """Return the same filter with other noise levels, steady gains made anew."""
@@ -185,15 +207,8 @@ class KalmanObserver:
             f"  {self.form} form, {'constant gains' if self.is_steady else 'gains from the covariance'}",
             f"  {n} states: {STATES[self.form]} of {_and(self.robot.outputs.names)}{acts}",
             f"  noise: {', '.join(levels)}",
-            f"  gate: chi-square level {self.gate_level:g} (innovation <= {c[KALMAN_GATE]:.3g}); "
-            f"by force after {c[KALMAN_REJECTIONS]:g} rejections",
-            f"  healthy until {c[KALMAN_TIMEOUT] * self.sample_time * 1e3:g} ms without an accepted measurement"
-            + (f" or {c[KALMAN_FROZEN]:g} identical ones" if c[KALMAN_FROZEN] > 0 else ""),
+            *filter_lines(self.gate_level, c, self.sample_time, self.delay_source),
         ]
-        if c[KALMAN_DIVIDER] > 1 or self.lead > 0:
-            lines.append(
-                f"  measured every {c[KALMAN_DIVIDER] * self.sample_time * 1e3:g} ms, late by {self.lead * 1e3:g} ms"
-            )
         return "\n".join(lines)
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
@@ -210,7 +225,8 @@ class KalmanObserver:
             "inputs": [port.name for port in block.inputs],
             "outputs": [port.name for port in block.outputs],
             "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
-            **({} if self.robot.is_neck else {"robot": self.robot.as_dict()}),
+            **({} if self.delay_source == "given" else {"delay_source": self.delay_source}),
+            **self.robot.in_header(),
         }
         names = SteadyKalmanArrays.names()  # of a filter without steady gains the first
         write_archive(path, header, dict(zip(names, self.arrays, strict=False)), force=force)
@@ -237,9 +253,33 @@ class KalmanObserver:
                 order=str(header["order"]),
                 gate_level=float(header["gate_level"]),
                 robot=robot,
+                delay_source=delay_source(header),
             )
         except SettingsError as error:
             raise FileFormatError(f"{error} Design the observer again.") from error
+
+
+def filter_lines(gate_level: float, constants: Vector, sample_time: float, source: str) -> list[str]:
+    """Return what a summary says of the gate, of health and of the sensor's timing."""
+    c = constants
+    lines = [
+        f"  gate: chi-square level {gate_level:g} (innovation <= {c[KALMAN_GATE]:.3g}); "
+        f"by force after {c[KALMAN_REJECTIONS]:g} rejections",
+        f"  healthy until {c[KALMAN_TIMEOUT] * sample_time * 1e3:g} ms without an accepted measurement"
+        + (f" or {c[KALMAN_FROZEN]:g} identical ones" if c[KALMAN_FROZEN] > 0 else ""),
+    ]
+    if c[KALMAN_DIVIDER] > 1 or c[KALMAN_LEAD] > 0:
+        lines.append(
+            f"  measured every {c[KALMAN_DIVIDER] * sample_time * 1e3:g} ms, late by "
+            f"{c[KALMAN_LEAD] * sample_time * 1e3:g} ms ({_SOURCES[source]})"
+        )
+    return lines
+
+
+def delay_source(header: Mapping[str, Any]) -> str:
+    """Return where the sensor's delay comes from; files of earlier versions do not say."""
+    source = str(header.get("delay_source", "given"))
+    return source if source in _SOURCES else "given"
 
 
 def observer_ports(form: str, robot: Robot = _NECK) -> tuple[tuple[Port, ...], tuple[Port, ...]]:

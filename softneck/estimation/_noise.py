@@ -78,7 +78,7 @@ def fit_noise(
     runs = [run for recording in given for run in recording.runs()]
     for run in runs:
         check_recording(observer, run)
-    cost = _Cost(observer, runs)
+    cost = Cost(observer, runs)
     if cost.rows < _LEAST_ROWS:
         raise DataError(
             f"noise levels need at least {_LEAST_ROWS} measurements after the first {_SETTLE} rows of each run; "
@@ -110,7 +110,7 @@ def _free(names: Sequence[str], fixed: Sequence[str]) -> np.ndarray:
     return np.array([name not in fixed for name in names])
 
 
-def _likeliest(cost: _Cost, start: Vector, free: np.ndarray) -> tuple[Vector, float, np.ndarray]:
+def _likeliest(cost: Cost, start: Vector, free: np.ndarray) -> tuple[Vector, float, np.ndarray]:
     """Return the decadic logarithms of the levels, their cost, and which ran to the end of their range (3,)."""
     from scipy.optimize import minimize
 
@@ -129,7 +129,7 @@ def _likeliest(cost: _Cost, start: Vector, free: np.ndarray) -> tuple[Vector, fl
     return whole, float(found.fun), at_bound
 
 
-class _Cost:
+class Cost:
     """The cost of levels over all runs, per measurement."""
 
     def __init__(self, observer: KalmanObserver, runs: Sequence[Recording]) -> None:
@@ -147,7 +147,7 @@ class _Cost:
         self.outliers = 0
         for run in runs:
             z = measured_angles(run)
-            spoilt = _outliers(z)
+            spoilt = outliers(z)
             z[spoilt] = np.nan
             self.outliers += int(spoilt.sum())
             self._tables.append(_table(observer, run, z))
@@ -174,7 +174,7 @@ def _table(observer: KalmanObserver, run: Recording, z: Matrix) -> Matrix:
     return np.hstack([sources, z, valid])
 
 
-def _outliers(z: Matrix) -> np.ndarray:
+def outliers(z: Matrix) -> np.ndarray:
     """Return which measurements (time,) stand apart from both neighbours that came."""
     spoilt = np.zeros(len(z), dtype=bool)
     came = np.flatnonzero(np.isfinite(z).all(axis=1))

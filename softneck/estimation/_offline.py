@@ -28,21 +28,26 @@ from ._kalman_parts_runtime import (
 )
 
 
-class LinearFilter(Protocol):
+class Filter(Protocol):
+    """What an observer says of the recordings that it takes."""
+
+    @property
+    def form(self) -> str: ...
+    @property
+    def robot(self) -> Robot: ...
+    @property
+    def sample_time(self) -> float: ...
+
+
+class LinearFilter(Filter, Protocol):
     """What filtering a recording needs of a Kalman observer."""
 
     @property
     def arrays(self) -> tuple[Matrix, ...]: ...
     @property
-    def form(self) -> str: ...
-    @property
     def noise(self) -> tuple[float, float, float]: ...
     @property
     def order(self) -> str: ...
-    @property
-    def robot(self) -> Robot: ...
-    @property
-    def sample_time(self) -> float: ...
     def filterpy(self) -> Any: ...
 
 
@@ -120,8 +125,13 @@ def smooth_recording(observer: LinearFilter, recording: Recording) -> Estimates:
 
 def measured_angles(run: Recording) -> Matrix:
     """Return the measured outputs (time, outputs): `pitch_measured` where a simulation logged it, else `pitch`."""
-    names = run.robot.outputs.names
-    return np.column_stack([run.channels.get(f"{axis}_measured", run.channels[axis]) for axis in names])
+    return np.column_stack([run.channels[name] for name in measured_names(run)])
+
+
+def measured_names(run: Recording) -> list[str]:
+    """Return the channels of the measured outputs: `pitch` beside `pitch_measured` is the truth."""
+    axes = run.robot.outputs.names
+    return [f"{axis}_measured" if f"{axis}_measured" in run.channels else axis for axis in axes]
 
 
 def source_rows(observer: LinearFilter, run: Recording) -> tuple[Matrix, np.ndarray]:
@@ -135,14 +145,14 @@ def source_rows(observer: LinearFilter, run: Recording) -> tuple[Matrix, np.ndar
     return np.where(known[:, None] < 0, 0.0, rates[known]), lost
 
 
-def check_recording(observer: LinearFilter, recording: Recording) -> None:
+def check_recording(observer: Filter, recording: Recording) -> None:
     """Raise DataError for another sample time, missing rates or another robot."""
     if not math.isclose(recording.sample_time, observer.sample_time, rel_tol=1e-6):
         raise DataError(
             f"the recording has sample time {recording.sample_time:g} s, the observer {observer.sample_time:g} s; "
             "resample it or design the observer for it."
         )
-    require_same_robot(recording.robot, observer.robot, "the recording and the observer")
+    require_same_robot(observer.robot, recording.robot, "the recording and the observer")
     if observer.form == "gyro":
         for axis in recording.robot.outputs.names:
             _rate(recording, axis)

@@ -17,12 +17,14 @@ class SensorNoise:
         noise_std: standard deviation of pitch and of roll at rest [rad].
         gyro_noise_std: standard deviation of its rates from sample to sample [rad/s].
         source: where the numbers come from.
+        delay: how late its angles are, with the lag of its filter [s]; None: not known, that of the robot's file holds.
     """
 
     name: str
     noise_std: float
     gyro_noise_std: float
     source: str
+    delay: float | None = None
 
 
 # Upper ends of what the recordings show on plateaus: a filter that trusts too little lags a little,
@@ -41,6 +43,7 @@ SENSORS: dict[str, SensorNoise] = {
             math.radians(0.04),
             math.radians(0.05),
             "3DM-GX5-10, 50 Hz: 0.02 to 0.04 deg on plateaus of the recordings; rates: data sheet class",
+            delay=0.015,  # 10 ms behind a filter of 5 ms, as the virtual one has
         ),
         SensorNoise(
             "paper", math.radians(0.05), math.radians(0.1), "the virtual neck's inclinometer in the paper preset"

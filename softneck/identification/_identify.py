@@ -9,18 +9,21 @@ from softneck.core._kinds import make_settings
 from softneck.signals import Recording
 
 from .models._model import Model
+from .models._validity import with_tolerance
 
 
-def identify(kind: str, recording: Recording, **settings: Any) -> Model:
+def identify(kind: str, recording: Recording, *, tolerance: float | None = None, **settings: Any) -> Model:
     """Return the model of `kind` fitted on all of `recording`; `settings` are those of the kind's settings class.
 
     Args:
         kind: name in the table of kinds: "rls", "oe", "nlsm", "nn", ...
         recording: what to identify from; join several with `softneck.signals.concatenate`.
+        tolerance: error that `validity` allows, in the unit in which people see the outputs (a neck's 2 deg).
         **settings: for instance `delay=0.08`; angles in rad.
 
     Raises:
         SettingsError: an unknown kind or setting, or a value out of range.
         DataError: the recording does not determine the model.
     """
-    return make_settings(resolve(find_kind(kind, "model").settings), settings).fit(recording)
+    model = make_settings(resolve(find_kind(kind, "model").settings), settings).fit(recording)
+    return model if tolerance is None else with_tolerance(model, tolerance)

@@ -11,6 +11,7 @@ from softneck.robot import Robot
 from ._faults import Fault
 from ._part import Part
 from ._references import Reference
+from ._wiring import Link
 
 ORDERS = ("sequential", "jacobi")
 _NAMES = ("plant", "observer", "controller", "reference")
@@ -34,7 +35,7 @@ class Loop:
         faults: what goes wrong, acting in this order.
         others: further parts by name, such as a filter; and `other_parameters` their parameters.
         other_inputs: part -> constants for inputs of the observer, the controller or one of the others.
-        connections: "part.input" -> "part.output" where names alone do not say it.
+        connections: "part.input" -> "part.output", or a `Link` with factor and offset, where names alone do not say it.
         robot: whose loop it is; of another than the neck the reference returns a value for each output instead of
             pitch and roll.
     """
@@ -53,7 +54,7 @@ class Loop:
     others: Mapping[str, Part] = field(default_factory=dict)
     other_parameters: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     other_inputs: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    connections: Mapping[str, str] = field(default_factory=dict)
+    connections: Mapping[str, str | Link] = field(default_factory=dict)
     robot: Robot = field(default_factory=Robot.preset)
 
     def __post_init__(self) -> None:

@@ -62,13 +62,15 @@ _RISE = (0.1, 0.9)
 # The steady state is judged on the last quarter of what follows the step.
 _STEADY_PART = 0.25
 
+# Metrics whose limit is a lower one.
+_AT_LEAST = ("validity.min",)
 _AXIS = ("rise_s", "settling_s", "overshoot_pct", "rms_error_deg", "iae", "ise", "itae", "steady_rms_deg")
 _MOTORS = ("max_rad", "max_rate_rad_s", "effort", "total_variation_rad", "limit_violation_s", "slack_s")
 Metrics = dict[str, dict[str, float | None]]
 
 
 def metrics(result: LoopResult, *, angle: str = "true") -> Metrics:
-    """Return the metrics of a run: a table each for `pitch`, `roll` and `motors`.
+    """Return the metrics of a run: a table each for `pitch`, `roll` and `motors`, `validity` of an identified plant.
 
     For an axis:
 
@@ -82,6 +84,8 @@ def metrics(result: LoopResult, *, angle: str = "true") -> Metrics:
     For the motors, of the set-points: `max_rad`, `max_rate_rad_s` between samples, `effort` = integral of
     P1^2 + P2^2 + P3^2 [rad^2 s], `total_variation_rad` = sum of all moves, `limit_violation_s` = time with a
     set-point beyond 6 rad [s]; `slack_s` = time with a tendon without tension [s], None where no tension is known.
+
+    `validity.min` is the least that the plant's output `validity` was; there is none where the plant has none.
 
     Another robot has a table for each of its outputs. What is in deg and rad above is in the display unit of its
     outputs and the unit of its motors, which end the names (`rms_error_mm`, `max_bar`); angles stay in deg.
@@ -108,6 +112,8 @@ def metrics(result: LoopResult, *, angle: str = "true") -> Metrics:
             "limit_violation_s": float(_beyond(P, robot).sum() * result.sample_time),
             "slack_s": _slack(result),
         },
+        # Only an identified plant has it.
+        **({"validity": {"min": float(result["validity"].min())}} if "validity" in result.signals else {}),
     }
 
 
@@ -137,7 +143,9 @@ def _word(unit: str) -> str:
 
 
 def check_limits(values: Mapping[str, Any], limits: Mapping[str, float]) -> list[dict[str, Any]]:
-    """Compare metrics with upper limits named as in a loop file, such as "pitch.overshoot_pct".
+    """Compare metrics with limits named as in a loop file, such as "pitch.overshoot_pct" or "validity.min".
+
+    A validity of at least its limit holds; of everything else at most.
 
     Returns:
         For each limit {"metric", "limit", "value", "holds"}; a metric that is None does not hold.
@@ -148,12 +156,14 @@ def check_limits(values: Mapping[str, Any], limits: Mapping[str, float]) -> list
     known = {f"{group}.{name}": value for group, table in values.items() for name, value in table.items()}
     rows = []
     for name, limit in limits.items():
+        if name == "validity.min" and name not in known:
+            raise SettingsError("limit on `validity.min`, and this plant has no output `validity`: identify a model.")
         if name not in known:
             raise SettingsError(f"limit on unknown metric `{name}`; use one of {', '.join(known)}.")
         if isinstance(limit, bool) or not isinstance(limit, int | float) or math.isnan(limit):
             raise SettingsError(f"the limit of `{name}` must be a number; got {limit!r}.")
         value = known[name]
-        holds = value is not None and value <= limit
+        holds = value is not None and (value >= limit if name in _AT_LEAST else value <= limit)
         rows.append({"metric": name, "limit": float(limit), "value": value, "holds": bool(holds)})
     return rows
 

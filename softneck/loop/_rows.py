@@ -34,7 +34,13 @@ def late(part: Part) -> bool:
 
 
 def cycle(
-    parts: Mapping[str, Part], taps: Mapping[str, Tap], ratios: Mapping[str, int], *, order: str, disturbed: bool
+    parts: Mapping[str, Part],
+    taps: Mapping[str, Tap],
+    ratios: Mapping[str, int],
+    *,
+    order: str,
+    disturbed: bool,
+    closed: bool = True,
 ) -> list[Action]:
     """Return the actions of a row: what is valid at t_k comes to the bus, the parts step, the row is recorded.
 
@@ -47,6 +53,7 @@ def cycle(
         ratios: part -> its sample time in rows.
         order: "sequential" or "jacobi".
         disturbed: whether faults act.
+        closed: whether there is a reference.
 
     Raises:
         SettingsError: an algebraic loop.
@@ -57,7 +64,7 @@ def cycle(
         return [(what, numbers[name], ratios[name]) for name in names]
 
     waiting = [name for name, part in parts.items() if late(part)]
-    refer = [] if "reference" in parts else [(ROWS_REFER, len(parts), 1)]
+    refer = [] if "reference" in parts or not closed else [(ROWS_REFER, len(parts), 1)]
     # Sensors' faults act on what arrives, the others on what the plant is about to read.
     at_sensors, at_plant = ([(ROWS_DISTURB, place, 1)] if disturbed else [] for place in (0, 1))
     arrive = [*each(ROWS_SHOW, waiting), *refer, *at_sensors]
@@ -167,7 +174,7 @@ class Rows:
             step,
             (
                 tuple(tap.slots for tap in taps),
-                tuple(np.zeros(0) if tap.factors is None else tap.factors for tap in taps),
+                tuple(np.zeros((2, 0)) if tap.scales is None else tap.scales for tap in taps),
                 tuple(tap.fragile for tap in taps),
                 tuple(np.array(flags, dtype=np.bool_) for flags in missing),
             ),

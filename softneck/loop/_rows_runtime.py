@@ -71,14 +71,15 @@ def run_rows(
 def rows_step(part: int, time: float, taps: tuple, bus: np.ndarray, outputs: np.ndarray, parts: tuple) -> int:
     """Gather the inputs of a part, step it, look at its outputs.
 
-    taps: of each part, the inputs' places on the bus, their factors (none if all are one), which of them must not be
-    missing, and which of its outputs may be (none if nobody looks).
+    taps: of each part, the inputs' places on the bus, their factors and offsets (none if nothing is converted), which
+    of them must not be missing, and which of its outputs may be (none if nobody looks).
     """
-    slots, factors, fragile, missing = taps
+    slots, scales, fragile, missing = taps
     # A copy: no part can change the bus by its inputs.
     inputs = bus[slots[part]]
-    if factors[part].size:
-        inputs *= factors[part]
+    if scales[part].size:
+        inputs *= scales[part][0]
+        inputs += scales[part][1]
     if fragile[part].size:
         # Parts that cannot use a missing value say so; all others get the NaN.
         for i in fragile[part]:

@@ -18,6 +18,7 @@ from ._part import Part
 from ._result import LoopResult
 from ._rows import Rows, can_compile, cycle, late
 from ._state import LoopState, SaveablePart
+from ._system import System
 from ._wiring import BusSignal, Wiring, reference_ports, wire
 
 # Ratio of two sample times that should be whole; 1e-6 allows 0.02 / 0.01 in binary and nothing else.
@@ -46,7 +47,7 @@ StepCallback = Callable[[LoopStep], bool | None]
 
 
 def run_loop(
-    loop: Loop,
+    loop: Loop | System,
     report: Callable[[float], None] | None = None,
     *,
     on_step: StepCallback | None = None,
@@ -93,24 +94,25 @@ class LoopRun:
         step: base step [s], the shortest sample time.
     """
 
-    def __init__(self, loop: Loop, *, compiled: bool = False) -> None:
+    def __init__(self, loop: Loop | System, *, compiled: bool = False) -> None:
         """Wire `loop`; the parts start with the first `advance` or `restore`.
 
         `compiled` takes compiled rows where all parts are blocks.
         """
-        self.loop, self._parts = loop, loop.parts
+        self.loop, self._parts = loop, dict(loop.parts)
+        closed = isinstance(loop, Loop)
         self.step, ratios = _schedule(self._parts)
-        wiring = wire(self._parts, loop.constants, loop.connections, loop.robot)
+        wiring = wire(self._parts, loop.constants, loop.connections, loop.robot, closed=closed)
         self._cycle = cycle(
-            self._parts, wiring.taps, ratios, order=loop.order, disturbed=bool(loop.faults)
+            self._parts, wiring.taps, ratios, order=loop.order, disturbed=bool(loop.faults), closed=closed
         )  # fmt: skip
         self.row, self.rows = 0, max(1, round(loop.duration / self.step))
         self._wiring, self._faults = place_faults(
             loop.faults, wiring, self._parts, step=self.step, rows=self.rows, robot=loop.robot
         )  # fmt: skip
-        self._columns = _columns(self._wiring)
+        self._columns = _columns(self._wiring) if closed else _plain_columns(self._wiring)
         self._table = np.empty((self.rows, self._wiring.start.size))
-        self._reference = _reference_table(loop, self.step, self.rows)
+        self._reference = _reference_table(loop, self.step, self.rows) if isinstance(loop, Loop) else None
         self._late = [i for i, part in enumerate(self._parts.values()) if late(part)]
         self._compile = compiled and can_compile(self._parts)
         self._begun: Rows | None = None
@@ -273,6 +275,11 @@ def _columns(wiring: Wiring) -> dict[str, int]:
         name = _signal_name(item, columns, faulty)
         columns[name] = item.slot
     return columns
+
+
+def _plain_columns(wiring: Wiring) -> dict[str, int]:
+    """Return "part.output" -> place on the bus."""
+    return {f"{item.part}.{item.port.name}": item.slot for item in wiring.named}
 
 
 def _in_si(values: Vector, port: Port) -> tuple[Vector, str]:

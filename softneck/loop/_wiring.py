@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softneck.core import DataError, SettingsError, Vector, to_si
+from softneck.core import DataError, Matrix, SettingsError, Vector, to_si
 from softneck.robot import Robot
 from softneck.runtime import Port
 
@@ -58,6 +58,20 @@ def _sources(wanted: str, robot: Robot) -> tuple[tuple[str, str], ...]:
 
 
 @dataclass(frozen=True, slots=True)
+class Link:
+    """A connection that says itself what becomes of the value, whatever the units: factor * value + offset.
+
+    Attributes:
+        origin: "part.output".
+        factor, offset: of the value.
+    """
+
+    origin: str
+    factor: float = 1.0
+    offset: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class BusSignal:
     """A place on the bus that a result shows.
 
@@ -82,7 +96,7 @@ class Tap:
         owners: part that feeds each input, "" for a constant.
         sources: text "plant `pitch`" of each source, for messages.
         slots: (n_in,) positions in the bus.
-        factors: (n_in,) unit of the source to unit of the input; None where all are one.
+        scales: (2, n_in) factor and offset from the source to the input; None where nothing is converted.
         fragile: positions among the inputs where a missing value may come but must not.
     """
 
@@ -91,7 +105,7 @@ class Tap:
     owners: tuple[str, ...]
     sources: tuple[str, ...]
     slots: np.ndarray
-    factors: Vector | None
+    scales: Matrix | None
     fragile: np.ndarray
 
     @property
@@ -101,7 +115,7 @@ class Tap:
 
     def read(self, bus: Vector, time: float) -> Vector:
         """Return the inputs (n_in,) from the bus; raise DataError if a needed one is missing."""
-        u = bus[self.slots] if self.factors is None else bus[self.slots] * self.factors
+        u = bus[self.slots] if self.scales is None else bus[self.slots] * self.scales[0] + self.scales[1]
         if self.fragile.size and not np.isfinite(u[self.fragile]).all():
             i = self.fragile[~np.isfinite(u[self.fragile])][0]
             raise DataError(
@@ -131,23 +145,27 @@ class Wiring:
 def wire(
     parts: Mapping[str, Part],
     constants: Mapping[str, Mapping[str, float]],
-    connections: Mapping[str, str] | None = None,
+    connections: Mapping[str, str | Link] | None = None,
     robot: Robot = _NECK,
+    *,
+    closed: bool = True,
 ) -> Wiring:
     """Connect the parts "plant", "controller" and others by name.
 
     Args:
         parts: name in the loop -> part.
         constants: part -> values of inputs that nobody else writes, such as `payload` of the plant.
-        connections: "part.input" -> "part.output" for what names alone do not say.
+        connections: "part.input" -> "part.output", or a `Link`, for what names alone do not say.
         robot: whose loop it is.
+        closed: it is a loop, with a plant and a reference; False for parts that need be neither.
 
     Raises:
         SettingsError: an input without a source, two writers, units that do not fit, an unknown name.
     """
-    _check_plant(parts["plant"], constants.get("plant", {}), robot)
+    if closed:
+        _check_plant(parts["plant"], constants.get("plant", {}), robot)
     ports = [(name, port) for name, part in parts.items() for port in part.outputs]
-    if "reference" not in parts:
+    if closed and "reference" not in parts:
         ports += [("reference", port) for port in reference_ports(robot)]
     slots = {(name, port.name): i for i, (name, port) in enumerate(ports)}
     links = _links(connections or {}, parts, slots, constants)
@@ -164,14 +182,14 @@ def wire(
             else:
                 extra.append(value)
                 places.append(len(ports) + len(extra) - 1)
-        taps[name] = _tap(name, part, places, ports)
+        taps[name] = _tap(name, part, places, ports, connections or {})
     start = np.array([port.start for _, port in ports] + extra)
     named = tuple(BusSignal(i, part, port) for i, (part, port) in enumerate(ports))
-    return Wiring(start, named, _spans(parts, len(reference_ports(robot))), taps)
+    return Wiring(start, named, _spans(parts, len(reference_ports(robot)) if closed else 0), taps)
 
 
 def _links(
-    connections: Mapping[str, str],
+    connections: Mapping[str, str | Link],
     parts: Mapping[str, Part],
     slots: Mapping[tuple[str, str], int],
     constants: Mapping[str, Mapping[str, float]],
@@ -179,6 +197,7 @@ def _links(
     """Return (part, input) -> (part, output) of the connections that the user wrote."""
     links = {}
     for target, origin in connections.items():
+        origin = origin.origin if isinstance(origin, Link) else origin
         (part, name), (owner, output) = _ends(target), _ends(origin)
         if part not in parts or name not in {port.name for port in parts[part].inputs}:
             raise SettingsError(f"connection to `{target}`: there is no such input; {_offers(part, parts, 'inputs')}")
@@ -277,22 +296,30 @@ def _candidates(name: str, wanted: str, parts: Mapping[str, Part], robot: Robot)
         yield from ((part, wanted) for part in ("reference", "plant", "observer") if part != name)
 
 
-def _tap(name: str, part: Part, places: list[int], ports: list[tuple[str, Port]]) -> Tap:
-    factors, owners, sources, fragile = [], [], [], []
+def _tap(
+    name: str, part: Part, places: list[int], ports: list[tuple[str, Port]], connections: Mapping[str, str | Link]
+) -> Tap:
+    scales, owners, sources, fragile = [], [], [], []
     for i, (port, place) in enumerate(zip(part.inputs, places, strict=True)):
         if place >= len(ports):
-            factors.append(1.0)
+            scales.append((1.0, 0.0))
             owners.append("")
             sources.append("a constant")
             continue
         owner, origin = ports[place]
-        factors.append(_factor(f"`{origin.name}` of the {owner}", origin, f"`{port.name}` of the {name}", port))
+        link = connections.get(f"{name}.{port.name}")
+        if isinstance(link, Link):
+            scales.append((link.factor, link.offset))
+        else:
+            scales.append(
+                (_factor(f"`{origin.name}` of the {owner}", origin, f"`{port.name}` of the {name}", port), 0.0)
+            )
         owners.append(owner)
         sources.append(f"{owner} `{origin.name}`")
         if origin.missing and not port.missing:
             fragile.append(i)
     index = np.array(fragile, dtype=np.intp)
-    scale = None if all(factor == 1.0 for factor in factors) else np.array(factors)
+    scale = None if all(pair == (1.0, 0.0) for pair in scales) else np.array(scales).T.copy()
     return Tap(name, tuple(part.inputs), tuple(owners), tuple(sources), np.array(places, dtype=np.intp), scale, index)
 
 

@@ -62,6 +62,8 @@ def record(
     for name in neck.robot.outputs.names:
         channels[name][lost] = np.nan
         channels[f"{name}_rate"][lost] = np.nan
+    if payload > 0.0:  # without the channel there was none
+        channels["payload"] = np.full(len(P), payload)
     set_points = dict(zip(neck.robot.set_points, P.T, strict=True))
     return Recording(excitation.time, excitation.sample_time, {**set_points, **channels}, robot=neck.robot)
 

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import Matrix, Vector
+from softneck.core import Matrix, Vector, to_si
+from softneck.robot import Robot
 
 from ._style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, label, new_figure
 
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _COLOURS = (BLUE, ORANGE, GREEN, RED, PURPLE, GREY)
-_QUANTITIES = ("static gain [deg/rad]", "pole [1/s]", "dead time [ms]")
+_QUANTITIES = ("pole [1/s]", "dead time [ms]")
 # Two-sided 95 %.
 _REACH = 1.96
 
@@ -53,27 +54,39 @@ def convergence_figure(
     return figure
 
 
-def local_map_figure(groups: Mapping[str, tuple[Vector, Matrix, Matrix]], title: str) -> Figure:
+def local_map_figure(
+    groups: Mapping[str, tuple[Vector, Matrix, Matrix]], title: str, robot: Robot | None = None
+) -> Figure:
     """Draw static gain, pole and dead time of local models against inclination, with 95 % bars.
 
     Args:
-        groups: name -> inclination (n,) [rad], numbers (n, 3) and standard deviations (n, 3 or more) of static gain
-            [rad/rad], pole [1/s], dead time [s].
+        groups: name -> inclination (n,) [rad], of robots other than the neck the distance of the outputs from their
+            mean; numbers (n, 3) and standard deviations (n, 3 or more) of static gain, pole, dead time; in SI.
         title: of the figure.
+        robot: whose; None: the neck's.
     """
     figure, axes = new_figure(3, row_height=2.1)
-    scale = np.array([np.degrees(1.0), 1.0, 1e3])
+    unit, gain, per = shown_gain(robot or Robot.preset())
+    scale = np.array([gain, 1.0, 1e3])
     for (name, (inclination, numbers, std)), colour in zip(groups.items(), _COLOURS, strict=False):
         for i, ax in enumerate(axes):
             ax.errorbar(
-                np.degrees(inclination), scale[i] * numbers[:, i], yerr=_REACH * scale[i] * std[:, i],
+                per * inclination, scale[i] * numbers[:, i], yerr=_REACH * scale[i] * std[:, i],
                 fmt="o", ms=4, lw=0.8, capsize=2, color=colour, label=name,
             )  # fmt: skip
-    for ax, name in zip(axes, _QUANTITIES, strict=True):
+    for ax, name in zip(axes, (f"static gain [{unit}]", *_QUANTITIES), strict=True):
         label(ax, name, legend=ax is axes[0])
-    axes[-1].set_xlabel("inclination [deg]")
+    whose = robot or Robot.preset()
+    what = "inclination" if whose.is_neck else "distance from the mean"
+    axes[-1].set_xlabel(f"{what} [{whose.outputs.display_unit}]")
     figure.suptitle(title)
     return figure
+
+
+def shown_gain(robot: Robot) -> tuple[str, float, float]:
+    """Return the unit in which a robot's static gains are shown, the factor to it, and that of its outputs."""
+    out, into = (to_si(unit)[0] for unit in (robot.outputs.display_unit, robot.motors.unit))
+    return f"{robot.outputs.display_unit}/{robot.motors.unit}", into / out, 1.0 / out
 
 
 def cover_figure(frequency: Vector, errors: Matrix, weight: Vector, title: str) -> Figure:

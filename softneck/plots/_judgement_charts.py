@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -139,3 +139,26 @@ def cost_chart(
     ]
     levels = () if chosen is None else (Level(chosen, "chosen", GREY, vertical=True),)
     return Chart(title, [Panel(curves, labels[1], levels=levels)], labels[0], caption=caption, row_height=3.0)
+
+
+def reliability_chart(rows: Sequence[Mapping[str, float]], title: str) -> Chart:
+    """Describe how often what was predicted with a probability happened; on the diagonal it is as often as said.
+
+    Args:
+        rows: `predicted`, `held` and `rows` of each group of samples.
+        title: of the chart.
+    """
+    predicted, held, count = (np.array([row[name] for row in rows]) for name in ("predicted", "held", "rows"))
+    ends = np.array([0.0, 1.0])
+    panels = [
+        Panel(
+            [
+                Curve(ends, ends, "as often as said", GREY, "dashed"),
+                Curve(predicted, held, "samples", BLUE, "marked", width=2.0),
+            ],
+            "share within the tolerance",
+            y_range=(-0.05, 1.05),
+        ),
+        Panel([Curve(predicted, count, "", BLUE, "stems")], "samples", legend=False),
+    ]
+    return Chart(title, panels, "predicted probability")

@@ -1,4 +1,4 @@
-"""The neck in three dimensions: link, tendons coloured by tension and platform, played in one HTML file.
+"""A robot bent by tendons in three dimensions: link, tendons coloured by tension and platform, in one HTML file.
 
 The page needs no network and no library: a canvas and a short renderer that it carries along.
 """
@@ -11,10 +11,12 @@ from importlib.resources import files
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, Vector, require_between, require_positive
+from softneck.core import DataError, Matrix, Vector, require_between, require_positive, to_si
+from softneck.robot import Robot
 from softneck.signals import Recording
+from softneck.signals.recording._channels import file_unit
 
-# The lab's neck (hardware facts): link length and attachment radius [m], tendons at 0, 120, 240 deg.
+# The lab's neck (hardware facts): link length and attachment radius [m]; robots of other sizes are drawn alike.
 LINK_LENGTH, ATTACHMENT_RADIUS = 0.107, 0.052
 # Samples a page carries at most per second; 50 Hz is more than a screen shows of this neck.
 _FRAME_TIME = 0.02
@@ -27,10 +29,10 @@ def neck_view(
     link_length: float = LINK_LENGTH,
     attachment_radius: float = ATTACHMENT_RADIUS,
 ) -> str:
-    """Return an HTML page that plays the neck of a recording or simulation result.
+    """Return an HTML page that plays the neck, or another robot bent by tendons, of a recording or simulation result.
 
-    Pitch and roll give the bend of a link of constant curvature; `compression` shortens it where it was
-    recorded. Tendons are coloured by `tension_1..3` where those were recorded, else by the motors.
+    The two angles (one: in a plane) give the bend of a link of constant curvature; `compression` shortens it where it
+    was recorded. Tendons are coloured by `tension_1..` where those were recorded, else by the motors.
 
     Args:
         recording: its first run is played.
@@ -38,21 +40,25 @@ def neck_view(
         link_length, attachment_radius: of the drawing [m].
 
     Raises:
-        DataError: no sample of pitch and roll, or a tilt beyond 90 deg.
+        DataError: no sample of the angles, a tilt beyond 90 deg, or a robot that is not bent by tendons.
     """
+    if why := not_drawn(recording.robot):
+        raise DataError(why)
     require_positive("link_length", link_length, "m")
     require_between("attachment_radius", attachment_radius, 1e-3, 1.0, "m")
     run = recording.runs()[0]
     keep = slice(None, None, max(1, round(_FRAME_TIME / run.sample_time)))
-    angles = _held(run.outputs[keep])
+    angles = _held(run.outputs[keep], run.robot)
+    unit = file_unit(run.robot.set_points[0], run.robot)
     frames = {
         "time": _rounded(run.time[keep] - run.time[0], 4),
-        "bend": _rounded(bend_of(angles), 5),
+        "bend": _rounded(bend_of(np.column_stack([angles, np.zeros(len(angles))])[:, :2]), 5),
         "angles": _rounded(np.degrees(angles), 2),
         "compression": _rounded(_channel(run, "compression", keep), 6),
-        "pull": _rounded(_pulls(run)[keep], 3),
-        "motors": _rounded(run.motor_positions[keep], 3),
-        "unit": "N" if _has_tensions(run) else "rad",
+        "pull": _rounded(_pulls(run, unit)[keep], 3),
+        "unit": "N" if _has_tensions(run) else unit,
+        "names": run.robot.outputs.names,
+        "tendons": run.robot.directions.angles_deg,
         "length": link_length,
         "radius": attachment_radius,
     }
@@ -60,6 +66,13 @@ def neck_view(
     # `</` inside a script would end it; in JSON `<\/` is the same text.
     data = json.dumps(frames).replace("</", "<\\/")
     return template.replace("@@TITLE@@", html.escape(title)).replace("@@DATA@@", data)
+
+
+def not_drawn(robot: Robot) -> str:
+    """Return in a line why `robot` has no view; empty where it has one."""
+    if robot.directions.kind == "tendons" and to_si(robot.outputs.unit)[1] == "rad":
+        return ""
+    return f"robot {robot.label()} has no view in 3-D: it is drawn of robots that tendons at known angles bend."
 
 
 def bend_of(angles: Matrix) -> Matrix:
@@ -75,25 +88,30 @@ def bend_of(angles: Matrix) -> Matrix:
     return lean * factor[:, None]
 
 
-def _held(angles: Matrix) -> Matrix:
+def _held(angles: Matrix, robot: Robot) -> Matrix:
     """Fill missed samples with the last one before (the first one after, at the start)."""
     good = np.isfinite(angles).all(axis=1)
     if not good.any():
-        raise DataError("the recording has no sample of pitch and roll to draw.")
+        raise DataError(f"the recording has no sample of {' and '.join(robot.outputs.names)} to draw.")
     if np.abs(angles[good]).max() >= np.pi / 2:
-        raise DataError("pitch or roll exceeds 90 deg; a neck does not bend so far. Are the angles in degrees?")
+        names = " or ".join(robot.outputs.names)
+        raise DataError(f"{names} exceeds 90 deg; a neck does not bend so far. Are the angles in degrees?")
     last = np.maximum.accumulate(np.where(good, np.arange(good.size), int(np.argmax(good))))
     return angles[last]
 
 
 def _has_tensions(run: Recording) -> bool:
-    return all(f"tension_{j}" in run.channels for j in (1, 2, 3))
+    return all(name in run.channels for name in _tensions(run))
 
 
-def _pulls(run: Recording) -> Matrix:
+def _tensions(run: Recording) -> list[str]:
+    return [f"tension_{j + 1}" for j in range(len(run.robot.motors.names))]
+
+
+def _pulls(run: Recording, unit: str) -> Matrix:
     if not _has_tensions(run):
-        return np.maximum(run.motor_positions, 0.0)
-    return np.nan_to_num(np.column_stack([run.channels[f"tension_{j}"] for j in (1, 2, 3)]))
+        return np.maximum(run.motor_positions / to_si(unit)[0], 0.0)
+    return np.nan_to_num(np.column_stack([run.channels[name] for name in _tensions(run)]))
 
 
 def _channel(run: Recording, name: str, keep: slice) -> Vector:

@@ -6,22 +6,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from softneck.core import Vector, to_si
-from softneck.signals import SET_POINTS, Quality, Recording, redefine
-from softneck.signals.quality._excitation import BANDWIDTH
-from softneck.signals.quality._region import reachable_hexagon
-from softneck.signals.recording._channels import MOTOR_POSITIONS, OUTPUTS, file_unit
+from softneck.core import SettingsError, Vector, to_si
+from softneck.signals import Quality, Recording, redefine
+from softneck.signals.quality._region import Region, reachable_hexagon
+from softneck.signals.recording._channels import file_unit, si_unit
 
 from ._page import Section, Table, page
-from ._style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, label, new_figure
+from ._style import ALL_MOTOR_COLOURS, BLUE, GREEN, GREY, ORANGE, PURPLE, RED, label, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_INPUT_COLOURS = (BLUE, ORANGE, GREEN)
-_INPUT_NAMES = (r"$\theta_i$", r"$\phi_i$", r"$\delta_i$")
+_INPUT_NAMES = {"theta_i": r"$\theta_i$", "phi_i": r"$\phi_i$", "delta_i": r"$\delta_i$"}
 # More points than this hide each other.
 _POINTS = 20_000
 _FAULTS = (("missed", RED), ("frozen", PURPLE), ("clipped", ORANGE), ("outliers", GREEN))
@@ -29,37 +27,42 @@ _SHOWN = {"outliers": "spikes"}
 
 
 def spectrum_figure(quality: Quality, title: str) -> Figure:
-    """Draw the spectral density of theta_i, phi_i and delta_i against the neck's bandwidth of 4 rad/s."""
+    """Draw the spectral density of the inputs against the robot's bandwidth, of a neck 4 rad/s."""
     figure, (ax,) = new_figure(1, row_height=3.6)
-    omega, density = quality.spectrum.omega[1:], quality.spectrum.density[1:]
+    spectrum, whose = quality.spectrum, "neck" if quality.robot.is_neck else "robot"
+    omega, density, bandwidth = spectrum.omega[1:], spectrum.density[1:], spectrum.bandwidth
     top = density.max(initial=1e-12)
-    for i in range(3):
-        if density[:, i].max() > 1e-15:
-            share = 100 * quality.spectrum.below_bandwidth[i]
-            name = f"{_INPUT_NAMES[i]} ({share:.0f} % below {BANDWIDTH:g} rad/s)"
-            ax.loglog(omega, np.maximum(density[:, i], 1e-12 * top), color=_INPUT_COLOURS[i], lw=1.2, label=name)
-    ax.axvline(BANDWIDTH, color="black", ls="--", lw=1.0)
-    ax.annotate("bandwidth of the neck", (BANDWIDTH, 0.93), xycoords=("data", "axes fraction"), xytext=(5, 0),
-                textcoords="offset points", fontsize="small")  # fmt: skip
+    for i, name in enumerate(spectrum.inputs):
+        if density[:, i].max(initial=0.0) > 1e-15:
+            below = f" below {bandwidth:.3g} rad/s" if quality.robot.is_neck else ""  # no room for more than three
+            share = "" if np.isnan(bandwidth) else f" ({100 * spectrum.below_bandwidth[i]:.0f} %{below})"
+            said = _INPUT_NAMES.get(name, f"motor {i + 1}") + share
+            ax.loglog(omega, np.maximum(density[:, i], 1e-12 * top), color=ALL_MOTOR_COLOURS[i], lw=1.2, label=said)
+    if not np.isnan(bandwidth):
+        ax.axvline(bandwidth, color="black", ls="--", lw=1.0)
+        ax.annotate(f"bandwidth of the {whose}", (bandwidth, 0.93), xycoords=("data", "axes fraction"), xytext=(5, 0),
+                    textcoords="offset points", fontsize="small")  # fmt: skip
     ax.set_ylim(1e-7 * top, 3.0 * top)
     ax.set_xlabel("frequency [rad/s]")
-    label(ax, "density [rad$^2$ s/rad]", legend=len(ax.lines) > 1)
+    unit = si_unit(quality.robot.set_points[0], quality.robot)
+    label(ax, rf"density [{unit}$^2$ s/rad]", legend=len(ax.lines) > 1)
     figure.suptitle(title)
     return figure
 
 
 def region_figure(recording: Recording, quality: Quality, title: str) -> Figure:
-    """Draw the (theta_i, phi_i) visited, coloured by delta_i, in the hexagon that the motors reach."""
+    """Draw the (theta_i, phi_i) that a neck visited, coloured by delta_i, in the hexagon that the motors reach."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    region = _neck_region(quality)
     P = recording.motor_positions
     P = P[np.isfinite(P).all(axis=1)]
     theta, phi, delta = redefine(P[:: max(1, len(P) // _POINTS)]).T
     figure = Figure(figsize=(10.0, 4.6), layout="constrained")
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
-    limit = quality.region.limit
+    limit = region.limit
     left.plot(*reachable_hexagon(limit).T, color=GREY, lw=1.0)
     span = max(float(np.abs(delta).max(initial=0.0)), 1e-3)
     points = left.scatter(theta, phi, c=delta, s=3, cmap="coolwarm", vmin=-span, vmax=span, rasterized=True)
@@ -67,18 +70,24 @@ def region_figure(recording: Recording, quality: Quality, title: str) -> Figure:
     left.set_aspect("equal")
     left.set_xlabel(r"$\theta_i$ [rad]")
     left.set_ylabel(r"$\phi_i$ [rad]")
-    covered = 100 * quality.region.tilt_coverage
+    covered = 100 * region.tilt_coverage
     left.set_title(f"{covered:.0f} % of what motors of $\\pm${limit:g} rad reach", fontsize="medium")
-    _behaviours(right, quality)
+    _behaviours(right, region)
     figure.suptitle(title)
     return figure
 
 
-def _behaviours(ax: Axes, quality: Quality) -> None:
+def _neck_region(quality: Quality) -> Region:
+    if quality.region is None:
+        raise SettingsError(f"the region of theta_i and phi_i is a neck's, not that of robot {quality.robot.label()}.")
+    return quality.region
+
+
+def _behaviours(ax: Axes, region: Region) -> None:
     """Draw for how long each behaviour took place; one that never did is marked."""
-    names = list(quality.region.behaviours)
-    seconds = np.array([quality.region.behaviours[name] for name in names])
-    never = np.array([name in quality.region.never for name in names])
+    names = list(region.behaviours)
+    seconds = np.array([region.behaviours[name] for name in names])
+    never = np.array([name in region.never for name in names])
     rows = np.arange(len(names))
     ax.barh(rows, seconds, color=np.where(never, RED, BLUE))
     for row in rows:
@@ -116,7 +125,7 @@ def channels_figure(recording: Recording, quality: Quality, title: str) -> Figur
                 ax.axvline(_values(recording, name)[stretch.start], color=ORANGE, lw=1.0)
         step = "no steps" if channel.quantum is None else f"steps of {channel.shown(channel.quantum):.2g}"
         ax.set_title(name if channel.command else f"{name}: {step}", fontsize="small")
-        ax.set_xlabel(f"[{file_unit(name)}]", fontsize="small")
+        ax.set_xlabel(f"[{channel.unit}]", fontsize="small")
         ax.set_yscale("log")
         ax.yaxis.set_minor_formatter(NullFormatter())
         ax.spines[["top", "right"]].set_visible(False)
@@ -131,7 +140,7 @@ def _bins(levels: float | None) -> int:
 
 def faults_figure(recording: Recording, quality: Quality, title: str) -> Figure:
     """Draw the measured channels over time, with the rows marked that are missed, frozen, clipped or spikes."""
-    names = [name for name in _shown(recording) if name not in SET_POINTS]
+    names = [name for name in _shown(recording) if name not in recording.robot.set_points]
     figure, axes = new_figure(len(names), row_height=1.6)
     # Times restart at each run; rows do not.
     t = np.arange(len(recording)) * recording.sample_time
@@ -149,7 +158,7 @@ def faults_figure(recording: Recording, quality: Quality, title: str) -> Figure:
                 else:
                     mark = ax.axvspan(t[rows][0], t[rows][-1] + recording.sample_time, color=colour, alpha=0.5, lw=1.0)
                 seen.setdefault(sort, mark)
-        label(ax, f"{name.replace('_', ' ')}\n[{file_unit(name)}]", legend=False)
+        label(ax, f"{name.replace('_', ' ')}\n[{quality.channels[name].unit}]", legend=False)
     if seen:
         figure.legend(
             list(seen.values()),
@@ -174,28 +183,29 @@ def correlation_figure(quality: Quality, title: str) -> Figure:
     ax.set_facecolor("#dddddd")
     image = ax.imshow(quality.correlation, cmap="coolwarm", vmin=-1.0, vmax=1.0)
     figure.colorbar(image, ax=ax, label="correlation")
-    for i in range(3):
-        for j in range(3):
+    motors = range(len(quality.correlation))
+    for i in motors:
+        for j in motors:
             r = quality.correlation[i, j]
             text = "never\nmoves" if np.isnan(r) else f"{r:.2f}"
             ax.text(j, i, text, ha="center", va="center", color="white" if abs(r) > 0.7 else "black")
-    ticks = [f"motor {j}" for j in (1, 2, 3)]
-    ax.set_xticks(range(3), ticks)
-    ax.set_yticks(range(3), ticks)
+    ticks = [f"motor {j + 1}" for j in motors]
+    # Names of more motors than three would run into each other.
+    ax.set_xticks(motors, ticks if len(motors) <= 3 else [str(j + 1) for j in motors])
+    ax.set_yticks(motors, ticks)
     figure.suptitle(title)
     return figure
 
 
 def _shown(recording: Recording) -> list[str]:
-    return [name for name in (*SET_POINTS, *MOTOR_POSITIONS, *OUTPUTS) if name in recording.channels]
+    robot = recording.robot
+    names = (*robot.set_points, *robot.motor_positions, *robot.outputs.names)
+    return [name for name in names if name in recording.channels]
 
 
 def _values(recording: Recording, name: str) -> Vector:
     """Return a channel in the unit of files; a copy."""
-    return recording.channels[name] / to_si(file_unit(name))[0]
-
-
-_INPUTS = ("theta_i", "phi_i", "delta_i")
+    return recording.channels[name] / to_si(file_unit(name, recording.robot))[0]
 
 
 def quality_page(recording: Recording, quality: Quality, title: str) -> str:
@@ -205,14 +215,12 @@ def quality_page(recording: Recording, quality: Quality, title: str) -> str:
         f"{quality.rows} rows in {runs} run{'s' if runs > 1 else ''} at {1e3 * quality.sample_time:g} ms, "
         f"{quality.rows * quality.sample_time:.1f} s. The worst finding is: {quality.severity}."
     )
+    neck, bandwidth = quality.robot.is_neck, quality.spectrum.bandwidth
     spectrum = [
-        "Power spectral density of the redefined inputs (Welch, never across runs). What has no power up to the "
-        f"bandwidth of {BANDWIDTH:g} rad/s cannot be identified."
+        f"Power spectral density of the {'redefined inputs' if neck else 'set-points'} (Welch, never across runs)."
     ]
-    region = [
-        "Each point is a row; the hexagon is what the motors reach. A model knows nothing outside the points, and "
-        "the paper's models failed at the behaviours beside it (section 7.4.2)."
-    ]
+    if not np.isnan(bandwidth):
+        spectrum[0] += f" What has no power up to the bandwidth of {bandwidth:.3g} rad/s cannot be identified."
     sections = [
         Section("Findings", [summary, *(str(finding) for finding in quality.findings)]),
         Section("Channels", [], [_channels(quality)], [
@@ -222,12 +230,26 @@ def quality_page(recording: Recording, quality: Quality, title: str) -> str:
         Section("Excitation", spectrum, [_inputs(quality)], [
             ("Spectrum of the inputs.", spectrum_figure(quality, "Excitation")),
         ]),
-        Section("Region", region, [], [("Visited region.", region_figure(recording, quality, "Visited region"))]),
+        _region(recording, quality),
         Section("Independence", ["Correlation between the motors' set-points."], [_conditions(quality)], [
             ("Correlation of the motors.", correlation_figure(quality, "Motors")),
         ]),
     ]  # fmt: skip
     return page(title, sections, footer=f"softneck info: {quality.rows} rows checked.")
+
+
+def _region(recording: Recording, quality: Quality) -> Section:
+    if not quality.robot.is_neck:
+        text = (
+            f"Robot {quality.robot.label()}: what its motors went through is in the tables. A map of tilt and the "
+            "behaviours that the paper names (one tendon alone, co-contraction) are shown of three-tendon necks only."
+        )
+        return Section("Region", [text])
+    text = (
+        "Each point is a row; the hexagon is what the motors reach. A model knows nothing outside the points, and "
+        "the paper's models failed at the behaviours beside it (section 7.4.2)."
+    )
+    return Section("Region", [text], [], [("Visited region.", region_figure(recording, quality, "Visited region"))])
 
 
 def _channels(quality: Quality) -> Table:
@@ -238,7 +260,7 @@ def _channels(quality: Quality) -> Table:
         counts = [str(shown[f"{sort}_rows"]) for sort in ("missed", "frozen", "clipped", "outliers")]
         numbers = [_number(shown[key]) for key in ("lowest", "highest")]
         tail = [_number(shown["quantum"]), "-" if channel.command else _number(shown["noise_std"])]
-        rows.append([name, *numbers, file_unit(name), *tail, *counts])
+        rows.append([name, *numbers, channel.unit, *tail, *counts])
     return Table("Channels: steps and noise in the channel's unit, faults in rows", head, rows)
 
 
@@ -247,14 +269,17 @@ def _inputs(quality: Quality) -> Table:
     rows = [
         [
             name,
-            *(f"{value:+.2f}" for value in quality.region.ranges[i]),
+            f"{low:+.3g}",
+            f"{high:+.3g}",
+            unit,
             _number(100 * spectrum.below_bandwidth[i]),
-            f"{spectrum.highest[i]:.1f}",
+            _number(spectrum.highest[i]),
             _number(spectrum.crest[i]),
         ]
-        for i, name in enumerate(_INPUTS)
+        for i, (name, (low, high, unit)) in enumerate(quality.inputs.items())
     ]
-    head = ["input", "lowest [rad]", "highest [rad]", "power below 4 rad/s [%]", "real power up to [rad/s]", "crest"]
+    below = f"power below {spectrum.bandwidth:.3g} rad/s [%]"
+    head = ["input", "lowest", "highest", "unit", below, "real power up to [rad/s]", "crest"]
     return Table("Inputs", head, rows)
 
 

@@ -14,6 +14,7 @@ from softneck.cosim.loops._loop_file import is_loop_file
 from softneck.cosim.loops._loop_values import read_toml
 from softneck.cosim.loops._trust import python_of
 from softneck.cosim.studies._store import read_description
+from softneck.identification.models._directions import bandwidth_of
 from softneck.signals import assess_quality, read_recording
 
 # Folders that are no part of a project, beside those whose name begins with a dot.
@@ -114,7 +115,7 @@ def _recording(project: Project, path: Path, name: str) -> None:
         project.problems[name] = f"larger than {_LARGEST / 1e6:.0f} MB: left out"
         return
     recording = read_recording(path)
-    project.recordings[name] = (recording, assess_quality(recording))
+    project.recordings[name] = (recording, assess_quality(recording, bandwidth=bandwidth_of(recording)))
 
 
 def _archive(project: Project, path: Path, name: str) -> None:

@@ -12,7 +12,7 @@ from softneck.core import Matrix, to_si
 from softneck.identification import INFINITE, Validation
 from softneck.plots import Chart, Section, Table, page
 from softneck.plots._charts import validation_chart
-from softneck.plots._judgement_charts import histogram_chart, residual_chart
+from softneck.plots._judgement_charts import histogram_chart, reliability_chart, residual_chart
 
 VALIDATION_NOTE = (
     "Fit is 100 (1 - |y - yhat| / |y - mean y|) in %, {outputs}. Persistence repeats the last sample: a one-step fit "
@@ -114,6 +114,8 @@ def _section(r: Validation) -> Section:
         errors = r.measured - values
         if np.isfinite(errors).any(axis=0).all():
             charts.append(histogram_chart(errors, f"Errors, {name}", robot=r.robot))
+    if r.validity is not None:
+        charts.append(reliability_chart(r.validity["reliability"], "Validity: predicted and observed"))
     return Section(_name(r), text=_remarks(r), tables=_run_tables(r), charts=charts)
 
 
@@ -149,6 +151,13 @@ def _remarks(r: Validation) -> list[str]:
         )
     if r.outside_pct is not None:
         words.append(f"{_cell(r.outside_pct, 1)} % of the samples lie outside what the model has seen.")
+    if r.validity is not None:
+        v = r.validity
+        words.append(
+            f"Validity is {v['mean']:.2f} in the mean, {v['least']:.2f} at least; {100 * v['held']:.0f} % of the "
+            f"samples were within the tolerance. Brier score {v['brier']:.3f} (0 is best); that share alone gets "
+            f"{v['brier_base_rate']:.3f}."
+        )
     words += [f"{said[0].upper()}{said[1:]}." for said in r.bounds_remarks]
     if r.novelty is not None and r.novelty.larger is not None:
         p50, p90, p99, most = (f"{value:.1f}" for value in r.novelty.larger)

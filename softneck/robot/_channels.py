@@ -11,8 +11,8 @@ from softneck.core import SettingsError, to_si
 MOST_MOTORS, MOST_OUTPUTS = 8, 4
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 # What recordings call other things: an output of that name, or one that ends so, could not be told from them.
-_TAKEN = re.compile(r"(time|run|motor_.*|payload|compression|push_.*|base_tilt_.*|innovation|healthy|enabled|.*_"
-                    r"(rate|measured|estimate|reference|lower|upper|start|valid))")  # fmt: skip
+_TAKEN = re.compile(r"(time|run|motor_.*|payload|compression|push_.*|base_tilt_.*|innovation|healthy|enabled|"
+                    r"validity|.*_(rate|measured|estimate|reference|lower|upper|start|valid))")  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

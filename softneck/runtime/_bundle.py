@@ -216,8 +216,19 @@ def declared(module: str, base: type) -> Any:
 def _members(runtime: str) -> tuple[str, list[tuple[str, int]]]:
     """Return the outer module, and each member with the number of its arrays."""
     outer, _, inner = runtime.partition("(")
-    pairs = [part.rpartition(":") for part in inner.rstrip(")").split(",")] if inner else []
+    pairs = [part.rpartition(":") for part in split_members(inner[:-1])] if inner else []
     return outer, [(name, int(count)) for name, _, count in pairs]
+
+
+def split_members(inner: str) -> list[str]:
+    """Split at the commas that are in no brackets: members may have members of their own."""
+    parts, depth, start = [], 0, 0
+    for i, letter in enumerate(inner):
+        depth += {"(": 1, ")": -1}.get(letter, 0)
+        if letter == "," and depth == 0:
+            parts.append(inner[start:i])
+            start = i + 1
+    return [*parts, inner[start:]]
 
 
 def _asks_for_tangents(module: str) -> bool:

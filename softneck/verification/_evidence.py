@@ -17,7 +17,7 @@ from ._confidence import MarginInterval, intervals
 from ._experiments import Crossing, LoopUnderTest, crossing_facts, crossing_values, crossings
 from ._laws import ControllerUnderTest
 from ._linear import Gaps, LinearLaw, gaps, judged, margins
-from ._neck_loops import STEP_AT, NeckRun, direction, neck_changes, no_virtual_plant, run_necks
+from ._neck_loops import NeckRun, direction, neck_changes, no_virtual_plant, run_necks, step_at
 from ._own_plants import OwnPlant
 from ._plants import Plants, UncertainNeck, all_plants, join, nominal_plants
 from ._requirements import Requirements
@@ -148,6 +148,8 @@ def gather(
         controller.block, asked, order=controller.order, observer=observer, seed=seed,
         progress=lambda done, text: progress(0.6 + 0.2 * done, text), own=own,
     ) if own or not why else []  # fmt: skip
+    robot, names = controller.robot, tuple(plants.axes)
+    axes = names if len(names) == 1 else (*names, "both")  # one output is all of them
     payloads = sorted({float(kg) for kg in (min(asked.neck["payloads_kg"]), max(asked.neck["payloads_kg"]))})
     loops = [
         LoopUnderTest(
@@ -155,16 +157,19 @@ def gather(
             plant=lambda plant=plant: plant.quiet(controller.block.sample_time), observer=observer,
             order=controller.order, inputs={"payload": kg} if plant.payload else {},
             # Each axis alone with the light payload; with the heavy one both at once, which is the harder test.
-            axes=("pitch", "roll", "both") if kg == payloads[0] or not plant.payload else ("both",),
+            axes=axes if kg == payloads[0] or not plant.payload else axes[-1:], robot=robot, time=asked.scale[0],
+            size=1.0 if robot.is_neck else asked.si(math.degrees(asked.scale[1])),
         )
         for plant in own for kg in (payloads if plant.payload else (0.0,))
     ]  # fmt: skip
-    found = crossings(loops, progress=lambda done, text: progress(0.8 + 0.2 * done, text)) if loops else []
-    tested = [
-        item
-        for law in controller.laws.values()
-        for item in tested_axes(families or {}, law, plants.axes, controller.extra)
-    ]
+    # What nobody requires of an axis alone need not be found of it.
+    alone = {f"{axis}.{name}" for axis in plants.axes for name in ("gain_margin", "delay_margin_ms")}
+    overall = all(item.metric not in alone for item in asked.bounds)
+    late = lambda done, text: progress(0.8 + 0.2 * done, text)  # noqa: E731
+    found = crossings(loops, overall=overall, progress=late) if loops else []
+    steep = float(asked.uncertainty["rolloff_db_per_decade"])
+    laws, kept = controller.laws.values(), families or {}
+    tested = [item for law in laws for item in tested_axes(kept, law, plants.axes, controller.extra, steep)]
     evidence = Evidence(
         plants, w, linear, steps, stepped, runs, foreign=_foreign(asked, own), tested=tested, crossings=found
     )
@@ -185,8 +190,8 @@ def _linear(
     table = margins(tried, law, w)
     drawn = np.random.default_rng(seed).uniform(-1.0, 1.0, (_SCALED, len(plants.axes), 3))
     drawn[: _SCALED // 3] = np.sign(drawn[: _SCALED // 3])
-    wanted = any(item.metric == "robust.sensitivity" for item in asked.bounds)
-    parts = [structured(neck, law, extra=extra, drawn=drawn, performance=wanted or detailed) for neck in necks]
+    wanted = detailed or any(item.metric == "robust.sensitivity" for item in asked.bounds)
+    parts = [structured(neck, law, extra=extra, drawn=drawn, performance=wanted) for neck in necks]
     nominals = [plant.later(extra) for plant in nominal_plants(necks)]
     distances = []
     for source, nominal in enumerate(nominals):
@@ -222,8 +227,8 @@ def _tell_data(evidence: Evidence) -> None:
     """Add the margins that the data support, and those by experiment."""
     for item in evidence.tested:
         for name, value in item.margins.items():
-            about = _tested_describer(item, name)
-            for group in (item.axis, "axes"):
+            about = _tested_describer(item, name)  # both channels at once stand no more than one alone
+            for group in (item.axis, "axes", *(("mimo",) if name == "disk_margin" else ())):
                 _add(evidence, f"{group}.{name}", Values(np.array([value]), about))
         _add(evidence, "robust.mu", Values(np.array([item.mu]), _tested_describer(item, "mu")))
     if not evidence.tested:
@@ -371,7 +376,7 @@ def _step_describer(evidence: Evidence, name: str) -> Describe:
 
 def _neck_describer(evidence: Evidence, controller: ControllerUnderTest, asked: Requirements) -> Describe:
     def describe(row: int) -> dict[str, Any]:
-        run = evidence.necks[row]
+        run, at = evidence.necks[row], step_at(controller.block)
         size = float(asked.neck["size_deg"])
         parameters = {} if run.parameters is None else neck_changes(run.parameters, controller.robot)
         return {
@@ -379,7 +384,7 @@ def _neck_describer(evidence: Evidence, controller: ControllerUnderTest, asked: 
             "payload_kg": run.payload,
             **{f"{name}_{shown_unit(controller.robot)[0]}": size * share for name, share in
                zip(controller.robot.outputs.names, direction(run.orientation, controller.robot), strict=True)},
-            "seed": run.seed, "at_s": STEP_AT, "duration_s": STEP_AT + float(asked.neck["duration_s"]),
+            "seed": run.seed, "at_s": at, "duration_s": at + float(asked.neck["duration_s"]),
             "sample_time_s": controller.block.sample_time, "order": controller.order,
         }  # fmt: skip
 

@@ -3,6 +3,9 @@
 Gain and delay act on the error between what is measured and the reference. The loop is led to a posture, kicked, and
 listened to: what is still as large in the last window as in the one before, and above what the loop does at gain 1, is
 sustained. Only the first crossing is bisected: stability need not be monotone in the gain.
+
+Times and sizes are a neck's; of another robot they are stretched by its time and by how far its outputs go, and its
+postures lie around the middle of its outputs.
 """
 
 from __future__ import annotations
@@ -19,9 +22,14 @@ import numpy as np
 
 from softneck.core import DataError, Progress, Vector, silent
 from softneck.loop import BlockPart, Loop, LoopResult, Part, run_loop
+from softneck.loop._result import shown_unit
+from softneck.robot import Robot
 from softneck.runtime import Block, Port
 
+from ._steps import middle_motors, middle_of
+
 _RUNTIME = "softneck.verification._louder_runtime"
+_NECK = Robot.preset()
 _KEPT = 34
 # The experiment [s]: led there, at rest, kicked; a moment that does not count, and two windows.
 _LED, _REST, _FORGOTTEN, _WINDOW = 1.0, 3.0, 2.0, 4.0
@@ -29,16 +37,28 @@ _LED, _REST, _FORGOTTEN, _WINDOW = 1.0, 3.0, 2.0, 4.0
 _SMALL, _LARGE = math.radians(1.0), math.radians(8.0)
 _LEAN = math.radians(5.0)
 _POSTURES = ((0.0, 0.0), (_LEAN, 0.0), (0.0, -_LEAN))
-# Sustained: the last window has this part of the one before, so what decays by less counts as if it did not; above this
-# part of the kick, and this many times what the loop does at gain 1.
-_KEEPS, _HEARD, _ABOVE_FLOOR = 0.97, 0.01, 2.0
+_TOGETHER = "both"
+# A neck's sample time [s], of which the delays that are scanned are so many.
+_SAMPLE = 0.02
+# Sustained: the last window has this part of the one before, so what decays by less counts as if it did not, or is
+# above what the kick itself swings without damping: the loop has fed it, though slow parts of a plant may still let it
+# shrink; above this part of the kick, and this many times what the loop does at gain 1.
+_KEEPS, _HEARD, _ABOVE_FLOOR = 0.97, 0.1, 2.0
+# Made quieter, a loop that friction holds comes late, and each axis then moves the other: less than the kick.
+_HEARD_QUIET = 1.0
 # At gain 1 a loop may hunt by friction; by more than this [rad] peak to peak it oscillates.
 _HUNTS = math.radians(1.0)
+# Parts of the kick: a loop that moves less does not answer it; hunting by more is told.
+_ANSWERS, _TOLD = 1e-3, 0.01
 # What is scanned: factors on the gain, up and down, and samples of delay; and to which part a crossing is bisected.
 _GAINS = tuple(2.0 ** (k / 4.0) for k in range(1, 17))
 _COARSE_GAINS = tuple(2.0 ** (k / 2.0) for k in range(1, 9))
 _DELAYS = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)
 _FINE = 0.005
+# Peak to peak, in parts of the kick: linear loops at their border swing by two, and by a little more if they overshoot.
+_FED = 3.0
+# Of which scans one that has crossed says where all end: a gain margin is up or down, whichever is nearer.
+_LED_BY = {"gain_up": ("gain_up", "gain_down"), "delay": ("delay",)}
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -53,6 +73,8 @@ class LoopUnderTest:
         inputs: constants of the plant, such as `payload`.
         compiled: as one function where all parts are blocks; that takes some ten seconds once, and each run a tenth.
         axes: that are raised.
+        robot: whose loop it is.
+        time, size: of another robot than the neck: by how much it is slower, and an output in SI for each rad of neck.
     """
 
     name: str
@@ -63,6 +85,32 @@ class LoopUnderTest:
     inputs: Mapping[str, float] | None = None
     compiled: bool = True
     axes: tuple[str, ...] = ("pitch", "roll", "both")
+    robot: Robot = _NECK
+    time: float = 1.0
+    size: float = 1.0
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """The outputs' names."""
+        return self.robot.outputs.names
+
+    @property
+    def middle(self) -> Vector:
+        """Around which outputs postures lie."""
+        return middle_of(self.robot)
+
+    @property
+    def samples(self) -> int:
+        """By how many samples a delay that is scanned is longer than a neck's."""
+        return max(1, round(self.time * _SAMPLE / self.controller.sample_time))
+
+    def postures(self) -> tuple[tuple[float, ...], ...]:
+        """Return where it is kicked, for a neck in rad: nowhere, and leaning to either side."""
+        m = len(self.outputs)
+        if m == len(_POSTURES[0]):
+            return _POSTURES
+        rest = (0.0,) * (m - 1)
+        return ((0.0, *rest), (_LEAN, *rest), (*rest, -_LEAN))
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,24 +119,28 @@ class Crossing:
 
     Attributes:
         plant: its name.
-        axes: "pitch", "roll" or "both".
+        axes: "pitch", "roll" or "both", which of another robot are all.
         what: "gain_up", "gain_down" or "delay".
-        amplitude: of the kick [rad].
-        posture: (pitch, roll) [rad].
+        amplitude: of the kick [rad], of another robot in SI.
+        posture: (pitch, roll) [rad], of another robot what its outputs are beside their middle.
         value: the factor on the gain (above 1 in both ways), or the delay [s]; inf where none was found.
         hunts: peak to peak at gain 1 [rad], where the loop does not come to rest.
+        robot: whose outputs these are.
     """
 
     plant: str
     axes: str
     what: str
     amplitude: float
-    posture: tuple[float, float]
+    posture: tuple[float, ...]
     value: float
     hunts: float
+    robot: Robot = _NECK
 
 
-def crossings(loops: Sequence[LoopUnderTest], *, coarse: bool = False, progress: Progress = silent) -> list[Crossing]:
+def crossings(
+    loops: Sequence[LoopUnderTest], *, coarse: bool = False, overall: bool = False, progress: Progress = silent
+) -> list[Crossing]:
     """Return the crossings of every loop: each axis and both, up, down and later, small and large, leaning and not.
 
     A scan ends where an earlier one of the same plant, axes and kind has crossed: only the least is looked for, and
@@ -97,46 +149,62 @@ def crossings(loops: Sequence[LoopUnderTest], *, coarse: bool = False, progress:
     Args:
         loops: over each plant.
         coarse: one posture, both axes at once, coarse gains, nothing bisected: the last value without oscillation.
+        overall: only the least gain margin and the least delay margin of all loops are looked for, in half the runs:
+            what the last loop stands of both axes at once, the harder test, ends the scans of all others, which take
+            every other step.
         progress: called now and then.
     """
     kinds = ("gain_up", "gain_down", "delay")
-    groups = [(loop, axes, what) for loop in loops for axes in (("both",) if coarse else loop.axes) for what in kinds]
+    groups = [
+        (loop, axes, what) for loop in loops for axes in (loop.axes[-1:] if coarse else loop.axes) for what in kinds
+    ]
+    # The first compiles the loop; several threads would do that several times.
+    leaders = groups[:1]
+    if overall:
+        leaders = [job for job in groups if job[0] is loops[-1] and job[1] == loops[-1].axes[-1] and job[2] in _LED_BY]
+    others = [job for job in groups if job not in leaders]
+    least: dict[str, float] = dict.fromkeys(kinds, math.inf)
     done = 0
 
     def group(job: tuple[LoopUnderTest, str, str]) -> list[Crossing]:
         nonlocal done
-        found = _group(*job, coarse)
+        found = _group(*job, coarse, least[job[2]])
         done += 1
         progress(done / len(groups), f"{job[0].name}: {job[2].replace('_', ' ')} of {job[1]}")
         return found
 
-    # The first compiles the loop; several threads would do that several times.
-    first = [found for job in groups[:1] for found in group(job)]
+    first = [found for job in leaders for found in group(job)]
+    if overall:
+        least |= {kind: min(x.value for x in first if x.what == by) for by, led in _LED_BY.items() for kind in led}
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        return first + [found for part in pool.map(group, groups[1:]) for found in part]
+        return first + [found for part in pool.map(group, others) for found in part]
 
 
-def _group(loop: LoopUnderTest, axes: str, what: str, coarse: bool) -> list[Crossing]:
+def _group(loop: LoopUnderTest, axes: str, what: str, coarse: bool, least: float = math.inf) -> list[Crossing]:
+    """Return the crossings of one kind; scans end at `least`, or where an earlier one has crossed."""
     found: list[Crossing] = []
-    least = math.inf
+    sparse = math.isfinite(least)
     # Leaning changes how loud a plant is, and not which loops need their gain to be stable.
-    postures = _POSTURES[:1] if coarse or what == "gain_down" else _POSTURES
-    for posture, amplitude in product(postures, (_SMALL, _LARGE)):
+    postures = loop.postures()[:1] if coarse or what == "gain_down" else loop.postures()
+    for lean, kick in product(postures, (_SMALL, _LARGE)):
+        posture, amplitude = tuple(loop.size * angle for angle in lean), loop.size * kick
         case = _Case(loop, axes, what, amplitude, posture)
-        floor = case.floor()
-        value = 1.0 if what != "delay" else 0.0
-        if floor <= _HUNTS:
-            value = _first_crossing(case, floor, least, coarse)
-        hunts = floor if floor > _HEARD * amplitude else 0.0
-        found.append(Crossing(loop.name, axes, what, amplitude, posture, value, hunts))
+        none = 1.0 if what != "delay" else 0.0
+        if least <= none:
+            break  # there is no less to look for
+        floor, value = case.floor(), none
+        if floor <= loop.size * _HUNTS:
+            value = _first_crossing(case, floor, least, coarse, sparse)
+        hunts = floor if _TOLD * amplitude < floor < math.inf else 0.0
+        found.append(Crossing(loop.name, axes, what, amplitude, posture, value, hunts, loop.robot))
         least = min(least, value)
     return found
 
 
-def _first_crossing(case: _Case, floor: float, least: float, coarse: bool) -> float:
+def _first_crossing(case: _Case, floor: float, least: float, coarse: bool, sparse: bool = False) -> float:
     """Return the least value scanned at which the loop oscillates, bisected; inf where none below `least` does."""
     calm = 0.0 if case.what == "delay" else 1.0
-    for scanned in _scanned(case, coarse):
+    for scanned in _scanned(case, coarse, sparse):
         value = min(scanned, least)
         if case.oscillates(value, floor):
             return calm if coarse else _bisected(case, calm, value, floor)
@@ -146,12 +214,13 @@ def _first_crossing(case: _Case, floor: float, least: float, coarse: bool) -> fl
     return math.inf
 
 
-def _scanned(case: _Case, coarse: bool) -> Iterator[float]:
+def _scanned(case: _Case, coarse: bool, sparse: bool) -> Iterator[float]:
     if case.what == "delay":
-        yield from (samples * case.sample_time for samples in _DELAYS)
+        unit = case.loop.samples * case.sample_time
+        yield from (samples * unit for samples in (_DELAYS[1::2] if sparse else _DELAYS))
     else:
         # Down to a quarter: what is stable by itself stands that, and what is not fails sooner.
-        yield from _COARSE_GAINS[:4] if case.what == "gain_down" else _COARSE_GAINS if coarse else _GAINS
+        yield from _COARSE_GAINS[:4] if case.what == "gain_down" else _COARSE_GAINS if coarse or sparse else _GAINS
 
 
 def _bisected(case: _Case, calm: float, loud: float, floor: float) -> float:
@@ -175,7 +244,7 @@ class _Case:
     axes: str
     what: str
     amplitude: float
-    posture: tuple[float, float]
+    posture: tuple[float, ...]
 
     @property
     def sample_time(self) -> float:
@@ -183,43 +252,49 @@ class _Case:
         return self.loop.controller.sample_time
 
     def floor(self) -> float:
-        """Return what the loop does at gain 1 and without delay, peak to peak at the end [rad]."""
+        """Return what the loop does at gain 1 and without delay, peak to peak at the end [rad]; inf: nothing."""
         return self._windows(1.0, 0.0)[1]
 
     def oscillates(self, value: float, floor: float) -> bool:
         """Return whether the loop goes on moving at a gain, its reciprocal, or a delay [s]."""
         gain = {"gain_up": value, "gain_down": 1.0 / value, "delay": 1.0}[self.what]
         before, last = self._windows(gain, value / self.sample_time if self.what == "delay" else 0.0)
-        return last >= _KEEPS * before and last > max(_HEARD * self.amplitude, _ABOVE_FLOOR * floor)
+        sustained = last >= _KEEPS * before or last >= _FED * self.amplitude
+        heard = (_HEARD_QUIET if self.what == "gain_down" else _HEARD) * self.amplitude
+        return sustained and last > max(heard, _ABOVE_FLOOR * floor)
 
     def _windows(self, gain: float, delay: float) -> tuple[float, float]:
-        """Return the largest motion, peak to peak [rad], in the last window but one and in the last."""
+        """Return the largest motion to and fro [rad] in the last window but one and in the last."""
         try:
             result = self._run(gain, delay)
         except DataError:  # numbers overflowed
             return 0.0, math.inf
-        rows = round(_WINDOW / result.sample_time)
-        angles = np.stack([result["pitch"], result["roll"]])
+        rows = round(_WINDOW * self.loop.time / result.sample_time)
+        angles = np.stack([result[name] for name in self.loop.outputs])
+        kicked = angles[:, result.time >= self.loop.time * _REST]
+        if (gain, delay) == (1.0, 0.0) and np.ptp(kicked, axis=1).max() <= _ANSWERS * self.amplitude:
+            return 0.0, math.inf  # motors that stand at their ends, for one: nothing can be said of this loop
         parts = angles[:, -2 * rows : -rows], angles[:, -rows:]
-        before, last = (float(np.ptp(part, axis=1).max()) for part in parts)
+        before, last = (max(_swing(angle, _FED * self.amplitude) for angle in part) for part in parts)
         return before, last
 
     def _run(self, gain: float, delay: float) -> LoopResult:
-        chosen = [self.axes in (axis, "both") for axis in ("pitch", "roll")]
-        parameters = {f"gain_{axis}": gain if on else 1.0 for axis, on in zip(("pitch", "roll"), chosen, strict=True)}
-        parameters |= {
-            f"delay_{axis}": delay if on else 0.0 for axis, on in zip(("pitch", "roll"), chosen, strict=True)
-        }
-        block, connections = louder(self.loop.controller, self.loop.observer)
+        loop = self.loop
+        chosen = [self.axes in (axis, _TOGETHER) for axis in loop.outputs]
+        parameters = {f"gain_{axis}": gain if on else 1.0 for axis, on in zip(loop.outputs, chosen, strict=True)}
+        parameters |= {f"delay_{axis}": delay if on else 0.0 for axis, on in zip(loop.outputs, chosen, strict=True)}
+        block, connections = louder(loop.controller, loop.observer, loop.outputs, loop.samples)
         # Towards upright: no neck is led further than its posture.
         kick = np.array([-self.amplitude if p > 0.0 else self.amplitude for p in self.posture]) * chosen
-        loop = self.loop
+        posture = tuple(float(a + b) for a, b in zip(loop.middle, self.posture, strict=True))
+        middle = float(middle_motors(loop.robot, loop.controller).mean())
         return run_loop(
             Loop(
                 plant=loop.plant(), controller=BlockPart(loop.controller),
                 observer=None if loop.observer is None else BlockPart(loop.observer),
-                reference=_Kicked(self.posture, (float(kick[0]), float(kick[1]))),
-                duration=_REST + _FORGOTTEN + 2.0 * _WINDOW, order=loop.order, plant_inputs=dict(loop.inputs or {}),
+                reference=_Kicked(posture, tuple(float(v) for v in kick), loop.time, middle), robot=loop.robot,
+                duration=loop.time * (_REST + _FORGOTTEN + 2.0 * _WINDOW), order=loop.order,
+                plant_inputs=dict(loop.inputs or {}),
                 others={"louder": BlockPart(block)}, other_parameters={"louder": parameters}, connections=connections,
                 # A rate has no reference: it is wanted to be zero.
                 other_inputs={"louder": {p.name: 0.0 for p in block.inputs if p.name.endswith("_wanted")}},
@@ -228,28 +303,48 @@ class _Case:
         )  # fmt: skip
 
 
+def _swing(angle: Vector, away: float) -> float:
+    """Return how far an angle (time,) goes to and fro; peak to peak where that is `away`.
+
+    A quiet loop may creep, or stick and come late: what goes one way is no oscillation, unless it runs away.
+    """
+    far = float(np.ptp(angle))
+    rise = float((angle - np.minimum.accumulate(angle)).max())
+    fall = float((np.maximum.accumulate(angle) - angle).max())
+    return far if far >= away else min(rise, fall)
+
+
 @dataclass(frozen=True, slots=True)
 class _Kicked:
     """A posture that is reached smoothly, and a step away from it."""
 
-    posture: tuple[float, float]
-    kick: tuple[float, float]
+    posture: tuple[float, ...]
+    kick: tuple[float, ...]
+    slower: float = 1.0
+    together: float = 0.0
 
     def __call__(self, time: float) -> tuple[float, ...]:
-        led = 0.5 - 0.5 * math.cos(math.pi * min(1.0, time / _LED))
-        on = float(time >= _REST)
-        return led * self.posture[0] + on * self.kick[0], led * self.posture[1] + on * self.kick[1], 0.0
+        led = 0.5 - 0.5 * math.cos(math.pi * min(1.0, time / (self.slower * _LED)))
+        on = float(time >= self.slower * _REST)
+        return *(
+            led * there + on * away for there, away in zip(self.posture, self.kick, strict=True)
+        ), led * self.together
 
 
-def louder(controller: Block, observer: Block | None) -> tuple[Block, dict[str, str]]:
+def louder(
+    controller: Block, observer: Block | None, outputs: tuple[str, ...] = _NECK.outputs.names, samples: int = 1
+) -> tuple[Block, dict[str, str]]:
     """Return what makes a loop louder or later, and its connections: it stands behind the sensor.
 
     Args:
         controller: sees the observer's angles, or without one those of the sensor.
         observer: sees the sensor.
+        outputs: that are measured.
+        samples: by how much longer its delays are than a neck's.
     """
     reader, role = (controller, "controller") if observer is None else (observer, "observer")
-    names = [f"{axis}{what}" for what in ("", "_rate") for axis in ("pitch", "roll")]
+    kept = (_KEPT - 2) * samples + 2
+    names = [f"{axis}{what}" for what in ("", "_rate") for axis in outputs]
     seen = {name: name if observer is None else f"{name}_measured" for name in names}
     ports = {port.name: port for port in reader.inputs}
     read = [name for name in names if seen[name] in ports]
@@ -259,17 +354,17 @@ def louder(controller: Block, observer: Block | None) -> tuple[Block, dict[str, 
         for name, gone in zip(read, missing, strict=True)
     ]
     references = [
-        Port(name=f"{name}_reference", unit="rad") if name in ("pitch", "roll") else Port(name=f"{name}_wanted")
+        Port(name=f"{name}_reference", unit=ports[seen[name]].unit) if name in outputs else Port(name=f"{name}_wanted")
         for name in read
     ]
     block = Block(
         kind="louder", role="filter", runtime=_RUNTIME, sample_time=controller.sample_time,
-        arrays=(np.array([float(name.startswith("roll")) for name in read]), np.array([float(_KEPT)])),  # pyright: ignore[reportArgumentType]
+        arrays=(np.array([float(outputs.index(name.removesuffix("_rate"))) for name in read]), np.array([float(kept)])),  # pyright: ignore[reportArgumentType]
         inputs=(*inputs, *references),
         outputs=tuple(replace(port, name=f"{port.name}_seen") for port in inputs),
         parameters=(
-            *(Port(name=f"gain_{axis}", start=1.0, minimum=0.0) for axis in ("pitch", "roll")),
-            *(Port(name=f"delay_{axis}", minimum=0.0, maximum=_KEPT - 2.0) for axis in ("pitch", "roll")),
+            *(Port(name=f"gain_{axis}", start=1.0, minimum=0.0) for axis in outputs),
+            *(Port(name=f"delay_{axis}", minimum=0.0, maximum=kept - 2.0) for axis in outputs),
         ),
     )  # fmt: skip
     connections = {f"{role}.{seen[name]}": f"louder.{name}_measured_seen" for name in read}
@@ -284,10 +379,12 @@ def louder(controller: Block, observer: Block | None) -> tuple[Block, dict[str, 
 
 def crossing_facts(item: Crossing) -> dict[str, Any]:
     """Return a crossing as JSON values."""
+    unit, factor = shown_unit(item.robot)
+    per = math.radians(1.0) if factor is None else factor
     return {
         "kind": "experiment", "name": item.plant, "axis": item.axes, "raised": item.what,
-        "kick_deg": math.degrees(item.amplitude), "posture_deg": [math.degrees(x) for x in item.posture],
-        "hunts_deg": math.degrees(item.hunts),
+        f"kick_{unit}": item.amplitude / per, f"posture_{unit}": [x / per for x in item.posture],
+        f"hunts_{unit}": item.hunts / per,
     }  # fmt: skip
 
 
@@ -295,7 +392,8 @@ def crossing_values(found: Sequence[Crossing]) -> dict[str, tuple[Vector, list[C
     """Return metric -> values and the crossings behind them: gain margins, and delay margins [ms]."""
     table: dict[str, tuple[Vector, list[Crossing]]] = {}
     for name, kinds, factor in (("gain_margin", ("gain_up", "gain_down"), 1.0), ("delay_margin_ms", ("delay",), 1e3)):
-        for group, axes in (("pitch", ("pitch",)), ("roll", ("roll",)), ("axes", ("pitch", "roll", "both"))):
+        names = found[0].robot.outputs.names if found else ()
+        for group, axes in (*((axis, (axis,)) for axis in names), ("axes", (*names, _TOGETHER))):
             chosen = [item for item in found if item.what in kinds and item.axes in axes]
             if chosen:
                 table[f"{group}.{name}"] = (factor * np.array([item.value for item in chosen]), chosen)

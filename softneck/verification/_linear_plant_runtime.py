@@ -20,6 +20,7 @@ class LinearPlantArrays(Arrays):
     delay = array("axes", "samples beyond the first until an input acts")
     mixed = array("axes, axes", "ones, and what of the other axes' inputs is added to an axis' own")
     T = array("references, motors", "of Eq. 9-11: motors to redefined inputs")
+    around = array("axes", "outputs around which the plant is linear")
     line = value("delay", function=linear_plant_line)
 
 
@@ -32,13 +33,15 @@ class LinearPlantState(StateVector):
 
 
 def initialise(p: LinearPlantArrays, parameters: np.ndarray, x: LinearPlantState, outputs: np.ndarray) -> None:
-    """Rest: motors and angles at zero."""
+    """Rest: motors at zero, outputs where the plant is linear."""
     x[:] = 0.0
     random_seed(x.random, parameters[1])
     outputs[:] = 0.0
-    if parameters[0] > 0.0:
-        for axis in range(p.axes):
-            outputs[p.axes + axis] = parameters[0] * random_normal(x.random)
+    for axis in range(p.axes):
+        outputs[axis] = p.around[axis]
+        outputs[p.axes + axis] = p.around[axis]
+        if parameters[0] > 0.0:
+            outputs[p.axes + axis] += parameters[0] * random_normal(x.random)
 
 
 def step(
@@ -61,8 +64,8 @@ def step(
                 total += p.mixed[axis, other] * tilt[other]
         held[0] = total + inputs[p.motors + axis]
         axis_advance(own, p.numerator[axis], p.denominator[axis], held[int(p.delay[axis])])
-        outputs[axis] = own[0]
-        outputs[p.axes + axis] = own[0]
+        outputs[axis] = p.around[axis] + own[0]
+        outputs[p.axes + axis] = outputs[axis]
         if parameters[0] > 0.0:
             outputs[p.axes + axis] += parameters[0] * random_normal(x.random)
     # No drives between: set-points are reached at once.

@@ -20,8 +20,8 @@ from softneck.runtime import Block
 from ._own_plants import OwnPlant, own_plant
 from ._requirements import Requirements, metric_ends
 
-# When the step comes [s]: after the controller took over the motors.
-STEP_AT = 0.5
+# When the step comes [s]: after the controller took over the motors, or has pulled tendons taut.
+_STEP_AT, _TAUT_AT = 0.5, 3.0
 _AXIS = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg")
 _MOTORS = ("max_rad", "limit_violation_s", "slack_s")
 # An axis that moves less than this part of the step is not judged as stepped.
@@ -83,6 +83,12 @@ def neck_file_of(robot: Robot, asked: Requirements) -> Path:
 def direction(orientation: float, robot: Robot) -> tuple[float, ...]:
     """Return the share of each output in a step of an orientation [rad]."""
     return (math.cos(orientation), math.sin(orientation))[: len(robot.outputs.names)]
+
+
+def step_at(controller: Block) -> float:
+    """Return when the step comes [s]."""
+    pulls = any(port.name == "least_cocontraction" and (port.start or 0.0) > 0.0 for port in controller.parameters)
+    return _TAUT_AT if pulls else _STEP_AT
 
 
 def run_necks(
@@ -153,18 +159,18 @@ def _loop(
     observer: Block | None,
     seed: int,
 ) -> Loop:
-    size, robot = asked.si(float(asked.neck["size_deg"])), asked.robot
+    size, robot, at = asked.si(float(asked.neck["size_deg"])), asked.robot, step_at(controller)
     ends = tuple(size * share for share in direction(orientation, robot))
     reference = (
-        StepReference(pitch=ends[0], roll=ends[1], at=STEP_AT) if robot.is_neck
-        else RobotReference(kind="step", values=ends, at=STEP_AT)
+        StepReference(pitch=ends[0], roll=ends[1], at=at) if robot.is_neck
+        else RobotReference(kind="step", values=ends, at=at)
     )  # fmt: skip
     return Loop(
         plant=plant.make(seed, controller.sample_time),
         controller=BlockPart(controller),
         observer=None if observer is None else BlockPart(observer),
         reference=reference,
-        duration=STEP_AT + float(asked.neck["duration_s"]),
+        duration=at + float(asked.neck["duration_s"]),
         order=order,
         robot=robot,
         plant_inputs={"payload": payload} if plant.payload else {},

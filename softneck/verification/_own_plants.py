@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, cast
+
+import numpy as np
 
 from softneck.core import SettingsError, SoftneckError
 from softneck.estimation._axis import robot_of
 from softneck.loop import BlockPart, Part
 from softneck.plant import NeckParameters, VirtualNeck
+from softneck.robot import Robot
 from softneck.runtime import Block
+
+from ._steps import Steps
+
+# Set by hand [rad]: pretension changes by some 3 % of itself.
+_SAME = 0.1
+# Of `scheduled` and `adaptive` on foreign necks such margins were up to four times the true ones.
+ALONE = (
+    "not supported by the data: found by experiment on models alone; a controller without linear form (`ss()`) is not "
+    "held against the weight over the recordings"
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -24,6 +37,7 @@ class OwnPlant:
         quiet: as `make`, without noise where the plant knows how.
         payload: whether it takes one.
         parameters: of a virtual neck; None of another plant.
+        conditions: payload and co-contraction that a model was trained at; nothing where it does not say.
     """
 
     name: str
@@ -31,6 +45,7 @@ class OwnPlant:
     quiet: Callable[[float], Part]
     payload: bool
     parameters: NeckParameters | None = None
+    conditions: Mapping[str, list[float]] = field(default_factory=dict)
 
 
 def is_own_plant(thing: Any) -> bool:
@@ -47,11 +62,11 @@ def is_own_plant(thing: Any) -> bool:
     return False
 
 
-def own_plant(thing: Any, name: str) -> OwnPlant:
+def own_plant(thing: Any, name: str, robot: Robot | None = None) -> OwnPlant:
     """Return a neck's parameters, a nonlinear model, a block, or a function that returns a part, as a plant.
 
     Raises:
-        SettingsError: no plant, or one that does not show pitch and roll.
+        SettingsError: no plant, or one that does not show pitch and roll, or another robot's outputs.
     """
     if isinstance(thing, NeckParameters | VirtualNeck):
         neck = thing if isinstance(thing, VirtualNeck) else VirtualNeck(thing)
@@ -69,7 +84,56 @@ def own_plant(thing: Any, name: str) -> OwnPlant:
     part = make()
     names = [port.name for port in part.outputs]
     part.close()
-    if part.role != "plant" or "pitch" not in names or "roll" not in names:
-        raise SettingsError(f"{name}: is no plant with the outputs pitch and roll (it has {', '.join(names)}).")
+    outputs = (robot or Robot.preset()).outputs.names
+    if part.role != "plant" or not set(outputs) <= set(names):
+        raise SettingsError(
+            f"{name}: is no plant with the outputs {' and '.join(outputs)} (it has {', '.join(names)})."
+        )
     payload = any(port.name == "payload" for port in part.inputs)
-    return OwnPlant(name=name, make=lambda _seed, _Ts: make(), quiet=lambda _Ts: make(), payload=payload)
+    known = getattr(thing, "findings", {}).get("conditions", {})
+    return OwnPlant(
+        name=name, make=lambda _seed, _Ts: make(), quiet=lambda _Ts: make(), payload=payload, conditions=known
+    )  # fmt: skip
+
+
+def not_recorded(tested: Mapping[str, Any], own: Sequence[OwnPlant], steps: Steps) -> dict[str, str]:
+    """Return why nothing is known of the "loop" and of plants that step, "neck"; nothing where all was recorded.
+
+    Args:
+        tested: by the names of families, what each says of its recordings.
+        own: plants that step.
+        steps: which show where the loop holds the motors.
+    """
+    half = steps.motors.shape[2] // 2
+    # Of most plants: where motors reach their limits their mean is another.
+    held = float(np.median(steps.motors[:, :, half - 1].mean(axis=-1)))
+    found: dict[str, str] = {}
+    for name, item in tested.items():
+        made = item.get("conditions", [])
+        for kg in sorted({value for part in made for value in part["payload_kg"]}):
+            if not any(_carries(plant, kg, held) for plant in own):
+                found["neck"] = (
+                    f"not supported by the data: {name} was recorded with {kg:g} kg, and no plant that steps carries "
+                    f"that at a co-contraction of {held:.2g} rad; `softneck identify greybox` a recording that does, "
+                    "or `softneck calibrate` with its --payload"
+                )
+            at = [end for part in made if _within(kg, part["payload_kg"]) for end in part["cocontraction"]]
+            if not _within(held, at, _SAME):
+                found["loop"] = (
+                    f"not supported by the data: the loop holds its motors at a co-contraction of {held:.2g} rad, and "
+                    f"with {kg:g} kg {name} was recorded at {min(at):.2g} to {max(at):.2g} rad; design with such a "
+                    "`least_cocontraction`, or record around the loop's (`softneck record --cocontraction`)"
+                )
+    return found
+
+
+def _carries(plant: OwnPlant, kg: float, held: float) -> bool:
+    """Return whether a plant takes any payload, or was made from recordings with this one and where the loop is."""
+    known = plant.conditions
+    return plant.payload or (
+        _within(kg, known.get("payload_kg", [0.0])) and _within(held, known.get("cocontraction", [held]), _SAME)
+    )
+
+
+def _within(value: float, ends: Sequence[float], more: float = 0.0) -> bool:
+    return min(ends) - more <= value <= max(ends) + more

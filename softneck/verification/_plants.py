@@ -20,40 +20,12 @@ from softneck.estimation._axis import directions_of, robot_of
 from softneck.robot import Robot
 from softneck.robot._redefined import redefinition_of
 
+from ._axis_box import AxisBox, sampled, within_weight
+
 QUANTITIES = ("static gain", "pole", "dead time")
 # A pole that does not count: so fast [1/s] that a sample is over before it shows.
 _NO_POLE = 1e4
 _ROUNDING = 1e-6
-
-
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class AxisBox:
-    """What one axis may be; numbers are static gain [rad/rad], pole [1/s], dead time [s].
-
-    Attributes:
-        nominal: (3,).
-        low, high: (3,).
-        samples: (n, 3) plants that were identified; none for a model.
-        std: (n, 3) their standard deviations; None where nobody knows.
-        rest: numerator and denominator (r + 1,) each, highest power first, of dynamics that are certain.
-    """
-
-    nominal: Vector
-    low: Vector
-    high: Vector
-    samples: Matrix
-    std: Matrix | None = None
-    rest: tuple[Vector, Vector] = field(default_factory=lambda: (np.ones(1), np.ones(1)))
-
-    @property
-    def widths(self) -> Vector:
-        """Half the width of the box (3,), 0 where it is certain."""
-        return 0.5 * (self.high - self.low)
-
-    @property
-    def middle(self) -> Vector:
-        """(3,) of the box."""
-        return 0.5 * (self.high + self.low)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -150,6 +122,7 @@ def neck_of_family(family: Any, name: str) -> UncertainNeck:
             AxisBox(
                 nominal=found.nominal.copy(), low=np.minimum(low, found.nominal), high=np.maximum(high, found.nominal),
                 samples=found.samples[used], std=found.std[used][:, :3],
+                measured=getattr(family, "measured", {}).get(axis),
             )
         )  # fmt: skip
     own = np.array([family.axes[axis].nominal[0] for axis in names])
@@ -242,9 +215,10 @@ def _cross_gains(model: Any, plants: list[AxisPlant], weights: Matrix) -> Vector
 
 
 def make_plants(neck: UncertainNeck, numbers: np.ndarray, names: list[str], *, source: int = 0) -> Plants:
-    """Return plants of `neck` with `numbers` (n, axes, 3), sampled exactly."""
+    """Return plants of `neck` with `numbers` (n, axes, 3), sampled exactly; of a tested family within its weight."""
     Ts = neck.sample_time
-    parts = [_sampled(numbers[:, i], box.rest, Ts) for i, box in enumerate(neck.axes)]
+    numbers = np.stack([within_weight(numbers[:, i], box, Ts) for i, box in enumerate(neck.axes)], axis=1)
+    parts = [sampled(numbers[:, i], box.rest, Ts) for i, box in enumerate(neck.axes)]
     q = max(part[0].shape[1] for part in parts)
     padded = [[np.pad(p, ((0, 0), (0, q - p.shape[1]))) for p in part[:2]] for part in parts]
     # Zeros behind both polynomials of an axis are poles and zeros at 0 that cancel.
@@ -257,24 +231,22 @@ def make_plants(neck: UncertainNeck, numbers: np.ndarray, names: list[str], *, s
     )  # fmt: skip
 
 
-def _sampled(numbers: Matrix, rest: tuple[Vector, Vector], Ts: float) -> tuple[Matrix, Matrix, np.ndarray]:
-    """Return numerator and denominator (n, q) and delay (n,) of one axis: y+ = a y + b0 u(k-d) + b1 u(k-d-1)."""
-    K, p, L = numbers.T
-    # 1e-9: dead times such as 0.08 / 0.02 are whole but for rounding.
-    d = np.floor(L / Ts + 1e-9)
-    part = np.clip(L / Ts - d, 0.0, 1.0)
-    a = np.exp(-p * Ts)
-    late = np.exp(-p * Ts * (1.0 - part))
-    first = np.stack([K * (1.0 - late), K * (late - a)], axis=1)
-    own = np.stack([np.ones_like(a), -a], axis=1)
-    above = _products(first, rest[0])
-    below = _products(own, np.append(rest[1], 0.0))
-    above = np.pad(above, ((0, 0), (below.shape[1] - above.shape[1], 0)))
-    return above, below, d.astype(int)
-
-
-def _products(rows: Matrix, polynomial: Vector) -> Matrix:
-    return np.stack([np.convolve(row, polynomial) for row in rows])
+def measured_plant(neck: UncertainNeck, source: int) -> Plants | None:
+    """Return the plant in the middle of what the recordings show, of one to three poles; None where none was tested."""
+    models = [box.measured.model for box in neck.axes if box.measured is not None]
+    if len(models) < len(neck.axes):
+        return None
+    parts = [model.sampled(neck.sample_time) for model in models]
+    # As `response_of` reads them: b/(z A) behind the whole samples.
+    above, below = (
+        np.array([np.pad(row, (0, 5 - row.size)) for row in rows])
+        for rows in ([np.append(0.0, b) for _, b, _ in parts], [np.append(1.0, a) for a, _, _ in parts])
+    )
+    numbers = [[m.b[0] / m.a[-1], -np.roots(np.append(1.0, m.a)).real.max(), m.delay] for m in models]
+    return Plants(
+        neck.sample_time, np.array([numbers]), neck.cross[None], (f"{neck.name}: middle of its recordings",),
+        np.array([source]), above[None], below[None], np.array([[d for _, _, d in parts]]), neck.names,
+    )  # fmt: skip
 
 
 def nominal_plants(necks: list[UncertainNeck]) -> list[Plants]:
@@ -321,7 +293,8 @@ def _of_neck(neck: UncertainNeck, count: int, seed: int, source: int) -> Plants:
         low, high = (np.stack([getattr(box, end) for box in neck.axes]) for end in ("low", "high"))
         numbers += list(low + drawn * (high - low))
         names += [f"{neck.name}: inside {k}" for k in range(inside)]
-    return make_plants(neck, np.array(numbers), names, source=source)
+    made, middle = make_plants(neck, np.array(numbers), names, source=source), measured_plant(neck, source)
+    return made if middle is None else join([made, middle])
 
 
 def _corner(box: AxisBox, signs: Vector) -> Vector:

@@ -77,7 +77,10 @@ _POSSIBLE = {"sensitivity": (1.0, math.inf), "disk_margin": (0.0, 2.0), "gain_ma
 _BOUNDS = ("min", "max", "below")
 # Number -> least, largest, unit.
 _NUMBERS: dict[str, dict[str, tuple[float, float, str]]] = {
-    "uncertainty": {"gain_pct": (0.0, 95.0, "%"), "pole_pct": (0.0, 95.0, "%"), "delay_ms": (0.0, 1000.0, "ms")},
+    "uncertainty": {
+        "gain_pct": (0.0, 95.0, "%"), "pole_pct": (0.0, 95.0, "%"), "delay_ms": (0.0, 1000.0, "ms"),
+        "rolloff_db_per_decade": (-1.0, 200.0, "dB"),
+    },
     "sampling": {"plants": (1, 100_000, ""), "search_generations": (0, 10_000, ""), "seed": (0, 2**31 - 2, "")},
     "step": {
         "size_deg": (0.01, 45.0, "deg"), "duration_s": (0.2, 600.0, "s"), "noise_deg": (0.0, 10.0, "deg"),

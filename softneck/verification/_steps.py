@@ -97,8 +97,8 @@ def run_steps(
     T = redefinition_matrix(np.asarray(TENDON_ANGLES))
     if weights is not None:
         T = redefinition_of(weights, whose.outputs.names)[0]
-    m, around = len(plants.axes), _middle(whose)
-    before = T @ _middle_motors(whose, block)
+    m, around = len(plants.axes), middle_of(whose)
+    before = T @ middle_motors(whose, block)
     Ts = plants.sample_time
     half = round(test.duration / Ts)
     rows = 2 * half
@@ -132,7 +132,7 @@ def run_steps(
     )
 
 
-def _middle(robot: Robot) -> Vector:
+def middle_of(robot: Robot) -> Vector:
     """Return around which outputs steps are made: no reference goes where the robot's outputs may not."""
     low, high = robot.outputs.min, robot.outputs.max
     if low is None or high is None:
@@ -140,7 +140,7 @@ def _middle(robot: Robot) -> Vector:
     return 0.5 * to_si(robot.outputs.unit)[0] * (np.array(low) + np.array(high))
 
 
-def _middle_motors(robot: Robot, block: Block) -> Vector:
+def middle_motors(robot: Robot, block: Block) -> Vector:
     """Return around which set-points (motors,) steps are made: from one end of their range motors go only one way."""
     limits = {port.name: port.start for port in block.parameters}
     ranges = None if robot.is_neck else motor_ranges(robot, limits.get("position_limit"))

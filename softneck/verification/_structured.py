@@ -4,6 +4,9 @@ Behind a zero-order hold an axis without its dead time is `y0+ = y0 + alpha (K u
 and pole enter once each, as real scalars, exactly. The dead time is a complex scalar whose weight is the largest
 relative change that a dead time of the box makes to any plant of the box. So the loop is `z = M w`, `w = Delta z` with
 two real and one complex scalar for an axis, and `mu < 1` at every frequency proves stability of the whole box.
+
+Of a family that was tested against its recordings it is `y = (1 + W Delta) G0 u` instead: one complex scalar for an
+axis, with the weight that covers what they show, in the band that they excite.
 """
 
 from __future__ import annotations
@@ -19,9 +22,10 @@ import numpy as np
 from softneck.core import Vector
 from softneck.design.robust._mu import Structure, mu_lower, mu_upper
 from softneck.design.robust._robustness import worst_gains
+from softneck.identification.uncertainty._measured import response_of
 
 from ._linear import LinearLaw, radii
-from ._plants import UncertainNeck, make_plants, mixing
+from ._plants import UncertainNeck, make_plants, measured_plant, mixing
 from ._search import axes_together, together
 
 # Dead times and poles of a box that its weight is taken over.
@@ -74,9 +78,11 @@ def structured(
         performance: whether the worst sensitivity is bounded too.
     """
     Ts = neck.sample_time
-    w = np.geomspace(0.05, math.pi / Ts, _FREQUENCIES)
     results = []
     for axes in axes_together(neck, law):
+        bands = [box.measured.band for box in (neck.axes[i] for i in axes) if box.measured is not None]
+        low, high = [max(ends) for ends in zip(*((a, -b) for a, b in bands), (0.05, -math.pi / Ts), strict=True)]
+        w = np.geomspace(low, -high, _FREQUENCIES)
         M, blocks = interconnection(neck, law, w, axes, extra)
         sampled, scale = _sampled(neck, law, axes, extra, drawn)
         name = together(neck, axes)
@@ -88,7 +94,7 @@ def structured(
         upper, lower = _bounds(M, blocks)
         sensitivity = math.nan
         if performance:
-            at = np.geomspace(0.3, math.pi / Ts, _PERFORMANCE_FREQUENCIES)
+            at = np.geomspace(max(0.3, low), -high, _PERFORMANCE_FREQUENCIES)
             sensitivity = max(_worst_sensitivity(neck, law, at, axes, extra))
         results.append(StructuredResult(name, w, upper, lower, sampled, scale, sensitivity))
     return results
@@ -96,6 +102,9 @@ def structured(
 
 def _middle_is_stable(neck: UncertainNeck, law: LinearLaw, axes: Sequence[int], extra: int) -> bool:
     """Return whether the loop around which the box is modelled is stable; an axis that is not judged is nominal."""
+    measured = measured_plant(neck, 0)
+    if measured is not None:
+        return bool(radii(measured.later(extra), law)[0] < 1.0)
     numbers = np.stack([box.nominal for box in neck.axes])
     for i in axes:
         box, Ts = neck.axes[i], neck.sample_time
@@ -148,13 +157,18 @@ def interconnection(
 
 def _uncertain(neck: UncertainNeck, axis: int, start: int) -> list[int]:
     """Return which of gain and pole of an axis are uncertain, and its dead time, which always is a little."""
-    widths = neck.axes[axis].widths
+    widths = neck.axes[axis].widths if neck.axes[axis].measured is None else np.zeros(3)
     return [start + k for k in range(3) if widths[k] > 0.0 or k == 2]
 
 
 def _axis(box: Any, w: Vector, Ts: float, extra: int) -> tuple[np.ndarray, ...]:
     """Return P (m,), H (m, 3), F (m, 3), E (m, 3, 3) of one axis around the middle of its box."""
     z = np.exp(1j * w * Ts)
+    if box.measured is not None:
+        P, W = response_of(box.measured.model, w, Ts) * z**-extra, box.measured.weight_at(w)
+        none = np.zeros((w.size, 3, 3), dtype=complex)
+        own = np.array([0.0, 0.0, 1.0])
+        return P, W[:, None] * own, P[:, None] * own, none
     K, _, L = box.middle
     rK = box.widths[0]
     ends = 1.0 - np.exp(-np.array([box.low[1], box.high[1]]) * Ts)

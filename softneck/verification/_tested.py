@@ -2,14 +2,15 @@
 
 At each frequency the loop is any point of a disk, `L = L0 (1 + W D)`, `|D| <= 1`; margins are those of the worst point,
 in closed form. Above the band nothing is known: a gain that moves the crossover of the worst loop there is not
-certified, and a loop that crosses there has no margin that the data support.
+certified, and a loop that crosses there has no margin that the data support. Where the user states how the plant falls
+above, its size is known there and its phase is not: a loop that may reach 1 there has no margin either.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from softneck.identification.uncertainty._measured import AxisMeasured, response
 
 from ._linear import LinearLaw
 
-_POINTS = 2000
+_POINTS, _ABOVE = 2000, 400
 # What is certified on the data; the others of an axis are of the box and its samples alone.
 TESTED = ("sensitivity", "complementary", "disk_margin", "gain_margin", "phase_margin_deg", "delay_margin_ms")
 
@@ -36,6 +37,7 @@ class TestedAxis:
         margins: name -> value; empty where the crossover is above the band.
         mu: the largest `|W T|`; below 1 all responses within the weight are stable.
         at: name -> frequency at which that is found [rad/s].
+        unheard: recordings of the family that move the axis and show no response of it.
     """
 
     source: str
@@ -45,9 +47,16 @@ class TestedAxis:
     margins: Mapping[str, float]
     mu: float
     at: Mapping[str, float]
+    unheard: tuple[str, ...] = ()
 
     def why(self) -> str:
         """Return why nothing is certified, with what to do; "" where something is."""
+        if self.unheard:
+            return (
+                f"not supported by the data: {self.unheard[0]} moves {self.axis} and shows no response of it, so "
+                f"{self.source} knows nothing of what it holds (slack tendons, friction?); record that where it "
+                "answers, or leave it out of the family"
+            )
         if math.isfinite(self.crossover):
             return ""
         low, high = self.band
@@ -58,7 +67,7 @@ class TestedAxis:
 
 
 def axis_on_data(
-    measured: AxisMeasured, law: LinearLaw, axis: int, *, source: str, name: str, extra: int
+    measured: AxisMeasured, law: LinearLaw, axis: int, *, source: str, name: str, extra: int, rolloff: float = -1.0
 ) -> TestedAxis:
     """Return the margins of one axis that hold for every response within the weight.
 
@@ -69,6 +78,7 @@ def axis_on_data(
         source: name of the family.
         name: of the axis.
         extra: samples of delay that the loop's order adds.
+        rolloff: by which the loudest response at the band's end falls above it [dB/decade]; below 0 nobody knows.
     """
     Ts = law.sample_time
     w = np.geomspace(*measured.band, _POINTS)
@@ -76,20 +86,25 @@ def axis_on_data(
     L = -law.feedback(w)[:, axis, axis] * G0
     # Half the way to the next frequency on top: no point of the curve lies between two disks.
     way = 0.5 * np.abs(np.diff(L)) / np.minimum(np.abs(L[1:]), np.abs(L[:-1]))
-    W = np.interp(np.log(w), np.log(measured.frequency), measured.weight)
-    W = W + np.maximum(np.append(way, 0.0), np.append(0.0, way))
+    W = measured.weight_at(w) + np.maximum(np.append(way, 0.0), np.append(0.0, way))
     loud = (1.0 + W) * np.abs(L)
     above = np.flatnonzero(loud >= 1.0)
     crossover = float(w[above[-1]]) if above.size else float(w[0])
-    if loud[-1] >= 1.0:
+    above_band = _above(measured.band[1], (1.0 + W[-1]) * np.abs(G0[-1]), law, axis, rolloff)
+    if max(loud[-1], above_band) >= 1.0:
         crossover = math.inf
     mu = W * np.abs(L / (1.0 + L))
     values = _disk_margins(L, W, w)
     # The gain at which the loudest loop would cross where nothing is known.
-    values["gain_margin"] = np.minimum(values["gain_margin"], 1.0 / max(loud[-1], 1e-12))
+    values["gain_margin"] = np.minimum(values["gain_margin"], 1.0 / max(loud[-1], above_band, 1e-12))
     peaks = ("sensitivity", "complementary")
     places = {key: int(np.argmax(item) if key in peaks else np.argmin(item)) for key, item in values.items()}
     margins = {key: float(values[key][k]) for key, k in places.items()}
+    if above_band < 1.0:
+        # Of any phase: |S| is at most 1/(1 - l), |T| l/(1 - l), |S - T| (1 + l)/(1 - l).
+        margins["sensitivity"] = max(margins["sensitivity"], 1.0 / (1.0 - above_band))
+        margins["complementary"] = max(margins["complementary"], above_band / (1.0 - above_band))
+        margins["disk_margin"] = min(margins["disk_margin"], 2.0 * (1.0 - above_band) / (1.0 + above_band))
     if mu.max() >= 1.0:
         # The disk may hold the point -1: none of its margins is above none at all.
         margins |= dict.fromkeys(peaks, math.inf)
@@ -99,6 +114,14 @@ def axis_on_data(
         margins=margins if math.isfinite(crossover) else {}, mu=float(mu.max()),
         at={**{key: float(w[k]) for key, k in places.items()}, "mu": float(w[int(np.argmax(mu))])},
     )  # fmt: skip
+
+
+def _above(end: float, loudest: float, law: LinearLaw, axis: int, rolloff: float) -> float:
+    """Return the largest loop gain between the band's end [rad/s] and Nyquist that the stated roll-off leaves, or 0."""
+    if rolloff < 0.0 or end >= math.pi / law.sample_time:
+        return 0.0
+    w = np.geomspace(end, math.pi / law.sample_time, _ABOVE)
+    return float((np.abs(law.feedback(w)[:, axis, axis]) * loudest * (end / w) ** (rolloff / 20.0)).max())
 
 
 def _disk_margins(L: np.ndarray, W: Vector, w: Vector) -> dict[str, Vector]:
@@ -145,10 +168,15 @@ def _gain_ratio(L: np.ndarray, W: Vector) -> Vector:
     return np.minimum(*ratios)
 
 
-def tested_axes(families: Mapping[str, Any], law: LinearLaw, axes: tuple[str, ...], extra: int) -> list[TestedAxis]:
+def tested_axes(
+    families: Mapping[str, Any], law: LinearLaw, axes: tuple[str, ...], extra: int, rolloff: float
+) -> list[TestedAxis]:
     """Return what the data support about every axis of every family that was tested against them."""
     return [
-        axis_on_data(measured, law, axes.index(axis), source=name, name=axis, extra=extra)
+        replace(
+            axis_on_data(measured, law, axes.index(axis), source=name, name=axis, extra=extra, rolloff=rolloff),
+            unheard=tuple(family.findings.get("tested", {}).get("unheard", {}).get(axis, ())),
+        )
         for name, family in families.items()
         for axis, measured in getattr(family, "measured", {}).items()
         if axis in axes

@@ -14,6 +14,8 @@ import numpy as np
 from softneck.core import DataError, Progress, SettingsError, silent
 from softneck.core._certificate import certificate_contents
 from softneck.estimation._axis import robot_of
+from softneck.plant import NeckParameters, VirtualNeck
+from softneck.robot import Robot
 from softneck.signals.recording._recording import require_same_robot
 
 from ._agreement import Agreement, agreements
@@ -21,7 +23,7 @@ from ._evidence import Evidence, gather, worst_row
 from ._experiments import crossing_values
 from ._laws import ControllerUnderTest, judge
 from ._neck_loops import check_blocks
-from ._own_plants import is_own_plant, own_plant
+from ._own_plants import ALONE, is_own_plant, not_recorded, own_plant
 from ._plants import UncertainNeck, neck_of_family, neck_of_model
 from ._requirements import Requirement, Requirements, read_requirements
 from ._scale import scaled
@@ -187,13 +189,18 @@ class Verification:
                 }  # fmt: skip
                 files[number] = write_linear(
                     target, name, facts, controller=Path(controller), asked=self.requirements,
-                    weights=self.necks[0].weights, force=force,
+                    block=self.controller.block, weights=self.necks[0].weights, force=force,
                 )  # fmt: skip
             elif worst.get("kind") == "neck":
                 seen = None if observer is None else Path(observer)
                 files[number] = write_neck(target, name, worst, controller=Path(controller), observer=seen, force=force,
                                            robot=self.controller.robot)  # fmt: skip
         return files
+
+
+def _standing_for(thing: Any, robot: Robot) -> Any:
+    """Return a plant of one's own, a neck's physics as those of the robot that it stands for."""
+    return VirtualNeck.of(robot, thing) if isinstance(thing, NeckParameters) and not robot.is_neck else thing
 
 
 def sources_of(things: Mapping[str, Any], requirements: Requirements) -> list[UncertainNeck]:
@@ -247,11 +254,12 @@ def verify(
     begin = time.perf_counter()
     robot, named = robot_of(controller), _named(plants)
     for what, thing in (*named.items(), *(() if observer is None else (("observer", observer),))):
-        require_same_robot(robot_of(thing), robot, f"the controller and {what}")
+        # Physics and functions of one's own say nothing of a robot: their ports have to be its own.
+        if robot.is_neck or hasattr(thing, "robot") or not is_own_plant(thing):
+            require_same_robot(robot_of(thing), robot, f"the controller and {what}")
     asked = read_requirements(robot=robot) if requirements is None else requirements.of_robot(robot)
     own = {name: thing for name, thing in named.items() if is_own_plant(thing)}
-    if own:
-        robot.require_neck(f"a margin by experiment, on {next(iter(own))},")
+    own = {name: _standing_for(thing, robot) for name, thing in own.items()}
     linear = {name: thing for name, thing in named.items() if name not in own}
     if not robot.is_neck:
         asked = scaled(asked, sources_of(linear, asked))
@@ -266,12 +274,14 @@ def verify(
                 f"the controller has a sample time of {judged.block.sample_time:g} s, {neck.name} one of "
                 f"{neck.sample_time:g} s; design it on a model of its own sample time."
             )
-    evidence = gather(
-        judged, necks, asked, observer=eyes, progress=progress, families=linear,
-        own=[own_plant(thing, name) for name, thing in own.items()],
-    )  # fmt: skip
+    step = [own_plant(thing, name, robot) for name, thing in own.items()]
+    evidence = gather(judged, necks, asked, observer=eyes, progress=progress, families=linear, own=step)
+    tested = {name: thing.findings["tested"] for name, thing in linear.items() if getattr(thing, "measured", {})}
+    elsewhere = not_recorded(tested, step, evidence.steps) if robot.is_neck else {}
+    if tested and not judged.laws:
+        elsewhere["margins"] = ALONE
     return Verification(
-        verdicts=[_verdict(item, evidence) for item in asked.bounds],
+        verdicts=[_verdict(item, evidence, elsewhere) for item in asked.bounds],
         evidence=evidence,
         agreements=agreements(evidence, asked.scale[1]),
         controller=judged,
@@ -280,7 +290,7 @@ def verify(
         files=dict(files or {}),
         observer=observer is not None,
         wall_time=time.perf_counter() - begin,
-        tested={name: thing.findings["tested"] for name, thing in linear.items() if getattr(thing, "measured", {})},
+        tested=tested,
     )
 
 
@@ -291,7 +301,7 @@ def _named(plants: Any) -> dict[str, Any]:
     return {f"plant {k}" if len(items) > 1 else "plant": item for k, item in enumerate(items, start=1)}
 
 
-def _verdict(item: Requirement, evidence: Evidence) -> Verdict:
+def _verdict(item: Requirement, evidence: Evidence, elsewhere: Mapping[str, str]) -> Verdict:
     values = evidence.metrics.get(item.metric)
     if values is None:
         group = item.metric.partition(".")[0]
@@ -302,7 +312,7 @@ def _verdict(item: Requirement, evidence: Evidence) -> Verdict:
     row = worst_row(evidence.metrics, item.metric, item.bound)
     value = float(values.values[row])
     worst = plain(values.describe(row))
-    why = _unsupported(item, evidence)
+    why = unsupported(item, evidence, elsewhere)
     if why:
         return Verdict(item, value, False, worst, why)
     if item.metric.startswith("neck.") and evidence.foreign and not item.asked:
@@ -315,14 +325,18 @@ _FOREIGN = "foreign plant: a preset does not decide; give a plant of yours that 
 _LINEAR_GROUPS = ("stability", "axes", "mimo", "robust")
 
 
-def _unsupported(item: Requirement, evidence: Evidence) -> str:
-    """Return why the data do not support a linear requirement: the loop may cross above their band; else ""."""
-    group = item.metric.partition(".")[0]
+def unsupported(item: Requirement, evidence: Evidence, elsewhere: Mapping[str, str]) -> str:
+    """Return why the data do not support a requirement; else ""."""
+    group, _, name = item.metric.partition(".")
     axes = evidence.plants.axes
-    if group not in (*_LINEAR_GROUPS, *axes):
+    if group == "neck":
+        return "" if evidence.foreign else elsewhere.get("neck", "")
+    if group not in (*_LINEAR_GROUPS, "step", *axes):
         return ""
-    reasons = [part.why() for part in evidence.tested if group not in axes or part.axis == group]
-    return next((reason for reason in reasons if reason), "")
+    parts = [part for part in evidence.tested if group not in axes or part.axis == group]
+    reasons = [part.why() for part in parts if group != "step" or part.unheard]
+    alone = elsewhere.get("margins", "") if name in ("gain_margin", "delay_margin_ms") else ""
+    return next((reason for reason in (*reasons, alone, elsewhere.get("loop", "")) if reason), "")
 
 
 def validity(evidence: Evidence, tested: Mapping[str, Any]) -> dict[str, Any]:

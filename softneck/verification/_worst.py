@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import Matrix, SettingsError, atomic_write, to_si
+from softneck.core import Matrix, SettingsError, Vector, atomic_write, to_si
 from softneck.loop._result import shown_unit
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.robot import Robot
 from softneck.robot._redefined import redefinition_of
 from softneck.runtime import Block, Port
-from softneck.signals import TENDON_ANGLES, redefinition_matrix
+from softneck.signals import TENDON_ANGLES, Recording, redefinition_matrix, write_recording
 
 from ._plants import mixing
 from ._requirements import Requirements
+from ._steps import middle_motors, middle_of
 
 _RUNTIME = "softneck.verification._linear_plant_runtime"
 
@@ -53,9 +54,7 @@ parameters = {{ {parameters} }}
 file = {controller}
 
 [reference]
-kind = "step"
 {wanted}
-at_s = {at:g}
 """
 
 
@@ -68,6 +67,8 @@ def linear_plant(
     sample_time: float = 0.02,
     robot: Mapping[str, Any] | None = None,
     directions: ArrayLike | None = None,
+    inputs: ArrayLike = (),
+    outputs: ArrayLike = (),
 ) -> Block:
     """Return linear axes as a plant for loops, with noise on the measured angles and a load on each input.
 
@@ -80,6 +81,7 @@ def linear_plant(
         sample_time: [s].
         robot: the tables of another robot than the neck.
         directions: (outputs, motors) weights of its motors in each axis's input.
+        inputs, outputs: (outputs,) of each axis, around which the plant is linear; zero where not given.
 
     Raises:
         SettingsError: shapes that do not fit, a direct way from input to angle, a negative delay.
@@ -103,13 +105,20 @@ def linear_plant(
     motors = [
         Port(name=name, unit=motor, description=f"set-point of motor {j}") for j, name in enumerate(whose.set_points, 1)
     ]
-    loads = [Port(name=f"load_{axis}", unit=motor, description=f"added to the input of {axis}") for axis in names]
+    before, around = (
+        np.asarray(item, dtype=np.float64) if np.size(item) else np.zeros(m) for item in (inputs, outputs)
+    )
+    loads = [
+        Port(name=f"load_{axis}", unit=motor, start=-before[i], description=f"added to the input of {axis}")
+        for i, axis in enumerate(names)
+    ]
     angles = [Port(name=name, unit=unit) for name in (*names, *(f"{axis}_measured" for axis in names))]
     positions = [Port(name=name, unit=motor) for name in whose.motor_positions]
     return Block(
         kind="linear_plant", role="plant", runtime=_RUNTIME, sample_time=sample_time,
         arrays=(
             above, below, np.asarray(delay, dtype=np.float64), mixing(np.asarray(cross[: m * (m - 1)], float), m), T,
+            around,
         ),
         inputs=(*motors, *loads), outputs=(*angles, *positions),
         parameters=(
@@ -127,9 +136,11 @@ def virtual_neck() -> Block:
 
 def write_linear(
     folder: Path, name: str, worst: Mapping[str, Any], *, controller: Path, asked: Requirements,
-    weights: Matrix | None = None, force: bool
+    block: Block, weights: Matrix | None = None, force: bool
 ) -> Path:  # fmt: skip
     """Write `name.toml` and the plant beside it; return the loop file.
+
+    Where a robot's motors work around something else than zero, they are brought there first, as in the step test.
 
     Args:
         folder: where.
@@ -137,27 +148,40 @@ def write_linear(
         worst: name, numerator, denominator, delay, cross, sample_time and axis (0 pitch, 1 roll) of the plant.
         controller: its file.
         asked: the requirements.
+        block: the controller.
         weights: (outputs, motors) of another robot's directions.
         force: replace what stands there.
     """
     robot, step = asked.robot, asked.step
     axes, more = "pitch (from theta_i) and roll (phi_i)", ""
+    around, before = middle_of(robot), np.zeros(len(robot.outputs.names) + 1)
     if weights is not None:
         axes = f"{', '.join(robot.outputs.names)} from their inputs"
         more = f"\n        robot={robot.as_dict()!r},\n        directions={np.asarray(weights).tolist()!r},"
+        before = redefinition_of(np.asarray(weights), robot.outputs.names)[0] @ middle_motors(robot, block)
+        if before.any() or around.any():
+            more += f"\n        inputs={before[:-1].tolist()!r},\n        outputs={around.tolist()!r},"
     named = {**worst, "name": str(worst["name"]).replace("\\", "/").replace('"', "'")}
     text = _PLANT.format(**named, axes=axes, more=more)
     # Modules of one name are imported once: another plant needs another name.
     module = f"plant_{hashlib.sha256(text.encode()).hexdigest()[:10]}"
     _write(folder / f"{module}.py", text, force=True)
-    size = float(step["size_deg"])
-    angles = tuple(size if i == worst["axis"] else 0.0 for i in range(len(robot.outputs.names)))
+    Ts, duration = float(worst["sample_time"]), float(step["duration_s"])
+    stepped = around + asked.si(float(step["size_deg"])) * (np.arange(around.size) == worst["axis"])
+    if before.any():
+        rows = 2 * round(duration / Ts)  # until the step, as long as the step test gives them
+        duration += rows * Ts
+        levels = np.vstack([np.tile([*around, before[-1]], (rows, 1)), [*stepped, before[-1]]])
+        _write_reference(folder / f"{name}_reference.csv", robot, levels, Ts, force=force)
+        wanted = f'kind = "recording"\nfile = "{name}_reference.csv"'
+    else:
+        factor = shown_unit(robot)[1]
+        wanted = _step(robot, np.degrees(stepped) if factor is None else stepped / factor, 0.0)
     noise = f"noise_std = {asked.si(step['noise_deg'])!r}"
     text = _loop(
-        robot,
         folder, f"{name}.toml", title=f"{name} on {worst['name']}, with a step", plant=f'python = "{module}:plant"',
-        parameters=noise, controller=controller, observer=None, angles=angles, at=0.0,
-        duration=float(step["duration_s"]), sample_time=float(worst["sample_time"]), order="sequential",
+        parameters=noise, controller=controller, observer=None, wanted=wanted,
+        duration=duration, sample_time=Ts, order="sequential",
     )  # fmt: skip
     _write(folder / f"{name}.toml", text, force=force)
     return folder / f"{name}.toml"
@@ -170,29 +194,41 @@ def write_neck(
     """Write `name.toml`, a loop over the virtual neck; `worst` is what the certificate says of that run."""
     whose = Robot.preset() if robot is None else robot
     unit = shown_unit(whose)[0]
+    ends = [worst[f"{axis}_{unit}"] for axis in whose.outputs.names]
     values = {**worst["parameters"], "payload": worst["payload_kg"], "noise_seed": float(worst["seed"])}
     text = _loop(
-        whose, folder, f"{name}.toml", title=f"{name} on {worst['name']}", plant='neck = "paper"',
+        folder, f"{name}.toml", title=f"{name} on {worst['name']}", plant='neck = "paper"',
         parameters=", ".join(f"{key} = {float(value)!r}" for key, value in values.items()), controller=controller,
-        observer=observer, angles=tuple(worst[f"{axis}_{unit}"] for axis in whose.outputs.names), at=worst["at_s"],
+        observer=observer, wanted=_step(whose, ends, worst["at_s"]),
         duration=worst["duration_s"], sample_time=worst["sample_time_s"], order=worst["order"],
     )  # fmt: skip
     _write(folder / f"{name}.toml", text, force=force)
     return folder / f"{name}.toml"
 
 
-def _loop(
-    robot: Robot, folder: Path, name: str, *, title: str, controller: Path, observer: Path | None,
-    angles: tuple[float, ...], **values: Any,
-) -> str:  # fmt: skip
+def _step(robot: Robot, levels: Iterable[float], at: float) -> str:
+    """Return the keys of a step from zero to levels in the unit that people see."""
     unit = shown_unit(robot)[0]
+    wanted = [f"{axis}_{unit} = {float(level)!r}" for axis, level in zip(robot.outputs.names, levels, strict=True)]
+    return "\n".join(['kind = "step"', *wanted, f"at_s = {at:g}"])
+
+
+def _write_reference(path: Path, robot: Robot, levels: Matrix, sample_time: float, *, force: bool) -> None:
+    """Write (rows, outputs + 1) of all outputs and co-contraction as a recording; the last row is held to the end."""
+    time = np.arange(len(levels)) * sample_time
+    channels: dict[str, Vector] = dict.fromkeys(robot.set_points, np.zeros(len(levels)))
+    channels["cocontraction_reference"] = levels[:, -1]
+    for axis, name in enumerate(robot.outputs.names):
+        channels |= dict.fromkeys((name, f"{name}_reference"), levels[:, axis])
+    write_recording(path, Recording(time, sample_time, channels, robot=robot), force=force)
+
+
+def _loop(
+    folder: Path, name: str, *, title: str, controller: Path, observer: Path | None, **values: Any
+) -> str:  # fmt: skip
     seen = "" if observer is None else f"\n[observer]\nfile = {_quoted(observer, folder)}\n"
     return _LOOP.format(
-        name=name, title=title.replace("\n", " "), controller=_quoted(controller, folder), observer=seen,
-        wanted="\n".join(
-            f"{axis}_{unit} = {float(angle)!r}" for axis, angle in zip(robot.outputs.names, angles, strict=True)
-        ),
-        **values,
+        name=name, title=title.replace("\n", " "), controller=_quoted(controller, folder), observer=seen, **values
     )  # fmt: skip
 
 

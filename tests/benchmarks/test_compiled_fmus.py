@@ -23,7 +23,19 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from softneck.design import FopiSettings, HinfSettings, MpcSettings, PiSettings
 from softneck.estimation import KalmanSettings
 from softneck.fmu import build_compiled_fmu, build_fmu, unpacked
-from softneck.identification import GreyBox, Network, NeuralStateSpace, Play, Residual, Rls, SetMembership, combine
+from softneck.identification import (
+    GreyBox,
+    Model,
+    Network,
+    NeuralStateSpace,
+    Play,
+    Residual,
+    Rls,
+    SetMembership,
+    combine,
+)
+from softneck.identification.uncertainty._guarded import Guarded
+from softneck.identification.uncertainty._guarded_base import Base
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.runtime import Block
 from softneck.signals import Recording, signal
@@ -53,6 +65,12 @@ def _play() -> Block:
 
 def _ensemble() -> Block:
     return combine([Play().fit(_training()), Rls().fit(_training())]).block()
+
+
+def _guarded(member: Model) -> Block:
+    """Five members, here alike, and equations as base: what a step takes is the same."""
+    base = Base(GreyBox(evaluations=3).fit(_training()), np.full(2, 0.01), np.array([90.0, 90.0]))
+    return Guarded().around(base, [member] * 5, _training()).block()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,6 +105,14 @@ _KINDS = {
     "greybox": _Kind(make=lambda: GreyBox(evaluations=3).fit(_training()).block()),
     "residual of any (rls)": _Kind(make=lambda: Residual(base="rls").fit(_training()).block()),
     "ensemble (play, rls)": _Kind(make=_ensemble),
+    "guarded (5 nn, greybox)": _Kind(
+        make=lambda: _guarded(Network(starts=1, iterations=1, refine=0, prior=0.0).fit(_training())),
+        wanted=10.0,
+        python=False,
+    ),
+    "guarded (5 nss, greybox)": _Kind(
+        make=lambda: _guarded(NeuralStateSpace(starts=1, iterations=3).fit(_training())), wanted=10.0, python=False
+    ),
     # 20 ms at 500 times real time.
     "virtual neck": _Kind(make=lambda: VirtualNeck(NeckParameters.paper()).block(), wanted=40.0),
     "observer (kalman)": _Kind(make=lambda: KalmanSettings().design(bake_off_neck()).block()),

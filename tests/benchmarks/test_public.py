@@ -79,17 +79,82 @@ def test_the_error_of_a_stand_in_is_its_noise(name: str, tmp_path: Path, capsys:
         assert np.all((error > 0.8 * NOISE) & (error < 2.0 * NOISE))
     said = capsys.readouterr().out
     assert "published: " in said
-    assert said.count("of the hold-out's spread") == 2 or "dead time" in said
+    assert said.count("% of the spread") == 2 or "dead time" in said
+
+
+def said(
+    arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> tuple[int, list[str]]:
+    """Return exit code and last line on each of stdout and stderr."""
+    monkeypatch.setattr("sys.argv", ["public.py", *arguments])
+    try:
+        main()
+        code = 0
+    except SystemExit as end:
+        code = int(end.code or 0)
+    captured = capsys.readouterr()
+    return code, (captured.out + captured.err).splitlines()
 
 
 def test_a_file_that_is_not_there_is_said_with_where_it_is_described(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sys.argv", ["public.py", str(tmp_path)])
-    main()
-    lines = capsys.readouterr().out.splitlines()
+    code, lines = said([str(tmp_path)], capsys, monkeypatch)
+    assert code == 0
     assert len(lines) == len(BENCHMARKS)
-    assert all("it is described at" in line for line in lines)
+    assert all(" described at " in line for line in lines)
+    # One that was asked for is an error.
+    write("emps", tmp_path)
+    (tmp_path / "DATA_EMPS_PULSES.mat").unlink()
+    code, lines = said([str(tmp_path), "--only", "emps"], capsys, monkeypatch)
+    assert code == 2
+    assert lines == [f"emps: no DATA_EMPS_PULSES.mat in {tmp_path}; described at {OF['emps'].described}."]
+    code, lines = said([str(tmp_path / "nowhere")], capsys, monkeypatch)
+    assert code == 2
+    assert "nowhere is not a folder; give the one" in lines[-1]
+
+
+@pytest.mark.parametrize(
+    ("name", "file", "content", "words"),
+    [
+        ("tanks", "dataBenchmark.mat", b"", "cannot be read as a MAT file"),
+        ("tanks", "dataBenchmark.mat", b"<html>Not found</html>" * 20, "cannot be read as a MAT file"),
+        ("tanks", "dataBenchmark.mat", {"uEst": np.ones(9)}, "has no `yEst`, `uVal`, `yVal`, `Ts`"),
+        ("tanks", "dataBenchmark.mat", {"yEst": np.ones(9)}, "200 inputs and 9 outputs"),
+        ("tanks", "dataBenchmark.mat", {"yEst": np.full(200, np.nan)}, "not a number"),
+        ("tanks", "dataBenchmark.mat", {"yEst": "text"}, "has no numbers in `yEst`"),
+        ("tanks", "dataBenchmark.mat", {"Ts": np.zeros((0, 0))}, "has no numbers in `Ts`"),
+        ("silverbox", "SNLS80mV.mat", {"V1": np.ones(99), "V2": np.ones(99)}, "99 of 127400 samples"),
+        ("emps", "DATA_EMPS.mat", {"t": np.ones(1)}, "`t` must have"),
+        ("pneumatic-arm", "pneumatic_arm_two_trials.csv", b"x,y\n1,2\n", "time [s]"),
+        ("pneumatic-arm", "pneumatic_arm_two_trials.csv", b"\xff\xfe\x00", "must have numbers in the columns"),
+    ],
+)  # fmt: skip
+def test_a_broken_file_is_one_line(
+    name: str,
+    file: str,
+    content: bytes | dict[str, object],
+    words: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from scipy.io import loadmat, savemat
+
+    write(name, tmp_path, rows=200) if name != "silverbox" else None
+    if isinstance(content, bytes):
+        (tmp_path / file).write_bytes(content)
+    elif "uEst" in content or name == "silverbox":
+        savemat(tmp_path / file, content)
+    else:
+        whole = {key: value for key, value in loadmat(tmp_path / file).items() if not key.startswith("__")}
+        savemat(tmp_path / file, whole | content)
+    code, lines = said([str(tmp_path), "--only", name], capsys, monkeypatch)
+    assert code == 2
+    assert len(lines) == 1
+    assert lines[0].startswith(f"{name}: ")
+    assert words in lines[0]
+    assert lines[0].endswith(f" Described at {OF[name].described}.")
 
 
 @pytest.mark.slow

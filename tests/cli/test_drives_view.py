@@ -69,7 +69,7 @@ def test_everything_is_on_the_screen() -> None:
     lines = [" ".join(line.strip("│ ").split()) for line in text.splitlines()]
     assert "pi.npz" in lines[0]
     # Sample 75 of 0.02 s; begun at 100 s of the clock.
-    assert "running loop 1.50 of 4.0 s since start 3.50 s bus cycle 350" in lines
+    assert "running loop 1.50 of 4.0 s since start 3.50 s bus cycle 350 validity -" in lines
     # The units are there: rich would take [deg] in a string for markup.
     assert "angle [deg] reference measured estimate error" in lines
     assert "motor set-point [rad] position [rad] lag [rad] tension [N] of limit" in lines

@@ -5,15 +5,18 @@ from __future__ import annotations
 import json
 import zipfile
 from pathlib import Path
+from typing import Any
 
+import fmpy
 import numpy as np
 import pytest
 from fmpy.validation import validate_fmu
 
 from softneck.cli._fmu import open_buildable
-from softneck.core import FileFormatError, read_archive, write_archive
+from softneck.core import FileFormatError, load, read_archive, write_archive
 from softneck.design import PiSettings
 from softneck.estimation import KalmanSettings
+from softneck.identification.models._validity import with_tolerance
 
 from .conftest import Call
 
@@ -69,6 +72,22 @@ def test_scores_and_free_run_on_data_go_into_the_fmu(call: Call, rls_file: Path,
     assert f"on {judged['rows_scored']} rows of neck.csv" in page
     assert f"<td>free run</td><td>{judged['fits']['model']['inf']['pitch']:.2f}</td>" in page
     assert page.count("free run</text>") == 2  # pitch and roll, beside what was measured
+
+
+def test_the_tolerance_that_identify_was_given_is_that_of_the_fmu(call: Call, recording: Path) -> None:
+    held = {"motor_setpoint_1": 1.5, "motor_setpoint_2": -0.5, "motor_setpoint_3": -1.0}
+    call("identify", "rls", recording, "-o", "rls.npz", "--tolerance", 5)
+    assert call("fmu", "rls.npz", "-o", "Rls.fmu").code == 0
+    played: Any = fmpy.simulate_fmu("Rls.fmu", stop_time=0.5, start_values=held, output=["validity"])
+    five = load("rls.npz", role="model")
+    validity = []
+    for model in (five, with_tolerance(five, 2.0)):
+        block = model.block()
+        row = [held.get(port.name, port.start) for port in block.inputs]
+        validity.append(block.run(block.initial_state(), np.tile(row, (25, 1)))[1][:, -1])
+    # The same scalar code, compiled here and not in the FMU: only the last digits may differ.
+    np.testing.assert_allclose(played["validity"][1:], validity[0], rtol=1e-9)
+    assert (validity[0] > validity[1]).all()
 
 
 def test_what_cannot_become_an_fmu_is_said(call: Call, rls_file: Path, tmp_path: Path) -> None:

@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
+
 from softneck import load
 from softneck.identification import OutputError
 from softneck.plant import NeckParameters, VirtualNeck, record
-from softneck.signals import concatenate, multisine_experiments, write_recording
+from softneck.signals import concatenate, multisine_experiments, read_recording, write_recording
+from softneck.signals.recording._conditions import conditions
 
 from .conftest import Call
 
@@ -57,3 +60,18 @@ def test_what_it_needs_is_recorded_and_refused_in_a_line(call: Call, tmp_path: P
         refused = call("record", *options, "-o", "u.csv")
         assert (refused.code, line in refused.error) == (2, True), refused.error
         assert not (tmp_path / "u.csv").exists()
+
+
+def test_record_plays_around_a_cocontraction_and_says_its_payload(call: Call, tmp_path: Path) -> None:
+    for name, more in (("plain", ()), ("taut", ("--cocontraction", "0.5", "--payload", "0.3"))):
+        assert call("record", "eq22", "-o", f"{name}.csv", "--duration", "2", *more).code == 0
+    plain, taut = (read_recording(tmp_path / f"{name}.csv") for name in ("plain", "taut"))
+    # Files keep all digits of a double.
+    np.testing.assert_allclose(taut.set_points, plain.set_points + 0.5, atol=1e-12)
+    assert "payload" not in plain.channels
+    assert conditions(taut)["payload_kg"] == [0.3, 0.3]
+    above = call("record", "multisine", "-o", "x.csv", "--amplitude", "2.5", "--cocontraction", "5")
+    assert (above.code, "the experiments go beyond the motors' limits" in above.error) == (2, True)
+    assert call("record", "eq22", "-o", "x.csv", "--cocontraction", "nan").code == 2
+    ended = call("record", "steps", "-o", "ended.csv", "--cocontraction", "5")
+    assert "set-points: " in ended.out

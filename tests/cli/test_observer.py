@@ -50,16 +50,19 @@ def test_noise_from_data_finds_that_of_the_sensor_by_its_gyro(call: Call, files:
 
 
 @pytest.mark.slow
-def test_levels_that_rows_held_out_do_not_speak_for_are_not_kept(call: Call) -> None:
+def test_nothing_is_kept_that_rows_held_out_do_not_speak_for(call: Call) -> None:
     recording = record(signal("eq22", duration=60.0), VirtualNeck(NeckParameters.paper()), seed=5)
     Rls().fit([recording.split(0.7)[0]]).save("rls.npz")
     write_recording("rec.csv", recording)
     assert call("observer", "rls.npz", "-o", "default.npz").code == 0
     said = call("observer", "rls.npz", "-o", "o.npz", "--data", "rec.csv")
     assert said.code == 0, said.err
-    # The model is wrong, and the likeliest levels have no sensor noise: they follow it, and go astray in gaps.
-    assert "not better, so the default levels are kept" in said.out
-    assert load("o.npz").noise == load("default.npz").noise
+    # Whichever it takes, none that it tried is better on the rows held out.
+    found = json.loads(call("observer", "rls.npz", "-o", "j.npz", "--data", "rec.csv", "--json").out)["fit"]
+    assert found["held_out"][found["what"]] == min(found["held_out"].values())
+    if not found["kept"]:
+        assert "no better, so the defaults are kept" in said.out
+        assert load("o.npz").noise == load("default.npz").noise
 
 
 @pytest.mark.slow

@@ -44,6 +44,14 @@ def test_bad_robots_are_one_line_and_exit_code_2(call: Call, tmp_path: Path) -> 
     said = call("robot", "check")
     assert said.code == 2
     assert "`drives.file`" in said.error
+    # The files are there, and are of another robot.
+    (tmp_path / "d.toml").write_text('profile = "ipos2015"\n[[drive]]\nnode = 1\n')
+    assert "three [[drive]] tables are needed" in call("robot", "check").error
+    (tmp_path / "robot.toml").write_text(
+        'name = "b"\nmotors = { names = ["a"], unit = "bar" }\noutputs = { names = ["x"], unit = "rad" }\n'
+        'directions = { kind = "identified" }\nplant = { neck = "paper" }\n'
+    )
+    assert "the virtual plant has motors in rad or deg, and `motors.unit` of robot `b`" in call("robot", "check").error
     (tmp_path / "robot.toml").write_text('extends = "neck"\n[plant]\nneck = "n.toml"\n')
     assert "n.toml` is neither a neck preset" in call("robot", "check").error
     (tmp_path / "robot.toml").write_text('extends = "neck"\n[motor]\nunit = "deg"\n')

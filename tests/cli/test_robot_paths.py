@@ -81,16 +81,28 @@ def test_bad_imports_are_one_line(call: Call, log: Path, tmp_path: Path) -> None
     (tmp_path / "c.csv").write_text("time,valve [V],pressure [bar],x\n0,1,2,1\n1,2,3,2\n2,4,1,1\n")
     said = call("import", "c.csv", "--robot-out", "r.toml", "-o", "rec.csv")
     assert (said.code, "one unit for all of them" in said.err) == (2, True)
+    titles = ",".join(f"motor_{j}" for j in range(9))
+    rows = "\n".join(",".join(str(k * (j + 1) % 13) for j in range(11)) for k in range(9))
+    (tmp_path / "d.csv").write_text(f"time,{titles},x\n{rows}\n")
+    said = call("import", "d.csv", "--robot-out", "r.toml", "-o", "rec.csv")
+    assert (said.code, "d.csv: `motors.names` must hold 1 to 8 names; got 9." in said.err) == (2, True)
+    said = call("import", log, "--robot-out", "r.txt", "-o", "rec.csv")
+    assert (said.code, "r.txt: must end in `.toml`" in said.err) == (2, True)
     assert not (tmp_path / "r.toml").exists()
     assert not (tmp_path / "rec.csv").exists()
+    assert call("import", log, "--robot-out", "r.toml", "-o", "rec.csv").code == 0
+    said = call("import", "rec.csv", "--robot-out", "s.toml", "-o", "t.csv")
+    assert (said.code, "is a recording of robot" in said.err) == (2, True)
 
 
 def test_commands_that_take_necks_only_say_so_in_a_line(call: Call, log: Path) -> None:
     assert call("import", log, "--robot-out", "robot.toml", "-o", "rec.csv").code == 0
     assert call("identify", "rls", "rec.csv", "-o", "m.npz", "--set", "delay=0.0").code == 0
     for arguments, why in (
-        (("design", "scheduled", "m.npz", "-o", "c.npz", "--any-fit"), "necks only so far, not robot `plant`"),
-        (("family", "rec.csv", "-o", "f.npz", "--html", "f.html"), "necks only so far, not robot `plant`"),
+        (
+            ("design", "scheduled", "m.npz", "-o", "c.npz", "--any-fit"),
+            "for robots with one or two angles; robot `plant`",
+        ),
         (("observer", "m.npz", "-o", "o.npz"), "`plant` gives no `sensor."),
     ):
         said = call(*arguments)
@@ -122,9 +134,9 @@ def test_the_page_of_a_loop_has_a_panel_for_each_output_in_its_unit(call: Call, 
     page = (tmp_path / "loop.html").read_text(encoding="utf-8")
     for label in ("x [mm]", "y [mm]", "z [mm]", "motor [bar]", "set-point 4", "z.rms_error_mm", "the true output"):
         assert label in page, label
-    # A neck is what the 3-D view draws.
+    # What tendons bend is what the 3-D view draws.
     assert not (tmp_path / "loop_3d.html").exists()
-    assert "3-D" not in page
+    assert "has no view in 3-D: it is drawn of robots that tendons at known angles bend." in page
 
 
 @pytest.mark.slow

@@ -107,7 +107,7 @@ def test_no_row_is_no_step(block_of: Callable[[str], Block]) -> None:
     block = block_of("rls")
     start = block.initial_state(pitch_start=0.1)
     end, Y = block.run(start, np.zeros((0, 8)))
-    assert Y.shape == (0, 5)
+    assert Y.shape == (0, 6)
     np.testing.assert_array_equal(end.values, start.values)
     np.testing.assert_array_equal(end.outputs, start.outputs)
 

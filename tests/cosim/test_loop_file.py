@@ -232,7 +232,7 @@ def _judge(path: Path) -> list[Any]:
             "[connections]\n'controller.pitch' = 'plant.yaw'\n[limits]",
             "`plant.yaw`: there is no such output",
         ),
-        ("[limits]", "[connections]\n'controller.pitch' = 1\n[limits]", r"\[connections\] must be a table of names"),
+        ("[limits]", "[connections]\n'controller.pitch' = 1\n[limits]", "must be a name or a table with `from`"),
         ('fmu = "Neck.fmu"', 'fmu = "Neck.fmu"\nisolated = 1', r"\[plant\] isolated must be true or false"),
         ('fmu = "Neck.fmu"', 'fmu = "Neck.fmu"\nnames = { speed = "pitch" }', "has no variable speed"),
         ('fmu = "Neck.fmu"', 'fmu = "Neck.fmu"\nnames = "pitch"', r"\[plant\] names must be a table of names"),

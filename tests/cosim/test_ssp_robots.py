@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from xml.etree import ElementTree
 
+import numpy as np
+import pytest
+
+from softneck.core import SettingsError
+from softneck.cosim import load_ssp, make_loop, simulate, write_ssp
+from softneck.cosim.loops._loop_file import reference_of
 from softneck.cosim.ssp._description import Component, system_description
+from softneck.design import design_controller
+from softneck.robot import Robot
+from softneck.robot._file import preset_text
 from softneck.runtime import Port
+
+from ..design.test_robots import plant
 
 SSD = "{http://ssp-standard.org/SSP1/SystemStructureDescription}"
 SSC = "{http://ssp-standard.org/SSP1/SystemStructureCommon}"
@@ -19,3 +31,35 @@ def test_pressures_and_lengths_are_connectors_with_units() -> None:
     assert names == ["motor_setpoint_1", "motor_setpoint_2", "level"]
     units = {unit.get("name"): unit[0].attrib for unit in root.iter(f"{SSC}Unit")}
     assert units == {"Pa": {"kg": "1", "m": "-1", "s": "-2"}, "m": {"m": "1"}}
+
+
+def test_the_reference_of_another_robots_loop_becomes_a_block(tmp_path: Path) -> None:
+    file = tmp_path / "loop.toml"
+    file.write_text(
+        'duration_s = 2.0\nrobot = "antagonist"\n[reference]\nkind = "step"\npitch_deg = 10.0\nat_s = 1.0\n'
+    )
+    tank = tmp_path / "tank.toml"
+    channels = '[motors]\nnames = ["pump"]\nunit = "V"\n[outputs]\nnames = ["level"]\nunit = "m"\n'
+    tank.write_text(f'name = "tank"\n{channels}[directions]\nkind = "identified"\n')
+    block = reference_of(file).block()
+    assert [port.name for port in block.outputs] == ["pitch_reference", "cocontraction_reference", "enabled"]
+    _, told = block.run(block.initial_state(), np.zeros((99, 0)))
+    # A step's outputs are those of the next sample.
+    np.testing.assert_array_equal(told[:, 0], np.where(np.arange(1, 100) < 50, 0.0, np.radians(10.0)))
+    with pytest.raises(SettingsError, match="pitch_deg"):
+        reference_of(file, robot=str(tank))
+
+
+def test_an_archive_is_of_the_robot_beside_it_and_its_fmus_say_whose_they_are(tmp_path: Path) -> None:
+    model = plant(Robot.preset("antagonist"))
+    loop = make_loop({
+        "duration_s": 1.0, "order": "jacobi", "plant": model, "controller": design_controller("pi", model),
+        "reference": {"kind": "step", "pitch_deg": 5.0, "at_s": 0.1},
+    })  # fmt: skip
+    archive = write_ssp(loop, tmp_path / "loop.ssp", compiled=False)
+    with pytest.raises(SettingsError, match=r"FMU of robot `antagonist` .* the loop of robot `neck`"):
+        load_ssp(archive)
+    (tmp_path / "robot.toml").write_text(preset_text("antagonist"))
+    read, made = simulate(load_ssp(archive)), simulate(loop)  # pyright: ignore[reportArgumentType]
+    np.testing.assert_array_equal(read["pitch"], made["pitch"])
+    assert read.metrics == made.metrics

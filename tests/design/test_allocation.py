@@ -263,4 +263,4 @@ def test_files_of_before_the_rule_are_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["least_position", "least_cocontraction"])
 def test_a_rule_that_leaves_no_room_is_refused(name: str) -> None:
     with pytest.raises(SettingsError, match=rf"`{name}` must be below `position_limit`, 2 rad"):
-        replace(PiSettings(position_limit=2.0), **{name: 2.5})
+        replace(PiSettings(position_limit=2.0), **{name: 2.5}).limits()

@@ -39,7 +39,11 @@ def test_the_pi_closes_a_stable_loop_around_it(model: Model) -> None:
 
 def test_the_kalman_filter_follows_the_recording(model: Model) -> None:
     r = neck_recording(600, seed=9, noise=1e-3)
-    found = KalmanSettings(measurement_noise_std=1e-3, model_noise_std=5e-4).design(model).estimate(r)
+    found = (
+        KalmanSettings(measurement_noise_std=1e-3, model_noise_std=5e-4, disturbance_noise_std=2e-4, sensor_delay=0.0)
+        .design(model)
+        .estimate(r)
+    )
     clean = neck_recording(600, seed=9, noise=0.0)
     # It must not be worse than what was measured.
     assert np.std((found.pitch - clean.outputs[:, 0])[50:]) < 1e-3

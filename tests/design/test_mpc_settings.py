@@ -111,7 +111,7 @@ def test_the_bake_off_is_won() -> None:
 )
 def test_bad_settings_are_refused(settings: dict[str, float], match: str) -> None:
     with pytest.raises(SettingsError, match=match):
-        MpcSettings(**settings)  # type: ignore[arg-type]
+        MpcSettings(**settings).design(bake_off_neck())  # type: ignore[arg-type]
 
 
 def test_models_it_cannot_use_are_refused() -> None:

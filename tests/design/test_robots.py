@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from softneck import identify, load, record
-from softneck.core import SettingsError
+from softneck.core import DataError, SettingsError
 from softneck.cosim import make_loop, simulate
 from softneck.cosim.loops._loop_table import check_key
 from softneck.design import MpcSettings, PiSettings, design_controller
@@ -88,7 +88,7 @@ def test_an_antagonist_follows_a_step_and_its_tendons_share_the_pull() -> None:
     model = plant(Robot.preset("antagonist"))
     result = closed(model, design_controller("pi", model), pitch_deg=6.0, cocontraction_rad=0.3)
     found = result.metrics
-    assert set(found) == {"pitch", "motors"}
+    assert set(found) == {"pitch", "motors", "validity"}
     assert found["pitch"]["overshoot_pct"] < 2.0
     assert found["pitch"]["settling_s"] < 1.0
     P = np.column_stack([result[f"motor_setpoint_{j}"] for j in (1, 2)])
@@ -201,15 +201,22 @@ def test_keys_of_studies_and_faults_know_the_robot() -> None:
         make_fault("motor_stuck", {"motor": 3}, model.robot)
 
 
-def test_kinds_that_take_necks_only_say_so() -> None:
-    with pytest.raises(SettingsError, match=r"takes necks only so far, not robot `antagonist`"):
-        design_controller("scheduled", plant(Robot.preset("antagonist")))
+def test_scheduling_is_refused_where_nothing_inclines() -> None:
+    said = r"scheduling over the inclination is for robots with one or two angles; robot `bellows` .* has x, y, z in mm"
+    with pytest.raises(SettingsError, match=said):
+        design_controller("scheduled", [plant(BELLOWS), plant(BELLOWS, gain=0.05)], inclinations=(0.0, 0.3))
+    with pytest.raises(DataError, match="plants of two robots"):
+        design_controller("scheduled", [plant(Robot.preset(name)) for name in ("antagonist", "trunk4")],
+                          inclinations=(0.0, 0.3))  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("setting", "said"),
     [
-        ({"tightening": True}, "predictive control with `tightening` takes necks only so far, not robot `antagonist`"),
+        (
+            {"tendon_angles": (0.0, 2.0, 4.0)},
+            "`tendon_angles` are of necks; those of `antagonist` are in its robot file",
+        ),
         ({"minimum_tautness": 0.1}, "`minimum_tautness` of robot `antagonist` needs tendons at known angles"),
     ],
 )

@@ -26,6 +26,7 @@ from softneck.design import (
 )
 from softneck.design.plants._step_and_load import StepAndLoad
 from softneck.estimation import LinearNeck
+from softneck.signals import redefinition_matrix
 
 from ..data import slow_but
 from ..oracles.bake_off import (
@@ -264,14 +265,48 @@ def test_a_controller_of_one_s_own_is_the_same_thing() -> None:
     np.testing.assert_allclose(error.ss()(z), pi.ss()(z), rtol=1e-9, atol=1e-12)
 
 
+def test_one_system_of_both_axes_is_taken_whole() -> None:
+    """Two controllers side by side are the same loop; one that couples them reaches file and step as it was given."""
+    plant, K = bake_off_neck(), PiSettings().design(bake_off_neck()).ss()
+    both = CustomSettings(controller=K).design(plant)
+    # The reference filter of `pi` is a part of the system here: its own is none.
+    z = np.exp(1j * np.array([0.5, 5.0]) * TS)
+    np.testing.assert_allclose(both.ss()(z), K(z), rtol=1e-9, atol=1e-12)
+    turn = np.array([[0.9, 0.1], [-0.1, 0.9]])
+    coupled = control.StateSpace(K.A, K.B, turn @ K.C, turn @ K.D, TS, inputs=list(K.input_labels))
+    mixed = CustomSettings(controller=coupled[:, [2, 3, 0, 1]]).design(plant)
+    np.testing.assert_allclose(mixed.ss()(z), np.einsum("ij,jkl->ikl", turn, K(z)), rtol=1e-9, atol=1e-12)
+    # From rest, within the limits: a step of the block is one of the system.
+    times = np.arange(100) * TS
+    asked = np.zeros((4, 100))
+    asked[0] = 1e-3
+    expected = control.forced_response(coupled, times, asked).outputs  # pyright: ignore[reportArgumentType]
+    block = mixed.block()
+    rows = np.zeros((100, len(block.inputs)))
+    names = [port.name for port in block.inputs]
+    rows[:, names.index("pitch_reference")] = 1e-3
+    rows[:, [names.index("healthy"), names.index("enabled")]] = 1.0
+    free = block.initial_state(lead_limit=12.0, least_position=-6.0, least_cocontraction=-6.0)
+    motors = block.run(free, rows)[1]
+    told = np.asarray(redefinition_matrix() @ motors.T)[:2]
+    np.testing.assert_allclose(told, expected, rtol=0, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("controller", "message"),
     [
+        (control.StateSpace([], [], [], np.eye(3), TS), "has 3 outputs; pitch and roll ask for 2"),
+        (control.StateSpace([], [], [], np.ones((2, 3)), TS), "as many inputs as outputs"),
+        (control.StateSpace([], [], [], np.ones((2, 4)), TS, inputs=list("abcd")), "name them pitch_reference, roll_"),
+        (
+            control.StateSpace(np.eye(2), np.eye(2), 90.0 * np.eye(2), np.zeros((2, 2)), TS),
+            "not stable around sample 0",
+        ),
         (None, "must be a control.StateSpace"),
         (control.TransferFunction([1.0], [1.0, 0.0]), "must be discrete"),
         (control.TransferFunction([1.0], [1.0, -1.0], 0.01), r"runs every 0.01 s, the plant every 0.02 s"),
         ({"pitch": control.TransferFunction([1.0], [1.0, -1.0], TS)}, "for pitch and roll; got pitch"),
-        (control.StateSpace([], [], [], [[1.0, 2.0, 3.0]], TS), "one output and one or two inputs"),
+        (control.StateSpace([], [], [], [[1.0, 2.0, 3.0]], TS), "as many inputs as outputs"),
         (control.StateSpace([], [], [], [[1.0, -1.0]], TS, inputs=["a", "b"]), "the inputs of the controller of pitch"),
         (
             control.StateSpace([], [], [], [[1.0, -1.0]], TS, inputs=["pitch_reference", "pitch"], outputs=["phi_i"]),

@@ -239,11 +239,11 @@ def test_a_family_of_one_inclination_is_refused() -> None:
         ({"schedule_time": -1.0}, "`schedule_time` must be between"),
         ({"inclinations": (15.0, 20.0)}, r"`inclinations` must be between 0 and 1\.5 \[rad\]; got 15"),
         ({"leak_time": 0.0}, "`leak_time` must be between"),
-        ({"slew_limit": 0.0}, "`slew_limit` must be between"),
+        ({"slew_limit": 0.0}, "`slew_limit` must be positive"),
         ({"order": "other"}, "`order` must be one of"),
         ({"least_cocontraction": 6.0}, "`least_cocontraction` must be below `position_limit`"),
     ],
 )
 def test_wrong_settings_are_refused(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(SettingsError, match=message):
-        ScheduledSettings(**settings)
+        ScheduledSettings(**settings).limits()

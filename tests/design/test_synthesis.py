@@ -214,3 +214,68 @@ def test_other_units_of_a_measurement_and_of_the_input_change_the_controller_by_
     assert scaled.gamma == pytest.approx(plain.gamma, rel=1e-6)
     for s in 1j * np.geomspace(1e-2, 100.0, 10):
         np.testing.assert_allclose(scaled.controller(s), plain.controller(s) @ np.linalg.inv(M) / N, rtol=1e-5)
+
+
+def several(inputs: int, outputs: int, *, discrete: bool) -> Any:
+    """A stable plant of several inputs and outputs with a pole for each pair, every axis a little of each."""
+    rng = np.random.default_rng(inputs + 10 * outputs)
+    n = max(inputs, outputs) + 1
+    A = -np.diag(rng.uniform(2.0, 6.0, n)) + 0.3 * rng.standard_normal((n, n))
+    B, C = rng.standard_normal((n, inputs)), rng.standard_normal((outputs, n))
+    plant = control.StateSpace(A, B, C, np.zeros((outputs, inputs)), 0)
+    return control.sample_system(plant, TS) if discrete else plant
+
+
+SIZES = [(2, 2, True), (2, 2, False), (3, 2, True), (1, 2, False), (3, 1, False)]
+
+
+@pytest.mark.parametrize(("inputs", "outputs", "discrete"), SIZES)
+def test_mixsyn_of_any_size_equals_slycot(inputs: int, outputs: int, discrete: bool) -> None:
+    pytest.importorskip("slycot")
+    plant = several(inputs, outputs, discrete=discrete)
+    W1, W3 = makeweight(20.0, 1.0, 0.5), makeweight(0.3, 20.0, 5.0)
+    ours, theirs = (mixsyn(plant, W1, 0.5, W3, method=method) for method in ("riccati", "slycot"))
+    # Both searches end within 1e-4 of the least gamma.
+    assert ours.gamma == pytest.approx(theirs.gamma, rel=3e-4)
+    K = ours.controller
+    assert (K.ninputs, K.noutputs, K.dt) == (outputs, inputs, plant.dt)
+    closed: Any = control.feedback(plant * K, control.ss([], [], [], np.eye(outputs), plant.dt))  # pyright: ignore[reportArgumentType]
+    poles = np.linalg.eigvals(closed.A)
+    assert np.all(np.abs(poles) < 1.0) if discrete else np.all(poles.real < 0.0)
+
+
+def test_mixsyn_of_two_plants_side_by_side_is_that_of_the_worse_one() -> None:
+    """gamma of a diagonal problem is the larger of both: what is between the axes is nothing."""
+    one, two = LAG, control.TransferFunction([2.0], [0.05, 1.0])
+    W1 = makeweight(20.0, 1.0, 0.5)
+    apart = [mixsyn(plant, W1, 0.2, method="riccati").gamma for plant in (one, two)]
+    both = mixsyn(control.append(control.ss(one), control.ss(two)), W1, 0.2, method="riccati")
+    assert both.gamma == pytest.approx(max(apart), rel=3e-4)
+
+
+@pytest.mark.parametrize(("inputs", "outputs", "discrete"), SIZES)
+def test_ncfsyn_of_any_size_reaches_its_margin(inputs: int, outputs: int, discrete: bool) -> None:
+    plant = several(inputs, outputs, discrete=discrete)
+    # More integrators than outputs would hide one; a slow lag does for any size.
+    found = ncfsyn(plant, control.TransferFunction([1.0, 2.0], [1.0, 0.01 if inputs > outputs else 0.0]))
+    # Built 5 % above gamma, which no controller is below; the grid sees the norm to 1e-3.
+    assert found.achieved <= 1.05 * found.gamma * 1.001
+    assert (found.controller.ninputs, found.controller.noutputs) == (outputs, inputs)
+    for K in (0.9, 1.1):
+        closed: Any = control.feedback(
+            plant * (K * found.controller),
+            control.ss([], [], [], np.eye(outputs), plant.dt),  # pyright: ignore[reportArgumentType]
+        )
+        poles = np.linalg.eigvals(closed.A)
+        assert np.all(np.abs(poles) < 1.0 + 1e-9) if discrete else np.all(poles.real < 1e-9)
+
+
+def test_weights_of_another_size_are_refused_in_a_line() -> None:
+    plant = several(2, 2, discrete=False)
+    wide = control.append(LAG, LAG, LAG)
+    with pytest.raises(SettingsError, match="W1 must have 2 inputs, or one input and one output; got 3 and 3"):
+        mixsyn(plant, wide, 0.2)
+    with pytest.raises(SettingsError, match="W must be scalar or have 2 inputs and outputs"):
+        ncfsyn(plant, wide)
+    with pytest.raises(SettingsError, match="`loopsyn` inverts plants of one input and one output; got 2 and 2"):
+        loopsyn(plant, LAG)

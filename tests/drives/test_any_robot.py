@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,9 @@ import pytest
 
 from softneck.core import CheckFailedError, SettingsError, SoftneckError, Vector
 from softneck.core._certificate import Certificate
+from softneck.cosim.loops._loop_file import LoopSetup, make_loop
+from softneck.cosim.loops._simulate import run_setup
+from softneck.design import design_controller
 from softneck.drives import (
     Experiment,
     default_drives,
@@ -20,6 +24,7 @@ from softneck.drives import (
     load_drives,
     open_sensor,
     preflight,
+    prepare,
     read_run_log,
     record_signal,
     replay,
@@ -48,6 +53,7 @@ from softneck.loop import Loop
 from softneck.robot import Robot
 from softneck.runtime import Port
 from softneck.signals import Recording, read_recording, write_recording
+from tests.design.test_robots import plant
 
 from .robots import robot
 
@@ -400,7 +406,7 @@ def test_a_controller_runs_on_four_drives_by_the_names_of_its_ports(tmp_path: Pa
 
 
 def test_a_loop_of_another_robot_is_refused() -> None:
-    with pytest.raises(SoftneckError, match=r"loop and drives of two robots .* `trunk4` .* and `neck`"):
+    with pytest.raises(SoftneckError, match=r"loop and drives of two robots .* `neck` .* and `trunk4`"):
         LoopPilot(loop_of(Robot.preset(), None), Robot.preset("trunk4"))
 
 
@@ -415,3 +421,26 @@ def test_a_certificate_of_another_robot_arms_nothing(tmp_path: Path) -> None:
     for found, moved in ((certificate(), trunk), (certificate(robot=of_trunk), neck)):
         with pytest.raises(CheckFailedError, match=f"the drives move `{moved.name}`"):
             _require_robot(found, moved)
+
+
+def test_a_controller_of_wider_limits_is_told_in_a_loop_and_refused_on_drives() -> None:
+    """Robots that differ in limits alone have one hash."""
+    wide = Robot.preset("antagonist")
+    narrow = replace(wide, motors=replace(wide.motors, setpoint_min=(-4.0, -4.0), setpoint_max=(4.0, 4.0)))
+    assert wide.hash == narrow.hash
+    model, far = plant(narrow), design_controller("pi", plant(wide))
+
+    def loop_with(controller: object, **more: object) -> LoopSetup:
+        return make_loop({
+            "duration_s": 0.1, "plant": {"object": model}, "controller": {"object": controller, **more},
+            "reference": {"kind": "step", "pitch_deg": 1.0},
+        })  # fmt: skip
+
+    why = f"may send `motor_setpoint_1` to -6 rad, and robot {narrow.label()} goes to -4 rad"
+    assert any(why in remark for remark in run_setup(loop_with(far)).remarks)
+    with pytest.raises(CheckFailedError, match=r"so were its certificates\. Design and certify it for that robot"):
+        prepare(loop_with(far), robot=narrow)
+    prepare(loop_with(far), robot=wide)
+    within = loop_with(far, parameters={"position_limit": 4.0})
+    assert not any("may send" in remark for remark in run_setup(within).remarks)
+    prepare(within, robot=narrow)

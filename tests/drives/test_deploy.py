@@ -36,6 +36,7 @@ from softneck.drives.simulated import SimulatedNeck, SimulatedSettings, serve
 from softneck.fmu import build_fmu
 from softneck.plant import NeckParameters
 
+from ..data import slow_but
 from .bench import Bench
 from .conftest import STEP, Project
 
@@ -246,15 +247,15 @@ def test_our_own_frames_that_a_bus_hands_back_are_dropped() -> None:
 # -- long runs --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-def test_thirty_minutes_without_a_missed_reaction_or_growth() -> None:
-    """30 simulated minutes; every minute a short dropout and a late cycle, at the end a fault in time."""
+@pytest.mark.parametrize("minutes", slow_but((5, 30), (), nightly=(30,)))
+def test_minutes_without_a_missed_reaction_or_growth(minutes: int) -> None:
+    """Simulated minutes; in every one a short dropout and a late cycle, at the end a fault in time."""
     bench = Bench().start()
     bench.pass_time(60.0)
     tracemalloc.start()
     bench.pass_time(1.0)
     before = tracemalloc.take_snapshot()
-    for _ in range(29):
+    for _ in range(minutes - 1):
         bench.neck.sensor = "drops"
         bench.pass_time(0.04)
         bench.neck.sensor = "works"
@@ -262,7 +263,7 @@ def test_thirty_minutes_without_a_missed_reaction_or_growth() -> None:
     after = tracemalloc.take_snapshot()
     tracemalloc.stop()
     grown = sum(item.size_diff for item in after.compare_to(before, "filename") if "softneck" in str(item.traceback))
-    # Nothing but counters: less than 20 kB over 29 minutes, where one float a cycle would be 5 MB.
+    # Nothing but counters: less than 20 kB, where one float a cycle would be 0.7 MB in four minutes.
     assert grown < 20_000
     assert bench.master.supervisor.fault is None
     bench.neck.drives[0].axis.trip(0x2310)

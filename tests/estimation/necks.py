@@ -8,12 +8,14 @@ from typing import Any
 import control
 import numpy as np
 
-from softneck.estimation import KalmanObserver, LinearNeck
+from softneck.estimation import KalmanObserver, KalmanSettings, LinearNeck
 from softneck.runtime import Block, load_runtime
 from softneck.signals import Recording, redefine, signal
 
 TS = 0.02
 POLE = math.exp(-5.293 * TS)
+# A sensor in time and a model that is right: what most laws are about.
+IN_TIME = KalmanSettings(sensor_delay=0.0, disturbance_noise_std=math.radians(0.02))
 
 
 def neck(*, pitch_delay: int = 4, roll_delay: int = 2, gain: float = 1.0, sample_time: float = TS) -> LinearNeck:

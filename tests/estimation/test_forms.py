@@ -14,7 +14,7 @@ from softneck.estimation import KalmanSettings, LinearNeck, axis_plant
 from softneck.signals import Recording
 
 from ..data import slow_but
-from .necks import TS, changed, neck, recording, rows_of, run_block, run_plain, smooth_motion
+from .necks import IN_TIME, TS, changed, neck, recording, rows_of, run_block, run_plain, smooth_motion
 
 FAST = 0.01
 LATE = KalmanSettings(sample_time=FAST, sensor_period=0.02, sensor_delay=0.025)
@@ -64,7 +64,7 @@ def test_the_runtime_of_every_form_equals_filterpy(settings: KalmanSettings, com
 
 def test_the_gyro_form_finds_the_bias_and_the_angle() -> None:
     record = smooth_motion(bias_deg=0.5)
-    observer = KalmanSettings(form="gyro", measurement_noise_std=math.radians(0.02)).design(neck(sample_time=FAST))
+    observer = replace(IN_TIME, form="gyro", measurement_noise_std=math.radians(0.02)).design(neck(sample_time=FAST))
     estimates = observer.estimate(record)
     late = slice(800, None)
     true_rate = 0.3 * 3.0 * np.cos(3.0 * record.time)
@@ -75,7 +75,7 @@ def test_the_gyro_form_finds_the_bias_and_the_angle() -> None:
 
 def test_the_gyro_carries_the_angle_through_a_second_of_darkness() -> None:
     record = changed(smooth_motion(), slice(1000, 1100), math.nan, "pitch_measured", "roll_measured")
-    observer = KalmanSettings(form="gyro", measurement_noise_std=math.radians(0.02)).design(neck(sample_time=FAST))
+    observer = replace(IN_TIME, form="gyro", measurement_noise_std=math.radians(0.02)).design(neck(sample_time=FAST))
     error = observer.estimate(record).pitch[1000:1100] - record.channels["pitch"][1000:1100]
     # 0.05 deg/s of rate noise makes 0.005 deg in 1 s; a bias known to 0.05 deg/s makes 0.05.
     assert np.abs(error).max() < math.radians(0.1)
@@ -116,12 +116,12 @@ def test_held_samples_of_a_slow_sensor_count_once() -> None:
         column[1::2] = column[:-1:2]
         held = held.with_channels(**{name: column})
         gaps = changed(gaps, slice(1, None, 2), math.nan, name)  # pyright: ignore[reportArgumentType]
-    observer = KalmanSettings(form="gyro", sensor_period=0.02).design(neck(sample_time=FAST))
+    observer = replace(IN_TIME, form="gyro", sensor_period=0.02).design(neck(sample_time=FAST))
     np.testing.assert_array_equal(run_block(observer, held)[:, :5], run_block(observer, gaps)[:, :5])
 
 
 def test_a_gap_of_the_gyro_is_bridged_and_doubted() -> None:
-    observer = KalmanSettings(form="gyro").design(neck(sample_time=FAST))
+    observer = replace(IN_TIME, form="gyro").design(neck(sample_time=FAST))
     record = changed(smooth_motion(), slice(700, 720), math.nan, "pitch_rate", "roll_rate")
     estimates = observer.estimate(record)
     assert np.isfinite(estimates.pitch).all()
@@ -196,7 +196,7 @@ def second_order(sample_time: float) -> control.TransferFunction:
         ({"sensor_period": 0.001}, r"must be a multiple of the sample time"),
         ({"sensor_period": 0.2}, "must be longer than `sensor_period`"),
         ({"sensor_delay": -0.01}, "`sensor_delay` must be between"),
-        ({"gyro_delay": 0.02}, "`gyro_delay` 0.02 s must be at most `sensor_delay`"),
+        ({"gyro_delay": 0.02, "sensor_delay": 0.0}, "`gyro_delay` 0.02 s must be at most `sensor_delay`"),
         ({"frozen_samples": 2.5}, "`frozen_samples` must be a whole number"),
         ({"gyro_noise_std": math.inf}, "`gyro_noise_std` must be a finite"),
         ({"acceleration_noise_std": 0.0}, "`acceleration_noise_std` must be positive"),

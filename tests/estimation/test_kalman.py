@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import control
@@ -14,7 +15,7 @@ from softneck.estimation import KalmanSettings, LinearNeck, axis_plant
 from softneck.estimation._sensors import SENSORS
 from softneck.signals import Recording
 
-from .necks import TS, neck, recording, run_block
+from .necks import IN_TIME, TS, neck, recording, run_block
 
 
 def with_gaps(record: Recording, rows: slice) -> Recording:
@@ -43,7 +44,7 @@ def test_the_runtime_equals_filterpy(compiled: bool) -> None:
 
 def test_without_noise_and_model_error_the_estimate_is_the_angle_itself() -> None:
     record = recording(noise_deg=0.0)
-    observer = KalmanSettings(measurement_noise_std=math.radians(0.05)).design(neck())
+    observer = replace(IN_TIME, measurement_noise_std=math.radians(0.05)).design(neck())
     estimates = observer.estimate(record)
     # What was unknown at the start has died out with the model's pole, exp(-5.3 x 8) < 1e-18, and the estimate
     # is the delay-aligned model itself; a delay off by one sample shows 1e-3 rad and more.
@@ -53,9 +54,8 @@ def test_without_noise_and_model_error_the_estimate_is_the_angle_itself() -> Non
 
 def test_a_right_model_filters_noise() -> None:
     record = recording(noise_deg=0.3)
-    observer = KalmanSettings(
-        measurement_noise_std=math.radians(0.3), model_noise_std=1e-4, disturbance_noise_std=math.radians(0.005)
-    ).design(neck())
+    levels = {"measurement_noise_std": 0.3, "model_noise_std": 0.005, "disturbance_noise_std": 0.005}
+    observer = replace(IN_TIME, **{name: math.radians(level) for name, level in levels.items()}).design(neck())
     error = observer.estimate(record).pitch - record.channels["pitch"]
     raw = record.channels["pitch_measured"] - record.channels["pitch"]
     assert np.std(error[100:]) < 0.3 * np.std(raw[100:])
@@ -70,7 +70,7 @@ def test_the_innovation_is_chi_square_when_the_model_is_right() -> None:
         pitch_measured=record.channels["pitch_measured"] + walk[0],
         roll_measured=record.channels["roll_measured"] + walk[1],
     )
-    observer = KalmanSettings(measurement_noise_std=math.radians(0.1), model_noise_std=1e-6).design(neck())
+    observer = replace(IN_TIME, measurement_noise_std=math.radians(0.1), model_noise_std=1e-6).design(neck())
     nis = observer.estimate(record).innovation[100:]
     # Mean 2 and 95 % below 5.99 for two degrees of freedom; over 2,900 samples the mean's std is 0.037 and
     # that of the share 0.4 %: four of them.
@@ -80,7 +80,7 @@ def test_the_innovation_is_chi_square_when_the_model_is_right() -> None:
 
 def test_a_blackout_is_bridged_and_announced_after_100_ms() -> None:
     record = with_gaps(recording(rows=600), slice(300, 340))
-    observer = KalmanSettings().design(neck())
+    observer = IN_TIME.design(neck())
     y = run_block(observer, record)
     assert np.isfinite(y).all()
     healthy = y[:, 5] > 0.5
@@ -106,7 +106,7 @@ def test_a_lasting_change_is_accepted_by_force_after_ten_rejections() -> None:
     record = recording(rows=600)
     shifted = record.channels["pitch_measured"].copy()
     shifted[300:] += math.radians(25.0)
-    estimates = KalmanSettings().design(neck()).estimate(record.with_channels(pitch_measured=shifted))
+    estimates = IN_TIME.design(neck()).estimate(record.with_channels(pitch_measured=shifted))
     assert not estimates.accepted[300:310].any()
     assert estimates.accepted[310]
     assert np.abs(estimates.pitch[400:] - shifted[400:]).max() < math.radians(0.5)
@@ -131,7 +131,7 @@ def test_pause_and_resume_equals_one_run() -> None:
 
 
 def test_it_starts_with_the_first_measurement_and_the_setpoints_as_they_stand() -> None:
-    observer = KalmanSettings().design(neck())
+    observer = IN_TIME.design(neck())
     block = observer.block()
     assert block.initial_state().outputs[5] == 0.0
     _, y = block.step(block.initial_state(), [2.0, 2.0, 2.0, 0.3, -0.2, 1.0])

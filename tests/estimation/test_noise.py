@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError, SettingsError
-from softneck.estimation import KalmanObserver, KalmanSettings, consistency, fit_noise
+from softneck.estimation import KalmanObserver, consistency, fit_noise
 from softneck.plots import chart_figure, consistency_figure
 from softneck.plots._estimation_charts import consistency_chart
 from softneck.signals import Recording
 
-from .necks import changed, neck, recording
+from .necks import IN_TIME, changed, neck, recording
 
 TRUE = (math.radians(0.1), math.radians(0.05), math.radians(0.02))
 
 
 def observer_of(noise: tuple[float, float, float] = TRUE) -> KalmanObserver:
-    return KalmanSettings().design(neck()).with_noise(noise)
+    return IN_TIME.design(neck()).with_noise(noise)
 
 
 def drawn(rows: int = 4000, *, seed: int = 3, noise: tuple[float, float, float] = TRUE) -> Recording:
@@ -85,7 +85,7 @@ def test_the_noise_behind_a_recording_is_found() -> None:
 
 def test_the_likelihood_is_that_of_filterpy() -> None:
     """filterpy computes it per update; ours differs by the constant log(2 pi) of two angles."""
-    from softneck.estimation._noise import _SETTLE, _Cost
+    from softneck.estimation._noise import _SETTLE, Cost
 
     observer, record = observer_of(), drawn(rows=400)
     kf, expected = observer.filterpy(), 0.0
@@ -99,7 +99,7 @@ def test_the_likelihood_is_that_of_filterpy() -> None:
         kf.update(np.array([[record.channels[f"{a}_measured"][k]] for a in ("pitch", "roll")]))
         expected += float(kf.log_likelihood) + math.log(2 * math.pi) if k >= _SETTLE else 0.0
     assert estimates.accepted.all()
-    ours = -0.5 * _Cost(observer, [record]).of(np.log10(TRUE))
+    ours = -0.5 * Cost(observer, [record]).of(np.log10(TRUE))
     # Sums of 350 terms of about 10.
     assert ours == pytest.approx(expected / (400 - _SETTLE), rel=1e-9)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import control
@@ -11,13 +12,13 @@ import pytest
 
 from softneck.core import FileFormatError, SettingsError, load, read_archive, write_archive
 from softneck.estimation import KalmanSettings
-from softneck.estimation._forms import FORMS, steady_covariance, steady_gains
+from softneck.estimation._forms import STATES, steady_covariance, steady_gains
 
-from .necks import changed, neck, recording, rows_of, run_block, run_plain, smooth_motion
+from .necks import IN_TIME, changed, neck, recording, rows_of, run_block, run_plain, smooth_motion
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", list(STATES))
 @pytest.mark.parametrize("divider", [1, 2])
 def test_constant_gains_are_those_that_filterpy_converges_to(form: str, divider: int) -> None:
     settings = KalmanSettings(form=form, sensor="mpu9250", sensor_period=0.02 * divider, steady=True)
@@ -35,7 +36,7 @@ def last_gain(kf) -> np.ndarray:
     return kf.K
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", list(STATES))
 def test_constant_gains_equal_those_of_python_control(form: str) -> None:
     observer = KalmanSettings(form=form, sensor="mpu9250", steady=True).design(neck())
     kf = observer.filterpy()
@@ -64,7 +65,7 @@ def rows(observer, record) -> np.ndarray:
 def test_constant_gains_gate_and_bridge_as_well() -> None:
     record = changed(recording(rows=600), [250, 251], 1.2, "pitch_measured")
     record = changed(record, slice(300, 340), math.nan, "pitch_measured")
-    y = run_block(KalmanSettings(steady=True).design(neck()), record)
+    y = run_block(replace(IN_TIME, steady=True).design(neck()), record)
     error = np.abs(y[:, 0] - record.channels["pitch"])[100:]
     assert np.degrees(error).max() < 0.5
     assert not (y[305:340, 5] > 0.5).any()
@@ -112,7 +113,7 @@ def test_a_covariance_that_is_none_is_refused(tmp_path: Path, value: float) -> N
 def test_the_smoother_solves_the_whole_least_squares_problem() -> None:
     """RTS equals the maximum a posteriori trajectory: one stacked weighted least-squares problem."""
     record = changed(smooth_motion(rows=40, noise_deg=0.3), slice(15, 22), math.nan, "pitch_measured")
-    settings = KalmanSettings(form="gyro", measurement_noise_std=math.radians(0.3), gyro_noise_std=0.02)
+    settings = replace(IN_TIME, form="gyro", measurement_noise_std=math.radians(0.3), gyro_noise_std=0.02)
     observer = settings.design(neck(sample_time=0.01))
     observer = observer.with_noise((math.radians(0.3), 0.02, 0.004))
     smoothed = observer.smooth(record)
@@ -153,7 +154,7 @@ def map_trajectory(observer, record) -> np.ndarray:
 
 def test_the_smoother_is_nearer_the_truth_than_the_filter() -> None:
     record = changed(smooth_motion(), slice(700, 760), math.nan, "pitch_measured", "roll_measured")
-    settings = KalmanSettings(form="kinematic", measurement_noise_std=math.radians(0.02), acceleration_noise_std=20.0)
+    settings = replace(IN_TIME, form="kinematic", measurement_noise_std=math.radians(0.02), acceleration_noise_std=20.0)
     observer = settings.design(neck(sample_time=0.01))
     errors = [
         np.std((estimates.pitch - record.channels["pitch"])[200:-50])

@@ -142,6 +142,10 @@ def _kalman_steady() -> Block:
     return KalmanSettings(steady=True).design(_linear()).block()
 
 
+def _nonlinear() -> Block:
+    return KalmanSettings().design(Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording())).block()
+
+
 def _pi() -> Block:
     return PiSettings().design(_linear()).block()
 
@@ -192,25 +196,35 @@ _REFERENCES = ["pitch_reference", "roll_reference", "cocontraction_reference", "
 
 # Kind -> its block, inputs, outputs and parameters that the public face names for it.
 KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...]]] = {
-    "rls": (_rls, MOTORS, ["pitch", "roll", "motor_position_1"], _MODEL),
-    "miso": (_miso, MOTORS, ["pitch", "roll", "motor_position_2"], _MODEL),
-    "oe": (_oe, MOTORS, ["pitch", "roll", "motor_position_1"], _MODEL),
-    "srivc": (_srivc, MOTORS, ["pitch", "roll", "motor_position_2"], _MODEL),
-    "subspace": (_subspace, MOTORS, ["pitch", "roll", "motor_position_3"], _MODEL),
-    "nlsm": (_nlsm, MOTORS, ["pitch", "roll", "pitch_lower", "pitch_upper", "roll_lower", "roll_upper"], _MODEL),
-    "residual": (_residual, MOTORS, ["pitch", "pitch_lower", "roll_upper", "motor_position_2"], _MODEL),
-    "play": (_play, MOTORS, ["pitch", "roll", "motor_position_3"], _MODEL),
-    "greybox": (_greybox, MOTORS, ["pitch", "roll", "motor_position_1"], _MODEL),
-    "any": (_any, MOTORS, ["pitch", "roll", "pitch_lower", "pitch_upper", "roll_lower", "roll_upper"], _MODEL),
+    "rls": (_rls, MOTORS, ["pitch", "roll", "motor_position_1", "validity"], _MODEL),
+    "miso": (_miso, MOTORS, ["pitch", "roll", "motor_position_2", "validity"], _MODEL),
+    "oe": (_oe, MOTORS, ["pitch", "roll", "motor_position_1", "validity"], _MODEL),
+    "srivc": (_srivc, MOTORS, ["pitch", "roll", "motor_position_2", "validity"], _MODEL),
+    "subspace": (_subspace, MOTORS, ["pitch", "roll", "motor_position_3", "validity"], _MODEL),
+    "nlsm": (
+        _nlsm,
+        MOTORS,
+        ["pitch", "roll", "pitch_lower", "pitch_upper", "roll_lower", "roll_upper", "validity"],
+        _MODEL,
+    ),
+    "residual": (_residual, MOTORS, ["pitch", "pitch_lower", "roll_upper", "motor_position_2", "validity"], _MODEL),
+    "play": (_play, MOTORS, ["pitch", "roll", "motor_position_3", "validity"], _MODEL),
+    "greybox": (_greybox, MOTORS, ["pitch", "roll", "motor_position_1", "validity"], _MODEL),
+    "any": (
+        _any,
+        MOTORS,
+        ["pitch", "roll", "pitch_lower", "pitch_upper", "roll_lower", "roll_upper", "validity"],
+        _MODEL,
+    ),
     "ensemble": (
         _ensemble,
         MOTORS,
-        ["pitch", "roll", "pitch_lower", "pitch_upper", "roll_lower", "roll_upper"],
+        ["pitch", "roll", "pitch_lower", "pitch_upper", "roll_lower", "roll_upper", "validity"],
         _MODEL,
     ),
-    "guarded": (_guarded, MOTORS, ["pitch", "roll", "motor_position_1"], _MODEL),
-    "nss": (_nss, MOTORS, ["pitch", "roll", "motor_position_3"], _MODEL),
-    "nn": (_nn, MOTORS, ["pitch", "roll", "motor_position_3"], _MODEL),
+    "guarded": (_guarded, MOTORS, ["pitch", "roll", "motor_position_1", "validity"], _MODEL),
+    "nss": (_nss, MOTORS, ["pitch", "roll", "motor_position_3", "validity"], _MODEL),
+    "nn": (_nn, MOTORS, ["pitch", "roll", "motor_position_3", "validity"], _MODEL),
     "neck": (
         _neck,
         [*MOTORS, "payload", "push_x", "push_y", "base_tilt_pitch", "base_tilt_roll"],
@@ -234,6 +248,12 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
         [*MOTORS, "pitch_measured", "roll_measured", "measurement_valid"],
         ["pitch", "roll", "pitch_rate", "roll_rate", "innovation", "healthy"],
         ("measurement_noise_std",),
+    ),
+    "nonlinear": (
+        _nonlinear,
+        [*MOTORS, "pitch_measured", "roll_measured", "measurement_valid"],
+        ["pitch", "roll", "pitch_rate", "roll_rate", "innovation", "healthy"],
+        ("measurement_noise_std", "rest_noise_std", "motion_noise_ratio"),
     ),
     "mpc": (
         _mpc,

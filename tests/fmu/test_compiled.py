@@ -95,13 +95,21 @@ def test_fmus_keep_compiled_code_where_softneck_does() -> None:
 
 @pytest.mark.parametrize(
     ("kind", "cost"),
-    [("rls", "light"), ("kalman", "middling"), ("nn", "middling"), ("nlsm", "heavy"), ("neck", "heavy")],
+    [
+        ("lag", "light"),
+        ("rls", "middling"),
+        ("kalman", "middling"),
+        ("nn", "middling"),
+        ("nlsm", "heavy"),
+        ("neck", "heavy"),
+    ],
 )
-def test_the_cost_decides_what_is_compiled(kind: str, cost: str) -> None:
+def test_the_cost_decides_what_is_compiled(kind: str, cost: str, toys: Any) -> None:
     from softneck.fmu.describe._cost import plain_cost
 
     # The paper's 7,000 points; the network's lines do not depend on its size.
-    block = _many_points() if kind == "nlsm" else block_of(kind)
+    special = {"nlsm": _many_points, "lag": toys.lag}
+    block = special[kind]() if kind in special else block_of(kind)
     assert plain_cost(block) == cost
 
 

@@ -146,7 +146,9 @@ def test_an_fmu_is_simulated_as_its_model(backend: str, fmi: int, tmp_path: Path
     found = drive_fmu(path, inputs, parameters={"use_measurement": 1.0})
     # What the start was is forgotten: 0.8^300 is below rounding.
     expected = chosen.simulate(rec, warm_up=WARM_UP)
-    np.testing.assert_allclose(found[WARM_UP:], expected[WARM_UP:], atol=1e-12)
+    np.testing.assert_allclose(found[WARM_UP:, :-1], expected[WARM_UP:, :-1], atol=1e-12)
+    # Of where the motors have been held 0.98^300 is left: 0.2 % of a unit.
+    np.testing.assert_allclose(found[WARM_UP:, -1], expected[WARM_UP:, -1], atol=2e-3)
 
 
 @pytest.mark.parametrize(("backend", "fmi"), BACKENDS)

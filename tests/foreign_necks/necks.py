@@ -104,6 +104,8 @@ def record(
     kept = [f"{what}_{j}" for what in ("motor_position", "tension") for j in (1, 2, 3)] + ["compression"]
     channels = {name: rows[output].copy() for name, output in _OWN_CHANNELS.items()}
     channels |= {name: rows[name].copy() for name in kept}
+    if payload > 0.0:
+        channels["payload"] = np.full(len(P), payload)
     return Recording(excitation.time, excitation.sample_time, {**dict(zip(SET_POINTS, P.T, strict=True)), **channels})
 
 

@@ -13,7 +13,9 @@ from .held_out import HELD_OUT
 from .necks import CHOOSING, NECKS
 
 # What only shows: it prints what each neck is like, and chooses nothing.
-SHOWS = {"benchmarks/foreign_necks.py", "benchmarks/baseline.py", "benchmarks/promises.py"}
+SHOWS = {
+    "benchmarks/foreign_necks.py", "benchmarks/baseline.py", "benchmarks/observer.py", "benchmarks/promises.py",
+}  # fmt: skip
 SCRIPTS = [
     path
     for folder in ("benchmarks", "softneck")

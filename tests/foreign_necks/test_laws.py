@@ -277,7 +277,8 @@ def test_ports_and_recordings_are_those_of_the_virtual_neck(name: str) -> None:
     block, like = ForeignNeck(name=name).block(), ours.block()
     assert [port.name for port in block.inputs] == [port.name for port in like.inputs]
     assert [port.name for port in block.outputs] == [port.name for port in like.outputs]
-    recording, other = record(excitation, ForeignNeck(name=name), payload=0.5), softneck.record(excitation, ours)
+    recording = record(excitation, ForeignNeck(name=name), payload=0.5)
+    other = softneck.record(excitation, ours, payload=0.5)
     assert set(recording.channels) == set(other.channels)
     assert all(np.isfinite(channel).all() for channel in recording.channels.values())
 

@@ -86,7 +86,7 @@ def test_the_jacobian_is_what_small_changes_say() -> None:
         u = np.clip(u + rng.normal(0.0, 0.4, 3), -6.0, 6.0)
         state, _ = model.step(state, u)
     J, n = model.jacobian(state, u), state.values.size
-    assert [part.shape for part in J] == [(n, n), (n, 3), (5, n), (5, 3)]
+    assert [part.shape for part in J] == [(n, n), (n, 3), (6, n), (6, 3)]
     dx, du, h = rng.standard_normal(n), rng.standard_normal(3), 1e-6
     dx[np.abs(state.values) > 1e3] = 0.0  # the generator of random numbers
     ends = [model.step(State(state.values + s * dx, state.parameters, state.outputs), u + s * du) for s in (h, -h)]

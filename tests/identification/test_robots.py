@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -162,7 +163,8 @@ def test_set_membership_takes_any_robot(form: str, name: str, tmp_path: Path) ->
     assert min(judged.coverage_pct.values()) > (75.0 if form == "paper" else 95.0)
     ports = [port.name for port in model.block().outputs]
     first = recording.robot.outputs.names[0]
-    assert ports[-2 * recording.outputs.shape[1] :][:2] == [f"{first}_lower", f"{first}_upper"]
+    assert ports[-2 * recording.outputs.shape[1] - 1 :][:2] == [f"{first}_lower", f"{first}_upper"]
+    assert ports[-1] == "validity"
     model.save(tmp_path / "m.npz")
     np.testing.assert_array_equal(load(tmp_path / "m.npz").simulate(test), model.simulate(test))
     # Who starts where the robot rests stays there: the set adds the rest, the base nothing.
@@ -240,8 +242,15 @@ def test_a_family_holds_the_truth_of_each_axis(name: str, sample_time: float, tm
 
 def test_what_of_a_family_is_a_neck_s_alone_is_refused() -> None:
     recording = recorded(ROBOTS["antagonist"])
-    with pytest.raises(SettingsError, match=r"`lpv_knots`.* takes necks only so far, not robot `antagonist`"):
-        FamilySettings(lpv_knots=3).fit(recording)
+    table = ROBOTS["antagonist"].as_dict()
+    lengths = Robot.from_dict({**table, "outputs": {"names": ["x"], "unit": "mm"}})
+    channels = {**recording.channels, "x": recording.channels["pitch"]}
+    del channels["pitch"]
+    shown = replace(recording, channels=channels, robot=lengths)
+    with pytest.raises(
+        SettingsError, match=r"`lpv_knots`.* is for robots with one or two angles; robot .* has x in mm"
+    ):
+        FamilySettings(lpv_knots=3).fit(shown)
     with pytest.raises(DataError, match="recordings of two robots"):
         FamilySettings().fit([recording, recorded(ROBOTS["finger"])])
 

@@ -168,12 +168,11 @@ def record_run(_: Path) -> np.ndarray:
 
 
 def estimate_run(folder: Path) -> np.ndarray:
-    """Return what filters and smoothers make of a whole recording, the unscented one too."""
-    from softneck.estimation import ukf
-
+    """Return what filters and smoothers make of a whole recording, that over a nonlinear model too."""
     load, few = find("core:load"), recording().rows(0, 150)
     estimates = [load(folder / f"{name}.npz").estimate(few) for name in ("kalman", "kalman_steady")]
-    estimates += [load(folder / "kalman.npz").smooth(few), ukf(load(folder / "play.npz"), memory=2).estimate(few)]
+    nonlinear = find("estimation:KalmanSettings")().design(load(folder / "play.npz"))
+    estimates += [load(folder / "kalman.npz").smooth(few), nonlinear.estimate(few)]
     return np.vstack([np.column_stack([e.pitch, e.roll, e.pitch_rate, e.roll_rate]) for e in estimates])
 
 

@@ -31,7 +31,12 @@ def test_every_kind_has_a_file_and_what_is_stepped_has_outputs() -> None:
 @pytest.mark.parametrize("name", OUTPUTS)
 def test_outputs_are_those_of_the_version_that_wrote_the_file(name: str) -> None:
     expected = np.array(OUTPUTS[name])
-    seen = compiled_run(block_of(name, GOLDEN), GOLDEN_ROWS, "missing")
+    block = block_of(name, GOLDEN)
+    seen = compiled_run(block, GOLDEN_ROWS, "missing")
+    if block.outputs[-1].name == "validity":
+        # These files are from before it: they know none.
+        assert (seen[:, -1] == 0.0).all()
+        seen = seen[:, :-1]
     # Equal to the bit on the machine that wrote them (`same_as_commit.py`). Another machine's libm and sums of another
     # length of vector are off by a few 1e-16 of each signal's size; 1e-12 is what `test_native_kinds.py` grants too.
     scale = np.maximum(np.nanmax(np.abs(expected), axis=0), 1e-3)

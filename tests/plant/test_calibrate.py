@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,8 @@ from softneck.cli._main import run
 from softneck.core import DataError
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.plant._calibration import _Run, calibrate
-from softneck.signals import Recording, signal, write_recording
+from softneck.signals import Recording, read_recording, signal, write_recording
+from softneck.signals.recording._conditions import conditions
 
 TRUE = NeckParameters.paper().replace(bending_stiffness=0.75, drive_latency=0.03, pretension=2.5)
 
@@ -61,3 +63,20 @@ def test_the_command_writes_a_neck_that_loads_and_refuses_one_that_does_not_foll
     assert run(["calibrate", str(tmp_path / "bad.csv"), "-o", str(tmp_path / "bad.toml"), "--evaluations", "1"]) == 1
     assert "less than 85: not written" in capsys.readouterr().err
     assert not (tmp_path / "bad.toml").exists()
+
+
+@pytest.mark.slow
+def test_the_command_takes_a_grey_box_and_the_payload_that_a_recording_says(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    golden, neck = Path(__file__).parents[1] / "golden" / "greybox.npz", tmp_path / "neck.toml"
+    assert run(["calibrate", str(golden), "-o", str(neck), "--evaluations", "3", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["worst"] == min(fit for pair in told["fits"] for fit in pair) >= 85.0
+    assert NeckParameters.preset(str(neck)) != NeckParameters.preset(told["start"])
+    assert run(["calibrate", str(golden.with_name("oe.npz")), "-o", str(tmp_path / "no.toml")]) == 2
+    assert "is of kind oe; a neck is calibrated to recordings or to a `greybox`" in capsys.readouterr().err
+    assert conditions(recorded(0.5))["payload_kg"] == [0.5, 0.5]
+    write_recording(tmp_path / "half.csv", recorded(0.5))
+    assert conditions(read_recording(tmp_path / "half.csv"))["payload_kg"] == [0.5, 0.5]
+    assert conditions(recorded())["payload_kg"] == [0.0, 0.0]

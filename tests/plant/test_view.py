@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 from pathlib import Path
@@ -14,6 +15,7 @@ from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.plant._geometry_runtime import bend_functions, lean_angles, tilt_rotation
 from softneck.plots import neck_view
 from softneck.plots._neck3d import bend_of
+from softneck.robot import Robot
 from softneck.signals import Excitation, Recording, signal
 
 
@@ -49,6 +51,36 @@ def test_what_cannot_be_drawn_is_refused(recording: Recording) -> None:
         neck_view(lost)
     with pytest.raises(SettingsError, match="`link_length` must be positive"):
         neck_view(recording, link_length=0.0)
+
+
+@pytest.mark.parametrize("name", ["trunk4", "antagonist", "finger"])
+def test_robots_that_tendons_bend_are_drawn_by_theirs(name: str) -> None:
+    robot = Robot.preset(name)
+    outputs = len(robot.outputs.names)
+    angles = np.linspace(0.0, 0.5, 50 * outputs).reshape(50, outputs)
+    channels = dict.fromkeys(robot.set_points, np.ones(50)) | dict(zip(robot.outputs.names, angles.T, strict=True))
+    page = neck_view(Recording(0.02 * np.arange(50), 0.02, channels, robot=robot))
+    found = re.search(r"^const data = (.*);$", page, re.MULTILINE)
+    assert found is not None
+    data = json.loads(found[1])
+    assert tuple(data["tendons"]) == robot.directions.angles_deg
+    assert (tuple(data["names"]), data["unit"]) == (robot.outputs.names, "rad")
+    assert len(data["pull"][0]) == len(robot.set_points)
+    plane = np.column_stack([angles, np.zeros(50)])[:, :2]
+    # Rounded to five digits in the page.
+    np.testing.assert_allclose(data["bend"], bend_of(plane), atol=1e-5)
+
+
+def test_a_robot_that_no_tendons_bend_is_not_drawn() -> None:
+    robot = Robot.from_dict({
+        "name": "tank", "motors": {"names": ["pump"], "unit": "V"}, "outputs": {"names": ["level"], "unit": "V"},
+        "directions": {"kind": "identified"},
+    })  # fmt: skip
+    recording = Recording(0.02 * np.arange(5), 0.02, {"motor_setpoint_1": np.ones(5), "level": np.ones(5)}, robot=robot)
+    with pytest.raises(
+        DataError, match=r"robot `tank` \(\w{8}\) has no view in 3-D: it is drawn of robots that tendons"
+    ):
+        neck_view(recording)
 
 
 @pytest.mark.slow

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softneck.core import DataError
+from softneck.core import DataError, SettingsError
 from softneck.identification import OutputError, Validation, validate
+from softneck.plots import quality_page, region_figure
 from softneck.plots._charts import recording_chart, validation_chart
 from softneck.plots._judgement_charts import histogram_chart, residual_chart
-from softneck.plots._recording_page import recording_page
 from softneck.report import validation_page
 from softneck.robot import Robot
-from softneck.signals import Recording
+from softneck.signals import Recording, assess_quality
 
 TS = 0.02
 CHAMBERS = {
@@ -46,9 +46,15 @@ def test_a_recording_has_all_motors_and_outputs_in_the_robot_s_units(recording: 
     assert (motors.y_label, outputs.y_label) == ("set-point [bar]", "output [mm]")
     np.testing.assert_allclose(motors.curves[4].y, r.set_points[:, 4] / 1e5)
     np.testing.assert_allclose(outputs.curves[2].y, 1e3 * r.outputs[:, 2])
-    page = recording_page(r, "mine")
-    assert ">motor_setpoint_5<" in page
-    assert "`chambers`" in page
+
+
+def test_the_page_on_quality_is_of_any_robot_but_for_the_map_of_a_neck(recording: Recording) -> None:
+    found = assess_quality(recording, bandwidth=4.0)
+    page = quality_page(recording, found, "mine")
+    assert (page.count("data:image/png"), ">motor_setpoint_5<" in page, "`chambers`" in page) == (4, True, True)
+    assert page.count("<p>ok: ") == sum(finding.severity == "ok" for finding in found.findings)
+    with pytest.raises(SettingsError, match="a neck's, not that of robot `chambers`"):
+        region_figure(recording, found, "mine")
 
 
 def test_a_validation_has_a_panel_and_an_error_for_each_output(recording: Recording) -> None:

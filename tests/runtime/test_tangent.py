@@ -91,8 +91,8 @@ def test_directions_beyond_those_asked_for_stay_as_they_are() -> None:
     rng = np.random.default_rng(0)
     X, U = rng.standard_normal((x.size, 4)), rng.standard_normal((8, 4))
     all_of_them = along(block, x, u, q, X, U)[2]
-    some, Y = X.copy(), np.full((len(block.outputs), 4), 7.0)
-    load_tangent(block.runtime, compiled=False)(block.arrays, q, x.copy(), u, np.zeros(5), some, U, Y, 2)
+    some, y, Y = X.copy(), np.zeros(len(block.outputs)), np.full((len(block.outputs), 4), 7.0)
+    load_tangent(block.runtime, compiled=False)(block.arrays, q, x.copy(), u, y, some, U, Y, 2)
     np.testing.assert_array_equal(some[:, :2], all_of_them[:, :2])
     np.testing.assert_array_equal(Y[:, 2:], 7.0)
 
@@ -102,7 +102,8 @@ def test_compiled_it_is_the_same() -> None:
     x, u, q = moving(block, 20)
     X, U = np.eye(x.size), np.zeros((8, x.size))
     plain = along(block, x, u, q, X, U)
-    y, Y = np.zeros(5), np.zeros((5, x.size))
+    outputs = len(block.outputs)
+    y, Y = np.zeros(outputs), np.zeros((outputs, x.size))
     load_tangent(block.runtime)(block.arrays, q, x, u, y, X, U, Y, x.size)
     # numpy's own sums may be in another order: some 1e-16 of values around 1.
     for a, b in zip(plain, (x, y, X, Y), strict=True):

@@ -12,9 +12,12 @@ from hypothesis import strategies as st
 from scipy import signal as dsp
 
 from softneck.core import SettingsError
+from softneck.identification.models._directions import bandwidth_of
 from softneck.plant import NeckParameters, VirtualNeck, record
+from softneck.robot import Robot
 from softneck.signals import (
     SET_POINTS,
+    Quality,
     Recording,
     assess_quality,
     concatenate,
@@ -25,6 +28,7 @@ from softneck.signals import (
     signal,
 )
 from softneck.signals.quality._excitation import welch
+from softneck.signals.quality._region import Region
 
 from ..data import LAYOUTS, neck_recording, recording_from
 
@@ -34,6 +38,11 @@ TS = 0.02
 def from_inputs(inputs: np.ndarray) -> Recording:
     """The tests' neck under theta_i, phi_i, delta_i (time, 3)."""
     return recording_from(motors_from(inputs), noise=1e-3)
+
+
+def region_of(found: Quality) -> Region:
+    assert found.region is not None
+    return found.region
 
 
 def topics(recording: Recording, severity: str) -> set[str]:
@@ -135,22 +144,22 @@ def test_each_behaviour_is_seen_when_it_happens_and_missed_when_not() -> None:
     for j in range(3):
         alone = rest.copy()
         alone[100:] = 3.0 * np.eye(3)[j]
-        found = assess_quality(recording_from(alone)).region.behaviours
+        found = region_of(assess_quality(recording_from(alone))).behaviours
         expected = {f"tendon {i + 1} alone": (2.0 if i == j else 0.0) for i in range(3)}
         # 100 samples of 20 ms.
         assert {name: found[name] for name in expected} == pytest.approx(expected)
         assert found["co-contraction"] == 0.0
     together = rest + 2.0
-    assert assess_quality(recording_from(together)).region.behaviours["co-contraction"] == pytest.approx(4.0)
-    assert assess_quality(recording_from(together)).region.behaviours["holding still"] == pytest.approx(4.0)
+    assert region_of(assess_quality(recording_from(together))).behaviours["co-contraction"] == pytest.approx(4.0)
+    assert region_of(assess_quality(recording_from(together))).behaviours["holding still"] == pytest.approx(4.0)
 
 
 @pytest.mark.slow
 def test_the_papers_signal_misses_what_the_paper_says_and_mixed_does_not() -> None:
     neck = VirtualNeck(NeckParameters.preset("paper"))
     missing = ("tendon 1 alone", "tendon 2 alone", "tendon 3 alone", "co-contraction", "holding still")
-    assert assess_quality(record(signal("eq22"), neck)).region.never == missing
-    assert assess_quality(record(signal("mixed"), neck)).region.never == ()
+    assert region_of(assess_quality(record(signal("eq22"), neck))).never == missing
+    assert region_of(assess_quality(record(signal("mixed"), neck))).never == ()
 
 
 @pytest.mark.slow
@@ -158,10 +167,10 @@ def test_coverage_is_whole_where_the_motors_went_everywhere() -> None:
     # A grid of motor positions a third of a cell apart reaches every cell of the hexagon.
     axis = np.arange(-2.0, 2.01, 1 / 6)
     P = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
-    region = assess_quality(recording_from(P), motor_limit=2.0).region
+    region = region_of(assess_quality(recording_from(P), motor_limit=2.0))
     assert region.tilt_coverage == 1.0
     assert region.delta_coverage == 1.0
-    corner = assess_quality(recording_from(np.zeros((50, 3))), motor_limit=2.0).region
+    corner = region_of(assess_quality(recording_from(np.zeros((50, 3))), motor_limit=2.0))
     assert 0.0 < corner.tilt_coverage < 0.1
 
 
@@ -183,7 +192,7 @@ def test_nothing_reaches_across_runs() -> None:
     np.testing.assert_allclose(one.spectrum.density, other.spectrum.density, rtol=1e-9, atol=1e-15)
     assert one.conditioning["roll"].number == pytest.approx(other.conditioning["roll"].number, rel=1e-9)
     np.testing.assert_allclose(one.correlation, other.correlation, atol=1e-12)
-    assert one.region.behaviours == pytest.approx(other.region.behaviours)
+    assert region_of(one).behaviours == pytest.approx(region_of(other).behaviours)
 
 
 @pytest.mark.slow
@@ -229,3 +238,58 @@ def test_the_spectrum_is_scipys(rows: int, length: int, size: int) -> None:
     _, expected = dsp.welch(u, fs=50.0, nperseg=length, nfft=size, axis=0)
     # Two Fourier transforms of the same numbers: 1e-15 measured, 100 times that allowed.
     np.testing.assert_allclose(welch(u, 0.02, length, size), expected, rtol=0, atol=1e-13 * expected.max())
+
+
+def test_another_robot_is_judged_by_its_channels() -> None:
+    """The neck's recording, renamed, in mm and in bar: the same faults in place, condition and correlation."""
+    neck = record(signal("multisine", duration=60.0, seed=2), VirtualNeck(NeckParameters.preset("paper")), seed=3)
+    pitch = neck.channels["pitch"].copy()
+    pitch[100:120] = np.nan
+    neck = neck.with_channels(pitch=pitch)
+    robot = Robot.from_dict({
+        "name": "bellows",
+        "motors": {"names": ["a", "b", "c"], "unit": "bar", "setpoint_min": -6e-5, "setpoint_max": 6e-5},
+        "outputs": {"names": ["x", "y"], "unit": "m", "display_unit": "mm"},
+        "directions": {"kind": "identified"},
+    })  # fmt: skip
+    names = {"pitch": "x", "roll": "y"} | {n: n for n in (*neck.robot.set_points, *neck.robot.motor_positions)}
+    channels = {mine: neck.channels[name] for name, mine in names.items()}
+    other = Recording(neck.time, neck.sample_time, channels, robot=robot)
+    of_neck, found = assess_quality(neck), assess_quality(other, bandwidth=4.0)
+    for name, mine in names.items():
+        one, two = of_neck.channels[name], found.channels[mine]
+        assert (one.missed, one.frozen, one.clipped, one.outliers) == (
+            two.missed,
+            two.frozen,
+            two.clipped,
+            two.outliers,
+        )
+    assert found.conditioning["x"].number == of_neck.conditioning["pitch"].number
+    np.testing.assert_array_equal(found.correlation, of_neck.correlation)
+    assert found.as_dict()["channels"]["x"]["unit"] == "mm"
+    said = found.text()
+    assert "x: misses 20 of 3000 samples (0.67 %) in 1 stretch(es); the longest is 0.40 s at t = 2.00 s" in said
+    assert "beyond 0.1 s a control loop would have stopped" in said
+    assert "every motor moves up to the bandwidth of 4 rad/s." in said
+    assert found.spectrum.inputs == robot.set_points
+    assert "co-contraction" not in {finding.topic for finding in found.findings}
+    unknown = assess_quality(other)
+    assert [f.message for f in unknown.findings if f.topic == "excitation"] == [
+        "nothing is known of how fast the outputs follow the motors: the spectrum is not judged."
+    ]
+
+
+def test_the_bandwidth_of_a_robot_is_that_of_its_low_pass() -> None:
+    """A first-order robot with 0.2 s, the neck's time constant, has the neck's 4 rad/s; ten times slower, a tenth."""
+    robot = Robot.from_dict({
+        "name": "tank", "motors": {"names": ["pump"], "unit": "V"}, "outputs": {"names": ["level"], "unit": "V"},
+        "directions": {"kind": "identified"},
+    })  # fmt: skip
+    u = np.repeat(np.random.default_rng(0).uniform(0.0, 5.0, 40), 50)
+    for slower in (1.0, 10.0):
+        pole = np.exp(-TS / 0.2)
+        level = np.asarray(dsp.lfilter([0.0, 1.0 - pole], [1.0, -pole], u))
+        time = slower * TS * np.arange(u.size)
+        recording = Recording(time, slower * TS, {"motor_setpoint_1": u, "level": level}, robot=robot)
+        # The search over time constants ends within 0.1 % of its logarithm.
+        assert bandwidth_of(recording) == pytest.approx(4.0 / slower, rel=1e-2)

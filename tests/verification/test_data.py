@@ -4,22 +4,33 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import control
 import numpy as np
 import pytest
 
+from softneck.cli._verify import _opened
 from softneck.core import SettingsError
+from softneck.design import PiSettings
+from softneck.fmu import build_fmu
 from softneck.identification import Family
 from softneck.identification.linear._srivc_fit import Continuous
 from softneck.identification.uncertainty._measured import AxisMeasured, band_borders, response_of
-from softneck.plant import NeckParameters
-from softneck.verification import Verification, make_requirements, verify
+from softneck.loop import BlockPart
+from softneck.plant import NeckParameters, VirtualNeck
+from softneck.verification import Verification, _tested, make_requirements, verify
 from softneck.verification._evidence import Values, worst_row
-from softneck.verification._experiments import Crossing
+from softneck.verification._experiments import Crossing, LoopUnderTest, _Case
 from softneck.verification._linear import LinearLaw, margins
-from softneck.verification._own_plants import is_own_plant, own_plant
+from softneck.verification._neck_loops import step_at
+from softneck.verification._own_plants import ALONE, OwnPlant, is_own_plant, not_recorded, own_plant
+from softneck.verification._plants import all_plants, neck_of_family
+from softneck.verification._steps import Steps
+from softneck.verification._structured import structured
 from softneck.verification._tested import axis_on_data
+from softneck.verification._verify import unsupported
 
 from .necks import PAPER, QUICK, TS, family, linear_neck, pi
 
@@ -155,6 +166,69 @@ def test_what_crosses_beyond_the_band_is_not_supported_and_not_held() -> None:
 
 
 @pytest.mark.slow
+def test_what_a_family_cannot_speak_of_is_not_supported_and_not_held() -> None:
+    """Recordings at 1 kg that show nothing: every margin and every linear step was certified as if they were in it."""
+    plain = on_data(weight=0.15)
+    told = {**plain.findings["tested"], "unheard": {"pitch": ["1kg.csv"], "roll": []}}
+    found = verify(pi(), {"f.npz": replace(plain, findings={"tested": told})}, make_requirements(QUIET))
+    rows = {row["metric"]: row for row in found.contents()["requirements"]}
+    for metric in ("axes.gain_margin", "robust.mu", "stability.radius", "step.overshoot_pct"):
+        assert rows[metric]["holds"] is False
+        assert "not supported by the data: 1kg.csv moves pitch and shows no response" in rows[metric]["note"]
+    assert not found.holds
+
+
+def held_at(common: float) -> Steps:
+    return Steps(np.zeros(4), np.zeros((2, 3, 4)), np.full((2, 3, 4, 3), common), {}, {})
+
+
+@pytest.mark.parametrize(
+    ("payload", "at", "loop", "said"),
+    [
+        ([1.0], [0.0], 0.0, {}),
+        ([0.0], [0.0], 0.0, {"neck": "recorded with 1 kg, and no plant that steps carries that"}),
+        ([1.0], [0.0], 2.0, {"neck": "at a co-contraction of 2 rad", "loop": "recorded at -0.5 to 0.5 rad"}),
+        ([1.0], [2.0], 0.0, {"neck": "at a co-contraction of 0 rad"}),
+        (None, [0.0], 2.0, {"loop": "holds its motors at a co-contraction of 2 rad, and with 1 kg"}),
+    ],
+    ids=["recorded", "other payload", "tauter than all recordings", "tauter plant", "takes any payload"],
+)
+def test_what_nobody_recorded_is_not_supported(
+    payload: list[float] | None, at: list[float], loop: float, said: dict[str, str]
+) -> None:
+    """Steps with 1 kg were certified on a plant of 0 kg alone, and recordings of slack tendons for taut ones."""
+    tested = {"f.npz": {"conditions": [{"payload_kg": [1.0, 1.0], "cocontraction": [-0.5, 0.5]}]}}
+    known = {} if payload is None else {"payload_kg": payload, "cocontraction": at}
+    part: Any = None
+    plant = OwnPlant(name="p", make=part, quiet=part, payload=payload is None, conditions=known)
+    found = not_recorded(tested, [plant], held_at(loop))
+    assert found.keys() == said.keys()
+    for group, words in said.items():
+        assert words in found[group]
+
+
+@pytest.mark.slow
+def test_of_what_was_not_recorded_no_requirement_holds(supported: Verification) -> None:
+    evidence, why = supported.evidence, {"neck": "no such payload", "loop": "slack there"}
+    for item in make_requirements(QUIET).bounds:
+        group = "neck" if item.metric.startswith("neck.") else "loop"
+        assert unsupported(item, replace(evidence, foreign=False), why) == why[group], item.metric
+        # A preset is nobody's recorded plant, and decides nothing.
+        assert unsupported(item, evidence, {"neck": why["neck"]}) == "", item.metric
+
+
+@pytest.mark.slow
+def test_margins_of_a_controller_without_linear_form_are_no_promise(supported: Verification) -> None:
+    """Nothing of it is held against the weight over the recordings: models alone told four times the true margin."""
+    evidence, why = replace(supported.evidence, tested=[]), {"margins": ALONE}
+    told = {item.metric: unsupported(item, evidence, why) for item in supported.requirements.bounds}
+    assert {metric for metric, reason in told.items() if reason == ALONE} == {
+        metric for metric in told if metric.endswith(("gain_margin", "delay_margin_ms"))
+    }
+    assert told["axes.gain_margin"] == ALONE
+    assert told["step.overshoot_pct"] == ""
+
+
 def test_margins_by_experiment_stand_beside_the_linear_ones_and_the_smaller_is_certified(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -198,3 +272,87 @@ def test_what_steps_is_told_from_what_is_linear() -> None:
     assert not is_own_plant(family())
     with pytest.raises(SettingsError, match="c: is no plant with the outputs pitch and roll"):
         own_plant(pi().block(), "c")
+
+
+def test_a_roll_off_that_the_user_states_is_judged_up_to_nyquist() -> None:
+    """A controller whose gain rises above the band crosses there unless the plant falls steeply."""
+
+    def judge(rolloff: float, law: LinearLaw = LAW) -> _tested.TestedAxis:
+        narrow = measured(weight=0.01, high=20.0)
+        return axis_on_data(narrow, law, 0, source="f", name="pitch", extra=0, rolloff=rolloff)
+
+    silent, falling = judge(-1.0), judge(20.0)
+    # The law and the plant both fall above 20 rad/s: nothing is lost by asking.
+    assert falling.margins == pytest.approx(dict(silent.margins))
+    # A lead that begins above the band: silence does not see it, a plant as loud as at the band's end crosses.
+    lead = control.sample_system(control.TransferFunction([1.0 / 25.0, 1.0], [1.0 / 750.0, 1.0]), TS, "tustin")
+    one = control.ss([], [], [], [[1.0]], TS)
+    form = control.append(one, one, control.ss(lead), control.ss(lead))
+    rising = LinearLaw.of(_labelled(pi().ss() * form))
+    assert math.isfinite(judge(-1.0, rising).crossover)
+    assert math.isinf(judge(0.0, rising).crossover)
+    assert "not supported by the data" in judge(0.0, rising).why()
+    steep = judge(60.0, rising)
+    assert math.isfinite(steep.crossover)
+    # Just above the band nothing has fallen yet: the margins there are those of a loop of any phase.
+    assert steep.margins["disk_margin"] <= judge(-1.0, rising).margins["disk_margin"]
+
+
+def _labelled(system: Any) -> Any:
+    names = [f"{axis}{end}" for end in ("_reference", "") for axis in ("pitch", "roll")]
+    return control.ss(system, inputs=names, outputs=["theta_i", "phi_i"])
+
+
+def test_a_step_waits_for_the_motors_that_pull_tendons_taut() -> None:
+    taut = PiSettings(least_cocontraction=0.6).design(linear_neck())
+    assert step_at(pi().block()) == 0.5
+    assert step_at(taut.block()) == 3.0
+
+
+def test_a_tested_family_holds_no_plant_that_its_recordings_exclude_and_reaches_to_the_weight() -> None:
+    """Corners put together what no recording has: a slow pole and a long dead time, of which designs were refused."""
+    neck = neck_of_family(on_data(weight=0.15, high=25.0), "f")
+    wide = tuple(replace(box, low=0.5 * box.nominal, high=2.0 * box.nominal) for box in neck.axes)
+    plants = all_plants([replace(neck, axes=wide)], 60, 0)
+    w = np.geomspace(0.3, 25.0, 20)
+    error = np.abs(plants.response(w) / response_of(MODEL, w, TS) - 1.0).max(axis=2)
+    # Ten halvings: to a thousandth of the way, on which the error grows by less than three.
+    assert error.max() <= 0.15 * (1.0 + 1e-9)
+    assert error.max() == pytest.approx(0.15, rel=0.02)
+    assert plants.names[-1] == "f: middle of its recordings"
+    assert error[-1].max() < 1e-9
+    # Without recordings the box is whole.
+    bare = tuple(replace(box, measured=None) for box in wide)
+    assert all_plants([replace(neck, axes=bare)], 60, 0).numbers[:, :, 0].max() == wide[0].high[0]
+
+
+@pytest.mark.parametrize("weight", [0.1, 0.3])
+def test_mu_over_the_weight_of_axes_apart_is_the_largest_of_each(weight: float) -> None:
+    neck = replace(neck_of_family(on_data(weight=weight), "f"), cross=np.zeros(2))
+    drawn = np.zeros((1, 2, 3))
+    found = structured(neck, LAW, extra=0, drawn=drawn, performance=True)
+    alone = axis_on_data(measured(weight=weight), LAW, 0, source="f", name="pitch", extra=0)
+    # 90 frequencies in two decades: 5 % apart, and the peak is flat; the other grid adds half its step.
+    assert found[0].mu == pytest.approx(alone.mu, rel=0.03)
+    assert found[0].worst_sensitivity == pytest.approx(alone.margins["sensitivity"], rel=0.05)
+
+
+@pytest.mark.slow
+def test_an_fmu_stands_as_much_as_the_plant_that_it_is_made_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    block = VirtualNeck(NeckParameters.paper().without_noise()).block()
+    build_fmu(block, tmp_path / "neck.fmu")
+    monkeypatch.chdir(tmp_path)
+    own = own_plant(_opened((Path("neck.fmu"),), None)["neck.fmu"], "neck.fmu")
+    # Loading an FMU changes the folder for a moment: another thread's relative path was "no such file".
+    monkeypatch.chdir(Path("/"))
+    swings = [
+        _Case(
+            LoopUnderTest(name="p", plant=part, controller=pi().block(), inputs={"payload": 0.0}, compiled=False),
+            "both", "gain_up", math.radians(1.0), (0.0, 0.0),
+        )._windows(1.5, 0.0)
+        for part in (lambda: own.quiet(TS), lambda: BlockPart(block))
+    ]  # fmt: skip
+    assert own.payload
+    # The same runtime inside, to the last bits of outputs that pass as text nowhere.
+    assert swings[0] == pytest.approx(swings[1], rel=1e-9)
+    assert swings[1][1] > 0.0

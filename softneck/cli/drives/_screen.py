@@ -58,6 +58,8 @@ def _head(picture: dict[str, Any]) -> Text:
     of = "" if picture["duration"] is None else f" of {picture['duration']:.1f}"
     text.append(f"   loop {picture['run_time']:.2f}{of} s   since start {picture['since']:.2f} s")
     text.append(f"   bus cycle {picture['cycle']}")
+    text.append("   validity ")
+    text.append(_number(picture["validity"], ".2f"), style="bold red" if picture["validity"] < 0.5 else "none")
     if picture["fault"] is not None:
         text.append(f"\n{picture['fault']}", style="bold red")
     return text

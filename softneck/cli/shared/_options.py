@@ -41,6 +41,11 @@ def read_together(paths: Sequence[Path], robot: str | None = None) -> Recording:
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout and nothing else.")
 force_option = click.option("--force", is_flag=True, help="Replace an existing file.")
+tolerance_option = click.option(
+    "--tolerance",
+    type=float,
+    help="Error that the output `validity` allows, in the outputs' display unit; a neck's is 2 deg.",
+)
 trust_option = click.option(
     "--trust", is_flag=True, help="Run Python that the file names and that lies outside of the loop's folder."
 )

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from softneck.core import to_si
+
 from ._console import percent
 
 if TYPE_CHECKING:
@@ -80,6 +82,13 @@ def remarks(r: Validation) -> list[str]:
         )
     if r.outside_pct is not None and not lost:
         lines.append(f"{who}: {_pair(r.outside_pct.values())} % of them lie outside what the model has seen")
+    if r.validity is not None:
+        v = r.validity
+        lines.append(
+            f"{who}: validity {v['mean']:.2f} in the mean, {v['least']:.2f} at least; {100 * v['held']:.0f} % of the "
+            f"samples were within the tolerance (Brier score {v['brier']:.3f}, of that share alone "
+            f"{v['brier_base_rate']:.3f})"
+        )
     lines += [f"{who}: {said}" for said in r.bounds_remarks if not lost]
     if not lost:
         lines += _calibrated(who, r)
@@ -104,6 +113,10 @@ def _calibrated(who: str, r: Validation) -> list[str]:
                 f"{who}: calibrated on {found['records']} records, 90 % for {of} of a further one: {axis} "
                 f"+-{bound['half_width']:.2f} {unit}{held}"
             )
+    if lines:
+        unit, ends = r.robot.motors.unit, zip(found["domain"]["min"], found["domain"]["max"], strict=True)
+        said = "  ".join("..".join(f"{end / to_si(unit)[0]:.3g}" for end in pair) for pair in ends)
+        lines.append(f"{who}: beyond the set-points of these records ({said} {unit}) there is no such bound")
     if found["reason"] is not None:
         lines.append(f"{who}: no calibrated bounds, {found['reason']}" if not lines else f"{who}: {found['reason']}")
     return lines

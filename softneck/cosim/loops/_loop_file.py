@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +11,14 @@ from softneck.core import FileFormatError, SettingsError, SoftneckError, file_ha
 from softneck.loop import Fault, Loop, Part, ReferenceBlock
 from softneck.loop._faults import make_fault
 from softneck.loop._reference_parts import AheadReference
+from softneck.loop._system import System
 from softneck.robot import Robot, find_robot
 
 from ..parts._fmu_part import FmuPart
 from ..parts._isolated import IsolatedPart
+from ..structure._table import StructureTable, read_ssp
 from ._loop_parts import OBJECT, PRESETS, SOURCES, PartOpener
-from ._loop_values import number, numbers, read_toml, refuse_unknown, tables, texts
+from ._loop_values import links, number, numbers, read_toml, refuse_unknown, tables
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -25,7 +27,7 @@ class LoopSetup:
 
     Attributes:
         loop: the parts, the reference, the order.
-        limits: metric -> upper limit, such as "pitch.overshoot_pct": 5.0.
+        limits: metric -> upper limit, such as "pitch.overshoot_pct": 5.0; of "validity.min" a lower one.
         files: what was read for it: role -> (path, SHA-256).
         angle: which angle the metrics judge: "true" (where the plant offers it) or "measured".
     """
@@ -50,7 +52,7 @@ def load_loop(path: str | Path, *, robot: str | None = None) -> LoopSetup:
     """Read a loop file and open all it names; relative paths start at the file's folder.
 
     Args:
-        path: of the file.
+        path: of the file, or of an SSP archive of a closed loop.
         robot: a preset or a robot file, in the place of the file's `robot`; every part must be of it.
 
     Raises:
@@ -58,6 +60,8 @@ def load_loop(path: str | Path, *, robot: str | None = None) -> LoopSetup:
         SettingsError: unknown or missing keys, or values that do not fit; the line names the key.
     """
     source = Path(path)
+    if source.suffix == ".ssp":
+        return _of_structure(source, robot)
     table = read_toml(source)
     try:
         return _setup(table if robot is None else {**table, "robot": find_robot(robot)}, source)
@@ -65,6 +69,52 @@ def load_loop(path: str | Path, *, robot: str | None = None) -> LoopSetup:
         if str(error).startswith(str(source)):
             raise
         raise type(error)(f"{source}: {error}") from error
+
+
+def load_ssp(path: str | Path) -> LoopSetup | System:
+    """Read an SSP 1.0 or 2.0 archive of FMUs for co-simulation, of any tool.
+
+    Args:
+        path: of the archive; its FMUs are unpacked until this process ends.
+
+    Returns:
+        A loop where the FMUs are one plant, one controller and one reference (of softneck, or so named), and
+        perhaps an observer and others; else a system, whose signals are named "part.output".
+
+    Raises:
+        FileFormatError: no archive, or one that is damaged, reaches out of itself or lacks what it names.
+        SettingsError: what a loop cannot carry, such as signal dictionaries; the line names it.
+    """
+    read = read_ssp(path)
+    if read.closed:
+        return _of_structure(Path(path), None, read)
+    opener = PartOpener(Path())
+    entries = {entry["name"]: entry for entry in read.table["part"]}
+    parts = {name: opener.other(name, entry) for name, entry in entries.items()}
+    inputs, parameters = _constants(parts, entries)
+    return System(
+        parts=parts,
+        connections=links(read.table["connections"]),
+        constants=inputs,
+        parameters=parameters,
+        duration=number("duration_s", read.table["duration_s"]),
+        order=read.table["order"],
+    )
+
+
+def _of_structure(source: Path, robot: str | None, read: StructureTable | None = None) -> LoopSetup:
+    read = read_ssp(source) if read is None else read
+    if not read.closed:
+        raise SettingsError(
+            f"{source}: is no closed loop: its FMUs are not one plant whose set-points are fed, one controller and one "
+            "reference; `softneck simulate` runs it, and `load_ssp` returns it as a system."
+        )
+    table = {**read.table, "robot": find_robot(robot, beside=source)}
+    try:
+        setup = _setup(table, source.parent)
+    except SoftneckError as error:
+        raise type(error)(f"{source}: {error}") from error
+    return replace(setup, files={"ssp": (str(source), file_hash(source))})
 
 
 def is_loop_file(path: Path) -> bool:
@@ -77,10 +127,15 @@ def is_loop_file(path: Path) -> bool:
         return False
 
 
-def reference_of(path: str | Path) -> ReferenceBlock:
+def reference_of(path: str | Path, *, robot: str | None = None) -> ReferenceBlock:
     """Return the [reference] of a loop file as a block, of which `build_fmu` makes a reference FMU.
 
-    Its sample time is the file's `sample_time_s`, 20 ms if it states none; its other parts are not opened.
+    Its sample time is the file's `sample_time_s`, 20 ms if it states none; its other parts are not opened. The
+    reference of another robot than the neck is written down over the file's `duration_s`.
+
+    Args:
+        path: of the file.
+        robot: a preset or a robot file, in the place of the file's `robot` or of one beside it.
 
     Raises:
         SettingsError: the reference is an FMU already, or wrong.
@@ -88,13 +143,18 @@ def reference_of(path: str | Path) -> ReferenceBlock:
     source = Path(path)
     table = read_toml(source)
     try:
-        find_robot(beside=source).require_neck("the FMU of a reference")
-        reference = PartOpener(source.parent).reference(table["reference"])
+        said = table.get("robot") if robot is None else robot
+        opener = PartOpener(source.parent)
+        whose = opener.robot(said, source)
+        reference = opener.reference(table["reference"], robot=whose)
         if isinstance(reference, AheadReference):
             reference = reference.reference
         if hasattr(reference, "advance"):
             raise SettingsError("[reference] is an FMU already.")
-        return ReferenceBlock(reference, sample_time=number("sample_time_s", table.get("sample_time_s", 0.02)))  # pyright: ignore[reportArgumentType]
+        step, duration = (
+            number(key, table.get(key, usual)) for key, usual in (("sample_time_s", 0.02), ("duration_s", 0))
+        )
+        return ReferenceBlock(reference, sample_time=step, duration=duration or None, robot=whose)  # pyright: ignore[reportArgumentType]
     except SoftneckError as error:
         raise type(error)(f"{source}: {error}") from error
 
@@ -153,7 +213,7 @@ def _setup(table: Mapping[str, Any], source: Path, opened: dict[Any, Any] | None
         others={name: parts[name] for name in others},
         faults=_faults(table.get("fault", []), robot),
         robot=robot,
-        connections=texts("[connections]", table.get("connections", {})),
+        connections=links(table.get("connections", {})),
     )
     _check_sample_time(loop, table.get("sample_time_s"))
     limits = numbers("[limits]", table.get("limits", {}))

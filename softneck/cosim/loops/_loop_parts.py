@@ -106,7 +106,7 @@ class PartOpener:
                 table["kind"], values, robot)  # fmt: skip
         refuse_unknown("[reference]", values, ("file",))
         recording = read_recording(self._file("reference", str(values.get("file", ""))))
-        require_same_robot(recording.robot, robot, "[reference] file and the loop")
+        require_same_robot(robot, recording.robot, "[reference] file and the loop")
         if len(recording.runs()) > 1:
             raise DataError("[reference] file: the recording has several runs; cut out the one to follow.")
         channels = recording.channels

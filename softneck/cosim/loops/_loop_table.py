@@ -11,6 +11,7 @@ from softneck.loop import BlockPart, Loop, Part
 from softneck.loop._faults import fault_field, fault_keys
 from softneck.loop._references import reference_field, reference_keys
 from softneck.loop._robot_references import reference_key
+from softneck.loop._wiring import Link
 from softneck.robot import Robot
 
 from ..parts._fmu_part import FmuPart
@@ -44,10 +45,17 @@ def loop_table(loop: Loop | LoopSetup) -> dict[str, Any]:
     if plain.faults:
         table["fault"] = [fault_keys(fault) for fault in plain.faults]
     if plain.connections:
-        table["connections"] = dict(plain.connections)
+        table["connections"] = {
+            target: origin if isinstance(origin, str) else {"from": origin.origin, **_line(origin)}
+            for target, origin in plain.connections.items()
+        }
     if setup.limits:
         table["limits"] = dict(setup.limits)
     return table
+
+
+def _line(link: Link) -> dict[str, float]:
+    return {"factor": link.factor, "offset": link.offset}
 
 
 def with_values(table: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:

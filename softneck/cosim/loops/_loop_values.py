@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import FileFormatError, SettingsError
+from softneck.loop._wiring import Link
 
 
 def read_toml(source: Path) -> dict[str, Any]:
@@ -48,6 +49,26 @@ def texts(where: str, table: Any) -> dict[str, str]:
     if not isinstance(table, dict) or not all(isinstance(value, str) for value in table.values()):
         raise SettingsError(f"{where} must be a table of names; got {table!r}.")
     return dict(table)
+
+
+def links(table: Any) -> dict[str, str | Link]:
+    """Return [connections]: each a name, or {from = name, factor, offset}, which stands for any conversion of units."""
+    if not isinstance(table, dict):
+        raise SettingsError(f"[connections] must be a table; got {table!r}.")
+    made: dict[str, str | Link] = {}
+    for target, origin in table.items():
+        where = f'[connections] "{target}"'
+        if isinstance(origin, Mapping):
+            refuse_unknown(where, origin, ("from", "factor", "offset"))
+            name, factor, offset = origin.get("from"), origin.get("factor", 1.0), origin.get("offset", 0.0)
+            if not isinstance(name, str):
+                raise SettingsError(f"{where} needs `from`, the name of an output; got {name!r}.")
+            made[target] = Link(name, number(f"{where} factor", factor), number(f"{where} offset", offset))
+        elif isinstance(origin, str):
+            made[target] = origin
+        else:
+            raise SettingsError(f"{where} must be a name or a table with `from`; got {origin!r}.")
+    return made
 
 
 def tables(key: str, listed: Any) -> list[Mapping[str, Any]]:

@@ -28,11 +28,13 @@ class Result:
 
     Attributes:
         signals: all signals, named as in a recording, with their units.
-        bounds: metric -> upper limit, as in the loop file.
+        bounds: metric -> limit, as in the loop file: an upper one, of `validity.min` a lower one.
         wall_time: what the run took [s].
         files: what it was told to read: role -> (path, SHA-256).
         order: "sequential" or "jacobi".
         angle: which angle the metrics judge, "true" or "measured".
+        closed: whether it was a closed loop; other systems have signals and no metrics.
+        remarks: what there is to warn of, one line each: where the plant is a model and knows itself to be wrong.
     """
 
     signals: LoopResult
@@ -41,6 +43,8 @@ class Result:
     files: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     order: str = "sequential"
     angle: str = "true"
+    closed: bool = True
+    remarks: tuple[str, ...] = ()
 
     def __getitem__(self, name: str) -> Vector:
         """Return one signal (N,) in SI."""
@@ -54,7 +58,7 @@ class Result:
     @property
     def metrics(self) -> dict[str, dict[str, float | None]]:
         """Rise, settling, overshoot and errors of each axis, and what the motors did."""
-        return metrics(self.signals, angle=self.angle)
+        return metrics(self.signals, angle=self.angle) if self.closed else {}
 
     @property
     def limits(self) -> list[dict[str, Any]]:

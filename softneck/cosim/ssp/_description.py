@@ -50,17 +50,25 @@ class Component:
 
 @dataclass(frozen=True, slots=True)
 class Connection:
-    """A connection from (component, output) to (component, input), times `factor` where units differ."""
+    """A connection from (component, output) to (component, input): factor * value + offset.
+
+    `explicit` ones say so even where that is the value itself: their units differ, and nobody is to convert them.
+    """
 
     origin: tuple[str, str]
     target: tuple[str, str]
     factor: float
+    offset: float = 0.0
+    explicit: bool = False
 
 
 def system_description(
     name: str, components: Sequence[Component], links: Sequence[Connection], *, step: float, duration: float
 ) -> bytes:
-    """Return the XML text of a system of `components`, stepped by `step` [s] for `duration` [s]."""
+    """Return the XML text of a system of `components`, stepped by `step` [s] for `duration` [s].
+
+    SSP prescribes no master; two notes say which one computes what we do: OMSimulator's own, and ours.
+    """
     root = Element(
         "ssd:SystemStructureDescription", {**_SPACES, "version": "1.0", "name": name, "generationTool": "softneck"}
     )
@@ -76,12 +84,16 @@ def system_description(
     # No SystemGeometry: OMSimulator refuses a file that has one, and the boxes of the components say as much.
     master = {"description": "oms-ma", "stepSize": repr(step)}
     settings = {**master, "absoluteTolerance": "1e-4", "relativeTolerance": "1e-4"}
-    SubElement(SubElement(_omsimulator(system), "oms:SimulationInformation"), "oms:FixedStepMaster", settings)
+    notes = SubElement(system, "ssd:Annotations")
+    SubElement(SubElement(_omsimulator(notes), "oms:SimulationInformation"), "oms:FixedStepMaster", settings)
+    # Behind that of OMSimulator, which looks at the first alone.
+    note = SubElement(notes, "ssc:Annotation", {"type": "softneck"})
+    SubElement(note, "Master", {"order": "jacobi", "stepSize": repr(step)})
     _units(root, components)
     experiment = SubElement(root, "ssd:DefaultExperiment", {"startTime": "0", "stopTime": repr(duration)})
     # Where this is missing OMSimulator says that the file is deprecated.
     results = {"resultFile": f"{name}_res.mat", "bufferSize": "1"}
-    SubElement(_omsimulator(experiment), "oms:SimulationInformation", results)
+    SubElement(_omsimulator(SubElement(experiment, "ssd:Annotations")), "oms:SimulationInformation", results)
     indent(root)
     return tostring(root, encoding="utf-8", xml_declaration=True)
 
@@ -130,17 +142,17 @@ def _bindings(element: Element, component: Component) -> None:
 def _connection(connections: Element, link: Connection) -> None:
     (owner, output), (part, name) = link.origin, link.target
     head = {"startElement": owner, "startConnector": output, "endElement": part, "endConnector": name}
-    if link.factor == 1.0:
+    if (link.factor, link.offset) == (1.0, 0.0) and not link.explicit:
         SubElement(connections, "ssd:Connection", head)
         return
     # Masters that convert by units themselves must not do it twice.
     connection = SubElement(connections, "ssd:Connection", {**head, "suppressUnitConversion": "true"})
-    SubElement(connection, "ssc:LinearTransformation", {"factor": repr(link.factor)})
+    offset = {"offset": repr(link.offset)} if link.offset else {}
+    SubElement(connection, "ssc:LinearTransformation", {"factor": repr(link.factor), **offset})
 
 
-def _omsimulator(parent: Element) -> Element:
-    annotation = SubElement(SubElement(parent, "ssd:Annotations"), "ssc:Annotation", {"type": "org.openmodelica"})
-    return SubElement(annotation, "oms:Annotations")
+def _omsimulator(notes: Element) -> Element:
+    return SubElement(SubElement(notes, "ssc:Annotation", {"type": "org.openmodelica"}), "oms:Annotations")
 
 
 def _units(root: Element, components: Sequence[Component]) -> None:

@@ -18,7 +18,9 @@ from softneck.fmu.compiled._model_file import node_of
 from softneck.fmu.describe._modelled_drives import with_modelled_drives
 from softneck.loop import BlockPart, Loop, Part, ReferenceBlock
 from softneck.loop._loop import USE_MOTOR_POSITIONS
-from softneck.loop._wiring import Wiring, wire
+from softneck.loop._system import System
+from softneck.loop._wiring import Link, Wiring, wire
+from softneck.robot import Robot
 from softneck.runtime import Block, Port, bundle
 from softneck.runtime._compile import compiled_name
 
@@ -75,8 +77,8 @@ def _block(path: Path, folder: Path, facts: dict, description: Description) -> B
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 
-def write_ssp(loop: Loop | LoopSetup, path: str | Path, *, force: bool = False, compiled: bool = True) -> Path:
-    """Write `loop` as an SSP 1.0 archive and return its path.
+def write_ssp(loop: Loop | LoopSetup | System, path: str | Path, *, force: bool = False, compiled: bool = True) -> Path:
+    """Write `loop`, or a system that `load_ssp` returned, as an SSP 1.0 archive and return its path.
 
     Parts that are not FMUs become some; so does the reference. A master that sets all inputs first and then steps all
     computes what `simulate` does with order "jacobi".
@@ -100,7 +102,8 @@ def write_ssp(loop: Loop | LoopSetup, path: str | Path, *, force: bool = False, 
     if plain.faults:
         raise SettingsError("an SSP file cannot hold the loop's faults; take [[fault]] out of a copy of the loop file.")
     step = min(part.sample_time for part in plain.parts.values())
-    if not hasattr(plain.reference, "advance"):
+    closed = isinstance(plain, Loop)
+    if closed and not hasattr(plain.reference, "advance"):
         block = ReferenceBlock(
             plain.reference,  # pyright: ignore[reportArgumentType]
             sample_time=step,
@@ -108,9 +111,9 @@ def write_ssp(loop: Loop | LoopSetup, path: str | Path, *, force: bool = False, 
             robot=plain.robot,
         ).block()
         plain = replace(plain, reference=BlockPart(block))
-    wiring = wire(plain.parts, plain.constants, plain.connections, plain.robot)
+    wiring = wire(plain.parts, plain.constants, plain.connections, plain.robot, closed=closed)
     with tempfile.TemporaryDirectory(prefix="softneck-ssp-") as folder:
-        sources = {name: _fmu_of(name, part, Path(folder), compiled) for name, part in plain.parts.items()}
+        sources = {name: _fmu_of(name, part, Path(folder), compiled, plain.robot) for name, part in plain.parts.items()}
         parts = [_component(name, part, sources[name], plain, wiring) for name, part in plain.parts.items()]
         text = system_description(target.stem, parts, _links(plain, wiring), step=step, duration=plain.duration)
         members = {"SystemStructure.ssd": text}
@@ -119,20 +122,23 @@ def write_ssp(loop: Loop | LoopSetup, path: str | Path, *, force: bool = False, 
     return target
 
 
-def _fmu_of(name: str, part: Part, folder: Path, compiled: bool) -> Path:
+def _fmu_of(name: str, part: Part, folder: Path, compiled: bool, robot: Robot) -> Path:
     """Return an FMU of `part`, in `folder` if it must be made or renamed."""
     block = part.block if isinstance(part, BlockPart) else None
     if isinstance(part, FmuPart | IsolatedPart):
         block = block_without_python(part.path) if compiled else None
         if block is None:
-            renamed = folder / f"{name}_{part.path.name}"
+            # One that came out of an archive of ours has its name already.
+            bare = part.path.name.removeprefix(f"{name}_")
+            renamed = folder / (bare if bare == f"{name}.fmu" else f"{name}_{bare}")
             renamed.write_bytes(part.path.read_bytes())
             return renamed
     if block is None:
         raise SettingsError(
             f"the {name} is a {type(part).__name__}, of which no FMU can be built; give an FMU or a file."
         )
-    target, info = folder / f"{name}.fmu", FmuInfo(description=f"{block.kind} of a loop")
+    told = None if robot.is_neck else (robot.name, robot.hash)
+    target, info = folder / f"{name}.fmu", FmuInfo(description=f"{block.kind} of a loop", robot=told)
     if compiled:
         build_compiled_fmu(block, target, info=info)
         return target
@@ -153,7 +159,7 @@ def _names(part: Part) -> _Names:
     return _Names(part.native_names if isinstance(part, FmuPart | IsolatedPart) else {})
 
 
-def _component(name: str, part: Part, source: Path, loop: Loop, wiring: Wiring) -> Component:
+def _component(name: str, part: Part, source: Path, loop: Loop | System, wiring: Wiring) -> Component:
     names = _names(part)
     tap = wiring.taps[name]
     constants = {
@@ -164,7 +170,7 @@ def _component(name: str, part: Part, source: Path, loop: Loop, wiring: Wiring) 
     }
     known = {port.name: port for port in (*part.inputs, *_parameters(part))}
     # What is an FMU only here has this parameter only here; see `Loop.parameters`.
-    defaults = {USE_MOTOR_POSITIONS: 1.0} if USE_MOTOR_POSITIONS in known else {}
+    defaults = {USE_MOTOR_POSITIONS: 1.0} if USE_MOTOR_POSITIONS in known and isinstance(loop, Loop) else {}
     values = {**constants, **defaults, **loop.parameters.get(name, {})}
     for key in values:
         if key not in known:
@@ -188,16 +194,20 @@ def _renamed(port: Port, names: _Names) -> Port:
     return replace(port, name=names.of(port.name))
 
 
-def _links(loop: Loop, wiring: Wiring) -> list[Connection]:
+def _links(loop: Loop | System, wiring: Wiring) -> list[Connection]:
     links = []
     parts = loop.parts
     for name, tap in wiring.taps.items():
-        factors = tap.factors if tap.factors is not None else [1.0] * len(tap.ports)
-        for port, owner, slot, factor in zip(tap.ports, tap.owners, tap.slots.tolist(), factors, strict=True):
+        scales = np.tile([[1.0], [0.0]], len(tap.ports)) if tap.scales is None else tap.scales
+        for port, owner, slot, (factor, offset) in zip(
+            tap.ports, tap.owners, tap.slots.tolist(), scales.T.tolist(), strict=True
+        ):
             if owner:
-                output = next(item.port.name for item in wiring.named if item.slot == slot)
-                origin = (owner, _names(parts[owner]).of(output))
-                links.append(Connection(origin, (name, _names(parts[name]).of(port.name)), float(factor)))
+                output = next(item.port for item in wiring.named if item.slot == slot)
+                origin = (owner, _names(parts[owner]).of(output.name))
+                target = (name, _names(parts[name]).of(port.name))
+                said = isinstance(loop.connections.get(f"{name}.{port.name}"), Link) and output.unit != port.unit
+                links.append(Connection(origin, target, factor, offset, said))
     return links
 
 

@@ -19,7 +19,7 @@ from softneck.robot import Robot
 from softneck.robot._search import robot_file_of
 from softneck.runtime import Block
 
-from ..loops._loop_file import LoopSetup, make_loop, normal_table
+from ..loops._loop_file import LoopSetup, load_loop, make_loop, normal_table
 from ..loops._loop_parts import OBJECT, SOURCES, PartOpener
 from ..loops._loop_table import check_key, loop_table, set_sources, settable, with_values
 from ..loops._loop_values import read_toml
@@ -200,6 +200,8 @@ def _opened(loop: Source) -> tuple[Mapping[str, Any], Path]:
         path = Path(loop)
         if not path.is_file():
             raise FileFormatError(f"there is no loop file {path}.")
+        if path.suffix == ".ssp":
+            return loop_table(load_loop(path)), path.parent.resolve()
         return _with_robot(read_toml(path), path), path.parent.resolve()
     if isinstance(loop, Loop | LoopSetup):
         return loop_table(loop), Path.cwd()

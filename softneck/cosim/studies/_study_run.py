@@ -14,7 +14,7 @@ from softneck.core import SoftneckError
 
 from ..loops._loop_file import make_loop
 from ..loops._loop_table import with_values
-from ..loops._simulate import simulate
+from ..loops._simulate import run_setup
 from ._vary import Point
 
 Row = dict[str, Any]
@@ -79,7 +79,7 @@ def _judged(chunk: Chunk, point: Point) -> Row:
     opened = _opened(chunk.digest, threading.get_ident())
     setup = make_loop(with_values(chunk.loop, point.values), chunk.folder, opened=opened)
     try:
-        result = simulate(setup, compiled=True, keep=True)
+        result = run_setup(setup, compiled=True, keep=True)
     finally:
         # FMUs stay loaded for the next run; what this run alone holds is released.
         kept = [id(part) for part in opened.values()]
@@ -88,7 +88,7 @@ def _judged(chunk: Chunk, point: Point) -> Row:
                 part.close()
     table = result.metrics
     values = {f"{group}.{name}": value for group, metrics in table.items() for name, value in metrics.items()}
-    return {**values, "holds": result.holds if setup.limits else None}
+    return {**{name: values[name] for name in chunk.metrics}, "holds": result.holds if setup.limits else None}
 
 
 @lru_cache(maxsize=64)

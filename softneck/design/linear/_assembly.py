@@ -79,10 +79,6 @@ def assemble(
     """
     from scipy.linalg import block_diag
 
-    sample_time = float(constants[0])
-    a = np.array([math.exp(-sample_time / time) if time > 0.0 else 0.0 for time in reference_times])
-    # rf_k = a rf_k-1 + (1 - a) r_k, with state a rf_k-1: what is asked now acts now.
-    Af, Bf, Cf, Df = np.diag(a), np.diag(a * (1.0 - a)), np.eye(a.size), np.diag(1.0 - a)
     A, Br, By, C, L = (
         np.asarray(block_diag(*parts), dtype=np.float64)
         for parts in (
@@ -94,6 +90,23 @@ def assemble(
         )
     )
     Dr, Dy = np.diag([axis.Dr for axis in axes]), np.diag([axis.Dy for axis in axes])
+    return assemble_whole(
+        (A, Br, By, C, Dr, Dy, L), reference_times=reference_times, redefinition=redefinition, constants=constants
+    )
+
+
+def assemble_whole(
+    law: tuple[Matrix, ...], *, reference_times: Sequence[float], redefinition: tuple[Matrix, Matrix], constants: Vector
+) -> tuple[Matrix, ...]:
+    """Return the arrays of `LinearArrays` for one controller of all axes: A, Br, By, C, Dr, Dy and L.
+
+    The rest is as in `assemble`.
+    """
+    A, Br, By, C, Dr, Dy, L = law
+    sample_time = float(constants[0])
+    a = np.array([math.exp(-sample_time / time) if time > 0.0 else 0.0 for time in reference_times])
+    # rf_k = a rf_k-1 + (1 - a) r_k, with state a rf_k-1: what is asked now acts now.
+    Af, Bf, Cf, Df = np.diag(a), np.diag(a * (1.0 - a)), np.eye(a.size), np.diag(1.0 - a)
     align = _alignment(A, Br + By, C, Dr + Dy)
     # The filter's state at rest, where rf = r.
     rest = np.diag(a)

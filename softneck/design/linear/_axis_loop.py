@@ -39,18 +39,27 @@ def conditioning_gain(A: Matrix, B: Matrix, C: Matrix, D: float) -> Matrix:
     Otherwise the gain of the innovations form of v: the Kalman predictor of a state driven by r as by noise, which
     is B/D with its unstable zeros mirrored (Anderson and Moore 1979, sec. 9.3), and exists for D = 0.
     """
-    from scipy.linalg import solve_discrete_are
-
     if abs(D) > 1e-9:
         L = B / D
         if float(np.abs(np.linalg.eigvals(A - L @ C)).max(initial=0.0)) <= _FORGETS:
             return L
-    n = A.shape[0]
+    return innovations_gain(A, B, C, np.array([[D]]))
+
+
+def innovations_gain(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> Matrix:
+    """Return the gain L (n, m) of the innovations form of `v = C x + D r`, x+ = A x + B r, for r as white noise.
+
+    Raises:
+        SettingsError: a mode that is not stable does not show in v.
+    """
+    from scipy.linalg import solve_discrete_are
+
+    n, m = A.shape[0], C.shape[0]
     # In units of what a reference does, so that the spread is relative.
     size = max(float(np.linalg.norm(B)), 1e-12)
     Q = B @ B.T + (_SPREAD * size) ** 2 * np.eye(n)
-    v = max(abs(D), 1e-3 * float(np.abs(C @ B).max(initial=0.0)), 1e-9)
-    R, S = np.array([[v * v * (1.0 + _SPREAD)]]), B * D
+    v = max(float(np.linalg.norm(D, 2)), 1e-3 * float(np.abs(C @ B).max(initial=0.0)), 1e-9)
+    R, S = v * v * (1.0 + _SPREAD) * np.eye(m), B @ D.T
     try:
         P = solve_discrete_are(A.T, C.T, Q, R, s=S)
     except (np.linalg.LinAlgError, ValueError) as error:
@@ -58,7 +67,7 @@ def conditioning_gain(A: Matrix, B: Matrix, C: Matrix, D: float) -> Matrix:
             "no conditioning keeps the controller stable at its limits: a mode that is not stable does not show in "
             "its output. Ask for less, or reduce it (`controller_order`)."
         ) from error
-    return np.asarray((A @ P @ C.T + S) / (C @ P @ C.T + R))
+    return np.asarray(np.linalg.solve((C @ P @ C.T + R).T, (A @ P @ C.T + S).T).T)
 
 
 def conditioning_candidates(axis: AxisController) -> list[Matrix]:

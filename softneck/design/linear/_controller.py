@@ -136,7 +136,7 @@ class LinearController:
             "inputs": [port.name for port in block.inputs],
             "outputs": [port.name for port in block.outputs],
             "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
-            **({} if self.robot.is_neck else {"robot": self.robot.as_dict()}),
+            **self.robot.in_header(),
         }
         write_archive(path, header, dict(zip(LinearArrays.names(), self.arrays, strict=True)), force=force)
 

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
-from softneck.core import DataError, SettingsError
+from softneck.core import DataError, Matrix, SettingsError
+from softneck.estimation._axis import AxisPlant
 
 from ..plants._uncertain import UncertainAxis, UncertainPlant
-from ._assembly import AxisController
-from ._axis_loop import conditioning_gain, error_feedback
+from ._assembly import AxisController, assemble_whole
+from ._axis_loop import conditioning_gain, delayed_form, error_feedback, innovations_gain
 from ._axis_settings import AxisDesign, AxisSettings
 from ._controller import LinearController
 
@@ -22,14 +23,16 @@ _INPUTS = {"pitch": "theta_i", "roll": "phi_i"}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CustomSettings(AxisSettings):
-    """A discrete `control` system as the controller of each axis; limits, filter and verification are as everywhere.
+    """A discrete `control` system as the controller of each axis, or of all; limits and filter are as everywhere.
 
-    Reference filter, order and conditioning, with limits and loop, are those of `AxisSettings`.
+    Reference filter, order and conditioning, with limits and loop, are those of `AxisSettings`. One system of all
+    outputs (from `ncfsyn`, say) is taken as it is: `reference_time` is 0 where it is not given, and nothing is reduced.
 
     Attributes:
         controller: K of `v = K (r - y)`, or a system of two inputs, reference and angle, `v = K (r, y)`; one for
-            both axes, or a mapping of "pitch" and "roll" (or another robot's outputs) to one each. Inputs named
-            `pitch_reference` and `pitch` are found by name, in any order.
+            both axes, or a mapping of "pitch" and "roll" (or another robot's outputs) to one each, or one system with
+            as many outputs as the robot, from as many errors, or from all references and then all outputs. Inputs
+            named `pitch_reference` and `pitch` are found by name, in any order.
     """
 
     KIND: ClassVar[str] = "custom"
@@ -38,15 +41,62 @@ class CustomSettings(AxisSettings):
 
     def __post_init__(self) -> None:
         AxisSettings.__post_init__(self)
-        for system in self.controller.values() if isinstance(self.controller, Mapping) else (self.controller,):
-            _require_system(system)
+        if isinstance(self.controller, Mapping):
+            for system in self.controller.values():
+                _require_system(system, 1)
+        else:
+            _require_system(self.controller, getattr(self.controller, "noutputs", 1))
 
     def _designed(self, uncertain: UncertainPlant) -> LinearController:
         names = uncertain.names
         if isinstance(self.controller, Mapping) and set(self.controller) != set(names):
             given = ", ".join(map(str, self.controller)) or "none"
             raise SettingsError(f"`controller` must be given for {' and '.join(names)}; got {given}.")
+        if not isinstance(self.controller, Mapping) and self.controller.noutputs > 1:
+            return self._whole(uncertain)
         return AxisSettings._designed(self, uncertain)
+
+    def _whole(self, uncertain: UncertainPlant) -> LinearController:
+        """Return the controller of all outputs at once."""
+        names, K = uncertain.names, self.controller
+        if K.noutputs != len(names):
+            raise SettingsError(f"`controller` has {K.noutputs} outputs; {' and '.join(names)} ask for {len(names)}.")
+        _require_sample_time(K, uncertain.sample_time)
+        law, time = _law(K, names), self.reference_time or 0.0
+        axes = {name: self._prepared(uncertain.axis(name)) for name in names}
+        count = max(len(axis.samples) for axis in axes.values())
+        for k in range(count):
+            plants = [axis.samples[min(k, len(axis.samples) - 1)] for axis in axes.values()]
+            radius = _closed_radius(law, plants, self.extra_delay)
+            if radius >= 1.0:
+                raise SettingsError(
+                    f"the loop is not stable around sample {k} of {count} (spectral radius {radius:.4f}); design the "
+                    "controller for less."
+                )
+        limits = self.limits(uncertain.robot)
+        found = {
+            name: {
+                "gains": {"reference_time_s": time},
+                "dead_time_s": (axis.nominal.delay + self.extra_delay) * axis.sample_time,
+                "states": len(law[0]),
+                "samples": count,
+                "imported": True,
+            }
+            for name, axis in axes.items()
+        }
+        return LinearController(
+            kind=self.KIND,
+            sample_time=uncertain.sample_time,
+            arrays=assemble_whole(
+                law,
+                reference_times=[time] * (len(names) + 1),
+                redefinition=self.redefinition(uncertain),
+                constants=limits.constants(uncertain.sample_time),
+            ),
+            limits=limits,
+            order=self.order,
+            design={"settings": self._stored(), "extra_delay": self.extra_delay, **found},
+        )
 
     def _of(self, name: str) -> Any:
         return self.controller[name] if isinstance(self.controller, Mapping) else self.controller
@@ -62,24 +112,29 @@ class CustomSettings(AxisSettings):
         import control
 
         K = self._of(name)
-        if not math.isclose(float(K.dt), axis.sample_time, rel_tol=1e-9):
-            raise SettingsError(
-                f"the controller runs every {K.dt:g} s, the plant every {axis.sample_time:g} s; design it at "
-                f"{axis.sample_time:g} s, or identify the plant at {K.dt:g} s."
-            )
+        _require_sample_time(K, axis.sample_time)
         made = error_feedback(control.ss(K)) if K.ninputs == 1 else _of_two(K, name)
         return AxisDesign(made, {}, {"imported": True})
 
 
-def _require_system(K: Any) -> None:
+def _require_sample_time(K: Any, sample_time: float) -> None:
+    if not math.isclose(float(K.dt), sample_time, rel_tol=1e-9):
+        raise SettingsError(
+            f"the controller runs every {K.dt:g} s, the plant every {sample_time:g} s; design it at {sample_time:g} s, "
+            f"or identify the plant at {K.dt:g} s."
+        )
+
+
+def _require_system(K: Any, outputs: int) -> None:
     import control
 
     if not isinstance(K, control.StateSpace | control.TransferFunction):
         raise SettingsError(f"`controller` must be a control.StateSpace or TransferFunction; got {type(K).__name__}.")
-    if K.noutputs != 1 or K.ninputs not in (1, 2):
+    if K.noutputs != outputs or K.ninputs not in (outputs, 2 * outputs):
         raise SettingsError(
-            f"`controller` must have one output and one or two inputs for each axis; got {K.noutputs} and "
-            f"{K.ninputs}. Give {{'pitch': ..., 'roll': ...}}."
+            f"`controller` must have as many inputs as outputs (errors), or twice as many (references and angles); got "
+            f"{K.ninputs} inputs and {K.noutputs} outputs. Give one system of all outputs, or {{'pitch': ..., 'roll': "
+            "...}} of one output each."
         )
     if K.dt is None or isinstance(K.dt, bool) or not K.dt > 0.0:
         raise SettingsError(
@@ -114,3 +169,39 @@ def _of_two(K: Any, name: str) -> AxisController:
     Br, By = B[:, order[:1]], B[:, order[1:]]
     Dr, Dy = float(D[0, order[0]]), float(D[0, order[1]])
     return AxisController(A=A, Br=Br, By=By, C=C, Dr=Dr, Dy=Dy, L=conditioning_gain(A, Br, C, Dr))
+
+
+def _law(K: Any, names: Sequence[str]) -> tuple[Matrix, ...]:
+    """Return A, Br, By, C, Dr, Dy and the conditioning L of a system of all outputs."""
+    import control
+
+    m, labels = len(names), list(K.input_labels)
+    wanted = [*(f"{name}_reference" for name in names), *names]
+    system: Any = control.ss(K)
+    A, B, C, D = (np.asarray(part, dtype=np.float64) for part in (system.A, system.B, system.C, system.D))
+    if K.ninputs == m:
+        Br, By, Dr, Dy = B, -B, D, -D
+    else:
+        if set(labels) == set(wanted):
+            order = [labels.index(label) for label in wanted]
+        elif all(label.startswith("u[") for label in labels):
+            order = list(range(2 * m))
+        else:
+            raise SettingsError(f"the inputs of the controller are {', '.join(labels)}; name them {', '.join(wanted)}.")
+        B, D = B[:, order], D[:, order]
+        Br, By, Dr, Dy = B[:, :m], B[:, m:], D[:, :m], D[:, m:]
+    return A, Br, By, C, Dr, Dy, innovations_gain(A, Br, C, Dr)
+
+
+def _closed_radius(law: tuple[Matrix, ...], plants: Sequence[AxisPlant], extra_delay: int) -> float:
+    """Return the spectral radius of the loop of all axes with their exact delays; below 1 is stable."""
+    from scipy.linalg import block_diag
+
+    A, _, By, C, _, Dy, _ = law
+    forms = [delayed_form(plant, extra_delay) for plant in plants]
+    Ap, Bp, Cp = (
+        np.asarray(block_diag(*parts))
+        for parts in ([f[0] for f in forms], [f[1][:, None] for f in forms], [f[2][None, :] for f in forms])
+    )
+    whole = np.block([[Ap + Bp @ Dy @ Cp, Bp @ C], [By @ Cp, A]])
+    return float(np.abs(np.linalg.eigvals(whole)).max())

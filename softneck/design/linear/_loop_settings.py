@@ -15,7 +15,7 @@ from softneck.robot._redefined import redefinition_of
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
 from ..plants._uncertain import UncertainPlant
-from ._ports import LIMITS, ControllerLimits, robot_limits
+from ._ports import LIMITS, ControllerLimits, require_limits, robot_limits
 
 _NECK = Robot.preset("neck")
 
@@ -62,7 +62,7 @@ class LoopSettings:
         require_between("least_delay", self.least_delay, 0.0, 1.0, "s")
         require_between("small_move_pole", self.small_move_pole, 0.0, 1000.0, "1/s")
         require_one_of("order", self.order, ORDERS)
-        self.limits()
+        require_limits({name: getattr(self, name) for name in LIMITS})
 
     def of_robot(self, plant: UncertainPlant) -> Self:
         """Return the settings for the robot of `plant`: where nobody says otherwise, nothing that is known of necks.

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import SettingsError, Vector, require_between, require_positive, to_si
+from softneck.core import SettingsError, Vector, require_between, require_finite, require_positive, to_si
 from softneck.robot import Robot
 from softneck.runtime import Port
 
@@ -132,8 +132,9 @@ class ControllerLimits:
 
     def __post_init__(self) -> None:
         if not self.robot.is_neck:
-            for name, unit in (("position_limit", ""), ("slew_limit", "/s"), ("lead_limit", "")):
-                require_positive(name, getattr(self, name), to_si(self.robot.motors.unit)[1] + unit)
+            require_limits({name: getattr(self, name) for name in LIMITS})
+            for name in LIMITS[3:]:
+                _require_room(name, getattr(self, name), self.position_limit, self.robot.motors.unit)
             return
         require_between("position_limit", self.position_limit, 0.01, MAX_MOTOR, "rad")
         require_between("slew_limit", self.slew_limit, 0.01, MAX_SLEW, "rad/s")
@@ -226,15 +227,26 @@ def _not_given(robot: Robot, key: str, setting: str) -> SettingsError:
     )
 
 
+def require_limits(limits: Mapping[str, float]) -> None:
+    """Raise SettingsError for limits that are none of any robot: how far its motors go is known when it is."""
+    for name, value in limits.items():
+        check = require_finite if name.startswith("least_") else require_positive
+        check(name, value)
+
+
 def require_taut(least_position: float, least_cocontraction: float, position_limit: float) -> None:
     """Raise SettingsError unless the rule for taut tendons leaves the motors room below their limit."""
     for name, value in (("least_position", least_position), ("least_cocontraction", least_cocontraction)):
         require_between(name, value, -MAX_MOTOR, MAX_MOTOR, "rad")
-        if value >= position_limit:
-            raise SettingsError(
-                f"`{name}` must be below `position_limit`, {position_limit:g} rad, or no room to tilt is left; "
-                f"got {value:g}."
-            )
+        _require_room(name, value, position_limit, "rad")
+
+
+def _require_room(name: str, value: float, position_limit: float, unit: str) -> None:
+    if value >= position_limit:
+        most, got = (number / to_si(unit)[0] for number in (position_limit, value))
+        raise SettingsError(
+            f"`{name}` must be below `position_limit`, {most:g} {unit}, or no room to tilt is left; got {got:g}."
+        )
 
 
 def _taut_lines(least_position: float, least_cocontraction: float) -> list[str]:

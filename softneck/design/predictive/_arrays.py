@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from softneck.core import Matrix, Vector
 
 from . import _mpc_state_runtime as rt
-from ._disturbance import MeasuredDisturbance
 from ._prediction import Matrices, Problem, disturbance_pole, padded, rest_states
 from ._scale import Scale
 
@@ -28,7 +27,7 @@ class Tuning:
         preview: samples that the reference is known ahead.
         budget: iterations that the solver may take.
         coast: samples without measurement until the motors are held.
-        disturbances: that are measured.
+        disturbances: (k, outputs + 1) of each measured one its gains on the outputs, and its time constant [s].
         scale: of another robot than the neck.
     """
 
@@ -37,7 +36,7 @@ class Tuning:
     preview: int = 0
     budget: int = 100
     coast: int = 25
-    disturbances: tuple[MeasuredDisturbance, ...] = ()
+    disturbances: Matrix = field(default_factory=lambda: np.zeros((0, 3)))
     scale: Scale | None = None
 
 
@@ -56,8 +55,8 @@ def assemble(problem: Problem, found: Matrices, tuning: Tuning) -> tuple[Matrix,
     ])  # fmt: skip
     keep = math.exp(-Ts / tuning.reference_time) if tuning.reference_time > 0.0 else 0.0
     disturbances = np.zeros((max(1, len(tuning.disturbances)), p.outputs + 1))
-    for row, item in zip(disturbances, tuning.disturbances, strict=False):
-        row[:] = item.pitch, item.roll, math.exp(-Ts / item.time) if item.time > 0.0 else 0.0
+    for row, (*gains, time) in zip(disturbances, tuning.disturbances.tolist(), strict=False):
+        row[:] = *gains, math.exp(-Ts / time) if time > 0.0 else 0.0
     poles = np.array([disturbance_pole(plant, p.disturbance_time) for plant in plants])
     made = {
         "constants": constants,

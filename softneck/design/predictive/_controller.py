@@ -183,13 +183,15 @@ class MpcController:
             "kind": "mpc",
             "sample_time": self.sample_time,
             **{name: getattr(self, name) for name in _LIMITS},
-            "disturbances": [asdict(item) for item in self.disturbances],
+            "disturbances": [
+                {k: v for k, v in asdict(item).items() if k != "gains" or v} for item in self.disturbances
+            ],
             "order": self.order,
             "design": dict(self.design),
             "inputs": [port.name for port in block.inputs],
             "outputs": [port.name for port in block.outputs],
             "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
-            **({} if self.robot.is_neck else {"robot": self.robot.as_dict()}),
+            **self.robot.in_header(),
         }
         write_archive(path, header, dict(zip(rt.MpcArrays.names(), self.arrays, strict=True)), force=force)
 

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
-from softneck.core import SettingsError, require_between, require_finite
+import numpy as np
+
+from softneck.core import SettingsError, Vector, require_between, require_finite
+from softneck.robot import Robot
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeasuredDisturbance:
-    """An input of the controller that adds `gain / (1 + time s)` times itself to the angles.
+    """An input of the controller that adds `gain / (1 + time s)` times itself to the outputs.
 
     Attributes:
         name: of the port, such as "base_tilt_pitch".
         unit: SI unit of the port.
         pitch, roll: static gains [rad per unit].
         time: time constant [s]; 0 for at once.
+        gains: static gains on the outputs of another robot, by their names [SI unit of the output per unit].
     """
 
     name: str
@@ -23,10 +28,28 @@ class MeasuredDisturbance:
     roll: float = 0.0
     time: float = 0.0
     unit: str = "1"
+    gains: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier():
             raise SettingsError(f"`{self.name}` cannot be the name of a port; use letters, digits and _.")
         for axis in ("pitch", "roll"):
             require_finite(axis, getattr(self, axis), f"rad per {self.unit}")
-        require_between("time", self.time, 0.0, 60.0, "s")
+        for name, gain in self.gains.items():
+            require_finite(f"gains.{name}", gain, f"per {self.unit}")
+        require_between("time", self.time, 0.0, 1e6, "s")
+
+    def on(self, robot: Robot) -> Vector:
+        """Return the static gains (outputs,) on the outputs of a robot.
+
+        Raises:
+            SettingsError: a gain on what the robot does not have.
+        """
+        gains = {name: gain for name, gain in {"pitch": self.pitch, "roll": self.roll, **self.gains}.items() if gain}
+        names = robot.outputs.names
+        if unknown := sorted(set(gains) - set(names)):
+            raise SettingsError(
+                f"the disturbance `{self.name}` moves `{unknown[0]}`, which robot {robot.label()} does not have; its "
+                f"outputs are {', '.join(names)}."
+            )
+        return np.array([gains.get(name, 0.0) for name in names])

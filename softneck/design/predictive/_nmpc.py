@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,36 +13,52 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import (
+    Matrix,
     SettingsError,
     Vector,
     require_between,
     require_one_of,
     require_positive,
     require_whole,
+    to_si,
     write_archive,
 )
 from softneck.estimation import AxisPlant
 from softneck.estimation._settings import ORDERS
 from softneck.identification import Model
+from softneck.identification.models._arrays import without_validity
+from softneck.identification.models._linear_systems import weights_of
+from softneck.identification.models._nested import nested, nested_model
+from softneck.robot import Robot
+from softneck.robot._neck_default import NeckCount, NeckDefault
+from softneck.robot._redefined import redefinition_of
 from softneck.runtime import Block, Port, State
+from softneck.runtime._bundle import sized
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
-from ..linear._ports import controller_inputs, controller_outputs, limit_ports
+from ..linear._ports import LIMITS, ControllerLimits, controller_inputs, controller_outputs, require_limits
+from ..plants._uncertain import UncertainAxis, UncertainPlant
 from ._nmpc_part import NmpcPart, SampleSolution, explain
 from ._nmpc_prepared import NonlinearProblem, controller_arrays
-from ._settings import spaced_starts
-from ._tuning import move_weight
+from ._nmpc_probe import plant_of, probed
+from ._scale import SizedPlant, limits_of, sized_plant
+from ._tuning import move_weight, spaced_starts
 
+_RUNTIME = "softneck.design.predictive._nmpc_runtime"
 # Kinds of model whose derivatives the runtime has.
 NONLINEAR_KINDS = ("nn", "play", "greybox", "nss")
-# The model is moved by this much of a redefined input to learn its gain and its time constant [rad].
-_PROBE = 1.0
-_PROBE_SECONDS = 6.0
+# Of another robot, stretched by its slowest pole: the horizon behind the dead time, and the window [s], as a neck's 20
+# and 8 samples.
+_HORIZON, _WINDOW = 0.32, 0.16
+_LONGEST = 100
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NmpcSettings:
-    """Nonlinear predictive control of both axes over `nn`, `play`, `greybox` or `nss`.
+    """Nonlinear predictive control of all axes over `nn`, `play`, `greybox` or `nss`.
+
+    The defaults are the neck's. Of another robot times are stretched by its slowest pole, limits are those of its file,
+    and those given are in the unit of its motors. Weights count as for a plant of the neck's size.
 
     One Gauss-Newton iteration for each sample, from the shifted plan of the sample before (real-time iteration, Diehl
     et al. 2005); `converged` iterates to the end.
@@ -57,7 +73,7 @@ class NmpcSettings:
         moves: times at which the motors move.
         converged: iterate until nothing changes, for reference.
         position_limit, slew_limit, lead_limit, least_position: of each motor [rad], [rad/s], [rad], [rad].
-        angle_limit: soft limit of pitch and roll [rad]; None for none.
+        angle_limit: soft limit of pitch and roll, or of another robot's angles [rad]; None for none.
         cocontraction_weight: on the error of co-contraction, against that of the tilt's inputs, squared.
         slack_weight: on violations of soft limits, against errors of the angles, squared.
         budget: iterations of the QP solver.
@@ -65,18 +81,18 @@ class NmpcSettings:
         tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
     """
 
-    bandwidth: float = 8.0
-    window: int = 8
+    bandwidth: float = NeckDefault(8.0)
+    window: int = NeckCount(8)
     disturbance_time: float | None = None
-    reference_time: float = 0.2
+    reference_time: float = NeckDefault(0.2)
     preview: float = 0.0
-    horizon: int = 20
-    moves: int = 10
+    horizon: int = NeckCount(20)
+    moves: int = NeckCount(10)
     converged: bool = False
-    position_limit: float = 6.0
-    slew_limit: float = 12.5
-    lead_limit: float = 1.0
-    least_position: float = -6.0
+    position_limit: float = NeckDefault(6.0)
+    slew_limit: float = NeckDefault(12.5)
+    lead_limit: float = NeckDefault(1.0)
+    least_position: float = NeckDefault(-6.0)
     angle_limit: float | None = None
     cocontraction_weight: float = 1.0
     slack_weight: float = 1e3
@@ -85,20 +101,17 @@ class NmpcSettings:
     tendon_angles: tuple[float, float, float] = tuple(TENDON_ANGLES.tolist())
 
     def __post_init__(self) -> None:
-        require_between("bandwidth", self.bandwidth, 0.5, 100.0, "rad/s")
+        require_positive("bandwidth", self.bandwidth, "rad/s")
         require_whole("window", self.window, 2, 100)
         if self.disturbance_time is not None:
-            require_between("disturbance_time", self.disturbance_time, 0.02, 20.0, "s")
-        require_between("reference_time", self.reference_time, 0.0, 60.0, "s")
-        require_between("preview", self.preview, 0.0, 4.0, "s")
+            require_positive("disturbance_time", self.disturbance_time, "s")
+        require_between("reference_time", self.reference_time, 0.0, 1e6, "s")
+        require_between("preview", self.preview, 0.0, 1e6, "s")
         require_whole("horizon", self.horizon, 2, 100)
         require_whole("moves", self.moves, 1, self.horizon)
-        require_between("position_limit", self.position_limit, 0.01, 6.0, "rad")
-        require_between("slew_limit", self.slew_limit, 0.01, 1000.0, "rad/s")
-        require_between("lead_limit", self.lead_limit, 0.01, 12.0, "rad")
-        require_between("least_position", self.least_position, -6.0, self.position_limit - 1e-3, "rad")
+        require_limits({name: getattr(self, name) for name in LIMITS[:4]})
         if self.angle_limit is not None:
-            require_between("angle_limit", self.angle_limit, 0.01, 0.8, "rad")
+            require_positive("angle_limit", self.angle_limit, "rad")
         for name in ("cocontraction_weight", "slack_weight"):
             require_positive(name, getattr(self, name))
         require_whole("budget", self.budget, 1, 10_000)
@@ -110,7 +123,7 @@ class NmpcSettings:
         """Return the controller for an identified nonlinear `model`.
 
         Raises:
-            SettingsError: a model of another kind, or one that its inputs do not move.
+            SettingsError: a model of another kind, one that its inputs do not move, or limits of no robot.
         """
         if not isinstance(model, Model) or model.kind not in NONLINEAR_KINDS:
             got = model.kind if isinstance(model, Model) else type(model).__name__
@@ -118,32 +131,60 @@ class NmpcSettings:
                 f"nonlinear predictive control is over {', '.join(NONLINEAR_KINDS)}; got {got}. "
                 "For a linear model use `softneck design mpc`."
             )
-        model.robot.require_neck("nonlinear predictive control")
-        plants = probed(model, redefinition_matrix(np.array(self.tendon_angles)))
-        found = {
-            axis: {
-                "static_gain": plant.static_gain,
-                "pole": -math.log(float(plant.denominator[1] * -1.0)) / plant.sample_time,
-                "delay": plant.delay,
-            }
-            for axis, plant in zip(("pitch", "roll"), plants, strict=True)
+        robot = model.robot
+        if not robot.is_neck and self.tendon_angles != NmpcSettings().tendon_angles:
+            raise SettingsError(f"`tendon_angles` are of necks; those of `{robot.name}` are in its robot file.")
+        limits = limits_of(self, robot)
+        directions = None if robot.is_neck else weights_of(model)
+        found = probed(model, self._redefinition(directions, robot)[1], limits)
+        per_motor = to_si(robot.motors.unit)[0]
+        own = replace(self, **{name: getattr(limits, name) / per_motor for name in LIMITS[:4]})
+        return NmpcController(
+            settings=own if robot.is_neck else own._of_robot(found, model.sample_time),
+            model=model,
+            found=found,
+            directions=directions,
+        )
+
+    def _redefinition(self, directions: Matrix | None, robot: Robot) -> tuple[Matrix, Matrix]:
+        """Return T from motors to redefined inputs, and its inverse."""
+        if directions is not None:
+            return redefinition_of(directions, robot.outputs.names)
+        T = redefinition_matrix(np.array(self.tendon_angles))
+        return T, np.linalg.inv(T)
+
+    def _of_robot(self, found: Mapping[str, Mapping[str, float]], sample_time: float) -> NmpcSettings:
+        """Return the settings for another robot, times stretched by its slowest plant near rest."""
+        plants = [plant_of(item, sample_time, neck=False) for item in found.values()]
+        stretch = max(plant.stretch for plant in plants)
+        horizon = max(plant.delay for plant in plants) + round(_HORIZON * stretch / sample_time)
+        others = {
+            "bandwidth": self.bandwidth / stretch,
+            "reference_time": self.reference_time * stretch,
+            "horizon": min(max(horizon, 3), _LONGEST),
+            "window": min(max(round(_WINDOW * stretch / sample_time), 2), _LONGEST),
         }
-        return NmpcController(settings=self, model=model, found=found)
+        changed = {k: v for k, v in others.items() if isinstance(getattr(self, k), NeckDefault | NeckCount)}
+        if isinstance(self.moves, NeckCount):
+            changed["moves"] = min(int(self.moves), int(changed.get("horizon", self.horizon)))
+        return replace(self, **changed)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class NmpcController:
-    """A nonlinear predictive controller of pitch and roll; `NmpcSettings.design` makes it.
+    """A nonlinear predictive controller of all outputs; `NmpcSettings.design` makes it.
 
     Attributes:
-        settings: what was asked.
+        settings: what was asked; limits in the unit of the motors.
         model: that it predicts with.
         found: static gain, pole and dead time of the model near rest, by axis.
+        directions: (outputs, motors) of the motors in each output of another robot than the neck.
     """
 
     settings: NmpcSettings
     model: Model
     found: Mapping[str, Mapping[str, float]]
+    directions: Matrix | None = None
 
     kind = "nmpc"
 
@@ -153,6 +194,18 @@ class NmpcController:
         return self.model.sample_time
 
     @property
+    def robot(self) -> Robot:
+        """Whose controller it is."""
+        return self.model.robot
+
+    @property
+    def limits(self) -> ControllerLimits:
+        """What its set-points may do."""
+        per_motor = to_si(self.robot.motors.unit)[0]
+        given = {name: per_motor * getattr(self.settings, name) for name in LIMITS[:4]}
+        return ControllerLimits(robot=self.robot, **given, least_cocontraction=-given["position_limit"])
+
+    @property
     def preview(self) -> float:
         """How far ahead the reference is known [s]."""
         return round(self.settings.preview / self.sample_time) * self.sample_time
@@ -160,32 +213,51 @@ class NmpcController:
     @cached_property
     def inputs(self) -> tuple[Port, ...]:
         """The ports of a controller, and with preview those of the reference ahead."""
+        names = self.robot.outputs.names
         ahead = tuple(
-            Port(name=f"{axis}_reference_ahead", unit="rad", minimum=-0.8, maximum=0.8,
-                 description=f"wanted {axis} {self.preview:g} s from now")
-            for axis in ("pitch", "roll")
+            replace(port, name=f"{port.name}_ahead", description=f"{port.description} {self.preview:g} s from now")
+            for port in controller_inputs(self.robot)[: len(names)]
         ) if self.preview > 0.0 else ()  # fmt: skip
-        return (*controller_inputs(), *ahead)
+        return (*controller_inputs(self.robot), *ahead)
 
     @cached_property
     def outputs(self) -> tuple[Port, ...]:
         """The set-points."""
-        return controller_outputs()
+        return controller_outputs(self.robot)
 
     @cached_property
     def parameters(self) -> tuple[Port, ...]:
         """The limits that can be changed at the start."""
-        s = self.settings
-        return limit_ports((s.position_limit, s.slew_limit, s.lead_limit, s.least_position, -6.0))[:4]
+        return self.limits.ports()[:4]
 
-    def plants(self) -> tuple[AxisPlant, AxisPlant]:
-        """Return the linear plants that the model is near rest."""
-        first, second = (_plant(self.found[axis], self.sample_time) for axis in ("pitch", "roll"))
-        return first, second
+    def plants(self) -> tuple[AxisPlant, ...]:
+        """Return the linear plants that the model is near rest, of another robot in the units of its size."""
+        if self._sized is None:
+            return self._near_rest
+        return tuple(axis.nominal for axis in self._sized.axes.values())
+
+    @property
+    def _near_rest(self) -> tuple[AxisPlant, ...]:
+        neck = self.robot.is_neck
+        return tuple(plant_of(self.found[axis], self.sample_time, neck) for axis in self.robot.outputs.names)
+
+    @cached_property
+    def _sized(self) -> SizedPlant | None:
+        """Another robot's plants in the units of its size."""
+        if self.directions is None:
+            return None
+        names = self.robot.outputs.names
+        axes = {name: UncertainAxis(plant, (plant,)) for name, plant in zip(names, self._near_rest, strict=True)}
+        T = self.settings._redefinition(self.directions, self.robot)
+        return sized_plant(UncertainPlant(axes, self.robot, self.directions), self.limits, T)
 
     def problem(self) -> NonlinearProblem:
         """Return what is asked, in numbers."""
-        s, plants = self.settings, self.plants()
+        s, plants, scale = self.settings, self.plants(), None
+        if self._sized is None:
+            T, inverse = s._redefinition(None, self.robot)
+        else:
+            (T, inverse), scale = self._sized.redefinition, self._sized.scale
         weights = np.tile([1.0 / plant.static_gain**2 for plant in plants], (s.horizon, 1))
         # What follows the horizon: an error that dies out as fast as the loop.
         weights[-1] /= 1.0 - math.exp(-2.0 * s.bandwidth * self.sample_time)
@@ -193,10 +265,12 @@ class NmpcController:
             model=self.model,
             horizon=s.horizon,
             starts=spaced_starts(s.horizon, s.moves),
-            T=redefinition_matrix(np.array(s.tendon_angles)),
+            T=T,
+            T_inverse=inverse,
             weights=weights,
             move_weight=1.5 * max(move_weight(plant, s.bandwidth) for plant in plants),
             cocontraction_weight=s.cocontraction_weight,
+            scale=scale,
         )
 
     def initial_state(self, **parameters: float) -> State:
@@ -232,11 +306,13 @@ class NmpcController:
 
     @cached_property
     def _block(self) -> Block:
-        plant = self.model.block()
+        # How far it can be trusted is no part of a prediction, and takes time in each of its steps.
+        plant, robot = replace(self.model, arrays=without_validity(self.model.arrays)).block(), self.robot
+        outer = sized(_RUNTIME, len(robot.motors.names), len(robot.outputs.names))
         return Block(
             kind="nmpc",
             role="controller",
-            runtime=f"softneck.design.predictive._nmpc_runtime({plant.runtime}:{len(plant.arrays)})",
+            runtime=f"{outer}({plant.runtime}:{len(plant.arrays)})",
             sample_time=self.sample_time,
             arrays=(*controller_arrays(self), *plant.arrays),
             inputs=self.inputs,
@@ -246,72 +322,43 @@ class NmpcController:
 
     def summary(self) -> str:
         """Return some lines for people."""
-        s = self.settings
+        s, robot = self.settings, self.robot
         lines = [
             f"nmpc controller over {self.model.kind}, {1e3 * self.sample_time:g} ms, {s.order} order",
-            f"  {3 * s.moves} unknowns, horizon {s.horizon} samples, bandwidth {s.bandwidth:g} rad/s, disturbance over "
-            f"{s.window} samples, {'converged' if s.converged else 'one iteration a sample'}",
+            f"  {len(robot.motors.names) * s.moves} unknowns, horizon {s.horizon} samples, bandwidth "
+            f"{s.bandwidth:.4g} rad/s, disturbance over {s.window} samples, "
+            f"{'converged' if s.converged else 'one iteration a sample'}",
         ]
-        for axis in ("pitch", "roll"):
+        if not robot.is_neck:
+            lines += self.limits.lines(self.sample_time)
+        shown, motor = to_si(robot.outputs.display_unit)[0], to_si(robot.motors.unit)[0]
+        for axis in robot.outputs.names:
             f = self.found[axis]
             lines.append(
-                f"  {axis}: the model near rest is {math.degrees(f['static_gain']):.3g} deg/rad, pole {f['pole']:.3g} "
-                f"1/s, dead time {1e3 * f['delay'] * self.sample_time:g} ms"
+                f"  {axis}: the model near rest is {f['static_gain'] * motor / shown:.3g} "
+                f"{robot.outputs.display_unit}/{robot.motors.unit}, pole {f['pole']:.3g} 1/s, dead time "
+                f"{1e3 * f['delay'] * self.sample_time:g} ms"
             )
         return "\n".join(lines)
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write the controller with its model to one `.npz` file."""
-        m = self.model
+        model, arrays = nested(self.model)
         header = {
             "kind": "nmpc",
             "settings": asdict(self.settings),
             "found": {axis: dict(values) for axis, values in self.found.items()},
-            "model": {
-                "kind": m.kind, "sample_time": m.sample_time, "arrays": list(m.arrays), "settings": dict(m.settings),
-                "findings": dict(m.findings),
-            },
-        }  # fmt: skip
-        arrays = {f"model_{name}": array for name, array in m.arrays.items()}
-        write_archive(path, header, {**arrays, "model_training_rows": m.training_rows}, force=force)
+            "model": model,
+            **({} if self.directions is None else {"directions": self.directions.tolist()}),
+            **self.robot.in_header(),
+        }
+        write_archive(path, header, arrays, force=force)
 
     @classmethod
     def from_archive(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> NmpcController:
         """Return the controller that `save` wrote; `softneck.core.load` calls this."""
-        names = [*header["model"]["arrays"], "training_rows"]
-        model = Model.from_archive(dict(header["model"]), {name: arrays[f"model_{name}"] for name in names})
+        model = nested_model(header["model"], arrays)
         settings = dict(header["settings"])
         settings["tendon_angles"] = tuple(settings["tendon_angles"])
-        return cls(settings=NmpcSettings(**settings), model=model, found=header["found"])
-
-
-def probed(model: Model, T: np.ndarray) -> tuple[AxisPlant, AxisPlant]:
-    """Return one-pole plants with dead time that step as the model does near rest.
-
-    Raises:
-        SettingsError: an input that does not move its angle.
-    """
-    block = model.block()
-    rows = round(_PROBE_SECONDS / model.sample_time)
-    plants = []
-    for axis, name in enumerate(("pitch", "roll")):
-        ends = []
-        for sign in (0.0, 1.0):
-            u = np.full((rows, 8), np.nan)
-            u[:, :3] = sign * _PROBE * np.linalg.inv(T)[:, axis]
-            ends.append(block.run(block.initial_state(use_measurement=0.0), u)[1][:, axis])
-        y = (ends[1] - ends[0]) / _PROBE
-        if not np.isfinite(y).all() or abs(y[-1]) < 1e-3:
-            raise SettingsError(f"the model's {name} does not follow its input (Eq. 9, 10); identify it again.")
-        share = y / y[-1]
-        dead, risen = (int(np.argmax(share > part)) for part in (0.05, 0.632))
-        a = math.exp(-1.0 / max(1, risen - dead))
-        plants.append(_plant({"static_gain": y[-1], "a": a, "delay": dead}, model.sample_time))
-    return plants[0], plants[1]
-
-
-def _plant(found: Mapping[str, float], sample_time: float) -> AxisPlant:
-    a = found["a"] if "a" in found else math.exp(-found["pole"] * sample_time)
-    return AxisPlant(
-        np.array([found["static_gain"] * (1.0 - a)]), np.array([1.0, -a]), int(found["delay"]), sample_time
-    )
+        directions = np.array(header["directions"]) if "directions" in header else None
+        return cls(settings=NmpcSettings(**settings), model=model, found=header["found"], directions=directions)

@@ -11,7 +11,7 @@ from softneck.core import Matrix, Vector
 from softneck.loop import BlockPart
 from softneck.runtime import Block
 
-from ._nmpc_state_runtime import NmpcArrays, NmpcState
+from ._nmpc_state_runtime import NMPC_NUMBERS, NmpcArrays, NmpcState
 
 _STATUS_NAMES = ("not started", "optimal", "softened", "previous plan", "holding")
 
@@ -25,7 +25,7 @@ class SampleSolution:
         iterations: of the QP solver, all Gauss-Newton steps together.
         residual: of the QP's KKT conditions.
         previous_plan, softened: samples so far on which those happened.
-        moves: (moves, 3) that are planned next [rad].
+        moves: (moves, motors) that are planned next [rad], of another robot in SI.
     """
 
     status: str
@@ -38,7 +38,10 @@ class SampleSolution:
 
 def explain(block: Block, values: Vector) -> SampleSolution:
     """Return what the sample decided that led a controller's `block` to the state `values`."""
-    parts = NmpcState.parts(NmpcArrays(block.arrays))
+    a = NmpcArrays(block.arrays)
+    parts = NmpcState.parts(a)
+    # Of another robot the motors' unit, before those of the outputs.
+    unit = a.setup[-a.T.shape[0]] if a.setup.size > NMPC_NUMBERS else 1.0
     number = {name: float(values[place.start]) for name, place in parts.items()}
     return SampleSolution(
         status=_STATUS_NAMES[int(number["status"])],
@@ -46,7 +49,7 @@ def explain(block: Block, values: Vector) -> SampleSolution:
         residual=number["residual"],
         previous_plan=int(number["shifted"]),
         softened=int(number["softened"]),
-        moves=values[parts["plan"]].reshape(-1, 3).copy(),
+        moves=unit * values[parts["plan"]].reshape(-1, a.T.shape[1]),
     )
 
 

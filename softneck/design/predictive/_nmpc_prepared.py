@@ -13,9 +13,15 @@ from softneck.estimation import AxisPlant
 from softneck.identification import Model
 from softneck.runtime import Block
 
-# Samples without measurement until the motors hold, and samples after which a model has settled.
+from ._prediction import idle_moves
+from ._scale import Scale
+
+# Samples without measurement until the motors hold, and samples after which a model has settled; of another robot those
+# of a neck at 20 ms, stretched by its slowest pole.
 COAST = 25
 SETTLE = 200
+# A neck's [s].
+NECK_SAMPLE = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -30,29 +36,48 @@ class NonlinearProblem:
         model: that is predicted.
         horizon: N, samples from now.
         starts: samples at which the motors may move.
-        T: (3, 3) of Eq. 9-11.
-        weights: (N, 2) on angle errors [1/rad^2].
+        T: (outputs + 1, motors) of Eq. 9-11, of a neck with 3 motors and 2 outputs.
+        T_inverse: (motors, outputs + 1).
+        weights: (N, outputs) on angle errors [1/rad^2].
         move_weight: lambda.
         cocontraction_weight: rho.
+        scale: units of another robot than the neck, in which all these numbers are.
     """
 
     model: Model
     horizon: int
     starts: tuple[int, ...]
     T: Matrix
+    T_inverse: Matrix
     weights: Matrix
     move_weight: float
     cocontraction_weight: float
+    scale: Scale | None = None
+
+    @property
+    def motors(self) -> int:
+        """Number of motors."""
+        return self.T.shape[1]
+
+    @property
+    def outputs(self) -> int:
+        """Number of outputs."""
+        return self.T.shape[0] - 1
 
     @property
     def variables(self) -> int:
         """Number of moves of all motors."""
-        return 3 * len(self.starts)
+        return self.motors * len(self.starts)
+
+    @property
+    def levels(self) -> Matrix:
+        """(kept, motors) co-contraction, and what else of the motors moves no output and is kept at zero."""
+        return np.vstack([self.T[-1:], idle_moves(self.T)])
 
     def spread(self) -> Matrix:
-        """Return (3 N, nz): which moves make the set-points of each sample."""
+        """Return (motors N, nz): which moves make the set-points of each sample."""
         rows = np.array([[float(start <= i) for start in self.starts] for i in range(self.horizon)])
-        return np.kron(rows, np.eye(3))
+        return np.kron(rows, np.eye(self.motors))
 
 
 class NonlinearController(Protocol):
@@ -64,7 +89,7 @@ class NonlinearController(Protocol):
     def model(self) -> Model: ...
     @property
     def sample_time(self) -> float: ...
-    def plants(self) -> tuple[AxisPlant, AxisPlant]: ...
+    def plants(self) -> tuple[AxisPlant, ...]: ...
     def problem(self) -> NonlinearProblem: ...
     def block(self) -> Block: ...
 
@@ -76,13 +101,12 @@ class Preparation:
         """Prepare `controller`."""
         s, Ts = controller.settings, controller.sample_time
         p = self.problem = controller.problem()
-        plants = controller.plants()
+        plants = self.plants = controller.plants()
         pole = max(float(-plant.denominator[1]) for plant in plants)
         if s.disturbance_time is not None:
             pole = math.exp(-Ts / s.disturbance_time)
         self.gains = estimate_gains(pole, s.window)
         self.future = disturbance_ahead(pole, p.horizon)
-        self.gain = np.array([plant.static_gain for plant in plants])
         self.ahead = round(s.preview / Ts)
         self.keep = math.exp(-Ts / s.reference_time) if s.reference_time > 0.0 else 0.0
         self.lead = min(round(s.reference_time / Ts), self.ahead)
@@ -98,7 +122,7 @@ class Preparation:
         weights[np.arange(places.size), low] += 1.0 - (places - low)
         weights[np.arange(places.size), low + 1] += places - low
         self.slopes = np.diff(weights, axis=0)
-        self.inverse = np.linalg.inv(p.T)[:, :2]
+        self.inverse = p.T_inverse[:, :-1] / np.array([plant.static_gain for plant in plants])
 
 
 def estimate_gains(pole: float, window: int) -> Matrix:
@@ -130,12 +154,16 @@ def controller_arrays(controller: NonlinearController) -> tuple[Matrix, ...]:
     p, block = prepared.problem, controller.model.block()
     start = block.initial_state(use_measurement=0.0, noise_std=0.0)
     slack = 0.0 if s.angle_limit is None else s.slack_weight * float(p.weights[0].max())
+    scale, stretch = p.scale, max(plant.stretch for plant in prepared.plants)
+    coast, settle = COAST, SETTLE
+    if scale is not None:
+        coast, settle = (max(1, round(n * NECK_SAMPLE * stretch / controller.sample_time)) for n in (COAST, SETTLE))
     constants = np.array([
         controller.sample_time, p.horizon, s.window, prepared.ahead, prepared.lead, prepared.keep, p.move_weight,
-        p.cocontraction_weight, slack, s.angle_limit or 0.0, s.budget, float(s.converged), COAST, SETTLE,
-        len(block.outputs),
+        p.cocontraction_weight, slack, s.angle_limit or 0.0, s.budget, float(s.converged), coast, settle,
+        len(block.outputs), *(() if scale is None else (*scale.bounds, scale.motors, *scale.outputs)),
     ])  # fmt: skip
     return (
-        constants, np.array(p.starts, dtype=np.float64), p.T, p.weights, prepared.gains, prepared.future,
-        prepared.slopes, prepared.inverse / prepared.gain, prepared.asked_at.astype(np.float64), start.parameters,
+        constants, np.array(p.starts, dtype=np.float64), p.T, p.levels, p.weights, prepared.gains, prepared.future,
+        prepared.slopes, prepared.inverse, prepared.asked_at.astype(np.float64), start.parameters,
     )  # fmt: skip

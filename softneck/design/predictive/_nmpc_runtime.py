@@ -11,7 +11,6 @@ import numpy as np
 from softneck.design.linear._rest_runtime import initialise as initialise
 from softneck.design.predictive._dual_runtime import qp_backward, qp_solve
 from softneck.design.predictive._nmpc_state_runtime import (
-    NMPC_ANGLE_LIMIT,
     NMPC_BUDGET,
     NMPC_COAST,
     NMPC_COCONTRACTION,
@@ -19,6 +18,7 @@ from softneck.design.predictive._nmpc_state_runtime import (
     NMPC_HOLDING,
     NMPC_MOVE,
     NMPC_NO_BOUND,
+    NMPC_NUMBERS,
     NMPC_OPTIMAL,
     NMPC_OUTPUTS,
     NMPC_PLAN,
@@ -29,9 +29,13 @@ from softneck.design.predictive._nmpc_state_runtime import (
     NmpcArrays,
     NmpcState,
     nmpc_ahead,
+    nmpc_angle_limit,
     nmpc_asked,
+    nmpc_inputs,
+    nmpc_limits,
     nmpc_listen,
-    nmpc_plausible,
+    nmpc_measured,
+    nmpc_range,
     nmpc_shift,
 )
 from softneck.runtime._members_runtime import member_initialise, member_size, member_step, member_tangent
@@ -51,59 +55,68 @@ def step(p: NmpcArrays, parameters: np.ndarray, x: NmpcState, inputs: np.ndarray
     """Compute the set-points for now, and the state for the next sample.
 
     inputs: pitch, roll and co-contraction reference, pitch, roll, motor_position_1..3, healthy, enabled; with preview
-    pitch_reference_ahead, roll_reference_ahead.
+    pitch_reference_ahead, roll_reference_ahead. The outputs of another robot stand for pitch and roll.
     outputs: motor_setpoint_1..3.
     parameters: position limit [rad], slew limit [rad/s], lead limit [rad], least position [rad].
     """
+    u = nmpc_inputs(p, inputs)
+    flags = 2 * p.outputs + 1 + p.motors
     first = x.started == 0.0
     if first:
-        for j in range(3):
-            x.held[j] = inputs[5 + j] if math.isfinite(inputs[5 + j]) else 0.0
-    nmpc_listen(p, x, inputs, first)
-    measured = nmpc_plausible(inputs[3]) and nmpc_plausible(inputs[4])
+        for j in range(p.motors):
+            position = u[2 * p.outputs + 1 + j]
+            x.held[j] = position if math.isfinite(position) else 0.0
+    nmpc_listen(p, x, u, first)
+    measured = nmpc_measured(p, u)
     x.lost = 0.0 if measured else x.lost + 1.0
-    acts = inputs[8] > 0.5 and inputs[9] > 0.5 and x.lost <= p.setup[NMPC_COAST]
+    acts = u[flags] > 0.5 and u[flags + 1] > 0.5 and x.lost <= p.setup[NMPC_COAST]
     if first:
         nmpc_settle(p, x)
     if measured:
-        nmpc_compare(p, x, inputs, first or not acts)
+        nmpc_compare(p, x, u, first or not acts)
     if first or not acts:
         # Whoever takes over goes on from where the neck is: no bump.
-        for axis in range(2):
+        for axis in range(p.outputs):
             x.filtered[axis] = x.angles[axis] + x.missed[0, axis]
-        x.filtered[2] = np.dot(p.T[2], x.held)
+        x.filtered[p.outputs] = np.dot(p.T[p.outputs], x.held)
         x.plan[:] = 0.0
         x.active[:] = 0.0
     x.started = 1.0
     x.status = NMPC_HOLDING
     if acts:
-        nmpc_decide(p, parameters, x, inputs)
+        nmpc_decide(p, nmpc_limits(p, parameters), x, u)
     # In free run, measured or not: what it misses is in `missed`, not in its state.
     nmpc_model(p, x.model, x.held, x.angles)
     outputs[:] = x.held
+    if p.numbers > NMPC_NUMBERS:
+        outputs *= p.setup[p.numbers - p.outputs - 1]
 
 
 def nmpc_compare(p: NmpcArrays, x: NmpcState, inputs: np.ndarray, anew: bool) -> None:
     """Push what the measurement is above the model into `missed`; `anew` as if it had always been that."""
-    missed = x.missed
-    for i in range(missed.shape[0] - 1, 1, -1):
-        missed[i] = missed[i - 2]
-    for axis in range(2):
-        error = inputs[3 + axis] - x.angles[axis]
+    missed, m = x.missed, p.outputs
+    for i in range(missed.shape[0] - 1, m - 1, -1):
+        missed[i] = missed[i - m]
+    for axis in range(m):
+        error = inputs[m + 1 + axis] - x.angles[axis]
         missed[axis] = error
         if anew:
-            for i in range(axis, missed.shape[0], 2):
+            for i in range(axis, missed.shape[0], m):
                 missed[i] = error
 
 
 def nmpc_model(p: NmpcArrays, model: np.ndarray, motors: np.ndarray, angles: np.ndarray) -> None:
     """Move the model on in free run under `motors` and fill its `angles`."""
-    u = np.empty(8)
-    u[:3] = motors
-    u[3:] = np.nan  # NaN: nothing is measured
+    u = np.empty(2 * p.motors + p.outputs)
+    u[: p.motors] = motors
+    u[p.motors :] = np.nan  # NaN: nothing is measured
+    if p.numbers > NMPC_NUMBERS:
+        u[: p.motors] *= p.setup[p.numbers - p.outputs - 1]
     out = np.zeros(int(p.setup[NMPC_OUTPUTS]))
     member_step(p, 0, p.free, model, u, out)
-    angles[:] = out[:2]
+    angles[:] = out[: p.outputs]
+    if p.numbers > NMPC_NUMBERS:
+        angles /= p.setup[p.numbers - p.outputs :]
 
 
 def nmpc_settle(p: NmpcArrays, x: NmpcState) -> None:
@@ -115,57 +128,67 @@ def nmpc_settle(p: NmpcArrays, x: NmpcState) -> None:
 
 
 def nmpc_linear(p: NmpcArrays, x: NmpcState, z: np.ndarray, Y: np.ndarray, S: np.ndarray) -> None:
-    """Fill the angles Y (2 N,) that the plan `z` leads to from now on, and their derivative S (2 N, nz)."""
-    nz = z.shape[0]
+    """Fill the angles Y (outputs N,) that the plan `z` leads to from now on, and their derivative S (outputs N, nz)."""
+    nz, n, m = z.shape[0], p.motors, p.outputs
     # A copy: the controller's own model stays at t_k.
     now, held = x.model.copy(), x.held.copy()
-    u, out = np.empty(8), np.zeros(int(p.setup[NMPC_OUTPUTS]))
-    u[3:] = np.nan
+    u, out = np.empty(2 * n + m), np.zeros(int(p.setup[NMPC_OUTPUTS]))
+    u[n:] = np.nan
+    # The model's own units, of a neck the same.
+    unit = p.setup[p.numbers - m - 1] if p.numbers > NMPC_NUMBERS else 1.0
     # dx/dz, du/dz, dy/dz: the state of now answers to no move.
-    X, U, D = np.zeros((now.shape[0], nz)), np.zeros((8, nz)), np.zeros((out.shape[0], nz))
+    X, U, D = np.zeros((now.shape[0], nz)), np.zeros((2 * n + m, nz)), np.zeros((out.shape[0], nz))
     block = 0
     for k in range(p.N):
         if block < p.moves and p.starts[block] == k:
-            for j in range(3):
-                held[j] += z[3 * block + j]
-                U[j, 3 * block + j] = 1.0  # from here on, as `held` keeps the move
+            for j in range(n):
+                held[j] += z[n * block + j]
+                U[j, n * block + j] = unit  # from here on, as `held` keeps the move
             block += 1
-        u[:3] = held
+        u[:n] = unit * held
         # Moves that are still to come have moved nothing.
-        moved = 3 * block
+        moved = n * block
         member_tangent(p, 0, p.free, now, u, out, X, U, D, moved)
-        Y[2 * k : 2 * k + 2] = out[:2]
-        S[2 * k : 2 * k + 2, :moved] = D[:2, :moved]
+        for axis in range(m):
+            size = p.setup[p.numbers - m + axis] if p.numbers > NMPC_NUMBERS else 1.0
+            Y[m * k + axis] = out[axis] / size
+            S[m * k + axis, :moved] = D[axis, :moved] / size
 
 
 def nmpc_quadratic(
     p: NmpcArrays, x: NmpcState, z: np.ndarray, missing: np.ndarray, S: np.ndarray, asked: np.ndarray, H: np.ndarray,
     f: np.ndarray,
 ) -> None:  # fmt: skip
-    """Fill the QP's H and f for absolute moves; `missing` (2 N,) is what angles are above their targets."""
-    q, nz, N, starts, T = p.setup, z.shape[0], p.N, p.starts, p.T
-    weights = p.weights.reshape(2 * N)
+    """Fill the QP's H and f for absolute moves; `missing` (outputs N,) is what angles are above their targets."""
+    q, nz, N, starts, n = p.setup, z.shape[0], p.N, p.starts, p.motors
+    rows = p.outputs * N
+    weights = p.weights.reshape(rows)
     # Gauss-Newton: H = 2 S' Q S, without the second derivative of the free run.
-    weighted = np.empty((nz, 2 * N))
-    for i in range(2 * N):
+    weighted = np.empty((nz, rows))
+    for i in range(rows):
         weighted[:, i] = 2.0 * weights[i] * S[i]
     H[:, :] = 0.0
     f[:] = 0.0
     H[:nz, :nz] = np.dot(weighted, S)
     # S z taken off, so that z are moves and not changes of the plan; `asked` are those that the reference needs.
     f[:nz] = np.dot(weighted, missing - np.dot(S, z)) - 2.0 * q[NMPC_MOVE] * asked
-    level = np.dot(T[2], x.held) - x.filtered[2]  # delta of now above what is wanted
     for b in range(starts.shape[0]):
-        for j in range(3):
-            i = 3 * b + j
-            H[i, i] += 2.0 * q[NMPC_MOVE]
-            # A move counts in all samples from its own on.
-            f[i] += 2.0 * q[NMPC_COCONTRACTION] * T[2, j] * (N - starts[b]) * level
-            for c in range(starts.shape[0]):
-                # Samples on which both moves are in what is held.
-                both = N - max(starts[b], starts[c])
-                for m in range(3):
-                    H[i, 3 * c + m] += 2.0 * q[NMPC_COCONTRACTION] * both * T[2, j] * T[2, m]
+        for j in range(n):
+            H[n * b + j, n * b + j] += 2.0 * q[NMPC_MOVE]
+    for kept in range(p.kept):
+        row = p.levels[kept]
+        # Of now above what is wanted: delta, and nothing of what else moves no output.
+        level = np.dot(row, x.held) - (x.filtered[p.outputs] if kept == 0 else 0.0)
+        for b in range(starts.shape[0]):
+            for j in range(n):
+                i = n * b + j
+                # A move counts in all samples from its own on.
+                f[i] += 2.0 * q[NMPC_COCONTRACTION] * row[j] * (N - starts[b]) * level
+                for c in range(starts.shape[0]):
+                    # Samples on which both moves are in what is held.
+                    both = N - max(starts[b], starts[c])
+                    for other in range(n):
+                        H[i, n * c + other] += 2.0 * q[NMPC_COCONTRACTION] * both * row[j] * row[other]
     # sigma (eps^2 + 0.1 eps): the linear part makes slack zero wherever it can be.
     if q[NMPC_SLACK] > 0.0:
         H[nz, nz] = 2.0 * q[NMPC_SLACK]
@@ -177,11 +200,12 @@ def nmpc_bounds(
 ) -> None:
     """Fill the bounds of moves, slack and positions."""
     move = parameters[1] * p.setup[NMPC_TS]
-    nz, slacks = 3 * p.moves, p.slacks
+    n, slacks = p.motors, p.slacks
+    nz = n * p.moves
     for i in range(nz):
         lower[i] = -move
         upper[i] = move
-    for j in range(3):
+    for j in range(n):
         known = motors[j] if math.isfinite(motors[j]) else held[j]  # an encoder that says nothing: no lead to keep
         # Within the slew at any rate, as in `mpc_bounds`.
         lower[j] = min(max(-move, known - parameters[2] - held[j]), move)
@@ -191,47 +215,45 @@ def nmpc_bounds(
         upper[nz] = NMPC_NO_BOUND
     for i in range(nz):
         # A motor beyond a limit comes back as fast as its first move may: that can always be done.
-        j = i % 3
-        lower[nz + slacks + i] = min(max(-parameters[0], parameters[3]), held[j] + upper[j]) - held[j]
-        upper[nz + slacks + i] = max(parameters[0], held[j] + lower[j]) - held[j]
+        j = i % n
+        least, most = nmpc_range(p, parameters, j)
+        lower[nz + slacks + i] = min(least, held[j] + upper[j]) - held[j]
+        upper[nz + slacks + i] = max(most, held[j] + lower[j]) - held[j]
 
 
 def nmpc_rows(
-    p: NmpcArrays,
-    z: np.ndarray,
-    reached: np.ndarray,
-    S: np.ndarray,
-    A: np.ndarray,
-    lower: np.ndarray,
+    p: NmpcArrays, z: np.ndarray, reached: np.ndarray, S: np.ndarray, A: np.ndarray, lower: np.ndarray,
     upper: np.ndarray,
-) -> None:
+) -> None:  # fmt: skip
     """Fill the QP's rows (m, n): moves and slack as they are, positions, angles at the ends of the holds.
 
-    reached: (2 N,) angles as they are expected under the plan `z`, disturbance among them.
+    reached: (outputs N,) angles as they are expected under the plan `z`, disturbance among them.
     """
     nz, n, b, starts = z.shape[0], A.shape[1], p.moves, p.starts
     A[:, :] = 0.0
     for i in range(n):
         A[i, i] = 1.0
     for i in range(nz):
-        for c in range(i // 3 + 1):  # a position is the sum of the moves so far
-            A[n + i, 3 * c + i % 3] = 1.0
+        for c in range(i // p.motors + 1):  # a position is the sum of the moves so far
+            A[n + i, p.motors * c + i % p.motors] = 1.0
     if n > nz:
-        for axis in range(2):
+        below = p.outputs * b  # from limits above to those below
+        for axis in range(p.outputs):
+            limit = nmpc_angle_limit(p, axis)
             for c in range(b):
                 end = int(starts[c + 1]) if c + 1 < b else p.N
-                at = 2 * (end - 1) + axis  # y of sample k + 1 stands in rows 2 k and 2 k + 1
+                at = p.outputs * (end - 1) + axis  # y of sample k + 1 stands in the rows of k
                 row = n + nz + axis * b + c
                 # The angle without any move: y(z) - S z, on its tangent.
                 free = reached[at] - np.dot(S[at], z)
                 for side in range(2):
-                    A[row + 2 * b * side, :nz] = S[at]
+                    A[row + below * side, :nz] = S[at]
                 A[row, nz] = -1.0
-                A[row + 2 * b, nz] = 1.0
+                A[row + below, nz] = 1.0
                 lower[row] = -NMPC_NO_BOUND
-                upper[row] = p.setup[NMPC_ANGLE_LIMIT] - free
-                lower[row + 2 * b] = -p.setup[NMPC_ANGLE_LIMIT] - free
-                upper[row + 2 * b] = NMPC_NO_BOUND
+                upper[row] = limit - free
+                lower[row + below] = -limit - free
+                upper[row + below] = NMPC_NO_BOUND
 
 
 def nmpc_factor(H: np.ndarray, L: np.ndarray) -> bool:
@@ -308,15 +330,16 @@ def nmpc_residual(
 def nmpc_decide(p: NmpcArrays, parameters: np.ndarray, x: NmpcState, inputs: np.ndarray) -> None:
     """Plan, check the plan, and move `held` by its first moves, or by those of the plan before."""
     q = p.setup
-    N, nz = p.N, 3 * p.moves
+    nz, rows = p.motors * p.moves, p.outputs * p.N
     at, sign = x.plan.copy(), x.active.copy()
     n, m = nz + p.slacks, sign.shape[0]
-    target, asked, ahead = np.empty(2 * N), np.empty(nz), np.empty(2 * N)
+    target, asked, ahead = np.empty(rows), np.empty(nz), np.empty(rows)
     nmpc_asked(p, x, target, asked)
     nmpc_ahead(p, x, ahead)
     lower, upper, lam = np.empty(m), np.empty(m), np.zeros(m)
-    nmpc_bounds(p, parameters, x.held, inputs[5:8], lower, upper)
-    Y, S = np.empty(2 * N), np.zeros((2 * N, nz))
+    first = 2 * p.outputs + 1  # of the motors
+    nmpc_bounds(p, parameters, x.held, inputs[first : first + p.motors], lower, upper)
+    Y, S = np.empty(rows), np.zeros((rows, nz))
     H, f, A, z = np.empty((n, n)), np.empty(n), np.empty((m, n)), np.empty(n)
     total = 0
     answered = False
@@ -347,10 +370,13 @@ def nmpc_decide(p: NmpcArrays, parameters: np.ndarray, x: NmpcState, inputs: np.
     x.iterations = total
     nmpc_take(p, x, at, sign, answered, slack)
     plan, held = x.plan, x.held
-    for j in range(3):
+    for j in range(p.motors):
         # Bounds of now: a plan of an earlier sample knew others.
         move = min(max(plan[j], lower[j]), upper[j])
-        low, high = min(-parameters[0], held[j]), max(parameters[0], held[j])
+        low, high = -parameters[0], parameters[0]
+        if p.numbers > NMPC_NUMBERS:
+            low, high = nmpc_range(p, parameters, j)
+        low, high = min(low, held[j]), max(high, held[j])
         held[j] = min(max(held[j] + move, low), high)
     nmpc_shift(p.starts, plan)
 

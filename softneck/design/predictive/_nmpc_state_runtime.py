@@ -1,4 +1,7 @@
-"""What the nonlinear predictive controller remembers, what it is asked for, and what it expects its model to miss."""
+"""What the nonlinear predictive controller remembers, what it is asked for, and what it expects its model to miss.
+
+Of another robot than the neck all but the model's state is in units in which it has a neck's size (see `_scale`).
+"""
 
 import math
 
@@ -34,6 +37,9 @@ NMPC_CONVERGED = 11
 NMPC_COAST = 12
 NMPC_SETTLE = 13
 NMPC_OUTPUTS = 14  # of the model
+# Of another robot behind them: the lowest and highest set-points, and references, in the units of its size; then these
+# units in SI, that of the motors and one for each output.
+NMPC_NUMBERS = 15
 
 
 def nmpc_slacks(setup: np.ndarray) -> int:
@@ -41,23 +47,36 @@ def nmpc_slacks(setup: np.ndarray) -> int:
     return 1 if setup[NMPC_SLACK] > 0.0 else 0
 
 
+def nmpc_outputs(T: np.ndarray) -> int:
+    """Return the number of outputs: the redefined inputs are one more, co-contraction."""
+    return T.shape[0] - 1
+
+
+def nmpc_motors(T: np.ndarray) -> int:
+    """Return the number of motors."""
+    return T.shape[1]
+
+
 class NmpcArrays(Arrays):
     """Those of the model follow."""
 
-    setup = array("15", "numbers of the problem, at the places NMPC_TS to NMPC_OUTPUTS")
+    setup = array("numbers", "numbers of the problem, at the places NMPC_TS to NMPC_NUMBERS")
     starts = array("moves", "samples at which the motors may move")
-    T = array("3, 3", "of Eq. 9-11: motors to redefined inputs")
-    weights = array("N, 2", "on angle errors [1/rad^2]")
+    T = array("references, motors", "of Eq. 9-11: motors to redefined inputs")
+    levels = array("kept, motors", "co-contraction, and what else of the motors moves no output and is kept at zero")
+    weights = array("N, outputs", "on angle errors [1/rad^2]")
     gains = array("2, window", "what was missed to its level and rate")
     future = array("N, 2", "what level and rate of it make of each sample to come")
     slopes = array("moves, path", "references to come to moves of the redefined inputs")
-    inverse = array("3, 2", "of T, by the static gains")
+    inverse = array("motors, outputs", "of T, by the static gains")
     asked_at = array("path", "which of the references to come each sample asks for")
     free = array("parameters", "of the model in free run")
     N = value("setup", NMPC_N)
     H = value("setup", NMPC_AHEAD)
     lead = value("setup", NMPC_LEAD)
     slacks = value("setup", function=nmpc_slacks)
+    outputs = value("T", function=nmpc_outputs, written=True)
+    motors = value("T", function=nmpc_motors, written=True)
 
 
 class NmpcState(StateVector):
@@ -70,67 +89,120 @@ class NmpcState(StateVector):
     softened = cells("", "samples on which a soft limit could not be kept")
     lost = cells("", "samples in a row without a measurement")
     residual = cells("", "of the KKT conditions, last answer")
-    held = cells("3", "set-points [rad]")
-    filtered = cells("3", "references behind their filter [rad]")
-    seen = cells("3", "references last seen [rad]")
-    ahead = cells("2, H", "references to come [rad]")
-    angles = cells("2", "of the model now [rad]")
-    missed = cells("window, 2", "what measurements were above the model, newest first [rad]")
-    plan = cells("3 * moves", "moves of the motors [rad]")
-    active = cells("6 * moves + slacks * (1 + 4 * moves)", "sign of each row of the QP that is active")
+    held = cells("motors", "set-points [rad]")
+    filtered = cells("outputs + 1", "references behind their filter [rad]")
+    seen = cells("outputs + 1", "references last seen [rad]")
+    ahead = cells("outputs, H", "references to come [rad]")
+    angles = cells("outputs", "of the model now [rad]")
+    missed = cells("window, outputs", "what measurements were above the model, newest first [rad]")
+    plan = cells("motors * moves", "moves of the motors [rad]")
+    active = cells(
+        "2 * motors * moves + slacks * (1 + 2 * outputs * moves)", "sign of each row of the QP that is active"
+    )
     model = rest("state of the model")
 
 
-def nmpc_plausible(angle: float) -> bool:
-    """Return whether an angle is one that a neck can have."""
-    return math.isfinite(angle) and abs(angle) < NMPC_PLAUSIBLE
+def nmpc_inputs(p: NmpcArrays, inputs: np.ndarray) -> np.ndarray:
+    """Return the inputs in the units of the robot's size."""
+    u = inputs.copy()
+    if p.numbers > NMPC_NUMBERS:
+        first = p.numbers - p.outputs  # of the outputs' units; the motors' stands before them
+        flags = 2 * p.outputs + 1 + p.motors
+        for i in range(p.outputs):
+            u[i] /= p.setup[first + i]
+            u[p.outputs + 1 + i] /= p.setup[first + i]
+            if p.H > 0:
+                u[flags + 2 + i] /= p.setup[first + i]
+        u[p.outputs] /= p.setup[first - 1]
+        for j in range(p.motors):
+            u[2 * p.outputs + 1 + j] /= p.setup[first - 1]
+    return u
+
+
+def nmpc_limits(p: NmpcArrays, parameters: np.ndarray) -> np.ndarray:
+    """Return the parameters in the units of the robot's size."""
+    limits = parameters.copy()
+    if p.numbers > NMPC_NUMBERS:
+        limits /= p.setup[p.numbers - p.outputs - 1]
+    return limits
+
+
+def nmpc_range(p: NmpcArrays, parameters: np.ndarray, j: int) -> tuple[float, float]:
+    """Return the lowest and highest set-point of motor j."""
+    least, most = max(-parameters[0], parameters[3]), parameters[0]
+    if p.numbers > NMPC_NUMBERS:
+        least = max(least, p.setup[NMPC_NUMBERS + j])
+        most = min(most, p.setup[NMPC_NUMBERS + p.motors + j])
+    return least, most
+
+
+def nmpc_angle_limit(p: NmpcArrays, axis: int) -> float:
+    """Return the soft limit of an angle."""
+    limit = p.setup[NMPC_ANGLE_LIMIT]
+    return limit / p.setup[p.numbers - p.outputs + axis] if p.numbers > NMPC_NUMBERS else limit
+
+
+def nmpc_measured(p: NmpcArrays, inputs: np.ndarray) -> bool:
+    """Return whether the outputs are numbers, of a neck those that it can have."""
+    for i in range(p.outputs + 1, 2 * p.outputs + 1):
+        if not math.isfinite(inputs[i]) or (p.numbers == NMPC_NUMBERS and abs(inputs[i]) >= NMPC_PLAUSIBLE):
+            return False
+    return True
+
+
+def nmpc_reference(p: NmpcArrays, i: int, asked: float) -> float:
+    """Return a reference within what may be asked for."""
+    if p.numbers > NMPC_NUMBERS:
+        low = NMPC_NUMBERS + 2 * p.motors + i
+        return min(max(asked, p.setup[low]), p.setup[low + p.outputs + 1])
+    limit = NMPC_REFERENCE_LIMIT if i < p.outputs else NMPC_MOTOR_LIMIT
+    return min(max(asked, -limit), limit)
 
 
 def nmpc_listen(p: NmpcArrays, x: NmpcState, inputs: np.ndarray, first: bool) -> None:
     """Take in the references; one that is not finite leaves what was."""
-    for i in range(3):
+    for i in range(p.outputs + 1):
         if math.isfinite(inputs[i]):
-            limit = NMPC_REFERENCE_LIMIT if i < 2 else NMPC_MOTOR_LIMIT
-            x.seen[i] = min(max(inputs[i], -limit), limit)
-    for axis in range(2):
+            x.seen[i] = nmpc_reference(p, i, inputs[i])  # pyright: ignore[reportArgumentType]  (a number)
+    for axis in range(p.outputs):
         if p.H > 0:
             row = x.ahead[axis]
             if first:
                 row[:] = x.seen[axis]
             for i in range(p.H - 1):
                 row[i] = row[i + 1]
-            newest = inputs[10 + axis]
+            newest = inputs[2 * p.outputs + 3 + p.motors + axis]
             if math.isfinite(newest):
-                row[p.H - 1] = min(max(newest, -NMPC_REFERENCE_LIMIT), NMPC_REFERENCE_LIMIT)
+                row[p.H - 1] = nmpc_reference(p, axis, newest)  # pyright: ignore[reportArgumentType]
 
 
 def nmpc_asked(p: NmpcArrays, x: NmpcState, target: np.ndarray, asked: np.ndarray) -> None:
-    """Move the reference filters on; fill the filtered references to come (2 N,) and the moves they ask for (nz,)."""
+    """Move the filters on; fill the filtered references to come (outputs N,), and the moves they ask for (nz,)."""
     keep = p.setup[NMPC_KEEP]
     path = np.empty(p.path)
     asked[:] = 0.0
-    for i in range(3):
+    for i in range(p.outputs + 1):
         now = x.seen[i]
-        if i < 2 and p.H > 0 and p.lead > 0:
+        if i < p.outputs and p.H > 0 and p.lead > 0:
             now = x.ahead[i, p.lead - 1]  # as many samples early as the filter makes late
         x.filtered[i] = keep * x.filtered[i] + (1.0 - keep) * now
-    for axis in range(2):
+    for axis in range(p.outputs):
         filtered = x.filtered[axis]
         for i in range(p.path):
             wanted = x.ahead[axis, int(p.asked_at[i])] if p.H > 0 else x.seen[axis]  # no preview: it stays
             filtered = keep * filtered + (1.0 - keep) * wanted
             path[i] = filtered
-            if 2 * i + axis < target.shape[0]:
-                target[2 * i + axis] = filtered
+            if p.outputs * i + axis < target.shape[0]:
+                target[p.outputs * i + axis] = filtered
         for b in range(p.moves):
             move = np.dot(p.slopes[b], path)
-            for j in range(3):
-                asked[3 * b + j] += p.inverse[j, axis] * move  # T^-1 over the static gains
+            for j in range(p.motors):
+                asked[p.motors * b + j] += p.inverse[j, axis] * move  # T^-1 over the static gains
 
 
 def nmpc_ahead(p: NmpcArrays, x: NmpcState, ahead: np.ndarray) -> None:
-    """Fill what the model will miss (2 N,), from what it missed."""
-    for axis in range(2):
+    """Fill what the model will miss (outputs N,), from what it missed."""
+    for axis in range(p.outputs):
         # o and r of now, by least squares over the window (see `estimate_gains`).
         level = 0.0
         rate = 0.0
@@ -139,14 +211,15 @@ def nmpc_ahead(p: NmpcArrays, x: NmpcState, ahead: np.ndarray) -> None:
             rate += p.gains[1, i] * x.missed[i, axis]
         for i in range(p.future.shape[0]):
             # o_i = o + r (1 + a + ...): the same disturbance as the linear controller's.
-            ahead[2 * i + axis] = p.future[i, 0] * level + p.future[i, 1] * rate
+            ahead[p.outputs * i + axis] = p.future[i, 0] * level + p.future[i, 1] * rate
 
 
 def nmpc_shift(starts: np.ndarray, plan: np.ndarray) -> None:
     """Make the plan that of the next sample: what is planned for one sample later becomes first."""
     b = starts.shape[0]
+    motors = plan.shape[0] // b
     before = plan.copy()
-    for j in range(3):
+    for j in range(motors):
         last = 0.0
         for i in range(b):
             # Position one sample after this start, relative to what is held now.
@@ -154,6 +227,6 @@ def nmpc_shift(starts: np.ndarray, plan: np.ndarray) -> None:
             # The first move is in `held` already: the sum begins at 1.
             for c in range(1, b):
                 if starts[c] <= starts[i] + 1.0:
-                    now += before[3 * c + j]
-            plan[3 * i + j] = now - last
+                    now += before[motors * c + j]
+            plan[motors * i + j] = now - last
             last = now

@@ -2,7 +2,8 @@
 
     min  sum w (Y(z) - t)^2 + |R z - a|^2    subject to    low <= Q Y(z) + G z <= high,  least <= z <= most
 
-with Y (2 N,) the angles of the model's free run under the set-points `spread z + offset` (3 N,), sample by sample.
+with Y (2 N,) the angles of the model's free run under the set-points `spread z + offset` (3 N,), sample by sample; of
+another robot its outputs under its motors, in the units of its size.
 ipopt is given the exact gradient and the Hessian of Gauss and Newton: kinks of a model have no second derivative.
 """
 
@@ -20,6 +21,7 @@ from softneck.runtime import load_functions
 
 from ._nmpc_prepared import NonlinearController
 from ._nmpc_state_runtime import NmpcArrays, NmpcState
+from ._scale import Scale
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -51,20 +53,22 @@ class OptimalControl:
     """A problem whose matrices stay: its expression is made once and solved for any number of tasks."""
 
     def __init__(
-        self, model: Model, *, spread: Matrix, weights: Vector, R: Matrix, Q: Matrix, G: Matrix, options: dict[str, Any]
-    ) -> None:
-        """Make the expression; `options` are ipopt's."""
+        self, model: Model, *, spread: Matrix, weights: Vector, R: Matrix, Q: Matrix, G: Matrix,
+        options: dict[str, Any], scale: Scale | None = None,
+    ) -> None:  # fmt: skip
+        """Make the expression; `options` are ipopt's, `scale` the units of another robot."""
         import casadi as ca
 
-        linear, self._keep = linear_step(model)
-        N, nz = weights.size // 2, spread.shape[1]
-        sizes = (len(self._keep), 3 * N, 2 * N, R.shape[0])
+        n, m = len(model.robot.motors.names), len(model.robot.outputs.names)
+        linear, self._keep = linear_step(model, scale)
+        N, nz = weights.size // m, spread.shape[1]
+        sizes = (len(self._keep), n * N, m * N, R.shape[0])
         z, p = ca.MX.sym("z", nz), ca.MX.sym("p", sum(sizes))
         x, offset, target, asked = ca.vertsplit(p, [0, *np.cumsum(sizes).tolist()])
-        U = ca.reshape(ca.mtimes(_sparse(spread), z) + offset, 3, N)
+        U = ca.reshape(ca.mtimes(_sparse(spread), z) + offset, n, N)
         S, angles, slopes = ca.MX(len(self._keep), nz), [], []
         for i in range(N):
-            move = _sparse(spread[3 * i : 3 * i + 3])
+            move = _sparse(spread[n * i : n * i + n])
             x, y, A, B, C, D = linear(x, U[:, i])
             slopes.append(ca.mtimes(C, S) + ca.mtimes(D, move))
             S = ca.mtimes(A, S) + ca.mtimes(B, move)
@@ -97,25 +101,25 @@ class OptimalControl:
         return np.array(found["x"])[:, 0], str(self._solver.stats()["return_status"])
 
 
-def linear_step(model: Model) -> tuple[Any, list[int]]:
-    """Return `casadi.Function` x, u -> x_next, y, A, B, C, D of pitch and roll, over the states that they depend on.
+def linear_step(model: Model, scale: Scale | None = None) -> tuple[Any, list[int]]:
+    """Return `casadi.Function` x, u -> x_next, y, A, B, C, D of the outputs, over the states that they depend on.
 
     Those states are returned too: the others (random numbers, what no lag reads) hold what they held at the start.
     """
     import casadi as ca
 
-    step = model.casadi()
+    step, n, m = model.casadi(), len(model.robot.motors.names), len(model.robot.outputs.names)
     reads = [np.array(ca.DM(step.jac_sparsity(i, 0), 1.0)) != 0.0 for i in range(2)]
-    need, more = reads[1][:2].any(axis=0), True
+    need, more = reads[1][:m].any(axis=0), True
     while more:
         before, need = need, need | reads[0][need].any(axis=0)
         more = bool((before != need).any())
     keep = np.flatnonzero(need).tolist()
-    x, u = ca.SX.sym("x", len(keep)), ca.SX.sym("u", 3)
+    x, u = ca.SX.sym("x", len(keep)), ca.SX.sym("u", n)
     whole = ca.SX(ca.DM(model.block().initial_state().values))
     whole[keep] = x
-    ahead, y = step(whole, u)
-    both = ahead[keep], y[:2]
+    ahead, y = step(whole, u if scale is None else scale.motors * u)
+    both = ahead[keep], y[:m] if scale is None else y[:m] / ca.DM(scale.outputs)
     return ca.Function("linear", [x, u], [*both, *(ca.jacobian(of, by) for of in both for by in (x, u))]), keep
 
 
@@ -132,43 +136,47 @@ class OptimalPart(BlockPart):
     it. Only the first sample, which has no state yet, is the block's alone.
 
     Attributes:
-        moves: (moves, 3) that ipopt found for the last sample [rad].
+        moves: (moves, motors) that ipopt found for the last sample [rad], of another robot in the unit of its size.
         status: what ipopt said of them.
     """
 
     def __init__(self, controller: NonlinearController) -> None:
         """Make the problem of `controller`."""
         super().__init__(controller.block())
-        self.status, self.moves = "", np.zeros((0, 3))
         p, s = controller.problem(), controller.settings
-        self._problem, self._limit = p, s.angle_limit
+        n, m = p.motors, p.outputs
+        self.status, self.moves = "", np.zeros((0, n))
+        self._problem = p
         self._runtime: Any = load_functions(self.block.runtime, compiled=False)
         self._parts = NmpcState.parts(NmpcArrays(self.block.arrays))
         nz, slacks = p.variables, int(s.angle_limit is not None)
-        spread = np.hstack([p.spread(), np.zeros((3 * p.horizon, slacks))])
-        sums = np.kron(np.tril(np.ones((nz // 3, nz // 3))), np.eye(3))
+        spread = np.hstack([p.spread(), np.zeros((n * p.horizon, slacks))])
+        sums = np.kron(np.tril(np.ones((nz // n, nz // n))), np.eye(n))
         # Rows: positions; then, with a soft limit, angles at the ends of the holds from above and from below.
         ends = np.array([*p.starts[1:], p.horizon]) - 1
-        self._seen = np.eye(2 * p.horizon)[np.concatenate([2 * ends, 2 * ends + 1])[: None if slacks else 0]]
+        places = np.concatenate([m * ends + axis for axis in range(m)])[: None if slacks else 0]
+        self._seen = np.eye(m * p.horizon)[places]
+        units = np.ones(m) if p.scale is None else p.scale.outputs
+        self._limits = (s.angle_limit or 0.0) / units[places % m]
         give = np.eye(1, nz + slacks, nz + slacks - 1).repeat(len(self._seen), axis=0)
         # The slack costs w (e^2 + e / 10) = w (e + 1/20)^2 + constant.
         self._slack = np.sqrt(s.slack_weight * p.weights[0].max()) * np.eye(slacks, nz + slacks, nz)
-        level = np.kron(np.eye(p.horizon), p.T[2:]) @ spread
+        level = np.kron(np.eye(p.horizon), p.levels) @ spread
         self._solver = OptimalControl(
             controller.model, spread=spread, weights=p.weights.ravel(),
             R=np.vstack([
                 np.sqrt(p.move_weight) * np.eye(nz, nz + slacks), np.sqrt(p.cocontraction_weight) * level, self._slack,
             ]),
-            Q=np.vstack([np.zeros((nz, 2 * p.horizon)), self._seen, self._seen]),
+            Q=np.vstack([np.zeros((nz, m * p.horizon)), self._seen, self._seen]),
             G=np.vstack([np.hstack([sums, np.zeros((nz, slacks))]), -give, give]),
-            options={"tol": 1e-10},
+            options={"tol": 1e-10}, scale=p.scale,
         )  # fmt: skip
 
     def advance(self, time: float, inputs: Vector) -> Vector:
         """Step once and return the set-points."""
         if self._state[self._parts["started"]] != 0.0:
             z, self.status = self._solver.solve(self._task(inputs))
-            self.moves = z[: self._problem.variables].reshape(-1, 3)
+            self.moves = z[: self._problem.variables].reshape(-1, self._problem.motors)
             self._state[self._parts["plan"]] = self.moves.ravel()
         return super().advance(time, inputs)
 
@@ -177,18 +185,21 @@ class OptimalPart(BlockPart):
         f, arrays, problem, state = self._runtime, self.block.arrays, self._problem, self._state.copy()
         x = {name: state[place] for name, place in self._parts.items()}
         nz, N, slacks = problem.variables, problem.horizon, len(self._slack)
+        n, m = problem.motors, problem.outputs
+        u = f.nmpc_inputs(arrays, u)
         f.nmpc_listen(arrays, state, u, False)
-        if f.nmpc_plausible(u[3]) and f.nmpc_plausible(u[4]):
+        if f.nmpc_measured(arrays, u):
             f.nmpc_compare(arrays, state, u, False)
-        target, asked, ahead = np.empty(2 * N), np.empty(nz), np.empty(2 * N)
+        target, asked, ahead = np.empty(m * N), np.empty(nz), np.empty(m * N)
         f.nmpc_asked(arrays, state, target, asked)
         f.nmpc_ahead(arrays, state, ahead)
         lower, upper = np.empty(x["active"].size), np.empty(x["active"].size)
-        f.nmpc_bounds(arrays, self._parameters, x["held"], u[5:8], lower, upper)
+        limits, first = f.nmpc_limits(arrays, self._parameters), 2 * m + 1
+        f.nmpc_bounds(arrays, limits, x["held"], u[first : first + n], lower, upper)
         least, most = lower[: nz + slacks], upper[: nz + slacks]
-        level = np.full(N, np.sqrt(problem.cocontraction_weight) * (x["filtered"][2] - problem.T[2] @ x["held"]))
-        free, none = self._seen @ ahead, np.full(len(self._seen), np.inf)
-        limit = self._limit or 0.0
+        wanted = np.append(x["filtered"][m], np.zeros(len(problem.levels) - 1))
+        level = np.tile(np.sqrt(problem.cocontraction_weight) * (wanted - problem.levels @ x["held"]), N)
+        free, none, limit = self._seen @ ahead, np.full(len(self._seen), np.inf), self._limits
         return Task(
             start=x["model"], offset=np.tile(x["held"], N), target=target - ahead,
             asked=np.concatenate([np.sqrt(problem.move_weight) * asked, level, -0.05 * self._slack.sum(axis=1)]),

@@ -71,8 +71,7 @@ class Problem:
     @property
     def idle(self) -> Matrix:
         """(k, motors) moves of the motors that neither tilt nor co-contract, orthonormal; none of a neck."""
-        _, values, rows = np.linalg.svd(self.T)
-        return rows[int(np.sum(values > 1e-9 * values[0])) :]
+        return idle_moves(self.T)
 
     @property
     def order(self) -> int:
@@ -117,6 +116,12 @@ class Problem:
         Looked at sooner, a limit would ask for a loop that is as fast as the samples, and the neck would swing on it.
         """
         return tuple(end for end in self.ends if end >= min(self.guard, self.horizon))
+
+
+def idle_moves(T: Matrix) -> Matrix:
+    """Return (k, motors) orthonormal moves of the motors that change no redefined input; none of a neck."""
+    _, values, rows = np.linalg.svd(T)
+    return rows[int(np.sum(values > 1e-9 * values[0])) :]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

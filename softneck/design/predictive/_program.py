@@ -110,24 +110,30 @@ class MpcProgram:
     def function(self) -> Any:
         """Return `casadi.Function` theta, limits -> H, f, A, lower, upper: the QP as any solver takes it.
 
-        Limits are position [rad], move per sample [rad], angle [rad] and tautness [rad]; the lead limit, which is
-        the block's own matter, is left out.
+        Limits are position [rad], move per sample [rad], angle [rad] and tautness [rad], of another robot in SI; the
+        lead limit, which is the block's own matter, is left out.
         """
         import casadi as ca
 
-        if self.constants.size > rt.MPC_NUMBERS:
-            raise SettingsError("the QP as a CasADi function takes necks only so far; `solve` takes any robot.")
         theta, limits = ca.SX.sym("theta", self.F.shape[1]), ca.SX.sym("limits", 4)
-        q = self.constants
-        position, move = limits[0], limits[1]
-        angle, taut = limits[2] - float(q[rt.MPC_ANGLE_BACK]), limits[3] + float(q[rt.MPC_TAUT_BACK])
+        q, inf = self.constants, rt.MPC_NO_BOUND
+        unit, outputs, _ = units_of(self.arrays)
+        position, move, taut = limits[0] / unit, limits[1] / unit, limits[3] / unit + float(q[rt.MPC_TAUT_BACK])
+
+        def ends(kind: float, which: int) -> tuple[Any, Any]:
+            angle = limits[2] / outputs[which % outputs.size] - float(q[rt.MPC_ANGLE_BACK])
+            low, high = -position, position
+            if q.size > rt.MPC_NUMBERS:  # the motors' own ranges
+                motors = rt.MpcArrays(self.arrays).T.shape[1]
+                low = ca.fmax(low, q[rt.MPC_NUMBERS + which % motors])
+                high = ca.fmin(high, q[rt.MPC_NUMBERS + motors + which % motors])
+            return {
+                rt.MPC_ROW_MOVE: (-move, move), rt.MPC_ROW_POSITION: (low, high), rt.MPC_ROW_SLACK: (0.0, inf),
+                rt.MPC_ROW_ANGLE_HIGH: (-inf, angle), rt.MPC_ROW_ANGLE_LOW: (-angle, inf), rt.MPC_ROW_TAUT: (taut, inf),
+            }[kind]  # fmt: skip
+
         free = ca.mtimes(ca.DM(self.E), theta)
-        inf = rt.MPC_NO_BOUND
-        ends = {
-            rt.MPC_ROW_MOVE: (-move, move), rt.MPC_ROW_POSITION: (-position, position), rt.MPC_ROW_SLACK: (0.0, inf),
-            rt.MPC_ROW_ANGLE_HIGH: (-inf, angle), rt.MPC_ROW_ANGLE_LOW: (-angle, inf), rt.MPC_ROW_TAUT: (taut, inf),
-        }  # fmt: skip
-        rows = [ends[kind] for kind in self.kinds[:, 0]]
+        rows = [ends(kind, int(which)) for kind, which in self.kinds]
         lower = ca.vertcat(*(row[0] for row in rows)) - free
         upper = ca.vertcat(*(row[1] for row in rows)) - free
         return ca.Function(

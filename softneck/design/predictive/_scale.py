@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, Vector, to_si
+from softneck.core import Matrix, SettingsError, Vector, require_between, to_si
 from softneck.robot import Robot
 from softneck.robot._neck_default import NeckDefault
 from softneck.runtime._bundle import sized
 
-from ..linear._ports import ControllerLimits
+from ..linear._loop_settings import stricter_limits
+from ..linear._ports import LIMITS, MAX_REFERENCE, ControllerLimits, robot_limits
 from ..plants._uncertain import UncertainAxis, UncertainPlant
 from . import _mpc_state_runtime as rt
 
@@ -92,6 +93,35 @@ class SizedPlant:
         return [plant.tf() for plant in self.axes[output].samples]
 
 
+def limits_of(settings: Any, robot: Robot) -> ControllerLimits:
+    """Return the limits of a predictive controller: what its settings give in the unit of the motors, and the file.
+
+    Raises:
+        SettingsError: one that the robot does not have, that its file does not give, or that contradicts another.
+    """
+    given = {name: getattr(settings, name) for name in LIMITS[:4]}
+    if robot.is_neck:
+        limits = ControllerLimits(robot=robot, **stricter_limits(robot, given))
+    else:
+        limits = robot_limits(robot, {name: v for name, v in given.items() if not isinstance(v, NeckDefault)})
+    unit, angle = robot.motors.unit, settings.angle_limit
+    if angle is not None:
+        if robot.is_neck:
+            require_between("angle_limit", angle, 0.01, MAX_REFERENCE, "rad")
+        elif to_si(robot.outputs.unit)[1] != "rad":
+            raise SettingsError(
+                f"`angle_limit` is for outputs that are angles; those of `{robot.name}` are in "
+                f"{robot.outputs.unit}. Leave it out."
+            )
+    taut, most = getattr(settings, "minimum_tautness", None), limits.position_limit / to_si(unit)[0]
+    if taut is not None and taut >= most:
+        raise SettingsError(
+            f"`minimum_tautness` {taut:g} {unit} and `position_limit` {most:g} {unit} contradict each other: no motor "
+            "could pull that far. Lower the first."
+        )
+    return limits
+
+
 def sized_plant(plant: UncertainPlant, limits: ControllerLimits, redefinition: tuple[Matrix, Matrix]) -> SizedPlant:
     """Return another robot's plant as one of a neck's size."""
     T, inverse = (part.copy() for part in redefinition)
@@ -146,14 +176,8 @@ def unbound(arrays: tuple[Matrix, ...]) -> tuple[Matrix, ...]:
 def refuse_what_is_for_necks(settings: Any, robot: Robot) -> None:
     """Raise SettingsError for settings of `MpcSettings` that mean nothing for another robot than the neck."""
     usual = type(settings)()
-    for name in ("disturbances", "tightening", "tendon_angles"):
-        if getattr(settings, name) != getattr(usual, name):
-            robot.require_neck(f"predictive control with `{name}`")
-    if settings.angle_limit is not None and to_si(robot.outputs.unit)[1] != "rad":
-        raise SettingsError(
-            f"`angle_limit` is for outputs that are angles; those of `{robot.name}` are in "
-            f"{robot.outputs.unit}. Leave it out."
-        )
+    if settings.tendon_angles != usual.tendon_angles:
+        raise SettingsError(f"`tendon_angles` are of necks; those of `{robot.name}` are in its robot file.")
     if settings.minimum_tautness is not None and (
         robot.directions.kind != "tendons" or isinstance(settings.tautness_lever, NeckDefault)
     ):

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import (
+    Matrix,
     SettingsError,
     Vector,
     require_between,
@@ -21,13 +22,13 @@ from softneck.core import (
 from softneck.estimation import axis_plant
 from softneck.estimation._axis import HasTransferFunctions, robot_of
 from softneck.estimation._settings import ORDERS
+from softneck.robot import Robot
 from softneck.robot._neck_default import NeckCount, NeckDefault
 from softneck.robot._redefined import redefinition_of
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
-from ..linear._loop_settings import stricter_limits
 from ..linear._margins import LOWEST, frequencies
-from ..linear._ports import MAX_MOTOR, ControllerLimits, require_taut, robot_limits
+from ..linear._ports import LIMITS, ControllerLimits, require_limits
 from ..plants._uncertain import UncertainPlant, uncertain_plant
 from ._arrays import Tuning, assemble, observer_bandwidth, with_filter, with_gains
 from ._controller import MpcController
@@ -35,23 +36,24 @@ from ._disturbance import MeasuredDisturbance
 from ._lti import system
 from ._mpc_state_runtime import MpcArrays
 from ._prediction import Problem, matrices
-from ._scale import SizedPlant, refuse_what_is_for_necks, sized_plant
+from ._scale import SizedPlant, limits_of, refuse_what_is_for_necks, sized_plant
 from ._scenarios import chosen_scenarios, sample_pairs
-from ._tightening import LimitTrial, tightened
+from ._tightening import LimitTrial, measurement_bound, tightened
 from ._tuning import (
     FULL_TRUST,
     Pair,
+    guard_samples,
     keeps_bounds,
     move_weight,
     observer_trust,
     radius,
     reference_time,
+    scaled,
     sensitivity,
     slowness,
+    spaced_starts,
 )  # fmt: skip
 
-# Samples of the last hold: ten moves over thirty samples, dense where they matter.
-_SPACING = (0, 1, 2, 3, 4, 6, 8, 11, 15, 20)
 # Of Ms at 5 % between frequencies; a peak is missed by less than 1 %.
 _THINNING = 5
 # Bandwidths that are tried [rad/s], and how often the range is halved: to 2 %.
@@ -61,7 +63,6 @@ _HALVINGS = 7
 # measurement until the motors hold [s].
 _HORIZON, _COAST = 0.6, 0.5
 _LONGEST = 200
-_LIMITS = ("position_limit", "slew_limit", "lead_limit", "least_position")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,7 +103,8 @@ class MpcSettings:
         slack_weight: on violations of soft limits, against errors of the angles, squared.
         tightening: whether soft limits are tightened until they hold in trials with the identified plant and with every
             judged sample of a family.
-        measurement_bound: by how much a measured angle may be wrong in these trials [rad].
+        measurement_bound: by how much a measured angle may be wrong in these trials [rad], of another robot in the unit
+            of its outputs; by default seven times the `noise_std` of its sensor, as the neck's.
         disturbance_time: time constant of the output disturbance's rate [s]; None for the plant's own, as a load at its
             input makes it. A longer one follows what keeps changing, such as a payload carried round, less robustly.
         budget: iterations of the solver for each sample; beyond them the previous plan goes on.
@@ -139,7 +141,7 @@ class MpcSettings:
     slack_weight: float = 1e3
     tightening: bool = False
     # The observer of the 3DM-GX5-10 on the virtual neck is wrong by up to 0.34 deg near a limit, by 0.1 deg at rest.
-    measurement_bound: float = math.radians(0.35)
+    measurement_bound: float = NeckDefault(math.radians(0.35))
     disturbance_time: float | None = None
     budget: int = 100
     # The paper's own dead time and pole (Eq. 31: 0.08 s, 5.293 1/s).
@@ -151,7 +153,7 @@ class MpcSettings:
 
     def __post_init__(self) -> None:
         if self.bandwidth is not None:
-            require_between("bandwidth", self.bandwidth, 0.5, 100.0, "rad/s")
+            require_positive("bandwidth", self.bandwidth, "rad/s")
         require_between("max_sensitivity", self.max_sensitivity, 1.05, 4.0)
         require_between("worst_sensitivity", self.worst_sensitivity, self.max_sensitivity, 10.0)
         if self.reference_time is not None:
@@ -162,32 +164,21 @@ class MpcSettings:
         require_whole("moves", self.moves, 1, self.horizon)
         require_whole("scenarios", self.scenarios, 0, 8)
         require_between("preview", self.preview, 0.0, 4.0, "s")
-        self._check_limits()
+        require_limits({name: getattr(self, name) for name in LIMITS[:4]})
+        require_between("tautness_lever", self.tautness_lever, 0.0, 100.0, "rad/rad")
+        if self.angle_limit is not None:
+            require_positive("angle_limit", self.angle_limit, "rad")
+        if self.minimum_tautness is not None:
+            require_finite("minimum_tautness", self.minimum_tautness)
         if self.disturbance_time is not None:
-            require_between("disturbance_time", self.disturbance_time, 0.02, 20.0, "s")
+            require_positive("disturbance_time", self.disturbance_time, "s")
         for name in ("cocontraction_weight", "slack_weight"):
             require_positive(name, getattr(self, name))
-        require_between("measurement_bound", self.measurement_bound, 0.0, 0.1, "rad")
+        require_between("measurement_bound", self.measurement_bound, 0.0, 1e12)
         require_whole("budget", self.budget, 1, 10_000)
         require_between("least_delay", self.least_delay, 0.0, 1.0, "s")
         require_between("small_move_pole", self.small_move_pole, 0.0, 1000.0, "1/s")
         require_one_of("order", self.order, ORDERS)
-
-    def _check_limits(self) -> None:
-        require_between("position_limit", self.position_limit, 0.01, 6.0, "rad")
-        require_between("slew_limit", self.slew_limit, 0.01, 1000.0, "rad/s")
-        require_between("lead_limit", self.lead_limit, 0.01, 12.0, "rad")
-        require_between("tautness_lever", self.tautness_lever, 0.0, 100.0, "rad/rad")
-        require_taut(self.least_position, -MAX_MOTOR, self.position_limit)
-        if self.angle_limit is not None:
-            require_between("angle_limit", self.angle_limit, 0.01, 0.8, "rad")
-        if self.minimum_tautness is not None:
-            require_finite("minimum_tautness", self.minimum_tautness, "rad")
-            if self.minimum_tautness >= self.position_limit:
-                raise SettingsError(
-                    f"`minimum_tautness` {self.minimum_tautness:g} rad and `position_limit` {self.position_limit:g} "
-                    "rad contradict each other: no motor could pull that far. Lower the first."
-                )
 
     @property
     def extra_delay(self) -> int:
@@ -207,12 +198,10 @@ class MpcSettings:
                 robustness that nothing keeps.
         """
         robot = robot_of(model)
+        limits = limits_of(self, robot)
         if robot.is_neck:
-            own = stricter_limits(robot, {name: getattr(self, name) for name in _LIMITS})
-            return self._designed(model, ControllerLimits(robot=robot, **own))
+            return self._designed(model, limits)
         uncertain = uncertain_plant(model)
-        given = {name: getattr(self, name) for name in _LIMITS}
-        limits = robot_limits(robot, {name: v for name, v in given.items() if not isinstance(v, NeckDefault)})
         T = redefinition_of(np.asarray(uncertain.weights), uncertain.names)
         return self._of_robot(uncertain)._designed(sized_plant(uncertain, limits, T), limits)
 
@@ -240,14 +229,14 @@ class MpcSettings:
         bandwidth = self._fastest(model, nominal, samples) if self.bandwidth is None else self.bandwidth
         arrays, found = self._tuned(self._arrays(model, bandwidth), nominal, samples)
         found["bandwidth_rad_s"] = bandwidth
+        per_motor = to_si(limits.robot.motors.unit)[0]
         if self.tightening:
             plants = [self._delayed(pair) for pair in [*self._families(nominal), *samples]]
-            arrays, found["back_off_rad"] = tightened(arrays, plants, self._trial())
-        per_motor = to_si(limits.robot.motors.unit)[0]
+            arrays, found["back_off_rad"] = tightened(arrays, plants, self._trial(model, limits))
         return MpcController(
             sample_time=Ts,
             arrays=arrays,
-            **{name: getattr(limits, name) for name in _LIMITS},
+            **{name: getattr(limits, name) for name in LIMITS[:4]},
             robot=limits.robot,
             angle_limit=self.angle_limit,
             minimum_tautness=None if self.minimum_tautness is None else per_motor * self.minimum_tautness,
@@ -278,11 +267,12 @@ class MpcSettings:
         Ts = problem.scenarios[0].axes[0].sample_time
         tuning = Tuning(
             trust=FULL_TRUST, reference_time=self.reference_time or 0.0, preview=round(self.preview / Ts),
-            budget=self.budget, disturbances=self.disturbances,
+            budget=self.budget, disturbances=self._measured(robot_of(model)),
         )  # fmt: skip
         if isinstance(model, SizedPlant):
             coast = max(1, round(_COAST * slowness(problem.scenarios[0].axes) / Ts))
-            tuning = replace(tuning, scale=model.scale, coast=coast)
+            measured = tuning.disturbances / np.append(model.scale.outputs, 1.0)
+            tuning = replace(tuning, scale=model.scale, coast=coast, disturbances=measured)
         return assemble(problem, matrices(problem), tuning)
 
     def problem(self, model: HasTransferFunctions, bandwidth: float) -> Problem:
@@ -290,10 +280,10 @@ class MpcSettings:
         nominal = self._nominal(model)
         scenarios = chosen_scenarios(model, self._delayed(nominal), self.scenarios, self.least_delay, self.extra_delay)
         if isinstance(model, SizedPlant):
-            (T, inverse), lever = model.redefinition, model.lever(self.tautness_lever)
+            T, inverse = model.redefinition
         else:
             T = redefinition_matrix(np.array(self.tendon_angles))
-            inverse, lever = np.linalg.inv(T), self.tautness_lever * T[:2].T
+            inverse = np.linalg.inv(T)
         weights: Vector = np.array([1.0 / plant.static_gain**2 for plant in nominal])
         # For symmetric tendons |P|^2 = 2/3 (theta^2 + phi^2) + 3 delta^2: the weight on an input becomes one on motors.
         on_input = max(move_weight(plant, bandwidth) for plant in nominal)
@@ -308,19 +298,32 @@ class MpcSettings:
             cocontraction_weight=self.cocontraction_weight,
             slack_weight=self.slack_weight * float(weights.max()),
             angles=self.angle_limit is not None,
-            tautness=None if self.minimum_tautness is None else lever,
+            tautness=None if self.minimum_tautness is None else self._lever(model),
             disturbance_time=self.disturbance_time,
             guard=guard_samples(bandwidth, nominal[0].sample_time),
         )
 
-    def _trial(self) -> LimitTrial:
+    def _lever(self, model: HasTransferFunctions) -> Matrix:
+        """Return (motors, outputs) how much an angle loosens each tendon."""
+        if isinstance(model, SizedPlant):
+            return model.lever(self.tautness_lever)
+        return self.tautness_lever * redefinition_matrix(np.array(self.tendon_angles))[:2].T
+
+    def _measured(self, robot: Robot) -> Matrix:
+        """Return (k, outputs + 1) gains and time constant of each measured disturbance."""
+        rows = [[*item.on(robot), item.time] for item in self.disturbances]
+        return np.array(rows).reshape(-1, len(robot.outputs.names) + 1)
+
+    def _trial(self, model: HasTransferFunctions, limits: ControllerLimits) -> LimitTrial:
         """Return what tightening is tried with."""
+        motors = to_si(limits.robot.motors.unit)[0]
         return LimitTrial(
-            parameters=(self.position_limit, self.slew_limit, self.lead_limit, self.least_position),
+            parameters=tuple(getattr(limits, name) for name in LIMITS[:4]),
             angle_limit=self.angle_limit,
-            minimum_tautness=self.minimum_tautness,
-            tautness_lever=self.tautness_lever,
-            measurement_bound=self.measurement_bound,
+            minimum_tautness=None if self.minimum_tautness is None else motors * self.minimum_tautness,
+            lever=self._lever(model),
+            measurement_bound=measurement_bound(self.measurement_bound, limits.robot),
+            neck=limits.robot.is_neck,
         )
 
     def _families(self, nominal: Pair) -> list[Pair]:
@@ -376,25 +379,3 @@ class MpcSettings:
             "starts": list(self.starts),
         }  # fmt: skip
         return arrays, found
-
-
-def guard_samples(bandwidth: float, sample_time: float) -> int:
-    """Return after how many samples soft limits are looked at: the time constant of the loop."""
-    return max(1, round(1.0 / (bandwidth * sample_time)))
-
-
-def spaced_starts(horizon: int, moves: int) -> tuple[int, ...]:
-    """Return samples at which the motors move: dense at first, sparse later."""
-    places = np.interp(np.linspace(0.0, 9.0, moves), np.arange(10), np.array(_SPACING) * horizon / 30.0)
-    starts = [0]
-    for place in places[1:]:
-        starts.append(max(starts[-1] + 1, round(float(place))))
-    # Squeezed together at the end where there are as many moves as samples.
-    for i in range(moves):
-        starts[-1 - i] = min(starts[-1 - i], horizon - 1 - i)
-    return tuple(starts)
-
-
-def scaled(pair: Pair, factor: float) -> Pair:
-    """Return both plants with their gain times `factor`."""
-    return tuple(replace(plant, numerator=factor * plant.numerator) for plant in pair)

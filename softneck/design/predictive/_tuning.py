@@ -1,8 +1,9 @@
-"""From bandwidth and robustness to weights, observer and reference filter."""
+"""From bandwidth and robustness to weights, moves, observer and reference filter."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,6 +24,8 @@ _HALVINGS = 18
 # A step response is judged over this long [s].
 _HORIZON = 4.0
 _SLOWEST_FILTER = 2.0
+# Samples of the last hold: ten moves over thirty samples, dense where they matter.
+_SPACING = (0, 1, 2, 3, 4, 6, 8, 11, 15, 20)
 
 
 def move_weight(plant: AxisPlant, bandwidth: float) -> float:
@@ -191,3 +194,25 @@ def _peak(parts: tuple[Matrix, Matrix, Matrix, Matrix], pair: Pair, extra_delay:
 def slowness(pair: Pair) -> float:
     """Return by how much the slowest axis is slower than a neck's."""
     return max(plant.stretch for plant in pair)
+
+
+def guard_samples(bandwidth: float, sample_time: float) -> int:
+    """Return after how many samples soft limits are looked at: the time constant of the loop."""
+    return max(1, round(1.0 / (bandwidth * sample_time)))
+
+
+def spaced_starts(horizon: int, moves: int) -> tuple[int, ...]:
+    """Return samples at which the motors move: dense at first, sparse later."""
+    places = np.interp(np.linspace(0.0, 9.0, moves), np.arange(10), np.array(_SPACING) * horizon / 30.0)
+    starts = [0]
+    for place in places[1:]:
+        starts.append(max(starts[-1] + 1, round(float(place))))
+    # Squeezed together at the end where there are as many moves as samples.
+    for i in range(moves):
+        starts[-1 - i] = min(starts[-1 - i], horizon - 1 - i)
+    return tuple(starts)
+
+
+def scaled(pair: Pair, factor: float) -> Pair:
+    """Return both plants with their gain times `factor`."""
+    return tuple(replace(plant, numerator=factor * plant.numerator) for plant in pair)

@@ -13,7 +13,7 @@ from softneck.core import Matrix, SettingsError, require_between, require_one_of
 
 from ._bilinear import to_continuous, to_discrete
 from ._riccati import least_gamma, partition, solve_at
-from ._weights import weight_image
+from ._weights import repeated, weight_image
 
 if TYPE_CHECKING:
     import control
@@ -67,9 +67,11 @@ def mixsyn(
     """Return the controller that keeps `|W1 S; W2 K S; W3 T|` small (Skogestad and Postlethwaite 2005, sec. 9.3.6).
 
     Args:
-        G: scalar plant; a discrete one, dead time as poles at zero, is taken exactly through the bilinear map.
-        W1, W2, W3: None, numbers or stable scalar systems, continuous or of the plant's dt. Continuous weights of
-            a discrete plant act at `2/Ts tan(w Ts/2)`.
+        G: plant of any number of inputs and outputs; a discrete one, dead time as poles at zero, is taken exactly
+            through the bilinear map.
+        W1, W2, W3: None, numbers or stable systems, continuous or of the plant's dt: of as many inputs as the plant
+            has outputs (W1, W3) or inputs (W2), or scalar ones, which weigh each of the signals alike. Continuous
+            weights of a discrete plant act at `2/Ts tan(w Ts/2)`.
         method: "slycot" (the routine behind python-control's `mixsyn`), "riccati" (ours), or what is there.
         above: the controller is built at this factor above the least gamma.
 
@@ -77,15 +79,17 @@ def mixsyn(
         SettingsError: no weight, one that cannot be solved for, another dt, or no controller.
     """
     dt = _dt_of(G)
-    weights = [weight_image(W, dt, name) for name, W in (("W1", W1), ("W2", W2), ("W3", W3))]
+    outputs, inputs = G.noutputs, G.ninputs
+    sized = (("W1", W1, outputs), ("W2", W2, inputs), ("W3", W3, outputs))
+    weights = [weight_image(W, dt, name, size) for name, W, size in sized]
     if all(W is None for W in weights):
         raise SettingsError("`mixsyn` needs at least one weight.")
-    if not any(W is not None and abs(float(np.asarray(W.D)[0, 0])) > _LEAST_DIRECT for W in weights[1:]):
+    if not any(W is not None and np.abs(np.asarray(W.D)).max() > _LEAST_DIRECT for W in weights[1:]):
         raise SettingsError(
             "the control effort is not weighted at high frequencies (D12 has not full rank), where the search for a "
             "controller hangs: give W2 a gain there, a number for example, or a W3 with as many zeros as poles."
         )
-    found = hinfsyn(_augmented(to_continuous(G), weights), 1, 1, method=method, above=above)
+    found = hinfsyn(_augmented(to_continuous(G), weights), outputs, inputs, method=method, above=above)
     K = to_discrete(found.controller, dt) if dt else found.controller
     return Synthesis(controller=_named(K, G, dt), gamma=found.gamma, achieved=found.achieved, method=found.method)
 
@@ -132,8 +136,9 @@ def ncfsyn(G: Any, W: Any = None, *, above: float = _ABOVE) -> Synthesis:
     TAC 37:759; Zhou, Doyle and Glover 1996, sec. 18.3).
 
     Args:
-        G: scalar plant, continuous or discrete.
-        W: the shape; integrators are welcome. Continuous, or of the plant's dt.
+        G: plant of any number of inputs and outputs, continuous or discrete.
+        W: the shape at the plant's inputs, a scalar one the same for each; integrators are welcome. Continuous, or of
+            the plant's dt.
         above: factor above the least gamma.
     """
     found, weight = ncf_parts(G, W, above=above)
@@ -154,7 +159,14 @@ def ncf_parts(G: Any, W: Any, *, above: float = _ABOVE) -> tuple[Synthesis, Any]
 
     require_between("above", above, 1.001, 100.0)
     dt = _dt_of(G)
-    weight: Any = control.StateSpace([], [], [], [[1.0]], 0) if W is None else control.ss(W)
+    weight: Any = control.StateSpace([], [], [], np.eye(G.ninputs), 0) if W is None else control.ss(W)
+    if weight.ninputs == weight.noutputs == 1:
+        weight = repeated(weight, G.ninputs)
+    if (weight.noutputs, weight.ninputs) != (G.ninputs, G.ninputs):
+        raise SettingsError(
+            f"W must be scalar or have {G.ninputs} inputs and outputs, as the plant has inputs; "
+            f"got {weight.ninputs} and {weight.noutputs}."
+        )
     if weight.dt not in (0, None) and not math.isclose(float(weight.dt), dt, rel_tol=1e-9):
         raise SettingsError(f"W has dt = {weight.dt:g} s, the plant dt = {dt:g} s; they must agree.")
     weight = to_continuous(weight)
@@ -187,11 +199,17 @@ def loopsyn(G: Any, Gd: Any, *, above: float = _ABOVE) -> Synthesis:
     W = Gd/G needs the plant's inverse: its stable, minimum-phase part is inverted, its delay is left alone.
 
     Raises:
-        SettingsError: a plant with zeros outside the stability border; shape with `ncfsyn` there.
+        SettingsError: a plant of several inputs or outputs, or with zeros outside the stability border; shape with
+            `ncfsyn` there.
     """
     import control
 
     dt = _dt_of(G)
+    if (G.ninputs, G.noutputs) != (1, 1):
+        raise SettingsError(
+            f"`loopsyn` inverts plants of one input and one output; got {G.ninputs} and {G.noutputs}. "
+            "Use `ncfsyn` with a weight of your own."
+        )
     zeros: Any = np.asarray(control.zeros(G))
     outside = zeros[np.abs(zeros) >= 1.0] if dt else zeros[zeros.real >= 0.0]
     if outside.size:
@@ -216,26 +234,27 @@ def _augmented(G: Any, weights: list[Any]) -> control.StateSpace:
     """Return P from (r, u) to (W1 e, W2 u, W3 y, e) with e = r - G u (python-control's `augw`, which warns)."""
     import control
 
-    one = control.StateSpace([], [], [], [[1.0]], 0)
+    n, ny, nu = G.nstates, G.noutputs, G.ninputs
+    one = control.StateSpace([], [], [], np.eye(ny), 0)
     blocks = [(W, part) for W, part in zip(weights, ("e", "u", "y"), strict=True) if W is not None]
     A, B, C, D = (np.asarray(part, dtype=np.float64) for part in (G.A, G.B, G.C, G.D))
     rows = {
-        "e": (-C, np.hstack([np.ones((1, 1)), -D])),
-        "u": (np.zeros_like(C), np.array([[0.0, 1.0]])),
-        "y": (C, np.hstack([np.zeros((1, 1)), D])),
+        "e": (-C, np.hstack([np.eye(ny), -D])),
+        "u": (np.zeros((nu, n)), np.hstack([np.zeros((nu, ny)), np.eye(nu)])),
+        "y": (C, np.hstack([np.zeros((ny, ny)), D])),
     }
-    states, inputs = A, np.hstack([np.zeros_like(B), B])
+    states, inputs = A, np.hstack([np.zeros((n, ny)), B])
     outputs, direct = [], []
     for W, part in [*blocks, (one, "e")]:
         before = states.shape[0]
         row, gain = rows[part]
-        row = np.hstack([row, np.zeros((1, before - row.shape[1]))])
+        row = np.hstack([row, np.zeros((len(row), before - row.shape[1]))])
         Aw, Bw, Cw, Dw = (np.asarray(item, dtype=np.float64) for item in (W.A, W.B, W.C, W.D))
         states = np.block([[states, np.zeros((before, Aw.shape[0]))], [Bw @ row, Aw]])
         inputs = np.vstack([inputs, Bw @ gain])
         outputs.append(np.hstack([Dw @ row, Cw]))
         direct.append(Dw @ gain)
-    wide = [np.hstack([row, np.zeros((1, states.shape[0] - row.shape[1]))]) for row in outputs]
+    wide = [np.hstack([row, np.zeros((len(row), states.shape[0] - row.shape[1]))]) for row in outputs]
     return control.StateSpace(states, inputs, np.vstack(wide), np.vstack(direct), 0)
 
 
@@ -277,12 +296,18 @@ def _coprime(G: Any, K: Any) -> float:
     """Return `|[K; 1] (1 + G K)^-1 [1, G]|` on a grid, which 1/margin is; raise if the loop is not stable."""
     import control
 
-    closed: Any = control.feedback(G * K, 1)
+    one: Any = control.StateSpace([], [], [], np.eye(G.noutputs), 0)
+    closed: Any = control.feedback(G * K, one)
     if float(np.max(np.linalg.eigvals(np.asarray(closed.A)).real, initial=-np.inf)) >= 0.0:
         raise SettingsError("the result is not stable: shape a slower loop, or build further `above` gamma.")
     s = 1j * np.geomspace(1e-4, 1e5, 400)
-    g, k = np.asarray(G(s)), np.asarray(K(s))
-    return float(np.max(np.sqrt((1.0 + np.abs(g) ** 2) * (1.0 + np.abs(k) ** 2)) / np.abs(1.0 + g * k)))
+    if (G.ninputs, G.noutputs) == (1, 1):
+        g, k = np.asarray(G(s)), np.asarray(K(s))
+        return float(np.max(np.sqrt((1.0 + np.abs(g) ** 2) * (1.0 + np.abs(k) ** 2)) / np.abs(1.0 + g * k)))
+    g, k = (np.moveaxis(np.asarray(system(s, squeeze=False)), -1, 0) for system in (G, K))
+    unit = np.broadcast_to(np.eye(G.noutputs), (len(s), G.noutputs, G.noutputs))
+    inner = np.linalg.solve(unit + g @ k, np.concatenate([unit, g], axis=2))
+    return float(np.linalg.norm(np.concatenate([k @ inner, inner], axis=1), 2, axis=(1, 2)).max())
 
 
 def _dt_of(system: Any) -> float:

@@ -102,16 +102,18 @@ def ucover(
     return W
 
 
-def weight_image(weight: Any, dt: float, name: str) -> control.StateSpace | None:
+def weight_image(weight: Any, dt: float, name: str, size: int = 1) -> control.StateSpace | None:
     """Return a weight as a continuous system for synthesis at `dt`, after the checks that spare a hang or a lie.
 
     Args:
-        weight: None, a number, or a scalar system: continuous, or of the plant's sample time.
+        weight: None, a number, or a system: continuous, or of the plant's sample time. A scalar one weighs each of
+            the signals alike.
         dt: of the plant; 0 if continuous.
         name: for messages.
+        size: signals that it weighs.
 
     Raises:
-        SettingsError: another sample time, an integrator, an unstable or improper weight.
+        SettingsError: another number of inputs, another sample time, an integrator, an unstable or improper weight.
     """
     import control
 
@@ -121,15 +123,17 @@ def weight_image(weight: Any, dt: float, name: str) -> control.StateSpace | None
         return None
     if isinstance(weight, int | float):
         require_positive(name, float(weight))
-        return control.StateSpace([], [], [], [[float(weight)]], 0)
-    if weight.ninputs != 1 or weight.noutputs != 1:
-        raise SettingsError(f"{name} must have one input and one output; got {weight.ninputs} and {weight.noutputs}.")
+        return control.StateSpace([], [], [], float(weight) * np.eye(size), 0)
+    scalar = weight.ninputs == 1 and weight.noutputs == 1
+    if not scalar and (size == 1 or weight.ninputs != size):
+        inputs = "one input and one output" if size == 1 else f"{size} inputs, or one input and one output"
+        raise SettingsError(f"{name} must have {inputs}; got {weight.ninputs} and {weight.noutputs}.")
     wdt = float(weight.dt or 0.0)
     if wdt != 0.0 and not math.isclose(wdt, dt, rel_tol=1e-9):
         raise SettingsError(f"{name} has dt = {wdt:g} s, the plant dt = {dt:g} s; make it with `makeweight(..., dt=)`.")
     if isinstance(weight, control.TransferFunction):
-        above, below = (np.trim_zeros(np.asarray(p[0][0]), "f") for p in (weight.num, weight.den))
-        if above.size > below.size:
+        pairs = [(np.asarray(n), np.asarray(d)) for n, d in _entries(weight)]
+        if any(np.trim_zeros(n, "f").size > np.trim_zeros(d, "f").size for n, d in pairs):
             raise SettingsError(f"{name} has more zeros than poles; add a fast pole, as `makeweight` does.")
     image = to_continuous(weight)
     poles = np.linalg.eigvals(np.asarray(image.A)) if image.nstates else np.zeros(0)
@@ -140,7 +144,22 @@ def weight_image(weight: Any, dt: float, name: str) -> control.StateSpace | None
         )
     if poles.size and float(np.max(poles.real)) >= 0.0:
         raise SettingsError(f"{name} is not stable (a pole at {np.max(poles.real):.3g} rad/s); weights must be.")
-    return image
+    return repeated(image, size) if scalar else image
+
+
+def repeated(system: control.StateSpace, size: int) -> control.StateSpace:
+    """Return a scalar system beside itself, once for each of `size` signals."""
+    import control
+
+    each: Any = system
+    one = np.eye(size)
+    return control.StateSpace(*(np.kron(one, np.asarray(part)) for part in (each.A, each.B, each.C, each.D)), each.dt)
+
+
+def _entries(weight: Any) -> list[tuple[Any, Any]]:
+    """Return numerator and denominator of each entry of a transfer function."""
+    places = [(i, j) for i in range(weight.noutputs) for j in range(weight.ninputs)]
+    return [(weight.num[i][j], weight.den[i][j]) for i, j in places]
 
 
 def _discrete(above: np.ndarray, below: np.ndarray, dt: float) -> control.TransferFunction:

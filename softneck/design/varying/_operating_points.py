@@ -1,4 +1,4 @@
-"""What the neck may be near each inclination: the operating points of a schedule."""
+"""What a neck, or another robot of one or two angles, may be near each inclination: a schedule's operating points."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import numpy as np
 
 from softneck.core import DataError, Matrix, SettingsError
 from softneck.estimation import AxisPlant, axis_plant
-from softneck.estimation._axis import HasTransferFunctions
+from softneck.estimation._axis import HasTransferFunctions, robot_of
 from softneck.identification import Family, Lpv
+from softneck.signals.recording._recording import require_same_robot
 
 from ..linear._tuning import Plants
 
-AXES = ("pitch", "roll")
 # Operating points nearer to each other than this [rad] are one.
 _NEAREST = math.radians(1.0)
 
@@ -27,25 +27,31 @@ class OperatingPoint:
 
     Attributes:
         inclination: [rad].
-        plants: of pitch and of roll; the first of each is the one that is interpolated.
+        plants: of each output, such as pitch and roll; the first of each is the one that is interpolated.
     """
 
     inclination: float
-    plants: tuple[Plants, Plants]
+    plants: tuple[Plants, ...]
 
 
 def family_points(family: Family) -> list[OperatingPoint]:
-    """Return the operating points of a family: those of its interpolation, else those of its local models.
+    """Return the operating points of a family: those of its interpolation, else of a neck those of its local models.
 
     Raises:
         SettingsError: fewer than two.
     """
+    names = family.robot.outputs.names
     if family.lpv is not None and family.lpv.knots.size > 1:
         return [_of_knot(family.lpv, k, family.sample_time) for k in range(family.lpv.knots.size)]
+    if not family.robot.is_neck:
+        raise SettingsError(
+            f"the family of robot {family.robot.label()} knows no inclinations: make it with `--set lpv_knots=3`, or "
+            "give several models with one of `inclinations` each."
+        )
     step = float(family.settings.get("inclination_step", math.radians(7.5)))
     bins = {name: _bins(axis.samples[axis.used > 0.5], axis.where[axis.used > 0.5], step) for name, axis in
             family.axes.items()}  # fmt: skip
-    common = sorted(set(bins["pitch"]) & set(bins["roll"]))
+    common = sorted(set.intersection(*(set(bins[name]) for name in names)))
     if len(common) < 2:
         raise SettingsError(
             f"the family has {len(common)} operating point(s) over the inclination where scheduling needs 2: make it "
@@ -53,15 +59,15 @@ def family_points(family: Family) -> list[OperatingPoint]:
         )
     points = []
     for number in common:
-        where = float(np.mean(np.concatenate([bins[name][number][:, 3] for name in AXES])))
+        where = float(np.mean(np.concatenate([bins[name][number][:, 3] for name in names])))
         pairs = [
             tuple(
                 one_pole(gain, pole, round(delay / family.sample_time), family.sample_time)
                 for gain, pole, delay in _median_first(bins[name][number][:, :3])
             )
-            for name in AXES
+            for name in names
         ]
-        points.append(OperatingPoint(where, (pairs[0], pairs[1])))
+        points.append(OperatingPoint(where, tuple(pairs)))
     return points
 
 
@@ -87,10 +93,11 @@ def _median_first(samples: Matrix) -> Matrix:
 
 def _of_knot(lpv: Lpv, k: int, sample_time: float) -> OperatingPoint:
     """Return knot `k` of an interpolation as an operating point."""
-    pitch, roll = (
-        one_pole(float(lpv.gains[i, k]), float(lpv.poles[i, k]), float(lpv.delays[i]), sample_time) for i in range(2)
+    plants = (
+        one_pole(float(lpv.gains[i, k]), float(lpv.poles[i, k]), float(lpv.delays[i]), sample_time)
+        for i in range(len(lpv.gains))
     )
-    return OperatingPoint(float(lpv.knots[k]), ((pitch,), (roll,)))
+    return OperatingPoint(float(lpv.knots[k]), tuple((plant,) for plant in plants))
 
 
 def model_points(models: Sequence[HasTransferFunctions], inclinations: Sequence[float]) -> list[OperatingPoint]:
@@ -105,8 +112,11 @@ def model_points(models: Sequence[HasTransferFunctions], inclinations: Sequence[
             "scheduling needs a family, or at least two models with one of `inclinations` each; got "
             f"{len(models)} model(s) and {len(inclinations)} inclination(s)."
         )
+    robot = robot_of(models[0])
+    for model in models[1:]:
+        require_same_robot(robot_of(model), robot, "models")
     points = [
-        OperatingPoint(float(inclination), ((axis_plant(model, "pitch"),), (axis_plant(model, "roll"),)))
+        OperatingPoint(float(inclination), tuple((axis_plant(model, name),) for name in robot.outputs.names))
         for inclination, model in zip(inclinations, models, strict=True)
     ]
     points.sort(key=lambda point: point.inclination)

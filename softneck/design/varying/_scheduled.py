@@ -5,20 +5,25 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, require_between
+from softneck.core import Matrix, SettingsError, Vector, require_between
 from softneck.estimation import AxisPlant
 from softneck.estimation._axis import HasTransferFunctions, robot_of
 from softneck.identification import Family
+from softneck.identification.uncertainty._lpv import require_inclination
+from softneck.robot import Robot
+from softneck.robot._neck_default import NeckDefault
 
 from ..linear._assembly import AxisController, assemble
 from ..linear._linear_parts_runtime import LinearArrays
 from ..linear._loop_settings import LoopSettings
-from ..linear._margins import frequencies
+from ..linear._margins import LOWEST, frequencies
 from ..linear._tuning import Gains, tune_pi
-from ._operating_points import AXES, OperatingPoint, family_points, model_points
+from ..plants._uncertain import UncertainPlant, uncertain_plant
+from ._operating_points import OperatingPoint, family_points, model_points
 from ._varying import RUNTIMES, VaryingController
 
 
@@ -66,6 +71,9 @@ _BETWEEN = 4
 class ScheduledSettings(LoopSettings):
     """PI at every operating point of a family, gains linear over the inclination between them.
 
+    The inclination is that of the platform of a neck, or of another robot with one or two angles; its times are
+    stretched by its slowest pole.
+
     Limits, the order of the loop and what is doubted of the plant are those of `LoopSettings`.
 
     Attributes:
@@ -81,19 +89,19 @@ class ScheduledSettings(LoopSettings):
     phase_margin: float = math.radians(60.0)
     inclinations: tuple[float, ...] | list[float] = ()
     # As slow as the loop's own time constant.
-    schedule_time: float = 0.3
+    schedule_time: float = NeckDefault(0.3)
     # The model that is followed is the filter; this one only keeps the slew limit out of a step.
-    reference_time: float = 0.06
-    leak_time: float = 3.0
-    lead_limit: float = 0.8
+    reference_time: float = NeckDefault(0.06)
+    leak_time: float = NeckDefault(3.0)
+    lead_limit: float = NeckDefault(0.8)
 
     def __post_init__(self) -> None:
         LoopSettings.__post_init__(self)
         require_between("max_sensitivity", self.max_sensitivity, 1.05, 4.0)
         require_between("phase_margin", self.phase_margin, 0.1, 1.5, "rad")
-        require_between("schedule_time", self.schedule_time, 0.0, 60.0, "s")
-        require_between("reference_time", self.reference_time, 0.0, 60.0, "s")
-        require_between("leak_time", self.leak_time, 0.1, 60.0, "s")
+        require_between("schedule_time", self.schedule_time, 0.0, 1e6, "s")
+        require_between("reference_time", self.reference_time, 0.0, 1e6, "s")
+        require_between("leak_time", self.leak_time, 0.1, 1e6, "s")
         for inclination in self.inclinations:
             require_between("inclinations", inclination, 0.0, 1.5, "rad")
 
@@ -101,29 +109,43 @@ class ScheduledSettings(LoopSettings):
         """Return the controller for a family, or for several linear models at `inclinations`.
 
         Raises:
-            SettingsError: fewer than two operating points, no gains that keep the robustness, or a loop between two
-                points that does not keep it.
+            SettingsError: fewer than two operating points, no gains that keep the robustness, a loop between two
+                points that does not keep it, or a robot that has no inclination.
         """
-        items = plant if isinstance(plant, Sequence) else (plant,)
-        for item in items:
-            robot_of(item).require_neck("scheduling over the inclination")
+        robot = robot_of(plant[0] if isinstance(plant, Sequence) else plant)
+        require_inclination(robot, "scheduling over the inclination")
+        if robot.is_neck:
+            return self._designed(plant, robot, self.neck_redefinition())
+        uncertain = uncertain_plant(plant)
+        return self.of_robot(uncertain)._designed(plant, robot, self.redefinition(uncertain))
+
+    def _others(self, plant: UncertainPlant) -> dict[str, Any]:
+        stretch = max(axis.nominal.stretch for axis in plant.axes.values())
+        times = ("schedule_time", "reference_time", "leak_time")
+        return {**LoopSettings._others(self, plant), **{name: stretch * float(getattr(self, name)) for name in times}}
+
+    def _designed(
+        self, plant: Family | Sequence[HasTransferFunctions], robot: Robot, redefinition: tuple[Matrix, Matrix]
+    ) -> VaryingController:
+        names = robot.outputs.names
         points = [self._with_doubt(point) for point in self._points(plant)]
         sample_time = points[0].plants[0][0].sample_time
-        gains = [tuple(self._tune(point, axis) for axis in range(2)) for point in points]
+        gains = [tuple(self._tune(point, axis, name) for axis, name in enumerate(names)) for point in points]
         memory = math.exp(-sample_time / self.schedule_time) if self.schedule_time > 0.0 else 0.0
-        arrays = self._arrays(points, gains, sample_time) | {
+        limits = self.limits(robot)
+        arrays = self._arrays(points, gains, redefinition, limits.constants(sample_time)) | {
             "knots": np.array([point.inclination for point in points]),
             "memory": np.array([memory]),
         }
-        found = self._between(points, gains)
+        found = self._between(points, gains, names)
         return VaryingController(
             kind="scheduled",
             runtime=RUNTIMES["scheduled"],
             sample_time=sample_time,
             arrays=arrays,
-            limits=self.limits(robot_of(items[0])),
+            limits=limits,
             order=self.order,
-            lines=tuple(_lines(points, gains, found)),
+            lines=tuple(_lines(points, gains, found, names)),
             design={
                 "settings": asdict(self),
                 "extra_delay": self.extra_delay,
@@ -148,48 +170,48 @@ class ScheduledSettings(LoopSettings):
             late = [plant.delayed(self.least_delay) for plant in plants]
             quick = [late[0].faster(self.small_move_pole)] if self.small_move_pole > 0.0 else []
             pairs.append((*late, *(plant for plant in quick if plant is not late[0])))
-        return OperatingPoint(point.inclination, (pairs[0], pairs[1]))
+        return OperatingPoint(point.inclination, tuple(pairs))
 
     def _followed(self, plant: AxisPlant) -> AxisPlant:
         """Return the plant whose response is asked for: no slower than small moves are."""
         return plant.faster(self.small_move_pole) if self.small_move_pole > 0.0 else plant
 
-    def _tune(self, point: OperatingPoint, axis: int) -> Gains:
+    def _tune(self, point: OperatingPoint, axis: int, name: str) -> Gains:
         try:
             return tune_pi(point.plants[axis], self.extra_delay, self.max_sensitivity, self.phase_margin)
         except SettingsError as error:
-            where = f"{AXES[axis]} at {math.degrees(point.inclination):.3g} deg of inclination"
+            where = f"{name} at {math.degrees(point.inclination):.3g} deg of inclination"
             raise SettingsError(f"{where}: {error}") from error
 
     def _arrays(
-        self, points: Sequence[OperatingPoint], gains: Sequence[Sequence[Gains]], sample_time: float
-    ) -> dict[str, Matrix]:
+        self, points: Sequence[OperatingPoint], gains: Sequence[Sequence[Gains]],
+        redefinition: tuple[Matrix, Matrix], constants: Vector,
+    ) -> dict[str, Matrix]:  # fmt: skip
         """Return the arrays of the runtime: those of every point below each other where they differ."""
         # One delay line for all points of an axis, or their states would not mean the same.
-        delays = [max(point.plants[axis][0].delay for point in points) + self.extra_delay for axis in range(2)]
+        m = len(points[0].plants)
+        delays = [max(point.plants[axis][0].delay for point in points) + self.extra_delay for axis in range(m)]
         axes = [
             [
                 following_axis(pair[axis], self._followed(point.plants[axis][0]), delays[axis], self.leak_time)
                 for point, pair in zip(points, gains, strict=True)
             ]
-            for axis in range(2)
+            for axis in range(m)
         ]
-        redefinition, constants = self.neck_redefinition(), self.limits().constants(sample_time)
         each = [
             assemble(
-                (pitch, roll),
-                reference_times=(self.reference_time, self.reference_time, self.reference_time),
-                redefinition=redefinition,
-                constants=constants,
+                there, reference_times=(self.reference_time,) * (m + 1), redefinition=redefinition, constants=constants
             )
-            for pitch, roll in zip(*axes, strict=True)
+            for there in zip(*axes, strict=True)
         ]
         return {
             name: np.vstack([arrays[i] for arrays in each]) if name in _VARYING else each[0][i]
             for i, name in enumerate(LinearArrays.names())
         }
 
-    def _between(self, points: Sequence[OperatingPoint], gains: Sequence[Sequence[Gains]]) -> float:
+    def _between(
+        self, points: Sequence[OperatingPoint], gains: Sequence[Sequence[Gains]], names: tuple[str, ...]
+    ) -> float:
         """Return the largest Ms of all frozen loops at and between the points; refuse an unstable one.
 
         Between two points the plants of both must stand the gains there.
@@ -197,11 +219,11 @@ class ScheduledSettings(LoopSettings):
         worst = 0.0
         for low in range(len(points) - 1):
             for part in np.linspace(0.0, 1.0, _BETWEEN + 1):
-                for axis in range(2):
+                for axis, name in enumerate(names):
                     mixed = _mixed(gains[low][axis], gains[low + 1][axis], float(part))
                     for plant in (points[low].plants[axis][0], points[low + 1].plants[axis][0]):
                         where = points[low].inclination + part * (points[low + 1].inclination - points[low].inclination)
-                        worst = max(worst, self._sensitivity(plant, mixed, AXES[axis], float(where)))
+                        worst = max(worst, self._sensitivity(plant, mixed, name, float(where)))
         return worst
 
     def _sensitivity(self, plant: AxisPlant, gains: Gains, axis: str, inclination: float) -> float:
@@ -215,7 +237,7 @@ class ScheduledSettings(LoopSettings):
                 f"{axis} at {math.degrees(inclination):.3g} deg, between two operating points, is not stable (spectral "
                 f"radius {radius:.4f}): the points differ too much; give more of them."
             )
-        w = frequencies(plant.sample_time)
+        w = frequencies(plant.sample_time, lowest=LOWEST / plant.stretch)
         pi = gains.gain * (1.0 + rate / (np.exp(1j * w * plant.sample_time) - 1.0))
         return float(np.max(1.0 / np.abs(1.0 + pi * plant.response(w, extra_delay=self.extra_delay))))
 
@@ -227,10 +249,12 @@ def _mixed(low: Gains, high: Gains, part: float) -> Gains:
     return Gains(gain, gain / rate)
 
 
-def _lines(points: Sequence[OperatingPoint], gains: Sequence[Sequence[Gains]], worst: float) -> list[str]:
+def _lines(
+    points: Sequence[OperatingPoint], gains: Sequence[Sequence[Gains]], worst: float, names: tuple[str, ...]
+) -> list[str]:
     lines = [
         f"  at {math.degrees(point.inclination):5.1f} deg: "
-        + "; ".join(f"{name} K {g.gain:.4g}, Ti {g.integral_time:.3g} s" for name, g in zip(AXES, pair, strict=True))
+        + "; ".join(f"{name} K {g.gain:.4g}, Ti {g.integral_time:.3g} s" for name, g in zip(names, pair, strict=True))
         for point, pair in zip(points, gains, strict=True)
     ]
     return [*lines, f"  largest Ms of all loops at and between these inclinations: {worst:.3g}"]

@@ -29,17 +29,17 @@ class ScheduledArrays(FilterArrays):
     """The linear controller's arrays; those that follow the inclination hold one below the other."""
 
     A = array("k * n, n", "as of the linear controller, of every inclination")
-    Br = array("k * n, 2", "")
-    By = array("k * n, 2", "")
-    C = array("k * 2, n", "")
-    Dr = array("k * 2, 2", "")
-    Dy = array("k * 2, 2", "")
-    L = array("k * n, 2", "")
-    align = array("k * n, 4", "from angles and theta, phi to the state at rest")
-    rest = array("m, 3", "from r to the filter's state at rest")
-    T = array("3, 3", "of Eq. 9-11: motors to (theta_i, phi_i, delta_i)")
-    T_inverse = array("3, 3", "redefined inputs to motors")
-    constants = array("1", "sample time [s]")
+    Br = array("k * n, outputs", "")
+    By = array("k * n, outputs", "")
+    C = array("k * outputs, n", "")
+    Dr = array("k * outputs, outputs", "")
+    Dy = array("k * outputs, outputs", "")
+    L = array("k * n, outputs", "")
+    align = array("k * n, 2 * outputs", "from angles and theta, phi to the state at rest")
+    rest = array("m, references", "from r to the filter's state at rest")
+    T = array("references, motors", "of Eq. 9-11: motors to (theta_i, phi_i, delta_i)")
+    T_inverse = array("motors, references", "redefined inputs to motors")
+    constants = array("numbers", "as of the linear controller: the sample time [s], of other robots also their ranges")
     knots = array("k", "inclinations, rising [rad]")
     memory = array("1", "pole of the inclination's lag")
     motors = value("T_inverse", function=linear_motors, written=True)
@@ -59,11 +59,14 @@ def step(
     if not linear_finite(inputs):
         outputs[:] = x.held
         return
-    active = inputs[8] > 0.5 and inputs[9] > 0.5
+    flags, first = 2 * p.outputs + 1 + p.motors, p.outputs + 1
+    active = inputs[flags] > 0.5 and inputs[flags + 1] > 0.5
     started = x.started > 0.5
     if not started:
-        x.held[:] = inputs[5:8]
-    tilt = scheduled_inclination(inputs[3], inputs[4])
+        x.held[:] = inputs[first + p.outputs : flags]
+    # A robot of one angle has no roll.
+    roll = inputs[first + 1] if p.outputs > 1 else 0.0
+    tilt = scheduled_inclination(inputs[first], roll)  # pyright: ignore[reportArgumentType]  (numbers)
     if not started or not active:
         # Nothing moves: the lag has nothing to protect.
         x.inclination = tilt
@@ -72,8 +75,8 @@ def step(
         x.inclination = memory * x.inclination + (1.0 - memory) * tilt
     now = scheduled_arrays(p, x.inclination)
     if not started or not active:
-        linear_align(now, x, inputs[3:5])
-        scheduled_exactly(now, x, inputs[3:5])
+        linear_align(now, x, inputs[first : first + p.outputs])
+        scheduled_exactly(now, x, inputs[first : first + p.outputs])
     x.started = 1.0
     if active:
         linear_control(now, parameters, x, inputs)
@@ -128,7 +131,7 @@ def scheduled_exactly(p: LinearArrays, x: LinearState, y: np.ndarray) -> None:
     inside = x.x
     # With r at the angle, as `linear_align` has it.
     asked = np.dot(p.C, inside) + np.dot(p.Dr, y) + np.dot(p.Dy, y)
-    for i in range(2):
+    for i in range(p.outputs):
         row = p.C[i]
         size = np.dot(row, row)
         if size > 0.0:

@@ -99,7 +99,7 @@ class VaryingController:
             "inputs": [port.name for port in block.inputs],
             "outputs": [port.name for port in block.outputs],
             "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
-            **({} if self.robot.is_neck else {"robot": self.robot.as_dict()}),
+            **self.robot.in_header(),
         }
         write_archive(path, header, self.arrays, force=force)
 

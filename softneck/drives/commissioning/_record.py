@@ -224,7 +224,7 @@ class Experiment:
             own = None if self.robot is None or self.robot.is_neck else self.robot
             return [signal(self.signal, duration=self.duration, seed=self.seed + number, robot=own)]
         recording = read_recording(self.signal)
-        require_same_robot(recording.robot, self.robot or NECK, f"{self.signal} and the drives: set-points")
+        require_same_robot(self.robot or NECK, recording.robot, f"{self.signal} and the drives: set-points")
         rows = None if self.duration is None else max(2, round(self.duration / recording.sample_time))
         return [
             Excitation(self.signal, part.time[:rows] - part.time[0], part.set_points[:rows], recording.sample_time)

@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from softneck.core import SettingsError, load
+from softneck.core import CheckFailedError, SettingsError, load
 from softneck.cosim import FmuPart
 from softneck.cosim.loops._loop_file import LoopSetup
+from softneck.cosim.loops._validity import reach_beyond
 from softneck.loop import BlockPart, Loop, Part
 from softneck.plant import NeckParameters
 from softneck.robot import Robot
@@ -55,6 +56,7 @@ def prepare(setup: LoopSetup, controller: Path | None = None, robot: Robot | Non
     Raises:
         SettingsError: a controller that does not fit the loop.
         DataError: one of another robot.
+        CheckFailedError: one that may send motors beyond the robot's range.
     """
     loop, notes = setup.loop, []
     if controller is not None:
@@ -63,9 +65,12 @@ def prepare(setup: LoopSetup, controller: Path | None = None, robot: Robot | Non
             part = FmuPart(controller, role="controller")
         else:
             found = load(controller, role="controller")
-            require_same_robot(getattr(found, "robot", NECK), robot or NECK, f"{controller} and drives")
+            require_same_robot(robot or NECK, getattr(found, "robot", NECK), f"{controller} and drives")
             part = BlockPart(found.block())
         loop = replace(loop, controller=part)
+    beyond = "" if robot is None else reach_beyond(loop.controller, loop.controller_parameters, robot)
+    if beyond:
+        raise CheckFailedError(f"{beyond}, and so were its certificates. Design and certify it for that robot.")
     if loop.faults:
         notes.append(f"the loop file's {len(loop.faults)} fault(s) are not applied to drives")
     return Deployment(loop, neck_of(loop), tuple(notes))

@@ -63,6 +63,8 @@ class Snapshot:
         period: of the bus [s].
         sample_time: of the controller [s].
         tension_limit: beyond which a run stops [N].
+        validity: of the model that stands for the plant in the loop file, told what is measured; NaN without one, for
+            an FMU, which nothing runs beside the hardware, and for a model that does not know.
     """
 
     time: float
@@ -83,6 +85,7 @@ class Snapshot:
     sample_time: float
     tension_limit: float
     outputs: tuple[str, ...] = ("pitch", "roll")
+    validity: float = math.nan
 
     @property
     def run_time(self) -> float:
@@ -112,7 +115,8 @@ class Snapshots:
             index=master.index,
             references=signals[: len(outputs) + 1],
             angles=(math.nan,) * len(outputs) if tilt is None else tilt.values,
-            estimates=signals[len(outputs) + 1 :],
+            estimates=signals[len(outputs) + 1 : -1],
+            validity=signals[-1],
             setpoints=master.setpoints,
             positions=master.positions,
             tensions=master.tensions,
@@ -135,15 +139,16 @@ class Snapshots:
         )  # fmt: skip
 
     def _signals(self, master: Master, outputs: tuple[str, ...]) -> Motors:
-        """Return the references of the outputs and of co-contraction, and the estimates of the outputs."""
+        """Return the references of the outputs and of co-contraction, the estimates of the outputs, and validity."""
         pilot = master.pilot
         # Beyond the run they would be the last ones, and say something that nobody asks for any more.
         if not isinstance(pilot, LoopPilot) or master.index < 0 or master.supervisor.phase is not Phase.RUNNING:
-            return (math.nan,) * (2 * len(outputs) + 1)
+            return (math.nan,) * (2 * len(outputs) + 2)
         if pilot is not self._pilot:
             self._pilot = pilot
             wanted = [("reference", f"{name}_reference") for name in (*outputs, "cocontraction")]
             wanted += [("observer", name) for name in outputs]
             self._slots = tuple(pilot.slot(part, port) for part, port in wanted)
         signals = pilot.signals
-        return tuple([math.nan if slot is None else float(signals[slot]) for slot in self._slots])
+        seen = [math.nan if slot is None else float(signals[slot]) for slot in self._slots]
+        return (*seen, pilot.validity)

@@ -104,7 +104,7 @@ def _opened(kind: str, node: int, source: SensorSource, robot: Robot) -> Any:
             path = source.folder / source.file
             log = path.suffix.lower() == ".mcap"
             recording = read_run_log(path).recording() if log else read_recording(path)
-            require_same_robot(recording.robot, robot, f"{path} and the drives: outputs")
+            require_same_robot(robot, recording.robot, f"{path} and the drives: outputs")
             return ReplaySensor(recording.time, *recording.outputs.T)
         case "python":
             return make_python_sensor(source.python, source.options, source.folder, outputs=count)

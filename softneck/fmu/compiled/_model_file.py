@@ -13,6 +13,7 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError
 from softneck.runtime import Block, Port
+from softneck.runtime._bundle import split_members
 
 from .translate._kinds import is_known, module_of, ranks_of
 
@@ -44,7 +45,7 @@ def node_of(runtime: str, arrays: tuple[Matrix, ...]) -> Node:
         SettingsError: a runtime that is not in the table, or arrays of other ranks than those there.
     """
     outer, _, inner = runtime.partition("(")
-    pairs = [part.rpartition(":") for part in _split(inner[:-1])] if inner else []
+    pairs = [part.rpartition(":") for part in split_members(inner[:-1])] if inner else []
     runs = module_of(outer)
     if not is_known(runs):
         raise SettingsError(
@@ -63,17 +64,6 @@ def node_of(runtime: str, arrays: tuple[Matrix, ...]) -> Node:
         members.append(node_of(name, arrays[first : first + int(count)]))
         first += int(count)
     return Node(runs, arrays[:own], tuple(members))
-
-
-def _split(inner: str) -> list[str]:
-    """Split at the commas that are in no brackets."""
-    parts, depth, start = [], 0, 0
-    for i, letter in enumerate(inner):
-        depth += {"(": 1, ")": -1}.get(letter, 0)
-        if letter == "," and depth == 0:
-            parts.append(inner[start:i])
-            start = i + 1
-    return [*parts, inner[start:]]
 
 
 def model_bytes(block: Block, name: str, guid: str) -> bytes:

@@ -72,8 +72,10 @@ _MAX_BYTES = 2 * 2**30
 _PLAIN = re.compile(r"[A-Za-z0-9_./\\:~-]+")
 
 
-def unpack(path: str | Path) -> Path:
-    """Unpack an FMU into a new folder with a plain path and return that; the caller removes it.
+def unpack(path: str | Path, *, main: str = "modelDescription.xml", what: str = "an FMU") -> Path:
+    """Unpack an FMU, or another archive with a member `main`, into a new folder with a plain path and return that.
+
+    The caller removes the folder.
 
     Raises:
         FileFormatError: no FMU, or one with members that reach out of the folder or are too large.
@@ -83,7 +85,7 @@ def unpack(path: str | Path) -> Path:
         raise FileFormatError(f"{source}: no such file.")
     try:
         with zipfile.ZipFile(source) as archive:
-            _check_members(source, archive)
+            _check_members(source, archive, main, what)
             folder = Path(tempfile.mkdtemp(prefix="softneck-unpacked-", dir=_plain_folder()))
             try:
                 archive.extractall(folder)
@@ -95,7 +97,7 @@ def unpack(path: str | Path) -> Path:
     except OSError as error:
         raise OutputFileError(f"{source}: cannot be unpacked: {error.strerror or error}.") from error
     except Exception as error:  # zipfile and its decompressors raise whatever damaged bytes lead to
-        raise FileFormatError(f"{source}: is not an FMU or is damaged ({error}).") from error
+        raise FileFormatError(f"{source}: is not {what} or is damaged ({error}).") from error
     return folder
 
 
@@ -109,17 +111,17 @@ def unpacked(path: str | Path) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _check_members(source: Path, archive: zipfile.ZipFile) -> None:
+def _check_members(source: Path, archive: zipfile.ZipFile, main: str, what: str) -> None:
     entries = archive.infolist()
     for entry in entries:
         name = PurePosixPath(entry.orig_filename)
         if name.is_absolute() or ".." in name.parts or "\\" in entry.orig_filename or ":" in entry.orig_filename:
-            raise FileFormatError(f"{source}: its member `{entry.orig_filename}` reaches out of the FMU; not unpacked.")
+            raise FileFormatError(f"{source}: its member `{entry.orig_filename}` reaches out of it; not unpacked.")
     total = sum(entry.file_size for entry in entries)
     if total > _MAX_BYTES:
         raise FileFormatError(f"{source}: unpacks to {total} bytes, over the limit of {_MAX_BYTES}.")
-    if "modelDescription.xml" not in archive.namelist():
-        raise FileFormatError(f"{source}: is not an FMU: it has no modelDescription.xml.")
+    if main not in archive.namelist():
+        raise FileFormatError(f"{source}: is not {what}: it has no {main}.")
 
 
 def _plain_folder() -> Path:

@@ -7,6 +7,7 @@ own; their runtime and their start are put together here.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 
 import numpy as np
 
@@ -24,12 +25,53 @@ _LEAST_MEMBERS = {"guarded": 2}
 OBSERVED_NSS = "softneck.identification.networks._nss_observed_runtime"
 
 
+# What says where a model knows the robot: older files, models made by hand and members of others have none.
+VALIDITY = ("ground", "doubt")
+
+
+def without_validity(arrays: Mapping[str, Matrix]) -> dict[str, Matrix]:
+    """Return the arrays without those that only `validity` takes."""
+    return {name: array for name, array in arrays.items() if name.rpartition(".")[2] not in VALIDITY}
+
+
+def runtime_arrays(kind: str, arrays: Mapping[str, Matrix]) -> dict[str, Matrix]:
+    """Return the arrays as the runtime takes them: in its order, empty ones for `validity` where there are none."""
+    own = own_arrays(arrays)
+    history = own["history"]
+    outputs = int(history[1]) if len(history) > 1 else 2
+    motors = len(own["drive"]) if "drive" in own else int(history[2]) if len(history) > 2 else 3
+    empty = {"ground": np.zeros((0, 1 + 2 * motors)), "doubt": np.zeros((outputs, 3))}
+    names = _names(_module_of(kind, arrays))
+    found = {name: own[name] if name in own else empty[name] for name in names}
+    for number, (member, part) in enumerate(members(arrays)):
+        found |= {f"{number}.{member}.{name}": array for name, array in runtime_arrays(member, part).items()}
+    return found
+
+
+def with_validity(kind: str, arrays: Mapping[str, Matrix], ground: Matrix, doubt: Matrix) -> dict[str, Matrix]:
+    """Return the arrays with those for `validity`, in the order of a file."""
+    given = {**arrays, "ground": ground, "doubt": doubt}
+    inner = {name: array for name, array in arrays.items() if "." in name}
+    return {**{name: given[name] for name in _names(_module_of(kind, arrays))}, **inner}
+
+
+@cache
+def _names(module: str) -> tuple[str, ...]:
+    """Return the names of a runtime's arrays; every step asks."""
+    return declared(module, Arrays).names()
+
+
 def prefixed_arrays(members: list[tuple[str, Mapping[str, Matrix]]]) -> dict[str, Matrix]:
     """Return the arrays of all members (kind, arrays) under their names in a composed model."""
     for kind, _ in members:
         if kind in COMPOSED:
             raise SettingsError(f"a model of kind `{kind}` holds others itself and cannot be held; take its members.")
-    return {f"{i}.{kind}.{name}": array for i, (kind, arrays) in enumerate(members) for name, array in arrays.items()}
+    # The whole says how far it can be trusted, not its members.
+    return {
+        f"{i}.{kind}.{name}": array
+        for i, (kind, arrays) in enumerate(members)
+        for name, array in without_validity(arrays).items()
+    }
 
 
 def own_arrays(arrays: Mapping[str, Matrix]) -> dict[str, Matrix]:
@@ -60,19 +102,24 @@ def members(arrays: Mapping[str, Matrix]) -> list[tuple[str, dict[str, Matrix]]]
 
 def runtime_of(kind: str, arrays: Mapping[str, Matrix]) -> str:
     """Return the name of the runtime, with those of the members (see `softneck.runtime.bundle`)."""
+    history, module = arrays["history"], _module_of(kind, arrays)
     if kind not in COMPOSED:
-        runtime = KINDS[kind].runtime
-        if "A" in arrays:
-            state_space = AFFINE if "offset" in arrays else STATE_SPACE
-            runtime = (OBSERVED_NSS if "gain" in arrays else runtime) if kind == "nss" else state_space
-        history = arrays["history"]
-        return sized(runtime, len(arrays["drive"]), int(history[1]) if len(history) > 1 else 2)
-    inner = ",".join(f"{runtime_of(member, part)}:{len(part)}" for member, part in members(arrays))
-    history = arrays["history"]
-    outer = KINDS[kind].runtime
-    if len(history) > 2:
-        outer = sized(outer, int(history[2]), int(history[1]))
+        return sized(module, len(arrays["drive"]), int(history[1]) if len(history) > 1 else 2)
+    inner = ",".join(
+        f"{runtime_of(member, part)}:{len(runtime_arrays(member, part))}" for member, part in members(arrays)
+    )
+    outer = sized(module, int(history[2]), int(history[1])) if len(history) > 2 else module
     return f"{outer}({inner})"
+
+
+def _module_of(kind: str, arrays: Mapping[str, Matrix]) -> str:
+    """Return the module of the runtime: some kinds have several forms, which their arrays tell apart."""
+    runtime = KINDS[kind].runtime
+    if "A" not in arrays:
+        return runtime
+    if kind == "nss":
+        return OBSERVED_NSS if "gain" in arrays else runtime
+    return AFFINE if "offset" in arrays else STATE_SPACE
 
 
 def memory_of(arrays: Mapping[str, Matrix]) -> int:
@@ -83,7 +130,7 @@ def memory_of(arrays: Mapping[str, Matrix]) -> int:
 
 def set_now(kind: str, arrays: Mapping[str, Matrix], values: Vector, m: Vector, y: Vector) -> None:
     """Write motors `m` (3,) and outputs `y` (2,) of now into a state, which a `step` has moved on."""
-    runtime = runtime_of(kind, arrays).partition("(")[0]
+    runtime, arrays = runtime_of(kind, arrays).partition("(")[0], runtime_arrays(kind, arrays)
     named = declared(runtime, Arrays)(list(arrays.values()))
     parts = declared(runtime, StateVector).parts(named)
     if "added" in parts and kind in COMPOSED:
@@ -91,6 +138,8 @@ def set_now(kind: str, arrays: Mapping[str, Matrix], values: Vector, m: Vector, 
         y = y - values[parts["added"]]
     if "motors" in parts:
         values[parts["motors"]], values[parts["angles"]] = m, y
+    if "slow" in parts:
+        values[parts["slow"]] = m
     at = parts[list(parts)[-1]].start
     for member, part in members(arrays):
         size = load_runtime(runtime_of(member, part)).state_size(tuple(part.values()))
@@ -115,19 +164,24 @@ def check_arrays(kind: str, arrays: Mapping[str, Matrix]) -> None:
     # `rls` over the motors and more than one pole are state spaces as well.
     form = "subspace" if kind in ("rls", "oe", "srivc") and "A" in arrays else kind
     names = declared(runtime_of(kind, arrays), Arrays).names()
-    if tuple(arrays) != names:
+    if not _named(arrays, names):
         raise FileFormatError(f"a model of kind {kind} has the arrays {', '.join(names)}; got {', '.join(arrays)}.")
-    _check_numbers(form, arrays, runtime_of(kind, arrays))
+    _check_numbers(form, runtime_arrays(kind, arrays), runtime_of(kind, arrays))
+
+
+def _named(arrays: Mapping[str, Matrix], names: tuple[str, ...]) -> bool:
+    """Return whether arrays are those of a runtime, all in its order, or all but those for `validity`."""
+    return tuple(arrays) in (names, tuple(name for name in names if name not in VALIDITY))
 
 
 def _check_composed(kind: str, arrays: Mapping[str, Matrix]) -> None:
     names = declared(KINDS[kind].runtime, Arrays).names()
     own, parts = own_arrays(arrays), members(arrays)
-    if tuple(arrays)[: len(own)] != names:
+    if tuple(arrays)[: len(own)] != tuple(own) or not _named(own, names):
         raise FileFormatError(f"a model of kind {kind} starts with the arrays {', '.join(names)}.")
     if len(parts) < _LEAST_MEMBERS.get(kind, 1) or (kind == "residual" and len(parts) != 1):
         raise FileFormatError(f"a model of kind {kind} cannot have {len(parts)} members.")
-    _check_numbers(kind, own, KINDS[kind].runtime)
+    _check_numbers(kind, runtime_arrays(kind, own), KINDS[kind].runtime)
     for member, part in parts:
         check_arrays(member, part)
 
@@ -143,8 +197,17 @@ def _check_numbers(kind: str, arrays: Mapping[str, Matrix], runtime: str) -> Non
     sizes = declared(runtime, Arrays).lengths(arrays)
     if "drive" in arrays:
         within(arrays["drive"][:, 1], 0, sizes["H"], "a drive's delay")
+    _check_validity(arrays, sizes)
     if KINDS[kind].check:
         resolve(KINDS[kind].check)(arrays, sizes)
+
+
+def _check_validity(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
+    ground, doubt, n = arrays["ground"], arrays["doubt"], 2 * sizes["motors"]
+    if ground.shape not in ((0, 1 + n), (n, 1 + n)):
+        raise FileFormatError(f"its array `ground` has shape {ground.shape}; ({n}, {1 + n}) is needed, or no rows.")
+    if len(doubt) != sizes["outputs"] or (doubt < 0.0).any() or (ground.size and not (doubt[:, 0] > 0.0).all()):
+        raise FileFormatError("its array `doubt` must hold three variances of each output, the first positive.")
 
 
 def check_table(table: Matrix, sizes: Mapping[str, int]) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 
 from softneck.core import DataError, Matrix, Vector
 from softneck.signals import Recording, redefinition_matrix
+from softneck.signals.quality._excitation import BANDWIDTH
 
 # The neck's time constant [s], for which the seconds in the estimators' defaults were chosen.
 NECK_SECONDS = 0.2
@@ -128,6 +129,20 @@ def directions_of(recording: Recording, motors: list[Matrix]) -> Directions:
         found.append(weights / size if given is None else given[axis])
         seconds.append(tau)
     return Directions(names, np.array(found), np.array(seconds), given is None)
+
+
+def bandwidth_of(recording: Recording) -> float | None:
+    """Return up to where outputs follow set-points [rad/s]: a neck's 4 (section 3.1), by time constants of others.
+
+    None where an output follows no motor.
+    """
+    if recording.robot.is_neck:
+        return BANDWIDTH
+    try:
+        found = directions_of(recording, [run.set_points for run in recording.runs()])
+    except DataError:
+        return None
+    return BANDWIDTH / found.stretch
 
 
 def _first_order(inputs: Sequence[Matrix], outputs: Sequence[Vector], sample_time: float) -> tuple[float, Vector]:

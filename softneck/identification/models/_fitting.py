@@ -19,6 +19,7 @@ from softneck.signals.quality._poor_excitation import independent_motions
 from ._model import WARM_UP, Model
 from ._ports import trained_set_points
 from ._scores import nrmse_fit
+from ._validity import grounded
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -190,7 +191,7 @@ def fitted_model(
     findings: Mapping[str, Any],
 ) -> Model:
     """Return what `settings` made of `recording`."""
-    return Model(
+    model = Model(
         kind=kind,
         sample_time=recording.sample_time,
         arrays=arrays,
@@ -199,3 +200,4 @@ def fitted_model(
         training_rows=row_hashes(recording),
         robot=recording.robot,
     )
+    return grounded(model, recording)

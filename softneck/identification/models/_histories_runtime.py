@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from softneck.runtime._layout import Arrays, StateVector, array, cells, value
+from softneck.identification.models._validity_runtime import GroundArrays, ground_outside
+from softneck.runtime._layout import StateVector, array, cells, value
 from softneck.runtime._random_runtime import random_normal, random_seed
 from softneck.runtime._rest_runtime import REST
 
@@ -17,7 +18,7 @@ def narx_motors(drive: np.ndarray) -> int:
     return drive.shape[0]
 
 
-class NarxArrays(Arrays):
+class NarxArrays(GroundArrays):
     """The first arrays of every plant."""
 
     history = array("sizes", "H: how many samples of each signal are kept; and how many outputs there are, if not two")
@@ -37,6 +38,7 @@ class NarxState(StateVector):
     angles = cells("outputs", "pitch and roll of now [rad]")
     random = cells("6", "generator of the output noise")
     added = cells("outputs", "how far the angles of now are above what goes into their history [rad]")
+    slow = cells("motors", "where the motors have been held [rad]")
 
 
 # Parameters, in this order: the start of each output, use_measurement, noise_std, noise_seed.
@@ -53,11 +55,18 @@ def narx_rest(p: NarxArrays, parameters: np.ndarray, x: NarxState, outputs: np.n
     for axis in range(p.outputs):
         x.angles[axis] = parameters[axis]
         outputs[axis] = parameters[axis]
-    bounds = p.outputs + p.motors
-    if outputs.shape[0] > bounds:  # bounds, which hold nothing but the start yet
-        for axis in range(p.outputs):
-            outputs[bounds + 2 * axis] = parameters[axis]
-            outputs[bounds + 2 * axis + 1] = parameters[axis]
+    outputs[outputs.shape[0] - 1] = narx_validity(p, x)
+
+
+def narx_validity(p: NarxArrays, x: NarxState) -> float:
+    """Return the validity of outputs that follow from where the motors are at t_k; 0 where the model does not know."""
+    if p.ground.shape[0] == 0:
+        return 0.0
+    outside = ground_outside(p, x.m[0], x.slow)
+    doubt = 0.0
+    for axis in range(p.outputs):
+        doubt = max(doubt, p.doubt[axis, 0] + p.doubt[axis, 1] * outside)
+    return 1.0 / (1.0 + doubt)
 
 
 def narx_push(history: np.ndarray, newest: np.ndarray) -> None:
@@ -109,6 +118,8 @@ def narx_forward(p: NarxArrays, parameters: np.ndarray, x: NarxState, ahead: np.
     if parameters[p.outputs + 1] > 0.0:
         for axis in range(p.outputs):
             outputs[axis] += parameters[p.outputs + 1] * random_normal(x.random)
+    # Behind bounds, where a kind has them.
+    outputs[outputs.shape[0] - 1] = narx_validity(p, x)
 
 
 def narx_advance(
@@ -129,6 +140,7 @@ def narx_advance(
     if parameters[3] > 0.0:
         outputs[0] += parameters[3] * random_normal(x.random)
         outputs[1] += parameters[3] * random_normal(x.random)
+    outputs[outputs.shape[0] - 1] = narx_validity(p, x)
 
 
 def narx_regressor(p: NarxArrays, table: np.ndarray, x: NarxState, axis: int, regressor: np.ndarray) -> None:

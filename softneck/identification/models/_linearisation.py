@@ -86,6 +86,8 @@ def linearised(model: Stepped, at: State | Mapping[str, float] | ArrayLike | Non
         u = _set_points(block, at)
         state = _rest(model, block, u)
     J = jacobian(model, state, u)
+    # The last output, `validity`, is no part of the neck: a linear system has none.
+    J = J._replace(C=J.C[:-1], D=J.D[:-1])
     n, n_out = J.A.shape[0], J.C.shape[0]
     # A step returns the outputs of the next sample; as states of their own they are those of the state's.
     A = np.block([[J.A, np.zeros((n, n_out))], [J.C, np.zeros((n_out, n_out))]])
@@ -93,7 +95,7 @@ def linearised(model: Stepped, at: State | Mapping[str, float] | ArrayLike | Non
     kept = _reached(A, B) & _reached(A.T, C.T)
     return control.StateSpace(
         A[kept][:, kept], B[kept], C[:, kept], np.zeros((n_out, motors)), block.sample_time,
-        inputs=[port.name for port in block.inputs[:motors]], outputs=[port.name for port in block.outputs],
+        inputs=[port.name for port in block.inputs[:motors]], outputs=[port.name for port in block.outputs[:-1]],
         name=model.kind,
     )  # fmt: skip
 
@@ -120,7 +122,7 @@ def _rest(model: Stepped, block: Block, u: Vector) -> State:
     rows[:, : u.size] = u
     for _ in range(_TIMES):
         state, outputs = block.run(state, rows)
-        if np.isfinite(outputs).all() and np.ptp(outputs[-_SETTLE // 4 :], axis=0).max() <= _REST:
+        if np.isfinite(outputs).all() and np.ptp(outputs[-_SETTLE // 4 :, :-1], axis=0).max() <= _REST:
             return state
     raise SettingsError(
         f"the model of kind {model.kind} does not come to rest under the set-points {u.tolist()} rad within "

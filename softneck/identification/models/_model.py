@@ -30,7 +30,7 @@ from softneck.signals.recording._recording import require_same_robot
 
 from . import _linear_systems as _linear
 from . import _linearisation, _ports
-from ._arrays import check_arrays, members, memory_of, runtime_of, set_now
+from ._arrays import check_arrays, members, memory_of, runtime_arrays, runtime_of, set_now
 
 if TYPE_CHECKING:
     import casadi
@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 #: A free run starts from this many measured samples, for every kind; they are not scored.
 WARM_UP = 25
 _MOTORS = ("simulated", "measured")
+# Kinds that can be far off beyond their training and have a guarded form.
+_GUARDED = ("nn", "nss")
 # Kinds whose next output is looked up among the points of a set: which of them decide depends on the state.
 _SEARCHING = ("nlsm", "residual")
 
@@ -73,7 +75,7 @@ class Model:
             role="plant",
             runtime=runtime_of(self.kind, self.arrays),
             sample_time=self.sample_time,
-            arrays=tuple(self.arrays.values()),
+            arrays=tuple(runtime_arrays(self.kind, self.arrays).values()),
             inputs=_ports.inputs(self.findings, self.robot),
             outputs=_ports.outputs(self.kind, self.robot),
             parameters=_ports.parameters(self.robot),
@@ -103,6 +105,8 @@ class Model:
         # The last `step` moved the outputs of now; set them back to what the first row says.
         values = state.values.copy()
         set_now(self.kind, self.arrays, values, m0, y0)
+        # Of motors that are held at m0, as the start takes them to be.
+        outputs[-1] = block.run(State(values, state.parameters, outputs), held[:1])[1][0, -1]
         return State(values, state.parameters, outputs)
 
     def step(self, state: State, inputs: ArrayLike, *, measured: ArrayLike | None = None) -> tuple[State, Vector]:
@@ -114,7 +118,7 @@ class Model:
             measured: the outputs, or those and the motor positions, measured at t_k [rad]; NaN where not.
 
         Returns:
-            The next state and (pitch, roll, three motor positions, and bounds for set membership) [rad].
+            The next state and (pitch, roll, three motor positions, bounds for set membership) [rad], and validity last.
 
         Raises:
             DataError: wrong sizes or set-points that are not finite.
@@ -247,6 +251,13 @@ class Model:
         if self.kind in _linear.KINDS:
             lines += _linear.describe(self)
         lines += [f"{key}: {_short(value)}" for key, value in self.findings.items() if _is_plain(value)]
+        if not self.arrays.get("ground", np.zeros(0)).size:
+            lines.append("no validity in this file: identify it again")
+        if self.kind in _GUARDED:
+            lines.append(
+                f"a guarded form exists (`softneck identify guarded --set of={self.kind}`): it falls back where this "
+                "kind alone can be far off"
+            )
         lines.append(f"trained on {self.training_rows.size} rows")
         return "\n".join(lines)
 

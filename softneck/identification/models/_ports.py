@@ -12,6 +12,7 @@ from softneck.core import to_si
 from softneck.robot import Robot
 from softneck.runtime import Port
 from softneck.signals import Recording
+from softneck.signals.recording._conditions import conditions, joined
 
 # What a winch may do [rad], for models that do not say what they were trained on.
 _MOST = 6.0
@@ -71,7 +72,7 @@ def parameters(robot: Robot) -> tuple[Port, ...]:
 
 
 def trained_set_points(*sources: Recording | Mapping[str, Any]) -> dict[str, Any]:
-    """Return the finding that says over which set-points a model was trained, in SI; rest is among them.
+    """Return the findings that say over which set-points a model was trained, in SI (rest is among them), and how.
 
     Args:
         sources: recordings, and findings of models that are part of it.
@@ -80,7 +81,9 @@ def trained_set_points(*sources: Recording | Mapping[str, Any]) -> dict[str, Any
     for source in sources:
         seen.append(source.set_points if isinstance(source, Recording) else np.array(_range(source, 3)))
     rows = np.vstack([np.zeros((1, seen[0].shape[1])), *seen])
-    return {_TRAINED: {"min": np.nanmin(rows, axis=0).tolist(), "max": np.nanmax(rows, axis=0).tolist()}}
+    found = {"min": np.nanmin(rows, axis=0).tolist(), "max": np.nanmax(rows, axis=0).tolist()}
+    made = [conditions(part) if isinstance(part, Recording) else part.get("conditions", {}) for part in sources]
+    return {_TRAINED: found, "conditions": joined([part for part in made if part])}
 
 
 def trained_range(findings: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray] | None:
@@ -117,8 +120,12 @@ def _range(findings: Mapping[str, Any], motors: int) -> tuple[list[float], list[
     return seen["min"], seen["max"]
 
 
+#: Kinds with bounds of their outputs, which follow outputs and motors.
+BOUNDED = ("nlsm", "residual", "ensemble")
+
+
 def outputs(kind: str, robot: Robot) -> tuple[Port, ...]:
-    """Return the outputs of a kind; set membership and ensembles have bounds as well."""
+    """Return the outputs of a kind; set membership and ensembles have bounds as well, and `validity` is the last."""
     names = robot.outputs.names
     bounds = tuple(
         _output(robot, f"{name}_{side}", f"{side.capitalize()} bound of {name} by set membership (Eq. 19, 20) or of "
@@ -132,5 +139,11 @@ def outputs(kind: str, robot: Robot) -> tuple[Port, ...]:
             _motor(robot, f"motor_position_{j}", f"Position of motor {j} by the drive model")
             for j in range(1, len(robot.motors.names) + 1)
         ),
-        *(bounds if kind in ("nlsm", "residual", "ensemble") else ()),
+        *(bounds if kind in BOUNDED else ()),
+        Port(
+            name="validity",
+            description="Predicted probability that the error stays within the model's tolerance; 0: not known",
+            minimum=0.0,
+            maximum=1.0,
+        ),
     )

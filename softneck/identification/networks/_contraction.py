@@ -89,12 +89,16 @@ class Contraction:
         from scipy.linalg import cholesky
 
         n, q, r = self.states, self.neurons, self.rate
-        H11 = (2.0 - 1.0 / r**2) * np.eye(n)
-        room = float(np.linalg.eigvalsh(H11 - A.T @ A).min())
+        # M = I. With H33 = I a norm up to sqrt(2 - 1/r^2) has room; with H33 = |A| r I any norm below r, 2 (1 - |A|/r).
+        for h in (1.0, r * float(np.linalg.norm(A, 2))):
+            H11 = (2.0 - h / r**2) * np.eye(n)
+            room = float(np.linalg.eigvalsh(H11 - A.T @ A / h).min())
+            if room > 10.0 * _LEAST:
+                break
         # Of the room that A leaves, the neurons take half: `F' L F / 2`.
         weight = room / max(float(np.linalg.norm(F, 2)) ** 2, 1e-12)
         H = np.zeros((2 * n + q, 2 * n + q))
-        H[:n, :n], H[n:-n, n:-n], H[-n:, -n:] = H11, 2.0 * weight * np.eye(q), np.eye(n)
+        H[:n, :n], H[n:-n, n:-n], H[-n:, -n:] = H11, 2.0 * weight * np.eye(q), h * np.eye(n)
         H[n:-n, :n], H[-n:, :n] = -weight * F, A
         H = np.tril(H) + np.tril(H, -1).T
         X = cholesky(H - _LEAST * np.eye(len(H)), lower=True)

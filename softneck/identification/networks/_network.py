@@ -8,10 +8,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, Progress, SettingsError, require_positive, require_whole, silent
+from softneck.core import (
+    DataError,
+    Matrix,
+    Progress,
+    SettingsError,
+    Vector,
+    require_between,
+    require_positive,
+    require_whole,
+    silent,
+)
 from softneck.runtime import load_functions
-from softneck.signals import Recording
+from softneck.signals import Recording, concatenate
 
+from ..linear._oe import OutputError
 from ..models._directions import directions_of
 from ..models._drive import LoadedDrive, drive_start, fit_loaded_drive
 from ..models._error_feedback import fit_correction
@@ -19,6 +30,7 @@ from ..models._fitting import SAME_EXCITATION, fitted_model, training_recording
 from ..models._model import Model
 from ..models._regressors import PAPER_EQ21, regression, scaled_table
 from ..models._state_space import history_array
+from ..models._unrecorded import unrecorded
 from ._levenberg import Layers, random_layers
 from ._nn_training import FUNCTIONS, AxisData, Best, axis_data, train_axis
 
@@ -29,6 +41,8 @@ _HOLD_OUT = 0.2
 _PAPER, _LEAST_NEURONS, _ROWS_EACH = (25, 25), 4, 4
 # A hold-out shorter than this says nothing [rows].
 _LEAST = 75
+# Each of the three motions that nobody recorded is so long, of the record and [s]: all tendons have their turn in 8 s.
+_HINT, _HINT_SECONDS = 1.0 / 9.0, (8.0, 15.0)
 INTERRUPTED = "training was interrupted; this is the best network until then"
 
 
@@ -41,6 +55,8 @@ class _Problem:
         drive: simulates the motors.
         table: the regressor.
         necks: sample time by the robot's time constant over the neck's [s].
+        hints: motions that nobody recorded with what the line says of them; None for none.
+        prior: weight of their errors.
     """
 
     train: Recording
@@ -48,14 +64,26 @@ class _Problem:
     drive: LoadedDrive
     table: Matrix
     necks: float
+    hints: Recording | None
+    prior: float
 
-    def prepared(self, recording: Recording, axis: int, scale: tuple | None) -> tuple[AxisData, Matrix, Matrix]:
+    def training(self, axis: int) -> tuple[AxisData, Matrix, Matrix]:
+        """Return what is learnt from, with the scales of the record alone."""
+        own, inputs, output = self.prepared(self.train, axis, None)
+        if self.hints is None:
+            return own, inputs, output
+        weights = np.concatenate([np.ones(len(self.train)), np.full(len(self.hints), self.prior)])
+        return self.prepared(concatenate([self.train, self.hints]), axis, (inputs, output), weights)
+
+    def prepared(
+        self, recording: Recording, axis: int, scale: tuple | None, weights: Vector | None = None
+    ) -> tuple[AxisData, Matrix, Matrix]:
         """Return the data of an axis along logged motors (simulated ones where none were logged) and simulated ones."""
         motors = np.concatenate([self.drive.simulate(run.set_points, drive_start(run)) for run in recording.runs()])
         if not recording.has_motor_positions:
             logged = dict(zip(recording.robot.motor_positions, motors.T, strict=True))
             recording = recording.with_channels(**logged)
-        return axis_data(recording, motors, axis, self.table, 1.0 / self.necks, scale)
+        return axis_data(recording, motors, axis, self.table, 1.0 / self.necks, scale, weights)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,6 +100,8 @@ class Network:
         starts: random starts for each axis.
         decay: weight of the squared weights beside the squared error of scaled outputs; None tries 0.03, 0.1 and
             0.01 in turn over the starts.
+        prior: weight of an error against the line (`oe`) on motions that nobody recorded beside one against the
+            record; 0 leaves them out, and of other robots than the neck they are left out.
         seed: of the starting weights.
     """
 
@@ -80,6 +110,7 @@ class Network:
     refine: int = 24
     starts: int = 3
     decay: float | None = None
+    prior: float = 0.1
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -93,6 +124,7 @@ class Network:
         require_whole("refine", self.refine, 0, 100_000)
         require_whole("starts", self.starts, 1, 100)
         require_whole("seed", self.seed, 0, 2**63)
+        require_between("prior", self.prior, 0.0, 1.0)
         if self.decay is not None:
             require_positive("decay", self.decay)
 
@@ -125,7 +157,8 @@ class Network:
             train, judge = recording.split(1.0 - _HOLD_OUT)
             if all(len(run) < _LEAST for run in judge.runs()):
                 train, judge = recording, recording
-        axes, interrupted = sized._train(_Problem(train, judge, drive, table, necks), progress)
+        hints = _hints(train, drive) if self.prior > 0.0 and recording.robot.is_neck else None
+        axes, interrupted = sized._train(_Problem(train, judge, drive, table, necks, hints, self.prior), progress)
         names = ("W1", "b1", "W2", "b2", "w3", "b3", "input_scale", "output_scale")
         stacked = {name: np.array([axis[name] for axis in axes]) for name in names}
         arrays: dict[str, Matrix] = {
@@ -195,7 +228,7 @@ class Network:
             # Early stops leave steps out: it may jump at the end, never fall.
             told[axis] = (min(told[axis][0] + 1.0 / (expected + self.starts + 4), 0.99), f"{name}: {what}")
 
-        data, inputs, output = problem.prepared(problem.train, axis, None)
+        data, inputs, output = problem.training(axis)
         best = Best(problem.prepared(problem.judge, axis, (inputs, output))[0], tell, stop.is_set)
         decays = tuple(_DECAYS[i % 3] if self.decay is None else self.decay for i in range(self.starts))
         layers: Layers = train_axis(
@@ -205,6 +238,29 @@ class Network:
         correction = fit_correction(best.hold_out.one_step_errors(layers), problem.necks)
         found = {name: getattr(layers, name) for name in ("W1", "b1", "W2", "b2", "w3", "b3")}
         return {**found, "input_scale": inputs, "output_scale": output, "correction": correction, "fit": best.free}
+
+
+def _hints(train: Recording, drive: LoadedDrive) -> Recording | None:
+    """Return motions that nobody recorded with the outputs of the linear model of `train`; None where it has none.
+
+    A network is free where nothing was recorded, and each start uses that freedom otherwise.
+    """
+    try:
+        line = OutputError().fit(train)
+    except DataError:
+        return None
+    seconds = float(np.clip(_HINT * len(train) * train.sample_time, *_HINT_SECONDS))
+    # A record that hardly moves is slow beyond measure.
+    most = round(2.0 * seconds / train.sample_time)
+    motions, names = [], train.robot.outputs.names
+    # Not the motions by which `identify auto` compares kinds: those have another seed.
+    for whole in unrecorded(train, seconds, seed=1):
+        motion = whole.rows(0, min(most, len(whole)))
+        Y = line.simulate(motion, warm_up=1)[:, : len(names)]
+        motors = drive.simulate(motion.set_points, motion.set_points[0])
+        positions = zip(train.robot.motor_positions, motors.T, strict=True) if train.has_motor_positions else ()
+        motions.append(motion.with_channels(**dict(zip(names, Y.T, strict=True)), **dict(positions)))
+    return concatenate(motions)
 
 
 def _weights(inputs: int, hidden: tuple[int, int]) -> int:

@@ -43,6 +43,7 @@ class AxisData:
         shift, gain: (f,) those from the scaled output, `shift + gain y`.
         window: samples of one second of a neck.
         neck: whether they are a neck's; of other robots the free run counts, however short their samples are.
+        weight: (time,) of an error.
     """
 
     measured: Matrix
@@ -54,6 +55,7 @@ class AxisData:
     gain: Vector
     window: float
     neck: bool
+    weight: Vector
 
     @property
     def thin(self) -> int:
@@ -101,7 +103,13 @@ class AxisData:
 
 
 def axis_data(
-    recording: Recording, motors: Matrix, axis: int, table: Matrix, window: float, scale: tuple[Matrix, Vector] | None
+    recording: Recording,
+    motors: Matrix,
+    axis: int,
+    table: Matrix,
+    window: float,
+    scale: tuple[Matrix, Vector] | None,
+    weights: Vector | None = None,
 ) -> tuple[AxisData, Matrix, Vector]:
     """Return the data of one axis, its input scale (2, n) and output scale (2,).
 
@@ -112,12 +120,14 @@ def axis_data(
         table: rows (source, channel, lag), past outputs first.
         window: samples of one second of a neck.
         scale: of other data, to be used again.
+        weights: (time,) of errors; None: all alike.
     """
     lag = int(table[:, 2].max())
-    X, S, y, first = [], [], [], []
+    X, S, y, first, weight = [], [], [], [], []
+    rated = np.ones(len(recording)) if weights is None else weights
     at = 0
     for run in recording.runs():
-        part = motors[at : at + len(run)]
+        part, own = motors[at : at + len(run)], rated[at : at + len(run)]
         at += len(run)
         if len(run) <= lag:
             continue
@@ -128,6 +138,7 @@ def axis_data(
             into.append(np.column_stack(columns))
         y.append(run.outputs[lag:, axis])
         first.append(np.arange(rows - lag) == 0)
+        weight.append(own[lag:])
     measured, simulated, target = np.concatenate(X), np.concatenate(S), np.concatenate(y)
     if scale is None:
         known = measured[np.isfinite(measured).all(axis=1)]
@@ -148,6 +159,7 @@ def axis_data(
         gain=size / spread[fed],
         window=window,
         neck=recording.robot.is_neck,
+        weight=np.concatenate(weight),
     )
     return data, scale[0], scale[1]
 
@@ -197,16 +209,17 @@ def train_axis(
     """
     known = np.isfinite(data.measured).all(axis=1) & np.isfinite(data.target)
     rows = np.flatnonzero(known)[:: data.thin]
-    Z, target = data.measured[rows], data.target[rows]
+    Z, target, weight = data.measured[rows], data.target[rows], data.weight[rows]
     ends: list[tuple[float, Layers, float]] = []
     for number, decay in enumerate(decays):
-        start = _solved(random_layers(Z.shape[1], hidden, rng), Z, target)
-        layers = _series_parallel(start, Z, target, decay, max(iterations // 3, 1), best, f"start {number + 1}")
+        start = _solved(random_layers(Z.shape[1], hidden, rng), Z, target, weight)
+        what = f"start {number + 1}"
+        layers = _series_parallel(start, (Z, target, weight), decay, max(iterations // 3, 1), best, what)
         ends.append((best.hold_out.weights_fit(layers)[1], layers, decay))
         if best.stop():
             break
     _, layers, decay = max(ends, key=lambda end: end[0])
-    layers = _series_parallel(layers, Z, target, decay, iterations, best, "series-parallel")
+    layers = _series_parallel(layers, (Z, target, weight), decay, iterations, best, "series-parallel")
     for seconds in _WINDOWS if refine else ():
         if best.stop():
             break
@@ -215,22 +228,25 @@ def train_axis(
     return best.layers or layers
 
 
-def _solved(layers: Layers, Z: Matrix, target: Vector) -> Layers:
+def _solved(layers: Layers, Z: Matrix, target: Vector, weight: Vector) -> Layers:
     """Return the layers with the output layer of least squares: Levenberg-Marquardt starts far closer then."""
-    H = np.column_stack([layers.hidden(Z)[1], np.ones(len(Z))])
+    H = np.column_stack([layers.hidden(Z)[1], np.ones(len(Z))]) * weight[:, None]
     # Neurons are much alike at random: a thousandth of the rows keeps the weights of order one.
-    w = np.linalg.solve(H.T @ H + 1e-3 * len(H) * np.eye(H.shape[1]), H.T @ target)
+    w = np.linalg.solve(H.T @ H + 1e-3 * len(H) * np.eye(H.shape[1]), H.T @ (weight * target))
     return replace(layers, w3=w[:-1], b3=float(w[-1]))
 
 
 def _series_parallel(
-    start: Layers, Z: Matrix, target: Vector, decay: float, iterations: int, best: Best, what: str
+    start: Layers, rows: tuple[Matrix, Vector, Vector], decay: float, iterations: int, best: Best, what: str
 ) -> Layers:
+    """Minimise the weighted errors of one step over `rows`: regressors, targets and weights."""
+    Z, target, weight = rows
+
     def errors(w: Vector, *, derivatives: bool) -> tuple[Vector, Matrix | None]:
         if not derivatives:
-            return target - start.like(w).output(Z), None
+            return weight * (target - start.like(w).output(Z)), None
         output, J = jacobian(start.like(w), Z)
-        return target - output, J
+        return weight * (target - output), weight[:, None] * J
 
     def seen(w: Vector, cost: float) -> bool:
         return best.see(start.like(w), cost, what)
@@ -248,7 +264,10 @@ def _windows(
     free = np.empty(data.target.size)
     J = np.empty((there.size, start.vector().size))
     Z, target = data.measured[rows], data.target[rows]
-    one_step = _ONE_STEP_WEIGHT if data.neck else 1.0
+    # Of free runs, then of one step.
+    weight = np.concatenate([
+        data.weight[:: data.thin][there], (_ONE_STEP_WEIGHT if data.neck else 1.0) * data.weight[rows]
+    ])  # fmt: skip
 
     def errors(w: Vector, *, derivatives: bool) -> tuple[Vector, Matrix | None]:
         call = (w, h1, h2, data.simulated, data.lags, starts, data.shift, data.gain)
@@ -258,8 +277,8 @@ def _windows(
         else:
             functions.nn_sensitivities(*call, data.thin, free, J)
             one, by_one = jacobian(start.like(w), Z)
-        error = np.concatenate([(data.target - free)[:: data.thin][there], one_step * (target - one)])
-        return error, None if by_one is None else np.vstack([J[there], one_step * by_one])
+        error = weight * np.concatenate([(data.target - free)[:: data.thin][there], target - one])
+        return error, None if by_one is None else weight[:, None] * np.vstack([J[there], by_one])
 
     def seen(w: Vector, cost: float) -> bool:
         return best.see(start.like(w), cost, f"windows of {length}")

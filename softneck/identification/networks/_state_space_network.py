@@ -41,7 +41,8 @@ class NeuralStateSpace:
     It contracts, whatever its weights: two free runs under the same inputs draw together. Each start is the
     output-error linear model with whitened states and neurons that do nothing yet, trained by Levenberg-Marquardt with
     exact sensitivities over windows from one sample to 5 s and then over the whole free run. The start with the best
-    free run on the hold-out (`hold_out`, else the last fifth of each run) goes on, at last on all rows.
+    free run on the hold-out (`hold_out`, else the last fifth of each run; of another robot than a neck all rows where
+    they last less than 75 time constants) goes on, at last on all rows.
 
     Attributes:
         order: poles of the linear model of each axis; each input that moves none (co-contraction) has a state more.
@@ -107,10 +108,10 @@ class NeuralStateSpace:
             shape, linear, gain = whitened(fits, records, made, self.neurons)
             contraction = Contraction(shape.states, self.neurons, largest_rate(records.sample_time))
             self._check_rows(records, shape)
-            judge = records.only(records.held_out)
+            rows, judge = records.apart()
             if hold_out is not None:
-                judge = Records.of(hold_out, made, scales=records.scales)
-            job = _Job(self, shape, contraction, gain, shape.arrays(linear), records, judge, hold_out is None)
+                rows, judge = records, Records.of(hold_out, made, scales=records.scales)
+            job = _Job(self, shape, contraction, gain, shape.arrays(linear), records, rows, judge)
             theta, found = job.run(progress)
             weights = shape.arrays(job.weights(theta))
             arrays = _arrays(recording, made, records, weights, (self.echo, gain))
@@ -140,8 +141,8 @@ class _Job:
     gain: Matrix
     linear: dict[str, Matrix]
     records: Records
+    rows: Records
     judge: Records
-    same: bool
 
     def run(self, progress: Progress) -> tuple[np.ndarray, dict[str, Any]]:
         """Return the parameters to take, and what there is to say about them."""
@@ -149,12 +150,11 @@ class _Job:
         load_functions(FUNCTIONS)  # before the threads start: Python 3.11 cannot parse two texts at once
         total = settings.starts * (sum(_WINDOW_STEPS) + settings.iterations + 5) + 2 * settings.iterations
         told = _TrainingProgress(total)
-        rows = self.records.only(~self.records.held_out) if self.same else self.records
         jobs: list[tuple[Training, np.ndarray, BestMap]] = []
         for number in range(settings.starts):
             rng = np.random.default_rng([settings.seed, number])
             theta, base = random_start(self.linear, self.shape, self.contraction, rng)
-            training = Training(self.shape, self.contraction, self.gain, rows, settings.decay, base)
+            training = Training(self.shape, self.contraction, self.gain, self.rows, settings.decay, base)
             jobs.append((training, theta, BestMap(self.judge, told.see, stop.is_set)))
         steps = (*_WINDOW_STEPS, settings.iterations)
 
@@ -171,7 +171,8 @@ class _Job:
         theta = best.theta
         if not interrupted:
             theta, interrupted = self._finish(training, best, told, progress, stop)
-        found: dict[str, Any] = {"hold_out_fit": best.fit, "start_fits": fits}
+        judged = "training_fit" if self.judge is self.rows else "hold_out_fit"
+        found: dict[str, Any] = {judged: best.fit, "start_fits": fits}
         return theta, found | ({"interrupted": INTERRUPTED} if interrupted else {})
 
     def _finish(

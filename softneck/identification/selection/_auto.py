@@ -19,6 +19,8 @@ from ..models._linear_systems import KINDS as LINEAR
 from ..models._model import Model
 from ..set_membership._set_membership import noise_levels
 from ..uncertainty._ensemble import combine
+from ..uncertainty._guarded import OF, Guarded
+from ..uncertainty._guarded_base import BASES, fitted_base
 from ..uncertainty._residual import Residual
 from ..validation._score_tables import INFINITE
 from ..validation._validation import Rules, Validation, judge, judged_parts
@@ -48,6 +50,8 @@ ALIKE = 0.5
 # Below this [%] no kind has understood the recording.
 _POOR = 70.0
 _MOST_MEMBERS = 3
+# What a guarded form may cost on the rows held out [points]: it is taken for what it does elsewhere.
+_GUARD_COST = 2.0
 # So many kinds are trained on all rows at most, before the better of them is taken.
 _MOST_TRAINED = 2
 REFITTED = "trained on all rows after the choice; its scores are those of the model before, which had not seen them all"
@@ -96,7 +100,8 @@ def choose(
     kind, which controllers are designed on.
 
     `residual` is put on the best of the others, `ensemble` is the median of the best three, and is never taken where
-    one of them is better on anything held out. A kind that fails is listed with its reason.
+    one of them is better on anything held out. Of a learned kind that wins, the guarded form is taken: it falls back to
+    the better of `greybox` and `oe` where its members part. A kind that fails is listed with its reason.
 
     Args:
         train: to identify from.
@@ -122,13 +127,14 @@ def choose(
             race.screen(kind)
         race.examine()
         race.leave_out(lambda done, what: progress(0.7 + 0.1 * done, what))
-        chosen = race.trained(lambda done, what: progress(0.8 + 0.2 * done, what))
+        best = race.trained(lambda done, what: progress(0.8 + 0.1 * done, what))
+        chosen = race.guarded(best, lambda done, what: progress(0.9 + 0.1 * done, what))
         race.train_linear(chosen)
     ranking = race.ranking()
     progress(1.0, f"chosen: {chosen.kind}")
-    alike = [one for one in ranking if one.fit > chosen.fit - ALIKE and one is not chosen]
+    alike = [one for one in ranking if one.fit > best.fit - ALIKE and one not in (best, chosen)]
     remarks = (*poor_excitation(train), *_remarks(ranking, other_excitation))
-    return Choice(ranking, chosen, _why(chosen, alike), remarks, seed)
+    return Choice(ranking, chosen, _why(best, alike) + _guarded_why(best, chosen), remarks, seed)
 
 
 def refit(choice: Choice, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
@@ -165,6 +171,7 @@ class _Race:
         self.train, self.hold_out, self.seed = train, hold_out, seed
         self.folds = left_out or [Fold(train, ())]
         self.tried: dict[str, KindTrial] = {}
+        self.short: dict[str, Model] = {}
         # Baselines of the rows held out, which are the same for all; of the exam its motions, free runs and weights.
         self._known: dict = {}
         self._motions: list[Recording] = []
@@ -177,10 +184,9 @@ class _Race:
 
     def screen(self, kind: str) -> None:
         """Identify a kind in its short form, and judge it on what the first fold leaves out and on the hold-out."""
-        begin = time.perf_counter()
-        fold = self.folds[0]
+        fold, begin = self.folds[0], time.perf_counter()
         try:
-            model = self._short(kind, fold.train)
+            model = self.short[kind] = self._short(kind, fold.train)
             seconds = time.perf_counter() - begin
             found = {part.name: part.fit(model) for part in (*fold.judged, everything(HOLD_OUT, self.hold_out))}
         except (SoftneckError, np.linalg.LinAlgError) as error:
@@ -241,13 +247,40 @@ class _Race:
             self.whole(best.kind)
             trained += 1
 
+    def guarded(self, best: KindTrial, progress: Progress) -> KindTrial:
+        """Return the guarded form of a learned kind unless it is worse on the rows held out.
+
+        Over `greybox` its members are there already: the model of all rows, and the short one without the largest and
+        fastest motions. `oe` saves less, and needs members of their own. It is ranked by what its kind was worth on
+        what was left out, and by its own hold-out and cold start.
+        """
+        bases = [one.kind for one in self.ranking() if one.kind in BASES and one.fit > float("-inf")]
+        if best.kind not in OF or best.model is None or not bases:
+            return best
+        progress(0.0, f"guarded form of {best.kind}")
+        settings, begin = Guarded(of=best.kind, base=bases[0], seed=self.seed), time.perf_counter()
+        try:
+            if bases[0] == "oe":
+                model = settings.fit(self.train, progress=progress)
+            else:
+                base = fitted_base("greybox", self.train, _settings("greybox", self.seed, _SCREENED["greybox"]))
+                parts = [best.model, self.short[best.kind]]
+                model = replace(settings, members=len(parts)).around(base, parts, self.train)
+            judged = self._judged("guarded", model)
+        except (SoftneckError, np.linalg.LinAlgError) as error:
+            self.tried["guarded"] = KindTrial("guarded", time.perf_counter() - begin, failure=str(error))
+            return best
+        one = KindTrial("guarded", time.perf_counter() - begin, model, judged, "", best.left_out, best.errors)
+        self.tried["guarded"] = one
+        return one if one.hold_out_fit > best.hold_out_fit - _GUARD_COST else best
+
     def train_linear(self, chosen: KindTrial) -> None:
         """Train the best linear kind on all rows where the chosen one is not linear."""
         linear = [one for one in self.ranking() if one.kind in LINEAR and one.fit > float("-inf")]
         if chosen.kind not in LINEAR and linear:
             self.whole(linear[0].kind)
 
-    def whole(self, kind: str) -> KindTrial:
+    def whole(self, kind: str) -> None:
         """Train a kind on all rows to train on, and judge it again on the hold-out."""
         one = self.tried[kind]
         begin = time.perf_counter()
@@ -259,11 +292,9 @@ class _Race:
             error = everything(HOLD_OUT, self.hold_out).fit(model)[1]
         except (SoftneckError, np.linalg.LinAlgError) as error:
             self.tried[kind] = KindTrial(kind, one.seconds, failure=str(error))
-            return self.tried[kind]
-        seconds = one.seconds + time.perf_counter() - begin
-        errors = {**one.errors, HOLD_OUT: error}
-        self.tried[kind] = replace(one, seconds=seconds, model=model, judged=judged, errors=errors, whole=True)
-        return self.tried[kind]
+            return
+        one = replace(one, seconds=one.seconds + time.perf_counter() - begin, errors={**one.errors, HOLD_OUT: error})
+        self.tried[kind] = replace(one, model=model, judged=judged, whole=True)
 
     def _simplest_of_the_best(self) -> KindTrial:
         ranking = [one for one in self.ranking() if one.kind != "ensemble" or self._no_member_is_better(one)]
@@ -277,10 +308,8 @@ class _Race:
     def _no_member_is_better(self, ensemble: KindTrial) -> bool:
         """Return whether no member of the ensemble beats it on anything that was left or held out."""
         names = [] if ensemble.model is None else [kind for kind, _ in members(ensemble.model.arrays)]
-        scores = ensemble.scores
-        return all(
-            scores[what] >= fit for kind in names for what, fit in self.tried[kind].scores.items() if what in scores
-        )
+        own = ensemble.scores
+        return all(own[what] >= fit for kind in names for what, fit in self.tried[kind].scores.items() if what in own)
 
     def _short(self, kind: str, train: Recording) -> Model:
         best = [one.model for one in self.ranking() if one.model is not None and one.fit > float("-inf")]
@@ -314,6 +343,8 @@ def _settings(kind: str, seed: int, other: Mapping[str, Any]) -> Any:
 
 def _anew(model: Model, train: Recording, seed: int, progress: Progress = silent) -> Model:
     """Return the model's kind, made of the same kinds, identified with its usual settings from `train`."""
+    if model.kind == "guarded":
+        return Guarded(of=model.settings["of"], base=model.settings["base"], seed=seed).fit(train, progress=progress)
     parts = {"residual": [model.settings.get("base")], "ensemble": list(model.settings.get("members", ()))}
     made_of: list[Model] = []
     for number, kind in enumerate(parts.get(model.kind, [])):
@@ -337,6 +368,17 @@ def _why(chosen: KindTrial, alike: list[KindTrial]) -> str:
     return (
         f"{said}; {others} are not worse by more than {ALIKE:g} points, and of such kinds the one of the fewest "
         f"numbers is taken ({chosen.numbers})."
+    )
+
+
+def _guarded_why(best: KindTrial, chosen: KindTrial) -> str:
+    if chosen is best or chosen.model is None:
+        return ""
+    settings = chosen.model.settings
+    return (
+        f" Its guarded form is taken: {settings['members']} models of {best.kind} that fade to `{settings['base']}` "
+        f"where they part or nothing was seen; {chosen.hold_out_fit:.1f} % on the rows held out, {best.kind} alone "
+        f"{best.hold_out_fit:.1f} %."
     )
 
 

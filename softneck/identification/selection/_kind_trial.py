@@ -13,9 +13,10 @@ from ..validation._score_tables import INFINITE
 from ..validation._validation import Validation
 
 EXAM, HOLD_OUT, COLD = "agreement", "hold-out", "cold start"
-# What is in a model file but was not found from data: sizes, tables, copies of rows in another order.
+# What is in a model file but was not found from data: sizes, tables, copies of rows in another order; and what says how
+# far a model is known, which every kind has.
 _NOT_FOUND = ("history", "memory", "table", "redefinition", "nodes", "frame", "scale", "input_scale", "output_scale",
-              "range", "widths", "source")  # fmt: skip
+              "range", "widths", "source", "seen", "ground", "doubt")  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)

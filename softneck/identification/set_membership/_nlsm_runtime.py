@@ -40,6 +40,10 @@ class NlsmArrays(NarxArrays):
 def initialise(p: NlsmArrays, parameters: np.ndarray, x: NarxState, outputs: np.ndarray) -> None:
     """Rest: motors at zero, outputs at their start values for ever."""
     narx_rest(p, parameters, x, outputs)
+    bounds = p.outputs + p.motors
+    for axis in range(p.outputs):  # they hold nothing but the start yet
+        outputs[bounds + 2 * axis] = parameters[axis]
+        outputs[bounds + 2 * axis + 1] = parameters[axis]
     # Of another robot than a neck the base is zero at rest and the outputs need not be: the set adds where they are.
     if p.nb > 0 and p.c == p.outputs:
         for axis in range(p.outputs):

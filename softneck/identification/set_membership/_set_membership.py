@@ -72,7 +72,7 @@ def outside_seen(model: Model, outputs: Matrix) -> np.ndarray:
 
     Args:
         model: of kind `nlsm`.
-        outputs: (rows, 9 of a neck) what `model.simulate` or `model.predict` returned.
+        outputs: (rows, 10 of a neck) what `model.simulate` or `model.predict` returned.
 
     Raises:
         SettingsError: a model without bounds, or one identified before this was learned.
@@ -80,10 +80,10 @@ def outside_seen(model: Model, outputs: Matrix) -> np.ndarray:
     if not knows_what_it_saw(model):
         raise SettingsError("only a model of kind nlsm knows what it has seen; identify one (again).")
     first, axes = len(model.robot.outputs.names) + len(model.robot.motors.names), len(model.robot.outputs.names)
-    if outputs.ndim != 2 or outputs.shape[1] != first + 2 * axes:
-        columns = first + 2 * axes
+    columns = first + 2 * axes + 1  # `validity` is the last
+    if outputs.ndim != 2 or outputs.shape[1] != columns:
         raise DataError(f"`outputs` must be (rows, {columns}), as a model of kind nlsm returns; got {outputs.shape}.")
-    half = 0.5 * (outputs[:, first + 1 :: 2] - outputs[:, first::2])
+    half = 0.5 * (outputs[:, first + 1 : columns : 2] - outputs[:, first : columns - 1 : 2])
     return in_display_unit(model.robot, half) > np.array(model.findings[usual_finding(model.robot)])
 
 

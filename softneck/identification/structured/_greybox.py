@@ -26,6 +26,7 @@ from ..models._fitting import row_hashes, training_recording
 from ..models._model import Model
 from ..models._ports import trained_set_points
 from ..models._state_space import history_array
+from ..models._validity import grounded
 from ._arrays import ACROSS, NUMBERS, Number
 
 if TYPE_CHECKING:
@@ -244,7 +245,7 @@ def _model(settings: GreyBox, problem: _FitProblem, recording: Recording, delay:
         "echo": echo,
         "memory": memory_array(_MEMORY, problem.sample_time),
     }
-    return Model(
+    model = Model(
         kind="greybox",
         sample_time=recording.sample_time,
         arrays=arrays,
@@ -258,6 +259,7 @@ def _model(settings: GreyBox, problem: _FitProblem, recording: Recording, delay:
         training_rows=row_hashes(recording),
         robot=recording.robot,
     )
+    return grounded(model, recording)
 
 
 def _table(problem: _FitProblem, x: Vector, delay: int, errors: Sequence[Matrix]) -> list[dict]:

@@ -19,6 +19,8 @@ from ..models._scores import nrmse_fit
 # Rows of each run in which its unknown past still shows [s]: those that `validate` does not score either.
 _SETTLED = 0.5
 HOLD_OUT = 0.2
+# Rows held out that say something of a free run, where there are that many.
+_LEAST_HELD = 50
 # From so many runs on, a run is held out as a whole.
 _MANY_RUNS = 4
 
@@ -152,8 +154,10 @@ def scores(data: Data, hold_out: Data | None, form: PlayStructure, weights: tupl
     X, good = data.terms(form), data.settled
     if hold_out is None:
         far = _far(X[:, 1:], good)
+        # Of a few seconds a tenth must do: the last fifth is always more.
+        least = min(_LEAST_HELD, int(good.sum()) // 10)
         folds = [(X[good & ~held], data.outputs[good & ~held], X[good & held], data.outputs[good & held])
-                 for held in (*data.groups, far) if (good & held).sum() > 50]  # fmt: skip
+                 for held in (*data.groups, far) if (good & held).sum() > least]  # fmt: skip
     else:
         folds = [(X[good], data.outputs[good], hold_out.terms(form)[hold_out.settled],
                   hold_out.outputs[hold_out.settled])]  # fmt: skip

@@ -15,6 +15,7 @@ from ..models._arrays import COMPOSED, memory_of, prefixed_arrays
 from ..models._fitting import one_recording, row_hashes
 from ..models._model import Model
 from ..models._ports import trained_set_points
+from ..models._validity import grounded, joined
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,8 +55,8 @@ class Ensemble:
             part = _part(progress, number, len(members), kind)
             models.append(seeded(kind, self.seed + number).fit(recording, progress=part))
         progress(1.0, "done")
-        joined = combine(models)
-        return replace(joined, settings=asdict(replace(self, members=members)), training_rows=row_hashes(recording))
+        ensemble = grounded(combine(models), recording)
+        return replace(ensemble, settings=asdict(replace(self, members=members)), training_rows=row_hashes(recording))
 
 
 def combine(models: Sequence[Model]) -> Model:
@@ -78,7 +79,7 @@ def combine(models: Sequence[Model]) -> Model:
         "memory": np.array([float(memory)]),
         **prefixed_arrays([(model.kind, model.arrays) for model in models]),
     }
-    return Model(
+    ensemble = Model(
         kind="ensemble",
         sample_time=models[0].sample_time,
         arrays=arrays,
@@ -90,6 +91,7 @@ def combine(models: Sequence[Model]) -> Model:
         training_rows=np.unique(np.concatenate([model.training_rows for model in models])),
         robot=robot,
     )
+    return joined(ensemble, models)
 
 
 def seeded(kind: str, seed: int):

@@ -5,7 +5,7 @@ Each member runs free on its own outputs; a median of bounded numbers is bounded
 
 import numpy as np
 
-from softneck.identification.uncertainty._composed_runtime import ComposedArrays, composed_median
+from softneck.identification.uncertainty._composed_runtime import ComposedArrays, composed_median, composed_validity
 from softneck.runtime._layout import StateVector, cells, rest
 from softneck.runtime._members_runtime import member_count, member_initialise, member_size, member_step
 from softneck.runtime._random_runtime import random_normal, random_seed
@@ -15,6 +15,7 @@ class EnsembleState(StateVector):
     """The members' states follow, in their order."""
 
     random = cells("6", "generator of the output noise")
+    slow = cells("motors", "where the motors have been held [rad]")
     members = rest("states of the members")
 
 
@@ -29,7 +30,7 @@ def state_size(p: ComposedArrays) -> int:
 def initialise(p: ComposedArrays, parameters: np.ndarray, x: EnsembleState, outputs: np.ndarray) -> None:
     """Rest: as the members rest."""
     bounds = p.outputs + p.motors
-    own = np.zeros(bounds + 2 * p.outputs)
+    own = np.zeros(bounds + 2 * p.outputs + 1)
     at = 0
     members = x.members
     random_seed(x.random, float(parameters[p.outputs + 2]))
@@ -42,6 +43,7 @@ def initialise(p: ComposedArrays, parameters: np.ndarray, x: EnsembleState, outp
     for axis in range(p.outputs):
         outputs[bounds + 2 * axis] = own[axis]
         outputs[bounds + 2 * axis + 1] = own[axis]
+    outputs[bounds + 2 * p.outputs] = composed_validity(p, own[p.outputs : bounds], x.slow, np.zeros(p.outputs))
 
 
 def step(p: ComposedArrays, parameters: np.ndarray, x: EnsembleState, inputs: np.ndarray, outputs: np.ndarray) -> None:
@@ -52,7 +54,8 @@ def step(p: ComposedArrays, parameters: np.ndarray, x: EnsembleState, inputs: np
     count = member_count()
     bounds = p.outputs + p.motors
     angles = np.empty((p.outputs, count))
-    own = np.zeros(bounds + 2 * p.outputs)
+    spread = np.empty(p.outputs)
+    own = np.zeros(bounds + 2 * p.outputs + 1)
     at = 0
     members = x.members
     for i in range(count):
@@ -69,6 +72,8 @@ def step(p: ComposedArrays, parameters: np.ndarray, x: EnsembleState, inputs: np
         outputs[axis] = composed_median(inorder)
         outputs[bounds + 2 * axis] = inorder[0]
         outputs[bounds + 2 * axis + 1] = inorder[count - 1]
+        spread[axis] = 0.5 * (inorder[count - 1] - inorder[0])
+    outputs[bounds + 2 * p.outputs] = composed_validity(p, outputs[p.outputs : bounds], x.slow, spread)
     if parameters[p.outputs + 1] > 0.0:
         for axis in range(p.outputs):
             outputs[axis] += parameters[p.outputs + 1] * random_normal(x.random)

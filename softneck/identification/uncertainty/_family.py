@@ -16,6 +16,7 @@ from softneck.signals.recording._recording import require_same_robot
 
 from ..linear._srivc_fit import Continuous
 from ..models._directions import Directions
+from ._frf import SUPPORTED
 from ._lpv import Lpv
 from ._measured import (
     AxisMeasured,
@@ -219,6 +220,11 @@ class Family:
                 "confidence; nothing is known above"
             )
             lines += needed_lines(found, told.get("names", []), name)
+            lines += [
+                f"{name}: {part} moves it and shows no response known within {100 * SUPPORTED:.0f} %: nothing is known "
+                "of what it holds"
+                for part in told.get("unheard", {}).get(name, [])
+            ]
         return lines
 
     def _plain_lines(self) -> list[str]:
@@ -291,9 +297,10 @@ class Family:
         if header["lpv_source"] is not None:
             parts = {key: arrays[f"lpv_{key}"] for key in ("knots", "gains", "poles", "delays")}
             m = parts["knots"].size
-            if parts["gains"].shape != (2, m) or parts["poles"].shape != (2, m) or parts["delays"].shape != (2,):
+            n = len(axes)
+            if parts["gains"].shape != (n, m) or parts["poles"].shape != (n, m) or parts["delays"].shape != (n,):
                 raise FileFormatError("its interpolation has arrays that do not fit each other.")
-            lpv = Lpv(**parts, source=str(header["lpv_source"]))
+            lpv = Lpv(**parts, source=str(header["lpv_source"]), directions=weights)
         return cls(
             sample_time=float(header["sample_time"]),
             axes=axes,

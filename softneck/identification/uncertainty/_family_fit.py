@@ -20,15 +20,16 @@ from softneck.core import (
     silent,
 )
 from softneck.signals import Recording, concatenate
+from softneck.signals.recording._conditions import conditions
 
 from ..linear._oe import SOURCES
 from ..linear._srivc_fit import Continuous, SrivcFitOptions
 from ..models._directions import Directions, directions_of
 from ..models._fitting import check_training
 from ._envelope import envelope_weight
-from ._family import AXES, SCOPES, AxisFamily, Family, one_pole, relative_errors
+from ._family import SCOPES, AxisFamily, Family, one_pole, relative_errors
 from ._local_models import Local, Window, axis_inputs, fit_compression, fit_local, unit_response, windows
-from ._lpv import Lpv, fit_lpv
+from ._lpv import Lpv, fit_lpv, require_inclination
 from ._measured import (
     AxisMeasured,
     axis_points,
@@ -40,6 +41,7 @@ from ._measured import (
     measured_responses,
     middle_model,
     raised,
+    unheard,
 )
 from ._order import choose_order
 
@@ -164,7 +166,7 @@ class FamilySettings:
         for part in parts:
             check_training(part)
             if self.lpv_knots > 0:
-                part.robot.require_neck("`lpv_knots`: an interpolation over the inclination")
+                require_inclination(part.robot, "`lpv_knots`: an interpolation over the inclination")
         robot, together = parts[0].robot, concatenate(parts)
         motors = [run.motor_positions if self.source == "positions" else run.set_points for run in together.runs()]
         directions = directions_of(together, motors)
@@ -193,7 +195,8 @@ class FamilySettings:
         squeezed = None
         if robot.is_neck:
             squeezed = fit_compression(parts, SrivcFitOptions(sample_time=sample_time, offset=True), self.source)
-        lpv, fits = self._lpv(parts, axes, sample_time) if self.lpv_knots > 0 else (None, {})
+        weights = None if robot.is_neck else directions.weights
+        lpv, fits = self._lpv(parts, axes, sample_time, weights) if self.lpv_knots > 0 else (None, {})
         progress(0.9, "frequency responses")
         measured, tested = self._measured(search, parts, directions, nominal, names)
         progress(1.0, "done")
@@ -216,7 +219,7 @@ class FamilySettings:
                 **fits,
             },
             robot=robot,
-            directions=None if robot.is_neck else directions.weights,
+            directions=weights,
             measured=measured,
         )
 
@@ -233,9 +236,10 @@ class FamilySettings:
         if len(named) != len(parts):
             raise DataError(f"{len(named)} names were given for {len(parts)} recordings; give one for each.")
         responses, why = measured_responses(parts, self.source)
-        found = {}
+        found, silent_ones = {}, {}
         for axis, name in enumerate(directions.names):
             points = axis_points(responses, axis, directions, self.confidence)
+            silent_ones[name] = unheard(points, axis_runs(parts, directions, self.source, axis), named)
             # One frequency is no band.
             if points.size and points[:, 1].max() > 1.1 * points[:, 1].min():
                 found[name] = self._measured_axis(search, parts, directions, axis, points, nominal[axis])
@@ -243,8 +247,9 @@ class FamilySettings:
                 why.append(f"{name}: no band of its response is known within 30 %; record `multisine --band 0.5,25`")
         amplitudes = [[] if response is None else response.amplitude.tolist() for response in responses]
         tested = {
-            "confidence": self.confidence, "names": named, "sha256": [digest(part) for part in parts],
-            "amplitude": [max(sizes, default=0.0) for sizes in amplitudes], "why": why,
+            "confidence": self.confidence, "names": named, "sha256": [digest(part) for part in parts], "why": why,
+            "amplitude": [max(sizes, default=0.0) for sizes in amplitudes], "unheard": silent_ones,
+            "conditions": [conditions(part) for part in parts],
         }  # fmt: skip
         return found, tested
 
@@ -356,23 +361,25 @@ class FamilySettings:
         excess = float(np.max(relative_errors(plants, nominal, w, sample_time) / W))
         return above * max(1.0, excess), below
 
-    def _lpv(self, parts: list[Recording], axes: dict[str, AxisFamily], sample_time: float) -> tuple[Lpv, dict]:
+    def _lpv(
+        self, parts: list[Recording], axes: dict[str, AxisFamily], sample_time: float, directions: Matrix | None
+    ) -> tuple[Lpv, dict]:
         """Return the interpolation, and its free-run fits on the last 30 % of each run beside those of one model."""
         halves = [part.split(0.7) for part in parts]
         head, tail = [first for first, _ in halves], [second for _, second in halves]
-        nominal = np.array([axes[name].nominal for name in AXES])
+        nominal = np.array([axis.nominal for axis in axes.values()])
         start = Lpv(
             knots=np.zeros(1),
             gains=nominal[:, :1],
             poles=nominal[:, 1:2],
-            delays=np.round([np.median(axes[name].samples[axes[name].used > 0.5, 2]) / sample_time for name in AXES]),
+            delays=np.round([np.median(axis.samples[axis.used > 0.5, 2]) / sample_time for axis in axes.values()]),
             source=self.source,
+            directions=directions,
         )
         one = fit_lpv(head, start, 1)
         many = fit_lpv(head, one, self.lpv_knots) if self.lpv_knots > 1 else one
-        fits: dict[str, Any] = {
-            name: [model.fit(part) for part in tail] for name, model in (("invariant", one), ("lpv", many))
-        }
+        models = {"invariant": one, "lpv": many}
+        fits: dict[str, Any] = {name: [model.fit(part) for part in tail] for name, model in models.items()}
         return many, {"free_run_fit": {name: np.round(np.mean(f, axis=0), 2).tolist() for name, f in fits.items()}}
 
 
@@ -389,6 +396,4 @@ def _one_sample_time(parts: list[Recording]) -> float:
 
 
 def _numbers(model: Any) -> Vector:
-    if model is None:
-        return np.full(3, np.nan)
-    return np.array([model.b[0] / model.a[0], model.a[0], model.delay])
+    return np.full(3, np.nan) if model is None else np.array([model.b[0] / model.a[0], model.a[0], model.delay])

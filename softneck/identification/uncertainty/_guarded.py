@@ -26,6 +26,7 @@ from ..models._fitting import row_hashes, training_recording
 from ..models._jobs import Job, done
 from ..models._model import Model
 from ..models._ports import trained_set_points
+from ..models._validity import grounded
 from ..networks._network import Network
 from ..networks._state_space_network import NeuralStateSpace
 from ..set_membership._set_membership import SetMembership
@@ -110,7 +111,7 @@ class Guarded:
         robot, Ts = recording.robot, recording.sample_time
         outputs, motors = len(robot.outputs.names), len(robot.motors.names)
         M = base.model.simulate(recording)[:, outputs : outputs + motors]
-        seen, reach = _covering(M, _SEEN)
+        seen, reach = covering(M, _SEEN)
         parts = [base.model, *members]
         arrays = {
             "history": np.array([1.0] if robot.is_neck else [1.0, outputs, motors]),
@@ -129,7 +130,7 @@ class Guarded:
             **({"remark": base.remark} if base.remark else {}),
             **trained_set_points(recording),
         }
-        return Model(
+        model = Model(
             kind="guarded",
             sample_time=Ts,
             arrays=arrays,
@@ -138,13 +139,15 @@ class Guarded:
             training_rows=row_hashes(recording),
             robot=robot,
         )
+        return grounded(model, recording)
 
 
 def _member(kind: str, seed: int, rest: Recording, part: Recording) -> Model:
     """Return one member; `part` is what it is chosen on, or left out."""
     if kind == "nn":
         # The members are each other's starts: one of its own costs each a third of what a network alone takes.
-        settings = Network(seed=seed, starts=1, iterations=20, decay=_DECAYS[seed % len(_DECAYS)])
+        # No prior: where nothing was recorded they are to part.
+        settings = Network(seed=seed, starts=1, iterations=20, decay=_DECAYS[seed % len(_DECAYS)], prior=0.0)
         return settings.fit(rest, hold_out=part)
     if kind == "nss":
         return NeuralStateSpace(seed=seed, starts=1).fit(rest, hold_out=part)
@@ -160,7 +163,7 @@ def _least_missing(found: list[Base | str]) -> Base:
     return max(bases, key=lambda base: float(base.fit.mean()))
 
 
-def _covering(points: Matrix, most: int) -> tuple[Matrix, float]:
+def covering(points: Matrix, most: int) -> tuple[Matrix, float]:
     """Return at most so many of the points (rows, n), and how far any is from the nearest of them.
 
     Each is the one farthest from those before (Gonzalez 1985), so that no part is left out for being rare.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -10,7 +11,6 @@ from softneck.core import KINDS, SoftneckError, Vector, resolve
 from softneck.signals import Recording
 
 from ..models._model import Model
-from ..structured._greybox import GreyBox
 from ._left_out import left_out, left_out_error
 
 # What a base may be where none is named: equations where they fit, else a line.
@@ -46,17 +46,17 @@ class Base:
         )
 
 
-def fitted_base(kind: str, recording: Recording) -> Base:
-    """Return a base of that kind.
+def fitted_base(kind: str, recording: Recording, settings: Any = None) -> Base:
+    """Return a base of that kind, with the kind's defaults where no settings are given.
 
     Raises:
         DataError: what the kind raises.
     """
-    settings = resolve(KINDS[kind].settings)()
+    settings = resolve(KINDS[kind].settings)() if settings is None else settings
     model = settings.fit(recording)
     parts = left_out(recording, _PARTS)
     # Its dead time is a property of the sensor: known once, it need not be searched for again.
-    again = GreyBox(sensor_delay=int(model.findings["sensor_delay"])) if kind == "greybox" else settings
+    again = replace(settings, sensor_delay=int(model.findings["sensor_delay"])) if kind == "greybox" else settings
     error = left_out_error(again.fit, [parts[i] for i in _JUDGED])
     spread = np.nanstd(recording.outputs, axis=0)
     return Base(model, error, 100.0 * (1.0 - error / spread))

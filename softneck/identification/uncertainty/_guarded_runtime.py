@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from softneck.identification.uncertainty._composed_runtime import ComposedArrays, composed_median
+from softneck.identification.uncertainty._composed_runtime import ComposedArrays, composed_median, composed_validity
 from softneck.runtime._layout import StateVector, array, cells, rest
 from softneck.runtime._members_runtime import member_count, member_initialise, member_size, member_step
 from softneck.runtime._random_runtime import random_normal, random_seed
@@ -35,6 +35,7 @@ class GuardedState(StateVector):
     weight = cells("", "w of the members now")
     spread = cells("outputs", "s: mean distance of the members from their median [rad]")
     distance = cells("", "d: how far the base's motors are from what was seen [rad]")
+    slow = cells("motors", "where the motors have been held [rad]")
     members = rest("states of the base and the members")
 
 
@@ -49,7 +50,7 @@ def state_size(p: GuardedArrays) -> int:
 def initialise(p: GuardedArrays, parameters: np.ndarray, x: GuardedState, outputs: np.ndarray) -> None:
     """Rest: as base and members rest, where they agree."""
     bounds = p.outputs + p.motors
-    own = np.zeros(bounds + 2 * p.outputs)
+    own = np.zeros(bounds + 2 * p.outputs + 1)
     at = 0
     members = x.members
     x.weight = 1.0
@@ -63,6 +64,7 @@ def initialise(p: GuardedArrays, parameters: np.ndarray, x: GuardedState, output
         at += size
     for i in range(bounds):
         outputs[i] = own[i]
+    outputs[bounds] = composed_validity(p, own[p.outputs : bounds], x.slow, x.spread)
 
 
 def guarded_distance(seen: np.ndarray, reach: float, motors: np.ndarray) -> float:
@@ -98,7 +100,7 @@ def step(p: GuardedArrays, parameters: np.ndarray, x: GuardedState, inputs: np.n
     count = member_count() - 1
     bounds = p.outputs + p.motors
     angles = np.empty((p.outputs, count))
-    own = np.zeros(bounds + 2 * p.outputs)
+    own = np.zeros(bounds + 2 * p.outputs + 1)
     at = 0
     members = x.members
     for i in range(count + 1):
@@ -127,3 +129,4 @@ def step(p: GuardedArrays, parameters: np.ndarray, x: GuardedState, inputs: np.n
         outputs[axis] = (1.0 - x.weight) * outputs[axis] + x.weight * agreed[axis]
         if parameters[p.outputs + 1] > 0.0:
             outputs[axis] += parameters[p.outputs + 1] * random_normal(x.random)
+    outputs[bounds] = composed_validity(p, outputs[p.outputs : bounds], x.slow, x.spread)

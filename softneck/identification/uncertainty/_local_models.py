@@ -84,8 +84,9 @@ class Window:
 
 
 def tilt(outputs: Matrix) -> tuple[Vector, Vector]:
-    """Return inclination and direction (time,) [rad] of pitch and roll (time, 2)."""
-    p, r = np.tan(outputs[:, 0]), np.tan(outputs[:, 1])
+    """Return inclination and direction (time,) [rad] of pitch and roll (time, 2), or of one angle (time, 1)."""
+    p = np.tan(outputs[:, 0])
+    r = np.tan(outputs[:, 1]) if outputs.shape[1] > 1 else np.zeros_like(p)
     return np.arctan(np.hypot(p, r)), np.arctan2(p, -r)
 
 

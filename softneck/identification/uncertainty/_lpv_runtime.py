@@ -1,4 +1,4 @@
-"""Two lags whose gain and pole follow the inclination that they themselves make, linear between knots."""
+"""Lags of one or two angles whose gain and pole follow the inclination that they make, linear between knots."""
 
 import math
 
@@ -28,28 +28,25 @@ def lpv_simulate(
     warm_up: int,
     outputs: np.ndarray,
 ) -> None:
-    """Fill `outputs` (time, 2) in free run; the first `warm_up` rows start from `measured` (time, 2).
+    """Fill `outputs` (time, n) in free run; the first `warm_up` rows start from `measured` (time, n).
 
-    `gains` and `poles` are (2, m), `delays` (2,) in samples, `inputs` (time, 2) theta_i and phi_i.
+    `gains` and `poles` are (n, m), `delays` (n,) in samples, `inputs` (time, n) theta_i and phi_i.
     """
-    pitch, roll = measured[0, 0], measured[0, 1]
-    if not np.isfinite(pitch):  # unknown: upright
-        pitch = 0.0
-    if not np.isfinite(roll):
-        roll = 0.0
+    n = outputs.shape[1]
+    angles = np.zeros(2)  # a robot of one angle has no roll
+    for axis in range(n):
+        if np.isfinite(measured[0, axis]):  # unknown: upright
+            angles[axis] = measured[0, axis]
     for k in range(outputs.shape[0]):
-        outputs[k, 0] = pitch
-        outputs[k, 1] = roll
-        if k < warm_up and np.isfinite(measured[k, 0]):
-            pitch = measured[k, 0]
-        if k < warm_up and np.isfinite(measured[k, 1]):
-            roll = measured[k, 1]
+        for axis in range(n):
+            outputs[k, axis] = angles[axis]
+            if k < warm_up and np.isfinite(measured[k, axis]):
+                angles[axis] = measured[k, axis]
         # Pitch and roll are atan2(n1, n3) and atan2(n2, n3) of the normal n: the squares of their tangents add up.
-        tilt = math.atan(math.hypot(math.tan(pitch), math.tan(roll)))
-        a0 = math.exp(-lpv_value(knots, poles[0], tilt) * sample_time)
-        a1 = math.exp(-lpv_value(knots, poles[1], tilt) * sample_time)
-        u0 = inputs[max(k - int(delays[0]), 0), 0]
-        u1 = inputs[max(k - int(delays[1]), 0), 1]
-        # Below pi/2, where the tangent ends, whatever a trial of gains and poles does.
-        pitch = min(max(a0 * pitch + (1.0 - a0) * lpv_value(knots, gains[0], tilt) * u0, -1.5), 1.5)
-        roll = min(max(a1 * roll + (1.0 - a1) * lpv_value(knots, gains[1], tilt) * u1, -1.5), 1.5)
+        tilt = math.atan(math.hypot(math.tan(angles[0]), math.tan(angles[1])))
+        for axis in range(n):
+            a = math.exp(-lpv_value(knots, poles[axis], tilt) * sample_time)
+            u = inputs[max(k - int(delays[axis]), 0), axis]
+            # Below pi/2, where the tangent ends, whatever a trial of gains and poles does.
+            ahead = a * angles[axis] + (1.0 - a) * lpv_value(knots, gains[axis], tilt) * u
+            angles[axis] = min(max(ahead, -1.5), 1.5)

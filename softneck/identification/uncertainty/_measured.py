@@ -52,6 +52,10 @@ class AxisMeasured:
         """Least and largest frequency that the data support [rad/s]."""
         return float(self.frequency[0]), float(self.frequency[-1])
 
+    def weight_at(self, frequency: Vector) -> Vector:
+        """Return the weight at frequencies of the band [rad/s]."""
+        return np.interp(np.log(frequency), np.log(self.frequency), self.weight)
+
     def arrays(self) -> dict[str, np.ndarray]:
         """Return what a file keeps."""
         model = {"a": self.model.a, "b": self.model.b, "delay": np.array([self.model.delay])}
@@ -118,7 +122,7 @@ def axis_runs(
 def axis_points(
     responses: Sequence[FrequencyResponse | None], axis: int, directions: Directions, confidence: float
 ) -> Matrix:
-    """Return the points (p, 5) that the responses of one axis have between the ends of what each supports."""
+    """Return the supported points (p, 5) of the responses of one axis, between the ends of what each supports."""
     rows = []
     for number, found in enumerate(responses):
         seen = None if found is None else _own_response(found, axis, directions, confidence)
@@ -131,10 +135,21 @@ def axis_points(
         pairs = np.flatnonzero(good[1:] & good[:-1])
         if pairs.size:
             part = slice(pairs[0], pairs[-1] + 2)
-            known = np.isfinite(G[part]) & np.isfinite(radius[part])
             table = np.column_stack([np.full(G.size, float(number)), found.frequency, G.real, G.imag, radius])
-            rows.append(table[part][known])
+            # A wider circle between them says nothing of the plant; the whole record is judged in time besides.
+            rows.append(table[part][good[part]])
     return np.concatenate(rows) if rows else np.zeros((0, 5))
+
+
+def unheard(points: Matrix, runs: Sequence[Sequence[tuple[Vector, Vector]]], names: Sequence[str]) -> list[str]:
+    """Return the names of recordings that move an axis and show no response of it: no weight can speak for them.
+
+    Friction, or tendons that a payload has made slack, hide what a loop that pulls them taut then meets.
+    """
+    heard = set(points[:, 0].astype(int).tolist())
+    # Rounding moves nothing.
+    moved = [any(np.ptp(u) > 1e-6 for u, _ in parts) for parts in runs]
+    return [name for number, name in enumerate(names) if moved[number] and number not in heard]
 
 
 def _own_response(

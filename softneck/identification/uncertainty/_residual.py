@@ -26,6 +26,7 @@ from ..models._model import WARM_UP, Model
 from ..models._ports import trained_set_points
 from ..models._regressors import lag_table
 from ..models._scores import nrmse_fit
+from ..models._validity import grounded
 from ..set_membership._regressor import gammas, residual_lags, residual_rows, scaled, set_arrays, widened, widening
 from ..set_membership._set_membership import noise_levels, usual_finding, usual_widths
 from ._ensemble import seeded
@@ -99,7 +100,7 @@ class Residual:
             **{key: value for key, value in base.findings.items() if key in _TAKEN},
             **trained_set_points(recording, base.findings),
         }
-        return Model(
+        model = Model(
             kind="residual",
             sample_time=recording.sample_time,
             arrays=arrays,
@@ -108,6 +109,7 @@ class Residual:
             training_rows=np.unique(np.concatenate([base.training_rows, row_hashes(recording)])),
             robot=robot,
         )
+        return grounded(model, recording)
 
     def _narrowest(self, base: Model, recording: Recording, noise: Vector) -> Vector:
         """Return the epsilon (outputs,) of the narrowest bounds over the last fifth of each run, among equal fits."""

@@ -9,15 +9,16 @@ import math
 import numpy as np
 
 from softneck.identification.models._histories_runtime import narx_push
+from softneck.identification.models._validity_runtime import GroundArrays
 from softneck.identification.set_membership._principal_tree_runtime import slant_bounds
-from softneck.identification.uncertainty._composed_runtime import composed_motors, composed_outputs
+from softneck.identification.uncertainty._composed_runtime import composed_motors, composed_outputs, composed_validity
 from softneck.runtime._compiled_runtime import COMPILED
-from softneck.runtime._layout import Arrays, StateVector, array, cells, rest, value
+from softneck.runtime._layout import StateVector, array, cells, rest, value
 from softneck.runtime._members_runtime import member_initialise, member_size, member_step
 from softneck.runtime._random_runtime import random_normal, random_seed
 
 
-class ResidualArrays(Arrays):
+class ResidualArrays(GroundArrays):
     """The set; the arrays of the base follow."""
 
     history = array("sizes", "H: how many samples of each signal are kept; and outputs and motors, if not a neck's")
@@ -43,6 +44,7 @@ class ResidualState(StateVector):
     angles = cells("outputs", "outputs of the base of now [rad]")
     added = cells("outputs", "what the set adds now [rad]")
     random = cells("6", "generator of the output noise")
+    slow = cells("motors", "where the motors have been held [rad]")
     base = rest("state of the base")
 
 
@@ -54,7 +56,7 @@ def state_size(p: ResidualArrays) -> int:
 def initialise(p: ResidualArrays, parameters: np.ndarray, x: ResidualState, outputs: np.ndarray) -> None:
     """Rest: as the base rests, its outputs at their start values for ever."""
     bounds = p.outputs + p.motors
-    base = np.zeros(bounds + 2 * p.outputs)
+    base = np.zeros(bounds + 2 * p.outputs + 1)
     x[:] = 0.0
     member_initialise(p, 0, parameters, x.base, base)
     # The histories hold the base's outputs, not what the set adds.
@@ -67,6 +69,7 @@ def initialise(p: ResidualArrays, parameters: np.ndarray, x: ResidualState, outp
         x.angles[axis] = base[axis]
         outputs[bounds + 2 * axis] = base[axis]
         outputs[bounds + 2 * axis + 1] = base[axis]
+    outputs[bounds + 2 * p.outputs] = composed_validity(p, base[p.outputs : bounds], x.slow, np.zeros(p.outputs))
 
 
 def residual_query(p: ResidualArrays, axis: int, regressor: np.ndarray) -> tuple[float, float]:
@@ -118,7 +121,7 @@ def step(p: ResidualArrays, parameters: np.ndarray, x: ResidualState, inputs: np
     # Behind the starts of the outputs stands `use_measurement`.
     residual_observe(p, x, given, float(parameters[p.outputs]) > 0.5)
     bounds = p.outputs + p.motors
-    base = np.zeros(bounds + 2 * p.outputs)
+    base = np.zeros(bounds + 2 * p.outputs + 1)
     member_step(p, 0, quiet, x.base, given, base)
     for axis in range(p.outputs):
         x.angles[axis] = base[axis]
@@ -127,6 +130,7 @@ def step(p: ResidualArrays, parameters: np.ndarray, x: ResidualState, inputs: np
         outputs[p.outputs + j] = base[p.outputs + j]
     # From histories that end at t_k: y(k+1) of the base, which is known by now, is not among them.
     regressor = np.empty(p.n)
+    half = np.empty(p.outputs)
     residual_regressor(p, x, regressor)
     for axis in range(p.outputs):
         low, high = residual_query(p, axis, regressor)
@@ -134,6 +138,8 @@ def step(p: ResidualArrays, parameters: np.ndarray, x: ResidualState, inputs: np
         outputs[axis] = base[axis] + 0.5 * (low + high)
         outputs[bounds + 2 * axis] = base[axis] + low
         outputs[bounds + 2 * axis + 1] = base[axis] + high
+        half[axis] = 0.5 * (high - low)
+    outputs[bounds + 2 * p.outputs] = composed_validity(p, base[p.outputs : bounds], x.slow, half)
     if parameters[p.outputs + 1] > 0.0:
         for axis in range(p.outputs):
             outputs[axis] += parameters[p.outputs + 1] * random_normal(x.random)

@@ -3,8 +3,9 @@
 Calibrated bounds take the errors of whole stretches as exchangeable, never rows: a free run that is wrong is wrong for
 long. The half-width for the largest error of a further record is an order statistic of the records' largest errors
 (Stankeviciute et al. 2021); that for one of its samples weighs each record alike, and a further one as infinite (Lee,
-Barber and Willett 2023). At 90 % either needs nine records. On motions unlike these the coverage is what it turns out
-to be: no guarantee (Barber et al. 2023).
+Barber and Willett 2023). At 90 % either needs nine records. They are exchangeable with records of the same kind alone:
+beyond the set-points of these there is no bound, and on motions unlike these the coverage is what it turns out to be:
+no guarantee (Barber et al. 2023).
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ LEVEL = 0.9
 LEAST_RECORDS = 9
 # Wider than this part of what was measured a bound says nothing that the range of the data does not.
 _USEFUL = 0.5
+# Of the range of the set-points: what is no further beyond it is not another motion.
+_SLACK = 0.01
 # What set membership promises is all of it; this much less is rounding and outliers [%].
 _PROMISED = 99.0
 
@@ -78,24 +81,36 @@ def calibrated_bounds(rows: Rows, errors: Matrix) -> dict[str, Any]:
         errors: (time, outputs) measured less free run; NaN where not judged.
 
     Returns:
-        Level, number of records, and for each of both axis -> half-width and coverage; or the reason why there is none.
+        Level, number of records, the range of their set-points (`domain`, in SI) beyond which there is no bound, and
+        for each of both axis -> half-width, what it held on records left out within the domain of the others, and how
+        much of them lay beyond that (`outside_pct`); or the reason why there is none.
     """
-    records = [errors[rows.stretch == number] for number in range(int(rows.stretch[-1]) + 1)]
-    records = [record for record in records if np.isfinite(record).all(axis=1).any()]
+    numbers = [number for number in range(int(rows.stretch[-1]) + 1)
+               if np.isfinite(errors[rows.stretch == number]).all(axis=1).any()]  # fmt: skip
+    records = [errors[rows.stretch == number] for number in numbers]
+    motors = [rows.set_points[rows.stretch == number] for number in numbers]
     found: dict[str, Any] = {"level_pct": 100.0 * LEVEL, "records": len(records), "reason": None}
     if len(records) < LEAST_RECORDS:
         reason = f"{len(records)} record(s): bounds at {100 * LEVEL:g} % need {LEAST_RECORDS} that are exchangeable"
         return {**found, "reason": reason}
+    found["domain"] = dict(zip(("min", "max"), (end.tolist() for end in _range_of(motors)), strict=True))
+    inside = [_within(own, [*motors[:number], *motors[number + 1 :]]) for number, own in enumerate(motors)]
     reasons = []
     for what, half_width in (("pointwise", _pointwise), ("path", _path)):
         found[what] = {}
         for i, name in enumerate(rows.names):
-            parts = [np.abs(record[np.isfinite(record[:, i]), i]) for record in records]
+            there = [np.isfinite(record[:, i]) for record in records]
+            parts = [np.abs(record[seen, i]) for record, seen in zip(records, there, strict=True)]
             half = half_width(parts)
             if 2.0 * half > _USEFUL * float(_range(rows)[i]):
                 reasons.append(f"no useful {what} bound in {name}: wider than half of what was measured")
                 continue
-            found[what][name] = {"half_width": rows.shown(half), "coverage_pct": _left_out(parts, half_width, what)}
+            known = [near[seen] for near, seen in zip(inside, there, strict=True)]
+            found[what][name] = {
+                "half_width": rows.shown(half),
+                "coverage_pct": _left_out(parts, known, half_width, what),
+                "outside_pct": 100.0 * float(np.mean(~np.concatenate(known))),
+            }
     return {**found, "reason": "; ".join(reasons) or None}
 
 
@@ -115,15 +130,31 @@ def _pointwise(parts: Sequence[Vector]) -> float:
     return float(values[order][reached[0]]) if reached.size else float("inf")
 
 
-def _left_out(parts: Sequence[Vector], half_width: Any, what: str) -> float | None:
-    """Return what share [%] of each record, or of records as a whole, the bound of all the others holds."""
+def _left_out(parts: Sequence[Vector], known: Sequence[np.ndarray], half_width: Any, what: str) -> float | None:
+    """Return what share [%] of each record, or of records as a whole, the bound of all the others holds.
+
+    Only where there is one: `known` says which samples lie within their domain; a whole path takes all of them.
+    """
     if len(parts) <= LEAST_RECORDS:
         return None
     held = []
-    for number, part in enumerate(parts):
+    for number, (part, near) in enumerate(zip(parts, known, strict=True)):
         inside = part <= half_width([*parts[:number], *parts[number + 1 :]])
-        held.append(inside.all() if what == "path" else inside.mean())
-    return 100.0 * float(np.mean(held))
+        if near.all() if what == "path" else near.any():
+            held.append(inside[near].mean() if what == "pointwise" else inside.all())
+    return 100.0 * float(np.mean(held)) if held else None
+
+
+def _range_of(motors: Sequence[Matrix]) -> tuple[Vector, Vector]:
+    """Return the least and the largest set-point of each motor (motors,) over records (time, motors)."""
+    return np.min([own.min(axis=0) for own in motors], axis=0), np.max([own.max(axis=0) for own in motors], axis=0)
+
+
+def _within(own: Matrix, others: Sequence[Matrix]) -> np.ndarray:
+    """Return (time,) whether all set-points of a record lie within those of the others, but for a hundredth."""
+    low, high = _range_of(others)
+    slack = _SLACK * (high - low)
+    return np.asarray(((own >= low - slack) & (own <= high + slack)).all(axis=1))
 
 
 def _range(rows: Rows) -> Vector:

@@ -62,7 +62,7 @@ def compare(
     Args:
         models: by name; without names they are called by their kind.
         recordings: by name; without names "data 1", "data 2", ...
-        rules: horizons, motors, include_training (see `validate`).
+        rules: horizons, motors, include_training, tolerance (see `validate`).
         training: what the models were trained on, for `Validation.novelty`.
         progress: called with the part done and a word on it.
 

@@ -11,7 +11,7 @@ from softneck.core import Matrix, Vector
 from softneck.robot import Robot
 
 from ..models._model import Model
-from ..models._ports import trained_range
+from ..models._ports import BOUNDED, trained_range
 from ..models._scores import nrmse_fit, r_squared, rmse, worst_error
 from ..set_membership._set_membership import knows_what_it_saw, outside_seen
 from ._bootstrap import fit_intervals
@@ -173,17 +173,17 @@ def interval_tables(
     return result
 
 
-def free_run_bounds(free: Matrix, robot: Robot) -> tuple[Matrix, Matrix]:
+def free_run_bounds(kind: str, free: Matrix, robot: Robot) -> tuple[Matrix, Matrix]:
     """Return the lower and upper bounds (time, outputs) among a model's outputs; NaN where its kind has none.
 
     Bounds of set membership follow the outputs and motors, lower and upper of one output after the other.
     """
     outputs = len(robot.outputs.names)
-    first = outputs + len(robot.motors.names)
-    if free.shape[1] <= first:
+    if kind not in BOUNDED or free.shape[1] == outputs:  # that many where there is no free run
         nothing = np.full((len(free), outputs), np.nan)
         return nothing, nothing
-    return free[:, first::2], free[:, first + 1 :: 2]
+    bounds = free[:, outputs + len(robot.motors.names) :][:, : 2 * outputs]
+    return bounds[:, ::2], bounds[:, 1::2]
 
 
 def coverage_tables(
@@ -206,7 +206,7 @@ def outside_table(model: Model, rows: Rows, free: Matrix) -> dict[str, float] | 
 
     Set membership says so by its bounds; of any other kind those count whose set-points were not trained on.
     """
-    lower, upper = free_run_bounds(free, model.robot)
+    lower, upper = free_run_bounds(model.kind, free, model.robot)
     there = np.isfinite(rows.measured)
     if knows_what_it_saw(model) and (there & np.isfinite(lower) & np.isfinite(upper)).any():
         there &= np.isfinite(lower) & np.isfinite(upper)

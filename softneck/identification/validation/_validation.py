@@ -13,6 +13,7 @@ from softneck.robot import Robot
 from softneck.signals import Recording
 
 from ..models._model import WARM_UP, Model
+from ..models._validity import with_tolerance
 from ._baselines import Baselines, baselines
 from ._bounds import calibrated_bounds, judged_bounds, useful_parts
 from ._horizons import predict
@@ -30,6 +31,7 @@ from ._score_tables import (
     spread_tables,
 )
 from ._scored_rows import Rows, ScoredStretch, pooled, unseen_stretches
+from ._validity import judged_validity
 
 _HORIZONS = (1, 5, 25, INFINITE)
 # Kinds whose bounds are guaranteed under an assumption; an ensemble's are its members' least and largest.
@@ -71,6 +73,8 @@ class Validation:
         outside_pct: axis -> measured samples [%] outside what the model has seen: of set membership where its bounds
             are wider than training's usually are (see `outside_seen`), of other kinds where a set-point lies beyond
             those that it was trained on; None where the model does not know.
+        validity: least and mean of the model's own in free run, and how well it foretold errors within its tolerance
+            (see `judged_validity`); None where the model has none.
         time, run: (time,) [s] and the number of the stretch, for plots: no line joins two of them.
         measured, free_run, one_step: (time, 2) [rad], NaN where nothing is scored.
         lower, upper: (time, 2) [rad] bounds of the free run, NaN where none is narrower than the data.
@@ -102,6 +106,7 @@ class Validation:
     bounds_remarks: tuple[str, ...]
     calibrated_bounds: dict[str, Any]
     outside_pct: dict[str, float] | None
+    validity: dict[str, Any] | None
     time: Vector
     run: np.ndarray
     measured: Matrix
@@ -162,6 +167,7 @@ class Validation:
             "bounds_remarks": list(self.bounds_remarks),
             "calibrated_bounds": self.calibrated_bounds,
             "outside_pct": self.outside_pct,
+            "validity": self.validity,
             "per_run": self.per_run,
         }
 
@@ -178,6 +184,7 @@ class Rules:
     motors: str = "simulated"
     include_training: bool = False
     initial: str = "warm"
+    tolerance: float | None = None
 
     def __post_init__(self) -> None:
         require_one_of("motors", self.motors, ("simulated", "measured"))
@@ -196,6 +203,7 @@ def validate(
     motors: str = "simulated",
     include_training: bool = False,
     initial: str = "warm",
+    tolerance: float | None = None,
     training: Recording | None = None,
 ) -> Validation:
     """Judge a model on the rows of a recording that it was not trained on.
@@ -212,13 +220,14 @@ def validate(
         motors: "simulated" or "measured".
         include_training: whether rows that the model was trained on are judged too.
         initial: "warm", or "cold": then the free run itself has the first row only.
+        tolerance: error that `validity` is to allow, in the unit in which people see the outputs; None: the model's.
         training: what the model was trained on, for `novelty`.
 
     Raises:
         DataError: nothing is left to judge, another sample time, no motor positions to measure, or a horizon longer
             than every stretch.
     """
-    rules = Rules(tuple(horizons), motors, include_training, initial)
+    rules = Rules(tuple(horizons), motors, include_training, initial, tolerance)
     check_training_data(model, training)
     parts = judged_parts(model, recording, rules)
     return judge(model, parts, rules, names=names, training=training)
@@ -273,6 +282,8 @@ def judge(
     model: Model, parts: Parts, rules: Rules, *, names: tuple[str, str], training: Recording | None = None
 ) -> Validation:
     """Return the validation of a model on its parts of a recording."""
+    if rules.tolerance is not None:
+        model = with_tolerance(model, rules.tolerance)
     rows, horizons = parts.rows, [str(h) for h in rules.horizons]
     axes = len(rows.names)
     outputs = _predictions(model, parts, rules)
@@ -285,7 +296,7 @@ def judge(
     scores = score_tables(rows, rows.time, measured, predicted, lost=first is not None)
     tests = residual_tests(rows.measured - outputs["1"][:, :axes], rows.set_points, rows.stretch)
     free = outputs.get(INFINITE, np.full((rows.time.size, axes), np.nan))
-    lower, upper = free_run_bounds(free, rows.robot)
+    lower, upper = free_run_bounds(model.kind, free, rows.robot)
     coverage, width = coverage_tables(rows, rows.measured, lower, upper)
     useful_width, said = judged_bounds(rows, coverage, width, promised=model.kind in _PROMISING)
     if first is None and INFINITE in outputs:
@@ -316,6 +327,7 @@ def judge(
         bounds_remarks=tuple(said),
         calibrated_bounds=calibrated,
         outside_pct=outside_table(model, rows, free),
+        validity=judged_validity(model, rows, free),
         time=rows.time,
         run=rows.stretch,
         measured=rows.measured,

@@ -70,7 +70,9 @@ class Changes:
     def __str__(self) -> str:
         said = {"ramped": self.ramp, "clipped in position": self.position, "clipped in slack": self.slack,
                 "limited in speed": self.speed}  # fmt: skip
-        return ", ".join(f"{100 * share:.2g} % {what}" for what, share in said.items() if share > 0) or "unchanged"
+        # Two digits, and a hundred as one.
+        parts = [f"{float(f'{100 * share:.2g}'):g} % {what}" for what, share in said.items() if share > 0]
+        return ", ".join(parts) or "unchanged"
 
 
 def prepare(

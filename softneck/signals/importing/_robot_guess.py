@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from softneck.core import DataError, to_si
+from softneck.core import DataError, SettingsError, to_si
 from softneck.robot import Robot
 
 from ._column_titles import read_title
@@ -66,10 +66,17 @@ def guess_robot(path: str | Path) -> RobotGuess:
         "outputs": {"names": _names(outputs), "unit": units[1]},
         "directions": {"kind": "identified"},
     }
-    robot = Robot.from_dict(content)
+    try:
+        robot = Robot.from_dict(content)
+    except SettingsError as error:
+        raise DataError(
+            f"{path}: {str(error).removesuffix('.')}. Leave out columns by a layout of your own."
+        ) from error
     layout = _layout(table, robot, motors, outputs, (time, run))
+    unknown = [f"{title}: its unit is unknown here and taken as 1" for title in rest if _unknown_unit(title)]
     lines = (
         *table.lines,
+        *unknown,
         f"motors [{units[0]}]: {', '.join(motors)}: because of words in their titles",
         f"outputs [{units[1]}]: {', '.join(outputs)}: because they move and are nothing else",
         "directions: to be identified; write tendon angles or a matrix into the robot file if you know them",
@@ -147,6 +154,14 @@ def _common_unit(path: str | Path, table: SniffResult, titles: Sequence[str]) ->
             "leave out columns by a layout of your own."
         )
     return named[0]
+
+
+def _unknown_unit(title: str) -> bool:
+    match = _UNIT.search(title)
+    try:
+        return match is not None and not to_si(match[1])
+    except DataError:
+        return True
 
 
 def _unit_of(table: SniffResult, title: str) -> str | None:

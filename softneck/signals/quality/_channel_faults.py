@@ -11,10 +11,10 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from softneck.core import Vector, to_si
+from softneck.robot import Robot
 
 from ..recording._channels import file_unit
 from ..recording._recording import Recording
-from ..recording._redefinition import redefine
 
 # "Frozen" is what a deployment takes for it as well: 20 identical samples (hardware facts, table of faults).
 FROZEN_SAMPLES = 20
@@ -36,8 +36,6 @@ _SPIKE_FLOOR = 0.02
 _MAD_TO_STD = 1.4826
 # Fourth differences of white noise: variance 1 + 16 + 36 + 16 + 1.
 _FOURTH = 70.0
-# Channels that have mass and cannot peak for one sample; a rate, a tension or a velocity can.
-_SMOOTH = re.compile(r"(pitch|roll)(_measured)?$|motor_position_\d$")
 # These say what was asked for; a held or a repeated value is no fault of a sensor.
 _COMMANDS = re.compile(r"motor_setpoint_|.*_reference$|payload|push_|base_tilt_|healthy|enabled|measurement_valid")
 
@@ -67,6 +65,7 @@ class ChannelQuality:
 
     Attributes:
         name: of the channel.
+        unit: in files, which is the one for people.
         rows: samples, missed ones included.
         lowest, highest: of the finite samples; NaN where there are none.
         missed: stretches without a sample.
@@ -79,6 +78,7 @@ class ChannelQuality:
     """
 
     name: str
+    unit: str
     rows: int
     lowest: float
     highest: float
@@ -106,15 +106,15 @@ class ChannelQuality:
         return is_command(self.name)
 
     def shown(self, value: float) -> float:
-        """Return an SI value in the channel's unit in files, which is the one for people."""
-        return value / to_si(file_unit(self.name))[0]
+        """Return an SI value in the channel's unit in files."""
+        return value / to_si(self.unit)[0]
 
     def as_dict(self) -> dict[str, Any]:
         """Return what JSON holds, in the unit of files; at most 20 stretches of each sort."""
         quantum = None if self.quantum is None else self.shown(self.quantum)
         faults = {"missed": self.missed, "frozen": self.frozen, "clipped": self.clipped, "outliers": self.outliers}
         return {
-            "unit": file_unit(self.name),
+            "unit": self.unit,
             "lowest": self.shown(self.lowest),
             "highest": self.shown(self.highest),
             "quantum": quantum,
@@ -128,12 +128,12 @@ class ChannelQuality:
 
 def check_channel(recording: Recording, name: str) -> ChannelQuality:
     """Return what is wrong with channel `name`; never across the border of two runs."""
-    y, run = recording.channels[name], recording.run
+    y, run, unit = recording.channels[name], recording.run, file_unit(name, recording.robot)
     good = np.isfinite(y)
     missed = _where(~good, recording)
     if not good.any():
         nan = float("nan")
-        return ChannelQuality(name, y.size, nan, nan, missed, (), (), (), None, 0.0, nan)
+        return ChannelQuality(name, unit, y.size, nan, nan, missed, (), (), (), None, 0.0, nan)
     equal = np.concatenate([[False], (y[1:] == y[:-1]) & (run[1:] == run[:-1])])
     repeats = float(equal[good].mean())
     quantum, (noise, noisy) = _quantum(y[good]), _noise(y, run)
@@ -150,8 +150,8 @@ def check_channel(recording: Recording, name: str) -> ChannelQuality:
         outside = equal & (y != y[good].max()) & (y != y[good].min())
         for start, stop in long:
             outside[start:stop] = False
-        # An inclinometer is never still; a drive, a tension or a length may be.
-        noisy = noisy and noise > 2.0 * (quantum or 0.0) and name.startswith(("pitch", "roll"))
+        # What measures an output is never still; a drive, a tension or a length may be.
+        noisy = noisy and noise > 2.0 * (quantum or 0.0) and name.startswith(recording.robot.outputs.names)
         chance = bool(outside.mean() < _RARELY) and noisy
         if name.startswith("tension"):
             flats, long = flats[y[flats[:, 0]] != 0.0], long[y[long[:, 0]] != 0.0]  # a slack tendon rests at zero
@@ -163,12 +163,17 @@ def check_channel(recording: Recording, name: str) -> ChannelQuality:
             if chance or _moved(inputs[flat[0] : flat[1] - _DEAD_SAMPLES], std) > _MOVED
         )
         clipped = _clipped(recording, y, flats, quantum or 0.0, inputs, chance)
-        if _SMOOTH.match(name):
+        if name in _smooth(recording.robot):
             outliers = _outliers(recording, y, quantum or 0.0, 0.0 if np.isnan(noise) else noise)
         edge = {(stretch.start, stretch.stop) for stretch in clipped}
         frozen = tuple(stretch for stretch in frozen if (stretch.start, stretch.stop) not in edge)
     low, high = float(y[good].min()), float(y[good].max())
-    return ChannelQuality(name, y.size, low, high, missed, frozen, clipped, outliers, quantum, repeats, noise)
+    return ChannelQuality(name, unit, y.size, low, high, missed, frozen, clipped, outliers, quantum, repeats, noise)
+
+
+def _smooth(robot: Robot) -> set[str]:
+    """Return the channels that have mass and cannot peak for one sample; a rate, a tension or a velocity can."""
+    return {*robot.motor_positions, *robot.outputs.names, *(f"{name}_measured" for name in robot.outputs.names)}
 
 
 def is_command(name: str) -> bool:
@@ -206,13 +211,12 @@ def _flats(equal: np.ndarray) -> np.ndarray:
 
 
 def _inputs(recording: Recording, name: str) -> np.ndarray:
-    """Return what drives a channel, (time, 1 or 3): its motor, theta_i for pitch, phi_i for roll, else all three."""
-    if name[-1] in "123":
-        return recording.set_points[:, [int(name[-1]) - 1]]
-    inputs = redefine(recording.set_points)
-    if name.startswith("pitch"):
-        return inputs[:, :1]
-    return inputs[:, 1:2] if name.startswith("roll") else inputs
+    """Return what drives a channel, (time, 1 or more): its motor, its output's direction, else all of them."""
+    if motor := re.fullmatch(r"(motor_\w+|tension)_(\d)", name):
+        return recording.set_points[:, [int(motor[2]) - 1]]
+    weights, outputs = recording.robot.weights(), recording.robot.outputs.names
+    of = next((i for i, output in enumerate(outputs) if name.startswith(output)), None)
+    return recording.set_points if weights is None or of is None else recording.set_points @ weights[[of]].T
 
 
 def _moved(part: np.ndarray, std: Vector) -> float:

@@ -1,4 +1,7 @@
-"""What the inputs tell: spectrum against the bandwidth, condition of Eq. 21's regressor, correlation, repeats."""
+"""What the inputs tell: spectrum against the bandwidth, condition of Eq. 21's regressor, correlation, repeats.
+
+Inputs are a neck's theta_i, phi_i and delta_i, and the set-points of another robot's motors.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from softneck.core import Matrix, Vector
 
-from ..recording._channels import MOTORS
 from ..recording._recording import Recording
 from ..recording._redefinition import redefine
 
@@ -20,24 +22,29 @@ BANDWIDTH = 4.0
 INPUTS = ("theta_i", "phi_i", "delta_i")
 # 41 s at 20 ms: lines 0.15 rad/s apart, and several segments to average over in an identification recording.
 _SEGMENT = 2048
+_NECK_STEP = 0.02 * BANDWIDTH
 # -20 dB: where a spectral density is below 1 % of its mean up to the bandwidth, a tenth of the amplitude is left.
 _REAL_POWER = 0.01
-# Two runs repeat each other if their set-points differ by no more than a drive's quantum.
-_SAME_SET_POINT = 2e-4
+# Two runs repeat each other if their set-points differ by no more than a drive's quantum: 2e-4 rad of a neck's 12.
+_SAME_SET_POINT, _SAME_SHARE = 2e-4, 2e-4 / 12.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Spectrum:
-    """Power spectral density of theta_i, phi_i and delta_i (Welch, Hann window, half overlapping, never across runs).
+    """Power spectral density of the inputs (Welch, Hann window, half overlapping, never across runs).
 
     Attributes:
+        inputs: their names, (n,).
+        bandwidth: up to where the outputs follow [rad/s]; NaN where nothing is known of it.
         omega: (frequencies,) [rad/s].
-        density: (frequencies, 3) [rad^2 s/rad].
-        below_bandwidth: (3,) share of the power below 4 rad/s.
-        highest: (3,) highest frequency whose density is at least 1 % of the mean up to 4 rad/s [rad/s].
-        crest: (3,) largest deviation from the mean by standard deviation.
+        density: (frequencies, n) [rad^2 s/rad, or by the unit of the motors].
+        below_bandwidth: (n,) share of the power below the bandwidth.
+        highest: (n,) highest frequency whose density is at least 1 % of the mean up to the bandwidth [rad/s].
+        crest: (n,) largest deviation from the mean by standard deviation.
     """
 
+    inputs: tuple[str, ...]
+    bandwidth: float
     omega: Vector
     density: Matrix
     below_bandwidth: Vector
@@ -52,7 +59,7 @@ class Spectrum:
                 "highest_frequency_rad_s": self.highest[i],
                 "crest_factor": self.crest[i],
             }
-            for i, name in enumerate(INPUTS)
+            for i, name in enumerate(self.inputs)
         }
 
 
@@ -61,7 +68,7 @@ class Conditioning:
     """Condition of one axis's regressor matrix (Eq. 21) with every column at mean 0 and standard deviation 1.
 
     Attributes:
-        axis: pitch or roll.
+        axis: name of the output.
         rows: regressors without a missed sample.
         columns: names of the regressor's columns.
         number: largest by smallest singular value; infinite where a column is constant or depends on others.
@@ -86,24 +93,24 @@ class Repeat:
     Attributes:
         runs: numbers of the two, from 0.
         rows: that both have.
-        rms: of pitch's and roll's difference by sqrt(2) [rad]: what no model can predict.
+        rms: of each output's difference by sqrt(2) [SI]: what no model can predict.
     """
 
     runs: tuple[int, int]
     rows: int
-    rms: tuple[float, float]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return what JSON holds."""
-        pitch, roll = np.degrees(self.rms)
-        return {"runs": self.runs, "rows": self.rows, "rms_deg": {"pitch": pitch, "roll": roll}}
+    rms: tuple[float, ...]
 
 
-def spectrum(recording: Recording) -> Spectrum:
-    """Return the spectrum of the redefined set-points, averaged over runs by their rows."""
-    runs = [redefine(run.set_points) for run in recording.runs()]
-    size = min(_SEGMENT, max(len(u) for u in runs))
-    density, rows = np.zeros((size // 2 + 1, 3)), 0
+def spectrum(recording: Recording, bandwidth: float) -> Spectrum:
+    """Return the spectrum of the inputs, averaged over runs by their rows."""
+    neck = recording.robot.is_neck
+    runs = [redefine(run.set_points) if neck else run.set_points for run in recording.runs()]
+    segment = _SEGMENT
+    if not neck and not np.isnan(bandwidth):
+        # As many lines up to the bandwidth as a neck has.
+        segment = max(16, round(_SEGMENT * _NECK_STEP / (bandwidth * recording.sample_time)))
+    size = min(segment, max(len(u) for u in runs))
+    density, rows = np.zeros((size // 2 + 1, runs[0].shape[1])), 0
     f = np.fft.rfftfreq(size, recording.sample_time)
     for u in runs:
         if len(u) >= 8:
@@ -114,7 +121,8 @@ def spectrum(recording: Recording) -> Spectrum:
     omega = 2.0 * np.pi * f
     density /= 2.0 * np.pi * max(rows, 1)
     pooled = np.concatenate(runs)
-    return Spectrum(omega, density, *_shares(omega, density), _crest(pooled))
+    names = INPUTS if neck else recording.robot.set_points
+    return Spectrum(names, bandwidth, omega, density, *_shares(omega, density, bandwidth), _crest(pooled))
 
 
 def welch(u: Matrix, sample_time: float, length: int, size: int) -> Matrix:
@@ -138,33 +146,37 @@ def welch(u: Matrix, sample_time: float, length: int, size: int) -> Matrix:
     return density
 
 
-def _shares(omega: Vector, density: Matrix) -> tuple[Vector, Vector]:
-    """Return the share of power below the bandwidth and the highest frequency with real power, both (3,)."""
-    low = omega <= BANDWIDTH
+def _shares(omega: Vector, density: Matrix, bandwidth: float) -> tuple[Vector, Vector]:
+    """Return the share of power below the bandwidth and the highest frequency with real power, both (n,)."""
+    inputs = density.shape[1]
+    if np.isnan(bandwidth):
+        return np.full(inputs, np.nan), np.full(inputs, np.nan)
+    low = omega <= bandwidth
     total = density.sum(axis=0)
     # Below, an input is constant and its density what rounding leaves.
     alive = total > 1e-18
-    share = np.divide(density[low].sum(axis=0), total, out=np.full(3, np.nan), where=alive)
+    share = np.divide(density[low].sum(axis=0), total, out=np.full(inputs, np.nan), where=alive)
     real = density >= _REAL_POWER * density[low].mean(axis=0)
-    highest = np.array([omega[np.flatnonzero(real[:, i])[-1]] if alive[i] else 0.0 for i in range(3)])
+    highest = np.array([omega[np.flatnonzero(real[:, i])[-1]] if alive[i] else 0.0 for i in range(inputs)])
     return share, highest
 
 
 def _crest(inputs: Matrix) -> Vector:
     deviation = inputs - inputs.mean(axis=0)
     std = deviation.std(axis=0)
-    return np.divide(np.abs(deviation).max(axis=0), std, out=np.full(3, np.nan), where=std > 1e-9)
+    return np.divide(np.abs(deviation).max(axis=0), std, out=np.full_like(std, np.nan), where=std > 1e-9)
 
 
 def conditioning(recording: Recording, axis: str) -> Conditioning:
     """Return the condition of Eq. 21's regressor for `axis`, row by row within each run.
 
-    The columns are y(k-1), u_j(k-2), u_j(k-3) and M_j(k-3); without logged positions the last three would repeat
+    The columns are y(k-1), u_j(k-2), u_j(k-3) and M_j(k-3); without logged positions the last ones would repeat
     the set-points and are left out.
     """
-    names = ["y(k-1)", *(f"u{j}(k-{lag})" for j in MOTORS for lag in (2, 3))]
+    motors = range(1, len(recording.robot.motors.names) + 1)
+    names = ["y(k-1)", *(f"u{j}(k-{lag})" for j in motors for lag in (2, 3))]
     if recording.has_motor_positions:
-        names += [f"M{j}(k-3)" for j in MOTORS]
+        names += [f"M{j}(k-3)" for j in motors]
     parts = [_regressors(run, axis) for run in recording.runs() if len(run) > 3]
     X = np.concatenate(parts) if parts else np.zeros((0, len(names)))
     X = X[np.isfinite(X).all(axis=1)]
@@ -182,7 +194,7 @@ def conditioning(recording: Recording, axis: str) -> Conditioning:
 def _regressors(run: Recording, axis: str) -> Matrix:
     """Return the rows k = 3 .. end of Eq. 21."""
     y, u = run.channels[axis], run.set_points
-    columns = [y[2:-1], *(u[3 - lag : len(u) - lag, j] for j in range(3) for lag in (2, 3))]
+    columns = [y[2:-1], *(u[3 - lag : len(u) - lag, j] for j in range(u.shape[1]) for lag in (2, 3))]
     if run.has_motor_positions:
         columns += list(run.motor_positions[:-3].T)
     return np.column_stack(columns)
@@ -193,7 +205,7 @@ def _named(names: list[str], chosen: np.ndarray) -> tuple[str, ...]:
 
 
 def correlation(recording: Recording) -> Matrix:
-    """Return the correlation of the three set-points, (3, 3); NaN with a motor that never moves."""
+    """Return the correlation of the set-points, (motors, motors); NaN with a motor that never moves."""
     u = recording.set_points - recording.set_points.mean(axis=0)
     std = u.std(axis=0)
     still = std <= 1e-9
@@ -204,19 +216,20 @@ def correlation(recording: Recording) -> Matrix:
 def repeats(recording: Recording) -> tuple[Repeat, ...]:
     """Return the pairs of runs with the same set-points over at least 1 s and nine tenths of the longer one."""
     runs = recording.runs()
+    robot, span = recording.robot, float(np.ptp(recording.set_points))
+    near = _SAME_SET_POINT if robot.is_neck else _SAME_SHARE * span
     # With more runs than this the pairs would take long, and nobody reads them.
     pairs = itertools.combinations(range(min(len(runs), 100)), 2)
-    found = (_repeat(runs[a], runs[b], (a, b)) for a, b in pairs)
+    found = (_repeat(runs[a], runs[b], (a, b), near) for a, b in pairs)
     return tuple(repeat for repeat in found if repeat is not None)
 
 
-def _repeat(first: Recording, second: Recording, numbers: tuple[int, int]) -> Repeat | None:
+def _repeat(first: Recording, second: Recording, numbers: tuple[int, int], near: float) -> Repeat | None:
     rows = min(len(first), len(second))
     if rows * first.sample_time < 1.0 or rows < 0.9 * max(len(first), len(second)):
         return None
-    if np.abs(first.set_points[:rows] - second.set_points[:rows]).max() > _SAME_SET_POINT:
+    if np.abs(first.set_points[:rows] - second.set_points[:rows]).max() > near:
         return None
     difference = first.outputs[:rows] - second.outputs[:rows]
     square = [np.mean(d[np.isfinite(d)] ** 2) if np.isfinite(d).any() else np.nan for d in difference.T]
-    pitch, roll = np.sqrt(np.array(square) / 2.0)
-    return Repeat(numbers, rows, (float(pitch), float(roll)))
+    return Repeat(numbers, rows, tuple(np.sqrt(np.array(square) / 2.0).tolist()))

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix
+from softneck.core import Matrix, Vector, to_si
+from softneck.robot import Robot
 
-from ..recording._channels import MOTORS, OUTPUTS, SET_POINTS, file_unit
 from ._channel_faults import ChannelQuality, Stretch, count_rows
-from ._excitation import BANDWIDTH, INPUTS, Conditioning, Repeat, Spectrum
+from ._excitation import BANDWIDTH, Conditioning, Repeat, Spectrum
 from ._region import Region
 
 SEVERITIES = ("ok", "note", "warning")
-# A loop must stop when the inclinometer is silent for longer (hardware facts); a model may lose as many rows.
+# A loop must stop when the inclinometer is silent for longer (hardware facts), half a time constant of the neck; a
+# model may lose as many rows.
 _LONG_GAP, _MANY_MISSED = 0.1, 0.05
 # Below so many levels in the range a step of the sensor is over 1 % of the motion.
 _COARSE = 100.0
@@ -24,8 +26,9 @@ _COARSE = 100.0
 _RELATED, _ALIKE = 0.7, 0.95
 # Eq. 22 gives 450, closed-loop steps 10,000; from a million on, what tells two columns apart is below any encoder.
 _ILL, _SINGULAR = 1e3, 1e6
-# A theta_i or phi_i without power beyond half the bandwidth says nothing of the neck's pole at about 5 1/s.
-_SLOW = 0.5 * BANDWIDTH
+# An input without power beyond half the bandwidth says nothing of the neck's pole at about 5 1/s. It reaches the
+# bandwidth where its power does but for a line of the spectrum, which is 0.15 of the neck's 4 rad/s wide.
+_SLOW, _REACHED = 0.5, 0.95
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,22 +72,24 @@ class Quality:
     """What `assess_quality` found; arrays in SI.
 
     Attributes:
+        robot: whose recording it is.
         rows: of the recording.
         sample_time: [s].
         channels: name -> faults of that channel.
-        spectrum: of theta_i, phi_i, delta_i.
-        conditioning: pitch, roll -> condition of Eq. 21's regressor.
-        region: of (theta_i, phi_i, delta_i) that was visited.
-        correlation: (3, 3) between the motors' set-points.
+        spectrum: of a neck's theta_i, phi_i, delta_i; of another robot's set-points.
+        conditioning: output -> condition of Eq. 21's regressor.
+        region: of (theta_i, phi_i, delta_i) that was visited; None of another robot than the neck.
+        correlation: (motors, motors) between the motors' set-points.
         repeats: pairs of runs with the same set-points.
     """
 
+    robot: Robot
     rows: int
     sample_time: float
     channels: dict[str, ChannelQuality]
     spectrum: Spectrum
     conditioning: dict[str, Conditioning]
-    region: Region
+    region: Region | None
     correlation: Matrix
     repeats: tuple[Repeat, ...]
 
@@ -105,12 +110,12 @@ class Quality:
             "severity": self.severity,
             "findings": [finding.as_dict() for finding in said],
             "channels": {name: channel.as_dict() for name, channel in self.channels.items()},
-            "bandwidth_rad_s": BANDWIDTH,
+            "bandwidth_rad_s": self.spectrum.bandwidth,
             "excitation": self.spectrum.as_dict(),
             "condition": {axis: condition.as_dict() for axis, condition in self.conditioning.items()},
-            "region": self.region.as_dict(),
-            "correlation": {"channels": SET_POINTS, "matrix": self.correlation},
-            "repeats": [repeat.as_dict() for repeat in self.repeats],
+            **({} if self.region is None else {"region": self.region.as_dict()}),
+            "correlation": {"channels": self.robot.set_points, "matrix": self.correlation},
+            "repeats": [self._repeat(repeat) for repeat in self.repeats],
         }
 
     def lines(self) -> tuple[str, ...]:
@@ -121,20 +126,39 @@ class Quality:
         """Return the report as text."""
         return "\n".join(self.lines())
 
+    @property
+    def inputs(self) -> dict[str, tuple[float, float, str]]:
+        """Return the lowest and highest value of each input of the spectrum, and their unit."""
+        if self.region is not None:
+            return {n: (*r, "rad") for n, r in zip(self.spectrum.inputs, self.region.ranges.tolist(), strict=True)}
+        said = {name: self.channels[name] for name in self.spectrum.inputs}
+        return {name: (c.shown(c.lowest), c.shown(c.highest), c.unit) for name, c in said.items()}
+
+    def _repeat(self, repeat: Repeat) -> dict[str, Any]:
+        shown = zip(self.robot.outputs.names, self.shown(repeat.rms), strict=True)
+        return {"runs": repeat.runs, "rows": repeat.rows, f"rms_{self.robot.outputs.display_unit}": dict(shown)}
+
+    def shown(self, values: Sequence[float] | Vector) -> list[float]:
+        """Return values of the outputs in SI in their display unit."""
+        return (np.asarray(values) / to_si(self.robot.outputs.display_unit)[0]).tolist()
+
     def _numbers(self) -> list[str]:
-        low, high = self.region.ranges.T
-        lines = [
-            f"{name}: {low[i]:+.2f} to {high[i]:+.2f} rad, {_percent(self.spectrum.below_bandwidth[i])} of its power "
-            f"below {BANDWIDTH:g} rad/s, real power up to {self.spectrum.highest[i]:.1f} rad/s, "
-            f"crest factor {_number(self.spectrum.crest[i])}"
-            for i, name in enumerate(INPUTS)
-        ]
-        noise = ", ".join(f"{axis} {np.degrees(self.channels[axis].noise):.3f} deg" for axis in OUTPUTS)
+        spectrum, unit = self.spectrum, self.robot.outputs.display_unit
+        lines = []
+        for i, (name, (low, high, of_input)) in enumerate(self.inputs.items()):
+            power = f"{_percent(spectrum.below_bandwidth[i])} of its power below {spectrum.bandwidth:.3g} rad/s, "
+            power += f"real power up to {spectrum.highest[i]:.3g} rad/s, "
+            judged = "" if np.isnan(spectrum.bandwidth) else power
+            crest = _number(spectrum.crest[i])
+            lines.append(f"{name}: {low:+.3g} to {high:+.3g} {of_input}, {judged}crest factor {crest}")
+        measured = [self.channels[name] for name in self.robot.outputs.names]
+        noise = ", ".join(f"{channel.name} {channel.shown(channel.noise):.3g} {unit}" for channel in measured)
         condition = ", ".join(f"{axis} {c.number:.3g}" for axis, c in self.conditioning.items())
-        r = self.correlation
         lines.append(f"noise (standard deviation): {noise}")
         lines.append(f"condition of Eq. 21's regressor, columns at unit variance: {condition}")
-        lines.append(f"correlation of motors 1-2, 1-3, 2-3: {_number(r[0, 1])}, {_number(r[0, 2])}, {_number(r[1, 2])}")
+        if pairs := _pairs(self):
+            which = ", ".join(f"{i + 1}-{j + 1}" for i, j in pairs)
+            lines.append(f"correlation of motors {which}: {', '.join(_number(self.correlation[p]) for p in pairs)}")
         steps = [
             f"{channel.name} {channel.shown(channel.quantum):.3g}"
             for channel in self.channels.values()
@@ -147,11 +171,13 @@ class Quality:
 
 def findings(quality: Quality) -> tuple[Finding, ...]:
     """Return all that there is to say, warnings first; a topic without fault says "ok" once."""
-    said = [finding for channel in quality.channels.values() for finding in _channel(channel, quality.sample_time)]
+    said = [finding for channel in quality.channels.values() for finding in _channel(channel, quality)]
     said += [*_excitation(quality), *_conditioning(quality), *_region(quality), *_correlation(quality)]
     said += _repeats(quality)
     topics = {finding.topic for finding in said if finding.severity != "ok"}
-    said += [Finding("ok", topic, "", text) for topic, text in _CLEAN.items() if topic not in topics]
+    moved = "pitch and roll are excited" if quality.robot.is_neck else "every motor moves"
+    clean = _CLEAN | {"excitation": f"{moved} up to the bandwidth of {quality.spectrum.bandwidth:.3g} rad/s."}
+    said += [Finding("ok", topic, "", text) for topic, text in clean.items() if topic not in topics]
     return tuple(sorted(said, key=lambda finding: -SEVERITIES.index(finding.severity)))
 
 
@@ -159,23 +185,23 @@ _CLEAN = {
     "dropouts": "no sample is missing.",
     "frozen": "no channel stands still while its input moves.",
     "clipping": "no channel has flat tops.",
-    "outliers": "no spikes in angles and motor positions.",
+    "outliers": "no spikes in outputs and motor positions.",
     "quantisation": "every channel has more than 100 levels in its range.",
-    "excitation": f"pitch and roll are excited up to the bandwidth of {BANDWIDTH:g} rad/s.",
     "regressors": "the columns of Eq. 21's regressor can be told apart.",
     "correlation": "the motors move independently enough.",
 }
 
 
-def _channel(channel: ChannelQuality, sample_time: float) -> Iterator[Finding]:
+def _channel(channel: ChannelQuality, quality: Quality) -> Iterator[Finding]:
+    sample_time, outputs = quality.sample_time, quality.robot.outputs.names
     if channel.missed_rows == channel.rows:
         advice = "Take it out of the file, or log it."
-        severity = "warning" if channel.name in OUTPUTS else "note"
+        severity = "warning" if channel.name in outputs else "note"
         yield Finding(severity, "dropouts", channel.name, "has no sample at all.", advice)
         return
     if channel.missed:
-        yield _dropouts(channel, sample_time)
-    if channel.lowest == channel.highest and channel.name in (*SET_POINTS, *OUTPUTS):
+        yield _dropouts(channel, quality)
+    if channel.lowest == channel.highest and channel.name in (*quality.robot.set_points, *outputs):
         message = f"never leaves {_value(channel, channel.lowest)}."
         advice = "Move it: nothing about it can be identified."
         yield Finding("warning", "excitation", channel.name, message, advice)
@@ -192,18 +218,20 @@ def _channel(channel: ChannelQuality, sample_time: float) -> Iterator[Finding]:
         message = f"has spikes of one or two samples, {_places(channel.outliers)}."
         advice = "Leave those samples empty; set membership in particular bends its bounds to them."
         yield Finding("warning", "outliers", channel.name, message, advice, channel.outliers[0].time)
-    yield from _resolution(channel)
+    yield from _resolution(channel, outputs)
 
 
-def _dropouts(channel: ChannelQuality, sample_time: float) -> Finding:
+def _dropouts(channel: ChannelQuality, quality: Quality) -> Finding:
+    gap = _LONG_GAP * BANDWIDTH / quality.spectrum.bandwidth  # of another robot, as long by its time constant
     longest = max(channel.missed, key=lambda stretch: stretch.rows)
-    share, seconds = channel.missed_rows / channel.rows, longest.rows * sample_time
+    share, seconds = channel.missed_rows / channel.rows, longest.rows * quality.sample_time
     message = (
         f"misses {channel.missed_rows} of {channel.rows} samples ({100 * share:.2g} %) in {len(channel.missed)} "
         f"stretch(es); the longest is {seconds:.2f} s at t = {longest.time:.2f} s."
     )
-    if share > _MANY_MISSED or seconds > _LONG_GAP:
-        advice = "Identification leaves these rows out; beyond 0.1 s a control loop would have stopped: check the line."
+    if share > _MANY_MISSED or seconds > gap:
+        stop = "" if np.isnan(gap) else f"; beyond {gap:.2g} s a control loop would have stopped"
+        advice = f"Identification leaves these rows out{stop}: check the line."
         return Finding("warning", "dropouts", channel.name, message, advice, longest.time)
     return Finding("note", "dropouts", channel.name, message, "Identification leaves these rows out.", longest.time)
 
@@ -218,39 +246,45 @@ def _clipping(channel: ChannelQuality) -> Finding:
     return Finding("warning", "clipping", channel.name, message, advice, time)
 
 
-def _resolution(channel: ChannelQuality) -> Iterator[Finding]:
+def _resolution(channel: ChannelQuality, outputs: tuple[str, ...]) -> Iterator[Finding]:
     if channel.levels is not None and channel.levels < _COARSE and channel.quantum is not None:
         message = f"has steps of {_value(channel, channel.quantum)}, only {channel.levels:.0f} in its whole range."
         advice = "Log more digits, or use a finer sensor."
-        yield Finding("warning" if channel.name in OUTPUTS else "note", "quantisation", channel.name, message, advice)
-    if channel.name in OUTPUTS and channel.repeats > 0.3:
+        yield Finding("warning" if channel.name in outputs else "note", "quantisation", channel.name, message, advice)
+    if channel.name in outputs and channel.repeats > 0.3:
         message = f"repeats its last value in {100 * channel.repeats:.0f} % of the samples."
         advice = "Its sensor is slower than the log: log at the sensor's rate."
         yield Finding("note", "quantisation", channel.name, message, advice)
 
 
 def _excitation(quality: Quality) -> Iterator[Finding]:
-    spectrum = quality.spectrum
-    for i, axis in enumerate(OUTPUTS):
-        highest, share = spectrum.highest[i], spectrum.below_bandwidth[i]
-        if highest < BANDWIDTH - 0.2:  # a line of the spectrum is 0.15 rad/s wide
-            message = (
-                f"moves {axis} with real power up to {highest:.1f} rad/s only; the neck's bandwidth is "
-                f"{BANDWIDTH:g} rad/s."
-            )
-            advice = "Add a faster signal (multisine, aprbs, mixed): a model is guesswork beyond."
-            yield Finding("warning" if highest < _SLOW else "note", "excitation", INPUTS[i], message, advice)
-        elif share < 0.5:
-            message = (
-                f"has {100 * (1 - share):.0f} % of its power above {BANDWIDTH:g} rad/s, where the neck hardly moves."
-            )
-            advice = "Move more slowly, or take the chatter out of the loop that made it."
-            yield Finding("note", "excitation", INPUTS[i], message, advice)
-    low, high = quality.region.ranges[2]
-    if not high - low > 0.5:
+    if np.isnan(quality.spectrum.bandwidth):
+        message = "nothing is known of how fast the outputs follow the motors: the spectrum is not judged."
+        yield Finding("note", "excitation", "", message)
+    elif quality.robot.is_neck:  # theta_i moves pitch, phi_i roll
+        for i, axis in enumerate(quality.robot.outputs.names):
+            yield from _power(quality.spectrum, i, f"{axis} ", "neck")
+    else:
+        for i in range(len(quality.spectrum.inputs)):
+            yield from _power(quality.spectrum, i, "", "robot")
+    if quality.region is not None and not np.ptp(quality.region.ranges[2]) > 0.5:
         message = "hardly changes (co-contraction, the mean of the motors): its effect cannot be identified."
         advice = "Play `mixed`, which has co-contraction moves, if stiffness matters."
         yield Finding("note", "co-contraction", "delta_i", message, advice)
+
+
+def _power(spectrum: Spectrum, i: int, moved: str, robot: str) -> Iterator[Finding]:
+    name, limit = spectrum.inputs[i], spectrum.bandwidth
+    highest, share = spectrum.highest[i], spectrum.below_bandwidth[i]
+    if highest < _REACHED * limit:
+        message = f"moves {moved}with real power up to {highest:.2g} rad/s only; the {robot}'s bandwidth is "
+        advice = "Add a faster signal (multisine, aprbs, mixed): a model is guesswork beyond."
+        severity = "warning" if highest < _SLOW * limit else "note"
+        yield Finding(severity, "excitation", name, f"{message}{limit:.3g} rad/s.", advice)
+    elif share < 0.5:
+        above = f"{100 * (1 - share):.0f} % of its power above {limit:.3g} rad/s"
+        advice = "Move more slowly, or take the chatter out of the loop that made it."
+        yield Finding("note", "excitation", name, f"has {above}, where the {robot} hardly moves.", advice)
 
 
 def _conditioning(quality: Quality) -> Iterator[Finding]:
@@ -262,12 +296,16 @@ def _conditioning(quality: Quality) -> Iterator[Finding]:
         message = (
             f"the condition of Eq. 21's regressor is {size}; least told apart: {', '.join(worst.weakest) or 'all'}."
         )
-        advice = "A linear model in theta_i and phi_i needs no more; others want motors that move independently."
+        needs = "theta_i and phi_i" if quality.robot.is_neck else "the robot's directions"
+        advice = f"A linear model in {needs} needs no more; others want motors that move independently."
         yield Finding("warning" if worst.number > _SINGULAR else "note", "regressors", "", message, advice)
 
 
 def _region(quality: Quality) -> Iterator[Finding]:
     region = quality.region
+    if region is None:
+        yield from _ranges(quality)
+        return
     message = (
         f"visited {100 * region.tilt_coverage:.0f} % of the theta_i, phi_i and {100 * region.delta_coverage:.0f} % of "
         f"the delta_i that motors of +-{region.limit:g} rad reach."
@@ -279,21 +317,37 @@ def _region(quality: Quality) -> Iterator[Finding]:
         yield Finding("note", "region", "", message, advice)
 
 
+def _ranges(quality: Quality) -> Iterator[Finding]:
+    """How much of its range each motor went through; the paper's behaviours are those of three tendons."""
+    motors = quality.robot.motors
+    if motors.setpoint_min is None or motors.setpoint_max is None:
+        return
+    ends = zip(quality.inputs.items(), motors.setpoint_min, motors.setpoint_max, strict=True)
+    shares = [f"{100 * (high - low) / (most - least):.0f} % by {name}" for (name, (low, high, _)), least, most in ends]
+    message = f"visited of each motor's range: {', '.join(shares)}."
+    yield Finding("ok", "region", "", message, "Models know nothing outside.")
+
+
+def _pairs(quality: Quality) -> list[tuple[int, int]]:
+    return list(itertools.combinations(range(len(quality.correlation)), 2))
+
+
 def _correlation(quality: Quality) -> Iterator[Finding]:
-    for i, j in ((0, 1), (0, 2), (1, 2)):
+    for i, j in _pairs(quality):
         r = quality.correlation[i, j]
         if abs(r) > _RELATED:
-            message = f"motors {MOTORS[i]} and {MOTORS[j]} move together (correlation {r:.2f})."
+            message = f"motors {i + 1} and {j + 1} move together (correlation {r:.2f})."
             advice = "Their effects cannot be told apart well; move them independently."
             yield Finding("warning" if abs(r) > _ALIKE else "note", "correlation", "", message, advice)
 
 
 def _repeats(quality: Quality) -> Iterator[Finding]:
     if quality.repeats:
-        pitch, roll = np.degrees(np.nanmean([repeat.rms for repeat in quality.repeats], axis=0))
+        outputs = quality.robot.outputs
+        rms = quality.shown(np.nanmean([repeat.rms for repeat in quality.repeats], axis=0))
+        said = " and ".join(f"{r:.2g} {outputs.display_unit} in {n}" for r, n in zip(rms, outputs.names, strict=True))
         message = (
-            f"{len(quality.repeats)} pair(s) of runs have the same set-points and differ by {pitch:.2f} deg in pitch "
-            f"and {roll:.2f} deg in roll (rms / sqrt 2)."
+            f"{len(quality.repeats)} pair(s) of runs have the same set-points and differ by {said} (rms / sqrt 2)."
         )
         yield Finding("ok", "repeats", "", message, "No model can predict better than that.")
 
@@ -305,7 +359,7 @@ def _places(stretches: tuple[Stretch, ...]) -> str:
 
 
 def _value(channel: ChannelQuality, value: float) -> str:
-    return f"{channel.shown(value):.3g} {file_unit(channel.name)}"
+    return f"{channel.shown(value):.3g} {channel.unit}"
 
 
 def _percent(share: float) -> str:

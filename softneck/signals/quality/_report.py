@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from softneck.core import require_positive
 
-from ..recording._channels import OUTPUTS
 from ..recording._recording import Recording
 from ._channel_faults import check_channel
-from ._excitation import conditioning, correlation, repeats, spectrum
+from ._excitation import BANDWIDTH, conditioning, correlation, repeats, spectrum
 from ._findings import Quality
 from ._region import visited
 
@@ -15,25 +14,34 @@ from ._region import visited
 MOTOR_LIMIT = 6.0
 
 
-def assess_quality(recording: Recording, *, motor_limit: float = MOTOR_LIMIT) -> Quality:
+def assess_quality(
+    recording: Recording, *, motor_limit: float = MOTOR_LIMIT, bandwidth: float | None = None
+) -> Quality:
     """Check a recording's channels and what its inputs can teach; never across the border of two runs.
 
     Args:
         recording: to check.
-        motor_limit: how far motors go to either side [rad]; coverage of the region is relative to that.
+        motor_limit: how far a neck's motors go to either side [rad]; coverage of the region is relative to that.
+        bandwidth: up to where the outputs follow the motors [rad/s]; a neck's is 4 (section 3.1), and the spectrum of
+            another robot is not judged where it is not given.
 
     Raises:
-        SettingsError: a limit that is not positive, or a robot other than the neck.
+        SettingsError: a limit or a bandwidth that is not positive.
     """
-    recording.robot.require_neck("the quality report")
+    neck = recording.robot.is_neck
     require_positive("motor_limit", motor_limit, "rad")
+    if bandwidth is None:
+        bandwidth = BANDWIDTH if neck else float("nan")
+    else:
+        require_positive("bandwidth", bandwidth, "rad/s")
     return Quality(
+        robot=recording.robot,
         rows=len(recording),
         sample_time=recording.sample_time,
         channels={name: check_channel(recording, name) for name in recording.channels},
-        spectrum=spectrum(recording),
-        conditioning={axis: conditioning(recording, axis) for axis in OUTPUTS},
-        region=visited(recording, motor_limit),
+        spectrum=spectrum(recording, bandwidth),
+        conditioning={axis: conditioning(recording, axis) for axis in recording.robot.outputs.names},
+        region=visited(recording, motor_limit) if neck else None,
         correlation=correlation(recording),
         repeats=repeats(recording),
     )

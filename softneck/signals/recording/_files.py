@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -264,7 +265,8 @@ def _from_columns(columns: Mapping[str, pd.Series | Vector], robot: Robot) -> Re
         if title.strip() == "run":
             run = integers(cells)
             continue
-        name, factor = parse_column(title, robot)
+        # Of two equal titles pandas calls the second `pitch [deg].1`.
+        name, factor = parse_column(re.sub(r"\]\.\d+$", "]", title), robot)
         if name in channels:
             raise DataError(f"channel `{name}` stands in two columns; drop one.")
         channels[name] = factor * numbers(cells, name, missing=may_miss(name, robot))

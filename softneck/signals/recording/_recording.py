@@ -237,6 +237,6 @@ def concatenate(recordings: list[Recording] | tuple[Recording, ...]) -> Recordin
 
 
 def require_same_robot(one: Robot, other: Robot, what: str) -> None:
-    """Raise DataError where `what` are of two robots whose numbers mean different things."""
+    """Raise DataError where `what` are of two robots whose numbers mean different things; `other` is named first."""
     if one.hash != other.hash:
         raise DataError(f"{what} of two robots cannot be used together: {other.label()} and {one.label()}.")

@@ -170,5 +170,6 @@ def test_abuse() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_much_abuse() -> None:
     run_state_machine_as_test(Abuse, settings=settings(max_examples=500, stateful_step_count=25, deadline=None))

@@ -34,7 +34,8 @@ def test_stepping_through_a_record_is_the_fit(structure: str, tmp_path: Path) ->
     # The same rows in the same order.
     for name in ("a", "b") if structure == "siso" else ("A", "B", "K"):
         np.testing.assert_allclose(model.arrays[name], batch.arrays[name], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(model.simulate(r), batch.simulate(r), rtol=0, atol=1e-12)
+    # What is learnt online knows no training to compare with: validity is 0.
+    np.testing.assert_allclose(model.simulate(r)[:, :-1], batch.simulate(r)[:, :-1], rtol=0, atol=1e-12)
     assert state.summary().startswith("pitch rls_state")
 
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import casadi
 import numpy as np
 import pytest
 
 from softneck.core import DataError, SettingsError, silent
-from softneck.identification import Network
+from softneck.identification import PAPER_EQ21, Network
+from softneck.identification.models._drive import fit_loaded_drive
 from softneck.identification.networks._levenberg import Layers, jacobian, random_layers, train
+from softneck.identification.networks._network import _hints, _Problem
 
 from ...data import neck_recording, short_neck
 
@@ -77,6 +80,35 @@ def test_a_seed_gives_the_same_bits() -> None:
     assert first.arrays["W1"].tobytes() != other.arrays["W1"].tobytes()
 
 
+def test_hints_are_learnt_by_their_weight() -> None:
+    recording, settings = neck_recording(900), Network(hidden=(4, 4), starts=1, iterations=6, refine=3)
+    drive = fit_loaded_drive(recording)
+    hints = _hints(recording, drive)
+    assert hints is not None
+    # Twice what the record says: a weight of 0 cannot know it.
+    hints = hints.with_channels(pitch=2.0 * hints.channels["pitch"], roll=2.0 * hints.channels["roll"])
+    found = []
+    for prior in (0.0, 1.0):
+        problem = _Problem(recording, hints, drive, PAPER_EQ21, recording.sample_time, hints, prior)
+        found.append([axis["fit"] for axis in settings._train(problem, silent)[0]])
+    # Half of it is missed without them.
+    assert max(found[0]) < 60.0
+    assert min(found[1]) > max(found[0]) + 5.0
+
+
+def test_a_prior_leaves_the_scales_of_the_record_and_weighs_its_own_rows_alone() -> None:
+    recording = short_neck()
+    drive = fit_loaded_drive(recording)
+    plain = _Problem(recording, recording, drive, PAPER_EQ21, recording.sample_time, None, 0.1)
+    own, *scales = plain.training(0)
+    both, *same = replace(plain, hints=_hints(recording, drive)).training(0)
+    rows = own.target.size
+    np.testing.assert_array_equal(both.measured[:rows], own.measured)
+    assert all((one == other).all() for one, other in zip(scales, same, strict=True))
+    assert set(both.weight[:rows]) == {1.0}
+    assert set(both.weight[rows:]) == {0.1}
+
+
 def test_progress_rises_to_one() -> None:
     seen: list[float] = []
     Network(hidden=(3, 3), iterations=4).fit(short_neck(), progress=lambda done, _what: seen.append(done))
@@ -93,3 +125,5 @@ def test_more_weights_than_rows_and_wrong_settings_are_refused() -> None:
         Network(hidden=(3, 0))
     with pytest.raises(SettingsError, match="`decay` must be positive"):
         Network(decay=0.0)
+    with pytest.raises(SettingsError, match="`prior` must be between 0 and 1"):
+        Network(prior=2.0)

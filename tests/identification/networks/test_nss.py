@@ -45,6 +45,18 @@ def test_any_parameters_give_a_map_that_contracts(size: float) -> None:
             assert after @ W @ after <= MAP.rate**2 * (before @ W @ before) * (1.0 + 1e-8)
 
 
+@pytest.mark.parametrize("sample_time", [0.02, 0.05, 0.3, 1.5])
+def test_a_start_has_room_for_neurons_however_long_the_samples_are(sample_time: float) -> None:
+    """Robots sampled every tenth of their time constant had none, and ended in an error of Cholesky."""
+    rng, rate = np.random.default_rng(0), float(np.exp(-sample_time / 5.0))
+    A = rng.standard_normal((4, 4))
+    A *= 0.9999 * rate / np.linalg.norm(A, 2)
+    contraction = Contraction(4, 3, rate)
+    theta = contraction.start(A, rng.standard_normal((3, 4)))
+    # Rounding of a Cholesky factor and back.
+    np.testing.assert_allclose(contraction.matrices(theta)["A"], A, rtol=0, atol=1e-12)
+
+
 def test_the_derivatives_of_the_contraction_are_central_differences() -> None:
     theta, h = np.random.default_rng(1).standard_normal(MAP.size), 1e-6
     exact = MAP.derivatives(theta)
@@ -55,12 +67,13 @@ def test_the_derivatives_of_the_contraction_are_central_differences() -> None:
         np.testing.assert_allclose(values, numeric, rtol=0, atol=1e-7)
 
 
-def test_a_start_is_the_matrix_it_was_given_with_neurons_that_do_nothing() -> None:
-    rng = np.random.default_rng(2)
+@pytest.mark.parametrize(("rate", "norm"), [(0.98, 0.9), (0.9, 0.89)], ids=["usual", "norm close to the rate"])
+def test_a_start_is_the_matrix_it_was_given_with_neurons_that_do_nothing(rate: float, norm: float) -> None:
+    rng, contraction = np.random.default_rng(2), Contraction(3, 2, rate)
     A = rng.standard_normal((3, 3))
-    A *= 0.9 / np.linalg.norm(A, 2)
+    A *= norm / np.linalg.norm(A, 2)
     F = rng.standard_normal((2, 3))
-    arrays = MAP.matrices(MAP.start(A, F))
+    arrays = contraction.matrices(contraction.start(A, F))
     # H is factored and multiplied out again; its smallest eigenvalues are 1e-2.
     np.testing.assert_allclose(arrays["A"], A, rtol=0, atol=1e-12)
     np.testing.assert_allclose(arrays["F"], F, rtol=0, atol=1e-12)

@@ -7,14 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from softneck.core import DataError, SettingsError
-from softneck.identification import Choice, Network, Play, Rls, SetMembership, choose, refit
+from softneck.core import DataError, SettingsError, silent
+from softneck.identification import Choice, Model, Network, OutputError, Play, Rls, SetMembership, choose, refit
+from softneck.identification.models._arrays import members
 from softneck.identification.models._fitting import known_rows, row_hashes
-from softneck.identification.selection._auto import ALIKE, REFITTED, _Race, kinds_to_try
+from softneck.identification.selection import _auto
+from softneck.identification.selection._auto import ALIKE, REFITTED, _guarded_why, _Race, kinds_to_try
 from softneck.identification.selection._exam import agreement, exams, weighted_median
 from softneck.identification.selection._kind_trial import COLD, EXAM, HOLD_OUT, KindTrial, numbers_of
 from softneck.identification.selection._left_out import folds
+from softneck.identification.uncertainty import _guarded
 from softneck.identification.uncertainty._ensemble import combine
+from softneck.identification.uncertainty._guarded import Guarded
+from softneck.identification.uncertainty._guarded_base import Base
 from softneck.signals import Recording, concatenate
 
 from ...data import neck_recording, slow_but
@@ -189,3 +194,81 @@ def test_an_ensemble_is_not_taken_where_a_member_is_better_on_anything_left_out(
     assert race._simplest_of_the_best().kind == "play"  # its worst is 92, but `rls` has 95 on y
     race.tried["ensemble"] = KindTrial("ensemble", 1.0, both, left_out={"x": 92.0, "y": 95.0})
     assert race._simplest_of_the_best().kind == "ensemble"
+
+
+@pytest.fixture(scope="module")
+def race() -> _Race:
+    """A race that `play` has won before `oe`."""
+    race = _Race(TRAIN, OTHER, [], 0)
+    for model, fit in ((Play().fit(TRAIN), 85.0), (OutputError(delay=0.06).fit(TRAIN), 80.0)):
+        judged = race._judged(model.kind, model)
+        race.tried[model.kind] = KindTrial(model.kind, 1.0, model, judged, left_out={"largest motions": fit})
+        race.short[model.kind] = model
+    return race
+
+
+def test_the_guarded_form_of_a_learned_winner_is_taken(race: _Race, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Guarded] = []
+
+    def fit(settings: Guarded, recording: Recording, **_: object) -> Model:
+        asked.append(settings)
+        line = race.tried["oe"].model
+        play = race.tried["play"].model
+        assert line is not None
+        assert play is not None
+        return settings.around(Base(line, np.full(2, 0.01), np.array([80.0, 80.0])), [play, play], recording)
+
+    monkeypatch.setattr(Guarded, "fit", fit)
+    best = race.tried["play"]
+    # Not its own: to compile each combination of kinds takes half a minute.
+    monkeypatch.setattr(_Race, "_judged", lambda *_: best.judged)
+    chosen = race.guarded(best, silent)
+    assert (asked[0].of, asked[0].base) == ("play", "oe")
+    assert chosen.kind == "guarded"
+    # It is ranked by what its kind was worth elsewhere.
+    assert chosen.scores["largest motions"] == 85.0
+    assert set(chosen.scores) == {"largest motions", HOLD_OUT, COLD}
+    assert "Its guarded form is taken: 5 models of play that fade to `oe`" in _guarded_why(best, chosen)
+    again = refit(Choice((chosen,), chosen, "", ()), [TRAIN, OTHER])
+    assert (asked[1].of, asked[1].base, again.kind) == ("play", "oe", "guarded")
+    # A guarded form that costs more than two points on the rows held out is none.
+    monkeypatch.setattr(KindTrial, "hold_out_fit", property(lambda one: {"guarded": 90.0, "play": 92.5}[one.kind]))
+    assert race.guarded(best, silent) is best
+    assert _guarded_why(best, best) == ""
+
+
+def test_over_greybox_the_members_are_those_that_are_there(race: _Race, monkeypatch: pytest.MonkeyPatch) -> None:
+    best, line = race.tried["play"], race.tried["oe"].model
+    assert best.model is not None
+    assert line is not None
+    base = Base(line, np.full(2, 0.01), np.array([80.0, 80.0]))
+    monkeypatch.setitem(race.tried, "greybox", KindTrial("greybox", 1.0, line, best.judged))
+    monkeypatch.setattr(_auto, "fitted_base", lambda *_: base)
+    # Not its own: to compile each combination of kinds takes half a minute.
+    monkeypatch.setattr(_Race, "_judged", lambda *_: best.judged)
+    monkeypatch.setattr(_guarded, "grounded", lambda model, _: model)
+    model = race.guarded(best, silent).model
+    assert model is not None
+    held = members(model.arrays)
+    assert [kind for kind, _ in held] == ["oe", "play", "play"]
+    for (_, arrays), there in zip(held[1:], (best.model, race.short["play"]), strict=True):
+        assert all(np.array_equal(arrays[name], there.arrays[name]) for name in arrays)
+    assert (model.findings["members"], model.settings["members"]) == ("2 of play", 2)
+
+
+def test_a_line_or_equations_are_not_guarded_and_no_base_is_no_guard(race: _Race) -> None:
+    assert race.guarded(race.tried["oe"], silent) is race.tried["oe"]
+    alone = _Race(TRAIN, OTHER, [], 0)
+    alone.tried = {"play": race.tried["play"]}
+    assert alone.guarded(alone.tried["play"], silent) is alone.tried["play"]
+
+
+def test_a_guarded_form_that_cannot_be_trained_is_listed_with_its_reason(
+    race: _Race, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fit(*_: object, **__: object) -> Model:
+        raise DataError("there is no base to fall back to")
+
+    monkeypatch.setattr(Guarded, "fit", fit)
+    assert race.guarded(race.tried["play"], silent) is race.tried["play"]
+    assert race.tried["guarded"].failure == "there is no base to fall back to"

@@ -238,8 +238,8 @@ def test_a_motion_like_the_data_is_known_and_a_wilder_one_is_not(models: dict, f
 
 def test_only_set_membership_knows_what_it_has_seen(models: dict) -> None:
     with pytest.raises(SettingsError, match="only a model of kind nlsm"):
-        outside_seen(models["rls"], np.zeros((3, 9)))
-    with pytest.raises(DataError, match=r"`outputs` must be \(rows, 9\).*got \(3, 5\)"):
+        outside_seen(models["rls"], np.zeros((3, 10)))
+    with pytest.raises(DataError, match=r"`outputs` must be \(rows, 10\).*got \(3, 5\)"):
         outside_seen(models["nlsm"], np.zeros((3, 5)))
 
 

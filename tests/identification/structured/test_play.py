@@ -10,7 +10,7 @@ from softneck.identification import INFINITE, Model, Play, validate
 from softneck.identification.models._directions import directions_of
 from softneck.identification.models._drive import FUNCTIONS, NO_LOAD, LoadedDrive, fit_loaded_drive
 from softneck.identification.models._error_feedback import fit_echo
-from softneck.identification.structured._play_terms import Data, PlayStructure, ridge
+from softneck.identification.structured._play_terms import Data, PlayStructure, ridge, scores
 from softneck.runtime import load_functions
 from softneck.signals import Recording, redefinition_matrix
 from softneck.signals.recording._channels import MOTOR_POSITIONS
@@ -166,6 +166,13 @@ def test_bad_settings_and_little_data_are_refused() -> None:
         Play(degree=4)
     with pytest.raises(DataError, match="are too few for 466 terms; record longer"):
         Play(order=31, widths=(0.1, 0.2, 0.3, 0.4), degree=1).fit(neck_recording(400))
+
+
+def test_of_a_few_seconds_rows_are_held_out_too() -> None:
+    """A fifth of 5 s is fewer than the rows that are asked for elsewhere: a mean of nothing chose between forms."""
+    data = Data.of(recording := neck_recording(250), fit_loaded_drive(recording), directions_of(recording, []),
+                   redefinition_matrix())  # fmt: skip
+    assert np.isfinite(scores(data, None, PlayStructure(15.0, 5, (0.2,), 2), (1e-3,))).all()
 
 
 def test_the_hold_out_given_decides_and_without_one_the_model_says_so() -> None:

@@ -13,13 +13,14 @@ from softneck.core import DataError, FileFormatError, Matrix, SettingsError, sil
 from softneck.identification import Model, Network, OutputError, Rls
 from softneck.identification.models._arrays import check_arrays
 from softneck.identification.models._jobs import Job, done
-from softneck.identification.uncertainty._guarded import Guarded, _covering, _least_missing
-from softneck.identification.uncertainty._guarded_base import Base, fitted_base
+from softneck.identification.uncertainty._guarded import Guarded, _least_missing, covering
+from softneck.identification.uncertainty._guarded_base import Base, base_or_reason, fitted_base
 from softneck.identification.uncertainty._left_out import left_out, left_out_error
+from softneck.plant import VirtualNeck
 from softneck.robot import Robot
 from softneck.runtime import load_runtime
 from softneck.runtime._compile import Runtime, load_tangent
-from softneck.signals import Recording, concatenate
+from softneck.signals import Recording, concatenate, signal
 
 from ...data import TS, Truth, neck_recording, recording_from, short_neck
 
@@ -47,7 +48,7 @@ def plain(model: Model) -> Runtime:
 
 def free_run(model: Model, U: Matrix) -> tuple[Matrix, Matrix]:
     """Return outputs (time, n_out) and what the blend goes by (time, 10): weight, spread and distance are last."""
-    runtime, arrays = plain(model), tuple(model.arrays.values())
+    runtime, arrays = plain(model), model.block().arrays
     block = model.block()
     parameters = np.array([port.start or 0.0 for port in block.parameters])
     state, y = np.zeros(runtime.state_size(arrays)), np.zeros(len(block.outputs))
@@ -85,7 +86,7 @@ def test_any_robot_has_it() -> None:
         Base(member, np.full(len(outputs), SIGMA), np.array([90.0])), [member] * 2, recording
     )
     check_arrays("guarded", model.arrays)
-    assert (free_run(model, U[:50])[0] == free_run(member, U[:50])[0]).all()
+    assert (free_run(model, U[:50])[0][:, :-1] == free_run(member, U[:50])[0][:, :-1]).all()
 
 
 def test_members_far_apart_leave_the_output_to_the_base() -> None:
@@ -190,11 +191,11 @@ def test_the_error_on_parts_left_out_is_the_noise_of_a_perfect_model() -> None:
 
 def test_points_that_stand_for_all_reach_all() -> None:
     points = np.random.default_rng(0).standard_normal((500, 3))
-    some, reach = _covering(points, 50)
+    some, reach = covering(points, 50)
     nearest = np.linalg.norm(points[:, None] - some[None], axis=2).min(axis=1)
     assert nearest.max() == pytest.approx(reach, rel=1e-12)
     assert len(some) == 50
-    assert _covering(points[:3], 50)[1] == 0.0
+    assert covering(points[:3], 50)[1] == 0.0
 
 
 def test_play_is_guarded_by_name_and_a_robot_may_have_it() -> None:
@@ -217,15 +218,15 @@ def test_processes_change_no_result() -> None:
 @pytest.mark.slow
 def test_its_derivative_is_what_differences_say() -> None:
     model = guarded([line(g) for g in (0.9, 1.0, 1.3)])
-    arrays, runtime = tuple(model.arrays.values()), plain(model)
+    arrays, runtime = model.block().arrays, plain(model)
     parameters, x = np.zeros(len(model.block().parameters)), np.zeros(runtime.state_size(arrays))
-    y, u = np.zeros(5), np.full(8, np.nan)
+    y, u = np.zeros(6), np.full(8, np.nan)
     runtime.initialise(arrays, parameters, x, y)
     for row in UNSEEN.set_points[:60]:
         u[:3] = row
         runtime.step(arrays, parameters, x, u, y)
     rng = np.random.default_rng(0)
-    X, U, Y = rng.standard_normal((x.size, 4)), np.zeros((8, 4)), np.zeros((5, 4))
+    X, U, Y = rng.standard_normal((x.size, 4)), np.zeros((8, 4)), np.zeros((6, 4))
     U[:3] = rng.standard_normal((3, 4))
     X[np.abs(x) > 1e3] = 0.0  # generators of random numbers
     moved, rows, out = x.copy(), X.copy(), y.copy()
@@ -252,3 +253,14 @@ def test_what_cannot_be_is_refused(fitted: Model) -> None:
     alone = {name: array for name, array in arrays.items() if not name[0].isdigit() or name[0] == "0"}
     with pytest.raises(FileFormatError, match="cannot have 1 members"):
         check_arrays("guarded", alone)
+
+
+@pytest.mark.slow
+@pytest.mark.nightly
+def test_another_robot_that_tendons_bend_can_have_equations_as_base() -> None:
+    robot = Robot.preset("antagonist")
+    moved = softneck.record(signal("eq22", duration=30.0, robot=robot), VirtualNeck.of(robot), seed=1)
+    base = base_or_reason("greybox", moved)
+    assert isinstance(base, Base), base
+    # 99 % on 40 s; a line has as much there, and 3 points less on four tendons.
+    assert base.fit.min() > 95.0

@@ -26,6 +26,7 @@ from softneck.identification.uncertainty._measured import (
     needed_lines,
     raised,
     response_of,
+    unheard,
 )
 from softneck.identification.uncertainty._order import choose_order
 from softneck.signals import SET_POINTS, Recording, concatenate, multisine_experiments, redefinition_matrix
@@ -115,6 +116,20 @@ def test_the_weight_holds_every_plant_that_was_recorded_in_the_band(spread: list
     assert np.nanmax(found.needed) <= 1.0 + 1e-9 or needed_lines(found, ["a", "b"], "pitch") != []
 
 
+def test_a_circle_too_wide_to_be_supported_says_nothing_between_those_that_are(spread: list[Recording]) -> None:
+    """It made weights of 1.4 at 4 rad/s on a neck whose other recordings know it there to 0.4."""
+    response = measured_responses(spread[:1], "set_points")[0][0]
+    assert response is not None
+    wide = response.covariance.copy()
+    wide[10:13] *= 1e4
+    kept, fewer = (axis_points([item], 0, DIRECTIONS, 0.95) for item in (response, replace(response, covariance=wide)))
+    assert len(fewer) == len(kept) - 3
+    # Without those lines the weight is what their neighbours leave, and the band the same.
+    (w, all_of_them), (same, weight) = (covering_weight(TWO, points, TS) for points in (kept, fewer))
+    np.testing.assert_allclose(same, w)
+    assert weight.max() <= 1.05 * all_of_them.max()
+
+
 def test_a_plant_that_the_family_lacks_is_found_out_in_its_band(spread: list[Recording]) -> None:
     found, _ = measured(spread, TWO)
     late = played(replace(TWO, delay=0.15), seed=7)
@@ -162,6 +177,32 @@ def test_where_a_record_needs_more_the_weight_is_raised() -> None:
     inside = (found.frequency > found.borders[1]) & (found.frequency < found.borders[2])
     np.testing.assert_allclose(more.weight[inside], 3.0 * found.weight[inside])
     np.testing.assert_allclose(more.weight[-5:], found.weight[-5:])
+
+
+def test_a_recording_that_moves_an_axis_and_shows_nothing_is_named() -> None:
+    """Seen on a foreign neck: slack tendons at 1 kg; half the recordings were in no weight, and nobody said so."""
+    loud, slack = played(TWO), played(replace(TWO, b=1e-5 * TWO.b), seed=1)
+    one_axis = played(TWO, seed=2)
+    still = [[(np.zeros_like(u), y) for u, y in parts] for parts in axis_runs([one_axis], DIRECTIONS, "set_points", 1)]
+    parts, names = [loud, slack, one_axis], ["loud", "slack", "one axis"]
+    responses, why = measured_responses(parts, "set_points")
+    assert why == []
+    for axis in (0, 1):
+        points = axis_points(responses, axis, DIRECTIONS, 0.95)
+        runs = axis_runs(parts, DIRECTIONS, "set_points", axis)
+        assert unheard(points, runs, names) == ["slack"]
+        # What never moved the axis need not show anything of it.
+        others = points[points[:, 0] != 2.0]
+        assert unheard(others, [*runs[:2], *still], names) == ["slack"]
+    family = replace(_family(), findings={"tested": {"names": ["a"], "unheard": {"pitch": ["slack"]}}})
+    assert "pitch: slack moves it and shows no response known within 30 %" in family.summary()
+
+
+def _family() -> Family:
+    old = load(GOLDEN, role="family")
+    assert isinstance(old, Family)
+    found, _ = measured([played(TWO)], TWO)
+    return replace(old, measured={"pitch": found})
 
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "family.npz"

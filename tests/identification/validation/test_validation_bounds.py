@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -63,6 +65,21 @@ def test_fewer_than_nine_records_have_no_bound_and_nine_have_the_largest_error()
     wide = calibrated_bounds(rows, 40.0 * errors)
     assert wide["path"] == {}
     assert "no useful path bound in pitch" in wide["reason"]
+
+
+def test_beyond_the_set_points_of_the_records_there_is_no_bound() -> None:
+    """One of ten records moves farther, and is far more wrong there: that is no miss of a bound that was not given."""
+    errors = drawn(10, np.random.default_rng(2))
+    rows = rows_of(np.resize(MOTION, errors.shape), records=10)
+    rows.set_points[:450] = np.resize(np.linspace(-1.0, 1.0, 50)[:, None], (450, 3))
+    rows.set_points[450:475] = 3.0
+    errors[450:475] *= 5.0
+    found = calibrated_bounds(rows, errors)
+    assert found["domain"] == {"min": [-1.0] * 3, "max": [3.0] * 3}
+    assert found["pointwise"]["pitch"]["outside_pct"] == pytest.approx(5.0)  # 25 of 500
+    near = calibrated_bounds(replace(rows, set_points=np.zeros((500, 3))), errors)
+    assert near["pointwise"]["pitch"]["outside_pct"] == 0.0
+    assert near["pointwise"]["pitch"]["half_width"] == found["pointwise"]["pitch"]["half_width"]
 
 
 def test_bounds_wider_than_the_data_are_never_shown() -> None:

@@ -2,30 +2,37 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import click
 
-from softneck.core import SettingsError, refuse_existing, require_between, to_si
+from softneck.core import SettingsError, refuse_existing, require_between, require_finite, to_si
 from softneck.robot import Robot, find_robot
 from softneck.signals import (
+    Excitation,
     SetPointLimits,
     concatenate,
     multisine_experiments,
     prepare,
+    read_recording,
     signal,
     signal_names,
     write_recording,
 )
+from softneck.signals.recording._recording import require_same_robot
 
-from .shared._console import print_json, progress
-from .shared._neck import load_neck
-from .shared._options import force_option, json_option, output_option
+from ..shared._console import print_json, progress
+from ..shared._neck import load_neck
+from ..shared._options import force_option, json_option, output_option
 
 
 @click.command(
     "record",
-    help="Record SIGNAL on the virtual neck, or on that of a robot.\n\nSignals: " + ", ".join(signal_names()) + ".",
+    help="Record SIGNAL on the virtual neck, or on that of a robot.\n\nSignals: "
+    + ", ".join(signal_names())
+    + ", or a "
+    "recording whose set-points are played, such as that of `softneck excite`.",
     epilog="Example: softneck record eq22 -o eq22.csv --neck paper --seed 1",
 )
 @click.argument("signal_name", metavar="SIGNAL")
@@ -54,6 +61,10 @@ from .shared._options import force_option, json_option, output_option
     metavar="N",
     help="`multisine` for `frf`: draws of the phases. [default: 4; 1 of a sine]",
 )
+@click.option(
+    "--cocontraction", type=float, default=0.0, show_default=True, metavar="RAD",
+    help="Played around this common position of all motors, which keeps tendons taut.",
+)  # fmt: skip
 @click.option("--payload", type=float, default=0.0, show_default=True, metavar="KG", help="Payload on the platform.")
 @click.option("--no-noise", is_flag=True, help="Simulate a perfect inclinometer.")
 @click.option("--ramp", type=float, default=0.0, metavar="S", help="Ramp in from rest and out to it. [default: none]")
@@ -72,6 +83,7 @@ def command(
     amplitude: float | None,
     band: str | None,
     realisations: int | None,
+    cocontraction: float,
     payload: float,
     no_noise: bool,
     ramp: float,
@@ -102,11 +114,17 @@ def command(
     if asked:
         played = multisine_experiments(seed=seed, robot=whose, **asked)
     else:
-        played = [signal(signal_name, duration=duration, seed=seed, robot=whose)]
+        played = _signals(signal_name, duration, seed, whose)
+    require_finite("--cocontraction", cocontraction, "rad")
+    common = to_si(whose.motors.unit)[0] * cocontraction
+    played = [replace(item, set_points=item.set_points + common) for item in played]
     prepared = [prepare(item, limits, ramp_s=ramp) for item in played]
     changes = prepared[0][1]
     if asked and any(item != type(changes)() for _, item in prepared):
-        raise SettingsError("the experiments go beyond the motors' limits; lower `--amplitude` or the top of `--band`.")
+        raise SettingsError(
+            "the experiments go beyond the motors' limits; lower `--amplitude`, the top of `--band` "
+            "or `--cocontraction`."
+        )
     with progress("record", quiet=as_json) as report:
         runs = []
         for number, (excitation, _) in enumerate(prepared):
@@ -119,8 +137,21 @@ def command(
         print_json({**facts, "signal": signal_name, "changes": changes.as_dict()})
         return
     click.echo(f"{output}: {len(recording)} rows of {signal_name} at {1e3 * recording.sample_time:g} ms")
-    if ramp > 0 or limits != SetPointLimits():
+    if ramp > 0 or limits != SetPointLimits() or changes != type(changes)():
         click.echo(f"set-points: {changes}")
+
+
+def _signals(name: str, duration: float | None, seed: int, robot: Robot) -> list[Excitation]:
+    """Return a signal by its name, or the set-points of each run of a recording."""
+    if Path(name).suffix.lower() not in (".csv", ".parquet"):
+        return [signal(name, duration=duration, seed=seed, robot=robot)]
+    recording = read_recording(name)
+    require_same_robot(robot, recording.robot, f"{name} and the virtual plant: set-points")
+    rows = None if duration is None else max(2, round(duration / recording.sample_time))
+    return [
+        Excitation(name, run.time[:rows] - run.time[0], run.set_points[:rows], recording.sample_time)
+        for run in recording.runs()
+    ]
 
 
 def _band(text: str | None) -> tuple[float, float] | None:

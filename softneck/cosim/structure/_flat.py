@@ -1,0 +1,266 @@
+"""Nested systems made flat: which output of which FMU feeds which input, through which line, and all values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from softneck.core import DataError, SettingsError, to_si
+from softneck.runtime import Port
+
+from ._parse import Affine, Binding, Component, Connector, Structure, SystemNode, Unit, Value
+
+# An element by the names on the way to it, and one of its connectors.
+Place = tuple[tuple[str, ...], str]
+# Our SI units in SSP's base units, for what the archive's own list does not have.
+_BASES = {
+    "rad": (("rad", 1),),
+    "rad/s": (("rad", 1), ("s", -1)),
+    "s": (("s", 1),),
+    "m": (("m", 1),),
+    "m/s": (("m", 1), ("s", -1)),
+    "kg": (("kg", 1),),
+    "N": (("kg", 1), ("m", 1), ("s", -2)),
+    "Pa": (("kg", 1), ("m", -1), ("s", -2)),
+    "A": (("A", 1),),
+    "V": (("A", -1), ("kg", 1), ("m", 2), ("s", -3)),
+    "1": (),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """factor * value + offset."""
+
+    factor: float = 1.0
+    offset: float = 0.0
+
+    def of(self, value: float) -> float:
+        """Return the line's value."""
+        return self.factor * value + self.offset
+
+    def then(self, other: Line) -> Line:
+        """Return this line and then the other as one."""
+        return Line(other.factor * self.factor, other.factor * self.offset + other.offset)
+
+
+@dataclass(frozen=True, slots=True)
+class Ports:
+    """What an FMU's description says of its variables: those that a loop moves, and the names of all others."""
+
+    inputs: Mapping[str, Port]
+    outputs: Mapping[str, Port]
+    parameters: Mapping[str, Port]
+    others: frozenset[str]
+
+
+@dataclass(frozen=True, slots=True)
+class Flat:
+    """The FMUs of a structure without its systems.
+
+    Attributes:
+        components: path -> component.
+        links: input of an FMU -> (output of an FMU, line).
+        values: path -> values of inputs and parameters, in the FMU's units.
+    """
+
+    components: Mapping[tuple[str, ...], Component]
+    links: Mapping[Place, tuple[Place, Line]]
+    values: Mapping[tuple[str, ...], Mapping[str, float]]
+
+
+def flatten(structure: Structure, ports: Mapping[str, Ports], where: Path) -> Flat:
+    """Return the FMUs of a structure and how they are connected.
+
+    Args:
+        structure: as read.
+        ports: source of each component -> its variables.
+        where: the archive, for messages.
+
+    Raises:
+        SettingsError: two writers of an input, connectors that are not there, units that do not fit, what a loop
+            cannot carry; the line names it.
+    """
+    flattening = _Flattening(structure, ports, where)
+    flattening.visit((), structure.root)
+    return flattening.result()
+
+
+@dataclass(slots=True)
+class _Flattening:
+    structure: Structure
+    ports: Mapping[str, Ports]
+    where: Path
+    components: dict[tuple[str, ...], Component] = field(default_factory=dict)
+    systems: dict[tuple[str, ...], SystemNode] = field(default_factory=dict)
+    # What ends at a place: where it starts, and its transformation.
+    ending: dict[Place, tuple[Place, Affine]] = field(default_factory=dict)
+    # Values by place, with the units of their own list; those of outer systems come later and win.
+    values: dict[Place, tuple[Value, Affine, Mapping[str, Unit]]] = field(default_factory=dict)
+
+    def visit(self, path: tuple[str, ...], system: SystemNode) -> None:
+        """Take in a system and all below it."""
+        self.systems[path] = system
+        for name, element in system.elements.items():
+            below = (*path, name)
+            if isinstance(element, SystemNode):
+                self.visit(below, element)
+            else:
+                self.components[below] = element
+                self._bind(below, element.bindings)
+        for connection in system.connections:
+            start, end = (
+                ((*path, element) if element else path, connector)
+                for element, connector in (connection.start, connection.end)
+            )
+            for place in (start, end):
+                self._connector(place)
+            if end in self.ending:
+                raise self._wrong(f"`{_named(end)}` has two writers")
+            self.ending[end] = (start, connection.affine)
+        self._bind(path, system.bindings)
+
+    def result(self) -> Flat:
+        """Return what was taken in, without systems."""
+        links, values = {}, {path: dict[str, float]() for path in self.components}
+        for path, component in self.components.items():
+            ports = self.ports[component.source]
+            for place, found in self._given(path):
+                name = place[1]
+                if name in ports.inputs or name in ports.parameters:
+                    values[path][name] = self._number(place, found, Line())
+                elif name in ports.others or name in ports.outputs:
+                    raise self._wrong(f"sets `{_named(place)}`, which is neither a number's parameter nor an input")
+            for name in (*ports.inputs, *ports.parameters):
+                place = (path, name)
+                if place not in self.ending:
+                    continue
+                origin, line = self._origin(place)
+                if origin[0] in self.components:
+                    if (
+                        name not in ports.inputs
+                        or origin[1] not in self.ports[self.components[origin[0]].source].outputs
+                    ):
+                        ends = f"`{_named(origin)}` to `{_named(place)}`"
+                        raise self._wrong(f"connects {ends}; softneck connects outputs to inputs")
+                    links[place] = (origin, line)
+                elif origin in self.values:
+                    values[path][name] = self._number(origin, self.values[origin], line)
+        return Flat(self.components, links, values)
+
+    def _given(self, path: tuple[str, ...]) -> Iterator[tuple[Place, tuple[Value, Affine, Mapping[str, Unit]]]]:
+        for place, found in self.values.items():
+            if place[0] == path:
+                yield place, found
+
+    def _origin(self, place: Place) -> tuple[Place, Line]:
+        """Return what feeds a place, through systems, and the line from there."""
+        line, seen = Line(), {place}
+        while place in self.ending:
+            start, affine = self.ending[place]
+            line = self._step(start, place, affine).then(line)
+            place = start
+            if place in seen:
+                raise self._wrong(f"connects `{_named(place)}` to itself")
+            seen.add(place)
+        return place, line
+
+    def _step(self, start: Place, end: Place, affine: Affine) -> Line:
+        after = Line(affine.factor, affine.offset)
+        if not affine.convert:
+            return after
+        (a, unit_a), (b, unit_b) = ((self._unit(place), self._connector(place).unit) for place in (start, end))
+        return self._converted(unit_a, a, unit_b, b, f"`{_named(start)}` to `{_named(end)}`").then(after)
+
+    def _converted(self, unit_a: str, a: Unit | None, unit_b: str, b: Unit | None, what: str) -> Line:
+        """Return the line from unit a to unit b; where one is not said nothing is converted."""
+        if unit_a == unit_b or not unit_a or not unit_b:
+            return Line()
+        if a is None or b is None:
+            unknown = unit_a if a is None else unit_b
+            raise self._wrong(f"has the unknown unit `{unknown}` on the way from {what}; define it in ssd:Units")
+        if a.base != b.base:
+            raise self._wrong(f"connects [{unit_a}] to [{unit_b}]: {what}; these units do not fit")
+        return Line(a.factor / b.factor, (a.offset - b.offset) / b.factor)
+
+    def _connector(self, place: Place) -> Connector:
+        """Return a connector as the structure says it; what it leaves out, as the FMU does."""
+        path, name = place
+        if path in self.components:
+            component = self.components[path]
+            ports = self.ports[component.source]
+            said = component.connectors.get(name)
+            if said is not None and said.type in ("Enumeration", "String", "Binary", "Clock"):
+                raise self._wrong(
+                    f"connects `{_named(place)}`, which is of type {said.type}; softneck connects numbers"
+                )
+            for kind, table in (("input", ports.inputs), ("output", ports.outputs), ("parameter", ports.parameters)):
+                if name in table:
+                    unit = "" if table[name].unit == "1" else table[name].unit
+                    return Connector(kind, said.unit if said is not None and said.unit else unit)
+            if name in ports.others:
+                raise self._wrong(f"connects `{_named(place)}`, which is no number's input, output or parameter")
+        elif path in self.systems and name in self.systems[path].connectors:
+            return self.systems[path].connectors[name]
+        raise self._wrong(f"connects `{_named(place)}`, which is not there")
+
+    def _unit(self, place: Place) -> Unit | None:
+        return self._known(self._connector(place).unit, {})
+
+    def _known(self, name: str, own: Mapping[str, Unit]) -> Unit | None:
+        for units in (own, self.structure.units):
+            if name in units:
+                return units[name]
+        try:
+            factor, si = to_si(name or "1")
+        except DataError:
+            return None
+        return Unit(tuple(sorted(_BASES[si])), factor) if si in _BASES else None
+
+    def _bind(self, path: tuple[str, ...], bindings: tuple[Binding, ...]) -> None:
+        for binding in bindings:
+            for name, (value, affine) in _mapped(binding).items():
+                place = self._place(path, name)
+                if place is not None:
+                    self.values[place] = (value, affine, binding.units)
+
+    def _place(self, path: tuple[str, ...], name: str) -> Place | None:
+        """Return the place of a hierarchical name below `path`; None where nothing has it, which SSP ignores."""
+        if path in self.components or name in self.systems[path].connectors:
+            return path, name
+        # An element's name may have dots itself: the longest that fits.
+        for element in sorted(self.systems[path].elements, key=len, reverse=True):
+            if name.startswith(f"{element}."):
+                return self._place((*path, element), name[len(element) + 1 :])
+        return None
+
+    def _number(self, place: Place, found: tuple[Value, Affine, Mapping[str, Unit]], line: Line) -> float:
+        value, affine, own = found
+        if isinstance(value.value, str):
+            raise self._wrong(f"sets `{_named(place)}` to the {value.type} `{value.value}`; softneck sets numbers")
+        after = Line(affine.factor, affine.offset)
+        if affine.convert and value.unit:
+            unit = self._connector(place).unit
+            what = f"the value of `{_named(place)}`"
+            after = self._converted(value.unit, self._known(value.unit, own), unit, self._known(unit, {}), what).then(
+                after
+            )
+        return after.then(line).of(value.value)
+
+    def _wrong(self, what: str) -> SettingsError:
+        return SettingsError(f"{self.where}: its structure {what}.")
+
+
+def _mapped(binding: Binding) -> dict[str, tuple[Value, Affine]]:
+    if binding.mapping is None:
+        return {name: (value, Affine()) for name, value in binding.values.items()}
+    return {
+        target: (binding.values[source], affine)
+        for target, source, affine in binding.mapping
+        if source in binding.values
+    }
+
+
+def _named(place: Place) -> str:
+    return ".".join((*place[0], place[1]))

@@ -1,0 +1,222 @@
+"""The observer over a nonlinear model: its free run, and a disturbance that walks as far as the model moves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from softneck.core import FileFormatError, Matrix, Vector, to_si, write_archive
+from softneck.identification import Model
+from softneck.identification.models._arrays import without_validity
+from softneck.identification.models._directions import NECK_SECONDS
+from softneck.identification.models._linear_systems import KINDS as LINEAR
+from softneck.identification.models._nested import nested, nested_model
+from softneck.robot import Robot
+from softneck.runtime import Block, Port, State
+from softneck.signals import Recording
+
+from ._forms import NOISES, noise_units
+from ._kalman import delay_source, filter_lines, observer_ports
+from ._kalman_parts_runtime import KALMAN_LEAD, KALMAN_MORE_LAGS
+from ._nonlinear_runtime import NonlinearArrays, NonlinearState
+from ._offline import Estimates, check_recording, measured_angles
+
+_RUNTIME = "softneck.estimation._nonlinear_runtime"
+FORM = "nonlinear"
+# Samples of a neck until its model stands, and what 20 ms leave of the fastest motion: half of it after 0.27 s, as long
+# as a neck is on its way. Of another robot both are stretched by its time constant.
+_SETTLE, _KEEP, _NECK_SAMPLE = 300, 0.95, 0.02
+
+
+_MEANINGS = ("standard deviation", "standard deviation", "of the model's fastest motion of late")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class NonlinearObserver:
+    """A filter over an identified model of any kind; `KalmanSettings.design` makes it.
+
+    The angle is what the model makes of the set-points in free run, plus a disturbance that walks: at rest by
+    `rest_noise_std` in a sample, in motion by `motion_noise_ratio` times the model's fastest motion of late.
+
+    Attributes:
+        model: of any kind; nothing corrects its state.
+        noise: standard deviations, named as `noise_names`, in SI.
+        constants: see KALMAN_* of `_kalman_parts_runtime`.
+        start: standard deviation of the disturbance when nothing is known, in SI.
+        sensor: name of the preset, "none" where the noise was given, "robot" where the robot's file says it.
+        order: of the loop it is for.
+        gate_level: chi-square level of the gate.
+        delay_source: where the sensor's delay comes from: "given", "sensor", "robot".
+    """
+
+    model: Model
+    noise: tuple[float, float, float]
+    constants: Vector
+    start: float
+    sensor: str
+    order: str
+    gate_level: float
+    delay_source: str = "given"
+    form: str = FORM
+
+    @property
+    def robot(self) -> Robot:
+        """Whose outputs it estimates."""
+        return self.model.robot
+
+    @property
+    def sample_time(self) -> float:
+        """Of the model and of the loop [s]."""
+        return self.model.sample_time
+
+    @property
+    def noise_names(self) -> tuple[str, ...]:
+        """Names of the noise levels."""
+        return tuple(name for name, _ in NOISES[FORM])
+
+    @property
+    def lead(self) -> float:
+        """How far the estimate runs ahead of the measurement [s]: the sensor's delay."""
+        return float(self.constants[KALMAN_LEAD]) * self.sample_time
+
+    def block(self) -> Block:
+        """Return the filter as a block of role "observer"."""
+        return self._block
+
+    @cached_property
+    def _block(self) -> Block:
+        # How far it can be trusted is no part of an estimate, and takes time in each of its steps.
+        plant = replace(self.model, arrays=without_validity(self.model.arrays)).block()
+        inputs, outputs = observer_ports(FORM, self.robot)
+        return Block(
+            kind=FORM,
+            role="observer",
+            runtime=f"{_RUNTIME}({plant.runtime}:{len(plant.arrays)})",
+            sample_time=self.sample_time,
+            arrays=(*self._own_arrays(plant), *plant.arrays),
+            inputs=inputs,
+            outputs=outputs,
+            parameters=tuple(
+                Port(name=name, unit=unit, start=value, minimum=0.0, description=meaning)
+                for (name, unit), value, meaning in zip(
+                    noise_units(FORM, self.robot), self.noise, _MEANINGS, strict=True
+                )
+            ),
+        )
+
+    def _own_arrays(self, plant: Block) -> tuple[Matrix, ...]:
+        stretch = max(self.model.findings.get("time_constants_s", [NECK_SECONDS])) / NECK_SECONDS
+        samples = _NECK_SAMPLE * stretch / self.sample_time  # for one of the neck's
+        setup = np.array([
+            len(self.robot.motors.names), len(self.robot.outputs.names), len(plant.outputs),
+            max(1, round(_SETTLE * samples)), self.start, _KEEP ** (1.0 / samples),
+        ])  # fmt: skip
+        return setup, self.constants, plant.initial_state(use_measurement=0.0).parameters
+
+    def initial_state(self, **parameters: float) -> State:
+        """Return the state at the start; parameters are the noise levels by name."""
+        return self.block().initial_state(**parameters)
+
+    def step(self, state: State, inputs: ArrayLike) -> tuple[State, Vector]:
+        """Return the next state and the outputs valid now; inputs and outputs as in `block()`."""
+        return self.block().step(state, inputs)
+
+    def estimate(self, recording: Recording) -> Estimates:
+        """Filter a recording; each of its runs starts anew. Missing samples are predicted over.
+
+        Raises:
+            DataError: another sample time or another robot.
+        """
+        check_recording(self, recording)
+        m, parts = len(self.robot.outputs.names), NonlinearState.parts(NonlinearArrays(self.block().arrays))
+        told, states = (np.vstack(rows) for rows in zip(*(self._rows(run) for run in recording.runs()), strict=True))
+        accepted = states[:, parts["unheard"]][:, 0] == 0.0
+        return Estimates(
+            time=recording.time,
+            outputs=told[:, :m].copy(),
+            rates=told[:, m : 2 * m].copy(),
+            innovation=told[:, 2 * m].copy(),
+            accepted=accepted,
+            healthy=told[:, 2 * m + 1] > 0.5,
+            judged=accepted | (told[:, 2 * m] > 0.0),
+            aligned=states[:, parts["angles"]] + states[:, parts["disturbance"]],
+            covariance=np.eye(m) * states[:, parts["variance"], None],
+            log_det=states[:, parts["log_det"]][:, 0],
+        )
+
+    def _rows(self, run: Recording) -> tuple[Matrix, Matrix]:
+        """Return outputs (time, outputs) and states (time, states) of a run."""
+        # The set-points of t_k are commanded after the measurement of t_k: the filter knows those before. In a Jacobi
+        # loop they come a sample early, and the filter keeps them for one.
+        late = 0 if self.order == "jacobi" else 1
+        setpoints = run.set_points[np.maximum(np.arange(len(run)) - late, 0)]
+        block, state, kept = self.block(), self.initial_state(), []
+        for row in np.column_stack([setpoints, measured_angles(run), np.ones(len(run))]):
+            state, _ = block.step(state, row)
+            kept.append(state)
+        return np.array([state.outputs for state in kept]), np.array([state.values for state in kept])
+
+    def summary(self) -> str:
+        """Return some lines for people."""
+        unit = self.robot.outputs.display_unit
+        first, rest = (level / to_si(unit)[0] for level in self.noise[:2])
+        lines = [
+            f"nonlinear observer over {self.model.kind}, {self.sample_time * 1e3:g} ms, {self.order} order, "
+            f"sensor {self.sensor}",
+            "  the model in free run, and a disturbance of each output that walks",
+            f"  noise: measurement {first:.3g} {unit}, disturbance {rest:.3g} {unit} a sample and "
+            f"{self.noise[2]:.3g} times the model's motion",
+            *filter_lines(self.gate_level, self.constants, self.sample_time, self.delay_source),
+        ]
+        return "\n".join(lines)
+
+    def save(self, path: str | Path, *, force: bool = False) -> None:
+        """Write the observer with its model to one `.npz` file."""
+        block, (model, arrays) = self.block(), nested(self.model)
+        header = {
+            "kind": FORM,
+            "form": FORM,
+            "sample_time": self.sample_time,
+            "noise": dict(zip(self.noise_names, self.noise, strict=True)),
+            "start": self.start,
+            "sensor": self.sensor,
+            "order": self.order,
+            "gate_level": self.gate_level,
+            "inputs": [port.name for port in block.inputs],
+            "outputs": [port.name for port in block.outputs],
+            "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
+            "delay_source": self.delay_source,
+            "model": model,
+            **self.robot.in_header(),
+        }
+        write_archive(path, header, {**arrays, "constants": self.constants}, force=force)
+
+    @classmethod
+    def from_archive(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> NonlinearObserver:
+        """Return the observer that `save` wrote; `softneck.core.load` calls this."""
+        constants = np.ascontiguousarray(arrays["constants"], dtype=np.float64)
+        model = nested_model(header["model"], arrays)
+        if constants.size != KALMAN_MORE_LAGS + max(len(model.robot.outputs.names) - 2, 0):
+            raise FileFormatError("its array `constants` has another length; design the observer again.")
+        levels = [float(header["noise"][name]) for name, _ in NOISES[FORM]]
+        return cls(
+            model=model,
+            noise=(levels[0], levels[1], levels[2]),
+            constants=constants,
+            start=float(header["start"]),
+            sensor=str(header["sensor"]),
+            order=str(header["order"]),
+            gate_level=float(header["gate_level"]),
+            delay_source=delay_source(header),
+        )
+
+
+def is_nonlinear(model: Any) -> bool:
+    """Return whether `model` is identified and of a kind that has no transfer functions."""
+    return isinstance(model, Model) and model.kind not in LINEAR

@@ -1,0 +1,167 @@
+"""A nonlinear model in free run, and a disturbance of its outputs that walks: more the faster the model moves.
+
+Member 0 is the model. Nothing corrects its state: what it misses is the disturbance, so that whatever a measurement
+says it stays where such a model can be, and one without derivatives will do. What a model misses it misses in motion.
+"""
+
+import math
+
+import numpy as np
+
+from softneck.estimation._kalman_parts_runtime import (
+    KALMAN_GATE,
+    KALMAN_LAG,
+    KALMAN_LEAD,
+    KALMAN_PERIOD,
+    KalmanCounters,
+    kalman_clear,
+    kalman_count,
+    kalman_forced,
+    kalman_healthy,
+    kalman_usable,
+)
+from softneck.runtime._layout import Arrays, array, cells, rest, value
+from softneck.runtime._members_runtime import member_initialise, member_size, member_step
+
+# Places in `setup`; the model's outputs are more than those that are measured.
+NONLINEAR_MOTORS = 0
+NONLINEAR_OUTPUTS = 1
+NONLINEAR_TOLD = 2
+NONLINEAR_SETTLE = 3
+NONLINEAR_START = 4
+NONLINEAR_KEEP = 5
+
+
+class NonlinearArrays(Arrays):
+    """Those of the model follow."""
+
+    setup = array(
+        "6",
+        "motors, outputs, outputs of the model, samples until it stands, standard deviation of the disturbance at "
+        "the start, part of the fastest motion that a sample keeps",
+    )
+    constants = array("numbers", "see KALMAN_*; a lag of 1: the set-points come a sample early")
+    free = array("parameters", "of the model in free run")
+    motors = value("setup", NONLINEAR_MOTORS)
+    outputs = value("setup", NONLINEAR_OUTPUTS)
+
+
+class NonlinearState(KalmanCounters):
+    """Counters, what the model says and misses; its own state follows."""
+
+    variance = cells("", "of each output's disturbance")
+    fastest = cells("", "motion of the model in a sample, of late")
+    angles = cells("outputs", "of the model at the filter's time")
+    disturbance = cells("outputs", "what it misses")
+    held = cells("motors", "set-points that came last")
+    model = rest("state of the model")
+
+
+def state_size(p: NonlinearArrays) -> int:
+    """Return the length of the state vector."""
+    return NonlinearState.size(p) + member_size(p, 0)
+
+
+def initialise(p: NonlinearArrays, parameters: np.ndarray, x: NonlinearState, outputs: np.ndarray) -> None:
+    """Start where nothing is known; the first sample tells where the motors stand."""
+    x[:] = 0.0
+    kalman_clear(p.constants, x)
+    outputs[:] = 0.0
+
+
+def step(
+    p: NonlinearArrays, parameters: np.ndarray, x: NonlinearState, inputs: np.ndarray, outputs: np.ndarray
+) -> None:
+    """Move the model on, then take in the measurement where there is a credible one.
+
+    inputs: motor_setpoint_1..3, pitch_measured, roll_measured, measurement_valid.
+    outputs: pitch, roll, pitch_rate, roll_rate, innovation, healthy.
+    parameters: measurement noise, the disturbance's at rest (standard deviations), and what of a motion it may be.
+    """
+    c, n, m = p.constants, p.motors, p.outputs
+    asked, measured = inputs[:n], inputs[n : n + m]
+    start = p.setup[NONLINEAR_START]
+    if x.samples == 0.0:
+        nonlinear_settle(p, x, asked)
+        x.variance = start * start
+    usable = kalman_usable(c, x, measured, float(inputs[n + m]), parameters[0])
+    forced = kalman_forced(c, x)
+    nonlinear_predict(p, parameters, x, asked)
+    if forced:
+        # Wide enough for the measurement to have its way.
+        x.variance += start * start
+    innovation, accepted = 0.0, False
+    if usable:
+        innovation, accepted = nonlinear_correct(p, parameters[0], x, measured, forced)
+    kalman_count(c, x, usable, accepted)
+    nonlinear_tell(p, x, asked, outputs)
+    outputs[2 * m] = innovation
+    outputs[2 * m + 1] = 1.0 if kalman_healthy(c, x, parameters[0]) else 0.0
+    x.samples += 1.0
+
+
+def nonlinear_settle(p: NonlinearArrays, x: NonlinearState, asked: np.ndarray) -> None:
+    """Bring the model to where it had been, had the motors stood there for ever."""
+    x.held[:] = asked
+    member_initialise(p, 0, p.free, x.model, np.zeros(int(p.setup[NONLINEAR_TOLD])))
+    for _ in range(int(p.setup[NONLINEAR_SETTLE])):
+        nonlinear_move(p, x.model, asked, x.angles)
+
+
+def nonlinear_move(p: NonlinearArrays, model: np.ndarray, motors: np.ndarray, angles: np.ndarray) -> None:
+    """Move the model on in free run under `motors` and fill its `angles`."""
+    u = np.empty(2 * p.motors + p.outputs)
+    u[: p.motors] = motors
+    u[p.motors :] = np.nan  # NaN: nothing is measured
+    out = np.zeros(int(p.setup[NONLINEAR_TOLD]))
+    member_step(p, 0, p.free, model, u, out)
+    angles[:] = out[: p.outputs]
+
+
+def nonlinear_predict(p: NonlinearArrays, parameters: np.ndarray, x: NonlinearState, asked: np.ndarray) -> None:
+    """Move the model on under what acted since the last sample, and widen what it may miss by how far it went."""
+    before = x.angles.copy()
+    if p.constants[KALMAN_LAG] > 0.5:
+        nonlinear_move(p, x.model, x.held, x.angles)
+    else:
+        nonlinear_move(p, x.model, asked, x.angles)
+    x.held[:] = asked
+    moved = p.setup[NONLINEAR_KEEP] * x.fastest
+    for i in range(p.outputs):
+        moved = max(moved, abs(x.angles[i] - before[i]))
+    x.fastest = moved
+    x.variance += parameters[1] * parameters[1] + (parameters[2] * moved) ** 2
+
+
+def nonlinear_correct(
+    p: NonlinearArrays, noise: float, x: NonlinearState, measured: np.ndarray, forced: bool
+) -> tuple[float, bool]:
+    """Take the measurement into the disturbance unless the gate refuses; return the NIS and whether it was taken in."""
+    S = x.variance + noise * noise
+    x.log_det = p.outputs * math.log(S)
+    innovation = 0.0
+    for i in range(p.outputs):
+        innovation += (measured[i] - x.angles[i] - x.disturbance[i]) ** 2 / S
+    if not (forced or innovation <= p.constants[KALMAN_GATE]):
+        return innovation, False
+    gain = x.variance / S
+    for i in range(p.outputs):
+        x.disturbance[i] += gain * (measured[i] - x.angles[i] - x.disturbance[i])
+    x.variance *= 1.0 - gain
+    return innovation, True
+
+
+def nonlinear_tell(p: NonlinearArrays, x: NonlinearState, asked: np.ndarray, outputs: np.ndarray) -> None:
+    """Carry the estimate from the filter's time to now, under the newest set-points; fill angles and rates."""
+    c, m = p.constants, p.outputs
+    whole = int(c[KALMAN_LEAD])
+    part = c[KALMAN_LEAD] - whole
+    # Copies: the filter's own model stays at the time of the measurement.
+    model, now, before = x.model.copy(), x.angles.copy(), np.empty(m)
+    for _ in range(whole + 1):
+        before[:] = now
+        nonlinear_move(p, model, asked, now)
+    for i in range(m):
+        # Between samples by a straight line, whose slope is the rate.
+        outputs[i] = before[i] + part * (now[i] - before[i]) + x.disturbance[i]
+        outputs[m + i] = (now[i] - before[i]) / c[KALMAN_PERIOD]

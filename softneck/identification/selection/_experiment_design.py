@@ -1,0 +1,319 @@
+"""What to record next: the motions on which members of a model part, or which lead where nothing was seen.
+
+Where several models that were trained alike part, most of them are wrong, and a record there would tell which. Each
+motion is scored by what it would make known of all of them: a sample's doubt,
+
+    s^2 = spread of the members^2 + (slope d)^2,
+
+d the distance from the set-points that were seen, falls by `1 - k^2` where the nearest recorded sample has the
+correlation k with it in set-points and their change (a kernel of length `_LENGTH`). The sum of what is left is
+submodular: taking the best motion first and so on reaches 63 % of the best choice at least (Nemhauser, Wolsey and
+Fisher 1978; Krause, Singh and Guestrin 2008). What is expected is expected by the members: what they share, they do not
+know.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from softneck.core import DataError, Matrix, Progress, SettingsError, Vector, require_between, silent, to_si
+from softneck.robot import Robot
+from softneck.signals import Recording
+
+from ..models._arrays import members, own_arrays
+from ..models._fitting import in_display_unit, training_recording
+from ..models._jobs import Job, done
+from ..models._model import Model
+from ..networks._state_space_network import NeuralStateSpace
+from ..uncertainty._guarded import Guarded, covering
+from ..uncertainty._left_out import left_out
+from ._candidate_motions import RAMP, Bounds, Motion, motions
+
+# Of a motion, ramps included [s]; a sequence has whole ones.
+_SECONDS = 10.0
+_LEAST, _MOST = 4.0 * RAMP, 3600.0
+# Samples are compared so often, and their change taken over so long [s].
+_EVERY, _CHANGE = 0.2, 0.4
+# Of the kernel, in standard deviations of set-points and changes over all motions.
+_LENGTH = 0.5
+# Of a record: so many quick models, steps of each over its whole free run, and set-points that stand for all.
+_MEMBERS, _STEPS, _SEEN = 4, 4, 200
+# The doubt beyond what was seen, as of guarded models.
+_UNSEEN = Guarded().unseen
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Known:
+    """What is there before the experiment.
+
+    Attributes:
+        models: members that run free; none where none could be trained.
+        seen: (points, motors) set-points that stand for all that were seen; None where a model does not say.
+        reach: how far any was from the nearest of them.
+        slope: (outputs,) how the doubt grows with the distance from them.
+        sample_time: [s].
+        robot: whose motors move.
+        said: where this is from.
+    """
+
+    models: tuple[Model, ...]
+    seen: Matrix | None
+    reach: float
+    slope: Vector
+    sample_time: float
+    robot: Robot
+    said: str
+
+    @classmethod
+    def of_model(cls, model: Model) -> Known:
+        """Return what a model with members knows.
+
+        Raises:
+            SettingsError: a model of one piece.
+        """
+        parts = [
+            Model(kind=kind, sample_time=model.sample_time, arrays=arrays, robot=model.robot)
+            for kind, arrays in members(model.arrays)
+        ]
+        # Of a guarded model the first is the base: it is another kind, and parts from the others everywhere.
+        parts = parts[1:] if model.kind == "guarded" else parts
+        if len(parts) < 2:
+            raise SettingsError(
+                f"a model of kind `{model.kind}` has no members that could part; give one of kind `guarded` or "
+                "`ensemble`, or the recording."
+            )
+        own, outputs = own_arrays(model.arrays), len(model.robot.outputs.names)
+        return cls(
+            models=tuple(parts),
+            seen=own.get("seen"),
+            reach=float(own["reach"][0]) if "reach" in own else 0.0,
+            slope=own.get("slope", np.zeros(outputs)),
+            sample_time=model.sample_time,
+            robot=model.robot,
+            said=f"{len(parts)} members of {model.kind}",
+        )
+
+    @classmethod
+    def of_recording(cls, recording: Recording, *, seed: int = 0, progress: Progress = silent) -> Known:
+        """Train neural state spaces quickly, and return what they know; of poor data where it was alone.
+
+        Raises:
+            DataError: a record that nothing can be trained on.
+        """
+        whole = training_recording(recording, any_robot=True)
+        seen, reach = covering(whole.set_points, _SEEN)
+        moved = np.sqrt(np.mean(whole.set_points.var(axis=0)))
+        parts = enumerate(left_out(whole, _MEMBERS))
+        jobs = [Job(f"member {i + 1}", _member, (seed + i, rest, part)) for i, (rest, part) in parts]
+        try:
+            training_recording(whole, any_robot=True, all_motors=True)  # before processes are started
+            models, said = done(jobs, min(os.cpu_count() or 1, _MEMBERS), progress), f"{_MEMBERS} quick models"
+        except DataError as error:
+            models, said = [], f"no models ({error})"
+        return cls(
+            models=tuple(models), seen=seen, reach=reach, slope=_UNSEEN * np.nanstd(whole.outputs, axis=0) / moved,
+            sample_time=whole.sample_time, robot=whole.robot, said=said,
+        )  # fmt: skip
+
+
+def _member(seed: int, rest: Recording, part: Recording) -> Model:
+    return NeuralStateSpace(seed=seed, starts=1, iterations=_STEPS).fit(rest, hold_out=part)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """One motion of an experiment.
+
+    Attributes:
+        start_s: when it begins [s].
+        motion: what is played.
+        spread: rms over it of the members' spread, in SI.
+        unseen: rms over it of the doubt for what was not seen, in SI.
+        outside: the farthest of its set-points from what was seen, in SI.
+    """
+
+    start_s: float
+    motion: Motion
+    spread: float
+    unseen: float
+    outside: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NextExperiment:
+    """What to record next.
+
+    Attributes:
+        recording: its set-points, and as outputs what the members expect.
+        parts: in their order.
+        before, after: rms doubt over all motions that could be played [SI]: now, and expected once this is recorded.
+        said: who doubts.
+    """
+
+    recording: Recording
+    parts: tuple[Part, ...]
+    before: float
+    after: float
+    said: str
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what JSON holds, in the unit in which people see the outputs."""
+        robot, unit = self.recording.robot, self.recording.robot.outputs.display_unit
+        shown = in_display_unit(robot, np.array([self.before, self.after]))
+        parts = []
+        for part in self.parts:
+            spread, unseen = in_display_unit(robot, np.array([part.spread, part.unseen]))
+            parts.append({
+                "start_s": part.start_s, "signal": part.motion.signal, "size": part.motion.size,
+                "speed": part.motion.speed, f"disagreement_{unit}": spread, f"unseen_{unit}": unseen,
+                "why": _why(part, spread, unit, robot),
+            })  # fmt: skip
+        return {
+            "members": self.said,
+            f"disagreement_{unit}": {"before": shown[0], "expected_after": shown[1]},
+            "parts": parts,
+        }
+
+
+def next_experiment(
+    known: Known, *, duration: float, seed: int = 0, bounds: Bounds | None = None, progress: Progress = silent
+) -> NextExperiment:
+    """Choose motions one after the other, each for what it makes known beside those before.
+
+    Motions that would lead an output beyond the robot's range are left out.
+
+    Args:
+        known: what is there.
+        duration: of the experiment [s].
+        seed: of levels and phases.
+        bounds: of the set-points; None takes the robot's.
+        progress: called with the part done.
+
+    Raises:
+        SettingsError: too short or too long, or no motion within the outputs' range.
+        DataError: no member runs free.
+    """
+    require_between("duration", duration, _LEAST, _MOST, "s")
+    robot, Ts = known.robot, known.sample_time
+    count = max(1, round(duration / _SECONDS))
+    rows, bounds = round(duration / Ts) // count, bounds or Bounds.of(robot)
+    drawn, tried = motions(robot, Ts, rows, bounds, seed), []
+    for number, motion in enumerate(drawn):
+        progress(number / len(drawn), str(motion))
+        tried.append(_Tried.of(motion, known))
+    tried = [one for one in tried if one.inside]
+    if not tried:
+        raise SettingsError("every motion leads an output out of the robot's range; lower --max-position.")
+    doubt = np.concatenate([one.doubt for one in tried])
+    cover = _coverage([one.features for one in tried])
+    chosen, reached = _greedy(doubt, cover, count)
+    parts, P, Y = [], [], []
+    for number, i in enumerate(chosen):
+        one = tried[i]
+        parts.append(Part(number * rows * Ts, one.motion, one.spread, one.unseen, one.outside))
+        P.append(one.motion.set_points)
+        Y.append(one.expected)
+    # What is left of whole parts: at rest.
+    left = round(duration / Ts) - rows * count
+    P.append(np.tile(bounds.rest, (left, 1)))
+    Y.append(np.tile(Y[-1][-1], (left, 1)))
+    before, after = (float(np.sqrt(np.mean(doubt * (1.0 - part)))) for part in (np.zeros(doubt.size), reached))
+    progress(1.0, "done")
+    return NextExperiment(_recording(robot, Ts, np.vstack(P), np.vstack(Y)), tuple(parts), before, after, known.said)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Tried:
+    """A motion and what is doubted of it, at samples `_EVERY` apart: squared doubt and features (samples, n)."""
+
+    motion: Motion
+    expected: Matrix
+    doubt: Vector
+    features: Matrix
+    spread: float
+    unseen: float
+    outside: float
+    inside: bool
+
+    @classmethod
+    def of(cls, motion: Motion, known: Known) -> _Tried:
+        """Run the members over a motion."""
+        robot, Ts, P = known.robot, known.sample_time, motion.set_points
+        outputs = len(robot.outputs.names)
+        blank = _recording(robot, Ts, P, np.zeros((len(P), outputs)))
+        runs = np.array([model.simulate(blank, warm_up=1)[:, :outputs] for model in known.models])
+        expected, variance = np.zeros((len(P), outputs)), np.zeros((len(P), outputs))
+        if len(runs):
+            runs = np.where(np.isfinite(runs), runs, np.inf)
+            expected = np.median(runs, axis=0)
+            if not np.isfinite(expected).all():
+                raise DataError("most members diverge; record with `mixed`, or train others.")
+            # One that diverges is as wrong as the motion is large.
+            apart = np.minimum(np.abs(runs - expected), max(float(np.ptp(expected, axis=0).max()), 1e-9))
+            variance = np.mean(apart**2, axis=0)
+        distance = _distance(P, known)
+        unseen = (distance[:, None] * known.slope) ** 2
+        every = slice(None, None, max(round(_EVERY / Ts), 1))
+        back = max(round(_CHANGE / Ts), 1)
+        change = P - np.vstack([np.repeat(P[:1], back, axis=0), P])[: len(P)]
+        low, high = (
+            np.full(outputs, side) if ends is None else np.array(ends)
+            for ends, side in ((robot.outputs.min, -np.inf), (robot.outputs.max, np.inf))
+        )
+        scale = to_si(robot.outputs.unit)[0]
+        return cls(
+            motion, expected, np.mean(variance + unseen, axis=1)[every], np.hstack([P, change])[every],
+            float(np.sqrt(variance.mean())), float(np.sqrt(unseen.mean())), float(distance.max()),
+            bool((expected >= scale * low).all() and (expected <= scale * high).all()),
+        )  # fmt: skip
+
+
+def _distance(P: Matrix, known: Known) -> Vector:
+    """Return how far set-points are beyond the reach of all that were seen (time,)."""
+    from scipy.spatial import KDTree
+
+    if known.seen is None:
+        return np.zeros(len(P))
+    return np.maximum(KDTree(known.seen).query(P)[0] - known.reach, 0.0)
+
+
+def _coverage(features: Sequence[Matrix]) -> Matrix:
+    """Return (samples, motions): what part of each sample's doubt a record of each motion would remove."""
+    from scipy.spatial import KDTree
+
+    every = np.vstack(features)
+    half = every.shape[1] // 2
+    # Set-points among themselves, and changes: a motor that moves less says less.
+    scale = np.repeat([max(float(every[:, part].std()), 1e-12) for part in (slice(half), slice(half, None))], half)
+    distances = [KDTree(own / scale).query(every / scale)[0] for own in features]
+    # k^2 = exp(-d^2 / length^2).
+    return np.exp(-((np.column_stack(distances) / _LENGTH) ** 2))
+
+
+def _greedy(doubt: Vector, cover: Matrix, count: int) -> tuple[list[int], Vector]:
+    """Return `count` motions and the part of each sample's doubt (samples,) that they remove together."""
+    reached, chosen = np.zeros(doubt.size), []
+    for _ in range(count):
+        gains = doubt @ np.maximum(cover - reached[:, None], 0.0)
+        # Once all is known, again what was most in doubt.
+        best = int(np.argmax(gains))
+        chosen.append(best)
+        reached = np.maximum(reached, cover[:, best])
+    return chosen, reached
+
+
+def _recording(robot: Robot, sample_time: float, P: Matrix, Y: Matrix) -> Recording:
+    channels = dict(zip((*robot.set_points, *robot.outputs.names), (*P.T, *Y.T), strict=True))
+    return Recording(np.arange(len(P)) * sample_time, sample_time, channels, robot=robot)
+
+
+def _why(part: Part, spread: float, unit: str, robot: Robot) -> str:
+    said = [f"members part by {spread:.2g} {unit}"] if part.spread > 0.0 else []
+    if part.outside > 0.0:
+        said.append(f"up to {part.outside / to_si(robot.motors.unit)[0]:.2g} {robot.motors.unit} from what was seen")
+    return "; ".join(said) or "nothing is in doubt"

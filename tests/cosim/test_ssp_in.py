@@ -1,0 +1,237 @@
+"""SSP archives of any tool: nested systems, lines, units, values and mappings mean what the standard says."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softneck.cli._main import run
+from softneck.core import FileFormatError, SettingsError, SoftneckError
+from softneck.cosim import FmuPart, load_loop, load_ssp, simulate, study, write_ssp
+from softneck.cosim.loops._loop_file import LoopSetup
+from softneck.loop._system import System
+
+from ._foreign import build_foreign
+
+SPACES = " ".join(
+    f'xmlns:{short}="http://ssp-standard.org/SSP1/SystemStructure{name}"'
+    for short, name in (
+        ("ssd", "Description"), ("ssc", "Common"), ("ssv", "ParameterValues"), ("ssm", "ParameterMapping"),
+    )
+)  # fmt: skip
+STEP, END = 0.1, 1.0
+# Two of the same FMU, the second in a system of its own behind connectors in rad; `alpha` is in deg.
+ELEMENTS = """
+<ssd:Component name="first" source="resources/F.fmu">
+  <ssd:ParameterBindings>
+    <ssd:ParameterBinding><ssd:ParameterValues><ssv:ParameterSet version="1.0" name="own"><ssv:Parameters>
+      <ssv:Parameter name="k"><ssv:Real value="4"/></ssv:Parameter>
+      <ssv:Parameter name="u1"><ssv:Real value="1"/></ssv:Parameter>
+      <ssv:Parameter name="u3"><ssv:Real value="0.3"/></ssv:Parameter>
+      <ssv:Parameter name="nobody"><ssv:Real value="3"/></ssv:Parameter>
+    </ssv:Parameters></ssv:ParameterSet></ssd:ParameterValues></ssd:ParameterBinding>
+    <ssd:ParameterBinding source="resources/late.ssv">
+      <ssd:ParameterMapping><ssm:ParameterMapping version="1.0">
+        <ssm:MappingEntry source="lag" target="T"><ssc:LinearTransformation factor="2" offset="0.1"/></ssm:MappingEntry>
+      </ssm:ParameterMapping></ssd:ParameterMapping>
+    </ssd:ParameterBinding>
+  </ssd:ParameterBindings>
+</ssd:Component>
+<ssd:System name="inner">
+  <ssd:Connectors>
+    <ssd:Connector name="turn" kind="input"><ssc:Real unit="rad"/></ssd:Connector>
+    <ssd:Connector name="gain" kind="parameter"><ssc:Real/></ssd:Connector>
+  </ssd:Connectors>
+  <ssd:ParameterBindings>
+    <ssd:ParameterBinding prefix="se.cond."><ssd:ParameterValues><ssv:ParameterSet version="1.0" name="low">
+      <ssv:Parameters><ssv:Parameter name="T"><ssv:Real value="9"/></ssv:Parameter></ssv:Parameters>
+    </ssv:ParameterSet></ssd:ParameterValues></ssd:ParameterBinding>
+  </ssd:ParameterBindings>
+  <ssd:Elements><ssd:Component name="se.cond" source="resources/F.fmu"/></ssd:Elements>
+  <ssd:Connections>
+    <ssd:Connection startConnector="turn" endElement="se.cond" endConnector="u1">
+      <ssc:LinearTransformation factor="3" offset="0.5"/></ssd:Connection>
+    <ssd:Connection startConnector="gain" endElement="se.cond" endConnector="k"/>
+  </ssd:Connections>
+</ssd:System>
+"""
+CONNECTIONS = """
+<ssd:Connection startElement="first" startConnector="alpha" endElement="inner" endConnector="turn"/>
+<ssd:Connection startElement="first" startConnector="beta" endElement="first" endConnector="u2"
+  suppressUnitConversion="true"/>
+"""
+# Values of the outermost system win over those below.
+OUTER = """
+<ssd:ParameterBinding><ssd:ParameterValues><ssv:ParameterSet version="1.0" name="outer"><ssv:Parameters>
+  <ssv:Parameter name="inner.se.cond.T"><ssv:Real value="250" unit="ms"/></ssv:Parameter>
+  <ssv:Parameter name="inner.gain"><ssv:Real value="7"/></ssv:Parameter>
+</ssv:Parameters></ssv:ParameterSet></ssd:ParameterValues></ssd:ParameterBinding>
+"""
+LATE = f"""<ssv:ParameterSet {SPACES} version="1.0" name="late"><ssv:Parameters>
+<ssv:Parameter name="lag"><ssv:Real value="0.2"/></ssv:Parameter>
+<ssv:Parameter name="k"><ssv:Real value="99"/></ssv:Parameter></ssv:Parameters></ssv:ParameterSet>"""
+
+
+def ssd(elements: str = ELEMENTS, connections: str = CONNECTIONS, outer: str = OUTER, *, version: str = "1.0") -> str:
+    """Return the text of a structure."""
+    return f"""<?xml version="1.0" encoding="UTF-8"?>
+<ssd:SystemStructureDescription {SPACES} version="{version}" name="Nested">
+<ssd:System name="root"><ssd:ParameterBindings>{outer}</ssd:ParameterBindings>
+<ssd:Elements>{elements}</ssd:Elements><ssd:Connections>{connections}</ssd:Connections>
+<ssd:Annotations><ssc:Annotation type="softneck"><Master order="jacobi" stepSize="{STEP}"/></ssc:Annotation>
+</ssd:Annotations></ssd:System>
+<ssd:DefaultExperiment startTime="0" stopTime="{END}"/></ssd:SystemStructureDescription>"""
+
+
+@pytest.fixture(scope="module", params=[2, 3], ids=["FMI 2", "FMI 3"])
+def foreign(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build_foreign(tmp_path_factory.mktemp("foreign"), request.param)
+
+
+def archive(folder: Path, fmu: Path | None, text: str, more: Mapping[str, bytes] | None = None) -> Path:
+    path = folder / "Nested.ssp"
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("SystemStructure.ssd", text)
+        file.writestr("resources/late.ssv", LATE)
+        if fmu is not None:
+            file.write(fmu, "resources/F.fmu")
+        for name, data in (more or {}).items():
+            file.writestr(name, data)
+    return path
+
+
+def by_hand(fmu: Path) -> np.ndarray:
+    """Return (rows, 4) alpha and beta of both FMUs: all inputs set, then all stepped."""
+    first, second = (FmuPart(fmu, role="plant", sample_time=STEP) for _ in range(2))
+    with first, second:
+        one = first.start(0.0, {"k": 4.0, "T": 2 * 0.2 + 0.1})
+        two = second.start(0.0, {"k": 7.0, "T": 0.25})
+        rows = []
+        for i in range(round(END / STEP)):
+            rows.append([*one[:2], *two[:2]])
+            u, v = np.array([1.0, one[1], 0.3]), np.array([3.0 * np.deg2rad(one[0]) + 0.5, 0.0, 0.0])
+            one, two = first.advance(i * STEP, u), second.advance(i * STEP, v)
+        return np.array(rows)
+
+
+@pytest.mark.parametrize("version", ["1.0", "2.0"])
+def test_nested_systems_lines_units_and_values(foreign: Path, version: str, tmp_path: Path) -> None:
+    system = load_ssp(archive(tmp_path, foreign, ssd(version=version)))
+    assert isinstance(system, System)
+    result = simulate(system)
+    names = [f"{part}.{axis}" for part in ("first", "inner_se_cond") for axis in ("alpha", "beta")]
+    shown = np.rad2deg(np.column_stack([result[name] for name in names]))
+    # Five numbers of one line come together in another order: rounding, on values of up to ten degrees.
+    np.testing.assert_allclose(shown, by_hand(foreign), rtol=0, atol=1e-13)
+    assert np.abs(shown[-1, :3]).min() > 1e-3, "nothing moves: the test shows nothing"
+
+
+def test_what_was_read_is_written_again(foreign: Path, tmp_path: Path) -> None:
+    first = load_ssp(archive(tmp_path, foreign, ssd()))
+    again = load_ssp(write_ssp(first, tmp_path / "again.ssp"))
+    a, b = simulate(first), simulate(again)
+    assert list(a.signals.signals) == list(b.signals.signals)
+    for name in a.signals.signals:
+        np.testing.assert_array_equal(a[name], b[name])
+
+
+def test_a_loop_of_ours_comes_back(loop_file: Path, tmp_path: Path) -> None:
+    loop_file.write_text('order = "jacobi"\n' + loop_file.read_text())
+    setup = load_loop(loop_file)
+    path = write_ssp(setup, tmp_path / "Loop.ssp", compiled=False)
+    back = load_ssp(path)
+    assert isinstance(back, LoopSetup)
+    assert set(back.files) == {"ssp"}
+    ours, theirs = simulate(setup), simulate(back)
+    assert ours.signals.signals.keys() == theirs.signals.signals.keys()
+    for name in ours.signals.signals:
+        np.testing.assert_array_equal(ours[name], theirs[name])
+    assert theirs.metrics == ours.metrics
+    twice = load_ssp(write_ssp(back, tmp_path / "Twice.ssp", compiled=False))
+    np.testing.assert_array_equal(simulate(twice)["pitch"], ours["pitch"])
+    with zipfile.ZipFile(path) as a, zipfile.ZipFile(tmp_path / "Twice.ssp") as b:
+        assert a.namelist() == b.namelist()
+
+
+def test_a_loop_file_takes_lines_on_connections(loop_file: Path) -> None:
+    line = '[connections]\n"controller.pitch_reference" = { from = "reference.pitch_reference", factor = 0.5 }\n'
+    half = loop_file.with_name("half.toml")
+    half.write_text(loop_file.read_text() + line)
+    small = loop_file.with_name("small.toml")
+    small.write_text(loop_file.read_text().replace("pitch_deg = 15.0", "pitch_deg = 7.5"))
+    # Half of the same number of radians.
+    np.testing.assert_allclose(simulate(half)["pitch"], simulate(small)["pitch"], rtol=0, atol=1e-15)
+
+
+def test_the_commands(loop_file: Path, foreign: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = archive(tmp_path, foreign, ssd())
+    assert run(["simulate", str(path), "-o", str(tmp_path / "out.csv")]) == 0
+    head = (tmp_path / "out.csv").read_text().splitlines()[0]
+    assert head == "time [s],first.alpha [deg],first.beta [deg],inner_se_cond.alpha [deg],inner_se_cond.beta [deg]"
+    assert run(["ssp", str(path), "-o", str(tmp_path / "b.ssp")]) == 0
+    # The loop's own order is sequential, in which its overshoot holds the limit; an archive has neither.
+    loop = write_ssp(load_loop(loop_file), tmp_path / "Loop.ssp", compiled=False)
+    assert run(["simulate", str(loop), "-o", str(tmp_path / "loop.csv"), "--json"]) == 0
+    assert '"overshoot_pct"' in capsys.readouterr().out
+
+
+COMPONENT = '<ssd:Component name="a" source="resources/F.fmu">{}</ssd:Component>'
+LINK = '<ssd:Connection startElement="a" startConnector="{}" endElement="a" endConnector="{}"/>'
+STRING = """<ssd:ParameterBindings><ssd:ParameterBinding><ssd:ParameterValues><ssv:ParameterSet><ssv:Parameters>
+<ssv:Parameter name="k"><ssv:Enumeration value="x"/></ssv:Parameter></ssv:Parameters></ssv:ParameterSet>
+</ssd:ParameterValues></ssd:ParameterBinding></ssd:ParameterBindings>"""
+UNIT = '<ssd:Connectors><ssd:Connector name="u1" kind="input"><ssc:Real unit="{}"/></ssd:Connector></ssd:Connectors>'
+BOMB = '<!DOCTYPE x [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;">]><x>&b;</x>'
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (BOMB, "DOCTYPE"),
+        ("<x/>", "no SSP 1.0 or 2.0"),
+        ("not xml", "no valid XML"),
+        (ssd("<ssd:SignalDictionaryReference name='d'/>", ""), "SignalDictionaryReference `d`"),
+        (ssd(COMPONENT.replace("F.fmu", "../../etc.fmu").format(""), ""), "outside the archive"),
+        (ssd(COMPONENT.replace("F.fmu", "G.fmu").format(""), ""), "no member `resources/G.fmu`"),
+        (ssd('<ssd:Component name="a" source="x.ssd" type="application/x-ssp-definition"/>', ""), "component `a`"),
+        (ssd(COMPONENT.format(""), LINK.format("alpha", "u9")), "`a.u9`, which is not there"),
+        (ssd(COMPONENT.format(""), LINK.format("alpha", "u1") * 2), "`a.u1` has two writers"),
+        (ssd(COMPONENT.format(""), LINK.format("u2", "u1")), "`a.u2` to `a.u1`"),
+        (ssd(COMPONENT.format(UNIT.format("parsec")), LINK.format("alpha", "u1")), "unknown unit `parsec`"),
+        (ssd(COMPONENT.format(UNIT.format("kg")), LINK.format("alpha", "u1")), "these units do not fit"),
+        (ssd(COMPONENT.format(STRING), ""), "Enumeration `x`"),
+        (ssd("", ""), "no components"),
+        (ssd(COMPONENT.format(""), "").replace('stepSize="0.1"', 'stepSize="soon"'), "stepSize = `soon`"),
+    ],
+)
+def test_what_cannot_be_run_is_named(text: str, words: str, foreign: Path, tmp_path: Path) -> None:
+    path = archive(tmp_path, foreign, text)
+    with pytest.raises(SoftneckError) as error:
+        load_ssp(path)
+    assert words in str(error.value)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_an_archive_that_reaches_out_of_itself(foreign: Path, tmp_path: Path) -> None:
+    path = archive(tmp_path, foreign, ssd(), {"../../out.txt": b"x"})
+    with pytest.raises(FileFormatError, match="reaches out of it"):
+        load_ssp(path)
+    assert not (tmp_path.parent / "out.txt").exists()
+    with pytest.raises(FileFormatError, match="is not an SSP archive"):
+        load_ssp(foreign)
+
+
+def test_only_loops_are_loops(foreign: Path, tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="is no closed loop"):
+        load_loop(archive(tmp_path, foreign, ssd()))
+
+
+def test_a_study_of_an_archive(loop_file: Path, tmp_path: Path) -> None:
+    path = write_ssp(load_loop(loop_file), tmp_path / "Loop.ssp", compiled=False)
+    runs = study(path, vary={"plant.parameters.payload": [0.0, 1.0]}, workers=1)
+    assert len(set(runs["pitch.rms_error_deg"].tolist())) == 2

@@ -1,0 +1,115 @@
+"""Numbers from data are kept where they are better on rows held out, and what tells the sensor's delay is said."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softneck.core import load
+from softneck.estimation import KalmanObserver, KalmanSettings
+from softneck.estimation._fitted import delayed, fitted_observer, likeliest_later, sensor_delay
+
+from .necks import IN_TIME, TS, neck, recording, smooth_motion
+
+
+def observer_of(settings: KalmanSettings = IN_TIME, *, pitch_delay: int = 4, roll_delay: int = 2) -> KalmanObserver:
+    return settings.design(neck(pitch_delay=pitch_delay, roll_delay=roll_delay))
+
+
+def test_a_dead_time_that_the_model_lacks_is_found_by_likelihood() -> None:
+    record = recording(rows=800)
+    assert likeliest_later(observer_of(), [record]) == 0
+    assert likeliest_later(observer_of(pitch_delay=2, roll_delay=0), [record]) == 2
+
+
+def test_what_was_fitted_is_kept_only_where_it_is_better() -> None:
+    """A model that lacks two samples of dead time: noise alone mends little of it, the delay nearly all."""
+    record = recording(rows=1200)
+    wrong = observer_of(pitch_delay=2, roll_delay=0)
+    found = fitted_observer(wrong, [record])
+    assert found.checks[found.kept] == min(found.checks.values())
+    assert found.kept == "noise and delay"
+    assert found.observer.delays == (4, 2)
+    # Nothing but the sensor's noise of 0.05 deg is left, of some 140 angles known to 6 %; by default a third more.
+    assert found.checks["noise and delay"] == pytest.approx(math.radians(0.05), rel=0.2)
+    assert found.checks["default"] > 1.2 * found.checks["noise and delay"]
+    assert "sensor_delay" in found.untold
+
+
+def test_levels_that_are_right_are_not_made_worse() -> None:
+    true = (math.radians(0.05), math.radians(1e-3), math.radians(1e-3))
+    right = observer_of().with_noise(true)
+    found = fitted_observer(right, [recording(rows=700)])
+    assert found.checks[found.kept] <= found.checks["default"]
+
+
+def test_a_gyro_tells_how_late_the_angles_are() -> None:
+    record = smooth_motion(noise_deg=0.02)
+    late = {axis: np.interp(record.time - 0.035, record.time, record.channels[axis]) for axis in ("pitch", "roll")}
+    record = record.with_channels(**{f"{axis}_measured": angle for axis, angle in late.items()})
+    # A quarter of a sample is the grid; what the gyro itself is late comes on top.
+    for gyro, sensor in ((0.0, 0.0), (0.0, 0.02), (0.05, 0.05)):
+        settings = replace(IN_TIME, form="gyro", gyro_delay=gyro, sensor_delay=sensor)
+        told, source = sensor_delay(settings.design(neck(sample_time=0.01)), [record])
+        assert source == "gyro"
+        assert told == pytest.approx(gyro + 0.035, abs=0.0026)
+    assert sensor_delay(IN_TIME.design(neck(sample_time=0.01)), [record]) == (None, "")
+
+
+def test_the_gyro_form_is_put_right_by_its_rates() -> None:
+    record = smooth_motion(noise_deg=0.02)
+    late = {axis: np.interp(record.time - 0.03, record.time, record.channels[axis]) for axis in ("pitch", "roll")}
+    record = record.with_channels(**{f"{axis}_measured": angle for axis, angle in late.items()})
+    observer = replace(IN_TIME, form="gyro").design(neck(sample_time=0.01))
+    found = fitted_observer(observer, [record])
+    assert (found.kept, found.observer.delay_source) == ("noise and delay", "gyro")
+    errors = [np.abs(item.estimate(record).pitch - record.channels["pitch"])[500:].max() for item in
+              (observer, found.observer)]  # fmt: skip
+    # 0.9 rad/s for 0.03 s is 1.5 deg; a sample's rate is exact to half a sample of its change.
+    assert errors[0] > math.radians(1.2)
+    assert errors[1] < math.radians(0.2)
+
+
+def test_rates_of_the_same_sensor_are_as_late_as_its_angles() -> None:
+    """Between two measurements act the rates of the same time."""
+    observer = KalmanSettings(form="gyro").design(neck())
+    assert observer.lead == 0.0
+    assert observer.constants[:2] == pytest.approx([0.5, 0.5])
+    apart = KalmanSettings(form="gyro", sensor_delay=0.05).design(neck())
+    assert apart.constants[:2] == pytest.approx([3.0, 3.0])
+
+
+def test_motor_positions_tell_the_most_that_it_can_be() -> None:
+    record, observer = recording(rows=800), observer_of(replace(IN_TIME, sensor_delay=0.1))
+    angles = record.set_points @ observer.directions.T
+    moved = {f"motor_position_{j + 1}": record.set_points[:, j] for j in range(3)}
+    for i, axis in enumerate(("pitch", "roll")):
+        # An angle that stands in proportion to the motors, 3 samples ago.
+        moved[f"{axis}_measured"] = 0.08 * np.concatenate([np.full(3, angles[0, i]), angles[:-3, i]])
+    told, source = sensor_delay(observer, [record.with_channels(**moved)])
+    assert (told, source) == (pytest.approx(3 * TS), "motor positions")
+    # The link lags as well: where the filter thinks of less, they tell nothing.
+    assert sensor_delay(observer_of(), [record.with_channels(**moved)]) == (None, "")
+    assert sensor_delay(observer, [record]) == (None, "")
+
+
+def test_the_summary_says_where_the_delay_comes_from() -> None:
+    assert "late by" not in observer_of(KalmanSettings()).summary()
+    assert "late by 30 ms (as given)" in observer_of(KalmanSettings(sensor_delay=0.03)).summary()
+
+
+def test_only_dead_time_is_later() -> None:
+    later = delayed(observer_of(), 2)
+    assert later.delays == (6, 4)
+    assert later.lead == observer_of().lead
+
+
+def test_the_file_keeps_where_the_delay_comes_from(tmp_path: Path) -> None:
+    observer = replace(observer_of(KalmanSettings(sensor_delay=0.03)), delay_source="gyro")
+    observer.save(tmp_path / "o.npz")
+    again = load(tmp_path / "o.npz", role="observer")
+    assert (again.delay_source, again.summary()) == ("gyro", observer.summary())
