@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -21,7 +21,8 @@ from softneck.robot import Robot
 from softneck.runtime import Block, Port, State
 from softneck.signals import Recording
 
-from ._forms import NOISES, noise_units
+from ._axis import directions_of
+from ._forms import NOISES, noise_units, require_levels
 from ._kalman import delay_source, filter_lines, observer_ports
 from ._kalman_parts_runtime import KALMAN_LEAD, KALMAN_MORE_LAGS
 from ._nonlinear_runtime import NonlinearArrays, NonlinearState
@@ -81,9 +82,23 @@ class NonlinearObserver:
         return tuple(name for name, _ in NOISES[FORM])
 
     @property
+    def directions(self) -> Matrix:
+        """Weights (outputs, motors) of the motors in each output."""
+        return directions_of(self.model)
+
+    @property
     def lead(self) -> float:
         """How far the estimate runs ahead of the measurement [s]: the sensor's delay."""
         return float(self.constants[KALMAN_LEAD]) * self.sample_time
+
+    def with_constants(self, constants: Vector) -> NonlinearObserver:
+        """Return the same filter with other constants."""
+        return replace(self, constants=constants)
+
+    def with_noise(self, noise: Sequence[float], *, sensor: str = "none") -> NonlinearObserver:
+        """Return the same filter with other noise levels."""
+        levels = require_levels(FORM, self.robot, noise)
+        return replace(self, noise=levels, sensor=sensor)
 
     def block(self) -> Block:
         """Return the filter as a block of role "observer"."""
@@ -149,6 +164,16 @@ class NonlinearObserver:
             covariance=np.eye(m) * states[:, parts["variance"], None],
             log_det=states[:, parts["log_det"]][:, 0],
         )
+
+    def free_run(self, run: Recording) -> tuple[Matrix, Vector]:
+        """Return what the model says of a run (time, outputs), and its fastest motion in a sample of late (time,).
+
+        Raises:
+            DataError: another sample time or another robot.
+        """
+        check_recording(self, run)
+        parts, (_, states) = NonlinearState.parts(NonlinearArrays(self.block().arrays)), self._rows(run)
+        return states[:, parts["angles"]], states[:, parts["fastest"]][:, 0]
 
     def _rows(self, run: Recording) -> tuple[Matrix, Matrix]:
         """Return outputs (time, outputs) and states (time, states) of a run."""
