@@ -3,8 +3,8 @@
 `python benchmarks/payload.py [--necks NECK...]`
 
 `several` is a `greybox` of 0, 0.5 and 1 kg, `own` one of the payload that it is judged on, `none` one of 0 kg, each of
-100 s of Eq. 22 a payload; judged in free run on the 40 s that follow. The observers see a poor sensor (noise of 0.25 deg,
-20 % of the samples lost, two blackouts of a second) on three motions at 0, 0.32, 0.75 and 1 kg: over `none`, over
+100 s of Eq. 22 a payload; judged in free run on the 40 s that follow. The observers see a poor sensor (noise of 0.25
+deg, 20 % of the samples lost, two blackouts of a second) on three motions at 0, 0.32, 0.75 and 1 kg: over `none`, over
 `several`, and over `several` whose payload is told. Nothing is chosen here.
 """
 
