@@ -81,8 +81,11 @@ def _layout(draft: Draft, found: dict[str, Unit]) -> Layout:
         return Source(terms, unit, pick.sign)
 
     tilt = "inclination" in draft.picks and "orientation" in draft.picks
+    asked = [term.column for name in SET_POINTS if name in draft.picks for term in draft.picks[name].terms]
     return replace(
         draft.sniffed.form,
+        # A set-point is never missed, as a measurement may be: where it is not said it holds.
+        merge=draft.sniffed.form.merge and any(draft.sniffed.lacks(column) for column in asked),
         channels={name: source(name) for name in draft.picks if name not in _NO_CHANNELS},
         inclination=source("inclination") if tilt else None,
         orientation=source("orientation") if tilt else None,

@@ -198,6 +198,7 @@ class TextForm:
     decimal: str = "."
     skip: int = 0
     unit_row: bool = False
+    encoding: str = "utf-8"
 
 
 def read_table(source: Path, suffix: str, form: TextForm) -> pd.DataFrame:
@@ -227,6 +228,7 @@ def read_table(source: Path, suffix: str, form: TextForm) -> pd.DataFrame:
                 keep_default_na=False,
                 na_values=[""],
                 low_memory=False,
+                encoding=form.encoding,
             )
     except (ValueError, OSError, ArithmeticError, MemoryError, pd.errors.ParserWarning) as error:
         raise _no_table(source, error) from error
