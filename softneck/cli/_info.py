@@ -168,7 +168,10 @@ def _describe(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dic
         case ".json":
             return _certificate(file)
         case ".mcap" | ".blf":
-            return describe_log(file)
+            from softneck.signals.importing.formats._mcap import is_run_log
+
+            foreign = file.suffix.lower() == ".mcap" and not is_run_log(file)
+            return _log(file, html, None) if foreign else describe_log(file)
         case ".log" if is_candump(file):
             return describe_log(file)
         case _:

@@ -91,7 +91,11 @@ def test_a_gap_in_the_time_column_splits_the_run_under_any_sample_time(tmp_path:
         ('"p", unit = "deg"', '"p", unit = 5', "unknown unit `5`"),
         ('"p", unit = "deg"', '"p", unit = ["deg"]', "wrong type"),
         ('{ column = "p", unit', "{ unit", r"\[channels\.pitch\] needs `column`"),
-        ('"p", unit = "deg"', '"p", unit = "deg", sing = -1', "unknown key `sing`; known: column, factor, integrate, sign"),
+        (
+            '"p", unit = "deg"',
+            '"p", unit = "deg", sing = -1',
+            "unknown key `sing`; known: column, factor, integrate, sign",
+        ),
         (
             '"p", unit = "deg"',
             '"p", unit = "deg", sign = "x"',

@@ -135,7 +135,7 @@ def test_what_is_no_mat_file(tmp_path: Path) -> None:
         load(tmp_path, "none.mat", layout_text(True))
     for content in (b"", b"t,a\n1,2\n" * 50, bytes(range(256)) * 9, b"\x89HDF\r\n\x1a\n" + bytes(600)):
         (tmp_path / "a.mat").write_bytes(content)
-        with pytest.raises(FileFormatError, match="cannot be read as a (MAT file|table .it is empty)"):
+        with pytest.raises(FileFormatError, match=r"cannot be read as a (MAT file|table .it is empty)"):
             load(tmp_path, "a.mat", layout_text(True))
 
 

@@ -105,7 +105,7 @@ def _between(time: Vector, values: Vector) -> Vector:
 def integrated(samples: Samples, sources: Mapping[str, Source]) -> tuple[Samples, tuple[str, ...]]:
     """Return the samples with the integrals over time of the channels whose source says so, and a note.
 
-    Rates are summed by trapezoids at the times as logged, from 0 in each run; a missed rate lies between its neighbours.
+    Rates are summed by trapezoids at the times as logged, from 0 in each run; a missed one lies between its neighbours.
     """
     names = [name for name, source in sources.items() if source.integrate and name in samples.channels]
     if not names:

@@ -165,7 +165,17 @@ def _layout(table: dict[str, Any], robot: Robot) -> Layout:
     )
     _known_keys(
         time,
-        {"column", "terms", "unit", "factor", "sample_time_s", "new_run_at_restart", "duplicates", "run_column", "merge"},
+        {
+            "column",
+            "terms",
+            "unit",
+            "factor",
+            "sample_time_s",
+            "new_run_at_restart",
+            "duplicates",
+            "run_column",
+            "merge",
+        },
         "[time]",
     )
     _known_keys(tilt, {"inclination", "orientation"}, "[tilt]")

@@ -85,7 +85,9 @@ def _imported(frame: pd.DataFrame, layout: Layout) -> ImportResult:
         o = _values(frame, layout.orientation, "pitch", layout)
         channels["pitch"], channels["roll"] = pitch_roll(i, o)
     if (q := layout.quaternion) is not None:
-        parts = [numbers(_column(frame, c, "pitch"), str(c), missing=True, nan_words=True) for c in (q.w, q.x, q.y, q.z)]
+        parts = [
+            numbers(_column(frame, c, "pitch"), str(c), missing=True, nan_words=True) for c in (q.w, q.x, q.y, q.z)
+        ]
         turned = turns(np.column_stack(parts))
         channels["pitch"], channels["roll"] = turned[q.pitch], turned[q.roll]
     samples, sample_time, notes = _clocked(frame, layout, channels)
@@ -126,8 +128,8 @@ def _beyond(layout: Layout, name: str, reach: float, limit: float) -> str:
         meant = "deg" if source.unit == "rad" else "deg/s"
         hint = f'is it in degrees (`unit = "{meant}"`)?'
     return (
-        f"`{name}` reaches {reach:.4g} {unit}{turns_said}; the motors' range is {limit:.4g} {unit}. Mend its line in the "
-        f"layout: {hint} If the robot does go so far, say so by `setpoint_max` in a robot.toml and --robot."
+        f"`{name}` reaches {reach:.4g} {unit}{turns_said}; the motors' range is {limit:.4g} {unit}. Mend its line in "
+        f"the layout: {hint} If the robot does go so far, say so by `setpoint_max` in a robot.toml and --robot."
     )
 
 

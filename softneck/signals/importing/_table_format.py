@@ -1,4 +1,4 @@
-"""What kind of table a log is: encoding, delimiter, decimal mark, header line, sheet, and which matrix of a MAT file."""
+"""What kind of table a log is: encoding, delimiter, decimal mark, header, sheet, and which matrix of a MAT file."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class SniffResult:
         columns: name, or index where there is no header -> (time,) numbers; NaN where a cell is empty. Dates are
             seconds; of rows of several clocks each column holds its last value.
         words: columns that hold no numbers.
-        form: a layout without channels that says how to read the file; to be merged where rows may be of several clocks.
+        form: a layout without channels that says how to read the file; `merge` where rows may be of several clocks.
         lines: why.
         units: what the line of units says of each column, where there is such a line.
         dates: columns that hold dates or times of day.
@@ -62,7 +62,6 @@ class SniffResult:
     units: dict[Column, str]
     dates: frozenset[Column]
     frame: pd.DataFrame
-
 
     def lacks(self, column: Column) -> bool:
         """Return whether a column has empty cells."""
@@ -241,7 +240,9 @@ def _text_form(source: Path, fewest: int) -> tuple[Layout, tuple[str, ...], list
 
 
 def _remarks(form: Layout) -> list[str]:
-    second = "the first line holds words: names" if form.header else "no header line, because the first line holds numbers"
+    second = (
+        "the first line holds words: names" if form.header else "no header line, because the first line holds numbers"
+    )
     return [
         *([f"file: the first {form.skip} line(s) are not part of the table"] if form.skip else []),
         f"file: {second}",

@@ -47,7 +47,9 @@ def seconds(column: pd.Series, name: str) -> Vector:
         bad = ~text.map(is_date).to_numpy(dtype=bool)
         if bad.any():
             row = int(np.argmax(bad))
-            raise DataError(f"column `{name}` holds `{column.iloc[row]}` at row {row} (the first is 0), which is no date.")
+            raise DataError(
+                f"column `{name}` holds `{column.iloc[row]}` at row {row} (the first is 0), which is no date."
+            )
         moments = _moments(text, name)
     if moments.isna().any():
         row = int(np.argmax(moments.isna()))

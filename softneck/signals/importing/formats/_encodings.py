@@ -110,7 +110,7 @@ def encoding_of(source: Path) -> tuple[str, str | None]:
             file.read().decode("cp1252")
         except UnicodeDecodeError as error:
             raise FileFormatError(
-                f"{source}: is not a text: byte {error.start} is none in UTF-8 or in Windows-1252; export the log as CSV."
+                f"{source}: is not a text: byte {error.start} is none in UTF-8 or Windows-1252; export the log as CSV."
             ) from None
     return "cp1252", "Windows-1252 (Latin 1), because it is not UTF-8"
 

@@ -73,7 +73,9 @@ def mcap_table(source: Path) -> pd.DataFrame:
     frame = pd.DataFrame(rows)
     if frame.empty or not len(frame.columns):
         also = f" (not decoded: {', '.join(sorted(skipped))})" if skipped else ""
-        raise DataError(f"{source}: no message of ROS 2 or JSON holds numbers{also}; record topics of set-points and angles.")
+        raise DataError(
+            f"{source}: no message of ROS 2 or JSON holds numbers{also}; record topics of set-points and angles."
+        )
     logged, stamped = np.array(clocks).T
     own = np.isfinite(stamped) & (np.abs(stamped - logged) < _SAME_CLOCK)
     time = np.where(own, stamped, logged)
