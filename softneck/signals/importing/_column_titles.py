@@ -32,6 +32,7 @@ _MOTOR = {"motor", "mot", "m", "winch", "tendon", "drive", "axis", "joint", "ser
 _ANGLES = {"pitch": "pitch", "roll": "roll", "yaw": "yaw", "inclination": "inclination", "incl": "inclination",
            "tilt": "inclination", "orientation": "orientation", "orient": "orientation",
            "azimuth": "orientation"}  # fmt: skip
+_EULER = {"pitch", "roll", "yaw"}
 _SENSED = {"sensor", "measured", "imu", "actual", "meas"}
 _NOT_SENSED = (
     ({"error", "err", "ep", "ev", "deviation", "residual"}, "an error of a control loop, not a measurement"),
@@ -94,7 +95,8 @@ def _role(words: list[str], motor: int | None) -> tuple[str, str, int]:
             return "ignored", f"'{' '.join(sorted(known & said))}' is {why}", 0
     if words[:1] == ["unnamed"]:
         return "ignored", "it counts the rows", 0
-    angle = next((word for word in words if word in _ANGLES), None)
+    # `tilt.pitch` of a topic is pitch.
+    angle = next((word for word in (*(known & _EULER), *words) if word in _ANGLES), None)
     target = next((word for word in _TARGET if word in known), None)
     speed = known & _VELOCITY
     if angle is not None:

@@ -83,6 +83,10 @@ def _columns(draft: Draft) -> list[Doubt]:
 def _units(draft: Draft, found: dict[str, Unit]) -> list[Doubt]:
     doubts: list[Doubt] = []
     groups = {**_GROUPS, "angles of the platform": _TILT, "time": ("time",)}
+    motors = [found[name].name for name in (SET_POINTS[0], MOTOR_POSITIONS[0]) if name in draft.picks and name in found]
+    if len(motors) == 2 and motors[0] == motors[1]:
+        del groups["motor set-points"], groups["motor positions"]
+        groups = {"motor set-points and positions": (*SET_POINTS, *MOTOR_POSITIONS), **groups}
     for about, channels in groups.items():
         names = tuple(name for name in channels if name in draft.picks and name in found)
         if not names or min(found[name].confidence for name in names) >= SURE:

@@ -122,7 +122,8 @@ def _beyond(layout: Layout, name: str, reach: float, limit: float) -> str:
     """Return what to do where a motor's channel reaches `reach` and the robot `limit`, both in SI units."""
     unit = to_si(layout.robot.motors.unit)[1]
     source = layout.channels[name]
-    turns_said = f", which is {reach / (2.0 * np.pi):.0f} turns" if unit == "rad" and reach > 2.0 * np.pi else ""
+    turned = reach / (2.0 * np.pi) if unit == "rad" else 0.0
+    turns_said = f", which is {turned:.0f} turns" if turned > 1.5 else ", more than a turn" if turned > 1.0 else ""
     hint = "is `factor` right?"
     if source.unit in ("rad", "rad/s"):
         meant = "deg" if source.unit == "rad" else "deg/s"

@@ -144,10 +144,8 @@ def mat_arrays(source: Path) -> dict[str, np.ndarray]:
         FileFormatError: no MAT file.
         DataError: a variable lies in another file or declares an impossible size.
     """
-    import h5py  # slow to import, and few logs need it
-
     try:
-        found = _by_name(_hdf5(source) if h5py.is_hdf5(source) else read_mat5(source.read_bytes()))
+        found = _by_name(_hdf5(source) if _is_hdf5(source) else read_mat5(source.read_bytes()))
     except (DataError, FileFormatError):
         raise
     except Exception as error:  # the parsers raise whatever the damaged bytes lead to
@@ -163,6 +161,15 @@ def _by_name(arrays: Iterator[tuple[str, np.ndarray]]) -> dict[str, np.ndarray]:
             raise ValueError(f"the variable `{name}` stands there twice")
         found[name] = array
     return found
+
+
+def _is_hdf5(source: Path) -> bool:
+    with source.open("rb") as file:
+        if is_mat5(file.read(_HEADER)):
+            return False
+    import h5py  # slow to import, and an extra that version 5 does without
+
+    return h5py.is_hdf5(source)
 
 
 def _hdf5(source: Path) -> Iterator[tuple[str, np.ndarray]]:

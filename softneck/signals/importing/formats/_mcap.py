@@ -6,7 +6,6 @@ Messages are decoded by `mcap-ros2-support` (MIT, pure Python), and JSON ones as
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,8 +23,8 @@ OURS = b"softneck"
 #: The column of time of such a table [s].
 TIME = "time"
 _MAX_DEPTH, _MOST_NUMBERS = 6, 64
-# [s] A clock of messages that is further from the logger's is a simulation's, or was never set.
-_SAME_CLOCK = 1.0
+# [ns] A clock of messages that is further from the logger's is a simulation's, or was never set.
+_SAME_CLOCK = 10**9
 _MOST_CELLS = 50_000_000
 
 
@@ -53,18 +52,18 @@ def mcap_table(source: Path) -> pd.DataFrame:
     import pandas as pd
 
     rows: list[dict[str, float]] = []
-    clocks: list[tuple[float, float]] = []
+    clocks: list[tuple[int, int]] = []
     skipped: set[str] = set()
     cells = 0
     try:
         for topic, logged, content in _messages(source, skipped):
             row = dict(_numbers(content, topic, 0))
-            stamp = row.pop(f"{topic}.header.stamp", math.nan)
+            row.pop(f"{topic}.header.stamp", None)
             cells += len(row)
             if cells > _MOST_CELLS:
                 raise DataError(f"{source}: holds more than {_MOST_CELLS} numbers; cut it by `ros2 bag filter`.")
             rows.append(row)
-            clocks.append((logged, stamp))
+            clocks.append((logged, _stamp(content, logged)))
     except (DataError, FileFormatError):
         raise
     except Exception as error:  # its readers and decoders raise whatever damaged bytes lead to
@@ -76,15 +75,23 @@ def mcap_table(source: Path) -> pd.DataFrame:
         raise DataError(
             f"{source}: no message of ROS 2 or JSON holds numbers{also}; record topics of set-points and angles."
         )
-    logged, stamped = np.array(clocks).T
-    own = np.isfinite(stamped) & (np.abs(stamped - logged) < _SAME_CLOCK)
-    time = np.where(own, stamped, logged)
-    frame.insert(0, TIME, time - time.min())
+    # Whole nanoseconds: a double of seconds since 1970 is off by 1e-7 s, and messages of one instant would swap.
+    logged, stamped = np.array(clocks, dtype=np.int64).T
+    time = np.where(np.abs(stamped - logged) < _SAME_CLOCK, stamped, logged)
+    frame.insert(0, TIME, 1e-9 * (time - time.min()))
     return frame.sort_values(TIME, kind="stable").reset_index(drop=True)
 
 
-def _messages(source: Path, skipped: set[str]) -> Iterator[tuple[str, float, Any]]:
-    """Yield (topic, logger's time [s], message) of all messages that can be decoded."""
+def _stamp(content: Any, logged: int) -> int:
+    """Return the time in a message's header [ns], or the logger's where it has none."""
+    stamp = getattr(getattr(content, "header", None), "stamp", None)
+    if stamp is None or not hasattr(stamp, "sec") or not hasattr(stamp, "nanosec"):
+        return logged
+    return 10**9 * int(stamp.sec) + int(stamp.nanosec)
+
+
+def _messages(source: Path, skipped: set[str]) -> Iterator[tuple[str, int, Any]]:
+    """Yield (topic, logger's time [ns], message) of all messages that can be decoded."""
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
@@ -101,7 +108,7 @@ def _messages(source: Path, skipped: set[str]) -> Iterator[tuple[str, float, Any
                     skipped.add(f"{channel.topic} is {channel.message_encoding}")
                     continue
                 content = decoders[channel.id](message.data)
-            yield topic, 1e-9 * message.log_time, content
+            yield topic, message.log_time, content
 
 
 def _numbers(content: Any, name: str, depth: int) -> Iterator[tuple[str, float]]:
