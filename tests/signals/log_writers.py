@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -75,7 +75,7 @@ def write_mat(path: Path, columns: Columns, *, turned: bool = False) -> None:
     savemat(path, {name: a.T if turned and a.ndim == 2 else a for name, a in content.items()}, oned_as="column")
 
 
-def write_trials(path: Path, trials: list[Columns]) -> None:
+def write_trials(path: Path, trials: Sequence[Columns]) -> None:
     """A cell of structures, one for each trial."""
     cell = np.empty((1, len(trials)), dtype=object)
     for k, columns in enumerate(trials):
@@ -83,7 +83,7 @@ def write_trials(path: Path, trials: list[Columns]) -> None:
     savemat(path, {"trials": cell, "gain": 3.0}, oned_as="column")
 
 
-def write_trials_v73(path: Path, trials: list[Columns]) -> None:
+def write_trials_v73(path: Path, trials: Sequence[Columns]) -> None:
     """The same as MATLAB 7.3 has it: references to structures that lie elsewhere in the file."""
     with h5py.File(path, "w") as file:
         cell = file.create_dataset("trials", (len(trials), 1), dtype=h5py.ref_dtype)

@@ -164,7 +164,9 @@ def test_one_axis_is_a_robot_of_one_output(tmp_path: Path, axis: str, weights: l
     assert guess.missing == ()
     r = import_log(tmp_path / "log.csv", guess.layout).recording
     assert r.robot.outputs.names == (axis,)
-    np.testing.assert_allclose(r.robot.weights(), [weights], atol=1e-4)  # the paper prints 0.866
+    found = r.robot.weights()
+    assert found is not None
+    np.testing.assert_allclose(found, [weights], atol=1e-4)  # the paper prints 0.866
     np.testing.assert_allclose(r.channels[axis], NECK.channels[axis], rtol=1e-12)
 
 

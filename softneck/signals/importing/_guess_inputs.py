@@ -41,7 +41,8 @@ def quaternions(draft: Draft) -> None:
             draft.passed_over[column] = f"it is `{name}` of a quaternion"
             draft.titles[column] = replace(draft.titles[column], role="quaternion")
     if whole:
-        draft.quaternion = Quaternion(*(whole[0][name] for name in "wxyz"))
+        parts = whole[0]
+        draft.quaternion = Quaternion(parts["w"], parts["x"], parts["y"], parts["z"])
 
 
 def drop_or_turn_quaternion(draft: Draft) -> None:

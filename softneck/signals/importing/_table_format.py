@@ -20,7 +20,7 @@ from .formats._dates import is_date, seconds
 from .formats._encodings import encoding_of, format_of
 from .formats._mcap import mcap_table
 from .formats._read import arrays_of
-from .formats._sheets import Cells, sheet_cells, sheet_table
+from .formats._sheets import sheet_cells, sheet_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -194,13 +194,8 @@ def _sheet(source: Path) -> Form:
     units = _unit_row(rows[skip + 1 : skip + 3]) if header else []
     form = Layout(channels={}, sheet=sheet, header=header, skip=skip, unit_row=bool(units))
     line = f"file: sheet '{sheet}', because it is the only one or the largest"
-    frame = sheet_table(_whole(cells), header=header, skip=skip, unit_row=bool(units))
+    frame = sheet_table(cells, header=header, skip=skip, unit_row=bool(units))
     return frame, form, (line, *_remarks(form)), units
-
-
-def _whole(cells: Cells) -> Cells:
-    width = max((len(row) for row in cells), default=0)
-    return [[*row, *[""] * (width - len(row))] for row in cells]
 
 
 def _text_form(source: Path, fewest: int) -> tuple[Layout, tuple[str, ...], list[str]]:

@@ -201,7 +201,7 @@ def _item(item: Any, name: str, depth: int, seen: set[int]) -> Iterator[tuple[st
         for place, reference in enumerate(np.asarray(item[()]).ravel(order="C")[:_MAX_ELEMENTS]):
             if isinstance(reference, h5py.Reference) and reference:
                 target = item.file[reference]
-                address = h5py.h5o.get_info(target.id).addr
+                address = h5py.h5o.get_info(target.id).addr  # pyright: ignore[reportAttributeAccessIssue]
                 if address not in seen:
                     seen.add(address)
                     yield from _item(target, f"{name}{{{place + 1}}}", depth + 1, seen)

@@ -6,6 +6,7 @@ It reads all four in one wheel without dependencies, ten times as fast as openpy
 from __future__ import annotations
 
 import datetime
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 # A sheet of Excel has 1,048,576 rows; a small hostile file may unpack to any size.
 _MOST_CELLS = 50_000_000
-Cells = list[list[object]]
+Cells = Sequence[Sequence[object]]
 
 
 def sheet_cells(source: Path, sheet: str | None) -> tuple[str, Cells]:
@@ -59,13 +60,11 @@ def sheet_table(cells: Cells, *, header: bool, skip: int, unit_row: bool) -> pd.
     if header and rows:
         names = [str(cell).strip() or f"Unnamed: {place}" for place, cell in enumerate(rows[0])]
         rows = rows[1 + unit_row :]
-    # An empty cell comes as an empty text.
+    # An empty cell comes as an empty text; all rows of a sheet are of one width.
     frame = pd.DataFrame([[None if cell == "" else cell for cell in row] for row in rows], dtype=object)
     frame = frame.dropna(how="all").reset_index(drop=True)
-    table = {place: _column(frame[place]) if place in frame.columns else pd.Series([None] * len(frame)) for place in
-             range(len(names))}  # fmt: skip
-    found = pd.DataFrame(table)
-    found.columns = names
+    found = pd.DataFrame({place: _column(pd.Series(frame[place])) for place in frame.columns})
+    found.columns = names[: found.shape[1]]
     return found
 
 
