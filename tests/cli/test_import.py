@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import os
+import pty
 import re
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +20,7 @@ import pytest
 from softneck.cli.shared import _settle
 from softneck.signals import read_recording, write_recording
 
-from ..data import neck_recording
+from ..data import ROOT, neck_recording
 from ..signals import log_writers as write
 from ..signals.test_doubts import log
 from ..signals.test_formats import columns
@@ -57,6 +62,40 @@ def test_in_a_terminal_a_doubt_is_asked(call: Call, tmp_path: Path, monkeypatch:
     # All taken: as without a terminal.
     assert call("import", "log.csv", "--guess", "--yes", "-o", "taken.csv").code == 2
     assert len(asked) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("answer", "code", "left"), [(b"deg\n", 0, {"r.csv", "r.layout.toml"}), (None, 130, set())])
+def test_in_a_real_terminal(tmp_path: Path, answer: bytes | None, code: int, left: set[str]) -> None:
+    log(tmp_path, motors=12.0, platform=25.0)
+    command = [
+        sys.executable,
+        "-c",
+        "from softneck.cli import main; main()",
+        "import",
+        "log.csv",
+        "--guess",
+        "-o",
+        "r.csv",
+    ]
+    ours, theirs = pty.openpty()
+    child = subprocess.Popen(
+        command, cwd=tmp_path, stdin=theirs, stdout=theirs, stderr=theirs, env={**os.environ, "PYTHONPATH": str(ROOT)}
+    )
+    os.close(theirs)
+    said, asked = b"", False
+    with contextlib.suppress(OSError):  # the terminal is gone when the command is
+        while part := os.read(ours, 4096):
+            said += part
+            if b"[rad]: " in said and not asked:
+                asked = True
+                if answer is None:
+                    child.send_signal(signal.SIGINT)
+                else:
+                    os.write(ours, answer)
+    os.close(ours)
+    assert (child.wait(60), asked) == (code, True), said
+    assert files(tmp_path) == {"log.csv", *left}
 
 
 def test_columns_that_are_said_to_be_wrong_import_nothing(

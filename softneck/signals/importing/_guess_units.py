@@ -10,7 +10,7 @@ import numpy as np
 from ..recording._channels import MOTOR_POSITIONS, MOTOR_TURNS, MOTORS, OUTPUTS, SET_POINTS, file_unit
 from ._draft import Draft
 from ._sample_time import velocity_period
-from ._unit_odds import Verdict, judge
+from ._unit_odds import MOTOR_RANGE, Verdict, judge
 from .formats._dates import DATE
 
 _VELOCITIES = tuple(f"motor_velocity_{j}" for j in MOTORS)
@@ -151,7 +151,9 @@ def _why(reaches: dict[str, float], titled: dict[str, str], group: str, verdict:
         return who + (
             "beyond two turns in rad" if reach > MOTOR_TURNS else "which in rad does not fit how the platform moves"
         )
-    return who + "within the motors' reach"
+    return who + (
+        "within the motors' reach" if reach <= MOTOR_RANGE else "beyond their range, but in deg hardly a move"
+    )
 
 
 def _velocities(draft: Draft, found: dict[str, Unit]) -> None:

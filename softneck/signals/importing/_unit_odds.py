@@ -23,7 +23,7 @@ _TILT_REACH, _TILT_SPREAD = log(0.3), 0.8
 # [rad/rad] 5 deg a rad at winches of 7.5 mm; of stiff necks and thin winches less, of long arms more.
 _GAIN, _GAIN_SPREAD = log(0.1), 0.9
 # [rad] Beyond the paper's range, and where the platform has turned by more than a right angle.
-_MOTOR_RANGE, _TILT_RANGE = 6.0, 0.8
+MOTOR_RANGE, _TILT_RANGE = 6.0, 0.8
 _BEYOND_RANGE = log(0.03)
 _TILT_LIMIT = pi / 2.0
 # One logger writes set-points and positions in one unit, nearly always.
@@ -86,7 +86,7 @@ def _log_odds(reach: Mapping[str, float], units: Mapping[str, str]) -> float:
         total += max(follow, late) + log1p(exp(-abs(follow - late)))
     if motors:
         total += _normal(log(motors[0]) - _MOTOR_REACH, _MOTOR_SPREAD)
-        total += _BEYOND_RANGE * (max(motors) > 1.02 * _MOTOR_RANGE) * (1.0 + log(max(motors) / _MOTOR_RANGE))
+        total += _BEYOND_RANGE * (max(motors) > 1.02 * MOTOR_RANGE) * (1.0 + log(max(motors) / MOTOR_RANGE))
     tilt = reach.get("tilt", 0.0)
     if tilt > 0.0:
         total += _normal(log(tilt) - _TILT_REACH, _TILT_SPREAD) + _BEYOND_RANGE * (tilt > _TILT_RANGE)
