@@ -78,7 +78,7 @@ def mcap_table(source: Path) -> pd.DataFrame:
     # Whole nanoseconds: a double of seconds since 1970 is off by 1e-7 s, and messages of one instant would swap.
     logged, stamped = np.array(clocks, dtype=np.int64).T
     time = np.where(np.abs(stamped - logged) < _SAME_CLOCK, stamped, logged)
-    frame.insert(0, TIME, 1e-9 * (time - time.min()))
+    frame.insert(0, TIME, (time - time.min()) / 1e9)
     return frame.sort_values(TIME, kind="stable").reset_index(drop=True)
 
 
