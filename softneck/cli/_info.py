@@ -121,7 +121,7 @@ def command(file: Path, html: Path | None, force: bool, as_json: bool) -> None:
     log it reports what `softneck import --guess` would take each column for.
     """
     if not file.is_file():
-        raise FileFormatError(f"{file}: no such file.")
+        raise FileFormatError(f"{file}: {'is a folder; name a file in it' if file.is_dir() else 'no such file'}.")
     if html is not None:
         if file.suffix.lower() not in _RECORDINGS:
             raise SettingsError(f"{file}: `--html` shows the quality of a recording (`.csv`, `.parquet`) only.")

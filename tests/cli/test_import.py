@@ -192,6 +192,7 @@ def test_what_is_no_log_is_one_line(call: Call, tmp_path: Path, name: str) -> No
 def test_a_folder_names_the_file_in_it(call: Call, tmp_path: Path) -> None:
     (tmp_path / "bag").mkdir()
     assert "bag: is a folder; name a file in it." in call("import", "bag", "--guess", "-o", "r.csv").error
+    assert "bag: is a folder; name a file in it." in call("info", "bag").error
     (tmp_path / "bag" / "bag_0.mcap").write_bytes(b"")
     assert "such as bag/bag_0.mcap" in call("import", "bag", "--guess", "-o", "r.csv").error
 
