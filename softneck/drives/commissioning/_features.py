@@ -32,6 +32,7 @@ class Features:
         error: of that, relative.
         direction: of that tilt, (outputs,), of length 1.
         force: units of current for one count under tension, without friction.
+        rise: by so many units it rose.
         friction: units of current that turning alone takes, to either side.
         lag: of the tilt behind the counts at the wiggle's frequency [s]; NaN where it cannot be told.
         noise: standard deviation of the sensor at rest, each output's mean square [rad].
@@ -45,6 +46,7 @@ class Features:
     error: float
     direction: Vector
     force: float
+    rise: float
     friction: float
     lag: float
     noise: float
@@ -82,6 +84,7 @@ def features(moved: MotorMoves) -> Features | None:
     noise = float(np.sqrt(np.mean(np.var(moved.outputs[rest], axis=0)))) if rest.any() else math.nan
     return Features(
         pull=pull, slack=knee, gain=abs(along), error=error, direction=direction, force=0.5 * (force + held),
+        rise=0.5 * (force + held) * float(np.max(x) - knee),
         friction=0.5 * (turning - returning), lag=lag, noise=noise,
         turn=counts_per_turn(moved.captures), residual=residual,
     )  # fmt: skip

@@ -17,7 +17,8 @@ import numpy as np
 from softneck.core import Matrix, Vector
 
 from ..bus._axes import Axes, axes_of, inverse, said_of
-from ..bus._file import DriveEntry, DrivesFile
+from ..bus._file import DrivesFile
+from ..bus._objects import ampere
 from ._features import Features, features
 from ._findings import Finding
 from ._mounting import FITS, Mounting, explain
@@ -28,10 +29,13 @@ from ._moves import HANGS, PULLED, Moves
 _MOTOR, _NECK = 0.15, 0.25
 # A scale this far from a power of two is none: then it is what was measured (0.35: 27 %).
 _NO_POWER = 0.35
+# Of a rise of some units the slope is known to this part of one.
+_UNIT = 0.4
 # From one turn of the motor to the next an index comes within this part.
 _INDEX = 0.02
-# A sensor that is late by less than two samples is on time [s].
-_LATE = 0.04
+# A sensor that is late by less than two samples is on time [s]; one whose noise is beyond this tells neither that nor
+# gears and currents (the lab's first inclinometer has 0.27 deg, its second 0.04) [rad].
+LATE, _NOISY = 0.04, math.radians(0.15)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +75,7 @@ class Identified:
         mounting: which motors pull which tendons and how the sensor sits; None where it cannot be told.
         late: how much later than expected the sensor is [s]; NaN where it cannot be told.
         noise: of the sensor, standard deviation of an output [rad].
+        quiet: whether the noise let gears, currents and lateness be judged.
     """
 
     findings: tuple[Finding, ...]
@@ -79,6 +84,7 @@ class Identified:
     mounting: Mounting | None
     late: float
     noise: float
+    quiet: bool
 
 
 def identify(
@@ -97,18 +103,19 @@ def identify(
     seen = tuple(None if (moved := moves.of(j)) is None else features(moved) for j in range(1, count + 1))
     mounting, turned = _mounting(seen, file)
     order = range(count) if mounting is None else mounting.order
-    scales = _scales(seen, file, expected, types or {}, order)
     lags = [one.lag for one in seen if one is not None and math.isfinite(one.lag)]
-    late = float(np.median(lags)) - expected.lag if lags and expected is not None else math.nan
+    noises = [one.noise for one in seen if one is not None]
+    noise = float(np.median(noises)) if noises else math.nan
+    quiet = noise < _NOISY
+    scales = _scales(seen, file, expected, types or {}, order, quiet=quiet)
+    late = float(np.median(lags)) - expected.lag if lags and quiet and expected is not None else math.nan
     findings = [*_unmoved(moves, count), *_signs(seen, file), *_scale_findings(scales, file, seen), *turned]
-    if late > _LATE:
+    if late > LATE:
         findings.append(Finding(
             "sensor late", f"{1e3 * late:.0f} ms later than expected", "Look at its filter, its rate and the line to "
             "it; a controller needs the delay that is proposed.",
         ))  # fmt: skip
-    noises = [one.noise for one in seen if one is not None]
-    noise = float(np.median(noises)) if noises else math.nan
-    return Identified(tuple(findings), seen, scales, mounting, late, noise)
+    return Identified(tuple(findings), seen, scales, mounting, late, noise, quiet)
 
 
 def seen_by(moves: Moves, file: DrivesFile, source: str) -> Expected | None:
@@ -118,19 +125,11 @@ def seen_by(moves: Moves, file: DrivesFile, source: str) -> Expected | None:
         one, entry = features(moved), file.drives[moved.motor - 1]
         if one is not None:
             counts = abs(entry.scale.counts_per_radian)
-            per_motor.append((one.gain * counts, one.force * counts * _ampere(entry, file), one.lag))
+            per_motor.append((one.gain * counts, one.force * counts * ampere(entry, file.profile), one.lag))
     if len(per_motor) < len(file.drives):
         return None
     gains, forces, lags = zip(*per_motor, strict=True)
     return Expected(gains, forces, float(np.median(lags)), source)
-
-
-def _ampere(entry: DriveEntry, file: DrivesFile) -> float:
-    """Return the current for one unit of what the drive tells [A]."""
-    from ..bus._objects import RATED_CURRENT
-    from ..bus._units import internal_to_current
-
-    return 1e-3 * RATED_CURRENT if file.profile == "ds402" else abs(internal_to_current(1, entry.scale))
 
 
 # -- scales -------------------------------------------------------------------------------------------------------
@@ -138,7 +137,7 @@ def _ampere(entry: DriveEntry, file: DrivesFile) -> float:
 
 def _scales(
     seen: Sequence[Features | None], file: DrivesFile, expected: Expected | None, types: Mapping[int, float],
-    order: Sequence[int],
+    order: Sequence[int], *, quiet: bool,
 ) -> tuple[Scale, ...]:
     """Return the scales of each motor: lines by the index, gear by the tilt, then the current's by the force."""
     rows = [(j, one, file.drives[j]) for j, one in enumerate(seen) if one is not None and one.gain > 0.0 < one.force]
@@ -146,23 +145,29 @@ def _scales(
     for j, one, entry in rows:
         lines = one.turn / entry.scale.counts_per_turn
         scales[j] = Scale(lines=lines if one.turn and abs(lines - 1.0) > _INDEX else 1.0)
-    known = [(abs(entry.scale.counts_per_radian), _ampere(entry, file)) for _, _, entry in rows]
+    known = [(abs(entry.scale.counts_per_radian), ampere(entry, file.profile)) for _, _, entry in rows]
     gains = np.array([one.gain * counts for (_, one, _), (counts, _) in zip(rows, known, strict=True)])
-    forces = np.array([one.force * counts * ampere for (_, one, _), (counts, ampere) in zip(rows, known, strict=True)])
+    forces = np.array([one.force * counts * unit for (_, one, _), (counts, unit) in zip(rows, known, strict=True)])
     lines = np.array([scales[j].lines for j, _, _ in rows])
-    if not rows:
-        return tuple(scales)
+    if not rows or not quiet:
+        return tuple(_by_type(scale, file, j, types.get(j)) for j, scale in enumerate(scales, start=1))
     # gain = expected / (lines gear), force = expected / (lines gear^2 peak)
     tendons = [order[j] for j, _, _ in rows]
     errors = np.array([math.hypot(_MOTOR, one.error / math.log(2.0)) for _, one, _ in rows])
     gears = factors(_logs(gains, expected and expected.gain, tendons) - np.log2(lines), errors)
     peaks = _logs(forces, expected and expected.force, tendons) - np.log2(lines) - 2.0 * np.log2(gears)
-    shown = factors(peaks)
-    for (j, _, entry), gear, peak in zip(rows, gears, shown, strict=True):
-        told = types.get(j + 1)
-        by_type = peak if told is None else told / entry.scale.peak_current
-        scales[j] = replace(scales[j], gear=float(gear), peak=float(by_type))
-    return tuple(scales)
+    # A current comes in whole units, of which there are few.
+    coarse = np.array([math.hypot(_MOTOR, _UNIT / max(one.rise, _UNIT) / math.log(2.0)) for _, one, _ in rows])
+    # What a ds402 drive tells is relative to its motor's rated current (6075h), which it knows itself.
+    shown = np.ones(len(rows)) if file.profile == "ds402" else factors(peaks, coarse)
+    for (j, _, _), gear, peak in zip(rows, gears, shown, strict=True):
+        scales[j] = replace(scales[j], gear=float(gear), peak=float(peak))
+    return tuple(_by_type(scale, file, j, types.get(j)) for j, scale in enumerate(scales, start=1))
+
+
+def _by_type(scale: Scale, file: DrivesFile, motor: int, peak: float | None) -> Scale:
+    """Return `scale` with the current's by the drive's type, where that is public."""
+    return scale if peak is None else replace(scale, peak=peak / file.drives[motor - 1].scale.peak_current)
 
 
 def _logs(values: Vector, expected: Sequence[float] | None, tendons: Sequence[int]) -> Vector:
@@ -184,7 +189,8 @@ def factors(powers: Vector, errors: Vector | float = _MOTOR) -> Vector:
         mistakes = min(np.count_nonzero(k), 1 + np.count_nonzero(k != k[0]))
         cost = float(np.sum(((powers - c - k) / errors) ** 2) + (c / _NECK) ** 2 + mistakes)
         best = min(best, (cost, float(c)))
-    left = powers - best[1]
+    # Against most of them: one that is no power of two is not to shift what all share.
+    left = powers - float(np.median(powers - np.round(powers - best[1])))
     whole = np.round(left)
     none = np.abs(left - whole) > np.maximum(_NO_POWER, 2.0 * np.asarray(errors))
     return 2.0 ** np.where(none, left, whole)

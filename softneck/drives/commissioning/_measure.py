@@ -71,7 +71,7 @@ def measure(
     most = guards.time * len(motors) + 60.0
     ended = run_session(session, mover, sample_time=SAMPLE_TIME, most=most, begin=mover.watch)
     fault = ended.master.supervisor.fault
-    stopped = mover.stopped or ("" if fault is None else str(fault))
+    stopped = mover.stopped or ("somebody asked for the end" if ended.left else "" if fault is None else str(fault))
     return Moves(tuple(mover.done), SAMPLE_TIME, stopped=stopped), ended
 
 

@@ -197,15 +197,22 @@ class Mover:
 
     def _search(self) -> Generator[Motors, None, tuple[str, int]]:
         """Go the way that should pull, the other one, and the first again farther, until the tendon is taut."""
-        self._phase, travel, way = FREE, self.guards.travel, 1
+        self._phase, travel = FREE, self.guards.travel
         taut = self._contact(1)
         yield from self._go(_INDEX_WAY, self.guards.speed, lambda: bool(self._index_seen or taut()))
         for end in (0.6 * travel, -travel, travel):
-            if self._tight:
-                break
             way = 1 if end > self._at else -1
-            yield from self._go(end, self.guards.speed * self._scale, self._contact(way))
-        return (yield from self._taut(way)) if self._tight else (HANGS, 0)
+            while self._tight or abs(end - self._at) > 1e-9:
+                if not self._tight:
+                    yield from self._go(end, self.guards.speed * self._scale, self._contact(way))
+                if not self._tight:
+                    break
+                told, outcome = self._tight, (yield from self._taut(way))
+                # A tilt that is gone while the motor stands was the sensor's noise.
+                if outcome[0] == PULLED or told == "current":
+                    return outcome
+                self._tight = ""
+        return HANGS, 0
 
     def _contact(self, way: int) -> _Until:
         """Return what says whether a tendon got taut on the way that begins now: by the tilt, or by the current."""

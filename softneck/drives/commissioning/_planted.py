@@ -23,6 +23,7 @@ from ..simulated._servo_runtime import SERVO_SIZE
 # How a mistake is written, for people.
 KINDS = ("reversed:N", "exchanged:N:M", "gear:N:FACTOR", "lines:N:FACTOR", "current:N:FACTOR", "axes", "sign:OUTPUT",
          "late:SECONDS", "duplicate:N")  # fmt: skip
+_SAID = {kind.partition(":")[0]: kind.count(":") for kind in KINDS}
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,8 +53,11 @@ def plant(file: DrivesFile, mistakes: Sequence[str]) -> Planted:
     # What is exchanged comes last: until then motors stand where the file has them.
     for mistake in sorted(mistakes, key=lambda text: text.startswith("exchanged")):
         try:
-            planted = _with(planted, *mistake.split(":"))
-        except (ValueError, IndexError, TypeError) as error:
+            kind, *said = mistake.split(":")
+            if len(said) != _SAID[kind]:
+                raise ValueError(mistake)
+            planted = _with(planted, kind, *said)
+        except (ValueError, KeyError) as error:
             raise SettingsError(f"--plant takes {', '.join(KINDS)}; got `{mistake}`.") from error
     return planted
 
@@ -88,10 +92,8 @@ def _with(planted: Planted, kind: str, *said: str) -> Planted:
         return replace(planted, file=replace(file, sensor_axes=said_of(axes, outputs)))
     elif kind == "late":
         return replace(planted, late=float(said[0]))
-    elif kind == "duplicate":
-        return replace(planted, twins=(*planted.twins, file.nodes[_motor(said[0], len(drives))]))
     else:
-        raise ValueError(kind)
+        return replace(planted, twins=(*planted.twins, file.nodes[_motor(said[0], len(drives))]))
     return replace(planted, file=replace(file, drives=tuple(drives)))
 
 
