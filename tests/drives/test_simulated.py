@@ -197,7 +197,7 @@ def test_texts_come_in_segments() -> None:
         toggle ^= 1
         if part.data[0] & 1:
             break
-    assert text.decode() == "iPOS4808 MX-CAN (simulated)"
+    assert text.decode() == "iPOS3604 MX-CAN (simulated)"
     assert size == len(text)
 
 

@@ -47,7 +47,8 @@ if TYPE_CHECKING:
 @click.option("--resume", is_flag=True, help="Do not move again what moves.json in DIR has of the same drives.")
 @click.option("--plant", "mistakes", multiple=True, metavar="MISTAKE",
               help="With --simulated: set the drives up otherwise than the file says: reversed:N, exchanged:N:M, "
-              "gear:N:FACTOR, lines:N:FACTOR, current:N:FACTOR, axes, sign:OUTPUT, late:SECONDS, duplicate:N.")  # fmt: skip
+              "gear:N:FACTOR, lines:N:FACTOR, current:N:FACTOR, axes, sign:OUTPUT, late:SECONDS, duplicate:N; may be "
+              "given several times.")  # fmt: skip
 @click.option("--pace", type=float, help="With --simulated: run at this multiple of real time.")
 @override_option
 @neck_option

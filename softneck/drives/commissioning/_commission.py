@@ -19,7 +19,7 @@ from ..running._scan import scan
 from ._findings import Finding
 from ._identify import LATE, Expected, Identified, identify, proposed
 from ._known import fatal, known_before, require_answers, typed
-from ._measure import measure
+from ._measure import SAMPLE_TIME, measure
 from ._moves import PULLED, Guards, Moves
 from ._plant import expected_of
 
@@ -153,13 +153,13 @@ def commission(
     believed, peaks = typed(file, found)
     identities = {item["node"]: item for item in found}
     old = () if before is None else tuple(moved for moved in before.motors if moved.outcome == PULLED)
-    _require_same(before, identities, count)
+    _require_same(before, identities, count, file.sensor_axes)
     ways = [j for j in (motors or range(1, count + 1)) if j not in {moved.motor for moved in old}]
     ended = None
-    moves = Moves(old, before.sample_time if before is not None else 0.02, identities)
+    moves = Moves(old, SAMPLE_TIME, identities, axes=file.sensor_axes)
     if ways:
         moved, ended = measure(replace(session, file=believed), guards, motors=ways, report=report)
-        moves = replace(moved, motors=(*old, *moved.motors), identities=identities)
+        moves = replace(moved, motors=(*old, *moved.motors), identities=identities, axes=file.sensor_axes)
         if keep is not None and moves.motors:
             keep(moves)
     pulled = any(moved.outcome == PULLED for moved in moves.motors)
@@ -171,9 +171,15 @@ def commission(
     )
 
 
-def _require_same(before: Moves | None, identities: Mapping[int, Mapping[str, Any]], count: int) -> None:
+def _require_same(before: Moves | None, identities: Mapping[int, Mapping[str, Any]], count: int,
+                  axes: tuple[str, ...]) -> None:  # fmt: skip
     """Raise SettingsError where earlier moves are of other drives."""
-    for moved in () if before is None else before.motors:
+    if before is None:
+        return
+    if before.axes != axes:
+        said = [", ".join(one) or "as they come" for one in (before.axes, axes)]
+        raise SettingsError(f"--resume: [sensor] axes was {said[0]} then and is {said[1]} now. Leave --resume out.")
+    for moved in before.motors:
         then, now = before.identities.get(moved.node, {}), identities.get(moved.node, {})
         if moved.motor > count or then.get("serial") != now.get("serial"):
             raise SettingsError(

@@ -57,7 +57,9 @@ def _proposal(result: Commissioned) -> Section:
     axes = [", ".join(table["sensor"].get("axes", [])) or "as they come" for table in (before, after)]
     if axes[0] != axes[1]:
         rows.append(["[sensor] axes", *axes])
-    said = [f"{robot.delay_s:g}" if robot.delay_s is not None else "-" for robot in (result.believed.moves, result.robot)]
+    said = [
+        f"{robot.delay_s:g}" if robot.delay_s is not None else "-" for robot in (result.believed.moves, result.robot)
+    ]
     if said[0] != said[1]:
         rows.append(["robot: [sensor] delay_s", *said])
     text = [] if rows else ["The proposed files say the same of drives and sensor as those that were given."]
@@ -78,7 +80,8 @@ def _motors(result: Commissioned) -> Section:
             rows.append([f"{j} (node {m['node']})", m["outcome"], *["-"] * 8])
             continue
         rows.append([
-            f"{j} (node {m['node']})", f"tendon {m['tendon']}", "falls" if m["reversed"] else "rises", f"{m['gear']:.5g}",
+            f"{j} (node {m['node']})", f"tendon {m['tendon']}", "falls" if m["reversed"] else "rises",
+            f"{m['gear']:.5g}",
             f"{m['encoder_counts']:.0f}{'' if m['index'] else ' (no index)'}", f"{m['peak_current_A']:g}",
             f"{m['slack_rad']:.2f}", f"{1e3 * m['friction_A']:.2f}", f"{m['tilt_deg_per_rad']:.2f}",
             f"{m['tension_N_per_rad']:.2f}",
@@ -129,7 +132,10 @@ def _moves(result: Commissioned, moved: MotorMoves, one: Features) -> Section:
     tilt = np.degrees((moved.outputs[rows] - np.nanmean(moved.outputs[:20], axis=0)) @ one.direction)
     quick = Chart(
         f"Motor {moved.motor}: the wiggle",
-        [Panel([Curve(time, x, "winch", _ORANGE)], "winch [rad]"), Panel([Curve(time, tilt, "tilt", _BLUE)], "tilt [deg]")],
+        [
+            Panel([Curve(time, x, "winch", _ORANGE)], "winch [rad]"),
+            Panel([Curve(time, tilt, "tilt", _BLUE)], "tilt [deg]"),
+        ],
         caption=f"The tilt is {1e3 * one.lag:.0f} ms behind the winch.",
     )
     return Section(f"Motor {moved.motor}", charts=[slow, quick])

@@ -50,7 +50,12 @@ class Finding:
 
     def table(self) -> dict[str, Any]:
         """Return what JSON holds of it."""
-        table: dict[str, Any] = {"name": self.name, "motors": list(self.motors), "text": self.text, "advice": self.advice}
+        table: dict[str, Any] = {
+            "name": self.name,
+            "motors": list(self.motors),
+            "text": self.text,
+            "advice": self.advice,
+        }
         if self.instead:
             table["or"] = list(self.instead)
         return {**table, "factor": self.factor} if self.factor else table

@@ -136,8 +136,13 @@ def seen_by(moves: Moves, file: DrivesFile, source: str) -> Expected | None:
 
 
 def _scales(
-    seen: Sequence[Features | None], file: DrivesFile, expected: Expected | None, types: Mapping[int, float],
-    order: Sequence[int], *, quiet: bool,
+    seen: Sequence[Features | None],
+    file: DrivesFile,
+    expected: Expected | None,
+    types: Mapping[int, float],
+    order: Sequence[int],
+    *,
+    quiet: bool,
 ) -> tuple[Scale, ...]:
     """Return the scales of each motor: lines by the index, gear by the tilt, then the current's by the force."""
     rows = [(j, one, file.drives[j]) for j, one in enumerate(seen) if one is not None and one.gain > 0.0 < one.force]
@@ -211,9 +216,7 @@ def _scale_findings(scales: Sequence[Scale], file: DrivesFile, seen: Sequence[Fe
             findings.append(Finding("gear", text, "Look at the motor's label; take the proposed `gear`.", (j,), instead,
                                     scale.gear))  # fmt: skip
         if scale.peak != 1.0:
-            text = (
-                f"{_times(scale.peak)} the {entry.scale.peak_current:g} A of the drives file, from slack to taut"
-            )
+            text = f"{_times(scale.peak)} the {entry.scale.peak_current:g} A of the drives file, from slack to taut"
             findings.append(Finding("current scale", text, "Look at the drive's label; take the proposed "
                                     "`peak_current_A`.", (j,), factor=scale.peak))  # fmt: skip
     return findings

@@ -24,8 +24,8 @@ def require_answers(found: Sequence[Mapping[str, Any]], where: str) -> None:
     """Raise CheckFailedError if nobody is on the bus."""
     if not found:
         raise CheckFailedError(
-            f"{where}: no node answers. Are the drives on, is the bit rate right, is the line terminated (60 ohm between "
-            "CAN_H and CAN_L)? Nothing was moved."
+            f"{where}: no node answers. Are the drives on, is the bit rate right, is the line terminated (60 ohm "
+            "between CAN_H and CAN_L)? Nothing was moved."
         )
 
 
@@ -44,7 +44,9 @@ def known_before(file: DrivesFile, found: Sequence[Mapping[str, Any]]) -> list[F
         several = several_devices(drive["serials"]) if drive else ""
         if drive is None or not drive["drive"]:
             what = "nobody answers" if drive is None else f"a device of type {drive['device_type']:08X}h answers"
-            findings.append(Finding("no drive", f"{what} at node {entry.node}", "Is it on, is its node number right?", (j,)))
+            findings.append(
+                Finding("no drive", f"{what} at node {entry.node}", "Is it on, is its node number right?", (j,))
+            )
         elif several:
             findings.append(Finding("duplicate node", f"node {entry.node}: {several}", "Give one of them another node "
                                     "number.", (j,)))  # fmt: skip

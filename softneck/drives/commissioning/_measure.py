@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import Any
@@ -16,8 +15,8 @@ from ..master import Frame, Master, MasterSettings
 from ..master._settings import ChannelSettings
 from ..running._bus_loop import RunEnd, Session, run_session
 from ..running._stop import wait
-from ._moves import FREE, Guards, Moves
 from ._mover import Mover
+from ._moves import Guards, Moves
 
 SAMPLE_TIME = 0.02
 # Winches without power unwind until nothing pulls them: less than `_STILL` rad in `_LOOK` s, for 10 s at most.
@@ -128,7 +127,8 @@ def _still(
             return here
         if link.now > until:
             raise CheckFailedError(
-                f"a winch still turns by {moved / _LOOK:.2f} rad/s without power. Let it come to rest; nothing was moved."
+                f"a winch still turns by {moved / _LOOK:.2f} rad/s without power. Let it come to rest; nothing was "
+                "moved."
             )
         before = here
 

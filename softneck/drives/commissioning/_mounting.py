@@ -1,4 +1,4 @@
-"""Which motor pulls which tendon, and how the sensor sits: what explains the measured directions with fewest mistakes."""
+"""Which motor pulls which tendon, and how the sensor sits: what explains measured directions with fewest mistakes."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from softneck.core import Matrix, Vector
 
@@ -63,13 +64,15 @@ def explain(directions: Matrix, tendons: Matrix) -> list[Mounting]:
         directions: (motors, outputs) in which each motor moved the outputs as they were measured, NaN where unknown.
         tendons: (outputs, motors) in which each tendon pulls by the robot file.
     """
-    known = np.isfinite(directions).all(axis=1)
+    known: NDArray[np.bool_] = np.asarray(np.isfinite(directions).all(axis=1))
     found = [Mounting(order, axes, _off(directions, tendons, order, axes, known))
              for axes in _axes(tendons.shape[0]) for order in _orders(directions, tendons, axes, known)]  # fmt: skip
     best = min(one.off for one in found)
     alike = [one for one in found if one.off < best + _ALIKE]
     fewest = min(one.mistakes for one in alike)
-    return sorted((one for one in alike if one.mistakes == fewest), key=lambda one: (one.axes != _straight(one), one.off))
+    return sorted(
+        (one for one in alike if one.mistakes == fewest), key=lambda one: (one.axes != _straight(one), one.off)
+    )
 
 
 def _straight(one: Mounting) -> Axes:
@@ -82,7 +85,7 @@ def _axes(outputs: int) -> Iterator[Axes]:
             yield tuple(zip(order, signs, strict=True))
 
 
-def _orders(directions: Matrix, tendons: Matrix, axes: Axes, known: Vector) -> Iterator[tuple[int, ...]]:
+def _orders(directions: Matrix, tendons: Matrix, axes: Axes, known: NDArray[np.bool_]) -> Iterator[tuple[int, ...]]:
     count = directions.shape[0]
     if count <= _ALL_ORDERS:
         yield from itertools.permutations(range(count))
@@ -100,8 +103,8 @@ def seen(direction: Vector, axes: Axes) -> Vector:
     return np.array([sign * direction[number] for number, sign in axes])
 
 
-def _off(directions: Matrix, tendons: Matrix, order: Sequence[int], axes: Axes, known: Vector) -> float:
-    angles = [_angle(directions[j], seen(tendons[:, order[j]], axes)) for j in np.flatnonzero(known)]
+def _off(directions: Matrix, tendons: Matrix, order: Sequence[int], axes: Axes, known: NDArray[np.bool_]) -> float:
+    angles = [_angle(directions[j], seen(tendons[:, order[j]], axes)) for j in range(len(order)) if known[j]]
     return float(np.sqrt(np.mean(np.square(angles)))) if angles else 0.0
 
 

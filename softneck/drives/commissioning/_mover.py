@@ -156,7 +156,10 @@ class Mover:
         recent = np.array(list(self._tilts)[-3:])
         # What the sensor's noise may add is not tilt.
         noise = min(2.0 * self._noise, _NOISE)
-        for before, most in ((self._level, self.guards.tilt + noise), (self._upright, self.guards.tilt + noise + _DRIFT)):
+        for before, most in (
+            (self._level, self.guards.tilt + noise),
+            (self._upright, self.guards.tilt + noise + _DRIFT),
+        ):
             size = float(np.median(np.linalg.norm(recent - before, axis=1)))
             if size > most:
                 self.stopped = f"tilt: {math.degrees(size):.1f} deg, {math.degrees(most):.1f} are allowed"
@@ -256,7 +259,7 @@ class Mover:
     def _measure(self, way: int) -> _Steps:
         """Slowly back into the slack, up and down under tension, and wiggle at the top."""
         self._phase, slow, far = SWEEP, self.guards.slow * self._scale, way * _BEYOND * self._scale
-        top = self._at
+        top, begin = self._at, 0
         for _ in range(_SWEEPS):
             yield from self._go(self._at - far, slow, lambda: self._size() < _LOOSE * self.guards.target)
             yield from self._go(self._at - way * _SLACK * self._scale, slow)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from softneck.core import FileFormatError, Matrix, Vector, atomic_write, require_between
 
@@ -17,11 +19,11 @@ from softneck.core import FileFormatError, Matrix, Vector, atomic_write, require
 # tension, in the quick wiggle, on the way back.
 REST, FREE, SWEEP, WIGGLE, BACK = range(5)
 # How the search for a tendon ended.
-PULLED, HANGS, BLIND, NOT_TRIED = "pulled", "hangs", "no tilt", "not tried"
+PULLED, HANGS, BLIND = "pulled", "hangs", "no tilt"
 # Quick wiggles, and the time of one [s].
 WIGGLES, PERIOD = 8, 1.0
-# How fast the neck tilts in what is measured, and in the search [rad/s]: within the 0.3 s in which a tilt, or one that a
-# sensor tells 0.2 s late, stops a motor, it is less than a degree also where a gear is half of what was believed.
+# How fast the neck tilts in what is measured, and in the search [rad/s]: within the 0.3 s in which a tilt stops a
+# motor, of a sensor that is 0.2 s late too, it is less than a degree also where a gear is half of what was believed.
 _SLOW_TILT, _FREE_TILT = math.radians(0.8), math.radians(1.3)
 _VERSION = 1
 # Of one index pulse [counts]: a quarter of a line to either side, and some for the drive's own delay.
@@ -77,8 +79,7 @@ class MotorMoves:
 
     Attributes:
         motor: from 1 on; node: of its drive.
-        outcome: "pulled", "hangs" (no tendon within the travel), "no tilt" (it pulls, and the sensor sees nothing), or
-            "not tried".
+        outcome: "pulled", "hangs" (no tendon within the travel), or "no tilt" (it pulls, and the sensor sees nothing).
         way: 1 where it pulls with the counts that the drives file calls positive, -1 against them, 0 not known.
         phase: (rows,) what each row was measured in.
         time: (rows,) [s].
@@ -98,7 +99,7 @@ class MotorMoves:
     outputs: Matrix
     captures: tuple[int, ...] = ()
 
-    def rows(self, *phases: int) -> Vector:
+    def rows(self, *phases: int) -> NDArray[np.bool_]:
         """Return which rows were measured in one of `phases`, (rows,) of bool."""
         return np.isin(self.phase, phases)
 
@@ -112,12 +113,14 @@ class Moves:
         sample_time: of the rows [s].
         identities: what each drive said of itself before, by node; see `softneck drives scan`.
         stopped: what ended them early, "" if nothing did.
+        axes: of the sensor, as the drives file had them.
     """
 
     motors: tuple[MotorMoves, ...]
     sample_time: float
     identities: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
     stopped: str = ""
+    axes: tuple[str, ...] = ()
 
     def of(self, motor: int) -> MotorMoves | None:
         """Return those of motor `motor`, from 1 on, if it was moved."""
@@ -129,7 +132,7 @@ def counts_per_turn(captures: Sequence[int]) -> int:
 
     The edges of one pulse lie some counts apart, by the way in which it is passed: those are no turn.
     """
-    steps = [abs(b - a) for a, b in zip(captures, captures[1:], strict=False)]
+    steps = [abs(b - a) for a, b in itertools.pairwise(captures)]
     return min((step for step in steps if step > _EDGES), default=0)
 
 
@@ -139,6 +142,7 @@ def write_moves(path: Path, moves: Moves, *, force: bool = False) -> None:
         "softneck_moves": _VERSION,
         "sample_time_s": moves.sample_time,
         "stopped": moves.stopped,
+        "axes": list(moves.axes),
         "identities": {str(node): dict(found) for node, found in moves.identities.items()},
         "motors": [_table(moved) for moved in moves.motors],
     }
@@ -165,7 +169,8 @@ def read_moves(path: Path) -> Moves:
             raise ValueError("another version")
         identities = {int(node): dict(found) for node, found in table["identities"].items()}
         motors = tuple(_moved(entry) for entry in table["motors"])
-        return Moves(motors, float(table["sample_time_s"]), identities, str(table["stopped"]))
+        return Moves(motors, float(table["sample_time_s"]), identities, str(table["stopped"]),
+                     tuple(map(str, table["axes"])))  # fmt: skip
     except OSError as error:
         raise FileFormatError(f"{path}: cannot be read ({error.strerror}).") from error
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
@@ -175,12 +180,14 @@ def read_moves(path: Path) -> Moves:
 
 
 def _moved(entry: Mapping[str, Any]) -> MotorMoves:
-    columns = [np.asarray(entry[name], dtype=np.float64) for name in ("phase", "time", "counts", "current")]
+    phase, time, counts, current = columns = [
+        np.asarray(entry[name], dtype=np.float64) for name in ("phase", "time", "counts", "current")
+    ]
     outputs = np.array([[math.nan if value is None else float(value) for value in row] for row in entry["outputs"]])
     if outputs.ndim != 2 or any(column.shape != outputs.shape[:1] for column in columns):
         raise ValueError("columns of different length")
-    if entry["outcome"] not in (PULLED, HANGS, BLIND, NOT_TRIED) or entry["way"] not in (-1, 0, 1):
+    if entry["outcome"] not in (PULLED, HANGS, BLIND) or entry["way"] not in (-1, 0, 1):
         raise ValueError("an outcome that is none")
     captures: Sequence[int] = [int(count) for count in entry["captures"]]
-    return MotorMoves(int(entry["motor"]), int(entry["node"]), entry["outcome"], entry["way"], *columns, outputs,
-                      tuple(captures))  # fmt: skip
+    return MotorMoves(int(entry["motor"]), int(entry["node"]), entry["outcome"], entry["way"], phase, time, counts,
+                      current, outputs, tuple(captures))  # fmt: skip

@@ -42,7 +42,6 @@ class MountedOtherwise:
 
     def _turned(self, sample: TiltSample | OutputSample) -> TiltSample | OutputSample:
         values, rates = (
-            tuple(sign * given[number] for number, sign in self._axes)
-            for given in (sample.values, sample.rates)
+            tuple(sign * given[number] for number, sign in self._axes) for given in (sample.values, sample.rates)
         )
         return sample_at(sample.time, values, rates, valid=sample.valid)

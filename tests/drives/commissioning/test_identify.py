@@ -1,4 +1,4 @@
-"""What moves say is a pure function: scales, signs and mountings that explain them, and the files that would be right."""
+"""What moves say is a pure function: scales, signs and mountings that explain them, and files that would be right."""
 
 from __future__ import annotations
 
@@ -172,7 +172,8 @@ def _scale(lines: float, gear: float, peak: float) -> Any:
 
 
 def _features(**changes: Any) -> Features:
-    values = {"pull": 1, "slack": 0.0, "gain": 1.0, "error": 0.0, "direction": np.array([1.0, 0.0]), "force": 1.0, "rise": 5.0,
+    values = {"pull": 1, "slack": 0.0, "gain": 1.0, "error": 0.0, "direction": np.array([1.0, 0.0]), "force": 1.0,
+              "rise": 5.0,
               "friction": 1.0, "lag": 0.0, "noise": 0.0, "turn": 2048, "residual": 0.0}  # fmt: skip
     return Features(**{**values, **changes})
 
@@ -182,7 +183,7 @@ def _features(**changes: Any) -> Features:
                 "duplicate:0", "exchanged:1", "lazy"],
 )  # fmt: skip
 def test_a_mistake_that_is_none_is_one_line(mistake: str) -> None:
-    with pytest.raises(SettingsError, match="--plant takes reversed:N|gear"):
+    with pytest.raises(SettingsError, match=r"--plant takes reversed:N|gear"):
         plant(default_drives(), [mistake])
 
 

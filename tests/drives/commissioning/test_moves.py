@@ -60,7 +60,8 @@ def test_motors_that_are_moved_in_another_order_measure_the_same() -> None:
     first, second = (Toy(**toy).run(mover_of(motors=order)) for order in ((1, 2, 3), (3, 1, 2)))  # type: ignore[arg-type]
     for motor in (1, 2, 3):
         a, b = (features(moves.of(motor)) for moves in (first, second))  # type: ignore[arg-type]
-        assert a is not None and b is not None
+        assert a is not None
+        assert b is not None
         # When it began shifts only the rounding of the times.
         assert (a.pull, a.turn, a.slack) == (b.pull, b.turn, b.slack)
         assert a.gain == pytest.approx(b.gain, rel=1e-6)
@@ -173,6 +174,8 @@ def test_no_file_is_one_line(tmp_path: Path) -> None:
 def test_moves_without_a_wiggle_say_nothing() -> None:
     moved = Toy().run(mover_of(motors=(1,))).motors[0]
     keep = ~moved.rows(WIGGLE)
-    cut = replace(moved, **{name: getattr(moved, name)[keep] for name in ("phase", "time", "counts", "current", "outputs")})
+    cut = replace(
+        moved, **{name: getattr(moved, name)[keep] for name in ("phase", "time", "counts", "current", "outputs")}
+    )
     assert features(cut) is None
     assert Moves((cut,), 0.02).of(1) is cut

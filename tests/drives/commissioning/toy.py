@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
 
-from softneck.drives.commissioning._moves import Guards, Moves
 from softneck.drives.commissioning._mover import Mover
+from softneck.drives.commissioning._moves import Guards, Moves
 from softneck.drives.master import Tilt
 from softneck.drives.master._measured import Measurement
 
