@@ -75,6 +75,13 @@ def test_a_tendon_that_hangs_ends_the_search_at_the_travel() -> None:
     assert far == pytest.approx(2.0, abs=0.01)
 
 
+def test_a_reversed_motor_is_let_out_by_less_than_the_travel() -> None:
+    """What hangs further out is wound up the wrong way round: the other way comes before the whole travel."""
+    moved = Toy(pull=(-1, 1, 1)).run(mover_of(Guards(travel=2.0), motors=(1,))).motors[0]
+    assert moved.outcome == PULLED
+    assert np.max(moved.counts) / COUNTS == pytest.approx(0.6 * 2.0, abs=0.01)
+
+
 def test_a_sensor_that_sees_nothing_is_named_and_the_current_ends_the_pull() -> None:
     toy = Toy(sees=0.0)
     moves = toy.run(mover_of(motors=(1,)))
