@@ -138,7 +138,7 @@ def test_names_of_motors_do_not_matter() -> None:
 
 
 @pytest.mark.slow
-def test_what_was_proposed_has_nothing_to_find_and_zeroes(tmp_path: object) -> None:
+def test_what_was_proposed_leaves_nothing_to_find(tmp_path: object) -> None:
     file, guards, _ = believed("paper")
     planted = plant(file, ["reversed:3", "lines:2:2", "sign:pitch"])
     neck = NeckParameters.paper()
