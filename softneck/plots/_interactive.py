@@ -150,6 +150,9 @@ def _plot(panel: Panel, chart: Chart, number: int) -> Plot:
         # The panel below has the same axis. Powers of ten cannot be drawn at no size (Bokeh stops with a NaN box).
         plot.xaxis.major_label_text_font_size = "1px" if panel.log_x else "0px"
         plot.xaxis.major_label_text_alpha = 0.0
+    if panel.ticks:
+        plot.xaxis.ticker = list(range(len(panel.ticks)))
+        plot.xaxis.major_label_overrides = dict(enumerate(panel.ticks))
     if panel.title:
         plot.title = Title(text=panel.title, text_font=_FONT, text_font_size="12px")
     return plot

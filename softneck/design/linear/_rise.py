@@ -49,8 +49,14 @@ def check_rise(rise: float, plant: AxisPlant, test: StepAndLoad) -> None:
         )
 
 
-def least_rise(plant: AxisPlant, test: StepAndLoad) -> float:
-    """Return the rise [s] with the input led to its end as fast as the slew allows; inf where 90 % is never reached."""
+def least_rise(plant: AxisPlant, test: StepAndLoad, size: float | None = None) -> float:
+    """Return the rise [s] with the input led to its end as fast as the slew allows; inf where 90 % is never reached.
+
+    Args:
+        plant: the nominal one.
+        test: the limits on its input.
+        size: of the step [rad]; that of the test if not given.
+    """
     from scipy.signal import lfilter
 
     dt = plant.sample_time
@@ -59,7 +65,7 @@ def least_rise(plant: AxisPlant, test: StepAndLoad) -> float:
     y = np.asarray(lfilter(np.append(0.0, plant.numerator), plant.denominator, u)) * math.copysign(
         1.0, plant.static_gain
     )
-    return rise_time(y / test.reference, dt)
+    return rise_time(y / (test.reference if size is None else size), dt)
 
 
 def rise_time(y: Vector, dt: float) -> float:
