@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _PATH = click.Path(path_type=Path)
 # As `softneck.tuning` has it, which is imported when the command runs.
-_BUDGET = 220
+_BUDGET = 160
 
 
 def _print_requirements(context: click.Context, _: click.Parameter, value: bool) -> None:
@@ -84,9 +84,8 @@ def command(
     if output.exists() and not output.is_dir():
         raise SettingsError(f"{output}: is a file; name a folder.")
     things = opened_plants(plants, robot)
-    asked = read_tune_requirements(
-        requirements, robot=_robot_of(things), stepping=any(map(is_own_plant, things.values()))
-    )
+    stepping = any(is_own_plant(thing) for thing in things.values())
+    asked = read_tune_requirements(requirements, robot=_robot_of(things), stepping=stepping)
     if not as_json:
         note("requirements: " + "; ".join(asked.lines()))
     files = {f"plant {k}": item for k, item in enumerate(plants, start=1) if item.is_file()}

@@ -109,12 +109,13 @@ def _write_loop(found: Tuned, folder: Path, steps: Mapping[str, Path | str]) -> 
     at = _LOOP_TAUT if taut else _LOOP_AT
     neck = task.asked.certificate.neck
     first, unit = robot.outputs.names[0], robot.outputs.display_unit
+    stepped = f"{first}_{unit}" if robot.is_neck else first
     table: dict[str, Any] = {
         "duration_s": at + float(neck["duration_s"]),
         "plant": {_plant_key(path): _relative(path, folder)},
         **({"observer": {"file": OBSERVER}} if found.observed else {}),
         "controller": {"file": BEST},
-        "reference": {"kind": "step", f"{first}_{unit}" if robot.is_neck else first: float(neck["size_deg"]), "at_s": at},
+        "reference": {"kind": "step", stepped: float(neck["size_deg"]), "at_s": at},
     }  # fmt: skip
     if any(plant.payload and plant.name == name for plant in found.own):
         table["plant"]["parameters"] = {"payload": float(max(neck["payloads_kg"]))}

@@ -31,7 +31,7 @@ from ._space import KINDS_SEARCHED, spaces
 from ._task import Task
 
 #: Judgements of candidates that a search makes where nobody says otherwise.
-BUDGET = 220
+BUDGET = 160
 # Fewer do not judge each of the kinds by a loop.
 _LEAST_BUDGET = 1
 # So many of the best are held against `verify`, until one holds.
@@ -123,7 +123,7 @@ def tune(
     task = _task(plants, requirements, seed)
     refuse_impossible(task.asked, task.plant)
     each = spaces(chosen, rise=_aimed(task), cocontraction=task.cocontraction, neck=task.robot.is_neck)
-    task = replace(task, digest=_digest(task, chosen))
+    task = replace(task, digest=_digest(task, chosen, files))
     log = Log(folder, task.digest, resume=resume, force=force)
     with crew(workers, None) as members:
         search = Search(task, each, members, log, budget, lambda done, text: progress(0.9 * done, text))
@@ -169,16 +169,18 @@ def _aimed(task: Task) -> float:
     return _USUAL_RISE / min(float(box.nominal[1]) for box in source.axes)
 
 
-def _digest(task: Task, kinds: Sequence[str]) -> str:
+def _digest(task: Task, kinds: Sequence[str], files: Mapping[str, tuple[str, str]] | None) -> str:
     """Return a name for all that the search depends on but its budget."""
     told = {
         "asked": [(b.metric, b.bound, b.limit, b.asked) for b in task.asked.bounds], "track": dict(task.asked.track),
         "tables": [dict(getattr(task.asked.certificate, name)) for name in ("uncertainty", "sampling", "step", "neck")],
-        "kinds": list(kinds), "seed": task.seed, "robot": task.robot.hash,
+        "kinds": list(kinds), "seed": task.seed, "robot": task.robot.hash, "plants": [*task.linear, *task.own],
+        "files": None if files is None else [digest for _, digest in files.values()],
     }  # fmt: skip
     text = json.dumps(told, sort_keys=True, default=str).encode()
-    # Bytes that are only compared: what a worker gets is what the search was over.
-    return hashlib.sha256(text + cloudpickle.dumps([*task.linear.items(), *task.own.items()])).hexdigest()
+    # Of plants without files the bytes that a worker gets, which are compared and never read.
+    sent = b"" if files is not None else cloudpickle.dumps([*task.linear.items(), *task.own.items()])
+    return hashlib.sha256(text + sent).hexdigest()
 
 
 def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progress: Progress) -> Tuned:
