@@ -127,11 +127,9 @@ def _print(found: Tuned, folder: Path) -> None:
 
 
 def _why(found: Tuned, folder: Path) -> str:
-    from softneck.tuning._result import in_words
+    from softneck.report._tune_page import stands_in_the_way
 
-    told = "; ".join(in_words(price) for price in found.prices if price.least is not None)
     return (
-        f"{folder}: the best so far does not keep all requirements; what stands in the way is {found.binding}"
-        + (f" ({told})" if told else "")
-        + ". Loosen it, or go on with a larger --budget."
+        f"{folder}: the best so far does not keep all requirements. {stands_in_the_way(found)} Loosen it, or go on "
+        "with a larger --budget."
     )

@@ -48,6 +48,17 @@ def requirement_rows(found: Tuned) -> list[list[str]]:
     return rows
 
 
+def stands_in_the_way(found: Tuned) -> str:
+    """Return what binds, and what it costs, in a sentence or two."""
+    if found.binding is None:
+        return ""
+    text = f"What stands in the way is {found.binding}"
+    if found.nearest is not None:
+        text += f": at {found.nearest:.3g} all the rest would hold"
+    told = [in_words(price) for price in found.prices if price.least is not None]
+    return text + (f" ({'; '.join(told)})." if told else ".")
+
+
 def _result(found: Tuned) -> Section:
     best = found.best
     text = [
@@ -55,17 +66,14 @@ def _result(found: Tuned) -> Section:
         f"{found.evaluations} judgements of {len({(i.kind, str(i.settings)) for i in found.candidates})} candidates "
         "that were closed in loops, and of others that were left behind before.",
     ]
-    text.append(
-        "All requirements hold."
-        if found.holds
-        else f"Not all requirements hold; what stands in the way: {found.binding}."
-    )
+    text.append("All requirements hold." if found.holds else f"Not all requirements hold. {stands_in_the_way(found)}")
     text += [f"{kind} was left out: {why}" for kind, why in found.dropped.items()]
-    tables = [Table("Requirements", ["metric", "bound", "limit", "value", "", "note"], requirement_rows(found))]
+    rows = requirement_rows(found)
+    tables = [Table("Requirements", ["metric", "bound", "limit", "value", ""], [row[:5] for row in rows])]
+    text += [f"{row[0]}: {row[5]}." for row in rows if row[5]]
     if found.prices:
-        rows = [[p.metric, f"{p.limit:.3g}", p.other, _text(p.least)] for p in found.prices]
-        tables.append(Table("What it costs, all else held", ["requirement", "at", "costs", "at least"], rows))
-        text += [in_words(price) for price in found.prices[:1]]
+        told = [[p.metric, f"{p.limit:.3g}", p.other, _text(p.least)] for p in found.prices]
+        tables.append(Table("What it costs, all else held", ["requirement", "at", "costs", "at least"], told))
     return Section("Result", text=text, tables=tables)
 
 
@@ -89,11 +97,11 @@ def _coordinates(found: Tuned, items: Sequence[Candidate]) -> Section:
         curves.append(Curve(np.arange(len(names), dtype=float), y, _label(found, item), colour, style, width))
     if not names or not curves:
         return Section("Parallel coordinates", text=["No requirement has a value."])
-    levels = [Level(1.0, "limit", RED)]
-    ticks = [name.replace("axes.", "").replace("neck.", "").replace("track.", "") for name in names]
+    highest = min(_MOST, 1.1 * max(1.1, *(float(np.nanmax(curve.y, initial=0.0)) for curve in curves)))
+    ticks = [name.partition(".")[2] if name.partition(".")[0] != "step" else name for name in names]
+    panel = Panel(curves, "value / limit", levels=[Level(1.0, "limit", RED)], y_range=(0.0, highest), ticks=ticks)
     chart = Chart(
-        "Each requirement in parts of its limit: below 1 it holds", [Panel(curves, "value / limit", levels=levels,
-        y_range=(0.0, _MOST), ticks=ticks)], "", row_height=4.4,
+        "Each requirement in parts of its limit: below 1 it holds", [panel], "requirement", row_height=4.4,
         caption=f"Of a least value the limit over it; what is beyond {_MOST:g} is drawn there.",
     )  # fmt: skip
     return Section("Parallel coordinates", charts=[chart])

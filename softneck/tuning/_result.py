@@ -63,8 +63,12 @@ def front(items: Sequence[Candidate], names: Sequence[str]) -> list[Candidate]:
     return sorted((items[i] for i in kept), key=lambda item: item.metrics[names[0]])
 
 
-def binding(items: Sequence[Candidate], bounds: Sequence[Requirement], *, tested: bool) -> str | None:
+def binding(
+    items: Sequence[Candidate], bounds: Sequence[Requirement], *, tested: bool
+) -> tuple[str | None, float | None]:
     """Return the requirement that stands in the way, None where a candidate keeps all.
+
+    And the value to which it alone would have to be loosened; None where that does not do.
 
     It is the one that must be loosened least, alone, for some candidate to keep the rest; where none does, the one
     that the best candidate breaks most.
@@ -73,17 +77,19 @@ def binding(items: Sequence[Candidate], bounds: Sequence[Requirement], *, tested
     for item in items:
         broken = {name: value for name, value in item.ratios(bounds, tested=tested).items() if value > 1.0}
         if not broken:
-            return None
+            return None, None
         if len(broken) == 1:
             name, value = next(iter(broken.items()))
             loosened[name] = min(value, loosened.get(name, math.inf))
     if loosened:
-        return min(loosened, key=lambda name: loosened[name])
+        name = min(loosened, key=lambda name: loosened[name])
+        item = next(bound for bound in bounds if bound.metric == name)
+        return name, item.limit / loosened[name] if item.bound == "min" else item.limit * loosened[name]
     best = min(items, key=lambda item: item.cost(bounds, tested=tested), default=None)
     if best is None:
-        return None
+        return None, None
     found = best.ratios(bounds, tested=tested)
-    return max(found, key=lambda name: found[name])
+    return max(found, key=lambda name: found[name]), None
 
 
 def prices(items: Sequence[Candidate], bounds: Sequence[Requirement], metric: str, *, tested: bool) -> list[Price]:

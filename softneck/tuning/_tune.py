@@ -57,6 +57,7 @@ class Tuned:
         front: those of them that none beats in every objective.
         objectives: the metrics of the front.
         binding: the requirement that stands in the way; None where nothing does.
+        nearest: the value to which that alone would have to be loosened; None where that would not do.
         prices: what it costs.
         evaluations: judgements that were asked for.
         dropped: kind -> why it could not be designed.
@@ -74,6 +75,7 @@ class Tuned:
     front: list[Candidate]
     objectives: list[str]
     binding: str | None
+    nearest: float | None
     prices: list[Price]
     evaluations: int
     dropped: Mapping[str, str]
@@ -196,7 +198,7 @@ def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progr
     names = objectives(compared)
     tracked = [b for b in bounds if b.metric.startswith("track.")]
     holds = verification.holds and best.holds(tracked, tested=False) if tracked and task.own else verification.holds
-    stuck = None if holds else binding(compared, bounds, tested=search.tested)
+    stuck, nearest = (None, None) if holds else binding(compared, bounds, tested=search.tested)
     if not holds and stuck is None:
         # The search saw nothing broken, the certificate of the whole box does.
         stuck = next((v.requirement.metric for v in verification.failed), None)
@@ -205,7 +207,7 @@ def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progr
         best=best, controller=controller, observer=eyes, own=made_ready(task).own,
         observed=eyes is not None and bool(task.own) and kept_with(task, best, eyes, bounds),
         verification=verification, holds=holds,
-        candidates=compared, front=front(compared, names), objectives=names, binding=stuck,
+        candidates=compared, front=front(compared, names), objectives=names, binding=stuck, nearest=nearest,
         prices=[] if stuck is None else prices(compared, bounds, stuck, tested=search.tested),
         evaluations=len(search.spent), dropped=search.dropped, task=task,
     )  # fmt: skip
