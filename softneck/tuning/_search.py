@@ -1,9 +1,10 @@
 """Successive halving over kinds and settings: generations of candidates, judged further the better they are.
 
 Each kind has its own CMA-ES over the cube of its settings (Hansen and Ostermeier 2001, Evolutionary Computation
-9:159), which knows ranks alone, so that candidates of different levels are told to it as they are. After each round
-half of the kinds are left (successive halving: Jamieson and Talwalkar 2016, AISTATS), and of a round's candidates half
-go on to the next level. All is asked for in rounds and told in order: the number of workers changes nothing.
+9:159), which knows ranks alone, so that candidates of different levels are told to it as they are. All kinds are judged
+at their start; after that and after each round half of them are left (successive halving: Jamieson and Talwalkar 2016,
+AISTATS), and of a round's candidates half go on to the next level. All is asked for in rounds and told in order: the
+number of workers changes nothing.
 """
 
 from __future__ import annotations
@@ -130,28 +131,20 @@ class Search:
     def run(self) -> None:
         """Search until the budget is spent."""
         optimisers = {space.kind: _optimiser(space, self.task.seed, i) for i, space in enumerate(self.spaces)}
-        alive, first = list(self.spaces), True
         # Only what steps has margins by experiment.
         finals = _FINALS if self.task.own else 0
-        before = -1
+        levels = LEVELS[: 3 if self.task.own else 1]
+        alive, before = self._begun(levels, finals), -1
         while self._left(finals) > 0 and alive and before < len(self.spent):
             before = len(self.spent)
-            generation = {space.kind: self._asked(space, optimisers[space.kind], first) for space in alive}
-            if first:
-                # One of each kind alone: what it compiles the others then find.
-                self._judge([each[0] for each in generation.values()], "linear", finals)
+            generation = {space.kind: self._asked(space, optimisers[space.kind]) for space in alive}
             every = [item for each in generation.values() for item in each]
-            for level in LEVELS[: 3 if self.task.own else 1]:
+            for level in levels:
                 self._judge(every, level, finals)
                 every = self._better(every, level)
-            for space in list(alive):
+            for space in alive:
                 _tell(optimisers[space.kind], generation[space.kind], self._key)
-                if all(item.error for item in generation[space.kind]) and first:
-                    self.dropped[space.kind] = generation[space.kind][0].error
-                    alive.remove(space)
-            keep = max(_LEAST_KINDS, math.ceil(len(alive) / 2))
-            alive.sort(key=lambda space: min(self._key(item) for item in self._of(space.kind)))
-            alive, first = alive[:keep], False
+            alive = self._halved(alive)
         if finals:
             self._judge(self.ranked()[:finals], "margins", 0)
 
@@ -179,18 +172,29 @@ class Search:
     def _left(self, reserved: int) -> int:
         return self.budget - reserved - len(self.spent)
 
-    def _asked(self, space: Space, optimiser: Any, first: bool) -> list[Candidate]:
-        """Return a generation; the first begins with the start itself."""
-        found = []
-        for i in range(_GENERATION):
-            x = optimiser.ask()
-            x = space.start if first and i == 0 else x
-            settings = space.settings(x)
-            job = Job.of(space.kind, settings, "")
-            found.append(
-                self.candidates.setdefault((job.kind, job.settings), Candidate(space.kind, settings, np.array(x)))
-            )
-        return found
+    def _begun(self, levels: Sequence[str], finals: int) -> list[Space]:
+        """Judge the start of every kind, each by itself: what it compiles the others then find; return those left."""
+        starts = {space.kind: self._candidate(space, space.start) for space in self.spaces}
+        for level in levels:
+            self._judge(list(starts.values()), level, finals)
+        self.dropped |= {kind: item.error for kind, item in starts.items() if item.error}
+        return self._halved([space for space in self.spaces if space.kind not in self.dropped])
+
+    def _halved(self, alive: list[Space]) -> list[Space]:
+        """Return the better half of the kinds, in their order."""
+        keep = max(_LEAST_KINDS, math.ceil(len(alive) / 2))
+        best = sorted(alive, key=lambda space: min(self._key(item) for item in self._of(space.kind)))[:keep]
+        return [space for space in alive if space in best]
+
+    def _asked(self, space: Space, optimiser: Any) -> list[Candidate]:
+        """Return a generation."""
+        return [self._candidate(space, optimiser.ask()) for _ in range(_GENERATION)]
+
+    def _candidate(self, space: Space, x: np.ndarray) -> Candidate:
+        """Return the candidate at a point of the cube; the same one for the same settings."""
+        settings = space.settings(x)
+        job = Job.of(space.kind, settings, "")
+        return self.candidates.setdefault((job.kind, job.settings), Candidate(space.kind, settings, np.array(x)))
 
     def _better(self, items: list[Candidate], level: str) -> list[Candidate]:
         """Return the better half of those that were judged at a level."""

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-
-import cloudpickle
 
 from softneck.core import Progress, SettingsError, require_whole, silent
 from softneck.cosim.studies._executors import crew
@@ -21,6 +17,7 @@ from softneck.verification._scale import scaled
 from softneck.verification._verify import sources_of
 
 from ._beforehand import refuse_impossible
+from ._digest import digest_of
 from ._judge import designed, made_ready
 from ._log import Log
 from ._requirements import TuneRequirements, make_tune_requirements, with_certificate
@@ -125,7 +122,7 @@ def tune(
     task = _task(plants, requirements, seed)
     refuse_impossible(task.asked, task.plant)
     each = spaces(chosen, rise=_aimed(task), cocontraction=task.cocontraction, neck=task.robot.is_neck)
-    task = replace(task, digest=_digest(task, chosen, files))
+    task = replace(task, digest=digest_of(task, chosen, files))
     log = Log(folder, task.digest, resume=resume, force=force)
     with crew(workers, None) as members:
         search = Search(task, each, members, log, budget, lambda done, text: progress(0.9 * done, text))
@@ -169,20 +166,6 @@ def _aimed(task: Task) -> float:
         return min(known)
     source = sources_of(task.linear, task.asked.certificate)[0]
     return _USUAL_RISE / min(float(box.nominal[1]) for box in source.axes)
-
-
-def _digest(task: Task, kinds: Sequence[str], files: Mapping[str, tuple[str, str]] | None) -> str:
-    """Return a name for all that the search depends on but its budget."""
-    told = {
-        "asked": [(b.metric, b.bound, b.limit, b.asked) for b in task.asked.bounds], "track": dict(task.asked.track),
-        "tables": [dict(getattr(task.asked.certificate, name)) for name in ("uncertainty", "sampling", "step", "neck")],
-        "kinds": list(kinds), "seed": task.seed, "robot": task.robot.hash, "plants": [*task.linear, *task.own],
-        "files": None if files is None else [digest for _, digest in files.values()],
-    }  # fmt: skip
-    text = json.dumps(told, sort_keys=True, default=str).encode()
-    # Of plants without files the bytes that a worker gets, which are compared and never read.
-    sent = b"" if files is not None else cloudpickle.dumps([*task.linear.items(), *task.own.items()])
-    return hashlib.sha256(text + sent).hexdigest()
 
 
 def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progress: Progress) -> Tuned:
