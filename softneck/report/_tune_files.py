@@ -49,7 +49,7 @@ def write_tuned(
         found.verification, files={role: (str(path), file_hash(path)) for role, path in read.items()}
     )
     certificate = folder / CERTIFICATE
-    if found.holds:
+    if verification.holds:
         write_certificate(certificate, verification.contents(), force=True)
     else:
         certificate.unlink(missing_ok=True)

@@ -120,7 +120,8 @@ def _for_linear(defaults: Mapping[str, Any]) -> dict[str, Any]:
     require = {f"step.{name.partition('.')[2]}": limit for name, limit in defaults["require"].items()
                if name.startswith("neck.")}  # fmt: skip
     tracked = {name: limit for name, limit in defaults["require"].items() if name.startswith("track.")}
-    return {**defaults, "require": {**require, **tracked}}
+    # Presets are foreign plants, which decide nothing and take half a minute.
+    return {**defaults, "neck": {**defaults["neck"], "necks": 0}, "require": {**require, **tracked}}
 
 
 def _numbers(given: Any, defaults: Mapping[str, float]) -> dict[str, float]:
