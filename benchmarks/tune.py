@@ -1,6 +1,6 @@
 """Hold what `softneck tune` returns against necks on which nothing was chosen.
 
-`python benchmarks/tune.py [--necks NECK...] [--kinds KIND...] [--budget N] [--seed N] [--workers N] [--fresh]`
+`python benchmarks/tune.py [--necks NECK...] [--kinds KIND...] [--budget N] [--seed N] [--workers N] [--best] [--fresh]`
 
 For each neck what docs/howto/payloads.md tells a user to do: the least co-contraction at which the large experiment is
 heard with 1 kg; from Eq. 22 and multisines of small and large amplitude at 0.32 and 1 kg, played around it, a family,
@@ -115,6 +115,7 @@ def main() -> None:
     parser.add_argument("--budget", type=int, default=BUDGET)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--best", action="store_true", help="Only what is returned, not the best of other kinds.")
     parser.add_argument("--fresh", action="store_true", help="Forget the models that are kept.")
     asked = parser.parse_args()
     if asked.fresh:
@@ -128,7 +129,7 @@ def main() -> None:
         found = tune(plants, kinds=tuple(asked.kinds), budget=asked.budget, seed=asked.seed, workers=asked.workers)
         spent = seconds() - begin
         shown = {found.best.kind: found.best}
-        for item in found.candidates:
+        for item in () if asked.best else found.candidates:
             shown.setdefault(item.kind, item)
         ready = made_ready(found.task)
         for item in shown.values():

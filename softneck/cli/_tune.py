@@ -15,7 +15,7 @@ from .shared._plants import opened_plants
 from .shared._robot import robot_option
 
 if TYPE_CHECKING:
-    from softneck.tuning import Tuned
+    from softneck.tuning._tune import Tuned
 
 _PATH = click.Path(path_type=Path)
 # As `softneck.tuning` has it, which is imported when the command runs.
@@ -77,8 +77,9 @@ def command(
     Exit code 1 if no candidate keeps all requirements: then it says which one stands in the way, and what it costs.
     """
     from softneck.core import SettingsError
-    from softneck.report import write_tuned
-    from softneck.tuning import read_tune_requirements, tune
+    from softneck.report._tune_files import write_tuned
+    from softneck.tuning import tune
+    from softneck.tuning._requirements import read_tune_requirements
     from softneck.verification._own_plants import is_own_plant
 
     if output.exists() and not output.is_dir():

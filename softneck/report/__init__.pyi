@@ -6,6 +6,4 @@ from ._project_page import project_page as project_page
 from ._reproduce import ReproduceSettings as ReproduceSettings
 from ._reproduce import reproduce as reproduce
 from ._study_page import study_page as study_page
-from ._tune_files import write_tuned as write_tuned
-from ._tune_page import tune_page as tune_page
 from ._validation_page import validation_page as validation_page

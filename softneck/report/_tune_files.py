@@ -21,8 +21,8 @@ from softneck.verification._worst import write_linear
 from ._tune_page import tune_page
 
 if TYPE_CHECKING:
-    from softneck.tuning import Tuned
     from softneck.tuning._search import Candidate
+    from softneck.tuning._tune import Tuned
 
 BEST, OBSERVER, CERTIFICATE, LOOP = "best.npz", "observer.npz", "best.certificate.json", "loop.toml"
 _LOOP_AT, _LOOP_TAUT = 1.0, 3.0

@@ -14,8 +14,8 @@ from softneck.tuning._responses import step_response
 from softneck.tuning._result import in_words, ratio_of
 
 if TYPE_CHECKING:
-    from softneck.tuning import Tuned
     from softneck.tuning._search import Candidate
+    from softneck.tuning._tune import Tuned
 
 # More lines than this nobody tells apart; the table has all.
 _DRAWN, _SHOWN = 12, 30

@@ -20,7 +20,7 @@ from ._beforehand import refuse_impossible
 from ._digest import digest_of
 from ._judge import designed, made_ready
 from ._log import Log
-from ._requirements import TuneRequirements, make_tune_requirements, with_certificate
+from ._requirements import TuneRequirements, make_tune_requirements, read_tune_requirements, with_certificate
 from ._responses import kept_with
 from ._result import Price, binding, front, objectives, prices
 from ._search import Candidate, Search
@@ -82,7 +82,7 @@ class Tuned:
 
 def tune(
     plants: Mapping[str, Any],
-    requirements: TuneRequirements | None = None,
+    requirements: TuneRequirements | Mapping[str, Any] | str | Path | None = None,
     *,
     kinds: Sequence[str] = (),
     budget: int = BUDGET,
@@ -101,7 +101,7 @@ def tune(
     Args:
         plants: by name: families and linear models, of which at least one, the first the nominal plant; and plants
             that step (nonlinear models, neck parameters, functions that return a part), which loops are closed over.
-        requirements: what is asked; the defaults if not given.
+        requirements: what is asked, also as a file or a table like one; the defaults if not given.
         kinds: of controllers; `KINDS_SEARCHED` if none is named.
         budget: judgements of candidates.
         seed: of the search and of the noise in its loops.
@@ -130,7 +130,9 @@ def tune(
     return _finished(search, files, lambda done, text: progress(0.9 + 0.1 * done, text))
 
 
-def _task(plants: Mapping[str, Any], requirements: TuneRequirements | None, seed: int) -> Task:
+def _task(
+    plants: Mapping[str, Any], requirements: TuneRequirements | Mapping[str, Any] | str | Path | None, seed: int
+) -> Task:
     own = {name: thing for name, thing in plants.items() if is_own_plant(thing)}
     linear = {name: thing for name, thing in plants.items() if name not in own}
     if not linear:
@@ -138,7 +140,12 @@ def _task(plants: Mapping[str, Any], requirements: TuneRequirements | None, seed
             "no linear plant to design on: give a FAMILY (`softneck family`), or a linear MODEL, as well."
         )
     robot = robot_of(next(iter(linear.values())))
-    asked = requirements or make_tune_requirements({}, robot=robot, stepping=bool(own))
+    if isinstance(requirements, TuneRequirements):
+        asked = requirements
+    elif isinstance(requirements, Mapping):
+        asked = make_tune_requirements(requirements, robot=robot, stepping=bool(own))
+    else:
+        asked = read_tune_requirements(requirements, robot=robot, stepping=bool(own))
     if not robot.is_neck:
         asked = with_certificate(asked, scaled(asked.certificate, sources_of(linear, asked.certificate)))
     return Task(

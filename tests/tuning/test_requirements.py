@@ -11,8 +11,8 @@ import pytest
 
 from softneck.core import FileFormatError, SettingsError
 from softneck.estimation import LinearNeck
-from softneck.tuning import make_tune_requirements, read_tune_requirements
 from softneck.tuning._beforehand import refuse_impossible
+from softneck.tuning._requirements import make_tune_requirements, read_tune_requirements
 from softneck.verification import make_requirements
 
 TS = 0.02

@@ -14,11 +14,12 @@ from hypothesis import strategies as st
 
 from softneck.core import KINDS, OutputFileError, SettingsError, SoftneckError, resolve
 from softneck.core._kinds import make_settings
-from softneck.tuning import Tuned, make_tune_requirements, tune
+from softneck.tuning import tune
 from softneck.tuning._log import FILE, Job, Log
 from softneck.tuning._result import binding, front, prices
 from softneck.tuning._search import Candidate, given_out, ratio
 from softneck.tuning._space import KINDS_SEARCHED, spaces
+from softneck.tuning._tune import Tuned
 from softneck.verification._requirements import Requirement
 
 from .test_requirements import neck
@@ -31,8 +32,7 @@ QUICK = {"sampling": {"plants": 30, "search_generations": 0}, "step": {"duration
 
 
 def searched(folder: Path | None = None, budget: int = 14, **more: Any) -> Tuned:
-    asked = make_tune_requirements(QUICK, stepping=False)
-    return tune({"neck": neck()}, asked, kinds=("pi", "lqg"), budget=budget, workers=more.pop("workers", 0),
+    return tune({"neck": neck()}, QUICK, kinds=("pi", "lqg"), budget=budget, workers=more.pop("workers", 0),
                 folder=folder, **more)  # fmt: skip
 
 
