@@ -109,3 +109,15 @@ def test_what_the_loop_cannot_give_is_refused_in_a_line() -> None:
 def test_two_settings_for_one_filter_are_refused(kind: str) -> None:
     with pytest.raises(SettingsError, match="not both"):
         resolve(KINDS[kind].settings)(rise_s=0.35, reference_time=0.1)
+
+
+def test_what_is_taken_from_the_papers_neck_is_said() -> None:
+    settings = resolve(KINDS["pi"].settings)
+    late_and_fast, quick = (settings().design(neck(*PLANTS[name])) for name in ("late", "slow"))
+    assert "of the paper's neck" not in late_and_fast.summary()
+    assert "of the paper's neck, not of this plant: small moves as fast as 5.293 1/s" in quick.summary()
+    both = settings().design(neck(4.0, 3.3, 2)).summary()
+    assert "a dead time of at least 0.08 s and small moves" in both
+    # What somebody says is not assumed.
+    said = settings(least_delay=0.08, small_move_pole=5.293).design(neck(4.0, 3.3, 2)).summary()
+    assert "of the paper's neck" not in said

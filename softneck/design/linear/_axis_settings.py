@@ -124,6 +124,7 @@ class AxisSettings(LoopSettings, ABC):
             design={
                 "settings": self._stored(),
                 "extra_delay": self.extra_delay,
+                "assumed": self.assumed(uncertain),
                 **{name: item[2] for name, item in made.items()},
             },
         )

@@ -91,6 +91,20 @@ class LoopSettings:
         """Return what stands for another robot in the place of the neck's defaults."""
         return {"least_delay": 0.0, "small_move_pole": 0.0}
 
+    def assumed(self, plant: UncertainPlant) -> dict[str, float]:
+        """Return what of the paper's neck, and not of this plant, a design takes where nobody says otherwise."""
+        nominal = [axis.nominal for axis in plant.axes.values()] if plant.robot.is_neck else []
+        changed = {
+            "least_delay": any(item.delayed(self.least_delay).delay > item.delay for item in nominal),
+            "small_move_pole": self.small_move_pole > 0.0
+            and any(item.faster(self.small_move_pole) is not item for item in nominal),
+        }
+        return {
+            name: float(getattr(self, name))
+            for name, changes in changed.items()
+            if changes and isinstance(getattr(self, name), NeckDefault)
+        }
+
     def redefinition(self, plant: UncertainPlant) -> tuple[Matrix, Matrix]:
         """Return T from motors to the redefined inputs of all axes and co-contraction, and its inverse."""
         return self.neck_redefinition() if plant.weights is None else redefinition_of(plant.weights, plant.names)

@@ -116,7 +116,12 @@ class PiSettings(LoopSettings):
             ),
             limits=limits,
             order=self.order,
-            design={"settings": asdict(self), "extra_delay": self.extra_delay, **found},
+            design={
+                "settings": asdict(self),
+                "extra_delay": self.extra_delay,
+                "assumed": self.assumed(uncertain),
+                **found,
+            },
         )
 
     def _family(self, plant: UncertainAxis) -> Plants:
