@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from softneck.core import KINDS, SettingsError, Vector, resolve
-from softneck.design.linear._rise import LAG, filter_for_lag
-from softneck.estimation import LinearNeck
+from softneck.design.linear._rise import LAG, check_rise, filter_for_lag, least_rise
+from softneck.design.plants._step_and_load import StepAndLoad
+from softneck.estimation import LinearNeck, axis_plant
 
 TS = 0.02
 # The kinds whose controller has a linear form.
@@ -69,6 +70,8 @@ def test_a_faster_loop_than_asked_is_lagged_and_a_slower_one_is_led() -> None:
     )
     assert "reference_lead_s" not in slow.design["pitch"]["gains"]
     assert fast.design["pitch"]["gains"]["reference_lead_s"] > fast.design["pitch"]["gains"]["reference_time_s"]
+    # The controller itself does it, and not the search for its filter alone; within rounding, as above.
+    assert rise(simulated(model, fast)) == pytest.approx(0.25, rel=0.02)
 
 
 @pytest.mark.parametrize("kind", LINEAR)
@@ -98,6 +101,17 @@ def test_what_the_motors_cannot_give_is_refused_in_a_line(kind: str) -> None:
         settings(rise_s=0.02).design(neck(*PLANTS["paper"]))
     with pytest.raises(SettingsError, match="rises in less than"):
         settings(rise_s=0.35, slew_limit=1.0).design(neck(*PLANTS["paper"]))
+
+
+def test_the_least_rise_is_where_it_is_refused() -> None:
+    plant, test = axis_plant(neck(*PLANTS["paper"]), "pitch"), StepAndLoad()
+    least = least_rise(plant, test)
+    # Twice the slew, twice the range and half the step are never slower.
+    assert least_rise(plant, StepAndLoad(slew_limit=0.5)) < least
+    assert least_rise(plant, test, 0.5 * test.reference) < least
+    check_rise(1.01 * least, plant, test)
+    with pytest.raises(SettingsError, match="rises in less than"):
+        check_rise(0.99 * least, plant, test)
 
 
 def test_what_the_loop_cannot_give_is_refused_in_a_line() -> None:

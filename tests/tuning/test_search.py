@@ -217,6 +217,9 @@ def test_what_binds_is_what_alone_must_give_way_least() -> None:
     slow = candidate(neck__rise_s=0.52, neck__overshoot_pct=5.0, axes__gain_margin=2.5)
     loud = candidate(neck__rise_s=0.3, neck__overshoot_pct=6.0, axes__gain_margin=1.0)
     assert binding([fast, slow, loud], BOUNDS, tested=False) == ("neck.rise_s", pytest.approx(0.52))
+    slower = candidate(neck__rise_s=0.55, neck__overshoot_pct=5.0, axes__gain_margin=2.5)
+    for listed in ([slow, slower, loud], [slower, slow, loud]):
+        assert binding(listed, BOUNDS, tested=False) == ("neck.rise_s", pytest.approx(0.52))
     assert binding([fast, loud], BOUNDS, tested=False) == ("neck.overshoot_pct", pytest.approx(7.0))
     assert binding([loud], BOUNDS, tested=False) == ("axes.gain_margin", None)
     good = candidate(neck__rise_s=0.3, neck__overshoot_pct=5.0, axes__gain_margin=2.0)
@@ -232,6 +235,15 @@ def test_what_a_requirement_costs() -> None:
     # The looser the requirement, the less it costs.
     assert least == sorted(least, reverse=True)
     assert least[-1] == 0.3
+
+
+def test_few_requirements_are_broken_rather_than_all_a_little() -> None:
+    one = candidate(neck__rise_s=0.5, neck__overshoot_pct=4.0, axes__gain_margin=2.1)
+    each = candidate(neck__rise_s=0.46, neck__overshoot_pct=5.75, axes__gain_margin=2.1)
+    good = candidate(neck__rise_s=0.4, neck__overshoot_pct=5.0, axes__gain_margin=2.0)
+    costs = [item.cost(BOUNDS, tested=False) for item in (good, one, each)]
+    assert costs[0] <= 1.0 < costs[1] < costs[2]
+    assert costs[1] == pytest.approx(1.25)
 
 
 def test_what_is_known_twice_counts_by_the_worse() -> None:
