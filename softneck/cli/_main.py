@@ -36,6 +36,7 @@ _COMMANDS = {
     "fmu": ("_fmu", "Package models, observers, controllers or the virtual neck as FMUs."),
     "observer": ("_observer", "Build a Kalman filter over a linear model."),
     "design": ("_design", "Design a controller on a linear model."),
+    "tune": ("_tune", "Search kinds and settings for the controller that keeps requirements."),
     "verify": ("_verify", "Verify a controller against requirements, or fail loudly."),
     "simulate": ("_simulate", "Close the loop that a TOML file describes and judge it."),
     "study": ("_study", "Run a loop many times over what varies: ranking, Pareto front, worst cases."),
