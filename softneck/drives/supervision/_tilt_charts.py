@@ -22,6 +22,8 @@ _NOISES = (1.0 / 25.0, 25.0)
 # What angles and gyro differ by leaks away over the first time, and its rate, the gyro's own bias, is averaged over the
 # second [s].
 _FORGET, _BIAS = 6.0, 15.0
+# A gyro that shows this part of what the model misses: some of it leaks away, and the model has errors of its own.
+_ALONE = 0.5
 # Times that the model looks back, until it is believed.
 _SETTLED = 2
 # Faults are weighed by what was seen in about this time [s].
@@ -175,7 +177,7 @@ class TiltCharts:
         possible, alone = np.ones(h, dtype=bool), False
         if self._turned is not None and self.gyro.known:
             square = float(np.sum(self.residual**2))
-            alone = float(np.sum(self.gyro.level * self.residual)) > 0.5 * square
+            alone = float(np.sum(self.gyro.level * self.residual)) > _ALONE * square
             possible = np.array([name in (_OF_SENSOR if alone else _OF_NECK) for name in names[:h]])
         gain = np.where(possible, gain, -np.inf)
         found = int(np.argmax(gain))
