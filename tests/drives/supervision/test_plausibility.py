@@ -55,7 +55,7 @@ def test_every_row_is_found_in_time(name: str) -> None:
         in_time(name, seed)
 
 
-@pytest.mark.parametrize("name", ["motor jams", "encoder slips 1 rad", "ten bad TPDO frames"])
+@pytest.mark.parametrize("name", ["motor jams", "encoder slips 1 rad", "ten bad TPDO frames", "gear x 1/2"])
 def test_faults_of_motors_get_their_own_names(name: str) -> None:
     assert play(ROWS[name], 4, payload=0.1).event == ROWS[name].names[0]
 
