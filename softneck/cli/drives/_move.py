@@ -156,6 +156,12 @@ def _print_jog(found: JogResult, *, as_json: bool) -> None:
     "--max-slack", type=float, metavar="RAD", help="Pay out no more than this. [default: slack_unwind_rad, at most 3]"
 )
 @click.option("--payload", type=float, default=0.0, metavar="KG", help="Payload on the platform of --simulated.")
+@click.option(
+    "--supervision",
+    type=click.Path(path_type=Path),
+    metavar="JSON",
+    help="Also write what the plausibility supervisor compares with: `baseline` of [supervision] in the drives file.",
+)
 @drives_options
 @override_option
 @neck_option
@@ -166,6 +172,7 @@ def _print_jog(found: JogResult, *, as_json: bool) -> None:
 def record_command(
     signal_name: str, output: Path, duration: float | None, runs: int, seed: int, ramp: float,
     max_position: float | None, max_speed: float | None, max_slack: float | None, payload: float,
+    supervision: Path | None,
     drives_file: Path | None, bus: str | None, simulated: bool, robot: str | None, arm: bool,
     overrides: tuple[str, ...],
     neck: str | None, pace: float | None, logs: tuple[Path, ...], no_log: bool, force: bool,
@@ -176,14 +183,21 @@ def record_command(
     from softneck.drives.bus._link import VirtualLink
     from softneck.drives.commissioning._record import drive_limits
     from softneck.drives.running._keyboard import Keyboard
+    from softneck.drives.supervision._calibrate import calibrate
+    from softneck.drives.supervision._log import MotionLog
     from softneck.signals.recording._files import recording_suffix
 
     recording_suffix(output)
     refuse_existing(output, force=force)
+    if supervision is not None:
+        refuse_existing(supervision, force=force)
     require_logs(logs, no_log=no_log, force=force)
     require_between("--payload", payload, 0.0, 1.0, "kg")
     virtual = load_neck(neck) if neck else None
     chosen = target_of(drives_file, bus, simulated, arm, neck=virtual, robot=robot)
+    if supervision is not None:
+        # What is to be compared with is not judged by what was compared with before.
+        chosen = replace(chosen, file=replace(chosen.file, baseline=None))
     _checked(chosen, pace)
     limits = drive_limits(chosen.file, position=max_position, speed=max_speed, slack=max_slack)
     moved = chosen.file.robot
@@ -201,6 +215,8 @@ def record_command(
         with progress("record", quiet=as_json) as tell, Keyboard() as keyboard:
             files = {**drives_of(chosen.path), **({"signal": signal_name} if Path(signal_name).is_file() else {})}
             session = _session(chosen, link, keyboard, overrides, pace, log, files)
+            motion = MotionLog()
+            session = replace(session, watches=(*session.watches, motion))
             recorded = record_signal(
                 [excitation for excitation, _ in prepared],
                 replace(session, facts={"record": experiment.facts()}),
@@ -213,6 +229,13 @@ def record_command(
         _print_record(output, recorded, facts, str(prepared[0][1]), as_json=as_json)
         leave_if_asked(keyboard, terminated=recorded.ended.terminated)
         recorded.require()
+        if supervision is not None:
+            settings = recorded.ended.master.settings
+            calibrate(
+                [motion.motion()], cycle=settings.bus.cycle, sample_cycles=settings.sample_cycles,
+                slack=settings.limits.slack,
+            ).save(supervision, force=force)  # fmt: skip
+            note(f"{supervision}: what plausibility is judged by; name it in the drives file: [supervision] baseline")
 
 
 def _print_record(

@@ -22,6 +22,7 @@ from ..master import MasterSettings
 from ..master._fieldbus import BusSettings
 from ..master._settings import LimitSettings, RampSettings, SensorSettings, WatchSettings
 from ._axes import axes_of
+from ..supervision._baseline import Baseline
 from ._load import MOST, bus_load
 from ._robot import channels_of, count_word, ranges, require_signs
 from ._sensor_source import SENSORS, SensorSource
@@ -152,6 +153,7 @@ class DrivesFile:
         quick_stop: deceleration of a quick stop (6085h) [rad/s^2].
         following: window (6065h) [rad]; following_time: its time-out (6066h) [s].
         robot: what the drives move; None: the neck, with no limits beside those here.
+        baseline: undisturbed motion, by which plausibility is judged; None: it is not.
     """
 
     profile: str
@@ -174,6 +176,7 @@ class DrivesFile:
     following: float = 2.0
     following_time: float = 0.2
     robot: Robot | None = None
+    baseline: Baseline | None = None
 
     def __post_init__(self) -> None:
         require_one_of("profile", self.profile, PROFILES)
@@ -193,6 +196,11 @@ class DrivesFile:
         if self.sensor_kind == "can" and self.sensor_node in nodes:
             raise SettingsError(f"[sensor] node {self.sensor_node} is that of a drive; each device needs its own.")
         axes_of(self.sensor_axes, self.moves.outputs.names)
+        if self.baseline is not None and (self.baseline.motors, self.baseline.outputs) != (motors, self._outputs):
+            raise SettingsError(
+                f"[supervision] `baseline` is of {self.baseline.motors} motors and {self.baseline.outputs} outputs; "
+                f"there are {motors} and {self._outputs}. Record one on these drives (`record --supervision`)."
+            )
         if self.robot is not None:
             require_signs([drive.scale.reversed for drive in self.drives], self.robot)
         if self.load > MOST:
@@ -200,6 +208,10 @@ class DrivesFile:
                 f"{motors} drives every {1e3 * self.cycle:g} ms would take {100.0 * self.load:.0f} % of a bus with "
                 f"{self.bit_rate:g} bit/s; at most {100.0 * MOST:g} % work. Raise `bit_rate` or `period_s` of [bus]."
             )
+
+    @property
+    def _outputs(self) -> int:
+        return len(self.moves.outputs.names)
 
     @property
     def nodes(self) -> tuple[int, ...]:
@@ -251,6 +263,12 @@ class DrivesFile:
                 f"the bus period {self.cycle:g} s must divide the controller's sample time {sample_time:g} s; "
                 "change `period_s` of [bus]."
             )
+        b = self.baseline
+        if b is not None and not (math.isclose(b.cycle, self.cycle) and b.sample_cycles == round(ratio)):
+            raise SettingsError(
+                f"[supervision] `baseline` is of samples every {b.cycle * b.sample_cycles:g} s on a bus of "
+                f"{b.cycle:g} s; these are {sample_time:g} s and {self.cycle:g} s. Record one for them."
+            )
         scales = [drive.scale for drive in self.drives]
         k = [scale.counts_per_radian for scale in scales]
         neck = self.neck
@@ -273,6 +291,7 @@ class DrivesFile:
             watch=self.watch,
             ramps=self.ramps,
             channels=channels_of(self.robot, self.limits),
+            baseline=b,
         )
 
 

@@ -13,6 +13,7 @@ from softneck.robot import Robot
 from softneck.signals.recording._channels import NECK
 
 from ..master._settings import LimitSettings, RampSettings, SensorSettings, WatchSettings
+from ..supervision._baseline import load_baseline
 from ._file import PROFILES, DriveEntry, DrivesFile, Guarding, Neck, ZeroSettings
 from ._robot import count_word, require_table, robot_of
 from ._sensor_source import SOURCE_KEYS, make_source
@@ -88,7 +89,8 @@ _KEYS: dict[str, dict[str, tuple[str, float]]] = {
         "product": ("product", 0.0), "serial": ("serial", 0.0), "firmware": ("firmware", 0.0),
     },
 }  # fmt: skip
-_TOP = ("profile", "eds", "bus", "guarding", "drive", "limits", "stop", "sensor", "watch", "zero", "ramp", "neck")
+_TOP = ("profile", "eds", "bus", "guarding", "drive", "limits", "stop", "sensor", "watch", "zero", "ramp", "neck",
+        "supervision")  # fmt: skip
 _CLASSES = {
     "guarding": Guarding, "zero": ZeroSettings, "neck": Neck, "limits": LimitSettings, "sensor": SensorSettings,
     "watch": WatchSettings, "ramp": RampSettings,
@@ -125,6 +127,12 @@ def make_drives(table: Mapping[str, Any], folder: Path = Path(), robot: Robot | 
         values[_FIELDS.get(name, name)] = _made(f"[{name}]", setting, name, content)
     values |= _values("[bus]", "bus", _table("bus", table.get("bus", {})))
     values |= _values("[stop]", "quick", _table("stop", table.get("stop", {})))
+    if "supervision" in table:
+        content = _table("supervision", table["supervision"])
+        _refuse_unknown("[supervision]", content, ("baseline",))
+        if not isinstance(content.get("baseline"), str):
+            raise SettingsError("[supervision] `baseline` must name the file that `drives record --supervision` wrote.")
+        values["baseline"] = load_baseline(folder / content["baseline"])
     if "eds" in table:
         values["eds"] = folder / str(table["eds"])
     return DrivesFile(**values)

@@ -21,6 +21,7 @@ from softneck.signals.recording._channels import NECK
 from ..master import MasterSettings
 from ..master._fieldbus import BusSettings
 from ..master._settings import ChannelSettings, LimitSettings, RampSettings, SensorSettings, WatchSettings
+from ..supervision._baseline import Baseline
 from ._cycle import Cycle, decode_cycle
 from ._result import recording_of, signal_units
 from ._rows import experiment_channels, experiment_recording, experiment_table, motion_at
@@ -35,6 +36,7 @@ _PARTS: dict[str, type] = {
     "watch": WatchSettings,
     "ramps": RampSettings,
     "channels": ChannelSettings,
+    "baseline": Baseline,
 }
 
 

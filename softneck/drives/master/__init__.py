@@ -1,7 +1,7 @@
 """The CiA 402 master without I/O: frames and time in, frames out.
 
 States, events and reactions are tables.
-Imports `core` only: no clock, no bus, no thread.
+Imports `core` and `drives.supervision`: no clock, no bus, no thread.
 """
 
 import lazy_loader

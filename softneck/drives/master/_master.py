@@ -15,7 +15,7 @@ from ._limiter import Limiter
 from ._measured import Measurement, Motors, Pilot
 from ._settings import MasterSettings
 from ._supervisor import ACTIVE, FINAL, GOALS, Phase, Signal, Supervisor
-from ._watches import Leaky, Watches
+from ._watches import Leaky, Watches, timing
 
 # Cycles without a set-point until the run stops (fault table: hold at once, stop at 5).
 _LOST = 5
@@ -52,7 +52,9 @@ class Master:
         self._gate = Gate(settings.sensor)
         count = len(self.bus.drives)
         channels = settings.channels
-        self._watches = Watches(settings.watch, settings.limits, channels and channels.weights, count)
+        self._watches = Watches(
+            settings.watch, settings.limits, channels and channels.weights, count, settings.baseline
+        )
         ranges = channels.ranges if channels else [None] * count
         self._limiters = tuple(Limiter(settings.limits, settings.bus.cycle, own) for own in ranges)
         scales = (settings.counts_per_radian, settings.newton_per_unit, settings.zeros)
@@ -157,13 +159,7 @@ class Master:
         if before is None:
             for view in self.bus.drives:
                 view.answered = now
-            return []
-        gap = (now - before) / self.settings.bus.cycle
-        if gap <= 0.0:
-            return [Event(now, "clock", 0, f"{before:.6f} s, then {now:.6f} s")]
-        if gap >= self.settings.bus.stalled_cycles:
-            return [Event(now, "stalled", 0, f"{gap * self.settings.bus.cycle * 1e3:.0f} ms")]
-        return [Event(now, "late_cycle")] if gap > 1.5 else []
+        return timing(now, before, self.settings.bus)
 
     def _measure(self) -> None:
         self.positions = tuple([(view.counts - zero) / per_radian for view, per_radian, _, zero in self._scales])
@@ -202,9 +198,11 @@ class Master:
             if phase is Phase.RAMP_IN:
                 self._watches.signs(now, self.settings.bus.nodes, self.tensions, events)
             self._watches.motors(now, self.setpoints, self.positions, self.settings.bus.nodes, self.tensions, events)
+            last = self._gate.last if fresh else None
+            self._watches.plausible(now, self.settings.bus.nodes, self.setpoints, self.positions, self.tensions, events,
+                                    due=due, sample=last)  # fmt: skip
             if due:
-                last = self._gate.last
-                measured = last.values if fresh and last else None
+                measured = last.values if last else None
                 step = self.settings.sample_cycles * self.settings.bus.cycle
                 self._watches.tilt(now, step, self.positions, measured, events)
         if events:

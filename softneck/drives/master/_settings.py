@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from softneck.core import require_between, require_one_of, require_whole
 
+from ..supervision._baseline import Baseline
 from ._fieldbus import BusSettings
 
 
@@ -167,6 +168,7 @@ class MasterSettings:
         sample_cycles: bus cycles for one sample of the controller.
         bus, limits, sensor, watch, ramps: as their classes say.
         channels: of the robot; None: the neck, with no limits beside `limits`.
+        baseline: undisturbed motion, which plausibility is judged by; None: it is not.
     """
 
     counts_per_radian: tuple[float, ...]
@@ -179,6 +181,7 @@ class MasterSettings:
     watch: WatchSettings = field(default_factory=WatchSettings)
     ramps: RampSettings = field(default_factory=RampSettings)
     channels: ChannelSettings | None = None
+    baseline: Baseline | None = None
 
     def __post_init__(self) -> None:
         require_whole("sample_cycles", self.sample_cycles, 1, 20)

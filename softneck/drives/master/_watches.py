@@ -5,7 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from ..supervision._baseline import Baseline
+from ..supervision._plausibility import Plausibility
 from ._events import Event
+from ._fieldbus import BusSettings
+from ._gate import Reading, Tilt
 from ._settings import LimitSettings, WatchSettings
 
 # Both watches speak after this time beyond their tolerance [s]; the fault table allows 200 ms, and what is told
@@ -49,6 +53,18 @@ class Leaky:
         return self._level >= self._limit - 1e-9
 
 
+def timing(now: float, before: float | None, bus: BusSettings) -> list[Event]:
+    """Return what is wrong with the time between two steps [s]."""
+    if before is None:
+        return []
+    gap = (now - before) / bus.cycle
+    if gap <= 0.0:
+        return [Event(now, "clock", 0, f"{before:.6f} s, then {now:.6f} s")]
+    if gap >= bus.stalled_cycles:
+        return [Event(now, "stalled", 0, f"{gap * bus.cycle * 1e3:.0f} ms")]
+    return [Event(now, "late_cycle")] if gap > 1.5 else []
+
+
 class Watches:
     """All of them, over one run.
 
@@ -62,8 +78,10 @@ class Watches:
         limits: LimitSettings,
         weights: Sequence[Sequence[float]] | None = None,
         motors: int = 3,
+        baseline: Baseline | None = None,
     ) -> None:
         """Begin upright; `weights` (outputs, motors) are directions, () where nobody knows them, None: the neck's."""
+        self._plausible = None if baseline is None else Plausibility(baseline)
         self._settings, self._limits = settings, limits
         self._rows = settings.weights if weights is None else weights
         self.angles = [0.0] * len(self._rows)
@@ -76,6 +94,8 @@ class Watches:
 
     def align(self, measured: Sequence[float], positions: Sequence[float]) -> None:
         """Take the angles before the motors move as those that belong to `positions`: a bias of sensor or link."""
+        if self._plausible is not None:
+            self._plausible.begin()
         if not self._rows:
             return
         self.angles = self._static(positions)
@@ -115,6 +135,19 @@ class Watches:
         )
         if self._tilted.over(now, gap > self._settings.tilt):
             events.append(Event(now, "diverged", 0, f"{math.degrees(gap):.0f} deg off"))
+
+    def plausible(self, now: float, nodes: Sequence[int], setpoints: Sequence[float], positions: Sequence[float],
+                  tensions: Sequence[float], events: list[Event], *, due: bool,
+                  sample: Tilt | Reading | None) -> None:  # fmt: skip
+        """Ask the charts; each cycle while enabled, with the sample that came where one is due."""
+        if self._plausible is None:
+            return
+        found = self._plausible.cycle(setpoints, positions, tensions)
+        if due and found is None:
+            values, rates = (None, ()) if sample is None else (sample.values, sample.rates)
+            found = self._plausible.sample(positions, values, rates)
+        if found is not None:
+            events.append(Event(now, found.name, 0 if found.motor < 0 else nodes[found.motor], found.detail))
 
     def _static(self, P: Sequence[float]) -> list[float]:
         """Return the tilt that motors at `P` end at: Eq. 9, 10 for tendons in any direction, and the gain."""

@@ -9,6 +9,7 @@ from softneck.drives.master._events import RULES, Reaction
 
 from ..bench import Bench
 from ..fault_table import Scenario, short_dropout
+from ..plausible import ROWS
 from ..scenarios import SCENARIOS
 
 
@@ -35,6 +36,8 @@ def test_guards_are_needed(name: str) -> None:
 def test_every_guard_that_stops_has_a_scenario_that_needs_it() -> None:
     needed = {guard for scenario in SCENARIOS.values() for guard in scenario.guards}
     acting = {name for name, rule in RULES.items() if rule.reaction in (Reaction.STOP, Reaction.RETREAT)}
+    # Those of the plausibility supervisor have rows of their own, in tests/drives/plausible.py.
+    needed |= {name for row in ROWS.values() for name in row.names} | {"sensor_rate"}
     # Tests of their own: `pushed` in test_jog.py, for it acts before a run begins, `not_off` in test_switched_off.py,
     # for it acts after; the others in test_master.py.
     assert acting - needed == {"clock", "enable_timeout", "ramp_timeout", "operator", "pushed", "not_off"}

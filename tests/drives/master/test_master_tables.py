@@ -97,12 +97,17 @@ def test_the_rules_are_those_of_the_fault_table() -> None:
         "sample_discarded": (count, 1, 0.0), "controller_failed": (stop, 1, 0.0), "clamped": (count, 1, 0.0),
         "clamp_persistent": (stop, 0, 1.0), "drive_limit": (count, 1, 0.0), "following": (stop, 0, 0.2),
         "diverged": (stop, 0, 0.2), "tension": (stop, 0, 0.2), "pushed": (stop, 0, 0.2), "stalled": (stop, 1, 0.0),
+        "motor_jammed": (stop, 0, 0.5), "encoder_slip": (stop, 0, 0.5), "position_bad": (stop, 0, 0.5),
+        "current_scale": (stop, 0, 0.5), "gear_wrong": (stop, 0, 0.5), "tilt_unexplained": (stop, 0, 4.0),
+        "sensor_reversed": (stop, 0, 0.5), "sensor_swapped": (stop, 0, 0.5), "sensor_stuck": (retreat, 0, 0.5),
+        "sensor_late": (retreat, 0, 0.5), "sensor_noise": (retreat, 0, 0.5), "sensor_rate": (retreat, 0, 0.5),
+        "sensor_drift": (retreat, 0, 4.0),
         "late_cycle": (count, 1, 0.0), "clock": (stop, 1, 0.0), "enable_timeout": (stop, 0, 2.0),
         "ramp_timeout": (stop, 0, 60.0), "not_off": (stop, 0, 1.0), "left": (count, 1, 0.0), "operator": (stop, 1, 0.0),
     }  # fmt: skip
     assert {name: (rule.reaction, rule.cycles, rule.seconds) for name, rule in RULES.items()} == expected
-    # A drive that booted has lost its encoder's zero; nothing else loses it.
-    assert [name for name, rule in RULES.items() if rule.rehome] == ["boot_up"]
+    # A drive that booted has lost its encoder's zero, and so has an encoder that slipped; nothing else loses it.
+    assert [name for name, rule in RULES.items() if rule.rehome] == ["boot_up", "encoder_slip"]
     assert {"second_master", "bus_off", "boot_up", "operator", "emergency"} == IDLE_TOO
 
 

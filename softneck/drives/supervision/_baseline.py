@@ -1,0 +1,118 @@
+"""What the supervisor compares with: models and thresholds, all from undisturbed motion of the commissioning run."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from softneck.core import FileFormatError, SettingsError, atomic_write
+
+_KIND, _VERSION = "softneck supervision", 1
+Row = tuple[float, ...]
+Rows = tuple[Row, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Baseline:
+    """Undisturbed motion in numbers; `calibrate` makes it.
+
+    Attributes:
+        cycle: of the bus [s]; sample_cycles: of these between two samples of the tilt.
+        outputs: how many are measured.
+        drive: of each motor, how its step follows from what was left to the set-points of the last cycles.
+        drive_spread: of its residual, variance [rad^2] and what is added for each rad^2 of the step. It is not
+            whitened: a motor that stands though asked shows in the mean, which whitening takes away.
+        current: of each motor, change of its tension over three cycles from changes of positions, speed, acceleration.
+        current_whitening, current_spread: of its residual [N].
+        current_top: largest tension seen of each, where its current may be cut off [N].
+        current_reach: how far each motor was behind its set-points in nearly all cycles [rad].
+        tilt: (outputs, lags x motors) tilt from the motors' positions so many samples ago.
+        lags: these [samples].
+        tilt_whitening: of each output's residual.
+        tilt_spread: variance [rad^2], and what is added for each rad^2 of change over two samples, and of way.
+        tilt_bias: how far slow errors of the model carry each output's residual without any fault [rad].
+        gyro_whitening, gyro_spread: the same of angles against integrated rates; () without a gyro.
+        noise: variance of second differences of each output beside the model [rad^2].
+        missing: part of the samples that did not come; missing_threshold: of the chart that counts them.
+        reach: of each motor, lowest and highest position seen [rad].
+        slack: of each tendon: below this it may hang, and the tilt is not what the motors say [N].
+        motor_thresholds, tilt_thresholds: of the charts, in the order of their names.
+        names: of both, to be sure of the order.
+        seconds: of motion that it was calibrated from.
+    """
+
+    cycle: float
+    sample_cycles: int
+    outputs: int
+    drive: Rows
+    drive_spread: Rows
+    current: Rows
+    current_whitening: Rows
+    current_spread: Rows
+    current_top: Row
+    current_reach: Row
+    tilt: Rows
+    lags: tuple[int, ...]
+    tilt_whitening: Rows
+    tilt_spread: Rows
+    tilt_bias: Row
+    gyro_whitening: Rows
+    gyro_spread: Row
+    noise: Row
+    missing: float
+    missing_threshold: float = math.inf
+    reach: Rows
+    slack: Row
+    motor_thresholds: Row = ()
+    tilt_thresholds: Row = ()
+    seconds: float = 0.0
+
+    @property
+    def motors(self) -> int:
+        """How many there are."""
+        return len(self.drive)
+
+    def save(self, path: str | Path, *, force: bool = False) -> None:
+        """Write it as JSON; an existing file is replaced only with `force`."""
+        text = json.dumps({"kind": _KIND, "version": _VERSION, **asdict(self)}, indent=1)
+        with atomic_write(path, force=force) as part:
+            part.write_text(text + "\n", encoding="utf-8")
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any]) -> Baseline:
+        """Return what `asdict` made, lists for tuples too.
+
+        Raises:
+            SettingsError: keys that are missing or unknown.
+        """
+        known = {item.name for item in fields(cls)}
+        wrong = sorted((known - {"seconds"}) ^ (set(table) - {"seconds"}))
+        if wrong:
+            raise SettingsError(f"`{wrong[0]}` is missing or unknown in what the supervisor compares with.")
+        return cls(**{name: _tuple(value) for name, value in table.items()})
+
+
+def load_baseline(path: str | Path) -> Baseline:
+    """Read what `Baseline.save` wrote.
+
+    Raises:
+        FileFormatError: no such file, or not one of these.
+    """
+    source = Path(path)
+    try:
+        table = json.loads(source.read_text(encoding="utf-8"))
+        if not isinstance(table, dict) or table.pop("kind", "") != _KIND or table.pop("version", 0) != _VERSION:
+            raise FileFormatError(f"{source}: is not what `softneck drives record --supervision` writes.")
+        return Baseline.from_dict(table)
+    except OSError as error:
+        raise FileFormatError(f"{source}: cannot be read ({error.strerror}).") from error
+    except (ValueError, RecursionError, TypeError, SettingsError) as error:
+        raise FileFormatError(f"{source}: is damaged ({error}).") from error
+
+
+def _tuple(value: Any) -> Any:
+    return tuple(_tuple(item) for item in value) if isinstance(value, list | tuple) else value

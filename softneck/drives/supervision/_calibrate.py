@@ -1,0 +1,386 @@
+"""From undisturbed motion to a baseline: models by least squares, thresholds from what they leave over elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softneck.core import DataError, Matrix, Vector
+from softneck.signals.detection._threshold import Budget, thresholds
+from softneck.signals.detection._whitening import Whitening
+
+from ._baseline import Baseline, Row, Rows
+from ._motor_charts import EDGES, MotorCharts, MotorFeatures
+from ._tilt_charts import GyroLevel, TiltCharts, TiltModel, tilt_names
+
+Flags = NDArray[np.bool_]
+# What the tilt may still answer to [s], in samples that lie closer together where it answers most.
+_REACH = 0.5
+_LAGS = 8
+# Motors further out than this part of the seen range are not known ground.
+_MARGIN = 0.2
+_LEAST = 20.0
+# What is further out than this part of the cycles counts for seldom.
+_NEARLY = 0.95
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Motion:
+    """One stretch of undisturbed motion, a row for each bus cycle.
+
+    Attributes:
+        setpoints: that were sent the cycle before (time, motors) [rad].
+        positions: (time, motors) [rad]; tensions: (time, motors) [N].
+        values: of the tilt (time, outputs) [rad]; NaN in cycles without a sample.
+        rates: of its gyro, the same [rad/s]; NaN without one.
+        due: cycles in which a sample was due (time,).
+    """
+
+    setpoints: Matrix
+    positions: Matrix
+    tensions: Matrix
+    values: Matrix
+    rates: Matrix
+    due: Flags
+
+    def halves(self) -> list[Motion]:
+        """Return its first and its second half."""
+        middle = len(self.due) // 2
+        names = ("setpoints", "positions", "tensions", "values", "rates", "due")
+        parts = [
+            {name: getattr(self, name)[cut] for name in names} for cut in (slice(None, middle), slice(middle, None))
+        ]
+        return [Motion(**part) for part in parts]
+
+
+def calibrate(
+    motions: Sequence[Motion],
+    *,
+    cycle: float,
+    sample_cycles: int,
+    slack: float,
+    budget: Budget | None = None,
+    seed: int = 0,
+) -> Baseline:
+    """Return what the supervisor compares with.
+
+    Thresholds come from stretches that their models were not fitted on: each is left out once, a single one by halves.
+
+    Args:
+        motions: undisturbed; together at least 40 s.
+        cycle: of the bus [s]; sample_cycles: of these for one sample of the tilt.
+        slack: tension below which a tendon hangs [N].
+        budget: of false alarms; `charts` and `step` are set here.
+        seed: of the bootstrap.
+
+    Raises:
+        DataError: too little motion, or motors that did not move.
+    """
+    seconds = sum(len(motion.due) for motion in motions) * cycle
+    if seconds < 2.0 * _LEAST:
+        raise DataError(f"{seconds:.3g} s of motion are too few to compare with; record at least {2.0 * _LEAST:g} s.")
+    parts = list(motions) if len(motions) > 1 else motions[0].halves()
+    motor, tilt, slow, fitted = [], [], [], []
+    for number in range(len(parts)):
+        others = [other for k, other in enumerate(parts) if k != number]
+        fitted.append(fit(others, cycle=cycle, sample_cycles=sample_cycles, slack=slack))
+        slow.append(_slow(fitted[-1], parts[number]))
+    bias = _row(np.max(slow, axis=0))
+    for part, model in zip(parts, fitted, strict=True):
+        found = scores_of(replace(model, tilt_bias=bias), part)
+        motor.append(found[0])
+        tilt.append(found[1])
+    charts = motor[0].shape[1] + tilt[0].shape[1] + 1
+    shared = replace(budget or Budget(), charts=charts)
+    rng = np.random.default_rng(seed)
+    whole = fit(motions, cycle=cycle, sample_cycles=sample_cycles, slack=slack)
+    # Of samples that come or not by chance, e^-h bounds the rate of false alarms (Basseville and Nikiforov, 5.2.2).
+    seldom = -np.log(shared.rate / shared.charts * cycle * sample_cycles)
+    whole = replace(whole, tilt_bias=bias, missing_threshold=float(seldom))
+    h = thresholds(motor, replace(shared, step=cycle), rng)
+    g = thresholds(tilt, replace(shared, step=cycle * sample_cycles), rng)
+    return replace(whole, motor_thresholds=_row(h), tilt_thresholds=_row(g), seconds=seconds)
+
+
+def scores_of(baseline: Baseline, motion: Motion) -> tuple[Matrix, Matrix]:
+    """Return the scores of all charts on one stretch: of motors (cycles, charts), of the tilt (samples, charts)."""
+    walk = _Walk(baseline)
+    ours, theirs = [], []
+    for k in range(len(motion.due)):
+        if walk.step(motion, k):
+            theirs.append(walk.tilt.scores.copy())
+        ours.append(walk.motors.scores.copy())
+    return np.array(ours), np.array(theirs)
+
+
+class _Walk:
+    """The charts over a stretch of motion, none of which ever says anything."""
+
+    def __init__(self, baseline: Baseline) -> None:
+        self._gains = np.array(baseline.current)
+        self.motors = MotorCharts(baseline, np.full(4 * baseline.motors, np.inf))
+        names = tilt_names(baseline.motors, baseline.outputs, gyro=bool(baseline.gyro_spread))
+        self.tilt = TiltCharts(baseline, np.full(len(names), np.inf))
+        self.tilt.begin()
+
+    def step(self, motion: Motion, k: int) -> bool:
+        """Take row `k`; return whether it held a sample."""
+        self.motors.step(motion.setpoints[k], motion.positions[k], motion.tensions[k])
+        if not motion.due[k]:
+            return False
+        values = motion.values[k] if np.isfinite(motion.values[k]).all() else None
+        self.tilt.step(motion.positions[k], self.motors.features.taut(self._gains), values, motion.rates[k])
+        return True
+
+
+def fit(motions: Sequence[Motion], *, cycle: float, sample_cycles: int, slack: float) -> Baseline:
+    """Return the models of drives, tendons and tilt, without thresholds."""
+    n, m = motions[0].positions.shape[1], motions[0].values.shape[1]
+    features = [_features(motion, cycle) for motion in motions]
+    drive, _, drive_spread = _rows(
+        [f.drive for f in features], [f.moved for f in features], n, "its motor did not move", most=0
+    )
+    current, current_white, current_spread = _rows(
+        [f.current for f in features], [f.change for f in features], n, "its current did not change"
+    )
+    step = cycle * sample_cycles
+    lags = _lags(step)
+    # At rest nobody knows which way friction holds: a tendon is taut for certain above that much only.
+    least = slack + np.abs(np.array(current)[:, n : n + len(EDGES)]).sum(axis=1)
+    samples = [_Samples.of(motion, f, np.array(current), least) for motion, f in zip(motions, features, strict=True)]
+    tilt = _tilt_gains(samples, lags)
+    residuals = [s.values - _predicted(s, tilt, lags, n) for s in samples]
+    known = [np.convolve(~s.taut, np.ones(lags[-1] + 1))[: len(s.taut)] < 0.5 for s in samples]
+    stretches = [part for r, good in zip(residuals, known, strict=True) for part in _stretches(r, good, lags[-1] + 1)]
+    white, spread = _tilt_noise(samples, residuals, known, tilt, lags, n)
+    gyro = _gyro_noise(samples, step)
+    bends = [np.diff(part - part.mean(axis=0), 2, axis=0) for part in stretches]
+    low = np.min([motion.positions.min(axis=0) for motion in motions], axis=0)
+    high = np.max([motion.positions.max(axis=0) for motion in motions], axis=0)
+    margin = _MARGIN * (high - low)
+    due = np.concatenate([s.came for s in samples])
+    return Baseline(
+        cycle=cycle, sample_cycles=sample_cycles, outputs=m, drive=drive, drive_spread=drive_spread,
+        current=current, current_whitening=current_white, current_spread=current_spread,
+        current_top=_row(np.max([np.abs(motion.tensions).max(axis=0) for motion in motions], axis=0)),
+        current_reach=_row(np.nanquantile(np.concatenate([f.behind for f in features]), _NEARLY, axis=0)),
+        tilt=_table(tilt), lags=lags, tilt_whitening=white, tilt_spread=spread, tilt_bias=(0.0,) * m,
+        gyro_whitening=gyro[0], gyro_spread=gyro[1], noise=_row(np.concatenate(bends).var(axis=0)),
+        missing=1.0 - float(np.mean(due)),
+        reach=_table(np.column_stack([low - margin, high + margin])), slack=_row(least),
+    )  # fmt: skip
+
+
+def _slow(baseline: Baseline, motion: Motion) -> Vector:
+    """Return how far the mean of a second of the residual goes on a stretch that the models were not fitted on."""
+    walk, rows = _Walk(baseline), []
+    for k in range(len(motion.due)):
+        if walk.step(motion, k):
+            rows.append(walk.tilt.residual if walk.tilt.valid else np.full(baseline.outputs, np.nan))
+    second = max(1, round(1.0 / (baseline.cycle * baseline.sample_cycles)))
+    means = [np.convolve(column, np.ones(second) / second, "valid") for column in np.array(rows).T]
+    return np.nanmax(np.abs(means), axis=1, initial=0.0)
+
+
+# -- drives and currents ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Features:
+    """Of each cycle and motor: regressors and what they explain."""
+
+    drive: Matrix
+    moved: Matrix
+    current: Matrix
+    change: Matrix
+    speeds: Matrix
+    behind: Matrix
+
+
+def _features(motion: Motion, cycle: float) -> _Features:
+    n = motion.positions.shape[1]
+    walk = MotorFeatures(n, cycle)
+    rows: list[list[Matrix]] = [[], [], [], [], [], []]
+    for s, p, tension in zip(motion.setpoints, motion.positions, motion.tensions, strict=True):
+        walk.step(s, p, tension)
+        told = (walk.drive, walk.moved, walk.current, walk.tension_change, walk.speeds, walk.behind)
+        for row, value in zip(rows, told, strict=True):
+            row.append(np.array(value) if walk.full else np.full_like(value, np.nan))
+    return _Features(*(np.array(row) for row in rows))
+
+
+def _rows(X: list[Matrix], y: list[Matrix], motors: int, why: str, *, most: int = 6) -> tuple[Rows, Rows, Rows]:
+    """Fit each motor's model; return coefficients, whitening, and variance with its part in the square of the model."""
+    gains, white, spread = [], [], []
+    for i in range(motors):
+        kept = [np.isfinite(part[:, i]).all(axis=-1) for part in X]
+        regressors = np.concatenate([part[good, i] for part, good in zip(X, kept, strict=True)])
+        target = np.concatenate([part[good, i] for part, good in zip(y, kept, strict=True)])
+        if float(np.std(target)) <= 0.0:
+            raise DataError(f"motor {i + 1} cannot be compared with: {why}.")
+        theta = _robust(regressors, target)
+        models = [part[good, i] @ theta for part, good in zip(X, kept, strict=True)]
+        left = [part[good, i] - model for part, good, model in zip(y, kept, models, strict=True)]
+        filter_ = Whitening.fit(left, most=most)
+        order = len(filter_.coefficients)
+        squares = np.concatenate([filter_.apply(part) ** 2 for part in left])
+        shape = np.concatenate([model[order:] ** 2 for model in models])
+        gains.append(_row(theta))
+        white.append(filter_.coefficients)
+        # Cycles at the current limit are for the bootstrap: the variance is that of the others.
+        spread.append(_variance(squares, shape[:, None], all_but=0.005))
+    return tuple(gains), tuple(white), tuple(spread)
+
+
+def _robust(X: Matrix, y: Vector) -> Vector:
+    """Return least squares by Huber's weights: a few cycles at the current limit are not the model's business."""
+    theta = np.linalg.lstsq(X, y, rcond=None)[0]
+    for _ in range(10):
+        off = np.abs(y - X @ theta)
+        # 1.48 median is the standard deviation of what is normal; 2.5 as in Huber's proposal 2.
+        weight = np.sqrt(np.minimum(1.0, 2.5 * 1.48 * np.median(off) / np.maximum(off, 1e-12)))
+        theta = np.linalg.lstsq(X * weight[:, None], y * weight, rcond=None)[0]
+    return theta
+
+
+def _variance(squares: Vector, shapes: Matrix, *, all_but: float = 0.0) -> Row:
+    """Return c_0, c_1, ... >= 0 of `squares ~ c_0 + shapes c`: least squares, each row weighed by what it expects.
+
+    Without the part `all_but` of the rows with the largest squares.
+    """
+    from scipy.optimize import nnls
+
+    kept = squares <= np.quantile(squares, 1.0 - all_but)
+    squares = squares[kept]
+    X = np.column_stack([np.ones(len(squares)), shapes[kept]])
+    weight = np.full(len(squares), float(np.mean(squares)))
+    found = np.zeros(X.shape[1])
+    for _ in range(5):
+        found = nnls(X / weight[:, None], squares / weight)[0]
+        weight = np.maximum(X @ found, 1e-3 * float(np.mean(squares)))
+    found[0] = max(found[0], 1e-3 * float(np.mean(squares)))
+    return _row(found)
+
+
+# -- tilt -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Samples:
+    """The samples of one stretch: positions, tilt with gaps bridged, rates, whether all tendons are taut, and came."""
+
+    positions: Matrix
+    values: Matrix
+    rates: Matrix
+    taut: Flags
+    came: Flags
+
+    @classmethod
+    def of(cls, motion: Motion, features: _Features, current: Matrix, slack: Vector) -> _Samples:
+        n = motion.positions.shape[1]
+        friction = np.einsum("tij,ij->ti", features.speeds, current[:, n:])
+        taut = (motion.tensions - friction >= slack).all(axis=1)
+        at = np.flatnonzero(motion.due)
+        values = motion.values[at].copy()
+        came = np.asarray(np.isfinite(values).all(axis=1))
+        if came.sum() < 100:
+            raise DataError("the tilt was measured too rarely to compare with.")
+        for a in range(values.shape[1]):
+            values[:, a] = np.interp(np.arange(len(at)), np.flatnonzero(came), values[came, a])
+        return cls(motion.positions[at], values, motion.rates[at], taut[at], came)
+
+
+def _lags(step: float) -> tuple[int, ...]:
+    """Return samples back to half a second: 0, 1, 2, then further and further apart."""
+    last = max(_LAGS, round(_REACH / step))
+    return tuple(sorted({0, 1, 2, *np.unique(np.round(np.geomspace(3, last, _LAGS - 2)).astype(int)).tolist()}))
+
+
+def _lagged(s: _Samples, lags: tuple[int, ...]) -> Matrix:
+    last = lags[-1]
+    columns = [s.positions[last - lag : len(s.positions) - lag] for lag in lags]
+    return np.hstack(columns)
+
+
+def _tilt_gains(samples: Sequence[_Samples], lags: tuple[int, ...]) -> Matrix:
+    """Return (outputs, lags x motors) by least squares, with an offset of its own for each stretch."""
+    X, y = [], []
+    for s in samples:
+        good = (np.convolve(~s.taut, np.ones(lags[-1] + 1))[: len(s.taut)] < 0.5)[lags[-1] :]
+        x, v = _lagged(s, lags)[good], s.values[lags[-1] :][good]
+        if len(x) > 1:
+            X.append(x - x.mean(axis=0))
+            y.append(v - v.mean(axis=0))
+    rows = sum(map(len, X))
+    if not rows or rows < 10 * X[0].shape[1]:
+        raise DataError("the tendons hung for most of the motion: there is no tilt to compare with.")
+    return np.linalg.lstsq(np.vstack(X), np.vstack(y), rcond=None)[0].T
+
+
+def _predicted(s: _Samples, tilt: Matrix, lags: tuple[int, ...], motors: int) -> Matrix:
+    walk = TiltModel(tilt, lags, motors)
+    return np.array([walk.step(p).sum(axis=0) for p in s.positions])
+
+
+def _stretches(values: Matrix, good: Flags, least: int) -> list[Matrix]:
+    """Return the runs of rows that are `good`, without the first `least` rows of all, and none of under 50 rows."""
+    usable = good.copy()
+    usable[:least] = False
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], usable.astype(int), [0]])))
+    return [values[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 50]
+
+
+def _tilt_noise(
+    samples: Sequence[_Samples],
+    residuals: Sequence[Matrix],
+    known: list[Flags],
+    tilt: Matrix,
+    lags: tuple[int, ...],
+    n: int,
+) -> tuple[Rows, Rows]:
+    white, spread = [], []
+    angles = [_predicted(s, tilt, lags, n) for s in samples]
+    for a in range(tilt.shape[0]):
+        parts, changes, ways = [], [], []
+        for r, angle, good in zip(residuals, angles, known, strict=True):
+            two = np.vstack([np.zeros((2, angle.shape[1])), angle[2:] - angle[:-2]])
+            stack = np.column_stack([r[:, a], two[:, a], angle[:, a]])
+            for part in _stretches(stack, good, lags[-1] + 1):
+                parts.append(part[:, 0] - part[:, 0].mean())
+                changes.append(part[:, 1])
+                ways.append(part[:, 2] - part[0, 2])
+        filter_ = Whitening.fit(parts)
+        order = len(filter_.coefficients)
+        squares = np.concatenate([filter_.apply(part) ** 2 for part in parts])
+        shapes = [np.concatenate([part[order:] ** 2 for part in column]) for column in (changes, ways)]
+        white.append(filter_.coefficients)
+        spread.append(_variance(squares, np.column_stack(shapes)))
+    return tuple(white), tuple(spread)
+
+
+def _gyro_noise(samples: Sequence[_Samples], step: float) -> tuple[Rows, Row]:
+    """Return whitening and variance of the angles against integrated rates; () where there are no rates."""
+    if not all(np.isfinite(s.rates[s.came]).all() for s in samples):
+        return (), ()
+    levels: list[Matrix] = []
+    for s in samples:
+        walk = GyroLevel(s.values.shape[1], step)
+        known = [(walk.take(v, r), walk.level) for v, r in zip(s.values, s.rates, strict=True)]
+        levels.append(np.array([level for good, level in known if good]).reshape(-1, s.values.shape[1]))
+    white, spread = [], []
+    for a in range(levels[0].shape[1]):
+        filter_ = Whitening.fit([level[:, a] for level in levels])
+        white.append(filter_.coefficients)
+        spread.append(float(np.mean(np.concatenate([filter_.apply(level[:, a]) for level in levels]) ** 2)))
+    return tuple(white), tuple(spread)
+
+
+def _row(values: Vector) -> Row:
+    return tuple(float(value) for value in values)
+
+
+def _table(values: Matrix) -> Rows:
+    return tuple(_row(row) for row in values)

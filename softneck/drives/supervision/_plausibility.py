@@ -1,0 +1,124 @@
+"""The supervisor's second half: beside the master, told all that the drives and the sensor say, each cycle."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ._baseline import Baseline
+from ._motor_charts import MotorCharts
+from ._tilt_charts import TiltCharts
+
+# Samples that go missing: as many as this, or thrice as many as did.
+_RATE_LEAST = 0.2
+# From the first chart beyond its threshold until the fault is named [s]: the likeliest one may need a little longer.
+_RIPE = 0.1
+# A current may be the first to show what is not its scale.
+_RIPE_CURRENT = 0.3
+# Or until it is so much likelier than the next, as a logarithm.
+_LEAD = 20.0
+
+
+class Finding(NamedTuple):
+    """A fault that explains what is seen better than none does.
+
+    Attributes:
+        name: of the event.
+        motor: from 0; -1 for none.
+        detail: for people.
+    """
+
+    name: str
+    motor: int
+    detail: str
+
+
+class Plausibility:
+    """All charts over one run.
+
+    Attributes:
+        motors, tilt: the charts.
+    """
+
+    def __init__(self, baseline: Baseline) -> None:
+        """Know nothing yet."""
+        self._b = baseline
+        self._gains = np.array(baseline.current)
+        self.motors = MotorCharts(baseline)
+        self.tilt = TiltCharts(baseline)
+        self._missing = 0.0
+        self._now = 0
+        self._since: int | None = None
+        self._current: Finding | None = None
+
+    def begin(self) -> None:
+        """Take what tilt and motors say now, at rest, for where they begin."""
+        self.tilt.begin()
+        self._missing = 0.0
+
+    def cycle(
+        self, setpoints: Sequence[float], positions: Sequence[float], tensions: Sequence[float]
+    ) -> Finding | None:
+        """Take one bus cycle: set-points sent before it [rad], positions [rad] and tensions [N] of all motors."""
+        self._now += 1
+        found = self.motors.step(np.array(setpoints), np.array(positions), np.array(tensions))
+        if found is not None and found[0] != "current_scale":
+            return Finding(*found)
+        if found is not None:
+            # Whatever goes wrong takes another current: it is its scale if nothing else shows.
+            self._current = Finding(*found)
+            self._since = self._now if self._since is None else self._since
+        return self._ripe()
+
+    def sample(
+        self, positions: Sequence[float], values: Sequence[float] | None, rates: Sequence[float]
+    ) -> Finding | None:
+        """Take what is due at a sample, after `cycle`: tilt [rad], None where none came, and rates [rad/s] or NaN."""
+        if self._rate(values is None):
+            return Finding("sensor_rate", -1, "samples are missing more often than in the commissioning run")
+        if self.motors.judging:
+            return None
+        taut = self.motors.features.taut(self._gains)
+        tilt = None if values is None else np.array(values)
+        if self.tilt.step(np.array(positions), taut, tilt, np.array(rates)) >= 0 and self._since is None:
+            self._since = self._now
+        return None
+
+    def _ripe(self) -> Finding | None:
+        """Return what explains best what was seen since the first chart spoke, once that is long enough ago."""
+        if self._since is None:
+            return None
+        found, lead = self.tilt.likeliest()
+        waited = (self._now - self._since) * self._b.cycle + 1e-9
+        if lead < _LEAD and waited < (_RIPE if found >= 0 else _RIPE_CURRENT):
+            return None
+        current = self._current
+        self._since = self._current = None
+        if found < 0:
+            return current
+        name, number, size = self.tilt.names[found]
+        return Finding(name, number if name == "gear_wrong" else -1, self._said(name, number, size))
+
+    def _rate(self, missing: bool) -> bool:
+        """CUSUM of a rate of missing samples that is thrice the usual, and at least a fifth."""
+        usual = max(self._b.missing, 1e-3)
+        other = min(0.9, max(_RATE_LEAST, 3.0 * usual))
+        score = math.log(other / usual) if missing else math.log((1.0 - other) / (1.0 - usual))
+        self._missing = max(0.0, self._missing + score)
+        return self._missing > self._b.missing_threshold
+
+    def _said(self, name: str, number: int, size: float) -> str:
+        off = np.degrees(self.tilt.residual)
+        gap = ", ".join(f"{value:.1f}" for value in off)
+        if name == "gear_wrong":
+            whose = "all motors" if number < 0 else f"motor {number + 1}"
+            return f"{whose}: the tilt moves as if the winch turned {size:g} times as far"
+        if name == "sensor_late":
+            return f"the tilt follows about {size:g} s later than it did"
+        if name == "sensor_noise":
+            times = "a fifth of" if size < 1.0 else "five times"
+            return f"output {number + 1}: its noise is {times} what it was, or beyond"
+        return f"output {number + 1}: tilt less model {gap} deg"

@@ -1,0 +1,287 @@
+"""The tilt against what the motors' positions give, and against its own gyro: which fault explains what is left."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+
+from softneck.core import Matrix, Vector
+from softneck.signals.detection._cusum import Charts, shift_score, spread_score
+from softneck.signals.detection._whitening import Filter, Whitening
+
+from ._baseline import Baseline
+
+# Faults as large as those that have to be found: a gear of another stage, a filter that takes 0.2 s, 1.5 deg of drift
+# (half of the 3 deg that a fault may lead the neck astray), a fifth or five times the noise.
+_GEARS = (2.0, 0.5)
+_LATE = 0.2
+_OFFSET = math.radians(1.5)
+_NOISES = (1.0 / 25.0, 25.0)
+# What angles and gyro differ by leaks away over the first time, and its rate, the gyro's own bias, is averaged over the
+# second [s].
+_FORGET, _BIAS = 6.0, 15.0
+# A gyro that shows this part of what the model misses: some of it leaks away, and the model has errors of its own.
+_ALONE = 0.5
+# Times that the model looks back, until it is believed.
+_SETTLED = 2
+# Faults are weighed by what was seen in about this time [s].
+_LATELY = 0.5
+# Samples at rest that say where tilt and model begin.
+_REST = 25
+# Faults that the residual of the model tells of; of these, what a gyro denies, and what it confirms: a unit that hangs
+# has a gyro that hangs.
+_OF_MODEL = frozenset(
+    {"gear_wrong", "sensor_stuck", "sensor_reversed", "sensor_swapped", "sensor_late", "tilt_unexplained"}
+)
+_OF_SENSOR = frozenset({"sensor_stuck", "sensor_late", "tilt_unexplained"})
+_OF_NECK = _OF_MODEL
+
+
+def tilt_names(motors: int, outputs: int, *, gyro: bool) -> list[tuple[str, int, float]]:
+    """Return (event, motor or output from 0, size) of each chart; motor -1: all of them."""
+    names: list[tuple[str, int, float]] = [("gear_wrong", i, g) for g in _GEARS for i in (*range(motors), -1)]
+    names += [("sensor_stuck", a, 0.0) for a in range(outputs)] + [("sensor_reversed", a, 0.0) for a in range(outputs)]
+    names += [("sensor_swapped", a, 0.0) for a in range(outputs - 1)] + [("sensor_late", -1, _LATE)]
+    names += [("tilt_unexplained", a, sign * _OFFSET) for a in range(outputs) for sign in (1.0, -1.0)]
+    names += [("sensor_noise", a, ratio) for a in range(outputs) for ratio in _NOISES]
+    if gyro:
+        names += [("sensor_drift", a, sign * _OFFSET) for a in range(outputs) for sign in (1.0, -1.0)]
+    return names
+
+
+class TiltModel:
+    """Free-running tilt from the motors' positions, with each motor's part of it."""
+
+    def __init__(self, tilt: Matrix, lags: tuple[int, ...], motors: int) -> None:
+        """Know nothing yet; `tilt` is (outputs, lags x motors)."""
+        self._gains = tilt.reshape(len(tilt), len(lags), motors)
+        self._lags = np.array(lags)
+        self._past = np.zeros((max(lags) + 1, motors))
+        self._begun = False
+
+    def step(self, positions: Vector) -> Matrix:
+        """Return each motor's part of the tilt (motors, outputs) [rad], but for an offset."""
+        # Motors stood before the first sample.
+        self._past[1:] = self._past[:-1] if self._begun else positions
+        self._past[0] = positions
+        self._begun = True
+        return np.einsum("alm,lm->ma", self._gains, self._past[self._lags])
+
+
+class GyroLevel:
+    """Angles less integrated rates, with what is slow forgotten: the gyro's own bias, and where the angles began.
+
+    Attributes:
+        level: [rad] (outputs,).
+        known: whether the bias was averaged for long enough.
+    """
+
+    def __init__(self, outputs: int, step: float) -> None:
+        """Begin at zero."""
+        self._step = step
+        self.level = np.zeros(outputs)
+        self._bias = np.zeros(outputs)
+        self._last: tuple[Vector, Vector] | None = None
+        self._samples = 0
+
+    @property
+    def known(self) -> bool:
+        """Whether the bias was averaged for a third of its memory."""
+        return self._samples * self._step > _BIAS / 3.0
+
+    def take(self, values: Vector | None, rates: Vector) -> bool:
+        """Take a sample; return whether the level went on."""
+        last, self._last = self._last, None
+        if values is None or not np.isfinite(rates).all():
+            return False
+        self._last = (values, rates)
+        if last is None:
+            return False
+        change = values - last[0] - 0.5 * self._step * (rates + last[1])
+        # From the mean of all samples to that of the last ones.
+        self._samples += 1
+        self._bias = self._bias + max(self._step / _BIAS, 1.0 / self._samples) * (change - self._bias)
+        self.level = (1.0 - self._step / _FORGET) * self.level + change - self._bias
+        return self.known
+
+
+class TiltCharts:
+    """The charts of all outputs.
+
+    Attributes:
+        scores: of the last sample, in the order of `tilt_names`.
+        charts: their sums.
+        valid: whether the model is on known ground.
+        residual: tilt less model [rad]; gyro: tilt against its rates.
+        bend: second difference of the residual [rad].
+    """
+
+    def __init__(self, baseline: Baseline, thresholds: Vector | None = None) -> None:
+        """Begin; `thresholds` other than the baseline's are for calibrating."""
+        b = self._b = baseline
+        n, m = b.motors, b.outputs
+        self.names = tilt_names(n, m, gyro=bool(b.gyro_spread))
+        self._model = TiltModel(np.array(b.tilt), b.lags, n)
+        self._step = b.cycle * b.sample_cycles
+        self._hypotheses = 2 * (n + 1) + 2 * m + (m - 1) + 1 + 2 * m
+        self._filter = Filter([Whitening(row) for row in b.tilt_whitening], (1 + self._hypotheses,))
+        self._turned = Filter([Whitening(row) for row in b.gyro_whitening], (3,)) if b.gyro_spread else None
+        self.gyro = GyroLevel(m, self._step)
+        self._spread, self._gyro_spread = np.array(b.tilt_spread), np.array(b.gyro_spread)
+        self._noise = np.array(b.noise)
+        # A slow error of the model goes through the whitening as well, and may look like any fault a little.
+        passes = np.array([1.0 - sum(row) for row in b.tilt_whitening])
+        self._bias_allowed = np.abs(passes) * np.array(b.tilt_bias)
+        self._slack = np.array(b.slack)
+        self._low, self._high = np.array(b.reach).T
+        self.scores = np.zeros(len(self.names))
+        self.charts = Charts(np.array(b.tilt_thresholds) if thresholds is None else thresholds)
+        late = max(1, round(_LATE / self._step))
+        self._angles: deque[Vector] = deque(maxlen=late + 1)
+        self._residuals: deque[Vector] = deque(maxlen=3)
+        self._rest: deque[Vector] = deque(maxlen=_REST)
+        self._began: Matrix | None = None
+        self._offset = np.zeros(m)
+        self._stuck = np.zeros((m, m))
+        self._explained = self._information = np.zeros(self._hypotheses)
+        self._running, self._wait = False, _SETTLED * b.lags[-1]
+        self.residual = self.bend = np.zeros(m)
+        self.valid = False
+
+    def begin(self) -> None:
+        """Take the mean of the last samples at rest for where tilt and model begin."""
+        self._running = True
+        self._align()
+        # How the neck came to rest is not the gyro's bias.
+        self.gyro = GyroLevel(self._b.outputs, self._step)
+        self.charts.sums[:] = 0.0
+
+    def likeliest(self) -> tuple[int, float]:
+        """Return the fault that explains best what was seen lately, and how much better than any of another name.
+
+        -1 where nothing is beyond its threshold.
+
+        Likelihoods over the last half second, each fault of the size that fits best within 0.7 and 1.4 of its own. A
+        gyro that tells the same as the angles says that the neck moved, one that does not that the sensor is wrong.
+        """
+        beyond = self.charts.sums > self.charts.thresholds
+        names = [name for name, _, _ in self.names]
+        told = {name for name, over in zip(names, beyond, strict=True) if over}
+        if not told & _OF_MODEL:
+            return (int(np.argmax(np.where(beyond, self.charts.sums, -np.inf))) if told else -1), 0.0
+        h = self._hypotheses
+        size = np.clip(self._explained / np.maximum(self._information, 1e-12), 0.7, 1.4)
+        gain = size * self._explained - 0.5 * size**2 * self._information
+        possible, alone = np.ones(h, dtype=bool), False
+        if self._turned is not None and self.gyro.known:
+            square = float(np.sum(self.residual**2))
+            alone = float(np.sum(self.gyro.level * self.residual)) > _ALONE * square
+            possible = np.array([name in (_OF_SENSOR if alone else _OF_NECK) for name in names[:h]])
+        gain = np.where(possible, gain, -np.inf)
+        found = int(np.argmax(gain))
+        other = np.array([name != names[found] for name in names[:h]])
+        lead = float(gain[found] - np.max(gain[other]))
+        if alone and names[found] == "tilt_unexplained":
+            found = names.index("sensor_drift") + 2 * self.names[found][1] + int(self.names[found][2] < 0.0)
+        return found, lead
+
+    def step(self, positions: Vector, taut: Vector, values: Vector | None, rates: Vector) -> int:
+        """Take one sample; return the number of a chart beyond its threshold, -1 for none.
+
+        Args:
+            positions: of the motors (motors,) [rad].
+            taut: of the tendons, friction apart (motors,) [N].
+            values: of the tilt (outputs,) [rad]; None where it did not come.
+            rates: of its gyro (outputs,) [rad/s]; NaN without one.
+        """
+        parts = self._model.step(positions)
+        angle = parts.sum(axis=0)
+        self._angles.append(angle)
+        self._ground(positions, taut)
+        turned = self.gyro.take(values, rates)
+        if values is None:
+            return -1
+        free = values - angle
+        self._rest.append(free)
+        if self._began is None:
+            self._began = parts
+        self.residual = free - self._offset
+        self._residuals.append(free)
+        if len(self._residuals) == 3:
+            self.bend = self._residuals[0] - 2.0 * self._residuals[1] + self._residuals[2]
+        self._score(parts, angle, turned)
+        return self.charts.step(self.scores) if self._running else -1
+
+    # -- parts --------------------------------------------------------------------------------------------------
+
+    def _ground(self, positions: Vector, taut: Vector) -> None:
+        """Tendons that hang, or motors beyond where they were seen: the tilt is not what the model says."""
+        out = bool((taut < self._slack).any() or (positions < self._low).any() or (positions > self._high).any())
+        # And so long after as the model looks back, and again for the rest that it begins anew from.
+        self._wait = _SETTLED * self._b.lags[-1] if out else max(0, self._wait - 1)
+        before, self.valid = self.valid, self._wait == 0
+        if self.valid and not before:
+            self._align()
+
+    def _score(self, parts: Matrix, angle: Vector, turned: bool) -> None:
+        n, m, h = self._b.motors, self._b.outputs, self._hypotheses
+        began = parts if self._began is None else self._began
+        way = parts - began
+        moved = angle - began.sum(axis=0)
+        raw = np.zeros((1 + h, m))
+        raw[0] = self.residual
+        at = 1
+        for gear in _GEARS:
+            # The file's gear is off by this: the winch turned so many times what its counts say.
+            raw[at : at + n] = (gear - 1.0) * way
+            raw[at + n] = (gear - 1.0) * moved
+            at += n + 1
+        stuck, eye = at, np.eye(m)
+        raw[at : at + m] = eye * (self._stuck - angle)
+        raw[at + m : at + 2 * m] = eye * (-2.0 * moved)
+        at += 2 * m
+        for a in range(m - 1):
+            raw[at, a], raw[at, a + 1] = moved[a + 1] - moved[a], moved[a] - moved[a + 1]
+            at += 1
+        raw[at] = self._angles[0] - angle
+        at += 1
+        raw[at : at + 2 * m : 2], raw[at + 1 : at + 2 * m : 2] = eye * _OFFSET, eye * -_OFFSET
+        # An offset that is there from now on was not there before, and a sensor that is stuck now was not.
+        white = self._filter.step(raw)
+        change = self._angles[-1] - self._angles[-min(3, len(self._angles))]
+        spread = self._spread[:, 0] + self._spread[:, 1] * change**2 + self._spread[:, 2] * moved**2
+        good = self.valid and self._filter.settled
+        allowance = np.sum(np.abs(white[1:]) * self._bias_allowed / spread, axis=1)
+        self.scores[:h] = shift_score(white[0], white[1:], spread) - allowance if good else 0.0
+        lately = math.exp(-self._step / _LATELY) if good else 0.0
+        self._explained = lately * self._explained + np.sum(white[1:] * white[0] / spread, axis=1)
+        self._information = lately * self._information + np.sum(white[1:] ** 2 / spread, axis=1)
+        at = h
+        for a in range(m):
+            for ratio in _NOISES:
+                self.scores[at] = spread_score(float(self.bend[a]), float(self._noise[a]), ratio) if good else 0.0
+                at += 1
+        if self._turned is not None:
+            offset = np.full(m, _OFFSET)
+            white = self._turned.step(np.stack([self.gyro.level, offset, -offset]))
+            for a in range(m):
+                for sign in (1, 2):
+                    score = shift_score(white[0, a : a + 1], white[sign, None, a : a + 1], self._gyro_spread[a : a + 1])
+                    self.scores[at] = float(score[0]) if turned and self._turned.settled else 0.0
+                    at += 1
+        if not good:
+            self.charts.sums[: h + 2 * m] = 0.0
+        # Where a chart is empty, its fault begins now: a stuck sensor stays at what the model says.
+        for a in range(m):
+            if self.charts.sums[stuck - 1 + a] <= 0.0:
+                self._stuck[a] = angle
+                self._filter.past[:, stuck + a] = 0.0
+
+    def _align(self) -> None:
+        """What tilt and model differ by now is an offset of theirs."""
+        if self._rest:
+            self._offset = np.mean(self._rest, axis=0)
+        self._began = None
+        self._filter.reset()
