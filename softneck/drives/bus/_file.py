@@ -21,8 +21,8 @@ from softneck.signals.recording._channels import NECK
 from ..master import MasterSettings
 from ..master._fieldbus import BusSettings
 from ..master._settings import LimitSettings, RampSettings, SensorSettings, WatchSettings
-from ._axes import axes_of
 from ..supervision._baseline import Baseline
+from ._axes import axes_of
 from ._load import MOST, bus_load
 from ._robot import channels_of, count_word, ranges, require_signs
 from ._sensor_source import SENSORS, SensorSource
