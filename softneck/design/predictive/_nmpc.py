@@ -42,7 +42,7 @@ from ._nmpc_part import NmpcPart, SampleSolution, explain
 from ._nmpc_prepared import NonlinearProblem, controller_arrays
 from ._nmpc_probe import plant_of, probed
 from ._scale import SizedPlant, limits_of, sized_plant
-from ._tuning import move_weight, spaced_starts
+from ._tuning import move_weight, require_rise, require_solvable, spaced_starts
 
 _RUNTIME = "softneck.design.predictive._nmpc_runtime"
 # Kinds of model whose derivatives the runtime has.
@@ -68,6 +68,8 @@ class NmpcSettings:
         window: samples over which the output disturbance is estimated.
         disturbance_time: time constant of the disturbance's rate [s]; None for the model's own.
         reference_time: time constant of the reference filter [s].
+        rise_s: time [s] in which a step rises from 10 to 90 %, in the place of `reference_time`, as if bandwidth and
+            filter were two lags; where the bandwidth is too slow for it, that is raised.
         preview: how far ahead the reference is known [s].
         horizon: N, samples from now, the dead time among them.
         moves: times at which the motors move.
@@ -85,6 +87,7 @@ class NmpcSettings:
     window: int = NeckCount(8)
     disturbance_time: float | None = None
     reference_time: float = NeckDefault(0.2)
+    rise_s: float | None = None
     preview: float = 0.0
     horizon: int = NeckCount(20)
     moves: int = NeckCount(10)
@@ -106,6 +109,7 @@ class NmpcSettings:
         if self.disturbance_time is not None:
             require_positive("disturbance_time", self.disturbance_time, "s")
         require_between("reference_time", self.reference_time, 0.0, 1e6, "s")
+        require_rise(self.rise_s, self.reference_time)
         require_between("preview", self.preview, 0.0, 1e6, "s")
         require_whole("horizon", self.horizon, 2, 100)
         require_whole("moves", self.moves, 1, self.horizon)
@@ -139,12 +143,41 @@ class NmpcSettings:
         found = probed(model, self._redefinition(directions, robot)[1], limits)
         per_motor = to_si(robot.motors.unit)[0]
         own = replace(self, **{name: getattr(limits, name) / per_motor for name in LIMITS[:4]})
+        own = own if robot.is_neck else own._of_robot(found, model.sample_time)
+        own = own._risen()
+        own._require_horizon(found, model)
         return NmpcController(
-            settings=own if robot.is_neck else own._of_robot(found, model.sample_time),
+            settings=own,
             model=model,
             found=found,
             directions=directions,
         )
+
+    def _risen(self) -> NmpcSettings:
+        """Return the settings with the filter, or the bandwidth, that `rise_s` asks for."""
+        if self.rise_s is None:
+            return self
+        # Two lags a and b in series rise in ln 9 sqrt(a^2 + b^2), to 8 %.
+        whole, loop = self.rise_s / math.log(9.0), 1.0 / self.bandwidth
+        if whole < loop:
+            return replace(self, bandwidth=1.0 / whole, reference_time=NeckDefault(0.0))
+        return replace(self, reference_time=NeckDefault(math.sqrt(whole**2 - loop**2)))
+
+    def _require_horizon(self, found: Mapping[str, Mapping[str, float]], model: Model) -> None:
+        """Raise SettingsError for a plan that sees no move's effect, or is more than can be solved or remembered."""
+        robot = model.robot
+        require_solvable(self.moves, len(robot.motors.names))
+        late = max(plant_of(item, model.sample_time, robot.is_neck).delay for item in found.values())
+        if self.horizon <= late:
+            raise SettingsError(
+                f"`horizon` {self.horizon} samples end within the model's dead time of {late}: no move would be seen "
+                f"to do anything. Ask for {late + 10}."
+            )
+        if self.preview > _LONGEST * model.sample_time:
+            raise SettingsError(
+                f"`preview` {self.preview:g} s is more than the {_LONGEST} samples that are remembered, "
+                f"{_LONGEST * model.sample_time:g} s; ask for less, the horizon sees {self.horizon} samples."
+            )
 
     def _redefinition(self, directions: Matrix | None, robot: Robot) -> tuple[Matrix, Matrix]:
         """Return T from motors to redefined inputs, and its inverse."""
