@@ -292,6 +292,9 @@ QUESTIONS = {
     "mpc.least_delay": Question("least_delay", (0.08, 0.1, 0.12), MpcSettings(), follows),
     "mpc.reference_time": Question("reference_time", (0.0, 0.05, 0.1, 0.2), MpcSettings(), follows),
     "mpc.minimum_tautness": Question("minimum_tautness", (None, 0.0, 0.5, 0.75), MpcSettings(), follows),
+    "mpc.tautness_weight": Question(
+        "tautness_weight", (0.03, 0.1, 0.3, 1.0, 10.0), MpcSettings(tautness_weight=0.3), follows
+    ),
     "mpc.max_sensitivity": Question("max_sensitivity", (1.4, 1.5, 1.6), MpcSettings(), follows),
     "observer.sensor_delay": Question("sensor_delay", (0.0, 0.03, 0.04, 0.05, 0.06, 0.07), KalmanSettings(), observed),
 }

@@ -66,6 +66,8 @@ _HALVINGS = 7
 # Of another robot than the neck, stretched by its slowest pole: the neck's 25 samples without a measurement until the
 # motors hold [s].
 _COAST = 0.5
+# Weight of the default tautness (`benchmarks/leave_one_neck_out.py mpc.tautness_weight`).
+_WISH = 0.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,6 +108,9 @@ class MpcSettings:
         tautness_lever: motor angle that one radian of neck takes up [rad/rad].
         cocontraction_weight: on the error of co-contraction, against that of the tilt's inputs, squared.
         slack_weight: on violations of soft limits, against errors of the angles, squared.
+        tautness_weight: on a lack of tautness [rad of motor], against errors of the angles, squared; None for
+            `slack_weight` where `minimum_tautness` is given, which is a limit, and 0.3 where it is the default, a wish:
+            a limit would turn the noise of the angles into pulls of one sign, and tilt the neck by 0.2 deg.
         tightening: whether soft limits are tightened until they hold in trials with the identified plant and with every
             judged sample of a family.
         measurement_bound: by how much a measured angle may be wrong in these trials [rad], of another robot in the unit
@@ -148,6 +153,7 @@ class MpcSettings:
     # Light: where tendons must be taut, co-contraction gives way; at 1 the angles gave way by a quarter of a degree.
     cocontraction_weight: float = 0.05
     slack_weight: float = 1e3
+    tautness_weight: float | None = None
     tightening: bool = False
     # The observer of the 3DM-GX5-10 on the virtual neck is wrong by up to 0.34 deg near a limit, by 0.1 deg at rest.
     measurement_bound: float = NeckDefault(math.radians(0.35))
@@ -183,8 +189,9 @@ class MpcSettings:
             require_finite("minimum_tautness", self.minimum_tautness)
         if self.disturbance_time is not None:
             require_positive("disturbance_time", self.disturbance_time, "s")
-        for name in ("cocontraction_weight", "slack_weight"):
-            require_positive(name, getattr(self, name))
+        for name in ("cocontraction_weight", "slack_weight", "tautness_weight"):
+            if getattr(self, name) is not None:
+                require_positive(name, getattr(self, name))
         require_between("measurement_bound", self.measurement_bound, 0.0, 1e12)
         require_whole("budget", self.budget, 1, 10_000)
         require_between("least_delay", self.least_delay, 0.0, 1.0, "s")
@@ -318,11 +325,18 @@ class MpcSettings:
             move_weight=1.5 * on_input,
             cocontraction_weight=self.cocontraction_weight,
             slack_weight=self.slack_weight * float(weights.max()),
+            tautness_weight=self._tautness_weight * float(weights.max()),
             angles=self.angle_limit is not None,
             tautness=None if self.minimum_tautness is None else self._lever(model),
             disturbance_time=self.disturbance_time,
             guard=guard_samples(bandwidth, nominal[0].sample_time),
         )
+
+    @property
+    def _tautness_weight(self) -> float:
+        if self.tautness_weight is not None:
+            return self.tautness_weight
+        return _WISH if isinstance(self.minimum_tautness, NeckDefault) else self.slack_weight
 
     def _lever(self, model: HasTransferFunctions) -> Matrix:
         """Return (motors, outputs) how much an angle loosens each tendon."""
