@@ -1,22 +1,23 @@
 """Print why nonlinear predictive control loses to linear as soon as there is payload: one thing changed at a time.
 
-`python benchmarks/nmpc_payload.py [--necks NECK...] [--kind play]`: circle of 12 deg at 1.2 rad/s as in
-`mpc_following.py`, rms of the worse axis [deg], under 0 and 1 kg. Rows: linear `mpc` with its defaults; `nmpc` over a
-model of Eq. 22 without payload; the same with the model of the payload that is there; with its tendons kept taut by
-2 rad of co-contraction; with both; and all that with a slower or a quicker disturbance.
+`python benchmarks/nmpc_payload.py [--necks NECK...] [--kind play]`: the circle of 12 deg at 1.2 rad/s of
+`mpc_following.py`, and a step of 18 deg of pitch over 8 s, rms of the worse axis [deg], under 0 and 1 kg. `mpc` is over
+the family, `nmpc` over models of 80 s of Eq. 22, around zero or pulled taut by 2 rad of co-contraction.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-from mpc_following import CIRCLE_S, JUDGED, OURS, SETTLED, Specimen, circle, neck, rms_deg
+from mpc_following import AT, CIRCLE_S, JUDGED, OURS, SETTLED, STEP_S, Specimen, circle, neck, rms_deg
 
 from softneck.core import KINDS, resolve
 from softneck.design import MpcSettings, NmpcSettings
-from softneck.loop import BlockPart, Loop, Reference, run_loop
+from softneck.loop import BlockPart, Loop, run_loop
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.plant import record as record_own
 from softneck.signals import Recording, signal
@@ -25,6 +26,7 @@ from tests.foreign_necks.necks import CHOOSING, ForeignNeck, record
 TAUT = 2.0
 # As quick as the linear one's defaults.
 QUICK = NmpcSettings(bandwidth=12.0, reference_time=0.05)
+LARGE = math.radians(18.0)
 
 
 def recorded(name: str, payload: float, common: float) -> Recording:
@@ -36,42 +38,58 @@ def recorded(name: str, payload: float, common: float) -> Recording:
     return record(excitation, ForeignNeck(name=name), seed=6, payload=payload)
 
 
-def error(on: Specimen, controller: Any, payload: float, common: float) -> float:
-    """Return the rms error of the circle under a payload [kg] and a co-contraction [rad]."""
+def errors(on: Specimen, controllers: list[Any], common: float) -> list[float]:
+    """Return the rms errors of circle and large step under each payload and a co-contraction [rad].
+
+    Args:
+        on: the neck.
+        controllers: one for each payload of `JUDGED`.
+        common: co-contraction that is asked for.
+    """
 
     def around(time: float, /) -> tuple[float, float, float]:
         return *circle(time)[:2], common
 
-    reference: Reference = around
-    loop = Loop(plant=BlockPart(on.block(0)), controller=BlockPart(controller.block()),
-                observer=BlockPart(on.observer), reference=reference, duration=CIRCLE_S,
-                plant_inputs={"payload": payload})  # fmt: skip
-    return rms_deg(run_loop(loop), reference, SETTLED)
+    def stepped(time: float, /) -> tuple[float, float, float]:
+        return LARGE if time >= AT else 0.0, 0.0, common
+
+    found = []
+    for reference, duration, since in ((around, CIRCLE_S, SETTLED), (stepped, AT + STEP_S, AT)):
+        for controller, kg in zip(controllers, JUDGED, strict=True):
+            loop = Loop(plant=BlockPart(on.block(0)), controller=BlockPart(controller.block()),
+                        observer=BlockPart(on.observer), reference=reference, duration=duration,
+                        plant_inputs={"payload": kg})  # fmt: skip
+            found.append(rms_deg(run_loop(loop), reference, since))
+    return found
 
 
-def rows(name: str, kind: str) -> dict[str, list[float]]:
-    """Return the errors at each payload, by what was changed."""
+def rows(name: str, kind: str) -> Iterator[tuple[str, list[float]]]:
+    """Yield the errors by what was changed."""
     on = neck(name)
     fit = resolve(KINDS[kind].settings)().fit
-    models = {(kg, common): fit(recorded(name, kg, common)) for kg in JUDGED for common in (0.0, TAUT)}
-    linear = MpcSettings().design(on.family)
-    slack = MpcSettings(minimum_tautness=None).design(on.family)
-    slow, quick = replace(QUICK, disturbance_time=1.0), replace(QUICK, window=3)
-
-    def each(settings: NmpcSettings, common: float, *, known: bool) -> list[float]:
-        return [error(on, settings.design(models[kg if known else 0.0, common]), kg, common) for kg in JUDGED]
-
-    return {
-        "`mpc`, defaults": [error(on, linear, kg, 0.0) for kg in JUDGED],
-        "`mpc` that lets tendons hang": [error(on, slack, kg, 0.0) for kg in JUDGED],
-        f"`mpc`, defaults, {TAUT:g} rad of co-contraction": [error(on, linear, kg, TAUT) for kg in JUDGED],
-        "`nmpc`, model of 0 kg": each(QUICK, 0.0, known=False),
-        "`nmpc`, model of the payload": each(QUICK, 0.0, known=True),
-        f"`nmpc`, model of 0 kg, {TAUT:g} rad": each(QUICK, TAUT, known=False),
-        f"`nmpc`, model of the payload, {TAUT:g} rad": each(QUICK, TAUT, known=True),
-        "the same, disturbance of 1 s": each(slow, TAUT, known=True),
-        "the same, window of 3 samples": each(quick, TAUT, known=True),
-    }
+    slack, taut = ([recorded(name, kg, common) for kg in JUDGED] for common in (0.0, TAUT))
+    for what, settings, common in (
+        ("`mpc`, defaults", MpcSettings(), 0.0),
+        ("`mpc` that lets tendons hang", MpcSettings(minimum_tautness=None), 0.0),
+        ("`mpc`, 2 rad of co-contraction", MpcSettings(), TAUT),
+        ("`mpc`, 2 rad, `rise_s=0.2`", MpcSettings(rise_s=0.2), TAUT),
+    ):
+        yield what, errors(on, [settings.design(on.family)] * 2, common)
+    hanging, pulled = fit(slack[0]), fit(taut[0])
+    wish = replace(QUICK, minimum_tautness=0.5)
+    for what, settings, models, common in (
+        ("`nmpc`, model of 0 kg", QUICK, [hanging] * 2, 0.0),
+        ("the same, model of the payload", QUICK, [hanging, fit(slack[1])], 0.0),
+        ("the same, 2 rad of co-contraction", QUICK, [hanging] * 2, TAUT),
+        ("the same, `minimum_tautness=0.5`", wish, [hanging] * 2, 0.0),
+        ("`nmpc`, model of 0 kg pulled taut, 2 rad", QUICK, [pulled] * 2, TAUT),
+        ("the same, model of the payload", QUICK, [pulled, fit(taut[1])], TAUT),
+        ("the same, one model of both payloads", QUICK, [fit(taut)] * 2, TAUT),
+        ("the same, model of 0 kg, `minimum_tautness=2`", replace(QUICK, minimum_tautness=2.0), [pulled] * 2, 0.0),
+        ("the same, disturbance of 1 s", replace(QUICK, disturbance_time=1.0), [pulled] * 2, TAUT),
+        ("the same, window of 3 samples", replace(QUICK, window=3), [pulled] * 2, TAUT),
+    ):
+        yield what, errors(on, [settings.design(model) for model in models], common)
 
 
 def main() -> None:
@@ -81,9 +99,10 @@ def main() -> None:
     parser.add_argument("--kind", default="play", help="of model (play)")
     options = parser.parse_args()
     for name in options.necks:
-        print(f"\n| `{name}` | " + " | ".join(f"{kg:g} kg" for kg in JUDGED) + " |\n|---|---|---|")
-        for what, errors in rows(name, options.kind).items():
-            print(f"| {what} | " + " | ".join(f"{value:.2f}" for value in errors) + " |", flush=True)
+        heads = [f"{what}, {kg:g} kg" for what in ("circle", "step") for kg in JUDGED]
+        print(f"\n| `{name}` | {' | '.join(heads)} |\n|---|---|---|---|---|")
+        for what, found in rows(name, options.kind):
+            print(f"| {what} | " + " | ".join(f"{value:.2f}" for value in found) + " |", flush=True)
 
 
 if __name__ == "__main__":

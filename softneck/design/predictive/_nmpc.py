@@ -36,11 +36,11 @@ from softneck.runtime import Block, Port, State
 from softneck.runtime._bundle import sized
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
-from ..linear._ports import LIMITS, ControllerLimits, controller_inputs, controller_outputs, require_limits
+from ..linear._ports import LIMITS, MAX_MOTOR, ControllerLimits, controller_inputs, controller_outputs, require_limits
 from ..plants._uncertain import UncertainAxis, UncertainPlant
 from ._nmpc_part import NmpcPart, SampleSolution, explain
 from ._nmpc_prepared import NonlinearProblem, controller_arrays
-from ._nmpc_probe import plant_of, probed
+from ._nmpc_probe import plant_of, probed, require_horizon, risen
 from ._scale import SizedPlant, limits_of, sized_plant
 from ._tuning import move_weight, require_rise, require_solvable, spaced_starts
 
@@ -76,6 +76,10 @@ class NmpcSettings:
         converged: iterate until nothing changes, for reference.
         position_limit, slew_limit, lead_limit, least_position: of each motor [rad], [rad/s], [rad], [rad].
         angle_limit: soft limit of pitch and roll, or of another robot's angles [rad]; None for none.
+        minimum_tautness: least motor position beyond that at which a tendon follows the neck [rad], a wish that
+            co-contraction is raised for, with its weight; None for none. Models that have not seen tendons hang are
+            wrong where they do. For necks.
+        tautness_lever: motor angle that one radian of neck takes up [rad/rad].
         cocontraction_weight: on the error of co-contraction, against that of the tilt's inputs, squared.
         slack_weight: on violations of soft limits, against errors of the angles, squared.
         budget: iterations of the QP solver.
@@ -97,6 +101,8 @@ class NmpcSettings:
     lead_limit: float = NeckDefault(1.0)
     least_position: float = NeckDefault(-6.0)
     angle_limit: float | None = None
+    minimum_tautness: float | None = None
+    tautness_lever: float = NeckDefault(6.93)
     cocontraction_weight: float = 1.0
     slack_weight: float = 1e3
     budget: int = 200
@@ -118,6 +124,9 @@ class NmpcSettings:
             require_positive("angle_limit", self.angle_limit, "rad")
         for name in ("cocontraction_weight", "slack_weight"):
             require_positive(name, getattr(self, name))
+        if self.minimum_tautness is not None:
+            require_between("minimum_tautness", self.minimum_tautness, -MAX_MOTOR, MAX_MOTOR, "rad")
+        require_between("tautness_lever", self.tautness_lever, 0.0, 100.0, "rad/rad")
         require_whole("budget", self.budget, 1, 10_000)
         require_one_of("order", self.order, ORDERS)
         if self.order != "sequential":
@@ -138,46 +147,23 @@ class NmpcSettings:
         robot = model.robot
         if not robot.is_neck and self.tendon_angles != NmpcSettings().tendon_angles:
             raise SettingsError(f"`tendon_angles` are of necks; those of `{robot.name}` are in its robot file.")
+        if not robot.is_neck and self.minimum_tautness is not None:
+            raise SettingsError(f"`minimum_tautness` of `nmpc` is for necks; `{robot.name}` is none. Leave it out.")
         limits = limits_of(self, robot)
         directions = None if robot.is_neck else weights_of(model)
         found = probed(model, self._redefinition(directions, robot)[1], limits)
         per_motor = to_si(robot.motors.unit)[0]
         own = replace(self, **{name: getattr(limits, name) / per_motor for name in LIMITS[:4]})
         own = own if robot.is_neck else own._of_robot(found, model.sample_time)
-        own = own._risen()
-        own._require_horizon(found, model)
+        own = risen(own)
+        require_horizon(own, [plant_of(item, model.sample_time, robot.is_neck) for item in found.values()])
+        require_solvable(own.moves, len(robot.motors.names))
         return NmpcController(
             settings=own,
             model=model,
             found=found,
             directions=directions,
         )
-
-    def _risen(self) -> NmpcSettings:
-        """Return the settings with the filter, or the bandwidth, that `rise_s` asks for."""
-        if self.rise_s is None:
-            return self
-        # Two lags a and b in series rise in ln 9 sqrt(a^2 + b^2), to 8 %.
-        whole, loop = self.rise_s / math.log(9.0), 1.0 / self.bandwidth
-        if whole < loop:
-            return replace(self, bandwidth=1.0 / whole, reference_time=NeckDefault(0.0))
-        return replace(self, reference_time=NeckDefault(math.sqrt(whole**2 - loop**2)))
-
-    def _require_horizon(self, found: Mapping[str, Mapping[str, float]], model: Model) -> None:
-        """Raise SettingsError for a plan that sees no move's effect, or is more than can be solved or remembered."""
-        robot = model.robot
-        require_solvable(self.moves, len(robot.motors.names))
-        late = max(plant_of(item, model.sample_time, robot.is_neck).delay for item in found.values())
-        if self.horizon <= late:
-            raise SettingsError(
-                f"`horizon` {self.horizon} samples end within the model's dead time of {late}: no move would be seen "
-                f"to do anything. Ask for {late + 10}."
-            )
-        if self.preview > _LONGEST * model.sample_time:
-            raise SettingsError(
-                f"`preview` {self.preview:g} s is more than the {_LONGEST} samples that are remembered, "
-                f"{_LONGEST * model.sample_time:g} s; ask for less, the horizon sees {self.horizon} samples."
-            )
 
     def _redefinition(self, directions: Matrix | None, robot: Robot) -> tuple[Matrix, Matrix]:
         """Return T from motors to redefined inputs, and its inverse."""
@@ -331,7 +317,11 @@ class NmpcController:
         from ._optimal import OptimalPart
 
         require_one_of("solver", solver, ("own", "casadi"))
-        return NmpcPart(self._block) if solver == "own" else OptimalPart(self)
+        if solver == "own":
+            return NmpcPart(self._block)
+        if self.settings.minimum_tautness is not None:
+            raise SettingsError("`solver=casadi` knows no `minimum_tautness`; leave one of them out.")
+        return OptimalPart(self)
 
     def block(self) -> Block:
         """Return the controller as a block of role "controller"."""

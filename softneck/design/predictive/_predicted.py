@@ -44,7 +44,10 @@ def identified(model: Any) -> bool:
 
 def settings_for(settings: S, model: HasTransferFunctions) -> S:
     """Return the settings for what was identified of a neck, or for any other plant."""
-    return settings if robot_of(model).is_neck and identified(model) else _with(settings, _BELIEVED)
+    if robot_of(model).is_neck and identified(model):
+        # What is tightened until it holds is a limit; a wish is none.
+        return _with(settings, {"minimum_tautness": None}) if settings.tightening else settings
+    return _with(settings, _BELIEVED)
 
 
 def settings_of_robot(settings: S, plant: UncertainPlant) -> S:

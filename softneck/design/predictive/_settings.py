@@ -38,7 +38,7 @@ from ._predicted import predicted_plants, settings_for, settings_of_robot
 from ._prediction import Problem, matrices
 from ._scale import SizedPlant, limits_of, sized_plant
 from ._scenarios import chosen_scenarios, sample_pairs
-from ._tightening import LimitTrial, measurement_bound, tightened
+from ._tightening import tightened, trial_of
 from ._tuning import (
     FULL_TRUST,
     Pair,
@@ -109,8 +109,8 @@ class MpcSettings:
         cocontraction_weight: on the error of co-contraction, against that of the tilt's inputs, squared.
         slack_weight: on violations of soft limits, against errors of the angles, squared.
         tautness_weight: on a lack of tautness [rad of motor], against errors of the angles, squared; None for
-            `slack_weight` where `minimum_tautness` is given, which is a limit, and 0.3 where it is the default, a wish:
-            a limit would turn the noise of the angles into pulls of one sign, and tilt the neck by 0.2 deg.
+            `slack_weight` where `minimum_tautness` is given, a limit, and 0.3 where it is the default, a wish: a limit
+            turns the noise of the angles into pulls of one sign, and tilts the neck by 0.2 deg.
         tightening: whether soft limits are tightened until they hold in trials with the identified plant and with every
             judged sample of a family.
         measurement_bound: by how much a measured angle may be wrong in these trials [rad], of another robot in the unit
@@ -236,7 +236,7 @@ class MpcSettings:
         per_motor = to_si(limits.robot.motors.unit)[0]
         if self.tightening:
             plants = [self._delayed(pair) for pair in [*self._families(nominal), *samples]]
-            arrays, found["back_off_rad"] = tightened(arrays, plants, self._trial(model, limits))
+            arrays, found["back_off_rad"] = tightened(arrays, plants, trial_of(self, limits, self._lever(model)))
         return MpcController(
             sample_time=Ts,
             arrays=arrays,
@@ -348,18 +348,6 @@ class MpcSettings:
         """Return (k, outputs + 1) gains and time constant of each measured disturbance."""
         rows = [[*item.on(robot), item.time] for item in self.disturbances]
         return np.array(rows).reshape(-1, len(robot.outputs.names) + 1)
-
-    def _trial(self, model: HasTransferFunctions, limits: ControllerLimits) -> LimitTrial:
-        """Return what tightening is tried with."""
-        motors = to_si(limits.robot.motors.unit)[0]
-        return LimitTrial(
-            parameters=tuple(getattr(limits, name) for name in LIMITS[:4]),
-            angle_limit=self.angle_limit,
-            minimum_tautness=None if self.minimum_tautness is None else motors * self.minimum_tautness,
-            lever=self._lever(model),
-            measurement_bound=measurement_bound(self.measurement_bound, limits.robot),
-            neck=limits.robot.is_neck,
-        )
 
     def _families(self, nominal: Pair) -> list[Pair]:
         """Return what the neck may be: as identified, and faster."""
