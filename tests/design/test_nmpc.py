@@ -360,7 +360,7 @@ def test_what_it_cannot_use_is_refused(recording: Recording, controller: NmpcCon
 
 
 def test_the_loosest_tendon_gets_what_it_lacks(network: Model) -> None:
-    """Asked to lean, the neck is co-contracted until the loosest tendon is as taut as wished; without that it is not."""
+    """Asked to lean, the neck is co-contracted until the loosest tendon is as taut as was wished."""
     slack = []
     for wish in (None, 0.4):
         settings = NmpcSettings(horizon=12, moves=4, lead_limit=12.0, minimum_tautness=wish, reference_time=0.0)
@@ -382,7 +382,7 @@ def test_the_loosest_tendon_gets_what_it_lacks(network: Model) -> None:
         ({"horizon": 2, "moves": 1}, "`horizon` 2 samples end within the model's dead time"),
         ({"horizon": 100, "moves": 50}, "150 unknowns, and the solver takes at most 120 within a sample"),
         ({"preview": 60.0}, "`preview` 60 s is more than the 100 samples that are remembered"),
-        ({"minimum_tautness": 20.0}, "`minimum_tautness` must be between -12 and 12"),
+        ({"minimum_tautness": 20.0}, "`minimum_tautness` must be between -6 and 6"),
     ],
 )
 def test_horizons_beyond_what_is_solved_are_refused(network: Model, settings: dict[str, Any], match: str) -> None:
