@@ -26,7 +26,7 @@ def identified() -> Any:
     return Identified(pitch=nominal.pitch, roll=nominal.roll)
 
 
-@pytest.mark.parametrize("rise", [0.15, 0.4, 1.0])
+@pytest.mark.parametrize("rise", [pytest.param(0.15, marks=pytest.mark.slow), 0.4, 1.0])
 def test_a_step_rises_in_the_time_that_was_asked(rise: float) -> None:
     controller = MpcSettings(rise_s=rise).design(bake_off_neck())
     neck, y = Neck(controller), []
@@ -109,7 +109,7 @@ def test_on_a_neck_that_nobody_tuned_to_it_is_fast_and_close() -> None:
                              reference=reference, duration=duration))  # fmt: skip
 
     for axis in ("pitch", "roll"):
-        found = metrics(run(StepReference(**{axis: np.radians(10.0)}, at=1.0), 6.0))[axis]
+        found: Any = metrics(run(StepReference(**{axis: np.radians(10.0)}, at=1.0), 6.0))[axis]
         assert found["rise_s"] <= 0.45
         assert found["overshoot_pct"] <= 10.0
     result = run(around, 14.0)

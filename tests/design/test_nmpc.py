@@ -390,7 +390,10 @@ def test_horizons_beyond_what_is_solved_are_refused(network: Model, settings: di
         NmpcSettings(**settings).design(network)
 
 
-def test_a_rise_sets_filter_or_bandwidth(network: Model) -> None:
+def test_a_rise_sets_filter_or_bandwidth(network: Model, tmp_path: Path) -> None:
+    asked = NmpcSettings(rise_s=0.5, minimum_tautness=0.2).design(network)
+    asked.save(tmp_path / "c.npz")
+    assert load(tmp_path / "c.npz").settings == asked.settings
     slow, fast = (NmpcSettings(rise_s=rise).design(network).settings for rise in (0.5, 0.1))
     lag = 1.0 / slow.bandwidth
     assert np.log(9.0) * np.hypot(lag, slow.reference_time) == pytest.approx(0.5)

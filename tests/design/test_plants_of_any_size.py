@@ -34,7 +34,8 @@ def of_lags(dt: float, inputs: int = 2) -> Any:
 
 def closed(G: Any, K: Any) -> Any:
     """Return the loop from references to outputs."""
-    return control.feedback(G * K, control.StateSpace([], [], [], np.eye(G.noutputs), G.dt))
+    one: Any = control.StateSpace([], [], [], np.eye(G.noutputs), G.dt)
+    return control.feedback(G * K, one)
 
 
 @pytest.mark.parametrize("dt", [0.0, 0.05])

@@ -73,6 +73,7 @@ def soak(controller: MpcController, hours: float, seed: int) -> Soaked:
     y, line = np.zeros(2), np.zeros((DEAD, 3))
     T, u, gain, load = a.T, np.zeros(10), GAIN * np.ones(2), np.zeros(2)
     warm, first = seen.samples // 10, 0
+    blind = stuck = False
     for k in range(seen.samples):
         if k == warm:
             first = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

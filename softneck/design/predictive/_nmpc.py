@@ -367,9 +367,16 @@ class NmpcController:
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write the controller with its model to one `.npz` file."""
         model, arrays = nested(self.model)
+        settings = asdict(self.settings)
+        # Files say what they said before where nobody asks for what came later.
+        for name in (
+            "rise_s",
+            *(("minimum_tautness", "tautness_lever") if settings["minimum_tautness"] is None else ()),
+        ):
+            del settings[name]
         header = {
             "kind": "nmpc",
-            "settings": asdict(self.settings),
+            "settings": settings,
             "found": {axis: dict(values) for axis, values in self.found.items()},
             "model": model,
             **({} if self.directions is None else {"directions": self.directions.tolist()}),

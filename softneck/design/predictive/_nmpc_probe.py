@@ -13,7 +13,6 @@ from softneck.core import Matrix, SettingsError, Vector
 from softneck.estimation import AxisPlant
 from softneck.identification import Model
 from softneck.identification.models._directions import NECK_SECONDS
-from softneck.robot._neck_default import NeckDefault
 
 from ..linear._ports import ControllerLimits
 
@@ -97,8 +96,8 @@ def risen(settings: S) -> S:
     # Two lags a and b in series rise in ln 9 sqrt(a^2 + b^2), to 8 %.
     whole, loop = settings.rise_s / math.log(9.0), 1.0 / settings.bandwidth
     if whole < loop:
-        return replace(settings, bandwidth=1.0 / whole, reference_time=NeckDefault(0.0))
-    return replace(settings, reference_time=NeckDefault(math.sqrt(whole**2 - loop**2)))
+        return replace(settings, rise_s=None, bandwidth=1.0 / whole, reference_time=0.0)
+    return replace(settings, rise_s=None, reference_time=math.sqrt(whole**2 - loop**2))
 
 
 def require_horizon(settings: Any, plants: Sequence[AxisPlant]) -> None:

@@ -30,8 +30,10 @@ _LONGEST = 200
 class _Settings(Protocol):
     """What is read of `MpcSettings` here."""
 
-    least_delay: float
-    taut_pole: float
+    @property
+    def least_delay(self) -> float: ...
+    @property
+    def taut_pole(self) -> float: ...
 
 
 S = TypeVar("S", bound=Any)

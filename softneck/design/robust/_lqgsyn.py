@@ -43,7 +43,8 @@ def lqgsyn(
     """
     import control
 
-    dt, system = _dt_of(G), control.ss(G)
+    dt = _dt_of(G)
+    system: Any = control.ss(G)
     A, B, C, D = (np.asarray(part, dtype=np.float64) for part in (system.A, system.B, system.C, system.D))
     n, m = B.shape[1], C.shape[0]
     Q, R = _weight("output_weight", output_weight, m), _weight("control_weight", control_weight, n)
@@ -90,7 +91,7 @@ def _load_directions(system: Any, dt: float) -> Matrix:
     if n <= m:
         return np.eye(n)
     response = np.asarray(system(1.0 + _NEAR_REST if dt else _NEAR_REST, squeeze=False)).reshape(m, n)
-    return np.linalg.svd(response.real)[2][:m].T
+    return np.linalg.svd(np.real(response))[2][:m].T
 
 
 def _weight(name: str, value: Any, size: int) -> Matrix:

@@ -212,7 +212,8 @@ def loopsyn(G: Any, Gd: Any, *, above: float = _ABOVE) -> Synthesis:
     """
     import control
 
-    dt, plant = _dt_of(G), control.ss(G)
+    dt = _dt_of(G)
+    plant: Any = control.ss(G)
     if plant.ninputs < plant.noutputs:
         raise SettingsError(
             f"`loopsyn` inverts plants of at least as many inputs as outputs; got {G.ninputs} and {G.noutputs}. "
