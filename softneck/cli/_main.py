@@ -26,6 +26,7 @@ _COMMANDS = {
     "record": ("experiments._record", "Record a signal on the virtual neck."),
     "excite": ("experiments._excite", "Design what to record next: motions on which the members of a model disagree."),
     "import": ("_import", "Turn any logger's table into a recording, by a layout file."),
+    "resample": ("experiments._resample", "Bring a recording to another sample time."),
     "identify": ("_identify", "Identify a model from recordings."),
     "validate": ("_validate", "Validate models on rows that they were not trained on."),
     "reproduce-paper": ("_reproduce_paper", "Reproduce the paper on the virtual neck, our numbers beside its own."),
