@@ -20,11 +20,13 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+import mpc_following
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 import softneck
 from softneck.core import KINDS, Vector, load, resolve
+from softneck.design import MpcSettings
 from softneck.estimation import KalmanSettings
 from softneck.identification import INFINITE, GreyBox, Model, Network, NeuralStateSpace, OutputError, Rls, validate
 from softneck.identification.models._arrays import members
@@ -231,6 +233,12 @@ def learned_trusted(run: Run, candidates: list[Any]) -> Vector:
     return trusted(run, candidates, ("play", "nn", "nss"))
 
 
+def follows(run: Run, candidates: list[Any]) -> Vector:
+    """Return what `mpc_following.py` says of predictive controllers that follow steps and circles."""
+    number = 1000 * run.seed + run.number if run.number else 0
+    return mpc_following.scores(mpc_following.neck(run.name, number), candidates)
+
+
 _UNKNOWN: dict[str, Any] = {
     "name": "unknown",
     "motors": {"names": ["a", "b", "c"], "unit": "rad"},
@@ -280,6 +288,14 @@ QUESTIONS = {
     "nonlinear.motion_noise_ratio": Question(
         "motion_noise_ratio", (0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0), KalmanSettings(), observed_grey
     ),
+    "mpc.taut_pole": Question("taut_pole", (6.0, 9.0, 12.0), MpcSettings(), follows),
+    "mpc.least_delay": Question("least_delay", (0.08, 0.1, 0.12), MpcSettings(), follows),
+    "mpc.reference_time": Question("reference_time", (0.0, 0.05, 0.1, 0.2), MpcSettings(), follows),
+    "mpc.minimum_tautness": Question("minimum_tautness", (None, 0.0, 0.5, 0.75), MpcSettings(), follows),
+    "mpc.tautness_weight": Question(
+        "tautness_weight", (0.03, 0.1, 0.3, 1.0, 10.0), MpcSettings(tautness_weight=0.3), follows
+    ),
+    "mpc.max_sensitivity": Question("max_sensitivity", (1.4, 1.5, 1.6), MpcSettings(), follows),
     "observer.sensor_delay": Question("sensor_delay", (0.0, 0.03, 0.04, 0.05, 0.06, 0.07), KalmanSettings(), observed),
 }
 

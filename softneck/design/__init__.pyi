@@ -14,6 +14,7 @@ from .predictive._nmpc import NmpcController as NmpcController
 from .predictive._nmpc import NmpcSettings as NmpcSettings
 from .predictive._settings import MpcSettings as MpcSettings
 from .robust._hinf import HinfSettings as HinfSettings
+from .robust._lqgsyn import lqgsyn as lqgsyn
 from .robust._mu import mu_bounds as mu_bounds
 from .robust._ncf import NcfSettings as NcfSettings
 from .robust._nu_gap import nugap as nugap

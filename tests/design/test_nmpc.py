@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import daqp
 import numpy as np
@@ -356,3 +357,44 @@ def test_what_it_cannot_use_is_refused(recording: Recording, controller: NmpcCon
         controller.step(controller.initial_state(), [0.1] * 7)
     with pytest.raises(SettingsError, match="is not a parameter of nmpc"):
         controller.initial_state(colour=1.0)
+
+
+def test_the_loosest_tendon_gets_what_it_lacks(network: Model) -> None:
+    """Asked to lean, the neck is co-contracted until the loosest tendon is as taut as was wished."""
+    slack = []
+    for wish in (None, 0.4):
+        settings = NmpcSettings(horizon=12, moves=4, lead_limit=12.0, minimum_tautness=wish, reference_time=0.0)
+        controller = settings.design(network)
+        state, motors = controller.initial_state(), np.zeros(3)
+        for _ in range(80):
+            y = named(controller, state.values)["angles"]
+            state, motors = controller.step(state, [0.15, -0.05, 0.0, *y, *motors, 1.0, 1.0])
+        T = NmpcArrays(controller.block().arrays).T
+        slack.append(float((motors - settings.tautness_lever * np.array([0.15, -0.05]) @ T[:2]).min()))
+    assert slack[0] < 0.0
+    # A wish with the weight of co-contraction: tilt and moves give way a little.
+    assert slack[1] == pytest.approx(0.4, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("settings", "match"),
+    [
+        ({"horizon": 2, "moves": 1}, "`horizon` 2 samples end within the model's dead time"),
+        ({"horizon": 100, "moves": 50}, "150 unknowns, and the solver takes at most 120 within a sample"),
+        ({"preview": 60.0}, "`preview` 60 s is more than the 100 samples that are remembered"),
+        ({"minimum_tautness": 20.0}, "`minimum_tautness` must be between -6 and 6"),
+    ],
+)
+def test_horizons_beyond_what_is_solved_are_refused(network: Model, settings: dict[str, Any], match: str) -> None:
+    with pytest.raises(SettingsError, match=match):
+        NmpcSettings(**settings).design(network)
+
+
+def test_a_rise_sets_filter_or_bandwidth(network: Model, tmp_path: Path) -> None:
+    asked = NmpcSettings(rise_s=0.5, minimum_tautness=0.2).design(network)
+    asked.save(tmp_path / "c.npz")
+    assert load(tmp_path / "c.npz").settings == asked.settings
+    slow, fast = (NmpcSettings(rise_s=rise).design(network).settings for rise in (0.5, 0.1))
+    lag = 1.0 / slow.bandwidth
+    assert np.log(9.0) * np.hypot(lag, slow.reference_time) == pytest.approx(0.5)
+    assert (fast.reference_time, fast.bandwidth) == (0.0, pytest.approx(np.log(9.0) / 0.1))

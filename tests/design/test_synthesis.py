@@ -277,5 +277,5 @@ def test_weights_of_another_size_are_refused_in_a_line() -> None:
         mixsyn(plant, wide, 0.2)
     with pytest.raises(SettingsError, match="W must be scalar or have 2 inputs and outputs"):
         ncfsyn(plant, wide)
-    with pytest.raises(SettingsError, match="`loopsyn` inverts plants of one input and one output; got 2 and 2"):
-        loopsyn(plant, LAG)
+    with pytest.raises(SettingsError, match="Gd must be scalar or have 2 inputs and outputs"):
+        loopsyn(plant, wide)

@@ -36,13 +36,13 @@ from softneck.runtime import Block, Port, State
 from softneck.runtime._bundle import sized
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
-from ..linear._ports import LIMITS, ControllerLimits, controller_inputs, controller_outputs, require_limits
+from ..linear._ports import LIMITS, MAX_MOTOR, ControllerLimits, controller_inputs, controller_outputs, require_limits
 from ..plants._uncertain import UncertainAxis, UncertainPlant
 from ._nmpc_part import NmpcPart, SampleSolution, explain
 from ._nmpc_prepared import NonlinearProblem, controller_arrays
-from ._nmpc_probe import plant_of, probed
+from ._nmpc_probe import plant_of, probed, require_horizon, risen
 from ._scale import SizedPlant, limits_of, sized_plant
-from ._tuning import move_weight, spaced_starts
+from ._tuning import move_weight, require_rise, require_solvable, spaced_starts
 
 _RUNTIME = "softneck.design.predictive._nmpc_runtime"
 # Kinds of model whose derivatives the runtime has.
@@ -68,12 +68,18 @@ class NmpcSettings:
         window: samples over which the output disturbance is estimated.
         disturbance_time: time constant of the disturbance's rate [s]; None for the model's own.
         reference_time: time constant of the reference filter [s].
+        rise_s: time [s] in which a step rises from 10 to 90 %, in the place of `reference_time`, as if bandwidth and
+            filter were two lags; where the bandwidth is too slow for it, that is raised.
         preview: how far ahead the reference is known [s].
         horizon: N, samples from now, the dead time among them.
         moves: times at which the motors move.
         converged: iterate until nothing changes, for reference.
         position_limit, slew_limit, lead_limit, least_position: of each motor [rad], [rad/s], [rad], [rad].
         angle_limit: soft limit of pitch and roll, or of another robot's angles [rad]; None for none.
+        minimum_tautness: least motor position beyond that at which a tendon follows the neck [rad], a wish that
+            co-contraction is raised for, with its weight; None for none. Models that have not seen tendons hang are
+            wrong where they do. For necks.
+        tautness_lever: motor angle that one radian of neck takes up [rad/rad].
         cocontraction_weight: on the error of co-contraction, against that of the tilt's inputs, squared.
         slack_weight: on violations of soft limits, against errors of the angles, squared.
         budget: iterations of the QP solver.
@@ -85,6 +91,7 @@ class NmpcSettings:
     window: int = NeckCount(8)
     disturbance_time: float | None = None
     reference_time: float = NeckDefault(0.2)
+    rise_s: float | None = None
     preview: float = 0.0
     horizon: int = NeckCount(20)
     moves: int = NeckCount(10)
@@ -94,6 +101,8 @@ class NmpcSettings:
     lead_limit: float = NeckDefault(1.0)
     least_position: float = NeckDefault(-6.0)
     angle_limit: float | None = None
+    minimum_tautness: float | None = None
+    tautness_lever: float = NeckDefault(6.93)
     cocontraction_weight: float = 1.0
     slack_weight: float = 1e3
     budget: int = 200
@@ -106,6 +115,7 @@ class NmpcSettings:
         if self.disturbance_time is not None:
             require_positive("disturbance_time", self.disturbance_time, "s")
         require_between("reference_time", self.reference_time, 0.0, 1e6, "s")
+        require_rise(self.rise_s, self.reference_time)
         require_between("preview", self.preview, 0.0, 1e6, "s")
         require_whole("horizon", self.horizon, 2, 100)
         require_whole("moves", self.moves, 1, self.horizon)
@@ -114,6 +124,9 @@ class NmpcSettings:
             require_positive("angle_limit", self.angle_limit, "rad")
         for name in ("cocontraction_weight", "slack_weight"):
             require_positive(name, getattr(self, name))
+        if self.minimum_tautness is not None:
+            require_between("minimum_tautness", self.minimum_tautness, -MAX_MOTOR, MAX_MOTOR, "rad")
+        require_between("tautness_lever", self.tautness_lever, 0.0, 100.0, "rad/rad")
         require_whole("budget", self.budget, 1, 10_000)
         require_one_of("order", self.order, ORDERS)
         if self.order != "sequential":
@@ -134,13 +147,19 @@ class NmpcSettings:
         robot = model.robot
         if not robot.is_neck and self.tendon_angles != NmpcSettings().tendon_angles:
             raise SettingsError(f"`tendon_angles` are of necks; those of `{robot.name}` are in its robot file.")
+        if not robot.is_neck and self.minimum_tautness is not None:
+            raise SettingsError(f"`minimum_tautness` of `nmpc` is for necks; `{robot.name}` is none. Leave it out.")
         limits = limits_of(self, robot)
         directions = None if robot.is_neck else weights_of(model)
         found = probed(model, self._redefinition(directions, robot)[1], limits)
         per_motor = to_si(robot.motors.unit)[0]
         own = replace(self, **{name: getattr(limits, name) / per_motor for name in LIMITS[:4]})
+        own = own if robot.is_neck else own._of_robot(found, model.sample_time)
+        own = risen(own)
+        require_horizon(own, [plant_of(item, model.sample_time, robot.is_neck) for item in found.values()])
+        require_solvable(own.moves, len(robot.motors.names))
         return NmpcController(
-            settings=own if robot.is_neck else own._of_robot(found, model.sample_time),
+            settings=own,
             model=model,
             found=found,
             directions=directions,
@@ -298,7 +317,11 @@ class NmpcController:
         from ._optimal import OptimalPart
 
         require_one_of("solver", solver, ("own", "casadi"))
-        return NmpcPart(self._block) if solver == "own" else OptimalPart(self)
+        if solver == "own":
+            return NmpcPart(self._block)
+        if self.settings.minimum_tautness is not None:
+            raise SettingsError("`solver=casadi` knows no `minimum_tautness`; leave one of them out.")
+        return OptimalPart(self)
 
     def block(self) -> Block:
         """Return the controller as a block of role "controller"."""
@@ -344,9 +367,16 @@ class NmpcController:
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write the controller with its model to one `.npz` file."""
         model, arrays = nested(self.model)
+        settings = asdict(self.settings)
+        # Files say what they said before where nobody asks for what came later.
+        for name in (
+            "rise_s",
+            *(("minimum_tautness", "tautness_lever") if settings["minimum_tautness"] is None else ()),
+        ):
+            del settings[name]
         header = {
             "kind": "nmpc",
-            "settings": asdict(self.settings),
+            "settings": settings,
             "found": {axis: dict(values) for axis, values in self.found.items()},
             "model": model,
             **({} if self.directions is None else {"directions": self.directions.tolist()}),

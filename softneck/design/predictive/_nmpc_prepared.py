@@ -13,6 +13,7 @@ from softneck.estimation import AxisPlant
 from softneck.identification import Model
 from softneck.runtime import Block
 
+from ._nmpc_state_runtime import NMPC_NO_BOUND
 from ._prediction import idle_moves
 from ._scale import Scale
 
@@ -161,7 +162,8 @@ def controller_arrays(controller: NonlinearController) -> tuple[Matrix, ...]:
     constants = np.array([
         controller.sample_time, p.horizon, s.window, prepared.ahead, prepared.lead, prepared.keep, p.move_weight,
         p.cocontraction_weight, slack, s.angle_limit or 0.0, s.budget, float(s.converged), coast, settle,
-        len(block.outputs), *(() if scale is None else (*scale.bounds, scale.motors, *scale.outputs)),
+        len(block.outputs), -NMPC_NO_BOUND if s.minimum_tautness is None else s.minimum_tautness, s.tautness_lever,
+        *(() if scale is None else (*scale.bounds, scale.motors, *scale.outputs)),
     ])  # fmt: skip
     return (
         constants, np.array(p.starts, dtype=np.float64), p.T, p.levels, p.weights, prepared.gains, prepared.future,

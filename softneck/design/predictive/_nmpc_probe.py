@@ -1,9 +1,11 @@
-"""What a nonlinear model is near rest: linear plants of one pole, found by steps of its free run."""
+"""What a nonlinear model is near rest: linear plants of one pole, found by steps of its free run; what they ask for."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -25,6 +27,10 @@ _ROWS, _MOST_ROWS = 300, 40_000
 _AT_REST = 1e-3
 # Of the largest answer: an output that moves less does not follow.
 _LEAST = 1e-3
+# Samples of a reference ahead, each a cell of the state.
+_MOST_PREVIEW = 100
+
+S = TypeVar("S", bound=Any)
 
 
 def probed(model: Model, inverse: Matrix, limits: ControllerLimits) -> dict[str, dict[str, float]]:
@@ -81,3 +87,29 @@ def _places(limits: ControllerLimits) -> tuple[Vector, float]:
     motors = len(limits.robot.motors.names)
     low, high = np.split(limits.constants(1.0)[1 : 2 * motors + 1], 2)
     return 0.5 * (low + high), 0.5 * _OF_RANGE * float((high - low).min())
+
+
+def risen(settings: S) -> S:
+    """Return the settings with the filter, or the bandwidth, that their `rise_s` asks for."""
+    if settings.rise_s is None:
+        return settings
+    # Two lags a and b in series rise in ln 9 sqrt(a^2 + b^2), to 8 %.
+    whole, loop = settings.rise_s / math.log(9.0), 1.0 / settings.bandwidth
+    if whole < loop:
+        return replace(settings, rise_s=None, bandwidth=1.0 / whole, reference_time=0.0)
+    return replace(settings, rise_s=None, reference_time=math.sqrt(whole**2 - loop**2))
+
+
+def require_horizon(settings: Any, plants: Sequence[AxisPlant]) -> None:
+    """Raise SettingsError for a horizon that sees no move's effect, or a preview that is more than is remembered."""
+    late, Ts = max(plant.delay for plant in plants), plants[0].sample_time
+    if settings.horizon <= late:
+        raise SettingsError(
+            f"`horizon` {settings.horizon} samples end within the model's dead time of {late}: no move would be seen "
+            f"to do anything. Ask for {late + 10}."
+        )
+    if settings.preview > _MOST_PREVIEW * Ts:
+        raise SettingsError(
+            f"`preview` {settings.preview:g} s is more than the {_MOST_PREVIEW} samples that are remembered, "
+            f"{_MOST_PREVIEW * Ts:g} s; ask for less, the horizon sees {settings.horizon} samples."
+        )

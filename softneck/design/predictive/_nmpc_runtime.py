@@ -31,6 +31,7 @@ from softneck.design.predictive._nmpc_state_runtime import (
     nmpc_ahead,
     nmpc_angle_limit,
     nmpc_asked,
+    nmpc_common,
     nmpc_inputs,
     nmpc_limits,
     nmpc_listen,
@@ -178,7 +179,7 @@ def nmpc_quadratic(
     for kept in range(p.kept):
         row = p.levels[kept]
         # Of now above what is wanted: delta, and nothing of what else moves no output.
-        level = np.dot(row, x.held) - (x.filtered[p.outputs] if kept == 0 else 0.0)
+        level = np.dot(row, x.held) - (nmpc_common(p, x) if kept == 0 else 0.0)
         for b in range(starts.shape[0]):
             for j in range(n):
                 i = n * b + j

@@ -37,9 +37,11 @@ NMPC_CONVERGED = 11
 NMPC_COAST = 12
 NMPC_SETTLE = 13
 NMPC_OUTPUTS = 14  # of the model
+NMPC_TAUT = 15  # least tautness wished for; -NMPC_NO_BOUND for none
+NMPC_LEVER = 16  # motor that one radian of neck takes up [rad/rad]
 # Of another robot behind them: the lowest and highest set-points, and references, in the units of its size; then these
 # units in SI, that of the motors and one for each output.
-NMPC_NUMBERS = 15
+NMPC_NUMBERS = 17
 
 
 def nmpc_slacks(setup: np.ndarray) -> int:
@@ -100,6 +102,24 @@ class NmpcState(StateVector):
         "2 * motors * moves + slacks * (1 + 2 * outputs * moves)", "sign of each row of the QP that is active"
     )
     model = rest("state of the model")
+
+
+def nmpc_common(p: NmpcArrays, x: NmpcState) -> float:
+    """Return the co-contraction that is wanted [rad]: what was asked, or what keeps the loosest tendon taut.
+
+    Where the neck is asked to lean, not where it is measured: no noise goes into the tendons.
+    """
+    wanted = x.filtered[p.outputs]
+    if p.setup[NMPC_TAUT] > -NMPC_NO_BOUND:
+        short = -NMPC_NO_BOUND
+        for j in range(p.motors):
+            lean = 0.0
+            for axis in range(p.outputs):
+                lean += p.T[axis, j] * x.filtered[axis]
+            short = max(short, p.setup[NMPC_TAUT] + p.setup[NMPC_LEVER] * lean - x.held[j])
+        # All motors pull by what the loosest tendon lacks, or let go by what it has to spare.
+        wanted = max(wanted, np.dot(p.T[p.outputs], x.held) + short)
+    return wanted
 
 
 def nmpc_inputs(p: NmpcArrays, inputs: np.ndarray) -> np.ndarray:

@@ -37,7 +37,8 @@ class Problem:
         output_weight: (outputs,) on angle errors [1/rad^2].
         move_weight: on moves of the motors [1/rad^2].
         cocontraction_weight: on co-contraction's error [1/rad^2].
-        slack_weight: on violations of soft limits [1/rad^2].
+        slack_weight: on violations of the angles' soft limits [1/rad^2].
+        tautness_weight: on a lack of tautness [1/rad^2].
         angles: whether angles are limited.
         tautness: (motors, outputs) how much an angle loosens each tendon [rad/rad]; None for no limit.
         disturbance_time: of the output disturbance's rate [s]; None for the plant's own.
@@ -53,6 +54,7 @@ class Problem:
     move_weight: float
     cocontraction_weight: float
     slack_weight: float
+    tautness_weight: float
     angles: bool = False
     tautness: Matrix | None = None
     disturbance_time: float | None = None
@@ -89,9 +91,15 @@ class Problem:
         return self.horizon + self.dead_time
 
     @property
+    def slack_weights(self) -> tuple[float, ...]:
+        """Weight of each slack variable, those of angles first."""
+        angles = (self.slack_weight,) if self.angles else ()
+        return angles if self.tautness is None else (*angles, self.tautness_weight)
+
+    @property
     def slacks(self) -> int:
         """Number of slack variables."""
-        return int(self.angles) + int(self.tautness is not None)
+        return len(self.slack_weights)
 
     @property
     def variables(self) -> int:
@@ -217,7 +225,8 @@ def expression(problem: Problem) -> dict[str, Any]:
     if len(p.idle):
         # What neither tilts nor co-contracts is held at zero, or it would be anywhere.
         cost += p.cocontraction_weight * sum(ca.sumsqr(ca.mtimes(ca.DM(p.idle), motor)) for motor in motors[:-1])
-    cost += p.slack_weight * sum((value**2 + 0.1 * value for value in slack), ca.SX(0))
+    for weight, value in zip(p.slack_weights, slack, strict=True):
+        cost += weight * (value**2 + 0.1 * value)
 
     rows, kinds = _hard_rows(moves, positions, slack, M)
     _soft_rows(p, angles, motors, slack, rows, kinds)

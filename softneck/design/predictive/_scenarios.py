@@ -27,7 +27,7 @@ def sample_pairs(model: Any, least_delay: float) -> list[Pair]:
         return []
     axes = []
     for axis in robot_of(model).outputs.names:
-        plants = [plant.delayed(least_delay) for plant in _plants(model, axis)]
+        plants = [plant.delayed(least_delay) for plant in samples_of(model, axis)]
         axes.append(sorted(plants, key=lambda plant: plant.static_gain))
     count = min(_JUDGES, *(len(plants) for plants in axes))
     picks = [np.linspace(0, len(plants) - 1, count).round().astype(int) for plants in axes]
@@ -53,7 +53,10 @@ def chosen_scenarios(model: Any, nominal: Pair, count: int, least_delay: float, 
     return [Scenario(nominal, _NOMINAL_WEIGHT), *others]
 
 
-def _plants(model: Any, axis: str) -> list[AxisPlant]:
+def samples_of(model: Any, axis: str) -> list[AxisPlant]:
+    """Return the samples of an axis of a family; none of a single model."""
+    if not hasattr(model, "samples"):
+        return []
     if isinstance(model, SizedPlant):
         return list(model.axes[axis].samples)
     return [axis_plant(LinearNeck(pitch=tf, roll=tf), axis) for tf in model.samples(axis)]

@@ -19,7 +19,6 @@ from softneck.core import (
     require_whole,
     to_si,
 )
-from softneck.estimation import axis_plant
 from softneck.estimation._axis import HasTransferFunctions, robot_of
 from softneck.estimation._settings import ORDERS
 from softneck.robot import Robot
@@ -29,25 +28,30 @@ from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
 from ..linear._margins import LOWEST, frequencies
 from ..linear._ports import LIMITS, ControllerLimits, require_limits
-from ..plants._uncertain import UncertainPlant, uncertain_plant
+from ..plants._uncertain import uncertain_plant
 from ._arrays import Tuning, assemble, observer_bandwidth, with_filter, with_gains
 from ._controller import MpcController
 from ._disturbance import MeasuredDisturbance
 from ._lti import system
 from ._mpc_state_runtime import MpcArrays
+from ._predicted import predicted_plants, settings_for, settings_of_robot
 from ._prediction import Problem, matrices
-from ._scale import SizedPlant, limits_of, refuse_what_is_for_necks, sized_plant
+from ._scale import SizedPlant, limits_of, sized_plant
 from ._scenarios import chosen_scenarios, sample_pairs
-from ._tightening import LimitTrial, measurement_bound, tightened
+from ._tightening import tightened, trial_of
 from ._tuning import (
     FULL_TRUST,
     Pair,
+    filter_for_rise,
     guard_samples,
     keeps_bounds,
     move_weight,
     observer_trust,
     radius,
     reference_time,
+    require_rise,
+    require_solvable,
+    rise,
     scaled,
     sensitivity,
     slowness,
@@ -59,10 +63,11 @@ _THINNING = 5
 # Bandwidths that are tried [rad/s], and how often the range is halved: to 2 %.
 _BANDWIDTHS = (1.0, 40.0)
 _HALVINGS = 7
-# Of another robot than the neck, stretched by its slowest pole: the neck's 30 samples of 20 ms, and its 25 without a
-# measurement until the motors hold [s].
-_HORIZON, _COAST = 0.6, 0.5
-_LONGEST = 200
+# Of another robot than the neck, stretched by its slowest pole: the neck's 25 samples without a measurement until the
+# motors hold [s].
+_COAST = 0.5
+# Weight of the default tautness (`benchmarks/leave_one_neck_out.py mpc.tautness_weight`).
+_WISH = 0.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,6 +87,8 @@ class MpcSettings:
         worst_sensitivity: bound on Ms on every sample of a family.
         reference_time: time constant of the reference filter [s]; None for the least with which no plant overshoots by
             more than `overshoot_pct`.
+        rise_s: time [s] in which a step rises from 10 to 90 % on the predicted plant, no limit acting, in the place of
+            `reference_time`: a faster loop is filtered, a slower one gets more bandwidth, its observer less trust.
         overshoot_pct: of a step, without limits, on all plants and gains within `gain_spread`.
         gain_spread: relative spread of the plant's gain that the filter allows for.
         horizon: N, samples predicted behind the dead time.
@@ -101,6 +108,9 @@ class MpcSettings:
         tautness_lever: motor angle that one radian of neck takes up [rad/rad].
         cocontraction_weight: on the error of co-contraction, against that of the tilt's inputs, squared.
         slack_weight: on violations of soft limits, against errors of the angles, squared.
+        tautness_weight: on a lack of tautness [rad of motor], against errors of the angles, squared; None for
+            `slack_weight` where `minimum_tautness` is given, a limit, and 0.3 where it is the default, a wish: a limit
+            turns the noise of the angles into pulls of one sign, and tilts the neck by 0.2 deg.
         tightening: whether soft limits are tightened until they hold in trials with the identified plant and with every
             judged sample of a family.
         measurement_bound: by how much a measured angle may be wrong in these trials [rad], of another robot in the unit
@@ -111,6 +121,9 @@ class MpcSettings:
         least_delay: the dead time is taken as at least this [s]; a fit of free runs hides it in the pole.
         small_move_pole: the design must hold as well where the slowest pole is as fast as this [1/s]; 0 for the
             identified plant alone.
+        taut_pole: an identified neck is predicted as it moves while its tendons are taut: its slowest pole at least as
+            fast as this [1/s], its static gain the largest of its family. 0 for as identified. Slack tendons make fits
+            slow and low. A `LinearNeck` of one's own is taken as it is.
         order: of the loop; "jacobi" adds one sample for the controller and one for the observer.
         observer: whether the loop will have an observer.
         tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
@@ -119,7 +132,8 @@ class MpcSettings:
     bandwidth: float | None = None
     max_sensitivity: float = 1.5
     worst_sensitivity: float = 2.5
-    reference_time: float | None = NeckDefault(0.2)
+    reference_time: float | None = NeckDefault(0.05)
+    rise_s: float | None = None
     overshoot_pct: float = 2.0
     gain_spread: float = 0.2
     horizon: int = NeckCount(30)
@@ -133,20 +147,22 @@ class MpcSettings:
     lead_limit: float = NeckDefault(1.0)
     least_position: float = NeckDefault(-6.0)
     angle_limit: float | None = None
-    minimum_tautness: float | None = None
+    minimum_tautness: float | None = NeckDefault(0.5)
     # Radius of the tendons' attachment over that of the winch: 52 mm / 7.5 mm (lab code; paper, section 3.1).
     tautness_lever: float = NeckDefault(6.93)
     # Light: where tendons must be taut, co-contraction gives way; at 1 the angles gave way by a quarter of a degree.
     cocontraction_weight: float = 0.05
     slack_weight: float = 1e3
+    tautness_weight: float | None = None
     tightening: bool = False
     # The observer of the 3DM-GX5-10 on the virtual neck is wrong by up to 0.34 deg near a limit, by 0.1 deg at rest.
     measurement_bound: float = NeckDefault(math.radians(0.35))
     disturbance_time: float | None = None
     budget: int = 100
     # The paper's own dead time and pole (Eq. 31: 0.08 s, 5.293 1/s).
-    least_delay: float = NeckDefault(0.08)
+    least_delay: float = NeckDefault(0.1)
     small_move_pole: float = NeckDefault(5.293)
+    taut_pole: float = NeckDefault(9.0)
     order: str = "sequential"
     observer: bool = True
     tendon_angles: tuple[float, float, float] = tuple(TENDON_ANGLES.tolist())
@@ -158,6 +174,7 @@ class MpcSettings:
         require_between("worst_sensitivity", self.worst_sensitivity, self.max_sensitivity, 10.0)
         if self.reference_time is not None:
             require_between("reference_time", self.reference_time, 0.0, 1e6, "s")
+        require_rise(self.rise_s, self.reference_time)
         require_between("overshoot_pct", self.overshoot_pct, 0.1, 100.0, "%")
         require_between("gain_spread", self.gain_spread, 0.0, 0.9)
         require_whole("horizon", self.horizon, 1, 200)
@@ -172,12 +189,14 @@ class MpcSettings:
             require_finite("minimum_tautness", self.minimum_tautness)
         if self.disturbance_time is not None:
             require_positive("disturbance_time", self.disturbance_time, "s")
-        for name in ("cocontraction_weight", "slack_weight"):
-            require_positive(name, getattr(self, name))
+        for name in ("cocontraction_weight", "slack_weight", "tautness_weight"):
+            if getattr(self, name) is not None:
+                require_positive(name, getattr(self, name))
         require_between("measurement_bound", self.measurement_bound, 0.0, 1e12)
         require_whole("budget", self.budget, 1, 10_000)
         require_between("least_delay", self.least_delay, 0.0, 1.0, "s")
-        require_between("small_move_pole", self.small_move_pole, 0.0, 1000.0, "1/s")
+        for name in ("small_move_pole", "taut_pole"):
+            require_between(name, getattr(self, name), 0.0, 1000.0, "1/s")
         require_one_of("order", self.order, ORDERS)
 
     @property
@@ -197,42 +216,27 @@ class MpcSettings:
             SettingsError: a model that is not linear, discrete and stable, limits that contradict each other, or a
                 robustness that nothing keeps.
         """
-        robot = robot_of(model)
-        limits = limits_of(self, robot)
+        robot, settings = robot_of(model), settings_for(self, model)
+        limits = limits_of(settings, robot)
         if robot.is_neck:
-            return self._designed(model, limits)
+            return settings._designed(model, limits)
         uncertain = uncertain_plant(model)
         T = redefinition_of(np.asarray(uncertain.weights), uncertain.names)
-        return self._of_robot(uncertain)._designed(sized_plant(uncertain, limits, T), limits)
-
-    def _of_robot(self, plant: UncertainPlant) -> MpcSettings:
-        """Return the settings for another robot: seconds stretched by its slowest pole, nothing that is known of necks.
-
-        Raises:
-            SettingsError: what is for necks only.
-        """
-        refuse_what_is_for_necks(self, plant.robot)
-        stretch = max(axis.nominal.stretch for axis in plant.axes.values())
-        horizon = min(max(3, round(_HORIZON * stretch / plant.sample_time)), _LONGEST)
-        others = {"least_delay": 0.0, "small_move_pole": 0.0, "horizon": horizon}
-        if self.reference_time is not None:
-            others["reference_time"] = stretch * self.reference_time
-        changed = {k: v for k, v in others.items() if isinstance(getattr(self, k), NeckDefault | NeckCount)}
-        if isinstance(self.moves, NeckCount):
-            changed["moves"] = min(int(self.moves), int(changed.get("horizon", self.horizon)))
-        return replace(self, **changed)
+        return settings_of_robot(settings, uncertain)._designed(sized_plant(uncertain, limits, T), limits)
 
     def _designed(self, model: HasTransferFunctions, limits: ControllerLimits) -> MpcController:
-        nominal = self._nominal(model)
+        nominal = predicted_plants(self, model)
         Ts = nominal[0].sample_time
         samples = sample_pairs(model, self.least_delay)
         bandwidth = self._fastest(model, nominal, samples) if self.bandwidth is None else self.bandwidth
+        if self.rise_s is not None and self.bandwidth is None:
+            bandwidth = self._risen(model, nominal, bandwidth)
         arrays, found = self._tuned(self._arrays(model, bandwidth), nominal, samples)
         found["bandwidth_rad_s"] = bandwidth
         per_motor = to_si(limits.robot.motors.unit)[0]
         if self.tightening:
             plants = [self._delayed(pair) for pair in [*self._families(nominal), *samples]]
-            arrays, found["back_off_rad"] = tightened(arrays, plants, self._trial(model, limits))
+            arrays, found["back_off_rad"] = tightened(arrays, plants, trial_of(self, limits, self._lever(model)))
         return MpcController(
             sample_time=Ts,
             arrays=arrays,
@@ -262,8 +266,28 @@ class MpcSettings:
             low, high = (middle, high) if keeps(middle) else (low, middle)
         return low
 
+    def _risen(self, model: HasTransferFunctions, nominal: Pair, least: float) -> float:
+        """Return the least bandwidth from `least` on with which a step rises as fast as asked without a filter.
+
+        Beyond `least` the observer believes less of what is measured, so that the loop stays as robust.
+        """
+
+        def rises(bandwidth: float) -> bool:
+            unfiltered = with_filter(self._arrays(model, bandwidth), 0.0)
+            return rise(unfiltered, nominal, self.extra_delay) <= self.rise_s  # type: ignore[operator]
+
+        low, high = least, _BANDWIDTHS[1] / slowness(nominal)
+        if rises(low):
+            return low
+        if not rises(high):
+            raise SettingsError(f"`rise_s` {self.rise_s:g} is faster than any plan of this plant rises; ask for more.")
+        for _ in range(_HALVINGS):
+            middle = math.sqrt(low * high)
+            low, high = (low, middle) if rises(middle) else (middle, high)
+        return high
+
     def _arrays(self, model: HasTransferFunctions, bandwidth: float) -> tuple[Any, ...]:
-        problem = self.problem(model, bandwidth)
+        problem = self._problem(model, bandwidth)
         Ts = problem.scenarios[0].axes[0].sample_time
         tuning = Tuning(
             trust=FULL_TRUST, reference_time=self.reference_time or 0.0, preview=round(self.preview / Ts),
@@ -277,13 +301,17 @@ class MpcSettings:
 
     def problem(self, model: HasTransferFunctions, bandwidth: float) -> Problem:
         """Return what is asked with that bandwidth [rad/s], in numbers, before observer and filter are tuned."""
-        nominal = self._nominal(model)
+        return settings_for(self, model)._problem(model, bandwidth)
+
+    def _problem(self, model: HasTransferFunctions, bandwidth: float) -> Problem:
+        nominal = predicted_plants(self, model)
         scenarios = chosen_scenarios(model, self._delayed(nominal), self.scenarios, self.least_delay, self.extra_delay)
         if isinstance(model, SizedPlant):
             T, inverse = model.redefinition
         else:
             T = redefinition_matrix(np.array(self.tendon_angles))
             inverse = np.linalg.inv(T)
+        require_solvable(self.moves, T.shape[1])
         weights: Vector = np.array([1.0 / plant.static_gain**2 for plant in nominal])
         # For symmetric tendons |P|^2 = 2/3 (theta^2 + phi^2) + 3 delta^2: the weight on an input becomes one on motors.
         on_input = max(move_weight(plant, bandwidth) for plant in nominal)
@@ -297,11 +325,18 @@ class MpcSettings:
             move_weight=1.5 * on_input,
             cocontraction_weight=self.cocontraction_weight,
             slack_weight=self.slack_weight * float(weights.max()),
+            tautness_weight=self._tautness_weight * float(weights.max()),
             angles=self.angle_limit is not None,
             tautness=None if self.minimum_tautness is None else self._lever(model),
             disturbance_time=self.disturbance_time,
             guard=guard_samples(bandwidth, nominal[0].sample_time),
         )
+
+    @property
+    def _tautness_weight(self) -> float:
+        if self.tautness_weight is not None:
+            return self.tautness_weight
+        return _WISH if isinstance(self.minimum_tautness, NeckDefault) else self.slack_weight
 
     def _lever(self, model: HasTransferFunctions) -> Matrix:
         """Return (motors, outputs) how much an angle loosens each tendon."""
@@ -313,18 +348,6 @@ class MpcSettings:
         """Return (k, outputs + 1) gains and time constant of each measured disturbance."""
         rows = [[*item.on(robot), item.time] for item in self.disturbances]
         return np.array(rows).reshape(-1, len(robot.outputs.names) + 1)
-
-    def _trial(self, model: HasTransferFunctions, limits: ControllerLimits) -> LimitTrial:
-        """Return what tightening is tried with."""
-        motors = to_si(limits.robot.motors.unit)[0]
-        return LimitTrial(
-            parameters=tuple(getattr(limits, name) for name in LIMITS[:4]),
-            angle_limit=self.angle_limit,
-            minimum_tautness=None if self.minimum_tautness is None else motors * self.minimum_tautness,
-            lever=self._lever(model),
-            measurement_bound=measurement_bound(self.measurement_bound, limits.robot),
-            neck=limits.robot.is_neck,
-        )
 
     def _families(self, nominal: Pair) -> list[Pair]:
         """Return what the neck may be: as identified, and faster."""
@@ -340,15 +363,6 @@ class MpcSettings:
     def _frequencies(self, nominal: Pair) -> Vector:
         return frequencies(nominal[0].sample_time, lowest=LOWEST / slowness(nominal))[::_THINNING]
 
-    def _nominal(self, model: HasTransferFunctions) -> Pair:
-        names = robot_of(model).outputs.names
-        plants = tuple(axis_plant(model, axis).delayed(self.least_delay) for axis in names)
-        times = [plant.sample_time for plant in plants]
-        if not all(math.isclose(time, times[0], rel_tol=1e-9) for time in times):
-            each = " and ".join(f"{time:g} s" for time in times)
-            raise SettingsError(f"{' and '.join(names)} have different sample times, {each}.")
-        return plants
-
     def _delayed(self, pair: Pair) -> Pair:
         return tuple(replace(plant, delay=plant.delay + self.extra_delay) for plant in pair)
 
@@ -360,7 +374,9 @@ class MpcSettings:
         bounds = self._bounds(nominal, samples)
         arrays = with_gains(arrays, observer_trust(arrays, bounds, self.extra_delay, w))
         time = self.reference_time
-        if time is None:
+        if self.rise_s is not None:
+            time = filter_for_rise(arrays, nominal, self.extra_delay, self.rise_s)
+        elif time is None:
             spread = [scaled(pair, 1.0 + s) for pair in families for s in (-self.gain_spread, 0.0, self.gain_spread)]
             time = reference_time(
                 arrays, [*spread, *samples], self.extra_delay, overshoot=self.overshoot_pct / 100.0

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from softneck.robot import Robot
 from softneck.robot._neck_default import NeckDefault
 from softneck.runtime import load_runtime
 
+from ..linear._ports import LIMITS, ControllerLimits
 from . import _mpc_state_runtime as rt
 from ._arrays import with_back_off
 from ._scale import runtime_of, units_of
@@ -60,6 +62,19 @@ class LimitTrial:
     lever: Matrix
     measurement_bound: float
     neck: bool
+
+
+def trial_of(settings: Any, limits: ControllerLimits, lever: Matrix) -> LimitTrial:
+    """Return what the soft limits of `MpcSettings` are tried with."""
+    taut, motors = settings.minimum_tautness, to_si(limits.robot.motors.unit)[0]
+    return LimitTrial(
+        parameters=tuple(getattr(limits, name) for name in LIMITS[:4]),
+        angle_limit=settings.angle_limit,
+        minimum_tautness=None if taut is None else motors * taut,
+        lever=lever,
+        measurement_bound=measurement_bound(settings.measurement_bound, limits.robot),
+        neck=limits.robot.is_neck,
+    )
 
 
 def measurement_bound(given: float, robot: Robot) -> float:

@@ -7,8 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, Vector
+from softneck.core import Matrix, SettingsError, Vector, require_between
 from softneck.estimation import AxisPlant
+from softneck.robot._neck_default import NeckDefault
 
 from ._arrays import with_filter, with_gains
 from ._lti import system
@@ -24,6 +25,8 @@ _HALVINGS = 18
 # A step response is judged over this long [s].
 _HORIZON = 4.0
 _SLOWEST_FILTER = 2.0
+# With 180 a sample of 20 ms was over before half of the answers came, with 90 none of them took a tenth of it.
+_MOST_UNKNOWNS = 120
 # Samples of the last hold: ten moves over thirty samples, dense where they matter.
 _SPACING = (0, 1, 2, 3, 4, 6, 8, 11, 15, 20)
 
@@ -191,6 +194,43 @@ def _peak(parts: tuple[Matrix, Matrix, Matrix, Matrix], pair: Pair, extra_delay:
     return peak
 
 
+def rise(arrays: tuple[Matrix, ...], pair: Pair, extra_delay: int) -> float:
+    """Return in what time [s] a step of each reference alone rises from 10 to 90 %, no limit acting; of the slowest
+    axis, infinite where one does not rise."""
+    parts, m, Ts = system(arrays), len(pair), pair[0].sample_time
+    A, B, C = closed(parts, pair, extra_delay)
+    rows = math.ceil(_HORIZON * slowness(pair) / Ts)
+    x, y = np.zeros((A.shape[0], m)), np.zeros((rows, m))
+    for k in range(rows):
+        x = A @ x + B
+        y[k] = np.diag(C @ x)
+    return max(_crossed(path, 0.9) - _crossed(path, 0.1) for path in y.T) * Ts
+
+
+def _crossed(path: Vector, level: float) -> float:
+    """Return where a response first reaches a level [samples], between samples."""
+    above = np.flatnonzero(path >= level)
+    if not above.size:
+        return math.inf
+    k = int(above[0])
+    before = float(path[k - 1]) if k else 0.0
+    return k - (float(path[k]) - level) / (float(path[k]) - before)
+
+
+def filter_for_rise(arrays: tuple[Matrix, ...], pair: Pair, extra_delay: int, asked: float) -> float:
+    """Return the time constant [s] of the reference filter with which the loop rises in `asked` [s]; 0 where it does
+    not even without."""
+    low, high = 0.0, asked
+    if rise(with_filter(arrays, 0.0), pair, extra_delay) >= asked:
+        return 0.0
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        # A filter that answers so late that nothing rises within what is looked at is too slow as well.
+        quick = rise(with_filter(arrays, middle), pair, extra_delay) < asked
+        low, high = (middle, high) if quick else (low, middle)
+    return low
+
+
 def slowness(pair: Pair) -> float:
     """Return by how much the slowest axis is slower than a neck's."""
     return max(plant.stretch for plant in pair)
@@ -199,6 +239,24 @@ def slowness(pair: Pair) -> float:
 def guard_samples(bandwidth: float, sample_time: float) -> int:
     """Return after how many samples soft limits are looked at: the time constant of the loop."""
     return max(1, round(1.0 / (bandwidth * sample_time)))
+
+
+def require_solvable(moves: int, motors: int) -> None:
+    """Raise SettingsError where a plan has more unknowns than the solver answers within a sample."""
+    if moves * motors > _MOST_UNKNOWNS:
+        raise SettingsError(
+            f"`moves` {moves} of {motors} motors are {moves * motors} unknowns, and the solver takes at most "
+            f"{_MOST_UNKNOWNS} within a sample; ask for at most {_MOST_UNKNOWNS // motors} moves, `horizon` may stay."
+        )
+
+
+def require_rise(asked: float | None, filter_time: float | None) -> None:
+    """Raise SettingsError for a rise time [s] that is none, or beside a reference filter that is given as well."""
+    if asked is None:
+        return
+    require_between("rise_s", asked, 0.001, 1e6, "s")
+    if filter_time is not None and not isinstance(filter_time, NeckDefault):
+        raise SettingsError("`rise_s` sets the reference filter; give it or `reference_time`, not both.")
 
 
 def spaced_starts(horizon: int, moves: int) -> tuple[int, ...]:

@@ -24,6 +24,8 @@ METHODS = ("auto", "slycot", "riccati")
 _ABOVE = 1.05
 # |T_zw| found on a grid may exceed gamma by rounding of the synthesis, not more.
 _SLACK = 1e-3
+# Of a zero's place: rounding of an eigenvalue.
+_BORDER = 1e-9
 # A weight below this at infinity counts as strictly proper.
 _LEAST_DIRECT = 1e-9
 
@@ -162,7 +164,8 @@ def ncf_parts(G: Any, W: Any, *, above: float = _ABOVE) -> tuple[Synthesis, Any]
     weight: Any = control.StateSpace([], [], [], np.eye(G.ninputs), 0) if W is None else control.ss(W)
     if weight.ninputs == weight.noutputs == 1:
         weight = repeated(weight, G.ninputs)
-    if (weight.noutputs, weight.ninputs) != (G.ninputs, G.ninputs):
+    # As many inputs as outputs of the plant: what `loopsyn` makes of a plant that has more inputs.
+    if weight.noutputs != G.ninputs or weight.ninputs not in (G.ninputs, G.noutputs):
         raise SettingsError(
             f"W must be scalar or have {G.ninputs} inputs and outputs, as the plant has inputs; "
             f"got {weight.ninputs} and {weight.noutputs}."
@@ -196,38 +199,75 @@ def ncf_parts(G: Any, W: Any, *, above: float = _ABOVE) -> tuple[Synthesis, Any]
 def loopsyn(G: Any, Gd: Any, *, above: float = _ABOVE) -> Synthesis:
     """Return the controller whose loop G K follows `Gd` to within gamma, above and below (Glover and McFarlane).
 
-    W = Gd/G needs the plant's inverse: its stable, minimum-phase part is inverted, its delay is left alone.
+    W = Gd/G needs the plant's inverse: its stable, minimum-phase part is inverted, its delay is left alone. A plant of
+    several outputs is inverted whole, each output behind its own dead time or roll-off, so that each follows `Gd`.
+
+    Args:
+        G: plant of at least as many inputs as outputs.
+        Gd: the loop that is wanted, scalar (the same for each output) or from each output of G to each.
+        above: factor above the least gamma.
 
     Raises:
-        SettingsError: a plant of several inputs or outputs, or with zeros outside the stability border; shape with
-            `ncfsyn` there.
+        SettingsError: fewer inputs than outputs, or zeros outside the stability border; shape with `ncfsyn` there.
     """
     import control
 
     dt = _dt_of(G)
-    if (G.ninputs, G.noutputs) != (1, 1):
+    plant: Any = control.ss(G)
+    if plant.ninputs < plant.noutputs:
         raise SettingsError(
-            f"`loopsyn` inverts plants of one input and one output; got {G.ninputs} and {G.noutputs}. "
+            f"`loopsyn` inverts plants of at least as many inputs as outputs; got {G.ninputs} and {G.noutputs}. "
             "Use `ncfsyn` with a weight of your own."
         )
-    zeros: Any = np.asarray(control.zeros(G))
-    outside = zeros[np.abs(zeros) >= 1.0] if dt else zeros[zeros.real >= 0.0]
+    target: Any = to_discrete(to_continuous(Gd), dt) if dt and control.isctime(Gd) else control.ss(Gd)
+    if target.ninputs == target.noutputs == 1:
+        target = repeated(target, plant.noutputs)
+    if (target.ninputs, target.noutputs) != (plant.noutputs, plant.noutputs):
+        raise SettingsError(
+            f"Gd must be scalar or have {plant.noutputs} inputs and outputs, as the plant has outputs; "
+            f"got {target.ninputs} and {target.noutputs}."
+        )
+    return ncfsyn(G, _inverse(plant, dt) * target, above=above)
+
+
+def _inverse(G: Any, dt: float) -> Any:
+    """Return the inverse of G but for each output's delay of r samples, or lags in the place of its roll-off.
+
+    With (z^r) or (1 + s/f)^r before each output G has a direct way and an inverse (Silverman 1969, IEEE TAC 14:270).
+    """
+    import control
+
+    A, B, C = (np.asarray(part, dtype=np.float64) for part in (G.A, G.B, G.C))
+    poles = np.abs(np.linalg.eigvals(A))
+    fast = 1e3 * max(1.0, float(poles.max(initial=1.0)))
+    rise = A if dt else np.eye(A.shape[0]) + A / fast
+    rows, direct = [], []
+    for c, d in zip(C, np.asarray(G.D, dtype=np.float64), strict=True):
+        row, seen, scale = c, d, 1.0
+        for _ in range(A.shape[0] + 1):
+            if np.abs(seen).max() > _LEAST_DIRECT * np.abs(c).max() * np.abs(B).max() * scale:
+                break
+            # Once more before the output: A-row, and what of the input now shows at once.
+            row, seen = row @ rise, (row @ B if dt else row @ B / fast)
+            scale = scale if dt else scale / fast
+        rows.append(row)
+        direct.append(seen)
+    D = np.array(direct)
+    if np.linalg.matrix_rank(D) < D.shape[0]:
+        raise SettingsError(
+            "the plant's outputs are not moved apart from each other by the fastest of its inputs, so that it has no "
+            "inverse with diagonal delays; use `ncfsyn` with a weight of your own."
+        )
+    right = np.linalg.pinv(D)
+    inner = A - B @ right @ np.array(rows)
+    zeros = np.linalg.eigvals(inner)
+    outside = zeros[np.abs(zeros) >= 1.0 - _BORDER] if dt else zeros[zeros.real >= -_BORDER]
     if outside.size:
         raise SettingsError(
             f"the plant has a zero at {_number(outside[0])} outside the stability border, whose inverse is not stable; "
             "use `ncfsyn` with a weight of your own."
         )
-    tf: Any = control.ss2tf(G) if isinstance(G, control.StateSpace) else G
-    num, den = (np.trim_zeros(np.asarray(part[0][0]), "f") for part in (tf.num, tf.den))
-    if dt:
-        den = np.trim_zeros(den, "b")
-        inverse = control.TransferFunction(den, np.concatenate([num, np.zeros(den.size - num.size)]), dt)
-    else:
-        fast = 1e3 * max(1.0, float(np.abs(np.roots(den)).max(initial=1.0)))
-        lag = np.poly(np.full(den.size - num.size, -fast)) * fast ** (num.size - den.size)
-        inverse = control.TransferFunction(den, np.convolve(num, lag))
-    target: Any = to_discrete(to_continuous(Gd), dt) if dt and control.isctime(Gd) else Gd
-    return ncfsyn(G, control.minreal(control.ss2tf(control.ss(target)) * inverse, verbose=False), above=above)
+    return control.StateSpace(inner, B @ right, -right @ np.array(rows), right, dt)
 
 
 def _augmented(G: Any, weights: list[Any]) -> control.StateSpace:

@@ -1,0 +1,201 @@
+"""Print how fast and how closely `mpc` with its defaults follows on necks that nobody tuned to.
+
+`python benchmarks/mpc_following.py [--necks NECK...] [--set KEY=VALUE...] [--seed N]`: designed on the family of 80 s
+of Eq. 22 at 0, 0.5 and 1 kg, with the observer's defaults, sequential order, judged on the true angle. Steps of 10 deg
+of pitch and of roll; a circle of 12 deg at 1.2 rad/s, rms of the worse axis after the first turn, without and with
+preview. `python benchmarks/leave_one_neck_out.py mpc.taut_pole` (and the other `mpc.` settings) chooses by the same
+runs. Families are kept in `build/mpc_following`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softneck.core import Vector, load
+from softneck.design import MpcController, MpcSettings
+from softneck.estimation import KalmanSettings
+from softneck.identification import Family, FamilySettings, OutputError
+from softneck.loop import BlockPart, Loop, LoopResult, Reference, StepReference, metrics, run_loop
+from softneck.loop._reference_parts import AheadReference
+from softneck.plant import NeckParameters, VirtualNeck
+from softneck.plant import record as record_own
+from softneck.runtime import Block
+from softneck.signals import Excitation, Recording, signal
+from tests.foreign_necks.necks import CHOOSING, ForeignNeck, record
+
+OUT = Path("build/mpc_following")
+OURS = ("paper", "rough", "lab")
+AXES = ("pitch", "roll")
+PAYLOADS = (0.0, 0.5, 1.0)
+JUDGED = (0.0, 1.0)
+STEP, AT, STEP_S = math.radians(10.0), 2.0, 8.0
+TILT, TURN, CIRCLE_S = math.radians(12.0), 1.2, 20.0
+# Three seconds of rise, then one turn.
+SETTLED = 3.0 + 2.0 * math.pi / TURN
+PREVIEW = 0.6
+# An overshoot of so much counts as much as twice the error [%].
+_COSTLY = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Specimen:
+    """A neck to be followed on.
+
+    Attributes:
+        block: the neck as a plant, from the seed of its noise.
+        family: what its recordings tell.
+        observer: of the loop.
+    """
+
+    block: Callable[[int], Block]
+    family: Family
+    observer: Block
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Followed:
+    """What a controller did under one payload.
+
+    Attributes:
+        overshoot, rise, steady: the worst of the steps of both axes [%], [s], [deg].
+        step: rms errors of both steps, from the step on [deg].
+        circle, ahead: rms errors of the circle without and with preview [deg].
+    """
+
+    overshoot: float
+    rise: float
+    steady: float
+    step: float
+    circle: float
+    ahead: float
+
+    @property
+    def score(self) -> float:
+        """Geometric mean of the errors; overshoot counts on top."""
+        return (self.step * self.circle * self.ahead) ** (1.0 / 3.0) * (1.0 + self.overshoot / _COSTLY)
+
+
+def circle(time: float, /) -> tuple[float, float, float]:
+    """Return pitch, roll and co-contraction of the circle at `time` [s]."""
+    tilt = TILT * min(1.0, time / 3.0)
+    return tilt * math.cos(TURN * time), tilt * math.sin(TURN * time), 0.0
+
+
+def specimen(name: str, recorded: Callable[[Excitation, int, float], Recording], block: Callable[[int], Block]
+             ) -> Specimen:  # fmt: skip
+    """Return a neck with all that is known of it, from a function of signal, seed and payload [kg]; kept."""
+    files = [OUT / f"{name}-{what}.npz" for what in ("family", "oe")]
+    if not all(file.exists() for file in files):
+        OUT.mkdir(parents=True, exist_ok=True)
+        excitation = signal("eq22", duration=80.0)
+        runs = [recorded(excitation, 6 + i, kg) for i, kg in enumerate(PAYLOADS)]
+        for file, found in zip(files, (FamilySettings().fit(runs), OutputError().fit(runs[0])), strict=True):
+            found.save(file, force=True)
+    family, model = (load(file) for file in files)
+    return Specimen(block, family, KalmanSettings().design(model).block())
+
+
+def neck(name: str, number: int = 0) -> Specimen:
+    """Return one of our necks or of the foreign ones, its specimen `number`."""
+    if name in OURS:
+        parameters = NeckParameters.preset(name)
+        if number:
+            parameters = parameters.sample(np.random.default_rng(number))
+        own = VirtualNeck(parameters)
+        return specimen(
+            f"{name}-{number}",
+            lambda excitation, seed, kg: record_own(excitation, own, seed=seed, payload=kg),
+            lambda seed: own.block(noise_seed=seed),
+        )
+    foreign = ForeignNeck(name=name, seed=number)
+    return specimen(
+        f"{name}-{number}",
+        lambda excitation, seed, kg: record(excitation, foreign, seed=seed, payload=kg),
+        lambda seed: foreign.block(noise_seed=seed),
+    )
+
+
+def run(on: Specimen, controller: MpcController, reference: Reference, duration: float, payload: float,
+        seed: int = 0) -> LoopResult:  # fmt: skip
+    """Close the loop once."""
+    told = AheadReference(reference, controller.preview) if controller.preview > 0.0 else reference
+    return run_loop(
+        Loop(
+            plant=BlockPart(on.block(seed)), controller=BlockPart(controller.block()),
+            observer=BlockPart(on.observer), reference=told, duration=duration, plant_inputs={"payload": payload},
+        )
+    )  # fmt: skip
+
+
+def followed(on: Specimen, settings: MpcSettings, payload: float, seed: int = 0) -> Followed:
+    """Return what the controller of these settings does under a payload [kg]."""
+    plain = settings.design(on.family)
+    same = replace(settings, preview=PREVIEW, bandwidth=plain.design["bandwidth_rad_s"])
+    stepped = [_step(on, plain, axis, payload, seed) for axis in AXES]
+    around = [rms_deg(run(on, item, circle, CIRCLE_S, payload, seed), circle, SETTLED) for item in
+              (plain, same.design(on.family))]  # fmt: skip
+    overshoot, rise, steady, errors = np.array(stepped).T
+    return Followed(
+        overshoot=float(overshoot.max()), rise=float(rise.max()), steady=float(steady.max()),
+        step=float(np.sqrt(np.mean(errors**2))), circle=around[0], ahead=around[1],
+    )  # fmt: skip
+
+
+def _step(on: Specimen, controller: MpcController, axis: str, payload: float, seed: int) -> list[float]:
+    """Return overshoot [%], rise [s], steady rms and rms error from the step on [deg]."""
+    reference = StepReference(**{axis: STEP}, at=AT)
+    result = run(on, controller, reference, AT + STEP_S, payload, seed)
+    found = metrics(result)
+    steady = max(float(found[each]["steady_rms_deg"] or 0.0) for each in AXES)
+    values = [found[axis][name] for name in ("overshoot_pct", "rise_s")]
+    # A step that never rises took all the time there was.
+    return [float(values[0] or 0.0), float(STEP_S if values[1] is None else values[1]), steady,
+            rms_deg(result, reference, AT)]  # fmt: skip
+
+
+def rms_deg(result: LoopResult, reference: Reference, since: float) -> float:
+    """Return the rms error of the worse axis from a time [s] on [deg]."""
+    late = result.time >= since
+    wanted = np.array([reference(t)[:2] for t in result.time[late]])
+    errors = np.column_stack([result.angle(axis) for axis in AXES])[late] - wanted
+    return float(np.degrees(np.sqrt(np.mean(errors**2, axis=0)).max()))
+
+
+def scores(on: Specimen, candidates: list[Any]) -> Vector:
+    """Return the mean score of each candidate's settings over the payloads: less is better."""
+    return np.array([
+        np.mean([followed(on, settings, payload).score for payload in JUDGED]) for settings in candidates
+    ])  # fmt: skip
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    everywhere = (*CHOOSING, *OURS)
+    parser.add_argument("--necks", nargs="+", choices=everywhere, default=everywhere, help=", ".join(everywhere))
+    parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="settings other than the defaults")
+    parser.add_argument("--seed", type=int, default=0, help="of the sensor's noise (0)")
+    options = parser.parse_args()
+    changed = {
+        key: None if value == "None" else float(value) for key, value in (item.split("=") for item in options.set)
+    }
+    settings = MpcSettings(**changed)  # type: ignore[arg-type]
+    print("| neck | kg | overshoot [%] | rise [s] | steady rms [deg] | circle [deg] | with preview [deg] |")
+    print("|---|---|---|---|---|---|---|")
+    for name in options.necks:
+        on = neck(name)
+        for payload in JUDGED:
+            f = followed(on, settings, payload, options.seed)
+            print(f"| `{name}` | {payload:g} | {f.overshoot:.0f} | {f.rise:.2f} | {f.steady:.2f} | {f.circle:.1f} | "
+                  f"{f.ahead:.1f} |", flush=True)  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,101 @@
+"""The plant that is predicted, and the defaults that it has: of an identified neck, of one's own, of another robot."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, Protocol, TypeVar
+
+from softneck.core import SettingsError
+from softneck.estimation import AxisPlant, axis_plant
+from softneck.estimation._axis import HasTransferFunctions, robot_of
+from softneck.robot._neck_default import NeckCount, NeckDefault
+
+from ..plants._uncertain import UncertainPlant
+from ._scale import refuse_what_is_for_necks
+from ._scenarios import samples_of
+from ._tuning import Pair, scaled
+
+# What stands for the defaults of an identified neck where the plant is one's own or another robot's.
+_BELIEVED: dict[str, Any] = {
+    # The paper's own dead time (Eq. 31).
+    "least_delay": NeckDefault(0.08), "taut_pole": 0.0, "reference_time": NeckDefault(0.2), "minimum_tautness": None,
+}  # fmt: skip
+# Of another robot than the neck, stretched by its slowest pole: the neck's 30 samples of 20 ms [s].
+_HORIZON = 0.6
+_LONGEST = 200
+
+
+class _Settings(Protocol):
+    """What is read of `MpcSettings` here."""
+
+    @property
+    def least_delay(self) -> float: ...
+    @property
+    def taut_pole(self) -> float: ...
+
+
+S = TypeVar("S", bound=Any)
+
+
+def identified(model: Any) -> bool:
+    """Return whether a model comes from recordings; another is what somebody says it is."""
+    return hasattr(model, "findings")
+
+
+def settings_for(settings: S, model: HasTransferFunctions) -> S:
+    """Return the settings for what was identified of a neck, or for any other plant."""
+    if robot_of(model).is_neck and identified(model):
+        # What is tightened until it holds is a limit; a wish is none.
+        return _with(settings, {"minimum_tautness": None}) if settings.tightening else settings
+    return _with(settings, _BELIEVED)
+
+
+def settings_of_robot(settings: S, plant: UncertainPlant) -> S:
+    """Return the settings for another robot: seconds stretched by its slowest pole, nothing that is known of necks.
+
+    Raises:
+        SettingsError: what is for necks only.
+    """
+    refuse_what_is_for_necks(settings, plant.robot)
+    stretch = max(axis.nominal.stretch for axis in plant.axes.values())
+    horizon = min(max(3, round(_HORIZON * stretch / plant.sample_time)), _LONGEST)
+    others = {"least_delay": 0.0, "small_move_pole": 0.0, "horizon": horizon}
+    if settings.reference_time is not None:
+        others["reference_time"] = stretch * settings.reference_time
+    if isinstance(settings.moves, NeckCount):
+        length = horizon if isinstance(settings.horizon, NeckCount) else settings.horizon
+        others["moves"] = min(int(settings.moves), length)
+    return _with(settings, others)
+
+
+def _with(settings: S, others: Mapping[str, Any]) -> S:
+    """Return the settings with others in the place of a neck's defaults that nobody gave."""
+    changed = {k: v for k, v in others.items() if isinstance(getattr(settings, k), NeckDefault | NeckCount)}
+    return replace(settings, **changed)
+
+
+def predicted_plants(settings: _Settings, model: HasTransferFunctions) -> Pair:
+    """Return the plant of each output that is predicted.
+
+    Raises:
+        SettingsError: different sample times.
+    """
+    names = robot_of(model).outputs.names
+    plants = tuple(_predicted(settings, model, axis) for axis in names)
+    times = [plant.sample_time for plant in plants]
+    if not all(math.isclose(time, times[0], rel_tol=1e-9) for time in times):
+        each = " and ".join(f"{time:g} s" for time in times)
+        raise SettingsError(f"{' and '.join(names)} have different sample times, {each}.")
+    return plants
+
+
+def _predicted(settings: _Settings, model: HasTransferFunctions, axis: str) -> AxisPlant:
+    plant = axis_plant(model, axis).delayed(settings.least_delay)
+    if settings.taut_pole == 0.0:
+        return plant
+    # Recordings in which tendons hang say less than a taut neck does, none says more.
+    ratios = [abs(sample.static_gain / plant.static_gain) for sample in samples_of(model, axis)]
+    (taut,) = scaled((plant.faster(settings.taut_pole),), max([1.0, *ratios]))
+    return taut
