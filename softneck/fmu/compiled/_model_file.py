@@ -18,7 +18,7 @@ from softneck.runtime._bundle import split_members
 from .translate._kinds import is_known, module_of, ranks_of
 
 _MAGIC = b"SNMODEL\0"
-FORMAT = 1
+FORMAT = 2
 _MARK = 0x01020304
 _HEAD = 32
 _BOOLEAN, _MISSING, _INTEGER = 1, 2, 4
@@ -66,8 +66,10 @@ def node_of(runtime: str, arrays: tuple[Matrix, ...]) -> Node:
     return Node(runs, arrays[:own], tuple(members))
 
 
-def model_bytes(block: Block, name: str, guid: str) -> bytes:
+def model_bytes(block: Block, name: str, guid: str, *, ahead: int = 0) -> bytes:
     """Return the file of `block`; `guid` is what hosts hand over to show that description and model belong together.
+
+    The last `ahead` outputs are the first ones as they will be at the next sample.
 
     Raises:
         SettingsError: the library does not know the block's kind.
@@ -78,7 +80,7 @@ def model_bytes(block: Block, name: str, guid: str) -> bytes:
     writer.plain("<d", float(block.sample_time))
     ports = (block.inputs, block.outputs, block.parameters)
     # A reference steps like a plant: sample k gives what is read at k + 1.
-    writer.plain("<4I", block.role in ("plant", "reference"), *map(len, ports))
+    writer.plain("<5I", block.role in ("plant", "reference"), *map(len, ports), ahead)
     for port in (port for group in ports for port in group):
         writer.port(port)
     writer.node(node_of(block.runtime, block.arrays))
