@@ -85,7 +85,7 @@ def test_what_it_says_will_come_comes(path: Path, running: Any) -> None:
         fmu.begin()
         blind.begin()
         for k, row in enumerate(motion(60)):
-            for one in (fmu, blind):
+            for one in (fmu, blind) if k % 2 else ():  # held for two samples each
                 one.set(**dict(zip(MOTORS, row, strict=True)))
             said = fmu.get(*NEXT)
             derivatives(fmu, MOTORS)
@@ -155,6 +155,7 @@ def test_a_state_brings_its_next_sample_back(path: Path, running: Any) -> None:
         state = fmu.fmu.getFMUstate()
         said, moved = fmu.get(*NEXT), derivatives(fmu, MOTORS)
         move(fmu, 5)
+        assert fmu.get(*NEXT) != said
         fmu.fmu.setFMUstate(state)
         assert fmu.get(*NEXT) == said
         np.testing.assert_array_equal(derivatives(fmu, MOTORS), moved)
