@@ -18,6 +18,7 @@ from scipy.io import loadmat
 from softneck.cli._main import run
 from softneck.core import Matrix, SettingsError, Vector, load
 from softneck.cosim import linearize
+from softneck.cosim.linear import _linearize
 from softneck.cosim.linear._pulses import BlockSteps, realised
 from softneck.fmu import build_compiled_fmu, build_fmu
 from softneck.runtime import Block
@@ -73,6 +74,23 @@ def test_a_block_and_its_fmus_give_the_same_bits(kind: str, tmp_path: Path) -> N
         assert (other.inputs, other.outputs) == (one.inputs, one.outputs)
         for a, b in zip((one.A, one.B, one.C, one.D), (other.A, other.B, other.C, other.D), strict=True):
             np.testing.assert_array_equal(a, b)
+
+
+@needs_cc
+def test_an_fmu_that_runs_other_equations_is_taken_for_another_tools(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its library may be of another softneck: what it computes counts, not what its model file would give here."""
+    block = block_of("rls")
+    build_compiled_fmu(block, tmp_path / "Neck.fmu")
+    monkeypatch.setattr(_linearize, "block_of", lambda _: block_of("oe"))
+    held = {"motor_setpoint_1": 0.5}
+    system = linearize(tmp_path / "Neck.fmu", at=1.0, values=held)
+    assert system.method == "pulses"
+    # As pulses on the block itself: see below.
+    np.testing.assert_allclose(
+        response(system.ss()), response(linearize(block, at=1.0, values=held).ss()), rtol=0, atol=1e-8
+    )
 
 
 def test_a_small_step_answers_as_it_says() -> None:
