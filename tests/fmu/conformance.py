@@ -184,7 +184,7 @@ def c_host(case: Case) -> str:
             for key, ports in (("IN_BOOLEANS", case.block.inputs), ("OUT_BOOLEANS", case.block.outputs))
         }
         done = subprocess.run(
-            [str(host), str(library), (folder / "resources").as_uri(), model.guid, *numbers],
+            [str(host), str(library), (folder / "resources").as_uri(), model.guid or "", *numbers],
             input=case.inputs.astype("<f8").tobytes(), capture_output=True, check=False, env=os.environ | masks,
         )  # fmt: skip
         if done.returncode:
