@@ -5,8 +5,8 @@
 Noise of 0.25 deg, 20 % of the samples lost, 2 % outliers, a blackout of a second in each of four motions; every filter
 sees the same. The model is an `oe` of 140 s of Eq. 22 with that noise. `default`, `look-ahead` (over 50 ms) and `data`
 are ours, the last with what `--data` makes of the recording that the model is from; `greybox` is the default over
-that model of the same recording; `peer` is thirty lines of filterpy
-over the same model with three samples of look-ahead. Nothing is chosen here: the two necks that are held out have lines
+that model of the same recording, `fitted` with `--data`; `peer` is thirty lines of filterpy over the `oe` with three
+samples of look-ahead. Nothing is chosen here: the two necks that are held out have lines
 of their own; defaults are chosen by `leave_one_neck_out.py observer.*`.
 """
 
@@ -67,11 +67,13 @@ def row(neck: str, seed: int) -> dict[str, tuple[float, float]]:
     runs = [spoiled(block, motion, 1000 * seed + 10 + i) for i, motion in enumerate(motions())]
     model = OutputError().fit(log)
     observer = KalmanSettings().design(model)
+    over = KalmanSettings().design(GreyBox().fit(log))
     found = {
         "default": observer,
         "look-ahead": KalmanSettings(sensor_delay=0.05).design(model),
-        "greybox": KalmanSettings().design(GreyBox().fit(log)),
+        "greybox": over,
         "data": fitted_observer(observer, [log]).observer,
+        "fitted": fitted_observer(over, [log]).observer,
     }
     scores = {name: errors_deg(runs, [filtered(item, run.recording) for run in runs]) for name, item in found.items()}
     return {**scores, "peer": errors_deg(runs, [peer(model, run.recording) for run in runs])}
@@ -83,7 +85,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=2, help="specimens of each neck, with noise of their own (2)")
     parser.add_argument("--necks", nargs="*", default=list(NECKS), choices=NECKS, help="(all)")
     wanted = parser.parse_args()
-    heads = ("default", "look-ahead", "data", "greybox", "peer")
+    heads = ("default", "look-ahead", "data", "greybox", "fitted", "peer")
     print("rms error (in blackouts) [deg]\n" + f"{'':20}" + "".join(f"{head:>16}" for head in heads))
     for neck in wanted.necks:
         rows = [row(neck, seed) for seed in range(1, wanted.seeds + 1)]

@@ -113,7 +113,7 @@ def test_the_import_contract_holds() -> None:
 
 HEAVY = {
     "scipy", "pandas", "pyarrow", "numba", "matplotlib", "bokeh", "control", "casadi", "fmpy", "pythonfmu", "filterpy",
-    "h5py", "can", "canopen", "mcap", "serial", "loky",
+    "h5py", "python_calamine", "mcap_ros2", "can", "canopen", "mcap", "serial", "loky",
 }  # fmt: skip
 
 

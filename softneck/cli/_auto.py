@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import click
 
-from softneck.core import SettingsError, refuse_existing
+from softneck.core import CheckFailedError, SettingsError, refuse_existing
 
 from .shared._console import note, percent, print_json, print_table, progress
 from .shared._options import target
-from .shared._validate_table import with_fit
+from .shared._validate_table import useless, with_fit
 
 if TYPE_CHECKING:
     from softneck.identification import Choice, Model
@@ -74,14 +74,27 @@ def identify_auto(
     said = [] if linear is None else [_LINEAR.format(kind=linear.chosen.kind, path=linear_path)]
     if html is not None:
         write_page(html, _page(choice), force=force)
+    judged = choice.chosen.judged
+    why = None if judged is None else useless(judged)
     if as_json:
         facts = _facts(choice, path)
         print_json({**facts, "linear_model": None if linear is None else str(linear_path), "refit": refit_all})
+        _refuse_useless(path, why)
         return
     print_table(_title(parts[0].robot), _HEAD, _rows(choice))
     click.echo(f"{choice.why}\n{path}\n{models[0].summary()}")
     for remark in [*said, *choice.remarks, *([REFITTED] if refit_all else [])]:
         note(remark)
+    _refuse_useless(path, why)
+
+
+def _refuse_useless(path: Path, why: str | None) -> None:
+    """Raise CheckFailedError where the best of all kinds is no model."""
+    if why is not None:
+        raise CheckFailedError(
+            f"{path}: no kind made a model of the rows held out: {why}. Record again: `softneck info REC` says what is "
+            "poor in this recording."
+        )
 
 
 def _model(choice: Choice) -> Model:

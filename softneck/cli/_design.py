@@ -10,7 +10,7 @@ import click
 from softneck.core import KINDS, SettingsError, find_kind, load, refuse_existing, resolve
 from softneck.core._kinds import fitting, kinds_of
 
-from .shared._console import percent, print_json, progress
+from .shared._console import note, percent, print_json, progress
 from .shared._options import apply_settings, force_option, json_option, output_option, set_option, target
 from .shared._robot import load_of, robot_option
 
@@ -62,6 +62,9 @@ def command(
         if not hasattr(controller, "to_mat"):
             raise SettingsError(f"a controller of kind {kind} is not linear and cannot be written to a MAT file.")
         controller.to_mat(mat, force=force)
+    for model, plant in zip(models, plants, strict=True):
+        if "hold_out" not in getattr(plant, "findings", {"hold_out": None}):
+            note(f"warning: {model}: nothing was held out when it was identified: its fit is not known")
     if as_json:
         print_json({"controller": str(path), "kind": kind, "summary": controller.summary()})
         return

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,11 +14,57 @@ import click
 from softneck.core import DataError, SettingsError, atomic_write, refuse_existing
 
 from .shared._console import note, print_json
-from .shared._options import force_option, json_option, output_option, target
+from .shared._options import force_option, json_option, output_option, sample_time_of, target
+from .shared._settle import is_terminal, settle
 
 if TYPE_CHECKING:
     from softneck.robot import Robot
+    from softneck.signals import Guess, Layout
     from softneck.signals.importing._log import ImportResult
+
+
+@dataclass(slots=True)
+class _Job:
+    """An import on its way: what is read and where it goes.
+
+    Attributes:
+        log: to read.
+        path: of the recording.
+        replace: whether what stands at `path` and beside it may be replaced.
+        force: whether the user said so, as for files that were named one by one.
+        html: of the preview.
+        yes: take all guesses without asking.
+        as_json: print JSON.
+        sample_time: to resample at: a number [s], "robot", or None.
+        texts: file -> text to write beside the recording, and whether it may be replaced.
+    """
+
+    log: Path
+    path: Path
+    replace: bool
+    force: bool
+    html: Path | None = None
+    yes: bool = False
+    as_json: bool = False
+    sample_time: str | None = None
+    texts: dict[Path, tuple[str, bool]] = field(default_factory=dict)
+
+    def beside(self, ending: str) -> Path:
+        """Return the path of a file beside the recording; raise OutputFileError where one stands there."""
+        path = self.path.with_suffix(ending)
+        refuse_existing(path, force=self.replace)
+        return path
+
+    def write(self, more: dict[Path, tuple[Callable[[Path], object], bool]] | None = None) -> None:
+        """Write all files or, where one cannot be written, none."""
+        writers = {path: (_writer(text), force) for path, (text, force) in self.texts.items()} | (more or {})
+        with ExitStack() as stack:
+            for path, (write, force) in writers.items():
+                write(stack.enter_context(atomic_write(path, force=force)))
+
+
+def _writer(text: str) -> Callable[[Path], object]:
+    return lambda path: path.write_text(text, encoding="utf-8")
 
 
 @click.command(
@@ -37,6 +86,16 @@ if TYPE_CHECKING:
     help="Propose a robot by the log's titles, write it here, and import the log as its recording.",
 )
 @click.option("--guess", is_flag=True, help="Propose a layout, say why, and write it beside the recording.")
+@click.option("--yes", is_flag=True, help="Take all guesses; else a terminal is asked about those under 90 % sure.")
+@click.option(
+    "--html", type=click.Path(path_type=Path), metavar="FILE", help="Page: raw columns and channels, doubts first."
+)
+@click.option(
+    "--resample",
+    "sample_time",
+    metavar="S|robot",
+    help="Resample the recording at this sample time [s], or at the robot's.",
+)
 @output_option("recording", "REC")
 @force_option
 @json_option
@@ -46,23 +105,32 @@ def command(
     robot: str | None,
     robot_out: Path | None,
     guess: bool,
+    yes: bool,
+    html: Path | None,
+    sample_time: str | None,
     output: Path | None,
     force: bool,
     as_json: bool,
 ) -> None:
     """Turn any logger's table LOG into a recording, by a layout file or by a guess at one.
 
-    The .mcap log of `softneck drives run --log` needs neither.
+    Reads text in any encoding, spreadsheets, Parquet, MATLAB and Octave files, and ROS 2 bags (.mcap). The .mcap log of
+    `softneck drives run --log` needs neither layout nor guess.
     """
     from softneck.robot import find_robot
-    from softneck.signals import import_log, read_layout, write_recording
+    from softneck.signals import import_log, read_layout
+    from softneck.signals.importing.formats._mcap import is_run_log
     from softneck.signals.recording._files import recording_suffix, said_robot
 
-    if log.suffix.lower() == ".mcap":
-        _run_log(log, output, force=force, as_json=as_json, layout=guess or layout_file is not None)
-        return
+    asked = guess or layout_file is not None or robot_out is not None
+    ours = log.suffix.lower() == ".mcap" and (not asked or is_run_log(log))
     if log.suffix.lower() == ".blf":
         raise SettingsError(f"{log}: holds CAN frames only; import the `.mcap` log of the same run.")
+    path, replace = target(output, f"recordings/{log.stem}.csv", force=force)
+    job = _Job(log, path, replace, force, html, yes, as_json, sample_time)
+    if ours:
+        _run_log(job, layout=asked)
+        return
     if robot_out is not None:
         if guess or layout_file is not None or robot is not None:
             raise SettingsError("--robot-out guesses robot and layout; leave out --guess, --layout and --robot.")
@@ -74,22 +142,71 @@ def command(
     if guess == (layout_file is not None):
         what = "both were given" if guess else "neither was given"
         raise SettingsError(f"import needs either --layout LAYOUT.toml or --guess; {what}.")
-    path, replace = target(output, f"recordings/{log.stem}.csv", force=force)
     recording_suffix(path)
     refuse_existing(path, force=replace)
+    if html is not None:
+        refuse_existing(html, force=force)
     facts: dict[str, Any] = {}
     whose = find_robot(robot, beside=log)
     if robot_out is not None or (layout_file is None and not whose.is_neck):
-        imported, facts = _of_robot(log, path, whose, robot_out, (replace, force))
+        imported, layout, facts = _of_robot(job, whose, robot_out)
+        proposed = None
     elif layout_file is None:
-        imported, facts = _by_guess(log, path, replace)
+        proposed, imported, facts = _by_guess(job, whose)
+        layout = proposed.layout
     else:
-        imported = import_log(log, read_layout(layout_file, robot=whose))
-    write_recording(path, imported.recording, force=replace)
-    _tell(path, imported, facts, as_json)
+        layout, proposed = read_layout(layout_file, robot=whose), None
+        imported = import_log(log, layout)
+    _finish(job, imported, layout, proposed, facts)
 
 
-def _run_log(log: Path, output: Path | None, *, force: bool, as_json: bool, layout: bool) -> None:
+def _finish(job: _Job, imported: ImportResult, layout: Layout, proposed: Guess | None, facts: dict[str, Any]) -> None:
+    """Resample where asked, write all files, and say what was done."""
+    from softneck.signals import write_recording
+    from softneck.signals.recording._files import require_samples
+
+    imported = _at_sample_time(job, imported)
+    require_samples(imported.recording)
+    if job.html is not None:
+        job.texts[job.html] = (_preview(job, layout, proposed, imported), job.force)
+        facts["html"] = str(job.html)
+    job.write({job.path: (lambda path: write_recording(path, imported.recording, force=True), job.replace)})
+    _tell(job.path, imported, facts, job.as_json)
+
+
+def _at_sample_time(job: _Job, imported: ImportResult) -> ImportResult:
+    """Return the import at the sample time that was asked for."""
+    from softneck.signals import resampled
+    from softneck.signals.importing._log import ImportResult
+
+    if job.sample_time is None:
+        return imported
+    recording = imported.recording
+    if job.sample_time == "robot":
+        asked = recording.robot.require("sample_time_s", "--resample robot")
+    else:
+        asked = sample_time_of(job.sample_time, "--resample")
+    told = f"resampled from {1e3 * recording.sample_time:.6g} to {1e3 * asked:.6g} ms"
+    return ImportResult(resampled(recording, asked), (*imported.notes, told))
+
+
+def _preview(job: _Job, layout: Layout, proposed: Guess | None, imported: ImportResult | None) -> str:
+    """Return the page that shows the log's columns and what was made of them."""
+    from softneck.plots._import_page import import_page  # the charts take a while to import
+    from softneck.signals.importing._log import read_log
+
+    return import_page(
+        job.log,
+        read_log(job.log, layout),
+        layout,
+        recording=None if imported is None else imported.recording,
+        doubts=() if proposed is None else proposed.doubts,
+        lines=[*(() if proposed is None else proposed.lines), *(() if imported is None else imported.notes)],
+        problems=() if proposed is None else proposed.missing,
+    )
+
+
+def _run_log(job: _Job, *, layout: bool) -> None:
     """Import the log of a run on drives."""
     from softneck.drives import read_run_log  # the drives take a while to import
     from softneck.signals import write_recording
@@ -97,81 +214,81 @@ def _run_log(log: Path, output: Path | None, *, force: bool, as_json: bool, layo
     from softneck.signals.recording._files import recording_suffix
 
     if layout:
-        raise SettingsError(f"{log}: is a log of softneck, whose columns are known; leave out --layout and --guess.")
-    path, replace = target(output, f"recordings/{log.stem}.csv", force=force)
-    recording_suffix(path)
-    refuse_existing(path, force=replace)
-    run = read_run_log(log)
-    recording = run.recording()
-    notes = (f"{log}: {run.cut}: imported up to the cut",) if run.cut else ()
-    write_recording(path, recording, force=replace)
-    _tell(path, ImportResult(recording, notes), {}, as_json)
+        raise SettingsError(
+            f"{job.log}: is a log of softneck, whose columns are known; leave out --layout and --guess."
+        )
+    if job.html is not None:
+        raise SettingsError("--html shows what a layout or a guess made of a log; a log of softneck needs neither.")
+    recording_suffix(job.path)
+    refuse_existing(job.path, force=job.replace)
+    run = read_run_log(job.log)
+    notes = (f"{job.log}: {run.cut}: imported up to the cut",) if run.cut else ()
+    imported = _at_sample_time(job, ImportResult(run.recording(), notes))
+    write_recording(job.path, imported.recording, force=job.replace)
+    _tell(job.path, imported, {}, job.as_json)
 
 
-def _by_guess(log: Path, path: Path, replace: bool) -> tuple[ImportResult, dict[str, Any]]:
-    """Guess a layout, write it beside the recording, and import by it.
+def _by_guess(job: _Job, whose: Robot) -> tuple[Guess, ImportResult, dict[str, Any]]:
+    """Guess a layout, ask about what is not sure, and import by it.
 
     Raises:
-        DataError: what a recording needs was not found; the proposal is written as far as it goes.
+        DataError: what a recording needs was not found; the proposal and the preview are written as far as they go.
     """
+    import tomli_w
+
     from softneck.signals import guess_layout, import_log
 
-    proposal = path.with_suffix(".layout.toml")
-    refuse_existing(proposal, force=replace)
-    guess = guess_layout(log)
+    proposal = job.beside(".layout.toml")
+    guess = guess_layout(job.log, robot=whose)
     for line in guess.lines:
         note(line)
-    with atomic_write(proposal, force=replace) as temporary:
-        temporary.write_text(guess.text, encoding="utf-8")
+    if not job.yes and not job.as_json and is_terminal():
+        guess = settle(guess, job.log, proposal)
+    job.texts[proposal] = (guess.text, job.replace)
     if guess.missing:
+        if job.html is not None:
+            job.texts[job.html] = (_preview(job, guess.layout, guess, None), job.force)
+        job.write()
         raise DataError(
-            f"{log}: not found: {'; '.join(guess.missing)}. Fill it into {proposal}, then use --layout {proposal}."
+            f"{job.log}: not found: {'; '.join(guess.missing)}. Fill it into {proposal}, then use --layout {proposal}."
         )
+    facts = {"layout_file": str(proposal), "layout": tomllib.loads(guess.text), "reasons": list(guess.lines),
+             "doubts": [doubt.as_dict() for doubt in guess.doubts]}  # fmt: skip
+    if guess.layout.robot.hash != whose.hash:
+        robot_file = job.beside(".robot.toml")
+        text = f"# Proposed by softneck import --guess for {job.log.name!r}; its layout needs --robot {robot_file}\n"
+        job.texts[robot_file] = (text + tomli_w.dumps(guess.layout.robot.as_dict()), job.replace)
+        facts["robot_file"] = str(robot_file)
     try:
-        imported = import_log(log, guess.layout)
+        return guess, import_log(job.log, guess.layout), facts
     except DataError as error:
+        job.write()
         raise DataError(f"{error} (The proposed layout is in {proposal}.)") from error
-    facts = {"layout_file": str(proposal), "layout": tomllib.loads(guess.text), "reasons": list(guess.lines)}
-    return imported, facts
 
 
-def _of_robot(
-    log: Path, path: Path, robot: Robot, robot_out: Path | None, replace: tuple[bool, bool]
-) -> tuple[ImportResult, dict[str, Any]]:
-    """Import by titles a log of `robot`, or of the one that they speak of; write that robot and the layout.
-
-    Args:
-        log: to import.
-        path: of the recording.
-        robot: whose it is, if none is proposed.
-        robot_out: where to write a proposed robot.
-        replace: whether files beside the recording, and the robot, may be replaced.
-    """
+def _of_robot(job: _Job, robot: Robot, robot_out: Path | None) -> tuple[ImportResult, Layout, dict[str, Any]]:
+    """Import by titles a log of `robot`, or of the one that they speak of; propose that robot, to be written."""
     import tomli_w
 
     from softneck.signals import import_log, layout_toml
     from softneck.signals.importing._robot_guess import guess_robot, layout_for
 
-    proposal = path.with_suffix(".layout.toml")
-    refuse_existing(proposal, force=replace[0])
+    proposal = job.beside(".layout.toml")
     facts: dict[str, Any] = {"layout_file": str(proposal)}
-    texts: list[tuple[Path, str, bool]] = []
     if robot_out is not None:
-        refuse_existing(robot_out, force=replace[1])
-        found = guess_robot(log)
-        layout, text = found.layout, f"# Proposed by softneck import for {log.name!r}; edit it.\n"
-        texts.append((robot_out, text + tomli_w.dumps(found.robot.as_dict()), replace[1]))
+        refuse_existing(robot_out, force=job.force)
+        found = guess_robot(job.log)
+        layout, text = found.layout, f"# Proposed by softneck import for {job.log.name!r}; edit it.\n"
+        job.texts[robot_out] = (text + tomli_w.dumps(found.robot.as_dict()), job.force)
         facts |= {"robot_file": str(robot_out), "reasons": list(found.lines)}
         for line in found.lines:
             note(line)
     else:
-        layout = layout_for(log, robot)
-    texts.append((proposal, layout_toml(layout), replace[0]))
-    imported = import_log(log, layout)
-    for file, text, force in texts:
-        with atomic_write(file, force=force) as temporary:
-            temporary.write_text(text, encoding="utf-8")
-    return imported, {**facts, "layout": tomllib.loads(texts[-1][1]), "robot": imported.recording.robot.label()}
+        layout = layout_for(job.log, robot)
+    text = layout_toml(layout)
+    job.texts[proposal] = (text, job.replace)
+    imported = import_log(job.log, layout)
+    return imported, layout, {**facts, "layout": tomllib.loads(text), "robot": imported.recording.robot.label()}
 
 
 def _tell(path: Path, imported: ImportResult, more: dict[str, Any], as_json: bool) -> None:
@@ -191,8 +308,11 @@ def _tell(path: Path, imported: ImportResult, more: dict[str, Any], as_json: boo
         return
     for remark in imported.notes:
         note(remark)
-    if more:
-        note(f"the proposed layout is in {more['layout_file']}; edit it and use --layout if anything is wrong")
+    if more.get("doubts"):
+        note(f"{len(more['doubts'])} guess(es) under 90 % sure are marked NOT SURE in the layout")
+    if "layout_file" in more:
+        robot = f" with --robot {more['robot_file']}" if "doubts" in more and "robot_file" in more else ""
+        note(f"the proposed layout is in {more['layout_file']}; edit it and use --layout{robot} if anything is wrong")
     click.echo(
         f"{path}: {len(recording)} rows in {facts['runs']} run(s) at {1e3 * recording.sample_time:g} ms, "
         f"{missed} with a missed sample"

@@ -121,7 +121,7 @@ def command(file: Path, html: Path | None, force: bool, as_json: bool) -> None:
     log it reports what `softneck import --guess` would take each column for.
     """
     if not file.is_file():
-        raise FileFormatError(f"{file}: no such file.")
+        raise FileFormatError(f"{file}: {'is a folder; name a file in it' if file.is_dir() else 'no such file'}.")
     if html is not None:
         if file.suffix.lower() not in _RECORDINGS:
             raise SettingsError(f"{file}: `--html` shows the quality of a recording (`.csv`, `.parquet`) only.")
@@ -168,7 +168,10 @@ def _describe(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dic
         case ".json":
             return _certificate(file)
         case ".mcap" | ".blf":
-            return describe_log(file)
+            from softneck.signals.importing.formats._mcap import is_run_log
+
+            foreign = file.suffix.lower() == ".mcap" and not is_run_log(file)
+            return _log(file, html, None) if foreign else describe_log(file)
         case ".log" if is_candump(file):
             return describe_log(file)
         case _:

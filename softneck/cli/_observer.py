@@ -62,8 +62,6 @@ def command(
     observer = chosen.design(load_of(model, robot, role="model"))
     told: dict[str, Any] = {}
     lines: list[str] = []
-    if data and observer.form == "nonlinear":
-        raise SettingsError("--data fits filters over linear models; leave it out, or give the levels by --set.")
     if data:
         given = any(setting.replace(" ", "").startswith("sensor_delay=") for setting in settings)
         fixed = () if sensor is None else (observer.noise_names[0],)

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
-from softneck.core import CheckFailedError, SettingsError, file_hash, refuse_existing, write_certificate
+from softneck.core import CheckFailedError, file_hash, refuse_existing, write_certificate
 from softneck.core._certificate import CERTIFICATE_ENDING
 from softneck.loop._loop import ORDERS
 
 from .shared._console import print_json, print_table, progress
 from .shared._options import force_option, json_option, output_option, target
+from .shared._plants import opened_plants
 from .shared._robot import load_of, robot_option
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def command(
     judged = load_of(controller, robot, role="controller")
     whose = robot_of(judged)
     asked = read_requirements(requirements, robot=whose)
-    things, eyes = _opened(plants, robot), None if observer is None else load_of(observer, robot, role="observer")
+    things, eyes = opened_plants(plants, robot), None if observer is None else load_of(observer, robot, role="observer")
     files = {
         "controller": controller,
         **{f"plant {k}": item for k, item in enumerate(plants, start=1) if item.is_file()},
@@ -111,28 +111,6 @@ def command(
     if not found.holds:
         listed = ", ".join(verdict.requirement.metric for verdict in found.failed)
         raise CheckFailedError(f"{controller}: {len(found.failed)} requirement(s) do not hold: {listed}.")
-
-
-def _opened(plants: tuple[Path, ...], robot: str | None) -> dict[str, Any]:
-    from softneck.cosim import FmuPart
-    from softneck.plant import NeckParameters
-    from softneck.plant._presets import PRESETS
-
-    things: dict[str, Any] = {}
-    for item in plants:
-        if item.suffix == ".fmu":
-            # FMUs are loaded in several threads, each of which works in the FMU's own folder for a moment.
-            thing: Any = partial(FmuPart, item.absolute(), role="plant")
-        elif item.suffix == ".toml" or (str(item) in PRESETS and not item.exists()):
-            thing = NeckParameters.preset(str(item))
-        else:
-            thing = load_of(item, robot)
-            if not hasattr(thing, "tf"):
-                raise SettingsError(
-                    f"{item}: a MODEL, FAMILY, NECK or FMU is needed; this is a {type(thing).__name__}."
-                )
-        things[item.name if item.name not in things else str(item)] = thing
-    return things
 
 
 def _write_page(html: Path, found: Verification, controller: Path, certificate: Path, *, force: bool) -> None:

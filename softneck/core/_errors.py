@@ -39,6 +39,8 @@ EXTRAS = {
     "daqp": ("mpc", "predictive control solved by daqp"),
     "pyarrow": ("files", "Parquet files and studies"),
     "h5py": ("files", "MATLAB files of version 7.3"),
+    "python_calamine": ("files", "spreadsheets"),
+    "mcap_ros2": ("ros", "bags of ROS 2"),
     "can": ("drives", "a CAN bus"),
     "canopen": ("drives", "CANopen drives, simulated ones too"),
     "mcap": ("drives", "logs of runs on drives"),

@@ -68,7 +68,7 @@ KINDS: dict[str, Kind] = {
              "neural state space over play operators, contracting; trained over its whole free run",
              f"{_IDENT}.networks._arrays:check_nss"),
         Kind("greybox", "model", "softneck.identification:GreyBox", _MODEL, f"{_IDENT}.structured._greybox_runtime",
-             "equations of a tendon-driven neck, their 16 numbers fitted by the error of its free run",
+             "equations of a tendon-driven neck, their numbers fitted by the error of its free run",
              f"{_IDENT}.structured._arrays:check_greybox"),
         Kind("residual", "model", "softneck.identification:Residual", _MODEL,
              f"{_IDENT}.uncertainty._residual_runtime",

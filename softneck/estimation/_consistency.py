@@ -13,7 +13,7 @@ from softneck.core import DataError, Vector
 from softneck.signals import Recording
 
 from ._kalman import KalmanObserver
-from ._noise import outliers
+from ._likelihood import outliers
 from ._nonlinear import NonlinearObserver
 from ._offline import Estimates, measured_names
 
@@ -180,7 +180,9 @@ _PERIOD, _GAP = 25, 5
 _SETTLE = 50
 
 
-def look_ahead_error(observer: KalmanObserver, recording: Recording, late: float | None = None) -> float:
+def look_ahead_error(
+    observer: KalmanObserver | NonlinearObserver, recording: Recording, late: float | None = None
+) -> float:
     """Return the RMS [SI] between what the filter says is now and what its sensor, being late, says of it later.
 
     Of every 25 samples five are withheld from the filter. Likelihood rewards levels that trust any measurement where

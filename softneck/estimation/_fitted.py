@@ -8,14 +8,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from softneck.core import Matrix, Vector
+from softneck.core import Matrix, SettingsError, Vector
+from softneck.identification.models._fitting import known_rows
 from softneck.signals import Recording, concatenate
 
 from ._consistency import look_ahead_error
 from ._kalman import KalmanObserver
 from ._kalman_parts_runtime import KALMAN_LAG, KALMAN_LEAD, KALMAN_MORE_LAGS, kalman_lag
-from ._noise import Cost, NoiseFit, fit_noise
+from ._likelihood import cost_of
+from ._noise import NoiseFit, fit_noise
+from ._nonlinear import NonlinearObserver
 from ._offline import measured_angles
+
+AnyObserver = KalmanObserver | NonlinearObserver
 
 # Part of each run to fit to; the rest checks.
 _FITTED = 0.7
@@ -40,7 +45,7 @@ class FittedObserver:
         rows: held out.
     """
 
-    observer: KalmanObserver
+    observer: AnyObserver
     kept: str
     checks: dict[str, float]
     fit: NoiseFit
@@ -49,14 +54,14 @@ class FittedObserver:
 
 
 def fitted_observer(
-    observer: KalmanObserver, recordings: Sequence[Recording], *, fixed: Sequence[str] = (), delay: bool = True
+    observer: AnyObserver, recordings: Sequence[Recording], *, fixed: Sequence[str] = (), delay: bool = True
 ) -> FittedObserver:
     """Return the observer with the numbers under which the recordings are most likely, where they are better.
 
     Noise levels, and of form "model" the dead time of the set-points, have the greatest likelihood on the first 70 % of
     each run. From set-points and angles only the sum of what drives and sensor delay can be told; `sensor_delay` says
-    what motor positions and rates tell of the latter. All are judged by `look_ahead_error` on the rest, and nothing is
-    taken that is not better there.
+    what motor positions and rates tell of the latter. Over a nonlinear model what it misses is not told by rows that it
+    was trained on. All are judged by `look_ahead_error` on the rest, and nothing is taken that is not better there.
 
     Args:
         observer: with the numbers to start from.
@@ -65,27 +70,42 @@ def fitted_observer(
         delay: whether the delays may change as well.
 
     Raises:
+        SettingsError: nothing is left to be told by rows that the model was trained on.
         SettingsError, DataError: as `fit_noise` and `look_ahead_error`.
     """
     parts = [recording.split(_FITTED) for recording in recordings]
     heads, rest = [head for head, _ in parts], concatenate([tail for _, tail in parts])
+    unseen = () if not isinstance(observer, NonlinearObserver) else _of_the_model(observer, recordings)
+    if unseen and observer.noise_names[0] in fixed:
+        raise SettingsError(
+            "the model was trained on these rows, which tell no more than the sensor's noise, and that is given; "
+            "take a recording that the model has not seen."
+        )
+    fixed = (*fixed, *unseen)
     told, source = sensor_delay(observer, heads) if delay else (None, "")
     start = observer if told is None else _leading(observer, told, source)
     fit = fit_noise(start, heads, fixed=fixed)
     candidates = {"default": observer, "noise": fit.observer.with_constants(observer.constants)}
+    # A nonlinear model's dead time is its own.
     later = likeliest_later(fit.observer, heads) if observer.form == "model" and delay else 0
     if later:
         fit = fit_noise(delayed(start, later), heads, fixed=fixed)
     if later or told is not None:
         candidates["noise and delay"] = fit.observer
-    untold = (*fit.at_bound, *(("sensor_delay",) if told is None else ()))
+    untold = (*fit.at_bound, *unseen, *(("sensor_delay",) if told is None else ()))
     # One yardstick: each is asked for the same angles, as late as the sensor is said to be.
     checks = {name: look_ahead_error(item, rest, start.lead) for name, item in candidates.items()}
     kept = min(checks, key=lambda name: checks[name])
     return FittedObserver(observer=candidates[kept], kept=kept, checks=checks, fit=fit, untold=untold, rows=len(rest))
 
 
-def delayed(observer: KalmanObserver, later: int) -> KalmanObserver:
+def _of_the_model(observer: NonlinearObserver, recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """Return the levels that recordings cannot tell which the model is from: there it is better than anywhere else."""
+    seen = observer.model.training_rows
+    return observer.noise_names[1:] if any(known_rows(item, seen).any() for item in recordings) else ()
+
+
+def delayed(observer: AnyObserver, later: int) -> AnyObserver:
     """Return the same filter whose set-points act some samples later."""
     constants = observer.constants.copy()
     constants[KALMAN_LAG : KALMAN_LAG + 2] += later
@@ -93,7 +113,7 @@ def delayed(observer: KalmanObserver, later: int) -> KalmanObserver:
     return observer.with_constants(constants)
 
 
-def _leading(observer: KalmanObserver, lead: float, source: str) -> KalmanObserver:
+def _leading(observer: AnyObserver, lead: float, source: str) -> AnyObserver:
     """Return the same filter of a sensor that is `lead` [s] late."""
     constants = observer.constants.copy()
     if observer.form == "gyro":
@@ -104,18 +124,18 @@ def _leading(observer: KalmanObserver, lead: float, source: str) -> KalmanObserv
     return replace(observer.with_constants(constants), delay_source=source)
 
 
-def likeliest_later(observer: KalmanObserver, recordings: Sequence[Recording]) -> int:
+def likeliest_later(observer: AnyObserver, recordings: Sequence[Recording]) -> int:
     """Return by how many samples more than the model says set-points act late, by the likelihood at these levels."""
     runs = [run for recording in recordings for run in recording.runs()]
     level = np.log10(observer.noise)
-    return int(np.argmin([Cost(delayed(observer, later), runs).of(level) for later in range(_MOST_LATER + 1)]))
+    return int(np.argmin([cost_of(delayed(observer, later), runs).of(level) for later in range(_MOST_LATER + 1)]))
 
 
-def sensor_delay(observer: KalmanObserver, recordings: Sequence[Recording]) -> tuple[float | None, str]:
+def sensor_delay(observer: AnyObserver, recordings: Sequence[Recording]) -> tuple[float | None, str]:
     """Return how late the angles are [s], None where nothing tells, and by what: the gyro's rates or the motors.
 
     A gyro may be late itself, most of all one of the same sensor: it tells by how much more the angles are, which is
-    what form "gyro" needs, and its own delay comes on top. In form "model" motors tell the most that it can be, as the
+    what form "gyro" needs, and its own delay comes on top. Over a model motors tell the most that it can be, as the
     link lags as well: that holds where it is less than the filter thinks.
     """
     runs = [run for recording in recordings for run in recording.runs()]
@@ -123,7 +143,7 @@ def sensor_delay(observer: KalmanObserver, recordings: Sequence[Recording]) -> t
     pairs = [(measured_angles(run), reference(observer, run)) for run in runs]
     known = [(z, way) for z, way in pairs if way is not None]
     lag = _lag(known, observer.sample_time) if known else None
-    if lag is None or (observer.form == "model" and lag >= observer.lead):
+    if lag is None or (observer.form != "gyro" and lag >= observer.lead):
         return None, ""
     if observer.form == "gyro":
         # In the filter the rates act half a sample, and what they are newer than the angles, ago.
@@ -132,7 +152,7 @@ def sensor_delay(observer: KalmanObserver, recordings: Sequence[Recording]) -> t
     return lag, source
 
 
-def _turned(observer: KalmanObserver, run: Recording) -> Matrix | None:
+def _turned(observer: AnyObserver, run: Recording) -> Matrix | None:
     """Return the angle that the gyro's rates add up to (time, outputs)."""
     rates = []
     for axis in run.robot.outputs.names:
@@ -146,10 +166,10 @@ def _turned(observer: KalmanObserver, run: Recording) -> Matrix | None:
     return np.cumsum(steps, axis=0)
 
 
-def _pulled(observer: KalmanObserver, run: Recording) -> Matrix | None:
+def _pulled(observer: AnyObserver, run: Recording) -> Matrix | None:
     """Return what the motors' positions add up to in each axis (time, outputs)."""
     names = [f"motor_position_{j + 1}" for j in range(len(run.robot.motors.names))]
-    if observer.form != "model" or not set(names) <= set(run.channels):
+    if observer.form not in ("model", "nonlinear") or not set(names) <= set(run.channels):
         return None
     return np.column_stack([run.channels[name] for name in names]) @ observer.directions.T
 

@@ -59,6 +59,14 @@ def noise_units(form: str, robot: Robot) -> tuple[tuple[str, str], ...]:
     return tuple((name, told.replace("rad", unit)) for name, told in NOISES[form])
 
 
+def require_levels(form: str, robot: Robot, noise: Sequence[float]) -> tuple[float, float, float]:
+    """Return the three noise levels of a form; raise SettingsError where one is not positive."""
+    for (name, unit), value in zip(noise_units(form, robot), noise, strict=True):
+        if not (math.isfinite(value) and value > 0.0):
+            raise SettingsError(f"`{name}` must be positive{f' [{unit}]' if unit else ''}; got {value}.")
+    return float(noise[0]), float(noise[1]), float(noise[2])
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FilterMatrices:
     """Matrices of all axes together, as the runtime takes them.

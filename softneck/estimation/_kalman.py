@@ -18,7 +18,7 @@ from softneck.runtime import Block, Port, State
 from softneck.runtime._bundle import sized
 from softneck.signals import Recording
 
-from ._forms import NOISES, STATES, noise_units, steady_gains, system
+from ._forms import NOISES, STATES, noise_units, require_levels, steady_gains, system
 from ._kalman_parts_runtime import (
     KALMAN_DIVIDER,
     KALMAN_FROZEN,
@@ -120,10 +120,7 @@ class KalmanObserver:
 
     def with_noise(self, noise: Sequence[float], *, sensor: str = "none") -> KalmanObserver:
         """Return the same filter with other noise levels, steady gains made anew."""
-        levels = (float(noise[0]), float(noise[1]), float(noise[2]))
-        for (name, unit), value in zip(noise_units(self.form, self.robot), levels, strict=True):
-            if not (math.isfinite(value) and value > 0.0):
-                raise SettingsError(f"`{name}` must be positive [{unit}]; got {value}.")
+        levels = require_levels(self.form, self.robot, noise)
         bare = dataclasses.replace(self, noise=levels, sensor=sensor, arrays=self.arrays[: len(KalmanArrays.names())])
         return bare.steady() if self.is_steady else bare
 

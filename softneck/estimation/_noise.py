@@ -7,24 +7,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, SettingsError, Vector
-from softneck.runtime import load_functions
-from softneck.runtime._bundle import sized
+from softneck.core import DataError, SettingsError, Vector
 from softneck.signals import Recording
 
 from ._kalman import KalmanObserver
-from ._kalman_parts_runtime import KALMAN_FROZEN, KALMAN_GATE, KALMAN_REJECTIONS, KalmanArrays
-from ._offline import check_recording, measured_angles, source_rows
+from ._likelihood import SETTLE, Cost, WalkCost, cost_of
+from ._nonlinear import NonlinearObserver
+from ._offline import check_recording
 
 # Levels are searched within two powers of ten of where the search starts: smooth data would like none at all, and a
 # filter without noise trusts one measurement for good.
 _DECADES = 2.0
-# Rows at the start of each run that are not scored: there the filter is still uncertain of everything.
-_SETTLE = 50
+_STEP = 0.15
 # Measured rows below which three levels cannot be told apart.
 _LEAST_ROWS = 200
-# An outlier is further than so many robust standard deviations from the median of its neighbours and itself.
-_OUTLIER = 6.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,7 +38,7 @@ class NoiseFit:
         at_bound: names of levels that ran to the end of their range: the data do not tell them.
     """
 
-    observer: KalmanObserver
+    observer: KalmanObserver | NonlinearObserver
     names: tuple[str, ...]
     noise: tuple[float, float, float]
     start: tuple[float, float, float]
@@ -53,7 +49,10 @@ class NoiseFit:
 
 
 def fit_noise(
-    observer: KalmanObserver, recordings: Recording | Sequence[Recording], *, fixed: Sequence[str] = ()
+    observer: KalmanObserver | NonlinearObserver,
+    recordings: Recording | Sequence[Recording],
+    *,
+    fixed: Sequence[str] = (),
 ) -> NoiseFit:
     """Return the noise levels of greatest likelihood (Schweppe 1965; Anderson and Moore 1979, sec. 10.3).
 
@@ -78,10 +77,10 @@ def fit_noise(
     runs = [run for recording in given for run in recording.runs()]
     for run in runs:
         check_recording(observer, run)
-    cost = Cost(observer, runs)
+    cost = cost_of(observer, runs)
     if cost.rows < _LEAST_ROWS:
         raise DataError(
-            f"noise levels need at least {_LEAST_ROWS} measurements after the first {_SETTLE} rows of each run; "
+            f"noise levels need at least {_LEAST_ROWS} measurements after the first {SETTLE} rows of each run; "
             f"got {cost.rows}. Record longer."
         )
     start = np.log10(observer.noise)
@@ -110,7 +109,7 @@ def _free(names: Sequence[str], fixed: Sequence[str]) -> np.ndarray:
     return np.array([name not in fixed for name in names])
 
 
-def _likeliest(cost: Cost, start: Vector, free: np.ndarray) -> tuple[Vector, float, np.ndarray]:
+def _likeliest(cost: Cost | WalkCost, start: Vector, free: np.ndarray) -> tuple[Vector, float, np.ndarray]:
     """Return the decadic logarithms of the levels, their cost, and which ran to the end of their range (3,)."""
     from scipy.optimize import minimize
 
@@ -121,70 +120,12 @@ def _likeliest(cost: Cost, start: Vector, free: np.ndarray) -> tuple[Vector, flo
         whole[free] = levels
         return cost.of(whole)
 
-    found = minimize(of, start[free], method="Nelder-Mead", bounds=bounds, options={"xatol": 1e-3, "fatol": 1e-5})
+    # A first step of its own: scipy's is a part of the logarithm, none at all for a level of 1.
+    simplex = np.vstack([start[free], start[free] + _STEP * np.eye(int(free.sum()))])
+    options = {"xatol": 1e-3, "fatol": 1e-5, "initial_simplex": simplex}
+    found = minimize(of, start[free], method="Nelder-Mead", bounds=bounds, options=options)
     whole, at_bound = start.copy(), np.zeros(start.size, dtype=bool)
     whole[free] = found.x
     # A hundredth of a decade: where the simplex stops.
     at_bound[free] = [min(x - low, high - x) < 0.01 for x, (low, high) in zip(found.x, bounds, strict=True)]
     return whole, float(found.fun), at_bound
-
-
-class Cost:
-    """The cost of levels over all runs, per measurement."""
-
-    def __init__(self, observer: KalmanObserver, runs: Sequence[Recording]) -> None:
-        motors, outputs = len(observer.robot.motors.names), len(observer.robot.outputs.names)
-        self._functions = load_functions(sized("softneck.estimation._likelihood_runtime", motors, outputs))
-        self._told = 2 * outputs + 2
-        arrays = dict(zip(KalmanArrays.names(), observer.arrays, strict=False))  # without steady gains
-        arrays["constants"] = constants = arrays["constants"].copy()
-        # No gate, no force, no frozen sensor: the likelihood is of all that was measured.
-        constants[KALMAN_GATE] = constants[KALMAN_REJECTIONS] = np.inf
-        constants[KALMAN_FROZEN] = 0.0
-        self._arrays = tuple(arrays.values())
-        self._size = int(self._functions.state_size(self._arrays))
-        self._tables: list[Matrix] = []
-        self.outliers = 0
-        for run in runs:
-            z = measured_angles(run)
-            spoilt = outliers(z)
-            z[spoilt] = np.nan
-            self.outliers += int(spoilt.sum())
-            self._tables.append(_table(observer, run, z))
-        self.rows = sum(self._run(table, observer.noise)[1] for table in self._tables)
-
-    def of(self, levels: Vector) -> float:
-        """Return minus twice the log likelihood per measurement at 10 to the power of `levels`, but for a constant."""
-        noise = tuple(float(level) for level in 10.0**levels)
-        return sum(self._run(table, noise)[0] for table in self._tables) / self.rows
-
-    def _run(self, table: Matrix, noise: Sequence[float]) -> tuple[float, int]:
-        state, outputs, parameters = np.zeros(self._size), np.zeros(self._told), np.array(noise)
-        self._functions.initialise(self._arrays, parameters, state, outputs)
-        return self._functions.kalman_cost(self._arrays, parameters, state, table, _SETTLE)
-
-
-def _table(observer: KalmanObserver, run: Recording, z: Matrix) -> Matrix:
-    """Return the runtime's inputs row by row, as a loop would give them."""
-    sources, lost = source_rows(observer, run)
-    valid = np.ones((len(run), 1))
-    if observer.form == "gyro":
-        none = np.zeros((len(run), len(run.robot.motors.names)))
-        return np.hstack([none, z, valid, np.where(lost[:, None], np.nan, sources)])
-    return np.hstack([sources, z, valid])
-
-
-def outliers(z: Matrix) -> np.ndarray:
-    """Return which measurements (time,) stand apart from both neighbours that came."""
-    spoilt = np.zeros(len(z), dtype=bool)
-    came = np.flatnonzero(np.isfinite(z).all(axis=1))
-    if came.size < 3:
-        return spoilt
-    y = z[came]
-    middle = np.median(np.stack([y[:-2], y[1:-1], y[2:]]), axis=0)
-    distance = np.abs(y[1:-1] - middle)
-    # Scale from the changes between neighbours: 1.4826 times a median is a normal standard deviation. A noise-free
-    # recording has none, and no outliers.
-    scale = 1.4826 * np.median(np.abs(np.diff(y, axis=0)), axis=0)
-    spoilt[came[1:-1]] = (distance > _OUTLIER * np.maximum(scale, 1e-12)).any(axis=1)
-    return spoilt

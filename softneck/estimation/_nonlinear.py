@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,23 +18,32 @@ from softneck.identification.models._arrays import without_validity
 from softneck.identification.models._directions import NECK_SECONDS
 from softneck.identification.models._linear_systems import KINDS as LINEAR
 from softneck.identification.models._nested import nested, nested_model
+from softneck.identification.models._ports import payloads
 from softneck.robot import Robot
 from softneck.runtime import Block, Port, State
 from softneck.signals import Recording
 
-from ._forms import NOISES, noise_units
+from ._axis import directions_of
+from ._forms import NOISES, noise_units, require_levels
 from ._kalman import delay_source, filter_lines, observer_ports
 from ._kalman_parts_runtime import KALMAN_LEAD, KALMAN_MORE_LAGS
-from ._nonlinear_runtime import NonlinearArrays, NonlinearState
+from ._nonlinear_parts_runtime import NonlinearArrays
+from ._nonlinear_runtime import NonlinearState
 from ._offline import Estimates, check_recording, measured_angles
+from ._payload_runtime import PayloadArrays, PayloadState
 
 _RUNTIME = "softneck.estimation._nonlinear_runtime"
+# Over a model that takes the payload as a parameter.
+_PAYLOAD_RUNTIME = "softneck.estimation._payload_runtime"
 FORM = "nonlinear"
 # Samples of a neck until its model stands, and what 20 ms leave of the fastest motion: half of it after 0.27 s, as long
 # as a neck is on its way. Of another robot both are stretched by its time constant.
 _SETTLE, _KEEP, _NECK_SAMPLE = 300, 0.95, 0.02
 
 
+# How far the payload walks in a second, of a robot's time, as a part of the range that the model knows.
+_PAYLOAD_WALK = 0.1
+_PAYLOAD = Port(name="payload", unit="kg", description="estimated, within what the model's recordings had")
 _MEANINGS = ("standard deviation", "standard deviation", "of the model's fastest motion of late")
 
 
@@ -43,6 +53,9 @@ class NonlinearObserver:
 
     The angle is what the model makes of the set-points in free run, plus a disturbance that walks: at rest by
     `rest_noise_std` in a sample, in motion by `motion_noise_ratio` times the model's fastest motion of late.
+
+    Over a model of several payloads the payload is estimated as well: it walks by `_PAYLOAD_WALK` of their range in a
+    second, and has an output of its own.
 
     Attributes:
         model: of any kind; nothing corrects its state.
@@ -71,6 +84,11 @@ class NonlinearObserver:
         return self.model.robot
 
     @property
+    def payloads(self) -> tuple[float, float] | None:
+        """Least and most payload [kg] of the model's recordings; None where it knows but one."""
+        return payloads(self.model.arrays)
+
+    @property
     def sample_time(self) -> float:
         """Of the model and of the loop [s]."""
         return self.model.sample_time
@@ -81,9 +99,23 @@ class NonlinearObserver:
         return tuple(name for name, _ in NOISES[FORM])
 
     @property
+    def directions(self) -> Matrix:
+        """Weights (outputs, motors) of the motors in each output."""
+        return directions_of(self.model)
+
+    @property
     def lead(self) -> float:
         """How far the estimate runs ahead of the measurement [s]: the sensor's delay."""
         return float(self.constants[KALMAN_LEAD]) * self.sample_time
+
+    def with_constants(self, constants: Vector) -> NonlinearObserver:
+        """Return the same filter with other constants."""
+        return replace(self, constants=constants)
+
+    def with_noise(self, noise: Sequence[float], *, sensor: str = "none") -> NonlinearObserver:
+        """Return the same filter with other noise levels."""
+        levels = require_levels(FORM, self.robot, noise)
+        return replace(self, noise=levels, sensor=sensor)
 
     def block(self) -> Block:
         """Return the filter as a block of role "observer"."""
@@ -94,14 +126,15 @@ class NonlinearObserver:
         # How far it can be trusted is no part of an estimate, and takes time in each of its steps.
         plant = replace(self.model, arrays=without_validity(self.model.arrays)).block()
         inputs, outputs = observer_ports(FORM, self.robot)
+        payload = () if self.payloads is None else (_PAYLOAD,)
         return Block(
             kind=FORM,
             role="observer",
-            runtime=f"{_RUNTIME}({plant.runtime}:{len(plant.arrays)})",
+            runtime=f"{_PAYLOAD_RUNTIME if payload else _RUNTIME}({plant.runtime}:{len(plant.arrays)})",
             sample_time=self.sample_time,
             arrays=(*self._own_arrays(plant), *plant.arrays),
             inputs=inputs,
-            outputs=outputs,
+            outputs=(*outputs, *payload),
             parameters=tuple(
                 Port(name=name, unit=unit, start=value, minimum=0.0, description=meaning)
                 for (name, unit), value, meaning in zip(
@@ -117,7 +150,12 @@ class NonlinearObserver:
             len(self.robot.motors.names), len(self.robot.outputs.names), len(plant.outputs),
             max(1, round(_SETTLE * samples)), self.start, _KEEP ** (1.0 / samples),
         ])  # fmt: skip
-        return setup, self.constants, plant.initial_state(use_measurement=0.0).parameters
+        arrays = (setup, self.constants, plant.initial_state(use_measurement=0.0).parameters)
+        if self.payloads is None:
+            return arrays
+        least, most = self.payloads
+        walk = _PAYLOAD_WALK * (most - least) * math.sqrt(self.sample_time / stretch)
+        return (*arrays, np.array([least, most, walk]))
 
     def initial_state(self, **parameters: float) -> State:
         """Return the state at the start; parameters are the noise levels by name."""
@@ -134,7 +172,7 @@ class NonlinearObserver:
             DataError: another sample time or another robot.
         """
         check_recording(self, recording)
-        m, parts = len(self.robot.outputs.names), NonlinearState.parts(NonlinearArrays(self.block().arrays))
+        m, parts = len(self.robot.outputs.names), self._parts
         told, states = (np.vstack(rows) for rows in zip(*(self._rows(run) for run in recording.runs()), strict=True))
         accepted = states[:, parts["unheard"]][:, 0] == 0.0
         return Estimates(
@@ -146,9 +184,36 @@ class NonlinearObserver:
             healthy=told[:, 2 * m + 1] > 0.5,
             judged=accepted | (told[:, 2 * m] > 0.0),
             aligned=states[:, parts["angles"]] + states[:, parts["disturbance"]],
-            covariance=np.eye(m) * states[:, parts["variance"], None],
+            covariance=self._covariance(states),
             log_det=states[:, parts["log_det"]][:, 0],
         )
+
+    def free_run(self, run: Recording) -> tuple[Matrix, Vector]:
+        """Return what the model says of a run (time, outputs), and its fastest motion in a sample of late (time,).
+
+        Raises:
+            DataError: another sample time or another robot.
+        """
+        check_recording(self, run)
+        _, states = self._rows(run)
+        return states[:, self._parts["angles"]], states[:, self._parts["fastest"]][:, 0]
+
+    @cached_property
+    def _parts(self) -> dict[str, slice]:
+        """Where the parts of the runtime's state are."""
+        arrays = self.block().arrays
+        if self.payloads is None:
+            return NonlinearState.parts(NonlinearArrays(arrays))
+        return PayloadState.parts(PayloadArrays(arrays))
+
+    def _covariance(self, states: Matrix) -> Matrix:
+        """Return that of the outputs at the filter's time (time, outputs, outputs)."""
+        m = len(self.robot.outputs.names)
+        if self.payloads is None:
+            return np.eye(m) * states[:, self._parts["variance"], None]
+        P = states[:, self._parts["P"]].reshape(-1, m + 1, m + 1)
+        G = np.concatenate([np.tile(np.eye(m), (len(P), 1, 1)), states[:, self._parts["slopes"], None]], axis=2)
+        return G @ P @ G.transpose(0, 2, 1)
 
     def _rows(self, run: Recording) -> tuple[Matrix, Matrix]:
         """Return outputs (time, outputs) and states (time, states) of a run."""
@@ -174,6 +239,9 @@ class NonlinearObserver:
             f"{self.noise[2]:.3g} times the model's motion",
             *filter_lines(self.gate_level, self.constants, self.sample_time, self.delay_source),
         ]
+        if self.payloads is not None:
+            least, most = self.payloads
+            lines.append(f"  the payload, from {least:g} to {most:g} kg, is estimated: while the neck moves far")
         return "\n".join(lines)
 
     def save(self, path: str | Path, *, force: bool = False) -> None:

@@ -11,8 +11,6 @@ import numpy as np
 from softneck.estimation._kalman_parts_runtime import (
     KALMAN_GATE,
     KALMAN_LAG,
-    KALMAN_LEAD,
-    KALMAN_PERIOD,
     KalmanCounters,
     kalman_clear,
     kalman_count,
@@ -20,30 +18,16 @@ from softneck.estimation._kalman_parts_runtime import (
     kalman_healthy,
     kalman_usable,
 )
-from softneck.runtime._layout import Arrays, array, cells, rest, value
-from softneck.runtime._members_runtime import member_initialise, member_size, member_step
-
-# Places in `setup`; the model's outputs are more than those that are measured.
-NONLINEAR_MOTORS = 0
-NONLINEAR_OUTPUTS = 1
-NONLINEAR_TOLD = 2
-NONLINEAR_SETTLE = 3
-NONLINEAR_START = 4
-NONLINEAR_KEEP = 5
-
-
-class NonlinearArrays(Arrays):
-    """Those of the model follow."""
-
-    setup = array(
-        "6",
-        "motors, outputs, outputs of the model, samples until it stands, standard deviation of the disturbance at "
-        "the start, part of the fastest motion that a sample keeps",
-    )
-    constants = array("numbers", "see KALMAN_*; a lag of 1: the set-points come a sample early")
-    free = array("parameters", "of the model in free run")
-    motors = value("setup", NONLINEAR_MOTORS)
-    outputs = value("setup", NONLINEAR_OUTPUTS)
+from softneck.estimation._nonlinear_parts_runtime import (
+    NONLINEAR_START,
+    NonlinearArrays,
+    nonlinear_faster,
+    nonlinear_move,
+    nonlinear_settle,
+    nonlinear_tell,
+)
+from softneck.runtime._layout import cells, rest
+from softneck.runtime._members_runtime import member_size
 
 
 class NonlinearState(KalmanCounters):
@@ -82,7 +66,8 @@ def step(
     asked, measured = inputs[:n], inputs[n : n + m]
     start = p.setup[NONLINEAR_START]
     if x.samples == 0.0:
-        nonlinear_settle(p, x, asked)
+        x.held[:] = asked
+        nonlinear_settle(p, p.free, x.model, asked, x.angles)
         x.variance = start * start
     usable = kalman_usable(c, x, measured, float(inputs[n + m]), parameters[0])
     forced = kalman_forced(c, x)
@@ -94,43 +79,23 @@ def step(
     if usable:
         innovation, accepted = nonlinear_correct(p, parameters[0], x, measured, forced)
     kalman_count(c, x, usable, accepted)
-    nonlinear_tell(p, x, asked, outputs)
+    # Copies: the filter's own model stays at the time of the measurement.
+    nonlinear_tell(p, p.free, x.model.copy(), x.angles.copy(), x.disturbance, asked, outputs)
     outputs[2 * m] = innovation
     outputs[2 * m + 1] = 1.0 if kalman_healthy(c, x, parameters[0]) else 0.0
     x.samples += 1.0
-
-
-def nonlinear_settle(p: NonlinearArrays, x: NonlinearState, asked: np.ndarray) -> None:
-    """Bring the model to where it had been, had the motors stood there for ever."""
-    x.held[:] = asked
-    member_initialise(p, 0, p.free, x.model, np.zeros(int(p.setup[NONLINEAR_TOLD])))
-    for _ in range(int(p.setup[NONLINEAR_SETTLE])):
-        nonlinear_move(p, x.model, asked, x.angles)
-
-
-def nonlinear_move(p: NonlinearArrays, model: np.ndarray, motors: np.ndarray, angles: np.ndarray) -> None:
-    """Move the model on in free run under `motors` and fill its `angles`."""
-    u = np.empty(2 * p.motors + p.outputs)
-    u[: p.motors] = motors
-    u[p.motors :] = np.nan  # NaN: nothing is measured
-    out = np.zeros(int(p.setup[NONLINEAR_TOLD]))
-    member_step(p, 0, p.free, model, u, out)
-    angles[:] = out[: p.outputs]
 
 
 def nonlinear_predict(p: NonlinearArrays, parameters: np.ndarray, x: NonlinearState, asked: np.ndarray) -> None:
     """Move the model on under what acted since the last sample, and widen what it may miss by how far it went."""
     before = x.angles.copy()
     if p.constants[KALMAN_LAG] > 0.5:
-        nonlinear_move(p, x.model, x.held, x.angles)
+        nonlinear_move(p, p.free, x.model, x.held, x.angles)
     else:
-        nonlinear_move(p, x.model, asked, x.angles)
+        nonlinear_move(p, p.free, x.model, asked, x.angles)
     x.held[:] = asked
-    moved = p.setup[NONLINEAR_KEEP] * x.fastest
-    for i in range(p.outputs):
-        moved = max(moved, abs(x.angles[i] - before[i]))
-    x.fastest = moved
-    x.variance += parameters[1] * parameters[1] + (parameters[2] * moved) ** 2
+    x.fastest = nonlinear_faster(p, x.fastest, x.angles, before)
+    x.variance += parameters[1] * parameters[1] + (parameters[2] * x.fastest) ** 2
 
 
 def nonlinear_correct(
@@ -149,19 +114,3 @@ def nonlinear_correct(
         x.disturbance[i] += gain * (measured[i] - x.angles[i] - x.disturbance[i])
     x.variance *= 1.0 - gain
     return innovation, True
-
-
-def nonlinear_tell(p: NonlinearArrays, x: NonlinearState, asked: np.ndarray, outputs: np.ndarray) -> None:
-    """Carry the estimate from the filter's time to now, under the newest set-points; fill angles and rates."""
-    c, m = p.constants, p.outputs
-    whole = int(c[KALMAN_LEAD])
-    part = c[KALMAN_LEAD] - whole
-    # Copies: the filter's own model stays at the time of the measurement.
-    model, now, before = x.model.copy(), x.angles.copy(), np.empty(m)
-    for _ in range(whole + 1):
-        before[:] = now
-        nonlinear_move(p, model, asked, now)
-    for i in range(m):
-        # Between samples by a straight line, whose slope is the rate.
-        outputs[i] = before[i] + part * (now[i] - before[i]) + x.disturbance[i]
-        outputs[m + i] = (now[i] - before[i]) / c[KALMAN_PERIOD]

@@ -91,6 +91,7 @@ class Panel:
         y_range: lowest and highest y to start with; None: what the curves need.
         log_x, log_y: logarithmic axes.
         equal: one unit is as long on both axes, as a path over pitch and roll needs.
+        ticks: names that stand at x = 0, 1, ... instead of numbers.
     """
 
     curves: Sequence[Curve]
@@ -103,6 +104,7 @@ class Panel:
     log_x: bool = False
     log_y: bool = False
     equal: bool = False
+    ticks: Sequence[str] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -60,6 +60,8 @@ def _draw(ax: Axes, panel: Panel) -> None:
         ax.set_aspect("equal", adjustable="datalim")
     if panel.y_range is not None:
         ax.set_ylim(*panel.y_range)
+    if panel.ticks:
+        ax.set_xticks(range(len(panel.ticks)), panel.ticks, rotation=30, ha="right")
     ax.set_ylabel(panel.y_label)
     ax.set_title(panel.title, fontsize="medium", loc="left")
     if panel.legend and any(item.label for item in (*panel.curves, *panel.levels)):

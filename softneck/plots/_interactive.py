@@ -28,6 +28,8 @@ _MARGIN = 72
 # Longer curves are one pixel wide: browsers draw such lines 5 to 10 times as fast as the next wider ones.
 _FINE = 2_000
 _FONT = "system-ui, sans-serif"
+# Names under an axis are slanted [rad] and need so much room more [pixels].
+_SLANT, _NAMED = 0.5, 60
 _DASHES = {"dashed": [6, 4], "dotted": [2, 3]}
 # Draws the charts, and lets curves of one name vanish together in all panels of theirs. (Bokeh's own links are compiled
 # in the browser, which the page's security policy forbids.)
@@ -150,6 +152,11 @@ def _plot(panel: Panel, chart: Chart, number: int) -> Plot:
         # The panel below has the same axis. Powers of ten cannot be drawn at no size (Bokeh stops with a NaN box).
         plot.xaxis.major_label_text_font_size = "1px" if panel.log_x else "0px"
         plot.xaxis.major_label_text_alpha = 0.0
+    if panel.ticks:
+        plot.xaxis.ticker = list(range(len(panel.ticks)))
+        plot.xaxis.major_label_overrides = dict(enumerate(panel.ticks))
+        plot.xaxis.major_label_orientation = _SLANT
+        plot.height = (plot.height or 0) + _NAMED
     if panel.title:
         plot.title = Title(text=panel.title, text_font=_FONT, text_font_size="12px")
     return plot

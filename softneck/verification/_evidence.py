@@ -14,10 +14,18 @@ from softneck.loop._result import shown_unit
 from softneck.runtime import Block
 
 from ._confidence import MarginInterval, intervals
-from ._experiments import Crossing, LoopUnderTest, crossing_facts, crossing_values, crossings
+from ._experiments import Crossing, crossing_facts, crossing_values, crossings
 from ._laws import ControllerUnderTest
 from ._linear import Gaps, LinearLaw, gaps, judged, margins
-from ._neck_loops import NeckRun, direction, neck_changes, no_virtual_plant, run_necks, step_at
+from ._neck_loops import (
+    NeckRun,
+    direction,
+    loops_under_test,
+    neck_changes,
+    no_virtual_plant,
+    run_necks,
+    step_at,
+)
 from ._own_plants import OwnPlant
 from ._plants import Plants, UncertainNeck, all_plants, join, nominal_plants
 from ._requirements import Requirements
@@ -148,20 +156,9 @@ def gather(
         controller.block, asked, order=controller.order, observer=observer, seed=seed,
         progress=lambda done, text: progress(0.6 + 0.2 * done, text), own=own,
     ) if own or not why else []  # fmt: skip
-    robot, names = controller.robot, tuple(plants.axes)
-    axes = names if len(names) == 1 else (*names, "both")  # one output is all of them
-    payloads = sorted({float(kg) for kg in (min(asked.neck["payloads_kg"]), max(asked.neck["payloads_kg"]))})
-    loops = [
-        LoopUnderTest(
-            name=f"{plant.name}, {kg:g} kg" if plant.payload else plant.name, controller=controller.block,
-            plant=lambda plant=plant: plant.quiet(controller.block.sample_time), observer=observer,
-            order=controller.order, inputs={"payload": kg} if plant.payload else {},
-            # Each axis alone with the light payload; with the heavy one both at once, which is the harder test.
-            axes=axes if kg == payloads[0] or not plant.payload else axes[-1:], robot=robot, time=asked.scale[0],
-            size=1.0 if robot.is_neck else asked.si(math.degrees(asked.scale[1])),
-        )
-        for plant in own for kg in (payloads if plant.payload else (0.0,))
-    ]  # fmt: skip
+    loops = loops_under_test(
+        controller.block, own, asked, order=controller.order, observer=observer, robot=controller.robot
+    )
     # What nobody requires of an axis alone need not be found of it.
     alone = {f"{axis}.{name}" for axis in plants.axes for name in ("gain_margin", "delay_margin_ms")}
     overall = all(item.metric not in alone for item in asked.bounds)

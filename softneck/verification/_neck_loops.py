@@ -17,6 +17,7 @@ from softneck.plant import NeckParameters, VirtualNeck
 from softneck.robot import Robot
 from softneck.runtime import Block
 
+from ._experiments import LoopUnderTest
 from ._own_plants import OwnPlant, own_plant
 from ._requirements import Requirements, metric_ends
 
@@ -119,7 +120,7 @@ def run_necks(
         name = f"{plant.name}, {payload:g} kg, {angle:g} deg"
         progress(number / len(cases), name)
         loop = _loop(controller, plant, float(payload), math.radians(angle), asked, order, observer, seed + number)
-        values, result = _judge(loop)
+        values, result = judge_loop(loop)
         runs.append(NeckRun(name, plant.parameters, float(payload), math.radians(angle), seed + number, values, result))
     return runs
 
@@ -183,9 +184,10 @@ def _loop(
     )
 
 
-def _judge(loop: Loop) -> tuple[dict[str, float], LoopResult | None]:
+def judge_loop(loop: Loop, *, compiled: bool = False) -> tuple[dict[str, float], LoopResult | None]:
+    """Return the metrics of a step, the worse axis and the motors, and the signals; all inf and None if it broke."""
     try:
-        result = run_loop(loop)
+        result = run_loop(loop, compiled=compiled)
     except DataError:
         # Numbers overflowed: the loop is not stable, whatever its margins say.
         return dict.fromkeys((*_AXIS, *_MOTORS), math.inf), None
@@ -203,6 +205,34 @@ def _judge(loop: Loop) -> tuple[dict[str, float], LoopResult | None]:
     # A plant that tells no tension says nothing of slack tendons.
     values |= {name: math.nan if value is None else float(value) for name, value in told.items()}
     return values, result
+
+
+def loops_under_test(
+    controller: Block, own: Sequence[OwnPlant], asked: Requirements, *, order: str, observer: Block | None, robot: Robot
+) -> list[LoopUnderTest]:
+    """Return the loops for margins by experiment: each plant that steps, with its lightest and its heaviest payload.
+
+    Args:
+        controller, observer: that are judged.
+        own: plants that step.
+        asked: whose payloads count, and how slow and large the robot is.
+        order: of the loop.
+        robot: whose it is.
+    """
+    names = robot.outputs.names
+    axes = names if len(names) == 1 else (*names, "both")  # one output is all of them
+    payloads = sorted({float(kg) for kg in (min(asked.neck["payloads_kg"]), max(asked.neck["payloads_kg"]))})
+    return [
+        LoopUnderTest(
+            name=f"{plant.name}, {kg:g} kg" if plant.payload else plant.name, controller=controller,
+            plant=lambda plant=plant: plant.quiet(controller.sample_time), observer=observer,
+            order=order, inputs={"payload": kg} if plant.payload else {},
+            # Each axis alone with the light payload; with the heavy one both at once, which is the harder test.
+            axes=axes if kg == payloads[0] or not plant.payload else axes[-1:], robot=robot, time=asked.scale[0],
+            size=1.0 if robot.is_neck else asked.si(math.degrees(asked.scale[1])),
+        )
+        for plant in own for kg in (payloads if plant.payload else (0.0,))
+    ]  # fmt: skip
 
 
 def neck_changes(parameters: NeckParameters, robot: Robot) -> dict[str, float]:

@@ -56,6 +56,17 @@ def test_auto_saves_the_best_linear_model_beside_one_that_design_would_refuse(
     assert not Path("other_linear.npz").exists()
 
 
+def test_auto_ends_with_exit_code_1_where_no_kind_makes_a_model(
+    call: Call, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("softneck.cli._auto.useless", lambda judged: f"its free run diverges at {judged.time[0]:.0f} s")
+    for more in ((), ("--json",)):
+        said = call("identify", "auto", recording, "-o", f"best{len(more)}.npz", *more)
+        assert said.code == 1
+        assert "no kind made a model of the rows held out: its free run diverges" in said.err.splitlines()[-1]
+    assert json.loads(said.out)["model"] == "best1.npz"
+
+
 def test_auto_prints_one_json_object_and_holds_out_the_last_of_several(call: Call, recording: Path) -> None:
     write_recording(Path("other.csv"), neck_recording(300, seed=44))
     said = call("identify", "auto", recording, "other.csv", "--json")

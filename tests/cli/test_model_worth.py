@@ -92,6 +92,13 @@ def test_design_refuses_a_model_that_explains_less_than_half(
         assert call("design", "pi", "m.npz", "-o", "pi.npz", "--any-fit").code == 0
 
 
+def test_design_says_where_nothing_was_held_out(call: Call, recording: Path) -> None:
+    assert call("identify", "rls", recording, "-o", "m.npz", "--train", "1").code == 0
+    said = call("design", "pi", "m.npz", "-o", "pi.npz")
+    assert said.code == 0
+    assert "warning: m.npz: nothing was held out when it was identified: its fit is not known" in said.err
+
+
 def test_warnings_of_libraries_do_not_leak(call: Call, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fit = Rls.fit
 

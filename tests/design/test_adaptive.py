@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from softneck.core import SettingsError, load
 from softneck.design import AdaptiveSettings, LinearController, VaryingController
-from softneck.design.linear._assembly import assemble
+from softneck.design.linear._assembly import ReferenceFilter, assemble
 from softneck.design.linear._tuning import Gains
 from softneck.design.varying._adaptive_runtime import AdaptiveArrays, AdaptiveState
 from softneck.design.varying._scheduled import following_axis
@@ -139,7 +139,7 @@ def linear(settings: AdaptiveSettings) -> LinearController:
     time = settings.reference_time
     arrays = assemble(
         (axis, axis),
-        reference_times=(time, time, time),
+        filters=(ReferenceFilter(time),) * 3,
         constants=np.array([TS]),
         redefinition=settings.neck_redefinition(),
     )

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from softneck.core import DataError, FileFormatError, SettingsError, load, read_archive, write_archive
 from softneck.design import LinearController, ScheduledSettings, VaryingController
-from softneck.design.linear._assembly import assemble
+from softneck.design.linear._assembly import ReferenceFilter, assemble
 from softneck.design.linear._tuning import Gains
 from softneck.design.varying._scheduled import following_axis
 from softneck.estimation import LinearNeck, axis_plant
@@ -59,7 +59,7 @@ def test_equal_operating_points_make_the_linear_controller() -> None:
     linear = LinearController(
         kind="pi", sample_time=TS, order="sequential", design={}, limits=ScheduledSettings().limits(),
         arrays=assemble(
-            (axes[0], axes[1]), reference_times=(0.06, 0.06, 0.06), constants=np.array([TS]),
+            (axes[0], axes[1]), filters=(ReferenceFilter(0.06),) * 3, constants=np.array([TS]),
             redefinition=ScheduledSettings().neck_redefinition(),
         ),
     )  # fmt: skip

@@ -197,7 +197,7 @@ def test_texts_come_in_segments() -> None:
         toggle ^= 1
         if part.data[0] & 1:
             break
-    assert text.decode() == "iPOS4808 MX-CAN (simulated)"
+    assert text.decode() == "iPOS3604 MX-CAN (simulated)"
     assert size == len(text)
 
 
@@ -234,3 +234,33 @@ def test_the_hardware_stop_can_be_practised() -> None:
             signal.raise_signal(signal.SIGUSR1)
             assert [drive.axis.enable_input for drive in virtual.drives] == [not pressed] * 3
     assert signal.getsignal(signal.SIGUSR1) is before
+
+
+@pytest.mark.parametrize(
+    ("kind", "moves", "told"),
+    [
+        (1, True, list(range(30))),
+        (10, True, [9, 19, 29]),
+        (240, True, []),
+        # With the SYNC after a change: the first value, and each of a control word that comes and goes.
+        (0, False, [0]),
+        (0, True, [0, 5, 6]),
+        (255, False, []),
+    ],
+)
+def test_a_tpdo_of_type_n_comes_with_each_nth_sync(kind: int, moves: bool, told: list[int]) -> None:
+    """CiA 301, 7.5.2.35; type 10 came with each SYNC here, until a slave that others wrote did not."""
+    talk = ready()
+    for index, subindex, value, size in (
+        (0x1800, 1, 0x80000181, 4), (0x1A00, 0, 0, 1), (0x1A00, 1, 0x60400010, 4), (0x1A00, 0, 1, 1),
+        (0x1800, 2, kind, 1), (0x1800, 1, 0x181, 4),
+    ):  # fmt: skip
+        talk.write(index, subindex, value, size)
+    talk.frames((CanFrame(0x000, b"\x01\x01"),))
+    came = []
+    for sync in range(30):
+        if moves and sync in (5, 6):
+            talk.write(0x6040, 0, 6 if sync == 5 else 0, 2)
+        answers = talk.frames((CanFrame(0x080, b""),))
+        came += [sync for frame in answers if frame.identifier == 0x181]
+    assert came == told

@@ -85,7 +85,7 @@ def test_the_noise_behind_a_recording_is_found() -> None:
 
 def test_the_likelihood_is_that_of_filterpy() -> None:
     """filterpy computes it per update; ours differs by the constant log(2 pi) of two angles."""
-    from softneck.estimation._noise import _SETTLE, Cost
+    from softneck.estimation._likelihood import SETTLE, Cost
 
     observer, record = observer_of(), drawn(rows=400)
     kf, expected = observer.filterpy(), 0.0
@@ -97,11 +97,11 @@ def test_the_likelihood_is_that_of_filterpy() -> None:
         kf.predict(acting)
         kf.P = kf.P + (observer.arrays[5] if k < length else 0.0)
         kf.update(np.array([[record.channels[f"{a}_measured"][k]] for a in ("pitch", "roll")]))
-        expected += float(kf.log_likelihood) + math.log(2 * math.pi) if k >= _SETTLE else 0.0
+        expected += float(kf.log_likelihood) + math.log(2 * math.pi) if k >= SETTLE else 0.0
     assert estimates.accepted.all()
     ours = -0.5 * Cost(observer, [record]).of(np.log10(TRUE))
     # Sums of 350 terms of about 10.
-    assert ours == pytest.approx(expected / (400 - _SETTLE), rel=1e-9)
+    assert ours == pytest.approx(expected / (400 - SETTLE), rel=1e-9)
 
 
 @pytest.mark.slow

@@ -26,6 +26,7 @@ from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.fmu.describe._modelled_drives import with_modelled_drives
 from softneck.identification import (
     GreyBox,
+    Model,
     Network,
     NeuralStateSpace,
     OutputError,
@@ -107,6 +108,17 @@ def _greybox() -> Block:
     return GreyBox(evaluations=3, sensor_delay=2).fit(recording()).block()
 
 
+@cache
+def _loaded_greybox_model() -> Model:
+    """Two payloads of which nothing follows: what they change is searched for all the same."""
+    heavy = recording().with_channels(payload=np.full(len(recording()), 0.5))
+    return GreyBox(evaluations=2, sensor_delay=2).fit([recording(), heavy])
+
+
+def _loaded_greybox() -> Block:
+    return _loaded_greybox_model().block()
+
+
 def _any() -> Block:
     return Residual(base="rls").fit(recording()).block()
 
@@ -144,6 +156,10 @@ def _kalman_steady() -> Block:
 
 def _nonlinear() -> Block:
     return KalmanSettings().design(Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording())).block()
+
+
+def _payload_observer() -> Block:
+    return KalmanSettings().design(_loaded_greybox_model()).block()
 
 
 def _pi() -> Block:
@@ -210,6 +226,12 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
     "residual": (_residual, MOTORS, ["pitch", "pitch_lower", "roll_upper", "motor_position_2", "validity"], _MODEL),
     "play": (_play, MOTORS, ["pitch", "roll", "motor_position_3", "validity"], _MODEL),
     "greybox": (_greybox, MOTORS, ["pitch", "roll", "motor_position_1", "validity"], _MODEL),
+    "greybox_loaded": (
+        _loaded_greybox,
+        MOTORS,
+        ["pitch", "roll", "motor_position_1", "validity"],
+        (*_MODEL, "payload"),
+    ),
     "any": (
         _any,
         MOTORS,
@@ -253,6 +275,12 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
         _nonlinear,
         [*MOTORS, "pitch_measured", "roll_measured", "measurement_valid"],
         ["pitch", "roll", "pitch_rate", "roll_rate", "innovation", "healthy"],
+        ("measurement_noise_std", "rest_noise_std", "motion_noise_ratio"),
+    ),
+    "nonlinear_payload": (
+        _payload_observer,
+        [*MOTORS, "pitch_measured", "roll_measured", "measurement_valid"],
+        ["pitch", "roll", "pitch_rate", "roll_rate", "innovation", "healthy", "payload"],
         ("measurement_noise_std", "rest_noise_std", "motion_noise_ratio"),
     ),
     "mpc": (

@@ -290,10 +290,9 @@ def test_what_is_missing_is_named_with_its_candidates(tmp_path: Path) -> None:
                           "pitch": NECK.outputs[:, 0], "yaw": np.cos(NECK.time)})  # fmt: skip
     frame.to_csv(tmp_path / "log.csv", index=False)
     guess = guess_layout(tmp_path / "log.csv")
-    assert len(guess.missing) == 2
-    assert guess.missing[0].startswith("motor_setpoint_1, motor_setpoint_2, motor_setpoint_3: candidates are")
-    assert "only positions were logged" in guess.missing[0]
-    assert guess.missing[1].startswith("roll: candidates are 'yaw'")
+    assert len(guess.missing) == 1
+    assert guess.missing[0].startswith("roll: candidates are 'yaw'; a line such as `roll = { column = 'yaw'")
+    assert any("no set-points were logged, so the positions are the inputs" in line for line in guess.lines)
     assert parse_layout(guess.text) == guess.layout
     assert "# MISSING roll: candidates are 'yaw'" in guess.text
 

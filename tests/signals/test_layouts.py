@@ -21,13 +21,13 @@ LAYOUT = """
 column = "t"
 unit = "ms"
 [channels]
-motor_setpoint_1 = { column = "a", unit = "rad", factor = 0.25 }
+motor_setpoint_1 = { column = "a", unit = "rad", factor = 0.125 }
 motor_setpoint_2 = { column = "b", unit = "deg", sign = -1 }
 pitch = { column = "p", unit = "deg" }
 roll = { column = "r", unit = "deg" }
 [channels.motor_setpoint_3]
 unit = "rad"
-terms = [{ column = "a", factor = 0.125 }, { column = "b", factor = -0.25 }]
+terms = [{ column = "a", factor = 0.0625 }, { column = "b", factor = -0.125 }]
 """
 LOG = "t, a, b, p, r\n" + "\n".join(f"{20 * k}, {k}, {2 * k}, {3 * k}, {4 * k}" for k in range(30))
 
@@ -42,7 +42,7 @@ def test_units_signs_and_sums_of_columns(tmp_path: Path) -> None:
     r = imported(tmp_path).recording
     k = np.arange(30.0)
     assert r.sample_time == 0.02
-    expected = np.column_stack([k / 4, -np.radians(2 * k), 0.125 * k - 0.5 * k])
+    expected = np.column_stack([k / 8, -np.radians(2 * k), 0.0625 * k - 0.25 * k])
     np.testing.assert_allclose(r.set_points, expected, rtol=1e-15)
     np.testing.assert_allclose(r.outputs, np.radians(np.column_stack([3 * k, 4 * k])), rtol=1e-15)
 
@@ -91,7 +91,11 @@ def test_a_gap_in_the_time_column_splits_the_run_under_any_sample_time(tmp_path:
         ('"p", unit = "deg"', '"p", unit = 5', "unknown unit `5`"),
         ('"p", unit = "deg"', '"p", unit = ["deg"]', "wrong type"),
         ('{ column = "p", unit', "{ unit", r"\[channels\.pitch\] needs `column`"),
-        ('"p", unit = "deg"', '"p", unit = "deg", sing = -1', "unknown key `sing`; known: column, factor, sign"),
+        (
+            '"p", unit = "deg"',
+            '"p", unit = "deg", sing = -1',
+            "unknown key `sing`; known: column, factor, integrate, sign",
+        ),
         (
             '"p", unit = "deg"',
             '"p", unit = "deg", sign = "x"',
@@ -118,7 +122,7 @@ def test_a_gap_in_the_time_column_splits_the_run_under_any_sample_time(tmp_path:
             "needs both `inclination` and `orientation`",
         ),
         ("[time]", "file = 5\n[time]", r"\[file\] must be a table"),
-        ('{ column = "a", factor = 0.125 }', "5", "needs `column`"),
+        ('{ column = "a", factor = 0.0625 }', "5", "needs `column`"),
     ],
 )
 def test_a_wrong_layout_is_one_clear_line(tmp_path: Path, old: str, new: str, message: str) -> None:

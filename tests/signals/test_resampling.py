@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from softneck.core import DataError
@@ -184,3 +184,75 @@ def test_a_recording_goes_to_another_sample_time_and_its_runs_stay_apart() -> No
     np.testing.assert_array_equal(same.outputs, run.outputs)
     with pytest.raises(DataError, match=r"a run of 100 rows at 0\.021 s has no two samples 5 s apart"):
         resampled(both, 5.0)
+
+
+def of(outputs: np.ndarray, sample_time: float, set_points: np.ndarray | None = None) -> Recording:
+    """A recording of one motion, `outputs` (time,) [rad], on both axes."""
+    held = np.zeros(outputs.size) if set_points is None else set_points
+    channels = {f"motor_setpoint_{j}": held for j in (1, 2, 3)} | {"pitch": outputs, "roll": -outputs}
+    return Recording(sample_time * np.arange(outputs.size), sample_time, channels)
+
+
+def test_at_its_own_sample_time_a_recording_is_the_same_to_the_bit() -> None:
+    run = of(truth(0.02 * np.arange(200)), 0.02)
+    assert resampled(run, 0.02) is run
+    assert resampled(run, 0.02 * (1 + 1e-9)) is run  # a rounding of printed times
+
+
+@pytest.mark.parametrize("ratio", [2, 3, 5])
+def test_a_slow_motion_comes_back_from_a_slower_sample_time(ratio: int) -> None:
+    """There and back: what is slow enough for the slower grid is lost by its interpolation alone."""
+    time = 0.01 * np.arange(2000)
+    # Up to a tenth of the slower grid's Nyquist frequency.
+    omega = 0.1 * np.pi / (0.01 * ratio)
+    motion = 0.2 * np.sin(omega * time) + 0.1 * np.sin(0.37 * omega * time + 1.0)
+    back = resampled(resampled(of(motion, 0.01), 0.01 * ratio), 0.01)
+    inside = slice(100, len(back) - 100)  # the ends are continued, not known
+    # A monotone cubic between samples 1/20 of a period apart: h^2 max|x''| / 4 (h omega = 0.31), and 1e-3 of ripple.
+    bound = (0.1 * np.pi) ** 2 * 0.2 / 4.0 + 0.3e-3
+    assert np.abs(back.outputs[inside, 0] - motion[: len(back)][inside]).max() < bound
+    assert np.abs(back.outputs[inside, 0]).max() > 0.25
+
+
+@pytest.mark.parametrize("ratio", [2, 5])
+def test_there_and_back_by_a_faster_sample_time_is_the_identity_on_the_pass_band(ratio: int) -> None:
+    time = 0.02 * np.arange(1000)
+    motion = 0.2 * np.sin(5.0 * time)
+    back = resampled(resampled(of(motion, 0.02), 0.02 / ratio), 0.02)
+    # The faster grid holds each logged sample; what is left is the ripple of a window of 60 dB, 1e-3.
+    assert np.abs(back.outputs[100:-100, 0] - motion[100:-100]).max() < 1e-3 * 0.2
+
+
+def test_what_a_slower_grid_cannot_hold_is_filtered_out_and_not_folded_down() -> None:
+    time = 0.01 * np.arange(4000)
+    # 40 Hz at 100 Hz; at 20 Hz it would stand still as a constant of its amplitude.
+    noise = 0.3 * np.cos(2.0 * np.pi * 40.0 * time)
+    slow = resampled(of(noise, 0.01), 0.05).outputs[:, 0]
+    assert np.abs(slow[30:-30]).max() < 0.3e-3  # 60 dB
+    assert np.abs(noise[::5]).min() > 0.29  # what taking each fifth would have made of it
+
+
+@given(start=st.floats(-0.5, 0.5), slope=st.floats(-0.05, 0.05), ratio=st.floats(1.0, 8.0), rows=st.integers(12, 300))
+@settings(max_examples=40)
+def test_straight_lines_stay_straight_to_their_ends(start: float, slope: float, ratio: float, rows: int) -> None:
+    time = 0.02 * np.arange(rows)
+    found = resampled(of(start + slope * time, 0.02), 0.02 * ratio)
+    # Sums of some hundred weights, each rounded.
+    np.testing.assert_allclose(found.outputs[:, 0], start + slope * found.time, rtol=0, atol=1e-13)
+
+
+@given(data=st.data())
+@settings(max_examples=30)
+def test_set_points_are_held_and_missed_samples_stay_missed_at_any_sample_time(data: st.DataObject) -> None:
+    rows = data.draw(st.integers(12, 80))
+    asked = np.array(data.draw(st.lists(st.floats(-5.0, 5.0), min_size=rows, max_size=rows)))
+    outputs = truth(0.02 * np.arange(rows))
+    missed = data.draw(st.integers(1, rows - 2))
+    outputs[missed] = np.nan
+    sample_time = 0.02 * data.draw(st.floats(0.3, 4.0))
+    found = resampled(of(outputs, 0.02, asked), sample_time)
+    before = np.floor(found.time / 0.02 + 1e-5).astype(int)
+    np.testing.assert_array_equal(found.set_points[:, 0], asked[np.minimum(before, rows - 1)])
+    lost = np.isnan(found.outputs[:, 0])
+    near = np.abs(found.time - 0.02 * missed) < 0.02 * (1.0 - 1e-5)
+    np.testing.assert_array_equal(lost, near)

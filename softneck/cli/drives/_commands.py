@@ -13,6 +13,7 @@ from softneck.core import CheckFailedError, SettingsError, refuse_existing
 from ..shared._console import note, print_json, print_table, progress
 from ..shared._neck import load_neck
 from ..shared._options import force_option, json_option, output_option, target, trust_option
+from ._commission import commission_command
 from ._log import acting_files, log_options, opened_log, require_logs
 from ._move import jog_command, record_command
 from ._replay import replay_command
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
     epilog="Example: softneck drives check --simulated. Every command takes --json, and --help lists its options.",
 )
 def command() -> None:
-    """CANopen drives (CiA 301/402): scan, check, jog, zero, record, run, replay, stop, reset.
+    """CANopen drives (CiA 301/402): commission, scan, check, jog, zero, record, run, replay, stop, reset.
 
     While drives move on a bus, Escape and space stop them at once; Ctrl-C ramps to rest first.
 
@@ -326,6 +327,7 @@ def _states(states: dict[int, str], what: str, *, as_json: bool) -> None:
         print_table(what, ["node", "state"], [[str(node), state] for node, state in states.items()])
 
 
+command.add_command(commission_command)
 command.add_command(replay_command)
 command.add_command(jog_command)
 command.add_command(record_command)

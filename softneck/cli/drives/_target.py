@@ -237,7 +237,9 @@ def _told(file: DrivesFile) -> Iterator[Any]:
     """Yield the inclinometer; say at the end what happened to it, which no drive and no watch can know."""
     from softneck.drives import open_sensor
 
-    with open_sensor(file.sensor_kind, file.sensor_node, file.sensor_source, file.moves) as sensor:
+    with open_sensor(
+        file.sensor_kind, file.sensor_node, file.sensor_source, file.moves, axes=file.sensor_axes
+    ) as sensor:
         try:
             yield sensor
         finally:

@@ -33,7 +33,8 @@ def read_together(paths: Sequence[Path], robot: str | None = None) -> Recording:
             raise DataError(
                 f"{path}: is at {1e3 * recording.sample_time:g} ms and {paths[0]} at "
                 f"{1e3 * recordings[0].sample_time:g} ms; recordings are used together at one sample time only. Take "
-                "each by itself, or bring one to the other's (Python: `softneck.signals.resampled`)."
+                f"each by itself, or bring one to the other's: `softneck resample {path} --sample-time "
+                f"{recordings[0].sample_time:g} -o OTHER.csv`."
             )
         require_same_robot(recording.robot, recordings[0].robot, f"{paths[0]} and {path}: recordings")
     return concatenate(recordings)
@@ -101,6 +102,18 @@ def in_radians(key: str, value: Any, fields: set[str]) -> tuple[str, Any]:
     if key in fields or angle not in fields or isinstance(value, bool) or not isinstance(value, int | float):
         return key, value
     return angle, math.radians(value)
+
+
+def sample_time_of(text: str, option: str) -> float:
+    """Return a sample time [s] as an option says it.
+
+    Raises:
+        SettingsError: no positive number.
+    """
+    value = value_of(text)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < math.inf:
+        raise SettingsError(f"{option} takes a sample time in seconds, such as 0.02; got `{text}`.")
+    return float(value)
 
 
 def value_of(text: str) -> Any:

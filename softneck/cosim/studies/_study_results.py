@@ -44,10 +44,10 @@ def pareto_front(runs: pd.DataFrame, objectives: Sequence[str]) -> pd.DataFrame:
     finite = np.isfinite(runs[list(objectives)].to_numpy(float)).all(axis=1)
     good = runs.loc[finite & np.array([not error for error in runs["error"].tolist()], dtype=bool)]
     values = good[list(objectives)].to_numpy(float)
-    return good.loc[_front(values)].sort_values(list(objectives), kind="stable")
+    return good.loc[pareto_rows(values)].sort_values(list(objectives), kind="stable")
 
 
-def _front(values: Matrix) -> np.ndarray:
+def pareto_rows(values: Matrix) -> np.ndarray:
     """Return which rows of (n, m) no other row dominates; in lexical order only rows of the front can dominate."""
     keep = np.zeros(len(values), dtype=bool)
     front = np.empty((0, values.shape[1]))

@@ -49,6 +49,28 @@ class AxisController:
         return L
 
 
+@dataclass(frozen=True, slots=True)
+class ReferenceFilter:
+    """`(1 + T1 s)/(1 + T2 s)` before the reference; what is asked now acts now.
+
+    Attributes:
+        time: T2 [s]; 0 for none.
+        lead: T1 [s].
+    """
+
+    time: float
+    lead: float = 0.0
+
+    def pole(self, sample_time: float) -> float:
+        """Return a of `rf+ = a rf + (1 - a) r`."""
+        return math.exp(-sample_time / self.time) if self.time > 0.0 else 0.0
+
+    @property
+    def jump(self) -> float:
+        """T1/T2, the part of a step that passes at once beside what the lag passes."""
+        return self.lead / self.time if self.time > 0.0 else 0.0
+
+
 def pi_axis(gain: float, integral_time: float, sample_time: float) -> AxisController:
     """Return `v = K (e + s)`, `s+ = s + Ts/Ti e` with e = r - y.
 
@@ -65,7 +87,7 @@ def pi_axis(gain: float, integral_time: float, sample_time: float) -> AxisContro
 def assemble(
     axes: Sequence[AxisController],
     *,
-    reference_times: Sequence[float],
+    filters: Sequence[ReferenceFilter],
     redefinition: tuple[Matrix, Matrix],
     constants: Vector,
 ) -> tuple[Matrix, ...]:
@@ -73,7 +95,7 @@ def assemble(
 
     Args:
         axes: controllers of all axes: of pitch and roll.
-        reference_times: time constants of the reference filters of all axes and of co-contraction [s]; 0 for none.
+        filters: of the references of all axes and of co-contraction.
         redefinition: T (axes + 1, motors) and its inverse.
         constants: of the runtime, the sample time [s] first.
     """
@@ -90,13 +112,15 @@ def assemble(
         )
     )
     Dr, Dy = np.diag([axis.Dr for axis in axes]), np.diag([axis.Dy for axis in axes])
-    return assemble_whole(
-        (A, Br, By, C, Dr, Dy, L), reference_times=reference_times, redefinition=redefinition, constants=constants
-    )
+    return assemble_whole((A, Br, By, C, Dr, Dy, L), filters=filters, redefinition=redefinition, constants=constants)
 
 
 def assemble_whole(
-    law: tuple[Matrix, ...], *, reference_times: Sequence[float], redefinition: tuple[Matrix, Matrix], constants: Vector
+    law: tuple[Matrix, ...],
+    *,
+    filters: Sequence[ReferenceFilter],
+    redefinition: tuple[Matrix, Matrix],
+    constants: Vector,
 ) -> tuple[Matrix, ...]:
     """Return the arrays of `LinearArrays` for one controller of all axes: A, Br, By, C, Dr, Dy and L.
 
@@ -104,12 +128,13 @@ def assemble_whole(
     """
     A, Br, By, C, Dr, Dy, L = law
     sample_time = float(constants[0])
-    a = np.array([math.exp(-sample_time / time) if time > 0.0 else 0.0 for time in reference_times])
-    # rf_k = a rf_k-1 + (1 - a) r_k, with state a rf_k-1: what is asked now acts now.
-    Af, Bf, Cf, Df = np.diag(a), np.diag(a * (1.0 - a)), np.eye(a.size), np.diag(1.0 - a)
+    a = np.array([item.pole(sample_time) for item in filters])
+    # rf_k = x_k + d r_k with x = a (1 - jump) at rest under r = 1: without lead rf_k = a rf_k-1 + (1 - a) r_k.
+    held = a * (1.0 - np.array([item.jump for item in filters]))
+    Af, Bf, Cf, Df = np.diag(a), np.diag(held * (1.0 - a)), np.eye(a.size), np.diag(1.0 - held)
     align = _alignment(A, Br + By, C, Dr + Dy)
     # The filter's state at rest, where rf = r.
-    rest = np.diag(a)
+    rest = np.diag(held)
     return (Af, Bf, Cf, Df, A, Br, By, C, Dr, Dy, L, align, rest, *redefinition, constants)
 
 

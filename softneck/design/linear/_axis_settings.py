@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar
 
@@ -15,13 +15,14 @@ from softneck.estimation import AxisPlant
 
 from ..plants._step_and_load import StepAndLoad
 from ..plants._uncertain import UncertainAxis, UncertainPlant, uncertain_plant
-from ._assembly import AxisController, assemble
+from ._assembly import AxisController, ReferenceFilter, assemble
 from ._axis_loop import axis_margins, conditioning_candidates, sensitivities, unstable_samples
 from ._controller import LinearController
 from ._loop_settings import LoopSettings
 from ._margins import Margins
 from ._ports import ControllerLimits
 from ._reduction import reduce_axis
+from ._rise import check_rise, filter_for
 from ._sweep import Sweep, make_sweep
 
 # A reference filter slower than this [samples] would be no answer to overshoot.
@@ -96,9 +97,9 @@ class AxisSettings(LoopSettings, ABC):
         limits, redefinition = self.limits(uncertain.robot), self.redefinition(uncertain)
         axes = {name: self._prepared(uncertain.axis(name)) for name in uncertain.names}
         axes = {
-            name: replace(axis, test=self._test(axis.nominal, limits, redefinition[1])) for name, axis in axes.items()
+            name: replace(axis, test=axis_test(axis.nominal, limits, redefinition[1])) for name, axis in axes.items()
         }
-        made: dict[str, tuple[AxisController, float, dict[str, Any]]] = {}
+        made: dict[str, tuple[AxisController, ReferenceFilter, dict[str, Any]]] = {}
         for name, axis in axes.items():
             same = next((other for other in made if self._shared() and axis.same_as(axes[other])), None)
             if same is not None:
@@ -108,13 +109,13 @@ class AxisSettings(LoopSettings, ABC):
                 made[name] = self._made(axis, name)
             except SettingsError as error:
                 raise SettingsError(f"{name}: {error}") from error
-        times = [made[name][1] for name in axes]
+        filters = [made[name][1] for name in axes]
         return LinearController(
             kind=self.KIND,
             sample_time=uncertain.sample_time,
             arrays=assemble(
                 [made[name][0] for name in axes],
-                reference_times=(*times, max(times)),
+                filters=(*filters, slowest(filters)),
                 redefinition=redefinition,
                 constants=limits.constants(uncertain.sample_time),
             ),
@@ -123,6 +124,7 @@ class AxisSettings(LoopSettings, ABC):
             design={
                 "settings": self._stored(),
                 "extra_delay": self.extra_delay,
+                "assumed": self.assumed(uncertain),
                 **{name: item[2] for name, item in made.items()},
             },
         )
@@ -148,19 +150,19 @@ class AxisSettings(LoopSettings, ABC):
         more = tuple(scaled(plant, scale) for plant in taken.samples for scale in scales)
         return UncertainAxis(taken.nominal, (*taken.samples, *more))
 
-    def _made(self, axis: UncertainAxis, name: str) -> tuple[AxisController, float, dict[str, Any]]:
+    def _made(self, axis: UncertainAxis, name: str) -> tuple[AxisController, ReferenceFilter, dict[str, Any]]:
         found = self._synthesise(axis, name)
         controller, reduction = found.controller, {}
         if 0 < self.controller_order < controller.A.shape[0]:
             controller, reduction = reduce_axis(controller, axis.nominal, self.extra_delay, self.controller_order)
         margins = axis_margins(controller, axis.nominal, self.extra_delay)
         self._hold(controller, axis)
-        time = self._reference_time(controller, axis) if self.reference_time is None else self.reference_time
+        led = self._reference(controller, axis)
         if self.conditioning == "tuned":
-            controller = self._conditioned(controller, time, axis)
+            controller = self._conditioned(controller, led, axis)
         worst = float(sensitivities(controller, axis.samples, self.extra_delay).max())
         findings = {
-            "gains": {**found.gains, "reference_time_s": time},
+            "gains": {**found.gains, **filter_numbers(led)},
             "dead_time_s": (axis.nominal.delay + self.extra_delay) * axis.sample_time,
             "margins": margins_json(margins),
             "states": int(controller.A.shape[0]),
@@ -169,7 +171,7 @@ class AxisSettings(LoopSettings, ABC):
             **found.notes,
             **reduction,
         }
-        return controller, time, findings
+        return controller, led, findings
 
     def _hold(self, controller: AxisController, axis: UncertainAxis) -> None:
         """Raise unless the loop is stable around every sample, its delay exact."""
@@ -179,6 +181,16 @@ class AxisSettings(LoopSettings, ABC):
                 f"the loop is not stable around {len(lost)} of {len(axis.samples)} samples (the first is sample "
                 f"{lost[0]}); ask for less speed, or lower `max_sensitivity`."
             )
+
+    def _reference(self, controller: AxisController, axis: UncertainAxis) -> ReferenceFilter:
+        """Return the reference filter: for `rise_s`, of `reference_time`, or the least that keeps `overshoot_pct`."""
+        if self.rise_s is not None:
+            if axis.test is not None:
+                check_rise(self.rise_s, axis.nominal, axis.test)
+            return filter_for(self.rise_s, controller, axis.nominal, self.extra_delay)
+        return ReferenceFilter(
+            self._reference_time(controller, axis) if self.reference_time is None else self.reference_time
+        )
 
     def _reference_time(self, controller: AxisController, axis: UncertainAxis) -> float:
         """Return the least time [s] with which no sample overshoots by more, by halving in whole samples."""
@@ -200,7 +212,7 @@ class AxisSettings(LoopSettings, ABC):
             low, high = (low, middle) if keeps(middle) else (middle, high)
         return high * axis.sample_time
 
-    def _conditioned(self, controller: AxisController, time: float, axis: UncertainAxis) -> AxisController:
+    def _conditioned(self, controller: AxisController, led: ReferenceFilter, axis: UncertainAxis) -> AxisController:
         """Return the controller with the conditioning that overshoots least where limits matter."""
         usual = self._sweep(axis)
         large = replace(usual, test=replace(usual.test, reference=2.0 * usual.test.reference))
@@ -208,38 +220,20 @@ class AxisSettings(LoopSettings, ABC):
 
         def worst(L: Matrix) -> float:
             with np.errstate(over="ignore", invalid="ignore"):
-                peaks = [float(sweep.run(controller, time, L).overshoot.max()) for sweep in (large, slow)]
+                peaks = [float(sweep.run(controller, led, L).overshoot.max()) for sweep in (large, slow)]
             return max(peaks) if np.isfinite(peaks).all() else math.inf
 
         best, least = controller.conditioning(), worst(controller.conditioning()) - _WORTH_IT
         for L in conditioning_candidates(controller):
             found = worst(L)
             # What is asked for within the limits must not suffer.
-            if found < least and usual.run(controller, time, L).overshoot.max() <= self.overshoot_pct:
+            if found < least and usual.run(controller, led, L).overshoot.max() <= self.overshoot_pct:
                 best, least = L, found
         return replace(controller, L=best)
 
     def _sweep(self, axis: UncertainAxis) -> Sweep:
         """Return the samples ready for steps within the limits of the motors."""
         return make_sweep(axis.samples, extra_delay=self.extra_delay, test=axis.test)
-
-    def _test(self, plant: AxisPlant, limits: ControllerLimits, inverse: Matrix) -> StepAndLoad:
-        """Return the step and the load that a controller of this axis is judged by."""
-        # The motor that moves most has 2/3 of theta_i (Eq. 9), 0.577 of phi_i: the tighter one is taken.
-        share = float(np.abs(inverse[:, :-1]).max())
-        test = StepAndLoad(
-            sample_time=plant.sample_time,
-            position_limit=limits.position_limit / share,
-            slew_limit=limits.slew_limit * plant.sample_time / share,
-        )
-        if limits.robot.is_neck:
-            return test
-        # As large and as long for this robot as 10 deg, -0.5 rad and 6 s are for a neck, which they take 2 of 9 rad.
-        asked = 2.0 / 9.0 * test.position_limit * abs(plant.static_gain)
-        return replace(
-            test, reference=asked, load=-0.5 / 9.0 * test.position_limit, load_at=plant.stretch * test.load_at,
-            duration=plant.stretch * test.duration, size=test.reference / asked,
-        )  # fmt: skip
 
     def _keeps_all(self, controller: AxisController, axis: UncertainAxis) -> bool:
         """Return whether every sample is stable and keeps `max_sensitivity`."""
@@ -273,6 +267,35 @@ class AxisSettings(LoopSettings, ABC):
             else:
                 high = tried
         return best
+
+
+def axis_test(plant: AxisPlant, limits: ControllerLimits, inverse: Matrix) -> StepAndLoad:
+    """Return the step and the load that a controller of this axis is judged by."""
+    # The motor that moves most has 2/3 of theta_i (Eq. 9), 0.577 of phi_i: the tighter one is taken.
+    share = float(np.abs(inverse[:, :-1]).max())
+    test = StepAndLoad(
+        sample_time=plant.sample_time,
+        position_limit=limits.position_limit / share,
+        slew_limit=limits.slew_limit * plant.sample_time / share,
+    )
+    if limits.robot.is_neck:
+        return test
+    # As large and as long for this robot as 10 deg, -0.5 rad and 6 s are for a neck, which they take 2 of 9 rad.
+    asked = 2.0 / 9.0 * test.position_limit * abs(plant.static_gain)
+    return replace(
+        test, reference=asked, load=-0.5 / 9.0 * test.position_limit, load_at=plant.stretch * test.load_at,
+        duration=plant.stretch * test.duration, size=test.reference / asked,
+    )  # fmt: skip
+
+
+def slowest(filters: Sequence[ReferenceFilter]) -> ReferenceFilter:
+    """Return what filters the reference of co-contraction: as slow as the slowest, and never led."""
+    return ReferenceFilter(max(item.time for item in filters))
+
+
+def filter_numbers(led: ReferenceFilter) -> dict[str, float]:
+    """Return the numbers of a reference filter by name."""
+    return {"reference_time_s": led.time, **({"reference_lead_s": led.lead} if led.lead else {})}
 
 
 def _first_filter(plant: AxisPlant) -> int:

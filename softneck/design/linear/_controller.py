@@ -113,6 +113,7 @@ class LinearController:
             f"{self.kind} controller, {self.sample_time * 1e3:g} ms, {self.order} order, "
             f"{self.design.get('extra_delay', 0)} samples of delay added to the plant for it",
             *self.limits.lines(self.sample_time),
+            *_assumed(self.design.get("assumed", {})),
         ]
         for axis in self.robot.outputs.names:
             item = self.design.get(axis, {})
@@ -156,6 +157,15 @@ class LinearController:
 def robot_in(header: Mapping[str, Any]) -> Robot:
     """Return whose controller a file's header is of; one that does not say is a neck's."""
     return Robot.from_dict(header["robot"]) if "robot" in header else Robot.preset("neck")
+
+
+def _assumed(values: Mapping[str, float]) -> list[str]:
+    """Return a line on what was taken from the paper's neck, none where nothing was."""
+    words = {"least_delay": "a dead time of at least {:g} s", "small_move_pole": "small moves as fast as {:g} 1/s"}
+    told = [words[name].format(value) for name, value in values.items()]
+    if not told:
+        return []
+    return [f"  of the paper's neck, not of this plant: {' and '.join(told)} (--set {', '.join(values)})"]
 
 
 def _findings(item: Mapping[str, Any]) -> list[str]:

@@ -13,7 +13,7 @@ from softneck.core import DataError, Matrix, SettingsError
 from softneck.estimation._axis import AxisPlant
 
 from ..plants._uncertain import UncertainAxis, UncertainPlant
-from ._assembly import AxisController, assemble_whole
+from ._assembly import AxisController, ReferenceFilter, assemble_whole
 from ._axis_loop import conditioning_gain, delayed_form, error_feedback, innovations_gain
 from ._axis_settings import AxisDesign, AxisSettings
 from ._controller import LinearController
@@ -89,7 +89,7 @@ class CustomSettings(AxisSettings):
             sample_time=uncertain.sample_time,
             arrays=assemble_whole(
                 law,
-                reference_times=[time] * (len(names) + 1),
+                filters=[ReferenceFilter(time)] * (len(names) + 1),
                 redefinition=self.redefinition(uncertain),
                 constants=limits.constants(uncertain.sample_time),
             ),

@@ -43,6 +43,8 @@ class LoopSettings:
             -6 for no such rule.
         order: of the loop; "jacobi" adds one sample for the controller and one for the observer.
         observer: whether the loop will have an observer.
+        rise_s: time [s] in which a step on the nominal plant rises from 10 to 90 %, no limit acting; the reference
+            filter is made for it in the place of `reference_time`. None: by that.
         tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
     """
 
@@ -56,6 +58,7 @@ class LoopSettings:
     least_cocontraction: float = NeckDefault(-6.0)
     order: str = "sequential"
     observer: bool = True
+    rise_s: float | None = None
     tendon_angles: tuple[float, float, float] = tuple(TENDON_ANGLES.tolist())
 
     def __post_init__(self) -> None:
@@ -63,6 +66,11 @@ class LoopSettings:
         require_between("small_move_pole", self.small_move_pole, 0.0, 1000.0, "1/s")
         require_one_of("order", self.order, ORDERS)
         require_limits({name: getattr(self, name) for name in LIMITS})
+        if self.rise_s is not None:
+            require_between("rise_s", self.rise_s, 0.001, 1e6, "s")
+            given = getattr(self, "reference_time", None)
+            if given is not None and not isinstance(given, NeckDefault):
+                raise SettingsError("`rise_s` sets the reference filter; give it or `reference_time`, not both.")
 
     def of_robot(self, plant: UncertainPlant) -> Self:
         """Return the settings for the robot of `plant`: where nobody says otherwise, nothing that is known of necks.
@@ -82,6 +90,20 @@ class LoopSettings:
     def _others(self, plant: UncertainPlant) -> dict[str, Any]:  # noqa: ARG002 - kinds add what depends on it
         """Return what stands for another robot in the place of the neck's defaults."""
         return {"least_delay": 0.0, "small_move_pole": 0.0}
+
+    def assumed(self, plant: UncertainPlant) -> dict[str, float]:
+        """Return what of the paper's neck, and not of this plant, a design takes where nobody says otherwise."""
+        nominal = [axis.nominal for axis in plant.axes.values()] if plant.robot.is_neck else []
+        changed = {
+            "least_delay": any(item.delayed(self.least_delay).delay > item.delay for item in nominal),
+            "small_move_pole": self.small_move_pole > 0.0
+            and any(item.faster(self.small_move_pole) is not item for item in nominal),
+        }
+        return {
+            name: float(getattr(self, name))
+            for name, changes in changed.items()
+            if changes and isinstance(getattr(self, name), NeckDefault)
+        }
 
     def redefinition(self, plant: UncertainPlant) -> tuple[Matrix, Matrix]:
         """Return T from motors to the redefined inputs of all axes and co-contraction, and its inverse."""

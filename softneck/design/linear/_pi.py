@@ -6,18 +6,20 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from softneck.core import SettingsError, require_between, require_one_of, require_positive
+from softneck.core import Matrix, SettingsError, require_between, require_one_of, require_positive
 from softneck.estimation._axis import HasTransferFunctions
 from softneck.robot._neck_default import NeckDefault
 
 from ..plants._uncertain import UncertainAxis, UncertainPlant, uncertain_plant
-from ._assembly import assemble, pi_axis
+from ._assembly import ReferenceFilter, assemble, pi_axis
 from ._axis_loop import sensitivities, unstable_samples
-from ._axis_settings import margins_json, slowest_time
+from ._axis_settings import axis_test, filter_numbers, margins_json, slowest, slowest_time
 from ._controller import LinearController
 from ._loop_settings import LoopSettings
 from ._margins import LOWEST, loop_margins
 from ._pid import place_pid
+from ._ports import ControllerLimits
+from ._rise import check_rise, filter_for
 from ._tuning import Gains, Plants, open_loop, reference_time, tune_pi
 
 TUNINGS = ("nominal", "samples", "placement")
@@ -84,15 +86,18 @@ class PiSettings(LoopSettings):
 
     def _designed(self, uncertain: UncertainPlant) -> LinearController:
         sample_time, names, limits = uncertain.sample_time, uncertain.names, self.limits(uncertain.robot)
+        redefinition = self.redefinition(uncertain)
         plants = [uncertain.axis(axis).prepared(self.least_delay, self.small_move_pole) for axis in names]
         families = [self._family(plant) for plant in plants]
         tuned: list[Gains] = []
-        filters: list[float] = []
+        filters: list[ReferenceFilter] = []
         for i, plant in enumerate(plants):
             # Axes that are the same plants are tuned once.
             same = next((j for j in range(i) if plants[j].same_as(plant)), None)
             tuned.append(self._tuned(families[i]) if same is None else tuned[same])
-            filters.append(self._filter(families[i], tuned[i]) if same is None else filters[same])
+            filters.append(
+                self._filter(families[i], tuned[i], limits, redefinition[1]) if same is None else filters[same]
+            )
         found = {
             axis: _findings(plant, len(self._small(plant)), self.extra_delay, gains, time)
             for axis, plant, gains, time in zip(names, plants, tuned, filters, strict=True)
@@ -105,13 +110,18 @@ class PiSettings(LoopSettings):
             sample_time=sample_time,
             arrays=assemble(
                 [pi_axis(gains.gain, gains.integral_time, sample_time) for gains in tuned],
-                reference_times=(*filters, max(filters)),
-                redefinition=self.redefinition(uncertain),
+                filters=(*filters, slowest(filters)),
+                redefinition=redefinition,
                 constants=limits.constants(sample_time),
             ),
             limits=limits,
             order=self.order,
-            design={"settings": asdict(self), "extra_delay": self.extra_delay, **found},
+            design={
+                "settings": asdict(self),
+                "extra_delay": self.extra_delay,
+                "assumed": self.assumed(uncertain),
+                **found,
+            },
         )
 
     def _family(self, plant: UncertainAxis) -> Plants:
@@ -135,22 +145,29 @@ class PiSettings(LoopSettings):
             )
         return Gains(K, K / Ki)
 
-    def _filter(self, family: Plants, gains: Gains) -> float:
+    def _filter(self, family: Plants, gains: Gains, limits: ControllerLimits, inverse: Matrix) -> ReferenceFilter:
+        if self.rise_s is not None:
+            plant = family[0]
+            check_rise(self.rise_s, plant, axis_test(plant, limits, inverse))
+            axis = pi_axis(gains.gain, gains.integral_time, plant.sample_time)
+            return filter_for(self.rise_s, axis, plant, self.extra_delay)
         if self.reference_time is not None:
-            return self.reference_time
+            return ReferenceFilter(self.reference_time)
         # Samples say themselves how the gain spreads.
         spread = 0.0 if self.tuning == "samples" and len(family) > 2 else self.gain_spread
-        return reference_time(family, self.extra_delay, gains, gain_spread=spread, overshoot=self.overshoot_pct / 100.0)
+        return ReferenceFilter(
+            reference_time(family, self.extra_delay, gains, gain_spread=spread, overshoot=self.overshoot_pct / 100.0)
+        )
 
 
-def _findings(plant: UncertainAxis, small: int, extra_delay: int, gains: Gains, filter_time: float) -> dict[str, Any]:
+def _findings(plant: UncertainAxis, small: int, extra_delay: int, gains: Gains, led: ReferenceFilter) -> dict[str, Any]:
     """Return gains and margins of one axis as JSON values; None stands for infinity."""
     family = plant.samples[:small]
     lowest = LOWEST / plant.nominal.stretch
     margins = [margins_json(loop_margins(open_loop(item, extra_delay, gains), lowest=lowest)) for item in family]
     axis = pi_axis(gains.gain, gains.integral_time, plant.sample_time)
     lost = unstable_samples(axis, plant.samples, extra_delay)
-    named = {"K": gains.gain, "Ti_s": gains.integral_time, "reference_time_s": filter_time}
+    named = {"K": gains.gain, "Ti_s": gains.integral_time, **filter_numbers(led)}
     dead_time = (family[0].delay + extra_delay) * family[0].sample_time
     return {
         "gains": named,

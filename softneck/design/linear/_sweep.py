@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +13,7 @@ from softneck.estimation import AxisPlant
 from softneck.runtime import load_functions
 
 from ..plants._step_and_load import StepAndLoad, StepAndLoadResult, judge
-from ._assembly import AxisController
+from ._assembly import AxisController, ReferenceFilter
 
 _RUNTIME = "softneck.design.linear._sweep_runtime"
 
@@ -35,11 +34,14 @@ class Sweep:
     test: StepAndLoad
     nominal: int = 0
 
-    def run(self, axis: AxisController, reference_time: float, L: Matrix) -> StepAndLoadResult:
+    def run(self, axis: AxisController, reference: ReferenceFilter | float, L: Matrix) -> StepAndLoadResult:
         """Return how the axis does; equal to `run_bake_off` with the assembled controller."""
         test = self.test
-        a = math.exp(-test.sample_time / reference_time) if reference_time > 0.0 else 0.0
-        numbers = np.array([test.reference, a, test.position_limit, test.slew_limit, test.load, test.load_row])
+        led = reference if isinstance(reference, ReferenceFilter) else ReferenceFilter(reference)
+        numbers = np.array([
+            test.reference, led.pole(test.sample_time), test.position_limit, test.slew_limit, test.load, test.load_row,
+            led.jump,
+        ])  # fmt: skip
         angles = np.zeros((self.delays.size, test.rows))
         functions: Any = load_functions(_RUNTIME)
         functions.sweep_run(

@@ -17,7 +17,7 @@ def sweep_run(
     """Fill `angles` (plants, time) with what `run_bake_off` finds.
 
     A (n, n); B (n, 2) from filtered reference and angle; C (n,); D (2,); L (n,) conditioning.
-    test: reference, filter's pole, position limit, slew limit per sample, load, load's first row.
+    test: reference, filter's pole, position limit, slew limit per sample, load, load's first row, filter's jump.
     plants: (plants, 2, order) numerator and denominator without its leading one; delays: (plants,).
     """
     n, order = A.shape[0], plants.shape[2]
@@ -31,7 +31,8 @@ def sweep_run(
         x[:] = 0.0
         state[:] = 0.0
         line[:] = 0.0
-        held, rf = 0.0, 0.0
+        # What a lead passes at once stands in the filter from the start.
+        held, rf = 0.0, test[6] * test[0]
         delay = int(delays[i])
         for k in range(rows):
             y = state[0]

@@ -18,11 +18,13 @@ from softneck.robot import Robot
 from softneck.robot._neck_default import NeckDefault
 from softneck.runtime import Port
 
-from ..linear._assembly import assemble, pi_axis
+from ..linear._assembly import ReferenceFilter, assemble, pi_axis
+from ..linear._axis_settings import slowest
 from ..linear._linear_parts_runtime import LinearArrays
 from ..linear._loop_settings import LoopSettings
 from ..linear._margins import LOWEST, frequencies
 from ..linear._ports import ControllerLimits
+from ..linear._rise import filter_for_lag
 from ..plants._uncertain import UncertainPlant, uncertain_plant
 from ._adaptive_runtime import AdaptiveArrays
 from ._varying import RUNTIMES, VaryingController
@@ -220,6 +222,13 @@ class AdaptiveSettings(LoopSettings):
         gains = sorted((K * (1.0 - self.gain_range), K * (1.0 + self.gain_range)))
         return np.array([a**self.pole_range, a ** (1.0 / self.pole_range), *gains])
 
+    def _filters(self, plants: list[AxisPlant]) -> tuple[ReferenceFilter, ...]:
+        """Return the reference filters, the last of co-contraction."""
+        if self.rise_s is None:
+            return (ReferenceFilter(self.reference_time),) * (len(plants) + 1)
+        each = [filter_for_lag(self.rise_s, 1.0 / _pole(plant)) for plant in plants]
+        return (*each, slowest(each))
+
     def _arrays(
         self, plants: list[AxisPlant], delays: list[int], kappas: list[float], limits: ControllerLimits,
         redefinition: tuple[Matrix, Matrix], size: float,
@@ -228,7 +237,7 @@ class AdaptiveSettings(LoopSettings):
         Ts = plants[0].sample_time
         common = assemble(
             [pi_axis(1.0, 1.0, Ts)] * len(plants),
-            reference_times=(self.reference_time,) * (len(plants) + 1),
+            filters=self._filters(plants),
             redefinition=redefinition,
             constants=limits.constants(Ts),
         )

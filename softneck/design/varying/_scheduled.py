@@ -17,10 +17,12 @@ from softneck.identification.uncertainty._lpv import require_inclination
 from softneck.robot import Robot
 from softneck.robot._neck_default import NeckDefault
 
-from ..linear._assembly import AxisController, assemble
+from ..linear._assembly import AxisController, ReferenceFilter, assemble
+from ..linear._axis_settings import slowest
 from ..linear._linear_parts_runtime import LinearArrays
 from ..linear._loop_settings import LoopSettings
 from ..linear._margins import LOWEST, frequencies
+from ..linear._rise import filter_for_lag, lag_of
 from ..linear._tuning import Gains, tune_pi
 from ..plants._uncertain import UncertainPlant, uncertain_plant
 from ._operating_points import OperatingPoint, family_points, model_points
@@ -198,9 +200,13 @@ class ScheduledSettings(LoopSettings):
             ]
             for axis in range(m)
         ]
+        filters = self._filters([points[len(points) // 2].plants[axis][0] for axis in range(m)])
         each = [
             assemble(
-                there, reference_times=(self.reference_time,) * (m + 1), redefinition=redefinition, constants=constants
+                there,
+                filters=filters,
+                redefinition=redefinition,
+                constants=constants,
             )
             for there in zip(*axes, strict=True)
         ]
@@ -208,6 +214,13 @@ class ScheduledSettings(LoopSettings):
             name: np.vstack([arrays[i] for arrays in each]) if name in _VARYING else each[0][i]
             for i, name in enumerate(LinearArrays.names())
         }
+
+    def _filters(self, plants: Sequence[AxisPlant]) -> tuple[ReferenceFilter, ...]:
+        """Return the reference filters, the last of co-contraction: for `rise_s` at the middle operating point."""
+        if self.rise_s is None:
+            return (ReferenceFilter(self.reference_time),) * (len(plants) + 1)
+        each = [filter_for_lag(self.rise_s, lag_of(self._followed(plant))) for plant in plants]
+        return (*each, slowest(each))
 
     def _between(
         self, points: Sequence[OperatingPoint], gains: Sequence[Sequence[Gains]], names: tuple[str, ...]

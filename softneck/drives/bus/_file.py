@@ -21,6 +21,7 @@ from softneck.signals.recording._channels import NECK
 from ..master import MasterSettings
 from ..master._fieldbus import BusSettings
 from ..master._settings import LimitSettings, RampSettings, SensorSettings, WatchSettings
+from ._axes import axes_of
 from ._load import MOST, bus_load
 from ._robot import channels_of, count_word, ranges, require_signs
 from ._sensor_source import SENSORS, SensorSource
@@ -146,6 +147,8 @@ class DrivesFile:
         guarding, zero, neck, limits, sensor, watch, ramps: the tables of those names.
         sensor_kind, sensor_node: "simulated", or "can" for a CiA 410 inclinometer at that node; others need
             `sensor_source`.
+        sensor_axes: which of the sensor's own axes each output is, "-" before one that is reversed; () where it sits
+            as it should.
         quick_stop: deceleration of a quick stop (6085h) [rad/s^2].
         following: window (6065h) [rad]; following_time: its time-out (6066h) [s].
         robot: what the drives move; None: the neck, with no limits beside those here.
@@ -166,6 +169,7 @@ class DrivesFile:
     sensor_kind: str = "simulated"
     sensor_node: int = 10
     sensor_source: SensorSource = field(default_factory=SensorSource)
+    sensor_axes: tuple[str, ...] = ()
     quick_stop: float = 200.0
     following: float = 2.0
     following_time: float = 0.2
@@ -188,6 +192,7 @@ class DrivesFile:
             raise SettingsError(f"the {word} drives need {word} node numbers; got {', '.join(map(str, nodes))}.")
         if self.sensor_kind == "can" and self.sensor_node in nodes:
             raise SettingsError(f"[sensor] node {self.sensor_node} is that of a drive; each device needs its own.")
+        axes_of(self.sensor_axes, self.moves.outputs.names)
         if self.robot is not None:
             require_signs([drive.scale.reversed for drive in self.drives], self.robot)
         if self.load > MOST:

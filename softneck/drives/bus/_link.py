@@ -17,6 +17,7 @@ from ..master._gate import Reading, Tilt, sample_of
 from ..simulated import SimulatedNeck
 from ..simulated._frame import CanFrame
 from ..simulated._springs import SimulatedSprings
+from ._axes import Axes, turned
 from ._why import reason
 
 # Interfaces whose far end is a program on this machine: no drive can be behind them.
@@ -58,6 +59,7 @@ class VirtualLink:
         tap: called with (time, from_master, frame) for each frame that is on the wire.
         lose: returns whether a frame is lost: (from_master, frame).
         inject: frames of somebody else, delivered to both sides with the next exchange.
+        axes: which of the sensor's own axes each output is; None: as they come.
         sampling: whether passing time makes the inclinometer sample; else whoever steps the link does.
     """
 
@@ -72,6 +74,7 @@ class VirtualLink:
         self.tap: Callable[[float, bool, Frame], None] | None = None
         self.lose: Callable[[bool, Frame], bool] | None = None
         self.inject: list[Frame] = []
+        self.axes: Axes | None = None
         self.sampling = True
         self._samples = max(1, round(neck.settings.sample_time / self.cycle))
 
@@ -98,7 +101,8 @@ class VirtualLink:
     def newest(self) -> Tilt | Reading:
         """The sensor's newest sample, as the master takes it."""
         sample = self.neck.newest
-        return sample_of(sample.values, sample.rates, valid=sample.valid)
+        told = sample_of(sample.values, sample.rates, valid=sample.valid)
+        return told if self.axes is None else turned(told, self.axes)
 
     def pass_time(self) -> None:
         """Let one cycle pass: drives, neck, and what the drives say by themselves."""

@@ -9,7 +9,7 @@ from softneck.core import FileFormatError
 
 from ._file import DriveEntry, DrivesFile
 from ._sdo import is_integer
-from ._units import acceleration_to_internal, current_to_internal, position_to_counts
+from ._units import acceleration_to_internal, current_to_internal, internal_to_current, position_to_counts
 
 if TYPE_CHECKING:
     from canopen.objectdictionary import ObjectDictionary
@@ -100,6 +100,11 @@ def current_write(current: float, entry: DriveEntry, profile: str, topic: str) -
     if profile == _PLAIN:
         return Write(0x6073, 0, round(1000.0 * current / RATED_CURRENT), topic)
     return Write(0x207F, 0, abs(current_to_internal(current, entry.scale)), topic)
+
+
+def ampere(entry: DriveEntry, profile: str) -> float:
+    """Return the current for one unit of what the drive tells [A]."""
+    return 1e-3 * RATED_CURRENT if profile == _PLAIN else abs(internal_to_current(1, entry.scale))
 
 
 def _acceleration(value: float, entry: DriveEntry, profile: str) -> int:

@@ -118,6 +118,8 @@ def make_drives(table: Mapping[str, Any], folder: Path = Path(), robot: Robot | 
         content = dict(_table(name, table[name]))
         if name == "sensor":
             values |= {f"sensor_{key}": content.pop(key) for key in ("kind", "node") if key in content}
+            if "axes" in content:
+                values["sensor_axes"] = _texts("[sensor] axes", content.pop("axes"))
             kind, own = values.get("sensor_kind", "simulated"), [key for key in content if key in SOURCE_KEYS]
             values["sensor_source"] = make_source(kind, {key: content.pop(key) for key in own}, folder)
         values[_FIELDS.get(name, name)] = _made(f"[{name}]", setting, name, content)
@@ -173,6 +175,12 @@ def _value(where: str, value: Any, factor: float) -> Any:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise SettingsError(f"{where} must be a number; got {value!r}.")
     return factor * value
+
+
+def _texts(where: str, value: Any) -> tuple[str, ...]:
+    if not isinstance(value, list) or not all(isinstance(text, str) for text in value):
+        raise SettingsError(f"{where} must be a list of texts; got {value!r}.")
+    return tuple(value)
 
 
 def _table(name: str, value: Any) -> Mapping[str, Any]:

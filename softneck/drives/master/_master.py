@@ -55,7 +55,8 @@ class Master:
         self._watches = Watches(settings.watch, settings.limits, channels and channels.weights, count)
         ranges = channels.ranges if channels else [None] * count
         self._limiters = tuple(Limiter(settings.limits, settings.bus.cycle, own) for own in ranges)
-        self._scales = tuple(zip(self.bus.drives, settings.counts_per_radian, settings.newton_per_unit, strict=True))
+        scales = (settings.counts_per_radian, settings.newton_per_unit, settings.zeros)
+        self._scales = tuple(zip(self.bus.drives, *scales, strict=True))
         self._clamped = Leaky(settings.limits.persistent, settings.bus.cycle)
         self.positions: Motors = (0.0,) * count
         self.tensions = self.setpoints = self.wanted = self._from = self.positions
@@ -165,9 +166,8 @@ class Master:
         return [Event(now, "late_cycle")] if gap > 1.5 else []
 
     def _measure(self) -> None:
-        zero = self.settings.zero_counts
-        self.positions = tuple([(view.counts - zero) / per_radian for view, per_radian, _ in self._scales])
-        self.tensions = tuple([view.current * newton for view, _, newton in self._scales])
+        self.positions = tuple([(view.counts - zero) / per_radian for view, per_radian, _, zero in self._scales])
+        self.tensions = tuple([view.current * newton for view, _, newton, _ in self._scales])
 
     def _judge(self, now: float, events: list[Event]) -> None:
         if not events:
@@ -395,5 +395,5 @@ class Master:
         return [goal if i <= self._enabling else Goal.OFF for i in range(len(self._scales))]
 
     def _targets(self) -> list[int]:
-        k, zero = self.settings.counts_per_radian, self.settings.zero_counts
-        return [round(position * scale) + zero for position, scale in zip(self.setpoints, k, strict=True)]
+        values = zip(self.setpoints, self._scales, strict=True)
+        return [round(position * per_radian) + zero for position, (_, per_radian, _, zero) in values]

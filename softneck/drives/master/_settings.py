@@ -161,7 +161,8 @@ class MasterSettings:
 
     Attributes:
         counts_per_radian: of each winch, with sign.
-        zero_counts: counts at the zero of P (1: the mark of a homed drive, see `softneck drives zero`).
+        zero_counts: counts at the zero of P, of all motors or of each (1: the mark of a homed drive, see `softneck
+            drives zero`).
         newton_per_unit: tension for one unit of each drive's current, with sign.
         sample_cycles: bus cycles for one sample of the controller.
         bus, limits, sensor, watch, ramps: as their classes say.
@@ -170,7 +171,7 @@ class MasterSettings:
 
     counts_per_radian: tuple[float, ...]
     newton_per_unit: tuple[float, ...] = (0.0, 0.0, 0.0)
-    zero_counts: int = 1
+    zero_counts: int | tuple[int, ...] = 1
     sample_cycles: int = 2
     bus: BusSettings = field(default_factory=BusSettings)
     limits: LimitSettings = field(default_factory=LimitSettings)
@@ -181,6 +182,12 @@ class MasterSettings:
 
     def __post_init__(self) -> None:
         require_whole("sample_cycles", self.sample_cycles, 1, 20)
+
+    @property
+    def zeros(self) -> tuple[int, ...]:
+        """Counts at the zero of P, one for each motor."""
+        zero = self.zero_counts
+        return (zero,) * len(self.counts_per_radian) if isinstance(zero, int) else zero
 
     @property
     def outputs(self) -> tuple[str, ...]:

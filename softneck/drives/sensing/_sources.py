@@ -15,6 +15,7 @@ from softneck.signals import read_recording
 from softneck.signals.recording._channels import NECK
 from softneck.signals.recording._recording import require_same_robot
 
+from ..bus._axes import Axes, axes_of, turned
 from ..bus._sensor_source import SENSORS, SensorSource
 from ..logs._log_file import read_run_log
 from ..master import Frame, Tilt
@@ -68,9 +69,28 @@ class _FirstAngle:
         return None if tilt is None else sample_of(tilt.values[:1], tilt.rates[:1], valid=tilt.valid)
 
 
+class _Turned:
+    """A sensor that is mounted with other axes, or signs, than the robot's outputs."""
+
+    def __init__(self, sensor: Any, axes: Axes) -> None:
+        self._sensor, self._axes, self.take = sensor, axes, sensor.take
+
+    def __getattr__(self, name: str) -> Any:
+        # What not every sensor has: name, problem, close.
+        return getattr(self._sensor, name)
+
+    def read(self, now: float, frames: Sequence[Frame]) -> Tilt | Reading | None:
+        sample = self._sensor.read(now, frames)
+        return None if sample is None else turned(sample, self._axes)
+
+
 @contextlib.contextmanager
-def open_sensor(kind: str, node: int, source: SensorSource, robot: Robot = NECK) -> Iterator[Any]:
+def open_sensor(
+    kind: str, node: int, source: SensorSource, robot: Robot = NECK, *, axes: Sequence[str] = ()
+) -> Iterator[Any]:
     """Yield the inclinometer of a drives file, or what else measures the outputs of `robot`; see `Sensor`.
+
+    Its samples are turned by `axes`, see `DrivesFile.sensor_axes`.
 
     Raises:
         DataError: a recording of another robot.
@@ -79,6 +99,8 @@ def open_sensor(kind: str, node: int, source: SensorSource, robot: Robot = NECK)
         FileFormatError: no such recording.
     """
     sensor = _opened(kind, node, source, robot)
+    if axes:
+        sensor = _Turned(sensor, axes_of(axes, robot.outputs.names))
     try:
         yield sensor
     finally:

@@ -55,6 +55,8 @@ class Axis:
         fault: code of the fault that holds, 0 if none.
         homed: whether the encoder's zero was set since the last reset.
         enable_input: the hardware input; without it the drive faults.
+        device_name: which type it is (1008h), "" where it does not tell.
+        counts_per_turn: of the motor, once in which its encoder's index comes.
     """
 
     def __init__(self, node: int, profile: Profile, motion: Vector, *, peak_current: float, slow_loop: float) -> None:
@@ -62,7 +64,8 @@ class Axis:
         self.node, self.profile, self.motion = node, profile, motion
         self.peak_current, self.slow_loop = peak_current, slow_loop
         self.enable_input = True
-        self.tick = 1e-3
+        self.device_name = profile.name_of(peak_current)
+        self.tick, self.counts_per_turn = 1e-3, 2048.0
         self.values: dict[tuple[int, int], int] = {}
         self.emergencies: deque[tuple[int, int]] = deque()
         self.setters = {(0x6040, 0): self._control, (0x607A, 0): self._set_target, (0x60FF, 0): self._set_speed}
@@ -75,6 +78,8 @@ class Axis:
             (0x6078, 0): lambda: round(1000.0 * motion[SERVO_CURRENT] / max(profile.rated_current, 1e-9)),
             (0x603F, 0): lambda: self.fault,
             (0x1001, 0): lambda: 1 if self.fault else 0,
+            (0x60B9, 0): lambda: 0 if self._captured is None else 0x03,
+            (0x60BA, 0): lambda: self._captured or 0,
         }
         self.reset()
 
@@ -84,7 +89,7 @@ class Axis:
         """Power-on or node reset: start values everywhere; the encoder's zero is lost."""
         self.values = {key: item.start for key, item in self.profile.items.items()}
         for key in ((0x1018, 4), (0x1018, 2)):
-            self.values[key] = 1000 + self.node if key[1] == 4 else 27014101
+            self.values[key] = 1000 + self.node if key[1] == 4 else self.profile.products.get(self.device_name, 0)
         for n in range(4):
             for base in (0x1400, 0x1800):
                 self.values[(base + n, 1)] += self.node
@@ -95,6 +100,7 @@ class Axis:
         self._word = self._stop_then = 0
         self._attained = self._acknowledged = False
         self._limit_told = self._target = 0
+        self._turn, self._captured = None, None
         m = self.motion
         m[SERVO_POWER] = m[SERVO_TRIPPED] = m[SERVO_LEFT] = 0.0
         m[SERVO_ZERO] -= m[SERVO_POSITION]
@@ -118,7 +124,7 @@ class Axis:
         if item is None:
             return NO_SUBINDEX if any(key[0] == index for key in self.profile.items) else NO_OBJECT
         if not item.size:
-            return item.text.encode("ascii")
+            return (self.device_name if index == 0x1008 else item.text).encode("ascii")
         getter = self.getters.get((index, subindex))
         value = getter() if getter else self.values[(index, subindex)]
         return (int(value) & ((1 << 8 * item.size) - 1)).to_bytes(item.size, "little")
@@ -289,6 +295,7 @@ class Axis:
     def watch(self) -> None:
         """To be called after each stretch of motion: limits, following error, inputs, the end of stop ramps."""
         m = self.motion
+        self._probe()
         if m[SERVO_POWER] < 0.5:
             return
         if m[SERVO_TRIPPED] and self.state not in (power.FAULT, power.REACTION):
@@ -303,6 +310,18 @@ class Axis:
         if m[SERVO_MODE] == 0.0 and self._stop_then and abs(m[SERVO_DEMAND_SPEED]) < _STANDS:
             then, self._stop_then = self._stop_then, 0
             self._enter(then)
+
+    def _probe(self) -> None:
+        """Keep the position of the last index pulse while the touch probe (60B8h) waits for it."""
+        if self.values[(0x60B8, 0)] & 0x17 != 0x17:  # on, at each, at the index, at its rising edge
+            self._turn = self._captured = None
+            return
+        # Counts that home offset and reset do not move: the index sits on the rotor.
+        m = self.motion
+        turn = math.floor((m[SERVO_POSITION] - m[SERVO_ZERO]) / self.counts_per_turn)
+        if self._turn is not None and turn != self._turn:
+            self._captured = round(max(turn, self._turn) * self.counts_per_turn + m[SERVO_ZERO])
+        self._turn = turn
 
     # -- set-points ---------------------------------------------------------------------------------------------
 

@@ -17,6 +17,7 @@ from ._node import SimulatedDrive
 from ._profiles import PROFILES
 from ._servo_runtime import (
     SERVO_CURRENT_LIMIT,
+    SERVO_GEARING,
     SERVO_LAG,
     SERVO_PLACE,
     SERVO_POSITION,
@@ -97,7 +98,7 @@ class SimulatedDrives:
             size = settings.gear[row] * settings.counts_per_turn[row] / (2.0 * math.pi)
             self.motion[row, SERVO_SCALE] = -size if settings.reversed[row] else size
             self.motion[row, SERVO_LAG] = max(0, round(lag / self.h))
-            self.motion[row, SERVO_PLACE] = 0
+            self.motion[row, SERVO_PLACE], self.motion[row, SERVO_GEARING] = 0, 1.0
         self.nodes = tuple(self._drive(settings, row, current_limit) for row in range(count))
 
     def _drive(self, s: SimulatedSettings, row: int, current_limit: float) -> SimulatedDrive:
@@ -105,7 +106,7 @@ class SimulatedDrives:
         axis = Axis(
             s.nodes[row], PROFILES[s.profile](), m, peak_current=s.peak_current[row], slow_loop=s.slow_loop[row]
         )
-        axis.tick = self.h
+        axis.tick, axis.counts_per_turn = self.h, s.counts_per_turn[row]
         m[SERVO_CURRENT_LIMIT] = current_limit
         if s.homed:
             # As `drives zero` leaves it: home offset 1 count, which no drive has after a reset.

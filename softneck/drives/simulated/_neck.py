@@ -17,7 +17,7 @@ from softneck.runtime._bundle import sized
 
 from ._drives import OutputSample, SimulatedDrives, SimulatedSettings, TiltSample, exchange, sample_at, sensed
 from ._frame import CanFrame
-from ._servo_runtime import SERVO_STUCK
+from ._servo_runtime import SERVO_GEARING, SERVO_STUCK
 
 
 class SimulatedNeck:
@@ -49,6 +49,8 @@ class SimulatedNeck:
         )
         self.drives = self._on_bus.nodes
         self.motion: Matrix = self._on_bus.motion
+        # A drive with another gear than the neck's pulls with that one; what it has to accelerate stays the neck's.
+        self.motion[:, SERVO_GEARING] = np.array(settings.gear) / parameters.gear_ratio
         self._functions: ModuleType = load_functions(
             sized("softneck.drives.simulated._servo_runtime", motors, self._angles)
         )

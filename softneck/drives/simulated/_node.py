@@ -26,6 +26,7 @@ class _Pdo:
     actions: list[Callable]
     waiting: tuple[int, ...] | None = None
     sent: bytes = b""
+    syncs: int = 0
 
 
 class SimulatedDrive:
@@ -118,8 +119,14 @@ class SimulatedDrive:
                 self._apply(pdo, values)
         self.axis.synchronise()
         for pdo in self._transmit_pdos:
-            if 1 <= pdo.kind <= 240:
-                self._out.append(CanFrame(pdo.identifier, self._packed(pdo)))
+            if pdo.kind > 240:
+                continue
+            pdo.syncs += 1
+            data = self._packed(pdo)
+            # Type n: with each n-th SYNC; type 0: with the SYNC after a change (CiA 301, 7.5.2.35).
+            if pdo.syncs == pdo.kind or (pdo.kind == 0 and data != pdo.sent):
+                pdo.syncs, pdo.sent = 0, data
+                self._out.append(CanFrame(pdo.identifier, data))
 
     def _apply(self, pdo: _Pdo, values: tuple[int, ...]) -> None:
         # The last entries first: a set-point stands before the control word that may start it.

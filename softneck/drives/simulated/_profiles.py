@@ -41,6 +41,8 @@ class Profile:
         heartbeat_consumer: has 1016h.
         late_mode_display: 6061h shows 8 only in Operation Enabled.
         rated_current: [A], for 6073h and 6078h; 0 where currents are in internal units.
+        types: peak current [A] -> type of such a drive, as 1008h tells it.
+        products: type -> product code (1018h), of those that are public.
         units_per_count: internal speed units for one count per second; None: 65536 per slow-loop sample.
     """
 
@@ -50,6 +52,12 @@ class Profile:
     late_mode_display: bool = True
     rated_current: float = 0.0
     units_per_count: float | None = None
+    types: Mapping[float, str] = field(default_factory=dict)
+    products: Mapping[str, int] = field(default_factory=dict)
+
+    def name_of(self, peak_current: float) -> str:
+        """Return the type of a drive with that peak current [A]; the text of 1008h where there is only one."""
+        return self.types.get(peak_current, self.items[(0x1008, 0)].text)
 
 
 def _ro(start: int, size: int = 4, *, signed: bool = False) -> Item:
@@ -98,6 +106,9 @@ def _common() -> dict[Key, Item]:
         (0x6097, 1): Item(1),
         (0x6097, 2): Item(1),
         (0x6098, 0): Item(0, 1, signed=True),
+        (0x60B8, 0): Item(0, 2),
+        (0x60B9, 0): _ro(0, 2),
+        (0x60BA, 0): _ro(0, 4, signed=True),
         (0x60C2, 0): _ro(2, 1),
         (0x60C2, 1): Item(1, 1),
         (0x60C2, 2): Item(-3, 1, signed=True),
@@ -123,14 +134,15 @@ def _pdo(communication: int, mapping: int, identifier: int) -> dict[Key, Item]:
 def ipos2015() -> Profile:
     """Return the iPOS of the 2015 manual: life guarding only, currents in internal units."""
     items = _common() | {
-        (0x1008, 0): Item(text="iPOS4808 MX-CAN (simulated)", size=0, writable=False),
+        (0x1008, 0): Item(text="CiA 402 drive (simulated)", size=0, writable=False),
         (0x100A, 0): Item(text="F514I", size=0, writable=False),
         (0x207E, 0): _ro(0, 2, signed=True),
         (0x207F, 0): Item(0, 2),
         # The default of the manual: no bit for the cyclic mode (bit 7), though the drive has it.
         (0x6502, 0): _ro(0x001F0065),
     }
-    return Profile("ipos2015", items)
+    types = {10.0: "iPOS3604 MX-CAN (simulated)", 20.0: "iPOS4808 MX-CAN (simulated)"}
+    return Profile("ipos2015", items, types=types, products={types[20.0]: 27014101})
 
 
 def ds402() -> Profile:

@@ -47,7 +47,8 @@ SERVO_POSITION = 24  # out: encoder [counts]
 SERVO_ACTUAL_SPEED = 25  # out: [counts/s]
 SERVO_CURRENT = 26  # out: of the motor [A]
 SERVO_STUCK = 27  # 1.0: the winch is blocked
-SERVO_SIZE = 28
+SERVO_GEARING = 28  # torque of the drive's own gear by that of the neck's
+SERVO_SIZE = 29
 
 
 def servo_ticks(
@@ -120,11 +121,12 @@ def servo_tick(
     demand = ring[place - int(m[SERVO_LAG])] if m[SERVO_MODE] == 8.0 else m[SERVO_DEMAND]
     servo_follow(m, demand - counts, h)
     gain, speed_limit, bandwidth, reset, _, supply, back_emf, inertia, _, _ = drive
+    pull = per_ampere * m[SERVO_GEARING]
     # Counts have the drive's sign, the neck radians: the scale takes both over.
     wanted = min(max(gain * (demand - counts) / m[SERVO_SCALE], -speed_limit), speed_limit)
     error = inertia * bandwidth * (wanted - speed)
     asked = error + m[SERVO_INTEGRAL]
-    most = m[SERVO_CURRENT_LIMIT] * per_ampere  # what the drive is set to, not the neck's own limit
+    most = m[SERVO_CURRENT_LIMIT] * pull  # what the drive is set to, not the neck's own limit
     if m[SERVO_STUCK] > 0.5:
         # A blocked winch is held where it is by something stronger than the motor, which pushes in vain.
         m[SERVO_CURRENT] = math.copysign(m[SERVO_CURRENT_LIMIT], demand - counts)
@@ -138,7 +140,7 @@ def servo_tick(
         m[SERVO_INTEGRAL] += h * reset * error
     torque = min(max(asked, low), high)
     # Positive in the drive's own sense, as its counts are.
-    m[SERVO_CURRENT] = torque / per_ampere * (1.0 if m[SERVO_SCALE] > 0.0 else -1.0)
+    m[SERVO_CURRENT] = torque / pull * (1.0 if m[SERVO_SCALE] > 0.0 else -1.0)
     return torque
 
 

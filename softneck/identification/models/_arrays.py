@@ -23,6 +23,8 @@ COMPOSED = ("residual", "ensemble", "guarded")
 _LEAST_MEMBERS = {"guarded": 2}
 # Of `nss` where the state is corrected by what is measured.
 OBSERVED_NSS = "softneck.identification.networks._nss_observed_runtime"
+# Of `greybox` where the recordings had several payloads.
+LOADED_GREYBOX = "softneck.identification.structured._loaded_greybox_runtime"
 
 
 # What says where a model knows the robot: older files, models made by hand and members of others have none.
@@ -115,6 +117,8 @@ def runtime_of(kind: str, arrays: Mapping[str, Matrix]) -> str:
 def _module_of(kind: str, arrays: Mapping[str, Matrix]) -> str:
     """Return the module of the runtime: some kinds have several forms, which their arrays tell apart."""
     runtime = KINDS[kind].runtime
+    if kind == "greybox" and "payload" in arrays:
+        return LOADED_GREYBOX
     if "A" not in arrays:
         return runtime
     if kind == "nss":

@@ -78,14 +78,14 @@ class Model:
             arrays=tuple(runtime_arrays(self.kind, self.arrays).values()),
             inputs=_ports.inputs(self.findings, self.robot),
             outputs=_ports.outputs(self.kind, self.robot),
-            parameters=_ports.parameters(self.robot),
+            parameters=_ports.parameters(self.robot, self.arrays),
         )
 
     def initial_state(self, recording: Recording | None = None, **parameters: float) -> State:
         """Return the state at t_0: at rest, or as if the neck had stood at the first row of `recording`.
 
         Args:
-            recording: whose first pitch, roll and motor positions the neck had held before.
+            recording: whose first pitch, roll and motor positions the neck had held before, and whose payload it bears.
             **parameters: start values by name (`pitch_start`, `roll_start` [rad], ...), without a recording.
         """
         block = self.block()
@@ -97,7 +97,7 @@ class Model:
         y0 = np.nan_to_num(recording.outputs[0])
         logged = recording.motor_positions[0]
         m0 = np.where(np.isfinite(logged), logged, recording.set_points[0])
-        start = block.initial_state(use_measurement=1.0, **self._starts(y0))
+        start = block.initial_state(use_measurement=1.0, **self._starts(y0), **_payload_of(recording, block))
         held = np.tile(np.concatenate([m0, y0, m0]), (memory_of(self.arrays), 1))
         state, _ = block.run(start, held)
         outputs = start.outputs.copy()
@@ -248,6 +248,9 @@ class Model:
         if not self.robot.is_neck:
             lines.append(f"robot {self.robot.label()}: {len(self.robot.motors.names)} motor(s), outputs "
                          f"{', '.join(self.robot.outputs.names)}")  # fmt: skip
+        known = _ports.payloads(self.arrays)
+        if known is not None:
+            lines.append(f"parameter `payload`: the recordings had {known[0]:g} to {known[1]:g} kg")
         if self.kind in _linear.KINDS:
             lines += _linear.describe(self)
         lines += [f"{key}: {_short(value)}" for key, value in self.findings.items() if _is_plain(value)]
@@ -307,7 +310,7 @@ class Model:
         if not np.isclose(recording.sample_time, self.sample_time, rtol=1e-3):
             raise DataError(
                 f"the model was identified at {self.sample_time:g} s and the recording is at "
-                f"{recording.sample_time:g} s; resample it (`softneck.signals.resampled`) or identify again."
+                f"{recording.sample_time:g} s; resample it (`softneck resample`) or identify again."
             )
         if len(recording) < 2:
             raise DataError(f"a run needs at least 2 rows; got {len(recording)}.")
@@ -318,6 +321,13 @@ class Model:
         rows[:warm_up] = _input_rows(run, "measured")[:warm_up]
         _, outputs = self.block().run(start, rows)
         return np.vstack([start.outputs, outputs[:-1]])
+
+
+def _payload_of(run: Recording, block: Block) -> dict[str, float]:
+    """Return the payload of a run, that of its first row, where the model knows of any; none logged is none."""
+    if all(port.name != "payload" for port in block.parameters):
+        return {}
+    return {"payload": float(run.channels["payload"][0]) if "payload" in run.channels else 0.0}
 
 
 def _check_header(model: Model) -> None:

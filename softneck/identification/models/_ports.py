@@ -14,6 +14,8 @@ from softneck.runtime import Port
 from softneck.signals import Recording
 from softneck.signals.recording._conditions import conditions, joined
 
+#: What may hang on the platform [kg], as on the virtual neck's.
+MOST_PAYLOAD = 5.0
 # What a winch may do [rad], for models that do not say what they were trained on.
 _MOST = 6.0
 _TRAINED = "set_points_rad"
@@ -48,8 +50,9 @@ def _platform(robot: Robot, name: str) -> str:
     return f"{name.capitalize()} of the platform" if robot.is_neck else f"Output `{name}` of {robot.name}"
 
 
-def parameters(robot: Robot) -> tuple[Port, ...]:
-    """Return the parameters: the outputs' starts, whether to use measurements, and noise."""
+def parameters(robot: Robot, arrays: Mapping[str, np.ndarray]) -> tuple[Port, ...]:
+    """Return the parameters: the outputs' starts, whether to use measurements, noise, and the payload if it matters."""
+    known = payloads(arrays)
     names, largest = robot.outputs.names, 0.5 if to_si(robot.outputs.unit)[1] == "rad" else None
     return (
         *(_output(robot, f"{name}_start", f"{name.capitalize()} at the start") for name in names),
@@ -68,7 +71,19 @@ def parameters(robot: Robot) -> tuple[Port, ...]:
             maximum=largest,
         ),
         Port(name="noise_seed", description="Seed of that noise", minimum=0.0, maximum=2147483647.0, integer=True),
+        *(() if known is None else (_payload(*known),)),
     )
+
+
+def payloads(arrays: Mapping[str, np.ndarray]) -> tuple[float, float] | None:
+    """Return least and most payload [kg] of a model's recordings, or of its member's; None where it knows but one."""
+    found = [array for name, array in arrays.items() if name.rpartition(".")[2] == "payload"]
+    return (float(found[0][0]), float(found[0][1])) if found else None
+
+
+def _payload(least: float, most: float) -> Port:
+    seen = f"What hangs on the platform; the recordings had {least:g} to {most:g} kg, beyond which validity is 0"
+    return Port(name="payload", unit="kg", description=seen, start=least, minimum=0.0, maximum=MOST_PAYLOAD)
 
 
 def trained_set_points(*sources: Recording | Mapping[str, Any]) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import numpy as np
 from softneck.core import FileFormatError, Matrix
 
 from ..models._arrays import within
+from ..models._ports import MOST_PAYLOAD
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +39,7 @@ class Number:
     @property
     def is_rate(self) -> bool:
         """Whether it is by the second."""
-        return self.unit in ("1/s", "1/(rad s)", "1/(rad^2 s)")
+        return self.unit in ("1/s", "1/(rad s)", "1/(rad^2 s)", "1/(s kg)")
 
     def encode(self, value: float) -> float:
         """Return what the search moves."""
@@ -69,6 +70,12 @@ NUMBERS = (
 )
 
 
+# What a payload changes, where the recordings have several; of a kilogram as much as the numbers themselves are.
+LOADS = (
+    Number("payload_stiffness", "1/(s kg)", -3.0, -60.0, 60.0, 10.0, False, "what a payload adds to the stiffness"),
+    Number("payload_pretension", "rad/kg", -0.2, -5.0, 5.0, 1.0, False, "what a payload adds to the pretension"),
+)
+
 # Those that have no meaning where the link bends in one plane.
 ACROSS = ("asymmetry", "rest_roll", "twist")
 
@@ -84,6 +91,8 @@ def check_greybox(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> Non
     within(np.array([sizes["p"]]), 1, sizes["H"], "the length of the echo")
     within(arrays["drive"][:, 1], 1, sizes["H"], "a drive's delay")
     within(arrays["sensor"][:1], 0, 1000, "the sensor's dead time")
+    if "payload" in arrays:
+        _check_payload(arrays["payload"])
     numbers, tendons = np.split(arrays["neck"], [len(NUMBERS)])
     neck = (sizes["motors"], sizes["outputs"]) == (3, 2) and not tendons.size
     if not neck and tendons.size != 1 + 2 * sizes["motors"]:
@@ -94,4 +103,13 @@ def check_greybox(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> Non
         # A thousandth for the rounding of logarithms.
         margin = 1e-3 * max(abs(number.low), abs(number.high))
         if not number.low - min(margin, 0.1 * abs(number.low)) <= value <= number.high + margin:
+            raise FileFormatError(f"its {number.name} of {value:g} {number.unit} is out of range.")
+
+
+def _check_payload(load: Matrix) -> None:
+    least, most = load[:2]
+    if not 0.0 <= least <= most <= MOST_PAYLOAD:
+        raise FileFormatError(f"its payloads from {least:g} to {most:g} kg are not between 0 and {MOST_PAYLOAD:g}.")
+    for number, value in zip(LOADS, load[2:], strict=True):
+        if not number.low <= value <= number.high:
             raise FileFormatError(f"its {number.name} of {value:g} {number.unit} is out of range.")

@@ -1,7 +1,8 @@
 """Kind `greybox`: the equations of a tendon-driven neck with unknown numbers, fitted by the error of its free run.
 
 Those of a robot with other tendons are the same; its rates and dead times are in the time of a neck, so that their
-ranges hold for it. With one output it bends in one plane. What hangs on it is in its stiffness and pretension.
+ranges hold for it. With one output it bends in one plane. What hangs on it is in its stiffness and pretension:
+recordings of several payloads tell how these go with it, and the model takes the payload as a parameter.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ from ..models._model import Model
 from ..models._ports import trained_set_points
 from ..models._state_space import history_array
 from ..models._validity import grounded
-from ._arrays import ACROSS, NUMBERS, Number
+from ._arrays import ACROSS, LOADS, NUMBERS, Number
+from ._loaded_greybox_runtime import loaded_neck
 
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
@@ -53,7 +55,8 @@ INTERRUPTED = "the fit was interrupted; these are the best numbers until then"
 class GreyBox:
     """Tendon kinematics, slack, hysteresis, stalling drives, lag and dead time; 16 numbers, by output error.
 
-    The equations are in `_neck_equations_runtime`; findings hold each number with its unit and 95 % confidence.
+    The equations are in `_neck_equations_runtime`; findings hold each number with its unit and 95 % confidence. Where
+    the recordings' channel `payload` has several values, two more say what it changes.
 
     Attributes:
         evaluations: at most so many steps of Gauss-Newton for each dead time.
@@ -77,7 +80,7 @@ class GreyBox:
             progress: called with the part done and the error.
 
         Raises:
-            DataError: too short or constant.
+            DataError: too short or constant, or a payload that changes within a run.
             SettingsError: a robot that no tendons on winches bend.
         """
         recording = training_recording(recordings, any_robot=True)
@@ -117,15 +120,17 @@ class _FitProblem:
     Attributes:
         sample_time: in the time of a neck [s].
         runs: set-points, start, motor positions and outputs of each.
+        payloads: of each run [kg].
         drive: (motors, 2) pole and delay.
         logged: whether motor positions were.
-        numbers: those that are searched; with one output not those across.
+        numbers: those that are searched; with one output not those across, with several payloads what these change.
         tendons: what stands behind the numbers; nothing of a neck.
         directions: of the robot.
     """
 
     sample_time: float
     runs: list[tuple[Matrix, Vector, Matrix, Matrix]]
+    payloads: list[float]
     drive: Matrix
     logged: bool
     numbers: tuple[Number, ...]
@@ -146,8 +151,12 @@ class _FitProblem:
             for run in recording.runs()
         ]
         across = ACROSS if recording.outputs.shape[1] == 1 else ()
-        numbers = tuple(number for number in NUMBERS if number.name not in across)
-        return cls(Ts, runs, drive, recording.has_motor_positions, numbers, _tendons(recording.robot), directions)
+        payloads = [_payload(run) for run in recording.runs()]
+        loads = LOADS if len(set(payloads)) > 1 else ()
+        numbers = (*(number for number in NUMBERS if number.name not in across), *loads)
+        return cls(
+            Ts, runs, payloads, drive, recording.has_motor_positions, numbers, _tendons(recording.robot), directions
+        )
 
     def delays(self) -> tuple[int, ...]:
         """Return the sensor's dead times to try [samples], the likeliest first."""
@@ -157,17 +166,34 @@ class _FitProblem:
 
     def decode(self, x: Vector) -> Vector:
         """Return all numbers of what the search moved, then the tendons."""
-        found = {number.name: number.decode(value) for number, value in zip(self.numbers, x, strict=True)}
+        found = self._found(x)
         return np.array([*(found.get(number.name, number.guess) for number in NUMBERS), *self.tendons])
 
-    def simulate(self, numbers: Vector, delay: int) -> list[tuple[Matrix, Matrix]]:
-        """Return motors and outputs of all runs."""
+    def load(self, x: Vector) -> Vector:
+        """Return least and most payload [kg], and what they change; nothing where there is but one."""
+        found = [self._found(x)[number.name] for number in LOADS if number in self.numbers]
+        return np.array([min(self.payloads), max(self.payloads), *found]) if found else np.zeros(0)
+
+    def _found(self, x: Vector) -> dict[str, float]:
+        return {number.name: number.decode(value) for number, value in zip(self.numbers, x, strict=True)}
+
+    def simulate(self, x: Vector, delay: int) -> list[tuple[Matrix, Matrix]]:
+        """Return motors and outputs of all runs under what the search moved."""
         settle = round(_SETTLED / self.sample_time)
+        numbers, load = self.decode(x), self.load(x)
         parts = []
-        for u, start, _, y in self.runs:
+        for (u, start, _, y), payload in zip(self.runs, self.payloads, strict=True):
             M, Y = np.empty(u.shape), np.empty(y.shape)
             load_functions(_FUNCTIONS).neck_run(
-                numbers, self.sample_time, self.drive[:, 1], delay, settle, u, start, M, Y
+                loaded_neck(numbers, load, payload) if load.size else numbers,
+                self.sample_time,
+                self.drive[:, 1],
+                delay,
+                settle,
+                u,
+                start,
+                M,
+                Y,
             )
             parts.append((M, Y))
         return parts
@@ -178,7 +204,7 @@ class _FitProblem:
         guess = np.array([number.encode(number.guess) for number in self.numbers])
         spread = np.array([number.spread for number in self.numbers])
         parts = [_PRIOR * (x - guess) / spread]
-        for (M, Y), (_, _, m, y) in zip(self.simulate(self.decode(x), delay), self.runs, strict=True):
+        for (M, Y), (_, _, m, y) in zip(self.simulate(x, delay), self.runs, strict=True):
             parts.append((Y - y)[skip::_THIN].ravel())
             if self.logged:
                 parts.append(_MOTOR_WEIGHT * (M - m)[skip::_THIN].ravel())
@@ -198,6 +224,15 @@ class _FitProblem:
 
         inside = np.clip(start, low + 1e-6 * (high - low), high - 1e-6 * (high - low))
         return least_squares(errors, inside, bounds=(low, high), x_scale="jac", max_nfev=evaluations, xtol=1e-5)
+
+
+def _payload(run: Recording) -> float:
+    """Return the payload of a run [kg]; none logged is none."""
+    payload = run.channels.get("payload", np.zeros(1))
+    low, high = float(np.nanmin(payload)), float(np.nanmax(payload))
+    if low != high:
+        raise DataError(f"the payload changes within a run, from {low:g} to {high:g} kg; cut the recording there.")
+    return low
 
 
 def _tendons(robot: Robot) -> Vector:
@@ -229,9 +264,9 @@ class _SearchProgress:
 
 
 def _model(settings: GreyBox, problem: _FitProblem, recording: Recording, delay: int, x: Vector) -> Model:
-    numbers, outputs = problem.decode(x), recording.outputs.shape[1]
+    numbers, load, outputs = problem.decode(x), problem.load(x), recording.outputs.shape[1]
     skip = round(_SETTLED / problem.sample_time)
-    errors = [y - Y for (_, Y), (_, _, _, y) in zip(problem.simulate(numbers, delay), problem.runs, strict=True)]
+    errors = [y - Y for (_, Y), (_, _, _, y) in zip(problem.simulate(x, delay), problem.runs, strict=True)]
     for error in errors:
         error[:skip] = np.nan
     echo = np.array([fit_echo([error[:, axis] for error in errors], _ECHO) for axis in range(outputs)])
@@ -244,6 +279,7 @@ def _model(settings: GreyBox, problem: _FitProblem, recording: Recording, delay:
         "sensor": np.array([float(delay), problem.sample_time]),
         "echo": echo,
         "memory": memory_array(_MEMORY, problem.sample_time),
+        **({"payload": load} if load.size else {}),
     }
     model = Model(
         kind="greybox",

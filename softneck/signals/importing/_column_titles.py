@@ -5,17 +5,23 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
+from ._title_words import plain, words_of
+
 _UNITS = {
     "deg": "deg", "degree": "deg", "degrees": "deg", "°": "deg", "rad": "rad", "radians": "rad", "s": "s", "sec": "s",
     "seconds": "s", "ms": "ms", "millis": "ms", "milliseconds": "ms", "us": "us", "µs": "us", "micros": "us",
     "ns": "ns", "rad/s": "rad/s", "rad_s": "rad/s", "rads": "rad/s", "deg/s": "deg/s", "°/s": "deg/s", "rpm": "rpm",
-    "mm": "mm", "m": "m",
+    "mm": "mm", "m": "m", "grad": "deg", "grados": "deg", "grado": "deg", "grad/s": "deg/s", "grados/s": "deg/s",
+    "radianes": "rad", "radiant": "rad", "rad/seg": "rad/s", "u/min": "rpm", "1/min": "rpm", "sek": "s",
+    "sekunden": "s", "seg": "s", "segundos": "s", "millisekunden": "ms", "milisegundos": "ms", "mikrosekunden": "us",
+    "microsegundos": "us", "nsec": "ns", "nanosec": "ns",
 }  # fmt: skip
 _BRACKET = re.compile(r"\s*[\[(]([^\])]*)[\])]\s*$")
-_WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|°")
+# `position[0]` of ROS and `u(:,1)` of MATLAB are numbers of a motor and not units.
+_INDEX = re.compile(r":?,?\s*\d+")
 
 _TIME = {"time", "t", "timestamp", "stamp", "ts", "seconds", "sec", "s", "ms", "millis", "milliseconds", "micros", "us",
-         "ns", "clock", "elapsed"}  # fmt: skip
+         "ns", "clock", "elapsed", "nanosec", "nsec", "segundos", "sekunden"}  # fmt: skip
 _RUN = {"run", "trial", "experiment", "segment", "repetition"}
 _COUNTER = {"index", "idx", "sample", "samples", "row", "k", "n", "count", "counter", "unnamed", "id"}
 _TARGET = ("target", "setpoint", "setpoints", "set", "sp", "reference", "ref", "command", "commanded", "cmd", "desired",
@@ -26,12 +32,14 @@ _MOTOR = {"motor", "mot", "m", "winch", "tendon", "drive", "axis", "joint", "ser
 _ANGLES = {"pitch": "pitch", "roll": "roll", "yaw": "yaw", "inclination": "inclination", "incl": "inclination",
            "tilt": "inclination", "orientation": "orientation", "orient": "orientation",
            "azimuth": "orientation"}  # fmt: skip
+_EULER = {"pitch", "roll", "yaw"}
 _SENSED = {"sensor", "measured", "imu", "actual", "meas"}
 _NOT_SENSED = (
     ({"error", "err", "ep", "ev", "deviation", "residual"}, "an error of a control loop, not a measurement"),
     ({"kinematics", "kinematic", "model", "simulated", "sim", "computed", "estimated"},
      "computed by a model, not measured"),
-    ({"current", "curr", "torque", "voltage", "volt", "temperature", "temp", "pwm", "duty", "tcs", "status"},
+    ({"current", "curr", "torque", "voltage", "volt", "temperature", "temp", "pwm", "duty", "tcs", "status",
+      "force", "effort"},
      "a quantity of the drives that a recording does not hold"),
 )  # fmt: skip
 
@@ -60,23 +68,23 @@ class Title:
 def read_title(title: str) -> Title:
     """Return what a column's title says."""
     text, unit = _without_unit(title.strip())
-    words = [word.lower() for word in _WORD.findall(text)]
+    words = words_of(text)
     numbers = [int(word) for word in words if word.isdigit() and len(word) < 4]
-    plain = [word for word in words if not word.isdigit()]
-    if unit is None and len(plain) > 1 and plain[-1] in _UNITS and len(plain[-1]) > 1:
-        unit = _UNITS[plain.pop()]
+    said = [word for word in words if not word.isdigit()]
+    if unit is None and len(said) > 1 and said[-1] in _UNITS and len(said[-1]) > 1:
+        unit = _UNITS[said.pop()]
     motor = numbers[-1] if numbers else None
-    role, why, rank = _role(plain, motor)
-    if role == "time" and unit is None and plain[-1] in _UNITS and plain[-1] != "m":
-        unit = _UNITS[plain[-1]]
-    return Title(role, " ".join(plain), motor, unit, why, rank)
+    role, why, rank = _role(said, motor)
+    if role == "time" and unit is None and said and said[-1] in _UNITS and said[-1] != "m":
+        unit = _UNITS[said[-1]]
+    return Title(role, " ".join(said), motor, unit, why, rank)
 
 
 def _without_unit(title: str) -> tuple[str, str | None]:
     match = _BRACKET.search(title)
-    if match is None:
+    if match is None or _INDEX.fullmatch(match[1].strip()):
         return title, None
-    return title[: match.start()], _UNITS.get(match[1].strip().lower())
+    return title[: match.start()], _UNITS.get(plain(match[1].strip()), _UNITS.get(match[1].strip().lower()))
 
 
 def _role(words: list[str], motor: int | None) -> tuple[str, str, int]:
@@ -87,7 +95,8 @@ def _role(words: list[str], motor: int | None) -> tuple[str, str, int]:
             return "ignored", f"'{' '.join(sorted(known & said))}' is {why}", 0
     if words[:1] == ["unnamed"]:
         return "ignored", "it counts the rows", 0
-    angle = next((word for word in words if word in _ANGLES), None)
+    # `tilt.pitch` of a topic is pitch.
+    angle = next((word for word in (*(known & _EULER), *words) if word in _ANGLES), None)
     target = next((word for word in _TARGET if word in known), None)
     speed = known & _VELOCITY
     if angle is not None:

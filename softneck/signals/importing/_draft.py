@@ -12,9 +12,10 @@ from softneck.core import Matrix, Vector
 from ..recording._channels import MOTOR_POSITIONS, OUTPUTS, SET_POINTS, known_channels
 from ._column_shapes import shortened
 from ._column_titles import Title, read_title
-from ._layout import Column, Term
+from ._layout import Column, Quaternion, Term
 from ._table_format import SniffResult
 from ._tilt import pitch_roll
+from ._title_words import is_german, plain
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,14 +27,18 @@ class Pick:
         why: it was taken.
         unit: where the title names one.
         sign: 1 or -1.
-        sure: whether names or data leave little doubt.
+        confidence: probability that they are it, as far as names and data tell.
+        unit_sure: whether the unit in the title has one meaning: `Grad` are degrees in German.
+        integrate: whether they are rates whose sum it is.
     """
 
     terms: tuple[Term, ...]
     why: str
     unit: str | None = None
     sign: float = 1.0
-    sure: bool = True
+    confidence: float = 0.97
+    unit_sure: bool = True
+    integrate: bool = False
 
 
 @dataclass(slots=True)
@@ -44,6 +49,9 @@ class Draft:
     titles: dict[Column, Title] = field(default_factory=dict)
     moving: dict[Column, Vector] = field(default_factory=dict)
     picks: dict[str, Pick] = field(default_factory=dict)
+    quaternion: Quaternion | None = None
+    quaternion_why: str = ""
+    quaternion_sure: float = 1.0
     passed_over: dict[Column, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -55,10 +63,12 @@ class Draft:
             if isinstance(name, str)
         }
 
-    def pick(self, channel: str, column: Column, why: str, *, sign: float = 1.0, sure: bool = True) -> None:
+    def pick(self, channel: str, column: Column, why: str, *, sign: float = 1.0, confidence: float = 0.97) -> None:
         """Take one column for a channel."""
         title = self.titles.get(column)
-        self.picks[channel] = Pick((Term(column),), why, title.unit if title else None, sign, sure)
+        sure = "grad" not in plain(str(column)).replace("grados", "") or any(map(is_german, map(str, self.titles)))
+        unit = title.unit if title else None
+        self.picks[channel] = Pick((Term(column),), why, unit, sign, confidence, sure)
 
     def used(self) -> set[Column]:
         """Return all columns that were taken."""
@@ -77,8 +87,9 @@ class Draft:
 
     def platform(self) -> dict[str, Vector]:
         """Return the first rows of pitch and roll, from a tilt too, to a factor."""
-        if self.has(OUTPUTS):
-            return {name: self.values(name) for name in OUTPUTS}
+        there = [name for name in OUTPUTS if name in self.picks]
+        if there:
+            return {name: self.values(name) for name in there}
         if not self.has(("inclination", "orientation")):
             return {}
         turn = np.abs(self.values("orientation")).max(initial=0.0)

@@ -11,6 +11,7 @@ from softneck.core import SoftneckError
 from ..recording._channels import MOTOR_POSITIONS, MOTORS, SET_POINTS, parse_column
 from ._column_shapes import lagged
 from ._draft import Draft, Pick, say
+from ._guess_inputs import quaternions
 from ._layout import Column, Term
 from ._sample_time import velocity_period
 
@@ -24,6 +25,7 @@ Family = tuple[Column, Column, Column]
 def by_names(draft: Draft) -> None:
     """Take what titles name."""
     own = _own_titles(draft)
+    quaternions(draft)
     by_role: dict[str, list[tuple[int, Column]]] = defaultdict(list)
     for column, title in draft.titles.items():
         if column not in own:
@@ -57,19 +59,36 @@ def _own_titles(draft: Draft) -> set[Column]:
 
 
 def _time_and_run(draft: Draft, by_role: dict[str, list[tuple[int, Column]]]) -> None:
+    _seconds_and_nanoseconds(draft)
+    by_role["time"] += [(0, column) for column in draft.sniffed.dates if (0, column) not in by_role["time"]]
     for _, column in sorted(by_role["time"], key=lambda entry: entry[0]):
         step = np.diff(draft.moving.get(column, np.zeros(0)))
         rising = float((step > 0).mean()) if step.size else 0.0
+        if draft.sniffed.form.merge and step.size and (step >= 0).all():
+            rising = 1.0  # messages of several clocks have one time
+        if column in draft.used():
+            continue
         if "time" in draft.picks:
             draft.passed_over[column] = f"{say(draft.picks['time'].terms[0].column)} names time more clearly"
         elif rising > 0.5:
-            draft.pick("time", column, f"{draft.titles[column].why}, and it rises from row to row")
+            why = draft.titles[column].why if column in draft.titles else "it holds dates"
+            draft.pick("time", column, f"{why}, and it rises from row to row")
         else:
             draft.passed_over[column] = "it does not rise from row to row, so it is not a time"
     for _, column in by_role["run"]:
         values = draft.sniffed.columns[column]
         if "run" not in draft.picks and np.isfinite(values).all() and np.array_equal(values, np.round(values)):
             draft.pick("run", column, draft.titles[column].why)
+
+
+def _seconds_and_nanoseconds(draft: Draft) -> None:
+    """Take two columns of a stamp of ROS 2, which are a time only together."""
+    for column, title in draft.titles.items():
+        if title.role == "time" and title.unit == "ns":
+            whole = [c for c, t in draft.titles.items() if (t.role, t.family, t.unit) == ("time", title.family, "s")]
+            if len(whole) == 1 and "time" not in draft.picks:
+                terms = (Term(whole[0]), Term(column, 1e-9))
+                draft.picks["time"] = Pick(terms, "both parts of a stamp of ROS 2", "s")
 
 
 def _families(draft: Draft, role: str, own: set[Column]) -> list[Family]:

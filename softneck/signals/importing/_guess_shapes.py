@@ -28,6 +28,15 @@ _COUNTS = 0.05
 _AXIS = {"pitch": "theta_i", "roll": "phi_i"}
 
 
+# What the data alone tell is doubted, however well they agree: another column may behave alike.
+_SUREST = 0.89
+
+
+def _sure(agreement: float) -> float:
+    """Return the confidence in a column that was taken by a correlation or an R2."""
+    return min(_SUREST, abs(agreement))
+
+
 def by_shapes(draft: Draft) -> None:
     """Take for what is still missing the columns whose data behave like it."""
     _clock(draft)
@@ -45,7 +54,13 @@ def by_shapes(draft: Draft) -> None:
 def _answer(draft: Draft, axis: str, column: str | int, r: float) -> None:
     why = f"it answers {_AXIS[axis]} of the motors with correlation {r:.2f}; no other column does so more"
     sign = -1.0 if r < 0 else 1.0
-    draft.pick(axis, column, why + ("; turned round, so that it rises with it" if r < 0 else ""), sign=sign, sure=False)
+    draft.pick(
+        axis,
+        column,
+        why + ("; turned round, so that it rises with it" if r < 0 else ""),
+        sign=sign,
+        confidence=_sure(r),
+    )
 
 
 def _clock(draft: Draft) -> None:
@@ -56,7 +71,7 @@ def _clock(draft: Draft) -> None:
     if column is None:
         return
     step = np.diff(free[column])
-    draft.pick("time", column, f"it rises by equal steps of {np.median(step):.4g}", sure=False)
+    draft.pick("time", column, f"it rises by equal steps of {np.median(step):.4g}", confidence=0.85)
 
 
 def _rates(draft: Draft) -> None:
@@ -87,7 +102,12 @@ def _set_points(draft: Draft) -> None:
     found = followed(draft.moving, positions, free)
     if found is not None:
         for channel, column in zip(SET_POINTS, found[0], strict=True):
-            draft.pick(channel, column, f"the position follows it (correlation {found[1]:.2f} or more)", sure=False)
+            draft.pick(
+                channel,
+                column,
+                f"the position follows it (correlation {found[1]:.2f} or more)",
+                confidence=_sure(found[1]),
+            )
         return
     pair, factors, R2 = sums(draft.moving, positions, free[:12])
     if R2 < FOLLOWS:
@@ -97,7 +117,7 @@ def _set_points(draft: Draft) -> None:
         counts = parts[:, j] > _COUNTS * parts[:, j].sum()
         terms = tuple(Term(name, float(f"{factors[i, j]:.4g}")) for i, name in enumerate(pair) if counts[i])
         why = f"the position follows this sum (R2 {R2:.3f} or more); its factors were fitted to the data"
-        draft.picks[channel] = Pick(terms, why, draft.picks[MOTOR_POSITIONS[j]].unit, sure=False)
+        draft.picks[channel] = Pick(terms, why, draft.picks[MOTOR_POSITIONS[j]].unit, confidence=_sure(R2))
 
 
 def _motors_without_rates(draft: Draft) -> None:
@@ -121,9 +141,9 @@ def _motors_without_rates(draft: Draft) -> None:
         other = alike[0]
         first, other = (first, other) if leads(draft.moving, first, other) else (other, first)
         for channel, column in zip(MOTOR_POSITIONS, other, strict=True):
-            draft.pick(channel, column, f"{why}, and it trails the set-point", sure=False)
+            draft.pick(channel, column, f"{why}, and it trails the set-point", confidence=0.7)
     for channel, column in zip(SET_POINTS, first, strict=True):
-        draft.pick(channel, column, why, sure=False)
+        draft.pick(channel, column, why, confidence=0.7)
     for axis, (column, r) in axes.items():
         if axis not in draft.picks:
             _answer(draft, axis, column, r)

@@ -2,125 +2,167 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from math import exp, log
+from typing import NamedTuple
 
 import numpy as np
 
-from ..recording._channels import MOTOR_POSITIONS, MOTOR_TURNS, MOTORS, SET_POINTS, file_unit
+from ..recording._channels import MOTOR_POSITIONS, MOTOR_TURNS, MOTORS, OUTPUTS, SET_POINTS, file_unit
 from ._draft import Draft
 from ._sample_time import velocity_period
+from ._unit_odds import MOTOR_RANGE, Verdict, judge
+from .formats._dates import DATE
 
 _VELOCITIES = tuple(f"motor_velocity_{j}" for j in MOTORS)
-# Set-points in degrees and positions in rad, or the reverse; at rest a position is within a quarter of its set-point.
-_DEGREES, _ALIKE = 180.0 / np.pi, 1.25
-# The neck tilts by 0.8 rad at most: as radians, a quarter turn is out of reach.
-_TILT = np.pi / 2.0
-# The paper's sample time [s], which decides where the data leave it open.
-_USUAL = 0.02
-# Steps of a time column from which its unit is told: (at least, unit, factor to it).
-_CLOCKS = ((1e6, "ms", 1e-6, "ns"), (1e3, "ms", 1e-3, "us"), (1.0, "ms", 1.0, "ms"), (0.0, "s", 1.0, "s"))
+_TILTED = ("pitch", "roll", "inclination", "pitch_reference", "roll_reference")
+# The paper's sample time [s], which decides where the data leave it open; sample times of loggers lie around it by a
+# factor of exp(1.2), two thirds of them.
+_USUAL, _STEP_SPREAD = 0.02, 1.2
+# Units of a time column: name, in `s` or `ms`, and factor to it.
+_CLOCKS = {"s": ("s", 1.0), "ms": ("ms", 1.0), "us": ("ms", 1e-3), "ns": ("ms", 1e-6)}
+# No guess is surer: robots differ more than the odds know. What set-points and positions in two units are at most.
+_SUREST, _ALONE = 0.99, 0.85
+# Pitch and roll further apart than this are doubted.
+_FAR_APART, _ALIKE = 20.0, 0.6
 
-Unit = tuple[str, float, str]
+
+class Unit(NamedTuple):
+    """A channel's unit, a factor to it, why, and how likely it is."""
+
+    name: str
+    factor: float
+    why: str
+    confidence: float = 1.0
 
 
 def units(draft: Draft) -> dict[str, Unit]:
-    """Return for each pick its unit, a factor to it, and why."""
+    """Return for each pick its unit."""
     found: dict[str, Unit] = {}
     for channel, pick in draft.picks.items():
         if pick.unit is not None and channel not in ("time", "run"):
-            found[channel] = (pick.unit, 1.0, "its title says so")
+            sure = 1.0 if pick.unit_sure else 0.8
+            found[channel] = Unit(pick.unit, 1.0, "its title says so", sure)
     _time(draft, found)
-    _motors(draft, found)
-    _platform(draft, found)
+    _angles(draft, found)
     _velocities(draft, found)
     for channel in draft.picks:
         if channel not in found and channel != "run":
-            found[channel] = (file_unit(channel), 1.0, "the usual unit")
+            found[channel] = Unit(file_unit(channel), 1.0, "the usual unit", 0.9)
     return found
 
 
-def largest(draft: Draft, channel: str) -> float:
-    """Return the largest size of a channel as logged, of one that stands still too."""
+def largest(draft: Draft, channel: str, step: float = 1.0) -> float:
+    """Return the largest size of a channel as logged, also if it stands still; of a rate, of its sum at `step` [s]."""
     columns = draft.sniffed.columns
-    values = np.abs(sum(term.factor * columns[term.column] for term in draft.picks[channel].terms))
+    values = np.asarray(sum(term.factor * columns[term.column] for term in draft.picks[channel].terms))
+    if draft.picks[channel].integrate:
+        values = step * np.cumsum(np.nan_to_num(values))
+    values = np.abs(values)
     return float(values[np.isfinite(values)].max(initial=0.0))
 
 
 def _time(draft: Draft, found: dict[str, Unit]) -> None:
     if "time" not in draft.picks:
         return
+    column = draft.picks["time"].terms[0].column
+    if column in draft.sniffed.dates:
+        found["time"] = Unit(DATE, 1.0, "it holds dates or times of day")
+        return
     unit = draft.picks["time"].unit
     if unit is not None:
-        clear = {"us": ("ms", 1e-3), "ns": ("ms", 1e-6)}.get(unit, (unit, 1.0))
-        found["time"] = (*clear, f"its title says {unit}")
+        found["time"] = Unit(*_CLOCKS.get(unit, (unit, 1.0)), f"its title says {unit}")
         return
     step = np.diff(draft.values("time"))
     typical = float(np.median(step[step > 0])) if (step > 0).any() else 0.0
-    name, factor, meant = next(entry[1:] for entry in _CLOCKS if typical >= entry[0])
-    found["time"] = (name, factor, f"its steps of {typical:.4g} are a sample time only in {meant}")
+    odds = {
+        name: exp(
+            -0.5 * (log(max(typical, 1e-300) * factor * (1e-3 if unit == "ms" else 1.0) / _USUAL) / _STEP_SPREAD) ** 2
+        )
+        for name, (unit, factor) in _CLOCKS.items()
+    }
+    name = max(odds, key=lambda key: odds[key])
+    sure = min(odds[name] / sum(odds.values()), _SUREST) if sum(odds.values()) > 0.0 else 0.5
+    why = f"its steps of {typical:.4g} are a sample time only in {name}"
+    found["time"] = Unit(*_CLOCKS[name], why, sure)
 
 
-def _motors(draft: Draft, found: dict[str, Unit]) -> None:
-    """Positions follow their set-points: both have one unit, of which either may tell, unless they are 57 apart."""
-    groups = [group for group in (SET_POINTS, MOTOR_POSITIONS) if draft.has(group)]
-    names = [name for group in groups for name in group]
-    sizes = {group: max(largest(draft, name) for name in group) for group in groups}
-    if (
-        len(groups) == 2
-        and _DEGREES / _ALIKE < max(sizes.values()) / max(min(sizes.values()), 1e-12) < _DEGREES * _ALIKE
-    ):
-        for group in groups:
-            unit = "deg" if sizes[group] == max(sizes.values()) else "rad"
-            _unsure(draft, found, group, (unit, 1.0, "of set-points and positions one reaches 57 times the other"))
-        return
-    titled = {found[name][0] for name in names if name in found}
-    reach = max(sizes.values(), default=0.0)
-    beyond = reach > MOTOR_TURNS
-    unit = "deg" if beyond else "rad"
-    why = (
-        f"the motors' set-points and positions reach {reach:.4g}, " if len(groups) == 2 else f"they reach {reach:.4g}, "
-    )
-    why += "beyond two turns" if beyond else "within the motors' reach"
-    if len(titled) == 1:
-        unit, why = titled.pop(), "the title of another of the motors' columns says so"
-    for name in names:
-        found.setdefault(name, (unit, 1.0, why))
-
-
-def _unsure(draft: Draft, found: dict[str, Unit], group: tuple[str, ...], unit: Unit) -> None:
-    for name in group:
-        if name not in found:
-            found[name] = unit
-            draft.picks[name] = replace(draft.picks[name], sure=False)
-
-
-def _platform(draft: Draft, found: dict[str, Unit]) -> None:
-    tilted = [
-        name for name in ("pitch", "roll", "inclination", "pitch_reference", "roll_reference") if name in draft.picks
-    ]
-    if tilted:
-        size = max(largest(draft, name) for name in tilted)
-        beyond = size > _TILT
-        turn = "orientation" in draft.picks and largest(draft, "orientation") > 2.1 * np.pi
-        unit = "deg" if beyond or turn else "rad"
-        tilt = "the tilt" if "inclination" in draft.picks else "it"
-        why = f"{tilt} reaches {size:.4g}, more than a quarter turn in rad"
-        if not beyond:
-            why = f"{tilt} stays within {size:.4g}, as the neck does in rad"
-        if turn and not beyond:
-            why = "the orientation reaches more than a turn in rad"
-        for name in (*tilted, "orientation"):
+def _angles(draft: Draft, found: dict[str, Unit]) -> None:
+    """Judge the units of set-points, positions and platform together; a title tells the unit of its whole group."""
+    groups = {
+        "set-points": [name for name in SET_POINTS if name in draft.picks],
+        "positions": [name for name in MOTOR_POSITIONS if name in draft.picks],
+        "tilt": [name for name in _TILTED if name in draft.picks],
+    }
+    groups = {group: names for group, names in groups.items() if names}
+    step = nominal_step(draft, found)
+    reaches = {group: max(largest(draft, name, step) for name in names) for group, names in groups.items()}
+    summed = {group for group, names in groups.items() if draft.picks[names[0]].integrate}
+    titled: dict[str, str] = {}
+    for group, names in groups.items():
+        said = {found[name].name.removesuffix("/s") for name in names if name in found} & {"rad", "deg"}
+        if len(said) == 1:
+            titled[group] = said.pop()
+    turned = "orientation" in draft.picks and "tilt" not in titled and largest(draft, "orientation") > 2.1 * np.pi
+    verdicts = judge(reaches, {**titled, "tilt": "deg"} if turned else titled)
+    for group, verdict in verdicts.items():
+        why = _why(reaches, titled, group, verdict)
+        sure = 1.0 if group in titled or reaches[group] == 0.0 else min(verdict.probability, _SUREST)
+        sure = min(sure, _ALONE) if verdict.alone else sure
+        if group == "tilt" and turned:
+            why, sure = "the orientation reaches more than a turn in rad", _SUREST
+        elif group == "tilt" and group not in titled and _apart(draft):
+            why, sure = f"{why}; but one of pitch and roll goes {_FAR_APART:g} times as far as the other", _ALIKE
+        for name in (*groups[group], *(["orientation"] if group == "tilt" and "orientation" in draft.picks else [])):
+            found.setdefault(name, Unit(verdict.unit + ("/s" if group in summed else ""), 1.0, why, sure))
+    if "tilt" in verdicts:
+        for name in ("pitch_rate", "roll_rate"):
             if name in draft.picks:
-                found.setdefault(name, (unit, 1.0, why))
-    for name in ("pitch_rate", "roll_rate"):
-        if name in draft.picks and tilted:
-            same = "rad/s" if found[tilted[0]][0] == "rad" else "deg/s"
-            found.setdefault(name, (same, 1.0, "as the angles"))
+                found.setdefault(name, Unit(f"{verdicts['tilt'].unit}/s", 1.0, "as the angles", 0.9))
+
+
+def _apart(draft: Draft) -> bool:
+    """Return whether pitch and roll of a log may be in two units, or one of them is something else."""
+    sizes = [largest(draft, name) for name in OUTPUTS if name in draft.picks]
+    return len(sizes) == 2 and max(sizes) > _FAR_APART * min(sizes) > 0.0
+
+
+def _why(reaches: dict[str, float], titled: dict[str, str], group: str, verdict: Verdict) -> str:
+    """Return why a group is in its unit."""
+    reach = reaches[group]
+    if group == "tilt":
+        if titled.get(group):
+            return "the title of another of the platform's columns says so"
+        if verdict.unit == "deg":
+            return f"the platform reaches {reach:.4g}, " + (
+                "more than a quarter turn in rad" if reach > np.pi / 2.0 else "too far in rad for these motors"
+            )
+        return f"the platform stays within {reach:.4g}, as the neck does in rad"
+    if group in titled:
+        return "the title of another of the motors' columns says so"
+    if verdict.alone:
+        return "of set-points and positions one reaches 57 times the other"
+    both = "set-points" in reaches and "positions" in reaches
+    who = "the motors' set-points and positions reach" if both else "they reach"
+    who = f"{who} {max(reaches.get(name, 0.0) for name in ('set-points', 'positions')):.4g}, "
+    other = "positions" if group == "set-points" else "set-points"
+    if other in titled:
+        return who + "and the title of another of the motors' columns says so"
+    if verdict.unit == "deg":
+        return who + (
+            "beyond two turns in rad" if reach > MOTOR_TURNS else "which in rad does not fit how the platform moves"
+        )
+    return who + (
+        "within the motors' reach" if reach <= MOTOR_RANGE else "beyond their range, but in deg hardly a move"
+    )
 
 
 def _velocities(draft: Draft, found: dict[str, Unit]) -> None:
     """Take the unit in which rates and positions agree at a period next to the time column's, or to 20 ms."""
-    if not draft.has(_VELOCITIES) or not draft.has(MOTOR_POSITIONS) or _VELOCITIES[0] in found:
+    if not draft.has(_VELOCITIES) or _VELOCITIES[0] in found:
+        return
+    if not draft.has(MOTOR_POSITIONS):
+        if SET_POINTS[0] in draft.picks and draft.picks[SET_POINTS[0]].integrate:
+            found.update({name: found[asked] for name, asked in zip(_VELOCITIES, SET_POINTS, strict=True)})
         return
     factors = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "rpm": np.pi / 30.0}
     angle = np.pi / 180.0 if found[MOTOR_POSITIONS[0]][0] == "deg" else 1.0
@@ -136,14 +178,16 @@ def _velocities(draft: Draft, found: dict[str, Unit]) -> None:
     unit = min(factors, key=lambda name: abs(np.log(period / factors[name] / nominal)))
     why = f"in it they agree with the positions at {1e3 * period / factors[unit]:.3g} ms a sample"
     for name in _VELOCITIES:
-        found[name] = (unit, 1.0, why)
+        found[name] = Unit(unit, 1.0, why, 0.97)
 
 
 def nominal_step(draft: Draft, found: dict[str, Unit]) -> float:
     """Return the time column's usual step [s], or the paper's sample time where there is none."""
     if "time" not in draft.picks:
         return _USUAL
-    unit, factor, _ = found["time"]
+    unit, factor, *_ = found["time"]
+    if unit == DATE:
+        unit = "s"
     step = np.diff(draft.values("time"))
     typical = float(np.median(step[step > 0])) if (step > 0).any() else 0.0
     return max(typical * factor * (1e-3 if unit == "ms" else 1.0), 1e-9)

@@ -14,6 +14,8 @@ from softneck.robot import Robot
 
 from ..recording._channels import NECK, known_channels, si_unit
 from ..recording._files import WHITESPACE, TextForm
+from .formats._dates import DATE
+from .formats._encodings import ENCODINGS
 
 Column = str | int
 DUPLICATES = ("first", "last")
@@ -29,11 +31,31 @@ class Term:
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Where a channel comes from: the sum of terms, in `unit`, times `sign`."""
+    """Where a channel comes from: the sum of terms, in `unit`, times `sign`; where `integrate`, its integral over time.
+
+    The unit of what is integrated is that of the rate, and each run begins at 0.
+    """
 
     terms: tuple[Term, ...]
     unit: str
     sign: float = 1.0
+    integrate: bool = False
+
+
+#: Turns about an axis of the sensor that pitch and roll may be.
+AXES = ("x", "-x", "y", "-y")
+
+
+@dataclass(frozen=True, slots=True)
+class Quaternion:
+    """Columns of a sensor's orientation, and the turns about its axes that are pitch and roll."""
+
+    w: Column
+    x: Column
+    y: Column
+    z: Column
+    pitch: str = "y"
+    roll: str = "x"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,13 +65,17 @@ class Layout:
     Attributes:
         channels: channel name -> source.
         inclination, orientation: sources of the tilt vector, instead of pitch and roll.
-        time: the time column's source, or None.
+        quaternion: of the sensor, instead of pitch and roll.
+        time: the time column's source, or None; its unit may be `date`.
+        merge: the rows are messages of several clocks: rows are those of the outputs, set-points hold their last value.
         sample_time: true sample time [s]; None takes it from the time column.
         estimate: take the sample time at which logged positions and velocities agree.
         new_run_at_restart: a time that goes back starts a new run.
         duplicates: which row to keep of those with one time stamp, `first` or `last`; None refuses them.
         run: the column that numbers the runs, or None.
-        variable: the matrix of a MAT file; None takes its vectors by name.
+        variable: the matrix of a MAT or Octave file; None takes its vectors by name.
+        sheet: of a spreadsheet; None takes the largest.
+        encoding: of a text.
         header: whether the first line names the columns.
         delimiter: between cells, one character or `whitespace`.
         decimal: the decimal mark, `.` or `,`.
@@ -62,13 +88,17 @@ class Layout:
     channels: Mapping[str, Source]
     inclination: Source | None = None
     orientation: Source | None = None
+    quaternion: Quaternion | None = None
     time: Source | None = None
+    merge: bool = False
     sample_time: float | None = None
     estimate: bool = False
     new_run_at_restart: bool = False
     duplicates: str | None = None
     run: Column | None = None
     variable: str | None = None
+    sheet: str | None = None
+    encoding: str = "utf-8"
     header: bool = True
     delimiter: str = ","
     decimal: str = "."
@@ -80,7 +110,7 @@ class Layout:
     @property
     def form(self) -> TextForm:
         """How a text is a table."""
-        return TextForm(self.header, self.delimiter, self.decimal, self.skip, self.unit_row)
+        return TextForm(self.header, self.delimiter, self.decimal, self.skip, self.unit_row, self.encoding)
 
 
 def read_layout(path: str | Path, *, robot: Robot = NECK) -> Layout:
@@ -125,18 +155,35 @@ def parse_layout(text: str, *, robot: Robot = NECK) -> Layout:
 
 
 def _layout(table: dict[str, Any], robot: Robot) -> Layout:
-    _known_keys(table, {"file", "time", "channels", "tilt"}, "the layout")
+    _known_keys(table, {"file", "time", "channels", "tilt", "quaternion"}, "the layout")
     file, time = table.get("file", {}), table.get("time", {})
     tilt = table.get("tilt", {})
-    _known_keys(file, {"header", "delimiter", "decimal", "skip", "unit_row", "rows", "variable"}, "[file]")
+    _known_keys(
+        file,
+        {"header", "delimiter", "decimal", "skip", "unit_row", "rows", "variable", "sheet", "encoding"},
+        "[file]",
+    )
     _known_keys(
         time,
-        {"column", "unit", "factor", "sample_time_s", "new_run_at_restart", "duplicates", "run_column"},
+        {
+            "column",
+            "terms",
+            "unit",
+            "factor",
+            "sample_time_s",
+            "new_run_at_restart",
+            "duplicates",
+            "run_column",
+            "merge",
+        },
         "[time]",
     )
     _known_keys(tilt, {"inclination", "orientation"}, "[tilt]")
     if tilt:
         robot.require_neck("[tilt]")
+    quaternion = table.get("quaternion", {})
+    if quaternion:
+        robot.require_neck("[quaternion]")
     if len(tilt) == 1:
         raise SettingsError("[tilt] needs both `inclination` and `orientation`.")
     if type(time.get("run_column", "")) not in (str, int):
@@ -152,13 +199,17 @@ def _layout(table: dict[str, Any], robot: Robot) -> Layout:
         channels={name: _channel_source(name, entry, robot) for name, entry in table.get("channels", {}).items()},
         inclination=_source(tilt["inclination"], "rad", "[tilt] inclination") if tilt else None,
         orientation=_source(tilt["orientation"], "rad", "[tilt] orientation") if tilt else None,
+        quaternion=_quaternion(quaternion) if quaternion else None,
         time=_time_source(time),
+        merge=_flag(time, "merge", default=False),
         sample_time=None if time.get("sample_time_s") == "estimate" else _positive(time.get("sample_time_s")),
         estimate=time.get("sample_time_s") == "estimate",
         new_run_at_restart=_flag(time, "new_run_at_restart", default=False),
         duplicates=_choice(time, "duplicates", DUPLICATES, None),
         run=time.get("run_column"),
         variable=str(file["variable"]) if "variable" in file else None,
+        sheet=str(file["sheet"]) if "sheet" in file else None,
+        encoding=_choice(file, "encoding", ENCODINGS, "utf-8") or "utf-8",
         header=_flag(file, "header", default=True),
         delimiter=_delimiter(file.get("delimiter", ",")),
         decimal=_choice(file, "decimal", (".", ","), ".") or ".",
@@ -170,9 +221,25 @@ def _layout(table: dict[str, Any], robot: Robot) -> Layout:
 
 
 def _time_source(time: dict[str, Any]) -> Source | None:
-    if "column" not in time:
+    if not time.keys() & {"column", "terms"}:
         return None
-    return _source({"unit": "s", **_only(time, "column", "unit", "factor")}, "s", "[time]")
+    entry = {"unit": "s", **_only(time, "column", "terms", "unit", "factor")}
+    if entry["unit"] != DATE:
+        return _source(entry, "s", "[time]")
+    if type(entry.get("column")) not in (str, int) or "factor" in entry:
+        raise SettingsError("[time] of unit `date` needs one `column`, without a factor.")
+    return Source((Term(entry["column"]),), DATE)
+
+
+def _quaternion(entry: dict[str, Any]) -> Quaternion:
+    _known_keys(entry, {"w", "x", "y", "z", "pitch", "roll"}, "[quaternion]")
+    parts = [entry.get(name) for name in "wxyz"]
+    if any(type(part) not in (str, int) for part in parts):
+        raise SettingsError("[quaternion] needs the columns `w`, `x`, `y` and `z`: names, or indices from 0.")
+    pitch, roll = _choice(entry, "pitch", AXES, "y") or "y", _choice(entry, "roll", AXES, "x") or "x"
+    if pitch[-1] == roll[-1]:
+        raise SettingsError(f"[quaternion] pitch and roll are turns about two axes; got `{pitch}` and `{roll}`.")
+    return Quaternion(parts[0], parts[1], parts[2], parts[3], pitch, roll)  # pyright: ignore[reportArgumentType]
 
 
 def _channel_source(name: str, entry: Any, robot: Robot) -> Source:
@@ -185,7 +252,7 @@ def _channel_source(name: str, entry: Any, robot: Robot) -> Source:
 def _source(entry: Any, quantity: str, where: str) -> Source:
     if not isinstance(entry, dict):
         raise SettingsError(f"{where} must be a table with `column` (or `terms`) and `unit`.")
-    _known_keys(entry, {"column", "terms", "unit", "sign", "factor"}, where)
+    _known_keys(entry, {"column", "terms", "unit", "sign", "factor", "integrate"}, where)
     terms = entry.get("terms", [_only(entry, "column", "factor")])
     for term in terms:
         if not isinstance(term, dict) or type(term.get("column")) not in (str, int):
@@ -193,12 +260,14 @@ def _source(entry: Any, quantity: str, where: str) -> Source:
         _known_keys(term, {"column", "factor"}, where)
     if "unit" not in entry:
         raise SettingsError(f"{where} names no unit.")
-    if to_si(entry["unit"])[1] != quantity:
-        raise SettingsError(f"{where} cannot be in `{entry['unit']}`; its SI unit is {quantity}.")
+    integrate = _flag(entry, "integrate", default=False)
+    if to_si(entry["unit"])[1] != (f"{quantity}/s" if integrate else quantity):
+        what = f"; what is integrated to {quantity} is in {quantity}/s" if integrate else f"; its SI unit is {quantity}"
+        raise SettingsError(f"{where} cannot be in `{entry['unit']}`{what}.")
     parsed = tuple(Term(term["column"], _factor(term.get("factor", 1.0), where)) for term in terms)
     if entry.get("sign", 1) not in (1, -1) or isinstance(entry.get("sign"), bool):
         raise SettingsError(f"{where}: sign must be 1 or -1; got {entry['sign']!r}. Scale it by `factor`.")
-    return Source(parsed, entry["unit"], float(entry.get("sign", 1)))
+    return Source(parsed, entry["unit"], float(entry.get("sign", 1)), integrate)
 
 
 def _factor(value: Any, where: str) -> float:

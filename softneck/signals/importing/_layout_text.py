@@ -37,6 +37,9 @@ def layout_toml(layout: Layout, *, remarks: Mapping[str, str] | None = None, ope
         for name, source in (("inclination", layout.inclination), ("orientation", layout.orientation)):
             tilt += [*_comment(why.get(name)), f"{name} = {_inline(source)}"]
         blocks.append(tilt)
+    if layout.quaternion is not None:
+        axes = [f"{name} = {_text(getattr(layout.quaternion, name))}" for name in ("w", "x", "y", "z", "pitch", "roll")]
+        blocks.append([*_comment(why.get("quaternion")), "[quaternion]", *axes])
     blocks.append([line for end in open_ends for line in _comment(end)])
     return "\n\n".join("\n".join(block) for block in blocks if block) + "\n"
 
@@ -44,6 +47,10 @@ def layout_toml(layout: Layout, *, remarks: Mapping[str, str] | None = None, ope
 def _file(layout: Layout, why: Mapping[str, str]) -> list[str]:
     plain = Layout(channels={})
     lines = [f"variable = {_text(layout.variable)}"] if layout.variable is not None else []
+    if layout.sheet is not None:
+        lines.append(f"sheet = {_text(layout.sheet)}")
+    if layout.encoding != plain.encoding:
+        lines.append(f"encoding = {_text(layout.encoding)}")
     if layout.skip:
         lines.append(f"skip = {layout.skip}")
     if layout.unit_row:
@@ -62,11 +69,14 @@ def _file(layout: Layout, why: Mapping[str, str]) -> list[str]:
 def _time(layout: Layout, why: Mapping[str, str]) -> list[str]:
     lines = _comment(why.get("time"))
     if layout.time is not None:
-        if len(layout.time.terms) != 1 or layout.time.sign != 1.0:
+        if not layout.time.terms or layout.time.sign != 1.0:
             raise SettingsError("the time of a layout is one column without a sign; use its factor.")
-        term = layout.time.terms[0]
-        lines += [f"column = {_text(term.column)}", f"unit = {_text(layout.time.unit)}"]
-        lines += [f"factor = {term.factor!r}"] if term.factor != 1.0 else []
+        if len(layout.time.terms) == 1:
+            term = layout.time.terms[0]
+            lines += [f"column = {_text(term.column)}", f"unit = {_text(layout.time.unit)}"]
+            lines += [f"factor = {term.factor!r}"] if term.factor != 1.0 else []
+        else:
+            lines += _sum(layout.time)
     lines += _comment(why.get("sample_time"))
     if layout.estimate:
         lines.append('sample_time_s = "estimate"')
@@ -75,6 +85,7 @@ def _time(layout: Layout, why: Mapping[str, str]) -> list[str]:
     lines += ["new_run_at_restart = true"] if layout.new_run_at_restart else []
     lines += [f"duplicates = {_text(layout.duplicates)}"] if layout.duplicates is not None else []
     lines += [f"run_column = {_text(layout.run)}"] if layout.run is not None else []
+    lines += ["merge = true"] if layout.merge else []
     return ["[time]", *lines] if lines else []
 
 
@@ -85,14 +96,18 @@ def _inline(source: Source) -> str:
     parts = [f"column = {_text(term.column)}", f"unit = {_text(source.unit)}"]
     parts += [f"factor = {term.factor!r}"] if term.factor != 1.0 else []
     parts += [f"sign = {source.sign:g}"] if source.sign != 1.0 else []
+    parts += ["integrate = true"] if source.integrate else []
     return "{ " + ", ".join(parts) + " }"
 
 
 def _sum(source: Source) -> list[str]:
     terms = ", ".join(f"{{ column = {_text(t.column)}, factor = {t.factor!r} }}" for t in source.terms)
-    return [f"unit = {_text(source.unit)}", f"terms = [{terms}]"] + (
-        [f"sign = {source.sign:g}"] if source.sign != 1.0 else []
-    )
+    return [
+        f"unit = {_text(source.unit)}",
+        f"terms = [{terms}]",
+        *([f"sign = {source.sign:g}"] if source.sign != 1.0 else []),
+        *(["integrate = true"] if source.integrate else []),
+    ]
 
 
 def _text(value: str | int) -> str:

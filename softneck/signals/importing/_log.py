@@ -9,24 +9,26 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from softneck.core import DataError, FileFormatError, SoftneckError, Vector, to_si
-from softneck.robot import Robot
+from softneck.core import DataError, SoftneckError, Vector, to_si
 
-from ..recording._channels import MOTOR_POSITIONS, MOTOR_TURNS, SET_POINTS, may_miss
-from ..recording._files import integers, numbers, read_table
+from ..recording._channels import may_miss
+from ..recording._files import integers, numbers
 from ..recording._recording import Recording
 from ..recording._resampling import Samples, mean_step, resample, split_at_gaps, without_duplicates
 from ..recording._times import check_rising, median_step, uneven
+from ._clocks import clocked, integrated, merged, time_of
 from ._layout import Column, Layout, Source
-from ._mat import read_mat
 from ._sample_time import estimate_sample_time
-from ._tilt import pitch_roll
+from ._tilt import pitch_roll, turns
+from .formats._read import read_foreign
 
 if TYPE_CHECKING:
     import pandas as pd
 
 # Part of the samples of a channel that may be anything.
 _GLITCHES = 0.01
+# A wrong unit is off by 57. Less than half as far again as the range may be another winch, and is told only.
+_ANOTHER_UNIT = 1.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,58 +59,79 @@ def import_log(path: str | Path, layout: Layout) -> ImportResult:
 
 
 def read_log(source: Path, layout: Layout) -> pd.DataFrame:
-    """Return a log's table by its ending: `.parquet`, `.mat`, or else text.
+    """Return a log's table, by what the file is.
 
     Raises:
         FileFormatError: no such file or no table.
-        DataError: a MAT file without the variable.
+        DataError: the layout names a variable or a sheet that is not there.
     """
-    suffix = source.suffix.lower()
-    if suffix == ".mat":
-        if not source.is_file():
-            raise FileFormatError(f"{source}: no such file.")
-        return read_mat(source, layout.variable, tuple(str(c) for c in _columns(layout)))
-    if layout.variable is not None:
-        raise DataError(f"{source}: the layout's `variable` is for a `.mat` file.")
-    kind = ".parquet" if suffix == ".parquet" else ".csv"
-    frame = read_table(source, kind, layout.form)
-    frame.columns = [name.strip() if isinstance(name, str) else name for name in frame.columns]
-    return frame
+    wanted = tuple(str(column) for column in _columns(layout))
+    return read_foreign(source, layout.form, variable=layout.variable, sheet=layout.sheet, wanted=wanted)
 
 
 def _columns(layout: Layout) -> tuple[Column, ...]:
     """Return all columns that a layout names."""
     sources = [*layout.channels.values(), layout.inclination, layout.orientation, layout.time]
     named = [term.column for source in sources if source is not None for term in source.terms]
+    q = layout.quaternion
+    named += [] if q is None else [q.w, q.x, q.y, q.z]
     return (*named, layout.run) if layout.run is not None else tuple(named)
 
 
 def _imported(frame: pd.DataFrame, layout: Layout) -> ImportResult:
-    channels = {name: _values(frame, source, name, layout.robot) for name, source in layout.channels.items()}
+    channels = {name: _values(frame, source, name, layout) for name, source in layout.channels.items()}
     if layout.inclination is not None and layout.orientation is not None:
-        i = _values(frame, layout.inclination, "pitch", layout.robot)
-        o = _values(frame, layout.orientation, "pitch", layout.robot)
+        i = _values(frame, layout.inclination, "pitch", layout)
+        o = _values(frame, layout.orientation, "pitch", layout)
         channels["pitch"], channels["roll"] = pitch_roll(i, o)
+    if (q := layout.quaternion) is not None:
+        parts = [
+            numbers(_column(frame, c, "pitch"), str(c), missing=True, nan_words=True) for c in (q.w, q.x, q.y, q.z)
+        ]
+        turned = turns(np.column_stack(parts))
+        channels["pitch"], channels["roll"] = turned[q.pitch], turned[q.roll]
     samples, sample_time, notes = _clocked(frame, layout, channels)
     recording = Recording(samples.time, sample_time, samples.channels, samples.run, layout.robot)
-    if layout.robot.is_neck:
-        _refuse_turns(layout, recording.channels)
+    notes += _refuse_range(layout, recording.channels)
     if not np.ptp(recording.set_points, axis=0).any():
         notes += ("warning: no set-point ever changes: nothing can be identified from this log",)
     return ImportResult(recording, notes)
 
 
-def _refuse_turns(layout: Layout, channels: Mapping[str, Vector]) -> None:
-    """Raise DataError where motors turn further than they can for more than some glitches of an encoder."""
-    for name in (*SET_POINTS, *MOTOR_POSITIONS):
+def _refuse_range(layout: Layout, channels: Mapping[str, Vector]) -> tuple[str, ...]:
+    """Return a warning where set-points go further than the motors' range.
+
+    Raises:
+        DataError: motors go so far beyond it, for more than some glitches of an encoder, that the unit is wrong.
+    """
+    motors, robot = layout.robot.motors, layout.robot
+    warnings: list[str] = []
+    for name in (*robot.set_points, *robot.motor_positions):
+        j = int(name.rpartition("_")[2]) - 1
+        bounds = [abs(limit[j]) for limit in (motors.setpoint_min, motors.setpoint_max) if limit is not None]
         reached = np.abs(channels.get(name, np.zeros(1)))
-        if (reached > MOTOR_TURNS).mean() > _GLITCHES:
-            reach = np.nanmax(reached)
-            hint = 'is it in degrees (`unit = "deg"`)?' if layout.channels[name].unit == "rad" else "is `factor` right?"
-            raise DataError(
-                f"`{name}` reaches {reach:.4g} rad, which is {reach / (2.0 * np.pi):.0f} turns; the motors' range is "
-                f"6 rad. Mend its line in the layout: {hint}"
-            )
+        limit = max(bounds, default=np.inf) * to_si(motors.unit)[0]
+        if (reached > limit * _ANOTHER_UNIT).mean() > _GLITCHES:
+            raise DataError(_beyond(layout, name, float(np.nanmax(reached)), limit))
+        if name in robot.set_points and (reached > 1.001 * limit).mean() > _GLITCHES:
+            warnings.append(f"warning: {_beyond(layout, name, float(np.nanmax(reached)), limit)}")
+    return tuple(warnings[:1])
+
+
+def _beyond(layout: Layout, name: str, reach: float, limit: float) -> str:
+    """Return what to do where a motor's channel reaches `reach` and the robot `limit`, both in SI units."""
+    unit = to_si(layout.robot.motors.unit)[1]
+    source = layout.channels[name]
+    turned = reach / (2.0 * np.pi) if unit == "rad" else 0.0
+    turns_said = f", which is {turned:.0f} turns" if turned > 1.5 else ", more than a turn" if turned > 1.0 else ""
+    hint = "is `factor` right?"
+    if source.unit in ("rad", "rad/s"):
+        meant = "deg" if source.unit == "rad" else "deg/s"
+        hint = f'is it in degrees (`unit = "{meant}"`)?'
+    return (
+        f"`{name}` reaches {reach:.4g} {unit}{turns_said}; the motors' range is {limit:.4g} {unit}. Mend its line in "
+        f"the layout: {hint} If the robot does go so far, say so by `setpoint_max` in a robot.toml and --robot."
+    )
 
 
 def _clocked(
@@ -122,19 +145,24 @@ def _clocked(
         sample_time, notes = _sample_time(layout, channels, run, None)
         if sample_time is None:
             raise DataError("the layout gives neither a time column nor `sample_time_s`; give one.")
-        return Samples(_counted(run) * sample_time, run, channels), sample_time, notes
-    time = _values(frame, layout.time, "time", layout.robot)
-    notes = ()
+        samples, more = integrated(Samples(_counted(run) * sample_time, run, channels), layout.channels)
+        return samples, sample_time, notes + more
+    time, notes = time_of([_column(frame, term.column, "time") for term in layout.time.terms], layout.time)
     if layout.new_run_at_restart and run.size:
         run[1:] = np.cumsum((np.diff(time) < 0) | (np.diff(run) != 0))
         run[0] = 0
-        notes = (f"{run[-1] + 1} run(s), by restarts of the time column",)
+        notes += (f"{run[-1] + 1} run(s), by restarts of the time column",)
     check_rising(time, run, may_stand=True)
-    samples, left_out = without_duplicates(Samples(time, run, channels), layout.duplicates)
+    samples = Samples(time, run, channels)
+    if layout.merge:
+        samples, note = merged(samples, layout.robot.outputs.names)
+        notes += (note,)
+    samples, left_out = without_duplicates(samples, layout.duplicates)
     samples, gaps = split_at_gaps(samples)
+    samples, summed = integrated(samples, layout.channels)
     nominal = median_step(samples.time, samples.run)
     sample_time, remarks = _sample_time(layout, samples.channels, samples.run, nominal)
-    notes += left_out + gaps + remarks
+    notes += left_out + gaps + summed + remarks
     if sample_time is None:
         return _evened(samples, nominal, notes)
     return _recounted(layout, samples, nominal, sample_time, notes)
@@ -191,13 +219,12 @@ def _counted(run: np.ndarray) -> np.ndarray:
     return np.arange(run.size) - np.repeat(first, np.diff(np.append(first, run.size)))
 
 
-def _values(frame: pd.DataFrame, source: Source, channel: str, robot: Robot) -> Vector:
+def _values(frame: pd.DataFrame, source: Source, channel: str, layout: Layout) -> Vector:
     total = np.zeros(len(frame))
     for term in source.terms:
         column = _column(frame, term.column, channel)
-        total = total + term.factor * numbers(
-            column, str(term.column), missing=may_miss(channel, robot), nan_words=True
-        )
+        missing = may_miss(channel, layout.robot) or clocked(layout, channel)
+        total = total + term.factor * numbers(column, str(term.column), missing=missing, nan_words=True)
     if total.size and np.isnan(total).all():
         named = ", ".join(f"`{term.column}`" for term in source.terms)
         raise DataError(

@@ -15,6 +15,7 @@ from softneck.robot import Robot
 from ._column_titles import read_title
 from ._layout import Column, Layout, Source, Term
 from ._table_format import SniffResult, sniff
+from .formats._dates import DATE
 
 # Words for what a robot is moved by; what else moves is an output.
 _MOVERS = {
@@ -130,7 +131,7 @@ def _layout(
     default = dict.fromkeys(robot.set_points, robot.motors.unit) | dict.fromkeys(
         robot.outputs.names, robot.outputs.display_unit
     )
-    time = None if clock[0] is None else Source((Term(clock[0]),), read_title(str(clock[0])).unit or "s")
+    time = None if clock[0] is None else Source((Term(clock[0]),), _clock_unit(table, clock[0]))
     return replace(
         table.form,
         channels={name: Source((Term(title),), _unit_of(table, title) or default[name]) for name, title in pairs},
@@ -139,6 +140,11 @@ def _layout(
         run=clock[1],
         robot=robot,
     )
+
+
+def _clock_unit(table: SniffResult, column: Column) -> str:
+    """Return the unit of a column of time: `date` where it holds such."""
+    return DATE if column in table.dates else read_title(str(column)).unit or "s"
 
 
 def _common_unit(path: str | Path, table: SniffResult, titles: Sequence[str]) -> str:

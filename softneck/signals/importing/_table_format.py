@@ -1,10 +1,11 @@
-"""What kind of table a log is: delimiter, decimal mark, header line, and which matrix of a MAT file."""
+"""What kind of table a log is: encoding, delimiter, decimal mark, header, sheet, and which matrix of a MAT file."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,9 +13,14 @@ import numpy as np
 
 from softneck.core import DataError, FileFormatError, Vector
 
-from ..recording._files import WHITESPACE, TextForm, read_table
+from ..recording._files import WHITESPACE, read_table
 from ._layout import Column, Layout
-from ._mat import mat_arrays, mat_table
+from .formats._arrays import table_of
+from .formats._dates import is_date, seconds
+from .formats._encodings import encoding_of, format_of
+from .formats._mcap import mcap_table
+from .formats._read import arrays_of
+from .formats._sheets import sheet_cells, sheet_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -22,11 +28,16 @@ if TYPE_CHECKING:
 
 # Enough lines to tell a format, whatever the size of the log.
 _HEAD_BYTES = 2**16
+_HEAD_ROWS = 500
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf)", re.IGNORECASE)
 _COMMA_NUMBER = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
-# A recording has five channels and a time.
-_FEWEST = 5
+# Three motors and an angle; a recording of a neck has five channels and a time.
+_FEWEST = 4
 _NAMES = {"\t": "a tab", ";": "`;`", ",": "`,`", WHITESPACE: "blanks"}
+# Rows of several clocks: so few have all their cells.
+_WHOLE_ROWS = 0.5
+
+Form = tuple["pd.DataFrame", Layout, tuple[str, ...], list[str]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,11 +45,14 @@ class SniffResult:
     """A log's columns and how they were read.
 
     Attributes:
-        columns: name, or index where there is no header -> (time,) numbers; NaN where a cell is empty.
+        columns: name, or index where there is no header -> (time,) numbers; NaN where a cell is empty. Dates are
+            seconds; of rows of several clocks each column holds its last value.
         words: columns that hold no numbers.
-        form: a layout without channels that says how to read the file.
+        form: a layout without channels that says how to read the file; `merge` where rows may be of several clocks.
         lines: why.
         units: what the line of units says of each column, where there is such a line.
+        dates: columns that hold dates or times of day.
+        frame: the table itself.
     """
 
     columns: dict[Column, Vector]
@@ -46,6 +60,13 @@ class SniffResult:
     form: Layout
     lines: tuple[str, ...]
     units: dict[Column, str]
+    dates: frozenset[Column]
+    frame: pd.DataFrame
+
+    def lacks(self, column: Column) -> bool:
+        """Return whether a column has empty cells."""
+        cells = self.frame[column] if isinstance(column, str) else self.frame.iloc[:, column]
+        return bool(cells.isna().any())
 
 
 def sniff(path: str | Path, *, fewest: int = _FEWEST) -> SniffResult:
@@ -56,25 +77,16 @@ def sniff(path: str | Path, *, fewest: int = _FEWEST) -> SniffResult:
         DataError: a table of fewer columns than a recording needs.
     """
     source = Path(path)
-    if not source.is_file():
-        raise FileFormatError(f"{source}: no such file.")
-    suffix = source.suffix.lower()
-    units: list[str] = []
-    if suffix == ".mat":
-        frame, form, lines = _mat(source, fewest)
-    elif suffix == ".parquet":
-        frame, form, lines = read_table(source, suffix, TextForm()), Layout(channels={}), ()
-    else:
-        form, lines, units = _text_form(source, fewest)
-        frame = read_table(source, ".csv", form.form)
-        if form.header:
-            frame.columns = [str(name).strip() for name in frame.columns]
+    frame, form, lines, units = _form(source, fewest)
     columns: dict[Column, Vector] = {}
     words: list[Column] = []
+    dates: set[Column] = set()
     for place, name in enumerate(frame.columns):
         # Where a name stands twice, only its index tells which.
         key = name if isinstance(name, str) and list(frame.columns).count(name) == 1 else place
         values = _numbers(frame.iloc[:, place])
+        if values is None and (values := _seconds(frame.iloc[:, place])) is not None:
+            dates.add(key)
         if values is None:
             words.append(key)
         else:
@@ -85,8 +97,55 @@ def sniff(path: str | Path, *, fewest: int = _FEWEST) -> SniffResult:
             f"{source}: has {len(columns)} column(s) of numbers; a recording needs {needed}. "
             "Is this a log? If so, write its delimiter into a layout and use --layout."
         )
+    if form.merge or _is_sparse(columns):
+        form = replace(form, merge=True)
+        columns = {name: _last_values(values) for name, values in columns.items()}
     named = {name: unit for name, unit in zip(frame.columns, units, strict=False) if unit}
-    return SniffResult(columns, tuple(words), form, lines, named)
+    return SniffResult(columns, tuple(words), form, lines, named, frozenset(dates), frame)
+
+
+def _form(source: Path, fewest: int) -> Form:
+    """Return a log's table, how it is read, why, and the cells of its line of units."""
+    kind = format_of(source)
+    if kind in ("mat", "octave"):
+        return (*_arrays(source, kind, fewest), [])
+    if kind == "parquet":
+        form = Layout(channels={})
+        return read_table(source, ".parquet", form.form), form, (), []
+    if kind == "mcap":
+        line = "file: MCAP: a row for each message, of the topics that hold numbers"
+        return mcap_table(source), Layout(channels={}, merge=True), (line,), []
+    if kind == "sheet":
+        return _sheet(source)
+    form, lines, units = _text_form(source, fewest)
+    frame = read_table(source, ".csv", form.form)
+    if form.header:
+        frame.columns = [str(name).strip() for name in frame.columns]
+    return frame, form, lines, units
+
+
+def _is_sparse(columns: dict[Column, Vector]) -> bool:
+    """Return whether rows are messages of several clocks: few are whole, and columns lack cells in different rows."""
+    absent = [np.isnan(values) for values in columns.values()]
+    patterns = {gaps.tobytes() for gaps in absent if gaps.mean() > 0.2}
+    return len(patterns) > 1 and float(np.any(absent, axis=0).mean()) > 1.0 - _WHOLE_ROWS
+
+
+def _last_values(values: Vector) -> Vector:
+    seen = np.isfinite(values)
+    last = np.maximum.accumulate(np.where(seen, np.arange(values.size), -1))
+    return np.where(last >= 0, values[last], np.nan)
+
+
+def _seconds(column: pd.Series) -> Vector | None:
+    """Return a column of dates as seconds, or None where it holds none."""
+    cells = column.head(_HEAD_ROWS)
+    if column.dtype.kind != "M" and not (cells.size and all(map(is_date, cells))):
+        return None
+    try:
+        return seconds(column, str(column.name))
+    except DataError:
+        return None
 
 
 def _numbers(column: pd.Series) -> Vector | None:
@@ -106,24 +165,45 @@ def _numbers(column: pd.Series) -> Vector | None:
     return values if values.size and filled.mean() > 0.5 and np.isfinite(values).any() else None
 
 
-def _mat(source: Path, fewest: int) -> tuple[pd.DataFrame, Layout, tuple[str, ...]]:
-    arrays = mat_arrays(source)
-    vectors = [array.size for array in arrays.values() if 1 in array.shape and array.size > 1]
-    length, count = Counter(vectors).most_common(1)[0] if vectors else (0, 0)
+def _arrays(source: Path, kind: str, fewest: int) -> tuple[pd.DataFrame, Layout, tuple[str, ...]]:
+    arrays = arrays_of(source, kind)
+    try:
+        beside = table_of(source, arrays, None)
+    except DataError:
+        beside = None
     matrices = {name: array for name, array in arrays.items() if min(array.shape) >= fewest}
-    if count >= fewest or not matrices:
-        line = f"file: {count} vectors of {length} numbers by their names"
-        return mat_table(source, arrays, None), Layout(channels={}), (line,)
+    if beside is not None and (len(beside.columns) >= fewest or not matrices):
+        line = f"file: {len(beside.columns)} columns of {len(beside)} numbers, vectors and matrices by their names"
+        return beside, Layout(channels={}), (line,)
+    if not matrices:
+        return table_of(source, arrays, None), Layout(channels={}), ()  # which says what is missing
     name = max(matrices, key=lambda key: matrices[key].size)
     line = f"file: the matrix '{name}', because it is the largest one ({' x '.join(map(str, matrices[name].shape))})"
-    return mat_table(source, arrays, name), Layout(channels={}, variable=name, header=False), (line,)
+    return table_of(source, arrays, name), Layout(channels={}, variable=name, header=False), (line,)
+
+
+def _sheet(source: Path) -> Form:
+    sheet, cells = sheet_cells(source, None)
+    rows = [[str(cell).strip() for cell in row] for row in cells[:_HEAD_ROWS]]
+    filled = [sum(bool(cell) for cell in row) for row in rows]
+    usual = Counter(count for count in filled if count > 1).most_common(1)
+    if not usual:
+        raise FileFormatError(f"{source}: cannot be read as a table (no row of sheet `{sheet}` has two cells).")
+    skip = next(place for place, count in enumerate(filled) if count >= usual[0][0])
+    header = any(cell and not _NUMBER.fullmatch(cell) and not is_date(cell) for cell in rows[skip])
+    units = _unit_row(rows[skip + 1 : skip + 3]) if header else []
+    form = Layout(channels={}, sheet=sheet, header=header, skip=skip, unit_row=bool(units))
+    line = f"file: sheet '{sheet}', because it is the only one or the largest"
+    frame = sheet_table(cells, header=header, skip=skip, unit_row=bool(units))
+    return frame, form, (line, *_remarks(form)), units
 
 
 def _text_form(source: Path, fewest: int) -> tuple[Layout, tuple[str, ...], list[str]]:
     """Return how a text is a table, why, and the cells of its line of units."""
+    encoding, said = encoding_of(source)
     with source.open("rb") as file:
         head = file.read(_HEAD_BYTES)
-    raw = head.decode("utf-8-sig", errors="replace").splitlines()
+    raw = head.decode("utf-8-sig" if encoding == "utf-8" else encoding, errors="replace").splitlines()
     if len(head) == _HEAD_BYTES:
         raw = raw[:-1]
     lines = [line for line in raw if line.strip()]
@@ -134,12 +214,14 @@ def _text_form(source: Path, fewest: int) -> tuple[Layout, tuple[str, ...], list
     skip = next((place for place, line in enumerate(raw) if len(_cells(line, delimiter)) == cells), 0)
     lines = [line for line in raw[skip:] if line.strip()]
     body = [cell.strip() for line in lines[1:] for cell in _cells(line, delimiter)]
-    comma = delimiter != "," and any(map(_COMMA_NUMBER.fullmatch, body)) and not any("." in cell for cell in body)
+    comma = delimiter != "," and any(map(_COMMA_NUMBER.fullmatch, body)) and not any(
+        "." in cell for cell in body if not is_date(cell)
+    )  # fmt: skip
     first = [cell.strip().replace(",", ".") if comma else cell.strip() for cell in _cells(lines[0], delimiter)]
-    header = any(cell and not _NUMBER.fullmatch(cell) for cell in first)
+    header = any(cell and not _NUMBER.fullmatch(cell) and not is_date(cell) for cell in first)
     why = f"file: cells are separated by {_NAMES[delimiter]}, because that splits all lines into equally many"
-    second = "the first line holds words: names" if header else "no header line, because the first line holds numbers"
-    units = _unit_row(raw[skip + 1 : skip + 3], delimiter) if header else []
+    below = [[cell.strip() for cell in _cells(line, delimiter)] for line in raw[skip + 1 : skip + 3]]
+    units = _unit_row(below) if header else []
     form = Layout(
         channels={},
         header=header,
@@ -147,23 +229,31 @@ def _text_form(source: Path, fewest: int) -> tuple[Layout, tuple[str, ...], list
         decimal="," if comma else ".",
         skip=skip,
         unit_row=bool(units),
+        encoding=encoding,
     )
-    before = (f"file: the first {skip} line(s) are not part of the table",) if skip else ()
-    after = [
-        *(["file: the line below the names holds units"] if units else []),
-        *(["file: decimal commas"] if comma else []),
+    return form, (why, *([] if said is None else [f"file: {said}"]), *_remarks(form)), units
+
+
+def _remarks(form: Layout) -> list[str]:
+    second = (
+        "the first line holds words: names" if form.header else "no header line, because the first line holds numbers"
+    )
+    return [
+        *([f"file: the first {form.skip} line(s) are not part of the table"] if form.skip else []),
+        f"file: {second}",
+        *(["file: the line below the names holds units"] if form.unit_row else []),
+        *(["file: decimal commas"] if form.decimal == "," else []),
     ]
-    return form, (why, *before, f"file: {second}", *after), units
 
 
-def _unit_row(lines: list[str], delimiter: str) -> list[str]:
-    """Return the cells of the line below the names, without brackets, if it holds no number and the next line does."""
+def _unit_row(lines: Sequence[Sequence[str]]) -> list[str]:
+    """Return the cells of the row below the names, without brackets, if it holds no number and the next row does."""
     if len(lines) < 2:
         return []
-    cells = [cell.strip().strip("[]()").strip() for cell in _cells(lines[0], delimiter)]
-    below = [cell.strip().replace(",", ".") for cell in _cells(lines[1], delimiter)]
+    cells = [cell.strip("[]()").strip() for cell in lines[0]]
+    below = [cell.replace(",", ".") for cell in lines[1]]
     words = [cell for cell in cells if cell]
-    if not words or any(_NUMBER.fullmatch(cell.replace(",", ".")) for cell in words):
+    if not words or any(_NUMBER.fullmatch(cell.replace(",", ".")) or is_date(cell) for cell in words):
         return []
     return cells if sum(bool(_NUMBER.fullmatch(cell)) for cell in below) > len(below) / 2 else []
 

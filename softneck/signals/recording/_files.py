@@ -73,7 +73,7 @@ def write_recording(path: str | Path, recording: Recording, *, force: bool = Fal
         DataError: another ending than `.csv` or `.parquet`, or a channel without a sample.
     """
     suffix = recording_suffix(path)
-    _require_samples(recording)
+    require_samples(recording)
     with atomic_write(path, force=force) as temporary:
         if suffix == ".csv":
             _write_csv(_titled(recording), temporary, _robot_line(recording.robot))
@@ -198,6 +198,7 @@ class TextForm:
     decimal: str = "."
     skip: int = 0
     unit_row: bool = False
+    encoding: str = "utf-8"
 
 
 def read_table(source: Path, suffix: str, form: TextForm) -> pd.DataFrame:
@@ -227,6 +228,7 @@ def read_table(source: Path, suffix: str, form: TextForm) -> pd.DataFrame:
                 keep_default_na=False,
                 na_values=[""],
                 low_memory=False,
+                encoding=form.encoding,
             )
     except (ValueError, OSError, ArithmeticError, MemoryError, pd.errors.ParserWarning) as error:
         raise _no_table(source, error) from error
@@ -274,11 +276,11 @@ def _from_columns(columns: Mapping[str, pd.Series | Vector], robot: Robot) -> Re
         raise DataError("there is no column `time [s]`.")
     time = channels.pop("time")
     recording = Recording(time, median_step(time, run), channels, run, robot)
-    _require_samples(recording)
+    require_samples(recording)
     return recording
 
 
-def _require_samples(recording: Recording) -> None:
+def require_samples(recording: Recording) -> None:
     """Raise DataError where a channel that models are made from has no sample at all."""
     for name in (*recording.robot.outputs.names, *recording.robot.motor_positions):
         if name in recording.channels and np.isnan(recording.channels[name]).all():

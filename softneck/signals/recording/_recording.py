@@ -211,6 +211,8 @@ def _dealt(rows: Sequence[int], count: int) -> list[list[int]]:
 def concatenate(recordings: list[Recording] | tuple[Recording, ...]) -> Recording:
     """Put recordings of one sample time behind each other as separate runs; channels that all have are kept.
 
+    One without the channel `payload` bore none where another has it.
+
     Raises:
         DataError: none given, or sample times or robots differ.
     """
@@ -226,7 +228,11 @@ def concatenate(recordings: list[Recording] | tuple[Recording, ...]) -> Recordin
             )
         require_same_robot(recording.robot, first.robot, "recordings")
         parts.extend(recording.runs())
-    names = [name for name in first.channels if all(name in part.channels for part in parts)]
+    if any("payload" in part.channels for part in parts):
+        parts = [
+            part if "payload" in part.channels else part.with_channels(payload=np.zeros(len(part))) for part in parts
+        ]
+    names = [name for name in parts[0].channels if all(name in part.channels for part in parts)]
     return Recording(
         np.concatenate([part.time for part in parts]),
         first.sample_time,

@@ -17,6 +17,8 @@ from ._recording import Recording
 _GAP = 1.5
 # Lags of 2 to 4 and a delay of as much again: a shorter piece gives a model not one row to learn from.
 SHORTEST = 10
+# Of the new Nyquist frequency, what is passed; damping beyond it [dB].
+_PASSED, _DAMPING = 0.7, 60.0
 # An instant that is this close to a logged one, in sample times, is that one: rounding of sums of steps.
 _SAME = 1e-6
 
@@ -110,22 +112,60 @@ def mean_step(samples: Samples) -> float:
 
 
 def resampled(recording: Recording, sample_time: float) -> Recording:
-    """Return a recording at another sample time [s], run by run, as an import makes uneven times even.
+    """Return a recording at another sample time [s], run by run; at its own it comes back to the bit.
 
-    A model is of one sample time; this brings other recordings there. What a slower one cannot hold is not filtered
-    out before.
+    A model is of one sample time; this brings other recordings there. Measured channels follow a monotone cubic, as an
+    import makes uneven times even. Before they go to a slower sample time, what that cannot hold is filtered out
+    without a delay (`low_pass`). Set-points and flags hold their last value.
 
     Raises:
         DataError: a run is shorter than the new sample time.
     """
     require_positive("sample_time", sample_time, "s")
+    if abs(sample_time - recording.sample_time) <= _SAME * recording.sample_time:
+        return recording
     shortest = min(len(run) for run in recording.runs())
     if (shortest - 1) * recording.sample_time < sample_time:
         raise DataError(
             f"a run of {shortest} rows at {recording.sample_time:g} s has no two samples {sample_time:g} s apart."
         )
-    even, _ = resample(Samples(recording.time, recording.run, recording.channels), sample_time)
+    samples = Samples(recording.time, recording.run, recording.channels)
+    ratio = sample_time / recording.sample_time
+    if ratio > 1.0:
+        samples = _without_aliases(samples, ratio)
+    even, _ = resample(samples, sample_time)
     return Recording(even.time, sample_time, even.channels, even.run, recording.robot)
+
+
+def _without_aliases(samples: Samples, ratio: float) -> Samples:
+    """Return the samples with measured channels low-passed for a sample time `ratio` times as long, run by run."""
+    channels = dict(samples.channels)
+    for name, values in samples.channels.items():
+        if not is_held(name):
+            channels[name] = np.concatenate([low_pass(values[rows], ratio) for rows in samples.runs()])
+    return Samples(samples.time, samples.run, channels)
+
+
+def low_pass(values: Vector, ratio: float) -> Vector:
+    """Return values (time,) without what a sample time `ratio` times as long would fold down to lower frequencies.
+
+    A sinc in a Kaiser window of 60 dB (Kaiser 1974), symmetric and so without delay, that passes all below 0.7 of the
+    new Nyquist frequency and ends at it. Both ends are continued by their reflection in the last value, which keeps
+    straight lines straight. Lines stand in for missed samples, which stay missed.
+    """
+    seen = np.isfinite(values)
+    if values.size < 3 or seen.sum() < 2:
+        return values
+    stop = np.pi / ratio
+    width = (1.0 - _PASSED) * stop
+    # A run shorter than the window gets a shorter one, whose edge is less steep.
+    half = min(int(np.ceil((_DAMPING - 7.95) / (2.285 * width) / 2.0)), values.size - 1)
+    k = np.arange(-half, half + 1)
+    weights = np.sinc((stop - width / 2.0) / np.pi * k) * np.kaiser(2 * half + 1, 0.1102 * (_DAMPING - 8.7))
+    whole = np.interp(np.arange(values.size), np.flatnonzero(seen), values[seen])
+    ends = 2.0 * whole[0] - whole[half:0:-1], 2.0 * whole[-1] - whole[-2 : -half - 2 : -1]
+    filtered = np.convolve(np.concatenate([ends[0], whole, ends[1]]), weights / weights.sum(), mode="valid")
+    return np.where(seen, filtered, np.nan)
 
 
 def resample(samples: Samples, sample_time: float) -> tuple[Samples, float]:

@@ -22,6 +22,7 @@ _NECKS = (
     "softneck.design.linear._linear_controller_runtime",
     "softneck.identification.networks._nss_runtime",
     "softneck.identification.structured._greybox_runtime",
+    "softneck.identification.structured._loaded_greybox_runtime",
     "softneck.identification.uncertainty._residual_runtime",
     "softneck.identification.uncertainty._ensemble_runtime",
     "softneck.identification.uncertainty._guarded_runtime",
@@ -29,6 +30,7 @@ _NECKS = (
     "softneck.estimation._kalman_runtime",
     "softneck.estimation._steady_kalman_runtime",
     "softneck.estimation._nonlinear_runtime",
+    "softneck.estimation._payload_runtime",
     "softneck.design.linear._linear_controller_runtime",
     "softneck.design.varying._scheduled_runtime",
     "softneck.design.varying._adaptive_runtime",
@@ -40,6 +42,7 @@ _NECKS = (
 _ROBOTS = (
     "softneck.identification.set_membership._nlsm_runtime",
     "softneck.identification.structured._greybox_runtime",
+    "softneck.identification.structured._loaded_greybox_runtime",
     "softneck.identification.uncertainty._residual_runtime",
     "softneck.identification.uncertainty._ensemble_runtime",
     "softneck.identification.uncertainty._guarded_runtime",

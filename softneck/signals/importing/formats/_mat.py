@@ -1,4 +1,4 @@
-"""MATLAB files as tables: v5, and v7.3 (HDF5) through h5py; numbers only, no code, no other files."""
+"""MATLAB files as arrays: v5, and v7.3 (HDF5) through h5py; numbers only, no code, no other files."""
 
 from __future__ import annotations
 
@@ -6,21 +6,19 @@ import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from softneck.core import DataError, FileFormatError
 
-if TYPE_CHECKING:
-    import pandas as pd
-
 # Table 1-1: types of data.
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _MATRIX, _COMPRESSED = 14, 15
 # Table 1-3: classes of arrays.
-_STRUCT, _NUMBERS = 2, range(6, 16)
+_CELL, _STRUCT, _NUMBERS = 1, 2, range(6, 16)
 _COMPLEX = 0x0800
 _HEADER = 128
 # Structures of logs are one or two deep; deeper ones are loops or hostile.
@@ -72,7 +70,9 @@ def is_mat5(data: bytes) -> bool:
 
 
 def read_mat5(data: bytes) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the real numeric arrays of a file by their names; a structure of one element is opened.
+    """Yield the real numeric arrays of a file by their names; structures and cells are opened.
+
+    A field is `structure.field`; an element of a cell, or of an array of structures, `name{1}`.
 
     Raises:
         ValueError, struct.error, zlib.error: the file is damaged.
@@ -104,47 +104,37 @@ def _array(parts: _Elements, name: str | None, depth: int) -> Iterator[tuple[str
     shape = tuple(int(size) for size in parts.numbers())
     own = parts.text()
     name = own if name is None else name
-    if flags & 0xFF == _STRUCT and shape == (1, 1) and depth < _MAX_DEPTH:
+    kind = flags & 0xFF
+    if kind == _CELL and depth < _MAX_DEPTH:
+        for place in range(prod(shape)):
+            yield from _array(_Elements(_matrix(parts), parts.order), f"{name}{{{place + 1}}}", depth + 1)
+    elif kind == _STRUCT and depth < _MAX_DEPTH:
         width = int(parts.numbers()[0])
         names = bytes(parts.next()[1])
         if not 0 < width <= 256:
             raise ValueError(f"the fields of a structure have names of {width} bytes")
-        for start in range(0, len(names) - width + 1, width):
-            field = names[start : start + width].split(b"\0")[0].decode("utf-8", errors="replace")
-            kind, content = parts.next()
-            if kind != _MATRIX:
-                raise ValueError(f"a field of a structure has the type {kind}")
-            yield from _array(_Elements(content, parts.order), f"{name}.{field}", depth + 1)
-    elif flags & 0xFF in _NUMBERS and not flags & _COMPLEX:
+        for place in range(prod(shape)):
+            element = name if prod(shape) == 1 else f"{name}{{{place + 1}}}"
+            for start in range(0, len(names) - width + 1, width):
+                field = names[start : start + width].split(b"\0")[0].decode("utf-8", errors="replace")
+                yield from _array(_Elements(_matrix(parts), parts.order), f"{element}.{field}", depth + 1)
+    elif kind in _NUMBERS and not flags & _COMPLEX:
         # Stored by columns, in the smallest type that holds the numbers.
         yield name, parts.numbers().astype(np.float64).reshape(shape, order="F")
 
 
+def _matrix(parts: _Elements) -> memoryview:
+    """Return the next element, which must be an array."""
+    kind, content = parts.next()
+    if kind != _MATRIX:
+        raise ValueError(f"a field of a structure has the type {kind}")
+    return content
+
+
 # A small hostile file may declare any size; no log of ours comes near 2^27 numbers (1 GiB).
 _MAX_NUMBERS = 2**27
-
-
-def read_mat(source: Path, variable: str | None, wanted: tuple[str, ...] = ()) -> pd.DataFrame:
-    """Read a MAT file as a table.
-
-    Args:
-        source: the file, v5 or v7.3.
-        variable: a matrix (time, columns), whose columns get the numbers 0, 1, ...; None takes all vectors
-            by their names. Fields of a structure are named `structure.field`.
-        wanted: the vectors that are needed; others of another length are left out.
-
-    Raises:
-        FileFormatError: no MAT file.
-        DataError: the variable is not there, is not a matrix of numbers, or vectors differ in length.
-    """
-    return mat_table(source, mat_arrays(source), variable, wanted)
-
-
-def mat_table(
-    source: Path, arrays: dict[str, np.ndarray], variable: str | None, wanted: tuple[str, ...] = ()
-) -> pd.DataFrame:
-    """Return the table of `read_mat` from the file's arrays."""
-    return _vectors(source, arrays, wanted) if variable is None else _matrix(source, arrays, variable)
+# More are no experiments.
+_MAX_ELEMENTS = 10_000
 
 
 def mat_arrays(source: Path) -> dict[str, np.ndarray]:
@@ -154,10 +144,8 @@ def mat_arrays(source: Path) -> dict[str, np.ndarray]:
         FileFormatError: no MAT file.
         DataError: a variable lies in another file or declares an impossible size.
     """
-    import h5py  # slow to import, and few logs need it
-
     try:
-        found = _by_name(_hdf5(source) if h5py.is_hdf5(source) else read_mat5(source.read_bytes()))
+        found = _by_name(_hdf5(source) if _is_hdf5(source) else read_mat5(source.read_bytes()))
     except (DataError, FileFormatError):
         raise
     except Exception as error:  # the parsers raise whatever the damaged bytes lead to
@@ -175,61 +163,55 @@ def _by_name(arrays: Iterator[tuple[str, np.ndarray]]) -> dict[str, np.ndarray]:
     return found
 
 
-def _matrix(source: Path, arrays: dict[str, np.ndarray], variable: str) -> pd.DataFrame:
-    import pandas as pd
+def _is_hdf5(source: Path) -> bool:
+    with source.open("rb") as file:
+        if is_mat5(file.read(_HEADER)):
+            return False
+    import h5py  # slow to import, and an extra that version 5 does without
 
-    if variable not in arrays:
-        raise DataError(f"{source}: there is no variable `{variable}` with numbers; the file has {_listed(arrays)}.")
-    array = arrays[variable]
-    return pd.DataFrame(array.T if array.shape[0] == 1 else array)
-
-
-def _vectors(source: Path, arrays: dict[str, np.ndarray], wanted: tuple[str, ...]) -> pd.DataFrame:
-    import pandas as pd
-
-    vectors = {name: array.ravel() for name, array in arrays.items() if 1 in array.shape and array.size > 1}
-    if not vectors:
-        raise DataError(
-            f"{source}: has no vectors of numbers; name the matrix by `[file] variable`; it has {_listed(arrays)}."
-        )
-    lengths = {name: vectors[name].size for name in wanted if name in vectors}
-    if len(set(lengths.values())) > 1:
-        listed = ", ".join(f"{name} ({size})" for name, size in lengths.items())
-        raise DataError(f"{source}: the layout's variables differ in length: {listed}; cut them to one length.")
-    sizes = [vector.size for vector in vectors.values()]
-    rows = next(iter(lengths.values()), max(sizes, key=sizes.count))
-    return pd.DataFrame({name: vector for name, vector in vectors.items() if vector.size == rows})
-
-
-def _listed(arrays: dict[str, np.ndarray]) -> str:
-    return ", ".join(f"{name} ({a.shape[0]} x {a.shape[1]})" for name, a in arrays.items()) or "none"
+    return h5py.is_hdf5(source)
 
 
 def _hdf5(source: Path) -> Iterator[tuple[str, np.ndarray]]:
     import h5py
 
     with h5py.File(source, "r") as file:
-        yield from _members(file, "", 0)
+        yield from _members(file, "", 0, set())
 
 
-def _members(group: Any, prefix: str, depth: int) -> Iterator[tuple[str, np.ndarray]]:
+def _members(group: Any, prefix: str, depth: int, seen: set[int]) -> Iterator[tuple[str, np.ndarray]]:
     import h5py
 
     for name in group:
         # Soft and external links lead elsewhere, external ones to other files; MATLAB writes neither.
         if name.startswith("#") or not isinstance(group.get(name, getlink=True), h5py.HardLink):
             continue
-        item = group[name]
-        if isinstance(item, h5py.Group):
-            if depth < _MAX_DEPTH:
-                yield from _members(item, f"{prefix}{name}.", depth + 1)
-        elif isinstance(item, h5py.Dataset) and _is_numbers(item):
-            if item.external or item.is_virtual:
-                raise DataError(f"variable `{prefix}{name}` lies in another file; softneck reads what is in this one.")
-            if item.size is not None and item.size > _MAX_NUMBERS:
-                raise DataError(f"variable `{prefix}{name}` declares {item.size} numbers; that is not a log.")
-            # MATLAB stores columns first: the file's shape is the transpose.
-            yield f"{prefix}{name}", np.asarray(item[()], dtype=np.float64).T
+        yield from _item(group[name], f"{prefix}{name}", depth, seen)
+
+
+def _item(item: Any, name: str, depth: int, seen: set[int]) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield what a group or a dataset holds; of `seen` addresses nothing more: references may lead in circles."""
+    import h5py
+
+    if isinstance(item, h5py.Group):
+        if depth < _MAX_DEPTH:
+            yield from _members(item, f"{name}.", depth + 1, seen)
+    elif isinstance(item, h5py.Dataset) and item.dtype.kind == "O" and item.size is not None and depth < _MAX_DEPTH:
+        # Elements of cells, and fields of arrays of structures, lie elsewhere in the file.
+        for place, reference in enumerate(np.asarray(item[()]).ravel(order="C")[:_MAX_ELEMENTS]):
+            if isinstance(reference, h5py.Reference) and reference:
+                target = item.file[reference]
+                address = h5py.h5o.get_info(target.id).addr  # pyright: ignore[reportAttributeAccessIssue]
+                if address not in seen:
+                    seen.add(address)
+                    yield from _item(target, f"{name}{{{place + 1}}}", depth + 1, seen)
+    elif isinstance(item, h5py.Dataset) and _is_numbers(item):
+        if item.external or item.is_virtual:
+            raise DataError(f"variable `{name}` lies in another file; softneck reads what is in this one.")
+        if item.size is not None and item.size > _MAX_NUMBERS:
+            raise DataError(f"variable `{name}` declares {item.size} numbers; that is not a log.")
+        # MATLAB stores columns first: the file's shape is the transpose.
+        yield name, np.asarray(item[()], dtype=np.float64).T
 
 
 def _is_numbers(item: Any) -> bool:

@@ -1,0 +1,147 @@
+"""Hold what `softneck tune` returns against necks on which nothing was chosen.
+
+`python benchmarks/tune.py [--necks NECK...] [--kinds KIND...] [--budget N] [--seed N] [--workers N] [--best] [--fresh]`
+
+For each neck what docs/howto/payloads.md tells a user to do: the least co-contraction at which the large experiment is
+heard with 1 kg; from Eq. 22 and multisines of small and large amplitude at 0.32 and 1 kg, played around it, a family,
+and from Eq. 22 a grey box of each payload. `tune` gets those alone. What it returns, and the best of every other kind
+that it judged by all loops, is then run on the neck itself: steps of 15 deg in three directions with 0.32, 0.66 and 1
+kg, and a circle of 12 deg at 1.2 rad/s, known ahead by as much as `tune` says and not. Angles are those that the neck's
+sensor tells. Nothing is chosen here. Recordings' models are kept in `build/tune`; --fresh forgets them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import resource
+import shutil
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import softneck
+from benchmarks.promises import AMPLITUDES, SHOWN, Sensed, block_of, experiments, recorded, taut
+from softneck.identification import FamilySettings, GreyBox
+from softneck.loop import BlockPart, Loop, LoopResult, RotationReference, StepReference, metrics, run_loop
+from softneck.signals import signal
+from softneck.tuning import tune
+from softneck.tuning._judge import designed, made_ready
+from softneck.tuning._tune import BUDGET
+
+OUT = Path("build/tune")
+PAYLOADS, JUDGED = (0.32, 1.0), (0.32, 0.66, 1.0)
+ORIENTATIONS = (0.0, 45.0, 90.0)
+SIZE, CIRCLE, TURN = math.radians(15.0), math.radians(12.0), 1.2
+# Overshoot [%], rise [s], steady rms [deg], circle unknown and known ahead [deg].
+GOALS = {"overshoot": 5.0, "rise": 0.4, "steady": 0.15, "circle": 3.0, "ahead": 1.5}
+
+
+def known(neck: str) -> dict[str, Any]:
+    """Return the family and the grey boxes of what a user would record; made once and kept."""
+    files = {
+        f"{name}.npz": OUT / f"{neck}_{name}.npz" for name in ("family", *(f"greybox_{kg:g}kg" for kg in PAYLOADS))
+    }
+    if not all(file.exists() for file in files.values()):
+        begin = time.process_time()
+        common = taut(neck)
+        eq22 = [recorded(neck, signal("eq22", duration=80.0), n, kg, common) for n, kg in enumerate(PAYLOADS)]
+        for name, part in zip([*files][1:], eq22, strict=True):
+            GreyBox().fit(part).save(files[name], force=True)
+        played = [
+            experiments(neck, amplitude, 10 * n, kg, common)
+            for n, amplitude in enumerate(AMPLITUDES)
+            for kg in PAYLOADS
+        ]
+        FamilySettings().fit([*eq22, *played]).save(files["family.npz"], force=True)
+        print(f"  {neck}: models at {common:g} rad, {time.process_time() - begin:.0f} s", file=sys.stderr, flush=True)
+    return {name: softneck.load(file) for name, file in files.items()}
+
+
+def truth(neck: str, controller: Any, ahead: float) -> dict[str, float]:
+    """Return the worst of what the neck itself does."""
+    block = controller.block()
+    worst = dict.fromkeys(GOALS, 0.0)
+    for seed, kg in enumerate(JUDGED):
+        for angle in ORIENTATIONS:
+            share = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+            step = StepReference(pitch=SIZE * share[0], roll=SIZE * share[1], at=3.0)
+            found = metrics(run(neck, block, step, kg, seed, 8.0))
+            stepped = [found[axis] for axis, part in zip(("pitch", "roll"), share, strict=True) if part > 0.05]
+            for name, key in (("overshoot", "overshoot_pct"), ("rise", "rise_s")):
+                worst[name] = max(worst[name], *(math.inf if item[key] is None else item[key] for item in stepped))
+            worst["steady"] = max(
+                worst["steady"], *(found[axis]["steady_rms_deg"] or 0.0 for axis in ("pitch", "roll"))
+            )
+        circle = RotationReference(inclination=CIRCLE, frequency=TURN / (2.0 * math.pi), at=3.0, rise=2.0)
+        result = run(neck, block, circle, kg, seed, 5.0 + 4.0 * math.pi / TURN)
+        for name, lead in (("circle", 0.0), ("ahead", ahead)):
+            worst[name] = max(worst[name], distance(result, round(lead / result.sample_time)))
+    return worst
+
+
+def run(neck: str, block: Any, reference: Any, kg: float, seed: int, duration: float) -> LoopResult:
+    """Return a loop over the neck's sensor."""
+    plant = Sensed(block_of(neck, noise=True, seed=seed))
+    return run_loop(Loop(plant=plant, controller=BlockPart(block), reference=reference, duration=duration,
+                         plant_inputs={"payload": kg}))  # fmt: skip
+
+
+def distance(result: LoopResult, lead: int) -> float:
+    """Return the rms distance [deg] of the last turn to where the circle was `lead` samples before."""
+    rows, turn = result.time.size, round(2.0 * math.pi / TURN / result.sample_time)
+    parts = [
+        result[axis][-turn:] - result[f"{axis}_reference"][rows - turn - lead : rows - lead]
+        for axis in ("pitch", "roll")
+    ]
+    return math.degrees(math.sqrt(float(np.mean(np.square(parts).sum(axis=0)))))
+
+
+def seconds() -> float:
+    """Return the processor time of this process and those it has waited for [s]."""
+    own, children = resource.getrusage(resource.RUSAGE_SELF), resource.getrusage(resource.RUSAGE_CHILDREN)
+    return own.ru_utime + own.ru_stime + children.ru_utime + children.ru_stime
+
+
+def main() -> None:
+    """Compute and print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--necks", nargs="*", default=("beam", "twisted"), choices=SHOWN)
+    parser.add_argument("--kinds", nargs="*", default=())
+    parser.add_argument("--budget", type=int, default=BUDGET)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--best", action="store_true", help="Only what is returned, not the best of other kinds.")
+    parser.add_argument("--fresh", action="store_true", help="Forget the models that are kept.")
+    asked = parser.parse_args()
+    if asked.fresh:
+        shutil.rmtree(OUT, ignore_errors=True)
+    OUT.mkdir(parents=True, exist_ok=True)
+    print("| neck | controller | certificate | processor [s] | overshoot [%] | rise [s] | steady rms [deg] | "
+          "circle [deg] | known ahead [deg] | all goals |\n|---|---|---|---|---|---|---|---|---|---|")  # fmt: skip
+    for neck in asked.necks:
+        plants = known(neck)
+        begin = seconds()
+        found = tune(plants, kinds=tuple(asked.kinds), budget=asked.budget, seed=asked.seed, workers=asked.workers)
+        spent = seconds() - begin
+        shown = {found.best.kind: found.best}
+        for item in () if asked.best else found.candidates:
+            shown.setdefault(item.kind, item)
+        ready = made_ready(found.task)
+        for item in shown.values():
+            controller = designed(found.task, ready, item.kind, item.settings)
+            true = truth(neck, controller, item.metrics.get("track.ahead_s", 0.0))
+            best = item is found.best
+            said = ("holds" if found.holds else f"fails: {found.binding}") if best else "-"
+            cells = [neck, f"**{item.kind}**" if best else item.kind, said, f"{spent:.0f}" if best else "",
+                     *(f"{true[name]:.3g}" for name in GOALS), "yes" if all(true[n] <= g for n, g in GOALS.items()) else
+                     ", ".join(n for n, g in GOALS.items() if true[n] > g)]  # fmt: skip
+            print(f"| {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,136 @@
+"""softneck tune: from requirements to the best controller, or exit code 1 with what stands in the way."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from softneck.core import CheckFailedError, file_hash
+
+from .shared._console import note, print_json, print_table, progress
+from .shared._options import force_option, json_option
+from .shared._plants import opened_plants
+from .shared._robot import robot_option
+
+if TYPE_CHECKING:
+    from softneck.tuning._tune import Tuned
+
+_PATH = click.Path(path_type=Path)
+# As `softneck.tuning` has it, which is imported when the command runs.
+_BUDGET = 160
+
+
+def _print_requirements(context: click.Context, _: click.Parameter, value: bool) -> None:
+    from softneck.tuning._requirements import DEFAULT_FILE
+
+    if value:
+        click.echo(DEFAULT_FILE.read_text(encoding="utf-8"), nl=False)
+        context.exit()
+
+
+@click.command("tune", epilog="Example: softneck tune family.npz greybox.npz --requirements wanted.toml -o build/tune")
+@click.argument("plants", metavar="FAMILY|MODEL...", nargs=-1, required=True, type=_PATH)
+@click.option("--requirements", type=_PATH, metavar="TOML", help="What must hold, where it differs from the defaults.")
+@click.option(
+    "--print-requirements", is_flag=True, is_eager=True, expose_value=False, callback=_print_requirements,
+    help="Print the default requirements and exit.",
+)  # fmt: skip
+@click.option("--kinds", metavar="K,K", help="Kinds of controller to search. [default: all but nmpc and custom]")
+@click.option(
+    "--budget", type=click.IntRange(min=1), default=_BUDGET, show_default=True, metavar="EVALUATIONS",
+    help="Judgements of candidates, by linear checks, loops or experiments.",
+)  # fmt: skip
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the search and its noise.")
+@click.option("--workers", type=click.IntRange(min=0), help="Local processes; 0: this one. [default: one a core]")
+@click.option("--resume", is_flag=True, help="Refuse to begin anew where DIR holds nothing of the same search.")
+@click.option("-o", "--output", type=_PATH, metavar="DIR", required=True, help="Folder of the search and its results.")
+@robot_option
+@force_option
+@json_option
+def command(
+    plants: tuple[Path, ...],
+    requirements: Path | None,
+    kinds: str | None,
+    budget: int,
+    seed: int,
+    workers: int | None,
+    resume: bool,
+    output: Path,
+    robot: str | None,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Search kinds and settings for the controller that keeps the requirements on all plants.
+
+    Designs are made on the linear MODELs and FAMILYs, the first of which is the nominal plant; loops are closed over
+    plants that step: nonlinear MODELs, NECKs (a neck file, or a preset by its name) and FMUs.
+
+    \b
+    DIR gets  best.npz               the controller, and observer.npz for it
+              best.certificate.json  of verify with the same requirements, if it holds
+              loop.toml              a loop with both, for softneck simulate
+              pareto.csv, .json      what no other candidate beats, and report.html
+              requirements.toml      what verify was asked
+              evaluations.json       all judgements: the same command goes on where it was
+    Exit code 1 if no candidate keeps all requirements: then it says which one stands in the way, and what it costs.
+    """
+    from softneck.core import SettingsError
+    from softneck.report._tune_files import write_tuned
+    from softneck.tuning import tune
+    from softneck.tuning._requirements import read_tune_requirements
+    from softneck.verification._own_plants import is_own_plant
+
+    if output.exists() and not output.is_dir():
+        raise SettingsError(f"{output}: is a file; name a folder.")
+    things = opened_plants(plants, robot)
+    stepping = any(is_own_plant(thing) for thing in things.values())
+    asked = read_tune_requirements(requirements, robot=_robot_of(things), stepping=stepping)
+    if not as_json:
+        note("requirements: " + "; ".join(asked.lines()))
+    files = {f"plant {k}": item for k, item in enumerate(plants, start=1) if item.is_file()}
+    with progress("tune", quiet=as_json) as report:
+        found = tune(
+            things, asked, kinds=tuple(kinds.split(",")) if kinds else (), budget=budget, seed=seed, workers=workers,
+            folder=output, resume=resume, force=force, progress=report,
+            files={role: (str(item), file_hash(item)) for role, item in files.items()},
+        )  # fmt: skip
+    steps = {name: item if item.exists() else str(item) for name, item in zip(things, plants, strict=True)
+             if is_own_plant(things[name])}  # fmt: skip
+    values = write_tuned(found, output, files, steps)
+    if as_json:
+        print_json(values)
+    else:
+        _print(found, output)
+    if not found.holds:
+        raise CheckFailedError(_why(found, output))
+
+
+def _robot_of(things: dict[str, Any]) -> Any:
+    from softneck.estimation._axis import robot_of
+
+    return robot_of(next((thing for thing in things.values() if hasattr(thing, "robot")), None))
+
+
+def _print(found: Tuned, folder: Path) -> None:
+    from softneck.report._tune_page import requirement_rows
+
+    best = found.best
+    settings = ", ".join(f"{name} {value:.4g}" for name, value in best.settings.items())
+    print_table(f"{folder / 'best.npz'}: {best.kind} ({settings})", ["metric", "bound", "limit", "value", ""],
+                [row[:5] for row in requirement_rows(found)])  # fmt: skip
+    for kind, why in found.dropped.items():
+        click.echo(f"left out: {kind}: {why}")
+    click.echo(
+        f"{found.evaluations} evaluations, {len(found.front)} candidates on the front; report: {folder / 'report.html'}"
+    )
+
+
+def _why(found: Tuned, folder: Path) -> str:
+    from softneck.report._tune_page import stands_in_the_way
+
+    return (
+        f"{folder}: the best so far does not keep all requirements. {stands_in_the_way(found)} Loosen it, or go on "
+        "with a larger --budget."
+    )

@@ -1,0 +1,206 @@
+"""Commissioning: who is there, small guarded moves, what they say, and the files that would be right."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from softneck.core import CheckFailedError, SettingsError, require_whole, to_si
+from softneck.plant import NeckParameters
+from softneck.robot import Robot
+
+from ..bus._file import DrivesFile
+from ..bus._objects import ampere
+from ..running._bus_loop import RunEnd, Session
+from ..running._scan import scan
+from ._findings import Finding
+from ._identify import LATE, Expected, Identified, identify, proposed
+from ._known import fatal, known_before, require_answers, typed
+from ._measure import SAMPLE_TIME, measure
+from ._moves import PULLED, Guards, Moves
+from ._plant import expected_of
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Commissioned:
+    """What a commissioning found.
+
+    Attributes:
+        believed: the drives file as it was given.
+        findings: what is not as it says, or as the robot file says.
+        moves: as measured; None where nothing moved.
+        identified: what they say; None where nothing moved.
+        expected: what was expected of them; None where no virtual plant stands for the robot.
+        file, robot: that would be right, as far as it is known.
+        ended: how the run on the drives ended; None where there was none.
+    """
+
+    believed: DrivesFile
+    findings: tuple[Finding, ...]
+    moves: Moves | None
+    identified: Identified | None
+    expected: Expected | None
+    file: DrivesFile
+    robot: Robot
+    ended: RunEnd | None = None
+
+    @property
+    def holds(self) -> bool:
+        """Whether all is as the files say, and was looked at."""
+        return not self.findings
+
+    def require(self) -> None:
+        """Raise CheckFailedError with what was found, in one line."""
+        if self.ended is not None and self.ended.master.supervisor.rehome:
+            self.ended.require()
+        if self.findings:
+            told = "; ".join(str(one) for one in self.findings)
+            raise CheckFailedError(f"{len(self.findings)} finding(s): {told}.")
+
+    def table(self) -> dict[str, Any]:
+        """Return the JSON of `softneck drives commission`."""
+        nothing = {"late_s": math.nan, "noise_deg": math.nan, "quiet": False}
+        found = self.identified
+        sensor = nothing if found is None else {
+            "late_s": found.late, "noise_deg": math.degrees(found.noise), "quiet": found.quiet,
+        }  # fmt: skip
+        return {
+            "holds": self.holds,
+            "findings": [one.table() for one in self.findings],
+            "motors": [] if found is None else [motor_table(self, j) for j in range(1, len(found.motors) + 1)],
+            "sensor": {**sensor, "axes": list(self.file.sensor_axes), "delay_s": self.robot.delay_s},
+            "expected": None if self.expected is None else self.expected.source,
+            "stopped": "" if self.moves is None else self.moves.stopped,
+            **({} if self.ended is None else self.ended.table()),
+        }
+
+
+def motor_table(result: Commissioned, motor: int) -> dict[str, Any]:
+    """Return what was found of motor `motor` of the drives file as it was given, from 1 on, in SI units."""
+    found, entry = result.identified, result.believed.drives[motor - 1]
+    one = None if found is None else found.motors[motor - 1]
+    table: dict[str, Any] = {"motor": motor, "node": entry.node, "outcome": "not moved"}
+    if result.moves is not None and (moved := result.moves.of(motor)) is not None:
+        table["outcome"] = moved.outcome
+    if found is None or one is None:
+        return table
+    right = next(made for made in result.file.drives if made.node == entry.node)
+    counts, unit = abs(right.scale.counts_per_radian), ampere(right, result.file.profile)
+    neck = result.file.neck
+    newton = unit * neck.torque_constant * neck.efficiency * right.scale.gear / neck.winch_radius
+    return table | {
+        "tendon": motor if found.mounting is None else found.mounting.order[motor - 1] + 1,
+        "reversed": right.scale.reversed,
+        "gear": right.scale.gear,
+        "encoder_counts": right.scale.counts_per_turn,
+        "peak_current_A": right.scale.peak_current,
+        "index": one.turn > 0,
+        "slack_rad": max(0.0, one.slack / counts),
+        "friction_A": one.friction * unit,
+        "friction_N": one.friction * newton,
+        "tilt_deg_per_rad": math.degrees(one.gain * counts),
+        "tilt_error": one.error,
+        "tension_N_per_rad": one.force * counts * newton,
+        "direction": one.direction.tolist(),
+        "lag_s": one.lag,
+    }
+
+
+def commission(
+    session: Session,
+    *,
+    guards: Guards | None = None,
+    neck: NeckParameters | None = None,
+    motors: Sequence[int] = (),
+    before: Moves | None = None,
+    keep: Callable[[Moves], None] | None = None,
+    report: Callable[[float, str], None] | None = None,
+    where: str = "the bus",
+) -> Commissioned:
+    """Find out how drives, tendons and sensor are really set up, by moves of some degrees that are guarded.
+
+    Before anything moves, whoever is on the bus is asked who it is; two devices with one number, or a drive that is not
+    there, end it. Then each motor in turn is led out of its slack until the neck tilts by a degree.
+
+    Args:
+        session: on which drives; its drives file is what is believed.
+        guards: limits of the moves; None: as slow as the gain in [watch] asks for.
+        neck: the virtual plant to compare with; None: the one that the robot names.
+        motors: those that move, from 1 on; () for all.
+        before: moves of an earlier commissioning; its motors are not moved again.
+        keep: called with what was measured, as soon as the drives are off.
+        report: called now and then with the done fraction and a word.
+        where: the bus, for messages.
+
+    Raises:
+        CheckFailedError: nobody answers, or the pre-flight failed; nothing moved.
+        BusError: the bus takes no frames.
+        SettingsError: no such motor, or moves of other drives.
+    """
+    file, count = session.file, len(session.file.drives)
+    for motor in motors:
+        require_whole("--motor", motor, 1, count)
+    guards = Guards.of(file.watch.gain) if guards is None else guards
+    found = scan(session.link, bit_rate=file.bit_rate)
+    require_answers(found, where)
+    told = known_before(file, found)
+    if fatal(told):
+        return Commissioned(file, tuple(told), None, None, None, file, file.moves)
+    # Whose type says what its current is relative to is led by that from the first move on.
+    believed, peaks = typed(file, found)
+    identities = {item["node"]: item for item in found}
+    old = () if before is None else tuple(moved for moved in before.motors if moved.outcome == PULLED)
+    _require_same(before, identities, count, file.sensor_axes)
+    ways = [j for j in (motors or range(1, count + 1)) if j not in {moved.motor for moved in old}]
+    ended = None
+    moves = Moves(old, SAMPLE_TIME, identities, axes=file.sensor_axes)
+    if ways:
+        moved, ended = measure(replace(session, file=believed), guards, motors=ways, report=report)
+        moves = replace(moved, motors=(*old, *moved.motors), identities=identities, axes=file.sensor_axes)
+        if keep is not None and moves.motors:
+            keep(moves)
+    pulled = any(moved.outcome == PULLED for moved in moves.motors)
+    expected = expected_of(believed, guards, neck) if pulled else None
+    seen = identify(moves, believed, expected, types=peaks)
+    right = proposed(believed, seen)
+    return Commissioned(
+        file, (*told, *seen.findings), moves, seen, expected, right, _robot(right, seen, expected), ended
+    )
+
+
+def _require_same(before: Moves | None, identities: Mapping[int, Mapping[str, Any]], count: int,
+                  axes: tuple[str, ...]) -> None:  # fmt: skip
+    """Raise SettingsError where earlier moves are of other drives."""
+    if before is None:
+        return
+    if before.axes != axes:
+        said = [", ".join(one) or "as they come" for one in (before.axes, axes)]
+        raise SettingsError(f"--resume: [sensor] axes was {said[0]} then and is {said[1]} now. Leave --resume out.")
+    for moved in before.motors:
+        then, now = before.identities.get(moved.node, {}), identities.get(moved.node, {})
+        if moved.motor > count or then.get("serial") != now.get("serial"):
+            raise SettingsError(
+                f"--resume: motor {moved.motor} was moved by a drive with serial number {then.get('serial')}, and node "
+                f"{moved.node} has {now.get('serial')}. Leave --resume out."
+            )
+
+
+def _robot(file: DrivesFile, found: Identified, expected: Expected | None) -> Robot:
+    """Return the robot file's content with what was found of the sensor, and which drives file is right."""
+    robot = file.moves
+    motors = robot.motors
+    if min(motors.sign) < 0.0:
+        signs = tuple(-1.0 if entry.scale.reversed else 1.0 for entry in file.drives)
+        motors = replace(motors, sign=signs)
+    noise, delay = robot.noise_std, robot.delay_s
+    if math.isfinite(found.noise):
+        noise = float(f"{found.noise / to_si(robot.outputs.unit)[0]:.2g}")
+    if expected is not None and found.late > LATE:
+        delay = round((delay or 0.0) + found.late, 3)
+    neck = robot.neck
+    if neck is not None and robot.folder is not None and Path(robot.folder / neck).is_file():
+        neck = str((robot.folder / neck).resolve())
+    return replace(robot, motors=motors, noise_std=noise, delay_s=delay, neck=neck, drives="drives.toml")

@@ -1,0 +1,126 @@
+"""Simulated drives that are not set up as the drives file says, to practise on: what a commissioning has to find."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from softneck.core import SettingsError
+from softneck.plant import NeckParameters
+
+from ..bus._axes import Axes, axes_of, inverse, said_of
+from ..bus._file import DrivesFile
+from ..bus._link import VirtualLink
+from ..running._virtual import simulated_plant
+from ..simulated import SimulatedDrive
+from ..simulated._axis import Axis
+from ..simulated._mounted import MountedOtherwise
+from ..simulated._profiles import PROFILES
+from ..simulated._servo_runtime import SERVO_SIZE
+
+# How a mistake is written, for people.
+KINDS = ("reversed:N", "exchanged:N:M", "gear:N:FACTOR", "lines:N:FACTOR", "current:N:FACTOR", "axes", "sign:OUTPUT",
+         "late:SECONDS", "duplicate:N")  # fmt: skip
+_SAID = {kind.partition(":")[0]: kind.count(":") for kind in KINDS}
+
+
+@dataclass(frozen=True, slots=True)
+class Planted:
+    """How the simulated drives are really set up.
+
+    Attributes:
+        file: the drives file that would be right; its drives stand in the order of the tendons.
+        late: the sensor is by so much [s].
+        twins: node numbers that a second device has as well.
+    """
+
+    file: DrivesFile
+    late: float = 0.0
+    twins: tuple[int, ...] = ()
+
+
+def plant(file: DrivesFile, mistakes: Sequence[str]) -> Planted:
+    """Return how drives are set up where `file` is right but for `mistakes`, such as `reversed:1` or `gear:2:0.5`.
+
+    Motors are those of `file`; what is exchanged goes with its drive.
+
+    Raises:
+        SettingsError: a mistake that is none.
+    """
+    planted = Planted(file)
+    # What is exchanged comes last: until then motors stand where the file has them.
+    for mistake in sorted(mistakes, key=lambda text: text.startswith("exchanged")):
+        try:
+            kind, *said = mistake.split(":")
+            if len(said) != _SAID[kind]:
+                raise ValueError(mistake)
+            planted = _with(planted, kind, *said)
+        except (ValueError, KeyError) as error:
+            raise SettingsError(f"--plant takes {', '.join(KINDS)}; got `{mistake}`.") from error
+    return planted
+
+
+_SCALES = {"gear": "gear", "lines": "counts_per_turn", "current": "peak_current"}
+
+
+def _with(planted: Planted, kind: str, *said: str) -> Planted:
+    drives, file = list(planted.file.drives), planted.file
+    outputs = file.moves.outputs.names
+    if kind == "exchanged":
+        a, b = (_motor(text, len(drives)) for text in said)
+        drives[a], drives[b] = drives[b], drives[a]
+    elif kind in ("reversed", *_SCALES):
+        (where, *factor) = said
+        j = _motor(where, len(drives))
+        scale = drives[j].scale
+        if kind == "reversed":
+            drives[j] = replace(drives[j], scale=replace(scale, reversed=not scale.reversed))
+        else:
+            name = _SCALES[kind]
+            changed = replace(scale, **{name: getattr(scale, name) * float(factor[0])})
+            drives[j] = replace(drives[j], scale=changed)
+    elif kind in ("axes", "sign"):
+        turn: Axes = ((1, 1.0), (0, 1.0), *((k, 1.0) for k in range(2, len(outputs)))) if kind == "axes" else tuple(
+            (k, -1.0 if name == said[0] else 1.0) for k, name in enumerate(outputs)
+        )  # fmt: skip
+        if kind == "sign" and said[0] not in outputs:
+            raise ValueError(said[0])
+        before = axes_of(file.sensor_axes, outputs)
+        axes = tuple((before[n][0], sign * before[n][1]) for n, sign in turn)
+        return replace(planted, file=replace(file, sensor_axes=said_of(axes, outputs)))
+    elif kind == "late":
+        return replace(planted, late=float(said[0]))
+    else:
+        return replace(planted, twins=(*planted.twins, file.nodes[_motor(said[0], len(drives))]))
+    return replace(planted, file=replace(file, drives=tuple(drives)))
+
+
+def _motor(text: str, count: int) -> int:
+    number = int(text)
+    if not 1 <= number <= count:
+        raise ValueError(text)
+    return number - 1
+
+
+def planted_link(
+    believed: DrivesFile, planted: Planted, neck: NeckParameters | None, *, sample_time: float, seed: int = 0
+) -> VirtualLink:
+    """Return simulated drives that are set up as `planted` says, on a bus that is read as `believed` says."""
+    turns = simulated_plant(planted.file, neck, sample_time=sample_time, homed=False, seed=seed)
+    outputs = believed.moves.outputs.names
+    mounted = MountedOtherwise(turns, inverse(axes_of(planted.file.sensor_axes, outputs)), late=planted.late)
+    link = VirtualLink(mounted)  # pyright: ignore[reportArgumentType]  # it stands for what it is around
+    link.axes = axes_of(believed.sensor_axes, outputs)
+    twins = [_twin(node, planted.file.profile) for node in planted.twins]
+    turns.drives = (*turns.drives, *twins)
+    return link
+
+
+def _twin(node: int, profile: str) -> SimulatedDrive:
+    drive = SimulatedDrive(Axis(node, PROFILES[profile](), np.zeros(SERVO_SIZE), peak_current=10.0, slow_loop=1e-3))
+    drive.axis.values[(0x1018, 4)] = 2000 + node
+    # Its boot-up message was long ago.
+    drive.tick(0.0)
+    return drive

@@ -1,0 +1,84 @@
+"""What observers over nonlinear models share: the model in free run, and the way from the filter's time to now."""
+
+import numpy as np
+
+from softneck.estimation._kalman_parts_runtime import KALMAN_LEAD, KALMAN_PERIOD
+from softneck.runtime._layout import Arrays, array, value
+from softneck.runtime._members_runtime import member_initialise, member_step
+
+# Places in `setup`; the model's outputs are more than those that are measured.
+NONLINEAR_MOTORS = 0
+NONLINEAR_OUTPUTS = 1
+NONLINEAR_TOLD = 2
+NONLINEAR_SETTLE = 3
+NONLINEAR_START = 4
+NONLINEAR_KEEP = 5
+
+
+class NonlinearArrays(Arrays):
+    """Those of the model follow."""
+
+    setup = array(
+        "6",
+        "motors, outputs, outputs of the model, samples until it stands, standard deviation of the disturbance at "
+        "the start, part of the fastest motion that a sample keeps",
+    )
+    constants = array("numbers", "see KALMAN_*; a lag of 1: the set-points come a sample early")
+    free = array("parameters", "of the model in free run")
+    motors = value("setup", NONLINEAR_MOTORS)
+    outputs = value("setup", NONLINEAR_OUTPUTS)
+
+
+def nonlinear_settle(
+    p: NonlinearArrays, free: np.ndarray, model: np.ndarray, motors: np.ndarray, angles: np.ndarray
+) -> None:
+    """Bring the model to where it had been, had the motors stood there for ever; fill its `angles`."""
+    member_initialise(p, 0, free, model, np.zeros(int(p.setup[NONLINEAR_TOLD])))
+    for _ in range(int(p.setup[NONLINEAR_SETTLE])):
+        nonlinear_move(p, free, model, motors, angles)
+
+
+def nonlinear_move(
+    p: NonlinearArrays, free: np.ndarray, model: np.ndarray, motors: np.ndarray, angles: np.ndarray
+) -> None:
+    """Move the model on in free run under `motors` and fill its `angles`; `free` are its parameters."""
+    u = np.empty(2 * p.motors + p.outputs)
+    u[: p.motors] = motors
+    u[p.motors :] = np.nan  # NaN: nothing is measured
+    out = np.zeros(int(p.setup[NONLINEAR_TOLD]))
+    member_step(p, 0, free, model, u, out)
+    angles[:] = out[: p.outputs]
+
+
+def nonlinear_faster(p: NonlinearArrays, fastest: float, angles: np.ndarray, before: np.ndarray) -> float:
+    """Return the fastest motion of late, from what it was and the outputs of now and of the sample before."""
+    moved = p.setup[NONLINEAR_KEEP] * fastest
+    for i in range(p.outputs):
+        moved = max(moved, abs(angles[i] - before[i]))
+    return moved
+
+
+def nonlinear_tell(
+    p: NonlinearArrays,
+    free: np.ndarray,
+    model: np.ndarray,
+    angles: np.ndarray,
+    disturbance: np.ndarray,
+    motors: np.ndarray,
+    outputs: np.ndarray,
+) -> None:
+    """Carry the estimate from the filter's time to now, under the newest set-points; fill angles and rates.
+
+    `model` and `angles` are spent.
+    """
+    c, m = p.constants, p.outputs
+    whole = int(c[KALMAN_LEAD])
+    part = c[KALMAN_LEAD] - whole
+    before = np.empty(m)
+    for _ in range(whole + 1):
+        before[:] = angles
+        nonlinear_move(p, free, model, motors, angles)
+    for i in range(m):
+        # Between samples by a straight line, whose slope is the rate.
+        outputs[i] = before[i] + part * (angles[i] - before[i]) + disturbance[i]
+        outputs[m + i] = (angles[i] - before[i]) / c[KALMAN_PERIOD]

@@ -1,0 +1,143 @@
+"""The page of a tuning: the best, what binds, the front in parallel coordinates, and its steps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from softneck.plots import Chart, Curve, Level, Panel, Section, Table, page
+from softneck.plots._style import GREY, RED, looks
+from softneck.tuning._responses import step_response
+from softneck.tuning._result import in_words, ratio_of
+
+if TYPE_CHECKING:
+    from softneck.tuning._search import Candidate
+    from softneck.tuning._tune import Tuned
+
+# More lines than this nobody tells apart; the table has all.
+_DRAWN, _SHOWN = 12, 30
+_STEPS = 6
+_MOST = 3.0
+
+
+def tune_page(found: Tuned) -> str:
+    """Return the HTML page of a tuning."""
+    items = [found.best, *(item for item in found.front if item is not found.best)]
+    return page(
+        f"Tuning of {found.task.robot.name}",
+        [_result(found), _asked(found), _coordinates(found, items), _steps(found, items), _front(found)],
+    )
+
+
+def requirement_rows(found: Tuned) -> list[list[str]]:
+    """Return a row for each requirement: metric, bound, limit, value of the best, verdict, note."""
+    words = {"min": ">=", "max": "<=", "below": "<"}
+    rows = []
+    for verdict in found.verification.verdicts:
+        item = verdict.requirement
+        said = "-" if verdict.holds is None else "holds" if verdict.holds else "fails"
+        rows.append([item.metric, words[item.bound], f"{item.limit:g}", _text(verdict.value), said, verdict.note])
+    for item in found.task.asked.bounds:
+        if item.metric.startswith("track."):
+            value = found.best.metrics.get(item.metric)
+            said = "-" if value is None else "holds" if item.holds(value) else "fails"
+            rows.append([item.metric, words[item.bound], f"{item.limit:g}", _text(value), said, ""])
+    return rows
+
+
+def stands_in_the_way(found: Tuned) -> str:
+    """Return what binds, and what it costs, in a sentence or two."""
+    if found.binding is None:
+        return ""
+    text = f"What stands in the way is {found.binding}"
+    if found.nearest is not None:
+        text += f": at {found.nearest:.3g} all the rest would hold"
+    told = [in_words(price) for price in found.prices if price.least is not None]
+    return text + (f" ({'; '.join(told)})." if told else ".")
+
+
+def _result(found: Tuned) -> Section:
+    best = found.best
+    text = [
+        f"{best.kind}: " + ", ".join(f"{name} {_text(value)}" for name, value in best.settings.items()) + ".",
+        f"{found.evaluations} judgements of {len({(i.kind, str(i.settings)) for i in found.candidates})} candidates "
+        "that were closed in loops, and of others that were left behind before.",
+    ]
+    text.append("All requirements hold." if found.holds else f"Not all requirements hold. {stands_in_the_way(found)}")
+    text += [f"{kind} was left out: {why}" for kind, why in found.dropped.items()]
+    rows = requirement_rows(found)
+    tables = [Table("Requirements", ["metric", "bound", "limit", "value", ""], [row[:5] for row in rows])]
+    text += [f"{row[0]}: {row[5]}." for row in rows if row[5]]
+    if found.prices:
+        told = [[p.metric, f"{p.limit:.3g}", p.other, _text(p.least)] for p in found.prices]
+        tables.append(Table("What it costs, all else held", ["requirement", "at", "costs", "at least"], told))
+    return Section("Result", text=text, tables=tables)
+
+
+def _asked(found: Tuned) -> Section:
+    return Section("What was asked", text=["; ".join(found.task.asked.lines()) + "."])
+
+
+def _coordinates(found: Tuned, items: Sequence[Candidate]) -> Section:
+    bounds = {b.metric: b for b in found.task.asked.bounds}
+    names = [name for name in found.objectives if name in bounds] + [
+        b.metric for b in found.task.asked.bounds
+        if b.metric not in found.objectives and b.metric in found.best.metrics
+        and b.metric.startswith(("neck", "track", "axes", "step.load"))
+    ]  # fmt: skip
+    names = list(dict.fromkeys(names))
+    curves = []
+    for item, (colour, style) in zip(items[:_DRAWN], looks(), strict=False):
+        y = [ratio_of(item, bounds[name]) for name in names]
+        y = np.array([math.nan if value is None else min(value, _MOST) for value in y])
+        style, width = ("marked", 2.4) if item is found.best else (style, 1.0)
+        curves.append(Curve(np.arange(len(names), dtype=float), y, _label(found, item), colour, style, width))
+    if not names or not curves:
+        return Section("Parallel coordinates", text=["No requirement has a value."])
+    highest = min(_MOST, 1.1 * max(1.1, *(float(np.nanmax(curve.y, initial=0.0)) for curve in curves)))
+    ticks = [name.partition(".")[2] if name.partition(".")[0] != "step" else name for name in names]
+    panel = Panel(curves, "value / limit", levels=[Level(1.0, "limit", RED)], y_range=(0.0, highest), ticks=ticks)
+    chart = Chart(
+        "Each requirement in parts of its limit: below 1 it holds", [panel], "requirement", row_height=4.4,
+        caption=f"Of a least value the limit over it; what is beyond {_MOST:g} is drawn there.",
+    )  # fmt: skip
+    return Section("Parallel coordinates", charts=[chart])
+
+
+def _steps(found: Tuned, items: Sequence[Candidate]) -> Section:
+    curves: list[Curve] = []
+    for item, (colour, style) in zip(items[:_STEPS], looks(), strict=False):
+        time, y, reference = step_response(found.task, item)
+        if not curves:
+            curves.append(Curve(time, reference, "reference", GREY, "step"))
+        curves.append(Curve(time, y, _label(found, item), colour, style, 2.0 if item is found.best else 1.0))
+    outputs = found.task.robot.outputs
+    where = "with the heaviest payload" if found.task.own else "of the nominal plant"
+    chart = Chart(f"Steps {where}", [Panel(curves, f"{outputs.names[0]} [{outputs.display_unit}]")], row_height=4.0)
+    return Section("Steps of the front", charts=[chart])
+
+
+def _front(found: Tuned) -> Section:
+    rows = [
+        [item.kind, *(_text(item.metrics[name]) for name in found.objectives),
+         ", ".join(f"{name} {_text(value)}" for name, value in item.settings.items())]
+        for item in found.front[:_SHOWN]
+    ]  # fmt: skip
+    more = len(found.front) - _SHOWN
+    text = [f"{len(found.front)} candidates that none beats in every objective; all are in pareto.csv."]
+    text += [f"The first {_SHOWN} by {found.objectives[0]}."] if more > 0 else []
+    return Section("Pareto front", text=text, tables=[Table("", ["kind", *found.objectives, "settings"], rows)])
+
+
+def _label(found: Tuned, item: Candidate) -> str:
+    number = next((k for k, other in enumerate(found.front, start=1) if other is item), 0)
+    return f"best: {item.kind}" if item is found.best else f"{item.kind} {number}"
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,128 @@
+"""Times of a log: seconds or dates, sums of columns, rows of several clocks, and rates summed up to positions."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from softneck.core import DataError, Vector, to_si
+
+from ..recording._channels import is_held
+from ..recording._files import numbers
+from ..recording._resampling import Samples
+from ._layout import Layout, Source
+from .formats._dates import DATE, EPOCH, seconds
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+# Measured values between two messages further apart than this many usual ones are missed, not interpolated.
+_FAR = 2.5
+
+
+def time_of(columns: Sequence[pd.Series], source: Source) -> tuple[Vector, tuple[str, ...]]:
+    """Return (time,) [s] of the columns of a time's source, and what was done; times since 1970 count from the first.
+
+    Raises:
+        DataError: a cell is neither number nor date.
+    """
+    if source.unit == DATE:
+        column, name = columns[0], str(source.terms[0].column)
+        return seconds(column, name), (f"time counts from the first date, {column.iloc[0]}",) if len(column) else ()
+    total = np.zeros(len(columns[0]))
+    factor, start = to_si(source.unit)[0], 0.0
+    for column, term in zip(columns, source.terms, strict=True):
+        values = numbers(column, str(term.column), missing=False)
+        scale = source.sign * factor * term.factor
+        if values.size and abs(scale * values[0]) > EPOCH:
+            # Subtracted before it is scaled: whole numbers of nanoseconds lose nothing.
+            start = scale * float(values[0])
+            values = values - values[0]
+        total = total + scale * values
+    return total, (f"time counts from {_moment(start)}",) if start else ()
+
+
+def _moment(since_1970: float) -> str:
+    try:
+        return datetime.datetime.fromtimestamp(since_1970, datetime.UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+    except (ValueError, OverflowError, OSError):
+        return f"{since_1970:.10g} s"
+
+
+def merged(samples: Samples, outputs: Sequence[str]) -> tuple[Samples, str]:
+    """Return rows where an output was measured, of rows that are messages of several clocks, and a note.
+
+    Set-points and flags keep the last value before; other channels are interpolated linearly between their neighbours,
+    and are missed where those are far apart. Rows before the first set-point are left out.
+
+    Raises:
+        DataError: an output or a set-point was never told.
+    """
+    told = {name: np.isfinite(values) for name, values in samples.channels.items()}
+    silent = [name for name, there in told.items() if not there.any()]
+    if silent:
+        raise DataError(f"`{silent[0]}` holds no number in any row.")
+    base = min((name for name in outputs if name in told), key=lambda name: int(told[name].sum()), default=None)
+    if base is None:
+        raise DataError(f"`merge` needs the columns of {', '.join(outputs)}.")
+    keep = told[base].copy()
+    found: dict[str, Vector] = {}
+    for name, values in samples.channels.items():
+        found[name] = np.full(values.size, np.nan)
+        for rows in samples.runs():
+            part = _held(values[rows]) if is_held(name) else _between(samples.time[rows], values[rows])
+            found[name][rows] = part
+        if is_held(name):
+            keep &= np.isfinite(found[name])
+    if not keep.any():
+        raise DataError("no row has both an output and all set-points before it.")
+    note = f"merged rows of several clocks: {keep.sum()} of {keep.size} rows, those of `{base}`; set-points hold"
+    return Samples(samples.time, samples.run, found).rows(keep), note
+
+
+def _held(values: Vector) -> Vector:
+    """Return each value until the next one; NaN before the first."""
+    last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(values.size), -1))
+    return np.where(last >= 0, values[last], np.nan)
+
+
+def _between(time: Vector, values: Vector) -> Vector:
+    """Return values at all times, on straight lines between those that are there."""
+    seen = np.isfinite(values)
+    if seen.sum() < 2:
+        return values
+    t, x = time[seen], values[seen]
+    step = np.diff(t)
+    usual = float(np.median(step[step > 0])) if (step > 0).any() else 0.0
+    after = np.clip(np.searchsorted(t, time), 1, t.size - 1)
+    far = (t[after] - t[after - 1] > _FAR * usual) | (time < t[0]) | (time > t[-1])
+    return np.where(seen, values, np.where(far, np.nan, np.interp(time, t, x)))
+
+
+def integrated(samples: Samples, sources: Mapping[str, Source]) -> tuple[Samples, tuple[str, ...]]:
+    """Return the samples with the integrals over time of the channels whose source says so, and a note.
+
+    Rates are summed by trapezoids at the times as logged, from 0 in each run; a missed one lies between its neighbours.
+    """
+    names = [name for name, source in sources.items() if source.integrate and name in samples.channels]
+    if not names:
+        return samples, ()
+    channels = dict(samples.channels)
+    for name in names:
+        channels[name] = np.zeros(samples.time.size)
+        for rows in samples.runs():
+            t, v = samples.time[rows], samples.channels[name][rows]
+            seen = np.isfinite(v)
+            v = np.interp(t, t[seen], v[seen]) if seen.any() else np.zeros(v.size)
+            channels[name][rows] = np.concatenate([[0.0], np.cumsum(np.diff(t) * (v[1:] + v[:-1]) / 2.0)])
+    note = f"{', '.join(names)}: summed up from rates, from 0 at the start of each run; what drifts is not seen"
+    return Samples(samples.time, samples.run, channels), (note,)
+
+
+def clocked(layout: Layout, name: str) -> bool:
+    """Return whether a channel may lack numbers where rows are messages of several clocks, or rates that are summed."""
+    source = layout.channels.get(name)
+    return layout.merge or (source is not None and source.integrate)

@@ -1,0 +1,5 @@
+"""What foreign files hold: text in any encoding, spreadsheets, MATLAB, Octave, MCAP; and dates as seconds.
+
+Tables come out; what their columns mean is told in the room above.
+May import `signals.recording`.
+"""

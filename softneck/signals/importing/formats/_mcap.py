@@ -1,0 +1,137 @@
+"""ROS 2 bags of the MCAP kind as one sparse table: a row for each message, columns `topic.field[0]`.
+
+Messages are decoded by `mcap-ros2-support` (MIT, pure Python), and JSON ones as they are.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from softneck.core import DataError, FileFormatError
+from softneck.core._errors import require_package
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+# What `softneck drives run --log` calls itself in the header of its logs.
+OURS = b"softneck"
+#: The column of time of such a table [s].
+TIME = "time"
+_MAX_DEPTH, _MOST_NUMBERS = 6, 64
+# [ns] A clock of messages that is further from the logger's is a simulation's, or was never set.
+_SAME_CLOCK = 10**9
+_MOST_CELLS = 50_000_000
+
+
+def is_run_log(source: Path) -> bool:
+    """Return whether an MCAP file was written by softneck's drives: then its first record says so."""
+    try:
+        with source.open("rb") as file:
+            return OURS in file.read(256)
+    except OSError:
+        return False
+
+
+def mcap_table(source: Path) -> pd.DataFrame:
+    """Return a row for each message in the order of time, NaN where a topic said nothing.
+
+    Time is that of the messages' headers where they have one that follows the logger's, else the logger's.
+
+    Raises:
+        SettingsError: the packages that read it are not installed.
+        FileFormatError: no MCAP file, or damaged.
+        DataError: no message holds numbers.
+    """
+    for package in ("mcap", "mcap_ros2"):
+        require_package(package)
+    import pandas as pd
+
+    rows: list[dict[str, float]] = []
+    clocks: list[tuple[int, int]] = []
+    skipped: set[str] = set()
+    cells = 0
+    try:
+        for topic, logged, content in _messages(source, skipped):
+            row = dict(_numbers(content, topic, 0))
+            row.pop(f"{topic}.header.stamp", None)
+            cells += len(row)
+            if cells > _MOST_CELLS:
+                raise DataError(f"{source}: holds more than {_MOST_CELLS} numbers; cut it by `ros2 bag filter`.")
+            rows.append(row)
+            clocks.append((logged, _stamp(content, logged)))
+    except (DataError, FileFormatError):
+        raise
+    except Exception as error:  # its readers and decoders raise whatever damaged bytes lead to
+        reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
+        raise FileFormatError(f"{source}: cannot be read as MCAP ({reason}).") from error
+    frame = pd.DataFrame(rows)
+    if frame.empty or not len(frame.columns):
+        also = f" (not decoded: {', '.join(sorted(skipped))})" if skipped else ""
+        raise DataError(
+            f"{source}: no message of ROS 2 or JSON holds numbers{also}; record topics of set-points and angles."
+        )
+    # Whole nanoseconds: a double of seconds since 1970 is off by 1e-7 s, and messages of one instant would swap.
+    logged, stamped = np.array(clocks, dtype=np.int64).T
+    time = np.where(np.abs(stamped - logged) < _SAME_CLOCK, stamped, logged)
+    frame.insert(0, TIME, (time - time.min()) / 1e9)
+    return frame.sort_values(TIME, kind="stable").reset_index(drop=True)
+
+
+def _stamp(content: Any, logged: int) -> int:
+    """Return the time in a message's header [ns], or the logger's where it has none."""
+    stamp = getattr(getattr(content, "header", None), "stamp", None)
+    if stamp is None or not hasattr(stamp, "sec") or not hasattr(stamp, "nanosec"):
+        return logged
+    return 10**9 * int(stamp.sec) + int(stamp.nanosec)
+
+
+def _messages(source: Path, skipped: set[str]) -> Iterator[tuple[str, int, Any]]:
+    """Yield (topic, logger's time [ns], message) of all messages that can be decoded."""
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    ros, decoders = DecoderFactory(), {}
+    with source.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            topic = channel.topic.strip("/").replace("/", ".")
+            if channel.message_encoding == "json":
+                content = json.loads(message.data)
+            else:
+                if channel.id not in decoders:
+                    decoders[channel.id] = ros.decoder_for(channel.message_encoding, schema)
+                if decoders[channel.id] is None:
+                    skipped.add(f"{channel.topic} is {channel.message_encoding}")
+                    continue
+                content = decoders[channel.id](message.data)
+            yield topic, message.log_time, content
+
+
+def _numbers(content: Any, name: str, depth: int) -> Iterator[tuple[str, float]]:
+    """Yield all numbers of a message with their names; a header becomes its stamp [s]."""
+    if isinstance(content, bool | int | float):
+        yield name, float(content)
+    elif depth > _MAX_DEPTH or isinstance(content, str | bytes) or content is None:
+        return
+    elif hasattr(content, "sec") and hasattr(content, "nanosec"):
+        yield name, float(content.sec) + 1e-9 * float(content.nanosec)
+    elif isinstance(content, Mapping) or hasattr(content, "__slots__") or hasattr(content, "__dict__"):
+        fields = content if isinstance(content, Mapping) else {key: getattr(content, key) for key in _fields(content)}
+        for key, value in fields.items():
+            yield from _numbers(value, f"{name}.{key}", depth + 1)
+    else:
+        try:
+            items = list(content)
+        except TypeError:
+            return
+        if len(items) <= _MOST_NUMBERS:  # more are pictures, clouds and maps
+            for place, item in enumerate(items):
+                yield from _numbers(item, f"{name}[{place}]", depth + 1)
+
+
+def _fields(content: Any) -> list[str]:
+    return [key for key in getattr(content, "__slots__", None) or vars(content) if not key.startswith("_")]

@@ -1,0 +1,57 @@
+"""Any logger's file as a table, by what it is and how a layout says it is read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from softneck.core import DataError
+
+from ...recording._files import TextForm, read_table
+from ._arrays import Arrays, table_of
+from ._encodings import format_of
+from ._mat import mat_arrays
+from ._mcap import mcap_table
+from ._octave import octave_arrays
+from ._sheets import sheet_cells, sheet_table
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def read_foreign(
+    source: Path, form: TextForm, *, variable: str | None = None, sheet: str | None = None, wanted: tuple[str, ...] = ()
+) -> pd.DataFrame:
+    """Return the table of a log.
+
+    Args:
+        source: the file.
+        form: how a text, or a sheet, is a table.
+        variable: the matrix of a MATLAB or Octave file; None takes its vectors.
+        sheet: of a spreadsheet; None takes the largest.
+        wanted: the columns that are needed, by which vectors of another length are told.
+
+    Raises:
+        FileFormatError: no such file or no table.
+        DataError: no such variable or sheet.
+    """
+    kind = format_of(source)
+    if variable is not None and kind not in ("mat", "octave"):
+        raise DataError(f"{source}: the layout's `variable` is for a `.mat` file.")
+    if sheet is not None and kind != "sheet":
+        raise DataError(f"{source}: the layout's `sheet` is for a spreadsheet.")
+    if kind in ("mat", "octave"):
+        return table_of(source, arrays_of(source, kind), variable, wanted)
+    if kind == "mcap":
+        return mcap_table(source)
+    if kind == "sheet":
+        _, cells = sheet_cells(source, sheet)
+        return sheet_table(cells, header=form.header, skip=form.skip, unit_row=form.unit_row)
+    frame = read_table(source, ".parquet" if kind == "parquet" else ".csv", form)
+    frame.columns = [name.strip() if isinstance(name, str) else name for name in frame.columns]
+    return frame
+
+
+def arrays_of(source: Path, kind: str) -> Arrays:
+    """Return the arrays of a MATLAB or Octave file."""
+    return mat_arrays(source) if kind == "mat" else octave_arrays(source)

@@ -1,0 +1,80 @@
+"""Spreadsheets (.xlsx, .xls, .xlsb, .ods) as rows of cells, by python-calamine.
+
+It reads all four in one wheel without dependencies; openpyxl reads the first.
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from softneck.core import DataError, FileFormatError
+from softneck.core._errors import require_package
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+# A sheet of Excel has 1,048,576 rows; a small hostile file may unpack to any size.
+_MOST_CELLS = 50_000_000
+Cells = Sequence[Sequence[object]]
+
+
+def sheet_cells(source: Path, sheet: str | None) -> tuple[str, Cells]:
+    """Return a sheet's name and its rows of cells; without a name the sheet with most cells.
+
+    Raises:
+        SettingsError: the package that reads them is not installed.
+        FileFormatError: no spreadsheet.
+        DataError: no such sheet.
+    """
+    require_package("python_calamine")
+    import python_calamine as calamine
+
+    try:
+        book = calamine.CalamineWorkbook.from_path(source)
+        names = list(book.sheet_names)
+        if sheet is not None and sheet not in names:
+            raise DataError(f"{source}: there is no sheet `{sheet}`; it has {', '.join(names)}.")
+        sheets = [book.get_sheet_by_name(name) for name in ([sheet] if sheet is not None else names)]
+        found = max(sheets, key=lambda one: one.total_height * one.total_width, default=None)
+        if found is None or found.total_height * found.total_width == 0:
+            raise DataError(f"{source}: its sheets hold no cell ({', '.join(names)}).")
+        if found.total_height * found.total_width > _MOST_CELLS:
+            raise DataError(f"{source}: sheet `{found.name}` declares {found.total_height} rows; that is not a log.")
+        return found.name, found.to_python(skip_empty_area=False)
+    except DataError:
+        raise
+    except Exception as error:  # its readers raise whatever damaged bytes lead to
+        reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
+        raise FileFormatError(f"{source}: cannot be read as a spreadsheet ({reason}).") from error
+
+
+def sheet_table(cells: Cells, *, header: bool, skip: int, unit_row: bool) -> pd.DataFrame:
+    """Return the table below `skip` rows: names in its first row, or columns 0, 1, ..."""
+    import pandas as pd
+
+    rows = cells[skip:]
+    names: list[object] = list(range(len(rows[0]) if rows else 0))
+    if header and rows:
+        names = [str(cell).strip() or f"Unnamed: {place}" for place, cell in enumerate(rows[0])]
+        rows = rows[1 + unit_row :]
+    # An empty cell comes as an empty text; all rows of a sheet are of one width.
+    frame = pd.DataFrame([[None if cell == "" else cell for cell in row] for row in rows], dtype=object)
+    frame = frame.dropna(how="all").reset_index(drop=True)
+    found = pd.DataFrame({place: _column(pd.Series(frame[place])) for place in frame.columns})
+    found.columns = names[: found.shape[1]]
+    return found
+
+
+def _column(cells: pd.Series) -> pd.Series:
+    """Return numbers, dates or words; spreadsheets say of each cell which it is."""
+    import pandas as pd
+
+    kinds = {type(cell) for cell in cells.dropna()}
+    if kinds <= {int, float, bool}:
+        return cells.astype("float64")
+    if kinds <= {datetime.datetime, datetime.date}:
+        return pd.to_datetime(cells)
+    return cells

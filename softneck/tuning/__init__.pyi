@@ -1,0 +1,1 @@
+from ._tune import tune as tune

@@ -1,0 +1,102 @@
+"""What can be said before anything is searched: requirements that motors, range or dead time do not allow."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from softneck.core import SettingsError
+from softneck.design.linear._axis_settings import axis_test
+from softneck.design.linear._loop_settings import LoopSettings
+from softneck.design.linear._rise import least_rise
+from softneck.design.plants._uncertain import UncertainPlant, uncertain_plant
+from softneck.estimation import AxisPlant
+
+from ._requirements import TuneRequirements
+
+_RISES = ("neck.rise_s", "step.rise_s")
+
+
+def refuse_impossible(asked: TuneRequirements, plant: Any) -> None:
+    """Raise SettingsError for a requirement that no controller of the nominal plant can keep.
+
+    Args:
+        asked: the requirements.
+        plant: whatever `uncertain_plant` takes.
+    """
+    uncertain = uncertain_plant(plant)
+    limits = LoopSettings().of_robot(uncertain)
+    for name in uncertain.names:
+        nominal = uncertain.axis(name).nominal
+        _refuse_rise(asked, uncertain, limits, name, nominal)
+        _refuse_circle(asked, name, nominal)
+        _refuse_load(asked, name, nominal)
+
+
+def _refuse_rise(
+    asked: TuneRequirements, uncertain: UncertainPlant, limits: LoopSettings, name: str, plant: AxisPlant
+) -> None:
+    """Refuse a rise that slew and range cannot give, however the motors are led."""
+    test = axis_test(plant, limits.limits(uncertain.robot), limits.redefinition(uncertain)[1])
+    for metric in _RISES:
+        limit = asked.limit(metric)
+        if limit is None:
+            continue
+        table = asked.certificate.neck if metric.startswith("neck") else asked.certificate.step
+        least = least_rise(plant, test, asked.certificate.si(float(table["size_deg"])))
+        if math.isinf(least):
+            raise SettingsError(
+                f"`{metric}` cannot be: the motors' range does not reach {name}'s step of the requirements; ask for a "
+                "smaller step."
+            )
+        if limit < least:
+            raise SettingsError(
+                f"`{metric}` <= {limit:g} s cannot be: within the motors' slew and range {name}'s step of the "
+                f"requirements takes at least {least:.2g} s; allow more, or ask for a smaller step."
+            )
+
+
+def _refuse_circle(asked: TuneRequirements, name: str, plant: AxisPlant) -> None:
+    """Refuse a circle closer than the dead time alone leaves it behind: a bandwidth beyond 1/delay."""
+    limit = asked.limit("track.circle_rms_deg")
+    if limit is None or not asked.certificate.robot.is_neck:
+        return
+    dead = (plant.delay + 1) * plant.sample_time
+    track = asked.track
+    behind = 2.0 * track["circle_deg"] * math.sin(min(0.5 * track["circle_rad_s"] * dead, 0.5 * math.pi))
+    if limit < behind:
+        raise SettingsError(
+            f"`track.circle_rms_deg` <= {limit:g} cannot be: the dead time of {name}, {1e3 * dead:.0f} ms, alone "
+            f"leaves a circle of {track['circle_deg']:g} deg at {track['circle_rad_s']:g} rad/s {behind:.2g} deg "
+            "behind; allow more, or ask for `track.ahead_rms_deg`, of a reference that is known ahead."
+        )
+
+
+def _refuse_load(asked: TuneRequirements, name: str, plant: AxisPlant) -> None:
+    """Refuse a load rejected sooner than the dead time lets anybody act on it."""
+    certificate = asked.certificate
+    metric = f"step.{certificate.name_of('load_rms_deg')}"
+    limit = asked.limit(metric)
+    if limit is None:
+        return
+    rows = round(float(certificate.step["duration_s"]) / plant.sample_time)
+    load = certificate.motor_si(float(certificate.step["load_rad"]))
+    # Felt a dead time late, and answered one more later: until then it acts alone.
+    alone = np.zeros(rows)
+    felt = load * _step_response(plant, plant.delay + 2)
+    alone[plant.delay : plant.delay + felt.size] = felt[: max(rows - plant.delay, 0)]
+    least = math.sqrt(float((alone**2).mean())) / certificate.si(1.0)
+    if limit < least:
+        raise SettingsError(
+            f"`{metric}` <= {limit:g} cannot be: the load of the requirements moves {name} for a dead time before any "
+            f"feedback acts, which alone is {least:.2g}; allow more."
+        )
+
+
+def _step_response(plant: AxisPlant, rows: int) -> np.ndarray:
+    """Return the response (rows,) to a step of the input, without the delay."""
+    from scipy.signal import lfilter
+
+    return np.asarray(lfilter(np.append(0.0, plant.numerator), plant.denominator, np.ones(rows)))

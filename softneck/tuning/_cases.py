@@ -1,0 +1,165 @@
+"""The loops over plants that step: steps of several sizes and directions, noise, delay, and a circle."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from softneck.core import DataError, Vector, to_si
+from softneck.loop import BlockPart, Loop, LoopResult, RotationReference, SensorFault, StepReference, run_loop
+from softneck.loop._references import Reference
+from softneck.loop._robot_references import RobotReference
+from softneck.robot import Robot
+from softneck.runtime import Block
+from softneck.verification._neck_loops import direction, judge_loop, step_at
+from softneck.verification._own_plants import OwnPlant
+
+from ._requirements import TuneRequirements
+from ._task import Task
+
+# The circle is led in over so long [s], then goes round so often, of which the last turn is judged.
+_LED, _TURNS = 2.0, 2.0
+# A reference is known so much earlier at most [s].
+_AHEAD = 0.8
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One loop.
+
+    Attributes:
+        plant: number of the plant.
+        payload: [kg].
+        orientation: of the step [rad].
+        part: of the step's size.
+        noise: whether the sensor is noisy.
+        late: whether the plant is later than it says.
+        circle: a circle instead of the step.
+    """
+
+    plant: int
+    payload: float
+    orientation: float = 0.0
+    part: float = 1.0
+    noise: bool = False
+    late: bool = False
+    circle: bool = False
+
+
+def cases(own: Sequence[OwnPlant], asked: TuneRequirements, robot: Robot, *, few: bool) -> tuple[Case, ...]:
+    """Return the loops of a level: a few with the ends of the payloads, or all."""
+    table, small = asked.certificate.neck, asked.track["small_part"]
+    payloads = sorted({float(kg) for kg in table["payloads_kg"]})
+    angles = [math.radians(a) for a in table["orientations_deg"]] if len(robot.outputs.names) > 1 else [0.0]
+    found = []
+    for number, plant in enumerate(own):
+        heavy = payloads if plant.payload else [0.0]
+        for kg in [heavy[0], heavy[-1]] if few and len(heavy) > 1 else heavy:
+            steps = [Case(number, kg, angle) for angle in (angles[:: max(1, len(angles) - 1)] if few else angles)]
+            if not few:
+                steps += [Case(number, kg, angle, part=small, noise=True) for angle in (angles[0], angles[-1])]
+                steps.append(Case(number, kg, angles[0], late=True))
+            found += steps
+            if robot.is_neck:
+                found.append(Case(number, kg, circle=True))
+    return tuple(dict.fromkeys(found))
+
+
+def run_case(
+    case: Case, plant: OwnPlant, block: Block, order: str, task: Task
+) -> tuple[dict[str, float], Vector | None]:
+    """Return the metrics of a loop by the names of requirements; of a circle its distance for each lead [deg]."""
+    loop = loop_of(case, plant, block, order, task)
+    if case.circle:
+        return {}, _distances(loop, task)
+    values, result = judge_loop(loop, compiled=True)
+    asked = task.asked.certificate
+    names = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg", "max_rad", "slack_s")
+    found = {f"neck.{asked.name_of(name)}": values[name] for name in names if not math.isnan(values[name])}
+    if case.noise:
+        found["track.variation_rad_s"] = math.inf if result is None else variation(result)
+    if case.part < 1.0:
+        # A small step of a neck with friction is judged by where it goes, not by percent of little.
+        found = {name: value for name, value in found.items() if not name.endswith(("overshoot_pct", "settling_s"))}
+    return found, None
+
+
+def loop_of(case: Case, plant: OwnPlant, block: Block, order: str, task: Task) -> Loop:
+    """Return the loop of a case."""
+    asked, track, robot = task.asked.certificate, task.asked.track, task.robot
+    at = step_at(block)
+    common = task.cocontraction or 0.0
+    pulls = any(port.name == "least_cocontraction" for port in block.parameters)
+    together = 0.0 if pulls else common
+    if together:
+        at = max(at, 3.0)
+    size = case.part * asked.si(float(asked.neck["size_deg"]))
+    ends = tuple(size * share for share in direction(case.orientation, robot))
+    duration = at + float(asked.neck["duration_s"])
+    faults = []
+    if case.noise and track["noise_deg"] > 0.0:
+        faults.append(SensorFault(kind="noise", std=asked.si(track["noise_deg"]), seed=task.seed))
+    Ts = block.sample_time
+    if case.late and round(track["delay_ms"] / 1e3 / Ts):
+        faults.append(SensorFault(kind="delay", delay=Ts * round(track["delay_ms"] / 1e3 / Ts)))
+    if case.circle:
+        frequency = track["circle_rad_s"] / (2.0 * math.pi)
+        reference = RotationReference(
+            inclination=math.radians(track["circle_deg"]), frequency=frequency, at=at, rise=_LED
+        )
+        duration = at + _LED + _TURNS / frequency
+    elif robot.is_neck:
+        reference = StepReference(pitch=ends[0], roll=ends[1], at=at)
+    else:
+        reference = RobotReference(kind="step", values=ends, at=at)
+    return Loop(
+        plant=plant.quiet(Ts), controller=BlockPart(block), reference=_Together(reference, together),
+        duration=duration, order=order,
+        robot=robot, plant_inputs={"payload": case.payload} if plant.payload else {}, faults=tuple(faults),
+        # Nobody knows the step before it comes: a predictive controller sees the reference of now as that of later.
+        connections={
+            f"controller.{port.name}": f"reference.{port.name.removesuffix('_ahead')}"
+            for port in block.inputs if port.name.endswith("_reference_ahead")
+        },
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class _Together:
+    """A reference with a co-contraction that is there from the start."""
+
+    reference: Reference
+    cocontraction: float
+
+    def __call__(self, time: float, /) -> tuple[float, ...]:
+        return (*self.reference(time)[:-1], self.cocontraction)
+
+
+def variation(result: LoopResult) -> float:
+    """Return by how much all set-points move in a second, in the unit of the motors."""
+    P = np.column_stack([result[name] for name in result.robot.set_points]) / to_si(result.robot.motors.unit)[0]
+    return float(np.abs(np.diff(P, axis=0)).sum() / result.time[-1])
+
+
+def _distances(loop: Loop, task: Task) -> Vector:
+    """Return the rms distance [deg] of the last turn to where the circle was 0, 1, ... samples ago (leads,)."""
+    leads = round(_AHEAD / loop.controller.sample_time)
+    try:
+        result = run_loop(loop, compiled=True)
+    except DataError:
+        return np.full(leads + 1, math.inf)
+    turn = round(2.0 * math.pi / task.asked.track["circle_rad_s"] / result.sample_time)
+    names = result.robot.outputs.names
+    y = np.stack([result.angle(name) for name in names])[:, -turn:]
+    r = np.stack([result[f"{name}_reference"] for name in names])
+    rows = r.shape[1]
+    each = [y - r[:, rows - turn - lead : rows - lead] for lead in range(leads + 1)]
+    return np.degrees([math.sqrt(float((part**2).sum(axis=0).mean())) for part in each])
+
+
+def quietly(case: Case) -> Case:
+    """Return the plain step of a case, for pictures."""
+    return replace(case, noise=False, late=False, circle=False, part=1.0)

@@ -1,0 +1,149 @@
+"""What is asked of a tuned controller: the requirements of `verify`, and the loops that only tuning looks at."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from softneck.core import FileFormatError, SettingsError
+from softneck.robot import Robot
+from softneck.verification import Requirements, make_requirements
+from softneck.verification._requirements import VERSION, Requirement
+
+DEFAULT_FILE = Path(__file__).with_name("requirements.toml")
+#: Metrics of the loops of [track].
+TRACK_METRICS = ("track.circle_rms_deg", "track.ahead_rms_deg", "track.variation_rad_s")
+# Least, largest and unit of the numbers of [track].
+_TRACK = {
+    "small_part": (0.05, 1.0, ""), "noise_deg": (0.0, 10.0, "deg"), "delay_ms": (0.0, 1000.0, "ms"),
+    "circle_deg": (0.1, 40.0, "deg"), "circle_rad_s": (0.01, 20.0, "rad/s"),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class TuneRequirements:
+    """What is asked.
+
+    Attributes:
+        certificate: what `verify` is asked to hold.
+        track: the loops that are judged besides.
+        bounds: all requirements, those of `certificate` first.
+        table: what a requirements file for `verify` must state to ask for the same.
+    """
+
+    certificate: Requirements
+    track: Mapping[str, float]
+    bounds: tuple[Requirement, ...]
+    table: Mapping[str, Any]
+
+    def limit(self, metric: str) -> float | None:
+        """Return the largest value that is allowed of a metric; None where nothing bounds it from above."""
+        limits = [item.limit for item in self.bounds if item.metric == metric and item.bound != "min"]
+        return min(limits, default=None)
+
+    def lines(self) -> list[str]:
+        """Return each requirement as a line for people."""
+        words = {"min": ">=", "max": "<=", "below": "<"}
+        return [f"{item.metric} {words[item.bound]} {item.limit:g}" for item in self.bounds]
+
+
+def read_tune_requirements(
+    path: str | Path | None = None, *, robot: Robot | None = None, stepping: bool = True
+) -> TuneRequirements:
+    """Return the defaults, with what the file at `path` says instead.
+
+    Args:
+        path: a requirements file, also one for `verify`.
+        robot: whose controller is asked for; None: a neck's.
+        stepping: whether there are plants that step; else `neck.*` of the defaults is asked of the linear plants.
+
+    Raises:
+        FileFormatError: no such file, no TOML, another version.
+        SettingsError: an unknown key or metric, a value out of range, or bounds that contradict each other.
+    """
+    if path is None:
+        return make_tune_requirements({}, robot=robot, stepping=stepping)
+    try:
+        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f"{path}: is not valid TOML ({error}).") from error
+    except OSError as error:
+        raise FileFormatError(
+            f"{path}: cannot be read ({error.strerror}); name a requirements file (.toml)."
+        ) from error
+    if table.get("version") != VERSION:
+        raise FileFormatError(f"{path}: must say `version = {VERSION}`; it says {table.get('version')}.")
+    try:
+        return make_tune_requirements(table, robot=robot, stepping=stepping)
+    except SettingsError as error:
+        raise SettingsError(f"{path}: {error}") from error
+
+
+def make_tune_requirements(
+    table: Mapping[str, Any], *, robot: Robot | None = None, stepping: bool = True
+) -> TuneRequirements:
+    """Return the defaults with what a table like a requirements file says instead."""
+    whose = Robot.preset() if robot is None else robot
+    defaults = tomllib.loads(DEFAULT_FILE.read_text(encoding="utf-8"))
+    # The defaults of tuning are a neck's; those of `verify` know how other robots differ.
+    usual = _for_linear(defaults) if not stepping else defaults
+    if not whose.is_neck:
+        usual = {"track": defaults["track"]}
+    merged = {
+        key: {**usual.get(key, {}), **table.get(key, {})} if isinstance(usual.get(key, {}), Mapping)
+        and isinstance(table.get(key, {}), Mapping) else table[key]
+        for key in dict.fromkeys((*usual, *table)) if key != "version"
+    }  # fmt: skip
+    track = _numbers(merged.pop("track", {}), defaults["track"])
+    require = dict(merged.get("require", {}))
+    extra = tuple(
+        bound for metric in [*require] if metric.startswith("track.") for bound in _bounds(metric, require.pop(metric))
+    )
+    certificate = make_requirements({**merged, "require": require}, robot=whose)
+    return TuneRequirements(
+        certificate=certificate, track=track, bounds=(*certificate.bounds, *extra),
+        table={"version": VERSION, **merged, "require": require},
+    )  # fmt: skip
+
+
+def with_certificate(asked: TuneRequirements, certificate: Requirements) -> TuneRequirements:
+    """Return them with other requirements for `verify`, such as ones stretched to another robot."""
+    own = tuple(item for item in asked.bounds if item.metric.startswith("track."))
+    return replace(asked, certificate=certificate, bounds=(*certificate.bounds, *own))
+
+
+def _for_linear(defaults: Mapping[str, Any]) -> dict[str, Any]:
+    require = {f"step.{name.partition('.')[2]}": limit for name, limit in defaults["require"].items()
+               if name.startswith("neck.")}  # fmt: skip
+    tracked = {name: limit for name, limit in defaults["require"].items() if name.startswith("track.")}
+    # Presets are foreign plants, which decide nothing and take half a minute.
+    return {**defaults, "neck": {**defaults["neck"], "necks": 0}, "require": {**require, **tracked}}
+
+
+def _numbers(given: Any, defaults: Mapping[str, float]) -> dict[str, float]:
+    if not isinstance(given, Mapping):
+        raise SettingsError("`track` must be a table: [track].")
+    for key, value in given.items():
+        if key not in _TRACK:
+            raise SettingsError(f"unknown key `{key}` of [track]; it takes {', '.join(_TRACK)}.")
+        low, high, unit = _TRACK[key]
+        if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+            raise SettingsError(f"`[track] {key}` must be from {low:g} to {high:g} {unit}; got {value!r}.".strip())
+    return {**defaults, **{key: float(value) for key, value in given.items()}}
+
+
+def _bounds(metric: str, entry: Any) -> list[Requirement]:
+    if metric not in TRACK_METRICS:
+        raise SettingsError(f"unknown metric `{metric}`; of [track] there are {', '.join(TRACK_METRICS)}.")
+    if entry is False:
+        return []
+    if not isinstance(entry, Mapping) or list(entry) != ["max"]:
+        raise SettingsError(f"`{metric}` must say {{ max = NUMBER }}, or false; got {entry!r}.")
+    limit = entry["max"]
+    if isinstance(limit, bool) or not isinstance(limit, int | float) or not math.isfinite(limit) or limit <= 0.0:
+        raise SettingsError(f"the limit of `{metric}` must be a positive number; got {limit!r}.")
+    return [Requirement(metric, "max", float(limit), True)]

@@ -1,0 +1,152 @@
+"""What a search found: the front, what binds, and what each requirement costs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from softneck.cosim.studies._study_results import pareto_rows
+from softneck.verification._linear import LARGE
+from softneck.verification._requirements import Requirement
+
+from ._search import Candidate, ratio
+
+# What is traded, the first of each that was found; of the least ones the reciprocal counts.
+_OBJECTIVES = (
+    ("neck.rise_s", "step.rise_s"), ("neck.overshoot_pct", "step.overshoot_pct"), ("step.load_rms_",),
+    ("neck.steady_rms_", "step.steady_rms_"), ("track.circle_rms_deg",), ("track.variation_rad_s",),
+    ("axes.sensitivity",), ("axes.gain_margin",),
+)  # fmt: skip
+# Limits at which the price of a requirement is told, in parts of its own.
+_LOOSER = (1.0, 1.25, 1.5, 2.0, 3.0, 5.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Price:
+    """What one requirement costs another: with all others held and this one at `limit`, the other is `least`.
+
+    Attributes:
+        metric: what binds.
+        limit: to which it is loosened.
+        other: the metric that is paid with.
+        least: its best value; None where no candidate keeps all others.
+    """
+
+    metric: str
+    limit: float
+    other: str
+    least: float | None
+
+
+def objectives(items: Sequence[Candidate]) -> list[str]:
+    """Return the metrics that are traded, of those that all candidates of the last level have."""
+    names = set.intersection(*(set(item.metrics) for item in items)) if items else set()
+    found = []
+    for group in _OBJECTIVES:
+        match = next((name for start in group for name in sorted(names) if name.startswith(start)), None)
+        if match is not None:
+            found.append(match)
+    return found
+
+
+def front(items: Sequence[Candidate], names: Sequence[str]) -> list[Candidate]:
+    """Return the candidates that none beats in one objective without losing in another, by the first objective."""
+    table = np.array([[_small(name, item.metrics[name]) for name in names] for item in items])
+    if not table.size:
+        return []
+    finite = np.isfinite(table).all(axis=1)
+    rows = np.flatnonzero(finite)
+    kept = rows[pareto_rows(table[finite])]
+    return sorted((items[i] for i in kept), key=lambda item: item.metrics[names[0]])
+
+
+def binding(
+    items: Sequence[Candidate], bounds: Sequence[Requirement], *, tested: bool
+) -> tuple[str | None, float | None]:
+    """Return the requirement that stands in the way, None where a candidate keeps all.
+
+    And the value to which it alone would have to be loosened; None where that does not do.
+
+    It is the one that must be loosened least, alone, for some candidate to keep the rest; where none does, the one
+    that the best candidate breaks most.
+    """
+    loosened: dict[str, float] = {}
+    for item in items:
+        broken = {name: value for name, value in item.ratios(bounds, tested=tested).items() if value > 1.0}
+        if not broken:
+            return None, None
+        if len(broken) == 1:
+            name, value = next(iter(broken.items()))
+            loosened[name] = min(value, loosened.get(name, math.inf))
+    if loosened:
+        name = min(loosened, key=lambda name: loosened[name])
+        item = next(bound for bound in bounds if bound.metric == name)
+        return name, item.limit / loosened[name] if item.bound == "min" else item.limit * loosened[name]
+    best = min(items, key=lambda item: item.cost(bounds, tested=tested), default=None)
+    if best is None:
+        return None, None
+    found = best.ratios(bounds, tested=tested)
+    return max(found, key=lambda name: found[name]), None
+
+
+def prices(items: Sequence[Candidate], bounds: Sequence[Requirement], metric: str, *, tested: bool) -> list[Price]:
+    """Return the curve of what the requirement on `metric` costs: of the other that is broken most when it is held."""
+    item = next((bound for bound in bounds if bound.metric == metric), None)
+    if item is None:
+        return []
+    other = _paid_with(items, bounds, item, tested=tested)
+    if other is None:
+        return []
+    found = []
+    for part in _LOOSER:
+        limit = item.limit / part if item.bound == "min" else item.limit * part
+        allowed = {metric: part, other.metric: math.inf}
+        kept = [
+            one.metrics[other.metric]
+            for one in items
+            if all(value <= allowed.get(name, 1.0) for name, value in one.ratios(bounds, tested=tested).items())
+        ]
+        least = (max(kept) if other.bound == "min" else min(kept)) if kept else None
+        found.append(Price(metric, limit, other.metric, least))
+    return found
+
+
+def _paid_with(
+    items: Sequence[Candidate], bounds: Sequence[Requirement], item: Requirement, *, tested: bool
+) -> Requirement | None:
+    """Return the requirement that is broken least when `item` is held, alone if that can be."""
+    best: tuple[int, float, Requirement] | None = None
+    for one in items:
+        found = one.ratios(bounds, tested=tested)
+        if found.get(item.metric, math.inf) > 1.0:
+            continue
+        broken = {name: value for name, value in found.items() if value > 1.0}
+        if not broken:
+            continue
+        name = max(broken, key=lambda key: broken[key])
+        bound = next(bound for bound in bounds if bound.metric == name)
+        rank = (len(broken), broken[name])
+        if name in one.metrics and (best is None or rank < best[:2]):
+            best = (*rank, bound)
+    return None if best is None else best[2]
+
+
+def in_words(price: Price) -> str:
+    """Return a price as a sentence."""
+    what = f"{price.metric} {price.limit:.3g}"
+    if price.least is None:
+        return f"{what}: no candidate keeps the rest"
+    return f"{what} costs {price.other} {price.least:.3g}"
+
+
+def _small(name: str, value: float) -> float:
+    return -value if name.rpartition(".")[2] in LARGE else value
+
+
+def ratio_of(item: Candidate, bound: Requirement) -> float | None:
+    """Return how far a candidate is from a bound; None where it is not known."""
+    value = item.metrics.get(bound.metric)
+    return None if value is None or math.isnan(value) else ratio(bound, value)

@@ -1,0 +1,298 @@
+"""Successive halving over kinds and settings: generations of candidates, judged further the better they are.
+
+Each kind has its own CMA-ES over the cube of its settings (Hansen and Ostermeier 2001, Evolutionary Computation
+9:159), which knows ranks alone, so that candidates of different levels are told to it as they are. All kinds are judged
+at their start; after that and after each round half of them are left (successive halving: Jamieson and Talwalkar 2016,
+AISTATS), and of a round's candidates half go on to the next level. All is asked for in rounds and told in order: the
+number of workers changes nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from softneck.core import Progress, SoftneckError
+from softneck.cosim.studies._executors import Crew
+from softneck.verification._requirements import Requirement
+
+from ._judge import LEVELS, Judgement, judge_candidate
+from ._log import Job, Log
+from ._space import Space
+from ._task import Task
+
+# Candidates of a kind in each round: CMA-ES' own 4 + 3 ln n for two to four settings, and even.
+_GENERATION = 6
+# The first step of the search, as a part of each range.
+_STEP = 0.25
+# Kinds that are never left out, and candidates whose margins are found by experiment at the end.
+_LEAST_KINDS, _FINALS = 2, 3
+# What of a candidate without linear form is not certified beside recordings counts as so far beyond its limit.
+_NOT_CERTIFIED = 2.0
+# What breaks ties: all ratios together weigh this part of the largest one.
+_REST = 0.02
+# No ratio counts for more.
+_FAR = 1e3
+_MARGINS = ("axes.gain_margin", "axes.delay_margin_ms")
+
+
+@dataclass(slots=True, eq=False)
+class Candidate:
+    """One kind with its settings, and all that is known of it.
+
+    Attributes:
+        kind: of controller.
+        settings: of its design.
+        x: where that is in the cube of its space.
+        level: the last one it was judged at; "" for none.
+        metrics: of all levels, the worse where two say something.
+        error: why it has none.
+    """
+
+    kind: str
+    settings: Mapping[str, Any]
+    x: np.ndarray
+    level: str = ""
+    metrics: dict[str, float] = field(default_factory=dict)
+    error: str = ""
+
+    def take(self, level: str, judgement: Judgement) -> None:
+        """Add what came of a level."""
+        self.error = judgement.error or self.error
+        if judgement.error:
+            return
+        self.level = level
+        # Of margins linear methods and experiments each know a part: the least counts.
+        self.metrics |= {
+            name: min(value, self.metrics.get(name, math.inf)) if name in _MARGINS else value
+            for name, value in judgement.metrics.items()
+        }
+
+    def ratios(self, bounds: Sequence[Requirement], *, tested: bool) -> dict[str, float]:
+        """Return requirement -> value over limit (limit over value of a least one); 1 is the limit itself."""
+        found = {}
+        for item in bounds:
+            value = self.metrics.get(item.metric)
+            if value is None or math.isnan(value):
+                if tested and item.metric in _MARGINS and "axes.sensitivity" not in self.metrics and self.metrics:
+                    found[item.metric] = _NOT_CERTIFIED
+                continue
+            found[item.metric] = max(found.get(item.metric, 0.0), ratio(item, value))
+        return found
+
+    def cost(self, bounds: Sequence[Requirement], *, tested: bool) -> float:
+        """Return how far requirements are beyond their limits; at most 1 where all known ones hold.
+
+        Where all hold, the largest ratio; else 1 and what is beyond 1 of each, added up: few are broken rather than all
+        a little, as with any exact penalty (Nocedal and Wright 2006, sec. 17.2).
+        """
+        found = list(self.ratios(bounds, tested=tested).values())
+        if self.error or not found:
+            return math.inf
+        beyond = sum(min(value, _FAR) - 1.0 for value in found if value > 1.0)
+        if beyond > 0.0:
+            return 1.0 + beyond
+        return (1.0 - _REST) * max(found) + _REST * float(np.mean(found))
+
+    def holds(self, bounds: Sequence[Requirement], *, tested: bool) -> bool:
+        """Whether every requirement that is known is kept."""
+        found = self.ratios(bounds, tested=tested)
+        return not self.error and bool(found) and max(found.values()) <= 1.0
+
+
+def ratio(item: Requirement, value: float) -> float:
+    """Return value over limit, or limit over value of a least one; above 1 it does not hold."""
+    if item.bound == "min":
+        return item.limit / value if value > 0.0 else math.inf
+    if item.limit <= 0.0:
+        return 0.0 if item.holds(value) else math.inf
+    return value / item.limit if item.bound == "max" or value < item.limit else max(value / item.limit, 1.0 + 1e-9)
+
+
+@dataclass(slots=True, eq=False)
+class Search:
+    """A search at work.
+
+    Attributes:
+        task: what is tuned.
+        spaces: of the kinds.
+        crew: workers.
+        log: what has been judged.
+        budget: of judgements.
+        report: called with the part done and the best so far.
+    """
+
+    task: Task
+    spaces: list[Space]
+    crew: Crew
+    log: Log
+    budget: int
+    report: Progress
+    candidates: dict[tuple[str, str], Candidate] = field(default_factory=dict)
+    spent: set[Job] = field(default_factory=set)
+    dropped: dict[str, str] = field(default_factory=dict)
+
+    def run(self) -> None:
+        """Search until the budget is spent."""
+        optimisers = {space.kind: _optimiser(space, self.task.seed, i) for i, space in enumerate(self.spaces)}
+        # Only what steps has margins by experiment.
+        finals = _FINALS if self.task.own else 0
+        levels = LEVELS[: 3 if self.task.own else 1]
+        alive, before = self._begun(levels, finals), -1
+        while self._left(finals) > 0 and alive and before < len(self.spent):
+            before = len(self.spent)
+            generation = {space.kind: self._asked(space, optimisers[space.kind]) for space in alive}
+            every = [item for each in generation.values() for item in each]
+            for level in levels:
+                self._judge(every, level, finals)
+                every = self._better(every, level)
+            for space in alive:
+                _tell(optimisers[space.kind], generation[space.kind], self._key)
+            alive = self._halved(alive)
+        if finals:
+            self._judge(self.ranked()[:finals], "margins", 0)
+
+    def ranked(self) -> list[Candidate]:
+        """Return all candidates that have metrics, the best first."""
+        return sorted((item for item in self.candidates.values() if item.level), key=self._key)
+
+    def cost(self, item: Candidate) -> float:
+        """Return what the search minimises."""
+        return item.cost(self.task.asked.bounds, tested=self.tested)
+
+    @property
+    def tested(self) -> bool:
+        """Whether a family was tested against its recordings."""
+        return any(getattr(thing, "measured", {}) for thing in self.task.linear.values())
+
+    def _of(self, kind: str) -> list[Candidate]:
+        return [item for item in self.candidates.values() if item.kind == kind]
+
+    def _key(self, item: Candidate) -> tuple[int, float]:
+        """Return the rank: what was judged further first, `margins` as `all`; then the cost."""
+        level = min(LEVELS.index(item.level), 2) if item.level else -1
+        return -level, self.cost(item)
+
+    def _left(self, reserved: int) -> int:
+        return self.budget - reserved - len(self.spent)
+
+    def _begun(self, levels: Sequence[str], finals: int) -> list[Space]:
+        """Judge the start of every kind, each by itself: what it compiles the others then find; return those left."""
+        starts = {space.kind: self._candidate(space, space.start) for space in self.spaces}
+        for level in levels:
+            self._judge(list(starts.values()), level, finals)
+        self.dropped |= {kind: item.error for kind, item in starts.items() if item.error}
+        return self._halved([space for space in self.spaces if space.kind not in self.dropped])
+
+    def _halved(self, alive: list[Space]) -> list[Space]:
+        """Return the better half of the kinds, in their order."""
+        keep = max(_LEAST_KINDS, math.ceil(len(alive) / 2))
+        best = sorted(alive, key=lambda space: min(self._key(item) for item in self._of(space.kind)))[:keep]
+        return [space for space in alive if space in best]
+
+    def _asked(self, space: Space, optimiser: Any) -> list[Candidate]:
+        """Return a generation."""
+        return [self._candidate(space, optimiser.ask()) for _ in range(_GENERATION)]
+
+    def _candidate(self, space: Space, x: np.ndarray) -> Candidate:
+        """Return the candidate at a point of the cube; the same one for the same settings."""
+        settings = space.settings(x)
+        job = Job.of(space.kind, settings, "")
+        return self.candidates.setdefault((job.kind, job.settings), Candidate(space.kind, settings, np.array(x)))
+
+    def _better(self, items: list[Candidate], level: str) -> list[Candidate]:
+        """Return the better half of those that were judged at a level."""
+        good = sorted((item for item in items if item.level == level and not item.error), key=self.cost)
+        # Equal candidates are one.
+        good = list({id(item): item for item in good}.values())
+        return good[: math.ceil(len(good) / 2)]
+
+    def _judge(self, items: Sequence[Candidate], level: str, reserved: int) -> None:
+        """Judge candidates at a level, as many as the budget allows; those in the log are read from it."""
+        wanted: dict[Job, Candidate] = {}
+        for item in items:
+            job = Job.of(item.kind, item.settings, level)
+            if item.level == level or item.error or job in wanted or job in self.spent:
+                continue
+            if self._left(reserved) - len(wanted) <= 0:
+                break
+            wanted[job] = item
+        given_out([job for job in wanted if job not in self.log], self._run, self.crew, self._took)
+        for job, item in wanted.items():
+            self.spent.add(job)
+            item.take(level, self.log[job])
+        self._say()
+
+    def _run(self, job: Job) -> Future:
+        item = self.candidates[(job.kind, job.settings)]
+        return self.crew.submit(judge_candidate, self.task, job.kind, item.settings, job.level)
+
+    def _took(self, job: Job, judgement: Judgement) -> None:
+        self.log.add(job, judgement)
+        self.log.write()
+        self._say(len(self.spent) + 1)
+
+    def _say(self, done: int | None = None) -> None:
+        share = min(1.0, (len(self.spent) if done is None else done) / self.budget)
+        best = next(iter(self.ranked()), None)
+        self.report(share, "nothing yet" if best is None else in_words(best, self.cost(best)))
+
+
+def given_out(
+    jobs: Sequence[Job], run: Callable[[Job], Future], crew: Crew, took: Callable[[Job, Judgement], None]
+) -> None:
+    """Have jobs done, two for each worker at a time, and take each as it ends.
+
+    Raises:
+        SoftneckError: a worker died.
+    """
+    left, out = list(jobs)[::-1], {}
+    found: dict[Job, Judgement] = {}
+    try:
+        while left or out:
+            while left and len(out) < 2 * crew.size:
+                job = left.pop()
+                out[run(job)] = job
+            done, _ = wait(out, return_when=FIRST_COMPLETED)
+            for future in done:
+                job = out.pop(future)
+                found[job] = future.result()
+                took(job, found[job])
+    except BrokenExecutor as error:
+        raise SoftneckError(
+            "a worker process died (out of memory, or a plant that crashed); what is done is kept, run it again."
+        ) from error
+
+
+def in_words(item: Candidate, cost: float) -> str:
+    """Return a candidate in a few words."""
+    names = {"neck.rise_s": "rise {:.2f} s", "step.rise_s": "rise {:.2f} s", "neck.overshoot_pct": "overshoot {:.1f} %",
+             "step.overshoot_pct": "overshoot {:.1f} %", "axes.gain_margin": "gain margin {:.2g}"}  # fmt: skip
+    told: dict[str, str] = {}
+    for name, text in names.items():
+        if name in item.metrics and math.isfinite(item.metrics[name]):
+            told.setdefault(text, text.format(item.metrics[name]))
+    return ", ".join(
+        [f"best {item.kind}", *told.values(), "all hold" if cost <= 1.0 else f"{cost - 1.0:.2f} beyond limits"]
+    )
+
+
+def _optimiser(space: Space, seed: int, number: int) -> Any:
+    from cmaes import CMA
+
+    n = len(space.dimensions)
+    return CMA(
+        mean=space.start, sigma=_STEP, bounds=np.array([[0.0, 1.0]] * n), population_size=_GENERATION,
+        seed=(1000 * seed + number) % 2**32,
+    )  # fmt: skip
+
+
+def _tell(optimiser: Any, generation: Sequence[Candidate], key: Callable[[Candidate], Any]) -> None:
+    """Tell the ranks: CMA-ES knows no more than which is better."""
+    order = sorted(range(len(generation)), key=lambda i: key(generation[i]))
+    optimiser.tell([(generation[i].x, float(rank)) for rank, i in enumerate(order)])

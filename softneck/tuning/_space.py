@@ -1,0 +1,123 @@
+"""What is searched: for each kind of controller the settings that matter, from a cube to numbers and back."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from softneck.core import KINDS, SettingsError, Vector, resolve
+from softneck.core._kinds import kinds_of
+
+#: Kinds that are searched where nobody names any; `nmpc` needs a nonlinear model of its own and minutes.
+KINDS_SEARCHED = ("pi", "pid", "fopi", "hinf", "ncf", "lqg", "scheduled", "adaptive", "mpc")
+
+
+@dataclass(frozen=True, slots=True)
+class Dimension:
+    """One setting.
+
+    Attributes:
+        name: of the setting.
+        low, high: ends of its range; logarithmic.
+        start: where the search begins.
+    """
+
+    name: str
+    low: float
+    high: float
+    start: float
+
+    def value(self, part: float) -> float:
+        """Return the setting at a part of the range, 0 to 1, to four digits: what is logged is what is designed."""
+        return float(f"{self.low * (self.high / self.low) ** min(max(part, 0.0), 1.0):.4g}")
+
+    @property
+    def start_part(self) -> float:
+        """Where the start lies in the range, 0 to 1."""
+        return math.log(self.start / self.low) / math.log(self.high / self.low)
+
+
+_ANGLE = math.radians(1.0)
+# The bound on Ms sets how fast the feedback is, the rise what the reference filter makes of it.
+_OWN: dict[str, tuple[Dimension, ...]] = {
+    "pi": (Dimension("max_sensitivity", 1.15, 2.5, 1.5), Dimension("phase_margin", 40 * _ANGLE, 80 * _ANGLE, 1.05)),
+    "pid": (Dimension("max_sensitivity", 1.2, 3.0, 1.5), Dimension("noise_gain", 2.0, 10.0, 5.0)),
+    "fopi": (Dimension("max_sensitivity", 1.2, 3.0, 1.5), Dimension("phase_margin", 60 * _ANGLE, 100 * _ANGLE, 1.4)),
+    "hinf": (Dimension("max_sensitivity", 1.2, 3.0, 1.5), Dimension("control_weight", 0.05, 1.0, 0.3)),
+    "ncf": (Dimension("max_sensitivity", 1.2, 3.0, 1.5),),
+    "lqg": (Dimension("max_sensitivity", 1.2, 3.0, 1.4), Dimension("control_weight", 0.01, 1.0, 0.06),
+            Dimension("input_noise", 1.0, 100.0, 5.0)),
+    "scheduled": (Dimension("max_sensitivity", 1.15, 2.0, 1.5), Dimension("phase_margin", 0.7, 1.4, 1.05)),
+    "adaptive": (Dimension("max_sensitivity", 1.15, 2.0, 1.5), Dimension("phase_margin", 0.7, 1.4, 1.05)),
+    "mpc": (Dimension("max_sensitivity", 1.2, 2.5, 1.5),),
+    "nmpc": (),
+}  # fmt: skip
+# Starts were chosen on the foreign neck `column`, by this search: what is asked of the nominal plant is less than what
+# the slowest payload and the motors make of it.
+_AIM = 0.6
+_LEAD = Dimension("lead_limit", 0.4, 2.0, 0.8)
+
+
+@dataclass(frozen=True, slots=True)
+class Space:
+    """The settings of one kind that are searched, and those that are fixed.
+
+    Attributes:
+        kind: of controller.
+        dimensions: searched.
+        fixed: settings that hold for all.
+    """
+
+    kind: str
+    dimensions: tuple[Dimension, ...]
+    fixed: Mapping[str, Any]
+
+    @property
+    def start(self) -> Vector:
+        """Where the search begins, in the cube."""
+        return np.array([item.start_part for item in self.dimensions])
+
+    def settings(self, x: Vector) -> dict[str, Any]:
+        """Return the settings at a point of the cube."""
+        searched = {item.name: item.value(float(part)) for item, part in zip(self.dimensions, x, strict=True)}
+        return {**self.fixed, **searched}
+
+
+def spaces(kinds: tuple[str, ...], *, rise: float, cocontraction: float | None, neck: bool) -> list[Space]:
+    """Return the space of every kind.
+
+    Args:
+        kinds: of controllers.
+        rise: the longest that is allowed [s].
+        cocontraction: at which the robot was recorded [rad]; None: no rule is set.
+        neck: whether it is a neck: of another robot limits are those of its file.
+
+    Raises:
+        SettingsError: an unknown kind, or one with nothing to search.
+    """
+    found = []
+    for kind in kinds:
+        if kind not in _OWN:
+            raise SettingsError(
+                f"`{kind}` cannot be tuned; use some of {', '.join(_OWN)}."
+                if kind in kinds_of("controller")
+                else f"unknown kind of controller `{kind}`; use some of {', '.join(_OWN)}."
+            )
+        names = {item.name for item in dataclasses.fields(resolve(KINDS[kind].settings))}
+        # Until a kind has the one meaning of speed, its filter stands for it: of a lag that is a part of its rise.
+        speed = (
+            Dimension("rise_s", 0.4 * rise, 1.2 * rise, _AIM * rise)
+            if "rise_s" in names
+            else Dimension("reference_time", 0.05 * rise, 0.6 * rise, 0.25 * rise)
+        )
+        wanted = (speed, *_OWN[kind], *((_LEAD,) if neck else ()))
+        fixed: dict[str, Any] = {}
+        if cocontraction is not None and "least_cocontraction" in names:
+            fixed["least_cocontraction"] = cocontraction
+        found.append(Space(kind, tuple(item for item in wanted if item.name in names), fixed))
+    return found

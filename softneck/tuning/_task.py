@@ -1,0 +1,40 @@
+"""What is tuned: plants, requirements and whose controller, as one thing that goes to every worker."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from softneck.robot import Robot
+
+from ._requirements import TuneRequirements
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Task:
+    """All that a worker must know to judge a candidate.
+
+    Attributes:
+        digest: of all that follows; workers keep what they have made ready by it.
+        linear: by name, models and families.
+        own: by name, plants that step.
+        asked: the requirements.
+        robot: whose controller is tuned.
+        cocontraction: at which the loops are held [rad]; None: by the controller's own rule.
+        seed: of the noise.
+    """
+
+    digest: str
+    linear: Mapping[str, Any]
+    own: Mapping[str, Any]
+    asked: TuneRequirements
+    robot: Robot
+    cocontraction: float | None = None
+    seed: int = 0
+
+    @property
+    def plant(self) -> Any:
+        """What controllers are designed on: the first of several linear sources is the nominal plant."""
+        sources = list(self.linear.values())
+        return sources[0] if len(sources) == 1 else sources

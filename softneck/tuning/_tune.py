@@ -1,0 +1,232 @@
+"""From requirements to a controller: the search, the certificate of its best, and what else belongs to it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from softneck.core import Progress, SettingsError, require_whole, silent
+from softneck.cosim.studies._executors import crew
+from softneck.estimation import KalmanSettings
+from softneck.estimation._axis import robot_of
+from softneck.verification import Verification, verify
+from softneck.verification._own_plants import OwnPlant, is_own_plant
+from softneck.verification._scale import scaled
+from softneck.verification._verify import sources_of
+
+from ._beforehand import refuse_impossible
+from ._digest import digest_of
+from ._judge import designed, made_ready
+from ._log import Log
+from ._requirements import TuneRequirements, make_tune_requirements, read_tune_requirements, with_certificate
+from ._responses import kept_with
+from ._result import Price, binding, front, objectives, prices
+from ._search import Candidate, Search
+from ._space import KINDS_SEARCHED, spaces
+from ._task import Task
+
+#: Judgements of candidates that a search makes where nobody says otherwise.
+BUDGET = 160
+# Fewer do not judge each of the kinds by a loop.
+_LEAST_BUDGET = 1
+# So many of the best are held against `verify`, until one holds.
+_VERIFIED = 2
+# The rise that is aimed at where nothing limits it, in time constants of the nominal plant.
+_USUAL_RISE = 2.0
+# Motors that are held closer to zero than this [rad] have no rule for their co-contraction.
+_TAUT = 0.05
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Tuned:
+    """What came of a search.
+
+    Attributes:
+        best: the candidate with the least cost, or the first whose certificate holds.
+        controller: designed as it says.
+        observer: for the loop; None where none can be built on the nominal plant.
+        observed: whether the steps keep their requirements with it.
+        verification: of `verify` with the same requirements.
+        holds: whether all requirements are kept, those of the certificate and those of [track].
+        candidates: all that were judged by all loops, the best first.
+        front: those of them that none beats in every objective.
+        objectives: the metrics of the front.
+        binding: the requirement that stands in the way; None where nothing does.
+        nearest: the value to which that alone would have to be loosened; None where that would not do.
+        prices: what it costs.
+        evaluations: judgements that were asked for.
+        dropped: kind -> why it could not be designed.
+        task: what was tuned.
+        own: plants that step.
+    """
+
+    best: Candidate
+    controller: Any
+    observer: Any
+    observed: bool
+    verification: Verification
+    holds: bool
+    candidates: list[Candidate]
+    front: list[Candidate]
+    objectives: list[str]
+    binding: str | None
+    nearest: float | None
+    prices: list[Price]
+    evaluations: int
+    dropped: Mapping[str, str]
+    task: Task
+    own: Sequence[OwnPlant] = ()
+
+
+def tune(
+    plants: Mapping[str, Any],
+    requirements: TuneRequirements | Mapping[str, Any] | str | Path | None = None,
+    *,
+    kinds: Sequence[str] = (),
+    budget: int = BUDGET,
+    seed: int = 0,
+    workers: int | None = None,
+    folder: Path | None = None,
+    resume: bool = False,
+    force: bool = False,
+    files: Mapping[str, tuple[str, str]] | None = None,
+    progress: Progress = silent,
+) -> Tuned:
+    """Return the best controller of some kinds for plants, by what is required of it.
+
+    The same plants, requirements, kinds, budget and seed give the same result, whatever the number of workers.
+
+    Args:
+        plants: by name: families and linear models, of which at least one, the first the nominal plant; and plants
+            that step (nonlinear models, neck parameters, functions that return a part), which loops are closed over.
+        requirements: what is asked, also as a file or a table like one; the defaults if not given.
+        kinds: of controllers; `KINDS_SEARCHED` if none is named.
+        budget: judgements of candidates.
+        seed: of the search and of the noise in its loops.
+        workers: local processes, as many as cores if not given; 0 for this process.
+        folder: where judgements are kept as they come; the same call goes on with what is there.
+        resume: refuse to begin anew.
+        force: replace another search that `folder` holds.
+        files: role -> (path, SHA-256) of what was read, for the certificate.
+        progress: called with the part done and the best so far.
+
+    Raises:
+        SettingsError: no linear plant, an unknown kind, or requirements that contradict each other or the motors.
+        OutputFileError: `folder` holds another search.
+    """
+    require_whole("budget", budget, _LEAST_BUDGET, 1_000_000)
+    require_whole("seed", seed, 0, 2**31 - 2)
+    chosen = tuple(dict.fromkeys(kinds or KINDS_SEARCHED))
+    task = _task(plants, requirements, seed)
+    refuse_impossible(task.asked, task.plant)
+    each = spaces(chosen, rise=_aimed(task), cocontraction=task.cocontraction, neck=task.robot.is_neck)
+    task = replace(task, digest=digest_of(task, chosen, files))
+    log = Log(folder, task.digest, resume=resume, force=force)
+    with crew(workers, None) as members:
+        search = Search(task, each, members, log, budget, lambda done, text: progress(0.9 * done, text))
+        search.run()
+    return _finished(search, files, lambda done, text: progress(0.9 + 0.1 * done, text))
+
+
+def _task(
+    plants: Mapping[str, Any], requirements: TuneRequirements | Mapping[str, Any] | str | Path | None, seed: int
+) -> Task:
+    own = {name: thing for name, thing in plants.items() if is_own_plant(thing)}
+    linear = {name: thing for name, thing in plants.items() if name not in own}
+    if not linear:
+        raise SettingsError(
+            "no linear plant to design on: give a FAMILY (`softneck family`), or a linear MODEL, as well."
+        )
+    robot = robot_of(next(iter(linear.values())))
+    if isinstance(requirements, TuneRequirements):
+        asked = requirements
+    elif isinstance(requirements, Mapping):
+        asked = make_tune_requirements(requirements, robot=robot, stepping=bool(own))
+    else:
+        asked = read_tune_requirements(requirements, robot=robot, stepping=bool(own))
+    if not robot.is_neck:
+        asked = with_certificate(asked, scaled(asked.certificate, sources_of(linear, asked.certificate)))
+    return Task(
+        digest="", linear=linear, own=own, asked=asked, robot=robot, cocontraction=_held(linear), seed=seed
+    )  # fmt: skip
+
+
+def _held(linear: Mapping[str, Any]) -> float | None:
+    """Return the co-contraction [rad] around which families were recorded: that of the heaviest payload."""
+    made = [part for thing in linear.values()
+            for part in getattr(thing, "findings", {}).get("tested", {}).get("conditions", [])]  # fmt: skip
+    if not made:
+        return None
+    heaviest = max(max(part["payload_kg"]) for part in made)
+    middles = [sum(part["cocontraction"]) / 2.0 for part in made if max(part["payload_kg"]) >= heaviest]
+    common = round(sorted(middles)[len(middles) // 2], 3)
+    return common if common > _TAUT else None
+
+
+def _aimed(task: Task) -> float:
+    """Return the longest rise that is allowed [s], or what is usual for the plant."""
+    limits = [task.asked.limit(metric) for metric in ("neck.rise_s", "step.rise_s")]
+    known = [limit for limit in limits if limit is not None]
+    if known:
+        return min(known)
+    source = sources_of(task.linear, task.asked.certificate)[0]
+    return _USUAL_RISE / min(float(box.nominal[1]) for box in source.axes)
+
+
+def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progress: Progress) -> Tuned:
+    """Return the result of a search: its best verified, and what it means for the requirements."""
+    task, ranked = search.task, search.ranked()
+    if not ranked:
+        why = "; ".join(f"{kind}: {text}" for kind, text in search.dropped.items()) or "the budget is too small"
+        raise SettingsError(f"no candidate could be judged ({why}).")
+    deepest = max(range(4), key=lambda k: any(_level(item) >= k for item in ranked) * k)
+    compared = [item for item in ranked if _level(item) >= min(deepest, 2)]
+    best, verification, controller = _verified(search, compared, files, progress)
+    bounds = task.asked.bounds
+    names = objectives(compared)
+    tracked = [b for b in bounds if b.metric.startswith("track.")]
+    holds = verification.holds and best.holds(tracked, tested=False) if tracked and task.own else verification.holds
+    stuck, nearest = (None, None) if holds else binding(compared, bounds, tested=search.tested)
+    if not holds and stuck is None:
+        # The search saw nothing broken, the certificate of the whole box does.
+        stuck = next((v.requirement.metric for v in verification.failed), None)
+    eyes = _observer(task)
+    return Tuned(
+        best=best, controller=controller, observer=eyes, own=made_ready(task).own,
+        observed=eyes is not None and bool(task.own) and kept_with(task, best, eyes, bounds),
+        verification=verification, holds=holds,
+        candidates=compared, front=front(compared, names), objectives=names, binding=stuck, nearest=nearest,
+        prices=[] if stuck is None else prices(compared, bounds, stuck, tested=search.tested),
+        evaluations=len(search.spent), dropped=search.dropped, task=task,
+    )  # fmt: skip
+
+
+def _level(item: Candidate) -> int:
+    return ("linear", "few", "all", "margins").index(item.level)
+
+
+def _verified(
+    search: Search, compared: Sequence[Candidate], files: Mapping[str, tuple[str, str]] | None, progress: Progress
+) -> tuple[Candidate, Verification, Any]:
+    """Return the first of the best whose certificate holds, else the best, each with what `verify` says."""
+    task, found = search.task, []
+    ready = made_ready(task)
+    promising = [item for item in compared if search.cost(item) <= 1.0][:_VERIFIED] or compared[:1]
+    for number, item in enumerate(promising):
+        controller = designed(task, ready, item.kind, item.settings)
+        progress(number / len(promising), f"verify {item.kind}")
+        verification = verify(controller, {**task.linear, **task.own}, task.asked.certificate, files=files)
+        if verification.holds:
+            return item, verification, controller
+        found.append((item, verification, controller))
+    return found[0]
+
+
+def _observer(task: Task) -> Any:
+    """Return the filter over the nominal plant; None where it has none."""
+    try:
+        return KalmanSettings().design(next(iter(task.linear.values())))
+    except SettingsError:
+        return None

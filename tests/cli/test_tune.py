@@ -1,0 +1,112 @@
+"""`softneck tune`: what its folder holds, what it says, and what it refuses before it searches."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from softneck.cli._main import run
+
+from ..data import ROOT
+
+MODEL = ROOT / "tests" / "golden" / "oe.npz"
+QUICK = """version = 1
+[sampling]
+plants = 30
+search_generations = 0
+[step]
+duration_s = 3.0
+[require]
+"stability.searched_radius" = false
+"robust.mu" = false
+"axes.disk_margin" = false
+"mimo.disk_margin" = false
+"axes.gain_margin" = { min = 1.2 }
+"axes.phase_margin_deg" = { min = 10.0 }
+"axes.sensitivity" = { max = 6.0 }
+"step.overshoot_pct" = { max = 60.0 }
+"step.load_rms_deg" = { max = 9.0 }
+"step.settling_s" = { max = 3.0 }
+"step.steady_rms_deg" = { max = 2.0 }
+"step.rise_s" = { max = %s }
+"""
+
+
+@pytest.fixture
+def call(tmp_path: Path) -> list[str]:
+    (tmp_path / "wanted.toml").write_text(QUICK % 1.5)
+    return ["tune", str(MODEL), "--requirements", str(tmp_path / "wanted.toml"), "--kinds", "pi", "--workers", "0",
+            "--budget", "2", "-o", str(tmp_path / "out")]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_the_folder_holds_what_belongs_to_the_best(
+    tmp_path: Path, call: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run([*call, "--json"]) == 0
+    values, folder = json.loads(capsys.readouterr().out), tmp_path / "out"
+    assert set(values) >= {"best", "pareto", "binding", "evaluations"}
+    assert values["best"].keys() >= {"kind", "file", "metrics", "holds"}
+    assert (values["best"]["kind"], values["best"]["holds"], values["binding"]) == ("pi", True, None)
+    assert values["evaluations"] == 2
+    assert all(row.keys() >= {"kind", "settings", "metrics"} for row in values["pareto"])
+    assert {path.name for path in folder.iterdir()} >= {
+        "best.npz", "observer.npz", "best.certificate.json", "loop.toml", "pareto.csv", "report.html"
+    }  # fmt: skip
+    assert len((folder / "pareto.csv").read_text().splitlines()) == 1 + len(values["pareto"])
+    # What the certificate says `verify` says too, with the requirements that are left there.
+    asked = ["--requirements", str(folder / "requirements.toml")]
+    assert run(["verify", str(folder / "best.npz"), str(MODEL), *asked, "--json", "-o", str(tmp_path / "c.json")]) == 0
+    again, mine = json.loads(capsys.readouterr().out), json.loads((folder / "best.certificate.json").read_text())
+    assert [(r["metric"], r["value"], r["holds"]) for r in again["requirements"]] == [
+        (r["metric"], r["value"], r["holds"]) for r in mine["requirements"]
+    ]
+    assert run(["simulate", str(folder / "loop.toml"), "--json"]) == 0
+    # The same command again judges nothing anew and finds the same.
+    capsys.readouterr()
+    assert run([*call, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == values
+
+
+@pytest.mark.slow
+def test_what_does_not_hold_is_said_and_leaves_no_certificate(
+    tmp_path: Path, call: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / "best.certificate.json").write_text("of an earlier search")
+    (tmp_path / "wanted.toml").write_text(QUICK % 0.25)
+    assert run(call) == 1
+    said = capsys.readouterr()
+    assert "What stands in the way is step.rise_s" in said.err
+    assert "requirements: " in said.err
+    assert "fails" in said.out
+    assert not (folder / "best.certificate.json").exists()
+    assert (folder / "best.npz").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (["--requirements", "{folder}/fast.toml"], "within the motors' slew and range"),
+        (["--kinds", "pie"], "unknown kind of controller `pie`"),
+        (["--resume"], "no search to resume"),
+        (["--requirements", "{folder}/none.toml"], "cannot be read"),
+        (["-o", "{folder}/wanted.toml"], "is a file; name a folder"),
+        (["--budget", "0"], "0 is not in the range"),
+    ],
+)
+def test_bad_input_is_said_before_anything_is_searched(
+    tmp_path: Path, call: list[str], capsys: pytest.CaptureFixture[str], change: list[str], match: str
+) -> None:
+    (tmp_path / "fast.toml").write_text(QUICK % 0.05)
+    assert run([*call, *(text.format(folder=tmp_path) for text in change)]) == 2
+    assert match in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_default_requirements_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["tune", "--print-requirements"]) == 0
+    assert '"neck.rise_s" = { max = 0.4 }' in capsys.readouterr().out

@@ -1,0 +1,122 @@
+"""Times of foreign logs: several clocks, rates that are summed up, dates; and what they refuse."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from softneck.core import DataError
+from softneck.signals import guess_layout, import_log
+from softneck.signals.importing._clocks import integrated, merged
+from softneck.signals.importing._layout import Source, Term
+from softneck.signals.importing._tilt import turns
+from softneck.signals.importing._unit_odds import judge
+from softneck.signals.importing.formats._dates import is_date, seconds
+from softneck.signals.importing.formats._mat import mat_arrays
+from softneck.signals.recording._resampling import Samples
+
+from .log_writers import from_angles
+from .test_formats import columns, named
+
+
+def test_messages_of_several_clocks_meet_at_the_rows_of_the_outputs() -> None:
+    """Angles each 20 ms; set-points each 50 ms, which hold; positions each 30 ms, on lines, missed in a gap."""
+    clocks = {"pitch": 0.02 * np.arange(60), "motor_setpoint_1": 0.05 * np.arange(24) + 0.005,
+              "motor_position_1": np.delete(0.03 * np.arange(41), slice(10, 16)) + 0.001}  # fmt: skip
+    time = np.unique(np.concatenate(list(clocks.values())))
+    channels = {name: np.where(np.isin(time, t), np.round(3.0 * time, 12), np.nan) for name, t in clocks.items()}
+    found, note = merged(Samples(time, np.zeros(time.size, dtype=int), channels), ("pitch", "roll"))
+    assert "59 of" in note  # the first angle comes before the first set-point
+    np.testing.assert_array_equal(found.time, clocks["pitch"][1:])
+    last = np.searchsorted(clocks["motor_setpoint_1"], found.time, side="right") - 1
+    np.testing.assert_allclose(found.channels["motor_setpoint_1"], 3.0 * clocks["motor_setpoint_1"][last], rtol=1e-12)
+    t, x = found.time, found.channels["motor_position_1"]
+    gap = (t > 0.271) & (t < 0.481)
+    np.testing.assert_array_equal(np.isnan(x), gap | (t > 1.201))
+    np.testing.assert_allclose(x[np.isfinite(x)], 3.0 * t[np.isfinite(x)], rtol=1e-12)  # a line stays one
+
+
+def test_a_channel_that_was_never_told_cannot_be_merged() -> None:
+    time = np.arange(5.0)
+    with pytest.raises(DataError, match="`motor_setpoint_1` holds no number in any row"):
+        merged(Samples(time, np.zeros(5, dtype=int), {"pitch": time, "motor_setpoint_1": time * np.nan}), ("pitch",))
+    late = {"pitch": np.array([1, 1, np.nan]), "motor_setpoint_1": np.array([np.nan, np.nan, 1])}
+    with pytest.raises(DataError, match="no row has both an output and all set-points before it"):
+        merged(Samples(np.arange(3.0), np.zeros(3, dtype=int), late), ("pitch",))
+
+
+@given(rates=st.lists(st.floats(-5.0, 5.0), min_size=4, max_size=12), missed=st.integers(1, 2))
+def test_rates_on_straight_lines_sum_up_exactly_and_each_run_begins_at_zero(rates: list[float], missed: int) -> None:
+    time = np.cumsum(np.linspace(0.01, 0.03, len(rates)))  # uneven, as logged
+    v = rates[0] + rates[1] * time
+    there = v.copy()
+    there[missed] = np.nan  # lies on the line between its neighbours
+    run = np.repeat([0, 1], len(rates))
+    samples = Samples(np.tile(time, 2), run, {"motor_setpoint_1": np.tile(there, 2)})
+    found, _ = integrated(samples, {"motor_setpoint_1": Source((Term("v"),), "rad/s", integrate=True)})
+    exact = rates[0] * (time - time[0]) + rates[1] * (time**2 - time[0] ** 2) / 2.0
+    # Trapezoids are exact on lines: what is left is the rounding of a dozen sums.
+    np.testing.assert_allclose(found.channels["motor_setpoint_1"], np.tile(exact, 2), rtol=0, atol=1e-13)
+
+
+def test_times_of_day_pass_midnight() -> None:
+    t = seconds(pd.Series(["23:59:59.90", "23:59:59.95", "00:00:00.00", "00:00:00.05"]), "t")
+    np.testing.assert_allclose(t, [0.0, 0.05, 0.1, 0.15], atol=1e-9)  # nanoseconds are whole
+
+
+@pytest.mark.parametrize(
+    "form", ["%d.%m.%Y %H:%M:%S", "%m/%d/%Y %H:%M:%S", "%Y-%m-%d %H:%M:%S", "%d/%m/%Y %I:%M:%S %p"]
+)
+def test_days_and_months_are_told_apart(form: str) -> None:
+    # Over midnight from the 12th to the 13th, which alone tells which number is the day.
+    moments = pd.date_range("2026-11-12 12:00", periods=4, freq="6h")
+    cells = pd.Series([moment.strftime(form) for moment in moments])
+    assert all(is_date(cell) for cell in cells)
+    np.testing.assert_array_equal(seconds(cells, "t"), 21_600.0 * np.arange(4))
+
+
+def test_a_word_among_dates_is_named() -> None:
+    with pytest.raises(DataError, match=r"column `t` holds `soon` at row 1 \(the first is 0\), which is no date"):
+        seconds(pd.Series(["2026-11-23 06:00:00", "soon"]), "t")
+
+
+def test_dates_in_german_with_a_comma_before_the_milliseconds(tmp_path: Path) -> None:
+    table = named(columns())
+    stamps = [
+        f"23.11.2026 06:{int(t // 60):02d}:{t % 60:06.3f}".replace(".", ",").replace(",", ".", 2) for t in table["t"]
+    ]
+    frame = pd.DataFrame({**table, "t": stamps}).rename(columns={"t": "Zeitstempel"})
+    frame.to_csv(tmp_path / "log.csv", sep=";", decimal=",", index=False, float_format="%.17g")
+    guess = guess_layout(tmp_path / "log.csv")
+    assert (guess.layout.time, guess.layout.decimal) == (Source((Term("Zeitstempel"),), "date"), ",")
+    assert import_log(tmp_path / "log.csv", guess.layout).recording.sample_time == pytest.approx(0.02, rel=1e-6)
+
+
+def test_what_is_no_quaternion_is_refused_and_zeros_are_missed() -> None:
+    sound = np.array([from_angles(0.1, -0.2)] * 4)
+    sound[2] = 0.0
+    np.testing.assert_allclose(turns(sound)["y"], [0.1, 0.1, np.nan, 0.1], rtol=1e-14)
+    np.testing.assert_allclose(turns(sound)["x"], [-0.2, -0.2, np.nan, -0.2], rtol=1e-14)
+    with pytest.raises(DataError, match="have length 2 and not 1: they are something else"):
+        turns(np.ones((5, 4)))
+
+
+def test_references_in_a_circle_end(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.mat", "w") as file:
+        cell = file.create_dataset("trials", (40, 1), dtype=h5py.ref_dtype)
+        for k in range(40):
+            cell[k, 0] = cell.ref if k else file.create_dataset("x", data=np.ones((3, 1))).ref
+    # Followed each time they are met these were 40^4 of them.
+    assert set(mat_arrays(tmp_path / "a.mat")) == {"x", "trials{1}"}
+
+
+def test_drives_that_hardly_moved_are_no_other_unit() -> None:
+    """Set-points and positions of one log are in one unit unless it is said or all but sure."""
+    found = judge({"set-points": 115.0, "positions": 4.0, "tilt": 2.0}, {})
+    assert (found["set-points"].unit, found["positions"].unit) == ("deg", "deg")

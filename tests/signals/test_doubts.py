@@ -1,0 +1,140 @@
+"""What a guess is not sure of: units judged together, how sure it is, and how a doubt is settled."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from softneck.core import DataError, SettingsError
+from softneck.signals import Guess, guess_layout, import_log, parse_layout
+from softneck.signals.importing._unit_odds import UNITS, judge
+
+from ..data import neck_recording
+
+NECK = neck_recording(400)
+
+
+def log(folder: Path, *, motors: float, platform: float, positions: bool = True, header: str = "") -> Path:
+    """The synthetic neck scaled so that its motors and its platform reach these numbers, in units that nothing says."""
+    scale = motors / np.abs(NECK.set_points).max(), platform / np.abs(NECK.outputs).max()
+    columns = {"time": NECK.time} | {f"target{j}{header}": scale[0] * NECK.set_points[:, j - 1] for j in (1, 2, 3)}
+    if positions:
+        columns |= {f"encoder{j}": scale[0] * NECK.motor_positions[:, j - 1] for j in (1, 2, 3)}
+    columns |= {"pitch": scale[1] * NECK.outputs[:, 0], "roll": scale[1] * NECK.outputs[:, 1]}
+    pd.DataFrame(columns).to_csv(folder / "log.csv", index=False, float_format="%.17g")
+    return folder / "log.csv"
+
+
+@pytest.mark.parametrize(
+    ("motors", "platform", "units"),
+    [(115.189, 25.0, ("deg", "deg")), (2.01, 25.0, ("rad", "deg")), (2.01, 0.44, ("rad", "rad")),
+     (30.0, 3.0, ("deg", "deg")), (340.0, 45.0, ("deg", "deg")), (5.9, 0.75, ("rad", "rad")),
+     (60.0, 0.1, ("deg", "rad"))],
+)  # fmt: skip
+def test_units_of_clear_logs_are_told_without_a_doubt(
+    tmp_path: Path, motors: float, platform: float, units: tuple[str, str]
+) -> None:
+    guess = guess_layout(log(tmp_path, motors=motors, platform=platform))
+    found = {guess.layout.channels[name].unit for name in ("motor_setpoint_1", "motor_position_2")}
+    assert (found, guess.layout.channels["roll"].unit) == ({units[0]}, units[1])
+    assert guess.doubts == ()
+
+
+def test_what_could_be_either_is_doubted_and_can_be_settled(tmp_path: Path) -> None:
+    # 12 deg are a small move, 12 rad are beyond the range: neither is likely.
+    guess = guess_layout(log(tmp_path, motors=12.0, platform=25.0))
+    (doubt,) = guess.doubts
+    assert doubt.about == "unit of motor set-points and positions"
+    assert doubt.confidence < 0.9
+    assert f"NOT SURE ({100 * doubt.confidence:.0f} %)" in guess.text
+    other = guess.settled(doubt, doubt.choices[0])
+    assert other.doubts == ()
+    assert {other.layout.channels[name].unit for name in doubt.channels} == set(doubt.choices)
+    assert parse_layout(other.text) == other.layout
+    assert "NOT SURE" not in other.text
+    with pytest.raises(SettingsError, match=r"unit of motor .*: `turns` is none of"):
+        guess.settled(doubt, "turns")
+
+
+def test_the_title_of_one_settles_the_unit_of_both(tmp_path: Path) -> None:
+    guess = guess_layout(log(tmp_path, motors=12.0, platform=25.0, header=" [deg]"))
+    assert guess.doubts == ()
+    assert guess.layout.channels["motor_position_1"].unit == "deg"
+
+
+reach = st.floats(1e-3, 1e4)
+
+
+@given(asked=reach, moved=reach, tilt=reach)
+def test_probabilities_are_of_the_likelier_choice_and_do_not_depend_on_the_unit_of_all(
+    asked: float, moved: float, tilt: float
+) -> None:
+    """Marginals of the likeliest choice of all groups are at least 1/8; a group more never changes a certain title."""
+    found = judge({"set-points": asked, "positions": moved, "tilt": tilt}, {})
+    assert set(found) == {"set-points", "positions", "tilt"}
+    assert all(verdict.unit in UNITS and 1.0 / 8.0 <= verdict.probability <= 1.0 + 1e-12 for verdict in found.values())
+    titled = judge({"set-points": asked, "positions": moved, "tilt": tilt}, {"positions": "deg", "tilt": "rad"})
+    assert (titled["positions"].unit, titled["tilt"].unit) == ("deg", "rad")
+    assert titled["positions"].probability == titled["tilt"].probability == 1.0
+
+
+@pytest.mark.slow
+def test_guesses_that_are_sure_are_right(tmp_path: Path) -> None:
+    """Of the units of 300 robots, drawn half as wide again as the odds expect, 90 % of those judged sure are right."""
+    rng = np.random.default_rng(0)
+    sure = right = 0
+    for _ in range(300):
+        motors = min(2.0 * np.exp(1.2 * rng.standard_normal()), 6.0)
+        tilt = min(motors * 0.1 * np.exp(1.2 * rng.standard_normal()), 1.2)
+        units = rng.choice(["rad", "deg"], 2)
+        reaches = {"set-points": motors / UNITS[units[0]], "tilt": tilt / UNITS[units[1]]}
+        reaches["positions"] = reaches["set-points"] * np.exp(0.1 * rng.standard_normal())
+        for group, unit in (("set-points", units[0]), ("tilt", units[1])):
+            verdict = judge(reaches, {})[group]
+            sure += verdict.probability >= 0.9
+            right += verdict.probability >= 0.9 and verdict.unit == unit
+    assert sure > 400  # of 600: a rule that doubts everything is no use
+    assert right > 0.9 * sure  # the promise; 96 % are
+
+
+@pytest.mark.parametrize(("scale", "code"), [(1.0, "fine"), (1.2, "warned"), (2.0, "refused")])
+def test_more_than_the_robot_s_range_is_told_or_refused(tmp_path: Path, scale: float, code: str) -> None:
+    path = log(tmp_path, motors=5.9 * scale, platform=0.5, positions=False)
+    layout = guess_layout(log(tmp_path, motors=5.0, platform=0.5, positions=False)).layout
+    log(tmp_path, motors=5.9 * scale, platform=0.5, positions=False)
+    if code == "refused":
+        with pytest.raises(DataError, match=r"reaches 11.* rad, which is 2 turns; the motors' range is 6 rad.*degrees"):
+            import_log(path, layout)
+        return
+    notes = import_log(path, layout).notes
+    assert any("the motors' range is 6 rad" in note for note in notes) == (code == "warned")
+
+
+def test_a_wrong_sign_is_doubted_and_can_be_turned_round(tmp_path: Path) -> None:
+    path = log(tmp_path, motors=3.0, platform=20.0)
+    frame = pd.read_csv(path)
+    frame["roll"] *= -1.0
+    frame.to_csv(path, index=False)
+    guess = guess_layout(path)
+    (doubt,) = guess.doubts
+    assert (doubt.about, doubt.choices) == ("sign of roll", ("turn it round",))
+    assert guess.settled(doubt, "turn it round").layout.channels["roll"].sign == -1.0
+    assert guess.settled(doubt).layout == guess.layout
+
+
+def test_a_log_without_a_clock_takes_the_sample_time_that_is_answered(tmp_path: Path) -> None:
+    path = log(tmp_path, motors=3.0, platform=20.0)
+    pd.read_csv(path).drop(columns="time").to_csv(path, index=False)
+    guess = guess_layout(path)
+    assert guess.missing == (
+        "the sample time: no column rises by equal steps; write `sample_time_s = 0.02` into [time]",
+    )
+    told: Guess = guess.with_sample_time(0.02)
+    assert told.missing == ()
+    assert parse_layout(told.text) == told.layout
+    assert import_log(path, told.layout).recording.sample_time == 0.02

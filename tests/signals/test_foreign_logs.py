@@ -1,0 +1,71 @@
+"""Six logs as labs left them (shared/data/foreign_logs): what each trap needs is done, or said in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softneck.signals import SET_POINTS, guess_layout, import_log, parse_layout
+from softneck.signals.recording._channels import MOTOR_POSITIONS
+
+
+@pytest.fixture(scope="module")
+def logs(shared_data: Path) -> Path:
+    """The folder of the logs."""
+    folder = shared_data / "foreign_logs"
+    if not folder.is_dir():
+        pytest.skip("../shared/data has no foreign logs")
+    return folder
+
+
+def test_a_step_in_degrees_is_one_and_teaches_nothing(logs: Path) -> None:
+    guess = guess_layout(logs / "test_soft25mm_400gr.csv")
+    assert {guess.layout.channels[name].unit for name in (*SET_POINTS, *MOTOR_POSITIONS)} == {"deg"}
+    assert guess.doubts == ()
+    done = import_log(logs / "test_soft25mm_400gr.csv", guess.layout)
+    # README of the logs: 115.189 is 2.01 rad.
+    assert done.recording.set_points[0, 0] == pytest.approx(2.01, abs=0.005)
+    assert any("no set-point ever changes: nothing can be identified" in note for note in done.notes)
+    for unit in ("rad", "deg"):
+        lines = [line.replace('"deg"', f'"{unit}"') if line.startswith("motor_") else line
+                 for line in guess.text.splitlines()]  # fmt: skip
+        layout = parse_layout("\n".join(lines))
+        if unit == "deg":
+            assert layout == guess.layout
+            continue
+        with pytest.raises(ValueError, match=r"reaches 115.* rad, which is 18 turns; .*is it in degrees"):
+            import_log(logs / "test_soft25mm_400gr.csv", layout)
+
+
+def test_velocities_become_inputs_and_it_is_said(logs: Path) -> None:
+    guess = guess_layout(logs / "pid_200.csv")
+    assert {guess.layout.channels[name].integrate for name in SET_POINTS} == {True}
+    assert {doubt.about for doubt in guess.doubts} == {"motor set-points", "sign of pitch", "sign of roll"}
+    done = import_log(logs / "pid_200.csv", guess.layout)
+    # Time in ms, 16 to 21 of them: resampled at the mean, 20.05.
+    assert done.recording.sample_time == pytest.approx(0.02005, abs=5e-5)
+    assert any("summed up from rates" in note for note in done.notes)
+    assert any("uneven" in note for note in done.notes)
+    # Rectangles over the raw rows: half a step of the first move apart from trapezoids, 5 % of the whole.
+    t, v = np.loadtxt(logs / "pid_200.csv", delimiter=",", skiprows=1, usecols=(0, 5), unpack=True)
+    assert done.recording.set_points[-1, 0] == pytest.approx(float(np.sum(v[1:] * np.diff(t)) / 1e3), rel=0.05)
+
+
+@pytest.mark.parametrize(("name", "asks"), [("MocapTest1_first400", True), ("arm_PI_P40Y40_first600", False)])
+def test_tables_without_names_and_clock_are_proposed_with_doubts(logs: Path, name: str, asks: bool) -> None:
+    guess = guess_layout(logs / f"{name}.csv")
+    assert {"pitch", "roll", "motor set-points"} <= {doubt.about for doubt in guess.doubts}
+    assert any(line.startswith("the sample time") for line in guess.missing) == asks
+    if not asks:  # positions and velocities tell it: 20 ms, says the README
+        assert guess.layout.sample_time == 0.02
+
+
+@pytest.mark.parametrize("name", ["joystick_first600", "step-coupled_first400"])
+def test_a_log_without_motors_says_that_they_are_missing_and_what_is_left(logs: Path, name: str) -> None:
+    guess = guess_layout(logs / f"{name}.csv")
+    assert len(guess.missing) == 1
+    assert guess.missing[0].startswith("motor_setpoint_1, motor_setpoint_2, motor_setpoint_3: candidates are none")
+    assert "a line such as `motor_setpoint_1 = { column = COLUMN, unit = 'rad' }`" in guess.missing[0]
+    assert "show how a loop followed, not how the neck moves" in guess.missing[0]

@@ -1,0 +1,129 @@
+"""What is asked of a tuning: the requirements of `verify` and its own, and what is refused before anything is tried."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import control
+import numpy as np
+import pytest
+
+from softneck.core import FileFormatError, SettingsError
+from softneck.estimation import LinearNeck
+from softneck.tuning._beforehand import refuse_impossible
+from softneck.tuning._requirements import make_tune_requirements, read_tune_requirements
+from softneck.verification import make_requirements
+
+TS = 0.02
+GAIN, POLE, DELAY = math.radians(5.23), 5.293, 4
+
+
+def neck(delay: int = DELAY) -> LinearNeck:
+    a = math.exp(-POLE * TS)
+    tf = control.TransferFunction([GAIN * (1 - a)], [1.0, -a, *[0.0] * delay], TS)
+    return LinearNeck(pitch=tf, roll=tf)
+
+
+def test_the_defaults_are_those_of_verify_with_what_tuning_adds() -> None:
+    asked = make_tune_requirements({})
+    theirs = {(b.metric, b.bound): b.limit for b in make_requirements({}).bounds}
+    mine = {(b.metric, b.bound): b.limit for b in asked.bounds}
+    assert set(theirs) <= set(mine)
+    changed = {key for key in theirs if theirs[key] != mine[key]}
+    assert changed == {("neck.overshoot_pct", "max"), ("neck.steady_rms_deg", "max")}
+    assert asked.limit("neck.rise_s") == 0.4
+    assert "track.circle_rms_deg <= 3" in asked.lines()
+
+
+def test_what_is_written_for_verify_asks_it_for_the_same() -> None:
+    asked = make_tune_requirements({"require": {"neck.rise_s": {"max": 0.5}, "track.ahead_rms_deg": False}})
+    again = make_requirements({key: value for key, value in asked.table.items() if key != "version"})
+    assert [(b.metric, b.bound, b.limit) for b in again.bounds] == [
+        (b.metric, b.bound, b.limit) for b in asked.bounds if not b.metric.startswith("track.")
+    ]
+    assert asked.limit("track.ahead_rms_deg") is None
+
+
+def test_without_a_plant_that_steps_the_linear_ones_are_asked() -> None:
+    asked = make_tune_requirements({}, stepping=False)
+    assert asked.limit("step.rise_s") == 0.4
+    assert asked.limit("neck.rise_s") is None
+
+
+@pytest.mark.parametrize(
+    ("table", "match"),
+    [
+        ({"track": {"circle": 3.0}}, "unknown key `circle`"),
+        ({"track": {"circle_deg": -1.0}}, "must be from 0.1 to 40"),
+        ({"track": {"noise_deg": True}}, "must be from"),
+        ({"require": {"track.lap_s": {"max": 1.0}}}, r"unknown metric `track.lap_s`"),
+        ({"require": {"track.circle_rms_deg": {"min": 1.0}}}, "must say"),
+        ({"require": {"track.circle_rms_deg": {"max": 0.0}}}, "must be a positive number"),
+        ({"require": {"neck.rise_s": {"min": 1.0, "max": 0.4}}}, "cannot be at least 1 and at most 0.4"),
+        ({"require": {"neck.rise_s": {"min": 3.0}, "neck.settling_s": {"max": 2.0}}}, "cannot"),
+    ],
+)
+def test_bad_requirements_are_refused_in_a_line(table: dict, match: str) -> None:
+    with pytest.raises(SettingsError, match=match):
+        make_tune_requirements(table)
+
+
+def test_a_file_says_what_differs(tmp_path: Path) -> None:
+    path = tmp_path / "wanted.toml"
+    path.write_text('version = 1\n[track]\ncircle_deg = 10.0\n[require]\n"neck.rise_s" = { max = 0.6 }\n')
+    asked = read_tune_requirements(path)
+    assert (asked.limit("neck.rise_s"), asked.track["circle_deg"], asked.track["circle_rad_s"]) == (0.6, 10.0, 1.2)
+    path.write_text("version = 2\n")
+    with pytest.raises(FileFormatError, match="version = 1"):
+        read_tune_requirements(path)
+    with pytest.raises(FileFormatError, match="cannot be read"):
+        read_tune_requirements(tmp_path / "none.toml")
+
+
+def test_the_defaults_can_be_had() -> None:
+    refuse_impossible(make_tune_requirements({}), neck())
+
+
+def test_a_rise_is_refused_exactly_where_the_motors_cannot_give_it() -> None:
+    # All the slew there is until the range ends, through the plant's own difference equation: 0.25 rad a sample of a
+    # motor is 0.375 of theta_i (Eq. 9), 6 rad 9; what a sample takes is told apart.
+    a, y, u, rows = math.exp(-POLE * TS), 0.0, 0.0, []
+    for _ in range(400):
+        rows.append(y / math.radians(15.0))
+        u = min(u + 0.375, 9.0)
+        y = a * y + GAIN * (1 - a) * u
+    low, high = (np.interp(level, rows, np.arange(400) * TS) for level in (0.1, 0.9))
+    least = float(high - low)
+    for factor in (0.95, 1.05):
+        table = {"require": {"neck.rise_s": {"max": least * factor}, "track.circle_rms_deg": False}}
+        asked = make_tune_requirements(table)
+        if factor > 1.0:
+            refuse_impossible(asked, neck())
+        else:
+            with pytest.raises(SettingsError, match="within the motors' slew and range pitch's step"):
+                refuse_impossible(asked, neck())
+    with pytest.raises(SettingsError, match="range does not reach"):
+        refuse_impossible(
+            make_tune_requirements({"neck": {"size_deg": 45.0}}), LinearNeck(neck().pitch / 2, neck().roll)
+        )
+
+
+def test_a_circle_closer_than_the_dead_time_is_refused() -> None:
+    dead = (DELAY + 1) * TS
+    # The chord between two points of the circle that are the dead time apart.
+    z = np.exp(1j * 1.2 * np.array([0.0, dead]))
+    least = 12.0 * abs(z[0] - z[1])
+    for limit, refused in ((0.99 * least, True), (1.01 * least, False)):
+        asked = make_tune_requirements({"require": {"track.circle_rms_deg": {"max": float(limit)}}})
+        if refused:
+            with pytest.raises(SettingsError, match="dead time of pitch, 100 ms, alone"):
+                refuse_impossible(asked, neck())
+        else:
+            refuse_impossible(asked, neck())
+
+
+def test_a_load_rejected_within_the_dead_time_is_refused() -> None:
+    asked = make_tune_requirements({"require": {"step.load_rms_deg": {"max": 0.02}}})
+    with pytest.raises(SettingsError, match="dead time before any feedback acts"):
+        refuse_impossible(asked, neck())

@@ -1,0 +1,256 @@
+"""Searches: the same whatever runs them, resumed as if never stopped, and their results by independent means."""
+
+from __future__ import annotations
+
+import json
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from softneck.core import KINDS, OutputFileError, SettingsError, SoftneckError, resolve
+from softneck.core._kinds import make_settings
+from softneck.tuning import tune
+from softneck.tuning._log import FILE, Job, Log
+from softneck.tuning._result import binding, front, prices
+from softneck.tuning._search import Candidate, given_out, ratio
+from softneck.tuning._space import KINDS_SEARCHED, spaces
+from softneck.tuning._tune import Tuned
+from softneck.verification._requirements import Requirement
+
+from .test_requirements import neck
+
+# As quick as a verification can be; margins that a nominal plant within 20 % allows.
+QUICK = {"sampling": {"plants": 30, "search_generations": 0}, "step": {"duration_s": 3.0},
+         "require": {"stability.searched_radius": False, "robust.mu": False, "step.overshoot_pct": {"max": 30.0},
+                     "axes.sensitivity": {"max": 3.0}, "axes.gain_margin": {"min": 1.5}, "step.rise_s": {"max": 0.9},
+                     "axes.disk_margin": False, "mimo.disk_margin": False}}  # fmt: skip
+
+
+def searched(folder: Path | None = None, budget: int = 14, **more: Any) -> Tuned:
+    return tune({"neck": neck()}, QUICK, kinds=("pi", "lqg"), budget=budget, workers=more.pop("workers", 0),
+                folder=folder, **more)  # fmt: skip
+
+
+def told(found: Tuned) -> list[tuple[str, dict[str, Any], dict[str, float]]]:
+    return [(item.kind, dict(item.settings), item.metrics) for item in found.candidates]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Tuned, Path]:
+    folder = tmp_path_factory.mktemp("whole")
+    return searched(folder), folder
+
+
+@pytest.mark.slow
+def test_a_search_finds_what_verify_certifies(whole: tuple[Tuned, Path]) -> None:
+    found, _ = whole
+    assert found.holds
+    assert found.verification.holds
+    assert found.binding is None
+    assert found.evaluations == 14
+    costs = [item.cost(found.task.asked.bounds, tested=False) for item in found.candidates]
+    assert found.best.cost(found.task.asked.bounds, tested=False) == min(costs)
+
+
+@pytest.mark.slow
+def test_the_number_of_workers_changes_nothing(whole: tuple[Tuned, Path]) -> None:
+    assert told(searched(workers=2)) == told(whole[0])
+
+
+@pytest.mark.slow
+def test_another_seed_is_another_search(whole: tuple[Tuned, Path]) -> None:
+    assert told(searched(budget=14, seed=1)) != told(whole[0])
+
+
+@pytest.mark.slow
+def test_a_search_that_was_stopped_goes_on_as_if_it_never_was(
+    whole: tuple[Tuned, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from softneck.tuning import _search
+
+    judged, calls = _search.judge_candidate, []
+
+    def until_ctrl_c(*arguments: Any) -> Any:
+        calls.append(arguments)
+        if len(calls) == 6:
+            raise KeyboardInterrupt
+        return judged(*arguments)
+
+    monkeypatch.setattr(_search, "judge_candidate", until_ctrl_c)
+    with pytest.raises(KeyboardInterrupt):
+        searched(tmp_path)
+    kept = json.loads((tmp_path / FILE).read_text())["evaluations"]
+    # Two are out at a time: the fifth was judged, and not taken in yet.
+    assert len(kept) == 4
+    assert [path.name for path in tmp_path.iterdir()] == [FILE]
+    monkeypatch.setattr(_search, "judge_candidate", lambda *arguments: calls.append(arguments) or judged(*arguments))
+    calls.clear()
+    assert told(searched(tmp_path, resume=True)) == told(whole[0])
+    assert len(calls) == 14 - 4
+    # And once more, where all is there: nothing is judged again, a larger budget goes on.
+    calls.clear()
+    assert told(searched(tmp_path)) == told(whole[0])
+    assert not calls
+    assert searched(tmp_path, budget=20).evaluations == 20
+    assert len(calls) == 6
+
+
+@pytest.mark.slow
+def test_a_small_budget_gives_the_best_so_far(tmp_path: Path) -> None:
+    found = searched(tmp_path, budget=1)
+    assert (found.evaluations, len(found.candidates)) == (1, 1)
+
+
+@pytest.mark.slow
+def test_the_folder_of_another_search_is_kept(whole: tuple[Tuned, Path], tmp_path: Path) -> None:
+    _, folder = whole
+    before = (folder / FILE).read_bytes()
+    with pytest.raises(OutputFileError, match="holds a search over other plants"):
+        searched(folder, seed=3)
+    with pytest.raises(SettingsError, match="give those that began it"):
+        searched(folder, seed=3, resume=True)
+    with pytest.raises(SettingsError, match="no search to resume"):
+        searched(tmp_path, resume=True)
+    assert (folder / FILE).read_bytes() == before
+    (tmp_path / FILE).write_text("{}")
+    with pytest.raises(SoftneckError, match="is no log of a search"):
+        searched(tmp_path)
+
+
+def test_a_log_gives_back_what_was_put_in(tmp_path: Path) -> None:
+    from softneck.tuning._judge import Judgement
+
+    log = Log(tmp_path, "d")
+    job = Job.of("pi", {"b": 1.25, "a": 1e-17 + 0.1}, "few")
+    log.add(job, Judgement({"x": 1.0 / 3.0, "y": float("inf")}))
+    log.add(Job.of("pi", {}, "few"), Judgement({}, "no plant"))
+    log.write()
+    again = Log(tmp_path, "d")
+    assert dict(again.items()) == dict(log.items())
+    assert job == Job.of("pi", {"a": 1e-17 + 0.1, "b": 1.25}, "few")
+
+
+def test_work_is_given_out_two_to_a_worker_and_all_of_it_comes_back() -> None:
+    out: list[Job] = []
+
+    class Lazy:
+        size = 2
+
+    def run(job: Job) -> Future:
+        out.append(job)
+        assert len(out) <= 4
+        future: Future = Future()
+        future.set_result(job.settings)
+        return future
+
+    jobs, back = [Job("pi", str(k), "few") for k in range(9)], []
+
+    def took(job: Job, result: Any) -> None:
+        out.remove(job)
+        back.append((job, result))
+
+    given_out(jobs, run, Lazy(), took)  # pyright: ignore[reportArgumentType]
+    assert sorted(back, key=lambda pair: pair[1]) == [(job, job.settings) for job in jobs]
+
+
+@pytest.mark.parametrize("kind", [*KINDS_SEARCHED, "nmpc"])
+def test_every_point_of_a_space_is_a_setting_of_its_kind(kind: str) -> None:
+    (space,) = spaces((kind,), rise=0.4, cocontraction=1.0, neck=True)
+    made = resolve(KINDS[kind].settings)
+    rng = np.random.default_rng(0)
+    n = len(space.dimensions)
+    for x in (np.zeros(n), np.ones(n), space.start, *rng.random((5, n))):
+        make_settings(made, space.settings(x))
+    started = space.settings(space.start)
+    # To the four digits that settings are rounded to.
+    assert all(started[item.name] == pytest.approx(item.start, rel=1e-3) for item in space.dimensions)
+
+
+def test_what_cannot_be_tuned_is_refused() -> None:
+    for kind, match in (("custom", "cannot be tuned"), ("pie", "unknown kind")):
+        with pytest.raises(SettingsError, match=match):
+            spaces((kind,), rise=0.4, cocontraction=None, neck=True)
+    with pytest.raises(SettingsError, match="no linear plant"):
+        tune({})
+
+
+@given(
+    bound=st.sampled_from(["min", "max", "below"]),
+    limit=st.floats(1e-3, 1e3),
+    value=st.one_of(st.floats(0.0, 1e4), st.just(float("inf"))),
+)
+def test_a_ratio_is_at_most_one_exactly_where_the_requirement_holds(bound: str, limit: float, value: float) -> None:
+    item = Requirement("x", bound, limit, True)
+    # Of two floats whose quotient rounds to 1 nothing can be said.
+    if value == limit or abs(value / limit - 1.0) > 1e-12:
+        assert (ratio(item, value) <= 1.0) == item.holds(value)
+
+
+def candidate(**metrics: float) -> Candidate:
+    named = {name.replace("__", "."): value for name, value in metrics.items()}
+    return Candidate("pi", {}, np.zeros(1), "all", named)
+
+
+BOUNDS = (Requirement("neck.rise_s", "max", 0.4, True), Requirement("neck.overshoot_pct", "max", 5.0, True),
+          Requirement("axes.gain_margin", "min", 2.0, True))  # fmt: skip
+
+
+def test_the_front_is_what_no_other_beats() -> None:
+    rng = np.random.default_rng(1)
+    items = [candidate(a=x, axes__gain_margin=y) for x, y in rng.integers(0, 6, (40, 2)).astype(float)]
+    kept = front(items, ["a", "axes.gain_margin"])
+
+    def beats(one: Candidate, other: Candidate) -> bool:
+        p, q = ((item.metrics["a"], -item.metrics["axes.gain_margin"]) for item in (one, other))
+        return p[0] <= q[0] and p[1] <= q[1] and p != q
+
+    assert {id(item) for item in kept} == {id(item) for item in items if not any(beats(other, item) for other in items)}
+
+
+def test_what_binds_is_what_alone_must_give_way_least() -> None:
+    fast = candidate(neck__rise_s=0.3, neck__overshoot_pct=7.0, axes__gain_margin=2.5)
+    slow = candidate(neck__rise_s=0.52, neck__overshoot_pct=5.0, axes__gain_margin=2.5)
+    loud = candidate(neck__rise_s=0.3, neck__overshoot_pct=6.0, axes__gain_margin=1.0)
+    assert binding([fast, slow, loud], BOUNDS, tested=False) == ("neck.rise_s", pytest.approx(0.52))
+    slower = candidate(neck__rise_s=0.55, neck__overshoot_pct=5.0, axes__gain_margin=2.5)
+    for listed in ([slow, slower, loud], [slower, slow, loud]):
+        assert binding(listed, BOUNDS, tested=False) == ("neck.rise_s", pytest.approx(0.52))
+    assert binding([fast, loud], BOUNDS, tested=False) == ("neck.overshoot_pct", pytest.approx(7.0))
+    assert binding([loud], BOUNDS, tested=False) == ("axes.gain_margin", None)
+    good = candidate(neck__rise_s=0.3, neck__overshoot_pct=5.0, axes__gain_margin=2.0)
+    assert binding([good, slow], BOUNDS, tested=False) == (None, None)
+
+
+def test_what_a_requirement_costs() -> None:
+    fast = candidate(neck__rise_s=0.3, neck__overshoot_pct=7.0, axes__gain_margin=2.5)
+    slow = candidate(neck__rise_s=0.52, neck__overshoot_pct=4.9, axes__gain_margin=2.5)
+    found = prices([fast, slow], BOUNDS, "neck.overshoot_pct", tested=False)
+    assert (found[0].limit, found[0].other, found[0].least) == (5.0, "neck.rise_s", 0.52)
+    least = [price.least for price in found if price.least is not None]
+    # The looser the requirement, the less it costs.
+    assert least == sorted(least, reverse=True)
+    assert least[-1] == 0.3
+
+
+def test_few_requirements_are_broken_rather_than_all_a_little() -> None:
+    one = candidate(neck__rise_s=0.5, neck__overshoot_pct=4.0, axes__gain_margin=2.1)
+    each = candidate(neck__rise_s=0.46, neck__overshoot_pct=5.75, axes__gain_margin=2.1)
+    good = candidate(neck__rise_s=0.4, neck__overshoot_pct=5.0, axes__gain_margin=2.0)
+    costs = [item.cost(BOUNDS, tested=False) for item in (good, one, each)]
+    assert costs[0] <= 1.0 < costs[1] < costs[2]
+    assert costs[1] == pytest.approx(1.25)
+
+
+def test_what_is_known_twice_counts_by_the_worse() -> None:
+    from softneck.tuning._judge import Judgement
+
+    item = candidate(axes__gain_margin=2.5)
+    item.take("margins", Judgement({"axes.gain_margin": 1.8, "axes.delay_margin_ms": 90.0}))
+    assert item.metrics["axes.gain_margin"] == 1.8
+    item.take("margins", Judgement({"axes.gain_margin": 4.0}))
+    assert item.metrics["axes.gain_margin"] == 1.8
