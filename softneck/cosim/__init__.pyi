@@ -1,5 +1,3 @@
-from .linear._linearize import LinearPoint as LinearPoint
-from .linear._linearize import linearize as linearize
 from .loops._loop_file import load_loop as load_loop
 from .loops._loop_file import load_ssp as load_ssp
 from .loops._loop_file import make_loop as make_loop

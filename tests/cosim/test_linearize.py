@@ -17,8 +17,8 @@ from scipy.io import loadmat
 
 from softneck.cli._main import run
 from softneck.core import Matrix, SettingsError, Vector, load
-from softneck.cosim import linearize
 from softneck.cosim.linear import _linearize
+from softneck.cosim.linear._linearize import linearize
 from softneck.cosim.linear._pulses import BlockSteps, realised
 from softneck.fmu import build_compiled_fmu, build_fmu
 from softneck.runtime import Block

@@ -9,10 +9,10 @@ import click
 
 from softneck.core import SettingsError, refuse_existing
 
-from ._fmu import open_buildable
-from .shared._console import print_json
-from .shared._options import force_option, json_option, output_option, target
-from .shared._robot import robot_option
+from .._fmu import open_buildable
+from ..shared._console import print_json
+from ..shared._options import force_option, json_option, output_option, target
+from ..shared._robot import robot_option
 
 # What pulses may differ by before the page of a linear system is not worth much.
 _POOR = 1e-3
@@ -46,7 +46,7 @@ def command(
     FILE is an FMU of any tool (FMI 2.0 or 3.0, Co-Simulation), or what `softneck fmu` takes. Exact for what is ours
     and has derivatives; else from pulses on a saved state, and what they miss is said.
     """
-    from softneck.cosim import linearize
+    from softneck.cosim.linear._linearize import linearize
 
     path, replace = target(output, f"linear/{Path(file).stem}.mat", force=force, ending=".mat")
     refuse_existing(path, force=replace)
