@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test slow check docs benchmark mutate native wheel nightly nightly-tests nightly-fmu nightly-can nightly-systemd clean
+.PHONY: demo test slow check docs benchmark conformance mutate native wheel nightly nightly-tests nightly-fmu nightly-can nightly-systemd clean
 
 demo: $(VENV)/.installed
 	$(BIN)/softneck demo --out build/demo
@@ -28,6 +28,11 @@ docs: $(VENV)/.documented
 
 benchmark: $(VENV)/.tested
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-only
+
+# Every kind of FMU in every independent tool that is here; what is absent is "not run". docs/howto/conformance.md has the
+# table.
+conformance: $(VENV)/.tested
+	$(BIN)/python -m tests.fmu.conformance
 
 # Change one thing at a time in the rooms that protect people and promises, and see whether a test notices: an hour or
 # more for all; `make mutate ROOMS="master loop"` tries some. docs/howto/mutation.md has the figures.

@@ -19,6 +19,7 @@ from .shared._robot import load_of, robot_option
 if TYPE_CHECKING:
     from softneck.fmu.describe._describe import Buildable
     from softneck.identification import Validation
+    from softneck.runtime import Block
 
 
 @click.command("fmu", epilog="Example: softneck fmu build/demo/models/rls.npz -o Rls.fmu")
@@ -52,12 +53,19 @@ if TYPE_CHECKING:
     metavar="NAME",
     help=f"Build a compiled FMU only for these platforms: {', '.join(PLATFORMS)}.  [default: all that are built]",
 )
+@click.option(
+    "--sensitivities",
+    is_flag=True,
+    help="Add outputs of the next sample (pitch_next, roll_next) and their directional derivatives; plants with "
+    "--backend compiled.",
+)
 @robot_option
 @force_option
 @json_option
 def command(
     file: str | None, output: Path | None, folder: Path | None, data: tuple[Path, ...],
-    backend: str, fmi: str, platforms: tuple[str, ...], robot: str | None, force: bool, as_json: bool,
+    backend: str, fmi: str, platforms: tuple[str, ...], sensitivities: bool, robot: str | None, force: bool,
+    as_json: bool,
 ) -> None:  # fmt: skip
     """Package FILE as a Co-Simulation FMU of FMI 2.0 or 3.0.
 
@@ -67,8 +75,10 @@ def command(
     """
     from softneck.fmu import build_compiled_fmu, build_fmu, fmu_info
 
-    if backend == "python" and (fmi != "2" or platforms):
-        raise SettingsError("--fmi 3 and --platform are for compiled FMUs only; add `--backend compiled`.")
+    if backend == "python" and (fmi != "2" or platforms or sensitivities):
+        raise SettingsError(
+            "--fmi 3, --platform and --sensitivities are for compiled FMUs only; add `--backend compiled`."
+        )
     origin = ""
     jobs, replace = _what(file, folder, output, force=force)
     # All are read before any is written: one bad file stops the command with nothing done.
@@ -82,7 +92,10 @@ def command(
             judged = _judge(thing, source, data, robot) if data else None
             block, info = thing.block(), fmu_info(thing, validation=judged)
             if backend == "compiled":
-                origin = build_compiled_fmu(block, path, info=info, force=replace, fmi=int(fmi), platforms=platforms)
+                ahead = sensitivities and (folder is None or _has_sensitivities(block))
+                origin = build_compiled_fmu(
+                    block, path, info=info, force=replace, fmi=int(fmi), platforms=platforms, sensitivities=ahead
+                )
             else:
                 build_fmu(block, path, info=info, force=replace)
             built.append({"source": str(source), "fmu": str(path)})
@@ -125,6 +138,17 @@ def open_buildable(source: str | Path, robot: str | None = None) -> Buildable:
 
 def _can_be_fmu(source: str | Path) -> bool:
     return Path(source).suffix != ".npz" or hasattr(load(source), "block")
+
+
+def _has_sensitivities(block: Block) -> bool:
+    """Return whether an FMU of `block` can have them; of a folder the others are built without, which is said."""
+    from softneck.fmu.compiled._build import next_outputs
+
+    try:
+        return bool(next_outputs(block))
+    except SettingsError as error:
+        click.echo(f"warning: built without: {error}", err=True)
+        return False
 
 
 def _judge(thing: Buildable, source: str | Path, data: tuple[Path, ...], robot: str | None) -> Validation | None:

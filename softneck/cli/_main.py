@@ -34,6 +34,7 @@ _COMMANDS = {
     "frf": ("_frf", "Estimate a frequency response with confidence, coherence and the band that the data support."),
     "family": ("_family", "Fit an uncertain linear plant over inclinations and payloads."),
     "fmu": ("_fmu", "Package models, observers, controllers or the virtual neck as FMUs."),
+    "linearize": ("experiments._linearize", "Write A, B, C, D that a model or any tool's FMU has near a moment."),
     "observer": ("_observer", "Build a Kalman filter over a linear model."),
     "design": ("_design", "Design a controller on a linear model."),
     "tune": ("_tune", "Search kinds and settings for the controller that keeps requirements."),

@@ -11,13 +11,15 @@ At a kink the derivative to the right counts: `max` and `min` of equal numbers a
 little, so is `abs` of zero, and so is a length of zero by its first part. A play operator on its edge thus moves with a
 growing input and stays with a falling one, whatever the direction: the derivative stays linear. An `if` follows the
 branch that the step takes. Whole numbers, tests and draws of random numbers are moved by nothing.
+
+Where the members of a runtime are not in the text (in C each stands for itself), `member_tangent` is what derives them.
 """
 
 from __future__ import annotations
 
 from functools import cache
 
-from ._tangent_activity import Pattern, Program, TangentError
+from ._tangent_activity import MEMBER_STEP, Pattern, Program, TangentError
 from ._tangent_back import Back, worth_it
 from ._tangent_rows import Rows
 
@@ -33,6 +35,14 @@ def tangent_shifted(rows, to, start, count, moved):
                 rows[to + i, r] = rows[start + i, r]
 """
 
+_MEMBER = """
+def member_tangent(
+    arrays, member, parameters, state, inputs, outputs, state_rows, inputs_rows, outputs_rows, moved
+):
+    raise NotImplementedError
+"""
+_MOVED_MEMBER = (("state", 1), ("inputs", 1), ("outputs", 1))
+
 
 @cache
 def with_tangent(text: str) -> str:
@@ -43,7 +53,8 @@ def with_tangent(text: str) -> str:
     """
     derivation = _Derivation(Program(text))
     derivation.rows_of_step()
-    return "\n\n".join([text, _SHIFTED, *derivation.texts])
+    members = [_MEMBER] if derivation.calls_members else []
+    return "\n\n".join([text, _SHIFTED, *members, *derivation.texts])
 
 
 class _Derivation:
@@ -52,6 +63,7 @@ class _Derivation:
     def __init__(self, program: Program) -> None:
         self._program = program
         self.texts: list[str] = []
+        self.calls_members = False
         self._rows: dict[tuple[str, Pattern], str] = {}
         self._back: dict[tuple[str, Pattern], str | None] = {}
 
@@ -64,6 +76,11 @@ class _Derivation:
         """Return the name of a function's derivative in rows."""
         activity = self._program.activity(name, pattern)
         key = (name, tuple(activity.written.items()))
+        if name == MEMBER_STEP and self._program.has_members:
+            if key[1] != _MOVED_MEMBER:
+                raise TangentError("a member's state, inputs and outputs move, and nothing else of it.")
+            self.calls_members = True
+            return "member_tangent"
         if key not in self._rows:
             self._rows[key] = self._unique(f"{name}_tangent")
             self.texts.append(Rows(activity, self).text(self._rows[key]))

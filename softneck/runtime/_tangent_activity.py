@@ -21,6 +21,14 @@ STEPS = ("int", "bool", "len", "floor", "ceil", "round", "isfinite", "isnan", "i
 # What searches data for its nearest points: set membership.
 SEARCHES = ("slant_bounds", "nlsm_bounds")
 
+# A member that is not in the text: what is known of it is that its outputs and state follow from state and inputs.
+MEMBER_STEP = "member_step"
+_MEMBER = """
+def member_step(arrays, member, parameters, state, inputs, outputs):
+    state[0] = state[0] + inputs[0]
+    outputs[0] = state[0]
+"""
+
 # Argument -> number of its dimensions, for those that depend on state or inputs.
 Pattern = tuple[tuple[str, int], ...]
 
@@ -34,13 +42,17 @@ class Program:
 
     Attributes:
         functions: by name.
-        constants: names that the text defines beside its functions.
+        has_members: whether it calls members whose text is elsewhere.
     """
 
     def __init__(self, text: str) -> None:
         """Read the bundle `text`."""
         tree = ast.parse(text)
         self.functions = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
+        stub = self.functions.get(MEMBER_STEP)
+        self.has_members = stub is not None and isinstance(stub.body[-1], ast.Raise)
+        if self.has_members:
+            self.functions |= {node.name: node for node in ast.parse(_MEMBER).body if isinstance(node, ast.FunctionDef)}
         self._done: dict[tuple[str, Pattern], Activity] = {}
         self._open: set[tuple[str, Pattern]] = set()
 

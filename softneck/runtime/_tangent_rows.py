@@ -387,10 +387,10 @@ def without_unused(lines: list[str]) -> list[str]:
         for line in lines:
             target, sign, value = line.partition(" = ")
             text = value if sign and re.fullmatch(r"\s*_[vpi]\d+", target) else line
-            used |= set(re.findall(r"_[vpi]\d+", text))
+            used |= set(re.findall(r"\b_[vpi]\d+\b", text))  # not `_v1_bar`: what it passes on needs no value
         left = []
         for line in lines:
-            found = re.match(r"\s*(_[vpi]\d+) = (?!.*_(tangent|back)\w*\()", line)
+            found = re.match(r"\s*(_[vpi]\d+) = (?!.*(_(tangent|back)\w*|random_\w+)\()", line)
             if not found or found[1] in used:
                 left.append(line)
         if len(left) == len(lines):

@@ -179,12 +179,54 @@ def test_the_commands(loop_file: Path, foreign: Path, tmp_path: Path, capsys: py
     assert '"overshoot_pct"' in capsys.readouterr().out
 
 
+CONNECTORS = "".join(
+    f'<ssd:Connector name="{name}" kind="{kind}"><ssc:Real unit="{unit}"/></ssd:Connector>'
+    for name, kind, unit in (("u1", "input", "rad"), ("u2", "input", "rad"), ("alpha", "output", "deg"))
+)
+# What pyssp_standard 0.9.1 writes: types and no implementations, the set and its mapping in files, folders as members.
+THEIRS = f"""<?xml version='1.0' encoding='utf-8'?>
+<ssd:SystemStructureDescription {SPACES} version="1.0" name="Two" generationTool="pyssp_standard">
+<ssd:System name="root"><ssd:ParameterBindings><ssd:ParameterBinding source="resources/values.ssv">
+<ssd:ParameterMapping source="resources/map.ssm"/></ssd:ParameterBinding></ssd:ParameterBindings><ssd:Elements>
+<ssd:Component name="first" type="application/x-fmu-sharedlibrary" source="resources/F.fmu">
+<ssd:Connectors>{CONNECTORS}</ssd:Connectors></ssd:Component>
+<ssd:Component name="second" type="application/x-fmu-sharedlibrary" source="resources/F.fmu">
+<ssd:Connectors>{CONNECTORS}</ssd:Connectors></ssd:Component></ssd:Elements>
+<ssd:Connections><ssd:Connection startElement="first" startConnector="alpha" endElement="second" endConnector="u1"/>
+</ssd:Connections>{{}}</ssd:System><ssd:DefaultExperiment startTime="0.0" stopTime="{END}"/>
+</ssd:SystemStructureDescription>"""
+VALUES = f"""<ssv:ParameterSet {SPACES} version="1.0" name="values"><ssv:Parameters>
+<ssv:Parameter name="gain"><ssv:Real value="4.0" unit=""/></ssv:Parameter>
+<ssv:Parameter name="lag"><ssv:Real value="250.0" unit="ms"/></ssv:Parameter>
+<ssv:Parameter name="one"><ssv:Real value="1.0" unit=""/></ssv:Parameter></ssv:Parameters></ssv:ParameterSet>"""
+MAPPING = f"""<ssm:ParameterMapping {SPACES} version="1.0"><ssm:MappingEntry target="first.k" source="gain"/>
+<ssm:MappingEntry target="second.T" source="lag"/><ssm:MappingEntry target="first.u1" source="one"/>
+</ssm:ParameterMapping>"""
+MASTER = f'''<ssd:Annotations><ssc:Annotation type="softneck">
+<Master order="jacobi" stepSize="{STEP}"/></ssc:Annotation>
+</ssd:Annotations>'''
+
+
+def test_an_archive_of_another_writer(foreign: Path, tmp_path: Path) -> None:
+    more = {"resources/": b"", "resources/values.ssv": VALUES.encode(), "resources/map.ssm": MAPPING.encode()}
+    with pytest.raises(SettingsError, match="says a step size; put `<ssd:Annotations>"):
+        load_ssp(archive(tmp_path, foreign, THEIRS.format(""), more))
+    result = simulate(load_ssp(archive(tmp_path, foreign, THEIRS.format(MASTER), more)))
+    alpha, beta = 0.0, 0.0
+    for k, (first, second) in enumerate(zip(result["first.alpha"], result["second.alpha"], strict=True)):
+        # dx/dt = (k u - x) / T by forward Euler, in deg; the second is driven by the first's angle in rad.
+        assert (np.rad2deg(first), np.rad2deg(second)) == pytest.approx((alpha, beta), abs=1e-12), k
+        alpha, beta = alpha + STEP / 0.5 * (4.0 - alpha), beta + STEP / 0.25 * (10.0 * np.deg2rad(alpha) - beta)
+
+
 COMPONENT = '<ssd:Component name="a" source="resources/F.fmu">{}</ssd:Component>'
 LINK = '<ssd:Connection startElement="a" startConnector="{}" endElement="a" endConnector="{}"/>'
 STRING = """<ssd:ParameterBindings><ssd:ParameterBinding><ssd:ParameterValues><ssv:ParameterSet><ssv:Parameters>
 <ssv:Parameter name="k"><ssv:Enumeration value="x"/></ssv:Parameter></ssv:Parameters></ssv:ParameterSet>
 </ssd:ParameterValues></ssd:ParameterBinding></ssd:ParameterBindings>"""
 UNIT = '<ssd:Connectors><ssd:Connector name="u1" kind="input"><ssc:Real unit="{}"/></ssd:Connector></ssd:Connectors>'
+DEEP, FLAT = '<ssd:System name="x"><ssd:Elements>', "</ssd:Elements></ssd:System>"
+BASE = '<ssd:Units><ssc:Unit name="q"><ssc:BaseUnit m="{}" factor="{}"/></ssc:Unit></ssd:Units>'
 BOMB = '<!DOCTYPE x [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;">]><x>&b;</x>'
 
 
@@ -206,6 +248,18 @@ BOMB = '<!DOCTYPE x [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;">]><x>&b;</x>'
         (ssd(COMPONENT.format(STRING), ""), "Enumeration `x`"),
         (ssd("", ""), "no components"),
         (ssd(COMPONENT.format(""), "").replace('stepSize="0.1"', 'stepSize="soon"'), "stepSize = `soon`"),
+        (ssd(COMPONENT.format(""), "").replace('stepSize="0.1"', 'stepSize="nan"'), "no finite number"),
+        (ssd(COMPONENT.format(""), "").replace('stepSize="0.1"', 'stepSize="0"'), "must be positive"),
+        (ssd(COMPONENT.format(""), "").replace('stopTime="1.0"', 'stopTime="inf"'), "stopTime = `inf`"),
+        (ssd(COMPONENT.format(""), "").replace('stopTime="1.0"', 'stopTime="0"'), "begins at 0 s"),
+        (ssd().replace('factor="3"', 'factor="nan"'), "factor = `nan`"),
+        (ssd().replace('value="4"', 'value="inf"'), "k = `inf`"),
+        (ssd(COMPONENT.format("") * 2, ""), "two elements `a`"),
+        (ssd(COMPONENT.replace('name="a"', "").format(""), ""), "a nameless element"),
+        (ssd(DEEP * 3000 + FLAT * 3000, ""), "more than 50"),
+        (ssd(COMPONENT.replace("F.fmu", "a" * 5000).format(""), ""), "has no member"),
+        (ssd(COMPONENT.format(""), "").replace("<ssd:Def", f"{BASE.format('inf', '1')}<ssd:Def"), "m = `inf`"),
+        (ssd(COMPONENT.format(""), "").replace("<ssd:Def", f"{BASE.format('1', '0')}<ssd:Def"), "`q` of factor 0"),
     ],
 )
 def test_what_cannot_be_run_is_named(text: str, words: str, foreign: Path, tmp_path: Path) -> None:

@@ -56,12 +56,28 @@ static void quiet(void *self, int status, const char *text)
     refused++;
 }
 
+/* The outputs of the next sample and what moves them, of any variables by any. */
+static void look(sn_instance *s, int wild)
+{
+    uint32_t unknown[4], known[4];
+    double seeds[4], moved[4];
+    for (int i = 0; i < 4; i++) {
+        unknown[i] = wild && draw() % 8 == 0 ? (uint32_t)draw() : s->model.n_in + (uint32_t)(draw() % s->model.n_out);
+        known[i] = wild && draw() % 8 == 0 ? (uint32_t)draw() : (uint32_t)(draw() % s->model.n_in);
+        seeds[i] = wild ? number() : 1.0;
+    }
+    (void)sn_get(s, s->model.n_in + s->model.n_out - 1, moved);
+    (void)sn_derivative(s, unknown, 4, known, 4, seeds, moved);
+}
+
 static int steps(sn_instance *s, int count, int wild)
 {
     for (int k = 0; k < count; k++) {
         for (uint32_t i = 0; i < s->model.n_in; i++)
             (void)sn_set(s, i, s->model.ports[i].flags & SN_BOOLEAN ? (double)(draw() % 8 > 0)
                                : wild ? number() : 0.01 * (double)(draw() % 64));
+        if (s->model.ahead > 0 && s->model.n_in > 0)
+            look(s, wild);
         if (!sn_do_step(s, s->start + (double)s->count * s->model.sample_time, s->model.sample_time))
             return 0;
         stepped++;

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import dataclasses
 import json
@@ -19,15 +20,19 @@ from typing import Any
 import fmpy
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from softneck.cli import main
-from softneck.core import FileFormatError, SettingsError
+from softneck.core import FileFormatError, SettingsError, load
 from softneck.fmu import build_compiled_fmu, build_fmu
 from softneck.fmu.compiled import _library
-from softneck.fmu.compiled._model_file import model_bytes
+from softneck.fmu.compiled._build import next_outputs
+from softneck.fmu.compiled._model_file import model_bytes, read_model
 from softneck.fmu.compiled._sources import Sources, c_sources
 from softneck.fmu.describe._modelled_drives import with_modelled_drives
 
+from ..data import ROOT
 from .every_kind import NATIVE, block_of
 
 pytestmark = pytest.mark.skipif(
@@ -61,7 +66,7 @@ def _mended(data: bytes) -> bytes:
     [
         (lambda _: b"", "ends too early"),
         (lambda d: b"PK" + d[2:], "is no model file"),
-        (lambda d: d[:8] + b"\x09" + d[9:], "has format 9; this library reads 1"),
+        (lambda d: d[:8] + b"\x09" + d[9:], "has format 9; this library reads 2"),
         (lambda d: d[:-8], "and should have"),
         (lambda d: d[:-1] + bytes([d[-1] ^ 1]), "its checksum is another one"),
         (lambda d: _mended(d[:-8]), "it ends too early"),
@@ -167,10 +172,18 @@ def test_the_sources_compile_without_a_warning_and_fit_the_standards_headers(own
     assert done.returncode == 0, done.stderr[-3000:]
 
 
+def _sensitive(kind: str) -> bool:
+    try:
+        return bool(next_outputs(block_of(kind)))
+    except SettingsError:
+        return False
+
+
 @pytest.mark.slow
-def test_hostile_files_and_states_break_nothing_under_the_sanitizers(tmp_path: Path) -> None:
+@pytest.mark.parametrize("sensitivities", [False, True])
+def test_hostile_files_and_states_break_nothing_under_the_sanitizers(sensitivities: bool, tmp_path: Path) -> None:
     """Every kind, unchanged first: no memory asked for in a step; then with wrong bytes (SOFTNECK_FUZZ_ROUNDS each)."""
-    _write_sources(tmp_path, c_sources())
+    _write_sources(tmp_path, c_sources(sensitivities=sensitivities))
     shutil.copy(Path(__file__).with_name("native_fuzz.c"), tmp_path)
     command = [
         "cc", "-std=c99", "-O1", "-g", "-ffp-contract=off", "-fsanitize=address,undefined",
@@ -179,17 +192,19 @@ def test_hostile_files_and_states_break_nothing_under_the_sanitizers(tmp_path: P
     built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert built.returncode == 0, built.stderr[-2000:]
     files = []
-    for kind in NATIVE:
+    for kind in filter(_sensitive, NATIVE) if sensitivities else NATIVE:
+        block = with_modelled_drives(block_of(kind))
+        ahead = next_outputs(block) if sensitivities else ()
+        block = dataclasses.replace(block, outputs=(*block.outputs, *ahead))
         files.append(tmp_path / f"{kind}.bin")
-        files[-1].write_bytes(
-            model_bytes(with_modelled_drives(block_of(kind)), kind, "00000000-0000-0000-0000-000000000000")
-        )
+        files[-1].write_bytes(model_bytes(block, kind, "00000000-0000-0000-0000-000000000000", ahead=len(ahead)))
     done = subprocess.run(
         ["./fuzz", str(ROUNDS), "1", *map(str, files)], cwd=tmp_path, capture_output=True, text=True, check=False,
         timeout=3000,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-3000:]
-    assert f"{len(NATIVE)} files" in done.stdout
+    assert f"{len(files)} files" in done.stdout
+    assert len(files) > 5
 
 
 # Making one
@@ -281,3 +296,26 @@ def test_the_command_line_builds_one_and_refuses_what_python_cannot(
     assert code.value.code == 2
     assert "add `--backend compiled`" in capsys.readouterr().err
     assert build_fmu(block_of("pi"), tmp_path / "Pi.fmu").is_file()
+
+
+# Reading one back
+
+
+@pytest.mark.parametrize("kind", ["rls", "ensemble"])
+def test_a_model_file_is_read_as_it_was_written(kind: str) -> None:
+    block = load(ROOT / "tests" / "golden" / f"{kind}.npz").block()
+    data = model_bytes(block, kind, "guid")
+    back = read_model(data, block.kind, block.role)
+    assert model_bytes(back, kind, "guid") == data
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.data())
+def test_wrong_bytes_in_a_model_file_are_refused_or_read(data: st.DataObject) -> None:
+    block = load(ROOT / "tests" / "golden" / "ensemble.npz").block()
+    whole = bytearray(model_bytes(block, "x", "guid"))
+    for _ in range(data.draw(st.integers(1, 4))):
+        whole[data.draw(st.integers(32, len(whole) - 1))] = data.draw(st.integers(0, 255))
+    cut = data.draw(st.sampled_from([len(whole), len(whole) // 2, 40, 3]))
+    with contextlib.suppress(FileFormatError):
+        read_model(_mended(bytes(whole[:cut])) if cut > 32 else bytes(whole[:cut]), block.kind, block.role)

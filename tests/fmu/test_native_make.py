@@ -25,7 +25,7 @@ def test_a_second_call_takes_up_what_the_first_left_behind(tmp_path: Path, monke
         return platform.name.encode()
 
     monkeypatch.setattr(_library, "compile_for", compile_for)
-    monkeypatch.setattr(_library, "c_sources", lambda: SOURCES)
+    monkeypatch.setattr(_library, "c_sources", lambda **_: SOURCES)
     names = list(PLATFORMS)
     with pytest.raises(SettingsError, match="power"):
         _library.build_all(tmp_path)

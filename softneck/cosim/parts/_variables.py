@@ -102,7 +102,8 @@ class Description:
             maximum=_number(variable.max if variable.max is not None else getattr(declared, "max", None), None),
             nominal=_number(variable.nominal, None),
             boolean=variable.type == "Boolean",
-            integer="Int" in variable.type,
+            integer=variable.type
+            not in ("Real", "Float64", "Float32", "Boolean"),  # an enumeration is a number of a list
             missing=variable.name in self.annotation.missing,
         )
 

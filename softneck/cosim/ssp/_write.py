@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 import tempfile
 import zipfile
 from collections.abc import Mapping
@@ -14,20 +12,19 @@ import numpy as np
 
 from softneck.core import OutputFileError, SettingsError, atomic_write, refuse_existing
 from softneck.fmu import FmuInfo, build_compiled_fmu, build_fmu, unpacked
-from softneck.fmu.compiled._model_file import node_of
 from softneck.fmu.describe._modelled_drives import with_modelled_drives
 from softneck.loop import BlockPart, Loop, Part, ReferenceBlock
 from softneck.loop._loop import USE_MOTOR_POSITIONS
 from softneck.loop._system import System
 from softneck.loop._wiring import Link, Wiring, wire
 from softneck.robot import Robot
-from softneck.runtime import Block, Port, bundle
-from softneck.runtime._compile import compiled_name
+from softneck.runtime import Block, Port
 
 from ..loops._loop_file import LoopSetup
 from ..parts._fmu_part import FmuPart
 from ..parts._isolated import IsolatedPart
-from ..parts._variables import Description, read_description
+from ..parts._ours import python_block
+from ..parts._variables import read_description
 from ._description import Component, Connection, system_description
 
 
@@ -40,9 +37,9 @@ def block_without_python(path: Path) -> Block | None:
     """
     with unpacked(path) as folder:
         description = read_description(path, folder, {})
-        facts = folder / "resources" / "block.json"
-        if description.annotation.role and facts.is_file():
-            return _block(path, folder, json.loads(facts.read_text(encoding="utf-8")), description)
+        block = python_block(path, folder, description)
+        if block is not None:
+            return block
         experiment = description.model.coSimulation
         if experiment is not None and experiment.needsExecutionTool:
             raise SettingsError(
@@ -50,27 +47,6 @@ def block_without_python(path: Path) -> Block | None:
                 "give a file of softneck instead, or use `--backend python`."
             )
         return None
-
-
-def _block(path: Path, folder: Path, facts: dict, description: Description) -> Block:
-    runtime = facts.get("module_of_runtime", "")
-    flat = np.load(folder / "resources" / "arrays.npy", allow_pickle=False)
-    ends = np.cumsum([math.prod(shape) for shape in facts["shapes"]])
-    parts = np.split(flat, ends[:-1]) if len(ends) else []
-    arrays = tuple(part.reshape(shape) for part, shape in zip(parts, facts["shapes"], strict=True))
-    # The table of kinds comes first: the name of a module from a file is not to be imported unseen.
-    if runtime:
-        node_of(runtime, arrays)
-    if not runtime or compiled_name(bundle(runtime)) != facts["runtime"]:
-        raise SettingsError(
-            f"{path}: was made by another version of softneck, whose equations may differ; make it again with "
-            "`softneck fmu`, or use `--backend python`."
-        )
-    return Block(
-        kind=facts["kind"], role=facts["role"], runtime=runtime, sample_time=facts["sample_time"], arrays=arrays,
-        inputs=description.ports("input"), outputs=description.ports("output"),
-        parameters=description.ports("parameter"),
-    )  # fmt: skip
 
 
 # Fixed, so that the same loop gives the same bytes.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -19,6 +20,8 @@ _WHOLE = ("Integer", *(f"{u}Int{bits}" for u in ("", "U") for bits in (8, 16, 32
 _NUMBERS = (*_REAL, *_WHOLE, "Boolean")
 _NAMES = ("Enumeration", "String", "Binary", "Clock")
 _KINDS = ("input", "output", "parameter", "calculatedParameter", "structuralParameter", "constant", "local", "inout")
+# Systems within systems; honest ones have some.
+_DEEPEST = 50
 _SOURCES = (None, "", "SSD", "component")
 
 
@@ -137,12 +140,15 @@ class Reader:
         experiment = root.find(f"{SSD}DefaultExperiment")
         start, stop = (None if experiment is None else experiment.get(key) for key in ("startTime", "stopTime"))
         begin = 0.0 if start is None else self._number("startTime", start)
+        span = None if stop is None else self._number("stopTime", stop) - begin
+        if span is not None and span <= 0.0:
+            raise self._wrong("SystemStructure.ssd", f"ends at {stop} s and begins at {begin:g} s")
         step, order = self._master(root)
         return Structure(
             name=root.get("name", ""),
             root=self._system(system),
             units=self._units(root.find(f"{SSD}Units")),
-            stop=None if stop is None else self._number("stopTime", stop) - begin,
+            stop=span,
             step=step,
             order=order,
         )
@@ -153,8 +159,12 @@ class Reader:
         path = PurePosixPath(name)
         if ":" in name or "\\" in name or path.is_absolute() or ".." in path.parts:
             raise FileFormatError(f"{self.where}: `{source}` is outside the archive; softneck reads members only.")
-        if not (self.folder / path).is_file():
-            raise FileFormatError(f"{self.where}: has no member `{source}`, which its structure names.")
+        try:
+            found = (self.folder / path).is_file()
+        except (OSError, ValueError):  # a name that no file can have
+            found = False
+        if not found:
+            raise FileFormatError(f"{self.where}: has no member `{source[:200]}`, which its structure names.")
         return self.folder / path
 
     def _xml(self, name: str) -> ET.Element:
@@ -172,9 +182,18 @@ class Reader:
 
     def _number(self, name: str, text: str) -> float:
         try:
-            return float(text)
+            number = float(text)
         except ValueError:
-            raise self._wrong("SystemStructure.ssd", f"has {name} = `{text}`, which is no number") from None
+            number = math.nan
+        if not math.isfinite(number):
+            raise self._wrong("SystemStructure.ssd", f"has {name} = `{text[:40]}`, which is no finite number")
+        return number
+
+    def _positive(self, name: str, text: str) -> float:
+        number = self._number(name, text)
+        if number <= 0.0:
+            raise self._wrong("SystemStructure.ssd", f"has {name} = `{text[:40]}`, which must be positive")
+        return number
 
     def _master(self, root: ET.Element) -> tuple[float | None, str | None]:
         """Return step [s] and order of our annotation; else the step of OMSimulator's, whose order is its own."""
@@ -184,20 +203,26 @@ class Reader:
                 order = master.get("order", "jacobi")
                 if order not in ("jacobi", "sequential"):
                     raise self._wrong("SystemStructure.ssd", f"has the order `{order}`; known are jacobi, sequential")
-                return self._number("stepSize", master.get("stepSize", "")), order
+                return self._positive("stepSize", master.get("stepSize", "")), order
         for element in root.iter():
             if element.tag.endswith("}FixedStepMaster") and element.get("stepSize"):
-                return self._number("stepSize", element.get("stepSize", "")), None
+                return self._positive("stepSize", element.get("stepSize", "")), None
         return None, None
 
-    def _system(self, node: ET.Element) -> SystemNode:
+    def _system(self, node: ET.Element, depth: int = 0) -> SystemNode:
+        if depth > _DEEPEST:
+            raise self._wrong("SystemStructure.ssd", f"has systems within systems, more than {_DEEPEST} of them")
         if node.find(f"{SSD}SignalDictionaries") is not None:
             raise self._wrong("SystemStructure.ssd", "uses signal dictionaries, which softneck does not read")
         elements: dict[str, Component | SystemNode] = {}
         for element in node.iterfind(f"{SSD}Elements/*"):
             name = element.get("name", "")
+            if not name or name in elements:
+                raise self._wrong(
+                    "SystemStructure.ssd", f"has {f'two elements `{name}`' if name else 'a nameless element'}"
+                )
             if element.tag == f"{SSD}System":
-                elements[name] = self._system(element)
+                elements[name] = self._system(element, depth + 1)
             elif element.tag == f"{SSD}Component":
                 elements[name] = self._component(name, element)
             else:
@@ -313,6 +338,8 @@ class Reader:
                 raise self._wrong("SystemStructure.ssd", f"has the unit `{item.get('name', '')}` without a base unit")
             powers = {key: int(self._number(key, value)) for key, value in base.attrib.items() if key not in _SCALES}
             factor, offset = (self._number(key, base.get(key, default)) for key, default in _SCALES.items())
+            if factor == 0.0:
+                raise self._wrong("SystemStructure.ssd", f"has the unit `{item.get('name', '')}` of factor 0")
             exponents = tuple(sorted((key, value) for key, value in powers.items() if value))
             units[item.get("name", "")] = Unit(exponents, factor, offset)
         return units

@@ -156,7 +156,11 @@ class _Writer:
         experiments = [item.model.defaultExperiment for item in self.descriptions.values()]
         steps = [float(item.stepSize) for item in experiments if item is not None and item.stepSize]
         if not steps:
-            raise SettingsError(f"{self.source}: neither the structure nor an FMU says a step size.")
+            raise SettingsError(
+                f"{self.source}: neither the structure nor an FMU says a step size; put `<ssd:Annotations>"
+                '<ssc:Annotation type="softneck"><Master order="jacobi" stepSize="0.01"/></ssc:Annotation>'
+                "</ssd:Annotations>` at the end of its system."
+            )
         return min(steps)
 
     def _duration(self) -> float:

@@ -6,21 +6,22 @@ import sys
 
 from softneck.core import SoftneckError
 
-from ._library import BINARIES, build_all
+from ._library import BINARIES, SENSITIVE, build_all
 
 
 def main() -> int:
     """Build all libraries and print their sizes; 2 where that fails."""
-    try:
-        library = build_all()
-    except SoftneckError as error:
-        sys.stderr.write(f"{error}\n")
-        return 2
-    for name, data in library.binaries.items():
-        sys.stdout.write(f"{name}: {len(data) / 1e3:.0f} kB\n")
-    for module, reason in library.sources.refused.items():
-        sys.stdout.write(f"left out: {module}: {reason}\n")
-    sys.stdout.write(f"{BINARIES}\n")
+    for folder in (BINARIES, SENSITIVE):
+        try:
+            library = build_all(folder, sensitivities=folder == SENSITIVE)
+        except SoftneckError as error:
+            sys.stderr.write(f"{error}\n")
+            return 2
+        for name, data in library.binaries.items():
+            sys.stdout.write(f"{name}: {len(data) / 1e3:.0f} kB\n")
+        for module, reason in library.sources.refused.items():
+            sys.stdout.write(f"left out: {module}: {reason}\n")
+        sys.stdout.write(f"{folder}\n")
     return 0
 
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 import hashlib
 import uuid
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from softneck import __version__
 from softneck.core import SettingsError, atomic_write, refuse_existing
-from softneck.runtime import Block
+from softneck.runtime import Block, Port, bundle
+from softneck.runtime._tangent import with_tangent
+from softneck.runtime._tangent_activity import TangentError
 
 from ..describe._description import Identity, described_block, model_description
 from ..describe._documentation import FmuInfo, documentation_page
@@ -42,7 +45,7 @@ and put it into binaries/ under the folder of your platform. `sn_kinds.h` was ge
 
 def build_compiled_fmu(
     block: Block, path: str | Path, *, info: FmuInfo | None = None, force: bool = False, fmi: int = 2,
-    platforms: Sequence[str] = (),
+    platforms: Sequence[str] = (), sensitivities: bool = False,
 ) -> str:  # fmt: skip
     """Write `block` as a Co-Simulation FMU that needs no Python, and return one line on where its libraries come from.
 
@@ -55,9 +58,11 @@ def build_compiled_fmu(
         force: replace an existing file.
         fmi: 2 or 3.
         platforms: that the FMU must run on, e.g. "x86_64-windows"; none: all whose library is here.
+        sensitivities: add outputs of the next sample (`pitch_next`, ..) and their directional derivatives.
 
     Raises:
-        SettingsError: NAME is not an FMI identifier, the kind cannot be compiled, or a platform is not built.
+        SettingsError: NAME is not an FMI identifier, the kind cannot be compiled or has no derivative, or a platform
+            is not built.
         FileFormatError: a library is damaged.
         OutputFileError: the file exists or cannot be written.
     """
@@ -68,15 +73,37 @@ def build_compiled_fmu(
     if fmi not in FMI_VERSIONS:
         raise SettingsError(f"unknown FMI version {fmi}; use 2 or 3.")
     block = described_block(block)
+    ahead = next_outputs(block) if sensitivities else ()
     modules = node_of(block.runtime, block.arrays).modules
-    library = find_library(modules)
+    library = find_library(modules, sensitivities=True) if ahead else find_library(modules)
     _check_kinds(modules, library.sources)
     folders = _folders(library, platforms, fmi)
-    members = _members(block, info or FmuInfo(), name, fmi, library.sources)
+    block = replace(block, outputs=(*block.outputs, *ahead))
+    members = _members(block, info or FmuInfo(), name, fmi, library.sources, len(ahead))
     members |= {f"binaries/{folder}/{name}{suffix}": data for folder, suffix, data in folders}
     with atomic_write(target, force=force) as temporary:
         write_zip(temporary, members, library.streams)
     return library.origin
+
+
+def next_outputs(block: Block) -> tuple[Port, ...]:
+    """Return the outputs that an FMU with sensitivities has beside its own: those of the robot at the next sample.
+
+    Raises:
+        SettingsError: no identified plant, or one of a kind that has no derivative.
+    """
+    motors = [i for i, port in enumerate(block.outputs) if port.name.startswith("motor_position_")]
+    if block.role != "plant" or not motors:
+        raise SettingsError(f"{block.kind} ({block.role}) has no sensitivities; only plants have outputs to come.")
+    try:
+        with_tangent(bundle(block.runtime, loops=False))
+    except TangentError as error:
+        raise SettingsError(f"{block.kind} has no sensitivities: {error}") from None
+    what = "at the next sample, if the inputs are held"
+    return tuple(
+        replace(port, name=f"{port.name}_next", description=f"{port.description or port.name} {what}")
+        for port in block.outputs[: motors[0]]
+    )
 
 
 def _check_kinds(modules: set[str], sources: Sources) -> None:
@@ -109,21 +136,21 @@ def _folders(library: Library, wanted: Sequence[str], fmi: int) -> list[tuple[st
     return found
 
 
-def _members(block: Block, info: FmuInfo, name: str, fmi: int, sources: Sources) -> dict[str, bytes]:
+def _members(block: Block, info: FmuInfo, name: str, fmi: int, sources: Sources, ahead: int) -> dict[str, bytes]:
     tool = f"softneck {__version__} (compiled)"
     content = hashlib.sha256()
     for part in (
-        model_bytes(block, name, ""),
+        model_bytes(block, name, "", ahead=ahead),
         repr((info, tool, fmi)).encode(),
         *map(str.encode, sources.files.values()),
     ):
         content.update(part)
     guid = str(uuid.uuid5(uuid.NAMESPACE_OID, content.hexdigest()))
-    identity = Identity(name, guid, generation_date(), tool, (MAIN,))
+    identity = Identity(name, guid, generation_date(), tool, (MAIN,), ahead)
     describe = model_description if fmi == 2 else model_description3
     members = {
         "modelDescription.xml": describe(block, info, identity),
-        "resources/model.bin": model_bytes(block, name, guid),
+        "resources/model.bin": model_bytes(block, name, guid, ahead=ahead),
         "documentation/index.html": documentation_page(name, block, info, _HOST).encode(),
         "documentation/licenses/license.txt": license_text("softneck", info.license).encode(),
         ("model.png" if fmi == 2 else "terminalsAndIcons/icon.png"): icon_png(block.kind, block.role),

@@ -37,6 +37,7 @@ def model_description3(block: Block, info: FmuInfo, identity: Identity) -> bytes
     }
     root = Element("fmiModelDescription", head | head_texts(block, info))
     yes = ("canHandleVariableCommunicationStepSize", "canGetAndSetFMUState", "canSerializeFMUState")
+    yes += ("providesDirectionalDerivatives",) if identity.ahead else ()
     fixed = {"modelIdentifier": identity.name, "fixedInternalStepSize": repr(float(block.sample_time))}
     SubElement(root, "CoSimulation", fixed | dict.fromkeys(yes, "true"))
     add_unit_definitions(root, block)
@@ -46,7 +47,7 @@ def model_description3(block: Block, info: FmuInfo, identity: Identity) -> bytes
     times = {"startTime": "0", "stopTime": repr(float(info.stop_time)), "stepSize": repr(float(block.sample_time))}
     SubElement(root, "DefaultExperiment", times)
     _variables(root, block)
-    _structure(root, block)
+    _structure(root, block, identity.ahead)
     _annotation(root, block, info)
     indent(root)
     return b'<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="utf-8") + b"\n"
@@ -81,15 +82,16 @@ def _variable(table: Element, port: Port, causality: str, reference: int) -> Non
         SubElement(table, "Float64", head | unit_attributes(port) | range_attributes(port) | start)
 
 
-def _structure(root: Element, block: Block) -> None:
+def _structure(root: Element, block: Block, ahead: int) -> None:
     structure = SubElement(root, "ModelStructure")
     n_in, n_out = len(block.inputs), len(block.outputs)
     first = n_in + n_out
-    parameters = " ".join(str(first + i) for i in range(len(block.parameters)))
-    # As in FMI 2.0: an input shows in no output before the next communication step.
-    for tag, known in (("Output", ""), ("InitialUnknown", parameters)):
+    parameters, inputs = [str(first + i) for i in range(len(block.parameters))], [str(i) for i in range(n_in)]
+    # As in FMI 2.0: an input shows in no output before the next communication step, but in those of the next sample.
+    for tag, known in (("Output", []), ("InitialUnknown", parameters)):
         for i in range(n_out):
-            SubElement(structure, tag, valueReference=str(n_in + i), dependencies=known)
+            all_known = [*inputs, *known] if i >= n_out - ahead else known
+            SubElement(structure, tag, valueReference=str(n_in + i), dependencies=" ".join(all_known))
 
 
 def _annotation(root: Element, block: Block, info: FmuInfo) -> None:

@@ -24,6 +24,8 @@ from ._sources import GENERATED, HERE, Sources, c_sources, sources_key
 from .translate._kinds import RUNTIMES
 
 BINARIES = HERE / "binaries"
+# With the derivatives of the kinds' steps: half as large again, and no business of other FMUs.
+SENSITIVE = BINARIES / "sensitivities"
 _MANIFEST = "manifest.json"
 _BEGUN = "begun.json"  # of a `make native` that has not ended
 
@@ -45,18 +47,21 @@ class Library:
     streams: dict[bytes, bytes] = field(default_factory=dict)
 
 
-def find_library(modules: set[str] | None = None) -> Library:
+def find_library(modules: set[str] | None = None, *, sensitivities: bool = False) -> Library:
     """Return the libraries that are here, compiling for this machine only where none are.
 
     Args:
         modules: that it must hold; those of robots of other sizes than the neck's are compiled, for this machine only.
+        sensitivities: with the derivatives of the kinds' steps.
 
     Raises:
         FileFormatError: a library is damaged.
         SettingsError: there is none, and no C compiler.
     """
     if modules and not modules <= set(RUNTIMES):
-        return _local_library(tuple(sorted(modules)))
+        return _local_library(tuple(sorted(modules)), sensitivities=sensitivities)
+    if sensitivities:
+        return packaged_library(SENSITIVE) or _local_library(tuple(sorted(modules or RUNTIMES)), sensitivities=True)
     return packaged_library() or _local_library()
 
 
@@ -67,7 +72,7 @@ def packaged_library(folder: Path = BINARIES) -> Library | None:
         FileFormatError: a file is damaged.
     """
     manifest = _manifest(folder)
-    if manifest is None or manifest["key"] != sources_key():
+    if manifest is None or manifest["key"] != sources_key(sensitivities=folder == SENSITIVE):
         return None
     return _read(folder, manifest)
 
@@ -104,12 +109,12 @@ def platforms_built() -> tuple[list[str], str]:
     return [machine.name], f"by {compiler[0]} at the first export{stale}"
 
 
-def build_all(folder: Path = BINARIES) -> Library:
+def build_all(folder: Path = BINARIES, *, sensitivities: bool = False) -> Library:
     """Cross-compile for all platforms with zig and write them to `folder`: `make native`.
 
     Each library is kept as it comes: a call after one that was interrupted or failed takes up what is there.
     """
-    sources, key = c_sources(), sources_key()
+    sources, key = c_sources(sensitivities=sensitivities), sources_key(sensitivities=sensitivities)
     folder.mkdir(parents=True, exist_ok=True)
     digests = _begun(folder, key)
     for name, platform in PLATFORMS.items():
@@ -119,7 +124,7 @@ def build_all(folder: Path = BINARIES) -> Library:
     _keep(folder, GENERATED, sources.files[GENERATED].encode(), digests)
     manifest = {"key": key, "platforms": list(PLATFORMS), "files": digests, "refused": sources.refused}
     for path in folder.iterdir():  # of another version
-        if path.name not in digests:
+        if path.name not in digests and path.is_file():
             path.unlink()
     (folder / _MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
     return _read(folder, manifest)
@@ -150,7 +155,7 @@ def _packed(data: bytes) -> bytes:
     return zopfli.compress(data)[2:-4]  # without zlib's head and checksum
 
 
-def _local_library(modules: tuple[str, ...] = RUNTIMES) -> Library:
+def _local_library(modules: tuple[str, ...] = RUNTIMES, *, sensitivities: bool = False) -> Library:
     """Return the library of this machine: from the user's cache, or compiled now."""
     machine, compiler = here(), local_compiler()
     if machine is None or compiler is None:
@@ -158,10 +163,10 @@ def _local_library(modules: tuple[str, ...] = RUNTIMES) -> Library:
             "there is no compiled library here and no C compiler to make one; run `make native` (it needs "
             "`pip install ziglang`), install a C compiler, or use `--backend python`."
         )
-    folder = _cache_folder() / sources_key(modules)
+    folder = _cache_folder() / sources_key(modules, sensitivities=sensitivities)
     library, generated, refused = folder / f"library{machine.suffix}", folder / GENERATED, folder / "refused.json"
     if not refused.is_file():
-        sources = c_sources(modules)
+        sources = c_sources(modules, sensitivities=sensitivities)
         folder.mkdir(parents=True, exist_ok=True)
         # The last one is the sign that all are there.
         for path, data in (
@@ -175,7 +180,8 @@ def _local_library(modules: tuple[str, ...] = RUNTIMES) -> Library:
     files[GENERATED] = generated.read_text(encoding="utf-8")
     sources = Sources(files, json.loads(refused.read_text(encoding="utf-8")))
     origin = f"compiled by {compiler[0]} for this machine alone ({machine.name})"
-    origin += "; `make native` builds all platforms" if modules == RUNTIMES else ", as the robot's sizes are its own"
+    ours = set(modules) <= set(RUNTIMES)
+    origin += "; `make native` builds all platforms" if ours else ", as the robot's sizes are its own"
     return Library({machine.name: library.read_bytes()}, sources, origin)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from softneck.runtime import bundle
+from softneck.runtime import _tangent, bundle
 
 from .translate._kinds import RUNTIMES, ranks_of
 from .translate._translate import Unit
@@ -37,12 +37,15 @@ class Sources:
     refused: dict[str, str]
 
 
-def c_sources(modules: tuple[str, ...] = RUNTIMES) -> Sources:
-    """Return the C sources of the library, or of one of other runtime `modules`, translated now."""
+def c_sources(modules: tuple[str, ...] = RUNTIMES, *, sensitivities: bool = False) -> Sources:
+    """Return the C sources of the library, or of one of other runtime `modules`, translated now.
+
+    With `sensitivities` the kinds hold the derivatives of their steps; those that have none are refused.
+    """
     unit, refused = Unit(), {}
     for module in modules:
         try:
-            unit.add(module, ranks_of(module))
+            unit.add(module, ranks_of(module), tangent=sensitivities)
         except TranslationError as error:
             refused[module] = str(error)
     files = {path.name: path.read_text(encoding="utf-8") for path in sorted((HERE / "c").glob("*.[ch]"))}
@@ -51,7 +54,7 @@ def c_sources(modules: tuple[str, ...] = RUNTIMES) -> Sources:
 
 
 @cache
-def sources_key(modules: tuple[str, ...] = RUNTIMES) -> str:
+def sources_key(modules: tuple[str, ...] = RUNTIMES, *, sensitivities: bool = False) -> str:
     """Return a digest of all that the library is made of: runtimes, translator, sources written by hand, flags.
 
     Far faster than translating: it tells whether a library that is there is still the right one.
@@ -60,6 +63,8 @@ def sources_key(modules: tuple[str, ...] = RUNTIMES) -> str:
     digest = hashlib.sha256(repr((FLAGS, [ranks_of(module) for module in modules], texts)).encode())
     # By name: a wheel has the packages in other folders than a checkout. By content where a name is there twice.
     paths = [*HERE.rglob("*.py"), *(HERE / "c").glob("*.[ch]")]
+    if sensitivities:
+        paths += Path(_tangent.__file__).parent.glob("_tangent*.py")
     for name, content in sorted((path.name.encode(), path.read_bytes()) for path in paths):
         digest.update(name + b"\0" + content)
     return digest.hexdigest()[:32]

@@ -31,6 +31,7 @@ class Identity:
         name, guid, date: as FMI means them.
         tool: what built it; None for pythonfmu.
         sources: files that a compiler takes to rebuild it; none where Python runs in it.
+        ahead: how many of the last outputs are the first ones at the next sample, with their derivatives.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Identity:
     date: str
     tool: str | None = None
     sources: tuple[str, ...] = ()
+    ahead: int = 0
 
 
 def described_block(block: Block) -> Block:
@@ -68,7 +70,7 @@ def model_description(block: Block, info: FmuInfo, identity: Identity) -> bytes:
     SubElement(root, "DefaultExperiment", times)
     _annotation(root, block, info)
     _variables(root, block)
-    _structure(root, block)
+    _structure(root, block, identity.ahead)
     indent(root)
     return b'<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="utf-8") + b"\n"
 
@@ -120,6 +122,7 @@ def _co_simulation(root: Element, identity: Identity) -> None:
         "canSerializeFMUstate",
     )
     python = {} if identity.sources else {"needsExecutionTool": "true"}  # the Python of the host
+    yes += ("providesDirectionalDerivative",) if identity.ahead else ()
     attributes = {"modelIdentifier": identity.name} | python | dict.fromkeys(yes, "true")
     element = SubElement(root, "CoSimulation", attributes)
     if identity.sources:
@@ -180,18 +183,21 @@ def _variable(table: Element, port: Port, causality: str, reference: int) -> Non
         SubElement(variable, "Real", unit_attributes(port) | range_attributes(port) | start)
 
 
-def _structure(root: Element, block: Block) -> None:
+def _structure(root: Element, block: Block, ahead: int) -> None:
     structure = SubElement(root, "ModelStructure")
     n_in, n_out = len(block.inputs), len(block.outputs)
     first = n_in + n_out
-    parameters = " ".join(str(first + i + 1) for i in range(len(block.parameters)))
+    parameters = [str(first + i + 1) for i in range(len(block.parameters))]
+    inputs = [str(i + 1) for i in range(n_in)]
     # Outputs change in a communication step alone: an input that is set shows in none before. A master that were told
     # otherwise would find an algebraic loop between observer and controller. At the start they follow the parameters.
-    for tag, known in (("Outputs", ""), ("InitialUnknowns", parameters)):
+    # Those of the next sample follow the inputs at once.
+    for tag, known in (("Outputs", []), ("InitialUnknowns", parameters)):
         if n_out:
             group = SubElement(structure, tag)
             for i in range(n_out):
-                SubElement(group, "Unknown", index=str(n_in + i + 1), dependencies=known)
+                all_known = [*inputs, *known] if i >= n_out - ahead else known
+                SubElement(group, "Unknown", index=str(n_in + i + 1), dependencies=" ".join(all_known))
 
 
 def _has_unit(port: Port) -> bool:

@@ -92,9 +92,9 @@ def linearised(model: Stepped, at: State | Mapping[str, float] | ArrayLike | Non
     # A step returns the outputs of the next sample; as states of their own they are those of the state's.
     A = np.block([[J.A, np.zeros((n, n_out))], [J.C, np.zeros((n_out, n_out))]])
     B, C = np.vstack([J.B, J.D]), np.hstack([np.zeros((n_out, n)), np.eye(n_out)])
-    kept = _reached(A, B) & _reached(A.T, C.T)
+    A, B, C = moved_through(A, B, C)
     return control.StateSpace(
-        A[kept][:, kept], B[kept], C[:, kept], np.zeros((n_out, motors)), block.sample_time,
+        A, B, C, np.zeros((n_out, motors)), block.sample_time,
         inputs=[port.name for port in block.inputs[:motors]], outputs=[port.name for port in block.outputs[:-1]],
         name=model.kind,
     )  # fmt: skip
@@ -128,6 +128,12 @@ def _rest(model: Stepped, block: Block, u: Vector) -> State:
         f"the model of kind {model.kind} does not come to rest under the set-points {u.tolist()} rad within "
         f"{_SETTLE * _TIMES * block.sample_time:g} s; give `at` a state."
     )
+
+
+def moved_through(A: Matrix, B: Matrix, C: Matrix) -> tuple[Matrix, Matrix, Matrix]:
+    """Return a system without the states that no input moves, or that no output shows."""
+    kept = _reached(A, B) & _reached(A.T, C.T)
+    return A[kept][:, kept], B[kept], C[:, kept]
 
 
 def _reached(A: Matrix, B: Matrix) -> np.ndarray:

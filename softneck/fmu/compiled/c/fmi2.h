@@ -172,6 +172,13 @@ SN_EXPORT fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real size, f
 
 SN_EXPORT fmi2Status fmi2CancelStep(fmi2Component c) { return sn_refused2(c, "fmi2CancelStep"); }
 
+SN_EXPORT fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReference unknown[], size_t n,
+                                                  const fmi2ValueReference known[], size_t n_known,
+                                                  const fmi2Real seeds[], fmi2Real moved[])
+{
+    return c != NULL && sn_derivative((sn_instance *)c, unknown, n, known, n_known, seeds, moved) ? fmi2OK : fmi2Error;
+}
+
 SN_EXPORT fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *state)
 {
     sn_snapshot *taken;
@@ -272,10 +279,6 @@ SN_EXPORT fmi2Status fmi2GetStringStatus(fmi2Component c, const fmi2StatusKind k
         unused;                                                                                                     \
         return sn_refused2(c, #name);                                                                               \
     }
-SN_REFUSE2(fmi2GetDirectionalDerivative,
-           (fmi2Component c, const fmi2ValueReference z[], size_t nz, const fmi2ValueReference v[], size_t nv,
-            const fmi2Real dv[], fmi2Real dz[]),
-           ((void)z, (void)nz, (void)v, (void)nv, (void)dv, (void)dz))
 SN_REFUSE2(fmi2SetRealInputDerivatives,
            (fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Integer order[], const fmi2Real value[]),
            ((void)vr, (void)n, (void)order, (void)value))

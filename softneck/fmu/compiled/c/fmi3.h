@@ -253,6 +253,15 @@ SN_EXPORT fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 time, fmi3Float64 si
     return done ? fmi3OK : fmi3Error;
 }
 
+SN_EXPORT fmi3Status fmi3GetDirectionalDerivative(fmi3Instance c, sn_references unknown, size_t n, sn_references known,
+                                                  size_t n_known, const fmi3Float64 seeds[], size_t n_seeds,
+                                                  fmi3Float64 moved[], size_t n_moved)
+{
+    if (!sn_counts3(c, n, n_moved) || !sn_counts3(c, n_known, n_seeds))
+        return fmi3Error;
+    return sn_derivative((sn_instance *)c, unknown, n, known, n_known, seeds, moved) ? fmi3OK : fmi3Error;
+}
+
 SN_EXPORT fmi3Status fmi3GetFMUState(fmi3Instance c, fmi3FMUState *state)
 {
     sn_snapshot *taken;
@@ -343,10 +352,6 @@ SN_REFUSE3(fmi3GetVariableDependencies,
            (fmi3Instance c, fmi3ValueReference vr, size_t a[], fmi3ValueReference b[], size_t d[],
             fmi3DependencyKind kinds[], size_t n),
            ((void)vr, (void)a, (void)b, (void)d, (void)kinds, (void)n))
-SN_REFUSE3(fmi3GetDirectionalDerivative,
-           (fmi3Instance c, sn_references a, size_t na, sn_references b, size_t nb, const fmi3Float64 seed[], size_t ns,
-            fmi3Float64 v[], size_t nv),
-           ((void)a, (void)na, (void)b, (void)nb, (void)seed, (void)ns, (void)v, (void)nv))
 SN_REFUSE3(fmi3GetAdjointDerivative,
            (fmi3Instance c, sn_references a, size_t na, sn_references b, size_t nb, const fmi3Float64 seed[], size_t ns,
             fmi3Float64 v[], size_t nv),

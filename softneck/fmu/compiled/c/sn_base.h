@@ -101,6 +101,9 @@ typedef struct sn_kind {
     int64_t (SN_INSIDE *state_size)(sn_work *, const sn_node *);
     void (SN_INSIDE *initialise)(sn_work *, const sn_node *, sn_v1, sn_v1, sn_v1);
     void (SN_INSIDE *step)(sn_work *, const sn_node *, sn_v1, sn_v1, sn_v1, sn_v1);
+    /* The same along so many directions, a column each (softneck.runtime._tangent); NULL in libraries without. */
+    void (SN_INSIDE *tangent)(sn_work *, const sn_node *, sn_v1, sn_v1, sn_v1, sn_v1, const sn_v2 *, const sn_v2 *,
+                              const sn_v2 *, int64_t);
 } sn_kind;
 
 SN_LEAVES static void sn_fault(sn_work *w, const char *why)
@@ -154,6 +157,16 @@ SN_APART static SN_INSIDE sn_v2 sn_zeros2(sn_work *w, int64_t n0, int64_t n1)
         sn_fault(w, SN_FULL);
     m.p = sn_zeros1(w, n0 * n1).p;
     return m;
+}
+
+SN_APART static SN_INSIDE sn_v3 sn_zeros3(sn_work *w, int64_t n0, int64_t n1, int64_t n2)
+{
+    sn_v2 all;
+    if (n1 < 0 || n1 > SN_MOST_NUMBERS || n2 < 0 || n2 > SN_MOST_NUMBERS)
+        sn_fault(w, SN_FULL);
+    all = sn_zeros2(w, n0, n1 * n2);
+    sn_v3 c = {all.p, all.n0, (int32_t)n1, (int32_t)n2, all.s0, (int32_t)n2, 1};
+    return c;
 }
 
 SN_APART static SN_INSIDE sn_i1 sn_zeros_i(sn_work *w, int64_t n)

@@ -21,6 +21,10 @@ typedef struct {
     double start, time, stop;
     int64_t count, states;
     int running, stale, stepping;
+    /* State, outputs and what moves them, of a step that is looked at and not taken; `looked`: the outputs hold. */
+    sn_v1 next_state, next;
+    sn_v2 state_rows, input_rows, next_rows;
+    int looked;
     char *instance_name;
     /* Of the version of FMI. */
     void (*tell)(void *self, int status, const char *text);
@@ -65,9 +69,9 @@ static void sn_ready(sn_work *w)
     w->fault = NULL;
 }
 
-enum { SN_SIZE, SN_INITIALISE, SN_STEP };
+enum { SN_SIZE, SN_INITIALISE, SN_STEP, SN_LOOK, SN_MOVE };
 
-/* Let the kind do one of its three things; 0 where it broke a rule, `fault` then says which. Nothing else may stand
+/* Let the kind do one of its things; 0 where it broke a rule, `fault` then says which. Nothing else may stand
  * here: what is in this function's registers is gone when `sn_fault` comes back to it. */
 static int sn_guarded(sn_instance *s, int what)
 {
@@ -78,8 +82,13 @@ static int sn_guarded(sn_instance *s, int what)
             s->states = root->kind->state_size(&s->work, root);
         else if (what == SN_INITIALISE)
             root->kind->initialise(&s->work, root, s->parameters, s->state, s->pending);
-        else
+        else if (what == SN_STEP)
             root->kind->step(&s->work, root, s->parameters, s->state, s->inputs, s->pending);
+        else if (what == SN_LOOK)
+            root->kind->step(&s->work, root, s->parameters, s->next_state, s->inputs, s->next);
+        else
+            root->kind->tangent(&s->work, root, s->parameters, s->next_state, s->inputs, s->next, &s->state_rows,
+                                &s->input_rows, &s->next_rows, 1);
         return 1;
     }
     return 0;
@@ -102,7 +111,7 @@ static size_t sn_room_needed(const sn_node *node)
 static int sn_make_room(sn_instance *s)
 {
     const sn_model *m = &s->model;
-    size_t ports = (size_t)m->n_in + m->n_out + m->n_par, i;
+    size_t ports = (size_t)m->n_in + m->n_out + m->n_par, own = m->n_out - m->ahead, looks, i;
     double *p;
     s->work.size = 262144u + sn_room_needed(&m->root) + 64u * ports;
     s->work.base = (unsigned char *)malloc(s->work.size);
@@ -113,7 +122,8 @@ static int sn_make_room(sn_instance *s)
         sn_say(s, SN_FAIL, "%s", s->work.fault != NULL ? s->work.fault : "the model has too many states");
         return 0;
     }
-    p = (double *)calloc(ports + m->n_out + (size_t)s->states + 1u, sizeof(double));
+    looks = m->ahead > 0 ? 2u * ((size_t)s->states + own) + m->n_in : 0u;
+    p = (double *)calloc(ports + own + (size_t)s->states + looks + 1u, sizeof(double));
     s->warned = (unsigned char *)calloc(m->n_in + 1u, 1);
     if (p == NULL || s->warned == NULL) {
         free(p);
@@ -123,8 +133,16 @@ static int sn_make_room(sn_instance *s)
     s->inputs = (sn_v1){p, (int32_t)m->n_in, 1};
     s->outputs = (sn_v1){p + m->n_in, (int32_t)m->n_out, 1};
     s->parameters = (sn_v1){p + m->n_in + m->n_out, (int32_t)m->n_par, 1};
-    s->pending = (sn_v1){p + ports, (int32_t)m->n_out, 1};
-    s->state = (sn_v1){p + ports + m->n_out, (int32_t)s->states, 1};
+    s->pending = (sn_v1){p + ports, (int32_t)own, 1};
+    s->state = (sn_v1){p + ports + own, (int32_t)s->states, 1};
+    if (m->ahead > 0) {
+        double *more = s->state.p + s->states;
+        s->next_state = (sn_v1){more, (int32_t)s->states, 1};
+        s->next = (sn_v1){more += s->states, (int32_t)own, 1};
+        s->state_rows = (sn_v2){more += own, (int32_t)s->states, 1, 1, 1};
+        s->input_rows = (sn_v2){more += s->states, (int32_t)m->n_in, 1, 1, 1};
+        s->next_rows = (sn_v2){more + m->n_in, (int32_t)own, 1, 1, 1};
+    }
     for (i = 0; i < ports; i++) /* what nobody connects or sets was not measured */
         p[i] = i < m->n_in && (m->ports[i].flags & SN_MISSING) ? sn_from_bits(0x7ff8000000000000u) : m->ports[i].start;
     return 1;
@@ -144,6 +162,7 @@ static void sn_restart(sn_instance *s)
     s->count = 0;
     s->running = 0;
     s->stale = 1;
+    s->looked = 0;
 }
 
 static int sn_worked(sn_instance *s, int what)
@@ -194,6 +213,7 @@ static int sn_begin(sn_instance *s, double start, double stop)
     s->start = s->time = start;
     s->stop = stop;
     s->count = 0;
+    s->looked = 0;
     return 1;
 }
 
@@ -243,6 +263,73 @@ static int sn_do_step(sn_instance *s, double time, double size)
     if (s->model.plant && s->start + (double)s->count * period <= end + slack)
         memcpy(s->outputs.p, s->pending.p, (size_t)s->pending.n * sizeof(double));
     s->time = end;
+    s->looked = 0;
+    return 1;
+}
+
+/* Whether the next sample is still open: behind a sample that was taken between two, inputs no longer change it. */
+static int sn_awaits(const sn_instance *s)
+{
+    double period = s->model.sample_time;
+    return s->start + (double)s->count * period <= s->time + SN_SAME_TIME * period;
+}
+
+/* The outputs of the next sample, if the inputs are held. */
+static int sn_look_ahead(sn_instance *s)
+{
+    const sn_model *m = &s->model;
+    double *shown = s->outputs.p + s->next.n;
+    if (s->looked)
+        return 1;
+    memcpy(s->next.p, s->pending.p, (size_t)s->next.n * sizeof(double));
+    if (sn_awaits(s)) {
+        memcpy(s->next_state.p, s->state.p, (size_t)s->state.n * sizeof(double));
+        if (!sn_worked(s, SN_LOOK))
+            return 0;
+    }
+    for (uint32_t i = 0; i < m->ahead; i++) {
+        shown[i] = s->next.p[i];
+        if (!sn_finite(shown[i])) {
+            sn_say(s, SN_FAIL, "%.80s becomes %f: the model diverges.", m->ports[m->n_in + s->next.n + i].name, shown[i]);
+            return 0;
+        }
+    }
+    s->looked = 1;
+    return 1;
+}
+
+/* What moves `unknown` outputs, where `known` inputs are moved by `seeds`. All but the outputs of the next sample stay:
+ * an input that is set shows in none of them before a communication step. */
+static int sn_derivative(sn_instance *s, const uint32_t *unknown, size_t n, const uint32_t *known, size_t n_known,
+                         const double *seeds, double *moved)
+{
+    const sn_model *m = &s->model;
+    uint32_t first = m->n_in + (uint32_t)s->next.n;
+    if (m->ahead == 0) {
+        sn_say(s, SN_FAIL, "this FMU was built without derivatives (softneck fmu --sensitivities).");
+        return 0;
+    }
+    if (!sn_initialise(s))
+        return 0;
+    memset(s->state_rows.p, 0, (size_t)(s->state.n + m->n_in + s->next.n) * sizeof(double));
+    for (size_t i = 0; i < n_known; i++) {
+        if (known[i] >= m->n_in || (m->ports[known[i]].flags & SN_BOOLEAN) || !sn_finite(seeds[i])) {
+            sn_say(s, SN_FAIL, "variable %u: derivatives are by inputs that are numbers, with finite seeds.",
+                   (unsigned)known[i]);
+            return 0;
+        }
+        s->input_rows.p[known[i]] += seeds[i];
+    }
+    memcpy(s->next_state.p, s->state.p, (size_t)s->state.n * sizeof(double));
+    if (sn_awaits(s) && !sn_worked(s, SN_MOVE))
+        return 0;
+    for (size_t i = 0; i < n; i++) {
+        if (unknown[i] < m->n_in || unknown[i] >= m->n_in + m->n_out) {
+            sn_say(s, SN_FAIL, "variable %u: derivatives are of outputs.", (unsigned)unknown[i]);
+            return 0;
+        }
+        moved[i] = unknown[i] < first ? 0.0 : s->next_rows.p[unknown[i] - first];
+    }
     return 1;
 }
 
@@ -295,7 +382,14 @@ static int sn_set(sn_instance *s, uint32_t i, double value)
         s->stale = 1;
     }
     s->values.p[i] = value;
+    s->looked = 0;
     return 1;
+}
+
+static int sn_is_ahead(const sn_instance *s, uint32_t i)
+{
+    uint32_t end = s->model.n_in + s->model.n_out;
+    return i < end && i >= end - s->model.ahead;
 }
 
 static int sn_get(sn_instance *s, uint32_t i, double *value)
@@ -304,7 +398,7 @@ static int sn_get(sn_instance *s, uint32_t i, double *value)
         sn_say(s, SN_FAIL, "there is no variable %u.", (unsigned)i);
         return 0;
     }
-    if (!sn_initialise(s))
+    if (!sn_initialise(s) || (sn_is_ahead(s, i) && !sn_look_ahead(s)))
         return 0;
     *value = s->values.p[i];
     /* An input that was never set shows its start value: hosts expect a number. */
@@ -345,6 +439,7 @@ static void sn_go_back(sn_instance *s, const sn_snapshot *from)
     s->running = (int)from->running;
     memcpy(s->values.p, from->values, sn_snapshot_bytes(s));
     s->stale = 0;
+    s->looked = 0;
 }
 
 /* Serialised: magic, size, CRC-32, GUID (40), the snapshot. */

@@ -12,7 +12,7 @@
 
 #include "sn_kinds.h"
 
-#define SN_FORMAT 1u
+#define SN_FORMAT 2u
 #define SN_HEAD 32
 #define SN_DEEPEST 8
 #define SN_MOST_PORTS 100000u
@@ -30,6 +30,7 @@ typedef struct {
     double sample_time;
     int plant;
     uint32_t n_in, n_out, n_par;
+    uint32_t ahead; /* the last outputs: the first ones as they will be at the next sample */
     sn_port *ports;
     sn_node root;
 } sn_model;
@@ -249,6 +250,7 @@ static int sn_parse_model(sn_model *model, unsigned char *bytes, size_t size, co
     model->n_in = sn_take_u32(&r);
     model->n_out = sn_take_u32(&r);
     model->n_par = sn_take_u32(&r);
+    model->ahead = sn_take_u32(&r);
     if (error[0] != '\0')
         return 0;
     if (!(model->sample_time > 1e-9 && model->sample_time < 1e9))
@@ -262,8 +264,12 @@ static int sn_parse_model(sn_model *model, unsigned char *bytes, size_t size, co
     for (uint64_t i = 0; i < count; i++)
         if (!sn_take_port(&r, &model->ports[i]))
             return 0;
+    if (model->ahead > model->n_out / 2 || (model->ahead > 0 && !model->plant))
+        return sn_refuse(&r, "%u of its %u outputs cannot be those of the next sample.", model->ahead, model->n_out);
     if (!sn_take_node(&r, &model->root, 0))
         return 0;
+    if (model->ahead > 0 && model->root.kind->tangent == NULL)
+        return sn_refuse(&r, "this library holds no derivative of `%.100s`.", model->root.kind->name);
     return r.at == r.end ? 1 : sn_refuse(&r, "has bytes behind its end.");
 }
 

@@ -247,6 +247,13 @@ static SN_INSIDE sn_v1 sn_dot_mv(sn_work *w, const sn_v2 *A, sn_v1 x)
 static SN_INSIDE sn_v1 sn_dot_vm(sn_work *w, sn_v1 x, const sn_v2 *A)
 {
     sn_v2 t = sn_turned(A);
+#ifdef SN_LANES
+    if (A->s1 == 1 && x.s == 1 && A->n1 >= 4 && A->n0 == x.n) {
+        sn_v1 r = sn_new1(w, A->n1);
+        sn_columns(w, r.p, A->p, x.p, A->n1, A->s0, x.n);
+        return r;
+    }
+#endif
     return sn_dot_mv(w, &t, x);
 }
 
@@ -303,6 +310,25 @@ static SN_INSIDE sn_v1 sn_sorted(sn_work *w, sn_v1 a)
     return r;
 }
 
+/* Where the sorted numbers stood: by insertion too, so that numbers alike keep their order. */
+static SN_INSIDE sn_i1 sn_order(sn_work *w, sn_v1 a)
+{
+    sn_i1 r = sn_zeros_i(w, a.n);
+    sn_rounds(w, (int64_t)r.n * r.n);
+    for (int64_t i = 0; i < r.n; i++) {
+        double x = a.p[i * a.s];
+        int64_t j = i;
+        for (; j > 0; j--) {
+            double y = a.p[r.p[j - 1] * a.s];
+            if (!(x < y || (y != y && x == x)))
+                break;
+            r.p[j] = r.p[j - 1];
+        }
+        r.p[j] = i;
+    }
+    return r;
+}
+
 /* Members of a runtime that holds others. */
 static const sn_node *sn_member(sn_work *w, const sn_node *node, int64_t i)
 {
@@ -327,6 +353,15 @@ static SN_INSIDE void sn_member_step(sn_work *w, const sn_node *node, int64_t i,
 {
     const sn_node *member = sn_member(w, node, i);
     member->kind->step(w, member, q, x, u, y);
+}
+
+static SN_INSIDE void sn_member_tangent(sn_work *w, const sn_node *node, int64_t i, sn_v1 q, sn_v1 x, sn_v1 u, sn_v1 y,
+                                        const sn_v2 *X, const sn_v2 *U, const sn_v2 *Y, int64_t m)
+{
+    const sn_node *member = sn_member(w, node, i);
+    if (member->kind->tangent == NULL)
+        sn_fault(w, "a member has no derivative in this library");
+    member->kind->tangent(w, member, q, x, u, y, X, U, Y, m);
 }
 
 #endif

@@ -97,6 +97,35 @@ typedef int64_t sn_l4 __attribute__((vector_size(32)));
         }                                                                                                           \
     }
 
+/* x A for rows without gaps, four columns side by side: `sn_dot` of each. The last four overlap those before. */
+#define SN_COLUMNS(name, attribute)                                                                                 \
+    attribute static void name(double *restrict y, const double *restrict A, const double *restrict x,              \
+                               int64_t columns, int64_t gap, int64_t n)                                             \
+    {                                                                                                               \
+        for (int64_t j = 0; j < columns; j += 4) {                                                                  \
+            const double *at = A + (j < columns - 4 ? j : columns - 4);                                             \
+            double *to = y + (at - A);                                                                              \
+            sn_d4 p = {0.0, 0.0, 0.0, 0.0}, q = p, r = p, s = p, a, b, c, d;                                        \
+            int64_t i = 0;                                                                                          \
+            for (; i + 4 <= n; i += 4, at += 4 * gap) {                                                             \
+                memcpy(&a, at, sizeof a);                                                                           \
+                memcpy(&b, at + gap, sizeof b);                                                                     \
+                memcpy(&c, at + 2 * gap, sizeof c);                                                                 \
+                memcpy(&d, at + 3 * gap, sizeof d);                                                                 \
+                p += x[i] * a;                                                                                      \
+                q += x[i + 1] * b;                                                                                  \
+                r += x[i + 2] * c;                                                                                  \
+                s += x[i + 3] * d;                                                                                  \
+            }                                                                                                       \
+            for (; i < n; i++, at += gap) {                                                                         \
+                memcpy(&a, at, sizeof a);                                                                           \
+                p += x[i] * a;                                                                                      \
+            }                                                                                                       \
+            a = (p + r) + (q + s);                                                                                  \
+            memcpy(to, &a, sizeof a);                                                                               \
+        }                                                                                                           \
+    }
+
 /* The cones of `slant_leaf`: four points at a time, each point's sum in the order of its sides, each lane its own bounds.
  * The last four overlap those before: what is worked out twice comes out equal. `best` is low and high. */
 static void sn_leaf_plain(double *best, const double *p, const double *values, int64_t gap, int64_t count,
@@ -128,6 +157,7 @@ static void sn_leaf_plain(double *best, const double *p, const double *values, i
 
 SN_TANH_ALL(sn_tanh_all_plain, )
 SN_ROWS(sn_rows_plain, )
+SN_COLUMNS(sn_columns_plain, )
 
 #if defined(__x86_64__)
 #include <cpuid.h>
@@ -217,6 +247,8 @@ SN_AVX2 static void sn_rows_wide(double *restrict y, const double *restrict A, c
     }
 }
 
+SN_COLUMNS(sn_columns_wide, SN_AVX2)
+
 /* `sn_leaf_plain` once more, eight points at a time: compilers take roots and choices one by one. */
 SN_AVX2 static void sn_leaf_wide(double *best, const double *p, const double *values, int64_t gap, int64_t count,
                                  const double *x, int64_t n, double gamma)
@@ -292,6 +324,7 @@ static int sn_has_wide(void)
 #else
 #define sn_tanh_all_wide sn_tanh_all_plain
 #define sn_rows_wide sn_rows_plain
+#define sn_columns_wide sn_columns_plain
 #define sn_leaf_wide sn_leaf_plain
 #define sn_children_wide sn_children_plain
 static int sn_has_wide(void) { return 0; }
@@ -311,6 +344,16 @@ static void sn_rows(const sn_work *w, double *y, const double *A, const double *
         sn_rows_wide(y, A, x, rows, gap, n);
     else
         sn_rows_plain(y, A, x, rows, gap, n);
+}
+
+/* x A, of four columns and more. */
+static void sn_columns(const sn_work *w, double *y, const double *A, const double *x, int64_t columns, int64_t gap,
+                       int64_t n)
+{
+    if (w->wide)
+        sn_columns_wide(y, A, x, columns, gap, n);
+    else
+        sn_columns_plain(y, A, x, columns, gap, n);
 }
 
 #else

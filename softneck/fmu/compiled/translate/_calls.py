@@ -61,6 +61,8 @@ def numpy_call(ex: CallContext, node: ast.AST, name: str, values: list[Value]) -
         return Value(_REDUCTIONS[name].format(values[0].code), FLOAT)
     if kinds == [VECTOR] and name in _ENTRYWISE:
         return ex.room(f"{_ENTRYWISE[name]}(w, {values[0].code})", VECTOR)
+    if kinds == [VECTOR] and name == "argsort":
+        return ex.room(f"sn_order(w, {values[0].code})", View(1, True))
     if kinds == [VECTOR] and name in _LIKE:
         made = ex.room(f"sn_zeros1(w, {values[0].code}.n)", VECTOR)
         if _LIKE[name] == "ones":
@@ -103,9 +105,12 @@ def _made(ex: CallContext, node: ast.AST, values: list[Value], *, whole: bool, v
         if value:
             ex.scope.emit(f"sn_fill2(&{made.code}, {value});")
         return made
+    if isinstance(shape, ast.Tuple) and len(shape.elts) == 3 and not whole and not value:
+        sizes = [ex.scalar(size, INT) for size in shape.elts]
+        return ex.room(f"sn_zeros3(w, {', '.join(sizes)})", View(3))
     size = values[0]
     if size.type != INT:
-        raise ex.scope.fail(node, "arrays are made with one or two dimensions.")
+        raise ex.scope.fail(node, "arrays are made with one to three dimensions.")
     made = ex.room(f"sn_zeros{'_i' if whole else '1'}(w, {size.code})", View(1, whole))
     if value and whole:
         raise ex.scope.fail(node, "whole numbers are made as zeros.")

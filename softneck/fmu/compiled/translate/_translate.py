@@ -12,7 +12,9 @@ from dataclasses import dataclass, field
 
 from softneck.runtime import bundle
 from softneck.runtime._tangent import with_tangent
+from softneck.runtime._tangent_activity import TangentError
 
+from ._along import along_one
 from ._chunks import defined, nested_loops, reached
 from ._expressions import Expressions
 from ._kinds import FAST
@@ -24,6 +26,7 @@ _MEMBERS = {
     "member_size": (2, INT, "sn_member_size(w, {})"),
     "member_initialise": (5, NONE, "sn_member_initialise(w, {})"),
     "member_step": (6, NONE, "sn_member_step(w, {})"),
+    "member_tangent": (10, NONE, "sn_member_tangent(w, {})"),
 }
 # Functions whose loops `sn_wide.h` has by hand, several numbers side by side: types and result as in Python, bits too.
 # One that returns numbers fills them in behind its arguments.
@@ -52,35 +55,37 @@ class Unit:
     functions: list[str] = field(default_factory=list)
     kinds: list[str] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
-    steps: list[str] = field(default_factory=list)
+    steps: list[tuple[str, str]] = field(default_factory=list)
     _bodies: dict[str, str] = field(default_factory=dict)
 
-    def add(self, module: str, ranks: tuple[int, ...]) -> None:
-        """Add runtime `module`, whose arrays have `ranks`.
+    def add(self, module: str, ranks: tuple[int, ...], *, tangent: bool = False) -> None:
+        """Add runtime `module`, whose arrays have `ranks`, and with `tangent` the derivative of its step.
 
         Raises:
             TranslationError: it uses what is not known in C; the unit is as it was before.
         """
         before = (list(self.types.declarations), list(self.functions), dict(self._bodies))
-        runtime = _Runtime(self, bundle(module, loops=False))
         arrays = Arrays(ranks)
         try:
+            text = bundle(module, loops=False)
+            runtime = _Runtime(self, along_one(text) if tangent else text)
             size = runtime.function("state_size", (arrays,))
             start = runtime.function("initialise", (arrays, VECTOR, VECTOR, VECTOR))
             step = runtime.function("step", (arrays, VECTOR, VECTOR, VECTOR, VECTOR))
             if size.result != INT or start.result != NONE or step.result != NONE:
                 raise TranslationError(f"{module}: `state_size` returns a whole number, the others nothing.")
-        except TranslationError as error:
+            moved = _tangent_of(runtime, arrays) if tangent else "NULL"
+        except (TranslationError, TangentError) as error:
             self.functions, self._bodies = before[1], before[2]
             raise TranslationError(f"{module}: {error}") from None
         number = len(self.names)
         self.names.append(module)
-        self.steps.append(step.name)
+        self.steps.append((step.name, moved))
         text = ", ".join(map(str, ranks)) or "0"
         self.functions.append(f"static const signed char sn_ranks{number}[] = {{{text}}};\n")
         self.kinds.append(
             f'    {{"{module}", sn_ranks{number}, {len(ranks)}, {int(runtime.has_members)}, '
-            f"{size.name}, {start.name}, {step.name}}},"
+            f"{size.name}, {start.name}, {step.name}, {moved}}},"
         )
 
     def tangent(self, module: str, ranks: tuple[int, ...]) -> str:
@@ -90,10 +95,7 @@ class Unit:
             TranslationError: it uses what is not known in C.
         """
         runtime = _Runtime(self, with_tangent(bundle(module, loops=False)))
-        if runtime.has_members:
-            raise TranslationError(f"{module}: derivatives of members are not translated.")
-        rows = (MATRIX, MATRIX, MATRIX)
-        return runtime.function("step_tangent", (Arrays(ranks), VECTOR, VECTOR, VECTOR, VECTOR, *rows, INT)).name
+        return _tangent_of(runtime, Arrays(ranks))
 
     def text(self) -> str:
         """Return the C file."""
@@ -112,7 +114,7 @@ class Unit:
         return {
             name
             for module, step in zip(self.names, self.steps, strict=True) if module in FAST
-            for name in reached(pieces, [step]) if depths[name] >= FAST[module]
+            for name in reached(pieces, step) if depths[name] >= FAST[module]
         }  # fmt: skip
 
     def keep(self, name: str, text: str) -> str:
@@ -219,7 +221,7 @@ class _Runtime:
             count, kind, code = _MEMBERS[name]
             if len(values) != count:
                 raise ex.scope.fail(node, f"`{name}` takes {count} arguments.")
-            value = Value(code.format(", ".join(value.code for value in values)), kind)
+            value = Value(code.format(", ".join(map(ex.scope.given, values))), kind)
         elif _BY_HAND.get(name, ((), NONE))[0] == tuple(value.type for value in values):
             kind = _BY_HAND[name][1]
             arguments = "".join(f", {ex.scope.given(value)}" for value in values)
@@ -240,6 +242,11 @@ class _Runtime:
             return Value("", NONE)
         ex.scope.allocates |= holds_view(value.type)
         return ex.scope.kept(value)
+
+
+def _tangent_of(runtime: _Runtime, arrays: Arrays) -> str:
+    rows = (MATRIX, MATRIX, MATRIX)
+    return runtime.function("step_tangent", (arrays, VECTOR, VECTOR, VECTOR, VECTOR, *rows, INT)).name
 
 
 def _whole_here(text: str) -> str:

@@ -1,0 +1,241 @@
+"""A, B, C, D of an FMU or a block after a while of held inputs.
+
+    x(k+1) = A x(k) + B u(k)
+    y(k)   = C x(k) + D u(k)
+
+of small changes, at the sample time. Of files and FMUs of ours whose step has derivatives they are exact; of all others
+they come from pulses on saved states.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from softneck.core import Matrix, SettingsError, Vector, atomic_write
+from softneck.identification.models._linearisation import moved_through
+from softneck.runtime import Block, Port, State
+from softneck.runtime._compile import load_tangent
+from softneck.runtime._tangent_activity import TangentError
+
+from ..parts._fmu_part import FmuPart
+from ..parts._ours import block_of
+from ._pulses import BlockSteps, FmuSteps, realised
+
+if TYPE_CHECKING:
+    import control
+
+# What an FMU of ours and its block may differ by: the library adds in another order (1e-12 of a signal's size).
+_SAME = 1e-9
+# Of a sample time: where `at` is meant to be one.
+_ON_GRID = 1e-6
+_MOST_SAMPLES = 10_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearPoint:
+    """A linear system near a moment.
+
+    Attributes:
+        A, B, C, D: (n, n), (n, inputs), (outputs, n), (outputs, inputs).
+        sample_time: [s].
+        time: the moment [s].
+        inputs, outputs: names; an FMU of others has them in its own units.
+        name: of the model.
+        method: "exact", or "pulses" on saved states.
+        error: most that the answers to pulses differ from this system's, of the largest of them; 0 where exact.
+    """
+
+    A: Matrix
+    B: Matrix
+    C: Matrix
+    D: Matrix
+    sample_time: float
+    time: float
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    name: str
+    method: str
+    error: float = 0.0
+
+    def ss(self) -> control.StateSpace:
+        """Return it for python-control, with `dt` and the signals' names."""
+        import control
+
+        return control.StateSpace(
+            self.A, self.B, self.C, self.D, self.sample_time,
+            inputs=list(self.inputs), outputs=list(self.outputs), name=self.name,
+        )  # fmt: skip
+
+    def to_mat(self, path: str | Path, *, force: bool = False) -> None:
+        """Write a MATLAB file: A, B, C, D, Ts, InputName, OutputName, as controllers write theirs."""
+        from scipy.io import savemat
+
+        names = {"InputName": self.inputs, "OutputName": self.outputs}
+        values = {"A": self.A, "B": self.B, "C": self.C, "D": self.D, "Ts": self.sample_time, "Time": self.time}
+        values |= {key: np.array(value, dtype=object) for key, value in names.items()}
+        with atomic_write(path, force=force) as temporary, temporary.open("wb") as file:
+            savemat(file, values)
+
+
+def linearize(
+    source: str | Path | Block, *, at: float = 0.0, values: Mapping[str, float] | None = None,
+    sample_time: float | None = None,
+) -> LinearPoint:  # fmt: skip
+    """Return the linear system near t = `at` of a block or an FMU whose inputs were held until then.
+
+    Booleans and inputs that mean "not measured" are held, and `validity` is no output of a linear system. States
+    that no input moves or no output shows are left out.
+
+    Args:
+        source: an FMU's path, or a block.
+        at: [s], on the grid of samples.
+        values: inputs and parameters that differ from their start values, in SI units.
+        sample_time: [s], of an FMU of others; its default step where none is given.
+
+    Raises:
+        SettingsError: a moment between samples, a name that is not there, an FMU that cannot save its state, or one
+            whose outputs no input moves.
+        FmuError: the FMU refused a call.
+    """
+    given = dict(values or {})
+    if isinstance(source, Block):
+        return _of_block(source, at, given)
+    with FmuPart(source, role=None if _says_role(source) else "plant", sample_time=sample_time) as part:
+        block = block_of(Path(source))
+        ours = block is not None and sample_time in (None, block.sample_time)
+        if block is not None and ours and _agrees(part, block, at, given):
+            return _of_block(block, at, given)
+        ports, parameters = _split(part.inputs, part.parameters, given, str(source))
+        steps = FmuSteps(part, parameters, ports)
+        return _by_pulses(steps, part.inputs, part.outputs, ports, at, Path(source).stem)
+
+
+def _says_role(path: str | Path) -> bool:
+    from softneck.fmu import unpacked
+
+    from ..parts._variables import read_description
+
+    with unpacked(Path(path)) as folder:
+        return bool(read_description(Path(path), folder, {}).annotation.role)
+
+
+def _of_block(block: Block, at: float, given: Mapping[str, float]) -> LinearPoint:
+    held, parameters = _split(block.inputs, block.parameters, given, block.kind)
+    state = _reached_state(block, block.initial_state(**parameters), held, at)
+    try:
+        tangent = load_tangent(block.runtime, compiled=False)  # for once: numba would take its time
+    except TangentError:
+        return _by_pulses(BlockSteps(block, state), block.inputs, block.outputs, held, at, block.kind, ready=True)
+    moved, shown = _moved(block.inputs, held), _shown(block.outputs)
+    n, m = state.values.size, len(moved)
+    X, U = np.zeros((n, n + m)), np.zeros((held.size, n + m))
+    X[:, :n] = np.eye(n)
+    U[moved, n + np.arange(m)] = 1.0
+    Y = np.zeros((len(block.outputs), n + m))
+    tangent(block.arrays, state.parameters, state.values.copy(), held, np.zeros(len(block.outputs)), X, U, Y, n + m)
+    A, B, C, D = X[:, :n], X[:, n:], Y[shown, :n], Y[shown, n:]
+    if block.role in ("plant", "reference"):
+        # A step returns the outputs of the next sample; as states of their own they are those of this one.
+        A, B = np.block([[A, np.zeros((n, len(C)))], [C, np.zeros((len(C), len(C)))]]), np.vstack([B, D])
+        C, D = np.hstack([np.zeros((len(C), n)), np.eye(len(C))]), np.zeros((len(C), m))
+    A, B, C = moved_through(A, B, C)
+    return LinearPoint(
+        A,
+        B,
+        C,
+        D,
+        block.sample_time,
+        at,
+        _names(block.inputs, moved),
+        _names(block.outputs, shown),
+        block.kind,
+        "exact",
+    )
+
+
+def _by_pulses(
+    steps: BlockSteps | FmuSteps, inputs: tuple[Port, ...], outputs: tuple[Port, ...], held: Vector, at: float,
+    name: str, *, ready: bool = False,
+) -> LinearPoint:  # fmt: skip
+    for _ in range(0 if ready else _samples(at, steps.sample_time, name)):
+        steps.step(held)
+    moved, shown = _moved(inputs, held), _shown(outputs)
+    A, B, C, D, error = realised(steps, held, moved, [_size(inputs[i]) for i in moved], shown, name)
+    return LinearPoint(
+        A, B, C, D, steps.sample_time, at, _names(inputs, moved), _names(outputs, shown), name, "pulses", error
+    )
+
+
+def _split(
+    inputs: tuple[Port, ...], parameters: tuple[Port, ...], given: Mapping[str, float], name: str
+) -> tuple[Vector, dict[str, float]]:
+    """Return the held inputs, and the parameters that are given."""
+    known = [port.name for port in inputs]
+    held = np.array([np.nan if port.missing else port.start for port in inputs])
+    left: dict[str, float] = {}
+    others = {port.name for port in parameters}
+    for key, value in given.items():
+        if not np.isfinite(value):
+            raise SettingsError(f"{key} = {value}: must be finite.")
+        if key in known:
+            held[known.index(key)] = value
+        elif key in others:
+            left[key] = value
+        else:
+            raise SettingsError(f"{name}: has no input or parameter `{key}`; it has {', '.join([*known, *others])}.")
+    return held, left
+
+
+def _samples(at: float, sample_time: float, name: str) -> int:
+    count = round(at / sample_time) if np.isfinite(at) and 0.0 <= at < _MOST_SAMPLES * sample_time else -1
+    if count < 0:
+        raise SettingsError(f"at t = {at:g} s: must be between 0 and {_MOST_SAMPLES} samples of {sample_time:g} s.")
+    if abs(at / sample_time - count) > _ON_GRID * max(count, 1):
+        raise SettingsError(
+            f"at t = {at:g} s: {name} has a sample each {sample_time:g} s; take {count * sample_time:g} s."
+        )
+    return count
+
+
+def _reached_state(block: Block, state: State, held: Vector, at: float) -> State:
+    count = _samples(at, block.sample_time, block.kind)
+    return block.run(state, np.tile(held, (count, 1)))[0] if count else state
+
+
+def _agrees(part: FmuPart, block: Block, at: float, given: Mapping[str, float]) -> bool:
+    """Return whether an FMU of ours still computes what this softneck's block does: up to `at`, and a sample more."""
+    held, parameters = _split(block.inputs, block.parameters, given, str(part.path))
+    state, seen = block.initial_state(**parameters), part.start(0.0, parameters)[: len(block.outputs)]
+    count = _samples(at, block.sample_time, block.kind)
+    expected = state.outputs
+    for k in range(count + 1):
+        seen = part.advance(k * block.sample_time, held)[: len(block.outputs)]
+        state, expected = block.step(state, held)
+    same = np.isclose(seen, expected, rtol=_SAME, atol=_SAME, equal_nan=True)
+    return bool(same.all())
+
+
+def _moved(inputs: tuple[Port, ...], held: Vector) -> list[int]:
+    return [i for i, port in enumerate(inputs) if not (port.boolean or port.integer) and np.isfinite(held[i])]
+
+
+def _shown(outputs: tuple[Port, ...]) -> list[int]:
+    return [i for i, port in enumerate(outputs) if not (port.boolean or port.integer) and port.name != "validity"]
+
+
+def _names(ports: tuple[Port, ...], chosen: list[int]) -> tuple[str, ...]:
+    return tuple(ports[i].name for i in chosen)
+
+
+def _size(port: Port) -> float:
+    """Return how large an input's moves are, for pulses to be small beside them."""
+    if port.nominal:
+        return abs(port.nominal)
+    if port.minimum is not None and port.maximum is not None and 0.0 < port.maximum - port.minimum < 1e6:
+        return 0.5 * (port.maximum - port.minimum)
+    return 1.0

@@ -1,0 +1,68 @@
+"""FMUs of ours as the blocks that they were made of."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+
+from softneck.core import FileFormatError, SettingsError
+from softneck.fmu import unpacked
+from softneck.fmu.compiled._model_file import node_of, read_model
+from softneck.runtime import Block, bundle
+from softneck.runtime._compile import compiled_name
+
+from ._variables import Description, read_description
+
+
+def block_of(path: Path) -> Block | None:
+    """Return the block in an FMU of ours, of both backends; None for an FMU of others or of another softneck.
+
+    A compiled FMU runs its own library: whether it computes what the block does is for the caller to see.
+
+    Raises:
+        FileFormatError: no FMU.
+    """
+    with unpacked(path) as folder:
+        description = read_description(path, folder, {})
+        if not description.annotation.role:
+            return None
+        model = folder / "resources" / "model.bin"
+        try:
+            if model.is_file():
+                return read_model(model.read_bytes(), description.annotation.kind, description.annotation.role)
+            return python_block(path, folder, description)
+        except (SettingsError, FileFormatError):
+            return None
+
+
+def python_block(path: Path, folder: Path, description: Description) -> Block | None:
+    """Return the block in an FMU of ours that runs Python, unpacked in `folder`; None for any other FMU.
+
+    Raises:
+        SettingsError: it was made by another version of softneck.
+    """
+    file = folder / "resources" / "block.json"
+    if not description.annotation.role or not file.is_file():
+        return None
+    facts = json.loads(file.read_text(encoding="utf-8"))
+    runtime = facts.get("module_of_runtime", "")
+    flat = np.load(folder / "resources" / "arrays.npy", allow_pickle=False)
+    ends = np.cumsum([math.prod(shape) for shape in facts["shapes"]])
+    parts = np.split(flat, ends[:-1]) if len(ends) else []
+    arrays = tuple(part.reshape(shape) for part, shape in zip(parts, facts["shapes"], strict=True))
+    # The table of kinds comes first: the name of a module from a file is not to be imported unseen.
+    if runtime:
+        node_of(runtime, arrays)
+    if not runtime or compiled_name(bundle(runtime)) != facts["runtime"]:
+        raise SettingsError(
+            f"{path}: was made by another version of softneck, whose equations may differ; make it again with "
+            "`softneck fmu`, or use `--backend python`."
+        )
+    return Block(
+        kind=facts["kind"], role=facts["role"], runtime=runtime, sample_time=facts["sample_time"], arrays=arrays,
+        inputs=description.ports("input"), outputs=description.ports("output"),
+        parameters=description.ports("parameter"),
+    )  # fmt: skip

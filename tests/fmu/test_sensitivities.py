@@ -1,0 +1,248 @@
+"""FMUs with sensitivities: what the next sample will be, and its directional derivatives, in FMI 2.0 and 3.0."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import fmpy
+import numpy as np
+import pytest
+from fmpy.fmi1 import FMICallException
+from fmpy.fmi3 import FMU3Slave
+from fmpy.validation import validate_fmu
+
+from softneck.cli._main import run
+from softneck.core import Matrix, SettingsError, load
+from softneck.fmu import build_compiled_fmu, unpacked
+from softneck.runtime import Block
+from softneck.runtime._compile import load_tangent
+
+from ..data import ROOT, slow_but
+from .conftest import Running
+
+TS = 0.02
+MOTORS = [f"motor_setpoint_{j}" for j in (1, 2, 3)]
+NEXT = ["pitch_next", "roll_next"]
+KINDS = ("rls", "rls_mimo", "oe", "srivc", "subspace", "nn", "play", "nss", "greybox", "ensemble", "guarded")
+pytestmark = pytest.mark.skipif(
+    shutil.which("cc") is None and not os.environ.get("CI"), reason="no C compiler here, and no library is built"
+)
+
+
+def block_of(kind: str) -> Block:
+    return load(ROOT / "tests" / "golden" / f"{kind}.npz", role="model").block()
+
+
+@pytest.fixture(scope="module", params=slow_but(KINDS, ("nn",)))
+def kind(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def path(kind: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    target = tmp_path_factory.mktemp(kind) / f"{kind}.fmu"
+    build_compiled_fmu(block_of(kind), target, sensitivities=True)
+    return target
+
+
+def motion(rows: int) -> Matrix:
+    """Set-points that wander, far from the corners of friction and limits."""
+    walk = np.cumsum(np.random.default_rng(3).normal(0.0, 0.3, (rows, 3)), axis=0)
+    return np.clip(walk, -4.0, 4.0)
+
+
+def move(fmu: Running, rows: int) -> None:
+    for k, row in enumerate(motion(rows)):
+        fmu.set(**dict(zip(MOTORS, row, strict=True)))
+        fmu.fmu.doStep(k * TS, TS)
+
+
+def derivatives(fmu: Running, names: list[str]) -> Matrix:
+    """Return (outputs to come, inputs), one input at a time as fmpy gives them."""
+    unknown = [fmu.references[name] for name in NEXT]
+    columns = [fmu.fmu.getDirectionalDerivative(unknown, [fmu.references[name]], [1.0]) for name in names]
+    return np.array(columns).T
+
+
+def differences(fmu: Running, names: list[str], size: float = 1e-5) -> Matrix:
+    columns = []
+    for name in names:
+        [held] = fmu.get(name)
+        sides = []
+        for sign in (1.0, -1.0):
+            fmu.set(**{name: held + sign * size})
+            sides.append(np.array(fmu.get(*NEXT)))
+        fmu.set(**{name: held})
+        columns.append((sides[0] - sides[1]) / (2.0 * size))
+    return np.array(columns).T
+
+
+def test_what_it_says_will_come_comes(path: Path, running: Any) -> None:
+    with running(path) as fmu, running(path) as blind:
+        fmu.begin()
+        blind.begin()
+        for k, row in enumerate(motion(60)):
+            for one in (fmu, blind) if k % 2 else ():  # held for two samples each
+                one.set(**dict(zip(MOTORS, row, strict=True)))
+            said = fmu.get(*NEXT)
+            derivatives(fmu, MOTORS)
+            for one in (fmu, blind):
+                one.fmu.doStep(k * TS, TS)
+            assert fmu.get("pitch", "roll") == said
+            # Looking changes nothing.
+            assert fmu.get("pitch", "roll") == blind.get("pitch", "roll")
+
+
+@pytest.mark.parametrize("measured", [False, True])
+def test_derivatives_are_those_of_differences(path: Path, measured: bool, running: Any) -> None:
+    names = MOTORS + (["pitch_measured", "roll_measured"] if measured else [])
+    with running(path) as fmu:
+        fmu.begin(use_measurement=float(measured))
+        if measured:
+            fmu.set(pitch_measured=0.01, roll_measured=-0.02)
+        move(fmu, 60)
+        exact, near = derivatives(fmu, names), differences(fmu, names)
+        # Rounding of differences: 1e-16 / 1e-5 of angles below 1; curvature times 1e-10; three digits of room.
+        np.testing.assert_allclose(exact, near, rtol=1e-5, atol=1e-8)
+        # Along several inputs at once: the sum.
+        seeds = np.linspace(-1.0, 1.0, len(names))
+        references = [fmu.references[name] for name in names]
+        moved = fmu.fmu.getDirectionalDerivative([fmu.references[name] for name in NEXT], references, seeds.tolist())
+        np.testing.assert_allclose(moved, exact @ seeds, rtol=1e-12, atol=1e-15)
+
+
+def test_it_is_the_derivative_of_the_python_model(path: Path, kind: str, running: Any) -> None:
+    block = block_of(kind)
+    state = block.initial_state(use_measurement=0.0)
+    rows = np.full((60, len(block.inputs)), np.nan)
+    rows[:, :3] = motion(60)
+    with running(path) as fmu:
+        fmu.begin()
+        for k, row in enumerate(motion(60)):
+            fmu.set(**dict(zip(MOTORS, row, strict=True)))
+            if k == 59:
+                at = block.run(state, rows[:59])[0]
+                X, U, Y = np.zeros((at.values.size, 3)), np.zeros((8, 3)), np.zeros((len(block.outputs), 3))
+                U[:3] = np.eye(3)
+                tangent = load_tangent(block.runtime, compiled=False)  # numba would take its time
+                tangent(block.arrays, at.parameters, at.values, rows[k], at.outputs.copy(), X, U, Y, 3)
+                # Sums of a network come in another order: rounding of some hundred terms.
+                np.testing.assert_allclose(derivatives(fmu, MOTORS), Y[:2], rtol=1e-10, atol=1e-13)
+            fmu.fmu.doStep(k * TS, TS)
+
+
+def test_between_samples_the_next_one_is_settled(path: Path, running: Any) -> None:
+    with running(path) as fmu:
+        fmu.begin()
+        move(fmu, 20)
+        fmu.set(motor_setpoint_1=1.0)
+        fmu.fmu.doStep(20 * TS, 0.4 * TS)
+        said = fmu.get(*NEXT)
+        fmu.set(motor_setpoint_1=-3.0)
+        assert fmu.get(*NEXT) == said
+        assert not derivatives(fmu, MOTORS).any()
+        fmu.fmu.doStep(20.4 * TS, 0.6 * TS)
+        assert fmu.get("pitch", "roll") == said
+
+
+def test_a_state_brings_its_next_sample_back(path: Path, running: Any) -> None:
+    with running(path) as fmu:
+        fmu.begin()
+        move(fmu, 20)
+        state = fmu.fmu.getFMUstate()
+        said, moved = fmu.get(*NEXT), derivatives(fmu, MOTORS)
+        move(fmu, 5)
+        assert fmu.get(*NEXT) != said
+        fmu.fmu.setFMUstate(state)
+        assert fmu.get(*NEXT) == said
+        np.testing.assert_array_equal(derivatives(fmu, MOTORS), moved)
+
+
+def test_what_the_file_says(path: Path) -> None:
+    assert validate_fmu(str(path)) == []
+    model = fmpy.read_model_description(str(path))
+    assert model.coSimulation is not None
+    assert model.coSimulation.providesDirectionalDerivative
+    known = {
+        getattr(unknown.variable, "name", ""): {v.name for v in unknown.dependencies or () if v is not None}
+        for unknown in model.outputs
+    }
+    inputs = {v.name for v in model.modelVariables if v.causality == "input"}
+    assert {name: known[name] == inputs for name in NEXT} == dict.fromkeys(NEXT, True)
+    assert not any(known[name] for name in known.keys() - set(NEXT))
+
+
+def test_fmi3_gives_the_same_bits(path: Path, kind: str, tmp_path: Path, running: Any) -> None:
+    build_compiled_fmu(block_of(kind), tmp_path / f"{kind}.fmu", sensitivities=True, fmi=3)
+    assert validate_fmu(str(tmp_path / f"{kind}.fmu")) == []
+    with running(path) as two:
+        two.begin()
+        move(two, 30)
+        expected, said = derivatives(two, MOTORS), two.get(*NEXT)
+    with unpacked(tmp_path / f"{kind}.fmu") as folder:
+        model = fmpy.read_model_description(str(folder))
+        assert model.coSimulation is not None
+        assert b'providesDirectionalDerivatives="true"' in (Path(folder) / "modelDescription.xml").read_bytes()
+        name = model.coSimulation.modelIdentifier
+        fmu = FMU3Slave(guid=model.guid, unzipDirectory=str(folder), modelIdentifier=name, instanceName="three")
+        references = {v.name: v.valueReference for v in model.modelVariables}
+        fmu.instantiate()
+        fmu.enterInitializationMode(startTime=0.0)
+        fmu.exitInitializationMode()
+        motors, unknown = [references[name] for name in MOTORS], [references[name] for name in NEXT]
+        for k, row in enumerate(motion(30)):
+            fmu.setFloat64(motors, row.tolist())
+            fmu.doStep(currentCommunicationPoint=k * TS, communicationStepSize=TS)
+        moved = [fmu.getDirectionalDerivative(unknown, [motor], [1.0]) for motor in motors]
+        assert list(fmu.getFloat64(unknown)) == said
+        fmu.freeInstance()
+    np.testing.assert_array_equal(np.array(moved).T, expected)
+
+
+def test_what_has_no_derivative_is_said(kind: str, path: Path, running: Any) -> None:
+    with running(path) as fmu:
+        fmu.begin()
+        ask = fmu.fmu.getDirectionalDerivative
+        ahead, motor = fmu.references["pitch_next"], fmu.references["motor_setpoint_1"]
+        # Other outputs wait for a step: no input moves them now.
+        assert ask([fmu.references["pitch"]], [motor], [1.0]) == [0.0]
+        for unknown, known, seed, words in (
+            (motor, motor, 1.0, "derivatives are of outputs"),
+            (ahead, fmu.references["pitch_start"], 1.0, "by inputs that are numbers"),
+            (ahead, 999, 1.0, "variable 999"),
+            (ahead, motor, float("nan"), "finite seeds"),
+        ):
+            with pytest.raises(FMICallException):
+                ask([unknown], [known], [seed])
+            assert words in fmu.log[-1][1]
+
+
+def test_an_fmu_without_says_so(tmp_path: Path, running: Any) -> None:
+    build_compiled_fmu(block_of("rls"), tmp_path / "Plain.fmu")
+    with running(tmp_path / "Plain.fmu") as fmu:
+        fmu.begin()
+        with pytest.raises(FMICallException):
+            fmu.fmu.getDirectionalDerivative([8], [0], [1.0])
+        assert "--sensitivities" in fmu.log[-1][1]
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("nlsm", "has no derivative"), ("pi", "only plants"), ("kalman", "only plants")]
+)
+def test_kinds_without_are_refused(name: str, words: str, tmp_path: Path) -> None:
+    block = load(ROOT / "tests" / "golden" / f"{name}.npz").block()
+    with pytest.raises(SettingsError, match=words):
+        build_compiled_fmu(block, tmp_path / "X.fmu", sensitivities=True)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source, target = str(ROOT / "tests" / "golden" / "nn.npz"), tmp_path / "Nn.fmu"
+    assert run(["fmu", source, "-o", str(target), "--sensitivities"]) == 2
+    assert "--backend compiled" in capsys.readouterr().err
+    assert not target.exists()
+    assert run(["fmu", source, "-o", str(target), "--backend", "compiled", "--sensitivities"]) == 0
+    assert "pitch_next" in {v.name for v in fmpy.read_model_description(str(target)).modelVariables}
