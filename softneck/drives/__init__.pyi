@@ -3,7 +3,6 @@ from .bus._file import default_drives as default_drives
 from .bus._link import CanLink as CanLink
 from .bus._link import open_bus as open_bus
 from .bus._read import load_drives as load_drives
-from .commissioning._commission import commission as commission
 from .commissioning._jog import jog as jog
 from .commissioning._neck_file import neck_drives as neck_drives
 from .commissioning._record import Experiment as Experiment
