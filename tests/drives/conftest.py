@@ -21,7 +21,7 @@ from .certified import write_verified
 LOOP = """duration_s = {duration}
 sample_time_s = 0.02
 [plant]
-python = "neck_for_drives:make"
+python = "{module}:make"
 [observer]
 file = "kalman.npz"
 [controller]
@@ -48,6 +48,11 @@ class Project:
     folder: Path
 
     @property
+    def module(self) -> str:
+        """Of the plant; of its own in each folder, as Python knows one module of a name."""
+        return f"neck_for_{self.folder.name}"
+
+    @property
     def controller(self) -> Path:
         return self.folder / "pi.npz"
 
@@ -61,7 +66,8 @@ class Project:
 
     def write_loop(self, name: str, reference: str, duration: float, limit: float = 30.0) -> Path:
         path = self.folder / name
-        path.write_text(LOOP.format(duration=duration, reference=reference, limit=limit), encoding="utf-8")
+        text = LOOP.format(module=self.module, duration=duration, reference=reference, limit=limit)
+        path.write_text(text, encoding="utf-8")
         return path
 
 
@@ -72,8 +78,8 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     model = Rls(delay=0.08).fit([record(signal("eq22", duration=40.0), paper, seed=1)])
     PiSettings().design(model).save(folder / "pi.npz")
     KalmanSettings().design(model).save(folder / "kalman.npz")
-    (folder / "neck_for_drives.py").write_text(NECK, encoding="utf-8")
     made = Project(folder)
+    (folder / f"{made.module}.py").write_text(NECK, encoding="utf-8")
     made.write_loop("loop.toml", STEP, 4.0)
     write_verified(made.controller)
     result = simulate(load_loop(made.loop))
