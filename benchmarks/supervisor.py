@@ -70,7 +70,8 @@ def undisturbed(hours: float) -> None:
         begin, told = bench.now, 0.0
         while bench.phase is Phase.RUNNING and bench.now < begin + 60.0 * _MINUTES:
             bench.step()
-            told += bench.master._watches._plausible.tilt.valid
+            plausible = bench.master._watches._plausible
+            told += 0.0 if plausible is None else plausible.tilt.valid
         fault = bench.master.supervisor.fault
         seconds = bench.now - begin
         add(path, {"seed": seed, "kind": kind, "payload": payload, "seconds": seconds,

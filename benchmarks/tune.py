@@ -73,9 +73,9 @@ def truth(neck: str, controller: Any, ahead: float) -> dict[str, float]:
             found = metrics(run(neck, block, step, kg, seed, 8.0))
             stepped = [found[axis] for axis, part in zip(("pitch", "roll"), share, strict=True) if part > 0.05]
             for name, key in (("overshoot", "overshoot_pct"), ("rise", "rise_s")):
-                worst[name] = max(worst[name], *(math.inf if item[key] is None else item[key] for item in stepped))
+                worst[name] = max([worst[name], *(math.inf if item[key] is None else item[key] for item in stepped)])
             worst["steady"] = max(
-                worst["steady"], *(found[axis]["steady_rms_deg"] or 0.0 for axis in ("pitch", "roll"))
+                [worst["steady"], *(found[axis]["steady_rms_deg"] or 0.0 for axis in ("pitch", "roll"))]
             )
         circle = RotationReference(inclination=CIRCLE, frequency=TURN / (2.0 * math.pi), at=3.0, rise=2.0)
         result = run(neck, block, circle, kg, seed, 5.0 + 4.0 * math.pi / TURN)

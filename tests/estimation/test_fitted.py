@@ -33,6 +33,7 @@ def test_what_was_fitted_is_kept_only_where_it_is_better() -> None:
     found = fitted_observer(wrong, [record])
     assert found.checks[found.kept] == min(found.checks.values())
     assert found.kept == "noise and delay"
+    assert isinstance(found.observer, KalmanObserver)
     assert found.observer.delays == (4, 2)
     # Nothing but the sensor's noise of 0.05 deg is left, of some 140 angles known to 6 %; by default a third more.
     assert found.checks["noise and delay"] == pytest.approx(math.radians(0.05), rel=0.2)
@@ -104,6 +105,7 @@ def test_the_summary_says_where_the_delay_comes_from() -> None:
 
 def test_only_dead_time_is_later() -> None:
     later = delayed(observer_of(), 2)
+    assert isinstance(later, KalmanObserver)
     assert later.delays == (6, 4)
     assert later.lead == observer_of().lead
 
