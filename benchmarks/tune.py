@@ -73,7 +73,8 @@ def truth(neck: str, controller: Any, ahead: float) -> dict[str, float]:
             found = metrics(run(neck, block, step, kg, seed, 8.0))
             stepped = [found[axis] for axis, part in zip(("pitch", "roll"), share, strict=True) if part > 0.05]
             for name, key in (("overshoot", "overshoot_pct"), ("rise", "rise_s")):
-                worst[name] = max([worst[name], *(math.inf if item[key] is None else item[key] for item in stepped)])
+                values = [item[key] for item in stepped]
+                worst[name] = max([worst[name], *(math.inf if value is None else value for value in values)])
             worst["steady"] = max(
                 [worst["steady"], *(found[axis]["steady_rms_deg"] or 0.0 for axis in ("pitch", "roll"))]
             )

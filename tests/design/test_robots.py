@@ -16,7 +16,7 @@ from softneck.cosim import make_loop, simulate
 from softneck.cosim.loops._loop_table import check_key
 from softneck.design import MpcSettings, PiSettings, design_controller
 from softneck.design.plants._uncertain import uncertain_plant
-from softneck.design.predictive._predicted import settings_of_robot
+from softneck.design.predictive._predicted import settings_for, settings_of_robot
 from softneck.identification import Model
 from softneck.identification.models._state_space import lss_arrays
 from softneck.loop._faults import make_fault
@@ -230,11 +230,11 @@ def test_what_predictive_control_has_for_necks_only_is_refused(setting: dict[str
 def test_a_predictive_controller_looks_as_far_as_its_robot_is_slow(sample_time: float) -> None:
     """The same rows are the same problem, however long a sample takes."""
     slow = replace(plant(BELLOWS), sample_time=sample_time)
-    asked = settings_of_robot(MpcSettings(), uncertain_plant(slow))
+    asked = settings_of_robot(settings_for(MpcSettings(), slow), uncertain_plant(slow))
     # 0.6 s of a neck's 0.2 s: three time constants of -1 / log(0.9) = 9.5 samples.
     assert (asked.horizon, asked.moves) == (28, 10)
     assert asked.reference_time == pytest.approx(-sample_time / math.log(POLE))
-    given = settings_of_robot(MpcSettings(horizon=20, moves=5), uncertain_plant(slow))
+    given = settings_of_robot(settings_for(MpcSettings(horizon=20, moves=5), slow), uncertain_plant(slow))
     assert (given.horizon, given.moves) == (20, 5)
 
 
