@@ -24,6 +24,7 @@ _OF_RATE = ("_rate", "_rate_measured", "_rate_estimate")
 _OF_ALL = {
     "compression": "m",
     "payload": "kg",
+    "payload_estimate": "kg",
     "push_x": "N",
     "push_y": "N",
     "base_tilt_pitch": "deg",
