@@ -40,8 +40,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "pid": {**TAUT, "lead_limit": 0.8, "reference_time": 0.25},
     "fopi": {**TAUT, "lead_limit": 0.8, "reference_time": 0.14},
     "lqg": {**TAUT, "lead_limit": 0.8, "reference_time": 0.16},
-    # Its tautness follows the neck; that of the rotation in `mpc_neck.py`. The filter is that of the PI.
-    "mpc": {"minimum_tautness": -0.1, "reference_time": 0.12},
+    "mpc": {},
 }
 
 # Kinds that nothing can be designed for here, and why.
