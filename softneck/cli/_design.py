@@ -11,6 +11,7 @@ from softneck.core import KINDS, SettingsError, find_kind, load, refuse_existing
 from softneck.core._kinds import fitting, kinds_of
 
 from .shared._console import note, percent, print_json, progress
+from .shared._groups import kinds_complete
 from .shared._options import apply_settings, force_option, json_option, output_option, set_option, target
 from .shared._robot import load_of, robot_option
 
@@ -27,7 +28,7 @@ _LEAST_FIT = 30.0
     f"\n\n\b\nKinds:\n{_KINDS}",
     epilog="Example: softneck design pi rls.npz -o pi.npz --set phase_margin_deg=60",
 )
-@click.argument("kind")
+@click.argument("kind", shell_complete=kinds_complete("controller"))
 @click.argument("models", nargs=-1, required=True, metavar="MODEL|FAMILY...", type=click.Path(path_type=Path))
 @output_option("controller", "CONTROLLER")
 @click.option("--any-fit", is_flag=True, help=f"Also on a model whose free run has a fit below {_LEAST_FIT:g} %.")
