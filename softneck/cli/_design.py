@@ -12,6 +12,7 @@ from softneck.core._kinds import fitting, kinds_of
 
 from .shared._console import note, percent, print_json, progress
 from .shared._groups import kinds_complete
+from .shared._kind_help import kind_command
 from .shared._options import apply_settings, force_option, json_option, output_option, set_option, target
 from .shared._robot import load_of, robot_option
 
@@ -23,6 +24,7 @@ _LEAST_FIT = 30.0
 
 @click.command(
     "design",
+    cls=kind_command("controller"),
     help="Design a controller of KIND on an identified linear MODEL or a FAMILY; of several files the first is the "
     "nominal plant and all are samples that the controller must hold on."
     f"\n\n\b\nKinds:\n{_KINDS}",

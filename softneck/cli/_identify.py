@@ -24,6 +24,7 @@ from ._search import (
 )
 from .shared._console import note, percent, print_json, progress
 from .shared._groups import kinds_complete
+from .shared._kind_help import kind_command
 from .shared._options import (
     apply_settings,
     force_option,
@@ -48,6 +49,7 @@ _KINDS += "\n  auto     tries them all and takes the best in free run"
 
 @click.command(
     "identify",
+    cls=kind_command("model"),
     help=f"Identify a model of KIND from one or more recordings.\n\n\b\nKinds:\n{_KINDS}",
     epilog="Example: softneck identify rls neck.csv -o rls.npz --set na=1 --set delay=0.08",
 )
