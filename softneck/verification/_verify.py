@@ -13,6 +13,7 @@ import numpy as np
 
 from softneck.core import DataError, Progress, SettingsError, silent
 from softneck.core._certificate import certificate_contents
+from softneck.core._shown import Shown, marks
 from softneck.estimation._axis import robot_of
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.robot import Robot
@@ -31,8 +32,8 @@ from ._steps import check_ports
 from ._worst import write_linear, write_neck
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Verdict:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Verdict(Shown):
     """One requirement and what came of it.
 
     Attributes:
@@ -50,8 +51,8 @@ class Verdict:
     note: str = ""
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Verification:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class Verification(Shown):
     """What a verification found: each requirement, its worst plant, and whether all hold.
 
     Attributes:
@@ -96,18 +97,16 @@ class Verification:
 
     def summary(self) -> str:
         """Return a line or two for people."""
-        count = len(self.verdicts)
-        text = (
-            f"{count - len(self.failed)} of {count} requirements hold"
-            if self.failed
-            else f"all {count} requirements hold"
-        )
-        absent = sum(verdict.value is None for verdict in self.verdicts)
-        text += f", {absent} of them not computed" if absent else ""
+        count, absent = len(self.verdicts), sum(verdict.value is None for verdict in self.verdicts)
+        text = f"{count - len(self.failed)} of {count}" if self.failed else f"all {count}"
+        text += " requirements hold" + (f", {absent} of them not computed" if absent else "")
         return (
             f"{text}; {len(self.evidence.plants)} plants, {len(self.evidence.necks)} loops over the virtual neck, "
             f"{self.order_words()}; {self.wall_time:.1f} s"
         )
+
+    def _picture(self) -> str:
+        return marks([verdict.holds for verdict in self.verdicts])
 
     def contents(self, loops: Mapping[int, Path] | None = None) -> dict[str, Any]:
         """Return the certificate's JSON values; `loops`: number of a verdict -> the loop file of its worst plant."""

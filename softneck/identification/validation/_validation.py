@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import DataError, Matrix, Vector, require_one_of
+from softneck.core._shown import Shown, sparkline
 from softneck.robot import Robot
 from softneck.signals import Recording
 
@@ -40,8 +41,8 @@ _PROMISING = ("nlsm", "residual")
 Scores = dict[str, dict[str, float | None]]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Validation:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Validation(Shown):
     """What one model is worth on one recording.
 
     Scores are tables horizon -> axis -> value ("1", ..., "inf"; "pitch", "roll"), None where the free run diverged or
@@ -115,6 +116,15 @@ class Validation:
     lower: Matrix
     upper: Matrix
     robot: Robot = field(default_factory=Robot.preset)
+
+    def summary(self) -> str:
+        """Return two lines: what was judged on what, and the fits of the free run."""
+        fits = self.fits.get("inf", {})
+        said = ", ".join(f"{axis} {'-' if fit is None else f'{fit:.1f} %'}" for axis, fit in fits.items())
+        return f"{self.model} on {self.data}, {self.rows_scored} rows judged\nfree run: {said or 'not asked for'}"
+
+    def _picture(self) -> str:
+        return sparkline([self.measured[:, 0], self.free_run[:, 0]])
 
     @property
     def white(self) -> bool:
