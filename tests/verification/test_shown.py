@@ -11,11 +11,11 @@ import pytest
 
 import softneck
 from softneck.core._shown import bars, marks, sparkline
-from softneck.cosim import make_study
+from softneck.cosim import make_loop, make_study
 from softneck.estimation import KalmanSettings
 from softneck.identification import Model
 from softneck.plant import NeckParameters, VirtualNeck
-from softneck.signals import Recording
+from softneck.signals import Recording, assess_quality
 from softneck.verification import make_requirements
 
 from .necks import QUICK, family, linear_neck, pi
@@ -48,6 +48,13 @@ def things(neck: Recording, models: dict[str, Model]) -> dict[str, Any]:
         "validation": softneck.validate(rls, neck, names=(HOSTILE, HOSTILE), include_training=True),
         "result": replace(done, remarks=(HOSTILE,)),
         "signals": done.signals,
+        "loop": make_loop(table).loop,
+        "loop with limits": make_loop(table),
+        "block": rls.block(),
+        "state": rls.initial_state(),
+        "robot": rls.robot,
+        "quality": assess_quality(neck),
+        "evidence": found.evidence,
         "study": replace(study, name=HOSTILE),
         "verification": found,
         "verdict": replace(found.verdicts[0], note=HOSTILE, worst={HOSTILE: 1}),
