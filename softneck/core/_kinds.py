@@ -197,6 +197,11 @@ def load(path: str | Path, *, role: str | None = None) -> Any:
         return resolve(kind.result).from_archive(header, arrays)
 
 
+def opened(thing: Any, role: str | None = None) -> Any:
+    """Return `thing`, or what its file holds where it is a path; as `load` otherwise."""
+    return load(thing, role=role) if isinstance(thing, str | Path) else thing
+
+
 @contextmanager
 def fitting(path: str | Path) -> Iterator[None]:
     """Raise FileFormatError for whatever a header and arrays that do not fit together lead to."""
