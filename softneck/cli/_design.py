@@ -11,6 +11,8 @@ from softneck.core import KINDS, SettingsError, find_kind, load, refuse_existing
 from softneck.core._kinds import fitting, kinds_of
 
 from .shared._console import note, percent, print_json, progress
+from .shared._groups import kinds_complete
+from .shared._kind_help import kind_command
 from .shared._options import apply_settings, force_option, json_option, output_option, set_option, target
 from .shared._robot import load_of, robot_option
 
@@ -22,12 +24,13 @@ _LEAST_FIT = 30.0
 
 @click.command(
     "design",
+    cls=kind_command("controller"),
     help="Design a controller of KIND on an identified linear MODEL or a FAMILY; of several files the first is the "
     "nominal plant and all are samples that the controller must hold on."
     f"\n\n\b\nKinds:\n{_KINDS}",
     epilog="Example: softneck design pi rls.npz -o pi.npz --set phase_margin_deg=60",
 )
-@click.argument("kind")
+@click.argument("kind", shell_complete=kinds_complete("controller"))
 @click.argument("models", nargs=-1, required=True, metavar="MODEL|FAMILY...", type=click.Path(path_type=Path))
 @output_option("controller", "CONTROLLER")
 @click.option("--any-fit", is_flag=True, help=f"Also on a model whose free run has a fit below {_LEAST_FIT:g} %.")

@@ -11,6 +11,7 @@ import numpy as np
 from softneck.core import CheckFailedError, file_hash, refuse_existing
 
 from .shared._console import print_json, progress
+from .shared._kind_help import kind_command
 from .shared._options import apply_settings, force_option, json_option, output_option, set_option, target
 from .shared._robot import robot_option
 
@@ -22,7 +23,9 @@ _SCOPES = ("windows", "operating points", "recordings")
 
 
 @click.command(
-    "family", epilog="Example: softneck family 0g.csv 400g.csv 1000g.csv -o neck_family.npz --html family.html"
+    "family",
+    cls=kind_command("family", "family"),
+    epilog="Example: softneck family 0g.csv 400g.csv 1000g.csv -o neck_family.npz --html family.html",
 )
 @click.argument("recordings", nargs=-1, required=True, type=click.Path(path_type=Path))
 @output_option("family", "FAMILY")

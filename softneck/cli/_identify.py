@@ -23,6 +23,8 @@ from ._search import (
     write_plot,
 )
 from .shared._console import note, percent, print_json, progress
+from .shared._groups import kinds_complete
+from .shared._kind_help import kind_command
 from .shared._options import (
     apply_settings,
     force_option,
@@ -47,10 +49,11 @@ _KINDS += "\n  auto     tries them all and takes the best in free run"
 
 @click.command(
     "identify",
+    cls=kind_command("model"),
     help=f"Identify a model of KIND from one or more recordings.\n\n\b\nKinds:\n{_KINDS}",
     epilog="Example: softneck identify rls neck.csv -o rls.npz --set na=1 --set delay=0.08",
 )
-@click.argument("kind")
+@click.argument("kind", shell_complete=kinds_complete("model", "auto"))
 @click.argument("recordings", nargs=-1, required=True, type=click.Path(path_type=Path))
 @output_option("model", "MODEL")
 @click.option("--train", default=0.7, show_default=True, help="Part of each run, from its start, to train on.")

@@ -16,6 +16,8 @@ from softneck import __version__
 from softneck.core import SoftneckError
 from softneck.core._errors import missing_extra
 
+from .shared._groups import NearGroup
+
 # Subcommand -> module and what it does; a module is imported when its command is called, so that
 # `softneck --help` answers at once.
 _COMMANDS = {
@@ -44,12 +46,13 @@ _COMMANDS = {
     "ssp": ("_ssp", "Write a loop as an SSP file for other simulators."),
     "drives": ("drives._commands", "Run controllers on CANopen drives, or on simulated ones."),
     "report": ("_report", "Write one page on a whole project: data, models, certificates, loops, studies."),
+    "completion": ("shared._completion", "Print the script by which a shell completes these commands."),
     "new": ("_new", "Start a project whose closed-loop test passes at once."),
 }
 _INTERRUPTED, _BAD_INPUT, _OUR_FAULT = 130, 2, 3
 
 
-class _LazyGroup(click.Group):
+class _LazyGroup(NearGroup):
     """A group whose subcommands are imported on demand."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:

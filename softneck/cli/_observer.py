@@ -10,6 +10,7 @@ import click
 from softneck.core import SettingsError, find_kind, refuse_existing, resolve, to_si
 
 from .shared._console import print_json
+from .shared._kind_help import kind_command
 from .shared._options import apply_settings, force_option, json_option, output_option, set_option, target
 from .shared._robot import load_of, robot_option
 
@@ -17,7 +18,11 @@ if TYPE_CHECKING:
     from softneck.estimation._fitted import FittedObserver
 
 
-@click.command("observer", epilog="Example: softneck observer rls.npz -o observer.npz --sensor paper")
+@click.command(
+    "observer",
+    cls=kind_command("observer", "kalman"),
+    epilog="Example: softneck observer rls.npz -o observer.npz --sensor paper",
+)
 @click.argument("model", type=click.Path(path_type=Path))
 @output_option("observer", "OBSERVER")
 @click.option(

@@ -10,13 +10,16 @@ import click
 from softneck.core import SettingsError, atomic_write
 
 from .shared._console import print_json
+from .shared._groups import NearGroup
 from .shared._options import force_option, json_option
 
 if TYPE_CHECKING:
     from softneck.robot import Robot
 
 
-@click.group("robot", epilog="Example: softneck robot new --preset antagonist, then softneck robot check")
+@click.group(
+    "robot", cls=NearGroup, epilog="Example: softneck robot new --preset antagonist, then softneck robot check"
+)
 def command() -> None:
     """Say what the robot is: its motors, outputs, directions and limits (`robot.toml`).
 

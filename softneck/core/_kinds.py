@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ._archive import read_archive
+from ._checks import did_you_mean
 from ._errors import FileFormatError, SettingsError
 
 
@@ -144,7 +145,10 @@ def find_kind(name: str, role: str) -> Kind:
     """Return the kind of that name; raise SettingsError with the known ones if there is none."""
     kind = KINDS.get(name)
     if kind is None or kind.role != role:
-        raise SettingsError(f"unknown kind of {role} `{name}`; use one of {', '.join(kinds_of(role))}.")
+        known = kinds_of(role)
+        raise SettingsError(
+            f"unknown kind of {role} `{name}`; {did_you_mean(name, known)}use one of {', '.join(known)}."
+        )
     return kind
 
 
@@ -157,7 +161,8 @@ def make_settings(settings_class: type, values: Mapping[str, Any]) -> Any:
     fields = {field.name for field in dataclasses.fields(settings_class)}
     unknown = sorted(set(values) - fields)
     if unknown:
-        raise SettingsError(f"unknown setting `{unknown[0]}`; this kind has {', '.join(sorted(fields))}.")
+        meant = did_you_mean(unknown[0], fields)
+        raise SettingsError(f"unknown setting `{unknown[0]}`; {meant}this kind has {', '.join(sorted(fields))}.")
     try:
         return settings_class(**values)
     except TypeError as error:
@@ -190,6 +195,11 @@ def load(path: str | Path, *, role: str | None = None) -> Any:
         raise FileFormatError(f"{path}: is a {kind.role} ({kind.name}), not a {role}.")
     with fitting(path):
         return resolve(kind.result).from_archive(header, arrays)
+
+
+def opened(thing: Any, role: str | None = None) -> Any:
+    """Return `thing`, or what its file holds where it is a path; as `load` otherwise."""
+    return load(thing, role=role) if isinstance(thing, str | Path) else thing
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from softneck.core import find_kind, resolve
-from softneck.core._kinds import make_settings
+from softneck.core._kinds import make_settings, opened
 
 
 def design_controller(kind: str, plant: Any, **settings: Any) -> Any:
@@ -13,11 +13,13 @@ def design_controller(kind: str, plant: Any, **settings: Any) -> Any:
 
     Args:
         kind: name in the table of kinds: "pi", "pid", "hinf", "mpc", ...
-        plant: an identified linear model, a family, or a list whose first entry is the nominal plant.
+        plant: an identified linear model, a family, the file of one, or a list whose first entry is the nominal plant.
         **settings: for instance `phase_margin=1.05`; angles in rad.
 
     Raises:
         SettingsError: an unknown kind or setting, a value out of range, or a plant that does not fit.
+        FileFormatError: no such file, or not one of ours.
         CheckFailedError: no controller of this kind meets its settings on that plant.
     """
-    return make_settings(resolve(find_kind(kind, "controller").settings), settings).design(plant)
+    made = make_settings(resolve(find_kind(kind, "controller").settings), settings)
+    return made.design([opened(one) for one in plant] if isinstance(plant, list | tuple) else opened(plant))

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from softneck.core import DataError, Vector
+from softneck.core._shown import Shown
 from softneck.signals import Recording
 
 from ._kalman import KalmanObserver
@@ -48,8 +49,8 @@ class Squares:
     window: int
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Consistency:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Consistency(Shown):
     """NIS and NEES of a filter over a recording.
 
     Attributes:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import FileFormatError, Matrix, SettingsError, Vector, to_si, write_archive
+from softneck.core._shown import Shown
 from softneck.robot import Robot
 from softneck.runtime import Block, Port, State
 from softneck.runtime._bundle import sized
@@ -46,8 +47,8 @@ _SOURCES = {"given": "as given", "sensor": "of the sensor", "robot": "of the rob
             "motor positions": "the most that motor positions allow"}  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class KalmanObserver:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class KalmanObserver(Shown):
     """A designed Kalman filter; `KalmanSettings.design` makes it.
 
     Attributes:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import FileFormatError, Matrix, Vector, to_si, write_archive
+from softneck.core._shown import Shown
 from softneck.identification import Model
 from softneck.identification.models._arrays import without_validity
 from softneck.identification.models._directions import NECK_SECONDS
@@ -47,8 +48,8 @@ _PAYLOAD = Port(name="payload", unit="kg", description="estimated, within what t
 _MEANINGS = ("standard deviation", "standard deviation", "of the model's fastest motion of late")
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class NonlinearObserver:
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class NonlinearObserver(Shown):
     """A filter over an identified model of any kind; `KalmanSettings.design` makes it.
 
     The angle is what the model makes of the set-points in free run, plus a disturbance that walks: at rest by

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from softneck.core import DataError, Matrix, Vector
+from softneck.core._shown import Shown
 from softneck.robot import Robot
 from softneck.signals import Recording
 from softneck.signals.recording._recording import require_same_robot
@@ -51,8 +52,8 @@ class LinearFilter(Filter, Protocol):
     def filterpy(self) -> Any: ...
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Estimates:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Estimates(Shown):
     """What the filter made of a recording, row by row; angles of another robot are its outputs, in SI.
 
     Attributes:

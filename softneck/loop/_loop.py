@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from softneck.core import SettingsError, require_one_of, require_positive
+from softneck.core._shown import Shown
 from softneck.robot import Robot
 
 from ._faults import Fault
@@ -19,8 +20,8 @@ _NAMES = ("plant", "observer", "controller", "reference")
 USE_MOTOR_POSITIONS = "use_motor_positions"
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Loop:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class Loop(Shown):
     """A closed loop.
 
     Attributes:

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 
 from softneck.core import DataError, SettingsError, Vector, require_one_of, to_si
+from softneck.core._shown import Shown, sparkline
 from softneck.robot import Robot
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LoopResult:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class LoopResult(Shown):
     """All signals of one run, named as in a recording.
 
     At row k stand the outputs of the plant at t_k and what observer and controller held from t_k on.
@@ -33,6 +34,15 @@ class LoopResult:
     units: Mapping[str, str]
     sample_time: float
     robot: Robot = field(default_factory=Robot.preset)
+
+    def summary(self) -> str:
+        """Return a line on what ran."""
+        length, step = len(self.time) * self.sample_time, 1e3 * self.sample_time
+        return f"{length:g} s in steps of {step:g} ms, {len(self.signals)} signals of {self.robot.name}"
+
+    def _picture(self) -> str:
+        axes = [axis for axis in self.robot.outputs.names if axis in self.signals or f"{axis}_measured" in self.signals]
+        return sparkline([self.angle(axis) for axis in axes])
 
     def __getitem__(self, name: str) -> Vector:
         """Return one signal (N,); raise DataError with the known names if there is none."""

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from softneck.core import require_one_of, require_positive
+from softneck.core._shown import Shown
 from softneck.robot import Robot
 
 from ._faults import Fault
@@ -14,8 +15,8 @@ from ._part import Part
 from ._wiring import Link
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class System:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class System(Shown):
     """Parts and their connections; nothing is connected by name, and no part must be a plant or a controller.
 
     Attributes:

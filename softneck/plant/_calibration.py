@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import DataError, Matrix, Progress, SettingsError, Vector, require_whole, silent
+from softneck.core._shown import Shown
 from softneck.signals import Recording
 
 from ._neck import VirtualNeck
@@ -31,8 +32,8 @@ _SETTLED, _THIN = 3.0, 2
 _PRIOR = 0.01
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Calibration:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class Calibration(Shown):
     """A neck and how well it follows what it was not fitted to.
 
     Attributes:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, require_between, to_si
+from softneck.core._shown import Shown
 from softneck.robot import Robot
 from softneck.runtime import Block, Port
 from softneck.runtime._bundle import sized
@@ -67,8 +68,8 @@ def _outputs(robot: Robot) -> tuple[Port, ...]:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class VirtualNeck:
+@dataclass(frozen=True, slots=True, repr=False)
+class VirtualNeck(Shown):
     """A physics model of the tendon-driven soft neck (docs, "The virtual neck"), or of a robot built like it.
 
     Attributes:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
 import math
 import tomllib
 from collections.abc import Iterator, Mapping
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import FileFormatError, SettingsError, SoftneckError, require_one_of
+from softneck.core._checks import did_you_mean
 
 from ._channels import Motors, Outputs
 from ._directions import Directions
@@ -139,9 +139,8 @@ def _check(table: Mapping[str, Any]) -> None:
 
 
 def _unknown(shown: str, key: str, known: list[str], prefix: str) -> SettingsError:
-    near = difflib.get_close_matches(key, known, n=1)
-    hint = f"did you mean `{prefix}{near[0]}`?" if near else f"known: {', '.join(known)}."
-    return SettingsError(f"unknown key `{shown}`; {hint}")
+    hint = did_you_mean(key, known, prefix) or f"known: {', '.join(known)}."
+    return SettingsError(f"unknown key `{shown}`; {hint.rstrip()}")
 
 
 def _check_value(key: str, value: Any, what: str) -> None:

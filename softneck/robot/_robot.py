@@ -13,14 +13,15 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, require_positive
+from softneck.core._shown import Shown
 
 from . import _file
 from ._channels import Motors, Outputs
 from ._directions import Directions
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Robot:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Robot(Shown):
     """A robot that motors move: what it is, and what is known of it; None where it is not given.
 
     Attributes:

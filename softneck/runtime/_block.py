@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import DataError, Matrix, SettingsError, Vector
+from softneck.core._shown import Shown
 
 from ._compile import Runtime, load_runtime
 
@@ -42,8 +43,8 @@ class Port:
     display_unit: str = ""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class State:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class State(Shown):
     """All that a block remembers.
 
     Attributes:
@@ -57,8 +58,8 @@ class State:
     outputs: Vector
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Block:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class Block(Shown):
     """A discrete-time system with named ports, described by a runtime module and its arrays.
 
     A plant's `step` holds the inputs over [t_k, t_k+1) and returns the outputs at t_k+1; that of an

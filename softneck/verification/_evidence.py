@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Progress, Vector
+from softneck.core._shown import Shown
 from softneck.loop._result import shown_unit
 from softneck.runtime import Block
 
@@ -84,8 +85,8 @@ class LinearEvidence:
     delays: np.ndarray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Evidence:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Evidence(Shown):
     """All that was computed.
 
     Attributes:

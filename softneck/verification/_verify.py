@@ -13,6 +13,8 @@ import numpy as np
 
 from softneck.core import DataError, Progress, SettingsError, silent
 from softneck.core._certificate import certificate_contents
+from softneck.core._kinds import opened
+from softneck.core._shown import Shown, marks
 from softneck.estimation._axis import robot_of
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.robot import Robot
@@ -24,15 +26,15 @@ from ._experiments import crossing_values
 from ._laws import ControllerUnderTest, judge
 from ._neck_loops import check_blocks
 from ._own_plants import ALONE, is_own_plant, not_recorded, own_plant
-from ._plants import UncertainNeck, neck_of_family, neck_of_model
+from ._plants import UncertainNeck, named_plants, neck_of_family, neck_of_model
 from ._requirements import Requirement, Requirements, read_requirements
 from ._scale import scaled
 from ._steps import check_ports
 from ._worst import write_linear, write_neck
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Verdict:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Verdict(Shown):
     """One requirement and what came of it.
 
     Attributes:
@@ -50,8 +52,8 @@ class Verdict:
     note: str = ""
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Verification:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class Verification(Shown):
     """What a verification found: each requirement, its worst plant, and whether all hold.
 
     Attributes:
@@ -96,18 +98,16 @@ class Verification:
 
     def summary(self) -> str:
         """Return a line or two for people."""
-        count = len(self.verdicts)
-        text = (
-            f"{count - len(self.failed)} of {count} requirements hold"
-            if self.failed
-            else f"all {count} requirements hold"
-        )
-        absent = sum(verdict.value is None for verdict in self.verdicts)
-        text += f", {absent} of them not computed" if absent else ""
+        count, absent = len(self.verdicts), sum(verdict.value is None for verdict in self.verdicts)
+        text = f"{count - len(self.failed)} of {count}" if self.failed else f"all {count}"
+        text += " requirements hold" + (f", {absent} of them not computed" if absent else "")
         return (
             f"{text}; {len(self.evidence.plants)} plants, {len(self.evidence.necks)} loops over the virtual neck, "
             f"{self.order_words()}; {self.wall_time:.1f} s"
         )
+
+    def _picture(self) -> str:
+        return marks([verdict.holds for verdict in self.verdicts])
 
     def contents(self, loops: Mapping[int, Path] | None = None) -> dict[str, Any]:
         """Return the certificate's JSON values; `loops`: number of a verdict -> the loop file of its worst plant."""
@@ -229,7 +229,7 @@ def sources_of(things: Mapping[str, Any], requirements: Requirements) -> list[Un
 def verify(
     controller: Any,
     plants: Mapping[str, Any] | Sequence[Any] | Any,
-    requirements: Requirements | None = None,
+    requirements: Requirements | str | Path | None = None,
     *,
     order: str | None = None,
     observer: Any = None,
@@ -239,9 +239,9 @@ def verify(
     """Judge a controller on all that its plant may be.
 
     Args:
-        controller: anything with `block()`; with `ss()` linear checks too.
-        plants: a linear model or a family, several, or name -> one.
-        requirements: what is asked; the defaults if not given.
+        controller: anything with `block()`, or its file; with `ss()` linear checks too.
+        plants: a linear model or a family, or the file of one; several, or name -> one.
+        requirements: what is asked, or its file; the defaults if not given.
         order: of the loop; the one that the controller was designed for if not given.
         observer: for the loops over the virtual neck; none if not given.
         files: role -> (path, SHA-256) of all that was read for it, for the certificate.
@@ -251,13 +251,14 @@ def verify(
         SettingsError: another sample time, other channels, no plants.
         DataError: controller, plants and observer of two robots.
     """
-    begin = time.perf_counter()
-    robot, named = robot_of(controller), _named(plants)
+    begin, controller, observer = time.perf_counter(), opened(controller, "controller"), opened(observer, "observer")
+    robot, named = robot_of(controller), named_plants(plants)
     for what, thing in (*named.items(), *(() if observer is None else (("observer", observer),))):
         # Physics and functions of one's own say nothing of a robot: their ports have to be its own.
         if robot.is_neck or hasattr(thing, "robot") or not is_own_plant(thing):
             require_same_robot(robot_of(thing), robot, f"the controller and {what}")
-    asked = read_requirements(robot=robot) if requirements is None else requirements.of_robot(robot)
+    own_words = isinstance(requirements, Requirements)
+    asked = requirements.of_robot(robot) if own_words else read_requirements(requirements, robot=robot)
     own = {name: thing for name, thing in named.items() if is_own_plant(thing)}
     own = {name: _standing_for(thing, robot) for name, thing in own.items()}
     linear = {name: thing for name, thing in named.items() if name not in own}
@@ -292,13 +293,6 @@ def verify(
         wall_time=time.perf_counter() - begin,
         tested=tested,
     )
-
-
-def _named(plants: Any) -> dict[str, Any]:
-    if isinstance(plants, Mapping):
-        return dict(plants)
-    items = list(plants) if isinstance(plants, Sequence) else [plants]
-    return {f"plant {k}" if len(items) > 1 else "plant": item for k, item in enumerate(items, start=1)}
 
 
 def _verdict(item: Requirement, evidence: Evidence, elsewhere: Mapping[str, str]) -> Verdict:

@@ -11,6 +11,7 @@ import click
 from softneck.core import CheckFailedError, SettingsError, refuse_existing
 
 from ..shared._console import note, print_json, print_table, progress
+from ..shared._groups import NearGroup
 from ..shared._neck import load_neck
 from ..shared._options import force_option, json_option, output_option, target, trust_option
 from ._commission import commission_command
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 
 @click.group(
     "drives",
+    cls=NearGroup,
     epilog="Example: softneck drives check --simulated. Every command takes --json, and --help lists its options.",
 )
 def command() -> None:

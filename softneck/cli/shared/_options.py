@@ -55,7 +55,7 @@ set_option = click.option(
     "settings",
     multiple=True,
     metavar="KEY=VALUE",
-    help="A setting of the kind; angles in rad, or KEY_deg=VALUE.",
+    help="A setting of the kind, which `KIND --help` lists; angles in rad, or KEY_deg=VALUE.",
 )
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import FileFormatError, SettingsError, SoftneckError, file_hash, require_one_of
+from softneck.core._shown import Shown
 from softneck.loop import Fault, Loop, Part, ReferenceBlock
 from softneck.loop._faults import make_fault
 from softneck.loop._reference_parts import AheadReference
@@ -21,8 +22,8 @@ from ._loop_parts import OBJECT, PRESETS, SOURCES, PartOpener
 from ._loop_values import links, number, numbers, read_toml, refuse_unknown, tables
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class LoopSetup:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class LoopSetup(Shown):
     """A loop with what is asked of it; a loop file describes one.
 
     Attributes:

@@ -10,6 +10,7 @@ import numpy as np
 
 from softneck.core import DataError, SettingsError, Vector, to_si
 from softneck.core._certificate import certificate_contents
+from softneck.core._shown import Shown
 from softneck.loop import LoopResult, check_limits, metrics
 from softneck.robot import Robot
 from softneck.signals import Recording
@@ -22,8 +23,8 @@ if TYPE_CHECKING:
 _TRACE_ROWS = 50
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Result:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class Result(Shown):
     """One simulated loop: its signals, its metrics, and whether it keeps its limits.
 
     Attributes:
@@ -45,6 +46,15 @@ class Result:
     angle: str = "true"
     closed: bool = True
     remarks: tuple[str, ...] = ()
+
+    def summary(self) -> str:
+        """Return two lines: what ran, and whether it keeps its limits."""
+        rows, failed = self.limits, [row["metric"] for row in self.limits if not row["holds"]]
+        said = f"fails {', '.join(failed)}" if failed else f"keeps {len(rows)} limits" if rows else "no limits stated"
+        return f"{self.signals.summary()}\n{said}" + "".join(f"\n{remark}" for remark in self.remarks)
+
+    def _picture(self) -> str:
+        return self.signals._picture()
 
     def __getitem__(self, name: str) -> Vector:
         """Return one signal (N,) in SI."""

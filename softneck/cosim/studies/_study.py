@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import FileFormatError, SettingsError, SoftneckError, file_hash
+from softneck.core._shown import Shown, sparkline
 from softneck.loop import Loop, LoopRun
 from softneck.loop._result import metric_names, shown_unit
 from softneck.loop._robot_references import reference_key
@@ -26,11 +27,13 @@ from ..loops._loop_values import read_toml
 from ._vary import StudyPoints, Vary, flattened, make_vary
 
 _TOP = ("loop", "runs", "seed", "sampling", "objectives", "vary")
+# Runs in the picture of a study.
+_MOST_SHOWN = 200
 Source = str | Path | Mapping[str, Any] | Loop | LoopSetup
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Study:
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class Study(Shown):
     """Many runs of one loop; a study file describes one, `study` runs it.
 
     Attributes:
@@ -63,6 +66,15 @@ class Study:
                 )
         if not self.objectives:
             raise SettingsError("`objectives` is empty; name at least one metric.")
+
+    def _picture(self) -> str:
+        # What the first number that varies is in each run.
+        runs = [self.points[run].values for run in range(min(len(self.points), _MOST_SHOWN))]
+        for key in self.vary:
+            values = [values[key] for values in runs]
+            if all(isinstance(value, int | float) for value in values):
+                return sparkline([values])
+        return ""
 
     @cached_property
     def metrics(self) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softneck.core import DataError, Matrix, SettingsError, SoftneckError, require_one_of
+from softneck.core._shown import Shown
 from softneck.estimation import AxisPlant, LinearNeck, axis_plant
 from softneck.estimation._axis import AXES, directions_of, robot_of
 from softneck.robot import Robot
@@ -66,8 +67,8 @@ class UncertainAxis:
         return UncertainAxis(nominal, (nominal, *more, *self.samples[1:]))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class UncertainPlant:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class UncertainPlant(Shown):
     """All axes of an uncertain robot, of a neck pitch and roll; what every design of this package works on.
 
     Attributes:

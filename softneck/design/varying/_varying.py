@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import Matrix, Vector, write_archive
+from softneck.core._shown import Shown
 from softneck.robot import Robot
 from softneck.runtime import Block, Port, State
 from softneck.runtime._bundle import declared, sized
@@ -20,8 +21,8 @@ from ..linear._controller import robot_in
 from ..linear._ports import ControllerLimits, controller_inputs, controller_outputs
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class VaryingController:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class VaryingController(Shown):
     """A designed controller of pitch and roll whose gains follow the inclination or what it learns.
 
     Attributes:

@@ -21,6 +21,7 @@ from softneck.core import (
     write_archive,
 )
 from softneck.core._checks import finite_vector
+from softneck.core._shown import Shown
 from softneck.runtime import load_functions
 
 _RUNTIME = "softneck.identification.linear._ud_runtime"
@@ -28,8 +29,8 @@ _RUNTIME = "softneck.identification.linear._ud_runtime"
 EXACT_START = 1e12
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class RecursionState:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class RecursionState(Shown):
     """What the recursion remembers.
 
     Attributes:

@@ -23,6 +23,7 @@ from softneck.core import (
 )
 from softneck.core import load as load_file
 from softneck.core._checks import finite_vector
+from softneck.core._shown import Shown, bars
 from softneck.robot import Robot
 from softneck.runtime import Block, State
 from softneck.signals import Recording
@@ -46,8 +47,8 @@ _GUARDED = ("nn", "nss")
 _SEARCHING = ("nlsm", "residual")
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Model:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class Model(Shown):
     """A plant identified from recordings: motor set-points in, the outputs out (of a neck pitch and roll).
 
     Attributes:
@@ -263,6 +264,11 @@ class Model:
             )
         lines.append(f"trained on {self.training_rows.size} rows")
         return "\n".join(lines)
+
+    def _picture(self) -> str:
+        # Of the rows held out, where it was judged on some: the fit of its free run.
+        fits = self.findings.get("hold_out", {}).get("fit", {})
+        return bars({axis: fit for axis, fit in fits.items() if fit is not None})
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write the model to an `.npz` file.

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import DataError, Matrix, Progress, SettingsError, Vector, require_between, silent, to_si
+from softneck.core._shown import Shown
 from softneck.robot import Robot
 from softneck.signals import Recording
 
@@ -144,8 +145,8 @@ class Part:
     outside: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class NextExperiment:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class NextExperiment(Shown):
     """What to record next.
 
     Attributes:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softneck.core import DataError, Progress, SettingsError, require_one_of, require_whole, silent
+from softneck.core._shown import Shown
 from softneck.signals import Recording
 from softneck.signals.recording._recording import require_same_robot
 
@@ -36,8 +37,8 @@ _SAME_EXCITATION = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Search:
+@dataclass(frozen=True, eq=False, repr=False)
+class Search(Shown):
     """All that a search tried, and what it chose.
 
     Attributes:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softneck.core import DataError, FileFormatError, Matrix, SettingsError, Vector, require_one_of, write_archive
+from softneck.core._shown import Shown
 from softneck.robot import Robot
 from softneck.signals import Recording, redefinition_matrix
 from softneck.signals.recording._recording import require_same_robot
@@ -62,8 +63,8 @@ class AxisFamily:
     envelope: Vector
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Family:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class Family(Shown):
     """An uncertain linear plant; `FamilySettings.fit` makes it and a design reads it.
 
     Attributes:

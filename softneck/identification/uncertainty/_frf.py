@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softneck.core import FileFormatError, SettingsError, Vector, require_between, to_si, write_archive
+from softneck.core._shown import Shown
 from softneck.robot import Robot
 
 from ._periodic import Sine
@@ -26,8 +27,8 @@ METHODS = {
 }
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class FrequencyResponse:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class FrequencyResponse(Shown):
     """From inputs, held between samples, to sampled outputs: `y(k) = G(exp(j w T)) u(k)`, in SI.
 
     Attributes:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from softneck.core import DataError, Matrix, SettingsError, Vector, to_si
+from softneck.core._shown import Shown
 from softneck.robot import Robot
 from softneck.runtime import load_functions
 from softneck.signals import Recording, redefine
@@ -20,8 +21,8 @@ _RUNTIME = "softneck.identification.uncertainty._lpv_runtime"
 _FASTEST = 60.0
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Lpv:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class Lpv(Shown):
     """Gain and pole of each axis over the inclination, linear between knots.
 
     Attributes:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from softneck.core import DataError, Progress, SettingsError, silent
+from softneck.core._shown import Shown
 from softneck.signals import Recording
 
 from ..models._model import Model
@@ -17,8 +18,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Comparison:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Comparison(Shown):
     """The scores of every model on every recording.
 
     Attributes:

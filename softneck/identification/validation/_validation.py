@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from softneck.core import DataError, Matrix, Vector, require_one_of
+from softneck.core._kinds import opened
+from softneck.core._shown import Shown, sparkline
 from softneck.robot import Robot
 from softneck.signals import Recording
+from softneck.signals.recording._files import opened_recording
 
 from ..models._model import WARM_UP, Model
 from ..models._validity import with_tolerance
@@ -40,8 +44,8 @@ _PROMISING = ("nlsm", "residual")
 Scores = dict[str, dict[str, float | None]]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Validation:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Validation(Shown):
     """What one model is worth on one recording.
 
     Scores are tables horizon -> axis -> value ("1", ..., "inf"; "pitch", "roll"), None where the free run diverged or
@@ -115,6 +119,15 @@ class Validation:
     lower: Matrix
     upper: Matrix
     robot: Robot = field(default_factory=Robot.preset)
+
+    def summary(self) -> str:
+        """Return two lines: what was judged on what, and the fits of the free run."""
+        fits = self.fits.get("inf", {})
+        said = ", ".join(f"{axis} {'-' if fit is None else f'{fit:.1f} %'}" for axis, fit in fits.items())
+        return f"{self.model} on {self.data}, {self.rows_scored} rows judged\nfree run: {said or 'not asked for'}"
+
+    def _picture(self) -> str:
+        return sparkline([self.measured[:, 0], self.free_run[:, 0]])
 
     @property
     def white(self) -> bool:
@@ -195,16 +208,16 @@ class Rules:
 
 
 def validate(
-    model: Model,
-    recording: Recording,
+    model: Model | str | Path,
+    recording: Recording | str | Path,
     *,
-    names: tuple[str, str] = ("model", "data"),
+    names: tuple[str, str] | None = None,
     horizons: Sequence[int | str] = _HORIZONS,
     motors: str = "simulated",
     include_training: bool = False,
     initial: str = "warm",
     tolerance: float | None = None,
-    training: Recording | None = None,
+    training: Recording | str | Path | None = None,
 ) -> Validation:
     """Judge a model on the rows of a recording that it was not trained on.
 
@@ -213,9 +226,9 @@ def validate(
     had the first row only.
 
     Args:
-        model: of any kind.
-        recording: at the model's sample time; its runs are never joined.
-        names: of model and data, for reports.
+        model: of any kind, or its file.
+        recording: at the model's sample time, or its file; its runs are never joined.
+        names: of model and data, for reports; the files' where files are given.
         horizons: samples ahead; "inf" is the free run.
         motors: "simulated" or "measured".
         include_training: whether rows that the model was trained on are judged too.
@@ -224,13 +237,19 @@ def validate(
         training: what the model was trained on, for `novelty`.
 
     Raises:
+        FileFormatError: no such file, or not one of ours.
         DataError: nothing is left to judge, another sample time, no motor positions to measure, or a horizon longer
             than every stretch.
     """
     rules = Rules(tuple(horizons), motors, include_training, initial, tolerance)
-    check_training_data(model, training)
-    parts = judged_parts(model, recording, rules)
-    return judge(model, parts, rules, names=names, training=training)
+    if names is None:
+        model_name, data_name = (str(of) if isinstance(of, str | Path) else None for of in (model, recording))
+        names = (model_name or "model", data_name or "data")
+    judged: Model = opened(model, "model")
+    known = None if training is None else opened_recording(training)
+    check_training_data(judged, known)
+    parts = judged_parts(judged, opened_recording(recording), rules)
+    return judge(judged, parts, rules, names=names, training=known)
 
 
 def check_training_data(model: Model, training: Recording | None) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, Vector, to_si
+from softneck.core._shown import Shown
 from softneck.robot import Robot
 
 from ._channel_faults import ChannelQuality, Stretch, count_rows
@@ -67,8 +68,8 @@ class Finding:
         return f"{self.severity}: {about}{self.message}" + (f" {self.advice}" if self.advice else "")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Quality:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Quality(Shown):
     """What `assess_quality` found; arrays in SI.
 
     Attributes:

@@ -150,6 +150,11 @@ def read_recording(path: str | Path, *, robot: str | Path | Robot | None = None)
         raise DataError(f"{source}: {error}") from error
 
 
+def opened_recording(thing: Recording | str | Path) -> Recording:
+    """Return `thing`, or what `read_recording` makes of it where it is a path."""
+    return read_recording(thing) if isinstance(thing, str | Path) else thing
+
+
 def said_robot(source: Path, suffix: str) -> Robot | None:
     """Return the robot that a file says it is of, or None.
 

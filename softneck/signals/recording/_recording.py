@@ -9,14 +9,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from softneck.core import DataError, Matrix, Vector, require_positive, to_si
+from softneck.core._shown import Shown, sparkline
 from softneck.robot import Robot
 
 from ._channels import NECK, known_channels, may_miss
 from ._times import check_times
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Recording:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Recording(Shown):
     """Samples of one or more experiments at one sample time.
 
     Attributes:
@@ -46,6 +47,18 @@ class Recording:
 
     def __len__(self) -> int:
         return self.time.size
+
+    def summary(self) -> str:
+        """Return two lines on what is in it."""
+        runs = np.count_nonzero(np.diff(self.run)) + (len(self) > 0)
+        names = [name for name in self.channels if name not in self.robot.set_points]
+        return (
+            f"{len(self)} rows of {1e3 * self.sample_time:g} ms in {runs} run(s), robot {self.robot.name}\n"
+            f"set-points of {len(self.robot.set_points)} motors, {', '.join(names)}"
+        )
+
+    def _picture(self) -> str:
+        return sparkline(self.outputs.T)
 
     @property
     def set_points(self) -> Matrix:
