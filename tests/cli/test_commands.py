@@ -31,6 +31,12 @@ def one_object(said: Said) -> dict:
     return value
 
 
+def test_python_runs_the_package_as_the_command() -> None:
+    done = subprocess.run([sys.executable, "-m", "softneck", "nothing"], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("softneck: no such command")
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_helps_with_an_example(call: Call, command: str) -> None:
     said = call(command, "--help")
