@@ -56,6 +56,7 @@ TITLE, SMALL = 10.5, 6.2
 def rooms_and_imports() -> Graph:
     """Return each room of `softneck` with the rooms that it imports, inside functions too."""
     graph = grimp.build_graph("softneck", cache_dir=None)
+    graph.remove_module("softneck.__main__")  # what `python -m softneck` runs is no room
     found: dict[str, set[str]] = {name.partition(".")[2]: set() for name in graph.find_children("softneck")}
     for module in graph.modules:
         for imported in graph.find_modules_directly_imported_by(module):
