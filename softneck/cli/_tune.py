@@ -114,12 +114,14 @@ def _robot_of(things: dict[str, Any]) -> Any:
 
 
 def _print(found: Tuned, folder: Path) -> None:
-    from softneck.report._tune_page import requirement_rows
+    from softneck.report._tune_page import notes, requirement_rows
 
     best = found.best
     settings = ", ".join(f"{name} {value:.4g}" for name, value in best.settings.items())
     print_table(f"{folder / 'best.npz'}: {best.kind} ({settings})", ["metric", "bound", "limit", "value", ""],
                 [row[:5] for row in requirement_rows(found)])  # fmt: skip
+    for line in notes(found):
+        click.echo(line)
     for kind, why in found.dropped.items():
         click.echo(f"left out: {kind}: {why}")
     click.echo(

@@ -48,6 +48,15 @@ def requirement_rows(found: Tuned) -> list[list[str]]:
     return rows
 
 
+def notes(found: Tuned) -> list[str]:
+    """Return what is to be said of requirements, each reason once with the metrics that it is of."""
+    told: dict[str, list[str]] = {}
+    for row in requirement_rows(found):
+        if row[5]:
+            told.setdefault(row[5], []).append(row[0])
+    return [f"{', '.join(metrics)}: {note}." for note, metrics in told.items()]
+
+
 def stands_in_the_way(found: Tuned) -> str:
     """Return what binds, and what it costs, in a sentence or two."""
     if found.binding is None:
@@ -62,15 +71,15 @@ def stands_in_the_way(found: Tuned) -> str:
 def _result(found: Tuned) -> Section:
     best = found.best
     text = [
+        "All requirements hold." if found.holds else f"Not all requirements hold. {stands_in_the_way(found)}",
         f"{best.kind}: " + ", ".join(f"{name} {_text(value)}" for name, value in best.settings.items()) + ".",
         f"{found.evaluations} judgements of {len({(i.kind, str(i.settings)) for i in found.candidates})} candidates "
         "that were closed in loops, and of others that were left behind before.",
     ]
-    text.append("All requirements hold." if found.holds else f"Not all requirements hold. {stands_in_the_way(found)}")
     text += [f"{kind} was left out: {why}" for kind, why in found.dropped.items()]
     rows = requirement_rows(found)
     tables = [Table("Requirements", ["metric", "bound", "limit", "value", ""], [row[:5] for row in rows])]
-    text += [f"{row[0]}: {row[5]}." for row in rows if row[5]]
+    text += notes(found)
     if found.prices:
         told = [[p.metric, f"{p.limit:.3g}", p.other, _text(p.least)] for p in found.prices]
         tables.append(Table("What it costs, all else held", ["requirement", "at", "costs", "at least"], told))
