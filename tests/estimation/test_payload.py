@@ -124,6 +124,31 @@ def test_an_outlier_moves_neither_angle_nor_payload(model: Model, run: Recording
     np.testing.assert_array_equal(told[0][300:, [0, 1, 6]], told[1][300:, [0, 1, 6]])
 
 
+@pytest.mark.parametrize("factor", [0.2, 3.0])
+def test_the_payload_stays_between_those_of_the_recordings(model: Model, run: Recording, factor: float) -> None:
+    far = run.with_channels(pitch=factor * run.channels["pitch"], roll=factor * run.channels["roll"])
+    masses = designed(PLAIN, model)._rows(far)[0][:, -1]
+    assert masses.min() >= 0.0
+    assert masses.max() <= 1.0
+    assert {0.0, 1.0} & set(masses)
+
+
+def test_a_jacobi_loop_gives_it_the_set_points_a_sample_early(model: Model, run: Recording) -> None:
+    rows = [designed(replace(PLAIN, order=order), model)._rows(run)[0] for order in ("sequential", "jacobi")]
+    np.testing.assert_array_equal(rows[0][:, [0, 1, 6]], rows[1][:, [0, 1, 6]])
+
+
+def test_a_step_of_the_sensor_is_believed_after_so_many_refusals(model: Model, run: Recording) -> None:
+    """By force, and then wholly: what was refused ten times is where the neck is."""
+    shift = np.where(np.arange(len(run)) < 300, 0.0, 0.5)
+    moved = run.with_channels(pitch=run.channels["pitch"] + shift, roll=run.channels["roll"] + shift)
+    outputs, _ = designed(KalmanSettings(sensor_delay=0.0), model)._rows(moved)
+    error = np.abs(outputs[:, :2] - moved.outputs).max(axis=1)
+    assert error[309] > math.radians(10.0)
+    # The innovation's gain is all but one, of 28 deg.
+    assert error[310] < math.radians(0.1)
+
+
 def test_its_file_says_the_payload(model: Model, run: Recording, tmp_path: Path) -> None:
     observer = designed(KalmanSettings(), model)
     observer.save(tmp_path / "o.npz")

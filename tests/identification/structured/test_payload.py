@@ -57,6 +57,18 @@ def test_under_a_payload_it_is_the_model_of_that_payload(model: Model, payload: 
     assert not np.array_equal(ours[:, :2], free_run(model, run, payload=0.4)[:, :2])
 
 
+def test_what_the_link_itself_pulls_does_not_go_with_the_payload(model: Model) -> None:
+    """Its stiffness times its rest and its asymmetry: moments that a payload adds nothing to."""
+    neck, stiffness = model.arrays["neck"], NAMES.index("stiffness")
+    loaded = loaded_neck(neck, np.array([0.0, 1.0, -3.0, -0.2]), 0.7)
+    assert loaded[stiffness] == neck[stiffness] - 3.0 * 0.7
+    assert loaded[NAMES.index("pretension")] == neck[NAMES.index("pretension")] - 0.2 * 0.7
+    for name in ("asymmetry", "rest_pitch", "rest_roll"):
+        place = NAMES.index(name)
+        # One product and one quotient apart.
+        np.testing.assert_allclose(loaded[place] * loaded[stiffness], neck[place] * neck[stiffness], rtol=1e-13)
+
+
 def test_a_recording_tells_its_payload(model: Model) -> None:
     run = log(0.5, 300)
     np.testing.assert_array_equal(model.simulate(run), at(model, 0.5).simulate(run))
