@@ -25,7 +25,7 @@ from ..models._drive import drive_start, fit_loaded_drive
 from ..models._error_feedback import fit_echo
 from ..models._fitting import row_hashes, training_recording
 from ..models._model import Model
-from ..models._ports import trained_set_points
+from ..models._ports import MOST_PAYLOAD, trained_set_points
 from ..models._state_space import history_array
 from ..models._validity import grounded
 from ._arrays import ACROSS, LOADS, NUMBERS, Number
@@ -80,7 +80,7 @@ class GreyBox:
             progress: called with the part done and the error.
 
         Raises:
-            DataError: too short or constant, or a payload that changes within a run.
+            DataError: too short or constant, or a payload that changes within a run or that no neck bears.
             SettingsError: a robot that no tendons on winches bend.
         """
         recording = training_recording(recordings, any_robot=True)
@@ -232,6 +232,8 @@ def _payload(run: Recording) -> float:
     low, high = float(np.nanmin(payload)), float(np.nanmax(payload))
     if low != high:
         raise DataError(f"the payload changes within a run, from {low:g} to {high:g} kg; cut the recording there.")
+    if not 0.0 <= low <= MOST_PAYLOAD:
+        raise DataError(f"a run's payload is {low:g} kg and must be 0 to {MOST_PAYLOAD:g}; is its column in grams?")
     return low
 
 

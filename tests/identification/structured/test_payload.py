@@ -102,6 +102,13 @@ def test_a_payload_that_changes_within_a_run_is_refused() -> None:
         GreyBox().fit(put_on)
 
 
+@pytest.mark.parametrize("payload", [-1.0, 500.0])
+def test_a_payload_that_no_neck_bears_is_refused_before_the_search(payload: float) -> None:
+    run = log(0.0, 800)
+    with pytest.raises(DataError, match="must be 0 to 5; is its column in grams"):
+        GreyBox().fit([run, run.with_channels(payload=np.full(800, payload))])
+
+
 def test_its_file_keeps_it(model: Model, tmp_path: Path) -> None:
     model.save(tmp_path / "m.npz")
     again, run = load(tmp_path / "m.npz"), log(0.5, 200)
