@@ -132,7 +132,7 @@ def _print(found: Tuned, folder: Path) -> None:
 def _why(found: Tuned, folder: Path) -> str:
     from softneck.report._tune_page import stands_in_the_way
 
-    return (
-        f"{folder}: the best so far does not keep all requirements. {stands_in_the_way(found)} Loosen it, or go on "
-        "with a larger --budget."
-    )
+    binds = [item.note for item in found.verification.verdicts if item.requirement.metric == found.binding]
+    unheard = any(note.startswith("not supported by the data") for note in binds)
+    way = "Record what is said above, no setting mends it" if unheard else "Loosen it, or go on with a larger --budget"
+    return f"{folder}: the best so far does not keep all requirements. {stands_in_the_way(found)} {way}."

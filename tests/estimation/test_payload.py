@@ -13,6 +13,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 
 from softneck.core import load
 from softneck.estimation import KalmanSettings, NonlinearObserver, consistency
+from softneck.estimation._fitted import fitted_observer
 from softneck.identification import GreyBox, Model
 from softneck.identification.structured._loaded_greybox_runtime import loaded_neck
 from softneck.plant import NeckParameters, VirtualNeck, record
@@ -157,6 +158,14 @@ def test_its_file_says_the_payload(model: Model, run: Recording, tmp_path: Path)
     assert [port.name for port in again.block().outputs][-2:] == ["healthy", "payload"]
     assert "from 0 to 1 kg" in again.summary()
     assert consistency(observer, run).nis.mean > 0.0
+
+
+def test_levels_from_data_are_kept_only_where_they_are_better(model: Model) -> None:
+    """Beside the payload that the observer itself estimates; the rows are not those of the model's training."""
+    found = fitted_observer(designed(KalmanSettings(), model), [log(0.6, 700, 11)])
+    assert found.checks[found.kept] == min(found.checks.values())
+    assert set(found.checks) == {"default", "noise"}
+    assert not {"rest_noise_std", "motion_noise_ratio"} <= set(found.untold) - set(found.fit.at_bound)
 
 
 @pytest.mark.slow
