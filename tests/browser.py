@@ -43,7 +43,9 @@ _COUNT = """([chart, panel, colour]) => {
 }"""
 _IDLE = """async () => {
   const frame = () => new Promise(done => requestAnimationFrame(() => setTimeout(done, 0)));
-  while (Bokeh.documents.length < document.querySelectorAll(".chart").length
+  const charts = document.querySelectorAll(".chart").length;
+  if (!charts) return;
+  while (typeof Bokeh === "undefined" || Bokeh.documents.length < charts
          || !Bokeh.documents.every(document => document.is_idle)) await frame();
   await frame(); await frame();
 }"""
@@ -54,7 +56,7 @@ def own_text(html: str) -> str:
 
     The tests in the browser watch that it asks for none, and the page's security policy forbids it.
     """
-    return re.sub(r'<script id="library">.*?</script>', "", html, flags=re.DOTALL)
+    return re.sub(r'<script type="application/gzip" id="library">.*?</script>', "", html, flags=re.DOTALL)
 
 
 def chromium_path() -> str:
