@@ -53,7 +53,7 @@ class Packer:
                 data = gzip.decompress(base64.b64decode(node["array"]["data"]))
                 return {**node, "array": {"type": "bytes", "data": self._hold(data, node["dtype"])}}
             return {key: self._lean(value) for key, value in node.items()}
-        return [self._lean(one) for one in node] if isinstance(node, list) else node
+        return [self._lean(one) for one in node] if isinstance(node, list | tuple) else node
 
     def _hold(self, data: bytes, kind: str) -> int:
         key = (kind, data)

@@ -22,6 +22,19 @@ function numbers({kind, count, low, step, start}, bytes) {
   }
   return values;
 }
+// On a narrow screen panels stand under each other, and the names above them in as many columns as there is room for.
+function fitted(chart, width) {
+  const children = chart.doc.roots[0].attributes.children;
+  if (width < 600) children.forEach((child, number) => child.splice(1, 2, number, 0));
+  const columns = 1 + Math.max(...children.map(child => child[2]));
+  const room = Math.max(1, Math.floor((width / columns - 110) / 105));
+  const narrow = node => {
+    if (node === null || typeof node !== "object") return;
+    if (node.name === "Legend" && node.attributes) node.attributes.ncols = Math.min(6, room);
+    Object.values(node).forEach(narrow);
+  };
+  narrow(children);
+}
 async function draw() {
   const script = document.createElement("script");
   script.textContent = new TextDecoder().decode(await unpacked("library"));
@@ -38,6 +51,7 @@ async function draw() {
     } else for (const child of Object.values(node)) fill(child);
   };
   for (const [id, chart] of Object.entries(charts)) {
+    fitted(chart, document.getElementById(id).clientWidth);
     fill(chart);
     await Bokeh.embed.embed_item(chart, id);
     const named = Bokeh.documents.at(-1).roots()[0].children.flatMap(([plot]) => plot.renderers).filter(r => r.name);

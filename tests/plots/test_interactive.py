@@ -85,7 +85,8 @@ _COLUMNS = """() => Bokeh.documents.map(one => {
   const found = {};
   for (const [plot] of one.roots()[0].children)
     for (const {data_source: {data}} of plot.renderers)
-      for (const [name, column] of data instanceof Map ? data : Object.entries(data)) found[name] ??= Array.from(column, String);
+      for (const [name, column] of data instanceof Map ? data : Object.entries(data))
+        found[name] ??= Array.from(column, String);
   return found;
 })"""
 
