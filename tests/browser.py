@@ -130,9 +130,9 @@ class Shown:
 
 
 @contextmanager
-def shown(browser: Browser, path: Path) -> Iterator[Shown]:
+def shown(browser: Browser, path: Path, *, width: int = 1200) -> Iterator[Shown]:
     """Show a file and note every request and complaint."""
-    page = browser.new_page(viewport={"width": 1200, "height": 900})
+    page = browser.new_page(viewport={"width": width, "height": 900})
     requests: list[str] = []
     complaints: list[str] = []
     page.on("request", lambda request: requests.append(request.url))

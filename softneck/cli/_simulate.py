@@ -170,15 +170,14 @@ def _page(name: str, result: Result, view: Path | None) -> str:
 def _verdict(result: Result) -> str:
     """Return in one sentence whether the loop keeps its limits, and which it breaks."""
     rows = result.limits
-    broken = [f"{row['metric']} is {_value(row)}, at most {row['limit']:g}" for row in rows if not row["holds"]]
+    broken = [f"{row['metric']} is {_value(row)}, limit {row['limit']:g}" for row in rows if not row["holds"]]
     if broken:
         return f"{len(broken)} of {len(rows)} limits broken: {'; '.join(broken)}."
     if not rows:
         return "The loop file states no limits, so nothing was judged."
-    nearest = max(rows, key=lambda row: row["value"] / row["limit"] if row["limit"] else 0.0)
-    return (
-        f"All {len(rows)} limits hold; the nearest is {nearest['metric']}, {_value(nearest)} of {nearest['limit']:g}."
-    )
+    upper = [row for row in rows if row["metric"] != "validity.min" and row["limit"]] or rows
+    nearest = max(upper, key=lambda row: row["value"] / row["limit"])
+    return f"All {len(rows)} limits hold; nearest: {nearest['metric']}, {_value(nearest)} of {nearest['limit']:g}."
 
 
 def _value(row: dict[str, Any]) -> str:

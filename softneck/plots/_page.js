@@ -25,7 +25,11 @@ function numbers({kind, count, low, step, start}, bytes) {
 // On a narrow screen panels stand under each other, and the names above them in as many columns as there is room for.
 function fitted(chart, width) {
   const children = chart.doc.roots[0].attributes.children;
-  if (width < 600) children.forEach((child, number) => child.splice(1, 2, number, 0));
+  if (width < 600)
+    children.forEach((child, number) => {
+      child.splice(1, 2, number, 0);
+      child[0].attributes.height += 50;
+    });
   const columns = 1 + Math.max(...children.map(child => child[2]));
   const room = Math.max(1, Math.floor((width / columns - 110) / 105));
   const narrow = node => {
