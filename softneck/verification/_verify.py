@@ -14,6 +14,7 @@ import numpy as np
 from softneck.core import DataError, Progress, SettingsError, silent
 from softneck.core._certificate import certificate_contents
 from softneck.core._kinds import opened
+from softneck.core._progress import shown_progress
 from softneck.core._shown import Shown, marks
 from softneck.estimation._axis import robot_of
 from softneck.plant import NeckParameters, VirtualNeck
@@ -234,7 +235,7 @@ def verify(
     order: str | None = None,
     observer: Any = None,
     files: Mapping[str, tuple[str, str]] | None = None,
-    progress: Progress = silent,
+    progress: Progress | None = None,
 ) -> Verification:
     """Judge a controller on all that its plant may be.
 
@@ -245,7 +246,7 @@ def verify(
         order: of the loop; the one that the controller was designed for if not given.
         observer: for the loops over the virtual neck; none if not given.
         files: role -> (path, SHA-256) of all that was read for it, for the certificate.
-        progress: called now and then.
+        progress: called now and then; a bar in a terminal if not given.
 
     Raises:
         SettingsError: another sample time, other channels, no plants.
@@ -276,7 +277,8 @@ def verify(
                 f"{neck.sample_time:g} s; design it on a model of its own sample time."
             )
     step = [own_plant(thing, name, robot) for name, thing in own.items()]
-    evidence = gather(judged, necks, asked, observer=eyes, progress=progress, families=linear, own=step)
+    with shown_progress("verify", progress) as tell:
+        evidence = gather(judged, necks, asked, observer=eyes, progress=tell, families=linear, own=step)
     tested = {name: thing.findings["tested"] for name, thing in linear.items() if getattr(thing, "measured", {})}
     elsewhere = not_recorded(tested, step, evidence.steps) if robot.is_neck else {}
     if tested and not judged.laws:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from softneck.core import OutputFileError, Progress, SettingsError, silent
+from softneck.core._progress import shown_progress
 
 from ._executors import Crew, check_sendable, crew
 from ._store import Store
@@ -40,7 +41,7 @@ def study(
     output: str | Path | None = None,
     resume: bool = False,
     force: bool = False,
-    report: Progress = silent,
+    report: Progress | None = None,
 ) -> pd.DataFrame:
     """Run a loop many times and return a row for each run: what varied, metrics, whether limits hold, error.
 
@@ -59,7 +60,7 @@ def study(
         output: folder that keeps the runs as they end; nothing is kept without one.
         resume: go on with the study that `output` holds.
         force: replace the study that `output` holds.
-        report: called with the part done and a word.
+        report: called with the part done and a word; a bar in a terminal if not given.
 
     Raises:
         SettingsError: a key that the loop does not have, an empty range, no runs, another study's folder.
@@ -70,10 +71,11 @@ def study(
     )  # fmt: skip
     if isinstance(loop, Study) and (vary, runs, objectives) != (None, None, None):
         raise SettingsError("a Study has its own vary, runs and objectives; make another one with `make_study`.")
-    if output is not None:
-        return run_study(made, Path(output), workers=workers, dask=dask, resume=resume, force=force, report=report)
-    with tempfile.TemporaryDirectory(prefix="softneck-study-") as folder:
-        return run_study(made, Path(folder), workers=workers, dask=dask, report=report)
+    with shown_progress("study", report) as tell:
+        if output is not None:
+            return run_study(made, Path(output), workers=workers, dask=dask, resume=resume, force=force, report=tell)
+        with tempfile.TemporaryDirectory(prefix="softneck-study-") as folder:
+            return run_study(made, Path(folder), workers=workers, dask=dask, report=tell)
 
 
 def run_study(
