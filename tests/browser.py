@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
 import os
 import re
 import shutil
@@ -57,6 +59,13 @@ def own_text(html: str) -> str:
     The tests in the browser watch that it asks for none, and the page's security policy forbids it.
     """
     return re.sub(r'<script type="application/gzip" id="library">.*?</script>', "", html, flags=re.DOTALL)
+
+
+def charts_of(html: str) -> str:
+    """Return the packed charts of a page as their JSON, without the numbers."""
+    (packed,) = re.findall(r'id="charts">([^<]*)<', html)
+    data = gzip.decompress(base64.b64decode(packed))
+    return data[4 : 4 + int.from_bytes(data[:4], "little")].decode()
 
 
 def chromium_path() -> str:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import DataError, Progress, SettingsError, silent
+from softneck.core import DataError, Progress, SettingsError
 from softneck.core._certificate import certificate_contents
 from softneck.core._kinds import opened
 from softneck.core._progress import shown_progress

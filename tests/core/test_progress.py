@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import sys
-import time
 
 import pytest
 
@@ -17,8 +16,8 @@ class Terminal(io.StringIO):
         return True
 
 
-@pytest.fixture
-def terminal(monkeypatch: pytest.MonkeyPatch) -> Terminal:
+def terminal_of(monkeypatch: pytest.MonkeyPatch) -> Terminal:
+    """Let errors go to a terminal; no fixture, since pytest sets `sys.stderr` once more before it calls a test."""
     made = Terminal()
     monkeypatch.setattr(sys, "stderr", made)
     monkeypatch.setenv("TERM", "xterm")
@@ -26,12 +25,12 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> Terminal:
 
 
 def later(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let every look at the clock be two and a half seconds after the one before."""
-    clock = iter(range(1000))
-    monkeypatch.setattr(time, "monotonic", lambda: 2.5 * next(clock))
+    """Let two seconds have passed."""
+    monkeypatch.setattr("softneck.core._progress._PATIENCE", -1.0)
 
 
-def test_what_takes_long_has_a_bar(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_takes_long_has_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = terminal_of(monkeypatch)
     with shown_progress("identify nn", None) as tell:
         tell(0.1, "quick")
         assert terminal.getvalue() == ""
@@ -42,7 +41,8 @@ def test_what_takes_long_has_a_bar(terminal: Terminal, monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize("off", ["no terminal", "variable", "silent"])
-def test_it_can_be_turned_off(terminal: Terminal, monkeypatch: pytest.MonkeyPatch, off: str) -> None:
+def test_it_can_be_turned_off(monkeypatch: pytest.MonkeyPatch, off: str) -> None:
+    terminal = terminal_of(monkeypatch)
     if off == "no terminal":
         monkeypatch.setattr(terminal, "isatty", lambda: False)
     if off == "variable":
@@ -55,7 +55,8 @@ def test_it_can_be_turned_off(terminal: Terminal, monkeypatch: pytest.MonkeyPatc
     assert terminal.getvalue() == ""
 
 
-def test_a_callback_of_ones_own_is_told(terminal: Terminal) -> None:
+def test_a_callback_of_ones_own_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = terminal_of(monkeypatch)
     told: list[tuple[float, str]] = []
     with shown_progress("verify", lambda done, word: told.append((done, word))) as tell:
         tell(0.5, "half")

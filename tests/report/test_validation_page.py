@@ -16,7 +16,7 @@ from softneck.plots._style import BLUE, COLOURS, ORANGE
 from softneck.report import validation_page
 from softneck.signals import Recording, concatenate
 
-from ..browser import shown
+from ..browser import charts_of, shown
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -89,7 +89,7 @@ def test_the_verdict_names_the_model_of_the_best_free_run(results: Sequence[Vali
 
 def test_models_of_one_file_name_keep_their_folders_apart(results: Sequence[Validation]) -> None:
     twins = [replace(results[0], model="a/rls.npz"), replace(results[1], model="b/rls.npz")]
-    html = validation_page(twins)
+    html = charts_of(validation_page(twins))
     assert "a/rls.npz" in html
     assert "b/rls.npz" in html
 

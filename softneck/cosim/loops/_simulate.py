@@ -54,8 +54,8 @@ def simulate(
     """
     with shown_progress("simulate", None if report is None else lambda done, _: report(done)) as tell:
         result = run_setup(
-            _opened(loop), report=None if tell is silent else lambda done: tell(done, ""), on_step=on_step, pace=pace, resume=resume, keep=keep,
-            compiled=compiled,
+            _opened(loop), report=None if tell is silent else lambda done: tell(done, ""), on_step=on_step, pace=pace,
+            resume=resume, keep=keep, compiled=compiled,
         )  # fmt: skip
     # A plant without validity is told in `remarks` and by the command: no warning for every model made by hand.
     for remark in result.remarks if np.any(result.signals.signals.get("validity", 0.0)) else ():

@@ -59,15 +59,15 @@ class Labelled(np.ndarray):
 
     def to_pandas(self) -> pd.DataFrame:
         """Return a table over time [s], a column for each channel in SI; `attrs["units"]` has their units."""
-        return table(self.time, self._columns(), self.units)
+        return table(*self._parts())
 
     def to_xarray(self) -> xarray.Dataset:
         """Return a Dataset over `time`, each channel with its unit; needs the extra `xarray`."""
-        return dataset(self.time, self._columns(), self.units)
+        return dataset(*self._parts())
 
     def plot(self, title: str = "") -> Figure:
         """Return a matplotlib figure of all channels, those of one unit together; angles in degrees."""
-        return signals_figure(self.time, self._columns(), self.units, title)
+        return signals_figure(*self._parts(), title)
 
     def __repr__(self) -> str:
         if not self.channels:
@@ -79,10 +79,10 @@ class Labelled(np.ndarray):
     def _repr_html_(self) -> str:
         return f"<div>{self!r}<br/>{sparkline(np.asarray(self).T)}</div>" if self.channels else f"<pre>{self!r}</pre>"
 
-    def _columns(self) -> dict[str, Vector]:
+    def _parts(self) -> tuple[Vector, dict[str, Vector], Mapping[str, str]]:
         if not self.channels:
             raise DataError("this is a part of a result, without its labels; ask the whole result.")
-        return {name: self[name] for name in self.channels}
+        return self.time, {name: self[name] for name in self.channels}, self.units
 
 
 def table(time: Vector, columns: Mapping[str, Vector], units: Mapping[str, str]) -> pd.DataFrame:
