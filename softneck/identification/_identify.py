@@ -36,6 +36,16 @@ def identify(
         SettingsError: an unknown kind or setting, or a value out of range.
         FileFormatError: no such file, or no recording.
         DataError: the recording does not determine the model.
+
+    Example:
+        >>> import softneck
+        >>> from softneck.plant import NeckParameters
+        >>> from softneck.signals import signal
+        >>> neck = softneck.VirtualNeck(NeckParameters.paper())
+        >>> recording = softneck.record(signal("eq22", duration=20.0), neck, seed=1)
+        >>> model = softneck.identify("rls", recording)
+        >>> model.simulate(recording).channels[:2]
+        ('pitch', 'roll')
     """
     estimator = make_settings(resolve(find_kind(kind, "model").settings), settings)
     with shown_progress(f"identify {kind}", progress) as tell:

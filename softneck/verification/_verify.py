@@ -251,6 +251,20 @@ def verify(
     Raises:
         SettingsError: another sample time, other channels, no plants.
         DataError: controller, plants and observer of two robots.
+
+    Example:
+        >>> import softneck
+        >>> from softneck.plant import NeckParameters
+        >>> from softneck.signals import signal
+        >>> neck = softneck.VirtualNeck(NeckParameters.paper())
+        >>> recording = softneck.record(signal("eq22", duration=20.0), neck, seed=1)
+        >>> from softneck.verification import make_requirements
+        >>> model = softneck.identify("rls", recording)
+        >>> few = {"plants": 20, "search_generations": 0}
+        >>> asked = make_requirements({"sampling": few, "neck": {"necks": 1, "payloads_kg": [0.0]}})
+        >>> found = softneck.verify(softneck.design_controller("pi", model), {"rls": model}, asked)
+        >>> len(found.verdicts) > 10
+        True
     """
     begin, controller, observer = time.perf_counter(), opened(controller, "controller"), opened(observer, "observer")
     robot, named = robot_of(controller), named_plants(plants)

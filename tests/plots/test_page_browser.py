@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -99,10 +99,10 @@ def test_nothing_is_cut_at_any_width(path: Path, browser: Browser, width: int) -
             )
 
 
-def legends(view: Shown) -> list[dict[str, float]]:
+def legends(view: Shown) -> list[Any]:
     found = [item.bounding_box() for item in view.page.locator(".bk-Legend .bk-item").all()]
     assert len(found) >= 10
-    return [dict(box) for box in found if box is not None]
+    return [box for box in found if box is not None]
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -19,7 +19,7 @@ from softneck.signals.recording._labelled import dataset, signals_figure, table
 
 if TYPE_CHECKING:
     import pandas as pd
-    import xarray
+    import xarray  # pyright: ignore[reportMissingImports]  an extra
     from matplotlib.figure import Figure
 
 # Rows of a run that its certificate keeps, spread over all of it: what goes another way is elsewhere in one of them.

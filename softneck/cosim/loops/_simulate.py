@@ -51,6 +51,19 @@ def simulate(
         SettingsError: parts that do not fit together, or what `make_loop` refuses.
         DataError: a part returned what is not a number.
         FmuError: an FMU refused a call.
+
+    Example:
+        >>> import softneck
+        >>> from softneck.plant import NeckParameters
+        >>> from softneck.signals import signal
+        >>> neck = softneck.VirtualNeck(NeckParameters.paper())
+        >>> recording = softneck.record(signal("eq22", duration=20.0), neck, seed=1)
+        >>> controller = softneck.design_controller("pi", softneck.identify("rls", recording))
+        >>> step = {"kind": "step", "pitch_deg": 10.0, "at_s": 0.5}
+        >>> loop = {"duration_s": 3.0, "plant": "paper", "controller": controller, "reference": step}
+        >>> result = softneck.simulate({**loop, "limits": {"pitch.overshoot_pct": 20.0}})
+        >>> result.holds, list(result.to_pandas())[:2]
+        (True, ['pitch', 'roll'])
     """
     with shown_progress("simulate", None if report is None else lambda done, _: report(done)) as tell:
         result = run_setup(

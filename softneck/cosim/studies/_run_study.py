@@ -65,6 +65,20 @@ def study(
     Raises:
         SettingsError: a key that the loop does not have, an empty range, no runs, another study's folder.
         OutputFileError: `output` holds a study already.
+
+    Example:
+        >>> import softneck
+        >>> from softneck.plant import NeckParameters
+        >>> from softneck.signals import signal
+        >>> neck = softneck.VirtualNeck(NeckParameters.paper())
+        >>> recording = softneck.record(signal("eq22", duration=20.0), neck, seed=1)
+        >>> controller = softneck.design_controller("pi", softneck.identify("rls", recording))
+        >>> step = {"kind": "step", "pitch_deg": 10.0, "at_s": 0.5}
+        >>> loop = {"duration_s": 3.0, "plant": "paper", "controller": controller, "reference": step}
+        >>> sizes = {"reference.pitch_deg": {"grid": [5.0, 10.0]}}
+        >>> runs = softneck.study(loop, vary=sizes, workers=0)
+        >>> runs["reference.pitch_deg"].tolist()
+        [5.0, 10.0]
     """
     made = loop if isinstance(loop, Study) else make_study(
         loop, vary=vary or {}, runs=runs, seed=seed, sampling=sampling, objectives=objectives

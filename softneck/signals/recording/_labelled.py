@@ -14,7 +14,7 @@ from softneck.core._shown import sparkline
 
 if TYPE_CHECKING:
     import pandas as pd
-    import xarray
+    import xarray  # pyright: ignore[reportMissingImports]  an extra
     from matplotlib.figure import Figure
 
 
@@ -97,7 +97,7 @@ def table(time: Vector, columns: Mapping[str, Vector], units: Mapping[str, str])
 def dataset(time: Vector, columns: Mapping[str, Vector], units: Mapping[str, str]) -> xarray.Dataset:
     """Return channels as a Dataset over `time`, each with its unit."""
     require_package("xarray")
-    import xarray
+    import xarray  # pyright: ignore[reportMissingImports]  an extra
 
     found = {name: ("time", values, {"units": units[name]}) for name, values in columns.items()}
     return xarray.Dataset(found, coords={"time": ("time", time, {"units": "s"})})
