@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from markupsafe import Markup
 
 from softneck.core import atomic_write
+from softneck.core._shown import Shown
 
 from ._chart import Chart
 from ._interactive import LICENCE, draw, library
@@ -22,8 +23,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-@dataclass(frozen=True, slots=True)
-class Table:
+@dataclass(frozen=True, slots=True, repr=False)
+class Table(Shown):
     """A table of text; a cell "holds" or "fails" is coloured.
 
     Attributes:
@@ -39,8 +40,8 @@ class Table:
     text: int = 1
 
 
-@dataclass(frozen=True, slots=True)
-class Section:
+@dataclass(frozen=True, slots=True, repr=False)
+class Section(Shown):
     """One part of a page; what is shown stands before its numbers, and these before how they came about.
 
     Attributes:

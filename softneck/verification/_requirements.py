@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import FileFormatError, SettingsError, require_between, require_whole, to_si
+from softneck.core._shown import Shown
 from softneck.loop._result import shown_unit
 from softneck.robot import Robot
 
@@ -123,8 +124,8 @@ class Requirement:
         return value < self.limit if self.bound == "below" else value <= self.limit
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Requirements:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Requirements(Shown):
     """What a verification asks of a controller, and how it is tried.
 
     Attributes:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import KINDS, DataError, Matrix, Progress, SettingsError, SoftneckError, resolve, silent
+from softneck.core._shown import Shown
 from softneck.signals import Recording
 from softneck.signals.quality._poor_excitation import poor_excitation
 
@@ -57,8 +58,8 @@ _MOST_TRAINED = 2
 REFITTED = "trained on all rows after the choice; its scores are those of the model before, which had not seen them all"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Choice:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Choice(Shown):
     """The outcome of `choose`: all kinds by the least of their scores, and the one that was taken.
 
     Attributes:
