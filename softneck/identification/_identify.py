@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -49,5 +50,7 @@ def identify(
     """
     estimator = make_settings(resolve(find_kind(kind, "model").settings), settings)
     with shown_progress(f"identify {kind}", progress) as tell:
-        model = estimator.fit(opened_recording(recording), progress=tell)
+        # A kind of one's own need not tell how far it is.
+        told = {"progress": tell} if "progress" in signature(estimator.fit).parameters else {}
+        model = estimator.fit(opened_recording(recording), **told)
     return model if tolerance is None else with_tolerance(model, tolerance)

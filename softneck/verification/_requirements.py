@@ -21,15 +21,9 @@ DEFAULT_FILE = Path(__file__).with_name("requirements.toml")
 VERSION = 1
 _AXIS_METRICS = (*LARGE, *SMALL, "nu_gap_ratio")
 _NECK_METRICS = (
-    "overshoot_pct",
-    "rise_s",
-    "settling_s",
-    "steady_rms_deg",
-    "rms_error_deg",
-    "max_rad",
-    "limit_violation_s",
+    "overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg", "max_rad", "limit_violation_s",
     "slack_s",
-)
+)  # fmt: skip
 _NECK = Robot.preset("neck")
 
 

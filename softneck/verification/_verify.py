@@ -213,9 +213,7 @@ def sources_of(things: Mapping[str, Any], requirements: Requirements) -> list[Un
     if not things:
         raise SettingsError("no plant: give at least one MODEL or FAMILY.")
     asked = requirements.uncertainty
-    spread = {
-        "gain": asked["gain_pct"] / 100.0, "pole": asked["pole_pct"] / 100.0, "delay": asked["delay_ms"] / 1e3,
-    }  # fmt: skip
+    spread = {"gain": asked["gain_pct"] / 100.0, "pole": asked["pole_pct"] / 100.0, "delay": asked["delay_ms"] / 1e3}
     necks = []
     for name, thing in things.items():
         if hasattr(thing, "axes") and hasattr(thing, "cross"):
@@ -257,13 +255,10 @@ def verify(
         >>> from softneck.plant import NeckParameters
         >>> from softneck.signals import signal
         >>> neck = softneck.VirtualNeck(NeckParameters.paper())
-        >>> recording = softneck.record(signal("eq22", duration=20.0), neck, seed=1)
         >>> from softneck.verification import make_requirements
-        >>> model = softneck.identify("rls", recording)
-        >>> few = {"plants": 20, "search_generations": 0}
-        >>> asked = make_requirements({"sampling": few, "neck": {"necks": 1, "payloads_kg": [0.0]}})
-        >>> found = softneck.verify(softneck.design_controller("pi", model), {"rls": model}, asked)
-        >>> len(found.verdicts) > 10
+        >>> model = softneck.identify("rls", softneck.record(signal("eq22", duration=20.0), neck, seed=1))
+        >>> asked = make_requirements({"sampling": {"plants": 20, "search_generations": 0}, "neck": {"necks": 1}})
+        >>> len(softneck.verify(softneck.design_controller("pi", model), {"rls": model}, asked).verdicts) > 10
         True
     """
     begin, controller, observer = time.perf_counter(), opened(controller, "controller"), opened(observer, "observer")
@@ -394,16 +389,12 @@ def plain(value: Any) -> Any:
     """Return JSON values of numbers, arrays, tables: what is not finite becomes None."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
+    if isinstance(value, np.ndarray | np.generic):
         return plain(value.tolist())
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
-    if isinstance(value, bool | np.bool_):
-        return bool(value)
-    if isinstance(value, int | np.integer):
-        return int(value)
-    if isinstance(value, float | np.floating):
-        return float(value) if math.isfinite(value) else None
-    if value is None or isinstance(value, str):
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, str | bool | int):
         return value
     raise DataError(f"a certificate cannot hold a {type(value).__name__}.")

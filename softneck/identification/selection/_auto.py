@@ -41,9 +41,8 @@ _SCREENED: dict[str, dict[str, Any]] = {
     "srivc": {"resamples": 0},
     "greybox": {"evaluations": 15, "sensor_delay": 2},
     "nn": {"starts": 1, "iterations": 8, "refine": 6},
-    "nlsm": {"output_weight": 5.0},
-    "nss": {"starts": 4, "iterations": 4},
-}
+    "nlsm": {"output_weight": 5.0}, "nss": {"starts": 4, "iterations": 4},
+}  # fmt: skip
 # Of the noise: the epsilon of screened sets, whose own choice among many takes several times as long.
 _SIGMAS = 8.0
 # Fits closer than this are alike [points]: seeds of noise and training move them by as much.
