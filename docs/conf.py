@@ -32,6 +32,8 @@ autodoc_typehints = "signature"
 python_maximum_signature_line_length = 80
 autodoc_preserve_defaults = True
 autodoc_typehints_format = "short"
+# Not what they stand for: `ndarray[tuple[Any, ...], dtype[floating[Any]]]`.
+autodoc_type_aliases = {name: name for name in ("Vector", "Matrix", "ArrayLike", "Progress", "Labelled", "Source")}
 python_use_unqualified_type_names = True
 # `--json` is a command's option and no dash: what is copied from a page runs.
 smartquotes = False
