@@ -58,7 +58,8 @@ def import_page(
             Section("Left out", tables=[Table("Columns that were not used", ["column", "why"], rows, text=2)])
         )
     return page(
-        f"Import of {log.name}", sections, verdict=_verdict(doubts, problems, recording), holds=not problems,
+        f"Import of {log.name}", sections, verdict=_verdict(doubts, problems, recording),
+        holds=False if problems else None if doubts else True,
         footer="Written by softneck import.",
     )  # fmt: skip
 

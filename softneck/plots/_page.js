@@ -22,6 +22,13 @@ function numbers({kind, count, low, step, start}, bytes) {
   }
   return values;
 }
+function wrapped(text, most) {
+  const lines = [""];
+  for (const word of text.split(" "))
+    if (lines.at(-1) && lines.at(-1).length + word.length >= most) lines.push(word);
+    else lines.push(`${lines.pop()} ${word}`.trim());
+  return lines.join("\n");
+}
 // On a narrow screen panels stand under each other, and the names above them in as many columns as there is room for.
 function fitted(chart, width) {
   const children = chart.doc.roots[0].attributes.children;
@@ -35,6 +42,8 @@ function fitted(chart, width) {
   const narrow = node => {
     if (node === null || typeof node !== "object") return;
     if (node.name === "Legend" && node.attributes) node.attributes.ncols = Math.min(6, room);
+    if (node.name === "Title" && node.attributes && node.attributes.text)
+      node.attributes.text = wrapped(node.attributes.text, Math.floor((width / columns - 130) / 7));
     Object.values(node).forEach(narrow);
   };
   narrow(children);

@@ -29,9 +29,10 @@ def study_page(description: Mapping[str, Any], runs: pd.DataFrame) -> str:
         description: what `study.json` in its folder says.
         runs: its table.
     """
+    name = description["name"]
     return page(
-        f"Study {description['name']}", study_sections(description, runs), verdict=study_verdict(description, runs),
-        footer="Written by softneck study.",
+        "Study" if name == "study" else f"Study {name}", study_sections(description, runs),
+        verdict=study_verdict(description, runs), footer="Written by softneck study.",
     )  # fmt: skip
 
 

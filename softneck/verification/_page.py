@@ -104,9 +104,23 @@ def _sentence(found: Verification) -> str:
     ]
     count, plants = len(found.verdicts), f"{len(found.evidence.plants)} plants"
     if not failed:
-        return f"All {count} requirements hold against {plants} and {len(found.evidence.necks)} loops of virtual necks."
+        held, absent = (sum(map(test, found.verdicts)) for test in (_held, _absent))
+        open_ = [(count - held - absent, "do not decide"), (absent, "are not computed")]
+        rest = "".join(f", {number} {words}" for number, words in open_ if number)
+        return (
+            f"{held} of {count} requirements hold{rest} and none fails, against {plants} and "
+            f"{len(found.evidence.necks)} loops of virtual necks."
+        )
     more = f"; {len(failed) - 3} more below" if len(failed) > 3 else ""
     return f"{len(failed)} of {count} requirements fail: {'; '.join(failed[:3])}{more}."
+
+
+def _held(verdict: Verdict) -> bool:
+    return verdict.holds is True
+
+
+def _absent(verdict: Verdict) -> bool:
+    return verdict.value is None
 
 
 def _first(found: Verification, certificate: str, stepped: Chart) -> Section:
