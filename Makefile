@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test slow check docs benchmark conformance mutate native wheel nightly nightly-tests nightly-fmu nightly-can nightly-systemd clean
+.PHONY: demo test slow check docs benchmark conformance mutate native wheel tag nightly nightly-tests nightly-fmu nightly-can nightly-systemd clean
 
 demo: $(VENV)/.installed
 	$(BIN)/softneck demo --out build/demo
@@ -69,6 +69,11 @@ wheel: native
 	rm -rf build/dist
 	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir build/dist .
 	$(BIN)/python tests/nightly/wheel.py build/dist/*.whl
+
+# The version stands in softneck/__init__.py alone; the tag says the same.
+tag: $(VENV)/.tested
+	$(BIN)/python -m pytest -q tests/test_packaging.py
+	$(BIN)/python -c "import softneck, subprocess as s; v = softneck.__version__; s.run(['git', 'tag', '-a', f'v{v}', '-m', f'softneck {v}'], check=True)"
 
 clean:
 	rm -rf $(VENV) docs/_build .pytest_cache .ruff_cache

@@ -4,7 +4,7 @@ import sys
 from importlib import metadata
 from pathlib import Path
 
-# Our own extensions, `public_names` and `kinds_tables`, stand beside this file.
+# Our own extensions, `public_names`, `kinds_tables` and `executed`, stand beside this file.
 sys.path.insert(0, str(Path(__file__).parent))
 
 project = "softneck"
@@ -18,6 +18,7 @@ extensions = [
     "sphinx-mathjax-offline",
     "public_names",
     "kinds_tables",
+    "executed",
 ]
 myst_enable_extensions = ["dollarmath", "colon_fence"]
 myst_heading_anchors = 3
@@ -27,6 +28,16 @@ html_static_path = ["_static"]
 html_title = "softneck"
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
+# A parameter to a line where they do not fit one, and defaults as they are written.
+python_maximum_signature_line_length = 80
+autodoc_preserve_defaults = True
+autodoc_typehints_format = "short"
+# Not what they stand for: `ndarray[tuple[Any, ...], dtype[floating[Any]]]`.
+autodoc_type_aliases = {name: name for name in ("Vector", "Matrix", "ArrayLike", "Progress", "Labelled", "Source")}
+python_use_unqualified_type_names = True
+# `--json` is a command's option and no dash: what is copied from a page runs.
+smartquotes = False
+html_css_files = ["gallery.css"]
 autodoc_default_options = {"members": True, "imported-members": True, "undoc-members": False}
 nitpicky = False
 napoleon_use_ivar = True

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
 import os
 import re
 import shutil
@@ -43,7 +45,9 @@ _COUNT = """([chart, panel, colour]) => {
 }"""
 _IDLE = """async () => {
   const frame = () => new Promise(done => requestAnimationFrame(() => setTimeout(done, 0)));
-  while (Bokeh.documents.length < document.querySelectorAll(".chart").length
+  const charts = document.querySelectorAll(".chart").length;
+  if (!charts) return;
+  while (typeof Bokeh === "undefined" || Bokeh.documents.length < charts
          || !Bokeh.documents.every(document => document.is_idle)) await frame();
   await frame(); await frame();
 }"""
@@ -54,7 +58,14 @@ def own_text(html: str) -> str:
 
     The tests in the browser watch that it asks for none, and the page's security policy forbids it.
     """
-    return re.sub(r'<script id="library">.*?</script>', "", html, flags=re.DOTALL)
+    return re.sub(r'<script type="application/gzip" id="library">.*?</script>', "", html, flags=re.DOTALL)
+
+
+def charts_of(html: str) -> str:
+    """Return the packed charts of a page as their JSON, without the numbers."""
+    (packed,) = re.findall(r'id="charts">([^<]*)<', html)
+    data = gzip.decompress(base64.b64decode(packed))
+    return data[4 : 4 + int.from_bytes(data[:4], "little")].decode()
 
 
 def chromium_path() -> str:
@@ -128,9 +139,9 @@ class Shown:
 
 
 @contextmanager
-def shown(browser: Browser, path: Path) -> Iterator[Shown]:
+def shown(browser: Browser, path: Path, *, width: int = 1200) -> Iterator[Shown]:
     """Show a file and note every request and complaint."""
-    page = browser.new_page(viewport={"width": 1200, "height": 900})
+    page = browser.new_page(viewport={"width": width, "height": 900})
     requests: list[str] = []
     complaints: list[str] = []
     page.on("request", lambda request: requests.append(request.url))

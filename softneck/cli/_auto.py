@@ -188,13 +188,17 @@ def _page(choice: Choice) -> str:
     names = list(dict.fromkeys(name for one in choice.ranking for name in one.scores))
     each = [[one.kind, *(percent(one.scores.get(name)) for name in names)] for one in choice.ranking]
     all_scores = Table("Free-run fit [%] over each part that was left out", ["kind", *names], each)
-    sections = [Section("Which model", text=[choice.why, *choice.remarks], tables=[table, all_scores])]
+    figures, found = [], []
     for one in choice.ranking:
         if one.judged is None or one is not choice.chosen:
             continue
         curves = {"free run": one.judged.free_run}
         figure = validation_figure(one.judged.time, one.judged.measured, curves, one.kind, robot=one.judged.robot)
-        sections.append(
-            Section(one.kind, text=[one.model.summary() if one.model else ""], figures=[(one.kind, figure)])
-        )
-    return page("identify auto", sections)
+        figures.append((f"{one.kind}: free run beside what was measured", figure))
+        found += one.model.summary().splitlines() if one.model else []
+    sections = [
+        Section("Which kind of model", figures=figures, tables=[table, all_scores], text=choice.remarks, method=found)
+    ]
+    return page(
+        "Models of all kinds, ranked", sections, verdict=choice.why, footer="Written by softneck identify auto."
+    )

@@ -131,7 +131,8 @@ def _page(family: Family, names: list[str]) -> str:
     from softneck.plots._identification_figures import shown_gain
 
     unit, gain, _ = shown_gain(family.robot)
-    sections = [Section("The plant", text=family.summary().splitlines())]
+    first, *rest = family.summary().splitlines()
+    sections = []
     for name, axis in family.axes.items():
         figures = []
         for number, what in enumerate(_SCOPES):
@@ -149,7 +150,8 @@ def _page(family: Family, names: list[str]) -> str:
         rows = [[label, *_numbers(row, gain)] for label, row in zip(("least", "largest"), axis.box, strict=True)]
         rows.append(["nominal", *_numbers(axis.nominal, gain)])
         sections.append(Section(name, tables=[Table("Box", head, rows)], figures=figures))
-    return page("Family of linear models", sections)
+    sections.append(Section("In numbers", text=rest))
+    return page("Family of linear models", sections, verdict=first, footer="Written by softneck family.")
 
 
 def _cover(family: Family, name: str) -> tuple[np.ndarray, np.ndarray]:

@@ -84,7 +84,8 @@ def _page(found: FrequencyResponse, models: dict[str, dict[str, np.ndarray]]) ->
     from softneck.plots import Section, frequency_response_figure, page
 
     scale, per_input, unit = found.shown()
-    sections: list[Any] = [Section("The response", text=found.summary().splitlines())]
+    first, *rest = found.summary().splitlines()
+    sections: list[Any] = []
     radius = found.radius()
     for i, output in enumerate(found.outputs):
         source = found.own_input(output)
@@ -106,4 +107,5 @@ def _page(found: FrequencyResponse, models: dict[str, dict[str, np.ndarray]]) ->
             sines=played,
         )
         sections.append(Section(title, figures=[(title, figure)]))
-    return page("Frequency response", sections)
+    sections.append(Section("Numbers", text=rest))
+    return page("Frequency response", sections, verdict=first, footer="Written by softneck frf.")

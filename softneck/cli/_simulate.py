@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 from markupsafe import Markup
@@ -142,17 +142,43 @@ def _page(name: str, result: Result, view: Path | None) -> str:
     from softneck.plots._charts import loop_chart
     from softneck.plots._neck3d import not_drawn
 
-    tables = [Table("Limits", *_limits(result)), Table("Metrics", *_metrics(result))]
-    chart = loop_chart(result.signals.time, result.signals.signals, name, robot=result.robot)
+    tables = [Table("Metrics", *_metrics(result))]
+    if result.limits:
+        tables.insert(0, Table("Limits", *_limits(result)))
+    chart = loop_chart(
+        result.signals.time, result.signals.signals, "Reference, outputs and motors", limits=result.bounds,
+        robot=result.robot,
+    )  # fmt: skip
     what = "angle" if result.robot.is_neck else "output"
     words = (
         f"Order {result.order}, metrics of the {result.angle} {what}, {result.real_time_factor:.0f} times real time."
     )
-    text = [words]
+    method = [words]
     if view is not None:
-        text.append(
+        method.append(
             Markup('<a href="{}">The {} in 3-D</a>').format(view.name, "neck" if result.robot.is_neck else "robot")
         )
     else:
-        text.append(not_drawn(result.robot))
-    return page(f"Loop {name}", [Section("Result", text=text, tables=tables, charts=[chart])])
+        method.append(not_drawn(result.robot))
+    return page(
+        "Closed loop" if name == "loop" else f"Closed loop: {name.replace('_', ' ')}",
+        [Section("Response", charts=[chart], tables=tables, method=method)],
+        verdict=_verdict(result), holds=result.holds if result.limits else None, footer="Written by softneck simulate.",
+    )  # fmt: skip
+
+
+def _verdict(result: Result) -> str:
+    """Return in one sentence whether the loop keeps its limits, and which it breaks."""
+    rows = result.limits
+    broken = [f"{row['metric']} is {_value(row)}, limit {row['limit']:g}" for row in rows if not row["holds"]]
+    if broken:
+        return f"{len(broken)} of {len(rows)} limits broken: {'; '.join(broken)}."
+    if not rows:
+        return "The loop file states no limits, so nothing was judged."
+    upper = [row for row in rows if row["metric"] != "validity.min" and row["limit"]] or rows
+    nearest = max(upper, key=lambda row: row["value"] / row["limit"])
+    return f"All {len(rows)} limits hold; nearest: {nearest['metric']}, {_value(nearest)} of {nearest['limit']:g}."
+
+
+def _value(row: dict[str, Any]) -> str:
+    return "not reached" if row["value"] is None else f"{row['value']:.3g}"

@@ -19,6 +19,7 @@ from softneck import __version__
 
 from ._errors import CheckFailedError, FileFormatError
 from ._files import atomic_write, file_hash
+from ._shown import Shown
 
 CERTIFICATE_VERSION = 1
 # The commands that write certificates.
@@ -28,8 +29,8 @@ _SHA256 = re.compile(r"[0-9a-f]{64}")
 _FOLDER = Path("build") / "certificates"
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Certificate:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class Certificate(Shown):
     """What a certificate says: whether all held, and for which files.
 
     Attributes:

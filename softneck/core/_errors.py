@@ -47,6 +47,7 @@ EXTRAS = {
     "serial": ("drives", "an inclinometer on a serial port"),
     "sklearn": ("sklearn", "the scikit-learn regressor"),
     "slycot": ("slycot", "synthesis by SLICOT"),
+    "xarray": ("xarray", "`.to_xarray()`"),
     "distributed": ("dask", "studies on a Dask cluster"),
 }
 

@@ -184,6 +184,16 @@ def load(path: str | Path, *, role: str | None = None) -> Any:
 
     Raises:
         FileFormatError: not a softneck file, another version, damaged, or of another role.
+
+    Example:
+        >>> import softneck
+        >>> from softneck.plant import NeckParameters
+        >>> from softneck.signals import signal
+        >>> neck = softneck.VirtualNeck(NeckParameters.paper())
+        >>> recording = softneck.record(signal("eq22", duration=20.0), neck, seed=1)
+        >>> softneck.identify("rls", recording).save("rls.npz")
+        >>> softneck.load("rls.npz").kind
+        'rls'
     """
     header, arrays = read_archive(path)
     kind = KINDS.get(str(header.get("kind")))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from softneck.core import DataError, Matrix, SettingsError, Vector
+from softneck.core._shown import Shown
 from softneck.identification.models._directions import NECK_SECONDS
 from softneck.identification.models._linear_systems import weights_of
 from softneck.robot import Robot
@@ -28,8 +29,8 @@ class HasTransferFunctions(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LinearNeck:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class LinearNeck(Shown):
     """Two transfer functions of one's own as a model of the neck, dead time as poles at zero.
 
     Attributes:
@@ -47,8 +48,8 @@ class LinearNeck:
         return self.pitch if output == "pitch" else self.roll
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class AxisPlant:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class AxisPlant(Shown):
     """`y(z) = z^-delay B(z)/A(z) u(z)` with deg B < deg A; monic A.
 
     Attributes:

@@ -18,6 +18,7 @@ from softneck.core import (
     require_positive,
     to_si,
 )
+from softneck.core._shown import Shown
 
 from ._reference_runtime import reference_ramp, reference_rotation, reference_row, reference_sine, reference_step
 
@@ -146,8 +147,8 @@ class RotationReference:
         )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RecordingReference:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class RecordingReference(Shown):
     """Recorded angles, each held until the next; the last one is held to the end.
 
     Attributes:

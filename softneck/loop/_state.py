@@ -11,6 +11,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from softneck.core import DataError, FileFormatError, Matrix, Vector, read_archive, write_archive
+from softneck.core._shown import Shown
 
 _KIND = "loop_state"
 # Raised whenever what a part saves stands in another order: lengths alone would not tell.
@@ -30,8 +31,8 @@ class SaveablePart(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class LoopState:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class LoopState(Shown):
     """A loop between two steps.
 
     Attributes:

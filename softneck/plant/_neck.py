@@ -78,6 +78,15 @@ class VirtualNeck(Shown):
 
     Raises:
         SettingsError: a robot without tendons that turn angles, or a link that so many tendons would buckle.
+
+    Example:
+        >>> import numpy as np
+        >>> import softneck
+        >>> from softneck.plant import NeckParameters
+        >>> block = softneck.VirtualNeck(NeckParameters.paper()).block()
+        >>> state, outputs = block.step(block.initial_state(), np.zeros(len(block.inputs)))
+        >>> [port.name for port in block.outputs][:2]
+        ['pitch', 'roll']
     """
 
     parameters: NeckParameters

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import FileFormatError, SettingsError, Vector, require_between, require_one_of
+from softneck.core._shown import Shown
 from softneck.runtime import Port
 
 from ._presets import PRESETS, SENSORS
@@ -29,8 +30,8 @@ def _number(default: float, unit: str, low: float, high: float, text: str, sourc
     return field(default=default, metadata=about)
 
 
-@dataclass(frozen=True, kw_only=True)
-class NeckParameters:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class NeckParameters(Shown):
     """Every number of the virtual neck; `about(name)` tells its unit, range and source.
 
     The defaults are the preset `paper`. Sources that read "calibrated" were fitted as the docs page "The

@@ -43,6 +43,15 @@ def record(
     Raises:
         DataError: set-points that are not finite or beyond the limits of the neck or robot.
         SettingsError: a payload, a seed or a step out of range.
+
+    Example:
+        >>> import softneck
+        >>> from softneck.plant import NeckParameters
+        >>> from softneck.signals import signal
+        >>> neck = softneck.VirtualNeck(NeckParameters.paper())
+        >>> recording = softneck.record(signal("eq22", duration=20.0), neck, seed=1)
+        >>> len(recording), recording.robot.outputs.names
+        (1000, ('pitch', 'roll'))
     """
     require_between("payload", payload, 0.0, 5.0, "kg")
     P = np.asarray(excitation.set_points, dtype=np.float64)

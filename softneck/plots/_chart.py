@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softneck.core import DataError, Vector, require_one_of
+from softneck.core._shown import Shown
 
 from ._style import BLUE, GREY
 
@@ -16,8 +17,8 @@ from ._style import BLUE, GREY
 STYLES = ("line", "dashed", "dotted", "points", "marked", "step", "bars", "stems", "band")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Curve:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Curve(Shown):
     """One set of points, drawn in one style; a NaN breaks lines and bands, nothing is drawn across it.
 
     Attributes:
@@ -77,8 +78,8 @@ class Level:
     vertical: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Panel:
+@dataclass(frozen=True, slots=True, repr=False)
+class Panel(Shown):
     """One pair of axes.
 
     Attributes:
@@ -107,8 +108,8 @@ class Panel:
     ticks: Sequence[str] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Chart:
+@dataclass(frozen=True, slots=True, repr=False)
+class Chart(Shown):
     """Panels under each other (or in several columns) that belong together.
 
     Attributes:

@@ -13,7 +13,7 @@ from softneck.robot import Robot
 from softneck.signals.recording._channels import NECK
 
 from ._chart import Chart, Curve, Level, Panel
-from ._style import ALL_MOTOR_COLOURS, BLUE, COLOURS, GREEN, GREY, MOTOR_COLOURS, ORANGE, SKY, looks, shown
+from ._style import ALL_MOTOR_COLOURS, BLUE, COLOURS, GREEN, GREY, MOTOR_COLOURS, ORANGE, RED, SKY, looks, shown
 
 # Of the whole time: the space between two runs that both start at zero.
 _SPACE = 0.03
@@ -177,7 +177,13 @@ def _range_for(measured: Vector, curves: list[Curve], least: float) -> tuple[flo
 
 
 def loop_chart(
-    time: Vector, signals: Mapping[str, Vector], title: str, *, caption: str = "", robot: Robot = NECK
+    time: Vector,
+    signals: Mapping[str, Vector],
+    title: str,
+    *,
+    limits: Mapping[str, float] | None = None,
+    caption: str = "",
+    robot: Robot = NECK,
 ) -> Chart:
     """Describe a closed loop: reference, true, measured and estimated outputs, motors, tensions where there are any.
 
@@ -186,10 +192,11 @@ def loop_chart(
         signals: name -> (time,) in SI: the outputs, of a neck pitch and roll (with _reference, _measured, _estimate),
             motor_setpoint_1..n, motor_position_1..n, tension_1..n [N].
         title: of the chart.
+        limits: metric -> limit; those of a step's overshoot and settling time are drawn.
         caption: for under the chart.
         robot: whose loop it is; outputs are drawn in its display unit, motors in their unit.
     """
-    panels = [_output_panel(time, signals, name, robot) for name in robot.outputs.names]
+    panels = [_output_panel(time, signals, name, limits or {}, robot) for name in robot.outputs.names]
     motors, unit = [], robot.motors.unit
     colours = MOTOR_COLOURS if robot.is_neck else ALL_MOTOR_COLOURS
     for j, (name, position) in enumerate(zip(robot.set_points, robot.motor_positions, strict=True)):
@@ -207,7 +214,9 @@ def loop_chart(
     return Chart(title, panels, caption=caption)
 
 
-def _output_panel(time: Vector, signals: Mapping[str, Vector], name: str, robot: Robot) -> Panel:
+def _output_panel(
+    time: Vector, signals: Mapping[str, Vector], name: str, limits: Mapping[str, float], robot: Robot
+) -> Panel:
     looks_of = (
         ("_lower", GREY, 0.7), ("_upper", GREY, 0.7), ("_measured", GREEN, 0.6), ("", BLUE, 1.4),
         ("_estimate", ORANGE, 0.9), ("_reference", BLACK, 1.0),
@@ -217,7 +226,35 @@ def _output_panel(time: Vector, signals: Mapping[str, Vector], name: str, robot:
         for end, colour, width in looks_of
         if f"{name}{end}" in signals
     ]
-    return Panel(curves, f"{name} [{robot.outputs.display_unit}]")
+    levels = _step_limits(time, signals.get(f"{name}_reference"), name, limits, robot)
+    flat = [level.value for level in levels if not level.vertical]
+    return Panel(curves, f"{name} [{robot.outputs.display_unit}]", levels=levels, y_range=_around(curves, flat))
+
+
+def _around(curves: list[Curve], values: list[float]) -> tuple[float, float] | None:
+    """Return a range that shows curves and `values`, which lines across a panel do not ask for; None: without any."""
+    if not values:
+        return None
+    seen = np.concatenate([*(curve.y[np.isfinite(curve.y)] for curve in curves), values])
+    low, high = float(seen.min()), float(seen.max())
+    return low - 0.05 * (high - low), high + 0.05 * (high - low)
+
+
+def _step_limits(
+    time: Vector, reference: Vector | None, name: str, limits: Mapping[str, float], robot: Robot
+) -> list[Level]:
+    """Return how far a step may overshoot and when it has to be settled; nothing where the reference is no step."""
+    jumps = () if reference is None else np.flatnonzero(np.diff(reference))
+    if reference is None or len(jumps) != 1:
+        return []
+    at = int(jumps[0]) + 1
+    levels = []
+    if (most := limits.get(f"{name}.overshoot_pct")) is not None:
+        top = reference[at] + most / 100.0 * (reference[at] - reference[at - 1])
+        levels.append(Level(float(shown(top, robot)), f"overshoot at most {most:g} %", RED))
+    if (latest := limits.get(f"{name}.settling_s")) is not None:
+        levels.append(Level(float(time[at]) + latest, f"settled after {latest:g} s", RED, vertical=True))
+    return levels
 
 
 def delay_chart(curves: Mapping[str, list[list[float]]], title: str, *, caption: str = "") -> Chart:

@@ -47,35 +47,46 @@ def import_page(
         lines: of the guess, and notes of the import.
         problems: what is missing, or why there is no recording.
     """
-    sections = [_doubts(doubts, problems, lines), _made(frame, layout, recording)]
-    charts = _charts(frame, layout, recording)
-    if charts:
-        text = [
-            "Left: the columns as logged, over their rows. Right: the channels of the recording, over time, in "
-            "the same colours."
-        ]
-        sections.append(Section("Raw and made", text=text, charts=charts))
+    first, *charts = [*_charts(frame, layout, recording), None]
+    sections = [_doubts(doubts, problems, lines, first), _made(frame, layout, recording)]
+    if charts[:-1]:
+        sections.append(Section("Raw and made", charts=[chart for chart in charts if chart is not None]))
     left_out = [line.removeprefix("ignored: ") for line in lines if line.startswith("ignored: ")]
     if left_out:
         rows = [[*line.split(": because ", 1), ""][:2] for line in left_out]
         sections.append(
             Section("Left out", tables=[Table("Columns that were not used", ["column", "why"], rows, text=2)])
         )
-    return page(f"Import of {log.name}", sections)
+    return page(
+        f"Import of {log.name}", sections, verdict=_verdict(doubts, problems, recording),
+        holds=False if problems else None if doubts else True,
+        footer="Written by softneck import.",
+    )  # fmt: skip
 
 
-def _doubts(doubts: Sequence[Doubt], problems: Sequence[str], lines: Sequence[str]) -> Section:
-    """Return what a reader has to decide, before all else."""
-    text = [f"Missing: {problem}" for problem in problems]
-    text += [line for line in lines if line.startswith("warning: ")]
-    if not doubts:
-        text.append("Nothing that was guessed is less than 90 % sure.")
-        return Section("Doubts", text=text)
-    # Paragraphs and no table: on a phone a table of five columns shows two.
-    text += [
-        f"{one} ({'or: ' + ', '.join(one.choices) if one.choices else 'if not, edit the layout'})" for one in doubts
+def _verdict(doubts: Sequence[Doubt], problems: Sequence[str], recording: Recording | None) -> str:
+    if problems or recording is None:
+        return f"No recording: {problems[0] if problems else 'something is missing'}"
+    made = f"A recording of {len(recording)} rows was made"
+    return f"{made}; {len(doubts)} guesses are for you to confirm." if doubts else f"{made}; no guess is in doubt."
+
+
+def _doubts(doubts: Sequence[Doubt], problems: Sequence[str], lines: Sequence[str], chart: Chart | None) -> Section:
+    """Return what a reader has to decide, before all else but the first picture."""
+    findings = [("warning", f"missing: {problem}") for problem in problems]
+    findings += [("warning", line.removeprefix("warning: ")) for line in lines if line.startswith("warning: ")]
+    # A list and no table: on a phone a table of five columns shows two.
+    findings += [
+        ("note", f"{one} ({'or: ' + ', '.join(one.choices) if one.choices else 'if not, edit the layout'})")
+        for one in doubts
     ]
-    return Section("Doubts", text=text)
+    if not doubts:
+        findings.append(("ok", "nothing that was guessed is less than 90 % sure."))
+    method = (
+        "Left: the columns as logged, over their rows. Right: the recording's channels over time, in the same colours."
+    )
+    charts = [] if chart is None else [chart]
+    return Section("Doubts", findings=findings, charts=charts, method=[method] if charts else [])
 
 
 def _made(frame: pd.DataFrame, layout: Layout, recording: Recording | None) -> Section:

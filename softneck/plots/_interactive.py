@@ -7,9 +7,8 @@ the first page with a chart is made, for the command line to start fast.
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +16,7 @@ import numpy as np
 from softneck.core import Vector
 
 from ._chart import Chart, Curve, Panel, bar_width
+from ._packed import compressed
 
 if TYPE_CHECKING:
     from bokeh.models import ColumnDataSource, GlyphRenderer, Legend, UIElement
@@ -31,46 +31,21 @@ _FONT = "system-ui, sans-serif"
 # Names under an axis are slanted [rad] and need so much room more [pixels].
 _SLANT, _NAMED = 0.5, 60
 _DASHES = {"dashed": [6, 4], "dotted": [2, 3]}
-# Draws the charts, and lets curves of one name vanish together in all panels of theirs. (Bokeh's own links are compiled
-# in the browser, which the page's security policy forbids.)
-_START = """
-for (const chart of document.querySelectorAll(".chart"))
-  Bokeh.embed.embed_item(JSON.parse(document.getElementById(chart.id + "-data").textContent), chart.id).then(() => {
-    const named = Bokeh.documents.at(-1).roots()[0].children.flatMap(([plot]) => plot.renderers).filter(r => r.name);
-    for (const one of named)
-      one.properties.visible.change.connect(() => {
-        for (const other of named) if (other.name === one.name) other.visible = one.visible;
-      });
-  });
-"""
+#: Bokeh's licence (BSD-3) asks for its notice; packed as the library is, nobody would find it there.
+LICENCE = "Plots: Bokeh, Copyright (c) Anaconda, Inc., and Bokeh Contributors; BSD-3-Clause, text in the library."
 _TOOLS = "box_zoom,pan,reset,save"
 
 
-@dataclass(frozen=True, slots=True)
-class RenderedChart:
-    """A chart as a page holds it.
-
-    Attributes:
-        data: JSON that Bokeh draws; safe inside a <script>.
-        height: that the chart takes [pixels].
-    """
-
-    data: str
-    height: int
-
-
+@lru_cache(maxsize=1)
 def library() -> str:
-    """Return the JavaScript that draws charts: Bokeh's core, one copy for a page, without widgets or tables."""
+    """Return the JavaScript that draws charts, packed: Bokeh's core, one copy for a page, without widgets or tables."""
     from bokeh.resources import Resources
 
-    return "\n".join([*Resources(mode="inline", components=["bokeh"], log_level="error").js_raw, _START])
+    return compressed("\n".join(Resources(mode="inline", components=["bokeh"], log_level="error").js_raw).encode())
 
 
-def draw(chart: Chart) -> RenderedChart:
-    """Return a chart for the browser.
-
-    All samples are there. Heights are kept to 7 digits (32 bit, which halves the page); x keeps all 64 bits.
-    """
+def draw(chart: Chart) -> tuple[Any, int]:
+    """Return a chart as Bokeh's JSON, and the height that it takes [pixels]."""
     from bokeh.embed import json_item
     from bokeh.layouts import gridplot
     from bokeh.models import BoxZoomTool, ToolProxy
@@ -90,9 +65,7 @@ def draw(chart: Chart) -> RenderedChart:
     for tool in grid.toolbar.tools:
         if isinstance(tool, ToolProxy) and isinstance(tool.tools[0], BoxZoomTool):
             grid.toolbar.active_drag = tool
-    # `<` would let a label end the script; JSON may spell it otherwise.
-    text = json.dumps(json_item(grid), separators=(",", ":")).replace("<", "\\u003c")
-    return RenderedChart(text, sum(plot.height or 0 for plot in plots[:: chart.columns]))
+    return json_item(grid), sum(plot.height or 0 for plot in plots[:: chart.columns])
 
 
 class _Sources:

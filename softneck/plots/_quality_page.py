@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,11 +12,12 @@ from softneck.signals import Quality, Recording, redefine
 from softneck.signals.quality._region import Region, reachable_hexagon
 from softneck.signals.recording._channels import file_unit, si_unit
 
+from ._chart import Chart, Curve, Panel
+from ._figures import chart_figure
 from ._page import Section, Table, page
 from ._style import ALL_MOTOR_COLOURS, BLUE, GREEN, GREY, ORANGE, PURPLE, RED, label, new_figure
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -24,6 +26,8 @@ _INPUT_NAMES = {"theta_i": r"$\theta_i$", "phi_i": r"$\phi_i$", "delta_i": r"$\d
 _POINTS = 20_000
 _FAULTS = (("missed", RED), ("frozen", PURPLE), ("clipped", ORANGE), ("outliers", GREEN))
 _SHOWN = {"outliers": "spikes"}
+# Of one sort in one channel.
+_MOST_MARKED = 200
 
 
 def spectrum_figure(quality: Quality, title: str) -> Figure:
@@ -140,36 +144,37 @@ def _bins(levels: float | None) -> int:
 
 def faults_figure(recording: Recording, quality: Quality, title: str) -> Figure:
     """Draw the measured channels over time, with the rows marked that are missed, frozen, clipped or spikes."""
-    names = [name for name in _shown(recording) if name not in recording.robot.set_points]
-    figure, axes = new_figure(len(names), row_height=1.6)
+    return chart_figure(faults_chart(recording, quality, title))
+
+
+def faults_chart(recording: Recording, quality: Quality, title: str) -> Chart:
+    """Describe the same: a band over the rows of a fault, a point on a spike."""
     # Times restart at each run; rows do not.
     t = np.arange(len(recording)) * recording.sample_time
     border = np.flatnonzero(np.diff(recording.run)) + 1
-    seen: dict[str, Artist] = {}
-    for ax, name in zip(axes, names, strict=True):
+    panels = []
+    for name in [name for name in _shown(recording) if name not in recording.robot.set_points]:
         y = _values(recording, name)
         y[border] = np.nan
-        ax.plot(t, y, color=GREY, lw=0.7)
+        curves = [Curve(t, y, colour=GREY, width=0.7)]
         for sort, colour in _FAULTS:
-            for stretch in getattr(quality.channels[name], sort)[:200]:
-                rows = slice(stretch.start, stretch.stop)
-                if sort == "outliers":
-                    (mark,) = ax.plot(t[rows], _values(recording, name)[rows], "o", color=colour, ms=4)
-                else:
-                    mark = ax.axvspan(t[rows][0], t[rows][-1] + recording.sample_time, color=colour, alpha=0.5, lw=1.0)
-                seen.setdefault(sort, mark)
-        label(ax, f"{name.replace('_', ' ')}\n[{quality.channels[name].unit}]", legend=False)
-    if seen:
-        figure.legend(
-            list(seen.values()),
-            [_SHOWN.get(sort, sort) for sort in seen],
-            loc="outside lower center",
-            ncols=4,
-            frameon=False,
-        )
-    axes[-1].set_xlabel("time from the first row [s]")
-    figure.suptitle(title)
-    return figure
+            if stretches := getattr(quality.channels[name], sort)[:_MOST_MARKED]:
+                rows = [np.arange(one.start, one.stop) for one in stretches]
+                curves.append(_marked(t, _values(recording, name), rows, sort, colour))
+        panels.append(Panel(curves, f"{name.replace('_', ' ')} [{quality.channels[name].unit}]"))
+    return Chart(title, panels, "time from the first row [s]", row_height=2.0)
+
+
+def _marked(t: Vector, y: Vector, rows: Sequence[np.ndarray], sort: str, colour: str) -> Curve:
+    """Return what marks rows of a fault: they are few, or hold no value that could be drawn otherwise."""
+    if sort == "outliers":
+        at = np.concatenate(rows)
+        return Curve(t[at], y[at], _SHOWN[sort], colour, "points", 1.3)
+    low, high = (float(np.nan_to_num(edge)) for edge in (np.nanmin(y, initial=0.0), np.nanmax(y, initial=0.0)))
+    step = t[1] - t[0] if t.size > 1 else 1.0
+    x = np.concatenate([[t[one[0]], t[one[-1]] + step, t[one[-1]] + step] for one in rows])
+    gaps = np.tile([0.0, 0.0, np.nan], len(rows))
+    return Curve(x, low + gaps, sort, colour, "band", upper=high + gaps)
 
 
 def correlation_figure(quality: Quality, title: str) -> Figure:
@@ -210,21 +215,16 @@ def _values(recording: Recording, name: str) -> Vector:
 
 def quality_page(recording: Recording, quality: Quality, title: str) -> str:
     """Return the HTML text of a recording's quality: findings, tables and figures."""
-    runs = len(recording.runs())
-    summary = (
-        f"{quality.rows} rows in {runs} run{'s' if runs > 1 else ''} at {1e3 * quality.sample_time:g} ms, "
-        f"{quality.rows * quality.sample_time:.1f} s. The worst finding is: {quality.severity}."
-    )
     neck, bandwidth = quality.robot.is_neck, quality.spectrum.bandwidth
     spectrum = [
         f"Power spectral density of the {'redefined inputs' if neck else 'set-points'} (Welch, never across runs)."
     ]
     if not np.isnan(bandwidth):
         spectrum[0] += f" What has no power up to the bandwidth of {bandwidth:.3g} rad/s cannot be identified."
+    faults = faults_chart(recording, quality, "What was measured, with the rows of each fault marked")
     sections = [
-        Section("Findings", [summary, *(str(finding) for finding in quality.findings)]),
+        Section("Findings", charts=[faults], findings=_findings(quality)),
         Section("Channels", [], [_channels(quality)], [
-            ("Measured channels; faults are marked.", faults_figure(recording, quality, "Faults")),
             ("How often each value occurs, with faults at the edges.", channels_figure(recording, quality, "Values")),
         ]),
         Section("Excitation", spectrum, [_inputs(quality)], [
@@ -235,7 +235,37 @@ def quality_page(recording: Recording, quality: Quality, title: str) -> str:
             ("Correlation of the motors.", correlation_figure(quality, "Motors")),
         ]),
     ]  # fmt: skip
-    return page(title, sections, footer=f"softneck info: {quality.rows} rows checked.")
+    return page(
+        title, sections, verdict=_verdict(recording, quality), holds=quality.severity != "warning",
+        footer="Written by softneck info.",
+    )  # fmt: skip
+
+
+def _verdict(recording: Recording, quality: Quality) -> str:
+    """Return in a sentence how good the recording is, and how long."""
+    count = {severity: sum(one.severity == severity for one in quality.findings) for severity in ("warning", "note")}
+    runs = len(recording.runs())
+    words = {
+        "warning": f"To mend before a model is identified: {count['warning']}",
+        "note": f"Fit to identify a model; to know: {count['note']}",
+        "ok": "Fit to identify a model; nothing is wrong with it",
+    }
+    return (
+        f"{words[quality.severity]}. It has {quality.rows} rows in {runs} run{'s' if runs > 1 else ''} at "
+        f"{1e3 * quality.sample_time:g} ms, {quality.rows * quality.sample_time:.1f} s."
+    )
+
+
+def _findings(quality: Quality) -> list[tuple[str, str]]:
+    """Return each finding with where it is first seen."""
+    return [
+        (
+            one.severity,
+            str(one).removeprefix(f"{one.severity}: ")
+            + (f" First at {one.time:.2f} s of its run." if one.time is not None and "at " not in one.message else ""),
+        )
+        for one in quality.findings
+    ]
 
 
 def _region(recording: Recording, quality: Quality) -> Section:

@@ -16,7 +16,7 @@ from softneck.plots import neck_view, page, write_page
 from softneck.signals import write_recording
 
 from ._closing import DemoDesign, close_loops, design
-from ._demo_page import sections
+from ._demo_page import sections, verdict, words
 from ._experiments import Experiments, Tell, ValidationPair, identify, judge, on_rough, record_experiments
 from ._packaging import PackagedFmu, package
 from ._tables import demo_json, score_line
@@ -114,7 +114,11 @@ def run_demo(settings: DemoSettings, *, tell: Tell) -> Demo:
     for name, result in loops.items():
         recording = result.recording()
         write_recording(out / "results" / f"{name}.csv", recording, force=True)
-        write_page(out / "results" / f"{name}_3d.html", neck_view(recording, title=name), force=True)
+        write_page(
+            out / "results" / f"{name}_3d.html",
+            neck_view(recording, title=f"The neck in the loop {words(name)}"),
+            force=True,
+        )
     demo = Demo(
         settings=settings,
         experiments=experiments,
@@ -141,8 +145,9 @@ def _write_results(demo: Demo, tell: Tell) -> None:
     out = demo.settings.out
     with atomic_write(out / "results" / "summary.json", force=True) as temporary:
         temporary.write_text(json.dumps(demo.as_dict(), indent=2) + "\n", encoding="utf-8")
+    sentence, holds = verdict(demo.packaged, demo.loops)
     html = page(
-        "softneck: from a recording to a verified closed loop",
+        "From a recording to a verified closed loop",
         sections(
             experiments=demo.experiments,
             models=demo.models,
@@ -153,6 +158,8 @@ def _write_results(demo: Demo, tell: Tell) -> None:
             loops=demo.loops,
             shortened=demo.settings.duration < FULL_DURATION,
         ),
-        footer="Written by `softneck demo`.",
+        verdict=sentence,
+        holds=holds,
+        footer="Written by softneck demo.",
     )
     write_page(out / "report.html", html, force=True)

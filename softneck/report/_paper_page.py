@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from softneck.identification import INFINITE
 from softneck.identification.models._linear_systems import continuous_parameters
 from softneck.plots import Section, Table, page
 
@@ -18,6 +19,8 @@ _PLANT = (
     "The plant is a virtual neck (preset `paper`), not the paper's hardware. What could be the plant's shows in the "
     "column other necks: the same estimators on the presets rough and lab and on necks drawn around paper."
 )
+# Measured with the free runs of all models: the paper's section 7.4.
+_FIRST = 21
 # Title of a section -> the numbers of its figures.
 PARTS = {
     "The experiment (sections 3.1 and 4)": range(4, 8),
@@ -35,10 +38,36 @@ def paper_page(found: Reproduction) -> str:
     rows = paper_entries(found)
     tables = [Table(title, PAPER_HEAD, [row.row() for row in part], text=3) for title, part in grouped(rows).items()]
     tables.append(Table("Eq. 31: the linear model, in deg", LINEAR_HEAD, linear_rows(found)))
-    sections = [Section("Tables 3 and 4, section 7.4", text=[_PLANT, PAPER_NOTE], tables=tables)]
+    first = Section(
+        "Tables 3 and 4, section 7.4", charts=[paper_chart(_FIRST, found)], tables=tables, method=[_PLANT, PAPER_NOTE]
+    )
+    sections = [first]
     for title, numbers in PARTS.items():
-        sections.append(Section(title, charts=[paper_chart(number, found) for number in numbers]))
-    return page("The paper, reproduced on a virtual neck", sections, footer="Written by `softneck reproduce-paper`.")
+        sections.append(Section(title, charts=[paper_chart(number, found) for number in numbers if number != _FIRST]))
+    return page(
+        "The paper, reproduced on a virtual neck", sections, verdict=_verdict(found),
+        footer="Written by softneck reproduce-paper.",
+    )  # fmt: skip
+
+
+def _verdict(found: Reproduction) -> str:
+    """Return in a sentence which model is best where the paper's section 7.4 judges: free run on the tests."""
+    least = {
+        model: min(
+            -np.inf if fit is None else fit
+            for (name, _), pair in found.judged.items() if name == model
+            for fit in pair.free.fits[INFINITE].values()
+        )
+        for model in found.models
+    }  # fmt: skip
+    best = max(least, key=lambda name: least[name])
+    worst = ", ".join(
+        f"{name} {'diverges' if np.isneginf(fit) else f'{fit:.1f} %'}" for name, fit in least.items() if name != best
+    )
+    return (
+        f"Run free from set-points alone, {best} is the safest of the paper's models on the virtual neck: its worst "
+        f"fit on any test is {least[best]:.1f} % (the others' worst: {worst})."
+    )
 
 
 def grouped(rows: list[Entry]) -> dict[str, list[Entry]]:

@@ -107,7 +107,7 @@ def _loop(project: Project, path: Path, name: str) -> None:
         named = next(python_of(read_toml(path)), "")
         if named:
             raise SettingsError(f"names Python (`{named}`), which a report never runs; `softneck simulate` does.")
-        project.loops[name] = simulate(load_loop(path), compiled=True)
+        project.loops[name] = simulate(load_loop(path), report=lambda _: None, compiled=True)
 
 
 def _recording(project: Project, path: Path, name: str) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from softneck.core import SoftneckError, file_hash
 from softneck.core._certificate import required_rows
+from softneck.core._shown import Shown
 from softneck.cosim import Result
 from softneck.identification import INFINITE, validate
 from softneck.plots import Chart, Section, Table, page
@@ -23,20 +25,59 @@ from ._validation_page import drawable
 _MOST_CHARTS = 4
 # Recordings on which each model is judged.
 _MOST_DATA = 6
+# Thumbnails of one sort.
+_MOST_CARDS = 12
 _HORIZONS: tuple[int | str, ...] = (1, 25, INFINITE)
 
 
 def project_page(project: Project) -> str:
     """Return the HTML page of a project: what it holds, what that is worth, what held and what failed."""
     title = f"Project {project.folder.resolve().name}"
-    sections = [_overview(project), _data(project), _models(project), _uncertain(project), _design(project)]
-    sections += [_certificates(project), _fmus(project), _loops(project), *_studies(project), _problems(project)]
+    sections = [_loops(project), _certificates(project), _data(project), _models(project), _uncertain(project)]
+    sections += [_design(project), _fmus(project), *_studies(project), _problems(project)]
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     kept = [section for section in sections if section is not None]
-    return page(title, kept, footer=f"softneck report, {now}. All plots and tables are in this file.")
+    places = {section.title: f"#s{number}" for number, section in enumerate(kept, start=2)}
+    sentence, holds = _sentence(project)
+    return page(
+        title, [_overview(project, places), *kept], verdict=sentence, holds=holds,
+        footer=f"softneck report, {now}. All plots and tables are in this file.",
+    )  # fmt: skip
 
 
-def _overview(project: Project) -> Section:
+def _sentence(project: Project) -> tuple[str, bool | None]:
+    """Return what holds and what does not, and whether all does; None: nothing was asked of anything."""
+    loops = [result for result in project.loops.values() if result.limits]
+    held = sum(result.holds for result in loops)
+    certified = sum(_certifies(content) for content in project.certificates.values())
+    parts = [f"{held} of {len(loops)} loops keep their limits"] if loops else []
+    if project.certificates:
+        parts.append(f"{certified} of {len(project.certificates)} certificates hold")
+    if project.problems:
+        parts.append(f"{len(project.problems)} file(s) could not be read or run")
+    if not parts:
+        return "Nothing in this project states a limit, so nothing was judged.", None
+    good = held == len(loops) and certified == len(project.certificates) and not project.problems
+    return f"{'; '.join(parts)}.".capitalize(), good
+
+
+def _cards(project: Project, places: Mapping[str, str]) -> list[tuple[str, str, str, str]]:
+    """Return a card for each thing of the project: a small picture, a line, and the way to its section."""
+    groups = {
+        "Loops": project.loops, "Data": {name: recording for name, (recording, _) in project.recordings.items()},
+        "Models": project.models, "Uncertain plant": project.families,
+        "Observers and controllers": {**project.observers, **project.controllers},
+    }  # fmt: skip
+    cards = []
+    for title, things in groups.items():
+        for name, thing in list(things.items())[:_MOST_CARDS]:
+            lines = _lines(thing)
+            said = lines[1] if title == "Loops" and len(lines) > 1 else lines[0]
+            cards.append((name, places[title], thing._picture() if isinstance(thing, Shown) else "", said[:90]))
+    return cards
+
+
+def _overview(project: Project, places: Mapping[str, str]) -> Section:
     loops = [result for result in project.loops.values() if result.limits]
     held = sum(result.holds for result in loops)
     certified = sum(_certifies(content) for content in project.certificates.values())
@@ -52,7 +93,8 @@ def _overview(project: Project) -> Section:
         ("files that could not be read or run", len(project.problems), "fails" if project.problems else "-"),
     ]
     rows = [[name, str(count), verdict] for name, count, verdict in lines]
-    return Section("Overview", tables=[Table("What is there", ["", "number", "verdict"], rows)])
+    table = Table("What is there", ["", "number", "verdict"], rows)
+    return Section("Overview", cards=_cards(project, places), tables=[table])
 
 
 def _verdict(held: int, of: int) -> str:
@@ -215,12 +257,13 @@ def _loops(project: Project) -> Section | None:
             verdict = "holds" if row["holds"] else "fails"
             limits.append([name, row["metric"], _cell(row["value"]), _cell(row["limit"]), verdict])
         if len(charts) < _MOST_CHARTS:
-            charts.append(loop_chart(result.signals.time, result.signals.signals, name, robot=result.robot))
+            signals = result.signals
+            charts.append(loop_chart(signals.time, signals.signals, name, limits=result.bounds, robot=result.robot))
     head = ["loop", "overshoot [%]", "settling [s]", "rms error [deg]", "largest set-point [rad]"]
     tables = [Table("Loops, pitch/roll", head, metrics)]
     if limits:
         tables.append(Table("Limits", ["loop", "metric", "value", "limit", "verdict"], limits, text=2))
-    return Section("Loops", text=["Run anew for this page."], tables=tables, charts=charts)
+    return Section("Loops", tables=tables, charts=charts, method=["Run anew for this page."])
 
 
 def _metrics(result: Result) -> list[str]:
@@ -234,7 +277,7 @@ def _studies(project: Project) -> list[Section]:
     sections = []
     for name, (description, runs) in project.studies.items():
         for part in study_sections(description, runs) if len(runs) else []:
-            sections.append(Section(f"Study {name}: {part.title}", part.text, part.tables, part.figures, part.charts))
+            sections.append(replace(part, title=f"Study {name}: {part.title}"))
     return sections
 
 

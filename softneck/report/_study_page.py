@@ -29,7 +29,11 @@ def study_page(description: Mapping[str, Any], runs: pd.DataFrame) -> str:
         description: what `study.json` in its folder says.
         runs: its table.
     """
-    return page(f"Study {description['name']}", study_sections(description, runs))
+    name = description["name"]
+    return page(
+        "Study" if name == "study" else f"Study {name}", study_sections(description, runs),
+        verdict=study_verdict(description, runs), footer="Written by softneck study.",
+    )  # fmt: skip
 
 
 def study_sections(description: Mapping[str, Any], runs: pd.DataFrame) -> list[Section]:
@@ -37,16 +41,27 @@ def study_sections(description: Mapping[str, Any], runs: pd.DataFrame) -> list[S
     failed = failures(runs)
     objectives = list(description["objectives"])
     vary = description["study"]["vary"]
-    sections = [_overview(description, runs, objectives)]
+    sections: list[Section] = []
     if not all(failed):
-        sections += [_ranking(runs, list(vary), objectives), _trade(runs, vary, objectives)]
-        sections += [_spread(runs, vary, objectives)]
+        sections += [_spread(runs, vary, objectives), _ranking(runs, list(vary), objectives)]
+        sections += [_trade(runs, vary, objectives)]
         inputs = _numbers(runs, vary)
         if inputs:
             sections.append(_influence(runs, inputs, objectives[0]))
     if any(failed):
         sections.append(_failures(runs))
-    return sections
+    return [*sections, _overview(description, runs, objectives)]
+
+
+def study_verdict(description: Mapping[str, Any], runs: pd.DataFrame) -> str:
+    """Return in a sentence how many runs keep their limits, and which is best."""
+    failed, held = sum(failures(runs)), runs["holds"].dropna().tolist()
+    objectives = list(description["objectives"])
+    said = f"{sum(map(bool, held))} of {len(held)} runs keep all limits" if held else f"{len(runs)} runs, no limits"
+    if failed < len(runs):
+        best = rank(runs, objectives).iloc[0]
+        said += f"; the best, run {best['run']}, has {objectives[0]} {_text(best[objectives[0]])}"
+    return said + (f"; {failed} failed with an error." if failed else ".")
 
 
 def study_rows(
@@ -87,7 +102,7 @@ def _overview(description: Mapping[str, Any], runs: pd.DataFrame, objectives: li
         tables.append(
             Table("By group", list(table.columns), [[_text(v) for v in row] for row in table.to_numpy()], len(by))
         )
-    return Section("Result", text=text, tables=tables)
+    return Section("What was run", text=text, tables=tables)
 
 
 def _ranking(runs: pd.DataFrame, keys: list[str], objectives: list[str]) -> Section:

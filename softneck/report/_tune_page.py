@@ -27,8 +27,11 @@ def tune_page(found: Tuned) -> str:
     """Return the HTML page of a tuning."""
     items = [found.best, *(item for item in found.front if item is not found.best)]
     return page(
-        f"Tuning of {found.task.robot.name}",
-        [_result(found), _asked(found), _coordinates(found, items), _steps(found, items), _front(found)],
+        f"Controller for {found.task.robot.label()}, tuned",
+        [_result(found, _steps(found, items)), _coordinates(found, items), _front(found), _asked(found)],
+        verdict="All requirements hold." if found.holds else f"Not all requirements hold. {stands_in_the_way(found)}",
+        holds=found.holds,
+        footer="Written by softneck tune.",
     )
 
 
@@ -68,10 +71,9 @@ def stands_in_the_way(found: Tuned) -> str:
     return text + (f" ({'; '.join(told)})." if told else ".")
 
 
-def _result(found: Tuned) -> Section:
+def _result(found: Tuned, steps: Chart) -> Section:
     best = found.best
     text = [
-        "All requirements hold." if found.holds else f"Not all requirements hold. {stands_in_the_way(found)}",
         f"{best.kind}: " + ", ".join(f"{name} {_text(value)}" for name, value in best.settings.items()) + ".",
         f"{found.evaluations} judgements of {len({(i.kind, str(i.settings)) for i in found.candidates})} candidates "
         "that were closed in loops, and of others that were left behind before.",
@@ -83,7 +85,7 @@ def _result(found: Tuned) -> Section:
     if found.prices:
         told = [[p.metric, f"{p.limit:.3g}", p.other, _text(p.least)] for p in found.prices]
         tables.append(Table("What it costs, all else held", ["requirement", "at", "costs", "at least"], told))
-    return Section("Result", text=text, tables=tables)
+    return Section("Best controller", charts=[steps], tables=tables, method=text)
 
 
 def _asked(found: Tuned) -> Section:
@@ -116,7 +118,7 @@ def _coordinates(found: Tuned, items: Sequence[Candidate]) -> Section:
     return Section("Parallel coordinates", charts=[chart])
 
 
-def _steps(found: Tuned, items: Sequence[Candidate]) -> Section:
+def _steps(found: Tuned, items: Sequence[Candidate]) -> Chart:
     curves: list[Curve] = []
     for item, (colour, style) in zip(items[:_STEPS], looks(), strict=False):
         time, y, reference = step_response(found.task, item)
@@ -125,8 +127,8 @@ def _steps(found: Tuned, items: Sequence[Candidate]) -> Section:
         curves.append(Curve(time, y, _label(found, item), colour, style, 2.0 if item is found.best else 1.0))
     outputs = found.task.robot.outputs
     where = "with the heaviest payload" if found.task.own else "of the nominal plant"
-    chart = Chart(f"Steps {where}", [Panel(curves, f"{outputs.names[0]} [{outputs.display_unit}]")], row_height=4.0)
-    return Section("Steps of the front", charts=[chart])
+    panel = Panel(curves, f"{outputs.names[0]} [{outputs.display_unit}]")
+    return Chart(f"Steps {where}: the best, and others on the front", [panel], row_height=4.0)
 
 
 def _front(found: Tuned) -> Section:

@@ -45,11 +45,35 @@ def validation_page(results: Sequence[Validation], *, title: str = "Validation")
         results: of `validate`, one for each model and recording.
         title: of the page.
     """
-    sections = [_overview(results), *_comparisons(results), *(_section(result) for result in results)]
-    return page(title, sections, footer="Written by softneck.")
+    together = _comparisons(results)
+    sections = [_overview(results, together or [_curves(results[0])])]
+    sections += [_section(r, drawn=not together and r is results[0]) for r in results]
+    return page(title, sections, verdict=_verdict(results), footer="Written by softneck validate.")
 
 
-def _overview(results: Sequence[Validation]) -> Section:
+def _verdict(results: Sequence[Validation]) -> str:
+    """Return in a sentence which model is best on each recording, by its longest horizon."""
+    said = []
+    for data in dict.fromkeys(r.data for r in results):
+        rivals = [r for r in results if r.data == data]
+        best = max(rivals, key=lambda r: min(-np.inf if fit is None else fit for fit in _last(r).values()))
+        fits = ", ".join(f"{name} {_text(fit, 1)} %" for name, fit in _last(best).items())
+        ahead = list(best.fits)[-1]
+        how = "free run" if ahead == INFINITE else f"{ahead} samples ahead"
+        diverged = [Path(r.model).stem for r in rivals if r.diverged is not None]
+        said.append(
+            f"On {Path(data).stem} {Path(best.model).stem} fits {how} {fits}"
+            + (f" (best of {len(rivals)} models)" if len(rivals) > 1 else "")
+            + (f"; diverged: {', '.join(diverged)}" if diverged else "")
+        )
+    return "; ".join(said) + "."
+
+
+def _last(r: Validation) -> dict[str, float | None]:
+    return r.fits[list(r.fits)[-1]]
+
+
+def _overview(results: Sequence[Validation], charts: Sequence[Chart]) -> Section:
     rows, outputs = [], results[0].robot.outputs
     names, unit = "/".join(outputs.names), outputs.display_unit
     for r in results:
@@ -69,8 +93,9 @@ def _overview(results: Sequence[Validation]) -> Section:
     counts = [[_name(r), str(r.rows_scored), str(r.rows_left_out), *_verdicts(r)] for r in results]
     head = ["model on data", "rows judged", "left out", "one-step errors white", "follow no input", "free run diverged"]
     return Section(
-        "Fits", text=[VALIDATION_NOTE.format(outputs=names)], tables=[fits, Table("What was judged", head, counts)]
-    )
+        "Fits", charts=charts, tables=[fits, Table("What was judged", head, counts)],
+        method=[VALIDATION_NOTE.format(outputs=names)],
+    )  # fmt: skip
 
 
 def _verdicts(r: Validation) -> list[str]:
@@ -79,38 +104,48 @@ def _verdicts(r: Validation) -> list[str]:
     return [*words, "no" if r.diverged is None else f"at {r.diverged:.2f} s"]
 
 
-def _comparisons(results: Sequence[Validation]) -> list[Section]:
+def _comparisons(results: Sequence[Validation]) -> list[Chart]:
     """Put the free runs of models that were judged on the same rows into one chart."""
     groups: dict[tuple[str, bytes, bytes], list[Validation]] = {}
     for r in results:
         if INFINITE in r.fits:
             groups.setdefault((r.data, r.time.tobytes(), r.measured.tobytes()), []).append(r)
-    sections = []
+    charts = []
     for group in groups.values():
         if len(group) > 1:
             data = Path(group[0].data).stem
             runs = {Path(r.model).stem: drawable(r, r.free_run) for r in group}
             runs = runs if len(runs) == len(group) else {r.model: drawable(r, r.free_run) for r in group}
             first = group[0]
-            chart = validation_chart(
-                first.time, first.measured, runs, "Free runs", run=first.run, caption=_ERROR, robot=first.robot
-            )
-            sections.append(Section(f"All models on {data}", charts=[chart]))
-    return sections
+            charts.append(
+                validation_chart(
+                    first.time, first.measured, runs, f"Free runs on {data}", run=first.run, caption=_ERROR,
+                    robot=first.robot,
+                )
+            )  # fmt: skip
+    return charts
 
 
-def _section(r: Validation) -> Section:
+def _predictions(r: Validation) -> dict[str, Matrix]:
     predictions = {"one step": drawable(r, r.one_step)}
     if INFINITE in r.fits:
         predictions["free run"] = drawable(r, r.free_run)
+    return predictions
+
+
+def _curves(r: Validation) -> Chart:
     bounds = _bounds_of(r)
     caption = _ERROR + (" The band holds the model's bounds of its free run." if bounds else "")
-    curves = validation_chart(
-        r.time, r.measured, predictions, "Measured and predicted", bounds=bounds, run=r.run, caption=caption,
-        robot=r.robot,
+    return validation_chart(
+        r.time, r.measured, _predictions(r), f"{_name(r)}: measured and predicted", bounds=bounds, run=r.run,
+        caption=caption, robot=r.robot,
     )  # fmt: skip
-    charts = [curves, _residuals(r)]
-    for name, values in predictions.items():
+
+
+def _section(r: Validation, *, drawn: bool) -> Section:
+    """Return all on one result; its curves unless they are `drawn` already."""
+    charts = [*([] if drawn else [_curves(r)]), _residuals(r)]
+    for name, values in _predictions(r).items():
         errors = r.measured - values
         if np.isfinite(errors).any(axis=0).all():
             charts.append(histogram_chart(errors, f"Errors, {name}", robot=r.robot))

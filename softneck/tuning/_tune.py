@@ -217,7 +217,9 @@ def _verified(
     for number, item in enumerate(promising):
         controller = designed(task, ready, item.kind, item.settings)
         progress(number / len(promising), f"verify {item.kind}")
-        verification = verify(controller, {**task.linear, **task.own}, task.asked.certificate, files=files)
+        verification = verify(
+            controller, {**task.linear, **task.own}, task.asked.certificate, files=files, progress=silent
+        )
         if verification.holds:
             return item, verification, controller
         found.append((item, verification, controller))

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from softneck.plots import Section, Table, page
+from softneck.plots import Chart, Section, Table, page
 
 from ._charts import (
     delay_sensitivity,
@@ -73,32 +73,66 @@ def verification_page(found: Verification, controller: str, certificate: str = "
     """
     evidence, robot = found.evidence, found.controller.robot
     first, *others = robot.outputs.names
-    sections = [_first(found, certificate), _methods(found)]
+    stepped = step_chart(evidence.steps, evidence.stepped, robot)
+    sections = [_first(found, certificate, stepped), _methods(found)]
     for part in evidence.linear:
         sections += _linear_sections(found, part)
-    stepped = step_chart(evidence.steps, evidence.stepped, robot)
     each = f" and, in a run of its own, of {' and '.join(others)}" if others else ""
     text = [
         "The controller's own runtime with all its limits, against every plant with its delay and noisy angles: a step "
         f"of {first}{each}; half way a load is added to the plant's input."
     ]
-    sections.append(Section("Steps", text=text, tables=[_spread(found, "step")], charts=[stepped]))
+    sections.append(Section("Steps", tables=[_spread(found, "step")], method=text))
     if evidence.necks:
         charts = [neck_chart(evidence, robot)] if any(run.result is not None for run in evidence.necks) else []
         sections.append(Section("Virtual neck", tables=[_spread(found, "neck"), _runs(found)], charts=charts))
     sections.append(_plants(found))
     words = "holds" if found.holds else "does not hold"
-    return page(f"{controller} {words}", sections, footer="Written by softneck verify.")
+    return page(
+        f"{controller} {words}", sections, verdict=_sentence(found), holds=found.holds,
+        footer="Written by softneck verify.",
+    )  # fmt: skip
 
 
-def _first(found: Verification, certificate: str) -> Section:
-    text = [f"{'Holds' if found.holds else 'Fails'}: {found.summary()}."]
+def _sentence(found: Verification) -> str:
+    """Return the verdict: what holds, and what fails where."""
+    axes = found.controller.robot.outputs.names
+    failed = [
+        f"{v.requirement.metric} is {number(v.value)}, asked {_BOUNDS[v.requirement.bound]} {v.requirement.limit:g} "
+        f"({_plant(v, axes)})"
+        for v in found.failed
+    ]
+    count, plants = len(found.verdicts), f"{len(found.evidence.plants)} plants"
+    if not failed:
+        held, absent = (sum(map(test, found.verdicts)) for test in (_held, _absent))
+        open_ = [(count - held - absent, "do not decide"), (absent, "are not computed")]
+        rest = "".join(f", {number} {words}" for number, words in open_ if number)
+        return (
+            f"{held} of {count} requirements hold{rest} and none fails, against {plants} and "
+            f"{len(found.evidence.necks)} loops of virtual necks."
+        )
+    more = f"; {len(failed) - 3} more below" if len(failed) > 3 else ""
+    return f"{len(failed)} of {count} requirements fail: {'; '.join(failed[:3])}{more}."
+
+
+def _held(verdict: Verdict) -> bool:
+    return verdict.holds is True
+
+
+def _absent(verdict: Verdict) -> bool:
+    return verdict.value is None
+
+
+def _first(found: Verification, certificate: str, stepped: Chart) -> Section:
+    text = [f"{found.summary()[0].upper()}{found.summary()[1:]}."]
     if certificate:
         text.append(f"Certificate: {certificate}. Each worst plant stands beside it as a loop for softneck simulate.")
     text += [f"Methods disagree: {item.question} {item.note}." for item in found.agreements if not item.agree]
     text += [f"Not computed: {name}: {why}." for name, why in found.evidence.not_computed.items()]
     table = verdict_table(found)
-    return Section("Verdict", text=text, tables=[Table("Requirements", table.head, table.rows)])
+    return Section(
+        "Requirements", charts=[stepped], tables=[Table("Each at its worst plant", table.head, table.rows)], method=text
+    )
 
 
 def _methods(found: Verification) -> Section:

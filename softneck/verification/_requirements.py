@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import FileFormatError, SettingsError, require_between, require_whole, to_si
+from softneck.core._shown import Shown
 from softneck.loop._result import shown_unit
 from softneck.robot import Robot
 
@@ -20,15 +21,9 @@ DEFAULT_FILE = Path(__file__).with_name("requirements.toml")
 VERSION = 1
 _AXIS_METRICS = (*LARGE, *SMALL, "nu_gap_ratio")
 _NECK_METRICS = (
-    "overshoot_pct",
-    "rise_s",
-    "settling_s",
-    "steady_rms_deg",
-    "rms_error_deg",
-    "max_rad",
-    "limit_violation_s",
+    "overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg", "max_rad", "limit_violation_s",
     "slack_s",
-)
+)  # fmt: skip
 _NECK = Robot.preset("neck")
 
 
@@ -123,8 +118,8 @@ class Requirement:
         return value < self.limit if self.bound == "below" else value <= self.limit
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Requirements:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Requirements(Shown):
     """What a verification asks of a controller, and how it is tried.
 
     Attributes:

@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import DataError, Progress, SettingsError, silent
+from softneck.core import DataError, Progress, SettingsError
 from softneck.core._certificate import certificate_contents
 from softneck.core._kinds import opened
+from softneck.core._progress import shown_progress
 from softneck.core._shown import Shown, marks
 from softneck.estimation._axis import robot_of
 from softneck.plant import NeckParameters, VirtualNeck
@@ -212,9 +213,7 @@ def sources_of(things: Mapping[str, Any], requirements: Requirements) -> list[Un
     if not things:
         raise SettingsError("no plant: give at least one MODEL or FAMILY.")
     asked = requirements.uncertainty
-    spread = {
-        "gain": asked["gain_pct"] / 100.0, "pole": asked["pole_pct"] / 100.0, "delay": asked["delay_ms"] / 1e3,
-    }  # fmt: skip
+    spread = {"gain": asked["gain_pct"] / 100.0, "pole": asked["pole_pct"] / 100.0, "delay": asked["delay_ms"] / 1e3}
     necks = []
     for name, thing in things.items():
         if hasattr(thing, "axes") and hasattr(thing, "cross"):
@@ -234,7 +233,7 @@ def verify(
     order: str | None = None,
     observer: Any = None,
     files: Mapping[str, tuple[str, str]] | None = None,
-    progress: Progress = silent,
+    progress: Progress | None = None,
 ) -> Verification:
     """Judge a controller on all that its plant may be.
 
@@ -245,11 +244,22 @@ def verify(
         order: of the loop; the one that the controller was designed for if not given.
         observer: for the loops over the virtual neck; none if not given.
         files: role -> (path, SHA-256) of all that was read for it, for the certificate.
-        progress: called now and then.
+        progress: called now and then; a bar in a terminal if not given.
 
     Raises:
         SettingsError: another sample time, other channels, no plants.
         DataError: controller, plants and observer of two robots.
+
+    Example:
+        >>> import softneck
+        >>> from softneck.plant import NeckParameters
+        >>> from softneck.signals import signal
+        >>> neck = softneck.VirtualNeck(NeckParameters.paper())
+        >>> from softneck.verification import make_requirements
+        >>> model = softneck.identify("rls", softneck.record(signal("eq22", duration=20.0), neck, seed=1))
+        >>> asked = make_requirements({"sampling": {"plants": 20, "search_generations": 0}, "neck": {"necks": 1}})
+        >>> len(softneck.verify(softneck.design_controller("pi", model), {"rls": model}, asked).verdicts) > 10
+        True
     """
     begin, controller, observer = time.perf_counter(), opened(controller, "controller"), opened(observer, "observer")
     robot, named = robot_of(controller), named_plants(plants)
@@ -276,7 +286,8 @@ def verify(
                 f"{neck.sample_time:g} s; design it on a model of its own sample time."
             )
     step = [own_plant(thing, name, robot) for name, thing in own.items()]
-    evidence = gather(judged, necks, asked, observer=eyes, progress=progress, families=linear, own=step)
+    with shown_progress("verify", progress) as tell:
+        evidence = gather(judged, necks, asked, observer=eyes, progress=tell, families=linear, own=step)
     tested = {name: thing.findings["tested"] for name, thing in linear.items() if getattr(thing, "measured", {})}
     elsewhere = not_recorded(tested, step, evidence.steps) if robot.is_neck else {}
     if tested and not judged.laws:
@@ -378,16 +389,12 @@ def plain(value: Any) -> Any:
     """Return JSON values of numbers, arrays, tables: what is not finite becomes None."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
+    if isinstance(value, np.ndarray | np.generic):
         return plain(value.tolist())
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
-    if isinstance(value, bool | np.bool_):
-        return bool(value)
-    if isinstance(value, int | np.integer):
-        return int(value)
-    if isinstance(value, float | np.floating):
-        return float(value) if math.isfinite(value) else None
-    if value is None or isinstance(value, str):
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, str | bool | int):
         return value
     raise DataError(f"a certificate cannot hold a {type(value).__name__}.")

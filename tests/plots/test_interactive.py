@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import base64
-import gzip
 import io
-import json
 import re
 import subprocess
 import sys
@@ -18,6 +15,7 @@ import pytest
 from PIL import Image
 
 from softneck.plots import Chart, Curve, Level, Panel, Section, page
+from softneck.plots._packed import thinned
 from softneck.plots._style import BLUE, GREEN, ORANGE, PURPLE, RED, SKY
 
 from ..browser import Shown, own_text, shown
@@ -83,20 +81,61 @@ def test_labels_cannot_end_the_script() -> None:
     assert NASTY not in page(NASTY, [Section(NASTY, charts=[chart])])
 
 
-def test_every_sample_is_in_the_page_and_a_shared_axis_once() -> None:
+_COLUMNS = """() => Bokeh.documents.map(one => {
+  const found = {};
+  for (const [plot] of one.roots()[0].children)
+    for (const {data_source: {data}} of plot.renderers)
+      for (const [name, column] of data instanceof Map ? data : Object.entries(data))
+        found[name] ??= Array.from(column, String);
+  return found;
+})"""
+
+
+def test_the_browser_has_every_sample_and_a_shared_axis_once(browser: Browser, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     y = rng.standard_normal((3, X.size))
-    html = page("t", [Section("s", charts=[Chart("c", [Panel([Curve(X, row) for row in y], "y")])])])
-    item = json.loads(re.findall(r'type="application/json" id="c1-1-data">(.*?)</script>', html)[0])
-    text = json.dumps(item)
-    arrays = [
-        np.frombuffer(gzip.decompress(base64.b64decode(data)), dtype=kind)
-        for data, kind in re.findall(r'"bytes", "data": "([^"]+)"}, "shape": \[\d+\], "dtype": "(\w+)"', text)
-    ]
-    assert [array.dtype.itemsize for array in arrays].count(8) == 1
-    np.testing.assert_array_equal(arrays[0], X)
-    for array, row in zip(arrays[1:], y, strict=True):
-        np.testing.assert_array_equal(array, row.astype(np.float32))
+    y[0, 7] = np.nan
+    steep = np.geomspace(1e-6, 1.0, X.size)
+    panel = Panel([*(Curve(X, row) for row in y), Curve(X, steep), Curve(X, np.full(X.size, 3.0))], "y")
+    odd = Chart("odd", [Panel([Curve(np.array([1e-3, 1.0, 1e3]), np.array([1.0, 2.0, 4.0]))], "y", log_x=True)])
+    path = tmp_path / "samples.html"
+    path.write_text(page("t", [Section("s", charts=[Chart("c", [panel]), odd])]), encoding="utf-8")
+    with shown(browser, path) as view:
+        first, second = (
+            {name: np.array(column, dtype=float) for name, column in chart.items()}
+            for chart in view.page.evaluate(_COLUMNS)
+        )
+    assert sorted(first) == ["x", "y1", "y2", "y3", "y4", "y5"]
+    # Half a step of the 2^31 into which an even axis is cut.
+    np.testing.assert_allclose(first["x"], X, rtol=0.0, atol=np.ptp(X) / 2**32 * 1.01)
+    for k, row in enumerate(y, start=1):
+        # Half a step of the 65534 of a range, and the rounding of 32 bits.
+        tolerance = 0.5 * np.ptp(row[np.isfinite(row)]) / 65534 + 1e-6
+        np.testing.assert_allclose(first[f"y{k}"], row, rtol=0.0, atol=tolerance)
+    # What spans decades keeps the seven digits of 32 bits.
+    np.testing.assert_allclose(first["y4"], steep, rtol=1e-6)
+    np.testing.assert_array_equal(first["y5"], 3.0)
+    np.testing.assert_array_equal(second["x"], [1e-3, 1.0, 1e3])
+
+
+def test_a_page_of_too_many_samples_keeps_the_least_and_the_most_of_each_piece_and_says_so() -> None:
+    rng = np.random.default_rng(1)
+    t = np.arange(100_000) * 0.02
+    y = np.sin(0.01 * t)
+    y[rng.integers(0, t.size, 5)] = 9.0  # a spike of one sample must not vanish
+    y[40_000:60_000] = np.nan
+    charts = [Chart("long", [Panel([Curve(t, y), Curve(t, 2 * y)], "y")]), Chart("short", [Panel([Curve(X, X)], "y")])]
+    long, short = thinned(charts, most=10_000)
+    assert short is charts[1]
+    assert sum(curve.y.size for panel in long.panels for curve in panel.curves) <= 10_000
+    assert "Of 100000 samples" in long.caption
+    curve = long.panels[0].curves[0]
+    assert (np.nanmax(curve.y), np.nanmin(curve.y)) == (np.nanmax(y), np.nanmin(y))
+    assert np.isin(curve.y[np.isfinite(curve.y)], y).all()
+    inside = (curve.x > t[40_100]) & (curve.x < t[59_900])  # but for the pieces at its ends
+    assert np.isnan(curve.y[inside]).all()
+    assert (np.diff(curve.x) > 0).all()
+    assert thinned(charts)[0] is charts[0]
 
 
 def test_the_command_line_starts_without_the_drawing_library() -> None:

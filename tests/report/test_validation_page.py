@@ -16,7 +16,7 @@ from softneck.plots._style import BLUE, COLOURS, ORANGE
 from softneck.report import validation_page
 from softneck.signals import Recording, concatenate
 
-from ..browser import shown
+from ..browser import charts_of, shown
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -40,7 +40,9 @@ def _headings(html: str) -> list[str]:
 
 
 def _tables(html: str) -> list[list[list[str]]]:
-    tables = [re.findall(r"<tr>(.*?)</tr>", table) for table in re.findall(r"<table>(.*?)</table>", html, re.DOTALL)]
+    tables = [
+        re.findall(r"<tr>(.*?)</tr>", table) for table in re.findall(r"<table[^>]*>(.*?)</table>", html, re.DOTALL)
+    ]
     return [[re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row) for row in rows] for rows in tables]
 
 
@@ -60,26 +62,34 @@ def test_the_page_tells_every_fit_beside_persistence(results: Sequence[Validatio
 
 def test_all_free_runs_come_first_and_then_each_model(html: str) -> None:
     headings = _headings(html)
-    assert headings[:3] == ["Fits", "All models on neck", "Free runs"]
-    assert [h for h in headings if " on neck" in h] == [
-        "All models on neck",
-        "rls on neck",
-        "nlsm on neck",
-        "nn on neck",
+    assert headings[:2] == ["Fits", "Free runs on neck"]
+    names = ("rls", "nlsm", "nn")
+    assert [h for h in headings if h.endswith(" on neck")] == ["Free runs on neck", *(f"{n} on neck" for n in names)]
+    assert [h for h in headings if h.endswith("measured and predicted")] == [
+        f"{name} on neck: measured and predicted" for name in names
     ]
-    assert headings.count("Measured and predicted") == 3
     assert headings.count("Errors, one step") == 3
 
 
 def test_one_model_or_other_rows_are_not_compared(results: Sequence[Validation], models: dict, neck: Recording) -> None:
-    assert "All models on neck" not in _headings(validation_page(results[:1]))
+    alone = _headings(validation_page(results[:1]))
+    assert "Free runs on neck" not in alone
+    assert alone[:2] == ["Fits", "rls on neck: measured and predicted"]
+    assert sum(h.endswith("measured and predicted") for h in alone) == 1
     other = validate(models["rls"], neck.rows(1400, 2000), names=("rls.npz", "neck.csv"))
-    assert "All models on neck" not in _headings(validation_page([results[1], other]))
+    assert "Free runs on neck" not in _headings(validation_page([results[1], other]))
+
+
+def test_the_verdict_names_the_model_of_the_best_free_run(results: Sequence[Validation], html: str) -> None:
+    best = max(results, key=lambda r: min(-np.inf if fit is None else fit for fit in r.fits[INFINITE].values()))
+    (said,) = re.findall(r'<p class="verdict ?">(.*?)</p>', html)
+    fits = ", ".join(f"{name} {fit:.1f} %" for name, fit in best.fits[INFINITE].items())
+    assert said.startswith(f"On neck {Path(best.model).stem} fits free run {fits} (best of 3 models)")
 
 
 def test_models_of_one_file_name_keep_their_folders_apart(results: Sequence[Validation]) -> None:
     twins = [replace(results[0], model="a/rls.npz"), replace(results[1], model="b/rls.npz")]
-    html = validation_page(twins)
+    html = charts_of(validation_page(twins))
     assert "a/rls.npz" in html
     assert "b/rls.npz" in html
 

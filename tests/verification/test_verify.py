@@ -97,7 +97,17 @@ def test_a_wrong_delay_fails_loudly() -> None:
     failed = {v.requirement.metric for v in found.failed}
     assert {"stability.radius", "axes.disk_margin", "robust.mu"} <= failed
     json.dumps(found.contents(), allow_nan=False)
-    assert "fails" in verification_page(found, "pi")
+    page = verification_page(found, "pi")
+    assert f"{len(found.failed)} of {len(found.verdicts)} requirements fail: " in page
+    assert "fails" in page
+
+
+def test_the_verdict_counts_what_was_not_computed_or_does_not_decide_as_neither(held: Verification) -> None:
+    first, second, *rest = held.verdicts
+    open_ = [replace(first, holds=None), replace(second, holds=None, value=None), *rest]
+    page = verification_page(replace(held, verdicts=open_), "pi")
+    count = len(held.verdicts)
+    assert f"{count - 2} of {count} requirements hold, 1 do not decide, 1 are not computed and none fails" in page
 
 
 @pytest.mark.slow
@@ -329,5 +339,8 @@ def test_the_page_is_drawn_in_full(browser: Any, held: Verification, tmp_path: P
         assert view.complaints == []
         assert view.requests == [path.as_uri()]
         assert view.page.locator("td.holds").count() == len(held.verdicts)
+        count = sum(verdict.holds is True for verdict in held.verdicts)
+        said = view.page.locator(".verdict").inner_text()
+        assert said.startswith(f"{count} of {len(held.verdicts)} requirements hold and none fails")
         assert view.pixels(0, 0, "#000000") > 50, "the nominal loop of the first Bode panel"
         assert not math.isnan(view.x_range(0)[0])

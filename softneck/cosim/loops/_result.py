@@ -15,9 +15,12 @@ from softneck.loop import LoopResult, check_limits, metrics
 from softneck.robot import Robot
 from softneck.signals import Recording
 from softneck.signals.recording._channels import file_unit, known_channels
+from softneck.signals.recording._labelled import dataset, signals_figure, table
 
 if TYPE_CHECKING:
     import pandas as pd
+    import xarray  # pyright: ignore[reportMissingImports]  an extra
+    from matplotlib.figure import Figure
 
 # Rows of a run that its certificate keeps, spread over all of it: what goes another way is elsewhere in one of them.
 _TRACE_ROWS = 50
@@ -95,6 +98,24 @@ class Result(Shown):
             unit, factor = _shown(name, self.signals.units[name], self.robot)
             columns[f"{name} [{unit}]"] = values * factor
         return pd.DataFrame(columns)
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return all signals as a table over time [s], in SI; `attrs["units"]` has their units."""
+        return table(self.signals.time, self.signals.signals, self.signals.units)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Return all signals as a Dataset over `time`, each with its unit; needs the extra `xarray`."""
+        return dataset(self.signals.time, self.signals.signals, self.signals.units)
+
+    def plot(self, title: str = "") -> Figure:
+        """Return a matplotlib figure: references, outputs and motors of a closed loop; of others all signals."""
+        from softneck.plots import chart_figure  # matplotlib takes a while to import
+        from softneck.plots._charts import loop_chart
+
+        time, signals = self.signals.time, self.signals.signals
+        if not self.closed:
+            return signals_figure(time, signals, self.signals.units, title)
+        return chart_figure(loop_chart(time, signals, title, limits=self.bounds, robot=self.robot))
 
     def recording(self) -> Recording:
         """Return the run as a recording: its channels of those names, with pitch and roll true where offered."""

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import SettingsError
+from softneck.core import SettingsError, silent
+from softneck.core._progress import shown_progress
 from softneck.loop import Loop, LoopState, run_loop
 from softneck.loop._run import StepCallback
 from softneck.loop._system import System
@@ -36,7 +37,7 @@ def simulate(
         loop: a plain loop, one with limits as `load_loop` returns it, a loop file, an SSP archive, a system as
             `load_ssp` returns it, or a table of a loop file's keys, whose relative paths start at the working folder
             and which may hold objects (see `make_loop`).
-        report: called now and then with the done fraction.
+        report: called now and then with the done fraction; a bar in a terminal if not given.
         on_step: called after each row with a `LoopStep`; it stops the run by returning True.
         pace: run at this multiple of real time; as fast as possible if not given.
         resume: go on from this state instead of t = 0.
@@ -50,10 +51,25 @@ def simulate(
         SettingsError: parts that do not fit together, or what `make_loop` refuses.
         DataError: a part returned what is not a number.
         FmuError: an FMU refused a call.
+
+    Example:
+        >>> import softneck
+        >>> from softneck.plant import NeckParameters
+        >>> from softneck.signals import signal
+        >>> neck = softneck.VirtualNeck(NeckParameters.paper())
+        >>> recording = softneck.record(signal("eq22", duration=20.0), neck, seed=1)
+        >>> controller = softneck.design_controller("pi", softneck.identify("rls", recording))
+        >>> step = {"kind": "step", "pitch_deg": 10.0, "at_s": 0.5}
+        >>> loop = {"duration_s": 3.0, "plant": "paper", "controller": controller, "reference": step}
+        >>> result = softneck.simulate({**loop, "limits": {"pitch.overshoot_pct": 20.0}})
+        >>> result.holds, list(result.to_pandas())[:2]
+        (True, ['pitch', 'roll'])
     """
-    result = run_setup(
-        _opened(loop), report=report, on_step=on_step, pace=pace, resume=resume, keep=keep, compiled=compiled
-    )
+    with shown_progress("simulate", None if report is None else lambda done, _: report(done)) as tell:
+        result = run_setup(
+            _opened(loop), report=None if tell is silent else lambda done: tell(done, ""), on_step=on_step, pace=pace,
+            resume=resume, keep=keep, compiled=compiled,
+        )  # fmt: skip
     # A plant without validity is told in `remarks` and by the command: no warning for every model made by hand.
     for remark in result.remarks if np.any(result.signals.signals.get("validity", 0.0)) else ():
         warnings.warn(remark, stacklevel=2)

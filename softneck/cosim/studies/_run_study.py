@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from softneck.core import OutputFileError, Progress, SettingsError, silent
+from softneck.core._progress import shown_progress
 
 from ._executors import Crew, check_sendable, crew
 from ._store import Store
@@ -40,7 +41,7 @@ def study(
     output: str | Path | None = None,
     resume: bool = False,
     force: bool = False,
-    report: Progress = silent,
+    report: Progress | None = None,
 ) -> pd.DataFrame:
     """Run a loop many times and return a row for each run: what varied, metrics, whether limits hold, error.
 
@@ -59,21 +60,36 @@ def study(
         output: folder that keeps the runs as they end; nothing is kept without one.
         resume: go on with the study that `output` holds.
         force: replace the study that `output` holds.
-        report: called with the part done and a word.
+        report: called with the part done and a word; a bar in a terminal if not given.
 
     Raises:
         SettingsError: a key that the loop does not have, an empty range, no runs, another study's folder.
         OutputFileError: `output` holds a study already.
+
+    Example:
+        >>> import softneck
+        >>> from softneck.plant import NeckParameters
+        >>> from softneck.signals import signal
+        >>> neck = softneck.VirtualNeck(NeckParameters.paper())
+        >>> recording = softneck.record(signal("eq22", duration=20.0), neck, seed=1)
+        >>> controller = softneck.design_controller("pi", softneck.identify("rls", recording))
+        >>> step = {"kind": "step", "pitch_deg": 10.0, "at_s": 0.5}
+        >>> loop = {"duration_s": 3.0, "plant": "paper", "controller": controller, "reference": step}
+        >>> sizes = {"reference.pitch_deg": {"grid": [5.0, 10.0]}}
+        >>> runs = softneck.study(loop, vary=sizes, workers=0)
+        >>> runs["reference.pitch_deg"].tolist()
+        [5.0, 10.0]
     """
     made = loop if isinstance(loop, Study) else make_study(
         loop, vary=vary or {}, runs=runs, seed=seed, sampling=sampling, objectives=objectives
     )  # fmt: skip
     if isinstance(loop, Study) and (vary, runs, objectives) != (None, None, None):
         raise SettingsError("a Study has its own vary, runs and objectives; make another one with `make_study`.")
-    if output is not None:
-        return run_study(made, Path(output), workers=workers, dask=dask, resume=resume, force=force, report=report)
-    with tempfile.TemporaryDirectory(prefix="softneck-study-") as folder:
-        return run_study(made, Path(folder), workers=workers, dask=dask, report=report)
+    with shown_progress("study", report) as tell:
+        if output is not None:
+            return run_study(made, Path(output), workers=workers, dask=dask, resume=resume, force=force, report=tell)
+        with tempfile.TemporaryDirectory(prefix="softneck-study-") as folder:
+            return run_study(made, Path(folder), workers=workers, dask=dask, report=tell)
 
 
 def run_study(

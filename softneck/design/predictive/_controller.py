@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import FileFormatError, Matrix, Vector, to_si, write_archive
+from softneck.core._shown import Shown
 from softneck.robot import Robot
 from softneck.runtime import Block, Port, State
 
@@ -34,8 +35,8 @@ _ILL_CONDITIONED = 1e8
 _SEEN = 0.5
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class MpcController:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class MpcController(Shown):
     """A linear predictive controller of all outputs; `MpcSettings.design` makes it.
 
     Attributes:

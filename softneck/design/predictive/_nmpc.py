@@ -23,6 +23,7 @@ from softneck.core import (
     to_si,
     write_archive,
 )
+from softneck.core._shown import Shown
 from softneck.estimation import AxisPlant
 from softneck.estimation._settings import ORDERS
 from softneck.identification import Model
@@ -53,8 +54,8 @@ _HORIZON, _WINDOW = 0.32, 0.16
 _LONGEST = 100
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NmpcSettings:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class NmpcSettings(Shown):
     """Nonlinear predictive control of all axes over `nn`, `play`, `greybox` or `nss`.
 
     The defaults are the neck's. Of another robot times are stretched by its slowest pole, limits are those of its file,
@@ -189,8 +190,8 @@ class NmpcSettings:
         return replace(self, **changed)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class NmpcController:
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class NmpcController(Shown):
     """A nonlinear predictive controller of all outputs; `NmpcSettings.design` makes it.
 
     Attributes:

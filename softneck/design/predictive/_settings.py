@@ -19,6 +19,7 @@ from softneck.core import (
     require_whole,
     to_si,
 )
+from softneck.core._shown import Shown
 from softneck.estimation._axis import HasTransferFunctions, robot_of
 from softneck.estimation._settings import ORDERS
 from softneck.robot import Robot
@@ -70,8 +71,8 @@ _COAST = 0.5
 _WISH = 0.3
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MpcSettings:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class MpcSettings(Shown):
     """Model predictive control of all axes over an identified linear model, moves of the motors as unknowns.
 
     The defaults are the neck's. Of another robot the horizon and the reference filter are stretched by its slowest

@@ -15,6 +15,7 @@ from softneck.core import (
     require_positive,
     require_whole,
 )
+from softneck.core._shown import Shown
 from softneck.robot import Robot
 from softneck.signals.recording._channels import NECK
 
@@ -135,8 +136,8 @@ class Neck:
         require_between("gear_efficiency", self.efficiency, 0.1, 1.0)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DrivesFile:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class DrivesFile(Shown):
     """All that a drives file (`drives.toml`) says.
 
     Attributes:

@@ -28,17 +28,17 @@ def commission_page(result: Commissioned, *, title: str = "Commissioning") -> st
             one = result.identified.motors[moved.motor - 1]
             if one is not None:
                 sections.append(_moves(result, moved, one))
-    return page(title, sections, footer="Written by softneck drives commission.")
+    said = f"{len(result.findings)} thing(s) to correct: see the findings." if result.findings else _UNTOUCHED
+    if result.moves is None:
+        said = "Nothing was moved: the findings have to be put right first."
+    elif result.moves.stopped:
+        said = f"The moves ended early: {result.moves.stopped}."
+    clean = not result.findings and result.moves is not None and not result.moves.stopped
+    return page(title, sections, verdict=said, holds=clean, footer="Written by softneck drives commission.")
 
 
 def _verdict(result: Commissioned) -> Section:
-    # As sentences: a table this wide would hide what to do on a phone.
-    text = [_sentence(one) for one in result.findings] or [_UNTOUCHED]
-    if result.moves is None:
-        text.append("Nothing was moved: this has to be put right first.")
-    elif result.moves.stopped:
-        text.append(f"The moves ended early: {result.moves.stopped}.")
-    return Section("Findings", text)
+    return Section("Findings", findings=[("note", _sentence(one)) for one in result.findings] or [("ok", _UNTOUCHED)])
 
 
 def _sentence(one: Finding) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import CheckFailedError, Matrix
+from softneck.core._shown import Shown
 from softneck.loop import LoopResult, metrics
 from softneck.robot import Robot
 from softneck.signals import Recording
@@ -77,8 +78,8 @@ def fault_table(fault: Event | None) -> dict[str, Any] | None:
     return {"time_s": fault.time, "event": fault.name, "node": fault.node, "text": str(fault)}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DrivesResult:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class DrivesResult(Shown):
     """What came of one run on the drives.
 
     Attributes:

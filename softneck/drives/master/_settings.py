@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 
 from softneck.core import require_between, require_one_of, require_whole
+from softneck.core._shown import Shown
 
 from ..supervision._baseline import Baseline
 from ._fieldbus import BusSettings
@@ -156,8 +157,8 @@ class ChannelSettings:
     ranges: tuple[tuple[float, float, float], ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MasterSettings:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class MasterSettings(Shown):
     """All settings of the master: bus, limits, inclinometer, watches, ramps.
 
     Attributes:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, require_between, require_one_of
+from softneck.core._shown import Shown
 
 from ._axis import Axis
 from ._frame import CanFrame
@@ -31,8 +32,8 @@ _TICK = 1e-3
 _RING = 128
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SimulatedSettings:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class SimulatedSettings(Shown):
     """How the simulated drives are set up; given by whoever configured the real ones.
 
     Attributes:

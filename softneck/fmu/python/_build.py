@@ -49,6 +49,16 @@ def build_fmu(block: Block, path: str | Path, *, info: FmuInfo | None = None, fo
     Raises:
         SettingsError: NAME is not an FMI identifier, or the block cannot be packaged.
         OutputFileError: the file exists or cannot be written.
+
+    Example:
+        >>> import softneck
+        >>> from softneck.plant import NeckParameters
+        >>> from softneck.signals import signal
+        >>> neck = softneck.VirtualNeck(NeckParameters.paper())
+        >>> recording = softneck.record(signal("eq22", duration=20.0), neck, seed=1)
+        >>> model = softneck.identify("rls", recording)
+        >>> softneck.build_fmu(model.block(), "Neck.fmu").name
+        'Neck.fmu'
     """
     target = Path(path)
     name = model_name(target)

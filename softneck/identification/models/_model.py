@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +27,7 @@ from softneck.core._shown import Shown, bars
 from softneck.robot import Robot
 from softneck.runtime import Block, State
 from softneck.signals import Recording
+from softneck.signals.recording._labelled import Labelled
 from softneck.signals.recording._recording import require_same_robot
 
 from . import _linear_systems as _linear
@@ -166,8 +167,10 @@ class Model(Shown):
         """
         return _linearisation.linearised(self, at)
 
-    def simulate(self, recording: Recording, *, motors: str = "simulated", warm_up: int = WARM_UP) -> Matrix:
+    def simulate(self, recording: Recording, *, motors: str = "simulated", warm_up: int = WARM_UP) -> Labelled:
         """Free run: return the outputs (time, n_out) [rad] from set-points alone; row 0 is the start.
+
+        The result is an array that knows its channels: `["pitch"]`, `.to_pandas()`, `.to_xarray()`, `.plot()`.
 
         Args:
             recording: whose set-points drive the model; its first `warm_up` samples align each run.
@@ -176,10 +179,12 @@ class Model(Shown):
         """
         self._check(recording)
         require_one_of("motors", motors, _MOTORS)
-        return np.concatenate([self._free_run(run, motors, warm_up) for run in recording.runs()])
+        return self._labelled(recording, [self._free_run(run, motors, warm_up) for run in recording.runs()])
 
-    def predict(self, recording: Recording, horizon: int = 1, *, motors: str = "simulated") -> Matrix:
+    def predict(self, recording: Recording, horizon: int = 1, *, motors: str = "simulated") -> Labelled:
         """Return the outputs (time, n_out) [rad] predicted `horizon` samples ahead from measured ones.
+
+        The result is labelled as that of `simulate`.
 
         The first rows of each run, with no such past, are predicted from its first row.
         """
@@ -197,7 +202,11 @@ class Model(Shown):
                 free = _input_rows(run, motors, outputs=False)
                 predicted = self.block().run_horizon(start, rows, free, horizon)
             parts.append(np.vstack([start.outputs, predicted[:-1]]))
-        return np.concatenate(parts)
+        return self._labelled(recording, parts)
+
+    def _labelled(self, recording: Recording, parts: Sequence[Matrix]) -> Labelled:
+        units = {port.name: port.unit for port in self.block().outputs}
+        return Labelled(np.concatenate(parts), recording.time, units)
 
     def tf(
         self,

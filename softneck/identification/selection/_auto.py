@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import KINDS, DataError, Matrix, Progress, SettingsError, SoftneckError, resolve, silent
+from softneck.core._shown import Shown
 from softneck.signals import Recording
 from softneck.signals.quality._poor_excitation import poor_excitation
 
@@ -40,9 +41,8 @@ _SCREENED: dict[str, dict[str, Any]] = {
     "srivc": {"resamples": 0},
     "greybox": {"evaluations": 15, "sensor_delay": 2},
     "nn": {"starts": 1, "iterations": 8, "refine": 6},
-    "nlsm": {"output_weight": 5.0},
-    "nss": {"starts": 4, "iterations": 4},
-}
+    "nlsm": {"output_weight": 5.0}, "nss": {"starts": 4, "iterations": 4},
+}  # fmt: skip
 # Of the noise: the epsilon of screened sets, whose own choice among many takes several times as long.
 _SIGMAS = 8.0
 # Fits closer than this are alike [points]: seeds of noise and training move them by as much.
@@ -57,8 +57,8 @@ _MOST_TRAINED = 2
 REFITTED = "trained on all rows after the choice; its scores are those of the model before, which had not seen them all"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Choice:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Choice(Shown):
     """The outcome of `choose`: all kinds by the least of their scores, and the one that was taken.
 
     Attributes:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import DataError, FileFormatError, Matrix, Vector, read_archive, write_archive
+from softneck.core._shown import Shown
 
 from ._forest import PointTree, all_cores, tighten
 from ._trees import tree_nodes
@@ -16,8 +17,8 @@ from ._trees import tree_nodes
 _KIND = "cones"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ConeSet:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class ConeSet(Shown):
     """What `Cones` makes of data: the data, the slopes and the noise bound.
 
     Attributes:

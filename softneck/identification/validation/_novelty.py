@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import DataError, Matrix, Vector
+from softneck.core._shown import Shown
 from softneck.signals import Recording, concatenate
 
 from ..models._arrays import members
@@ -32,8 +33,8 @@ _AXES = ("pitch", "roll")
 _MOST_KNOWN, _MOST_ASKED = 20_000, 10_000
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Novelty:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Novelty(Shown):
     """Quantiles (50, 90, 99 %, largest) of nearest-neighbour distances, for pitch's and roll's regressors.
 
     Attributes:

@@ -240,6 +240,17 @@ def validate(
         FileFormatError: no such file, or not one of ours.
         DataError: nothing is left to judge, another sample time, no motor positions to measure, or a horizon longer
             than every stretch.
+
+    Example:
+        >>> import softneck
+        >>> from softneck.plant import NeckParameters
+        >>> from softneck.signals import signal
+        >>> neck = softneck.VirtualNeck(NeckParameters.paper())
+        >>> recording = softneck.record(signal("eq22", duration=20.0), neck, seed=1)
+        >>> train, rest = recording.split(0.7)
+        >>> found = softneck.validate(softneck.identify("rls", train), rest)
+        >>> bool(found.fits["inf"]["pitch"] > 50.0)  # free run [%]
+        True
     """
     rules = Rules(tuple(horizons), motors, include_training, initial, tolerance)
     if names is None:

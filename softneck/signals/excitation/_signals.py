@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, require_between, require_one_of, to_si
+from softneck.core._shown import Shown
 from softneck.robot import Robot
 
 from ..recording._redefinition import motors_from
@@ -34,8 +35,8 @@ _LONGEST = 86_400.0
 _FIXED = ("steps", "sine", "rotation")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Excitation:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Excitation(Shown):
     """Motor set-points over time.
 
     Attributes:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from softneck.core import DataError
+from softneck.core._shown import Shown
 from softneck.robot import Robot
 
 from ..recording._channels import MOTOR_POSITIONS, MOTORS, NECK, OUTPUTS, SET_POINTS
@@ -31,8 +32,8 @@ _NO_CHANNELS = ("time", "run", "inclination", "orientation")
 _NECK_LAG = 25
 
 
-@dataclass(frozen=True, slots=True)
-class Guess:
+@dataclass(frozen=True, slots=True, repr=False)
+class Guess(Shown):
     """A layout that was proposed for a log, with the reason for each line.
 
     Attributes:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import FileFormatError, SettingsError, SoftneckError, to_si
+from softneck.core._shown import Shown
 from softneck.robot import Robot
 
 from ..recording._channels import NECK, known_channels, si_unit
@@ -58,8 +59,8 @@ class Quaternion:
     roll: str = "x"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Layout:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Layout(Shown):
     """How a foreign log is read: which column is which channel, in which unit.
 
     Attributes:

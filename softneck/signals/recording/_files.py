@@ -137,6 +137,17 @@ def read_recording(path: str | Path, *, robot: str | Path | Robot | None = None)
     Raises:
         FileFormatError: no such file, or no table.
         DataError: columns, units, numbers or times are not those of a recording of that robot; the line says which.
+
+    Example:
+        >>> import softneck
+        >>> from softneck.plant import NeckParameters
+        >>> from softneck.signals import signal
+        >>> neck = softneck.VirtualNeck(NeckParameters.paper())
+        >>> recording = softneck.record(signal("eq22", duration=20.0), neck, seed=1)
+        >>> from softneck.signals import write_recording
+        >>> write_recording("neck.csv", recording)
+        >>> len(softneck.read_recording("neck.csv"))
+        1000
     """
     source = Path(path)
     suffix = recording_suffix(source)

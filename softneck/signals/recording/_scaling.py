@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from softneck.core import DataError, FileFormatError, Matrix
+from softneck.core._shown import Shown
 
 
-@dataclass(frozen=True, slots=True)
-class Scaling:
+@dataclass(frozen=True, slots=True, repr=False)
+class Scaling(Shown):
     """`z = (x - offset) / scale`, column by column.
 
     Attributes:

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from softneck.core import DataError, FileFormatError, Vector
+from softneck.core._shown import Shown
 
 from ._recording import Recording
 
 
-@dataclass(frozen=True, slots=True)
-class Trend:
+@dataclass(frozen=True, slots=True, repr=False)
+class Trend(Shown):
     """`x - (level + slope (t - origin))` for each run, t in [s].
 
     Attributes:

@@ -1,0 +1,64 @@
+"""A bar is drawn in a terminal for what takes long, and nowhere else."""
+
+from __future__ import annotations
+
+import io
+import sys
+
+import pytest
+
+from softneck.core import silent
+from softneck.core._progress import shown_progress
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def terminal_of(monkeypatch: pytest.MonkeyPatch) -> Terminal:
+    """Let errors go to a terminal; no fixture, since pytest sets `sys.stderr` once more before it calls a test."""
+    made = Terminal()
+    monkeypatch.setattr(sys, "stderr", made)
+    monkeypatch.setenv("TERM", "xterm")
+    return made
+
+
+def later(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let two seconds have passed."""
+    monkeypatch.setattr("softneck.core._progress._PATIENCE", -1.0)
+
+
+def test_what_takes_long_has_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = terminal_of(monkeypatch)
+    with shown_progress("identify nn", None) as tell:
+        tell(0.1, "quick")
+        assert terminal.getvalue() == ""
+        later(monkeypatch)
+    with shown_progress("identify nn", None) as tell:
+        tell(0.5, "run[1].csv")
+    assert "identify nn: run[1].csv" in terminal.getvalue()
+
+
+@pytest.mark.parametrize("off", ["no terminal", "variable", "silent"])
+def test_it_can_be_turned_off(monkeypatch: pytest.MonkeyPatch, off: str) -> None:
+    terminal = terminal_of(monkeypatch)
+    if off == "no terminal":
+        monkeypatch.setattr(terminal, "isatty", lambda: False)
+    if off == "variable":
+        monkeypatch.setenv("SOFTNECK_PROGRESS", "0")
+    later(monkeypatch)
+    with shown_progress("study", silent if off == "silent" else None) as tell:
+        tell(0.1, "a")
+        tell(0.5, "b")
+    assert tell is silent
+    assert terminal.getvalue() == ""
+
+
+def test_a_callback_of_ones_own_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = terminal_of(monkeypatch)
+    told: list[tuple[float, str]] = []
+    with shown_progress("verify", lambda done, word: told.append((done, word))) as tell:
+        tell(0.5, "half")
+    assert told == [(0.5, "half")]
+    assert terminal.getvalue() == ""
