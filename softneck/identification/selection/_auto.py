@@ -97,7 +97,7 @@ def choose(
     others on motions that nobody recorded. The least of these scores ranks. After each training the better half goes
     on. The best, of those alike the one of the fewest numbers, is trained on all rows and judged on `hold_out` again,
     from the first row only as well; where it then falls behind the next, that one is trained too. So is the best linear
-    kind, which controllers are designed on.
+    kind, which controllers are designed on, or the best nonlinear one where the chosen is linear.
 
     `residual` is put on the best of the others, `ensemble` is the median of the best three, and is never taken where
     one of them is better on anything held out. Of a learned kind that wins, the guarded form is taken: it falls back to
@@ -129,7 +129,7 @@ def choose(
         race.leave_out(lambda done, what: progress(0.7 + 0.1 * done, what))
         best = race.trained(lambda done, what: progress(0.8 + 0.1 * done, what))
         chosen = race.guarded(best, lambda done, what: progress(0.9 + 0.1 * done, what))
-        race.train_linear(chosen)
+        race.train_other(chosen)
     ranking = race.ranking()
     progress(1.0, f"chosen: {chosen.kind}")
     alike = [one for one in ranking if one.fit > best.fit - ALIKE and one not in (best, chosen)]
@@ -162,6 +162,15 @@ def _wanted(train: Recording, kinds: Sequence[str]) -> list[str]:
     if unknown:
         raise SettingsError(f"`{unknown[0]}` cannot be tried; known: {', '.join(known)}.")
     return sorted(kinds or usual, key=_SIMPLE_FIRST.index)
+
+
+def best_other(ranking: Sequence[KindTrial], chosen: str) -> KindTrial | None:
+    """Return the best linear kind beside one that is not, and the other way round; None where none ran free.
+
+    A median of others may be one of linear kinds, so it does not stand for what bends.
+    """
+    sought = [one for one in ranking if (one.kind in LINEAR) != (chosen in LINEAR) and one.kind != "ensemble"]
+    return max((one for one in sought if one.fit > float("-inf")), key=lambda one: one.fit, default=None)
 
 
 class _Race:
@@ -274,11 +283,11 @@ class _Race:
         self.tried["guarded"] = one
         return one if one.hold_out_fit > best.hold_out_fit - _GUARD_COST else best
 
-    def train_linear(self, chosen: KindTrial) -> None:
-        """Train the best linear kind on all rows where the chosen one is not linear."""
-        linear = [one for one in self.ranking() if one.kind in LINEAR and one.fit > float("-inf")]
-        if chosen.kind not in LINEAR and linear:
-            self.whole(linear[0].kind)
+    def train_other(self, chosen: KindTrial) -> None:
+        """Train the best linear kind on all rows where the chosen one is not linear, else the best that is not."""
+        other = best_other(self.ranking(), chosen.kind)
+        if other is not None and not other.whole:
+            self.whole(other.kind)
 
     def whole(self, kind: str) -> None:
         """Train a kind on all rows to train on, and judge it again on the hold-out."""
