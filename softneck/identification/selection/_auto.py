@@ -309,8 +309,7 @@ class _Race:
         ranking = [one for one in self.ranking() if one.kind != "ensemble" or self._no_member_is_better(one)]
         best = ranking[0]
         if best.fit == float("-inf"):
-            reasons = "; ".join(f"{one.kind}: {one.failure or 'its free run diverged'}" for one in ranking)
-            raise DataError(f"no kind could be identified: {reasons}")
+            raise DataError(f"no kind could be identified: {_reasons(ranking)}")
         alike = [one for one in ranking if one.fit > best.fit - ALIKE]
         return min(alike, key=lambda one: (one.numbers, _SIMPLE_FIRST.index(one.kind)))
 
@@ -333,6 +332,17 @@ class _Race:
     def _judged(self, kind: str, model: Model) -> Validation:
         rules = Rules((1, INFINITE))
         return judge(model, judged_parts(model, self.hold_out, rules, self._known), rules, names=(kind, HOLD_OUT))
+
+
+def _reasons(ranking: Sequence[KindTrial]) -> str:
+    """Return why kinds failed, each reason once."""
+    said: dict[str, list[str]] = {}
+    for one in ranking:
+        if one.kind != "ensemble" or len(ranking) == 1:  # it lacks the others
+            said.setdefault(one.failure or "its free run diverged", []).append(one.kind)
+    if len(said) == 1:
+        return next(iter(said))
+    return "; ".join(f"{', '.join(kinds)}: {why}" for why, kinds in said.items())
 
 
 def _with(one: KindTrial, found: Mapping[str, tuple[float, float]]) -> KindTrial:
