@@ -27,7 +27,7 @@ class Asked:
         robot: a preset, or the absolute path of a robot file; None: the neck, or what the log shows.
         requirements: absolute path of the file for `tune`; None: the defaults.
         kinds: of controllers to search; None: those of `tune`.
-        budget: of `tune`; None: its own.
+        budget: of `tune`: by default half its own, so that a sitting ends within minutes.
         seed: of kinds of models and of the search.
         yes: take all guesses.
     """
@@ -36,7 +36,7 @@ class Asked:
     robot: str | None = None
     requirements: str | None = None
     kinds: str | None = None
-    budget: int | None = None
+    budget: int = 80
     seed: int = 0
     yes: bool = False
 

@@ -36,7 +36,7 @@ _NEXT = (
 )  # fmt: skip
 @click.option("--requirements", type=_PATH, metavar="TOML", help="What `tune` shall keep. [default: its own]")
 @click.option("--kinds", metavar="K,K", help="Kinds of controller that `tune` searches. [default: its own]")
-@click.option("--budget", type=click.IntRange(min=1), metavar="EVALUATIONS", help="Of `tune`. [default: its own]")
+@click.option("--budget", type=click.IntRange(min=1), metavar="EVALUATIONS", help="Of `tune`. [default: 80]")
 @click.option("--seed", type=click.IntRange(min=0), help="Of models and search. [default: 0]")
 @json_option
 def command(
