@@ -135,9 +135,8 @@ def _advised(error: SoftneckError, sitting: Sitting, folder: Path) -> SoftneckEr
     """Return the error with the step that it ended, and with what to do next."""
     stage = next(reversed(sitting.ran), "import").partition(":")[0]
     said = f"{stage}: {error}"
-    if stage == "identification":
-        lacks = [line for line in _lacks(sitting) if line.partition(": ")[2] not in str(error)]
-        return CheckFailedError(" ".join([said, *lacks, _NEXT]))
+    if stage == "identification":  # what the recordings lack was said before it
+        return CheckFailedError(f"{said} {_NEXT}")
     advice = f"Paths are those in {folder}. Mended, the same command goes on here."
     return type(error)(f"{said} {advice}") if sitting.ran else error
 
