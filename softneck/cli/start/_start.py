@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from softneck.core import CheckFailedError, FileFormatError, OutputFileError, SettingsError, SoftneckError
+from softneck.core import CheckFailedError, FileFormatError, OutputFileError, SettingsError, SoftneckError, find_kind
 
 from ..shared._console import note, percent, print_json, print_table
 from ..shared._options import json_option
@@ -51,6 +51,7 @@ def command(
     does not hold.
     """
     _require_logs(logs)
+    _require_known(requirements, kinds)
     folder = (output or Path("build/start") / logs[0].stem).absolute()
     given = {"robot": _robot_of(logs[0], robot), "requirements": requirements and str(requirements.absolute()),
              "kinds": kinds, "budget": budget, "seed": seed}  # fmt: skip
@@ -83,6 +84,14 @@ def _require_logs(logs: tuple[Path, ...]) -> None:
         raise SettingsError(f"{twice}: another log is called `{twice.stem}` too; rename one of them.")
 
 
+def _require_known(requirements: Path | None, kinds: str | None) -> None:
+    """Refuse at once what `tune` would refuse after minutes."""
+    if requirements is not None and not requirements.is_file():
+        raise FileFormatError(f"{requirements}: no such file.")
+    for kind in kinds.split(",") if kinds else ():
+        find_kind(kind, "controller")
+
+
 def _robot_of(log: Path, robot: str | None) -> str | None:
     """Return the robot as commands in another folder name it, None where nothing says whose log it is."""
     from softneck.robot import find_robot
@@ -105,6 +114,7 @@ def _asked(logs: tuple[str, ...], given: dict[str, Any], *, yes: bool, guided: b
     if guided and given.get("requirements") is None:
         said = click.prompt("Requirements file for the controller (Enter: the defaults)", default="",
                             show_default=False, err=True)  # fmt: skip
+        _require_known(Path(said) if said else None, None)
         given["requirements"] = said and str(Path(said).absolute())
     known = {key: value for key, value in given.items() if key in {f.name for f in fields(Asked)}}
     return Asked(logs=logs, yes=yes, **{key: value for key, value in known.items() if value not in (None, "")})

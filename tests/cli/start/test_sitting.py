@@ -245,3 +245,63 @@ def test_a_folder_that_cannot_be_made_is_one_line(call: Call, short: Path, monke
         2,
         True,
     )
+
+
+def test_in_a_terminal_what_was_not_said_is_asked_once(
+    call: Call, short: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from softneck.cli.start import _start
+    from softneck.robot import Robot
+
+    asked: list[str] = []
+
+    def prompt(text: str, **_: Any) -> str:
+        asked.append(text)
+        return "arm" if "Whose log" in text else ""
+
+    monkeypatch.setattr(_start, "is_terminal", lambda: True)
+    monkeypatch.setattr(_start.click, "prompt", prompt)
+    assert call("start", "log.csv", "-o", "p").code == 0
+    assert ["Whose log" in text for text in asked] == [True, False]
+    assert Robot.read("p/robot.toml").hash == Robot.preset("arm").hash
+    assert call("start", "log.csv", "-o", "p").code == 0
+    assert len(asked) == 2, "the answers stand in the folder"
+    for more in (("--yes",), ("--json",)):
+        assert call("start", "log.csv", "-o", f"q{more[0]}", *more).code == 0
+    assert len(asked) == 2
+
+
+def test_a_recording_that_lacks_something_is_asked_about_before_it_is_identified(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from softneck.cli.start import _start
+
+    plan = [_sitting.Step(stage="identification", command=("softneck", "new", "q"), makes=("q/loop.toml",))]
+    monkeypatch.setattr(_start, "steps", lambda _: iter(plan))
+    monkeypatch.setattr(_start, "is_terminal", lambda: True)
+    monkeypatch.setattr(_start.click, "prompt", lambda *_, default, **__: default)
+    monkeypatch.setattr(_start.click, "confirm", lambda *_, **__: False)
+    monkeypatch.setattr(_start, "_lacks", lambda _: ["log: a motor never moves."])
+    (tmp_path / "log.csv").write_text("a\n")
+    said = call("start", "log.csv", "-o", "p")
+    assert said.code == 1
+    assert "log: a motor never moves." in said.err
+    assert "stopped, as was answered. Record next" in said.err.splitlines()[-1]
+    assert not Path("p").exists()
+
+
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [
+        (("--kinds", "pi,mcp"), "mpc"),
+        (("--requirements", "absent.toml"), "absent.toml: no such file"),
+        (("--robot", "nek"), "nek"),
+        (("--budget", "0"), "--budget"),
+    ],
+)
+def test_what_a_later_step_would_refuse_is_refused_at_once(
+    call: Call, short: Path, more: tuple[str, ...], says: str
+) -> None:
+    said = call("start", "log.csv", "-o", "p", "--yes", *more)
+    assert (said.code, says in said.error) == (2, True), said.err
+    assert not Path("p").exists()

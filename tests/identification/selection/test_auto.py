@@ -12,7 +12,7 @@ from softneck.identification import Choice, Model, Network, OutputError, Play, R
 from softneck.identification.models._arrays import members
 from softneck.identification.models._fitting import known_rows, row_hashes
 from softneck.identification.selection import _auto
-from softneck.identification.selection._auto import ALIKE, REFITTED, _guarded_why, _Race, kinds_to_try
+from softneck.identification.selection._auto import ALIKE, REFITTED, _guarded_why, _Race, best_other, kinds_to_try
 from softneck.identification.selection._exam import agreement, exams, weighted_median
 from softneck.identification.selection._kind_trial import COLD, EXAM, HOLD_OUT, KindTrial, numbers_of
 from softneck.identification.selection._left_out import folds
@@ -111,6 +111,21 @@ def test_nothing_to_try_and_nothing_that_works_are_errors() -> None:
         choose(TRAIN, OTHER, kinds=("magic",))
     with pytest.raises(DataError, match=r"no kind could be identified: .*at least 100 are needed"):
         choose(TRAIN.rows(0, 60), OTHER, kinds=("rls", "play"))
+    still = TRAIN.with_channels(**{f"motor_setpoint_{j}": np.ones(len(TRAIN)) for j in (1, 2, 3)})
+    with pytest.raises(DataError) as said:
+        choose(still, OTHER, kinds=("rls", "oe", "play", "ensemble"))
+    assert str(said.value).count("constant") == 1, "a reason that all share is said once"
+
+
+def test_the_best_of_the_other_sort_is_no_median_and_ran_free() -> None:
+    fits = {"rls": 80.0, "oe": 85.0, "ensemble": 99.0, "play": 70.0, "nn": 75.0, "nss": float("-inf")}
+    ranking = [KindTrial(kind, 0.0, left_out={"hold-out": fit}) for kind, fit in fits.items()]
+    for chosen, other in (("rls", "nn"), ("play", "oe"), ("ensemble", "oe")):
+        found = best_other(ranking, chosen)
+        assert found is not None
+        assert found.kind == other
+    assert best_other(ranking[:2], "rls") is None
+    assert best_other(ranking[-1:], "rls") is None, "what diverged is no plant"
 
 
 def test_what_a_fold_judges_is_missing_from_its_training_and_no_set_point_is() -> None:
