@@ -24,6 +24,7 @@ from ..uncertainty._guarded_base import BASES, fitted_base
 from ..uncertainty._residual import Residual
 from ..validation._score_tables import INFINITE
 from ..validation._validation import Rules, Validation, judge, judged_parts
+from ._choice_words import ALIKE, guarded_why, reasons, remarks, why, word
 from ._exam import agreement, exams, free_runs
 from ._kind_trial import EXAM, HOLD_OUT, KindTrial
 from ._left_out import Fold, everything, folds
@@ -45,10 +46,6 @@ _SCREENED: dict[str, dict[str, Any]] = {
 }
 # Of the noise: the epsilon of screened sets, whose own choice among many takes several times as long.
 _SIGMAS = 8.0
-# Fits closer than this are alike [points]: seeds of noise and training move them by as much.
-ALIKE = 0.5
-# Below this [%] no kind has understood the recording.
-_POOR = 70.0
 _MOST_MEMBERS = 3
 # What a guarded form may cost on the rows held out [points]: it is taken for what it does elsewhere.
 _GUARD_COST = 2.0
@@ -121,7 +118,7 @@ def choose(
     # The matrices are small: a second thread of BLAS would only wait.
     with threadpool_limits(limits=1):
         for number, kind in enumerate(wanted):
-            progress(0.7 * number / len(wanted), _word(kind, list(race.tried.values())))
+            progress(0.7 * number / len(wanted), word(kind, list(race.tried.values())))
             if kind in _MADE_OF_OTHERS:
                 race.examine()
             race.screen(kind)
@@ -133,8 +130,8 @@ def choose(
     ranking = race.ranking()
     progress(1.0, f"chosen: {chosen.kind}")
     alike = [one for one in ranking if one.fit > best.fit - ALIKE and one not in (best, chosen)]
-    remarks = (*poor_excitation(train), *_remarks(ranking, other_excitation))
-    return Choice(ranking, chosen, _why(best, alike) + _guarded_why(best, chosen), remarks, seed)
+    wary = (*poor_excitation(train), *remarks(ranking, other_excitation))
+    return Choice(ranking, chosen, why(best, alike) + guarded_why(best, chosen), wary, seed)
 
 
 def refit(choice: Choice, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
@@ -309,7 +306,7 @@ class _Race:
         ranking = [one for one in self.ranking() if one.kind != "ensemble" or self._no_member_is_better(one)]
         best = ranking[0]
         if best.fit == float("-inf"):
-            raise DataError(f"no kind could be identified: {_reasons(ranking)}")
+            raise DataError(f"no kind could be identified: {reasons(ranking)}")
         alike = [one for one in ranking if one.fit > best.fit - ALIKE]
         return min(alike, key=lambda one: (one.numbers, _SIMPLE_FIRST.index(one.kind)))
 
@@ -332,17 +329,6 @@ class _Race:
     def _judged(self, kind: str, model: Model) -> Validation:
         rules = Rules((1, INFINITE))
         return judge(model, judged_parts(model, self.hold_out, rules, self._known), rules, names=(kind, HOLD_OUT))
-
-
-def _reasons(ranking: Sequence[KindTrial]) -> str:
-    """Return why kinds failed, each reason once."""
-    said: dict[str, list[str]] = {}
-    for one in ranking:
-        if one.kind != "ensemble" or len(ranking) == 1:  # it lacks the others
-            said.setdefault(one.failure or "its free run diverged", []).append(one.kind)
-    if len(said) == 1:
-        return next(iter(said))
-    return "; ".join(f"{', '.join(kinds)}: {why}" for why, kinds in said.items())
 
 
 def _with(one: KindTrial, found: Mapping[str, tuple[float, float]]) -> KindTrial:
@@ -372,48 +358,3 @@ def _anew(model: Model, train: Recording, seed: int, progress: Progress = silent
     if model.kind == "residual":
         return Residual().on(made_of[0], train)
     return combine(made_of) if model.kind == "ensemble" else _settings(model.kind, seed, {}).fit(train)
-
-
-def _word(kind: str, tried: list[KindTrial]) -> str:
-    best = max(tried, key=lambda one: one.fit, default=None)
-    return kind if best is None or best.fit == float("-inf") else f"{kind} (best so far {best.kind}, {best.fit:.1f} %)"
-
-
-def _why(chosen: KindTrial, alike: list[KindTrial]) -> str:
-    said = f"{chosen.kind} runs free with {chosen.fit:.1f} % at its worst ({chosen.worst})"
-    if not alike:
-        return f"{said}, better than all others at theirs."
-    others = ", ".join(f"{one.kind} {one.fit:.1f} % with {one.numbers} numbers" for one in alike)
-    return (
-        f"{said}; {others} are not worse by more than {ALIKE:g} points, and of such kinds the one of the fewest "
-        f"numbers is taken ({chosen.numbers})."
-    )
-
-
-def _guarded_why(best: KindTrial, chosen: KindTrial) -> str:
-    if chosen is best or chosen.model is None:
-        return ""
-    settings = chosen.model.settings
-    return (
-        f" Its guarded form is taken: {settings['members']} models of {best.kind} that fade to `{settings['base']}` "
-        f"where they part or nothing was seen; {chosen.hold_out_fit:.1f} % on the rows held out, {best.kind} alone "
-        f"{best.hold_out_fit:.1f} %."
-    )
-
-
-def _remarks(ranking: tuple[KindTrial, ...], other_excitation: bool) -> tuple[str, ...]:
-    remarks = []
-    if not other_excitation:
-        remarks.append(
-            "The rows held out are of the excitation that was trained on: this ranking may not hold for other "
-            "motions. Give a second recording with another signal; the last one is held out."
-        )
-    if ranking[0].fit < _POOR:
-        remarks.append(
-            f"No kind reaches {_POOR:g} % in free run. Look for a drifting sensor, a wrong sample time or sign, motors "
-            "that were not logged, or an excitation that hardly moves the robot."
-        )
-    failed = [one.kind for one in ranking if one.fit == float("-inf")]
-    if failed:
-        remarks.append(f"Not identified or diverged: {', '.join(failed)}.")
-    return tuple(remarks)

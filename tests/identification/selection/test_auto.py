@@ -12,7 +12,8 @@ from softneck.identification import Choice, Model, Network, OutputError, Play, R
 from softneck.identification.models._arrays import members
 from softneck.identification.models._fitting import known_rows, row_hashes
 from softneck.identification.selection import _auto
-from softneck.identification.selection._auto import ALIKE, REFITTED, _guarded_why, _Race, best_other, kinds_to_try
+from softneck.identification.selection._auto import ALIKE, REFITTED, _Race, best_other, kinds_to_try
+from softneck.identification.selection._choice_words import guarded_why
 from softneck.identification.selection._exam import agreement, exams, weighted_median
 from softneck.identification.selection._kind_trial import COLD, EXAM, HOLD_OUT, KindTrial, numbers_of
 from softneck.identification.selection._left_out import folds
@@ -243,13 +244,13 @@ def test_the_guarded_form_of_a_learned_winner_is_taken(race: _Race, monkeypatch:
     # It is ranked by what its kind was worth elsewhere.
     assert chosen.scores["largest motions"] == 85.0
     assert set(chosen.scores) == {"largest motions", HOLD_OUT, COLD}
-    assert "Its guarded form is taken: 5 models of play that fade to `oe`" in _guarded_why(best, chosen)
+    assert "Its guarded form is taken: 5 models of play that fade to `oe`" in guarded_why(best, chosen)
     again = refit(Choice((chosen,), chosen, "", ()), [TRAIN, OTHER])
     assert (asked[1].of, asked[1].base, again.kind) == ("play", "oe", "guarded")
     # A guarded form that costs more than two points on the rows held out is none.
     monkeypatch.setattr(KindTrial, "hold_out_fit", property(lambda one: {"guarded": 90.0, "play": 92.5}[one.kind]))
     assert race.guarded(best, silent) is best
-    assert _guarded_why(best, best) == ""
+    assert guarded_why(best, best) == ""
 
 
 def test_over_greybox_the_members_are_those_that_are_there(race: _Race, monkeypatch: pytest.MonkeyPatch) -> None:
