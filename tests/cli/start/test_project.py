@@ -105,3 +105,13 @@ def test_the_signal_that_a_refusal_asks_for_is_one(call: Call) -> None:
 
     assert "`mixed`" in _NEXT
     assert signal("mixed", duration=10.0).set_points.shape[1] == 3
+
+
+def test_a_page_leaves_out_the_worst_plants_of_a_certificate_and_nothing_else(tmp_path: Path) -> None:
+    from softneck.report._project import _files
+
+    for name in ("best.certificate.json", "best_worst/a.toml", "my_worst/b.toml", "_worst/c.toml", "loop.toml"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("")
+    found = {path.relative_to(tmp_path).as_posix() for path in _files(tmp_path)}
+    assert found == {"best.certificate.json", "my_worst/b.toml", "_worst/c.toml", "loop.toml"}
