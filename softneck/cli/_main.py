@@ -21,6 +21,7 @@ from .shared._groups import NearGroup
 # Subcommand -> module and what it does; a module is imported when its command is called, so that
 # `softneck --help` answers at once.
 _COMMANDS = {
+    "start": ("start._start", "Go from a log to a verdict in one sitting, each step a plain command."),
     "demo": ("_demo", "Run the main job: experiment, models, FMUs, controller, closed loop, report."),
     "doctor": ("_doctor", "Say which parts of this machine work."),
     "info": ("_info", "Say what a file is."),

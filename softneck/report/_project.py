@@ -86,6 +86,12 @@ def read_project(folder: str | Path, *, run_loops: bool = True, progress: Progre
     return project
 
 
+def _is_worst(entry: Path) -> bool:
+    """Return whether a folder holds the worst plants of a certificate beside it, which says what was found on them."""
+    stem = entry.name.removesuffix("_worst")
+    return stem != entry.name and entry.with_name(f"{stem}.certificate.json").is_file()
+
+
 def _files(root: Path) -> Iterator[Path]:
     """Yield files in the order of their names; a study's folder as its `study.json` alone."""
     entries = sorted(root.iterdir())
@@ -93,7 +99,7 @@ def _files(root: Path) -> Iterator[Path]:
         yield root / "study.json"
         entries = [entry for entry in entries if entry.is_dir()]
     for entry in entries:
-        if entry.name.startswith(".") or entry.name in _SKIPPED or entry.is_symlink():
+        if entry.name.startswith(".") or entry.name in _SKIPPED or entry.is_symlink() or _is_worst(entry):
             continue
         if entry.is_dir():
             yield from _files(entry)
