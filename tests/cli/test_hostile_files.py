@@ -35,7 +35,7 @@ def run(folder: Path, arguments: list[str]) -> tuple[int, str, float, float]:
             file_actions=[(os.POSIX_SPAWN_DUP2, out.fileno(), 1), (os.POSIX_SPAWN_DUP2, errors.fileno(), 2)],
         )
         # Where a budget fails the machine must not.
-        resource.prlimit(pid, resource.RLIMIT_AS, (6 * 2**30,) * 2)
+        resource.prlimit(pid, resource.RLIMIT_AS, (6 * 2**30, 6 * 2**30))
         resource.prlimit(pid, resource.RLIMIT_CPU, (20, 20))
         _, status, usage = os.wait4(pid, 0)
     code = os.waitstatus_to_exitcode(status)
