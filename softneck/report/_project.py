@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import KINDS, FileFormatError, Progress, SettingsError, SoftneckError, load, read_archive, silent
+from softneck.core._budget import MOST_JSON, open_zip, settings_text
 from softneck.cosim import load_loop, read_runs, simulate
 from softneck.cosim.loops._loop_file import is_loop_file
 from softneck.cosim.loops._loop_values import read_toml
@@ -140,6 +141,7 @@ def _fmu(project: Project, path: Path, name: str) -> None:
     import fmpy
 
     try:
+        open_zip(path).close()
         project.fmus[name] = fmpy.read_model_description(str(path), validate=False)
     except Exception as error:  # fmpy raises bare Exception
         raise FileFormatError(f"{path}: is not an FMU ({' '.join(str(error).split())}).") from error
@@ -161,8 +163,8 @@ def _is_study(path: Path) -> bool:
 
 def _content(path: Path) -> dict[str, Any]:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        content = json.loads(settings_text(path, MOST_JSON))
+    except (OSError, ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) else {}
 

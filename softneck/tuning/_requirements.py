@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import FileFormatError, SettingsError
+from softneck.core._budget import settings_text
 from softneck.robot import Robot
 from softneck.verification import Requirements, make_requirements
 from softneck.verification._requirements import VERSION, Requirement
@@ -80,7 +81,7 @@ def read_tune_requirements(
     if path is None:
         return make_tune_requirements({}, robot=robot, stepping=stepping)
     try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        table = tomllib.loads(settings_text(path))
     except (ValueError, RecursionError) as error:
         raise FileFormatError(f"{path}: is not valid TOML ({error}).") from error
     except OSError as error:

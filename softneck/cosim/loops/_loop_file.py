@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import FileFormatError, SettingsError, SoftneckError, file_hash, require_one_of
+from softneck.core._budget import require_steps
 from softneck.core._shown import Shown
 from softneck.loop import Fault, Loop, Part, ReferenceBlock
 from softneck.loop._faults import make_fault
@@ -195,6 +196,8 @@ def _setup(table: Mapping[str, Any], source: Path, opened: dict[Any, Any] | None
             raise SettingsError(f"`{key}` is missing.")
     folder = source if source.is_dir() else source.parent
     step = number("sample_time_s", table.get("sample_time_s", 0.02))
+    if step > 0.0:  # before the parts are opened, which takes longer; with all columns it is judged again
+        require_steps("duration_s", number("duration_s", table["duration_s"]), step)
     opener = PartOpener(folder / str(table.get("folder", ".")), step=step, opened=opened)
     if not source.is_dir():
         opener.files["loop"] = (str(source), file_hash(source))

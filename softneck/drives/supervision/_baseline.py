@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import FileFormatError, SettingsError, atomic_write
+from softneck.core._budget import MOST_JSON, settings_text
 
 _KIND, _VERSION = "softneck supervision", 1
 Row = tuple[float, ...]
@@ -104,7 +105,7 @@ def load_baseline(path: str | Path) -> Baseline:
     """
     source = Path(path)
     try:
-        table = json.loads(source.read_text(encoding="utf-8"))
+        table = json.loads(settings_text(source, MOST_JSON))
         if not isinstance(table, dict) or table.pop("kind", "") != _KIND or table.pop("version", 0) != _VERSION:
             raise FileFormatError(f"{source}: is not what `softneck drives record --supervision` writes.")
         return Baseline.from_dict(table)
