@@ -130,14 +130,15 @@ def supervised_levels(model: tuple, rules: tuple, past: tuple, x: np.ndarray, re
         for j in range(features):
             expected += level[i, j] * x[0, i, j]
         for j in range(n):
+            quiet = quiet or rest[j] > 0.0
             if j != i:
                 expected += level[i, features] * tension[0, j] / (n - 1)
-                quiet = quiet or rest[j] > 0.0
         # What hangs has no scale, and half of a tension must be told from none.
         quiet = quiet or expected < 2.0 * slack[i]
         for k in range(scales.shape[0]):
             score = chart_shift(tension[0, i] - expected, (scales[k] - 1.0) * expected, spread[i], sight)
-            scores[k * n + i] = 0.0 if quiet else score
+            # What was added up before is of another moment: half an answer each time is none.
+            scores[k * n + i] = SUPERVISED_NOT if quiet else score
 
 
 def supervised_angle(gains: np.ndarray, lags: np.ndarray, past: np.ndarray, positions: np.ndarray,
