@@ -206,8 +206,7 @@ class Model(Shown):
         return self._labelled(recording, parts)
 
     def _labelled(self, recording: Recording, parts: Sequence[Matrix]) -> Labelled:
-        units = {port.name: port.unit for port in self.block().outputs}
-        return Labelled(np.concatenate(parts), recording.time, units)
+        return Labelled(np.concatenate(parts), recording.time, {port.name: port.unit for port in self.block().outputs})
 
     def adapted(self, recording: Recording, *, window: float = 30.0) -> Model:
         """Return the model refitted to the latest data, held to what it is where these say nothing.
@@ -216,8 +215,7 @@ class Model(Shown):
         `findings["adaptation"]` says what became of it.
 
         Args:
-            recording: whose last `window` seconds are looked at.
-            window: [s].
+            recording: whose last `window` [s] is looked at.
 
         Raises:
             SettingsError: a kind that cannot adapt.
@@ -386,8 +384,7 @@ def _input_rows(run: Recording, source: str, *, outputs: bool = True) -> Matrix:
     motors, both = U.shape[1], U.shape[1] + Y.shape[1]
     rows = np.full((len(run), both + motors), np.nan)
     rows[:, :motors] = U
-    if outputs:
-        rows[:, motors:both] = Y
+    rows[:, motors:both] = Y if outputs else np.nan
     if source == "measured" and run.has_motor_positions:
         rows[:, both:] = run.motor_positions
     return rows
