@@ -133,9 +133,12 @@ def accepted(error: Vector, S: Matrix, refused: int) -> tuple[bool, int]:
 
 
 def judged(told: Callable[[Spoiled], Matrix], runs: list[Spoiled]) -> tuple[float, float]:
-    """Return the rms error [deg] over all, and the milliseconds a row took."""
+    """Return the rms error [deg] over all, and the milliseconds a row took; NaN where the filter breaks off."""
     start = time.process_time()
-    angles = [told(run) for run in runs]
+    try:
+        angles = [told(run) for run in runs]
+    except np.linalg.LinAlgError:  # filterpy's sigma points, of a covariance that is not positive definite
+        return math.nan, math.nan
     took = time.process_time() - start
     errors = np.vstack([said[SCORED:] - run.recording.outputs[SCORED:] for run, said in zip(runs, angles, strict=True)])
     return math.degrees(np.sqrt(np.mean(errors**2))), 1e3 * took / sum(len(run.dark) for run in runs)
