@@ -295,6 +295,7 @@ QUESTIONS = {
     "mpc.tautness_weight": Question(
         "tautness_weight", (0.03, 0.1, 0.3, 1.0, 10.0), MpcSettings(tautness_weight=0.3), follows
     ),
+    "mpc.payload_tautness": Question("payload_tautness", (0.0, 1.5, 3.0), MpcSettings(), follows),
     "mpc.max_sensitivity": Question("max_sensitivity", (1.4, 1.5, 1.6), MpcSettings(), follows),
     "observer.sensor_delay": Question("sensor_delay", (0.0, 0.03, 0.04, 0.05, 0.06, 0.07), KalmanSettings(), observed),
 }

@@ -1,8 +1,10 @@
 """Print why nonlinear predictive control loses to linear as soon as there is payload: one thing changed at a time.
 
-`python benchmarks/nmpc_payload.py [--necks NECK...] [--kind play]`: the circle of 12 deg at 1.2 rad/s of
+`python benchmarks/nmpc_payload.py [--necks NECK...] [--kind play] [--told]`: the circle of 12 deg at 1.2 rad/s of
 `mpc_following.py`, and a step of 18 deg of pitch over 8 s, rms of the worse axis [deg], under 0 and 1 kg. `mpc` is over
-the family, `nmpc` over models of 80 s of Eq. 22, around zero or pulled taut by 2 rad of co-contraction.
+the family, `nmpc` over models of 80 s of Eq. 22, around zero or pulled taut by 2 rad of co-contraction. `--told`: over
+a `greybox` of 0, 0.5 and 1 kg, pulled taut, that is told its payload, against linear ones as taut
+(`rise_s=0.2`; with preview the default), and the circle with preview.
 """
 
 from __future__ import annotations
@@ -13,13 +15,31 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-from mpc_following import AT, CIRCLE_S, JUDGED, OURS, SETTLED, STEP_S, Specimen, circle, neck, rms_deg
+from mpc_following import (
+    AT,
+    CIRCLE_S,
+    JUDGED,
+    OURS,
+    OUT,
+    PAYLOADS,
+    PREVIEW,
+    SETTLED,
+    STEP_S,
+    Specimen,
+    circle,
+    neck,
+    rms_deg,
+    run,
+)
+from payload import told
 
-from softneck.core import KINDS, resolve
+from softneck.core import KINDS, load, resolve
 from softneck.design import MpcSettings, NmpcSettings
+from softneck.identification import GreyBox
 from softneck.loop import BlockPart, Loop, run_loop
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.plant import record as record_own
+from softneck.robot._neck_default import NeckDefault
 from softneck.signals import Recording, signal
 from tests.foreign_necks.necks import CHOOSING, ForeignNeck, record
 
@@ -92,16 +112,44 @@ def rows(name: str, kind: str) -> Iterator[tuple[str, list[float]]]:
         yield what, errors(on, [settings.design(model) for model in models], common)
 
 
+def rows_told(name: str) -> Iterator[tuple[str, list[float]]]:
+    """Yield the errors of controllers that know the payload, by how taut tendons are."""
+    on, file = neck(name), OUT / f"{name}-taut-greybox.npz"
+    if not file.exists():
+        GreyBox().fit([recorded(name, kg, TAUT) for kg in PAYLOADS]).save(file, force=True)
+    several: Any = load(file)
+    models = [told(several, kg) for kg in JUDGED]
+    for taut in (TAUT, 3.5):
+        pulled = replace(QUICK, minimum_tautness=taut)
+        wish = MpcSettings(minimum_tautness=NeckDefault(taut))
+        quick, ahead = (replace(wish, **more).design(on.family) for more in ({"rise_s": 0.2}, {"preview": PREVIEW}))
+        yield f"`nmpc`, payload told, {taut:g} rad", [
+            *errors(on, [pulled.design(model) for model in models], 0.0),
+            *previewed(on, [replace(pulled, preview=PREVIEW).design(model) for model in models]),
+        ]  # fmt: skip
+        yield f"`mpc`, {taut:g} rad", [*errors(on, [quick] * 2, 0.0), *previewed(on, [ahead] * 2)]
+
+
+def previewed(on: Specimen, controllers: list[Any]) -> list[float]:
+    """Return the rms errors of the circle under each payload where it is known ahead [deg]."""
+    return [
+        rms_deg(run(on, item, circle, CIRCLE_S, kg), circle, SETTLED)
+        for item, kg in zip(controllers, JUDGED, strict=True)
+    ]  # fmt: skip
+
+
 def main() -> None:
     """Print a table for each neck."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--necks", nargs="+", choices=(*CHOOSING, *OURS), default=["chain", "column", "spring"])
     parser.add_argument("--kind", default="play", help="of model (play)")
+    parser.add_argument("--told", action="store_true", help="controllers that know the payload")
     options = parser.parse_args()
     for name in options.necks:
-        heads = [f"{what}, {kg:g} kg" for what in ("circle", "step") for kg in JUDGED]
-        print(f"\n| `{name}` | {' | '.join(heads)} |\n|---|---|---|---|---|")
-        for what, found in rows(name, options.kind):
+        columns = ("circle", "step", *(("ahead",) if options.told else ()))
+        heads = [f"{what}, {kg:g} kg" for what in columns for kg in JUDGED]
+        print(f"\n| `{name}` | {' | '.join(heads)} |\n|{'---|' * (1 + len(heads))}")
+        for what, found in rows_told(name) if options.told else rows(name, options.kind):
             print(f"| {what} | " + " | ".join(f"{value:.2f}" for value in found) + " |", flush=True)
 
 

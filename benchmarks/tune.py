@@ -1,13 +1,15 @@
 """Hold what `softneck tune` returns against necks on which nothing was chosen.
 
-`python benchmarks/tune.py [--necks NECK...] [--kinds KIND...] [--budget N] [--seed N] [--workers N] [--best] [--fresh]`
+`python benchmarks/tune.py [--necks NECK...] [--kinds KIND...] [--budget N] [--seed N] [--workers N] [--best |
+--defaults] [--fresh]`
 
 For each neck what docs/howto/payloads.md tells a user to do: the least co-contraction at which the large experiment is
 heard with 1 kg; from Eq. 22 and multisines of small and large amplitude at 0.32 and 1 kg, played around it, a family,
 and from Eq. 22 a grey box of each payload. `tune` gets those alone. What it returns, and the best of every other kind
 that it judged by all loops, is then run on the neck itself: steps of 15 deg in three directions with 0.32, 0.66 and 1
 kg, and a circle of 12 deg at 1.2 rad/s, known ahead by as much as `tune` says and not. Angles are those that the neck's
-sensor tells. Nothing is chosen here. Recordings' models are kept in `build/tune`; --fresh forgets them.
+sensor tells. With --defaults what a plain `design` makes is run instead, at the same co-contraction. Nothing is chosen
+here. Recordings' models are kept in `build/tune`; --fresh forgets them.
 """
 
 from __future__ import annotations
@@ -26,16 +28,18 @@ import numpy as np
 
 import softneck
 from benchmarks.promises import AMPLITUDES, SHOWN, Sensed, block_of, experiments, recorded, taut
+from softneck.core import KINDS, resolve
 from softneck.identification import FamilySettings, GreyBox
 from softneck.loop import BlockPart, Loop, LoopResult, RotationReference, StepReference, metrics, run_loop
 from softneck.signals import signal
 from softneck.tuning import tune
 from softneck.tuning._judge import designed, made_ready
-from softneck.tuning._tune import BUDGET
+from softneck.tuning._tune import BUDGET, task_of
 
 OUT = Path("build/tune")
 PAYLOADS, JUDGED = (0.32, 1.0), (0.32, 0.66, 1.0)
 ORIENTATIONS = (0.0, 45.0, 90.0)
+PLAIN = ("pi", "pid", "fopi", "hinf", "ncf", "lqg")
 SIZE, CIRCLE, TURN = math.radians(15.0), math.radians(12.0), 1.2
 # Overshoot [%], rise [s], steady rms [deg], circle unknown and known ahead [deg].
 GOALS = {"overshoot": 5.0, "rise": 0.4, "steady": 0.15, "circle": 3.0, "ahead": 1.5}
@@ -117,31 +121,47 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--best", action="store_true", help="Only what is returned, not the best of other kinds.")
+    parser.add_argument("--defaults", action="store_true", help="What a plain `design` makes; nothing is searched.")
     parser.add_argument("--fresh", action="store_true", help="Forget the models that are kept.")
     asked = parser.parse_args()
     if asked.fresh:
         shutil.rmtree(OUT, ignore_errors=True)
     OUT.mkdir(parents=True, exist_ok=True)
     print("| neck | controller | certificate | processor [s] | overshoot [%] | rise [s] | steady rms [deg] | "
-          "circle [deg] | known ahead [deg] | all goals |\n|---|---|---|---|---|---|---|---|---|---|")  # fmt: skip
+          "circle [deg] | known ahead [deg] | misses |\n|---|---|---|---|---|---|---|---|---|---|")  # fmt: skip
     for neck in asked.necks:
-        plants = known(neck)
-        begin = seconds()
-        found = tune(plants, kinds=tuple(asked.kinds), budget=asked.budget, seed=asked.seed, workers=asked.workers)
-        spent = seconds() - begin
-        shown = {found.best.kind: found.best}
-        for item in () if asked.best else found.candidates:
-            shown.setdefault(item.kind, item)
-        ready = made_ready(found.task)
-        for item in shown.values():
-            controller = designed(found.task, ready, item.kind, item.settings)
-            true = truth(neck, controller, item.metrics.get("track.ahead_s", 0.0))
-            best = item is found.best
-            said = ("holds" if found.holds else f"fails: {found.binding}") if best else "-"
-            cells = [neck, f"**{item.kind}**" if best else item.kind, said, f"{spent:.0f}" if best else "",
-                     *(f"{true[name]:.3g}" for name in GOALS), "yes" if all(true[n] <= g for n, g in GOALS.items()) else
-                     ", ".join(n for n, g in GOALS.items() if true[n] > g)]  # fmt: skip
-            print(f"| {' | '.join(cells)} |", flush=True)
+        (plain if asked.defaults else searched)(neck, asked)
+
+
+def searched(neck: str, asked: argparse.Namespace) -> None:
+    """Print what `tune` returns, and unless --best the best of every other kind."""
+    plants, begin = known(neck), seconds()
+    found = tune(plants, kinds=tuple(asked.kinds), budget=asked.budget, seed=asked.seed, workers=asked.workers)
+    spent = seconds() - begin
+    shown = {found.best.kind: found.best}
+    for item in () if asked.best else found.candidates:
+        shown.setdefault(item.kind, item)
+    ready = made_ready(found.task)
+    for item in shown.values():
+        controller = designed(found.task, ready, item.kind, item.settings)
+        best = item is found.best
+        said = ("holds" if found.holds else f"fails: {found.binding}") if best else "-"
+        row([neck, f"**{item.kind}**" if best else item.kind, said, f"{spent:.0f}" if best else ""],
+            truth(neck, controller, item.metrics.get("track.ahead_s", 0.0)))  # fmt: skip
+
+
+def plain(neck: str, asked: argparse.Namespace) -> None:
+    """Print what kinds do with their defaults, at the co-contraction of the recordings; nothing is known ahead."""
+    task = task_of(known(neck), None, asked.seed)
+    for kind in asked.kinds or PLAIN:
+        settings = resolve(KINDS[kind].settings)(least_cocontraction=task.cocontraction)
+        row([neck, f"{kind}, defaults", "-", ""], truth(neck, settings.design(task.plant), 0.0))
+
+
+def row(cells: list[str], true: dict[str, float]) -> None:
+    """Print a row of the table."""
+    missed = ", ".join(name for name, goal in GOALS.items() if true[name] > goal)
+    print(f"| {' | '.join([*cells, *(f'{true[name]:.3g}' for name in GOALS), missed or '-'])} |", flush=True)
 
 
 if __name__ == "__main__":

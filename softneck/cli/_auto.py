@@ -25,7 +25,10 @@ if TYPE_CHECKING:
 _HEAD = ["kind", "worst", "of", "all of them", "rows held out", "cold", "tried in", "found", ""]
 _TITLE = "Free-run fit [%] over what was left out, mean of {names}; +- one standard error"
 
-_LINEAR = "`design` of most kinds takes linear models: the best of them, {kind}, is in {path}"
+_OTHER = {
+    "linear": "`design` of most kinds takes linear models: the best of them, {kind}, is in {path}",
+    "nonlinear": "the best of the kinds that are not linear, {kind}, is in {path}: a plant to close loops over",
+}
 
 
 def identify_auto(
@@ -49,9 +52,9 @@ def identify_auto(
     from softneck.signals import read_recording
 
     path, overwrite = target(output, "models/auto.npz", force=force)
-    # Linear kinds are what `design` and `observer` take.
-    linear_path = path.with_name(f"{path.stem}_linear.npz")
-    for file in (path, linear_path):
+    # Linear kinds are what `design` and `observer` take; the best of the others is the better plant for loops.
+    beside = {name: path.with_name(f"{path.stem}_{name}.npz") for name in _OTHER}
+    for file in (path, *beside.values()):
         refuse_existing(file, force=overwrite)
     if html is not None:
         refuse_existing(html, force=force)
@@ -59,8 +62,8 @@ def identify_auto(
     head, tail, other = _split(parts, train)
     with progress("identify auto", quiet=as_json) as report:
         choice = choose(head, tail, other_excitation=other, seed=seed or 0, progress=report)
-    linear = _best_linear(choice)
-    saved = {path: choice} if linear is None else {path: choice, linear_path: linear}
+    other, sort = _other(choice)
+    saved = {path: choice} if other is None else {path: choice, beside[sort]: other}
     models: list[Model] = []
     for file, taken in saved.items():
         model = _model(taken)
@@ -71,14 +74,18 @@ def identify_auto(
             model = with_tolerance(model, tolerance)
         models.append(with_fit(model, taken.chosen.judged))
         models[-1].save(file, force=overwrite)
-    said = [] if linear is None else [_LINEAR.format(kind=linear.chosen.kind, path=linear_path)]
+    for file in beside.values():
+        if file not in saved:
+            file.unlink(missing_ok=True)  # of another choice, which --force replaces
+    said = [] if other is None else [_OTHER[sort].format(kind=other.chosen.kind, path=beside[sort])]
     if html is not None:
         write_page(html, _page(choice), force=force)
     judged = choice.chosen.judged
     why = None if judged is None else useless(judged)
     if as_json:
         facts = _facts(choice, path)
-        print_json({**facts, "linear_model": None if linear is None else str(linear_path), "refit": refit_all})
+        kept = {f"{name}_model": str(file) if file in saved else None for name, file in beside.items()}
+        print_json({**facts, **kept, "refit": refit_all})
         _refuse_useless(path, why)
         return
     print_table(_title(parts[0].robot), _HEAD, _rows(choice))
@@ -103,14 +110,14 @@ def _model(choice: Choice) -> Model:
     return choice.chosen.model
 
 
-def _best_linear(choice: Choice) -> Choice | None:
-    """Return the choice of the best linear kind where the chosen one is not linear; None where none ran free."""
+def _other(choice: Choice) -> tuple[Choice | None, str]:
+    """Return the choice of the best kind of the other sort, None where none ran free, and what sort that is."""
     from softneck.identification.models._linear_systems import KINDS
+    from softneck.identification.selection._auto import best_other
 
-    linear = [one for one in choice.ranking if one.kind in KINDS and one.fit > float("-inf")]
-    if choice.chosen.kind in KINDS or not linear:
-        return None
-    return replace(choice, chosen=linear[0])
+    one = best_other(choice.ranking, choice.chosen.kind)
+    sort = "nonlinear" if choice.chosen.kind in KINDS else "linear"
+    return (None if one is None or one.model is None else replace(choice, chosen=one)), sort
 
 
 def _split(parts: list[Recording], train: float) -> tuple[Recording, Recording, bool]:

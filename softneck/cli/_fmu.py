@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from softneck.core import FileFormatError, SettingsError, load
+from softneck.core._budget import settings_text
 from softneck.fmu.compiled._platforms import PLATFORMS
 
 from .shared._console import print_json, progress
@@ -200,7 +201,7 @@ def _has_keys(path: Path, keys: set[str]) -> bool:
     if path.suffix != ".toml" or not path.is_file():
         return False
     try:
-        return not keys.isdisjoint(tomllib.loads(path.read_text(encoding="utf-8")))
+        return not keys.isdisjoint(tomllib.loads(settings_text(path)))
     except (ValueError, RecursionError):
         return False
 

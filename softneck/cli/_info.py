@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from softneck.core import DataError, FileFormatError, SettingsError, file_hash, load, read_archive, refuse_existing
+from softneck.core._budget import MOST_JSON, open_zip, settings_text
 from softneck.core._kinds import KINDS, fitting
 
 from .shared._console import print_json, progress
@@ -245,7 +246,10 @@ def _fmu(file: Path) -> dict[str, Any]:
     import fmpy
 
     try:
+        open_zip(file).close()
         description = fmpy.read_model_description(str(file), validate=False)
+    except FileFormatError:
+        raise
     except Exception as error:  # fmpy raises bare Exception
         raise FileFormatError(
             f"{file}: is not an FMU ({str(error).splitlines()[0] if str(error) else error!r})."
@@ -272,7 +276,7 @@ def _toml(file: Path) -> dict[str, Any]:
     from softneck.signals import read_layout
 
     try:
-        table = tomllib.loads(file.read_text(encoding="utf-8"))
+        table = tomllib.loads(settings_text(file))
     except (ValueError, RecursionError) as error:  # no TOML, no UTF-8, thousands of digits or brackets
         raise FileFormatError(f"{file}: is not a TOML file ({error}).") from error
     if table.keys() & {"motors", "outputs", "directions", "extends"}:
@@ -293,7 +297,7 @@ def _toml(file: Path) -> dict[str, Any]:
 
 def _certificate(file: Path) -> dict[str, Any]:
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = json.loads(settings_text(file, MOST_JSON))
     except (ValueError, RecursionError) as error:
         raise FileFormatError(f"{file}: is not a JSON file ({error}).") from error
     if not isinstance(content, dict):

@@ -21,6 +21,7 @@ from .shared._groups import NearGroup
 # Subcommand -> module and what it does; a module is imported when its command is called, so that
 # `softneck --help` answers at once.
 _COMMANDS = {
+    "start": ("start._start", "Go from a log to a verdict in one sitting, each step a plain command."),
     "demo": ("_demo", "Run the main job: experiment, models, FMUs, controller, closed loop, report."),
     "doctor": ("_doctor", "Say which parts of this machine work."),
     "info": ("_info", "Say what a file is."),
@@ -30,6 +31,7 @@ _COMMANDS = {
     "import": ("_import", "Turn any logger's table into a recording, by a layout file."),
     "resample": ("experiments._resample", "Bring a recording to another sample time."),
     "identify": ("_identify", "Identify a model from recordings."),
+    "adapt": ("experiments._adapt", "Refit a model to the latest data of a neck that changed."),
     "validate": ("_validate", "Validate models on rows that they were not trained on."),
     "reproduce-paper": ("_reproduce_paper", "Reproduce the paper on the virtual neck, our numbers beside its own."),
     "calibrate": ("_calibrate", "Fit the virtual neck to recordings or to a grey box."),

@@ -19,11 +19,19 @@ _MOST_NAMES = 3
 
 @click.command("new", epilog="Example: softneck new my_neck && cd my_neck && pytest")
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+@click.option(
+    "--loop", "loop_file", type=click.Path(path_type=Path), metavar="LOOP.toml",
+    help="Around this loop, as `softneck tune` writes it, over Plant, Observer and Controller.fmu in DIR/fmus.",
+)  # fmt: skip
 @force_option
 @json_option
-def command(folder: Path, force: bool, as_json: bool) -> None:
-    """Write a project into DIR, new or empty: identification, design, loop, study, closed-loop test, drives."""
-    texts = _texts(_project_name(folder))
+def command(folder: Path, loop_file: Path | None, force: bool, as_json: bool) -> None:
+    """Write a project into DIR, new or empty: identification, design, loop, study, closed-loop test, drives.
+
+    It is of the virtual neck; `softneck start LOG` makes the one of your own log.
+    """
+    project = _project_name(folder)
+    texts = _texts(project) if loop_file is None else _of_loop(loop_file, folder, project)
     held = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
     if held and not force:
         more = ", ..." if len(held) > _MOST_NAMES else ""
@@ -38,7 +46,14 @@ def command(folder: Path, force: bool, as_json: bool) -> None:
         print_json({"folder": str(folder), "files": list(texts)})
         return
     click.echo(f"{folder}: {', '.join(texts)}")
-    click.echo(f"next: cd {folder} && pytest")
+    if loop_file is None:
+        click.echo(f"next: cd {folder} && pytest")
+
+
+def _of_loop(loop_file: Path, folder: Path, project: str) -> dict[str, str]:
+    from .start._project_files import project_of_loop
+
+    return {name: text.replace("NAME", project) for name, text in project_of_loop(loop_file, folder).items()}
 
 
 def _texts(project: str) -> dict[str, str]:

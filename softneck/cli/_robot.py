@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,22 +44,43 @@ def show(file: str | None, as_json: bool) -> None:
 
 @command.command("new")
 @click.argument("file", required=False, default="robot.toml", type=click.Path(path_type=Path))
-@click.option("--preset", default="neck", show_default=True, help="Which robot to begin with.")
+@click.option("--preset", default="neck", show_default=True, metavar="PRESET|FILE", help="Which robot to begin with.")
 @force_option
 @json_option
 def new(file: Path, preset: str, force: bool, as_json: bool) -> None:
-    """Write a preset into FILE (robot.toml), to edit."""
-    from softneck.robot._file import preset_text
+    """Write a preset, or another robot's file, into FILE (robot.toml), to edit."""
+    from softneck.robot._file import PRESETS, preset_text
 
     if file.suffix.lower() != ".toml":
         raise SettingsError(f"{file}: must end in `.toml`, by which softneck recognises the file.")
-    text = preset_text(preset)
+    taken = preset not in PRESETS and Path(preset).is_file()
+    text = _moved(Path(preset), file.parent) if taken else preset_text(preset)
     with atomic_write(file, force=force) as temporary:
         temporary.write_text(text, encoding="utf-8")
     if as_json:
         print_json({"file": str(file), "preset": preset})
         return
-    click.echo(f"{file}: the preset {preset}; edit it, then softneck robot check {file}")
+    what = f"as {preset}" if taken else f"the preset {preset}"
+    click.echo(f"{file}: {what}; edit it, then softneck robot check {file}")
+
+
+def _moved(source: Path, folder: Path) -> str:
+    """Return a robot file's text for another folder, from which the files that it names are found as well."""
+    import tomli_w
+
+    from softneck.plant._presets import PRESETS
+    from softneck.robot import Robot
+
+    Robot.read(source)  # which says what is wrong with it
+    text = source.read_text(encoding="utf-8")
+    table = tomllib.loads(text)
+    there = source.parent.resolve() != folder.resolve()
+    named = [(part, key) for part, key in (("plant", "neck"), ("drives", "file")) if key in table.get(part, {})]
+    for part, key in named if there else []:
+        name = table[part][key]
+        if name not in PRESETS and not Path(name).is_absolute():
+            table[part][key] = Path(os.path.relpath((source.parent / name).resolve(), folder.resolve())).as_posix()
+    return text if table == tomllib.loads(text) else tomli_w.dumps(table)
 
 
 @command.command("check")

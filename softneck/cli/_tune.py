@@ -135,4 +135,6 @@ def _why(found: Tuned, folder: Path) -> str:
     binds = [item.note for item in found.verification.verdicts if item.requirement.metric == found.binding]
     unheard = any(note.startswith("not supported by the data") for note in binds)
     way = "Record what is said above, no setting mends it" if unheard else "Loosen it, or go on with a larger --budget"
+    if found.binding is None:
+        return f"{folder}: the budget ended before the best was judged by all loops; go on with a larger --budget."
     return f"{folder}: the best so far does not keep all requirements. {stands_in_the_way(found)} {way}."

@@ -10,13 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from ._budget import MOST_JSON, open_zip
 from ._errors import FileFormatError
 from ._files import atomic_write
 
 FORMAT_VERSION = 1
 _HEADER = "header"
-# A header is a few kB and a model a few MB; more is an archive that wants to fill the memory.
-_MAX_BYTES = 4 * 2**30
 # What arrays may hold: numbers. Others are not ours, and complex ones would lose a part without a word.
 _NUMBERS = "fiub"
 
@@ -49,13 +48,18 @@ def read_archive(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray
             f"{source}: is not a softneck file or is damaged; expected a model, family, controller or observer (.npz)."
         )
     try:
-        _refuse_bomb(source)
+        open_zip(source).close()
         with np.load(source, allow_pickle=False) as archive:
             contents = {name: archive[name] for name in archive.files}
-        header = json.loads(contents.pop(_HEADER).tobytes().decode())
+        written = contents.pop(_HEADER)
+        if written.nbytes > MOST_JSON:
+            raise ValueError(f"its header has {written.nbytes} bytes")
+        header = json.loads(written.tobytes().decode())
         for name, array in contents.items():
             if not isinstance(array, np.ndarray) or array.dtype.kind not in _NUMBERS:
                 raise ValueError(f"its member `{name}` is not an array of numbers")
+    except FileFormatError:
+        raise
     except Exception as error:  # zipfile, its decompressors, numpy and json raise whatever damaged bytes lead to
         raise FileFormatError(f"{source}: is not a softneck file or is damaged ({_short(error)}).") from error
     _check_header(source, header)
@@ -71,13 +75,6 @@ def _check_header(source: Path, header: object) -> None:
             f"{source}: has format version {version}; this softneck reads {FORMAT_VERSION}. "
             "Write it again with this version or use the softneck that wrote it."
         )
-
-
-def _refuse_bomb(source: Path) -> None:
-    with zipfile.ZipFile(source) as archive:
-        total = sum(entry.file_size for entry in archive.infolist())
-    if total > _MAX_BYTES:
-        raise ValueError(f"it unpacks to {total} bytes")
 
 
 def _short(error: Exception) -> str:

@@ -17,6 +17,7 @@ from typing import Any
 
 from softneck import __version__
 
+from ._budget import MOST_JSON, settings_text
 from ._errors import CheckFailedError, FileFormatError
 from ._files import atomic_write, file_hash
 from ._shown import Shown
@@ -103,7 +104,7 @@ def read_certificate(path: str | Path) -> Certificate:
     """
     source = Path(path)
     try:
-        contents = json.loads(source.read_text(encoding="utf-8"))
+        contents = json.loads(settings_text(source, MOST_JSON))
     except FileNotFoundError as error:
         raise FileFormatError(f"{source}: no such certificate; `softneck verify` writes one.") from error
     except (OSError, UnicodeDecodeError, ValueError, RecursionError) as error:

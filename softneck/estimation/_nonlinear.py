@@ -146,11 +146,7 @@ class NonlinearObserver(Shown):
 
     def _own_arrays(self, plant: Block) -> tuple[Matrix, ...]:
         stretch = max(self.model.findings.get("time_constants_s", [NECK_SECONDS])) / NECK_SECONDS
-        samples = _NECK_SAMPLE * stretch / self.sample_time  # for one of the neck's
-        setup = np.array([
-            len(self.robot.motors.names), len(self.robot.outputs.names), len(plant.outputs),
-            max(1, round(_SETTLE * samples)), self.start, _KEEP ** (1.0 / samples),
-        ])  # fmt: skip
+        setup = model_setup(self.robot, plant, self.sample_time, stretch, self.start)
         arrays = (setup, self.constants, plant.initial_state(use_measurement=0.0).parameters)
         if self.payloads is None:
             return arrays
@@ -284,6 +280,15 @@ class NonlinearObserver(Shown):
             gate_level=float(header["gate_level"]),
             delay_source=delay_source(header),
         )
+
+
+def model_setup(robot: Robot, plant: Block, sample_time: float, stretch: float, start: float) -> Vector:
+    """Return the array `setup` of a runtime over a model (see `NonlinearArrays`)."""
+    samples = _NECK_SAMPLE * stretch / sample_time  # for one of the neck's
+    return np.array([
+        len(robot.motors.names), len(robot.outputs.names), len(plant.outputs),
+        max(1, round(_SETTLE * samples)), start, _KEEP ** (1.0 / samples),
+    ])  # fmt: skip
 
 
 def is_nonlinear(model: Any) -> bool:

@@ -9,6 +9,7 @@ from dataclasses import fields, replace
 import numpy as np
 
 from softneck.core import DataError, SettingsError, Vector, require_positive, to_si
+from softneck.core._budget import require_steps
 from softneck.robot import Robot
 from softneck.runtime import Block, Port
 
@@ -139,5 +140,6 @@ class ReferenceBlock:
         """Return (rows, 1 + values): the reference's values, sample by sample."""
         if self._duration is None:
             raise SettingsError("a reference of your own needs the duration over which it is written down.")
+        require_steps("duration_s", self._duration, self.sample_time, 4)
         times = np.arange(math.ceil(self._duration / self.sample_time) + 1) * self.sample_time
         return np.array([[time, *self.reference(time)] for time in times.tolist()])

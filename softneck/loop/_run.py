@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softneck.core import DataError, Matrix, SettingsError, Vector, to_si
+from softneck.core._budget import require_steps
 from softneck.runtime import Port
 
 from ._disturbed_bus import place_faults
@@ -106,7 +107,8 @@ class LoopRun:
         self._cycle = cycle(
             self._parts, wiring.taps, ratios, order=loop.order, disturbed=bool(loop.faults), closed=closed
         )  # fmt: skip
-        self.row, self.rows = 0, max(1, round(loop.duration / self.step))
+        self.row = 0
+        self.rows = max(1, require_steps("duration_s", loop.duration, self.step, wiring.start.size))
         self._wiring, self._faults = place_faults(
             loop.faults, wiring, self._parts, step=self.step, rows=self.rows, robot=loop.robot
         )  # fmt: skip

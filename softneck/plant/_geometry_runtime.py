@@ -27,17 +27,18 @@ def bend_functions(square: float) -> tuple[float, float, float, float, float, fl
         dB = -1.0 / 3.0 + square * (1.0 / 30.0 + square * (-1.0 / 840.0 + square / 45360.0))
         dS = -1.0 / 12.0 + square * (1.0 / 480.0 + square * (-1.0 / 53760.0 + square / 11612160.0))
         return A, B, S, dA, dB, dS
-    beta = math.sqrt(square)
-    sine = math.sin(beta)
-    cosine = math.cos(beta)
-    half = math.sin(0.5 * beta)
-    A = (1.0 - cosine) / square
-    B = sine / beta
-    S = 2.0 * half / beta
+    half = 0.5 * math.sqrt(square)
+    sine = math.sin(half)
+    cosine = math.cos(half)
+    # Of the half angle alone: sin(beta) = 2 sin cos, and 1 - cos(beta) = 2 sin^2, which loses no digits.
+    S = sine / half
+    B = S * cosine
+    A = 0.5 * S * S
     # Derivatives of the definitions above; divided by beta they are even, as A, B and S are.
-    dA = (B - 2.0 * A) / square
-    dB = (cosine - B) / square
-    dS = (math.cos(0.5 * beta) - S) / square
+    inverse = 1.0 / square
+    dA = (B - 2.0 * A) * inverse
+    dB = (1.0 - B) * inverse - A  # (cos(beta) - B) / beta^2
+    dS = (cosine - S) * inverse
     return A, B, S, dA, dB, dS
 
 
@@ -73,21 +74,33 @@ def lean_angles(
     b1, b2, w1, w2 = bend
     A, B, _, _, dB, _ = f
     along = b1 * w1 + b2 * w2
-    # n as the base sees it; 1 - A beta^2 is cos(beta).
-    m1 = B * b1
-    m2 = B * b2
-    m3 = 1.0 - A * (b1 * b1 + b2 * b2)
-    # Its rate: d beta/dt = b.w / beta, and the primes come divided by beta.
+    # The normal's rate as the base sees it: d beta/dt = b.w / beta, and the primes come divided by beta.
     k1 = B * w1 + dB * along * b1
     k2 = B * w2 + dB * along * b2
     k3 = -B * along
-    # n and its rate in the world.
-    n1 = R[0] * m1 + R[1] * m2 + R[2] * m3
-    n2 = R[3] * m1 + R[4] * m2 + R[5] * m3
-    n3 = R[6] * m1 + R[7] * m2 + R[8] * m3
+    n1, n2, n3 = lean_normal(b1, b2, A, B, R)
     v1 = R[0] * k1 + R[1] * k2 + R[2] * k3
     v2 = R[3] * k1 + R[4] * k2 + R[5] * k3
     v3 = R[6] * k1 + R[7] * k2 + R[8] * k3
     pitch_rate = (n3 * v1 - n1 * v3) / (n1 * n1 + n3 * n3)
     roll_rate = (n3 * v2 - n2 * v3) / (n2 * n2 + n3 * n3)
     return math.atan2(n1, n3), math.atan2(n2, n3), pitch_rate, roll_rate
+
+
+def lean_normal(
+    b1: float,
+    b2: float,
+    A: float,
+    B: float,
+    R: tuple[float, float, float, float, float, float, float, float, float],
+) -> tuple[float, float, float]:
+    """Return the platform's normal n in the world."""
+    m1 = B * b1
+    m2 = B * b2
+    # As the base sees it; 1 - A beta^2 is cos(beta).
+    m3 = 1.0 - A * (b1 * b1 + b2 * b2)
+    return (
+        R[0] * m1 + R[1] * m2 + R[2] * m3,
+        R[3] * m1 + R[4] * m2 + R[5] * m3,
+        R[6] * m1 + R[7] * m2 + R[8] * m3,
+    )

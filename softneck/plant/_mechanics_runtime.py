@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from softneck.plant._drive_runtime import drive_rates
-from softneck.plant._geometry_runtime import bend_functions, lean_angles, tilt_rotation
+from softneck.plant._geometry_runtime import bend_functions, lean_angles, lean_normal, tilt_rotation
 from softneck.plant._index_runtime import (
     NECK_ATTACHMENT_RADIUS,
     NECK_AXIAL_DAMPING,
@@ -177,7 +177,7 @@ def neck_rates(x: tuple, command: tuple, free: tuple, c: tuple, load: tuple) -> 
     """Return the time derivatives of the states; `command` [rad] and `free` [m] have one entry for each motor."""
     b1, b2, s, w1, w2, v, z1, z2 = x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7]
     f1, f2 = x[8 + 3 * MOTORS], x[9 + 3 * MOTORS]
-    link, hysteresis, _, geometry, directions, drive, rest = c
+    link, hysteresis, tendon, geometry, directions, drive, rest = c
     winch = rest[0]
     body = (b1, b2, s, w1, w2, v)
     f = bend_functions(b1 * b1 + b2 * b2)
@@ -185,7 +185,13 @@ def neck_rates(x: tuple, command: tuple, free: tuple, c: tuple, load: tuple) -> 
     # The arc is L0 - s long.
     g1, g2, gs = link_weight((b1, b2, geometry[0] - s), f, load[1], load[0])
     # Behind the link's eight come positions, speeds and integrals of the drives.
-    pulls = tuple(neck_pull(body, f, directions[j], x[8 + j], x[8 + MOTORS + j], free[j], c) for j in range(MOTORS))
+    chords = tuple(tendon_chord(body, f, directions[j], geometry) for j in range(MOTORS))
+    # Coulomb friction of guides and gears, each smoothed over its speed.
+    sliding, turning = tendon[3], drive[9]
+    signs = tanh_each(
+        (*(chords[j][1] / sliding for j in range(MOTORS)), *(x[8 + MOTORS + j] / turning for j in range(MOTORS)))
+    )
+    pulls = tuple(neck_pull(chords[j], x[8 + j], x[8 + MOTORS + j], free[j], signs[j], c) for j in range(MOTORS))
     force1, force2, force = q1 + g1, q2 + g2, qs + gs
     for j in range(MOTORS):
         force1 += pulls[j][1]
@@ -196,10 +202,16 @@ def neck_rates(x: tuple, command: tuple, free: tuple, c: tuple, load: tuple) -> 
     inertia = load[3]
     # The tendon's torque r T stands against the drive's.
     driven = tuple(
-        drive_rates((x[8 + j], x[8 + MOTORS + j], x[8 + 2 * MOTORS + j]), command[j], winch * pulls[j][0], drive)
+        drive_rates(
+            (x[8 + j], x[8 + MOTORS + j], x[8 + 2 * MOTORS + j]),
+            command[j],
+            winch * pulls[j][0],
+            signs[MOTORS + j],
+            drive,
+        )
         for j in range(MOTORS)
     )
-    pitch, roll, _, _ = lean_angles((b1, b2, w1, w2), f, load[2])
+    n1, n2, n3 = lean_normal(b1, b2, f[0], f[1], load[2])
     return (
         w1,
         w2,
@@ -212,25 +224,29 @@ def neck_rates(x: tuple, command: tuple, free: tuple, c: tuple, load: tuple) -> 
         *(x[8 + MOTORS + j] for j in range(MOTORS)),
         *(driven[j][0] for j in range(MOTORS)),
         *(driven[j][1] for j in range(MOTORS)),
-        (pitch - f1) / rest[1],
-        (roll - f2) / rest[1],
+        (math.atan2(n1, n3) - f1) / rest[1],
+        (math.atan2(n2, n3) - f2) / rest[1],
     )
 
 
+def tanh_each(values: tuple) -> tuple:
+    """Return the hyperbolic tangent of each; C has them side by side."""
+    return tuple(math.tanh(values[j]) for j in range(2 * MOTORS))
+
+
 def neck_pull(
-    body: tuple[float, float, float, float, float, float],
-    f: tuple[float, float, float, float, float, float],
-    direction: tuple[float, float],
+    chord: tuple[float, float, float, float, float],
     position: float,
     speed: float,
     free: float,
+    sliding: float,
     c: tuple,
 ) -> tuple[float, float, float, float]:
     """Return (tension at the winch [N], its forces on b1, b2 and s) of one tendon."""
     winch = c[6][0]
-    length, slide, g1, g2, gs = tendon_chord(body, f, direction, c[3])
+    length, slide, g1, g2, gs = chord
     # Stretch l - l0 + r P and its rate; the guide feels the tendon slide past it, the winch's turning not included.
-    at_winch, at_platform = tendon_tension(length - free + winch * position, slide + winch * speed, slide, c[2])
+    at_winch, at_platform = tendon_tension(length - free + winch * position, slide + winch * speed, sliding, c[2])
     # A tendon shortens if it can: forces are minus its tension along the length's gradient.
     return at_winch, -at_platform * g1, -at_platform * g2, -at_platform * gs
 
@@ -239,7 +255,9 @@ def neck_tensions(x: tuple, free: tuple, c: tuple) -> tuple:
     """Return the tensions at the winches [N] in the continuous states `x`."""
     body = (x[0], x[1], x[2], x[3], x[4], x[5])
     f = bend_functions(x[0] * x[0] + x[1] * x[1])
-    return tuple(neck_pull(body, f, c[4][j], x[8 + j], x[8 + MOTORS + j], free[j], c)[0] for j in range(MOTORS))
+    chords = tuple(tendon_chord(body, f, c[4][j], c[3]) for j in range(MOTORS))
+    # The guides' friction shows at the platform alone.
+    return tuple(neck_pull(chords[j], x[8 + j], x[8 + MOTORS + j], free[j], 0.0, c)[0] for j in range(MOTORS))
 
 
 def neck_lean(x: NeckBody, load: tuple) -> tuple[float, float, float, float]:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import FileFormatError, SettingsError, Vector, require_between, require_one_of
+from softneck.core._budget import settings_text
 from softneck.core._shown import Shown
 from softneck.runtime import Port
 
@@ -168,7 +169,7 @@ class NeckParameters(Shown):
         """
         source = Path(path)
         try:
-            content = tomllib.loads(source.read_text(encoding="utf-8"))
+            content = tomllib.loads(settings_text(source))
         except OSError as error:
             raise FileFormatError(
                 f"{source}: cannot be read ({error.strerror}); use {', '.join(PRESETS)} or a neck file (.toml)."

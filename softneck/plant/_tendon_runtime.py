@@ -1,7 +1,5 @@
 """One tendon: exact chord, elastic, pulls only, with Coulomb friction in its guide."""
 
-import math
-
 
 def tendon_chord(
     x: tuple[float, float, float, float, float, float],
@@ -26,19 +24,19 @@ def tendon_chord(
 
 
 def tendon_tension(
-    stretch: float, rate: float, slide: float, c: tuple[float, float, float, float]
+    stretch: float, rate: float, sliding: float, c: tuple[float, float, float, float]
 ) -> tuple[float, float]:
     """Return the tensions (at the winch, at the platform) [N]; both are zero when slack, never below.
 
-    `stretch` [m] and `rate` [m/s] are of the elastic span, `slide` [m/s] is the tendon's speed through the
-    guide (positive as it lengthens), `c` is (stiffness, damping, friction coefficient, friction speed).
-    Friction is Coulomb's, smoothed by tanh over the friction speed, and grows with tension (capstan).
+    `stretch` [m] and `rate` [m/s] are of the elastic span, `sliding` is tanh(slide / friction speed) of the tendon's
+    speed through the guide (positive as it lengthens), `c` is (stiffness, damping, friction coefficient, friction
+    speed). Friction is Coulomb's, smoothed by that tanh, and grows with tension (capstan).
     """
-    stiffness, damping, friction, speed = c
+    stiffness, damping, friction, _ = c
     if stretch <= 0.0:
         return 0.0, 0.0
     tension = stiffness * stretch + damping * rate
     # A damper may not push either: a tendon let go fast enough is slack before its stretch is gone.
     if tension <= 0.0:
         return 0.0, 0.0
-    return tension, tension * (1.0 + friction * math.tanh(slide / speed))
+    return tension, tension * (1.0 + friction * sliding)

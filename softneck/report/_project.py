@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import KINDS, FileFormatError, Progress, SettingsError, SoftneckError, load, read_archive, silent
+from softneck.core._budget import MOST_JSON, open_zip, settings_text
 from softneck.cosim import load_loop, read_runs, simulate
 from softneck.cosim.loops._loop_file import is_loop_file
 from softneck.cosim.loops._loop_values import read_toml
@@ -86,6 +87,12 @@ def read_project(folder: str | Path, *, run_loops: bool = True, progress: Progre
     return project
 
 
+def _is_worst(entry: Path) -> bool:
+    """Return whether a folder holds the worst plants of a certificate beside it, which says what was found on them."""
+    stem = entry.name.removesuffix("_worst")
+    return stem != entry.name and entry.with_name(f"{stem}.certificate.json").is_file()
+
+
 def _files(root: Path) -> Iterator[Path]:
     """Yield files in the order of their names; a study's folder as its `study.json` alone."""
     entries = sorted(root.iterdir())
@@ -93,7 +100,7 @@ def _files(root: Path) -> Iterator[Path]:
         yield root / "study.json"
         entries = [entry for entry in entries if entry.is_dir()]
     for entry in entries:
-        if entry.name.startswith(".") or entry.name in _SKIPPED or entry.is_symlink():
+        if entry.name.startswith(".") or entry.name in _SKIPPED or entry.is_symlink() or _is_worst(entry):
             continue
         if entry.is_dir():
             yield from _files(entry)
@@ -134,6 +141,7 @@ def _fmu(project: Project, path: Path, name: str) -> None:
     import fmpy
 
     try:
+        open_zip(path).close()
         project.fmus[name] = fmpy.read_model_description(str(path), validate=False)
     except Exception as error:  # fmpy raises bare Exception
         raise FileFormatError(f"{path}: is not an FMU ({' '.join(str(error).split())}).") from error
@@ -155,8 +163,8 @@ def _is_study(path: Path) -> bool:
 
 def _content(path: Path) -> dict[str, Any]:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        content = json.loads(settings_text(path, MOST_JSON))
+    except (OSError, ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) else {}
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import FileFormatError, SettingsError, SoftneckError, require_one_of
+from softneck.core._budget import settings_text
 from softneck.core._checks import did_you_mean
 
 from ._channels import Motors, Outputs
@@ -62,7 +63,7 @@ def read_table(path: Path) -> dict[str, Any]:
         FileFormatError: no such file, or no TOML.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(settings_text(path))
     except FileNotFoundError as error:
         raise FileFormatError(f"{path}: no such robot file; `softneck robot new {path}` writes one.") from error
     except (ValueError, RecursionError) as error:  # no TOML, no UTF-8, thousands of digits or brackets

@@ -41,7 +41,7 @@ def _refuse_rise(
     """Refuse a rise that slew and range cannot give, however the motors are led."""
     test = axis_test(plant, limits.limits(uncertain.robot), limits.redefinition(uncertain)[1])
     for metric in _RISES:
-        limit = asked.limit(metric)
+        limit = asked.wanted(metric)
         if limit is None:
             continue
         table = asked.certificate.neck if metric.startswith("neck") else asked.certificate.step
@@ -60,7 +60,7 @@ def _refuse_rise(
 
 def _refuse_circle(asked: TuneRequirements, name: str, plant: AxisPlant) -> None:
     """Refuse a circle closer than the dead time alone leaves it behind: a bandwidth beyond 1/delay."""
-    limit = asked.limit("track.circle_rms_deg")
+    limit = asked.wanted("track.circle_rms_deg")
     if limit is None or not asked.certificate.robot.is_neck:
         return
     dead = (plant.delay + 1) * plant.sample_time
@@ -78,7 +78,7 @@ def _refuse_load(asked: TuneRequirements, name: str, plant: AxisPlant) -> None:
     """Refuse a load rejected sooner than the dead time lets anybody act on it."""
     certificate = asked.certificate
     metric = f"step.{certificate.name_of('load_rms_deg')}"
-    limit = asked.limit(metric)
+    limit = asked.wanted(metric)
     if limit is None:
         return
     rows = round(float(certificate.step["duration_s"]) / plant.sample_time)

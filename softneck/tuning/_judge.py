@@ -13,6 +13,10 @@ import numpy as np
 
 from softneck.core import KINDS, SoftneckError, Vector, resolve
 from softneck.core._kinds import make_settings
+from softneck.design.linear._axis_settings import AxisSettings
+from softneck.design.linear._loop_settings import LoopSettings
+from softneck.design.linear._pi import PiSettings
+from softneck.design.plants._uncertain import UncertainPlant, uncertain_plant
 from softneck.runtime import Block
 from softneck.verification._experiments import crossing_values, crossings
 from softneck.verification._laws import ControllerUnderTest
@@ -44,6 +48,7 @@ class Ready:
         plants: linear ones, without the delay that a loop's order adds.
         frequency: on which they are judged [rad/s].
         weights: of the motors in each axis's input; None for a neck.
+        uncertain: what linear designs make of the task's plant, made once.
         own: plants that step.
         few, all: the loops of the levels of that name.
         kept: designs by kind and settings.
@@ -52,6 +57,7 @@ class Ready:
     plants: Plants
     frequency: Vector
     weights: Any
+    uncertain: UncertainPlant
     own: tuple[OwnPlant, ...]
     few: tuple[Case, ...]
     all: tuple[Case, ...]
@@ -96,7 +102,8 @@ def made_ready(task: Task) -> Ready:
         plants = all_plants(sources, _PLANTS, int(certificate.sampling["seed"]))
         own = tuple(own_plant(thing, name, task.robot) for name, thing in task.own.items())
         kept["ready"] = Ready(
-            plants, judged(plants.sample_time), sources[0].weights, own,
+            plants, judged(plants.sample_time), sources[0].weights,
+            uncertain_plant(task.plant), own,
             cases(own, task.asked, task.robot, few=True), cases(own, task.asked, task.robot, few=False),
         )  # fmt: skip
     return kept["ready"]
@@ -112,8 +119,16 @@ def designed(task: Task, ready: Ready, kind: str, settings: Mapping[str, Any]) -
     """Return the controller, or the one that this process has designed before."""
     key = json.dumps([kind, dict(settings)], sort_keys=True)
     if key not in ready.kept:
-        ready.kept[key] = make_settings(resolve(KINDS[kind].settings), settings).design(task.plant)
+        made = make_settings(resolve(KINDS[kind].settings), settings)
+        # The others read more of a family than its plants.
+        ready.kept[key] = made.design(ready.uncertain if isinstance(made, AxisSettings | PiSettings) else task.plant)
     return ready.kept[key]
+
+
+def assumed(task: Task, kind: str, settings: Mapping[str, Any]) -> dict[str, float]:
+    """Return what of the paper's neck a design takes where neither settings nor plants say otherwise."""
+    made = make_settings(resolve(KINDS[kind].settings), settings)
+    return made.assumed(made_ready(task).uncertain) if isinstance(made, LoopSettings) else {}
 
 
 def linear_metrics(task: Task, ready: Ready, controller: Any) -> dict[str, float]:

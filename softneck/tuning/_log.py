@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import FileFormatError, OutputFileError, SettingsError, atomic_write
+from softneck.core._budget import MOST_JSON, settings_text
 
 from ._judge import Judgement
 
@@ -110,9 +111,9 @@ class Log:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(settings_text(path, MOST_JSON))
         if content["format"] != _FORMAT or not isinstance(content["evaluations"], list):
             raise ValueError("another format")
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise FileFormatError(f"{path}: is no log of a search that this softneck reads ({error}).") from error
     return content

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import FileFormatError, SettingsError
+from softneck.core._budget import settings_text
 from softneck.robot import Robot
 from softneck.verification import Requirements, make_requirements
 from softneck.verification._requirements import VERSION, Requirement
@@ -31,24 +32,36 @@ class TuneRequirements:
     Attributes:
         certificate: what `verify` is asked to hold.
         track: the loops that are judged besides.
-        bounds: all requirements, those of `certificate` first.
+        bounds: all requirements, those of `certificate` first; the reserve is taken off.
+        reserve: metric -> what is kept back of its limit for a robot that is not quite as its models.
         table: what a requirements file for `verify` must state to ask for the same.
     """
 
     certificate: Requirements
     track: Mapping[str, float]
     bounds: tuple[Requirement, ...]
+    reserve: Mapping[str, float]
     table: Mapping[str, Any]
 
+    def wanted(self, metric: str) -> float | None:
+        """Return the largest value that is allowed of a metric of the robot itself: its limit with the reserve."""
+        limit = self.limit(metric)
+        return None if limit is None else limit + self.reserve.get(metric, 0.0)
+
     def limit(self, metric: str) -> float | None:
-        """Return the largest value that is allowed of a metric; None where nothing bounds it from above."""
+        """Return the largest value that is allowed of a metric on the plants; None where nothing bounds it."""
         limits = [item.limit for item in self.bounds if item.metric == metric and item.bound != "min"]
         return min(limits, default=None)
 
     def lines(self) -> list[str]:
         """Return each requirement as a line for people."""
         words = {"min": ">=", "max": "<=", "below": "<"}
-        return [f"{item.metric} {words[item.bound]} {item.limit:g}" for item in self.bounds]
+        lines = []
+        for item in self.bounds:
+            kept = self.reserve.get(item.metric, 0.0) if item.bound != "min" else 0.0
+            less = f" ({item.limit + kept:g} less a reserve of {kept:g})" if kept else ""
+            lines.append(f"{item.metric} {words[item.bound]} {item.limit:g}{less}")
+        return lines
 
 
 def read_tune_requirements(
@@ -68,7 +81,7 @@ def read_tune_requirements(
     if path is None:
         return make_tune_requirements({}, robot=robot, stepping=stepping)
     try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        table = tomllib.loads(settings_text(path))
     except (ValueError, RecursionError) as error:
         raise FileFormatError(f"{path}: is not valid TOML ({error}).") from error
     except OSError as error:
@@ -99,13 +112,13 @@ def make_tune_requirements(
         for key in dict.fromkeys((*usual, *table)) if key != "version"
     }  # fmt: skip
     track = _numbers(merged.pop("track", {}), defaults["track"])
-    require = dict(merged.get("require", {}))
+    require, reserve = _kept_back(dict(merged.get("require", {})), merged.pop("reserve", {}))
     extra = tuple(
         bound for metric in [*require] if metric.startswith("track.") for bound in _bounds(metric, require.pop(metric))
     )
     certificate = make_requirements({**merged, "require": require}, robot=whose)
     return TuneRequirements(
-        certificate=certificate, track=track, bounds=(*certificate.bounds, *extra),
+        certificate=certificate, track=track, bounds=(*certificate.bounds, *extra), reserve=reserve,
         table={"version": VERSION, **merged, "require": require},
     )  # fmt: skip
 
@@ -121,7 +134,33 @@ def _for_linear(defaults: Mapping[str, Any]) -> dict[str, Any]:
                if name.startswith("neck.")}  # fmt: skip
     tracked = {name: limit for name, limit in defaults["require"].items() if name.startswith("track.")}
     # Presets are foreign plants, which decide nothing and take half a minute.
-    return {**defaults, "neck": {**defaults["neck"], "necks": 0}, "require": {**require, **tracked}}
+    return {**defaults, "reserve": {}, "neck": {**defaults["neck"], "necks": 0}, "require": {**require, **tracked}}
+
+
+def _kept_back(require: dict[str, Any], reserve: Any) -> tuple[dict[str, Any], dict[str, float]]:
+    """Return the requirements less their reserve, and the reserve of those that are asked."""
+    if not isinstance(reserve, Mapping):
+        raise SettingsError("`reserve` must be a table: [reserve].")
+    kept: dict[str, float] = {}
+    for metric, value in reserve.items():
+        if not metric.startswith(("neck.", "track.")):
+            raise SettingsError(f"[reserve] is of loops over plants that step, `neck.*` and `track.*`; got `{metric}`.")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value < math.inf:
+            raise SettingsError(f"the reserve of `{metric}` must be a number from 0 on; got {value!r}.")
+        entry = require.get(metric)
+        if not isinstance(entry, Mapping):
+            continue  # nothing is asked of it, or what is asked is refused below
+        limit = entry.get("max")
+        if isinstance(limit, bool) or not isinstance(limit, int | float) or value == 0.0:
+            continue
+        if limit - value <= 0.0:
+            raise SettingsError(
+                f"`{metric}` <= {limit:g} leaves nothing beside its reserve of {value:g}; ask for more, or state "
+                f"another one ([reserve])."
+            )
+        require[metric] = {**entry, "max": round(limit - value, 9)}
+        kept[metric] = float(value)
+    return require, kept
 
 
 def _numbers(given: Any, defaults: Mapping[str, float]) -> dict[str, float]:

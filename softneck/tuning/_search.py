@@ -28,8 +28,8 @@ from ._task import Task
 
 # Candidates of a kind in each round: CMA-ES' own 4 + 3 ln n for two to four settings, and even.
 _GENERATION = 6
-# The first step of the search, as a part of each range.
-_STEP = 0.25
+#: The first step of the search, as a part of each range.
+STEP = 0.25
 # Kinds that are never left out, and candidates whose margins are found by experiment at the end.
 _LEAST_KINDS, _FINALS = 2, 3
 # What of a candidate without linear form is not certified beside recordings counts as so far beyond its limit.
@@ -125,6 +125,7 @@ class Search:
         log: what has been judged.
         budget: of judgements.
         report: called with the part done and the best so far.
+        finals: so many of the best have their margins found by experiment at the end.
     """
 
     task: Task
@@ -133,6 +134,7 @@ class Search:
     log: Log
     budget: int
     report: Progress
+    finals: int = _FINALS
     candidates: dict[tuple[str, str], Candidate] = field(default_factory=dict)
     spent: set[Job] = field(default_factory=set)
     dropped: dict[str, str] = field(default_factory=dict)
@@ -141,8 +143,9 @@ class Search:
         """Search until the budget is spent."""
         optimisers = {space.kind: _optimiser(space, self.task.seed, i) for i, space in enumerate(self.spaces)}
         # Only what steps has margins by experiment.
-        finals = _FINALS if self.task.own else 0
         levels = LEVELS[: 3 if self.task.own else 1]
+        # A small budget is for the starts first.
+        finals = min(self.finals, max(0, self.budget - len(levels) * len(self.spaces))) if self.task.own else 0
         alive, before = self._begun(levels, finals), -1
         while self._left(finals) > 0 and alive and before < len(self.spent):
             before = len(self.spent)
@@ -155,7 +158,9 @@ class Search:
                 _tell(optimisers[space.kind], generation[space.kind], self._key)
             alive = self._halved(alive)
         if finals:
-            self._judge(self.ranked()[:finals], "margins", 0)
+            # Of what breaks a requirement already margins say only how the best one stands.
+            best = self.ranked()[:finals]
+            self._judge([item for item in best if self.cost(item) <= 1.0] or best[:1], "margins", 0)
 
     def ranked(self) -> list[Candidate]:
         """Return all candidates that have metrics, the best first."""
@@ -287,7 +292,7 @@ def _optimiser(space: Space, seed: int, number: int) -> Any:
 
     n = len(space.dimensions)
     return CMA(
-        mean=space.start, sigma=_STEP, bounds=np.array([[0.0, 1.0]] * n), population_size=_GENERATION,
+        mean=space.start, sigma=STEP, bounds=np.array([[0.0, 1.0]] * n), population_size=_GENERATION,
         seed=(1000 * seed + number) % 2**32,
     )  # fmt: skip
 

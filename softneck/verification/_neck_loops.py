@@ -83,7 +83,8 @@ def neck_file_of(robot: Robot, asked: Requirements) -> Path:
 
 def direction(orientation: float, robot: Robot) -> tuple[float, ...]:
     """Return the share of each output in a step of an orientation [rad]."""
-    return (math.cos(orientation), math.sin(orientation))[: len(robot.outputs.names)]
+    outputs = len(robot.outputs.names)
+    return (math.cos(orientation), math.sin(orientation), *[0.0] * (outputs - 2))[:outputs]
 
 
 def step_at(controller: Block) -> float:
@@ -184,14 +185,22 @@ def _loop(
     )
 
 
-def judge_loop(loop: Loop, *, compiled: bool = False) -> tuple[dict[str, float], LoopResult | None]:
-    """Return the metrics of a step, the worse axis and the motors, and the signals; all inf and None if it broke."""
+def judge_loop(
+    loop: Loop, *, compiled: bool = False, angle: str = "true"
+) -> tuple[dict[str, float], LoopResult | None]:
+    """Return the metrics of a step, the worse axis and the motors, and the signals; all inf and None if it broke.
+
+    Args:
+        loop: that is run.
+        compiled: as one function where all parts are blocks.
+        angle: "true", or "measured" as the sensor tells.
+    """
     try:
         result = run_loop(loop, compiled=compiled)
     except DataError:
         # Numbers overflowed: the loop is not stable, whatever its margins say.
         return dict.fromkeys((*_AXIS, *_MOTORS), math.inf), None
-    table, robot = metrics(result), result.robot
+    table, robot = metrics(result, angle=angle), result.robot
     names = metric_ends(robot)
     sizes = {axis: float(np.abs(result[f"{axis}_reference"]).max()) for axis in robot.outputs.names}
     stepped = [axis for axis, size in sizes.items() if size > _SMALL * max(sizes.values())]

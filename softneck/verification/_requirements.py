@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import FileFormatError, SettingsError, require_between, require_whole, to_si
+from softneck.core._budget import settings_text
 from softneck.core._shown import Shown
 from softneck.loop._result import shown_unit
 from softneck.robot import Robot
@@ -218,13 +219,12 @@ def make_requirements(table: Mapping[str, Any], *, robot: Robot = _NECK) -> Requ
 
 def _read(source: Path) -> dict[str, Any]:
     try:
-        table = tomllib.loads(source.read_text(encoding="utf-8"))
+        table = tomllib.loads(settings_text(source))
     except (ValueError, RecursionError) as error:
         raise FileFormatError(f"{source}: is not valid TOML ({error}).") from error
     except OSError as error:
-        raise FileFormatError(
-            f"{source}: cannot be read ({error.strerror}); name a requirements file (.toml)."
-        ) from error
+        hint = "name a requirements file (.toml)."
+        raise FileFormatError(f"{source}: cannot be read ({error.strerror}); {hint}") from error
     if table.get("version") != VERSION:
         raise FileFormatError(
             f"{source}: must say `version = {VERSION}`, the form of requirements that this softneck reads; "

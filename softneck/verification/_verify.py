@@ -199,7 +199,7 @@ class Verification(Shown):
         return files
 
 
-def _standing_for(thing: Any, robot: Robot) -> Any:
+def standing_for(thing: Any, robot: Robot) -> Any:
     """Return a plant of one's own, a neck's physics as those of the robot that it stands for."""
     return VirtualNeck.of(robot, thing) if isinstance(thing, NeckParameters) and not robot.is_neck else thing
 
@@ -270,7 +270,7 @@ def verify(
     own_words = isinstance(requirements, Requirements)
     asked = requirements.of_robot(robot) if own_words else read_requirements(requirements, robot=robot)
     own = {name: thing for name, thing in named.items() if is_own_plant(thing)}
-    own = {name: _standing_for(thing, robot) for name, thing in own.items()}
+    own = {name: standing_for(thing, robot) for name, thing in own.items()}
     linear = {name: thing for name, thing in named.items() if name not in own}
     if not robot.is_neck:
         asked = scaled(asked, sources_of(linear, asked))

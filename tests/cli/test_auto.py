@@ -34,7 +34,7 @@ def test_auto_ranks_explains_and_saves(call: Call, recording: Path) -> None:
 
 
 @pytest.mark.slow
-def test_auto_saves_the_best_linear_model_beside_one_that_design_would_refuse(
+def test_auto_saves_the_best_of_the_other_sort_beside_its_choice(
     call: Call, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(_auto, "ALIKE", 1e-9)  # the better one is taken, however little better
@@ -43,17 +43,21 @@ def test_auto_saves_the_best_linear_model_beside_one_that_design_would_refuse(
     assert said.code == 0, said.err
     facts = json.loads(said.out)
     assert (facts["chosen"], facts["linear_model"]) == ("play", "best_linear.npz")
+    assert facts["nonlinear_model"] is None
     assert load("best_linear.npz").kind == "rls"
     assert call("design", "pi", "best.npz", "-o", "a.npz").code == 2
     assert call("design", "pi", "best_linear.npz", "-o", "pi.npz").code == 0
     assert call("observer", "best_linear.npz", "-o", "obs.npz").code == 0
-    # Nothing is replaced, and a chosen linear model needs no other.
+    # Nothing is replaced without --force; with it what another choice left beside it goes.
     Path("best.npz").unlink()
     assert "best_linear.npz: exists already" in call("identify", "auto", recording, "-o", "best.npz").error
     monkeypatch.setattr(_auto.KindTrial, "fit", property(lambda one: {"play": 80.0, "rls": 90.0}[one.kind]))
-    said = call("identify", "auto", recording, "-o", "other.npz", "--json")
-    assert json.loads(said.out)["linear_model"] is None
-    assert not Path("other_linear.npz").exists()
+    said = call("identify", "auto", recording, "-o", "best.npz", "--json", "--force")
+    facts = json.loads(said.out)
+    assert (facts["chosen"], facts["nonlinear_model"], facts["linear_model"]) == ("rls", "best_nonlinear.npz", None)
+    assert load("best_nonlinear.npz").kind == "play"
+    assert load("best_nonlinear.npz").findings["hold_out"]["rows"] > 0, "it was judged as the chosen one was"
+    assert not Path("best_linear.npz").exists()
 
 
 def test_auto_ends_with_exit_code_1_where_no_kind_makes_a_model(

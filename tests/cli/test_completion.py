@@ -21,7 +21,7 @@ from .conftest import Call
         (("desing",), "softneck: no such command `desing`; did you mean `design`?"),
         (("robot", "chek"), "softneck: no such command `chek`; did you mean `check`?"),
         (("drives", "recrod"), "softneck: no such command `recrod`; did you mean `record`?"),
-        (("xyzzy",), "softneck: no such command `xyzzy`; the commands are demo, doctor, "),
+        (("xyzzy",), "softneck: no such command `xyzzy`; the commands are start, demo, "),
         (("identify", "nnn", "a.csv"), "softneck: unknown kind of model `nnn`; did you mean `nn`? use one of rls, "),
         (
             ("design", "hif", "a.npz"),

@@ -9,6 +9,7 @@ import pytest
 from softneck.cli.drives._target import require_armed, sensor_of, words
 from softneck.core import SettingsError
 from softneck.drives import load_drives
+from softneck.drives.supervision._baseline import load_baseline
 from softneck.signals import read_recording
 
 from ..data import ROOT
@@ -81,3 +82,28 @@ def test_a_recording_is_no_sensor_for_real_drives(tmp_path):
     file = load_drives(tmp_path / "drives.toml")
     with pytest.raises(SettingsError, match="for simulated drives; on socketcan:can0"):
         sensor_of(file, "socketcan:can0")
+
+
+@pytest.mark.slow
+def test_a_baseline_is_of_this_experiment_and_those_beside_it(call: Call) -> None:
+    """Two payloads: what the supervisor compares with is of both, and is the same whenever it is asked for."""
+    first = ("drives", "record", "aprbs", "--simulated", "--duration", 25, "--max-position", 1.5)
+    assert call(*first, "-o", "a.csv", "--log", "a.mcap").code == 0
+    second = (*first, "--payload", 0.5, "--no-log")
+    assert call(*second, "-o", "b.csv", "--supervision", "b.json", "--beside", "a.mcap").code == 0
+    assert call(*second, "-o", "c.csv", "--supervision", "c.json", "--beside", "a.mcap").code == 0
+    told = load_baseline("b.json")
+    assert told == load_baseline("c.json")
+    # Each run of 25 s, and a moment before and after it.
+    assert 50.0 < told.seconds < 56.0
+    said = call(*second, "-o", "d.csv", "--supervision", "d.json")
+    assert said.code == 2
+    assert "too few to compare with" in said.error
+
+
+def test_beside_is_refused_before_anything_moves(call: Call) -> None:
+    record = ("drives", "record", "aprbs", "--simulated", "-o", "a.csv", "--no-log", "--beside", "a.mcap")
+    said = call(*record)
+    assert (said.code, "needs --supervision" in said.error) == (2, True)
+    said = call(*record, "--supervision", "b.json")
+    assert (said.code, "a.mcap" in said.error) == (2, True)

@@ -120,7 +120,7 @@ def test_a_preview_shows_doubts_first_and_what_was_made(call: Call, tmp_path: Pa
     facts = json.loads(said.out)
     assert facts["html"] == "p.html"
     (doubt,) = facts["doubts"]
-    assert (doubt["about"], doubt["channels"], doubt["choices"]) == ("sign of roll", ["roll"], ["turn it round"])
+    assert (doubt["about"], doubt["channels"], doubt["choices"]) == ("sign of roll", ["roll"], ["as logged"])
     assert 0.0 < doubt["confidence"] < 0.9
     page = (tmp_path / "p.html").read_text()
     order = [page.index(word) for word in ("<h2>Doubts", "sign of roll", "<h2>What was made", "<h2>Raw and made",

@@ -5,6 +5,9 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +16,7 @@ import pytest
 from softneck.core import OutputFileError, atomic_write, file_hash, refuse_existing, write_archive
 from softneck.signals import Recording, write_recording
 
-from ..data import neck_recording
+from ..data import ROOT, neck_recording
 
 
 def test_the_file_appears_only_when_it_is_whole(tmp_path: Path) -> None:
@@ -72,7 +75,7 @@ def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.M
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     # The last thing every writer does before its file is renamed.
-    monkeypatch.setattr(Path, "chmod", full)
+    monkeypatch.setattr(os, "fsync", full)
     target = tmp_path / f"a{suffix}"
     with pytest.raises(OutputFileError, match=r"No space left on device\. Nothing was left behind"):
         _write(target, neck_recording(120))
@@ -97,7 +100,7 @@ def test_a_new_file_obeys_the_umask(tmp_path: Path) -> None:
     try:
         with atomic_write(tmp_path / "a") as temporary:
             temporary.write_text("")
-        # mkstemp's own mode, 0600, would hide the file from the user's group.
+        # A mode of 0600 would hide the file from the user's group.
         assert (tmp_path / "a").stat().st_mode & 0o777 == 0o640
     finally:
         os.umask(before)
@@ -106,3 +109,98 @@ def test_a_new_file_obeys_the_umask(tmp_path: Path) -> None:
 def test_the_hash_is_that_of_the_content(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"neck")
     assert file_hash(tmp_path / "a") == hashlib.sha256(b"neck").hexdigest()
+
+
+def test_no_other_thread_ever_sees_another_umask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The umask is one for the process: a thread that makes a file meanwhile would make it for everybody."""
+    monkeypatch.setattr(os, "umask", lambda _mask: pytest.fail("the umask was changed"))
+    with atomic_write(tmp_path / "a") as temporary:
+        temporary.write_text("")
+
+
+def test_file_and_folder_are_on_the_disk_before_and_after_the_name_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[str, str]] = []
+    sync = os.fsync
+
+    def noted(descriptor: int) -> None:
+        target = tmp_path / "a"
+        seen.append(
+            (str(Path(f"/proc/self/fd/{descriptor}").readlink()), target.read_text() if target.exists() else "absent")
+        )
+        sync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", noted)
+    with atomic_write(tmp_path / "a") as temporary:
+        temporary.write_text("whole")
+    assert seen == [(str(temporary), "absent"), (str(tmp_path), "whole")]
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_a_link_is_followed_and_stays(tmp_path: Path, there: bool) -> None:
+    (tmp_path / "far").mkdir()
+    real, link = tmp_path / "far" / "real.txt", tmp_path / "link.txt"
+    link.symlink_to("far/real.txt")
+    if there:
+        real.write_text("old")
+        with pytest.raises(OutputFileError, match=r"link\.txt: exists already"), atomic_write(link):
+            pytest.fail("the body must not run")
+    with atomic_write(link, force=there) as temporary:
+        assert temporary.parent == real.parent, "renaming is atomic within one folder only"
+        temporary.write_text("new")
+    assert link.is_symlink()
+    assert (real.read_text(), real.is_symlink()) == ("new", False)
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["far", "link.txt", "real.txt"]
+
+
+def test_links_in_a_circle_and_to_folders_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    with pytest.raises(OutputFileError, match=r"a: cannot be written"), atomic_write(tmp_path / "a", force=True):
+        pytest.fail("the body must not run")
+    (tmp_path / "folder").symlink_to(tmp_path)
+    with pytest.raises(OutputFileError, match="is a folder; name a file"), atomic_write(tmp_path / "folder"):
+        pytest.fail("the body must not run")
+
+
+_KILLED = """
+import os, signal, sys
+from softneck.core import atomic_write
+with atomic_write(sys.argv[1], force=True) as temporary:
+    temporary.write_text("half a fi")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_what_a_killed_process_left_is_swept_by_the_next_write_and_nothing_else_is(tmp_path: Path) -> None:
+    target = tmp_path / "model.npz"
+    target.write_text("old")
+    for _ in range(2):
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        done = subprocess.run([sys.executable, "-c", _KILLED, target], env=environment, check=False)
+        assert done.returncode == -signal.SIGKILL
+        # The target is as it was; the second process swept what the first one left.
+        assert target.read_text() == "old"
+        assert len(list(tmp_path.iterdir())) == 2
+    (tmp_path / ".hidden-softneck.npz").write_text("somebody's")
+    with atomic_write(tmp_path / "one") as one:
+        one.write_text("still at work")
+        with atomic_write(tmp_path / "two") as two:  # a file of any other name in that folder
+            two.write_text("")
+        assert one.read_text() == "still at work"
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".hidden-softneck.npz", "model.npz", "one", "two"]
+
+
+def test_many_processes_may_write_one_file_at_once(tmp_path: Path) -> None:
+    """Each sweeps while the others begin: none loses its temporary file, and the last whole one stands."""
+    code = (
+        "import sys; from softneck.core import atomic_write\n"
+        "for k in range(60):\n"
+        "    with atomic_write(sys.argv[1], force=True) as t: t.write_text(sys.argv[2] * 1000)\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    runs = [subprocess.Popen([sys.executable, "-c", code, tmp_path / "a", letter], env=environment) for letter in "xyz"]
+    assert [run.wait() for run in runs] == [0, 0, 0]
+    assert (tmp_path / "a").read_text() in {letter * 1000 for letter in "xyz"}
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]

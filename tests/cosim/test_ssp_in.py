@@ -227,6 +227,12 @@ STRING = """<ssd:ParameterBindings><ssd:ParameterBinding><ssd:ParameterValues><s
 UNIT = '<ssd:Connectors><ssd:Connector name="u1" kind="input"><ssc:Real unit="{}"/></ssd:Connector></ssd:Connectors>'
 DEEP, FLAT = '<ssd:System name="x"><ssd:Elements>', "</ssd:Elements></ssd:System>"
 BASE = '<ssd:Units><ssc:Unit name="q"><ssc:BaseUnit m="{}" factor="{}"/></ssc:Unit></ssd:Units>'
+# A system that passes on what it is given, fed by itself: no FMU is in the circle.
+PASSES = """<ssd:System name="x"><ssd:Connectors><ssd:Connector name="a" kind="input"><ssc:Real/></ssd:Connector>
+<ssd:Connector name="b" kind="output"><ssc:Real/></ssd:Connector></ssd:Connectors>
+<ssd:Connections><ssd:Connection startConnector="a" endConnector="b"/></ssd:Connections></ssd:System>"""
+CIRCLE = """<ssd:Connection startElement="x" startConnector="b" endElement="x" endConnector="a"/>
+<ssd:Connection startElement="x" startConnector="b" endElement="a" endConnector="u1"/>"""
 BOMB = '<!DOCTYPE x [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;">]><x>&b;</x>'
 
 
@@ -243,6 +249,7 @@ BOMB = '<!DOCTYPE x [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;">]><x>&b;</x>'
         (ssd(COMPONENT.format(""), LINK.format("alpha", "u9")), "`a.u9`, which is not there"),
         (ssd(COMPONENT.format(""), LINK.format("alpha", "u1") * 2), "`a.u1` has two writers"),
         (ssd(COMPONENT.format(""), LINK.format("u2", "u1")), "`a.u2` to `a.u1`"),
+        (ssd(COMPONENT.format("") + PASSES, CIRCLE), "connects `x.b` to itself"),
         (ssd(COMPONENT.format(UNIT.format("parsec")), LINK.format("alpha", "u1")), "unknown unit `parsec`"),
         (ssd(COMPONENT.format(UNIT.format("kg")), LINK.format("alpha", "u1")), "these units do not fit"),
         (ssd(COMPONENT.format(STRING), ""), "Enumeration `x`"),
@@ -283,6 +290,27 @@ def test_an_archive_that_reaches_out_of_itself(foreign: Path, tmp_path: Path) ->
 def test_only_loops_are_loops(foreign: Path, tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="is no closed loop"):
         load_loop(archive(tmp_path, foreign, ssd()))
+
+
+FAULT = '[[fault]]\nkind = "sensor_freeze"\nstart_s = 1.5\nduration_s = 0.5\n'
+
+
+def test_faults_and_limits_over_an_archive(loop_file: Path, tmp_path: Path) -> None:
+    plain = write_ssp(load_loop(loop_file), tmp_path / "Loop.ssp", compiled=False)
+    beside = tmp_path / "faulty.toml"
+    beside.write_text(f'ssp = "Loop.ssp"\n[limits]\n"pitch.overshoot_pct" = 1e-6\n{FAULT}')
+    # As if the fault stood in the loop's own file; archives are Jacobi.
+    loop_file.write_text(f'order = "jacobi"\n{loop_file.read_text()}\n{FAULT}')
+    setup = load_loop(beside)
+    assert set(setup.files) == {"loop", "ssp"}
+    np.testing.assert_array_equal(simulate(setup)["pitch"], simulate(load_loop(loop_file))["pitch"])
+    assert np.abs(simulate(setup)["pitch"] - simulate(plain)["pitch"]).max() > 1e-6, "the fault shows nowhere"
+    assert run(["simulate", str(beside), "-o", str(tmp_path / "out.csv")]) == 1
+    runs = study(beside, vary={"plant.parameters.payload": [0.0, 1.0]}, workers=1)
+    assert runs["holds"].tolist() == [False, False]
+    beside.write_text('ssp = "Loop.ssp"\n[plant]\nmodel = "nn.npz"\n')
+    with pytest.raises(SettingsError, match=r"unknown key `plant`.*ssp"):
+        load_loop(beside)
 
 
 def test_a_study_of_an_archive(loop_file: Path, tmp_path: Path) -> None:

@@ -40,15 +40,19 @@ def pair() -> tuple[MpcController, MpcController]:
     return settings.design(family), replace(settings, tightening=True).design(family)
 
 
-def worst(controller: MpcController, gain: float, seed: int) -> tuple[float, float]:
-    """Return by how much angles and tautness pass their limits [rad], steps and errors being random."""
+def worst(controller: MpcController, gain: float, seed: int, *, hold: int = 60, late: int = 0) -> tuple[float, float]:
+    """Return by how much angles and tautness pass their limits [rad], steps and errors being random.
+
+    Steps last `hold` samples, and the neck is `late` samples later than predicted.
+    """
     rng = np.random.default_rng(seed)
     neck = Neck(controller, gain=gain)
+    neck.line += [np.zeros(2)] * late
     lever = 6.93 * rt.MpcArrays(controller.arrays).T[:2].T
     bias, beyond, slack = 0.5 * BOUND * rng.choice([-1.0, 1.0], 2), -math.inf, -math.inf
     wanted, behind = np.zeros(2), [np.zeros(3)] * 5
-    for k in range(300):
-        if k % 60 == 0:
+    for k in range(5 * hold):
+        if k % hold == 0:
             wanted = rng.choice([-1.3 * LIMIT, -LIMIT, 0.0, LIMIT, 1.3 * LIMIT], 2)
         true = neck.y.copy()
         beyond = max(beyond, float(np.abs(true).max()) - LIMIT)
@@ -72,6 +76,17 @@ def neck_measured(neck: Neck) -> np.ndarray:
 def test_tightened_limits_hold_on_every_sample(pair: tuple[MpcController, MpcController], gain: float) -> None:
     for seed in range(4):
         beyond, slack = worst(pair[1], gain, seed)
+        assert beyond <= 0.0
+        assert slack <= 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gain", GAINS)
+def test_they_hold_a_sample_later_and_for_as_long_as_is_asked(
+    pair: tuple[MpcController, MpcController], gain: float
+) -> None:
+    for seed in range(2):
+        beyond, slack = worst(pair[1], gain, seed, hold=150, late=1)
         assert beyond <= 0.0
         assert slack <= 0.0
 

@@ -12,7 +12,11 @@ import pytest
 from softneck.core import KINDS, SettingsError, Vector, resolve
 from softneck.design.linear._rise import LAG, check_rise, filter_for_lag, least_rise
 from softneck.design.plants._step_and_load import StepAndLoad
+from softneck.design.plants._uncertain import uncertain_plant
 from softneck.estimation import LinearNeck, axis_plant
+from softneck.robot import Robot
+
+from .test_robots import plant as lag
 
 TS = 0.02
 # The kinds whose controller has a linear form.
@@ -123,6 +127,13 @@ def test_what_the_loop_cannot_give_is_refused_in_a_line() -> None:
 def test_two_settings_for_one_filter_are_refused(kind: str) -> None:
     with pytest.raises(SettingsError, match="not both"):
         resolve(KINDS[kind].settings)(rise_s=0.35, reference_time=0.1)
+
+
+@pytest.mark.parametrize("kind", ["pi", "scheduled", "adaptive"])
+def test_the_rise_of_another_robot_needs_no_filter_of_its_own(kind: str) -> None:
+    robot = Robot.preset("antagonist")
+    asked = resolve(KINDS[kind].settings)(rise_s=0.6).of_robot(uncertain_plant(lag(robot)))
+    assert asked.rise_s == 0.6
 
 
 def test_what_is_taken_from_the_papers_neck_is_said() -> None:

@@ -83,6 +83,7 @@ class Bench:
         self.link.send([nmt_frame(Command.START, 0)])
         self.link.drain()
         self.run = VirtualRun(self.link, self.master)
+        self.advance: Callable[[], None] = self.run.step
         self.jobs: list[tuple[float, Callable[[Bench], object]]] = []
         self.stopped_at: float | None = None
         self.drive_stopped_at: list[float | None] = [None] * count
@@ -116,7 +117,7 @@ class Bench:
             self.jobs.remove((time, job))
             job(self)
         time = self.now
-        self.run.step()
+        self.advance()
         if self.phase is Phase.RUNNING:
             self.widest = max(self.widest, *map(abs, self.master.setpoints))
         # What the master did in this cycle it did at its begin.

@@ -3,27 +3,29 @@
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from softneck.drives import default_drives
 from softneck.drives.commissioning._record import drive_limits
-from softneck.drives.master import Frame, MasterSettings, Phase
+from softneck.drives.master import Phase
 from softneck.drives.master._measured import Measurement
 from softneck.drives.simulated import SimulatedNeck
 from softneck.drives.simulated._servo_runtime import SERVO_POSITION, SERVO_SCALE, SERVO_ZERO
 from softneck.drives.supervision._baseline import Baseline, load_baseline
-from softneck.drives.supervision._calibrate import Motion, calibrate
+from softneck.drives.supervision._calibrate import calibrate
 from softneck.drives.supervision._log import MotionLog
+from softneck.drives.supervision._motor_models import Motion
 from softneck.plant import NeckParameters
 from softneck.signals import prepare, signal
 
 from .bench import TS, Bench, T
+from .direct import DirectBus, direct
 
 BASELINE = Path(__file__).with_name("paper.supervision.json")
 # What a commissioning run plays: name, length [s], seed, farthest [rad] and fastest [rad/s] set-points. None of them
@@ -34,6 +36,8 @@ COMMISSIONING = (
     ("aprbs", 60.0, 13, 1.5, 12.0),
     ("multisine", 60.0, 14, 6.0, 3.9),
 )
+# What the neck carries in it [kg].
+PAYLOADS = (0.0, 0.5)
 PATH = math.radians(3.0)
 
 # At rest before a loop moves, as after the ramp in of a real run [samples].
@@ -77,11 +81,19 @@ def baseline() -> Baseline:
     return load_baseline(BASELINE)
 
 
-def commissioned(neck: NeckParameters | None = None) -> Baseline:
-    """Play the commissioning run in virtual time and calibrate."""
+def commissioned(neck: NeckParameters | None = None, payloads: tuple[float, ...] = PAYLOADS) -> Baseline:
+    """Play the commissioning run in virtual time with each payload [kg] and calibrate."""
+    motions = [motion for payload in payloads for motion in experiments(neck, payload)]
+    return calibrate(motions, cycle=T, sample_cycles=2, slack=default_drives().limits.slack)
+
+
+def experiments(neck: NeckParameters | None, payload: float) -> list[Motion]:
+    """Play the commissioning run in virtual time."""
     motions: list[Motion] = []
     for name, seconds, seed, position, speed in COMMISSIONING:
-        bench = Bench(neck=neck, seed=seed).start()
+        bench = Bench(neck=neck, seed=seed)
+        bench.neck.set(payload=payload)
+        direct(bench.start())
         log = MotionLog()
         bench.run.watches = (log,)
         bench.pilot.wanted = (0.0, 0.0, 0.0)
@@ -93,23 +105,28 @@ def commissioned(neck: NeckParameters | None = None) -> Baseline:
         bench.pass_time(seconds)
         assert bench.phase is Phase.RUNNING, bench.master.supervisor.fault
         motions.append(log.motion())
-    return calibrate(motions, cycle=T, sample_cycles=2, slack=default_drives().limits.slack)
+    return motions
 
 
 def watched(
-    seed: int, kind: str, payload: float = 0.0, *, off: frozenset[str] = frozenset(), gyro: bool = True
+    seed: int,
+    kind: str,
+    payload: float = 0.0,
+    *,
+    off: frozenset[str] = frozenset(),
+    gyro: bool = True,
+    judged: Baseline | None = None,
+    framed: bool = False,
 ) -> Bench:
-    """Return a bench whose master compares with the baseline, two seconds after its run began."""
-
-    def with_baseline(settings: MasterSettings) -> MasterSettings:
-        return replace(settings, baseline=baseline())
-
-    bench = Bench(seed=seed, change=with_baseline, off=off)
+    """Return a bench whose master compares with `judged`, where there is one, when its run has begun."""
+    bench = Bench(seed=seed, change=lambda settings: replace(settings, baseline=judged), off=off)
     bench.neck.set(payload=payload)
     if not gyro:
         sampled(bench, lambda _, values, __: (values, (math.nan, math.nan)))
     bench.pilot.wanted = (0.0, 0.0, 0.0)
     bench.start()
+    if not framed:
+        direct(bench)
     # Under a load tendons hang earlier: open loops go less far, so as not to be stopped for it.
     bench.pilot.act = Tracker(seed, kind, 1.0 - 0.7 * payload)
     return bench
@@ -142,16 +159,10 @@ def slips(bench: Bench, by: float = 1.0) -> None:
 
 def misreads(bench: Bench, cycles: int = 10, by: float = 1.0) -> None:
     """Ten frames of motor 1 that say it is elsewhere."""
-    counts = round(by * bench.neck.motion[0, SERVO_SCALE])
-
-    def spoil(b: Bench) -> None:
-        for k, frame in enumerate(b.link._inbox):
-            if frame.identifier == 0x181:
-                word, position, current = struct.unpack("<Hih", frame.data)
-                b.link._inbox[k] = Frame(0x181, struct.pack("<Hih", word, position + counts, current))
-
-    for k in range(cycles):
-        bench.at(bench.now + k * T, spoil)
+    bus = bench.master.bus
+    assert isinstance(bus, DirectBus)
+    bus.counts_off[0] = round(by * bench.neck.motion[0, SERVO_SCALE])
+    bench.at(bench.now + cycles * T, lambda _: bus.counts_off.__setitem__(0, 0))
 
 
 def peak_current(bench: Bench, factor: float) -> None:
@@ -221,6 +232,9 @@ def swapped(bench: Bench) -> None:
     sampled(bench, lambda _, v, r: (v[::-1], r[::-1]))
 
 
+# By the time it is found a gyro with 3 deg/s of noise in each sample has walked as far as half the drift.
+DRIFT = ("sensor_drift", "sensor_stuck", "tilt_unexplained")
+
 # The names behind the first are of what looks the same, see docs/theory/plausibility.md.
 ROWS: dict[str, Row] = {
     "motor jams": Row(lambda b: b.neck.block(1), ("motor_jammed",), ("position", 0.1)),
@@ -239,8 +253,8 @@ ROWS: dict[str, Row] = {
     "sensor 200 ms late": Row(late, ("sensor_late", "sensor_stuck"), BY_TILT),
     "sensor reversed": Row(reversed_, ("sensor_reversed",), BY_TILT, early=True),
     "sensor swapped": Row(swapped, ("sensor_swapped",), BY_TILT, early=True),
-    "bias +0.5 deg/s": Row(lambda b: drifts(b, 0.5 * DEG), ("sensor_drift", "sensor_stuck"), AT_ONCE, limit=4.0),
-    "bias -0.5 deg/s": Row(lambda b: drifts(b, -0.5 * DEG), ("sensor_drift", "sensor_stuck"), AT_ONCE, limit=4.0),
+    "bias +0.5 deg/s": Row(lambda b: drifts(b, 0.5 * DEG), DRIFT, AT_ONCE, limit=4.0),
+    "bias -0.5 deg/s": Row(lambda b: drifts(b, -0.5 * DEG), DRIFT, AT_ONCE, limit=4.0),
     "bias +0.5 deg/s, no gyro": Row(
         lambda b: drifts(b, 0.5 * DEG), ("tilt_unexplained", "sensor_stuck"), AT_ONCE, limit=4.0, gyro=False
     ),
@@ -263,51 +277,79 @@ class Outcome:
     excited: bool
 
 
+class Calm(NamedTuple):
+    """A run without any fault, cycle by cycle: what its master saw, and the true tilt [rad]."""
+
+    begin: float
+    positions: np.ndarray
+    tensions: np.ndarray
+    tilt: np.ndarray
+
+
+def kind_of(seed: int) -> str:
+    return ("step", "ramp", "open")[seed % 3]
+
+
+@lru_cache(maxsize=4)
+def calm_run(seed: int, payload: float, seconds: float) -> Calm:
+    bench = watched(seed, kind_of(seed), payload, judged=None)
+    begin, rows = bench.now, []
+    for _ in range(round(seconds / T)):
+        bench.step()
+        rows.append((bench.master.positions, bench.master.tensions, tuple(tilt_of(bench))))
+    return Calm(begin, *(np.array(column) for column in zip(*rows, strict=True)))
+
+
 def tilt_of(bench: Bench) -> np.ndarray:
-    truth = bench.neck.truth()
-    return np.array([truth["pitch"], truth["roll"]])
+    return bench.neck.outputs[:2]
 
 
 def play(
-    row: Row, seed: int, *, payload: float = 0.0, off: frozenset[str] = frozenset(), most: float = 12.0
+    row: Row,
+    seed: int,
+    *,
+    payload: float = 0.0,
+    off: frozenset[str] = frozenset(),
+    most: float = 12.0,
+    judged: Baseline | None = None,
 ) -> Outcome:
     """Break it at a time that `seed` chooses, beside the same run without the fault."""
-    rng = np.random.default_rng([seed, 77])
-    kind = ("step", "ramp", "open")[seed % 3]
-    begin = rng.uniform(3.0, 7.0)
-    both = []
-    for broken in (False, True):
-        bench = watched(seed, kind, payload, off=off, gyro=row.gyro)
-        if broken and row.early:
-            row.breaks(bench)
-        both.append(bench)
-    calm, bench = both
-    begin = bench.now if row.early else bench.now + begin
-    while bench.now < begin - 1e-9:
-        calm.step()
-        bench.step()
-    if not row.early:
+    begin = np.random.default_rng([seed, 77]).uniform(3.0, 7.0)
+    calm = calm_run(seed, payload, 7.0 + most)
+    bench = watched(seed, kind_of(seed), payload, off=off, gyro=row.gyro, judged=judged or baseline())
+    if row.early:
         row.breaks(bench)
-    what, by = row.excited
-    start = (np.array(calm.master.positions), tilt_of(calm))
-    since, beyond, pulls, pulled = None if what else bench.now, 0.0, 0, [calm.master.tensions[0]]
-    while bench.phase is Phase.RUNNING and bench.now < begin + most:
-        calm.step()
+        k = 0
+    else:
+        k = math.ceil(begin / T)
+        for _ in range(k):
+            bench.step()
+        row.breaks(bench)
+    first, last = k, k + round(most / T)
+    excited = _excited(row, calm, first)
+    beyond = 0.0
+    while bench.phase is Phase.RUNNING and k < last:
         bench.step()
-        pulled.append(calm.master.tensions[0])
-        pulls += abs(pulled[-1] - pulled[-min(4, len(pulled))]) > 0.25
-        beyond = max(beyond, float(np.hypot(*(tilt_of(bench) - tilt_of(calm)))))
-        if since is None:
-            moved = {
-                "position": abs(calm.master.positions[0] - start[0][0]),
-                "pulls": pulls,
-                "tilt": float(abs(tilt_of(calm)[0] - start[1][0])),
-            }[what]
-            since = bench.now if moved > by else None
+        beyond = max(beyond, float(np.hypot(*(tilt_of(bench) - calm.tilt[k]))))
+        k += 1
     fault = bench.master.supervisor.fault
-    return Outcome(
-        "" if fault is None else fault.name,
-        bench.now - T - (bench.now if since is None else since) if fault is not None else math.inf,
-        beyond,
-        since is not None,
-    )
+    if fault is None:
+        return Outcome("", math.inf, beyond, excited < last)
+    return Outcome(fault.name, (k - 1 - min(excited, k - 1)) * T, beyond, excited < k)
+
+
+def _excited(row: Row, calm: Calm, first: int) -> int:
+    """Return the cycle from which on the run without the fault excited it since `first`."""
+    what, by = row.excited
+    if not what:
+        return first
+    start = max(first - 1, 0)
+    if what == "pulls":
+        change = np.abs(calm.tensions[3:, 0] - calm.tensions[:-3, 0])
+        moved = np.cumsum(np.concatenate([np.zeros(3), change > 0.25]) * (np.arange(len(calm.tensions)) >= first))
+    elif what == "tilt":
+        moved = np.abs(calm.tilt[:, 0] - calm.tilt[start, 0])
+    else:
+        moved = np.abs(calm.positions[:, 0] - calm.positions[start, 0])
+    at = np.flatnonzero(moved[first:] > by)
+    return first + int(at[0]) if len(at) else len(moved)

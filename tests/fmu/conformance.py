@@ -1,10 +1,10 @@
 """Run every kind of FMU, of both backends, in every independent tool that is here: `make conformance`.
 
-    python -m tests.fmu.conformance [--out build/conformance.md] [KIND...]
+    python -m tests.fmu.conformance [--out build/conformance.md] [--add] [--backend B]... [KIND...]
 
 Tools that registries offer come with the dependency group `importers`; others are taken where PATH has them. One that
 is not here is "not run". What a tool computes is held against the block's own run; a checker is
-believed by its exit code.
+believed by its exit code. `--add` takes in the kinds of an earlier run with the same tools: some kinds at a time.
 Exit code 1 where anything fails.
 """
 
@@ -12,14 +12,16 @@ from __future__ import annotations
 
 import argparse
 import datetime
+import json
 import os
 import platform
 import shutil
 import subprocess
 import sys
+import sysconfig
 import tempfile
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -45,6 +47,11 @@ BACKENDS = ("python 2.0", "compiled 2.0", "compiled 3.0")
 ROWS = 40
 # Of the size of a signal: the library adds in another order than numpy, observers divide by small numbers.
 SAME = 1e-9
+# An FMU of the Python backend takes its interpreter from its host: one that is no Python is given one.
+PYTHON = {
+    "LD_PRELOAD": f"{sysconfig.get_config_var('LIBDIR')}/{sysconfig.get_config_var('LDLIBRARY')}",
+    "PYTHONPATH": os.pathsep.join(sys.path),
+}
 # What may be asked of a tool at most [s].
 _PATIENCE = 120.0
 
@@ -205,7 +212,9 @@ def on_path(command: str, *arguments: str) -> Callable[[Case], str]:
     def ask(case: Case) -> str:
         stop, step = repr(ROWS * case.block.sample_time), repr(case.block.sample_time)
         told = [text.format(stop=stop, step=step, fmu=case.path) for text in arguments]
-        done = ran([command, *told])
+        with zipfile.ZipFile(case.path) as archive:
+            alone = "resources/model.bin" in archive.namelist()
+        done = ran([command, *told], **({} if alone else PYTHON))
         return "" if done.returncode == 0 else last_line(done)
 
     return ask
@@ -229,8 +238,9 @@ def command_version(command: str, *arguments: str) -> Callable[[], str]:
     def found() -> str:
         if shutil.which(command) is None:
             return ""
-        lines = (ran([command, *arguments]).stdout or "").strip().splitlines()
-        return lines[0][:40] if lines else "version not said"
+        done = ran([command, *arguments])
+        lines = (done.stdout or done.stderr).strip().splitlines()
+        return lines[0][:60] if lines and not lines[0].startswith("Usage") else "version not said"
 
     return found
 
@@ -244,7 +254,7 @@ TOOLS = (
     Tool("ecos", packaged("ecospy"), ALL, importer("ecos")),
     Tool("pathsim-fmi", packaged("pathsim-fmi"), ALL, importer("pathsim")),
     Tool(
-        "fmusim", command_version("fmusim", "--help"), BACKENDS[1:],
+        "fmusim", command_version("fmusim", "--version"), BACKENDS[1:],
         on_path("fmusim", "--interface-type", "cs", "--stop-time", "{stop}", "{fmu}"),
     ),
     Tool(
@@ -272,26 +282,44 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("kinds", nargs="*", metavar="KIND", default=list(KINDS))
     parser.add_argument("--out", type=Path, default=Path("build/conformance.md"))
+    parser.add_argument("--add", action="store_true")
+    parser.add_argument("--backend", action="append", choices=BACKENDS)
     told = parser.parse_args()
     here = {tool.name: tool.found() for tool in TOOLS}
-    wrong: dict[tuple[str, str], list[str]] = {(tool.name, backend): [] for tool in TOOLS for backend in BACKENDS}
+    found = earlier(told.out.with_suffix(".json"), here) if told.add else {}
     with tempfile.TemporaryDirectory() as name:
         for kind in told.kinds:
-            for backend in BACKENDS:
+            said = {}
+            for backend in told.backend or BACKENDS:
                 made = case(kind, backend, Path(name))
-                for tool in TOOLS:
-                    if here[tool.name] and backend in tool.backends:
-                        said = asked(tool, made)
-                        wrong[tool.name, backend] += [f"{kind}: {said}"] if said else []
+                asks = [tool for tool in TOOLS if here[tool.name] and backend in tool.backends]
+                said |= {f"{tool.name}, {backend}": asked(tool, made) for tool in asks}
                 print(f"{kind}, {backend}", file=sys.stderr, flush=True)
-    text = table(here, wrong, told.kinds)
-    told.out.parent.mkdir(parents=True, exist_ok=True)
+            found[kind] = {place: one for place, one in said.items() if one}
+            told.out.parent.mkdir(parents=True, exist_ok=True)
+            told.out.with_suffix(".json").write_text(json.dumps({"tools": here, "found": found}), encoding="utf-8")
+    wrong: dict[tuple[str, str], list[str]] = {(tool.name, backend): [] for tool in TOOLS for backend in BACKENDS}
+    for kind, places in found.items():
+        for (tool, backend), many in wrong.items():
+            many += [f"{kind}: {places[place]}"] if (place := f"{tool}, {backend}") in places else []
+    text = table(here, wrong, list(found), told.backend or BACKENDS)
     told.out.write_text(text, encoding="utf-8")
     print(text)
     return int(any(wrong.values()))
 
 
-def table(here: dict[str, str], wrong: dict[tuple[str, str], list[str]], kinds: list[str]) -> str:
+def earlier(path: Path, here: dict[str, str]) -> dict[str, dict[str, str]]:
+    """Return what a run with the same tools found: kind -> tool and backend -> what is wrong."""
+    kept = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    return kept["found"] if kept.get("tools") == here else {}
+
+
+def table(
+    here: dict[str, str],
+    wrong: dict[tuple[str, str], list[str]],
+    kinds: list[str],
+    backends: Sequence[str] = BACKENDS,
+) -> str:
     """Return the table, and below what failed."""
     today = datetime.datetime.now(tz=datetime.UTC).date()
     lines = [f"{len(kinds)} kinds, {today}, {platform.system()} {platform.machine()}: {', '.join(kinds)}.", ""]
@@ -300,7 +328,7 @@ def table(here: dict[str, str], wrong: dict[tuple[str, str], list[str]], kinds: 
         cells = []
         for backend in BACKENDS:
             good = len(kinds) - len(wrong[tool.name, backend])
-            shown = f"{good} of {len(kinds)}" if here[tool.name] else "not run"
+            shown = f"{good} of {len(kinds)}" if here[tool.name] and backend in backends else "not run"
             cells.append(shown if backend in tool.backends else "-")
         lines.append(f"| {tool.name} | {here[tool.name] or '-'} | {' | '.join(cells)} |")
     failed = [f"- {tool}, {backend}: {one}" for (tool, backend), many in wrong.items() for one in many]

@@ -23,6 +23,7 @@ from softneck.design import (
     ScheduledSettings,
 )
 from softneck.estimation import KalmanSettings, LinearNeck
+from softneck.estimation.changes._settings import ChangeSettings
 from softneck.fmu.describe._modelled_drives import with_modelled_drives
 from softneck.identification import (
     GreyBox,
@@ -43,6 +44,8 @@ from softneck.identification.uncertainty._guarded_base import Base
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import Block, load_runtime
 from softneck.signals import Recording, redefine, signal
+
+from ..data import neck_recording
 
 TS = 0.02
 ROWS = 400
@@ -160,6 +163,10 @@ def _nonlinear() -> Block:
 
 def _payload_observer() -> Block:
     return KalmanSettings().design(_loaded_greybox_model()).block()
+
+
+def _change() -> Block:
+    return ChangeSettings().design(Rls().fit(recording()), neck_recording(4000, seed=9)).block()
 
 
 def _pi() -> Block:
@@ -282,6 +289,12 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
         [*MOTORS, "pitch_measured", "roll_measured", "measurement_valid"],
         ["pitch", "roll", "pitch_rate", "roll_rate", "innovation", "healthy", "payload"],
         ("measurement_noise_std", "rest_noise_std", "motion_noise_ratio"),
+    ),
+    "change": (
+        _change,
+        [*MOTORS, "pitch_measured", "roll_measured", "measurement_valid"],
+        ["changed", "since_s", "fit"],
+        (),
     ),
     "mpc": (
         _mpc,

@@ -6,7 +6,7 @@ tolerances: each seed is another specimen, 0 the nominal one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 
 import numpy as np
@@ -94,19 +94,29 @@ def record(
         warm: how long it has been moved before [s], by slow circles; 0 begins cold.
     """
     P: Matrix = np.asarray(excitation.set_points, dtype=np.float64)
-    block = neck.block(noise_seed=seed, sample_time=excitation.sample_time)
+    found = record_under(P, neck, np.full(len(P), payload), seed=seed, warm=warm, sample_time=excitation.sample_time)
+    return replace(found, time=excitation.time)
+
+
+def record_under(
+    P: Matrix, neck: ForeignNeck, payload: Vector, *, seed: int = 0, warm: float = 0.0, sample_time: float = 0.02
+) -> Recording:
+    """Run set-points `P` (time, 3) under a payload (time,) that changes on the way; otherwise as `record`."""
+    block = neck.block(noise_seed=seed, sample_time=sample_time)
     before = np.vstack([_circles(warm, block.sample_time), _rise(block.sample_time) * P[0]])
     U = np.zeros((len(before) + len(P) - 1, len(block.inputs)))
-    U[:, :3], U[:, 3] = np.vstack([before, P[:-1]]), payload
+    U[:, :3], U[:, 3] = np.vstack([before, P[:-1]]), np.concatenate([np.full(len(before), payload[0]), payload[:-1]])
     # Row k is what is measured at t_k, before its set-points act.
     Y = block.run(block.initial_state(), U)[1][len(before) - 1 :]
     rows = dict(zip([port.name for port in block.outputs], Y.T, strict=True))
     kept = [f"{what}_{j}" for what in ("motor_position", "tension") for j in (1, 2, 3)] + ["compression"]
     channels = {name: rows[output].copy() for name, output in _OWN_CHANNELS.items()}
     channels |= {name: rows[name].copy() for name in kept}
-    if payload > 0.0:
-        channels["payload"] = np.full(len(P), payload)
-    return Recording(excitation.time, excitation.sample_time, {**dict(zip(SET_POINTS, P.T, strict=True)), **channels})
+    if payload.any():
+        channels["payload"] = payload.astype(float)
+    return Recording(
+        sample_time * np.arange(len(P)), sample_time, {**dict(zip(SET_POINTS, P.T, strict=True)), **channels}
+    )
 
 
 def _circles(length: float, sample_time: float) -> Matrix:

@@ -155,7 +155,7 @@ def drive_run(seconds: float, command: float, pull: float, **changes: float) -> 
     c, dt = neck_drive(q), 2e-5
     x, rows = [0.0, 0.0, 0.0], []
     for _ in range(round(seconds / dt)):
-        acceleration, growth = drive_rates((x[0], x[1], x[2]), command, pull, c)
+        acceleration, growth = drive_rates((x[0], x[1], x[2]), command, pull, math.tanh(x[1] / c[9]), c)
         x = [x[0] + dt * x[1], x[1] + dt * acceleration, x[2] + dt * growth]
         rows.append(x[:2])
     return np.array(rows)

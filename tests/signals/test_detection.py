@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from softneck.core import DataError, SettingsError
-from softneck.signals.detection._cusum import Charts, shift_score, spread_score
+from softneck.signals.detection._charts_runtime import CHART_CLIP, chart_push, chart_shift, chart_spread
+from softneck.signals.detection._cusum import Charts, shift_score
 from softneck.signals.detection._threshold import Budget, thresholds, window_maxima
 from softneck.signals.detection._whitening import Filter, Whitening
 
@@ -57,7 +58,7 @@ def test_no_row_looks_back_across_a_border() -> None:
 def test_the_filter_that_runs_along_gives_what_the_whole_gives(a: list[float], seed: int) -> None:
     x = np.random.default_rng(seed).standard_normal(50)
     whitening = Whitening(tuple(a))
-    walk = Filter([whitening, Whitening((0.3,))], (2,))
+    walk = Filter([whitening, Whitening((0.3,))], 2)
     rows = np.array([walk.step(np.array([[v, 0.0], [2.0 * v, v]])) for v in x])
     # Rounding of sums in another order.
     np.testing.assert_allclose(rows[len(a) :, 0, 0], whitening.apply(x), atol=1e-12)
@@ -102,8 +103,8 @@ def test_a_fault_without_effect_says_nothing_and_one_sample_never_decides() -> N
 @pytest.mark.parametrize("ratio", [1.0 / 25.0, 25.0])
 def test_a_variance_is_told_from_another(ratio: float) -> None:
     rng = np.random.default_rng(4)
-    calm = np.mean([spread_score(e, 1.0, ratio) for e in rng.standard_normal(2000)])
-    other = np.mean([spread_score(e, 1.0, ratio) for e in np.sqrt(ratio) * rng.standard_normal(2000)])
+    calm = np.mean([chart_spread(e, 1.0, ratio) for e in rng.standard_normal(2000)])
+    other = np.mean([chart_spread(e, 1.0, ratio) for e in np.sqrt(ratio) * rng.standard_normal(2000)])
     assert calm < -0.5
     assert other > 0.5
 
@@ -181,3 +182,23 @@ def test_too_little_motion_is_refused_and_so_are_bad_settings() -> None:
         thresholds([np.full((3000, 1), np.nan)], Budget(), np.random.default_rng(0))
     with pytest.raises(SettingsError, match="rate"):
         Budget(rate=0.0)
+
+
+@given(e=st.floats(-50, 50), f=st.floats(-50, 50), v=st.floats(1e-3, 1e3), sight=st.floats(1.0, 9.0))
+def test_one_channel_after_the_other_scores_what_all_at_once_do(e: float, f: float, v: float, sight: float) -> None:
+    """The scalar code that charts run and the arrays of `shift_score`, of which it is the third of three channels."""
+    all_at_once = shift_score(np.array([0.0, 0.0, e]), np.array([[0.0, 0.0, f]]), np.full(3, v), sight=sight)
+    # Rounding of a dozen operations on numbers up to (CLIP + sight)^2.
+    assert chart_shift(e, f, v, sight) == pytest.approx(float(all_at_once[0]), abs=1e-11)
+
+
+def test_the_score_of_a_shift_is_bounded_and_no_shift_has_none() -> None:
+    assert chart_shift(3.0, 0.0, 1.0, CHART_CLIP) == 0.0
+    # Beyond the clip around the fault's mean an innovation tells no more: f (f + 5) - f^2 / 2.
+    assert chart_shift(1e9, 2.0, 1.0, CHART_CLIP) == pytest.approx(2.0 * 7.0 - 2.0)
+
+
+def test_what_is_pushed_comes_first_and_the_last_row_goes() -> None:
+    past = np.arange(6.0).reshape(3, 2)
+    chart_push(past, np.array([8.0, 9.0]))
+    np.testing.assert_array_equal(past, [[8.0, 9.0], [0.0, 1.0], [2.0, 3.0]])

@@ -115,15 +115,19 @@ def test_more_than_the_robot_s_range_is_told_or_refused(tmp_path: Path, scale: f
     assert any("the motors' range is 6 rad" in note for note in notes) == (code == "warned")
 
 
-def test_a_wrong_sign_is_doubted_and_can_be_turned_round(tmp_path: Path) -> None:
+def test_a_wrong_sign_is_turned_round_doubted_and_can_be_taken_as_logged(tmp_path: Path) -> None:
     path = log(tmp_path, motors=3.0, platform=20.0)
+    right = guess_layout(path)
     frame = pd.read_csv(path)
     frame["roll"] *= -1.0
     frame.to_csv(path, index=False)
     guess = guess_layout(path)
     (doubt,) = guess.doubts
-    assert (doubt.about, doubt.choices) == ("sign of roll", ("turn it round",))
-    assert guess.settled(doubt, "turn it round").layout.channels["roll"].sign == -1.0
+    assert (doubt.about, doubt.taken, doubt.choices) == ("sign of roll", "turned round", ("as logged",))
+    assert 0.5 < doubt.confidence < 0.9, "the likelier answer is taken, and asked about"
+    assert guess.layout.channels["roll"].sign == -1.0
+    assert guess.layout == parse_layout(guess.text)
+    assert guess.settled(doubt, "as logged").layout == right.layout
     assert guess.settled(doubt).layout == guess.layout
 
 

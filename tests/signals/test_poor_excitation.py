@@ -71,6 +71,17 @@ def test_what_motors_explain_is_what_is_left_of_the_variance_without_noise() -> 
     assert shared == pytest.approx(0.5 * clean, abs=0.08)
 
 
+@pytest.mark.parametrize("small", [1e-3, 1e-5])
+def test_a_motion_that_hardly_shows_where_it_is_fitted_does_not_hide_that_outputs_follow(small: float) -> None:
+    # Co-contraction as drives add it in one half of the blocks, and a motion in the other, extrapolated 1/small times.
+    rows = np.arange(len(GOOD))
+    V = GOOD.set_points @ redefinition_matrix().T
+    V[:, 2] = np.sin(0.05 * rows) * np.where(rows * 10 // len(GOOD) % 2 == 1, 1.0, small)
+    recording = recording_from(V @ np.linalg.inv(redefinition_matrix()).T, noise=2e-3)
+    assert (explained(recording) > 0.9).all()
+    assert poor_excitation(recording) == ()
+
+
 @pytest.mark.parametrize("settings", [Play(), Network(), NeuralStateSpace()], ids=lambda s: type(s).__name__)
 def test_kinds_that_learn_each_motor_refuse_motors_that_move_as_one(settings: Play) -> None:
     with pytest.raises(DataError, match=r"move along 1 direction\(s\) for 2 outputs.*or take `oe`"):

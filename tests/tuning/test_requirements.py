@@ -32,8 +32,27 @@ def test_the_defaults_are_those_of_verify_with_what_tuning_adds() -> None:
     assert set(theirs) <= set(mine)
     changed = {key for key in theirs if theirs[key] != mine[key]}
     assert changed == {("neck.overshoot_pct", "max"), ("neck.steady_rms_deg", "max")}
-    assert asked.limit("neck.rise_s") == 0.4
-    assert "track.circle_rms_deg <= 3" in asked.lines()
+    assert (asked.wanted("neck.rise_s"), asked.wanted("track.circle_rms_deg")) == (0.4, 3.0)
+
+
+def test_a_reserve_is_taken_off_what_plants_must_keep_and_said() -> None:
+    table = {"require": {"neck.rise_s": {"max": 0.5}}, "reserve": {"neck.rise_s": 0.1, "track.circle_rms_deg": 0.0}}
+    asked = make_tune_requirements(table)
+    assert (asked.limit("neck.rise_s"), asked.wanted("neck.rise_s")) == (0.4, 0.5)
+    assert asked.limit("track.circle_rms_deg") == asked.wanted("track.circle_rms_deg") == 3.0
+    assert {"neck.rise_s <= 0.4 (0.5 less a reserve of 0.1)", "track.circle_rms_deg <= 3"} <= set(asked.lines())
+    # What verify is asked is what the plants must keep.
+    assert asked.table["require"]["neck.rise_s"] == {"max": 0.4}
+    # What the robot itself is asked decides what cannot be.
+    assert asked.certificate.bounds == tuple(b for b in asked.bounds if not b.metric.startswith("track."))
+
+
+def test_nothing_is_kept_back_of_what_is_not_asked() -> None:
+    asked = make_tune_requirements({"require": {"neck.rise_s": False}, "reserve": {"neck.rise_s": 0.1}})
+    assert "neck.rise_s" not in asked.reserve
+    assert asked.limit("neck.rise_s") is None
+    # Linear plants have no loops of which anything was found to be beyond.
+    assert not make_tune_requirements({}, stepping=False).reserve
 
 
 def test_what_is_written_for_verify_asks_it_for_the_same() -> None:
@@ -60,6 +79,10 @@ def test_without_a_plant_that_steps_the_linear_ones_are_asked() -> None:
         ({"require": {"track.lap_s": {"max": 1.0}}}, r"unknown metric `track.lap_s`"),
         ({"require": {"track.circle_rms_deg": {"min": 1.0}}}, "must say"),
         ({"require": {"track.circle_rms_deg": {"max": 0.0}}}, "must be a positive number"),
+        ({"reserve": {"axes.gain_margin": 0.1}}, "is of loops over plants that step"),
+        ({"reserve": {"neck.rise_s": -0.1}}, "must be a number from 0 on; got -0.1"),
+        ({"reserve": {"neck.rise_s": 0.4}}, "<= 0.4 leaves nothing beside its reserve of 0.4"),
+        ({"reserve": 1.0}, "must be a table"),
         ({"require": {"neck.rise_s": {"min": 1.0, "max": 0.4}}}, "cannot be at least 1 and at most 0.4"),
         ({"require": {"neck.rise_s": {"min": 3.0}, "neck.settling_s": {"max": 2.0}}}, "cannot"),
     ],
@@ -73,7 +96,7 @@ def test_a_file_says_what_differs(tmp_path: Path) -> None:
     path = tmp_path / "wanted.toml"
     path.write_text('version = 1\n[track]\ncircle_deg = 10.0\n[require]\n"neck.rise_s" = { max = 0.6 }\n')
     asked = read_tune_requirements(path)
-    assert (asked.limit("neck.rise_s"), asked.track["circle_deg"], asked.track["circle_rad_s"]) == (0.6, 10.0, 1.2)
+    assert (asked.wanted("neck.rise_s"), asked.track["circle_deg"], asked.track["circle_rad_s"]) == (0.6, 10.0, 1.2)
     path.write_text("version = 2\n")
     with pytest.raises(FileFormatError, match="version = 1"):
         read_tune_requirements(path)

@@ -162,6 +162,13 @@ def _print_jog(found: JogResult, *, as_json: bool) -> None:
     metavar="JSON",
     help="Also write what the plausibility supervisor compares with: `baseline` of [supervision] in the drives file.",
 )
+@click.option(
+    "--beside",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    metavar="LOG.mcap",
+    help="With --supervision: compare with the motion of this earlier `record` too, such as one with another payload.",
+)
 @drives_options
 @override_option
 @neck_option
@@ -172,16 +179,17 @@ def _print_jog(found: JogResult, *, as_json: bool) -> None:
 def record_command(
     signal_name: str, output: Path, duration: float | None, runs: int, seed: int, ramp: float,
     max_position: float | None, max_speed: float | None, max_slack: float | None, payload: float,
-    supervision: Path | None,
+    supervision: Path | None, beside: tuple[Path, ...],
     drives_file: Path | None, bus: str | None, simulated: bool, robot: str | None, arm: bool,
     overrides: tuple[str, ...],
     neck: str | None, pace: float | None, logs: tuple[Path, ...], no_log: bool, force: bool,
     as_json: bool,
 ) -> None:  # fmt: skip
     """Record SIGNAL on the drives."""
-    from softneck.drives import Experiment, record_signal
+    from softneck.drives import Experiment, read_run_log, record_signal
     from softneck.drives.bus._link import VirtualLink
     from softneck.drives.commissioning._record import drive_limits
+    from softneck.drives.logs._replay import logged_motion
     from softneck.drives.running._keyboard import Keyboard
     from softneck.drives.supervision._calibrate import calibrate
     from softneck.drives.supervision._log import MotionLog
@@ -191,6 +199,8 @@ def record_command(
     refuse_existing(output, force=force)
     if supervision is not None:
         refuse_existing(supervision, force=force)
+    elif beside:
+        raise SettingsError("--beside needs --supervision: it is what the supervisor compares with that it adds to.")
     require_logs(logs, no_log=no_log, force=force)
     require_between("--payload", payload, 0.0, 1.0, "kg")
     virtual = load_neck(neck) if neck else None
@@ -206,6 +216,9 @@ def record_command(
         ranges=() if moved is None else chosen.file.ranges,
     )  # fmt: skip
     prepared = experiment.prepared()
+    # Before anything moves: what is read back may be damaged.
+    like = chosen.file.master_settings(prepared[0][0].sample_time)
+    motions = [logged_motion(read_run_log(path), like) for path in beside]
     with (
         open_link(chosen, moves=True, homed=True, seed=seed) as link,
         opened_log(chosen, "record", logs, no_log=no_log, force=force) as log,
@@ -232,7 +245,7 @@ def record_command(
         if supervision is not None:
             settings = recorded.ended.master.settings
             calibrate(
-                [motion.motion()], cycle=settings.bus.cycle, sample_cycles=settings.sample_cycles,
+                [*motions, motion.motion()], cycle=settings.bus.cycle, sample_cycles=settings.sample_cycles,
                 slack=settings.limits.slack,
             ).save(supervision, force=force)  # fmt: skip
             note(f"{supervision}: what plausibility is judged by; name it in the drives file: [supervision] baseline")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import FileFormatError, SettingsError, SoftneckError, file_hash, require_one_of
+from softneck.core._budget import require_steps
 from softneck.core._shown import Shown
 from softneck.loop import Fault, Loop, Part, ReferenceBlock
 from softneck.loop._faults import make_fault
@@ -46,6 +47,8 @@ _TOP = (
     "duration_s", "sample_time_s", "order", "plant", "observer", "controller", "reference", "part", "connections",
     "fault", "limits", "angle", "folder", "drives", "robot",
 )  # fmt: skip
+# What a file may say of the loop in an archive that it names.
+_BESIDE = ("ssp", "duration_s", "fault", "limits", "angle", "robot")
 _SAME_SAMPLE_TIME = 1e-6
 
 
@@ -65,6 +68,8 @@ def load_loop(path: str | Path, *, robot: str | None = None) -> LoopSetup:
         return _of_structure(source, robot)
     table = read_toml(source)
     try:
+        if "ssp" in table:
+            return _of_archive(table, source, robot)
         return _setup(table if robot is None else {**table, "robot": find_robot(robot)}, source)
     except SoftneckError as error:
         if str(error).startswith(str(source)):
@@ -103,14 +108,24 @@ def load_ssp(path: str | Path) -> LoopSetup | System:
     )
 
 
-def _of_structure(source: Path, robot: str | None, read: StructureTable | None = None) -> LoopSetup:
+def _of_archive(table: Mapping[str, Any], source: Path, robot: str | None) -> LoopSetup:
+    """Return the loop of the archive that a loop file names, with what the file says of it."""
+    refuse_unknown("a file with `ssp`", table, _BESIDE)
+    said = {key: value for key, value in table.items() if key not in ("ssp", "robot")}
+    setup = _of_structure(source.parent / str(table["ssp"]), robot or table.get("robot"), None, said)
+    return replace(setup, files={"loop": (str(source), file_hash(source)), **setup.files})
+
+
+def _of_structure(
+    source: Path, robot: str | None, read: StructureTable | None = None, said: Mapping[str, Any] | None = None
+) -> LoopSetup:
     read = read_ssp(source) if read is None else read
     if not read.closed:
         raise SettingsError(
             f"{source}: is no closed loop: its FMUs are not one plant whose set-points are fed, one controller and one "
             "reference; `softneck simulate` runs it, and `load_ssp` returns it as a system."
         )
-    table = {**read.table, "robot": find_robot(robot, beside=source)}
+    table = {**read.table, **(said or {}), "robot": find_robot(robot, beside=source)}
     try:
         setup = _setup(table, source.parent)
     except SoftneckError as error:
@@ -181,6 +196,8 @@ def _setup(table: Mapping[str, Any], source: Path, opened: dict[Any, Any] | None
             raise SettingsError(f"`{key}` is missing.")
     folder = source if source.is_dir() else source.parent
     step = number("sample_time_s", table.get("sample_time_s", 0.02))
+    if step > 0.0:  # before the parts are opened, which takes longer; with all columns it is judged again
+        require_steps("duration_s", number("duration_s", table["duration_s"]), step)
     opener = PartOpener(folder / str(table.get("folder", ".")), step=step, opened=opened)
     if not source.is_dir():
         opener.files["loop"] = (str(source), file_hash(source))

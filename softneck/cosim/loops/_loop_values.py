@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import FileFormatError, SettingsError
+from softneck.core._budget import settings_text
 from softneck.loop._wiring import Link
 
 
@@ -16,7 +17,7 @@ def read_toml(source: Path) -> dict[str, Any]:
     if not source.is_file():
         raise FileFormatError(f"{source}: no such file.")
     try:
-        return tomllib.loads(source.read_text(encoding="utf-8"))
+        return tomllib.loads(settings_text(source))
     except (ValueError, RecursionError) as error:
         raise FileFormatError(f"{source}: is not valid TOML ({error}).") from error
     except OSError as error:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from softneck import __version__
 from softneck.core import FileFormatError, OutputFileError, SettingsError, atomic_write
+from softneck.core._budget import MOST_JSON, settings_text
 
 from ._study import Study
 from ._vary import Vary
@@ -133,8 +134,8 @@ def read_description(folder: Path) -> dict[str, Any]:
     """Return what `study.json` says; raise FileFormatError if it describes no study."""
     path = folder / DESCRIPTION
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        content = json.loads(settings_text(path, MOST_JSON))
+    except (OSError, ValueError, RecursionError) as error:
         raise FileFormatError(f"{path}: cannot be read ({error}).") from error
     if not isinstance(content, dict) or "study" not in content:
         raise FileFormatError(f"{path}: does not describe a study.")

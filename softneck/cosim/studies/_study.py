@@ -212,9 +212,10 @@ def _opened(loop: Source) -> tuple[Mapping[str, Any], Path]:
         path = Path(loop)
         if not path.is_file():
             raise FileFormatError(f"there is no loop file {path}.")
-        if path.suffix == ".ssp":
+        table = {} if path.suffix == ".ssp" else read_toml(path)
+        if path.suffix == ".ssp" or "ssp" in table:
             return loop_table(load_loop(path)), path.parent.resolve()
-        return _with_robot(read_toml(path), path), path.parent.resolve()
+        return _with_robot(table, path), path.parent.resolve()
     if isinstance(loop, Loop | LoopSetup):
         return loop_table(loop), Path.cwd()
     if not isinstance(loop, Mapping):

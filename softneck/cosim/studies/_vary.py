@@ -16,6 +16,8 @@ KINDS = ("grid", "uniform", "log_uniform", "normal", "choices", "seed")
 SAMPLINGS = ("latin_hypercube", "monte_carlo")
 # A run's seed fits what FMUs take as `noise_seed`.
 _SEED_RANGE = 2**31 - 2
+# Of a tenth of a second each on two cores: half a day and more.
+_MOST_RUNS = 1_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,6 +126,9 @@ class StudyPoints:
             raise SettingsError("the study varies nothing: give [vary] at least one key.")
         self._vary = vary
         grids = [[(key, i) for i in range(len(item.values))] for key, item in vary.items() if item.is_grid]
+        size = math.prod(map(len, grids))
+        if size > _MOST_RUNS:
+            raise SettingsError(f"the grid has {size} points; at most {_MOST_RUNS} fit. Make it smaller, or draw.")
         self._grid = list(product(*grids))
         drawn = [key for key, item in vary.items() if item.is_drawn]
         random = bool(drawn) or any(item.kind == "seed" for item in vary.values())
@@ -158,8 +163,8 @@ def _number_of_runs(runs: int | None, grid: int, *, random: bool) -> int:
         if random:
             raise SettingsError("`runs` is missing: say how many; only a study of grids alone knows it by itself.")
         return grid
-    if isinstance(runs, bool) or not isinstance(runs, int) or runs < 1:
-        raise SettingsError(f"`runs` must be a whole number of at least 1; got {runs!r}.")
+    if isinstance(runs, bool) or not isinstance(runs, int) or not 1 <= runs <= _MOST_RUNS:
+        raise SettingsError(f"`runs` must be a whole number between 1 and {_MOST_RUNS}; got {runs!r}.")
     if not random and runs != grid:
         raise SettingsError(f"the grid has {grid} points and nothing is random, but `runs` is {runs}; leave it out.")
     if runs < grid:

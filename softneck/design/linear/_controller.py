@@ -117,7 +117,7 @@ class LinearController(Shown):
             f"{self.kind} controller, {self.sample_time * 1e3:g} ms, {self.order} order, "
             f"{self.design.get('extra_delay', 0)} samples of delay added to the plant for it",
             *self.limits.lines(self.sample_time),
-            *_assumed(self.design.get("assumed", {})),
+            *assumed_lines(self.design.get("assumed", {})),
         ]
         for axis in self.robot.outputs.names:
             item = self.design.get(axis, {})
@@ -174,7 +174,7 @@ def robot_in(header: Mapping[str, Any]) -> Robot:
     return Robot.from_dict(header["robot"]) if "robot" in header else Robot.preset("neck")
 
 
-def _assumed(values: Mapping[str, float]) -> list[str]:
+def assumed_lines(values: Mapping[str, float]) -> list[str]:
     """Return a line on what was taken from the paper's neck, none where nothing was."""
     words = {"least_delay": "a dead time of at least {:g} s", "small_move_pole": "small moves as fast as {:g} 1/s"}
     told = [words[name].format(value) for name, value in values.items()]

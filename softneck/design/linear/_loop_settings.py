@@ -85,6 +85,8 @@ class LoopSettings:
         others = {
             name: value for name, value in self._others(plant).items() if isinstance(getattr(self, name), NeckDefault)
         }
+        if self.rise_s is not None:
+            others.pop("reference_time", None)
         return replace(self, **others)
 
     def _others(self, plant: UncertainPlant) -> dict[str, Any]:  # noqa: ARG002 - kinds add what depends on it

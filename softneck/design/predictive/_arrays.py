@@ -27,7 +27,8 @@ class Tuning:
         preview: samples that the reference is known ahead.
         budget: iterations that the solver may take.
         coast: samples without measurement until the motors are held.
-        disturbances: (k, outputs + 1) of each measured one its gains on the outputs, and its time constant [s].
+        disturbances: (k, outputs + 2) of each measured one its gains on the outputs, its time constant [s], and the
+            tautness that it wishes for [rad].
         scale: of another robot than the neck.
     """
 
@@ -36,7 +37,7 @@ class Tuning:
     preview: int = 0
     budget: int = 100
     coast: int = 25
-    disturbances: Matrix = field(default_factory=lambda: np.zeros((0, 3)))
+    disturbances: Matrix = field(default_factory=lambda: np.zeros((0, 4)))
     scale: Scale | None = None
 
 
@@ -54,9 +55,9 @@ def assemble(problem: Problem, found: Matrices, tuning: Tuning) -> tuple[Matrix,
         *(() if tuning.scale is None else tuning.scale.numbers()),
     ])  # fmt: skip
     keep = math.exp(-Ts / tuning.reference_time) if tuning.reference_time > 0.0 else 0.0
-    disturbances = np.zeros((max(1, len(tuning.disturbances)), p.outputs + 1))
-    for row, (*gains, time) in zip(disturbances, tuning.disturbances.tolist(), strict=False):
-        row[:] = *gains, math.exp(-Ts / time) if time > 0.0 else 0.0
+    disturbances = np.zeros((max(1, len(tuning.disturbances)), p.outputs + 2))
+    for row, (*gains, time, taut) in zip(disturbances, tuning.disturbances.tolist(), strict=False):
+        row[:] = *gains, math.exp(-Ts / time) if time > 0.0 else 0.0, taut
     poles = np.array([disturbance_pole(plant, p.disturbance_time) for plant in plants])
     made = {
         "constants": constants,
@@ -65,7 +66,8 @@ def assemble(problem: Problem, found: Matrices, tuning: Tuning) -> tuple[Matrix,
         "observer": observer_gains(poles, tuning.trust),
         "rest": np.array([rest_states(plant, n) for plant in plants]),
         "delays": np.array([float(plant.delay) for plant in plants]),
-        "disturbances": disturbances,
+        # Files are as they were where nothing asks for tautness.
+        "disturbances": disturbances if disturbances[:, -1].any() else disturbances[:, :-1].copy(),
         "filters": np.full(p.outputs + 1, keep),
         "T": p.T,
         "starts": np.array(p.starts, dtype=np.float64),

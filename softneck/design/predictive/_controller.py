@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -184,9 +184,7 @@ class MpcController(Shown):
             "kind": "mpc",
             "sample_time": self.sample_time,
             **{name: getattr(self, name) for name in _LIMITS},
-            "disturbances": [
-                {k: v for k, v in asdict(item).items() if k != "gains" or v} for item in self.disturbances
-            ],
+            "disturbances": [item.saved() for item in self.disturbances],
             "order": self.order,
             "design": dict(self.design),
             "inputs": [port.name for port in block.inputs],

@@ -52,7 +52,7 @@ def step(p: MpcArrays, parameters: np.ndarray, x: MpcState, inputs: np.ndarray, 
     """
     u = mpc_inputs(p, inputs)
     if mpc_begin(p, x, u):
-        mpc_decide(p, mpc_limits(p, parameters), x, u)
+        mpc_decide(p, mpc_limits(p, x, parameters), x, u)
     # Held or moved: models and past inputs go on with what the motors were told.
     mpc_predict(p, x)
     mpc_give(p, x, outputs)

@@ -84,7 +84,7 @@ class MpcArrays(Arrays):
     rest = array(f"{_m} * S, n", "x at rest under an input of one")
     delays = array(f"{_m} * S", "d, dead times [samples]")
     disturbances = array(
-        "channels, references", "of each measured one: its gains on the outputs, and the pole of its filter"
+        "channels, columns", "of each measured one: gains on the outputs, pole of its filter, where asked for tautness"
     )
     filters = array("references", "poles of the reference filters")
     T = array("references, motors", "of Eq. 9-11: motors to redefined inputs")
@@ -164,8 +164,11 @@ def mpc_inputs(p: MpcArrays, inputs: np.ndarray) -> np.ndarray:
     return u
 
 
-def mpc_limits(p: MpcArrays, parameters: np.ndarray) -> np.ndarray:
-    """Return the parameters in the units of the robot's size; each output has one of its own for the angles' limit."""
+def mpc_limits(p: MpcArrays, x: MpcState, parameters: np.ndarray) -> np.ndarray:
+    """Return the parameters in the units of the robot's size; each output has one of its own for the angles' limit.
+
+    What is measured adds to the tautness that is wished for.
+    """
     limits = parameters.copy()
     if p.numbers > MPC_NUMBERS:
         unit = p.constants[p.numbers - 2 * p.outputs - 1]
@@ -174,6 +177,9 @@ def mpc_limits(p: MpcArrays, parameters: np.ndarray) -> np.ndarray:
         taut = int(p.constants[MPC_TAUT_AT])
         if taut < limits.shape[0]:
             limits[taut] /= unit
+    if p.columns > p.outputs + 1:
+        for j in range(p.measured):
+            limits[int(p.constants[MPC_TAUT_AT])] += p.disturbances[j, p.outputs + 1] * x.disturbances[j, 1]
     return limits
 
 

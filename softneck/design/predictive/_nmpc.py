@@ -152,7 +152,8 @@ class NmpcSettings(Shown):
             raise SettingsError(f"`minimum_tautness` of `nmpc` is for necks; `{robot.name}` is none. Leave it out.")
         limits = limits_of(self, robot)
         directions = None if robot.is_neck else weights_of(model)
-        found = probed(model, self._redefinition(directions, robot)[1], limits)
+        pulled = max(0.0, self.minimum_tautness or 0.0)
+        found = probed(model, self._redefinition(directions, robot)[1], limits, pulled)
         per_motor = to_si(robot.motors.unit)[0]
         own = replace(self, **{name: getattr(limits, name) / per_motor for name in LIMITS[:4]})
         own = own if robot.is_neck else own._of_robot(found, model.sample_time)

@@ -33,8 +33,14 @@ _MOST_PREVIEW = 100
 S = TypeVar("S", bound=Any)
 
 
-def probed(model: Model, inverse: Matrix, limits: ControllerLimits) -> dict[str, dict[str, float]]:
+def probed(model: Model, inverse: Matrix, limits: ControllerLimits, pulled: float = 0.0) -> dict[str, dict[str, float]]:
     """Return static gain, pole [1/s] and dead time [samples] of each axis, as the model steps near rest.
+
+    Args:
+        model: of any robot.
+        inverse: from redefined inputs to motors.
+        limits: of its motors.
+        pulled: where all motors of a neck stand before a step [rad]: a payload may leave its tendons hanging at zero.
 
     Raises:
         SettingsError: an input that does not move its output.
@@ -43,12 +49,15 @@ def probed(model: Model, inverse: Matrix, limits: ControllerLimits) -> dict[str,
     for axis, name in enumerate(model.robot.outputs.names):
         direction = inverse[:, axis]
         size = _PROBE if neck else _places(limits)[1] / float(np.abs(direction).max())
-        answers[name] = _answer(model, size * direction, limits)[:, axis] / size
+        answers[name] = _answer(model, size * direction, limits, pulled)[:, axis] / size
     largest = max(float(np.abs(y).max()) for y in answers.values())
     for name, y in answers.items():
         if not np.isfinite(y).all() or abs(y[-1]) < (_LEAST if neck else _LEAST * largest) or y[-1] == 0.0:
             told = "its input (Eq. 9, 10)" if neck else "its direction"
-            raise SettingsError(f"the model's {name} does not follow {told}; identify it again.")
+            hint = (
+                "identify it again, or ask for `minimum_tautness` if its tendons hang" if neck else "identify it again"
+            )
+            raise SettingsError(f"the model's {name} does not follow {told}; {hint}.")
         share = y / y[-1]
         dead, risen = (int(np.argmax(share > part)) for part in (0.05, 0.632))
         a = math.exp(-1.0 / max(1, risen - dead))
@@ -64,10 +73,10 @@ def plant_of(found: Mapping[str, float], sample_time: float, neck: bool) -> Axis
     return AxisPlant(numerator, np.array([1.0, -a]), int(found["delay"]), sample_time, stretch)
 
 
-def _answer(model: Model, step: Vector, limits: ControllerLimits) -> Matrix:
+def _answer(model: Model, step: Vector, limits: ControllerLimits, pulled: float) -> Matrix:
     """Return what a step (motors,) of the set-points changes of the outputs (time, outputs), until they rest."""
     neck, block = model.robot.is_neck, model.block()
-    middle = np.zeros(step.size) if neck else _places(limits)[0]
+    middle = np.full(step.size, pulled) if neck else _places(limits)[0]
     rows = round(_PROBE_SECONDS / model.sample_time) if neck else _ROWS
     while True:
         u = np.full((rows, len(block.inputs)), np.nan)

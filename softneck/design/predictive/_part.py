@@ -59,7 +59,7 @@ class MpcPart(BlockPart):
             m, count = program.E.shape
             theta, lower, upper = np.empty(count), np.empty(m), np.empty(m)
             f.mpc_parameter(arrays, state, theta)
-            limits, first = f.mpc_limits(arrays, parameters), 2 * len(self._names) + 1
+            limits, first = f.mpc_limits(arrays, state, parameters), 2 * len(self._names) + 1
             f.mpc_bounds(arrays, limits, u[first : first + self._outputs.size], theta, lower, upper)
             z, flag, lam = program.solve(theta, lower, upper)
             f.mpc_take(arrays, state, theta, z, lam, lower, upper, flag > 0)

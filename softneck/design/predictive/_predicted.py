@@ -13,6 +13,7 @@ from softneck.estimation._axis import HasTransferFunctions, robot_of
 from softneck.robot._neck_default import NeckCount, NeckDefault
 
 from ..plants._uncertain import UncertainPlant
+from ._disturbance import with_payload
 from ._scale import refuse_what_is_for_necks
 from ._scenarios import samples_of
 from ._tuning import Pair, scaled
@@ -45,11 +46,20 @@ def identified(model: Any) -> bool:
 
 
 def settings_for(settings: S, model: HasTransferFunctions) -> S:
-    """Return the settings for what was identified of a neck, or for any other plant."""
-    if robot_of(model).is_neck and identified(model):
+    """Return the settings for what was identified of a neck, or for any other plant.
+
+    Raises:
+        SettingsError: tautness for a payload where none is wished for without.
+    """
+    settings = replace(settings, disturbances=with_payload(settings.disturbances, settings.payload_tautness))
+    if not (robot_of(model).is_neck and identified(model)):
+        settings = _with(settings, _BELIEVED)
+    elif settings.tightening:
         # What is tightened until it holds is a limit; a wish is none.
-        return _with(settings, {"minimum_tautness": None}) if settings.tightening else settings
-    return _with(settings, _BELIEVED)
+        settings = _with(settings, {"minimum_tautness": None})
+    if settings.minimum_tautness is None and any(item.tautness for item in settings.disturbances):
+        raise SettingsError("`payload_tautness` adds to `minimum_tautness`, which is not set; give it, such as 0.5.")
+    return settings
 
 
 def settings_of_robot(settings: S, plant: UncertainPlant) -> S:

@@ -22,7 +22,6 @@ from softneck.core import (
 from softneck.core._shown import Shown
 from softneck.estimation._axis import HasTransferFunctions, robot_of
 from softneck.estimation._settings import ORDERS
-from softneck.robot import Robot
 from softneck.robot._neck_default import NeckCount, NeckDefault
 from softneck.robot._redefined import redefinition_of
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
@@ -32,7 +31,7 @@ from ..linear._ports import LIMITS, ControllerLimits, require_limits
 from ..plants._uncertain import uncertain_plant
 from ._arrays import Tuning, assemble, observer_bandwidth, with_filter, with_gains
 from ._controller import MpcController
-from ._disturbance import MeasuredDisturbance
+from ._disturbance import MeasuredDisturbance, effects
 from ._lti import system
 from ._mpc_state_runtime import MpcArrays
 from ._predicted import predicted_plants, settings_for, settings_of_robot
@@ -106,6 +105,8 @@ class MpcSettings(Shown):
         angle_limit: soft limit of pitch and roll, or of another robot's angles [rad]; None for none.
         minimum_tautness: least motor position beyond that at which a tendon follows the neck [rad], soft; None for no
             limit. With pretension it is negative: rest counts as 0.
+        payload_tautness: what a kilogram adds to `minimum_tautness` [rad/kg]; beyond 0 the controller has an input
+            `payload` [kg], which an observer over a model of several payloads tells. A payload slackens tendons.
         tautness_lever: motor angle that one radian of neck takes up [rad/rad].
         cocontraction_weight: on the error of co-contraction, against that of the tilt's inputs, squared.
         slack_weight: on violations of soft limits, against errors of the angles, squared.
@@ -149,6 +150,7 @@ class MpcSettings(Shown):
     least_position: float = NeckDefault(-6.0)
     angle_limit: float | None = None
     minimum_tautness: float | None = NeckDefault(0.5)
+    payload_tautness: float = 0.0
     # Radius of the tendons' attachment over that of the winch: 52 mm / 7.5 mm (lab code; paper, section 3.1).
     tautness_lever: float = NeckDefault(6.93)
     # Light: where tendons must be taut, co-contraction gives way; at 1 the angles gave way by a quarter of a degree.
@@ -184,6 +186,7 @@ class MpcSettings(Shown):
         require_between("preview", self.preview, 0.0, 4.0, "s")
         require_limits({name: getattr(self, name) for name in LIMITS[:4]})
         require_between("tautness_lever", self.tautness_lever, 0.0, 100.0, "rad/rad")
+        require_between("payload_tautness", self.payload_tautness, 0.0, 12.0, "rad/kg")
         if self.angle_limit is not None:
             require_positive("angle_limit", self.angle_limit, "rad")
         if self.minimum_tautness is not None:
@@ -236,7 +239,8 @@ class MpcSettings(Shown):
         found["bandwidth_rad_s"] = bandwidth
         per_motor = to_si(limits.robot.motors.unit)[0]
         if self.tightening:
-            plants = [self._delayed(pair) for pair in [*self._families(nominal), *samples]]
+            # A dead time is known to a sample, and `least_delay` makes those of all samples one.
+            plants = [self._delayed(pair, late) for pair in [*self._families(nominal), *samples] for late in (0, 1)]
             arrays, found["back_off_rad"] = tightened(arrays, plants, trial_of(self, limits, self._lever(model)))
         return MpcController(
             sample_time=Ts,
@@ -292,11 +296,11 @@ class MpcSettings(Shown):
         Ts = problem.scenarios[0].axes[0].sample_time
         tuning = Tuning(
             trust=FULL_TRUST, reference_time=self.reference_time or 0.0, preview=round(self.preview / Ts),
-            budget=self.budget, disturbances=self._measured(robot_of(model)),
+            budget=self.budget, disturbances=effects(self.disturbances, robot_of(model)),
         )  # fmt: skip
         if isinstance(model, SizedPlant):
             coast = max(1, round(_COAST * slowness(problem.scenarios[0].axes) / Ts))
-            measured = tuning.disturbances / np.append(model.scale.outputs, 1.0)
+            measured = tuning.disturbances / np.append(model.scale.outputs, [1.0, 1.0])
             tuning = replace(tuning, scale=model.scale, coast=coast, disturbances=measured)
         return assemble(problem, matrices(problem), tuning)
 
@@ -345,11 +349,6 @@ class MpcSettings(Shown):
             return model.lever(self.tautness_lever)
         return self.tautness_lever * redefinition_matrix(np.array(self.tendon_angles))[:2].T
 
-    def _measured(self, robot: Robot) -> Matrix:
-        """Return (k, outputs + 1) gains and time constant of each measured disturbance."""
-        rows = [[*item.on(robot), item.time] for item in self.disturbances]
-        return np.array(rows).reshape(-1, len(robot.outputs.names) + 1)
-
     def _families(self, nominal: Pair) -> list[Pair]:
         """Return what the neck may be: as identified, and faster."""
         if self.small_move_pole == 0.0:
@@ -364,8 +363,8 @@ class MpcSettings(Shown):
     def _frequencies(self, nominal: Pair) -> Vector:
         return frequencies(nominal[0].sample_time, lowest=LOWEST / slowness(nominal))[::_THINNING]
 
-    def _delayed(self, pair: Pair) -> Pair:
-        return tuple(replace(plant, delay=plant.delay + self.extra_delay) for plant in pair)
+    def _delayed(self, pair: Pair, late: int = 0) -> Pair:
+        return tuple(replace(plant, delay=plant.delay + self.extra_delay + late) for plant in pair)
 
     def _tuned(
         self, arrays: tuple[Any, ...], nominal: Pair, samples: list[Pair]

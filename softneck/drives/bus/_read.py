@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import DataError, FileFormatError, SettingsError
+from softneck.core._budget import settings_text
 from softneck.robot import Robot
 from softneck.signals.recording._channels import NECK
 
@@ -35,7 +36,7 @@ def load_drives(path: str | Path, robot: str | Path | Robot | None = None) -> Dr
     """
     source = Path(path)
     try:
-        table = tomllib.loads(source.read_text(encoding="utf-8"))
+        table = tomllib.loads(settings_text(source))
     except OSError as error:
         raise FileFormatError(f"{source}: cannot be read ({error.strerror}).") from error
     except (ValueError, RecursionError) as error:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softneck.core import FileFormatError, Matrix, Vector, atomic_write, require_between
+from softneck.core._budget import MOST_JSON, settings_text
 
 # What a row was measured in: standing before the moves, on the way through the slack, on the slow way up and down under
 # tension, in the quick wiggle, on the way back.
@@ -164,7 +165,7 @@ def read_moves(path: Path) -> Moves:
         FileFormatError: no such file, or another one.
     """
     try:
-        table = json.loads(path.read_text(encoding="utf-8"))
+        table = json.loads(settings_text(path, MOST_JSON))
         if table["softneck_moves"] != _VERSION:
             raise ValueError("another version")
         identities = {int(node): dict(found) for node, found in table["identities"].items()}

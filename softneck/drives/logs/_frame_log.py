@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from softneck.core import FileFormatError
+from softneck.core._budget import require_size
 
 from ..master import Frame
 
@@ -121,6 +122,8 @@ class FrameLog:
         reader: Any = BLFReader if binary else CanutilsLogReader
         self.cut = ""
         count = 0
+        if self.path.is_file():
+            require_size(self.path)
         try:
             # Opened here, for the readers leave the file open where it is damaged.
             with self.path.open("rb" if binary else "r", encoding=None if binary else "ascii") as stream:

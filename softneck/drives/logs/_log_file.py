@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 
 from softneck.core import DataError, FileFormatError, SettingsError, Vector, file_hash
+from softneck.core._budget import require_size
 from softneck.loop import LoopResult
 from softneck.robot import Robot
 from softneck.signals import Recording
+from softneck.signals.importing.formats._mcap import LARGEST_RECORD, require_chunks
 from softneck.signals.recording._channels import NECK
 
 from ..master import MasterSettings
@@ -27,8 +29,6 @@ from ._result import recording_of, signal_units
 from ._rows import experiment_channels, experiment_recording, experiment_table, motion_at
 from ._run_log import LOG_VERSION, METADATA
 
-# No record of ours comes near; a damaged length must not reserve the memory of the machine.
-_LARGEST = 1 << 26
 _PARTS: dict[str, type] = {
     "bus": BusSettings,
     "limits": LimitSettings,
@@ -150,8 +150,10 @@ def read_run_log(path: str | Path) -> LoggedRun:
     events: list[tuple[float, str, str]] = []
     cut = ""
     try:
+        require_size(source)
+        require_chunks(source)
         with source.open("rb") as stream:
-            for record in StreamReader(stream, record_size_limit=_LARGEST, validate_crcs=True).records:
+            for record in StreamReader(stream, record_size_limit=LARGEST_RECORD, validate_crcs=True).records:
                 if isinstance(record, Metadata) and record.name == METADATA:
                     facts = _facts(source, record.metadata)
                 elif isinstance(record, Channel):

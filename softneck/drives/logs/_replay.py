@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from softneck.core import CheckFailedError, DataError
 
 from ..bus._meaning import meaning
-from ..master import Master
+from ..master import Master, MasterSettings
 from ..master._measured import Measurement, Motors, Pilot
+from ..supervision._log import MotionLog
+from ..supervision._motor_models import Motion
 from ._cycle import Answer, Cycle, LoggedPilot, cycle_of
 from ._log_file import LoggedRun
 
@@ -113,7 +115,13 @@ class _DivergenceError(Exception):
     """The replayed core asks for what the logged one did not."""
 
 
-def replay(log: LoggedRun, pilot: Pilot | None = None, notes: Iterable[str] = ()) -> Replay:
+def replay(
+    log: LoggedRun,
+    pilot: Pilot | None = None,
+    notes: Iterable[str] = (),
+    *,
+    watches: Sequence[Callable[..., object]] = (),
+) -> Replay:
     """Feed the log's frames, samples, requests and times to a new master and compare all that it sends.
 
     Args:
@@ -121,6 +129,7 @@ def replay(log: LoggedRun, pilot: Pilot | None = None, notes: Iterable[str] = ()
         pilot: the run's controller, which is then computed again and compared too; without it the core gets the
             logged answers of the controller.
         notes: for the result.
+        watches: called after each cycle, as those of a run are.
 
     Raises:
         DataError: the log has no cycles.
@@ -137,6 +146,8 @@ def replay(log: LoggedRun, pilot: Pilot | None = None, notes: Iterable[str] = ()
         for what, why in cycle.taken:
             _ask_again(master, what, why)
         sent = master.step(cycle.time, cycle.received, cycle.tilt)
+        for watch in watches:
+            watch(cycle.time, cycle.received, sent, cycle.tilt, master)
         again = cycle_of(master, listened, cycle.time, cycle.received, cycle.tilt, sent)
         frames += len(sent)
         answers += sum(what == "step" for what, _ in again.answers) if pilot is not None else 0
@@ -150,6 +161,31 @@ def replay(log: LoggedRun, pilot: Pilot | None = None, notes: Iterable[str] = ()
     return Replay(
         done, frames, answers, str(master.supervisor.phase), "" if fault is None else str(fault), found, tuple(told)
     )
+
+
+def logged_motion(log: LoggedRun, like: MasterSettings) -> Motion:
+    """Return the undisturbed motion of a log, to compare with on drives that are set up as `like`.
+
+    Raises:
+        DataError: it is of other drives, or was not undisturbed.
+        CheckFailedError: the replay differs from the log.
+    """
+    settings = log.settings()
+    for name, ours, theirs in (
+        ("counts_per_radian", like.counts_per_radian, settings.counts_per_radian),
+        ("newton_per_unit", like.newton_per_unit, settings.newton_per_unit),
+        ("cycle", like.bus.cycle, settings.bus.cycle),
+        ("sample_cycles", like.sample_cycles, settings.sample_cycles),
+        ("outputs", like.outputs, settings.outputs),
+    ):
+        if ours != theirs:
+            raise DataError(f"{log.path}: `{name}` is {theirs} there and {ours} here; take a log of these drives.")
+    motion = MotionLog()
+    found = replay(log, watches=(motion,))
+    found.require()
+    if found.fault:
+        raise DataError(f"{log.path}: ended by {found.fault}; take one of motion that nothing disturbed.")
+    return motion.motion()
 
 
 def _ask_again(master: Master, what: str, why: str) -> None:

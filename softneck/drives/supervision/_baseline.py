@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import FileFormatError, SettingsError, atomic_write
+from softneck.core._budget import MOST_JSON, settings_text
 
-_KIND, _VERSION = "softneck supervision", 1
+_KIND, _VERSION = "softneck supervision", 2
 Row = tuple[float, ...]
 Rows = tuple[Row, ...]
 
@@ -26,16 +27,20 @@ class Baseline:
         drive: of each motor, how its step follows from what was left to the set-points of the last cycles.
         drive_spread: of its residual, variance [rad^2] and what is added for each rad^2 of the step. It is not
             whitened: a motor that stands though asked shows in the mean, which whitening takes away.
+        drive_fastest: largest step that a motor takes in a cycle, with a margin [rad].
         current: of each motor, change of its tension over three cycles from changes of positions, speed, acceleration.
         current_whitening, current_spread: of its residual [N].
         current_top: largest tension seen of each, where its current may be cut off [N].
         current_reach: how far each motor was behind its set-points in nearly all cycles [rad].
+        level: of each motor, its tension from the same features, the mean of the others' tensions, and one: a payload
+            is in all of them. level_spread: variance of the residual [N^2].
         tilt: (outputs, lags x motors) tilt from the motors' positions so many samples ago.
         lags: these [samples].
         tilt_whitening: of each output's residual.
         tilt_spread: variance [rad^2], and what is added for each rad^2 of change over two samples, and of way.
         tilt_bias: how far slow errors of the model carry each output's residual without any fault [rad].
         gyro_whitening, gyro_spread: the same of angles against integrated rates; () without a gyro.
+        gyro_wander: variance of what angles and gyro differ by [rad^2].
         noise: variance of second differences of each output beside the model [rad^2].
         missing: part of the samples that did not come; missing_threshold: of the chart that counts them.
         reach: of each motor, lowest and highest position seen [rad].
@@ -50,11 +55,14 @@ class Baseline:
     outputs: int
     drive: Rows
     drive_spread: Rows
+    drive_fastest: Row
     current: Rows
     current_whitening: Rows
     current_spread: Rows
     current_top: Row
     current_reach: Row
+    level: Rows
+    level_spread: Row
     tilt: Rows
     lags: tuple[int, ...]
     tilt_whitening: Rows
@@ -62,6 +70,7 @@ class Baseline:
     tilt_bias: Row
     gyro_whitening: Rows
     gyro_spread: Row
+    gyro_wander: Row
     noise: Row
     missing: float
     missing_threshold: float = math.inf
@@ -104,7 +113,7 @@ def load_baseline(path: str | Path) -> Baseline:
     """
     source = Path(path)
     try:
-        table = json.loads(source.read_text(encoding="utf-8"))
+        table = json.loads(settings_text(source, MOST_JSON))
         if not isinstance(table, dict) or table.pop("kind", "") != _KIND or table.pop("version", 0) != _VERSION:
             raise FileFormatError(f"{source}: is not what `softneck drives record --supervision` writes.")
         return Baseline.from_dict(table)

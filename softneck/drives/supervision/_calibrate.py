@@ -6,54 +6,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from softneck.core import DataError, Matrix, Vector
 from softneck.signals.detection._threshold import Budget, thresholds
 from softneck.signals.detection._whitening import Whitening
 
 from ._baseline import Baseline, Row, Rows
-from ._motor_charts import EDGES, MotorCharts, MotorFeatures
+from ._motor_charts import EDGES, MotorCharts, motor_names
+from ._motor_models import Features, Flags, Motion, features_of, level_rows, motor_rows, row_of, variance_of
 from ._tilt_charts import GyroLevel, TiltCharts, TiltModel, tilt_names
 
-Flags = NDArray[np.bool_]
 # What the tilt may still answer to [s], in samples that lie closer together where it answers most.
 _REACH = 0.5
 _LAGS = 8
-# Motors further out than this part of the seen range are not known ground.
+# Motors further out than this part of the seen range are not known ground, and none is so much faster.
 _MARGIN = 0.2
 _LEAST = 20.0
 # What is further out than this part of the cycles counts for seldom.
 _NEARLY = 0.95
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Motion:
-    """One stretch of undisturbed motion, a row for each bus cycle.
-
-    Attributes:
-        setpoints: that were sent the cycle before (time, motors) [rad].
-        positions: (time, motors) [rad]; tensions: (time, motors) [N].
-        values: of the tilt (time, outputs) [rad]; NaN in cycles without a sample.
-        rates: of its gyro, the same [rad/s]; NaN without one.
-        due: cycles in which a sample was due (time,).
-    """
-
-    setpoints: Matrix
-    positions: Matrix
-    tensions: Matrix
-    values: Matrix
-    rates: Matrix
-    due: Flags
-
-    def halves(self) -> list[Motion]:
-        """Return its first and its second half."""
-        middle = len(self.due) // 2
-        names = ("setpoints", "positions", "tensions", "values", "rates", "due")
-        parts = [
-            {name: getattr(self, name)[cut] for name in names} for cut in (slice(None, middle), slice(middle, None))
-        ]
-        return [Motion(**part) for part in parts]
 
 
 def calibrate(
@@ -83,12 +53,13 @@ def calibrate(
     if seconds < 2.0 * _LEAST:
         raise DataError(f"{seconds:.3g} s of motion are too few to compare with; record at least {2.0 * _LEAST:g} s.")
     parts = list(motions) if len(motions) > 1 else motions[0].halves()
+    known = [(part, features_of(part, cycle)) for part in parts]
     motor, tilt, slow, fitted = [], [], [], []
     for number in range(len(parts)):
-        others = [other for k, other in enumerate(parts) if k != number]
+        others = [other for k, other in enumerate(known) if k != number]
         fitted.append(fit(others, cycle=cycle, sample_cycles=sample_cycles, slack=slack))
         slow.append(_slow(fitted[-1], parts[number]))
-    bias = _row(np.max(slow, axis=0))
+    bias = row_of(np.max(slow, axis=0))
     for part, model in zip(parts, fitted, strict=True):
         found = scores_of(replace(model, tilt_bias=bias), part)
         motor.append(found[0])
@@ -96,13 +67,13 @@ def calibrate(
     charts = motor[0].shape[1] + tilt[0].shape[1] + 1
     shared = replace(budget or Budget(), charts=charts)
     rng = np.random.default_rng(seed)
-    whole = fit(motions, cycle=cycle, sample_cycles=sample_cycles, slack=slack)
+    whole = fit(known, cycle=cycle, sample_cycles=sample_cycles, slack=slack)
     # Of samples that come or not by chance, e^-h bounds the rate of false alarms (Basseville and Nikiforov, 5.2.2).
     seldom = -np.log(shared.rate / shared.charts * cycle * sample_cycles)
     whole = replace(whole, tilt_bias=bias, missing_threshold=float(seldom))
     h = thresholds(motor, replace(shared, step=cycle), rng)
     g = thresholds(tilt, replace(shared, step=cycle * sample_cycles), rng)
-    return replace(whole, motor_thresholds=_row(h), tilt_thresholds=_row(g), seconds=seconds)
+    return replace(whole, motor_thresholds=row_of(h), tilt_thresholds=row_of(g), seconds=seconds)
 
 
 def scores_of(baseline: Baseline, motion: Motion) -> tuple[Matrix, Matrix]:
@@ -121,7 +92,7 @@ class _Walk:
 
     def __init__(self, baseline: Baseline) -> None:
         self._gains = np.array(baseline.current)
-        self.motors = MotorCharts(baseline, np.full(4 * baseline.motors, np.inf))
+        self.motors = MotorCharts(baseline, np.full(len(motor_names(baseline.motors)), np.inf))
         names = tilt_names(baseline.motors, baseline.outputs, gyro=bool(baseline.gyro_spread))
         self.tilt = TiltCharts(baseline, np.full(len(names), np.inf))
         self.tilt.begin()
@@ -136,26 +107,29 @@ class _Walk:
         return True
 
 
-def fit(motions: Sequence[Motion], *, cycle: float, sample_cycles: int, slack: float) -> Baseline:
+def fit(known: Sequence[tuple[Motion, Features]], *, cycle: float, sample_cycles: int, slack: float) -> Baseline:
     """Return the models of drives, tendons and tilt, without thresholds."""
+    motions, features = [motion for motion, _ in known], [f for _, f in known]
     n, m = motions[0].positions.shape[1], motions[0].values.shape[1]
-    features = [_features(motion, cycle) for motion in motions]
-    drive, _, drive_spread = _rows(
+    drive, _, drive_spread = motor_rows(
         [f.drive for f in features], [f.moved for f in features], n, "its motor did not move", most=0
     )
-    current, current_white, current_spread = _rows(
+    current, current_white, current_spread = motor_rows(
         [f.current for f in features], [f.change for f in features], n, "its current did not change"
     )
     step = cycle * sample_cycles
+    top = np.max([np.abs(motion.tensions).max(axis=0) for motion in motions], axis=0)
+    reach = np.nanquantile(np.concatenate([f.behind for f in features]), _NEARLY, axis=0)
     lags = _lags(step)
     # At rest nobody knows which way friction holds: a tendon is taut for certain above that much only.
     least = slack + np.abs(np.array(current)[:, n : n + len(EDGES)]).sum(axis=1)
+    level, level_spread = level_rows(known, least, top, reach)
     samples = [_Samples.of(motion, f, np.array(current), least) for motion, f in zip(motions, features, strict=True)]
     tilt = _tilt_gains(samples, lags)
     residuals = [s.values - _predicted(s, tilt, lags, n) for s in samples]
-    known = [np.convolve(~s.taut, np.ones(lags[-1] + 1))[: len(s.taut)] < 0.5 for s in samples]
-    stretches = [part for r, good in zip(residuals, known, strict=True) for part in _stretches(r, good, lags[-1] + 1)]
-    white, spread = _tilt_noise(samples, residuals, known, tilt, lags, n)
+    sure = [np.convolve(~s.taut, np.ones(lags[-1] + 1))[: len(s.taut)] < 0.5 for s in samples]
+    stretches = [part for r, good in zip(residuals, sure, strict=True) for part in _stretches(r, good, lags[-1] + 1)]
+    white, spread = _tilt_noise(samples, residuals, sure, tilt, lags, n)
     gyro = _gyro_noise(samples, step)
     bends = [np.diff(part - part.mean(axis=0), 2, axis=0) for part in stretches]
     low = np.min([motion.positions.min(axis=0) for motion in motions], axis=0)
@@ -164,13 +138,15 @@ def fit(motions: Sequence[Motion], *, cycle: float, sample_cycles: int, slack: f
     due = np.concatenate([s.came for s in samples])
     return Baseline(
         cycle=cycle, sample_cycles=sample_cycles, outputs=m, drive=drive, drive_spread=drive_spread,
+        drive_fastest=row_of((1.0 + _MARGIN) * np.max([np.nanmax(np.abs(f.moved), axis=0) for f in features], axis=0)),
         current=current, current_whitening=current_white, current_spread=current_spread,
-        current_top=_row(np.max([np.abs(motion.tensions).max(axis=0) for motion in motions], axis=0)),
-        current_reach=_row(np.nanquantile(np.concatenate([f.behind for f in features]), _NEARLY, axis=0)),
-        tilt=_table(tilt), lags=lags, tilt_whitening=white, tilt_spread=spread, tilt_bias=(0.0,) * m,
-        gyro_whitening=gyro[0], gyro_spread=gyro[1], noise=_row(np.concatenate(bends).var(axis=0)),
+        current_top=row_of(top), current_reach=row_of(reach),
+        level=level, level_spread=level_spread, tilt=_table(tilt), lags=lags,
+        tilt_whitening=white, tilt_spread=spread, tilt_bias=(0.0,) * m,
+        gyro_whitening=gyro[0], gyro_spread=gyro[1], gyro_wander=gyro[2],
+        noise=row_of(np.concatenate(bends).var(axis=0)),
         missing=1.0 - float(np.mean(due)),
-        reach=_table(np.column_stack([low - margin, high + margin])), slack=_row(least),
+        reach=_table(np.column_stack([low - margin, high + margin])), slack=row_of(least),
     )  # fmt: skip
 
 
@@ -183,86 +159,6 @@ def _slow(baseline: Baseline, motion: Motion) -> Vector:
     second = max(1, round(1.0 / (baseline.cycle * baseline.sample_cycles)))
     means = [np.convolve(column, np.ones(second) / second, "valid") for column in np.array(rows).T]
     return np.nanmax(np.abs(means), axis=1, initial=0.0)
-
-
-# -- drives and currents ----------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Features:
-    """Of each cycle and motor: regressors and what they explain."""
-
-    drive: Matrix
-    moved: Matrix
-    current: Matrix
-    change: Matrix
-    speeds: Matrix
-    behind: Matrix
-
-
-def _features(motion: Motion, cycle: float) -> _Features:
-    n = motion.positions.shape[1]
-    walk = MotorFeatures(n, cycle)
-    rows: list[list[Matrix]] = [[], [], [], [], [], []]
-    for s, p, tension in zip(motion.setpoints, motion.positions, motion.tensions, strict=True):
-        walk.step(s, p, tension)
-        told = (walk.drive, walk.moved, walk.current, walk.tension_change, walk.speeds, walk.behind)
-        for row, value in zip(rows, told, strict=True):
-            row.append(np.array(value) if walk.full else np.full_like(value, np.nan))
-    return _Features(*(np.array(row) for row in rows))
-
-
-def _rows(X: list[Matrix], y: list[Matrix], motors: int, why: str, *, most: int = 6) -> tuple[Rows, Rows, Rows]:
-    """Fit each motor's model; return coefficients, whitening, and variance with its part in the square of the model."""
-    gains, white, spread = [], [], []
-    for i in range(motors):
-        kept = [np.isfinite(part[:, i]).all(axis=-1) for part in X]
-        regressors = np.concatenate([part[good, i] for part, good in zip(X, kept, strict=True)])
-        target = np.concatenate([part[good, i] for part, good in zip(y, kept, strict=True)])
-        if float(np.std(target)) <= 0.0:
-            raise DataError(f"motor {i + 1} cannot be compared with: {why}.")
-        theta = _robust(regressors, target)
-        models = [part[good, i] @ theta for part, good in zip(X, kept, strict=True)]
-        left = [part[good, i] - model for part, good, model in zip(y, kept, models, strict=True)]
-        filter_ = Whitening.fit(left, most=most)
-        order = len(filter_.coefficients)
-        squares = np.concatenate([filter_.apply(part) ** 2 for part in left])
-        shape = np.concatenate([model[order:] ** 2 for model in models])
-        gains.append(_row(theta))
-        white.append(filter_.coefficients)
-        # Cycles at the current limit are for the bootstrap: the variance is that of the others.
-        spread.append(_variance(squares, shape[:, None], all_but=0.005))
-    return tuple(gains), tuple(white), tuple(spread)
-
-
-def _robust(X: Matrix, y: Vector) -> Vector:
-    """Return least squares by Huber's weights: a few cycles at the current limit are not the model's business."""
-    theta = np.linalg.lstsq(X, y, rcond=None)[0]
-    for _ in range(10):
-        off = np.abs(y - X @ theta)
-        # 1.48 median is the standard deviation of what is normal; 2.5 as in Huber's proposal 2.
-        weight = np.sqrt(np.minimum(1.0, 2.5 * 1.48 * np.median(off) / np.maximum(off, 1e-12)))
-        theta = np.linalg.lstsq(X * weight[:, None], y * weight, rcond=None)[0]
-    return theta
-
-
-def _variance(squares: Vector, shapes: Matrix, *, all_but: float = 0.0) -> Row:
-    """Return c_0, c_1, ... >= 0 of `squares ~ c_0 + shapes c`: least squares, each row weighed by what it expects.
-
-    Without the part `all_but` of the rows with the largest squares.
-    """
-    from scipy.optimize import nnls
-
-    kept = squares <= np.quantile(squares, 1.0 - all_but)
-    squares = squares[kept]
-    X = np.column_stack([np.ones(len(squares)), shapes[kept]])
-    weight = np.full(len(squares), float(np.mean(squares)))
-    found = np.zeros(X.shape[1])
-    for _ in range(5):
-        found = nnls(X / weight[:, None], squares / weight)[0]
-        weight = np.maximum(X @ found, 1e-3 * float(np.mean(squares)))
-    found[0] = max(found[0], 1e-3 * float(np.mean(squares)))
-    return _row(found)
 
 
 # -- tilt -------------------------------------------------------------------------------------------------------
@@ -279,9 +175,9 @@ class _Samples:
     came: Flags
 
     @classmethod
-    def of(cls, motion: Motion, features: _Features, current: Matrix, slack: Vector) -> _Samples:
+    def of(cls, motion: Motion, features: Features, current: Matrix, slack: Vector) -> _Samples:
         n = motion.positions.shape[1]
-        friction = np.einsum("tij,ij->ti", features.speeds, current[:, n:])
+        friction = np.einsum("tij,ij->ti", features.place[:, :, n:], current[:, n:])
         taut = (motion.tensions - friction >= slack).all(axis=1)
         at = np.flatnonzero(motion.due)
         values = motion.values[at].copy()
@@ -357,14 +253,14 @@ def _tilt_noise(
         squares = np.concatenate([filter_.apply(part) ** 2 for part in parts])
         shapes = [np.concatenate([part[order:] ** 2 for part in column]) for column in (changes, ways)]
         white.append(filter_.coefficients)
-        spread.append(_variance(squares, np.column_stack(shapes)))
+        spread.append(variance_of(squares, np.column_stack(shapes)))
     return tuple(white), tuple(spread)
 
 
-def _gyro_noise(samples: Sequence[_Samples], step: float) -> tuple[Rows, Row]:
-    """Return whitening and variance of the angles against integrated rates; () where there are no rates."""
+def _gyro_noise(samples: Sequence[_Samples], step: float) -> tuple[Rows, Row, Row]:
+    """Return whitening of angles against integrated rates, variance after and before it; () without rates."""
     if not all(np.isfinite(s.rates[s.came]).all() for s in samples):
-        return (), ()
+        return (), (), ()
     levels: list[Matrix] = []
     for s in samples:
         walk = GyroLevel(s.values.shape[1], step)
@@ -375,12 +271,9 @@ def _gyro_noise(samples: Sequence[_Samples], step: float) -> tuple[Rows, Row]:
         filter_ = Whitening.fit([level[:, a] for level in levels])
         white.append(filter_.coefficients)
         spread.append(float(np.mean(np.concatenate([filter_.apply(level[:, a]) for level in levels]) ** 2)))
-    return tuple(white), tuple(spread)
-
-
-def _row(values: Vector) -> Row:
-    return tuple(float(value) for value in values)
+    wander = np.concatenate(levels).var(axis=0)
+    return tuple(white), tuple(spread), row_of(wander)
 
 
 def _table(values: Matrix) -> Rows:
-    return tuple(_row(row) for row in values)
+    return tuple(row_of(row) for row in values)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ._calibrate import Motion
+from ._motor_models import Motion
 
 
 class MotionLog:

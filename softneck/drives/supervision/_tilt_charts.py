@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from typing import Any
 
 import numpy as np
 
 from softneck.core import Matrix, Vector
-from softneck.signals.detection._cusum import Charts, shift_score, spread_score
+from softneck.runtime import load_functions
+from softneck.signals.detection._cusum import Charts, shift_score
 from softneck.signals.detection._whitening import Filter, Whitening
 
 from ._baseline import Baseline
+from ._motor_charts import RUNTIME
 
 # Faults as large as those that have to be found: a gear of another stage, a filter that takes 0.2 s, 1.5 deg of drift
 # (half of the 3 deg that a fault may lead the neck astray), a fifth or five times the noise.
@@ -22,21 +25,20 @@ _NOISES = (1.0 / 25.0, 25.0)
 # What angles and gyro differ by leaks away over the first time, and its rate, the gyro's own bias, is averaged over the
 # second [s].
 _FORGET, _BIAS = 6.0, 15.0
-# A gyro that shows this part of what the model misses: some of it leaks away, and the model has errors of its own.
-_ALONE = 0.5
+# Time in which a drift has to be found: the bias is taken from before [s].
+_OLD = 4.0
 # Times that the model looks back, until it is believed.
 _SETTLED = 2
 # Faults are weighed by what was seen in about this time [s].
 _LATELY = 0.5
 # Samples at rest that say where tilt and model begin.
 _REST = 25
-# Faults that the residual of the model tells of; of these, what a gyro denies, and what it confirms: a unit that hangs
-# has a gyro that hangs.
+# Faults that the residual of the model tells of; of these, what a gyro that stays behind confirms. One that goes along
+# denies nothing: of a unit that hangs the gyro hangs too.
 _OF_MODEL = frozenset(
     {"gear_wrong", "sensor_stuck", "sensor_reversed", "sensor_swapped", "sensor_late", "tilt_unexplained"}
 )
 _OF_SENSOR = frozenset({"sensor_stuck", "sensor_late", "tilt_unexplained"})
-_OF_NECK = _OF_MODEL
 
 
 def tilt_names(motors: int, outputs: int, *, gyro: bool) -> list[tuple[str, int, float]]:
@@ -56,18 +58,21 @@ class TiltModel:
 
     def __init__(self, tilt: Matrix, lags: tuple[int, ...], motors: int) -> None:
         """Know nothing yet; `tilt` is (outputs, lags x motors)."""
-        self._gains = tilt.reshape(len(tilt), len(lags), motors)
+        self._gains = tilt.reshape(len(tilt), len(lags), motors).copy()
         self._lags = np.array(lags)
         self._past = np.zeros((max(lags) + 1, motors))
         self._begun = False
+        self._functions: Any = load_functions(RUNTIME)
 
     def step(self, positions: Vector) -> Matrix:
         """Return each motor's part of the tilt (motors, outputs) [rad], but for an offset."""
-        # Motors stood before the first sample.
-        self._past[1:] = self._past[:-1] if self._begun else positions
-        self._past[0] = positions
-        self._begun = True
-        return np.einsum("alm,lm->ma", self._gains, self._past[self._lags])
+        if not self._begun:
+            # Motors stood before the first sample.
+            self._past[:] = positions
+            self._begun = True
+        parts = np.empty((len(positions), len(self._gains)))
+        self._functions.supervised_angle(self._gains, self._lags, self._past, positions, parts)
+        return parts
 
 
 class GyroLevel:
@@ -84,12 +89,13 @@ class GyroLevel:
         self.level = np.zeros(outputs)
         self._bias = np.zeros(outputs)
         self._last: tuple[Vector, Vector] | None = None
-        self._samples = 0
+        self._late: deque[Vector] = deque()
+        self._samples = self._averaged = 0
 
     @property
     def known(self) -> bool:
-        """Whether the bias was averaged for a third of its memory."""
-        return self._samples * self._step > _BIAS / 3.0
+        """Whether the bias was averaged for a tenth of its memory."""
+        return self._averaged * self._step > _BIAS / 10.0
 
     def take(self, values: Vector | None, rates: Vector) -> bool:
         """Take a sample; return whether the level went on."""
@@ -100,9 +106,13 @@ class GyroLevel:
         if last is None:
             return False
         change = values - last[0] - 0.5 * self._step * (rates + last[1])
-        # From the mean of all samples to that of the last ones.
         self._samples += 1
-        self._bias = self._bias + max(self._step / _BIAS, 1.0 / self._samples) * (change - self._bias)
+        self._late.append(change)
+        # The bias is that of before: of the older half of what was seen, or of what is as old as a drift may become.
+        while len(self._late) > min(self._samples // 2, round(_OLD / self._step)):
+            self._averaged += 1
+            share = max(self._step / _BIAS, 1.0 / self._averaged)
+            self._bias = self._bias + share * (self._late.popleft() - self._bias)
         self.level = (1.0 - self._step / _FORGET) * self.level + change - self._bias
         return self.known
 
@@ -126,8 +136,13 @@ class TiltCharts:
         self._model = TiltModel(np.array(b.tilt), b.lags, n)
         self._step = b.cycle * b.sample_cycles
         self._hypotheses = 2 * (n + 1) + 2 * m + (m - 1) + 1 + 2 * m
-        self._filter = Filter([Whitening(row) for row in b.tilt_whitening], (1 + self._hypotheses,))
-        self._turned = Filter([Whitening(row) for row in b.gyro_whitening], (3,)) if b.gyro_spread else None
+        self._filter = Filter([Whitening(row) for row in b.tilt_whitening], 1 + self._hypotheses)
+        self._turned = Filter([Whitening(row) for row in b.gyro_whitening], 1 + 2 * m) if b.gyro_spread else None
+        self._functions: Any = load_functions(RUNTIME)
+        self._gears, self._noises = np.array(_GEARS), np.array(_NOISES)
+        self._raw = np.zeros((1 + self._hypotheses, m))
+        # Where angles and gyro part, and what an offset of each output, to either side, would make of it.
+        self._levels = np.vstack([np.zeros(m), np.kron(np.eye(m), np.array([[_OFFSET], [-_OFFSET]]))])
         self.gyro = GyroLevel(m, self._step)
         self._spread, self._gyro_spread = np.array(b.tilt_spread), np.array(b.gyro_spread)
         self._noise = np.array(b.noise)
@@ -144,8 +159,8 @@ class TiltCharts:
         self._rest: deque[Vector] = deque(maxlen=_REST)
         self._began: Matrix | None = None
         self._offset = np.zeros(m)
-        self._stuck = np.zeros((m, m))
-        self._explained = self._information = np.zeros(self._hypotheses)
+        self._stuck = np.zeros(m)
+        self._explained, self._information = np.zeros(self._hypotheses), np.zeros(self._hypotheses)
         self._running, self._wait = False, _SETTLED * b.lags[-1]
         self.residual = self.bend = np.zeros(m)
         self.valid = False
@@ -170,20 +185,21 @@ class TiltCharts:
         names = [name for name, _, _ in self.names]
         told = {name for name, over in zip(names, beyond, strict=True) if over}
         if not told & _OF_MODEL:
-            return (int(np.argmax(np.where(beyond, self.charts.sums, -np.inf))) if told else -1), 0.0
+            # Noise and gyro have charts of their own, which nothing else raises.
+            return (int(np.argmax(np.where(beyond, self.charts.sums, -np.inf))), math.inf) if told else (-1, 0.0)
         h = self._hypotheses
         size = np.clip(self._explained / np.maximum(self._information, 1e-12), 0.7, 1.4)
         gain = size * self._explained - 0.5 * size**2 * self._information
-        possible, alone = np.ones(h, dtype=bool), False
+        alone = 0.0
         if self._turned is not None and self.gyro.known:
-            square = float(np.sum(self.residual**2))
-            alone = float(np.sum(self.gyro.level * self.residual)) > _ALONE * square
-            possible = np.array([name in (_OF_SENSOR if alone else _OF_NECK) for name in names[:h]])
-        gain = np.where(possible, gain, -np.inf)
+            # How much likelier angles that left their gyro by the whole residual are than a neck that moved.
+            r = self.residual
+            alone = max(0.0, float(np.sum(r * (self.gyro.level - 0.5 * r) / np.array(self._b.gyro_wander))))
+            gain = gain + alone * np.array([name in _OF_SENSOR for name in names[:h]])
         found = int(np.argmax(gain))
         other = np.array([name != names[found] for name in names[:h]])
         lead = float(gain[found] - np.max(gain[other]))
-        if alone and names[found] == "tilt_unexplained":
+        if alone > 0.0 and names[found] == "tilt_unexplained":
             found = names.index("sensor_drift") + 2 * self.names[found][1] + int(self.names[found][2] < 0.0)
         return found, lead
 
@@ -226,58 +242,34 @@ class TiltCharts:
             self._align()
 
     def _score(self, parts: Matrix, angle: Vector, turned: bool) -> None:
-        n, m, h = self._b.motors, self._b.outputs, self._hypotheses
+        m, h, run = self._b.outputs, self._hypotheses, self._functions
         began = parts if self._began is None else self._began
-        way = parts - began
-        moved = angle - began.sum(axis=0)
-        raw = np.zeros((1 + h, m))
-        raw[0] = self.residual
-        at = 1
-        for gear in _GEARS:
-            # The file's gear is off by this: the winch turned so many times what its counts say.
-            raw[at : at + n] = (gear - 1.0) * way
-            raw[at + n] = (gear - 1.0) * moved
-            at += n + 1
-        stuck, eye = at, np.eye(m)
-        raw[at : at + m] = eye * (self._stuck - angle)
-        raw[at + m : at + 2 * m] = eye * (-2.0 * moved)
-        at += 2 * m
-        for a in range(m - 1):
-            raw[at, a], raw[at, a + 1] = moved[a + 1] - moved[a], moved[a] - moved[a + 1]
-            at += 1
-        raw[at] = self._angles[0] - angle
-        at += 1
-        raw[at : at + 2 * m : 2], raw[at + 1 : at + 2 * m : 2] = eye * _OFFSET, eye * -_OFFSET
-        # An offset that is there from now on was not there before, and a sensor that is stuck now was not.
-        white = self._filter.step(raw)
+        seen = (self.residual, parts, began, self._angles[0], self._stuck)
+        run.supervised_faults(self._gears, _OFFSET, seen, self._raw)
         change = self._angles[-1] - self._angles[-min(3, len(self._angles))]
-        spread = self._spread[:, 0] + self._spread[:, 1] * change**2 + self._spread[:, 2] * moved**2
-        good = self.valid and self._filter.settled
-        allowance = np.sum(np.abs(white[1:]) * self._bias_allowed / spread, axis=1)
-        self.scores[:h] = shift_score(white[0], white[1:], spread) - allowance if good else 0.0
-        lately = math.exp(-self._step / _LATELY) if good else 0.0
-        self._explained = lately * self._explained + np.sum(white[1:] * white[0] / spread, axis=1)
-        self._information = lately * self._information + np.sum(white[1:] ** 2 / spread, axis=1)
-        at = h
-        for a in range(m):
-            for ratio in _NOISES:
-                self.scores[at] = spread_score(float(self.bend[a]), float(self._noise[a]), ratio) if good else 0.0
-                at += 1
+        squares = (change**2, (angle - began.sum(axis=0)) ** 2)
+        # An offset that is there from now on was not there before, and a sensor that is stuck now was not.
+        f = self._filter
+        f.seen += 1
+        good = self.valid and f.settled
+        run.supervised_tilt(
+            self._spread, self._bias_allowed, squares, (f.coefficients, f.past, self._raw),
+            (self._explained, self._information), math.exp(-self._step / _LATELY), good, self.scores,
+        )  # fmt: skip
+        run.supervised_noise(self.bend, self._noise, self._noises, good, self.scores[h : h + 2 * m])
         if self._turned is not None:
-            offset = np.full(m, _OFFSET)
-            white = self._turned.step(np.stack([self.gyro.level, offset, -offset]))
-            for a in range(m):
-                for sign in (1, 2):
-                    score = shift_score(white[0, a : a + 1], white[sign, None, a : a + 1], self._gyro_spread[a : a + 1])
-                    self.scores[at] = float(score[0]) if turned and self._turned.settled else 0.0
-                    at += 1
+            self._levels[0] = self.gyro.level
+            white = self._turned.step(self._levels)
+            told = turned and self._turned.settled
+            self.scores[h + 2 * m :] = shift_score(white[0], white[1:], self._gyro_spread) if told else 0.0
         if not good:
             self.charts.sums[: h + 2 * m] = 0.0
         # Where a chart is empty, its fault begins now: a stuck sensor stays at what the model says.
+        stuck = 1 + 2 * (self._b.motors + 1)
         for a in range(m):
             if self.charts.sums[stuck - 1 + a] <= 0.0:
-                self._stuck[a] = angle
-                self._filter.past[:, stuck + a] = 0.0
+                self._stuck[a] = angle[a]
+                f.past[:, stuck + a] = 0.0
 
     def _align(self) -> None:
         """What tilt and model differ by now is an offset of theirs."""

@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
 from softneck.core import FileFormatError, OutputFileError, SettingsError
+from softneck.core._budget import open_zip
 
 # PKWARE's APPNOTE 6.3: local header, entry of the directory, end of the directory.
 _LOCAL, _ENTRY, _END = "<4s5H3L2H", "<4s6H3L5H2L", "<4s4H2LH"
@@ -67,8 +68,6 @@ def read_zip(path: Path) -> dict[str, bytes]:
         return {entry.filename: archive.read(entry) for entry in archive.infolist() if not entry.is_dir()}
 
 
-# A three-platform FMU weighs a few MB; more than this wants to fill the disk.
-_MAX_BYTES = 2 * 2**30
 _PLAIN = re.compile(r"[A-Za-z0-9_./\\:~-]+")
 
 
@@ -84,7 +83,7 @@ def unpack(path: str | Path, *, main: str = "modelDescription.xml", what: str = 
     if not source.is_file():
         raise FileFormatError(f"{source}: no such file.")
     try:
-        with zipfile.ZipFile(source) as archive:
+        with open_zip(source) as archive:
             _check_members(source, archive, main, what)
             folder = Path(tempfile.mkdtemp(prefix="softneck-unpacked-", dir=_plain_folder()))
             try:
@@ -117,9 +116,6 @@ def _check_members(source: Path, archive: zipfile.ZipFile, main: str, what: str)
         name = PurePosixPath(entry.orig_filename)
         if name.is_absolute() or ".." in name.parts or "\\" in entry.orig_filename or ":" in entry.orig_filename:
             raise FileFormatError(f"{source}: its member `{entry.orig_filename}` reaches out of it; not unpacked.")
-    total = sum(entry.file_size for entry in entries)
-    if total > _MAX_BYTES:
-        raise FileFormatError(f"{source}: unpacks to {total} bytes, over the limit of {_MAX_BYTES}.")
     if main not in archive.namelist():
         raise FileFormatError(f"{source}: is not {what}: it has no {main}.")
 

@@ -18,6 +18,7 @@ from softneck.core import (
     SettingsError,
     Vector,
     require_one_of,
+    resolve,
     to_si,
     write_archive,
 )
@@ -177,7 +178,7 @@ class Model(Shown):
             motors: "measured" feeds logged motor positions throughout, as the paper does.
             warm_up: samples at the start of each run in which the measured outputs are fed.
         """
-        self._check(recording)
+        self.check(recording)
         require_one_of("motors", motors, _MOTORS)
         return self._labelled(recording, [self._free_run(run, motors, warm_up) for run in recording.runs()])
 
@@ -188,7 +189,7 @@ class Model(Shown):
 
         The first rows of each run, with no such past, are predicted from its first row.
         """
-        self._check(recording)
+        self.check(recording)
         require_one_of("motors", motors, _MOTORS)
         if horizon < 1:
             raise DataError(f"`horizon` must be at least 1 sample; got {horizon}.")
@@ -205,8 +206,22 @@ class Model(Shown):
         return self._labelled(recording, parts)
 
     def _labelled(self, recording: Recording, parts: Sequence[Matrix]) -> Labelled:
-        units = {port.name: port.unit for port in self.block().outputs}
-        return Labelled(np.concatenate(parts), recording.time, units)
+        return Labelled(np.concatenate(parts), recording.time, {port.name: port.unit for port in self.block().outputs})
+
+    def adapted(self, recording: Recording, *, window: float = 30.0) -> Model:
+        """Return the model refitted to the latest data, held to what it is where these say nothing.
+
+        Every third block of 2 s of the window is held out: where an output is worse there, this model is kept.
+        `findings["adaptation"]` says what became of it.
+
+        Args:
+            recording: whose last `window` [s] is looked at.
+
+        Raises:
+            SettingsError: a kind that cannot adapt.
+        """
+        # Above this room: what moves is known by kind.
+        return resolve("softneck.identification.adaptation._adapt:adapted")(self, recording, window)
 
     def tf(
         self,
@@ -320,7 +335,8 @@ class Model(Shown):
     def _starts(self, y0: Vector) -> dict[str, float]:
         return {f"{name}_start": float(y) for name, y in zip(self.robot.outputs.names, y0, strict=True)}
 
-    def _check(self, recording: Recording) -> None:
+    def check(self, recording: Recording) -> None:
+        """Raise DataError for a recording that this model cannot run along: another robot or sample time."""
         require_same_robot(recording.robot, self.robot, "a model and a recording")
         if not np.isclose(recording.sample_time, self.sample_time, rtol=1e-3):
             raise DataError(
@@ -368,8 +384,7 @@ def _input_rows(run: Recording, source: str, *, outputs: bool = True) -> Matrix:
     motors, both = U.shape[1], U.shape[1] + Y.shape[1]
     rows = np.full((len(run), both + motors), np.nan)
     rows[:, :motors] = U
-    if outputs:
-        rows[:, motors:both] = Y
+    rows[:, motors:both] = Y if outputs else np.nan
     if source == "measured" and run.has_motor_positions:
         rows[:, both:] = run.motor_positions
     return rows

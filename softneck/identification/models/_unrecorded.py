@@ -44,7 +44,7 @@ def unrecorded(train: Recording, seconds: float, *, seed: int = 0) -> list[Recor
 def _mapped(train: Recording, own: Matrix) -> Recording:
     """Return a neck's set-points (time, 3) at 20 ms mapped onto the trained ones and their speed."""
     Ts, first = train.sample_time, train.runs()[0]
-    P = _on_motors(own, train.set_points.shape[1])
+    P = on_motors(own, train.set_points.shape[1])
     # Slower or faster by as much as the record is.
     rows = np.arange(0.0, len(P) - 1.0, Ts / (SAMPLE_TIME * _stretch(train)))
     P = np.column_stack([np.interp(rows, np.arange(len(P)), column) for column in P.T])
@@ -66,7 +66,7 @@ def _root(P: Matrix, power: float) -> Matrix:
     return axes * np.maximum(variances, 1e-12 * variances[-1]) ** power @ axes.T
 
 
-def _on_motors(P: Matrix, motors: int) -> Matrix:
+def on_motors(P: Matrix, motors: int) -> Matrix:
     """Return the signal for as many motors (time, motors); those beyond three play it with another delay."""
     late = len(P) // (motors + 1)
     return np.column_stack([np.roll(P[:, j % P.shape[1]], late * (j // P.shape[1])) for j in range(motors)])

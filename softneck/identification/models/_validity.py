@@ -101,6 +101,17 @@ def grounded(model: Model, recording: Recording, *, trust: Trust | None = None) 
     )
 
 
+def doubted(model: Model, errors: Matrix) -> Model:
+    """Return `model` that trusts itself no more than `errors` (time, outputs) allow, NaN where nothing was measured."""
+    allowed = tolerance_of(model)
+    if allowed is None or not knows_validity(model):
+        return model
+    doubt = model.arrays["doubt"].copy()
+    missed = np.clip(np.nanmean(errors**2, axis=0) / allowed**2, 1e-6, _MOST)
+    doubt[:, 0] = np.maximum(doubt[:, 0], TRUST.get(model.kind, _LEARNED).ratio ** 2 * missed)
+    return replace(model, arrays={**model.arrays, "doubt": doubt})
+
+
 def tolerance_finding(robot: Robot, allowed: Vector) -> dict[str, Any]:
     """Return the finding that says what error `validity` allows, (outputs,) in SI, in the unit that people see."""
     unit = robot.outputs.display_unit

@@ -25,6 +25,7 @@ from ..uncertainty._guarded_base import BASES, fitted_base
 from ..uncertainty._residual import Residual
 from ..validation._score_tables import INFINITE
 from ..validation._validation import Rules, Validation, judge, judged_parts
+from ._choice_words import ALIKE, guarded_why, reasons, remarks, why, word
 from ._exam import agreement, exams, free_runs
 from ._kind_trial import EXAM, HOLD_OUT, KindTrial
 from ._left_out import Fold, everything, folds
@@ -45,10 +46,6 @@ _SCREENED: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 # Of the noise: the epsilon of screened sets, whose own choice among many takes several times as long.
 _SIGMAS = 8.0
-# Fits closer than this are alike [points]: seeds of noise and training move them by as much.
-ALIKE = 0.5
-# Below this [%] no kind has understood the recording.
-_POOR = 70.0
 _MOST_MEMBERS = 3
 # What a guarded form may cost on the rows held out [points]: it is taken for what it does elsewhere.
 _GUARD_COST = 2.0
@@ -97,7 +94,7 @@ def choose(
     others on motions that nobody recorded. The least of these scores ranks. After each training the better half goes
     on. The best, of those alike the one of the fewest numbers, is trained on all rows and judged on `hold_out` again,
     from the first row only as well; where it then falls behind the next, that one is trained too. So is the best linear
-    kind, which controllers are designed on.
+    kind, which controllers are designed on, or the best nonlinear one where the chosen is linear.
 
     `residual` is put on the best of the others, `ensemble` is the median of the best three, and is never taken where
     one of them is better on anything held out. Of a learned kind that wins, the guarded form is taken: it falls back to
@@ -121,7 +118,7 @@ def choose(
     # The matrices are small: a second thread of BLAS would only wait.
     with threadpool_limits(limits=1):
         for number, kind in enumerate(wanted):
-            progress(0.7 * number / len(wanted), _word(kind, list(race.tried.values())))
+            progress(0.7 * number / len(wanted), word(kind, list(race.tried.values())))
             if kind in _MADE_OF_OTHERS:
                 race.examine()
             race.screen(kind)
@@ -129,12 +126,12 @@ def choose(
         race.leave_out(lambda done, what: progress(0.7 + 0.1 * done, what))
         best = race.trained(lambda done, what: progress(0.8 + 0.1 * done, what))
         chosen = race.guarded(best, lambda done, what: progress(0.9 + 0.1 * done, what))
-        race.train_linear(chosen)
+        race.train_other(chosen)
     ranking = race.ranking()
     progress(1.0, f"chosen: {chosen.kind}")
     alike = [one for one in ranking if one.fit > best.fit - ALIKE and one not in (best, chosen)]
-    remarks = (*poor_excitation(train), *_remarks(ranking, other_excitation))
-    return Choice(ranking, chosen, _why(best, alike) + _guarded_why(best, chosen), remarks, seed)
+    wary = (*poor_excitation(train), *remarks(ranking, other_excitation))
+    return Choice(ranking, chosen, why(best, alike) + guarded_why(best, chosen), wary, seed)
 
 
 def refit(choice: Choice, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
@@ -162,6 +159,15 @@ def _wanted(train: Recording, kinds: Sequence[str]) -> list[str]:
     if unknown:
         raise SettingsError(f"`{unknown[0]}` cannot be tried; known: {', '.join(known)}.")
     return sorted(kinds or usual, key=_SIMPLE_FIRST.index)
+
+
+def best_other(ranking: Sequence[KindTrial], chosen: str) -> KindTrial | None:
+    """Return the best linear kind beside one that is not, and the other way round; None where none ran free.
+
+    A median of others may be one of linear kinds, so it does not stand for what bends.
+    """
+    sought = [one for one in ranking if (one.kind in LINEAR) != (chosen in LINEAR) and one.kind != "ensemble"]
+    return max((one for one in sought if one.fit > float("-inf")), key=lambda one: one.fit, default=None)
 
 
 class _Race:
@@ -274,11 +280,11 @@ class _Race:
         self.tried["guarded"] = one
         return one if one.hold_out_fit > best.hold_out_fit - _GUARD_COST else best
 
-    def train_linear(self, chosen: KindTrial) -> None:
-        """Train the best linear kind on all rows where the chosen one is not linear."""
-        linear = [one for one in self.ranking() if one.kind in LINEAR and one.fit > float("-inf")]
-        if chosen.kind not in LINEAR and linear:
-            self.whole(linear[0].kind)
+    def train_other(self, chosen: KindTrial) -> None:
+        """Train the best linear kind on all rows where the chosen one is not linear, else the best that is not."""
+        other = best_other(self.ranking(), chosen.kind)
+        if other is not None and not other.whole:
+            self.whole(other.kind)
 
     def whole(self, kind: str) -> None:
         """Train a kind on all rows to train on, and judge it again on the hold-out."""
@@ -300,8 +306,7 @@ class _Race:
         ranking = [one for one in self.ranking() if one.kind != "ensemble" or self._no_member_is_better(one)]
         best = ranking[0]
         if best.fit == float("-inf"):
-            reasons = "; ".join(f"{one.kind}: {one.failure or 'its free run diverged'}" for one in ranking)
-            raise DataError(f"no kind could be identified: {reasons}")
+            raise DataError(f"no kind could be identified: {reasons(ranking)}")
         alike = [one for one in ranking if one.fit > best.fit - ALIKE]
         return min(alike, key=lambda one: (one.numbers, _SIMPLE_FIRST.index(one.kind)))
 
@@ -353,48 +358,3 @@ def _anew(model: Model, train: Recording, seed: int, progress: Progress = silent
     if model.kind == "residual":
         return Residual().on(made_of[0], train)
     return combine(made_of) if model.kind == "ensemble" else _settings(model.kind, seed, {}).fit(train)
-
-
-def _word(kind: str, tried: list[KindTrial]) -> str:
-    best = max(tried, key=lambda one: one.fit, default=None)
-    return kind if best is None or best.fit == float("-inf") else f"{kind} (best so far {best.kind}, {best.fit:.1f} %)"
-
-
-def _why(chosen: KindTrial, alike: list[KindTrial]) -> str:
-    said = f"{chosen.kind} runs free with {chosen.fit:.1f} % at its worst ({chosen.worst})"
-    if not alike:
-        return f"{said}, better than all others at theirs."
-    others = ", ".join(f"{one.kind} {one.fit:.1f} % with {one.numbers} numbers" for one in alike)
-    return (
-        f"{said}; {others} are not worse by more than {ALIKE:g} points, and of such kinds the one of the fewest "
-        f"numbers is taken ({chosen.numbers})."
-    )
-
-
-def _guarded_why(best: KindTrial, chosen: KindTrial) -> str:
-    if chosen is best or chosen.model is None:
-        return ""
-    settings = chosen.model.settings
-    return (
-        f" Its guarded form is taken: {settings['members']} models of {best.kind} that fade to `{settings['base']}` "
-        f"where they part or nothing was seen; {chosen.hold_out_fit:.1f} % on the rows held out, {best.kind} alone "
-        f"{best.hold_out_fit:.1f} %."
-    )
-
-
-def _remarks(ranking: tuple[KindTrial, ...], other_excitation: bool) -> tuple[str, ...]:
-    remarks = []
-    if not other_excitation:
-        remarks.append(
-            "The rows held out are of the excitation that was trained on: this ranking may not hold for other "
-            "motions. Give a second recording with another signal; the last one is held out."
-        )
-    if ranking[0].fit < _POOR:
-        remarks.append(
-            f"No kind reaches {_POOR:g} % in free run. Look for a drifting sensor, a wrong sample time or sign, motors "
-            "that were not logged, or an excitation that hardly moves the robot."
-        )
-    failed = [one.kind for one in ranking if one.fit == float("-inf")]
-    if failed:
-        remarks.append(f"Not identified or diverged: {', '.join(failed)}.")
-    return tuple(remarks)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import DataError, SettingsError, Vector, require_between, require_one_of, require_whole
+from softneck.core._budget import available_bytes
 
 from ._cone_set import ConeSet, as_matrix, as_outputs
 from ._forest import PointTree, all_cores, plant, region_gammas, tighten
@@ -28,16 +28,6 @@ def require_memory(rows: int, inputs: int, outputs: int) -> None:
             f"{rows * per_row / 2**30:.3g} GB to build, and {free / 2**30:.3g} GB are free: at most "
             f"{int(free / per_row)} points fit. Take every m-th row."
         )
-
-
-def available_bytes() -> int | None:
-    """Return how much memory may be had without swapping, or None where the system does not say."""
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-    except OSError:
-        return None
-    kilobytes = [int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
-    return 1024 * kilobytes[0] if kilobytes else None
 
 
 # At most so many rows tell how wide the bounds are between the data: a quantile needs no more.

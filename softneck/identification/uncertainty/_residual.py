@@ -122,7 +122,9 @@ class Residual:
             arrays = self._arrays(base, head, sigmas * noise)[0]
             model = Model(kind="residual", sample_time=head.sample_time, arrays=arrays, robot=recording.robot)
             Y = model.simulate(tail)[WARM_UP:]
-            fit = sum(nrmse_fit(tail.outputs[WARM_UP:, axis], Y[:, axis]) for axis in range(noise.size)) / noise.size
+            fits = [nrmse_fit(tail.outputs[WARM_UP:, axis], Y[:, axis]) for axis in range(noise.size)]
+            known = [fit for fit in fits if np.isfinite(fit)]  # an output that stood still there has none
+            fit = sum(known) / len(known) if known else float("-inf")
             found.append((fit, float(np.mean(Y[:, lower + 1] - Y[:, lower])), sigmas * noise))
         best = max(fit for fit, _, _ in found)
         return min((entry for entry in found if entry[0] >= best - _ALIKE), key=lambda entry: entry[1])[2]

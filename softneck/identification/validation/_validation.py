@@ -266,7 +266,7 @@ def validate(
 def check_training_data(model: Model, training: Recording | None) -> None:
     """Raise DataError where the training data is at another sample time than the model."""
     if training is not None:
-        model._check(training)
+        model.check(training)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -283,7 +283,7 @@ def judged_parts(
     model: Model, recording: Recording, rules: Rules, known: dict[bytes, Baselines] | None = None
 ) -> Parts:
     """Return the stretches that a model has not seen; `known` keeps baselines for models that saw the same rows."""
-    model._check(recording)  # its sample time, before anything is computed
+    model.check(recording)  # its sample time, before anything is computed
     if rules.motors == "measured" and not recording.has_motor_positions:
         raise DataError(
             "motors=measured needs logged motor positions and the recording has none; judge it with --motors simulated."

@@ -15,13 +15,11 @@ import numpy as np
 
 from softneck.core import Vector
 
-# An innovation counts for no more than this many standard deviations, and so does a fault: no model is right to a few
-# per cent in each sample, and none alone shall decide.
-_CLIP = 5.0
+from ._charts_runtime import CHART_CLIP as _CLIP
 
 
 def shift_score(innovation: Vector, mean: Vector, variance: Vector, *, sight: float = _CLIP) -> Vector:
-    """Return s for the hypotheses of `mean` (hypotheses, channels): shape (hypotheses,).
+    """Return s for the hypotheses of `mean` (hypotheses, channels), all at once: shape (hypotheses,).
 
     Args:
         innovation: e (channels,).
@@ -34,13 +32,7 @@ def shift_score(innovation: Vector, mean: Vector, variance: Vector, *, sight: fl
     f = mean / spread
     # Clipped around the fault's mean as well: what the fault explains may be as large as it likes.
     seen = np.clip(e, np.minimum(f, 0.0) - _CLIP, np.maximum(f, 0.0) + _CLIP)
-    return np.sum(f * seen - 0.5 * f * f, axis=-1)
-
-
-def spread_score(innovation: float, variance: float, ratio: float) -> float:
-    """Return s for a variance that changed by `ratio` (Basseville and Nikiforov, example 2.2.2)."""
-    square = min(innovation * innovation / variance, _CLIP * _CLIP * max(1.0, ratio))
-    return 0.5 * (1.0 - 1.0 / ratio) * square - 0.5 * np.log(ratio)
+    return (f * (seen - 0.5 * f)).sum(axis=-1)
 
 
 class Charts:

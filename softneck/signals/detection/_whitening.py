@@ -9,10 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from softneck.core import DataError, Matrix, Vector
+from softneck.runtime import load_functions
 
 # Rows per coefficient below which an order is not tried: fewer fit the noise.
 _ROWS_EACH = 20
@@ -74,35 +76,36 @@ class Filter:
     """Whitening filters that run along, one for each channel: for residuals and for all that faults would add to them.
 
     Attributes:
-        past: values so far, the latest first (order, ..., channels).
+        coefficients: (order, channels), zero beyond a channel's own order.
+        past: values so far, the latest first (order, kinds, channels).
+        seen: how many values it took.
     """
 
-    __slots__ = ("_coefficients", "_seen", "past")
+    __slots__ = ("_step", "coefficients", "past", "seen")
 
-    def __init__(self, channels: Sequence[Whitening], shape: tuple[int, ...] = ()) -> None:
-        """Know nothing yet; values have shape (*shape, channels)."""
+    def __init__(self, channels: Sequence[Whitening], kinds: int = 1) -> None:
+        """Know nothing yet; values have shape (kinds, channels)."""
         order = max((len(channel.coefficients) for channel in channels), default=0)
         padded = [[*channel.coefficients, *(0.0,) * (order - len(channel.coefficients))] for channel in channels]
-        self._coefficients = np.array(padded).T.reshape(order, *(1,) * len(shape), len(channels))
-        self.past = np.zeros((order, *shape, len(channels)))
-        self._seen = 0
+        self.coefficients = np.array(padded).reshape(len(channels), order).T.copy()
+        self.past = np.zeros((order, kinds, len(channels)))
+        self.seen = 0
+        self._step: Any = load_functions("softneck.signals.detection._charts_runtime").chart_whiten
 
     @property
     def settled(self) -> bool:
         """Whether it has seen as many values as it looks back."""
-        return self._seen >= len(self.past)
+        return self.seen >= len(self.past)
 
     def step(self, value: Matrix) -> Matrix:
-        """Return the innovations of `value` (*shape, channels)."""
-        if not len(self.past):
-            return value
-        white = value - (self._coefficients * self.past).sum(axis=0)
-        self.past[1:] = self.past[:-1]
-        self.past[0] = value
-        self._seen += 1
+        """Return the innovations of `value` (kinds, channels)."""
+        white = np.array(value, dtype=np.float64)
+        for channel in range(white.shape[1]):
+            self._step(self.coefficients, self.past, white, channel)
+        self.seen += 1
         return white
 
     def reset(self) -> None:
         """Forget all values."""
         self.past[:] = 0.0
-        self._seen = 0
+        self.seen = 0

@@ -109,9 +109,9 @@ def _guess(path: Path, neck: Robot) -> Guess:
     found = units(draft)
     moved = all(name in draft.picks for name in SET_POINTS)
     robot = one_axis(draft, _other_axis(draft), neck) if moved else neck
+    check_lines, sign_doubts = _checks(draft)
     layout, clock_lines, clock_doubts = _clocked(draft, found, _layout(draft, found, robot))
     missing = _missing(draft, layout)
-    check_lines, sign_doubts = _checks(draft)
     doubts = sorted([*doubts_of(draft, found), *clock_doubts, *sign_doubts], key=lambda doubt: doubt.confidence)
     remarks = {name: _why(draft, found, name) for name in draft.picks}
     remarks |= {doubt.channels[0]: f"{remarks[doubt.channels[0]]}; NOT SURE: {doubt}" for doubt in sign_doubts}
@@ -227,7 +227,10 @@ def _line(draft: Draft, found: dict[str, Unit], name: str) -> str:
 
 
 def _checks(draft: Draft) -> tuple[list[str], list[Doubt]]:
-    """Say whether the platform rises with the redefined inputs, as the signs of the public face ask."""
+    """Say whether the platform rises with the redefined inputs, as the signs of the public face ask.
+
+    An angle that falls is turned round, which is the likelier answer, and doubted.
+    """
     motors, platform = draft.motors(), draft.platform()
     if motors is None or not platform or len(motors) < 4 * _NECK_LAG:
         return [], []
@@ -236,11 +239,17 @@ def _checks(draft: Draft) -> tuple[list[str], list[Doubt]]:
         if axis not in platform:
             continue
         r, _ = lagged(u, platform[axis], _NECK_LAG)
-        if r < -0.5:
-            lines.append(f"not sure: {axis} falls as {name} rises (correlation {r:.2f}); if so, write `sign = -1`")
-            doubts += [sign_doubt(axis, name, r)] if axis in draft.picks else []
-        else:
+        if r >= -0.5:
             lines.append(f"check: {axis} and {name} of the motors have correlation {r:.2f}")
+            continue
+        falls = f"not sure: {axis} falls as {name} rises (correlation {r:.2f})"
+        if axis not in draft.picks:  # of a tilt, which has no sign of its own
+            lines.append(f"{falls}; is the order of the motors right?")
+            continue
+        pick = draft.picks[axis]
+        draft.picks[axis] = replace(pick, sign=-pick.sign)
+        lines.append(f"{falls}: turned round; if that is wrong, write `sign = {pick.sign:g}`")
+        doubts.append(sign_doubt(axis, name, r))
     return lines, doubts
 
 

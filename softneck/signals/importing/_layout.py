@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import FileFormatError, SettingsError, SoftneckError, to_si
+from softneck.core._budget import settings_text
 from softneck.core._shown import Shown
 from softneck.robot import Robot
 
@@ -123,7 +124,7 @@ def read_layout(path: str | Path, *, robot: Robot = NECK) -> Layout:
     """
     source = Path(path)
     try:
-        text = source.read_text(encoding="utf-8")
+        text = settings_text(source)
     except FileNotFoundError:
         raise FileFormatError(f"{source}: no such file.") from None
     except (UnicodeDecodeError, OSError, ValueError) as error:  # ValueError: a null character in the path

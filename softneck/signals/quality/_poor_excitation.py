@@ -17,8 +17,9 @@ _NO_MOTION = 0.02
 # An output of which the motors explain less than this [R2] follows something else.
 _UNRELATED = 0.2
 _BLOCKS = 10
-# Columns of lagged set-points that others say to this share are left out of a fit.
-_SINGULAR = 1e-6
+# Motions of lagged set-points below this part of the largest are left out of a fit: what hardly moves in the blocks
+# fitted, and moves in those judged, is extrapolated by thousands of times. Which part is small is tried.
+_SINGULAR = (1e-6, 1e-4, 1e-2)
 # Lags [samples] over which an output may follow: an octave apart, to 5 s at 20 ms.
 _LAGS = (0, *(2**k for k in range(9)))
 
@@ -75,11 +76,14 @@ def explained(recording: Recording) -> Vector:
         if spread <= 1e-18 or min(len(y) for _, y in parts) < 2 * X.shape[1]:
             found.append(np.nan)
             continue
-        rest = 0.0
-        for (A, b), (C, d) in (parts, parts[::-1]):
-            rest += float(((d - C @ np.linalg.lstsq(A, b, rcond=_SINGULAR)[0]) ** 2).sum())
-        found.append(1.0 - rest / spread)
+        found.append(1.0 - min(_unexplained(parts, cut) for cut in _SINGULAR) / spread)
     return np.array(found)
+
+
+def _unexplained(parts: list[tuple[Matrix, Vector]], cut: float) -> float:
+    """Return the sum of squares that each half leaves when fitted on the other."""
+    fits = [np.linalg.lstsq(A, b, rcond=cut)[0] for A, b in parts]
+    return sum(float(((b - A @ fit) ** 2).sum()) for (A, b), fit in zip(parts, fits[::-1], strict=True))
 
 
 def _halves(odd: np.ndarray, there: np.ndarray) -> list[np.ndarray]:

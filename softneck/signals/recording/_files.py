@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from softneck.core import DataError, FileFormatError, SoftneckError, Vector, atomic_write, to_si
+from softneck.core._budget import MOST_TOML, require_numbers, require_size, require_table
 from softneck.robot import Robot, find_robot
 from softneck.robot._search import robot_file_of
 
@@ -44,6 +45,7 @@ def read_plain_csv(source: Path) -> dict[str, Vector] | None:
             head, _, body = body.partition("\n")
     except (OSError, UnicodeDecodeError):
         return None
+    require_numbers(source, 1, 1 + head.count(","))
     titles = head.split(",")
     if body.strip(_CHARACTERS) or not all(titles) or len(set(titles)) < len(titles) or '"' in head:
         return None
@@ -151,6 +153,8 @@ def read_recording(path: str | Path, *, robot: str | Path | Robot | None = None)
     """
     source = Path(path)
     suffix = recording_suffix(source)
+    if source.is_file():
+        require_size(source)
     said = said_robot(source, suffix)
     columns: Mapping[str, pd.Series | Vector] | None = read_plain_csv(source) if suffix == ".csv" else None
     if columns is None:
@@ -185,7 +189,7 @@ def said_robot(source: Path, suffix: str) -> Robot | None:
             said = json.loads(attributes).get("robot")
         elif suffix == ".csv" and source.is_file():
             with source.open(encoding="utf-8", errors="replace") as file:
-                line = file.readline()
+                line = file.readline(MOST_TOML)
             said = json.loads(line.removeprefix(ROBOT_LINE)) if line.startswith(ROBOT_LINE) else None
         return None if said is None else Robot.from_dict(said)  # pyright: ignore[reportArgumentType]
     except (ValueError, AttributeError, TypeError, RecursionError) as error:
@@ -229,6 +233,7 @@ def read_table(source: Path, suffix: str, form: TextForm) -> pd.DataFrame:
         raise FileFormatError(f"{source}: no such file.")
     if suffix == ".parquet":
         return _read_parquet(source)
+    require_table(source, zeros=form.encoding.startswith("utf-16") or form.encoding == "utf-32")
     try:
         with warnings.catch_warnings():
             # pandas only warns of rows that are longer than the header; their cells cannot be told apart.
@@ -255,8 +260,10 @@ def _read_parquet(source: Path) -> pd.DataFrame:
     from pyarrow.parquet import ParquetFile
 
     try:
+        file = ParquetFile(source)
+        require_numbers(source, file.metadata.num_rows, file.metadata.num_columns)
         # Without pandas' own remarks, which fail in any way where damaged; an index is a column like others.
-        return ParquetFile(source).read().to_pandas(ignore_metadata=True)
+        return file.read().to_pandas(ignore_metadata=True)
     except (ValueError, OSError, ArithmeticError, MemoryError, ArrowException) as error:
         raise _no_table(source, error) from error
 

@@ -17,7 +17,7 @@ from softneck.drives.supervision._baseline import Baseline, load_baseline
 from softneck.drives.supervision._plausibility import Plausibility
 
 from ..bench import Bench
-from ..plausible import BASELINE, PATH, ROWS, Row, baseline, drifts, play, sampled, watched
+from ..plausible import BASELINE, PATH, ROWS, Row, baseline, drifts, kind_of, play, sampled, watched
 
 PLAUSIBLE = frozenset(
     {
@@ -80,13 +80,13 @@ def test_every_event_has_a_row_and_a_reaction() -> None:
 
 @pytest.mark.parametrize(("seed", "payload"), [(0, 0.0), (1, 0.5), (2, 1.0)])
 def test_nothing_is_told_of_undisturbed_motion(seed: int, payload: float) -> None:
-    bench = watched(seed, ("step", "ramp", "open")[seed], payload)
+    bench = watched(seed, kind_of(seed), payload, judged=baseline())
     bench.pass_time(8.0)
     assert bench.phase is Phase.RUNNING, bench.master.supervisor.fault
 
 
 def test_a_rate_that_falls_is_told_and_a_short_dropout_is_not() -> None:
-    bench = watched(1, "ramp")
+    bench = watched(1, "ramp", judged=baseline())
     bench.pass_time(2.0)
     bench.neck.sensor = "drops"
     bench.pass_time(0.04)
@@ -112,7 +112,7 @@ def test_a_gyro_tells_a_drifting_sensor_from_a_pushed_neck() -> None:
     """The isolability matrix: the same tilt of the readings, once of the sensor alone and once of the neck."""
     told = []
     for broken in (True, False):
-        bench = watched(1, "ramp")
+        bench = watched(1, "ramp", judged=baseline())
         # Its own bias takes the gyro five seconds.
         bench.pass_time(8.0)
         if broken:
@@ -130,7 +130,7 @@ def test_a_gyro_tells_a_drifting_sensor_from_a_pushed_neck() -> None:
 
 def test_where_tendons_hang_the_tilt_is_not_judged() -> None:
     """At 1 kg the model of taut tendons is not valid: what it says must not be believed, and is not."""
-    bench = watched(1, "ramp", 1.0)
+    bench = watched(1, "ramp", 1.0, judged=baseline())
     charts = bench.master._watches._plausible
     assert charts is not None
     known = []
@@ -144,7 +144,7 @@ def test_where_tendons_hang_the_tilt_is_not_judged() -> None:
 def test_the_same_run_gives_the_same_sums_to_the_bit() -> None:
     sums = []
     for _ in range(2):
-        bench = watched(0, "step", 0.2)
+        bench = watched(0, "step", 0.2, judged=baseline())
         bench.pass_time(3.0)
         charts = bench.master._watches._plausible
         assert charts is not None
@@ -210,3 +210,20 @@ def test_a_bench_without_baseline_says_nothing() -> None:
 
 def test_rows_say_what_they_need() -> None:
     assert all(isinstance(row, Row) and row.limit in (0.5, 4.0) for row in ROWS.values())
+
+
+@pytest.mark.parametrize(("seed", "payload"), [(0, 0.3), (1, 0.9)])
+def test_a_bench_without_frames_is_the_one_with_frames_bit_by_bit(seed: int, payload: float) -> None:
+    """The hours of `benchmarks/supervisor.py` are played without frames: nothing may hang on that."""
+    traces = []
+    for framed in (True, False):
+        bench = watched(seed, kind_of(seed), payload, judged=baseline(), framed=framed)
+        rows = []
+        for _ in range(300):
+            bench.step()
+            charts = bench.master._watches._plausible
+            assert charts is not None
+            sums = [charts.motors.charts.sums.tolist(), charts.tilt.charts.sums.tolist()]
+            rows.append((bench.now, bench.master.setpoints, bench.master.positions, bench.master.tensions, sums))
+        traces.append(repr(rows))
+    assert traces[0] == traces[1]

@@ -12,7 +12,8 @@ from softneck.identification import Choice, Model, Network, OutputError, Play, R
 from softneck.identification.models._arrays import members
 from softneck.identification.models._fitting import known_rows, row_hashes
 from softneck.identification.selection import _auto
-from softneck.identification.selection._auto import ALIKE, REFITTED, _guarded_why, _Race, kinds_to_try
+from softneck.identification.selection._auto import ALIKE, REFITTED, _Race, best_other, kinds_to_try
+from softneck.identification.selection._choice_words import guarded_why
 from softneck.identification.selection._exam import agreement, exams, weighted_median
 from softneck.identification.selection._kind_trial import COLD, EXAM, HOLD_OUT, KindTrial, numbers_of
 from softneck.identification.selection._left_out import folds
@@ -111,6 +112,21 @@ def test_nothing_to_try_and_nothing_that_works_are_errors() -> None:
         choose(TRAIN, OTHER, kinds=("magic",))
     with pytest.raises(DataError, match=r"no kind could be identified: .*at least 100 are needed"):
         choose(TRAIN.rows(0, 60), OTHER, kinds=("rls", "play"))
+    still = TRAIN.with_channels(**{f"motor_setpoint_{j}": np.ones(len(TRAIN)) for j in (1, 2, 3)})
+    with pytest.raises(DataError) as said:
+        choose(still, OTHER, kinds=("rls", "oe", "play", "ensemble"))
+    assert str(said.value).count("constant") == 1, "a reason that all share is said once"
+
+
+def test_the_best_of_the_other_sort_is_no_median_and_ran_free() -> None:
+    fits = {"rls": 80.0, "oe": 85.0, "ensemble": 99.0, "play": 70.0, "nn": 75.0, "nss": float("-inf")}
+    ranking = [KindTrial(kind, 0.0, left_out={"hold-out": fit}) for kind, fit in fits.items()]
+    for chosen, other in (("rls", "nn"), ("play", "oe"), ("ensemble", "oe")):
+        found = best_other(ranking, chosen)
+        assert found is not None
+        assert found.kind == other
+    assert best_other(ranking[:2], "rls") is None
+    assert best_other(ranking[-1:], "rls") is None, "what diverged is no plant"
 
 
 def test_what_a_fold_judges_is_missing_from_its_training_and_no_set_point_is() -> None:
@@ -228,13 +244,13 @@ def test_the_guarded_form_of_a_learned_winner_is_taken(race: _Race, monkeypatch:
     # It is ranked by what its kind was worth elsewhere.
     assert chosen.scores["largest motions"] == 85.0
     assert set(chosen.scores) == {"largest motions", HOLD_OUT, COLD}
-    assert "Its guarded form is taken: 5 models of play that fade to `oe`" in _guarded_why(best, chosen)
+    assert "Its guarded form is taken: 5 models of play that fade to `oe`" in guarded_why(best, chosen)
     again = refit(Choice((chosen,), chosen, "", ()), [TRAIN, OTHER])
     assert (asked[1].of, asked[1].base, again.kind) == ("play", "oe", "guarded")
     # A guarded form that costs more than two points on the rows held out is none.
     monkeypatch.setattr(KindTrial, "hold_out_fit", property(lambda one: {"guarded": 90.0, "play": 92.5}[one.kind]))
     assert race.guarded(best, silent) is best
-    assert _guarded_why(best, best) == ""
+    assert guarded_why(best, best) == ""
 
 
 def test_over_greybox_the_members_are_those_that_are_there(race: _Race, monkeypatch: pytest.MonkeyPatch) -> None:

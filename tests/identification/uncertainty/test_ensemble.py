@@ -36,6 +36,16 @@ def test_two_equal_members_are_the_member(models: dict[str, Model]) -> None:
     np.testing.assert_allclose(twice.predict(UNSEEN)[:, :5], models["play"].predict(UNSEEN)[:, :5], rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("still", [("roll",), ("pitch", "roll")])
+def test_a_residual_takes_an_output_that_stands_still_where_it_is_judged(still: tuple[str, ...]) -> None:
+    neck = short_neck()
+    stopped = {name: neck.channels[name].copy() for name in still}
+    for values in stopped.values():
+        values[-len(neck) // 4 :] = 0.1  # such a stretch has no fit: the others decide, or the noise alone
+    model = Residual(base="rls").fit(neck.with_channels(**stopped))
+    assert np.isfinite(model.simulate(UNSEEN)).all()
+
+
 def test_a_residual_on_rls_is_set_membership_of_form_residual() -> None:
     recording = short_neck()
     ours = Residual(base="rls", epsilon=0.02).fit(recording)

@@ -126,6 +126,15 @@ static SN_INSIDE sn_v1 sn_tanh_v(sn_work *w, sn_v1 a)
     return r;
 }
 
+/* `narx_push` of the histories: everything moves back, the newest sample goes in front. */
+static SN_INSIDE void sn_narx_push(sn_work *w, sn_v1 history, sn_v1 newest)
+{
+    if (SN_RARE(history.s != 1 || newest.s != 1 || newest.n > history.n))
+        sn_outside(w);
+    memmove(history.p + newest.n, history.p, (size_t)(history.n - newest.n) * sizeof(double));
+    memmove(history.p, newest.p, (size_t)newest.n * sizeof(double));
+}
+
 static SN_INSIDE void sn_fill1(sn_v1 a, double value)
 {
     for (int64_t i = 0; i < a.n; i++)

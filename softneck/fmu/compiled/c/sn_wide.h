@@ -367,6 +367,15 @@ static void sn_tanh_all(const sn_work *w, double *y, const double *x, int64_t n)
 }
 #endif
 
+/* `tanh_each` of a runtime: so many numbers, at most two for each motor; what is behind them fills the last lanes. */
+static void sn_tanh_each(const sn_work *w, int64_t n, const double *x, double *y)
+{
+    double from[16] = {0.0}, to[16];
+    memcpy(from, x, (size_t)n * sizeof *x);
+    sn_tanh_all(w, to, from, (n + 3) & ~(int64_t)3);
+    memcpy(y, to, (size_t)n * sizeof *y);
+}
+
 /* What the runtimes' functions of these names do, with their checks made once for all entries; see `_translate.py`. */
 static SN_INSIDE void sn_slant_children(sn_work *w, const sn_v2 *nodes, int64_t node, sn_v1 at, sn_v1 plane,
                                         double *result)

@@ -31,6 +31,7 @@ _NECKS = (
     "softneck.estimation._steady_kalman_runtime",
     "softneck.estimation._nonlinear_runtime",
     "softneck.estimation._payload_runtime",
+    "softneck.estimation.changes._change_runtime",
     "softneck.design.linear._linear_controller_runtime",
     "softneck.design.varying._scheduled_runtime",
     "softneck.design.varying._adaptive_runtime",

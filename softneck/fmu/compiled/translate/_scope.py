@@ -20,7 +20,7 @@ class Scope:
         lines: of C.
         variables: name -> type, widened from pass to pass.
         allocates: whether the function takes room in the workspace.
-        lent: parameter -> C, for those that are read where the caller keeps them.
+        lent: parameter, or a part of one under its own name -> C, for those that are read where the caller keeps them.
     """
 
     def __init__(self, function: str, types: CTypes, variables: dict[str, Type]) -> None:
@@ -55,9 +55,13 @@ class Scope:
         self.temporaries.append((name, kind))
         return name
 
+    def stands(self, value: Value) -> bool:
+        """Return whether `value` has a place that no variable chooses."""
+        return _PLACE.fullmatch(value.code) is not None
+
     def place(self, value: Value) -> str:
         """Return C of the place where `value` stands."""
-        if _PLACE.fullmatch(value.code):
+        if self.stands(value):
             return value.code[2:-1] if value.code.startswith("(*") and value.code.endswith(")") else f"&{value.code}"
         return f"&{self.kept(value).code}"
 

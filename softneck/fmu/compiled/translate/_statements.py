@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -21,6 +22,8 @@ class Statements:
     def __init__(self, function: ast.FunctionDef, scope: Scope, expressions: Expressions, result: Type | None) -> None:
         self.scope, self.ex, self.result = scope, expressions, result
         self._function = function
+        names = (part for part in ast.walk(function) if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store))
+        self._bound = Counter([name.id for name in names] + [argument.arg for argument in function.args.args])
 
     def block(self, statements: list[ast.stmt]) -> None:
         """Write statements one after the other."""
@@ -102,19 +105,27 @@ class Statements:
         if value.type == NONE:
             raise self.scope.fail(target, "there is no value to keep.")
         if isinstance(target, ast.Name):
-            if target.id != "_":
+            if isinstance(value.type, Bundle) and self._bound[target.id] == 1 and self._lent(value):
+                self.scope.variables.setdefault(target.id, value.type)
+                self.scope.lent[target.id] = value.code
+            elif target.id != "_":
                 kind = self.scope.bind(target.id, value.type)
                 self.scope.emit(f"v_{target.id} = {self.scope.cast(value, kind)};")
         elif isinstance(target, ast.Tuple):
             if not isinstance(value.type, Bundle) or len(value.type.items) != len(target.elts):
                 raise self.scope.fail(target, "the tuple has another length.")
-            held = self.scope.kept(value)
+            # What a parameter points to nobody changes meanwhile: it is read where it stands.
+            held = value if self._lent(value) else self.scope.kept(value)
             for i, (part, kind) in enumerate(zip(target.elts, value.type.items, strict=True)):
                 self.assign(part, Value(held.code + self.scope.types.field(value.type, i), kind))
         elif isinstance(target, ast.Subscript):
             self._store(target, value)
         else:
             raise self.scope.fail(target, "nothing can be assigned to this.")
+
+    def _lent(self, value: Value) -> bool:
+        """Return whether `value` stands in what a parameter points to."""
+        return self.scope.stands(value) and any(value.code.startswith(place) for place in self.scope.lent.values())
 
     def _store(self, target: ast.Subscript, value: Value) -> None:
         # Python takes the value before it looks for the place.

@@ -28,11 +28,12 @@ _MEMBERS = {
     "member_step": (6, NONE, "sn_member_step(w, {})"),
     "member_tangent": (10, NONE, "sn_member_tangent(w, {})"),
 }
-# Functions whose loops `sn_wide.h` has by hand, several numbers side by side: types and result as in Python, bits too.
+# Functions that C has by hand, several numbers side by side or moved at once: types and result as in Python, bits too.
 # One that returns numbers fills them in behind its arguments.
 _FOUR = Bundle((FLOAT, FLOAT, FLOAT, FLOAT))
 _BY_HAND: dict[str, tuple[tuple[Type, ...], Type]] = {
     "slant_children": ((MATRIX, INT, VECTOR, VECTOR), _FOUR),
+    "narx_push": ((VECTOR, VECTOR), NONE),
     "slant_leaf": ((MATRIX, VECTOR, INT, INT, FLOAT, VECTOR, VECTOR, VECTOR), NONE),
 }
 _PASSES = 20
@@ -191,7 +192,11 @@ class _Runtime:
         ]
         # An array that is returned may lie in the workspace: then the caller gives the room back.
         releases = scope.allocates and not holds_view(result)
-        own = [(f"v_{name}", kind) for name, kind in scope.variables.items() if name not in given or name in widened]
+        own = [
+            (f"v_{name}", kind)
+            for name, kind in scope.variables.items()
+            if (name not in given and name not in scope.lent) or name in widened
+        ]
         lines = [f"{spell(kind)} {name}{_zero(kind)};" for name, kind in own + scope.temporaries]
         lines += ["size_t top = w->top;"] if releases else []
         lines += [f"{spell(result)} result{_zero(result)};"] if result != NONE else []
@@ -222,6 +227,11 @@ class _Runtime:
             if len(values) != count:
                 raise ex.scope.fail(node, f"`{name}` takes {count} arguments.")
             value = Value(code.format(", ".join(map(ex.scope.given, values))), kind)
+        elif name == "tanh_each":
+            filled = ex.scope.temporary(values[0].type)
+            count = len(values[0].type.items) if isinstance(values[0].type, Bundle) else 0
+            ex.scope.emit(f"sn_tanh_each(w, {count}, ({ex.scope.given(values[0])})->f, {filled}.f);")
+            return Value(filled, values[0].type)
         elif _BY_HAND.get(name, ((), NONE))[0] == tuple(value.type for value in values):
             kind = _BY_HAND[name][1]
             arguments = "".join(f", {ex.scope.given(value)}" for value in values)

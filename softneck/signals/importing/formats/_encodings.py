@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import codecs
 import zipfile
+import zlib
 from pathlib import Path
 from typing import BinaryIO
 
 from softneck.core import FileFormatError
+from softneck.core._budget import open_zip, require_size, require_table
 
 #: What a logger's file may be; `text` is all that has no mark of its own.
 FORMATS = ("text", "parquet", "mat", "octave", "sheet", "mcap")
@@ -57,6 +59,7 @@ def format_of(source: Path) -> str:
         raise FileFormatError(f"{source}: is a folder; {hint}.")
     if not source.is_file():
         raise FileFormatError(f"{source}: no such file.")
+    require_size(source)
     with source.open("rb") as file:
         head = file.read(_HEAD)
     if not head.strip():
@@ -75,9 +78,11 @@ def format_of(source: Path) -> str:
 
 def _zipped(source: Path) -> str:
     try:
-        with zipfile.ZipFile(source) as archive:
+        with open_zip(source, verify=True) as archive:
             names = set(archive.namelist())
-    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
+    except FileFormatError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, OSError, ValueError, NotImplementedError):
         names = set()
     if names & {"xl/workbook.xml", "xl/workbook.bin", "content.xml"}:
         return "sheet"
@@ -90,6 +95,7 @@ def encoding_of(source: Path) -> tuple[str, str | None]:
     Raises:
         FileFormatError: no text in any of them.
     """
+    require_table(source, zeros=True)
     with source.open("rb") as file:
         head = file.read(_HEAD)
         for mark, name in _BOMS:
@@ -106,12 +112,14 @@ def encoding_of(source: Path) -> tuple[str, str | None]:
         if _is_utf8(head, file):
             return "utf-8", None
         file.seek(0)
-        try:
-            file.read().decode("cp1252")
-        except UnicodeDecodeError as error:
-            raise FileFormatError(
-                f"{source}: is not a text: byte {error.start} is none in UTF-8 or Windows-1252; export the log as CSV."
-            ) from None
+        while part := file.read(2**20):
+            try:
+                part.decode("cp1252")
+            except UnicodeDecodeError as error:
+                place = file.tell() - len(part) + error.start
+                raise FileFormatError(
+                    f"{source}: is not a text: byte {place} is none in UTF-8 or Windows-1252; export the log as CSV."
+                ) from None
     return "cp1252", "Windows-1252 (Latin 1), because it is not UTF-8"
 
 

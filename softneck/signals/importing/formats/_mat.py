@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import DataError, FileFormatError
+from softneck.core._budget import room
 
 # Table 1-1: types of data.
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
@@ -23,8 +24,6 @@ _COMPLEX = 0x0800
 _HEADER = 128
 # Structures of logs are one or two deep; deeper ones are loops or hostile.
 _MAX_DEPTH = 4
-# [bytes]; a small hostile file may unpack to any size.
-_MAX_BYTES = 2**30
 
 
 @dataclass(slots=True)
@@ -79,19 +78,25 @@ def read_mat5(data: bytes) -> Iterator[tuple[str, np.ndarray]]:
     """
     if not is_mat5(data):
         raise ValueError("neither version 5 nor 7.3; save it with -v7")
+    left = room(len(data))
     file = _Elements(memoryview(data), "<" if data[126:128] == b"IM" else ">", _HEADER)
     while file.place + 8 <= len(data):
         kind, content = file.next()
         if kind == _COMPRESSED:
-            kind, content = _Elements(_unpacked(content), file.order).next()
+            unpacked = _unpacked(content, file.order, left)
+            left -= len(unpacked)
+            kind, content = _Elements(unpacked, file.order).next()
         if kind == _MATRIX:
             yield from _array(_Elements(content, file.order), None, 0)
 
 
-def _unpacked(content: memoryview) -> memoryview:
+def _unpacked(content: memoryview, order: str, most: int) -> memoryview:
     stream = zlib.decompressobj()
-    unpacked = stream.decompress(content, _MAX_BYTES)
-    if not stream.eof:
+    head = stream.decompress(content, 8)
+    # What it says it unpacks to; a stream that holds more is not at its end behind that.
+    size = struct.unpack(order + "II", head)[1]
+    unpacked = head + stream.decompress(stream.unconsumed_tail, size + 1) if size < most else b""
+    if not stream.eof or len(unpacked) > 8 + size:
         raise ValueError("a compressed variable is cut off or too large")
     return memoryview(unpacked)
 
@@ -131,8 +136,6 @@ def _matrix(parts: _Elements) -> memoryview:
     return content
 
 
-# A small hostile file may declare any size; no log of ours comes near 2^27 numbers (1 GiB).
-_MAX_NUMBERS = 2**27
 # More are no experiments.
 _MAX_ELEMENTS = 10_000
 
@@ -145,7 +148,8 @@ def mat_arrays(source: Path) -> dict[str, np.ndarray]:
         DataError: a variable lies in another file or declares an impossible size.
     """
     try:
-        found = _by_name(_hdf5(source) if _is_hdf5(source) else read_mat5(source.read_bytes()))
+        arrays = _hdf5(source) if _is_hdf5(source) else read_mat5(source.read_bytes())
+        found = _by_name(arrays, room(8 * source.stat().st_size))
     except (DataError, FileFormatError):
         raise
     except Exception as error:  # the parsers raise whatever the damaged bytes lead to
@@ -154,9 +158,12 @@ def mat_arrays(source: Path) -> dict[str, np.ndarray]:
     return {name: array for name, array in found.items() if array.ndim == 2 and array.size}
 
 
-def _by_name(arrays: Iterator[tuple[str, np.ndarray]]) -> dict[str, np.ndarray]:
+def _by_name(arrays: Iterator[tuple[str, np.ndarray]], left: int) -> dict[str, np.ndarray]:
     found: dict[str, np.ndarray] = {}
     for name, array in arrays:
+        left -= array.nbytes
+        if left < 0:
+            raise ValueError("its variables unpack to more than a log of its size holds")
         if name in found:
             raise ValueError(f"the variable `{name}` stands there twice")
         found[name] = array
@@ -198,7 +205,8 @@ def _item(item: Any, name: str, depth: int, seen: set[int]) -> Iterator[tuple[st
             yield from _members(item, f"{name}.", depth + 1, seen)
     elif isinstance(item, h5py.Dataset) and item.dtype.kind == "O" and item.size is not None and depth < _MAX_DEPTH:
         # Elements of cells, and fields of arrays of structures, lie elsewhere in the file.
-        for place, reference in enumerate(np.asarray(item[()]).ravel(order="C")[:_MAX_ELEMENTS]):
+        references = np.asarray(item[()]) if item.size <= _MAX_ELEMENTS else np.array([])
+        for place, reference in enumerate(references.ravel(order="C")):
             if isinstance(reference, h5py.Reference) and reference:
                 target = item.file[reference]
                 address = h5py.h5o.get_info(target.id).addr  # pyright: ignore[reportAttributeAccessIssue]
@@ -208,7 +216,7 @@ def _item(item: Any, name: str, depth: int, seen: set[int]) -> Iterator[tuple[st
     elif isinstance(item, h5py.Dataset) and _is_numbers(item):
         if item.external or item.is_virtual:
             raise DataError(f"variable `{name}` lies in another file; softneck reads what is in this one.")
-        if item.size is not None and item.size > _MAX_NUMBERS:
+        if item.size is not None and 8 * item.size > room(8 * item.file.id.get_filesize()):
             raise DataError(f"variable `{name}` declares {item.size} numbers; that is not a log.")
         # MATLAB stores columns first: the file's shape is the transpose.
         yield name, np.asarray(item[()], dtype=np.float64).T

@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softneck.core import DataError, FileFormatError
+from softneck.core._budget import MOST_UNPACKED, require_unpacked
 from softneck.core._errors import require_package
 
 if TYPE_CHECKING:
     import pandas as pd
+    from mcap.records import Chunk
 
 # What `softneck drives run --log` calls itself in the header of its logs.
 OURS = b"softneck"
@@ -26,6 +28,8 @@ _MAX_DEPTH, _MOST_NUMBERS = 6, 64
 # [ns] A clock of messages that is further from the logger's is a simulation's, or was never set.
 _SAME_CLOCK = 10**9
 _MOST_CELLS = 50_000_000
+# [bytes] No message that is not a picture comes near; a damaged length must not reserve the memory of the machine.
+LARGEST_RECORD = 1 << 26
 
 
 def is_run_log(source: Path) -> bool:
@@ -35,6 +39,46 @@ def is_run_log(source: Path) -> bool:
             return OURS in file.read(256)
     except OSError:
         return False
+
+
+def require_chunks(source: Path) -> None:
+    """Raise FileFormatError where a file's compressed pieces unpack to more than they say or than a log may hold.
+
+    Where it is damaged otherwise the reader says so.
+    """
+    from mcap.records import Chunk
+    from mcap.stream_reader import StreamReader
+
+    size = source.stat().st_size
+    with source.open("rb") as file:
+        pieces = (record for record in StreamReader(file, emit_chunks=True, record_size_limit=LARGEST_RECORD).records)
+        total = 0
+        while True:
+            try:
+                piece = next(pieces, None)
+            except Exception:  # whatever damaged bytes lead to
+                return
+            if piece is None:
+                return
+            if isinstance(piece, Chunk):
+                total += piece.uncompressed_size if _is_true(piece) else MOST_UNPACKED
+                require_unpacked(source, total, size)
+
+
+def _is_true(piece: Chunk) -> bool:
+    """Return whether a compressed piece does not hold more than it says, as far as it can be read."""
+    from lz4.frame import LZ4FrameDecompressor
+    from zstandard import CONTENTSIZE_UNKNOWN, get_frame_parameters
+
+    says = piece.uncompressed_size
+    try:
+        if piece.compression == "lz4":
+            return len(LZ4FrameDecompressor().decompress(piece.data, max_length=says + 1)) <= says
+        # Where the frame does not say, zstd stops at what the piece says.
+        holds = get_frame_parameters(piece.data).content_size if piece.compression == "zstd" else says
+        return holds in (says, CONTENTSIZE_UNKNOWN)
+    except Exception:  # damaged: its reader says so
+        return True
 
 
 def mcap_table(source: Path) -> pd.DataFrame:
@@ -51,6 +95,7 @@ def mcap_table(source: Path) -> pd.DataFrame:
         require_package(package)
     import pandas as pd
 
+    require_chunks(source)
     rows: list[dict[str, float]] = []
     clocks: list[tuple[int, int]] = []
     skipped: set[str] = set()

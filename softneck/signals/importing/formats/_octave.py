@@ -15,10 +15,12 @@ from pathlib import Path
 import numpy as np
 
 from softneck.core import FileFormatError
+from softneck.core._budget import MOST_NUMBERS
 
 # As in MATLAB files: deeper structures are loops or hostile, and larger arrays are no logs.
 _MAX_DEPTH = 4
-_MAX_NUMBERS = 2**27
+# A range is three numbers in the file.
+_MAX_RANGE = 2**22
 # Save types of doubles, in the order of Octave's `save_type`.
 _DOUBLES = ("u1", "u2", "u4", "i1", "i2", "i4", "f4", "f8", "u8", "i8")
 _INTEGERS = {f"{sign}int{bits}": f"{sign[:1] or 'i'}{bits // 8}" for sign in ("", "u") for bits in (8, 16, 32, 64)}
@@ -54,7 +56,7 @@ def _shaped(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _checked(shape: tuple[int, ...]) -> tuple[int, ...]:
-    if any(size < 0 for size in shape) or prod(shape) > _MAX_NUMBERS:
+    if any(size < 0 for size in shape) or prod(shape) > MOST_NUMBERS:
         raise ValueError(f"an array of {' x '.join(map(str, shape))} numbers is no log")
     return shape
 
@@ -141,8 +143,9 @@ class _Text:
 def _range(base: float, limit: float, step: float) -> np.ndarray:
     """Return base, base + step, ... up to `limit`, which for a step of 0 is the count."""
     count = limit if step == 0.0 else np.floor((limit - base) / step * (1.0 + 1e-15) + 1e-10) + 1.0
-    (size,) = _checked((int(max(count, 0.0)),))
-    return base + step * np.arange(size)
+    if not count <= _MAX_RANGE:
+        raise ValueError(f"a range of {count:g} numbers is no log")
+    return base + step * np.arange(int(max(count, 0.0)))
 
 
 @dataclass(slots=True)

@@ -6,6 +6,8 @@ It reads all four in one wheel without dependencies; openpyxl reads the first.
 from __future__ import annotations
 
 import datetime
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,8 +18,19 @@ from softneck.core._errors import require_package
 if TYPE_CHECKING:
     import pandas as pd
 
-# A sheet of Excel has 1,048,576 rows; a small hostile file may unpack to any size.
+# A sheet of Excel has 1,048,576 rows.
 _MOST_CELLS = 50_000_000
+# Two cells in opposite corners make the reader take a place for each cell between; where memory ends it ends the
+# process, so that another one tries first: with 128 MB, and more for more bytes of the file.
+_TRY = """
+import resource, sys
+import python_calamine
+resource.setrlimit(resource.RLIMIT_DATA, (int(sys.argv[2]),) * 2)
+book = python_calamine.CalamineWorkbook.from_path(sys.argv[1])
+for name in book.sheet_names:
+    book.get_sheet_by_name(name)
+"""
+_LEAST_ROOM, _MOST_ROOM, _ROOM_PER_BYTE, _PATIENCE_S = 2**27, 2**31, 200, 120.0
 Cells = Sequence[Sequence[object]]
 
 
@@ -32,6 +45,7 @@ def sheet_cells(source: Path, sheet: str | None) -> tuple[str, Cells]:
     require_package("python_calamine")
     import python_calamine as calamine
 
+    _try(source)
     try:
         book = calamine.CalamineWorkbook.from_path(source)
         names = list(book.sheet_names)
@@ -49,6 +63,22 @@ def sheet_cells(source: Path, sheet: str | None) -> tuple[str, Cells]:
     except Exception as error:  # its readers raise whatever damaged bytes lead to
         reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
         raise FileFormatError(f"{source}: cannot be read as a spreadsheet ({reason}).") from error
+
+
+def _try(source: Path) -> None:
+    """Raise FileFormatError where reading a spreadsheet ends the process that does so."""
+    most = min(_MOST_ROOM, _LEAST_ROOM + _ROOM_PER_BYTE * source.stat().st_size)
+    arguments = [sys.executable, "-c", _TRY, str(source.resolve()), str(most)]
+    try:
+        done = subprocess.run(arguments, capture_output=True, timeout=_PATIENCE_S, check=False)
+    except subprocess.TimeoutExpired:
+        raise FileFormatError(f"{source}: takes longer than {_PATIENCE_S:g} s to read; export it as CSV.") from None
+    # An exception of the reader is exit code 1: what is wrong it says when it is asked here.
+    if done.returncode < 0 or b"MemoryError" in done.stderr:
+        raise FileFormatError(
+            f"{source}: its sheets would fill {most / 1e6:.0f} MB of memory, which no log of its size does; "
+            "export the table as CSV."
+        )
 
 
 def sheet_table(cells: Cells, *, header: bool, skip: int, unit_row: bool) -> pd.DataFrame:

@@ -1,0 +1,149 @@
+"""How soon a change detector over a `greybox` finds a payload, how often it cries wolf, and how it was chosen.
+
+`python benchmarks/changes.py choose|found|alarms [--necks NECK...] [--hours H]`
+
+Models are of 140 s of Eq. 22; thresholds of some 200 s of other motion of the same neck. `choose` leaves each neck out
+in turn: seconds until a payload put on at 60 s is found during the paper's rotation (60 where it is not), and as many
+again for each false alarm over other motion. `found` prints these seconds, and those of the next motion after a hold
+at 14 deg. `alarms` counts false alarms over independent minutes of motion; it goes on where it was stopped
+(`build/changes`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from adaptation import trained
+
+from softneck.core import Matrix, Vector
+from softneck.estimation.changes._change import ChangeDetector
+from softneck.estimation.changes._settings import ChangeSettings
+from softneck.signals import Recording, concatenate, signal
+from tests.foreign_necks.choosing import leave_one_out
+from tests.foreign_necks.held_out import HELD_OUT
+from tests.foreign_necks.necks import CHOOSING, NECKS, ForeignNeck, record_under
+
+OUT, TS = Path("build/changes"), 0.02
+LOADS = (0.32, 0.5, 1.0)
+CANDIDATES = [
+    ChangeSettings(period=period, clip=clip, ratio=ratio)
+    for period in (0.2, 0.5)
+    for clip in (1.5, 2.0, 3.0)
+    for ratio in (2.0, 4.0)
+]
+PUT_ON, NEXT = 60.0, 70.0
+
+
+def moved(neck: str, P: Matrix, payload: float | Vector, seed: int) -> Recording:
+    """Return what a specimen of a neck does under set-points (time, 3) and a payload, a number or (time,)."""
+    return record_under(P, ForeignNeck(name=neck, seed=1), np.broadcast_to(payload, len(P)), seed=seed)
+
+
+def motions(seed: int) -> list[Matrix]:
+    """Return set-points (time, 3) of some 200 s: the paper's tests, and three that each seed makes anew."""
+    own = [signal(name).set_points for name in ("steps", "sine", "rotation")]
+    return own + [signal(name, duration=40.0, seed=seed).set_points for name in ("aprbs", "multisine", "mixed")]
+
+
+def rotation(seconds: float) -> Matrix:
+    """Return the paper's rotation (time, 3) for longer."""
+    t = np.arange(round(seconds / TS)) * TS
+    return np.stack(
+        [2.8 * np.minimum(1.0, t / 3.0) * np.cos(1.2 * t - 2.0 * np.pi * j / 3.0) for j in range(3)], axis=1
+    )
+
+
+def hold(seconds: float) -> Matrix:
+    """Return a hold at some 14 deg (time, 3), and the move to another side at `NEXT`."""
+    t = np.arange(round(seconds / TS))[:, None] * TS
+    there, other = np.array([1.6, -0.8, -0.8]), np.array([-0.8, 1.6, -0.8])
+    return there * np.clip(t / 2.0, 0.0, 1.0) + (other - there) * np.clip((t - NEXT) / 0.5, 0.0, 1.0)
+
+
+@cache
+def baseline(neck: str) -> Recording:
+    """Return undisturbed motion."""
+    return concatenate([moved(neck, P, 0.0, 5) for P in motions(3)])
+
+
+def first(detector: ChangeDetector, run: Recording, since: float) -> float:
+    """Return the seconds from `since` to the first alarm; infinite where there is none, below 0 where it is false."""
+    alarms = np.flatnonzero(detector.watch(run)[:, 0] > 0.5)
+    return float(alarms[0]) * TS - since if alarms.size else np.inf
+
+
+def loaded(neck: str, P: Matrix, payload: float, seed: int = 9) -> Recording:
+    """Return a run in which a payload is put on at `PUT_ON`."""
+    return moved(neck, P, np.where(np.arange(len(P)) * TS >= PUT_ON, payload, 0.0), seed)
+
+
+def choose(necks: list[str]) -> None:
+    """Print what each neck left out gets from the others' choice."""
+    default, scores = next(i for i, c in enumerate(CANDIDATES) if c == ChangeSettings()), {}
+    for neck in necks:
+        runs = [loaded(neck, rotation(80.0), payload) for payload in LOADS]
+        quiet = [moved(neck, P, 0.0, seed) for seed in (11, 12) for P in motions(seed)]
+        row = []
+        for candidate in CANDIDATES:
+            detector = candidate.design(trained(neck, "greybox"), baseline(neck))
+            delays = [first(detector, run, PUT_ON) for run in runs]
+            false = sum(np.isfinite(first(detector, run, 0.0)) for run in quiet)
+            row.append(float(np.mean([d if 0.0 < d < np.inf else PUT_ON for d in delays]) + PUT_ON * false))
+        scores[neck] = np.array([row])
+        print(neck, np.round(row, 1), flush=True)
+    for fold in leave_one_out(scores, default):
+        c = CANDIDATES[fold.chosen]
+        print(f"left out {fold.left_out:8} others choose period {c.period:g} s, clip {c.clip:g}, ratio {c.ratio:g}: "
+              f"{fold.ratios[fold.chosen]:.2f} of the code's; its own best {fold.ratios[fold.best]:.2f}")  # fmt: skip
+
+
+def found(necks: list[str]) -> None:
+    """Print how soon a payload is found."""
+    print(f"{'':22}" + "".join(f"{payload:>9g} kg" for payload in (0.0, *LOADS)))
+    for neck in necks:
+        detector = ChangeSettings().design(trained(neck, "greybox"), baseline(neck))
+        mark = neck + (" (held out)" if neck in HELD_OUT else "")
+        for name, P, since in (("rotation", rotation(80.0), PUT_ON), ("hold", hold(80.0), NEXT)):
+            delays = [first(detector, loaded(neck, P, payload), since) for payload in (0.0, *LOADS)]
+            print(f"{mark:14}{name:8}" + "".join(f"{'none' if d == np.inf else f'{d:.2f} s':>12}" for d in delays),
+                  flush=True)  # fmt: skip
+
+
+def alarms(necks: list[str], hours: float) -> None:
+    """Count false alarms, minute by minute of motion that each seed makes anew; kept where it stopped."""
+    OUT.mkdir(parents=True, exist_ok=True)
+    for neck in necks:
+        detector = ChangeSettings().design(trained(neck, "greybox"), baseline(neck))
+        path = OUT / f"{neck}.alarms.json"
+        done: list[bool] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
+        while len(done) < 60.0 * hours:
+            seed = 1000 + len(done)
+            rng = np.random.default_rng(seed)
+            name = ("aprbs", "multisine", "mixed")[seed % 3]
+            P = rng.uniform(0.5, 1.0) * signal(name, duration=60.0, seed=seed).set_points
+            done.append(bool(np.isfinite(first(detector, moved(neck, P, 0.0, seed), 0.0))))
+            path.write_text(json.dumps(done), encoding="utf-8")
+        print(f"{neck:14}{sum(done)} false alarms in {len(done) / 60.0:.2f} h of motion", flush=True)
+
+
+def main() -> None:
+    """Print what was asked for."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("what", choices=["choose", "found", "alarms"])
+    parser.add_argument("--necks", nargs="*", choices=NECKS, default=list(CHOOSING))
+    parser.add_argument("--hours", type=float, default=30.0, help="of motion of each neck")
+    asked = parser.parse_args()
+    if asked.what == "choose":
+        choose([neck for neck in asked.necks if neck in CHOOSING])
+    elif asked.what == "found":
+        found(asked.necks)
+    else:
+        alarms(asked.necks, asked.hours)
+
+
+if __name__ == "__main__":
+    main()

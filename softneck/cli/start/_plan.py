@@ -1,0 +1,177 @@
+"""The steps of a sitting, one after the other: each looks at the files that those before it made."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import isclose
+from pathlib import Path
+
+from softneck.core import SettingsError
+
+from ._step import Step, Unmet
+
+AUTO, PI, OBSERVER, BEST = "models/auto.npz", "controllers/pi.npz", "observers/kalman.npz", "tune/best.npz"
+PLANT_FMU, OBSERVER_FMU, CONTROLLER_FMU = "fmus/Plant.fmu", "fmus/Observer.fmu", "fmus/Controller.fmu"
+_FMUS = (PLANT_FMU, OBSERVER_FMU, CONTROLLER_FMU)
+_TUNED_LOOP, _REQUIREMENTS = "tune/loop.toml", "tune/requirements.toml"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Asked:
+    """What the user asked for.
+
+    Attributes:
+        logs: absolute paths, as the commands run in the project's folder.
+        robot: a preset, or the absolute path of a robot file; None: the neck, or what the log shows.
+        requirements: absolute path of the file for `tune`; None: the defaults.
+        kinds: of controllers to search; None: those of `tune`.
+        budget: of `tune`: by default half its own, so that a sitting ends within minutes.
+        seed: of kinds of models and of the search.
+        yes: take all guesses.
+    """
+
+    logs: tuple[str, ...]
+    robot: str | None = None
+    requirements: str | None = None
+    kinds: str | None = None
+    budget: int = 80
+    seed: int = 0
+    yes: bool = False
+
+
+def steps(asked: Asked) -> Iterator[Step]:
+    """Yield the steps; the folder of the project is the working folder."""
+    if asked.robot is not None:
+        yield _robot(asked.robot)
+    recordings = []
+    for log in asked.logs:
+        recordings.append(f"recordings/{Path(log).stem}.csv")
+        yield _import(log, recordings[-1], asked)
+    if asked.robot is None:
+        # Of a log of one axis the import proposes a robot of one output.
+        proposed = Path(recordings[0]).with_suffix(".robot.toml")
+        yield _robot(proposed.as_posix() if proposed.is_file() else "neck")
+    for recording in recordings:
+        page = f"build/quality/{Path(recording).stem}.html"
+        command = ("softneck", "info", recording, "--html", page, "--force")
+        yield Step(stage="quality", command=command, makes=(page,), reads=(recording,))
+    yield from _of_one_sample_time(recordings)
+    yield from _models(recordings, asked)
+    yield from _controller(asked)
+    yield from _loops()
+
+
+def _robot(source: str) -> Step:
+    command = ("softneck", "robot", "new", "robot.toml", "--preset", source, "--force")
+    return Step(stage="robot", command=command, makes=("robot.toml",), reads=(source,))
+
+
+def _import(log: str, recording: str, asked: Asked) -> Step:
+    from softneck.signals.importing.formats._mcap import is_run_log
+
+    layout, robot = (Path(recording).with_suffix(ending) for ending in (".layout.toml", ".robot.toml"))
+    whose = "robot.toml" if asked.robot is not None else robot.as_posix() if robot.is_file() else None
+    page = f"build/import/{Path(recording).stem}.html"
+    if Path(log).suffix.lower() == ".mcap" and is_run_log(Path(log)):
+        words: list[str] = []  # of a run on drives: its columns are known
+    else:
+        words = ["--layout", layout.as_posix()] if layout.is_file() else ["--guess", *(["--yes"] if asked.yes else [])]
+        words += ["--html", page] + ([] if whose is None else ["--robot", whose])
+    return Step(
+        stage="import", command=("softneck", "import", log, *words, "-o", recording, "--force"), makes=(recording,),
+        reads=(log, layout.as_posix(), *([] if whose is None else [whose])), settings=f"{log} of {asked.robot}",
+    )  # fmt: skip
+
+
+def _of_one_sample_time(recordings: list[str]) -> Iterator[Step]:
+    """Bring recordings to the sample time of the first, in `recordings`, where they differ."""
+    from softneck.signals import read_recording
+
+    if len(recordings) < 2:
+        return
+    first = read_recording(recordings[0]).sample_time
+    for number, recording in enumerate(recordings):
+        if isclose(read_recording(recording).sample_time, first, rel_tol=1e-6):  # as `identify` has it
+            continue
+        recordings[number] = resampled = f"{recording.removesuffix('.csv')}_resampled.csv"
+        command = ("softneck", "resample", recording, "--sample-time", repr(first), "-o", resampled, "--force")
+        yield Step(stage="quality", command=command, makes=(resampled,), reads=(recording, recordings[0]))
+
+
+def _models(recordings: list[str], asked: Asked) -> Iterator[Step]:
+    """Yield what identifies, and what refuses a model of which nothing can be believed."""
+    seed = str(asked.seed)
+    command = ("softneck", "identify", "auto", *recordings, "-o", AUTO, "--html", "build/models.html", "--seed", seed,
+               "--force")  # fmt: skip
+    yield Step(stage="identification", command=command, makes=(AUTO,), reads=tuple(recordings), unmet=Unmet.NO_MODEL)
+    linear = linear_model()
+    command = ("softneck", "design", "pi", linear, "-o", PI, "--force")
+    yield Step(stage="identification", command=command, makes=(PI,), reads=(linear,), unmet=Unmet.NO_MODEL)
+    data = [word for recording in recordings for word in ("--data", recording)]
+    command = ("softneck", "observer", linear, *data, "-o", OBSERVER, "--force")
+    yield Step(stage="observer", command=command, makes=(OBSERVER,), reads=(linear, *recordings))
+
+
+def linear_model() -> str:
+    """Return the file of the best linear model."""
+    beside = AUTO.replace(".npz", "_linear.npz")
+    return beside if Path(beside).is_file() else AUTO
+
+
+def nonlinear_model() -> str | None:
+    """Return the file of the best nonlinear model; None where no such kind ran free."""
+    beside = AUTO.replace(".npz", "_nonlinear.npz")
+    return beside if Path(beside).is_file() else AUTO if linear_model() != AUTO else None
+
+
+def _controller(asked: Asked) -> Iterator[Step]:
+    linear, nonlinear = linear_model(), nonlinear_model()
+    plants = (linear,) if nonlinear is None else (linear, nonlinear)
+    wanted = () if asked.requirements is None else (asked.requirements,)
+    words = [word for name, value in (("--requirements", asked.requirements), ("--kinds", asked.kinds),
+                                      ("--budget", asked.budget), ("--seed", asked.seed))
+             if value is not None for word in (name, str(value))]  # fmt: skip
+    # --force goes on with the judgements of the same search, and replaces another one.
+    command = ("softneck", "tune", *plants, *words, "-o", "tune", "--force")
+    yield Step(stage="tune", command=command, makes=(BEST, _TUNED_LOOP, "tune/report.html"), reads=(*plants, *wanted))
+    eyes = (OBSERVER,) if observed() else ()
+    certificate = "certificates/best.certificate.json"
+    command = ("softneck", "verify", BEST, *plants, "--requirements", _REQUIREMENTS,
+               *(word for file in eyes for word in ("--observer", file)),
+               "-o", certificate, "--html", "build/verify.html", "--force")  # fmt: skip
+    yield Step(stage="verify", command=command, makes=(certificate, "build/verify.html"),
+               reads=(BEST, *plants, _REQUIREMENTS, *eyes))  # fmt: skip
+    for file, fmu in ((plants[-1], PLANT_FMU), (OBSERVER, OBSERVER_FMU), (BEST, CONTROLLER_FMU)):
+        command = ("softneck", "fmu", file, "--backend", "compiled", "-o", fmu, "--force")
+        yield Step(stage="FMUs", command=command, makes=(fmu,), reads=(file,))
+
+
+def observed() -> bool:
+    """Return whether `tune` found the loop better with an observer."""
+    try:
+        return "observer" in tomllib.loads(Path(_TUNED_LOOP).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise SettingsError(f"{_TUNED_LOOP}: is not the loop that `softneck tune` wrote ({error}).") from error
+
+
+def _loops() -> Iterator[Step]:
+    files = ("README.md", "loop.toml", "study.toml", "test_closed_loop.py", "pyproject.toml", ".gitignore")
+    command = ("softneck", "new", ".", "--loop", _TUNED_LOOP, "--force")
+    yield Step(stage="loop", command=command, makes=("loop.toml", *files), reads=(_TUNED_LOOP, "robot.toml"))
+    page, certificate = "build/loop.html", "loop.certificate.json"
+    command = ("softneck", "simulate", "loop.toml", "-o", "results/loop.csv", "--html", page, "--force")
+    if "limits" in tomllib.loads(Path("loop.toml").read_text(encoding="utf-8")):
+        command += ("--certificate", certificate)
+    yield Step(stage="loop", command=command, makes=("results/loop.csv", page), reads=("loop.toml", *_FMUS))
+    yield Step(stage="study", command=("softneck", "study", "study.toml", "-o", "build/study", "--force"),
+               makes=("build/study/runs.parquet", "build/study/report.html"),
+               reads=("study.toml", "loop.toml", *_FMUS), resumes="build/study/study.json")  # fmt: skip
+    command = ("python", "-m", "pytest", "-q", "-p", "no:cacheprovider", "--junitxml", "build/test.xml")
+    yield Step(stage="test", command=command, makes=("build/test.xml",),
+               reads=("test_closed_loop.py", "loop.toml", *_FMUS))  # fmt: skip
+    command = ("softneck", "report", ".", "-o", "build/report.html", "--force")
+    yield Step(stage="report", command=command, makes=("build/report.html",),
+               reads=(AUTO, BEST, "certificates/best.certificate.json", "results/loop.csv", "build/study/runs.parquet",
+                      "build/test.xml"))  # fmt: skip

@@ -1,0 +1,174 @@
+"""A sitting at work: runs steps in the project's folder, and knows what is done by the hashes of what was read."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import click
+
+from softneck.core import CheckFailedError, FileFormatError, OutputFileError, SoftneckError, atomic_write, file_hash
+
+from ..shared._console import note
+from ._step import STAGES, Step, Unmet
+
+#: In the folder: which steps are done, from what, by which command, and what they found.
+FILE = "start.json"
+_FORMAT = 1
+
+
+@dataclass(slots=True)
+class Sitting:
+    """What was done in a folder, which is the working folder.
+
+    Attributes:
+        done: key of a step -> its command, what it read (file -> SHA-256), whether it ended and held, its seconds.
+        answers: what was asked for beside the logs.
+        as_json: print nothing but JSON.
+        ran: keys of the steps of this call, in their order, each with whether it was done before.
+    """
+
+    done: dict[str, dict[str, Any]] = field(default_factory=dict)
+    answers: dict[str, Any] = field(default_factory=dict)
+    as_json: bool = False
+    ran: dict[str, bool] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, *, as_json: bool) -> Sitting:
+        """Return the sitting of the working folder, a new one where there is none.
+
+        Raises:
+            FileFormatError: its file is damaged.
+        """
+        path = Path(FILE)
+        if not path.is_file():
+            return cls(as_json=as_json)
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            steps = {str(key): dict(entry) for key, entry in content["steps"].items()}
+            answers = dict(content["asked"])
+            known = content["format"] == _FORMAT and all(isinstance(e["reads"], dict) for e in steps.values())
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise FileFormatError(f"{path.resolve()}: is damaged; remove it, and all steps are done again.") from error
+        if not known:
+            raise FileFormatError(f"{path.resolve()}: is of another version; remove it, and all steps are done again.")
+        return cls(steps, answers, as_json)
+
+    def write(self) -> None:
+        """Write what was done."""
+        content = {"format": _FORMAT, "asked": self.answers, "steps": self.done}
+        with atomic_write(FILE, force=True) as temporary:
+            temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+    def do(self, step: Step) -> None:
+        """Run a step unless it is done; what it found is in `done` then.
+
+        Raises:
+            SoftneckError: it cannot be done, or nothing that comes after could be believed.
+        """
+        entry = self.done.get(step.key, {})
+        reads = {name: _hash(name) for name in step.reads}
+        same = entry.get("asked") == step.asked and entry.get("reads") == reads
+        kept = same and bool(entry.get("ended")) and all(Path(name).is_file() for name in step.makes)
+        self.ran[step.key] = kept
+        self._tell(step, kept)
+        if not kept:
+            begun = bool(same and entry and not entry.get("ended"))
+            self.done[step.key] = {"command": step.shown, "asked": step.asked, "reads": reads, "ended": False}
+            self.write()
+            self._run(step, _words(step, begun=begun))
+        said = self.done[step.key]
+        if not said["holds"]:
+            if step.unmet is Unmet.NO_MODEL:
+                raise CheckFailedError(said["said"])
+            if not self.as_json:
+                note(f"does not hold: {said['said']}")
+
+    def _tell(self, step: Step, kept: bool) -> None:
+        line = f"[{STAGES.index(step.stage) + 1}/{len(STAGES)}] {step.stage}{' (done before)' if kept else ''}"
+        click.echo(f"\n{line}\n$ {step.shown}", err=self.as_json)
+
+    def _run(self, step: Step, words: tuple[str, ...]) -> None:
+        entry, begin = self.done[step.key], _processor_time()
+        entry |= {"holds": True, "said": ""}
+        try:
+            with _ctrl_c_ends(), contextlib.redirect_stdout(io.StringIO() if self.as_json else sys.stdout):
+                (_pytest if words[0] == "python" else _softneck)(words, as_json=self.as_json)
+        except CheckFailedError as error:
+            entry |= {"holds": False, "said": str(error)}
+        lacking = [name for name in step.makes if not Path(name).is_file()]
+        if lacking and entry["holds"]:
+            raise OutputFileError(f"{lacking[0]}: was not made by `{step.shown}`.")
+        # What was read is looked at again: a layout that an import proposed is one of its files from here on.
+        entry |= {"reads": {name: _hash(name) for name in step.reads}, "ended": True,
+                  "seconds": round(_processor_time() - begin, 2)}  # fmt: skip
+        self.write()
+
+
+def _processor_time() -> float:
+    """Return what this process and those that it started and that ended took [s]."""
+    return sum(os.times()[:4])
+
+
+def _hash(name: str) -> str:
+    return file_hash(name) if Path(name).is_file() else ""
+
+
+def _words(step: Step, *, begun: bool) -> tuple[str, ...]:
+    """Return the command's words, those that go on with what was begun where it can."""
+    if not (begun and step.resumes and Path(step.resumes).is_file()):
+        return step.command
+    return tuple("--resume" if word == "--force" else word for word in step.command)
+
+
+def _softneck(words: tuple[str, ...], *, as_json: bool) -> None:
+    from .._main import group
+
+    arguments = [*words[1:], *(["--json"] if as_json else [])]
+    try:
+        group.main(args=arguments, prog_name="softneck", standalone_mode=False)
+    except click.ClickException as error:
+        raise SoftneckError(error.format_message()) from error
+
+
+def _pytest(words: tuple[str, ...], *, as_json: bool) -> None:
+    done = subprocess.run([sys.executable, *words[1:]], capture_output=True, text=True, check=False)
+    if not as_json:
+        click.echo(done.stdout, nl=False)
+    last = (done.stdout.strip() or done.stderr.strip() or "no word").splitlines()[-1]
+    if done.returncode == 1:
+        raise CheckFailedError(f"a test of the closed loop failed: {last.strip('= ')}.")
+    if done.returncode:
+        raise SoftneckError(f"`{' '.join(words)}` ended with exit code {done.returncode}: {last}")
+
+
+@contextlib.contextmanager
+def _ctrl_c_ends() -> Iterator[None]:
+    """End with KeyboardInterrupt where Ctrl-C was pressed, though trainings keep their best at it and go on."""
+    usual = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(usual):
+        yield
+        return
+    pressed: list[int] = []
+
+    def heard(number: int, frame: Any) -> None:
+        pressed.append(number)
+        usual(number, frame)
+
+    signal.signal(signal.SIGINT, heard)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, usual)
+    if pressed:
+        raise KeyboardInterrupt

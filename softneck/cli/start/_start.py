@@ -1,0 +1,238 @@
+"""softneck start: one guided sitting from a log to a verdict."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import click
+
+from softneck.core import CheckFailedError, FileFormatError, OutputFileError, SettingsError, SoftneckError, find_kind
+
+from ..shared._console import note, percent, print_json, print_table
+from ..shared._options import json_option
+from ..shared._settle import is_terminal
+from ._plan import BEST, Asked, linear_model, nonlinear_model, steps
+from ._sitting import FILE, Sitting
+from ._step import STAGES, Step
+
+_PATH = click.Path(path_type=Path)
+_NEXT = (
+    "Record next: 60 s or more of `mixed`, in which every motor moves by itself and all together (on drives `softneck "
+    "drives record mixed`), and start again with this log too."
+)
+
+
+@click.command("start", epilog="Example: softneck start log.csv -o my_neck --yes")
+@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=_PATH)
+@click.option("-o", "--output", type=_PATH, metavar="DIR", help="Folder of the project. [default: build/start/LOG]")
+@click.option("--yes", is_flag=True, help="Ask nothing and take all guesses.")
+@click.option(
+    "--robot", metavar="ROBOT",
+    help="Whose log it is: a preset or a robot file. [default: robot.toml beside the log or above it, else the neck]",
+)  # fmt: skip
+@click.option("--requirements", type=_PATH, metavar="TOML", help="What `tune` shall keep. [default: its own]")
+@click.option("--kinds", metavar="K,K", help="Kinds of controller that `tune` searches. [default: its own]")
+@click.option("--budget", type=click.IntRange(min=1), metavar="EVALUATIONS", help="Of `tune`. [default: 80]")
+@click.option("--seed", type=click.IntRange(min=0), help="Of models and search. [default: 0]")
+@json_option
+def command(
+    logs: tuple[Path, ...], output: Path | None, yes: bool, robot: str | None, requirements: Path | None,
+    kinds: str | None, budget: int | None, seed: int | None, as_json: bool,
+) -> None:  # fmt: skip
+    """Go from LOGs to a verdict in one sitting: models, controller, certificate, FMUs, loop, study, test and page.
+
+    Each step is a plain command, printed before it runs in DIR, which becomes an ordinary project. What is done is not
+    done again unless a file that it reads changed: the same command goes on where a sitting was left, by Ctrl-C too.
+    A model that explains too little is refused with what to record next. Exit code 1: the verdict is that something
+    does not hold.
+    """
+    _require_logs(logs)
+    _require_known(requirements, kinds)
+    folder = (output or Path("build/start") / logs[0].stem).absolute()
+    given = {"robot": _robot_of(logs[0], robot), "requirements": requirements and str(requirements.absolute()),
+             "kinds": kinds, "budget": budget, "seed": seed}  # fmt: skip
+    paths = tuple(str(log.absolute()) for log in logs)
+    with _project(folder):
+        sitting = Sitting.read(as_json=as_json)
+        guided = is_terminal() and not yes and not as_json
+        asked = _asked(paths, {**sitting.answers, **{k: v for k, v in given.items() if v is not None}}, yes=yes,
+                       guided=guided and not sitting.done)  # fmt: skip
+        sitting.answers = {key: value for key, value in asdict(asked).items() if key in given}
+        if not as_json:
+            click.echo(f"$ cd {folder}")
+        try:
+            for step in steps(asked):
+                _before(step, sitting, guided=guided)
+                sitting.do(step)
+        except SoftneckError as error:
+            raise _advised(error, sitting, folder) from error
+        facts = _facts(sitting, folder)
+    _tell(facts, as_json=as_json)
+
+
+def _require_logs(logs: tuple[Path, ...]) -> None:
+    for log in logs:
+        if not log.is_file():
+            raise FileFormatError(f"{log}: {'is a folder; name a log in it' if log.is_dir() else 'no such file'}.")
+    stems = [log.stem for log in logs]
+    twice = next((log for log in logs if stems.count(log.stem) > 1), None)
+    if twice is not None:
+        raise SettingsError(f"{twice}: another log is called `{twice.stem}` too; rename one of them.")
+
+
+def _require_known(requirements: Path | None, kinds: str | None) -> None:
+    """Refuse at once what `tune` would refuse after minutes."""
+    if requirements is not None and not requirements.is_file():
+        raise FileFormatError(f"{requirements}: no such file.")
+    for kind in kinds.split(",") if kinds else ():
+        find_kind(kind, "controller")
+
+
+def _robot_of(log: Path, robot: str | None) -> str | None:
+    """Return the robot as commands in another folder name it, None where nothing says whose log it is."""
+    from softneck.robot import find_robot
+    from softneck.robot._file import PRESETS
+    from softneck.robot._search import robot_file_of
+
+    if robot is not None:
+        find_robot(robot)  # which says what is wrong with it
+        return robot if robot in PRESETS else str(Path(robot).absolute())
+    found = robot_file_of(log)
+    return None if found is None else str(found)
+
+
+def _asked(logs: tuple[str, ...], given: dict[str, Any], *, yes: bool, guided: bool) -> Asked:
+    """Return what is asked for; in a terminal what was not said is asked."""
+    if guided and given.get("robot") is None:
+        said = click.prompt("Whose log is it: neck, arm, antagonist, finger, trunk4 or a robot file", default="neck",
+                            err=True)  # fmt: skip
+        given["robot"] = None if said == "neck" else _robot_of(Path(logs[0]), said)
+    if guided and given.get("requirements") is None:
+        said = click.prompt("Requirements file for the controller (Enter: the defaults)", default="",
+                            show_default=False, err=True)  # fmt: skip
+        _require_known(Path(said) if said else None, None)
+        given["requirements"] = said and str(Path(said).absolute())
+    known = {key: value for key, value in given.items() if key in {f.name for f in fields(Asked)}}
+    return Asked(logs=logs, yes=yes, **{key: value for key, value in known.items() if value not in (None, "")})
+
+
+def _before(step: Step, sitting: Sitting, *, guided: bool) -> None:
+    """Say before a model is identified what the recordings cannot teach, and ask whether to go on."""
+    if step.stage != "identification" or any(key.startswith("identification") for key in sitting.done):
+        return
+    lacks = _lacks(sitting)
+    for line in lacks:
+        note(line)
+    if guided and lacks and not click.confirm("The recordings lack something. Go on?", default=True, err=True):
+        raise CheckFailedError(f"stopped, as was answered. {_NEXT}")
+
+
+def _lacks(sitting: Sitting) -> list[str]:
+    """Return what the recordings of a sitting cannot teach, where they are imported."""
+    from softneck.signals import read_recording
+    from softneck.signals.quality._poor_excitation import poor_excitation
+
+    files = [Path(key.partition(": ")[2]) for key in sitting.ran if key.startswith("import")]
+    found = [(file, line) for file in files if file.is_file() for line in poor_excitation(read_recording(file))]
+    return [f"{file.stem}: {line}" for file, line in found]
+
+
+def _advised(error: SoftneckError, sitting: Sitting, folder: Path) -> SoftneckError:
+    """Return the error with the step that it ended, and with what to do next."""
+    stage = next(reversed(sitting.ran), "import").partition(":")[0]
+    said = f"{stage}: {error}"
+    if stage == "identification":  # what the recordings lack was said before it
+        return CheckFailedError(f"{said} {_NEXT}")
+    advice = f"Paths are those in {folder}. Mended, the same command goes on here."
+    return type(error)(f"{said} {advice}") if sitting.ran else error
+
+
+@contextlib.contextmanager
+def _project(folder: Path) -> Iterator[None]:
+    """Make `folder` the working folder; where nothing was made in it, nothing of it is left.
+
+    Raises:
+        OutputFileError: it holds something else, or cannot be written.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise SettingsError(f"{folder}: is a file; name a folder.")
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / FILE).is_file():
+        raise OutputFileError(f"{folder}: is not empty, and no sitting began here; choose another folder.")
+    new = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputFileError(f"{folder}: cannot be written: {error.strerror}. Choose another folder.") from error
+    try:
+        with contextlib.chdir(folder):
+            yield
+    finally:
+        _leave_nothing_empty(folder, new)
+
+
+def _leave_nothing_empty(folder: Path, new: list[Path]) -> None:
+    """Remove the folders that were made, where no step made a file."""
+    with contextlib.suppress(OSError):
+        if all(path.is_dir() or path == folder / FILE for path in folder.rglob("*")):
+            (folder / FILE).unlink(missing_ok=True)
+            inside = sorted((path for path in folder.rglob("*") if path.is_dir()), reverse=True)
+            for path in [*inside, *new]:
+                path.rmdir()
+
+
+def _facts(sitting: Sitting, folder: Path) -> dict[str, Any]:
+    """Return what a whole sitting found."""
+    names = ("command", "holds", "said", "seconds")
+    rows = [
+        {"stage": key.partition(":")[0], **{name: sitting.done[key][name] for name in names}, "done_before": kept}
+        for key, kept in sitting.ran.items()
+    ]
+    models = {"linear": linear_model(), "nonlinear": nonlinear_model()}
+    return {
+        "folder": str(folder),
+        "holds": all(row["holds"] for row in rows),
+        "failed": [row["stage"] for row in rows if not row["holds"]],
+        "models": {sort: _model(file) for sort, file in models.items() if file is not None},
+        "controller": BEST,
+        "report": "build/report.html",
+        "steps": rows,
+    }
+
+
+def _model(file: str) -> dict[str, Any]:
+    from softneck.core import load
+
+    model = load(file, role="model")
+    return {"file": file, "kind": model.kind, "fit": model.findings.get("hold_out", {}).get("fit", {})}
+
+
+def _tell(facts: dict[str, Any], *, as_json: bool) -> None:
+    folder, failed = facts["folder"], [row for row in facts["steps"] if not row["holds"]]
+    if as_json:
+        print_json(facts)
+    else:
+        for sort, model in facts["models"].items():
+            fits = "/".join(map(percent, model["fit"].values())) or "not known"
+            click.echo(
+                f"\nbest {sort} model: {model['kind']}, free run {fits} % over the rows held out, {model['file']}"
+            )
+        print_table(f"Verdict on {folder}", ["step", "", "processor time [s]"], _rows(facts["steps"]))
+        click.echo(f"report: {folder}/{facts['report']}")
+    if failed:
+        more = f" ({len(failed)} of {len(STAGES)} steps say so: {', '.join(facts['failed'])})" if failed[1:] else ""
+        raise CheckFailedError(f"{failed[0]['stage']} does not hold{more}: {failed[0]['said']}")
+
+
+def _rows(steps_done: list[dict[str, Any]]) -> list[list[str]]:
+    found = []
+    for stage in STAGES:
+        rows = [row for row in steps_done if row["stage"] == stage]
+        verdict = "holds" if stage in ("tune", "verify", "loop", "study", "test") else "done"
+        if not all(row["holds"] for row in rows):
+            verdict = "fails"
+        found.append([stage, verdict, f"{sum(row['seconds'] for row in rows):.1f}"])
+    return found

@@ -1,0 +1,226 @@
+"""What the charts of motors and tilt add up, cycle by cycle: features, hypotheses, scores.
+
+All arrays are the callers' (`MotorCharts`, `TiltCharts`), who say what they hold.
+"""
+
+import math
+
+import numpy as np
+
+from softneck.signals.detection._charts_runtime import (
+    CHART_CLIP,
+    chart_push,
+    chart_shift,
+    chart_spread,
+    chart_whiten,
+)
+
+SUPERVISED_NOT = -1e6
+
+
+def supervised_features(
+    now: tuple, past: tuple, x: np.ndarray, edges: np.ndarray, asked: tuple[int, int], cycle: float
+) -> None:
+    """Take one cycle of (set-points, positions, tensions), each (motors,), into `past` of each and the features `x`.
+
+    `x` is (cycles, motors, features): positions of all motors, friction at each edge, three speeds, what was asked.
+    """
+    setpoints, positions, tensions = now
+    s, p, tension = past
+    chart_push(s, setpoints)
+    chart_push(p, positions)
+    chart_push(tension, tensions)
+    n = positions.shape[0]
+    for i in range(n):
+        for k in range(x.shape[0] - 1, 0, -1):
+            for j in range(x.shape[2]):
+                x[k, i, j] = x[k - 1, i, j]
+        for j in range(n):
+            x[0, i, j] = positions[j]
+        speed = (p[0, i] - p[1, i]) / cycle
+        at = n
+        for j in range(edges.shape[0]):
+            x[0, i, at] = math.tanh(speed / edges[j])
+            at += 1
+        for k in range(3):
+            x[0, i, at] = (p[k, i] - p[k + 1, i]) / cycle
+            at += 1
+        for k in range(asked[0], asked[1]):
+            x[0, i, at] = s[k, i] - positions[i]
+            at += 1
+
+
+def supervised_motors(model: tuple, rules: tuple, past: tuple, x: np.ndarray, white: tuple, rest: np.ndarray,
+                      scales: np.ndarray, cycle: float, scores: np.ndarray) -> None:  # fmt: skip
+    """Fill the scores (kinds x motors,) of one cycle: jams, jumps, and each scale of the currents.
+
+    Args:
+        model: drive, its spread, its fastest steps, current, its spread, top, reach, and below what tension a tendon
+            may hang.
+        rules: of `MotorRules`.
+        past: set-points, positions, tensions so far.
+        x: features.
+        white: coefficients and past of the currents' whitening, and room for (1 + scales, motors).
+        rest: cycles for which each current says nothing (motors,).
+        scales: wrong scales of a current.
+        cycle: of the bus [s].
+        scores: out.
+    """
+    drive, drive_spread, fastest, current, current_spread, top, reach, slack = model
+    usual, excited, sight, known, stands, near_top, cut = rules
+    s, p, tension = past
+    coefficients, before, values = white
+    n, last = rest.shape[0], x.shape[0] - 1
+    for i in range(n):
+        expected, behind = 0.0, 0.0
+        for k in range(s.shape[0]):
+            expected += drive[i, k] * (s[k, i] - p[1, i])
+            behind = max(behind, abs(s[k, i] - p[0, i]))
+        moved = p[0, i] - p[1, i]
+        spread = drive_spread[i, 0] + drive_spread[i, 1] * expected * expected
+        # What turns is not jammed, however late it is: an overloaded motor still creeps.
+        turns = abs(moved) > stands * cycle
+        scores[i] = SUPERVISED_NOT if turns else chart_shift(moved - expected, -expected, spread, CHART_CLIP)
+        # More than was asked, or the other way, and than a motor ever did: less is what a jam or a weak current does.
+        jumps = abs(moved) > abs(expected) and abs(moved) > fastest[i]
+        more = abs(moved - expected) / math.sqrt(spread) if jumps else 0.0
+        scores[n + i] = more - usual
+        change, taut = 0.0, tension[0, i]
+        for j in range(x.shape[2]):
+            change += current[i, j] * (x[0, i, j] - x[last, i, j])
+            if j >= n:
+                taut -= current[i, j] * x[0, i, j]
+        values[0, i] = tension[0, i] - tension[last, i] - change
+        for k in range(scales.shape[0]):
+            values[1 + k, i] = (scales[k] - 1.0) * change
+        chart_whiten(coefficients, before, values, i)
+        # Nor does a current at its limit speak, or that of a tendon that hangs, or that did a moment ago.
+        silent = abs(abs(tension[0, i]) / top[i] - 1.0) < near_top or taut < slack[i]
+        rest[i] = cut if silent else rest[i] - 1.0
+        # Nor where more is asked than in nearly all of the commissioning run.
+        quiet = behind > reach[i] or rest[i] > 0.0 or change * change < excited * excited * current_spread[i, 0]
+        spread = current_spread[i, 0] + current_spread[i, 1] * change * change
+        for k in range(scales.shape[0]):
+            f = values[1 + k, i]
+            # What passes for right is not one scale but all within a part of it.
+            allowed = known * min(f * f / (abs(scales[k] - 1.0) * spread), sight * sight)
+            score = chart_shift(values[0, i], f, spread, sight) - allowed
+            scores[(2 + k) * n + i] = 0.0 if quiet else score
+
+
+def supervised_levels(model: tuple, rules: tuple, past: tuple, x: np.ndarray, rest: np.ndarray, scales: np.ndarray,
+                      scores: np.ndarray) -> None:  # fmt: skip
+    """Fill the scores (scales x motors,) of each tension against those of the other tendons, which share a payload.
+
+    Args:
+        model: level, its spread, top, reach, and below what tension a tendon may hang.
+        rules, past, x, rest, scales, scores: as in `supervised_motors`.
+    """
+    level, spread, top, reach, slack = model
+    sight, near_top = rules[2], rules[5]
+    s, p, tension = past
+    n, features = rest.shape[0], x.shape[2]
+    overloaded = False
+    for i in range(n):
+        overloaded = overloaded or abs(tension[0, i]) > (1.0 - near_top) * top[i]
+        for k in range(s.shape[0]):
+            overloaded = overloaded or abs(s[k, i] - p[0, i]) > reach[i]
+    for i in range(n):
+        expected, quiet = level[i, features + 1], overloaded
+        for j in range(features):
+            expected += level[i, j] * x[0, i, j]
+        for j in range(n):
+            quiet = quiet or rest[j] > 0.0
+            if j != i:
+                expected += level[i, features] * tension[0, j] / (n - 1)
+        # What hangs has no scale, and half of a tension must be told from none.
+        quiet = quiet or expected < 2.0 * slack[i]
+        for k in range(scales.shape[0]):
+            score = chart_shift(tension[0, i] - expected, (scales[k] - 1.0) * expected, spread[i], sight)
+            # What was added up before is of another moment: half an answer each time is none.
+            scores[k * n + i] = SUPERVISED_NOT if quiet else score
+
+
+def supervised_angle(gains: np.ndarray, lags: np.ndarray, past: np.ndarray, positions: np.ndarray,
+                     parts: np.ndarray) -> None:  # fmt: skip
+    """Fill each motor's part of the tilt (motors, outputs) [rad] from its positions so far."""
+    chart_push(past, positions)
+    for i in range(parts.shape[0]):
+        for a in range(parts.shape[1]):
+            parts[i, a] = 0.0
+            for k in range(lags.shape[0]):
+                parts[i, a] += gains[a, k, i] * past[lags[k], i]
+
+
+def supervised_faults(gears: np.ndarray, offset: float, seen: tuple, raw: np.ndarray) -> None:
+    """Fill what the residual is, and what each fault would make of it: `raw` (1 + hypotheses, outputs)."""
+    residual, parts, began, late, stuck = seen
+    n, m = parts.shape
+    raw[:] = 0.0
+    for a in range(m):
+        angle, moved = 0.0, 0.0
+        for i in range(n):
+            angle += parts[i, a]
+            moved += parts[i, a] - began[i, a]
+        raw[0, a] = residual[a]
+        at = 1
+        for g in range(gears.shape[0]):
+            # The file's gear is off by this: the winch turned so many times what its counts say.
+            for i in range(n):
+                raw[at, a] = (gears[g] - 1.0) * (parts[i, a] - began[i, a])
+                at += 1
+            raw[at, a] = (gears[g] - 1.0) * moved
+            at += 1
+        raw[at + a, a] = stuck[a] - angle
+        raw[at + m + a, a] = -2.0 * moved
+        at += 2 * m
+        # Axes a and a + 1 are swapped: each shows what the other one did.
+        if a > 0:
+            raw[at + a - 1, a] -= moved
+            raw[at + a - 1, a - 1] += moved
+        if a < m - 1:
+            raw[at + a, a] -= moved
+            raw[at + a, a + 1] += moved
+        at += m - 1
+        raw[at, a] = late[a] - angle
+        raw[at + 1 + 2 * a, a] = offset
+        raw[at + 2 + 2 * a, a] = -offset
+
+
+def supervised_tilt(spreads: np.ndarray, allowed: np.ndarray, squares: tuple, white: tuple, sums: tuple,
+                    lately: float, good: bool, scores: np.ndarray) -> None:  # fmt: skip
+    """Fill the scores of the first hypotheses, and forget all but `lately` of what they explained.
+
+    Args:
+        spreads: variance of each output and its parts in the squares (outputs, 3).
+        allowed: how far slow errors of the model carry each innovation (outputs,).
+        squares: of the change over two samples, and of the way (outputs,) each.
+        white: coefficients, past and values of the whitening.
+        sums: explained and information of each hypothesis.
+        lately: part of these that is kept.
+        good: whether the model holds.
+        scores: out.
+    """
+    coefficients, before, values = white
+    explained, information = sums
+    for a in range(spreads.shape[0]):
+        chart_whiten(coefficients, before, values, a)
+    for k in range(explained.shape[0]):
+        score, fits, size = 0.0, 0.0, 0.0
+        for a in range(spreads.shape[0]):
+            spread = spreads[a, 0] + spreads[a, 1] * squares[0][a] + spreads[a, 2] * squares[1][a]
+            f = values[1 + k, a]
+            score += chart_shift(values[0, a], f, spread, CHART_CLIP) - abs(f) * allowed[a] / spread
+            fits += f * values[0, a] / spread
+            size += f * f / spread
+        scores[k] = score if good else 0.0
+        explained[k] = (lately if good else 0.0) * explained[k] + fits
+        information[k] = (lately if good else 0.0) * information[k] + size
+
+
+def supervised_noise(bend: np.ndarray, noise: np.ndarray, ratios: np.ndarray, good: bool, scores: np.ndarray) -> None:
+    """Fill the scores of the noise: for each output each ratio of variances."""
+    for a in range(bend.shape[0]):
+        for k in range(ratios.shape[0]):
+            score = chart_spread(bend[a], noise[a], ratios[k])
+            scores[ratios.shape[0] * a + k] = score if good else 0.0

@@ -1,0 +1,149 @@
+"""Models of drives and tendons: what the steps and the tensions of undisturbed motion follow from, by least squares."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softneck.core import DataError, Matrix, Vector
+from softneck.signals.detection._whitening import Whitening
+
+from ._baseline import Row, Rows
+from ._motor_charts import MotorFeatures, MotorRules
+
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Motion:
+    """One stretch of undisturbed motion, a row for each bus cycle.
+
+    Attributes:
+        setpoints: that were sent the cycle before (time, motors) [rad].
+        positions: (time, motors) [rad]; tensions: (time, motors) [N].
+        values: of the tilt (time, outputs) [rad]; NaN in cycles without a sample.
+        rates: of its gyro, the same [rad/s]; NaN without one.
+        due: cycles in which a sample was due (time,).
+    """
+
+    setpoints: Matrix
+    positions: Matrix
+    tensions: Matrix
+    values: Matrix
+    rates: Matrix
+    due: Flags
+
+    def halves(self) -> list[Motion]:
+        """Return its first and its second half."""
+        middle = len(self.due) // 2
+        names = ("setpoints", "positions", "tensions", "values", "rates", "due")
+        parts = [
+            {name: getattr(self, name)[cut] for name in names} for cut in (slice(None, middle), slice(middle, None))
+        ]
+        return [Motion(**part) for part in parts]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Features:
+    """Of each cycle and motor: regressors and what they explain."""
+
+    drive: Matrix
+    moved: Matrix
+    current: Matrix
+    change: Matrix
+    place: Matrix
+    behind: Matrix
+
+
+def features_of(motion: Motion, cycle: float) -> Features:
+    n = motion.positions.shape[1]
+    walk = MotorFeatures(n, cycle)
+    rows: list[list[Matrix]] = [[], [], [], [], [], []]
+    for s, p, tension in zip(motion.setpoints, motion.positions, motion.tensions, strict=True):
+        walk.step(s, p, tension)
+        told = (walk.drive, walk.moved, walk.current, walk.tension_change, walk.x[0], walk.behind)
+        for row, value in zip(rows, told, strict=True):
+            row.append(np.array(value) if walk.full else np.full_like(value, np.nan))
+    return Features(*(np.array(row) for row in rows))
+
+
+def motor_rows(X: list[Matrix], y: list[Matrix], motors: int, why: str, *, most: int = 6) -> tuple[Rows, Rows, Rows]:
+    """Fit each motor's model; return coefficients, whitening, and variance with its part in the square of the model."""
+    gains, white, spread = [], [], []
+    for i in range(motors):
+        kept = [np.isfinite(part[:, i]).all(axis=-1) for part in X]
+        regressors = np.concatenate([part[good, i] for part, good in zip(X, kept, strict=True)])
+        target = np.concatenate([part[good, i] for part, good in zip(y, kept, strict=True)])
+        if float(np.std(target)) <= 0.0:
+            raise DataError(f"motor {i + 1} cannot be compared with: {why}.")
+        theta = _robust(regressors, target)
+        models = [part[good, i] @ theta for part, good in zip(X, kept, strict=True)]
+        left = [part[good, i] - model for part, good, model in zip(y, kept, models, strict=True)]
+        filter_ = Whitening.fit(left, most=most)
+        order = len(filter_.coefficients)
+        squares = np.concatenate([filter_.apply(part) ** 2 for part in left])
+        shape = np.concatenate([model[order:] ** 2 for model in models])
+        gains.append(row_of(theta))
+        white.append(filter_.coefficients)
+        # Cycles at the current limit are for the bootstrap: the variance is that of the others.
+        spread.append(variance_of(squares, shape[:, None], all_but=0.005))
+    return tuple(gains), tuple(white), tuple(spread)
+
+
+def level_rows(known: Sequence[tuple[Motion, Features]], slack: Vector, top: Vector, reach: Vector) -> tuple[Rows, Row]:
+    """Fit each tension by the motors' places and the other tensions, where all may be believed; not for one motor."""
+    n = len(slack)
+    rows, spread = [], []
+    for i in range(n):
+        X, y = [], []
+        for motion, f in known:
+            T = motion.tensions
+            others = np.delete(T, i, axis=1).mean(axis=1) if n > 1 else np.zeros(len(T))
+            x = np.column_stack([f.place[:, i], others, np.ones(len(T))])
+            good = ((slack <= T) & ((1.0 - MotorRules().near_top) * top >= T) & (f.behind <= reach)).all(axis=1)
+            good &= np.isfinite(x).all(axis=1)
+            X.append(x[good])
+            y.append(T[good, i])
+        regressors, target = np.concatenate(X), np.concatenate(y)
+        told = n > 1 and len(target) > 10 * regressors.shape[1]
+        theta = _robust(regressors, target) if told else np.zeros(regressors.shape[1])
+        rows.append(row_of(theta))
+        spread.append(float(np.var(target - regressors @ theta)) if told else 1.0)
+    return tuple(rows), tuple(spread)
+
+
+def _robust(X: Matrix, y: Vector) -> Vector:
+    """Return least squares by Huber's weights: a few cycles at the current limit are not the model's business."""
+    theta = np.linalg.lstsq(X, y, rcond=None)[0]
+    for _ in range(10):
+        off = np.abs(y - X @ theta)
+        # 1.48 median is the standard deviation of what is normal; 2.5 as in Huber's proposal 2.
+        weight = np.sqrt(np.minimum(1.0, 2.5 * 1.48 * np.median(off) / np.maximum(off, 1e-12)))
+        theta = np.linalg.lstsq(X * weight[:, None], y * weight, rcond=None)[0]
+    return theta
+
+
+def variance_of(squares: Vector, shapes: Matrix, *, all_but: float = 0.0) -> Row:
+    """Return c_0, c_1, ... >= 0 of `squares ~ c_0 + shapes c`: least squares, each row weighed by what it expects.
+
+    Without the part `all_but` of the rows with the largest squares.
+    """
+    from scipy.optimize import nnls
+
+    kept = squares <= np.quantile(squares, 1.0 - all_but)
+    squares = squares[kept]
+    X = np.column_stack([np.ones(len(squares)), shapes[kept]])
+    weight = np.full(len(squares), float(np.mean(squares)))
+    found = np.zeros(X.shape[1])
+    for _ in range(5):
+        found = nnls(X / weight[:, None], squares / weight)[0]
+        weight = np.maximum(X @ found, 1e-3 * float(np.mean(squares)))
+    found[0] = max(found[0], 1e-3 * float(np.mean(squares)))
+    return row_of(found)
+
+
+def row_of(values: Vector) -> Row:
+    return tuple(float(value) for value in values)

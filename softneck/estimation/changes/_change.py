@@ -1,0 +1,175 @@
+"""The change detector: a model in free run beside the loop, and what it says of the neck."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from softneck.core import Matrix, Vector, to_si, write_archive
+from softneck.core._shown import Shown
+from softneck.identification import Model
+from softneck.identification.models._arrays import without_validity
+from softneck.identification.models._directions import NECK_SECONDS
+from softneck.identification.models._nested import nested, nested_model
+from softneck.robot import Robot
+from softneck.runtime import Block, Port, State, load_runtime
+from softneck.signals import Recording
+
+from .._kalman import observer_ports
+from .._kalman_parts_runtime import KALMAN_LAG, KALMAN_MORE_LAGS
+from .._nonlinear import model_setup
+from .._offline import measured_angles
+from ._change_runtime import ChangeArrays, ChangeState
+
+_RUNTIME = "softneck.estimation.changes._change_runtime"
+KIND = "change"
+#: What undisturbed motion says of a model.
+NAMES = ("spread", "thresholds", "chart")
+_OUTPUTS = (
+    Port(name="changed", description="the neck is not the one that the model was identified from", boolean=True),
+    Port(name="since_s", unit="s", description="time since that was found; 0 while it is not", minimum=0.0),
+    Port(name="fit", description="NRMSE fit of the model's free run of late in %, -100 at the least", minimum=-100.0,
+         maximum=100.0),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class ChangeDetector(Shown):
+    """Says whether the neck is still the one that the model was identified from; `ChangeSettings.design` makes it.
+
+    Attributes:
+        model: of any kind; nothing corrects its state.
+        arrays: see `ChangeArrays`, those of `NAMES`.
+        order: of the loop it is for.
+        findings: what the undisturbed motion was.
+    """
+
+    model: Model
+    arrays: Mapping[str, Matrix]
+    order: str = "sequential"
+    findings: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def robot(self) -> Robot:
+        """Whose outputs it watches."""
+        return self.model.robot
+
+    @property
+    def sample_time(self) -> float:
+        """Of the model and of the loop [s]."""
+        return self.model.sample_time
+
+    @property
+    def stretch(self) -> float:
+        """By how much the robot is slower than a neck."""
+        return max(self.model.findings.get("time_constants_s", [NECK_SECONDS])) / NECK_SECONDS
+
+    def block(self) -> Block:
+        """Return it as a block of role "observer"."""
+        return self._block
+
+    @cached_property
+    def _block(self) -> Block:
+        plant = replace(self.model, arrays=without_validity(self.model.arrays)).block()
+        inputs, _ = observer_ports("nonlinear", self.robot)
+        constants = np.zeros(KALMAN_MORE_LAGS)
+        constants[KALMAN_LAG] = 1.0 if self.order == "jacobi" else 0.0
+        own = (model_setup(self.robot, plant, self.sample_time, self.stretch, 0.0), constants,
+               plant.initial_state(use_measurement=0.0).parameters)  # fmt: skip
+        return Block(
+            kind=KIND,
+            role="observer",
+            runtime=f"{_RUNTIME}({plant.runtime}:{len(plant.arrays)})",
+            sample_time=self.sample_time,
+            arrays=(*own, *(self.arrays[name] for name in NAMES), *plant.arrays),
+            inputs=inputs,
+            outputs=_OUTPUTS,
+        )
+
+    def initial_state(self) -> State:
+        """Return the state at the start."""
+        return self.block().initial_state()
+
+    def step(self, state: State, inputs: ArrayLike) -> tuple[State, Vector]:
+        """Return the next state and the outputs valid now; inputs and outputs as in `block()`."""
+        return self.block().step(state, inputs)
+
+    def watch(self, recording: Recording) -> Matrix:
+        """Return `changed`, `since_s` and `fit` at each row (time, 3); each run starts anew.
+
+        Raises:
+            DataError: another sample time or another robot.
+        """
+        self.model.check(recording)
+        return np.concatenate([self.block().run(self.initial_state(), self.rows(run))[1] for run in recording.runs()])
+
+    def rows(self, run: Recording) -> Matrix:
+        """Return the inputs (time, inputs) that a run gives."""
+        # As for an observer: the set-points of t_k are commanded after the measurement of t_k.
+        late = 0 if self.order == "jacobi" else 1
+        asked = run.set_points[np.maximum(np.arange(len(run)) - late, 0)]
+        return np.column_stack([asked, measured_angles(run), np.ones(len(run))])
+
+    def states(self, run: Recording) -> dict[str, Matrix]:
+        """Return the parts of the state after each row of a run."""
+        block, state = self.block(), self.initial_state()
+        step, x, outputs = load_runtime(block.runtime).step, state.values, state.outputs
+        parts = ChangeState.parts(ChangeArrays(block.arrays))
+        own = slice(0, parts["model"].start)
+        kept = np.empty((len(run), own.stop))
+        for row, inputs in zip(kept, block.checked_inputs(self.rows(run)), strict=True):
+            step(block.arrays, state.parameters, x, inputs, outputs)
+            row[:] = x[own]
+        return {name: kept[:, part] for name, part in parts.items() if name != "model"}
+
+    def summary(self) -> str:
+        """Return some lines for people."""
+        unit = self.robot.outputs.display_unit
+        rest = np.sqrt(self.arrays["spread"][:, 0]) / to_si(unit)[0]
+        seconds = self.arrays["chart"][0] * self.sample_time
+        lines = [
+            f"change detector over {self.model.kind}, {self.sample_time * 1e3:g} ms, {self.order} order",
+            f"  at rest the model misses {', '.join(f'{value:.3g}' for value in rest)} {unit}; averaged over "
+            f"{seconds:.3g} s, cumulative sums beyond {', '.join(f'{h:.3g}' for h in self.arrays['thresholds'])}",
+        ]
+        if "seconds" in self.findings:
+            lines.append(
+                f"  from {self.findings['seconds']:.3g} s of undisturbed motion, a false alarm in "
+                f"{self.findings['hours']:g} h"
+            )
+        return "\n".join(lines)
+
+    def save(self, path: str | Path, *, force: bool = False) -> None:
+        """Write the detector with its model to one `.npz` file."""
+        block, (model, arrays) = self.block(), nested(self.model)
+        header = {
+            "kind": KIND,
+            "sample_time": self.sample_time,
+            "order": self.order,
+            "inputs": [port.name for port in block.inputs],
+            "outputs": [port.name for port in block.outputs],
+            "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
+            "findings": dict(self.findings),
+            "model": model,
+            **self.robot.in_header(),
+        }
+        write_archive(path, header, {**arrays, **self.arrays}, force=force)
+
+    @classmethod
+    def from_archive(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> ChangeDetector:
+        """Return the detector that `save` wrote; `softneck.core.load` calls this."""
+        found = cls(
+            model=nested_model(header["model"], arrays),
+            arrays={name: np.ascontiguousarray(arrays[name], dtype=np.float64) for name in NAMES},
+            order=str(header["order"]),
+            findings=header["findings"],
+        )
+        names = ("setup", "constants", "free", *NAMES)
+        ChangeArrays.read(dict(zip(names, found.block().arrays, strict=False)))
+        return found

@@ -1,0 +1,148 @@
+"""A change detector from undisturbed motion: how much the model misses there, and what sums that makes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from softneck.core import DataError, Matrix, SettingsError, require_one_of, require_positive
+from softneck.identification import Model
+from softneck.identification.models._fitting import known_rows, one_recording
+from softneck.signals import Recording
+from softneck.signals.detection._threshold import Budget, thresholds
+
+from ._change import ChangeDetector
+from ._change_runtime import CHANGE_PERIOD, CHANGE_QUIET, CHANGE_STILL
+
+# [s] of a neck's time: what a block of the bootstrap lasts (about a motion, whose misses belong together), its windows,
+# the free run's start.
+_BLOCK, _WINDOW, _QUIET = 5.0, 20.0, 3.0
+# Motion below this part of the mean one is none.
+_STILL = 0.1
+# Above this part of rows that the model was trained on, it misses less than it will elsewhere.
+_MOST_KNOWN = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChangeSettings:
+    """What a change is, and how often none may be called one.
+
+    Attributes:
+        ratio: of the variances of what the model misses, after and before: what is to be noticed soon.
+        period: over which it is averaged [s], of another robot by its time constant over a neck's.
+        clip: standard deviations for which such an average counts at most.
+        hours: of motion in which all sums together raise one false alarm [h].
+        memory: of the output `fit` [s].
+        order: of the loop it is for.
+        seed: of the bootstrap.
+    """
+
+    ratio: float = 2.0
+    period: float = 0.5
+    clip: float = 1.5
+    hours: float = 300.0
+    memory: float = 10.0
+    order: str = "sequential"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("ratio", "period", "clip", "hours", "memory"):
+            require_positive(name, getattr(self, name))
+        if self.ratio <= 1.0:
+            raise SettingsError(f"`ratio` must be above 1, for a change makes a model worse; got {self.ratio:g}.")
+        require_one_of("order", self.order, ("sequential", "jacobi"))
+
+    def design(self, model: Model, recordings: Recording | list[Recording]) -> ChangeDetector:
+        """Return the detector over a model.
+
+        Args:
+            model: of any kind.
+            recordings: undisturbed motion like that which it will see, on which the model was not trained.
+
+        Raises:
+            DataError: too little motion, or motion that the model was trained on.
+        """
+        recording = one_recording(recordings)
+        model.check(recording)
+        if float(np.mean(known_rows(recording, model.training_rows))) > _MOST_KNOWN:
+            raise DataError("the model was trained on this motion, so that it misses less than it will elsewhere; "
+                            "take another recording.")  # fmt: skip
+        draft = self._draft(model)
+        runs = [(run.outputs, draft.states(run)) for run in recording.runs()]
+        still = _STILL * float(np.mean(np.concatenate([states["fastest"] for _, states in runs])))
+        draft.arrays["chart"][CHANGE_STILL] = still
+        spread = _spread(runs, still)
+        scores = [self.scores(*_averages(draft, outputs, states, spread)) for outputs, states in runs]
+        period = draft.arrays["chart"][0] * draft.sample_time
+        budget = Budget(rate=1.0 / (3600.0 * self.hours), charts=len(spread) + 1, step=period,
+                        block=_BLOCK * draft.stretch, window=_WINDOW * draft.stretch)  # fmt: skip
+        limits = thresholds(scores, budget, np.random.default_rng(self.seed))
+        seconds = len(recording) * recording.sample_time
+        return replace(
+            draft,
+            arrays={**draft.arrays, "spread": spread, "thresholds": limits},
+            findings={"seconds": seconds, "hours": self.hours},
+        )
+
+    def scores(self, averages: Matrix, moved: np.ndarray) -> Matrix:
+        """Return the scores (periods, charts) of averages (periods, outputs), in the order of the charts.
+
+        Args:
+            averages: of what the model misses over its spread.
+            moved: (periods,) whether the neck moved in it; else nothing is counted.
+        """
+        square = np.minimum(averages**2, self.clip**2 * self.ratio)
+        each = moved[:, None] * (0.5 * (1.0 - 1.0 / self.ratio) * square - 0.5 * np.log(self.ratio))
+        return np.column_stack([each, each.sum(axis=1)])
+
+    def _draft(self, model: Model) -> ChangeDetector:
+        """Return a detector that knows nothing of undisturbed motion yet, and says nothing."""
+        m = len(model.robot.outputs.names)
+        none = {"spread": np.tile([1.0, 0.0, 0.0], (m, 1)), "thresholds": np.full(m + 1, 1e9), "chart": np.zeros(7)}
+        draft = ChangeDetector(model=model, arrays=none, order=self.order)
+        Ts, stretch = model.sample_time, draft.stretch
+        period, quiet = max(1, round(self.period * stretch / Ts)), round(_QUIET * stretch / Ts)
+        keep = float(np.exp(-Ts / (self.memory * stretch)))
+        chart = np.array([period, self.ratio, quiet, keep, Ts, self.clip, 0.0])
+        return replace(draft, arrays={**none, "chart": chart})
+
+
+def _spread(runs: list[tuple[Matrix, dict[str, Matrix]]], still: float) -> Matrix:
+    """Return the variance (outputs, 3) of what the model misses: at rest, by its motion squared, by y squared."""
+    from scipy.optimize import nnls
+
+    found = []
+    for axis in range(runs[0][0].shape[1]):
+        X, target = [], []
+        for outputs, states in runs:
+            y = states["angles"][:, axis]
+            X.append(np.column_stack([np.ones(len(y)), states["fastest"][:, 0] ** 2, y**2]))
+            target.append((outputs[:, axis] - y) ** 2)
+        A, b = np.concatenate(X), np.concatenate(target)
+        there = np.isfinite(b) & (A[:, 1] > still**2)
+        A, b = A[there], b[there]
+        size = np.maximum(A.mean(axis=0), 1e-12)
+        weights = nnls(A / size, b)[0] / size
+        # A model that misses nothing at rest was not held there for long.
+        weights[0] = max(weights[0], 0.1 * float(b.mean()), 1e-12)
+        found.append(weights)
+    return np.array(found)
+
+
+def _averages(
+    draft: ChangeDetector, outputs: Matrix, states: dict[str, Matrix], spread: Matrix
+) -> tuple[Matrix, np.ndarray]:
+    """Return what the model misses over its spread, averaged (periods, outputs), and whether the neck moved then."""
+    motion, y, chart = states["fastest"], states["angles"], draft.arrays["chart"]
+    scaled = (outputs - y) / np.sqrt(spread[:, 0] + spread[:, 1] * motion**2 + spread[:, 2] * y**2)
+    period = int(chart[CHANGE_PERIOD])
+    averages, moved = [], []
+    for first in range(0, len(scaled) - period + 1, period):
+        block, rows = scaled[first : first + period], slice(first, first + period)
+        there = np.isfinite(block).all(axis=1)
+        # As the runtime has it: by the last sample of a period.
+        if there.any() and first + period > chart[CHANGE_QUIET]:
+            averages.append(block[there].mean(axis=0))
+            moved.append(bool((motion[rows] > chart[CHANGE_STILL]).any()))
+    return np.array(averages).reshape(-1, scaled.shape[1]), np.array(moved, dtype=bool)

@@ -1,0 +1,41 @@
+"""Short plans of cheap commands, to see how a sitting goes on, stops and resumes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from softneck.cli.start import _start
+from softneck.cli.start._plan import Asked
+from softneck.cli.start._sitting import Sitting
+from softneck.cli.start._step import Step, Unmet
+
+
+def short_plan(asked: Asked) -> Iterator[Step]:
+    """A robot, a copy of it, and a project of the virtual neck: plain commands, each of what the one before made."""
+    first = ("softneck", "robot", "new", "robot.toml", "--preset", asked.robot or "neck", "--force")
+    yield Step(stage="robot", command=first, makes=("robot.toml",), reads=asked.logs)
+    second = ("softneck", "robot", "new", "copy.toml", "--preset", "robot.toml", "--force")
+    yield Step(stage="quality", command=second, makes=("copy.toml",), reads=("robot.toml",))
+    third = ("softneck", "new", "project", "--force")
+    yield Step(stage="loop", command=third, makes=("project/loop.toml",), reads=("copy.toml",), unmet=Unmet.FINDING)
+
+
+def facts_of(sitting: Sitting, folder: Path) -> dict[str, Any]:
+    """What a sitting that ends before its models says of itself."""
+    rows = [{"stage": key.partition(":")[0], "done_before": kept, **sitting.done[key]}
+            for key, kept in sitting.ran.items()]  # fmt: skip
+    return {"folder": str(folder), "models": {}, "report": "none", "failed": [], "steps": rows}
+
+
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """Let a sitting have the short plan; return a log."""
+    monkeypatch.setattr(_start, "steps", short_plan)
+    monkeypatch.setattr(_start, "_facts", facts_of)
+    path = tmp_path / "log.csv"
+    path.write_text("a,b\n1,2\n", encoding="utf-8")
+    return path

@@ -1,0 +1,160 @@
+"""Logs as labs leave them, a stand-in of each kind: each goes on, or ends in one line that says what to do."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from softneck.cli.start import _plan, _start
+from softneck.cli.start._plan import Asked
+from softneck.cli.start._step import STAGES, Step
+from softneck.signals import Recording, read_recording
+
+from ...data import neck_recording, recording_from
+from ..conftest import Call, Said
+from .conftest import facts_of
+
+NECK = neck_recording(700)
+# [rad/s] Of sines, whose rates are known.
+_W, _T = np.array([0.9, 1.1, 1.4]), NECK.time[:, None]
+SMOOTH = recording_from(2.0 * np.sin(_W * _T) + np.sin(2.3 * _W * _T), noise=5e-4)
+RATES = 2.0 * _W * np.cos(_W * _T) + 2.3 * _W * np.cos(2.3 * _W * _T)
+TILT = ("target_inclination", "sensor_inclination", "target_orientation", "sensor_orientation")
+
+
+def tilted() -> tuple[np.ndarray, np.ndarray]:
+    """Inclination and orientation of NECK [deg], as the data's README turns them into pitch and roll."""
+    x, y = np.tan(NECK.outputs.T)
+    inclination = np.arctan(np.hypot(x, y))
+    return np.degrees(inclination), np.degrees(np.arctan2(x, -y)) % 360.0
+
+
+def in_degrees_and_constant(path: Path) -> None:
+    """`motor_target1..3`, `encoder1..3`, inclination and orientation, all in degrees; set-points of one step."""
+    inclination, orientation = tilted()
+    settled = 115.189 * (1.0 - np.exp(-np.arange(len(NECK)) / 5.0))
+    table: dict[str, Any] = {"time": 0.01 * np.arange(len(NECK))}
+    for j, size in ((1, 1.0), (2, -0.347), (3, -0.347)):
+        table |= {f"motor_target{j}": 115.189 * size, f"encoder{j}": size * settled}
+    table |= {"inclination_sensor": inclination, "orientation_sensor": orientation}
+    pd.DataFrame(table).to_csv(path, index=False)
+
+
+def velocities_alone(path: Path) -> None:
+    """Targets and angles [rad], velocities of motors, time in ms with uneven steps; no set-points."""
+    rates = np.gradient(NECK.set_points, NECK.sample_time, axis=0)
+    jitter = np.random.default_rng(3).uniform(-2.0, 2.0, len(NECK))
+    table = {"Time": 1e3 * NECK.time + 14.0 + jitter, "TargetPitch": 0.17, "SensorPitch": NECK.outputs[:, 0],
+             "TargetRoll": 0.17, "SensorRoll": NECK.outputs[:, 1],
+             **{f"VelM{j}": rates[:, j - 1] for j in (1, 2, 3)}}  # fmt: skip
+    pd.DataFrame(table).to_csv(path, index=False)
+
+
+def bare(path: Path) -> None:
+    """No header and no clock, spaces around the commas: angles and positions among constant columns."""
+    table = np.column_stack([NECK.outputs, np.zeros(len(NECK)), NECK.set_points, np.full(len(NECK), 93.0)])
+    np.savetxt(path, table, delimiter=" , ", fmt="%.6g")
+
+
+def bare_with_rates(path: Path) -> None:
+    """The same with the motors' positions and velocities, which tell the sample time."""
+    table = np.column_stack([np.full(len(SMOOTH), 40.0), SMOOTH.outputs, SMOOTH.set_points, RATES])
+    np.savetxt(path, table, delimiter=" , ", fmt="%.8g")
+
+
+def references_alone(path: Path) -> None:
+    """Where the platform was asked to be and where it was; nothing of the motors."""
+    inclination, orientation = tilted()
+    columns = (15.0, inclination, 90.0, orientation)
+    pd.DataFrame({"time": NECK.time, **dict(zip(TILT, columns, strict=True))}).to_csv(path, index=False)
+
+
+@pytest.fixture
+def until(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Let a sitting end before a stage."""
+
+    def cut(stage: str) -> None:
+        def first(asked: Asked) -> Iterator[Step]:
+            known = set(STAGES[: STAGES.index(stage)])
+            yield from itertools.takewhile(lambda step: step.stage in known, _plan.steps(asked))
+
+        monkeypatch.setattr(_start, "steps", first)
+        monkeypatch.setattr(_start, "_facts", facts_of)
+
+    return cut
+
+
+def begun(call: Call, name: str, write: Callable[[Path], None]) -> Said:
+    write(Path.cwd() / name)
+    return call("start", name, "-o", "p", "--yes", "--json")
+
+
+@pytest.mark.parametrize(
+    ("write", "truth"), [(velocities_alone, NECK), (bare_with_rates, SMOOTH)], ids=["velocities", "bare"]
+)
+def test_logs_that_hold_what_is_needed_become_recordings(
+    call: Call, tmp_path: Path, until: Callable[[str], None], write: Callable[[Path], None], truth: Recording
+) -> None:
+    until("quality")
+    said = begun(call, "log.csv", write)
+    assert said.code == 0, said.err
+    assert [step["holds"] for step in json.loads(said.out)["steps"]] == [True, True]
+    recording = read_recording(tmp_path / "p" / "recordings" / "log.csv")
+    # Time stamps that jitter by a tenth of a sample give its mean to a thousandth.
+    assert recording.sample_time == pytest.approx(truth.sample_time, rel=1e-3)
+    # Sums of rates that were differences, resampled: a few percent of the range.
+    np.testing.assert_allclose(np.ptp(recording.set_points, axis=0), np.ptp(truth.set_points, axis=0), rtol=0.1)
+    assert (tmp_path / "p" / "recordings" / "log.layout.toml").is_file()
+
+
+def test_a_log_without_motors_ends_in_a_line_that_says_what_to_record(call: Call) -> None:
+    said = begun(call, "log.csv", references_alone)
+    assert said.code == 2
+    last = said.err.splitlines()[-1]
+    assert last.startswith("softneck: import: ")
+    assert "motor_setpoint_1, motor_setpoint_2, motor_setpoint_3: candidates are none of the columns" in last
+    assert "record the drives' set-points, positions or velocities too" in last
+    assert "the same command goes on here" in last
+    assert said.out == ""
+
+
+def test_a_log_without_a_clock_goes_on_by_its_layout_once_that_says_the_sample_time(
+    call: Call, tmp_path: Path, until: Callable[[str], None]
+) -> None:
+    until("quality")
+    said = begun(call, "log.csv", bare)
+    assert said.code == 2
+    assert "the sample time: no column rises by equal steps" in said.err.splitlines()[-1]
+    layout = tmp_path / "p" / "recordings" / "log.layout.toml"
+    assert not layout.with_name("log.csv").exists()
+    text = layout.read_text(encoding="utf-8")
+    layout.write_text(f"{text}\n[time]\nsample_time_s = 0.02\n", encoding="utf-8")
+    said = call("start", "log.csv", "-o", "p", "--yes", "--json")
+    assert said.code == 0, said.err
+    assert "--layout recordings/log.layout.toml" in json.loads(said.out)["steps"][0]["command"]
+    assert read_recording(layout.with_name("log.csv")).sample_time == 0.02
+    # An edit of the layout is read again, and nothing else is.
+    layout.write_text(layout.read_text(encoding="utf-8").replace("0.02", "0.04"), encoding="utf-8")
+    call("start", "log.csv", "-o", "p", "--yes", "--json")
+    assert read_recording(layout.with_name("log.csv")).sample_time == 0.04
+
+
+@pytest.mark.slow
+def test_constant_set_points_are_refused_with_the_reason_and_what_to_record(call: Call, tmp_path: Path) -> None:
+    said = begun(call, "log.csv", in_degrees_and_constant)
+    assert said.code == 1
+    last = said.err.splitlines()[-1]
+    assert last.count("the motor set-points are constant") == 1
+    assert "motor_setpoint_1, motor_setpoint_2, motor_setpoint_3 never moves" in said.err, "and all else that it lacks"
+    assert "Record next: 60 s or more of `mixed`" in last
+    # What was done stays: 115.189 degrees are 2.01 rad.
+    recording = read_recording(tmp_path / "p" / "recordings" / "log.csv")
+    assert recording.set_points.max() == pytest.approx(np.radians(115.189), rel=1e-6)
+    assert not (tmp_path / "p" / "models").exists()

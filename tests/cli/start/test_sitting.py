@@ -1,0 +1,307 @@
+"""A sitting runs the commands that it prints, does nothing twice, and goes on wherever it was left."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shlex
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from softneck.cli.start import _sitting
+from softneck.core import CheckFailedError
+
+from ..conftest import Call
+
+STEPS = ["robot: robot.toml", "quality: copy.toml", "loop: project/loop.toml"]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """All files but the sitting's own, which holds seconds."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != _sitting.FILE)
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def states(call: Call, *more: str, code: int = 0) -> list[bool]:
+    """Run the sitting and return which of its steps were done before."""
+    said = call("start", "log.csv", "-o", "p", "--yes", "--json", *more)
+    assert said.code == code, said.err
+    return [step["done_before"] for step in json.loads(said.out)["steps"]]
+
+
+def test_the_commands_that_are_printed_make_the_same_by_hand(call: Call, short: Path, tmp_path: Path) -> None:
+    said = call("start", "log.csv", "-o", "p", "--yes")
+    assert said.code == 0, said.err
+    (tmp_path / "hand").mkdir()
+    os.chdir("hand")
+    for line in said.out.splitlines():
+        if line.startswith("$ softneck "):
+            # The project is named after its folder, which is `project` in both.
+            assert _main(shlex.split(line)[2:]) == 0, line
+    os.chdir("..")
+    assert contents(tmp_path / "hand") == contents(tmp_path / "p")
+    recorded = json.loads((tmp_path / "p" / "start.json").read_text())["steps"]
+    assert list(recorded) == STEPS
+    assert [f"$ {entry['command']}" for entry in recorded.values()] == [
+        line for line in said.out.splitlines() if line.startswith("$ softneck ")
+    ]
+
+
+def _main(words: list[str]) -> int:
+    from softneck.cli._main import run
+
+    return run(words)
+
+
+def test_what_is_done_is_done_again_only_where_what_it_reads_changed(call: Call, short: Path) -> None:
+    assert states(call) == [False] * 3
+    assert states(call) == [True] * 3
+    made = Path("p/copy.toml")
+    made.write_text(made.read_text() + "# mine\n", encoding="utf-8")  # an edit is kept, and what reads it follows
+    assert states(call) == [True, True, False]
+    assert made.read_text().endswith("# mine\n")
+    short.write_text("a,b\n3,4\n", encoding="utf-8")
+    # The robot is made anew from another log, and is the same: nothing after it has to be done.
+    assert states(call) == [False, True, True]
+    Path("p/copy.toml").unlink()
+    assert states(call) == [True, False, False], "the edit is gone with the file"
+
+
+def test_other_settings_do_a_step_again_and_are_kept_for_the_next_time(call: Call, short: Path) -> None:
+    assert states(call, "--robot", "arm") == [False] * 3
+    assert states(call) == [True] * 3, "what was asked for stands in the folder"
+    assert states(call, "--robot", "finger") == [False, False, False]
+
+
+@pytest.mark.parametrize("number", range(3))
+@pytest.mark.parametrize("how", ["before", "after", "swallowed"])
+def test_ctrl_c_at_any_step_ends_in_one_line_and_the_same_command_goes_on(
+    call: Call, short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, how: str
+) -> None:
+    assert call("start", "log.csv", "-o", "whole/p", "--yes").code == 0
+    real: Callable[..., Any] = _sitting._softneck
+    calls: list[int] = []
+
+    def pressed(words: tuple[str, ...], *, as_json: bool) -> None:
+        calls.append(1)
+        if len(calls) <= number:
+            real(words, as_json=as_json)
+            return
+        if how == "after":
+            real(words, as_json=as_json)
+        if how != "swallowed":
+            raise KeyboardInterrupt
+        try:  # as trainings do, which keep the best so far
+            os.kill(os.getpid(), signal.SIGINT)
+            signal.pause()
+        except KeyboardInterrupt:
+            real(words, as_json=as_json)
+
+    monkeypatch.setattr(_sitting, "_softneck", pressed)
+    said = call("start", "log.csv", "-o", "p", "--yes")
+    assert (said.code, len(calls)) == (130, number + 1)
+    assert said.error == "softneck: interrupted; files already finished are kept, none is half written"
+    monkeypatch.setattr(_sitting, "_softneck", real)
+    assert states(call) == [k < number for k in range(3)], "the step that was interrupted is done again"
+    assert contents(tmp_path / "p") == contents(tmp_path / "whole" / "p")
+
+
+def test_ctrl_c_means_what_it_meant_before_a_sitting(call: Call, short: Path) -> None:
+    before = signal.getsignal(signal.SIGINT)
+    states(call)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.parametrize("unmet", list(_sitting.Unmet))
+def test_a_check_that_does_not_hold_is_a_result_but_of_models(
+    call: Call, short: Path, monkeypatch: pytest.MonkeyPatch, unmet: _sitting.Unmet
+) -> None:
+    from softneck.cli.start import _start
+
+    real: Callable[..., Any] = _sitting._softneck
+    plan = _start.steps
+
+    def fails(words: tuple[str, ...], *, as_json: bool) -> None:
+        real(words, as_json=as_json)
+        if "copy.toml" in words:
+            raise CheckFailedError("too slow.")
+
+    def judged(asked: Any) -> Any:
+        for step in plan(asked):
+            yield _sitting.Step(**{**{name: getattr(step, name) for name in step.__slots__}, "unmet": unmet})
+
+    monkeypatch.setattr(_sitting, "_softneck", fails)
+    monkeypatch.setattr(_start, "steps", judged)
+    for _ in range(2):  # what was found stays found
+        said = call("start", "log.csv", "-o", "p", "--yes")
+        assert said.code == 1
+        assert "too slow." in said.err.splitlines()[-1]
+        assert Path("p/project/loop.toml").exists() == (unmet is _sitting.Unmet.FINDING)
+
+
+def test_json_is_one_object_on_stdout(call: Call, short: Path) -> None:
+    said = call("start", "log.csv", "-o", "p", "--yes", "--json")
+    assert isinstance(json.loads(said.out), dict)
+    assert [line for line in said.err.splitlines() if line.startswith("$ ")] == [
+        f"$ {step['command']}" for step in json.loads(said.out)["steps"]
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "says"),
+    [
+        ("folder", None, "is a folder; name a log in it"),
+        ("absent.csv", b"", "no such file"),
+        ("empty.csv", b"", "empty"),
+        ("picture.png", b"\x89PNG\r\n\x1a\n" + bytes(200), "picture"),
+        ("picture.csv", b"\x89PNG\r\n\x1a\n" + bytes(200), "picture"),
+        ("words.csv", b"nothing\nof\nthis\nis a log\n", ""),
+    ],
+    ids=["folder", "absent", "empty", "picture", "named_csv", "words"],
+)
+def test_what_is_no_log_ends_in_one_line_and_leaves_nothing(
+    call: Call, tmp_path: Path, name: str, data: bytes | None, says: str
+) -> None:
+    if data is None:
+        (tmp_path / name).mkdir()
+    elif name != "absent.csv":
+        (tmp_path / name).write_bytes(data)
+    before = {path.name for path in tmp_path.iterdir()}
+    said = call("start", name, "-o", "new/p", "--yes")
+    assert said.code == 2
+    last = said.err.splitlines()[-1]
+    assert name in last
+    assert says in last
+    assert not any(line.startswith("Traceback") for line in said.err.splitlines())
+    assert {path.name for path in tmp_path.iterdir()} == before, "the folders that were made for it are gone"
+
+
+def test_a_folder_of_something_else_is_left_alone(call: Call, short: Path, tmp_path: Path) -> None:
+    (tmp_path / "p").mkdir()
+    (tmp_path / "p" / "mine.txt").write_text("mine")
+    said = call("start", "log.csv", "-o", "p", "--yes")
+    assert (said.code, said.error.endswith("no sitting began here; choose another folder.")) == (2, True)
+    assert contents(tmp_path / "p") == {"mine.txt": b"mine"}
+    assert "is a file" in call("start", "log.csv", "-o", "log.csv", "--yes").error
+
+
+def test_logs_of_one_name_are_refused(call: Call, short: Path, tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "log.csv").write_text("a\n")
+    assert "another log is called `log` too" in call("start", "log.csv", "other/log.csv", "--yes").error
+
+
+def test_a_damaged_state_is_said_and_nothing_is_done(call: Call, short: Path) -> None:
+    states(call)
+    for text in (
+        "{",
+        "[]",
+        '{"format": 1, "asked": {}, "steps": {"a": {}}}',
+        '{"format": 2, "asked": {}, "steps": {}}',
+    ):
+        Path("p/start.json").write_text(text)
+        assert "remove it, and all steps are done again" in call("start", "log.csv", "-o", "p", "--yes").error
+
+
+@pytest.mark.parametrize("reason", [errno.ENOSPC, errno.EROFS])
+@pytest.mark.parametrize("number", range(6))
+def test_a_full_disk_or_a_read_only_one_ends_in_one_line_wherever_it_comes(
+    call: Call, short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reason: int, number: int
+) -> None:
+    """The disk takes no file after the n-th, whichever file that is: those of steps, or the sitting's own."""
+    real = Path.replace
+    written: list[Path] = []
+
+    def replace(self: Path, target: Any) -> Path:
+        if len(written) >= number:
+            raise OSError(reason, os.strerror(reason))
+        written.append(Path(target))
+        return real(self, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", replace)
+        said = call("start", "log.csv", "-o", "p", "--yes")
+    assert said.code == 2
+    assert f"cannot be written: {os.strerror(reason)}" in said.error
+    left = {path for path in (tmp_path / "p").rglob("*") if path.is_file()}
+    assert left <= {path.absolute() for path in written} | {(tmp_path / "p" / path) for path in written}, "no half file"
+    assert all(states(call)) is False
+    assert call("start", "log.csv", "-o", "fresh/p", "--yes").code == 0
+    assert contents(tmp_path / "p") == contents(tmp_path / "fresh" / "p")
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(call: Call, short: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def mkdir(self: Path, *_: Any, **__: Any) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(self))
+
+    monkeypatch.setattr(Path, "mkdir", mkdir)
+    said = call("start", "log.csv", "-o", "p", "--yes")
+    assert (said.code, said.error.endswith("cannot be written: Read-only file system. Choose another folder.")) == (
+        2,
+        True,
+    )
+
+
+def test_in_a_terminal_what_was_not_said_is_asked_once(
+    call: Call, short: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from softneck.cli.start import _start
+    from softneck.robot import Robot
+
+    asked: list[str] = []
+
+    def prompt(text: str, **_: Any) -> str:
+        asked.append(text)
+        return "arm" if "Whose log" in text else ""
+
+    monkeypatch.setattr(_start, "is_terminal", lambda: True)
+    monkeypatch.setattr(_start.click, "prompt", prompt)
+    assert call("start", "log.csv", "-o", "p").code == 0
+    assert ["Whose log" in text for text in asked] == [True, False]
+    assert Robot.read("p/robot.toml").hash == Robot.preset("arm").hash
+    assert call("start", "log.csv", "-o", "p").code == 0
+    assert len(asked) == 2, "the answers stand in the folder"
+    for more in (("--yes",), ("--json",)):
+        assert call("start", "log.csv", "-o", f"q{more[0]}", *more).code == 0
+    assert len(asked) == 2
+
+
+def test_a_recording_that_lacks_something_is_asked_about_before_it_is_identified(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from softneck.cli.start import _start
+
+    plan = [_sitting.Step(stage="identification", command=("softneck", "new", "q"), makes=("q/loop.toml",))]
+    monkeypatch.setattr(_start, "steps", lambda _: iter(plan))
+    monkeypatch.setattr(_start, "is_terminal", lambda: True)
+    monkeypatch.setattr(_start.click, "prompt", lambda *_, default, **__: default)
+    monkeypatch.setattr(_start.click, "confirm", lambda *_, **__: False)
+    monkeypatch.setattr(_start, "_lacks", lambda _: ["log: a motor never moves."])
+    (tmp_path / "log.csv").write_text("a\n")
+    said = call("start", "log.csv", "-o", "p")
+    assert said.code == 1
+    assert "log: a motor never moves." in said.err
+    assert "stopped, as was answered. Record next" in said.err.splitlines()[-1]
+    assert not Path("p").exists()
+
+
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [
+        (("--kinds", "pi,mcp"), "mpc"),
+        (("--requirements", "absent.toml"), "absent.toml: no such file"),
+        (("--robot", "nek"), "nek"),
+        (("--budget", "0"), "--budget"),
+    ],
+)
+def test_what_a_later_step_would_refuse_is_refused_at_once(
+    call: Call, short: Path, more: tuple[str, ...], says: str
+) -> None:
+    said = call("start", "log.csv", "-o", "p", "--yes", *more)
+    assert (said.code, says in said.error) == (2, True), said.err
+    assert not Path("p").exists()

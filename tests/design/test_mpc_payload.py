@@ -1,0 +1,95 @@
+"""Predictive control that is told the payload: tendons are pulled tauter with it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from softneck.core import SettingsError, load
+from softneck.design import MeasuredDisturbance, MpcController, MpcSettings
+from softneck.design.predictive._mpc_state_runtime import MpcArrays
+from softneck.robot import Robot
+
+from .mpc_neck import SOLVED, Neck
+from .test_mpc_speed import identified
+
+PER_KG = 2.0
+
+
+@pytest.fixture(scope="module")
+def told() -> MpcController:
+    return MpcSettings(bandwidth=6.0, payload_tautness=PER_KG).design(identified())
+
+
+@pytest.fixture(scope="module")
+def untold() -> MpcController:
+    return MpcSettings(bandwidth=6.0).design(identified())
+
+
+def moved(neck: Neck, payloads: list[float] | None = None) -> np.ndarray:
+    """Return the set-points of some steps."""
+    rows = []
+    for k in range(60):
+        others = {} if payloads is None else {"payload": payloads[k]}
+        rows.append(neck.step(0.2 if k % 40 < 20 else -0.1, 0.1, **others))
+    return np.array(rows)
+
+
+def common(path: np.ndarray) -> float:
+    return float(path[-1].mean())
+
+
+def test_a_payload_is_worth_so_much_tautness(told: MpcController, untold: MpcController) -> None:
+    """The same numbers, to the bit, as of one whose wish is larger by as much."""
+    for kg in (0.0, 0.75):
+        other = Neck(untold, minimum_tautness=0.5 + PER_KG * kg)
+        np.testing.assert_array_equal(moved(Neck(told), [kg] * 60), moved(other))
+
+
+def test_what_comes_later_is_followed_slowly_and_what_is_lost_stays(told: MpcController) -> None:
+    lost = moved(Neck(told), [0.0] * 5 + [1.0] * 15 + [math.nan] * 40)
+    np.testing.assert_array_equal(lost, moved(Neck(told), [0.0] * 5 + [1.0] * 55))
+    jumped, there = common(moved(Neck(told), [0.0] * 59 + [1.0])), common(moved(Neck(told), [1.0] * 60))
+    before = common(moved(Neck(told), [0.0] * 60))
+    # One sample behind a lag of half a second is 4 % of the way.
+    assert 0.0 <= jumped - before < 0.06 * (there - before)
+    # A wish of light weight: co-contraction costs as well, and takes part of it away.
+    assert 0.2 * PER_KG < there - before <= PER_KG
+
+
+@pytest.mark.slow
+def test_daqp_is_told_as_well(told: MpcController) -> None:
+    parts = [told.part(), told.part(solver="daqp")]
+    names = [port.name for port in told.block().inputs]
+    u = np.zeros(len(names))
+    u[names.index("healthy")] = u[names.index("enabled")] = u[names.index("payload")] = 1.0
+    for part in parts:
+        part.start(0.0, {})
+    for k in range(20):
+        u[0] = 0.2
+        own, other = (part.advance(0.02 * k, u) for part in parts)
+        np.testing.assert_allclose(own, other, atol=SOLVED)
+
+
+def test_files_say_it_only_where_it_is_asked(told: MpcController, untold: MpcController, tmp_path: Path) -> None:
+    columns = [MpcArrays(item.arrays).disturbances.shape[1] for item in (untold, told)]
+    assert columns == [3, 4]
+    known = MeasuredDisturbance(name="base_tilt_pitch", unit="rad", pitch=1.0)
+    assert "tautness" not in known.saved()
+    told.save(tmp_path / "mpc.npz")
+    again: Any = load(tmp_path / "mpc.npz")
+    assert again.disturbances == told.disturbances
+    np.testing.assert_array_equal(moved(Neck(again), [1.0] * 60), moved(Neck(told), [1.0] * 60))
+
+
+def test_tautness_for_a_payload_needs_one_without() -> None:
+    with pytest.raises(SettingsError, match="`payload_tautness` adds to `minimum_tautness`, which is not set"):
+        MpcSettings(bandwidth=6.0, payload_tautness=1.0, minimum_tautness=None).design(identified())
+    with pytest.raises(SettingsError, match=r"`payload_tautness` must be between 0 and 12 \[rad/kg\]; got -1"):
+        MpcSettings(payload_tautness=-1.0)
+    with pytest.raises(SettingsError, match="`tautness` of `payload` is of necks"):
+        MeasuredDisturbance(name="payload", tautness=1.0).on(Robot.preset("finger"))

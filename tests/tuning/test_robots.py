@@ -1,0 +1,115 @@
+"""Other robots' models and FMUs as plants of a tuning: the loops are theirs, and what does not fit is said first."""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from softneck.core import DataError, SettingsError
+from softneck.cosim import FmuPart
+from softneck.design import PiSettings
+from softneck.fmu import build_fmu
+from softneck.loop import SensorFault
+from softneck.plant import NeckParameters, VirtualNeck
+from softneck.robot import Robot
+from softneck.tuning import tune
+from softneck.tuning._cases import loop_of
+from softneck.tuning._judge import made_ready
+from softneck.tuning._tune import Tuned, task_of
+from softneck.verification._neck_loops import direction
+from tests.design.test_robots import BELLOWS, plant
+
+QUICK: dict[str, Any] = {"sampling": {"plants": 12, "search_generations": 0}, "step": {"duration_s": 2.0},
+                         "neck": {"duration_s": 2.5}, "track": {"noise_deg": 0.0}}  # fmt: skip
+
+
+def tuned(plants: dict[str, Any]) -> Tuned:
+    # Of one kind: linear checks, a few loops, all of them, and the margins by experiment.
+    return tune(plants, QUICK, kinds=("pi",), budget=4, workers=0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["antagonist", "trunk4"])
+def test_a_robots_own_plant_steps_as_the_linear_one_that_it_is(name: str) -> None:
+    model = plant(Robot.preset(name))
+    found = tuned({"model": model, "again": model.block()})
+    metrics = found.best.metrics
+    assert found.best.level == "margins"
+    # The worst of a box around the model is never quicker than the model itself; a sample more is what rounds.
+    assert 0.0 < metrics["neck.rise_s"] <= metrics["step.rise_s"] + 0.02
+    assert metrics["neck.overshoot_pct"] <= metrics["step.overshoot_pct"] + 0.5
+    assert not [metric for metric in metrics if metric.startswith("track.circle")], "a circle is a neck's"
+
+
+@pytest.mark.slow
+def test_a_budget_that_ends_before_the_loops_promises_nothing_and_goes_on(tmp_path: Path) -> None:
+    model = plant(Robot.preset("antagonist"))
+    plants = {"model": model, "own": model.block()}
+    # Without loops nothing of the requirements on them is known, even where all that is known holds.
+    easy = {**QUICK, "require": {"step.rise_s": {"max": 2.0}}}
+    for budget, level in ((1, "linear"), (2, "few"), (3, "all")):
+        found = tune(plants, easy, kinds=("pi",), budget=budget, workers=0, folder=tmp_path, resume=budget > 1)
+        assert (found.evaluations, found.best.level) == (budget, level)
+        assert not found.holds or level == "all"
+    assert len(json.loads((tmp_path / "evaluations.json").read_text())["evaluations"]) == 3
+
+
+@pytest.mark.slow
+def test_an_fmu_is_the_plant_that_it_was_made_of(tmp_path: Path) -> None:
+    model = plant(Robot.preset("antagonist"))
+    build_fmu(model.block(), tmp_path / "plant.fmu")
+    as_fmu, as_block = (
+        tuned({"model": model, "own": own}).best.metrics
+        for own in (partial(FmuPart, tmp_path / "plant.fmu", role="plant"), model.block())
+    )
+    assert as_fmu == pytest.approx(as_block, rel=1e-6)
+
+
+def test_physics_stand_for_the_robot_and_not_for_a_neck() -> None:
+    robot = Robot.preset("trunk4")
+    task = task_of({"model": plant(robot), "physics": NeckParameters.preset("trunk")}, QUICK, 0)
+    neck = task.own["physics"]
+    assert isinstance(neck, VirtualNeck)
+    assert neck.robot.hash == robot.hash
+    assert [p.name for p in neck.block().inputs if p.name.startswith("motor_setpoint")] == [
+        f"motor_setpoint_{k}" for k in range(1, 5)
+    ]
+
+
+def test_a_plant_of_another_robot_is_refused_before_anything_is_searched(tmp_path: Path) -> None:
+    own, other = "antagonist", "trunk4"
+    with pytest.raises(DataError, match="of two robots cannot be used together"):
+        tune({"model": plant(Robot.preset(other)), "nonlinear": plant(Robot.preset(own))}, folder=tmp_path)
+    with pytest.raises(SettingsError, match="own: is no plant with the outputs"):
+        tune(
+            {"model": plant(Robot.preset("trunk4")), "own": plant(Robot.preset("antagonist")).block()}, folder=tmp_path
+        )
+    with pytest.raises(SettingsError, match="would begin at zero, where `bellows` cannot be; give linear plants alone"):
+        tune({"model": plant(BELLOWS), "own": plant(BELLOWS).block()}, folder=tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_every_step_that_is_judged_has_a_noisy_sensor_and_each_direction_its_own() -> None:
+    robot = Robot.preset("trunk4")
+    task = task_of({"model": plant(robot), "own": plant(robot).block()}, QUICK | {"track": {}}, 3)
+    ready, controller = made_ready(task), PiSettings().design(plant(robot))
+    for each in (ready.few, ready.all):
+        assert all(case.noise for case in each)
+    assert {case.late for case in ready.all} == {False, True}
+    loops = [loop_of(case, ready.own[0], controller.block(), "sequential", task) for case in ready.few]
+    noise = [fault for loop in loops for fault in loop.faults if isinstance(fault, SensorFault)]
+    assert len({fault.seed for fault in noise}) == len(loops) == 2
+    assert {fault.std for fault in noise} == {math.radians(0.05)}
+
+
+@pytest.mark.parametrize("outputs", [1, 2, 3])
+def test_a_step_has_a_share_of_every_output(outputs: int) -> None:
+    robot = (Robot.preset("antagonist"), Robot.preset("trunk4"), BELLOWS)[outputs - 1]
+    shares = direction(0.5, robot)
+    assert len(shares) == outputs
+    assert sum(share**2 for share in shares) == pytest.approx(1.0 if outputs > 1 else shares[0] ** 2)
