@@ -131,7 +131,6 @@ def _page(family: Family, names: list[str]) -> str:
     from softneck.plots._identification_figures import shown_gain
 
     unit, gain, _ = shown_gain(family.robot)
-    first, *rest = family.summary().splitlines()
     sections = []
     for name, axis in family.axes.items():
         figures = []
@@ -150,8 +149,15 @@ def _page(family: Family, names: list[str]) -> str:
         rows = [[label, *_numbers(row, gain)] for label, row in zip(("least", "largest"), axis.box, strict=True)]
         rows.append(["nominal", *_numbers(axis.nominal, gain)])
         sections.append(Section(name, tables=[Table("Box", head, rows)], figures=figures))
-    sections.append(Section("In numbers", text=rest))
-    return page("Family of linear models", sections, verdict=first, footer="Written by softneck family.")
+    sections.append(Section("In numbers", text=family.summary().splitlines()))
+    spans = []
+    for name, axis in family.axes.items():
+        low, high = (_numbers(row, gain) for row in axis.box)
+        spans.append(f"{name}'s static gain is {low[0]} to {high[0]} {unit} and its dead time {low[2]} to {high[2]} ms")
+    return page(
+        "Family of linear models", sections, verdict=f"Over {len(names)} recording(s) {'; '.join(spans)}.",
+        footer="Written by softneck family.",
+    )  # fmt: skip
 
 
 def _cover(family: Family, name: str) -> tuple[np.ndarray, np.ndarray]:

@@ -84,7 +84,6 @@ def _page(found: FrequencyResponse, models: dict[str, dict[str, np.ndarray]]) ->
     from softneck.plots import Section, frequency_response_figure, page
 
     scale, per_input, unit = found.shown()
-    first, *rest = found.summary().splitlines()
     sections: list[Any] = []
     radius = found.radius()
     for i, output in enumerate(found.outputs):
@@ -107,5 +106,13 @@ def _page(found: FrequencyResponse, models: dict[str, dict[str, np.ndarray]]) ->
             sines=played,
         )
         sections.append(Section(title, figures=[(title, figure)]))
-    sections.append(Section("Numbers", text=rest))
-    return page("Frequency response", sections, verdict=first, footer="Written by softneck frf.")
+    sections.append(Section("Numbers", text=found.summary().splitlines()))
+    bands = {output: found.band(output, found.own_input(output)) for output in found.outputs}
+    told = [
+        f"{output} nowhere" if band is None else f"{output} from {band[0]:.3g} to {band[1]:.3g} rad/s"
+        for output, band in bands.items()
+    ]
+    return page(
+        "Frequency response", sections, verdict=f"The data support the response of {', '.join(told)}.",
+        holds=None if all(bands.values()) else False, footer="Written by softneck frf.",
+    )  # fmt: skip
