@@ -231,7 +231,7 @@ def _rows(steps_done: list[dict[str, Any]]) -> list[list[str]]:
     found = []
     for stage in STAGES:
         rows = [row for row in steps_done if row["stage"] == stage]
-        verdict = "holds" if stage in ("tune", "verify", "loop", "study", "test") else "done"
+        verdict = "holds" if stage in ("tune", "verify", "loop", "test") else "done"
         if not all(row["holds"] for row in rows):
             verdict = "fails"
         found.append([stage, verdict, f"{sum(row['seconds'] for row in rows):.1f}"])
