@@ -25,6 +25,11 @@ _NEXT = (
     "drives record mixed`), and start again with this log too."
 )
 
+_OWN_REQUIREMENTS = (
+    "State what else shall hold in a file, as `softneck tune --print-requirements` has it, and give it by "
+    "--requirements."
+)
+
 
 @click.command("start", epilog="Example: softneck start log.csv -o my_neck --yes")
 @click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=_PATH)
@@ -148,6 +153,8 @@ def _advised(error: SoftneckError, sitting: Sitting, folder: Path) -> SoftneckEr
     if stage == "identification":  # what the recordings lack was said before it
         return CheckFailedError(f"{said} {_NEXT}")
     advice = f"Paths are those in {folder}. Mended, the same command goes on here."
+    if stage == "tune":
+        advice = f"{_OWN_REQUIREMENTS} {advice}"
     return type(error)(f"{said} {advice}") if sitting.ran else error
 
 
@@ -231,7 +238,7 @@ def _rows(steps_done: list[dict[str, Any]]) -> list[list[str]]:
     found = []
     for stage in STAGES:
         rows = [row for row in steps_done if row["stage"] == stage]
-        verdict = "holds" if stage in ("tune", "verify", "loop", "study", "test") else "done"
+        verdict = "holds" if stage in ("tune", "verify", "loop", "test") else "done"
         if not all(row["holds"] for row in rows):
             verdict = "fails"
         found.append([stage, verdict, f"{sum(row['seconds'] for row in rows):.1f}"])

@@ -305,3 +305,23 @@ def test_what_a_later_step_would_refuse_is_refused_at_once(
     said = call("start", "log.csv", "-o", "p", "--yes", *more)
     assert (said.code, says in said.error) == (2, True), said.err
     assert not Path("p").exists()
+
+
+@pytest.mark.parametrize(("stage", "advice"), [("tune", "give it by --requirements. Paths"), ("verify", "it. Paths")])
+def test_a_step_that_cannot_be_done_says_which_and_how_to_go_on(
+    call: Call, short: Path, monkeypatch: pytest.MonkeyPatch, stage: str, advice: str
+) -> None:
+    from softneck.cli.start import _start
+    from softneck.core import SettingsError
+
+    def refuses(words: tuple[str, ...], *, as_json: bool) -> None:
+        raise SettingsError(f"`{words[1]}` cannot be (as JSON: {as_json}); allow it.")
+
+    plan = [_sitting.Step(stage=stage, command=("softneck", "new", "q"), makes=("q/loop.toml",))]
+    monkeypatch.setattr(_start, "steps", lambda _: iter(plan))
+    monkeypatch.setattr(_sitting, "_softneck", refuses)
+    said = call("start", "log.csv", "-o", "p", "--yes")
+    assert said.code == 2
+    assert said.error.startswith(f"softneck: {stage}: `new` cannot be")
+    assert advice in said.error
+    assert said.error.endswith("Mended, the same command goes on here.")
