@@ -1,15 +1,15 @@
 """Hold what `softneck tune` returns against necks on which nothing was chosen.
 
 `python benchmarks/tune.py [--necks NECK...] [--kinds KIND...] [--budget N] [--seed N] [--workers N] [--best |
---defaults] [--fresh]`
+--defaults [--set NAME=VALUE...]] [--fresh]`
 
 For each neck what docs/howto/payloads.md tells a user to do: the least co-contraction at which the large experiment is
 heard with 1 kg; from Eq. 22 and multisines of small and large amplitude at 0.32 and 1 kg, played around it, a family,
 and from Eq. 22 a grey box of each payload. `tune` gets those alone. What it returns, and the best of every other kind
 that it judged by all loops, is then run on the neck itself: steps of 15 deg in three directions with 0.32, 0.66 and 1
 kg, and a circle of 12 deg at 1.2 rad/s, known ahead by as much as `tune` says and not. Angles are those that the neck's
-sensor tells. With --defaults what a plain `design` makes is run instead, at the same co-contraction. Nothing is chosen
-here. Recordings' models are kept in `build/tune`; --fresh forgets them.
+sensor tells. With --defaults what a plain `design` makes is run instead, at the same co-contraction, with what --set
+says. Nothing is chosen here. Recordings' models are kept in `build/tune`; --fresh forgets them.
 """
 
 from __future__ import annotations
@@ -122,6 +122,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--best", action="store_true", help="Only what is returned, not the best of other kinds.")
     parser.add_argument("--defaults", action="store_true", help="What a plain `design` makes; nothing is searched.")
+    parser.add_argument("--set", nargs="*", default=(), metavar="NAME=VALUE", help="Of --defaults: other settings.")
     parser.add_argument("--fresh", action="store_true", help="Forget the models that are kept.")
     asked = parser.parse_args()
     if asked.fresh:
@@ -154,8 +155,12 @@ def plain(neck: str, asked: argparse.Namespace) -> None:
     """Print what kinds do with their defaults, at the co-contraction of the recordings; nothing is known ahead."""
     task = task_of(known(neck), None, asked.seed)
     for kind in asked.kinds or PLAIN:
-        settings = resolve(KINDS[kind].settings)(least_cocontraction=task.cocontraction)
-        row([neck, f"{kind}, defaults", "-", ""], truth(neck, settings.design(task.plant), 0.0))
+        given = {name: float(value) for name, _, value in (text.partition("=") for text in asked.set)}
+        settings = resolve(KINDS[kind].settings)(least_cocontraction=task.cocontraction, **given)
+        row(
+            [neck, " ".join([kind, *(asked.set or ["defaults"])]), "-", ""],
+            truth(neck, settings.design(task.plant), 0.0),
+        )
 
 
 def row(cells: list[str], true: dict[str, float]) -> None:

@@ -4,10 +4,11 @@
 
 `tune` sees grey boxes of two payloads; the robot is not quite as they are. On each neck controllers are drawn around
 the start of `tune`'s search, with what a user would record (benchmarks/tune.py). Those whose loops, as `tune` judges
-them, are at most half beyond each limit are run on the neck itself. The reserve of a requirement is the least with
-which 95 % of the candidates that keep it truly do. It is taken from all necks but one; on that one it is counted how
-many do, without the reserve and with it. The last row is of all necks: [reserve] of
-softneck/tuning/requirements.toml. Results are kept in `build/tune_reserve`; --fresh after a change.
+them, are at most half beyond each limit are run on the neck itself. The reserve of a requirement is by how much the
+worst neck is beyond what was seen, for 90 % of the candidates that come near the limit. It is taken from all necks but
+one; on that one it is counted how many of the candidates that keep a requirement truly do, without the reserve and with
+it. The last row is of all necks: [reserve] of softneck/tuning/requirements.toml. Results are kept in
+`build/tune_reserve`; --fresh after a change.
 """
 
 from __future__ import annotations
@@ -34,9 +35,10 @@ OUT = Path("build/tune_reserve")
 KINDS = ("pi", "pid", "lqg", "ncf")
 METRICS = {"overshoot": "neck.overshoot_pct", "rise": "neck.rise_s", "steady": "neck.steady_rms_deg",
            "circle": "track.circle_rms_deg", "ahead": "track.ahead_rms_deg"}  # fmt: skip
-# What is further beyond a limit no search returns.
-_BEYOND = 1.5
-_NEARLY_ALL = 0.95
+# What is further beyond a limit no search returns; what is below this part of it says nothing of those near it.
+_BEYOND, _NEAR = 1.5, 0.5
+# Fewer candidates near a limit say nothing of it.
+_MOST, _FEW = 0.9, 5
 
 # Of a candidate: goal -> [what `tune` saw, what the neck does].
 Pairs = list[dict[str, list[float]]]
@@ -66,18 +68,16 @@ def pairs(neck: str, count: int) -> Pairs:
 
 
 def reserve(found: dict[str, Pairs], goal: str) -> float:
-    """Return the least reserve with which nearly all candidates that keep a requirement truly do, over all necks."""
-    limit, rows = GOALS[goal], [row[goal] for each in found.values() for row in each]
-    for back in sorted({0.0, *(_up(limit - seen) for seen, _ in rows if seen <= limit)}):
-        said = [true <= limit for seen, true in rows if seen <= limit - back]
-        if sum(said) >= _NEARLY_ALL * len(said):
-            return back
-    raise AssertionError("a reserve that leaves no candidate breaks no promise")
+    """Return by how much the worst neck is beyond what was seen, for most candidates that come near the limit.
 
-
-def _up(value: float) -> float:
-    """Return the next number of two digits: what is on its edge is then beyond it."""
-    return math.floor(100.0 * value + 1.0) / 100.0
+    None where no candidate would keep it: then plants do not show what the neck does, and no reserve mends that.
+    """
+    limit, beyond = GOALS[goal], [0.0]
+    for rows in found.values():
+        more = [true - seen for seen, true in (row[goal] for row in rows) if seen >= _NEAR * limit]
+        beyond += [float(np.quantile(more, _MOST))] if len(more) >= _FEW else []
+    back = math.ceil(100.0 * max(beyond)) / 100.0
+    return back if any(row[goal][0] <= limit - back for rows in found.values() for row in rows) else 0.0
 
 
 def told(rows: Pairs, back: dict[str, float]) -> str:
@@ -103,9 +103,9 @@ def main() -> None:
     for neck, rows in found.items():
         others = {other: each for other, each in found.items() if other != neck}
         back = {goal: reserve(others, goal) for goal in GOALS}
-        cells = [f"{part:.2g}; {told(rows, {goal: 0.0})}; {told(rows, {goal: part})}" for goal, part in back.items()]
+        cells = [f"{part:.3g}; {told(rows, {goal: 0.0})}; {told(rows, {goal: part})}" for goal, part in back.items()]
         print(f"| {neck} | {' | '.join(cells)} | {told(rows, dict.fromkeys(GOALS, 0.0))}; {told(rows, back)} |")
-    print("| none | " + " | ".join(f"{reserve(found, goal):.2g}" for goal in GOALS) + " | |")
+    print("| none | " + " | ".join(f"{reserve(found, goal):.3g}" for goal in GOALS) + " | |")
 
 
 if __name__ == "__main__":

@@ -46,7 +46,7 @@ class TuneRequirements:
     def wanted(self, metric: str) -> float | None:
         """Return the largest value that is allowed of a metric of the robot itself: its limit with the reserve."""
         limit = self.limit(metric)
-        return None if limit is None else limit + self.reserve.get(metric, 0.0)
+        return None if limit is None else round(limit + self.reserve.get(metric, 0.0), 9)
 
     def limit(self, metric: str) -> float | None:
         """Return the largest value that is allowed of a metric on the plants; None where nothing bounds it."""
@@ -151,7 +151,7 @@ def _kept_back(require: dict[str, Any], reserve: Any) -> tuple[dict[str, Any], d
         if not isinstance(entry, Mapping):
             continue  # nothing is asked of it, or what is asked is refused below
         limit = entry.get("max")
-        if isinstance(limit, bool) or not isinstance(limit, int | float) or value == 0.0:
+        if isinstance(limit, bool) or not isinstance(limit, int | float) or limit <= 0.0 or value == 0.0:
             continue
         if limit - value <= 0.0:
             raise SettingsError(

@@ -83,7 +83,7 @@ def test_without_a_plant_that_steps_the_linear_ones_are_asked() -> None:
         ({"reserve": {"neck.rise_s": -0.1}}, "must be a number from 0 on; got -0.1"),
         ({"reserve": {"neck.rise_s": 0.4}}, "<= 0.4 leaves nothing beside its reserve of 0.4"),
         ({"reserve": 1.0}, "must be a table"),
-        ({"require": {"neck.rise_s": {"min": 1.0, "max": 0.4}}}, "cannot be at least 1 and at most 0.4"),
+        ({"require": {"neck.rise_s": {"min": 1.0, "max": 0.4}}}, "cannot be at least 1 and at most"),
         ({"require": {"neck.rise_s": {"min": 3.0}, "neck.settling_s": {"max": 2.0}}}, "cannot"),
     ],
 )
