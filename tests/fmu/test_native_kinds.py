@@ -20,10 +20,12 @@ from fmpy.fmi1 import FMICallException
 from fmpy.fmi3 import FMU3Slave
 from fmpy.validation import validate_fmu
 
+from softneck.design import MpcSettings
 from softneck.fmu import build_compiled_fmu, build_fmu, unpacked
 from softneck.runtime import Block
 
 from ..data import slow_but
+from ..oracles.bake_off import bake_off_neck
 from .every_kind import FAMILIES, NATIVE, TS, as_block, block_of, inputs_of, plain_run
 
 ROWS = 400
@@ -68,6 +70,21 @@ def test_a_compiled_fmu_computes_what_the_block_does(kind: str, path: Path, runn
         fmu.begin(**as_block(block))
         _assert_equal(np.array([fmu.get(*[p.name for p in block.outputs])]), state.outputs[None])
         _assert_equal(_run(fmu, block, u), block.run(state, u)[1])
+
+
+@pytest.mark.slow
+def test_a_payload_pulls_tendons_tauter_in_c_as_well(tmp_path: Path, running: Any) -> None:
+    settings = MpcSettings(bandwidth=6.0, moves=5, minimum_tautness=0.2, payload_tautness=1.0)
+    block = settings.design(bake_off_neck()).block()
+    path = tmp_path / "mpc.fmu"
+    build_compiled_fmu(block, path)
+    u = inputs_of(block, ROWS)
+    u[:, [port.name for port in block.inputs].index("payload")] += 1.0
+    with running(path) as fmu:
+        fmu.begin(**as_block(block))
+        seen = _run(fmu, block, u)
+    # A limit of weight 1e3 makes the QP worse conditioned than the others' sums; its solver ends at 1e-10 rad.
+    np.testing.assert_allclose(seen, block.run(block.initial_state(), u)[1], rtol=0, atol=1e-10)
 
 
 def test_it_has_the_variables_of_the_python_one(kind: str, path: Path, tmp_path: Path) -> None:
