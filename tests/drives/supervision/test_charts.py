@@ -133,7 +133,7 @@ def test_a_drift_does_not_become_the_gyros_bias() -> None:
     """A bias from the start is averaged away; the same rate from 10 s on stands in the level for the next 4 s."""
     step, rate = 0.02, np.radians(0.5)
     for begin, expected in ((0.0, 0.0), (10.0, 1.0)):
-        level = GyroLevel(1, step)
+        level, known = GyroLevel(1, step), False
         for k in range(round(12.0 / step)):
             known = level.take(np.array([rate * max(0.0, k * step - begin)]), np.zeros(1))
         assert known
