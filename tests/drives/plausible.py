@@ -232,7 +232,7 @@ def swapped(bench: Bench) -> None:
     sampled(bench, lambda _, v, r: (v[::-1], r[::-1]))
 
 
-# By the time it is found a gyro with 3 deg/s of noise in each sample has walked as far as half the drift.
+# By the time it is found angles and gyro have wandered apart by half as much without any fault.
 DRIFT = ("sensor_drift", "sensor_stuck", "tilt_unexplained")
 
 # The names behind the first are of what looks the same, see docs/theory/plausibility.md.

@@ -133,8 +133,8 @@ def supervised_levels(model: tuple, rules: tuple, past: tuple, x: np.ndarray, re
             quiet = quiet or rest[j] > 0.0
             if j != i:
                 expected += level[i, features] * tension[0, j] / (n - 1)
-        # What hangs has no scale, and half of a tension must be told from none.
-        quiet = quiet or expected < 2.0 * slack[i]
+        # What hangs has no scale: half of a tension must be well above that.
+        quiet = quiet or expected < 3.0 * slack[i]
         for k in range(scales.shape[0]):
             score = chart_shift(tension[0, i] - expected, (scales[k] - 1.0) * expected, spread[i], sight)
             # What was added up before is of another moment: half an answer each time is none.

@@ -1,0 +1,141 @@
+"""What the charts of motors rest for, and what a jump was: each rule on numbers that only it decides."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from softneck.drives.supervision._charts_runtime import SUPERVISED_NOT, supervised_levels, supervised_motors
+from softneck.drives.supervision._motor_charts import SCALES, MotorCharts, MotorRules
+from softneck.drives.supervision._tilt_charts import GyroLevel
+
+from ..plausible import baseline
+
+N, FEATURES = 3, 16
+TOP, REACH, SLACK = 10.0, 1.0, 0.5
+GATES = (np.full(N, TOP), np.full(N, REACH), np.full(N, SLACK))
+
+
+def levels(tensions: list[float], *, behind: float = 0.0, rest: int | None = None) -> np.ndarray:
+    """Return scores (scales, motors) where each tension should be the mean of the others."""
+    level = np.zeros((N, FEATURES + 2))
+    level[:, FEATURES] = 1.0
+    past = (np.full((12, N), behind), np.zeros((5, N)), np.tile(tensions, (4, 1)))
+    resting = np.full(N, -1.0)
+    if rest is not None:
+        resting[rest] = 1.0
+    scores = np.full(len(SCALES) * N, np.nan)
+    model = (level, np.full(N, 0.01), *GATES)
+    supervised_levels(model, tuple(MotorRules()), past, np.zeros((4, N, FEATURES)), resting, np.array(SCALES), scores)
+    return scores.reshape(len(SCALES), N)
+
+
+def test_a_tension_twice_those_of_the_others_is_rather_a_scale_of_two_than_any_other() -> None:
+    found = levels([6.0, 3.0, 3.0])
+    assert SCALES[0] == 2.0
+    # Beyond sight a fault counts for `sight` standard deviations: 3^2 / 2.
+    assert found[0, 0] == pytest.approx(4.5)
+    # The others look small beside it, which is less likely: a third of its score, 4.5 (2 r/f - 1) at r/f = 2/3.
+    assert np.max(found.ravel()[1:]) == pytest.approx(1.5)
+    assert (levels([3.0, 3.0, 3.0]) < 0.0).all()
+    assert levels([1.5, 3.0, 3.0])[1, 0] == pytest.approx(4.5)
+
+
+@pytest.mark.parametrize(
+    "scores",
+    [
+        lambda: levels([6.0, 3.0, 3.0], behind=1.1 * REACH),
+        lambda: levels([6.0, 3.0, 3.0], rest=0),
+        lambda: levels([6.0, 3.0, 3.0], rest=2),
+        lambda: levels([0.96 * TOP, 4.8, 4.8]),
+        # The others say 1.4 N, which is not well above what may hang.
+        lambda: levels([2.8, 1.4, 1.4]),
+    ],
+    ids=["far behind", "its tendon hung", "another one hung", "at the limit", "near hanging"],
+)
+def test_levels_are_forgotten_where_they_say_nothing(scores: Callable[[], np.ndarray]) -> None:
+    assert scores()[0, 0] == SUPERVISED_NOT
+
+
+def changes(tension: float, *, moved: float = 0.0, fastest: float = 0.5, behind: float = 0.0) -> np.ndarray:
+    """Return scores (kinds, motors) where the tension of motor 1 rose by 2 N and should have by 1 N."""
+    place = np.zeros((4, N, FEATURES))
+    place[0, 0, 0] = 1.0
+    current = np.zeros((N, FEATURES))
+    current[:, 0] = 1.0
+    pulls = np.full((4, N), 3.0)
+    pulls[:, 0] = [tension, tension - 2.0, tension - 2.0, tension - 2.0]
+    positions = np.zeros((5, N))
+    positions[0] = moved
+    # Without regressors for its steps a motor is expected to stand.
+    spread = np.tile([1e-4, 0.0], (N, 1))
+    model = (np.zeros((N, 12)), spread, np.full(N, fastest), current, spread, *GATES)
+    past = (np.full((12, N), behind) + positions[0], positions, pulls)
+    white = (np.zeros((0, N)), np.zeros((0, 3, N)), np.zeros((3, N)))
+    scores = np.full(4 * N, np.nan)
+    supervised_motors(model, tuple(MotorRules()), past, place, white, np.full(N, -1.0), np.array(SCALES), 0.01, scores)
+    return scores.reshape(4, N)
+
+
+def test_a_change_twice_as_large_speaks_of_its_scale_but_not_at_the_limit_nor_where_tendons_hang() -> None:
+    # f^2 / 2 at three standard deviations, less what passes for right: a tenth of 3^2.
+    assert changes(5.0)[2, 0] == pytest.approx(4.5 - 0.9)
+    assert changes(5.0)[3, 0] < 0.0
+    assert (changes(5.0)[2:, 1:] == 0.0).all()
+    for quiet in (changes(0.98 * TOP), changes(0.9 * SLACK), changes(5.0, behind=1.1 * REACH)):
+        assert (quiet[2:] == 0.0).all()
+
+
+def test_only_what_is_faster_than_ever_is_a_jump() -> None:
+    assert changes(5.0, moved=0.6)[1, 0] == pytest.approx(60.0 - MotorRules().usual)
+    assert changes(5.0, moved=0.4)[1, 0] == -MotorRules().usual
+
+
+def test_a_motor_that_turns_is_not_jammed() -> None:
+    assert changes(5.0, moved=0.001)[0, 0] == SUPERVISED_NOT
+    assert changes(5.0)[0, 0] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("follows", "name"), [(1.0, "encoder_slip"), (0.6, "encoder_slip"), (0.4, "position_bad"), (0.0, "position_bad")]
+)
+def test_a_jump_is_a_slip_where_the_drive_leads_its_winch_back(follows: float, name: str) -> None:
+    """A motor that stands jumps by 1 rad, and goes the part `follows` of the way that its model expects."""
+    charts = MotorCharts(baseline())
+    back = -float(np.array(baseline().drive)[0].sum())
+    P, T = np.zeros(3), np.full(3, 2.0)
+    for _ in range(30):
+        assert charts.step(np.zeros(3), P, T) is None
+    P = P + np.array([1.0, 0.0, 0.0])
+    assert charts.step(np.zeros(3), P, T) is None
+    assert charts.judging
+    found = None
+    while found is None:
+        P = P + np.array([follows * back * P[0], 0.0, 0.0])
+        found = charts.step(np.zeros(3), P, T)
+    assert found[:2] == (name, 0)
+
+
+def test_a_number_that_came_back_was_no_slip() -> None:
+    charts = MotorCharts(baseline())
+    P, T = np.zeros(3), np.full(3, 2.0)
+    for _ in range(30):
+        charts.step(np.zeros(3), P, T)
+    charts.step(np.zeros(3), P + np.array([1.0, 0.0, 0.0]), T)
+    found = charts.step(np.zeros(3), P, T)
+    assert found is not None
+    assert found[:2] == ("position_bad", 0)
+
+
+def test_a_drift_does_not_become_the_gyros_bias() -> None:
+    """A bias from the start is averaged away; the same rate from 10 s on stands in the level for the next 4 s."""
+    step, rate = 0.02, np.radians(0.5)
+    for begin, expected in ((0.0, 0.0), (10.0, 1.0)):
+        level, known = GyroLevel(1, step), False
+        for k in range(round(12.0 / step)):
+            known = level.take(np.array([rate * max(0.0, k * step - begin)]), np.zeros(1))
+        assert known
+        # 2 s of drift, of which a sixth of the time's part leaks away: 6 (1 - e^(-2/6)) = 1.70 s are left.
+        assert np.degrees(level.level[0]) == pytest.approx(expected * 0.5 * 1.70, abs=0.02)
