@@ -91,7 +91,8 @@ def step_order(parts: Mapping[str, Part], taps: Mapping[str, Tap]) -> tuple[str,
         ready = [name for name in waits if name not in done and all(feeder in done for feeder in waits[name])]
         if not ready:
             raise SettingsError(_circle({name: waits[name] for name in waits if name not in done}))
-        done.append(ready[0])
+        # An observer before whoever moves the motors, wherever it stands: else it would know set-points of its future.
+        done.append(min(ready, key=lambda name: parts[name].role != "observer"))
     return tuple(done)
 
 
