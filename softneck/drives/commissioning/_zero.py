@@ -40,7 +40,7 @@ _SLOW_LOOP_TOLERANCE = 0.25
 # What is slower than this tells nothing about the slow loop [rad/s].
 _FAST_ENOUGH = 0.3
 _SETTLE = 1.0
-# [rad] Of a winch from the moment of its zero to the answer that tells it, of 7,717 counts in a radian: 17 were seen where
+# [rad] Of a winch from its zero to the answer that tells it, of 7,717 counts in a radian: 17 were seen where
 # answers come at once, 66 where each takes 50 ms, 88 at 100 ms; -5,947 before a zero that was set.
 _CREEPS = 0.02
 _ENABLE_TIME = 1.0
