@@ -186,6 +186,8 @@ def test_type_252_answers_with_what_it_had_at_the_last_sync_and_253_with_what_it
         before = talk.say(ask)[0].data
         talk.drive.axis.trip(0x4310)
         words[kind] = (before, [frame.data for frame in talk.say(ask) if frame.identifier == 0x181][-1])
+        talk.say(CanFrame(0x80, b""))
+        assert talk.say(ask)[-1].data != before, "the next SYNC samples again"
     assert words[252][0] == words[252][1]
     assert words[253][0] != words[253][1]
 
