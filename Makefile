@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test slow check docs benchmark conformance mutate native wheel tag nightly nightly-tests nightly-fmu nightly-can nightly-systemd clean
+.PHONY: demo test slow check docs benchmark conformance mutate native wheel tag constraints nightly nightly-tests nightly-fuzz nightly-fmu nightly-can nightly-systemd clean
 
 demo: $(VENV)/.installed
 	$(BIN)/softneck demo --out build/demo
@@ -43,11 +43,15 @@ mutate: $(VENV)/.mutated
 native: $(VENV)/.crossed
 	$(BIN)/python -m softneck.fmu.compiled
 
-nightly: nightly-tests nightly-fmu nightly-can nightly-systemd
+nightly: nightly-tests nightly-fuzz nightly-fmu nightly-can nightly-systemd
 
 # With `make test` and `make slow` that is all: every kind in every importer, predictive control over every kind.
 nightly-tests: $(VENV)/.tested
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m nightly
+
+# 100,000 damaged files, spread over the formats that we read; each is a file or one error of ours.
+nightly-fuzz: $(VENV)/.tested
+	SOFTNECK_FUZZ_INPUTS=100000 $(BIN)/python -m pytest -q -n 2 --dist worksteal tests/fuzz
 
 # The library on other platforms, bit for bit; wrong bytes under the sanitizers; libFuzzer for two minutes.
 # Debian: wine64 qemu-user libc6-arm64-cross gcc clang.
@@ -74,6 +78,10 @@ wheel: native
 tag: $(VENV)/.tested
 	$(BIN)/python -m pytest -q tests/test_packaging.py
 	$(BIN)/python -c "import softneck, subprocess as s; v = softneck.__version__; s.run(['git', 'tag', '-a', f'v{v}', '-m', f'softneck {v}'], check=True)"
+
+# The versions that CI installs, from the environment in which everything was tested; names and versions alone.
+constraints: $(VENV)/.documented $(VENV)/.linted $(VENV)/.mutated $(VENV)/.crossed
+	$(BIN)/python -m pip freeze --quiet --exclude-editable | grep -E '^[A-Za-z0-9._-]+==[A-Za-z0-9.]+$$' > .ci/constraints.txt
 
 clean:
 	rm -rf $(VENV) docs/_build .pytest_cache .ruff_cache

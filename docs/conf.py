@@ -4,7 +4,7 @@ import sys
 from importlib import metadata
 from pathlib import Path
 
-# Our own extensions, `public_names`, `kinds_tables` and `executed`, stand beside this file.
+# Our own extensions, `public_names`, `kinds_tables`, `executed` and `licences`, stand beside this file.
 sys.path.insert(0, str(Path(__file__).parent))
 
 project = "softneck"
@@ -19,6 +19,7 @@ extensions = [
     "public_names",
     "kinds_tables",
     "executed",
+    "licences",
 ]
 myst_enable_extensions = ["dollarmath", "colon_fence"]
 myst_heading_anchors = 3

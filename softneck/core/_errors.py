@@ -4,11 +4,19 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 
+# A message quotes what stands in files. Control characters there would end its line, or write to the terminal what they
+# like; where we say several things, a line each, it is by the newline alone.
+_CONTROLS = dict.fromkeys([*range(10), *range(11, 32), *range(127, 160), 0x2028, 0x2029], "?")
+
 
 class SoftneckError(Exception):
     """Base of all errors a user can mend; the command line prints it on one line and exits with 2."""
 
     exit_code = 2
+
+    def __str__(self) -> str:
+        """Return the message without control characters."""
+        return super().__str__().translate(_CONTROLS)
 
 
 class SettingsError(SoftneckError, ValueError):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import hashlib
 import os
 import signal
@@ -190,6 +191,24 @@ def test_what_a_killed_process_left_is_swept_by_the_next_write_and_nothing_else_
             two.write_text("")
         assert one.read_text() == "still at work"
     assert sorted(path.name for path in tmp_path.iterdir()) == [".hidden-softneck.npz", "model.npz", "one", "two"]
+
+
+def test_a_temporary_that_is_swept_while_it_begins_begins_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lock, swept = fcntl.flock, []
+
+    def late(descriptor: int, how: int) -> None:
+        lock(descriptor, how)
+        if not swept:  # another process had the lock first
+            swept.extend(tmp_path.iterdir())
+            swept[0].unlink()
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    with atomic_write(tmp_path / "a") as temporary:
+        temporary.write_text("whole")
+    assert swept != [temporary]
+    assert (tmp_path / "a").read_text() == "whole"
 
 
 def test_many_processes_may_write_one_file_at_once(tmp_path: Path) -> None:

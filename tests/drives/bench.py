@@ -15,6 +15,7 @@ from softneck.drives.master._measured import Measurement
 from softneck.drives.master._settings import RampSettings
 from softneck.drives.running._virtual import VirtualRun, simulated_plant
 from softneck.drives.simulated import SimulatedDrive
+from softneck.drives.simulated._wire import Wire, WireHabits
 from softneck.plant import NeckParameters
 
 T = 0.01
@@ -63,10 +64,16 @@ class Bench:
         neck: NeckParameters | None = None,
         seed: int = 0,
         rows: int = 100_000,
+        profile: str = "ipos2015",
+        habits: WireHabits | None = None,
     ) -> None:
-        self.file = replace(file or default_drives(), ramps=FAST)
+        self.file = replace(file or default_drives(profile), ramps=FAST)
         count = len(self.file.drives)
         self.neck = simulated_plant(self.file, neck or NeckParameters.paper(), sample_time=TS, seed=seed)
+        if habits is not None:
+            self.neck._on_bus.wire = Wire(habits, self.neck.settings.cycle)
+            for drive in self.neck.drives:
+                drive._sdo._plain = habits.plain_sdo
         self.link = VirtualLink(self.neck)
         self.pilot = Script(rows, count)
         settings = self.file.master_settings(TS, guarding=guarding)

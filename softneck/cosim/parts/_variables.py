@@ -148,7 +148,11 @@ def read_description(
     for name in units or {}:
         if name not in variables:
             raise FileFormatError(f"{path}: a unit is given for `{name}`, which is not one of its variables.")
-    return Description(path, model, _annotation(folder), variables, version, units or {})
+    try:
+        annotation = _annotation(folder)
+    except ET.ParseError as error:  # fmpy's parser mends more than Python's
+        raise FileFormatError(f"{path}: its modelDescription.xml cannot be read ({error}).") from error
+    return Description(path, model, annotation, variables, version, units or {})
 
 
 def _annotation(folder: Path) -> Annotation:

@@ -42,6 +42,9 @@ _CURRENT_RANGE = 65520.0
 # A stop ramp is over when the demand stands [counts/s].
 _STANDS = 1.0
 _FOLLOWING_ERROR, _ENABLE_INPUT, _GUARDING = 0x8611, 0x5441, 0x8130
+# 2000h by fault. That a fault shows there is known, which bit it is not: unverified like all that no hardware told.
+_MOTION_ERRORS = {_GUARDING: 1 << 0, 0x2340: 1 << 1, _FOLLOWING_ERROR: 1 << 3, 0x2310: 1 << 8, 0x4310: 1 << 11,
+                  0x3210: 1 << 12, 0x3220: 1 << 13, _ENABLE_INPUT: 1 << 15}  # fmt: skip
 _LIMIT_CODES = {1.0: 0xFF06, -1.0: 0xFF07}
 
 
@@ -78,6 +81,7 @@ class Axis:
             (0x6078, 0): lambda: round(1000.0 * motion[SERVO_CURRENT] / max(profile.rated_current, 1e-9)),
             (0x603F, 0): lambda: self.fault,
             (0x1001, 0): lambda: 1 if self.fault else 0,
+            (0x2000, 0): lambda: _MOTION_ERRORS.get(self.fault, 0),
             (0x60B9, 0): lambda: 0 if self._captured is None else 0x03,
             (0x60BA, 0): lambda: self._captured or 0,
         }
@@ -90,9 +94,9 @@ class Axis:
         self.values = {key: item.start for key, item in self.profile.items.items()}
         for key in ((0x1018, 4), (0x1018, 2)):
             self.values[key] = 1000 + self.node if key[1] == 4 else self.profile.products.get(self.device_name, 0)
-        for n in range(4):
-            for base in (0x1400, 0x1800):
-                self.values[(base + n, 1)] += self.node
+        own = [(base + n, 1) for base in (0x1400, 0x1800) for n in range(4)]
+        for key in (*own, (0x1014, 0), (0x1200, 1), (0x1200, 2)):
+            self.values[key] += self.node
         if self.profile.rated_current:
             self.values[(0x6075, 0)] = round(1000.0 * self.profile.rated_current)
         self._default_limits()
@@ -160,6 +164,8 @@ class Axis:
             (0x605E, 0): (-1, 0, 2),
             (0x6007, 0): (0, 1, 2, 3),
             (0x6098, 0): (0, 35, 37),
+            (0x1003, 0): (0,),
+            **{(0x1800 + n, 2): (*range(241), 252, 253, 254, 255) for n in range(4)},
         }.get(key)
         return allowed is None or value in allowed
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +26,7 @@ from ._servo_runtime import (
     SERVO_SIZE,
     SERVO_ZERO,
 )
+from ._wire import Wire, WireHabits
 
 _TICK = 1e-3
 # What the ring must hold: the upper end of `drive_latency`, 0.1 s, in ticks.
@@ -49,6 +50,7 @@ class SimulatedSettings(Shown):
             the neck's drive latency.
         homed: the drives were zeroed with the neck at rest before.
         seed: of the inclinometer's noise.
+        habits: of drives and wire that are stricter than a wire without time.
     """
 
     nodes: tuple[int, ...] = (1, 2, 3)
@@ -63,6 +65,7 @@ class SimulatedSettings(Shown):
     hold: float = 0.02
     homed: bool = True
     seed: int = 0
+    habits: WireHabits = field(default_factory=WireHabits)
 
     def __post_init__(self) -> None:
         require_one_of("profile", self.profile, tuple(PROFILES))
@@ -76,7 +79,7 @@ class SimulatedDrives:
     """All drives of a robot, stepped by whoever owns the time and what they turn.
 
     Attributes:
-        nodes: on the bus.
+        nodes: on the bus; wire: between them and whoever speaks with them.
         motion: (motors, SERVO_SIZE), see the servo runtime; ring: (motors, n) past demands.
         ticks: of the servo loops in one bus cycle; h: time of one [s].
     """
@@ -101,6 +104,7 @@ class SimulatedDrives:
             self.motion[row, SERVO_LAG] = max(0, round(lag / self.h))
             self.motion[row, SERVO_PLACE], self.motion[row, SERVO_GEARING] = 0, 1.0
         self.nodes = tuple(self._drive(settings, row, current_limit) for row in range(count))
+        self.wire = Wire(settings.habits, settings.cycle)
 
     def _drive(self, s: SimulatedSettings, row: int, current_limit: float) -> SimulatedDrive:
         m = self.motion[row]
@@ -114,15 +118,22 @@ class SimulatedDrives:
             axis.values[(0x607C, 0)] = 1
             m[SERVO_ZERO], m[SERVO_POSITION] = 1.0, 1.0
             axis.homed = True
-        return SimulatedDrive(axis)
+        return SimulatedDrive(axis, plain_sdo=s.habits.plain_sdo)
 
 
-def exchange(drives: Sequence[SimulatedDrive], frames: Sequence[CanFrame], now: float) -> list[CanFrame]:
-    """Deliver `frames` at `now` [s] to all drives, and return what they send in answer."""
+def exchange(drives: Sequence[SimulatedDrive], frames: Sequence[CanFrame], now: float, wire: Wire) -> list[CanFrame]:
+    """Deliver `frames` at `now` [s] to all drives, and return what comes from them over the wire."""
     for frame in frames:
         for drive in drives:
             drive.receive(now, frame)
-    return [frame for drive in drives for frame in drive.tick(now)]
+    said = [drive.tick(now) for drive in drives]
+    if wire.habits == WireHabits():
+        return [frame for frames in said for frame in frames]
+    out = wire.passed(now, frames, said)
+    for row, drive in enumerate(drives):
+        if code := wire.overrun(row):
+            drive.axis.emergencies.append((code, 0x10))
+    return out
 
 
 def sensed(

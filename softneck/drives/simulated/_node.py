@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from ._sdo import WRONG_STATE, WRONG_VALUE, SdoServer
 
 _PREOPERATIONAL, _OPERATIONAL, _STOPPED = 0x7F, 0x05, 0x04
 _COMMANDS = {0x01: _OPERATIONAL, 0x02: _STOPPED, 0x80: _PREOPERATIONAL}
-_DISABLED = 0x80000000
+_DISABLED, _NO_REMOTE = 0x80000000, 0x40000000
 
 
 @dataclass(slots=True)
@@ -27,6 +28,10 @@ class _Pdo:
     waiting: tuple[int, ...] | None = None
     sent: bytes = b""
     syncs: int = 0
+    inhibit: float = 0.0
+    timer: float = 0.0
+    sent_at: float = -math.inf
+    remote: bool = True
 
 
 class SimulatedDrive:
@@ -38,11 +43,11 @@ class SimulatedDrive:
         alive: False while it has no supply: then it neither hears nor speaks.
     """
 
-    def __init__(self, axis: Axis) -> None:
+    def __init__(self, axis: Axis, *, plain_sdo: bool = False) -> None:
         """Put `axis` on the bus; it speaks first when `tick` is called."""
         self.axis, self.alive = axis, True
         self._out: list[CanFrame] = []
-        self._sdo = SdoServer(axis.read, self._write)
+        self._sdo = SdoServer(axis.read, self._write, plain=plain_sdo)
         self._boot(0.0)
 
     def _boot(self, now: float) -> None:
@@ -54,6 +59,8 @@ class SimulatedDrive:
         self._beat_at = now
         self._receive_pdos: dict[int, _Pdo] = {}
         self._transmit_pdos: list[_Pdo] = []
+        self._asked: dict[int, _Pdo] = {}
+        self._errors: list[int] = []
         node = self.axis.node
         self._ids = (0x600 + node, 0x700 + node)
         self._out.append(CanFrame(0x700 + node, b"\0"))
@@ -80,15 +87,15 @@ class SimulatedDrive:
                     pdo.waiting = values
                 else:
                     self._apply(pdo, values)
-        elif identifier == 0x80 and not remote:
-            self._sync()
+        elif identifier == self.axis.values[(0x1005, 0)] & 0x7FF and not remote:
+            self._sync(now)
+        elif remote and identifier in self._asked:
+            self._requested(now, self._asked[identifier])
         elif identifier == self._ids[1] and remote:
             self._guard(now)
         elif identifier == self._ids[0] and not remote:
             if self.nmt != _STOPPED:
-                answer = self._sdo.answer(data)
-                if answer is not None:
-                    self._out.append(CanFrame(0x580 + self.axis.node, answer))
+                self._out += [CanFrame(0x580 + self.axis.node, answer) for answer in self._sdo.answers(data)]
         elif identifier == 0x000 and len(data) == 2 and data[1] in (0, self.axis.node):
             self._command(now, data[0])
         elif self._consumed and identifier == 0x700 + self._consumed[0]:
@@ -110,7 +117,7 @@ class SimulatedDrive:
         self._toggle ^= 0x80
         self._guarded_at, self._told = now, False
 
-    def _sync(self) -> None:
+    def _sync(self, now: float) -> None:
         if self.nmt != _OPERATIONAL:
             return
         for pdo in self._receive_pdos.values():
@@ -119,14 +126,25 @@ class SimulatedDrive:
                 self._apply(pdo, values)
         self.axis.synchronise()
         for pdo in self._transmit_pdos:
+            if pdo.kind == 252:  # sampled with SYNC, sent when asked
+                pdo.sent = self._packed(pdo)
             if pdo.kind > 240:
                 continue
             pdo.syncs += 1
             data = self._packed(pdo)
             # Type n: with each n-th SYNC; type 0: with the SYNC after a change (CiA 301, 7.5.2.35).
             if pdo.syncs == pdo.kind or (pdo.kind == 0 and data != pdo.sent):
-                pdo.syncs, pdo.sent = 0, data
-                self._out.append(CanFrame(pdo.identifier, data))
+                pdo.syncs = 0
+                self._send(now, pdo, data)
+
+    def _requested(self, now: float, pdo: _Pdo) -> None:
+        """Answer a remote request: type 252 with what it had at the last SYNC, all others with what they have."""
+        if self.nmt == _OPERATIONAL and pdo.remote:
+            self._send(now, pdo, (pdo.sent or self._packed(pdo)) if pdo.kind == 252 else self._packed(pdo))
+
+    def _send(self, now: float, pdo: _Pdo, data: bytes) -> None:
+        pdo.sent, pdo.sent_at = data, now
+        self._out.append(CanFrame(pdo.identifier, data))
 
     def _apply(self, pdo: _Pdo, values: tuple[int, ...]) -> None:
         # The last entries first: a set-point stands before the control word that may start it.
@@ -164,20 +182,30 @@ class SimulatedDrive:
             self._out.append(CanFrame(self._ids[1], bytes([self.nmt])))
         while axis.emergencies:
             code, register = axis.emergencies.popleft()
-            if self.nmt != _STOPPED:
-                self._out.append(CanFrame(0x80 + axis.node, struct.pack("<HB5x", code, register)))
+            self._remember(code)
+            told = axis.values[(0x1014, 0)]
+            if self.nmt != _STOPPED and not told & _DISABLED:
+                self._out.append(CanFrame(told & 0x7FF, struct.pack("<HB5x", code, register)))
         if self.nmt == _OPERATIONAL:
-            self._events()
+            self._events(now)
         frames, self._out = self._out, []
         return frames
 
-    def _events(self) -> None:
+    def _remember(self, code: int) -> None:
+        """Keep an error in 1003h, the newest first."""
+        v = self.axis.values
+        self._errors = [code, *self._errors][:2] if v[(0x1003, 0)] else [code]
+        v[(0x1003, 0)] = len(self._errors)
+        v |= {(0x1003, place): error for place, error in enumerate(self._errors, start=1)}
+
+    def _events(self, now: float) -> None:
+        """Send what changed, or what the event timer asks for; never sooner than the inhibit time allows."""
         for pdo in self._transmit_pdos:
-            if pdo.kind >= 254:
+            since = now - pdo.sent_at + 1e-9
+            if pdo.kind >= 254 and since >= pdo.inhibit:
                 data = self._packed(pdo)
-                if data != pdo.sent:
-                    pdo.sent = data
-                    self._out.append(CanFrame(pdo.identifier, data))
+                if data != pdo.sent or (pdo.timer and since >= pdo.timer):
+                    self._send(now, pdo, data)
 
     def _watch_times(self) -> None:
         v = self.axis.values
@@ -223,7 +251,7 @@ class SimulatedDrive:
     def _map(self) -> None:
         """Build the active PDOs from the objects."""
         v, axis = self.axis.values, self.axis
-        self._receive_pdos, self._transmit_pdos = {}, []
+        self._receive_pdos, self._transmit_pdos, self._asked = {}, [], {}
         items = dict(axis.profile.items)
         for n in range(4):
             for base, mapping in ((0x1400, 0x1600), (0x1800, 0x1A00)):
@@ -240,7 +268,11 @@ class SimulatedDrive:
                     self._receive_pdos[identifier & 0x7FF] = pdo
                 else:
                     actions = [self._getter(key) for key in keys]
-                    self._transmit_pdos.append(_Pdo(packed, keys, v[(base + n, 2)], identifier & 0x7FF, actions))
+                    pdo = _Pdo(packed, keys, v[(base + n, 2)], identifier & 0x7FF, actions)
+                    pdo.inhibit, pdo.timer = v[(base + n, 3)] * 1e-4, v[(base + n, 5)] * 1e-3
+                    pdo.remote = not identifier & _NO_REMOTE
+                    self._transmit_pdos.append(pdo)
+                    self._asked[pdo.identifier] = pdo
 
     def _setter(self, key: tuple[int, int]) -> Callable[[int], object]:
         axis, item = self.axis, self.axis.profile.items[key]

@@ -68,14 +68,23 @@ def _common() -> dict[Key, Item]:
     items: dict[Key, Item] = {
         (0x1000, 0): _ro(0x00020192),
         (0x1001, 0): _ro(0, 1),
+        # Of the errors so far the newest first; their count may be written, and 0 alone: it clears them.
+        (0x1003, 0): Item(0, 1),
+        (0x1003, 1): _ro(0),
+        (0x1003, 2): _ro(0),
+        (0x1005, 0): Item(0x80),
         (0x100C, 0): Item(0, 2),
         (0x100D, 0): Item(0, 1),
+        (0x1014, 0): Item(0x80),
         (0x1017, 0): Item(0, 2),
         (0x1018, 0): _ro(4, 1),
         (0x1018, 1): _ro(0x000001A3),
         (0x1018, 2): _ro(0),
         (0x1018, 3): _ro(0x00010001),
         (0x1018, 4): _ro(0),
+        (0x1200, 0): _ro(2, 1),
+        (0x1200, 1): _ro(0x600),
+        (0x1200, 2): _ro(0x580),
         (0x6007, 0): Item(0, 2, signed=True),
         (0x603F, 0): _ro(0, 2),
         (0x6040, 0): Item(0, 2),
@@ -128,6 +137,9 @@ def _pdo(communication: int, mapping: int, identifier: int) -> dict[Key, Item]:
         (communication, 2): Item(255, 1),
         (mapping, 0): Item(0, 1),
     }
+    if communication >= 0x1800:
+        # Inhibit time [0.1 ms] and event timer [ms].
+        items |= {(communication, 0): _ro(5, 1), (communication, 3): Item(0, 2), (communication, 5): Item(0, 2)}
     return items | {(mapping, i): Item(0) for i in range(1, 5)}
 
 
@@ -136,6 +148,9 @@ def ipos2015() -> Profile:
     items = _common() | {
         (0x1008, 0): Item(text="CiA 402 drive (simulated)", size=0, writable=False),
         (0x100A, 0): Item(text="F514I", size=0, writable=False),
+        # Motion and detailed error register.
+        (0x2000, 0): _ro(0, 2),
+        (0x2002, 0): _ro(0, 2),
         (0x207E, 0): _ro(0, 2, signed=True),
         (0x207F, 0): Item(0, 2),
         # The default of the manual: no bit for the cyclic mode (bit 7), though the drive has it.

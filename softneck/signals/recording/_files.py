@@ -342,7 +342,8 @@ def numbers(column: pd.Series | Vector, name: str, *, missing: bool, nan_words: 
             bad[bad] = [str(cell).strip().lower() != "nan" for cell in column[bad]]
     if bad.any():
         row = int(np.argmax(bad))
-        cell = "an empty cell" if pd.isna(column.iloc[row]) else f"`{column.iloc[row]}`"
+        said = " ".join(str(column.iloc[row]).split())[:60]  # a cell in quotes may hold lines
+        cell = "an empty cell" if pd.isna(column.iloc[row]) else f"`{said}`"
         raise _no_number(name, cell, row, missing=missing)
     return values
 

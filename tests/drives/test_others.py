@@ -1,0 +1,144 @@
+"""Masters and slaves that others wrote: python-canopen on one bus with our simulated drives, and with our master.
+
+Every day on python-can's `virtual`; on `vcan0` too where the kernel has it, as in the guest of `make nightly-can`.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+import canopen
+import pytest
+
+from softneck.drives.bus._link import CanLink
+from softneck.drives.bus._sdo import Objects, SdoError, load_eds
+from softneck.drives.running._scan import scan
+from softneck.drives.simulated import SimulatedNeck, SimulatedSettings, serve
+from softneck.drives.simulated._profiles import PROFILES
+from softneck.drives.simulated._wire import WireHabits
+from softneck.plant import NeckParameters
+
+EDS = Path(load_eds.__code__.co_filename).parent / "eds"
+VCAN = pytest.mark.skipif(
+    not Path("/sys/class/net/vcan0").exists(), reason="no vcan0: this kernel has no CAN (make nightly-can has)"
+)
+BUSES = ["virtual", pytest.param("socketcan", marks=VCAN)]
+
+
+def opened(interface: str, name: str) -> can.BusABC:
+    return can.Bus("vcan0" if interface == "socketcan" else name, interface=interface)
+
+
+def wait_for(what: Any, seconds: float = 5.0) -> Any:
+    """Wait until `what` returns something; a busy machine is no failure."""
+    until = time.monotonic() + seconds
+    while not (found := what()) and time.monotonic() < until:
+        time.sleep(0.005)
+    return found
+
+
+@pytest.fixture(params=BUSES)
+def foreign_master(request: pytest.FixtureRequest) -> Iterator[tuple[SimulatedNeck, canopen.Network]]:
+    """Our drives, stricter than they must be, and a network of python-canopen's."""
+    name, ended = request.node.name, threading.Event()
+    habits = WireHabits(sdo_latency=0.005, queue=16, bitrate=1e6)
+    neck = SimulatedNeck(NeckParameters.paper(), SimulatedSettings(habits=habits))
+    neck.move()
+    network = canopen.Network()
+    with opened(request.param, name) as theirs:
+        network.bus = opened(request.param, name)
+        network.notifier = can.Notifier(network.bus, network.listeners, 0.1)
+        server = threading.Thread(target=serve, args=(theirs, neck), kwargs={"stopped": ended.is_set}, daemon=True)
+        server.start()
+        yield neck, network
+        network.disconnect()
+        ended.set()
+        server.join()
+
+
+@pytest.mark.slow
+def test_a_foreign_master_reads_every_object_of_our_drives(
+    foreign_master: tuple[SimulatedNeck, canopen.Network],
+) -> None:
+    neck, network = foreign_master
+    node: Any = network.add_node(2, str(EDS / "ipos2015.eds"))
+    axis = neck.drives[1].axis
+    for (index, subindex), item in PROFILES["ipos2015"]().items.items():
+        data = node.sdo.upload(index, subindex)
+        assert len(data) == (item.size or len(axis.device_name if index == 0x1008 else item.text))
+        if item.size and (index, subindex) not in axis.getters:
+            signed = int.from_bytes(data, "little", signed=item.signed)
+            assert signed == axis.values[(index, subindex)], f"{index:04X}h:{subindex}"
+    with node.sdo.open(0x1008, 0, "rb", block_transfer=True) as stream:
+        assert stream.read().decode() == axis.device_name
+    node.sdo.download(0x6081, 0, (1234).to_bytes(4, "little"), force_segment=True)
+    assert axis.values[(0x6081, 0)] == 1234
+
+
+@pytest.mark.slow
+def test_a_foreign_master_leads_our_drive_through_its_states(
+    foreign_master: tuple[SimulatedNeck, canopen.Network],
+) -> None:
+    neck, network = foreign_master
+    node: Any = network.add_node(1, str(EDS / "ipos2015.eds"))
+    drive = neck.drives[0]
+    node.nmt.state = "RESET"
+    node.nmt.wait_for_bootup(5.0)
+    node.sdo[0x1017].raw = 20
+    assert node.nmt.wait_for_heartbeat(5.0) == "PRE-OPERATIONAL"
+    # Its own way to map a PDO: switched off, mapped, switched on.
+    node.tpdo.read()
+    node.tpdo[1].clear()
+    node.tpdo[1].add_variable(0x6041)
+    node.tpdo[1].add_variable(0x6064)
+    node.tpdo[1].trans_type, node.tpdo[1].event_timer, node.tpdo[1].enabled = 255, 20, True
+    node.tpdo.save()
+    node.nmt.state = "OPERATIONAL"
+    assert wait_for(lambda: node.tpdo[1].wait_for_reception(1.0))
+    assert node.tpdo[1][0x6041].raw & 0x6F == 0x40
+    for word, state in ((6, 0x31), (7, 0x33), (15, 0x37)):
+        node.sdo[0x6040].raw = word
+        assert wait_for(lambda state=state: node.tpdo[1][0x6041].raw & 0x7F == state), hex(node.tpdo[1][0x6041].raw)
+    drive.axis.trip(0x4310)
+    assert node.emcy.wait(0x4310, 5.0) is not None
+    assert node.sdo[0x1003][1].raw == 0x4310
+    assert wait_for(lambda: node.tpdo[1][0x6041].raw & 0x08)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("interface", BUSES)
+@pytest.mark.parametrize("profile", list(PROFILES))
+def test_our_master_finds_foreign_slaves_and_writes_and_reads_all_their_objects(
+    request: pytest.FixtureRequest, interface: str, profile: str
+) -> None:
+    """Their slaves hold whatever is written: what we read back is what we wrote, of every size and sign."""
+    name, eds = request.node.name, str(EDS / f"{profile}.eds")
+    slaves = canopen.Network()
+    slaves.bus = opened(interface, name)
+    slaves.notifier = can.Notifier(slaves.bus, slaves.listeners, 0.1)
+    try:
+        nodes: list[Any] = [slaves.create_node(number, eds) for number in (1, 2, 3)]
+        for node in nodes:
+            node.sdo[0x1000].raw = 0x00020192
+            node.sdo[0x1008].raw = f"a slave that others wrote {node.id}"
+        with opened(interface, name) as ours:
+            link = CanLink(ours, name)
+            assert [found["node"] for found in scan(link)] == [1, 2, 3]
+            objects = Objects(link, 2, load_eds(profile))
+            assert objects.read_text(0x1008) == "a slave that others wrote 2"
+            for (index, subindex), item in PROFILES[profile]().items.items():
+                if item.size and item.writable:
+                    value = -(2 ** (8 * item.size - 1)) if item.signed else 2 ** (8 * item.size) - 1
+                    assert objects.written(index, subindex, value) == value, f"{index:04X}h:{subindex}"
+            with pytest.raises(SdoError, match="node 2 refuses") as refused:
+                objects.write(0x6041, 0, 1)
+            assert refused.value.aborted
+            with pytest.raises(SdoError, match="node 5 does not answer"):
+                Objects(link, 5, load_eds(profile)).read(0x1000)
+    finally:
+        slaves.disconnect()
