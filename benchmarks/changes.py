@@ -126,7 +126,9 @@ def alarms(necks: list[str], hours: float) -> None:
             name = ("aprbs", "multisine", "mixed")[seed % 3]
             P = rng.uniform(0.5, 1.0) * signal(name, duration=60.0, seed=seed).set_points
             done.append(bool(np.isfinite(first(detector, moved(neck, P, 0.0, seed), 0.0))))
-            path.write_text(json.dumps(done), encoding="utf-8")
+            part = path.with_suffix(".part")
+            part.write_text(json.dumps(done), encoding="utf-8")
+            part.replace(path)
         print(f"{neck:14}{sum(done)} false alarms in {len(done) / 60.0:.2f} h of motion", flush=True)
 
 

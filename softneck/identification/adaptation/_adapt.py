@@ -1,6 +1,6 @@
 """A model that follows a neck that changed: a warm refit on the latest data, held to the old model elsewhere.
 
-The numbers below are chosen on necks that were left out: `benchmarks/adaptation.py choose`.
+Strength and blocks are chosen on necks that were left out: `benchmarks/adaptation.py choose`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ._problem import Problem, free_run, information, reference, scored
 
 #: The latest data that are looked at [s].
 WINDOW = 30.0
-# Of the prior: rows of the reference that each row of the window stands against.
+# Weight of a change along the reference beside an error over the window.
 _STRENGTH = 0.1
 # Held out: the last of every so many blocks, so long [s]; between them the window is learnt from.
 _EVERY, _BLOCK = 3, 2.0

@@ -170,6 +170,7 @@ def test_only_the_latest_seconds_count(old: Trained, window: Recording) -> None:
     assert same_arrays(changed, old["play"].adapted(window, window=20.0))
 
 
+@pytest.mark.slow
 def test_payload_and_a_biased_sensor_at_once(old: Trained, window: Recording) -> None:
     both = window.with_channels(pitch=window.channels["pitch"] + np.radians(2.0))
     judged = loaded("rotation", 1.0, 8)
