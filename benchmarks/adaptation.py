@@ -24,8 +24,7 @@ from softneck.identification import WARM_UP, Model
 from softneck.identification.adaptation._adapt import Adaptation
 from softneck.signals import Recording, concatenate, import_log, read_layout, signal
 from tests.foreign_necks.choosing import leave_one_out
-from tests.foreign_necks.held_out import HELD_OUT
-from tests.foreign_necks.necks import CHOOSING, NECKS, ForeignNeck, record
+from tests.foreign_necks.necks import CHOOSING, ForeignNeck, record
 
 OUT = Path("build/adaptation")
 MOTIONS, WINDOWS, LOADS = ("steps", "sine", "rotation", "eq22"), ("rotation", "eq22"), (0.32, 1.0)
@@ -119,13 +118,12 @@ def free(necks: list[str], kinds: list[str]) -> None:
     print(f"{'judged on':40}{'before':>14}{'after':>14}{'oracle':>14}")
     for neck, kind, payload in ((n, k, p) for n in necks for k in kinds for p in LOADS):
         model, oracle = trained(neck, kind), trained(neck, kind, payload)
-        mark = " (held out)" if neck in HELD_OUT else ""
         same = log(neck, "rotation", payload, 6)
         shown = [(same.rows(0, 750), [same.rows(750, 1500)])]
-        line(f"{neck + mark} {kind} {payload:g} kg, the same", model, oracle, shown)
+        line(f"{neck} {kind} {payload:g} kg, the same", model, oracle, shown)
         others = [log(neck, motion, payload) for motion in MOTIONS[:3]]
         shown = [(log(neck, "eq22", payload).rows(0, ROWS), others)]
-        line(f"{neck + mark} {kind} {payload:g} kg, other motion", model, oracle, shown)
+        line(f"{neck} {kind} {payload:g} kg, other motion", model, oracle, shown)
 
 
 def lab(folder: Path, kinds: list[str]) -> None:
@@ -152,11 +150,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("what", choices=["choose", "free", "lab"])
     parser.add_argument("--folder", type=Path, help="of the lab's logs")
-    parser.add_argument("--necks", nargs="*", choices=NECKS)
+    parser.add_argument("--necks", nargs="*", choices=CHOOSING)
     parser.add_argument("--kinds", nargs="*", default=list(CHOSEN))
     asked = parser.parse_args()
     if asked.what == "choose":
-        choose([neck for neck in asked.necks or CHOOSING if neck in CHOOSING], asked.kinds)
+        choose(asked.necks or list(CHOOSING), asked.kinds)
     elif asked.what == "free":
         free(asked.necks or list(CHOOSING), asked.kinds)
     else:

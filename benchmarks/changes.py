@@ -24,8 +24,7 @@ from softneck.estimation.changes._change import ChangeDetector
 from softneck.estimation.changes._settings import ChangeSettings
 from softneck.signals import Recording, concatenate, signal
 from tests.foreign_necks.choosing import leave_one_out
-from tests.foreign_necks.held_out import HELD_OUT
-from tests.foreign_necks.necks import CHOOSING, NECKS, ForeignNeck, record_under
+from tests.foreign_necks.necks import CHOOSING, ForeignNeck, record_under
 
 OUT, TS = Path("build/changes"), 0.02
 LOADS = (0.32, 0.5, 1.0)
@@ -106,10 +105,9 @@ def found(necks: list[str]) -> None:
     print(f"{'':22}" + "".join(f"{payload:>9g} kg" for payload in (0.0, *LOADS)))
     for neck in necks:
         detector = ChangeSettings().design(trained(neck, "greybox"), baseline(neck))
-        mark = neck + (" (held out)" if neck in HELD_OUT else "")
         for name, P, since in (("rotation", rotation(80.0), PUT_ON), ("hold", hold(80.0), NEXT)):
             delays = [first(detector, loaded(neck, P, payload), since) for payload in (0.0, *LOADS)]
-            print(f"{mark:14}{name:8}" + "".join(f"{'none' if d == np.inf else f'{d:.2f} s':>12}" for d in delays),
+            print(f"{neck:14}{name:8}" + "".join(f"{'none' if d == np.inf else f'{d:.2f} s':>12}" for d in delays),
                   flush=True)  # fmt: skip
 
 
@@ -136,11 +134,11 @@ def main() -> None:
     """Print what was asked for."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("what", choices=["choose", "found", "alarms"])
-    parser.add_argument("--necks", nargs="*", choices=NECKS, default=list(CHOOSING))
+    parser.add_argument("--necks", nargs="*", choices=CHOOSING, default=list(CHOOSING))
     parser.add_argument("--hours", type=float, default=30.0, help="of motion of each neck")
     asked = parser.parse_args()
     if asked.what == "choose":
-        choose([neck for neck in asked.necks if neck in CHOOSING])
+        choose(asked.necks)
     elif asked.what == "found":
         found(asked.necks)
     else:
