@@ -29,7 +29,7 @@ def test_auto_ranks_explains_and_saves(call: Call, recording: Path) -> None:
     assert "+-" in said.out
     assert "last one is held out" in " ".join(said.err.split())
     assert load("best.npz").kind in ("rls", "play")
-    assert "Which model" in Path("why.html").read_text()
+    assert "Which kind of model" in Path("why.html").read_text()
     assert call("identify", "auto", recording, "-o", "best.npz").code == 2
 
 

@@ -177,7 +177,7 @@ def test_a_wrong_setting_of_a_network(call: Call, tmp_path: Path, recording: Pat
         (("simulate", "none.toml"), "none.toml: no such file"),
         (("fmu", "none.npz", "-o", "M.fmu"), "none.npz: no such file"),
         (("fmu",), ""),
-        (("dance",), "no such command `dance`; the commands are demo, "),
+        (("dance",), "no such command `dance`; the commands are start, "),
         (("info", "--fast"), "No such option"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",

@@ -137,7 +137,9 @@ def test_a_preview_of_what_lacks_something_says_what(call: Call, tmp_path: Path)
     log(tmp_path, motors=3.0, platform=20.0)
     pd.read_csv("log.csv").drop(columns="time").to_csv("log.csv", index=False)
     assert call("import", "log.csv", "--guess", "-o", "r.csv", "--html", "p.html").code == 2
-    assert "Missing: the sample time" in (tmp_path / "p.html").read_text()
+    page = (tmp_path / "p.html").read_text()
+    assert "No recording: the sample time" in page
+    assert "missing: the sample time" in page
     assert files(tmp_path) == {"log.csv", "p.html", "r.layout.toml"}
 
 

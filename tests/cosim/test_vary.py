@@ -110,9 +110,9 @@ def test_ranges_that_are_none(given: Any, message: str) -> None:
     ("vary", "runs", "message"),
     [
         ({}, 10, "varies nothing"),
-        ({"a": [1, 2]}, 0, "at least 1"),
+        ({"a": [1, 2]}, 0, "between 1 and 1000000; got 0"),
         ({"a": {"uniform": [0, 1]}}, None, "`runs` is missing"),
-        ({"a": {"uniform": [0, 1]}}, -3, "at least 1"),
+        ({"a": {"uniform": [0, 1]}}, -3, "between 1 and 1000000; got -3"),
         ({"a": {"uniform": [0, 1]}}, 2.5, "whole number"),
         ({"a": [1, 2]}, 3, "2 points and nothing is random"),
         ({"a": [1, 2, 3], "b": {"uniform": [0, 1]}}, 2, "3 points; `runs` is 2"),

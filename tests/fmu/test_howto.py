@@ -77,4 +77,4 @@ def test_every_page_says_what_was_run(page: str) -> None:
     text = (PAGES / page).read_text(encoding="utf-8")
     assert "**Run here**" in text or "**Not run here:**" in text
     assert page == "fmu_fmpy.md" or "--backend compiled" in text.split("LD_PRELOAD")[0]
-    assert page.removesuffix(".md") in (PAGES.parent / "index.md").read_text(encoding="utf-8")
+    assert page.removesuffix(".md") in (PAGES / "exchange.md").read_text(encoding="utf-8")
