@@ -114,8 +114,10 @@ def load_baseline(path: str | Path) -> Baseline:
     source = Path(path)
     try:
         table = json.loads(settings_text(source, MOST_JSON))
-        if not isinstance(table, dict) or table.pop("kind", "") != _KIND or table.pop("version", 0) != _VERSION:
+        if not isinstance(table, dict) or table.pop("kind", "") != _KIND:
             raise FileFormatError(f"{source}: is not what `softneck drives record --supervision` writes.")
+        if table.pop("version", 0) != _VERSION:
+            raise FileFormatError(f"{source}: is of another version of softneck; record it anew.")
         return Baseline.from_dict(table)
     except OSError as error:
         raise FileFormatError(f"{source}: cannot be read ({error.strerror}).") from error
@@ -124,4 +126,6 @@ def load_baseline(path: str | Path) -> Baseline:
 
 
 def _tuple(value: Any) -> Any:
+    if isinstance(value, float) and math.isnan(value):
+        raise SettingsError("a number in it is NaN, and no chart would ever speak")
     return tuple(_tuple(item) for item in value) if isinstance(value, list | tuple) else value

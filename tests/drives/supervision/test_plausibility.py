@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -163,6 +164,8 @@ def test_a_baseline_comes_back_and_a_damaged_one_is_refused(tmp_path: Path) -> N
     for broken, match in (
         (text.replace('"softneck supervision"', '"x"'), "is not what"),
         (text.replace('"drive"', '"drove"'), "missing or unknown"),
+        (text.replace('"version": 2', '"version": 1'), "record it anew"),
+        (re.sub(r'("noise": \[\s*)[^,\s]+', r"\1NaN", text), "is NaN"),
         (text[:100], "damaged"),
         ("[]", "is not what"),
     ):
