@@ -61,7 +61,8 @@ class Program:
         key = (name, pattern)
         if pattern and name.endswith(SEARCHES):
             raise TangentError(
-                f"set membership (kinds `nlsm` and `residual`) searches its data and has no derivative (`{name}`)."
+                "set membership (kinds `nlsm`, `online_nlsm` and `residual`) searches its data and has no derivative "
+                f"(`{name}`)."
             )
         if key in self._open:
             raise TangentError(f"{name}: a function that calls itself has no known derivative.")

@@ -20,7 +20,21 @@ from ..data import ROOT
 
 TS, ROWS = 0.02, 1500
 GOLDEN = ROOT / "tests" / "golden"
-PLANTS = ("rls", "oe", "srivc", "subspace", "nlsm", "play", "greybox", "nss", "nn", "residual", "ensemble", "guarded")
+PLANTS = (
+    "rls",
+    "oe",
+    "srivc",
+    "subspace",
+    "nlsm",
+    "online_nlsm",
+    "play",
+    "greybox",
+    "nss",
+    "nn",
+    "residual",
+    "ensemble",
+    "guarded",
+)
 PLAY = Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4)
 
 

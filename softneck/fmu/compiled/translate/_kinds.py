@@ -17,6 +17,7 @@ _NECKS = (
     "softneck.identification.linear._oe_runtime",
     "softneck.identification.linear._state_space_runtime",
     "softneck.identification.set_membership._nlsm_runtime",
+    "softneck.identification.set_membership._online_nlsm_runtime",
     "softneck.identification.networks._nn_runtime",
     "softneck.identification.structured._play_runtime",
     "softneck.design.linear._linear_controller_runtime",
@@ -42,6 +43,7 @@ _NECKS = (
 # Those that robots of other sizes have; once more for all of these, so that the neck's know their sizes beforehand.
 _ROBOTS = (
     "softneck.identification.set_membership._nlsm_runtime",
+    "softneck.identification.set_membership._online_nlsm_runtime",
     "softneck.identification.structured._greybox_runtime",
     "softneck.identification.structured._loaded_greybox_runtime",
     "softneck.identification.uncertainty._residual_runtime",
@@ -71,6 +73,7 @@ _SIZE = re.compile(r"[1-8]x[1-4]")
 FAST = {
     "softneck.identification.linear._rls_runtime": 1,
     "softneck.identification.set_membership._nlsm_runtime": 1,
+    "softneck.identification.set_membership._online_nlsm_runtime": 1,
     "softneck.identification.networks._nn_runtime": 1,
     "softneck.estimation._kalman_runtime": 2,
     "softneck.design.predictive._mpc_runtime": 1,
