@@ -122,9 +122,10 @@ def _description(old: bytes, new: bytes) -> Callable[[str, bytes], tuple[str, by
         (b"<CoSimulation ", b"<ModelExchange ", FileFormatError, "Model Exchange only"),
         (b"<ModelVariables>", b"<ModelVariables", FileFormatError, "cannot be read"),
         (b' stepSize="0.02"', b"", SettingsError, "states no step size"),
+        (b' stepSize="0.02"', b' stepSize="0. 02"', FileFormatError, "`0. 02` where a number is needed"),
         (b'Tool name="softneck"', b'Tool name="else"', SettingsError, "say its role in the loop"),
     ],
-    ids=["version", "exchange", "damaged", "step", "role"],
+    ids=["version", "exchange", "damaged", "step", "no number", "role"],
 )
 def test_fmus_that_cannot_be_used_are_refused_with_a_reason(
     old: bytes, new: bytes, error: type[Exception], message: str, fmus: Path, tmp_path: Path

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 import tracemalloc
@@ -33,6 +34,14 @@ from softneck.drives.master._measured import Measurement
 from softneck.drives.master._settings import RampSettings
 from softneck.drives.running._pilot import LoopPilot
 from softneck.drives.simulated import SimulatedNeck, SimulatedSettings, serve
+from softneck.drives.simulated._servo_runtime import (
+    SERVO_DEMAND,
+    SERVO_POSITION,
+    SERVO_SCALE,
+    SERVO_TARGET,
+    SERVO_ZERO,
+)
+from softneck.drives.simulated._wire import WireHabits
 from softneck.fmu import build_fmu
 from softneck.plant import NeckParameters
 
@@ -171,6 +180,60 @@ def test_a_neck_that_leans_is_not_zeroed() -> None:
     with pytest.raises(CheckFailedError, match=r"the neck leans by pitch .* No zero was set"):
         zero(link, file, lambda: link.newest, guarding=report.guarding)
     assert not any(drive.axis.homed for drive in link.neck.drives)
+
+
+ENDS_OF_HOMING = (
+    "nothing", "turns on", "turned on by 0.01 rad", "went back by 0.01 rad", "not there", "not attained",
+    "tells an error",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("what", "latency"),
+    [*((what, latency) for what in ENDS_OF_HOMING for latency in (0.0, 0.05)), ("nothing", 0.03), ("nothing", 0.1)],
+)
+def test_no_zero_is_taken_for_one_where_homing_did_not_end(what: str, latency: float) -> None:
+    """A winch that turns on, a zero that was set later or not at all; whatever the time of an answer."""
+    file = default_drives()
+    settings = SimulatedSettings(homed=False, habits=WireHabits(sdo_latency=latency))
+    link = VirtualLink(SimulatedNeck(NeckParameters.paper(), settings))
+    report, axis = preflight(link, file), link.neck.drives[2].axis
+    begin, status = axis._mode_bits, axis.getters[(0x6041, 0)]
+
+    def homed(word: int, before: int) -> None:
+        at = axis.motion[SERVO_POSITION]
+        begin(word, before)
+        if axis.values[(0x6060, 0)] != 6 or not word & 0x10:
+            return
+        sign = math.copysign(1.0, axis.motion[SERVO_SCALE])
+        turned = {"turned on by 0.01 rad": 0.01, "went back by 0.01 rad": -0.01}.get(what, 0.0)
+        late = sign * turned * abs(axis.motion[SERVO_SCALE]) if what != "not there" else at
+        for column in (SERVO_ZERO, SERVO_POSITION, SERVO_DEMAND, SERVO_TARGET):
+            axis.motion[column] += late
+        if what == "turns on":  # the tendon slips off, and the motor runs where it was asked to pull
+            link.neck.tear(3)
+
+    axis._mode_bits = homed
+    wrong = {"not attained": lambda word: word & ~0x1000, "tells an error": lambda word: word | 0x2000}.get(what)
+    if wrong:
+        axis.getters[(0x6041, 0)] = lambda: wrong(status()) if axis.values[(0x6060, 0)] == 6 else status()
+    if what == "nothing":
+        zero(link, file, lambda: link.newest, guarding=report.guarding)
+        assert preflight(link, file, homed=True).holds
+        # Whoever kills the next zeroing before it homes leaves no marks of two different zeros.
+        marks = []
+        zero(
+            link, file, lambda: (marks.extend(d.axis.values[(0x607C, 0)] for d in link.neck.drives), link.newest)[1],
+            guarding=report.guarding,
+        )  # fmt: skip
+        assert marks == [0, 0, 0]
+        return
+    with pytest.raises(CheckFailedError, match="node 3: homing did not end"):
+        zero(link, file, lambda: link.newest, guarding=report.guarding)
+    assert all(drive.axis.state == 0x40 for drive in link.neck.drives)
+    # Nor does a mark stay that would let a run start from it.
+    with pytest.raises(CheckFailedError, match=r"node 1: homed: no\. Run `softneck drives zero`"):
+        preflight(link, file, homed=True).require()
 
 
 def test_another_slow_loop_is_found_while_zeroing() -> None:

@@ -243,3 +243,11 @@ def test_damaged_logs_are_a_result_or_a_clear_error(tmp_path: Path, name: str, d
         guess = guess_layout(damaged)
         assert parse_layout(guess.text, robot=guess.layout.robot) == guess.layout
         import_log(damaged, guess.layout)
+
+
+def test_a_type_with_a_line_end_in_it_is_told_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    write.write_octave_binary(path, columns())
+    path.write_bytes(path.read_bytes().replace(b"matrix", b"mat\nix"))
+    with pytest.raises(SoftneckError, match=r"it holds a `mat ix`"):
+        guess_layout(path)

@@ -22,7 +22,7 @@ from softneck.core import (
 from softneck.fmu import unpack, unpacked
 
 from ._native import ERROR, FATAL, Bank, CallError, Native
-from ._variables import Description, read_description
+from ._variables import Description, number_of, read_description
 
 if TYPE_CHECKING:
     from fmpy.fmi1 import FMICallException
@@ -258,10 +258,10 @@ def _check_platform(description: Description, folder: Path) -> None:
 
 def _sample_time(description: Description, given: float | None) -> float:
     experiment = description.model.defaultExperiment
-    step = given if given is not None else getattr(experiment, "stepSize", None)
+    step = given if given is not None else number_of(getattr(experiment, "stepSize", None), None)
     if step is None:
         raise SettingsError(f"{description.path}: states no step size; give its sample time in s.")
-    require_positive("sample_time", float(step), "s")
+    require_positive("sample_time", step, "s")
     return float(step)
 
 

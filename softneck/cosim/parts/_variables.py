@@ -97,10 +97,10 @@ class Description:
             name=name,
             unit=self.units.get(name) or variable.unit or (declared.unit if declared is not None else "") or "1",
             description=variable.description or "",
-            start=_number(variable.start, 0.0),
-            minimum=_number(variable.min if variable.min is not None else getattr(declared, "min", None), None),
-            maximum=_number(variable.max if variable.max is not None else getattr(declared, "max", None), None),
-            nominal=_number(variable.nominal, None),
+            start=number_of(variable.start, 0.0),
+            minimum=number_of(variable.min if variable.min is not None else getattr(declared, "min", None), None),
+            maximum=number_of(variable.max if variable.max is not None else getattr(declared, "max", None), None),
+            nominal=number_of(variable.nominal, None),
             boolean=variable.type == "Boolean",
             integer=variable.type
             not in ("Real", "Float64", "Float32", "Boolean"),  # an enumeration is a number of a list
@@ -165,7 +165,7 @@ def _annotation(folder: Path) -> Annotation:
     return Annotation(block.get("kind", ""), block.get("role", ""), frozenset(block.get("missing", "").split()), robot)
 
 
-def _number(text: Any, default: Any) -> Any:
+def number_of(text: Any, default: Any) -> Any:
     """Return an XML attribute as a float; Booleans become 0.0 and 1.0."""
     if text is None:
         return default

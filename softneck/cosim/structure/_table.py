@@ -14,7 +14,7 @@ from softneck.core import SettingsError
 from softneck.fmu import unpack, unpacked
 from softneck.loop._loop import USE_MOTOR_POSITIONS
 
-from ..parts._variables import Description, read_description
+from ..parts._variables import Description, number_of, read_description
 from ._flat import Flat, Line, Ports, flatten
 from ._parse import Component, Reader, Structure, SystemNode
 
@@ -154,7 +154,7 @@ class _Writer:
         if self.structure.step is not None:
             return self.structure.step
         experiments = [item.model.defaultExperiment for item in self.descriptions.values()]
-        steps = [float(item.stepSize) for item in experiments if item is not None and item.stepSize]
+        steps = [number_of(item.stepSize, 0.0) for item in experiments if item is not None and item.stepSize]
         if not steps:
             raise SettingsError(
                 f"{self.source}: neither the structure nor an FMU says a step size; put `<ssd:Annotations>"
@@ -167,7 +167,7 @@ class _Writer:
         if self.structure.stop is not None:
             return self.structure.stop
         experiments = [item.model.defaultExperiment for item in self.descriptions.values()]
-        stops = [float(item.stopTime) for item in experiments if item is not None and item.stopTime]
+        stops = [number_of(item.stopTime, 0.0) for item in experiments if item is not None and item.stopTime]
         if not stops:
             raise SettingsError(f"{self.source}: neither the structure nor an FMU says a stop time.")
         return max(stops)

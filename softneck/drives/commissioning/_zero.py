@@ -40,9 +40,6 @@ _SLOW_LOOP_TOLERANCE = 0.25
 # What is slower than this tells nothing about the slow loop [rad/s].
 _FAST_ENOUGH = 0.3
 _SETTLE = 1.0
-# [rad] Of a winch from its zero to the answer that tells it, of 7,717 counts in a radian: 17 were seen where
-# answers come at once, 66 where each takes 50 ms, 88 at 100 ms; -5,947 before a zero that was set.
-_CREEPS = 0.02
 _ENABLE_TIME = 1.0
 
 Look = Callable[[], Tilt | Reading | None]
@@ -98,6 +95,7 @@ class _Motor:
         writes = [
             *option_writes(),
             Write(0x6065, 0, 0, "zero"),
+            Write(0x607C, 0, 0, "zero"),
             Write(0x607D, 1, -(2**31), "zero"),
             Write(0x607D, 2, 2**31 - 1, "zero"),
             Write(0x6083, 0, max(1, abs(pull)), "zero"),
@@ -145,6 +143,7 @@ def zero(link: Link, file: DrivesFile, look: Look, *, guarding: str, operator: O
     guarded = GuardedLink(link, signs, file.guard_cycles * file.cycle)
     motors = [_Motor(guarded, entry, file, dictionary) for entry in file.drives]
     left: dict[int, str] = {}
+    zeroed = False
     try:
         for motor in motors:
             motor.prepare()
@@ -156,8 +155,11 @@ def zero(link: Link, file: DrivesFile, look: Look, *, guarding: str, operator: O
         outputs = _upright(file, look)
         for motor in motors:
             _set_zero(guarded, motor)
+        zeroed = True
     finally:
-        _off(motors)
+        _each(motors, (0x6040, 0x06), (0x6040, 0x00))
+        if not zeroed:  # a mark that stayed would let the next run start from a zero that nobody confirmed
+            _each(motors, (0x607C, 0))
         left = disarm(link, file, guarding, signs)
     for node, why in left.items():
         raise CheckFailedError(
@@ -221,18 +223,40 @@ def _upright(file: DrivesFile, look: Look) -> dict[str, float]:
 
 
 def _set_zero(link: Link, motor: _Motor) -> None:
-    objects = motor.objects
+    objects, still = motor.objects, motor.file.zero.still
+    before = _creep(link, motor)
     objects.write(0x607C, 0, HOMED_MARK)
     objects.write(0x6098, 0, _HERE)
     # The drive holds while its mode changes: its speed is zero and the tendon is tight.
     objects.write(0x60FF, 0, 0)
     objects.write(0x6060, 0, _HOMING)
+    begin = link.now
     motor.word(0x1F)
+    told = link.now
     wait(link, _LOOK)
     word = objects.read(0x6041)
+    asked = link.now
     counts = objects.read(0x6064)
-    if not word & 0x1000 or abs(counts_to_position(counts - HOMED_MARK, motor.entry.scale)) > _CREEPS:
-        raise CheckFailedError(f"node {motor.entry.node}: homing did not end (status {word:04X}h, position {counts}).")
+    passed = link.now - begin
+    speeds = (before, _creep(link, motor))
+    # The zero was taken between `begin` and `told`, the position after `asked`: what a winch, pulled on by its small
+    # current, creeps meanwhile, and what one that counts as still turns between two looks.
+    ways = [speed * time for speed in speeds for time in (asked - told, passed)]
+    off, slack = counts_to_position(counts - HOMED_MARK, motor.entry.scale), still * _LOOK
+    attained = word & 0x3000 == 0x1000  # bit 13: an error
+    near = min(ways) - slack <= off <= max(ways) + slack
+    if not (attained and near and max(map(abs, speeds)) <= still):
+        raise CheckFailedError(
+            f"node {motor.entry.node}: homing did not end (status {word:04X}h, position {counts}, "
+            f"{speeds[1]:.3f} rad/s). Is its tendon tight still? Zero again."
+        )
+
+
+def _creep(link: Link, motor: _Motor) -> float:
+    """Return how fast the winch turns, by its position at two looks [rad/s]: 606Ch steps by a count per sample."""
+    first, begin = motor.position(), link.now
+    wait(link, _LOOK)
+    return (motor.position() - first) / max(link.now - begin, _LOOK)
 
 
 def _signs_of_life(file: DrivesFile, guarding: str) -> list[Frame]:
@@ -242,12 +266,12 @@ def _signs_of_life(file: DrivesFile, guarding: str) -> list[Frame]:
     return [Frame(0x700 + MASTER_NODE, b"\x05")]
 
 
-def _off(motors: list[_Motor]) -> None:
-    """Switch all off; one that does not answer must not keep the others on."""
+def _each(motors: list[_Motor], *writes: tuple[int, int]) -> None:
+    """Write to all, as when they are switched off; one that does not answer must not keep the others on."""
     for motor in motors:
         try:
-            motor.word(0x06)
-            motor.word(0x00)
+            for index, value in writes:
+                motor.objects.write(index, 0, value)
         except SoftneckError:
             continue
 

@@ -44,8 +44,9 @@ def octave_arrays(source: Path) -> dict[str, np.ndarray]:
         else:
             found = dict(_Text(data.decode("utf-8", errors="replace").splitlines()).variables())
     except (ValueError, IndexError, struct.error, RecursionError, MemoryError, OverflowError) as error:
+        said = " ".join(str(error).split())  # names of the file's may hold line ends
         raise FileFormatError(
-            f"{source}: cannot be read as a file of Octave ({error}); save it again by `save -text`."
+            f"{source}: cannot be read as a file of Octave ({said}); save it again by `save -text`."
         ) from error
     return {name: array for name, array in found.items() if array.ndim == 2 and array.size}
 
