@@ -72,7 +72,7 @@ def command(
               best.certificate.json  of verify with the same requirements, if it holds
               loop.toml              a loop with both, for softneck simulate
               pareto.csv, .json      what no other candidate beats, and report.html
-              requirements.toml      what verify was asked
+              requirements.toml      what was asked, for tune and verify
               evaluations.json       all judgements: the same command goes on where it was
     Exit code 1 if no candidate keeps all requirements: then it says which one stands in the way, and what it costs.
     """
@@ -135,6 +135,5 @@ def _why(found: Tuned, folder: Path) -> str:
     binds = [item.note for item in found.verification.verdicts if item.requirement.metric == found.binding]
     unheard = any(note.startswith("not supported by the data") for note in binds)
     way = "Record what is said above, no setting mends it" if unheard else "Loosen it, or go on with a larger --budget"
-    if found.binding is None:
-        return f"{folder}: the budget ended before the best was judged by all loops; go on with a larger --budget."
+    way = "Go on with a larger --budget" if found.binding is None else way
     return f"{folder}: the best so far does not keep all requirements. {stands_in_the_way(found)} {way}."

@@ -11,7 +11,7 @@ from softneck.core import CheckFailedError, file_hash, refuse_existing, write_ce
 from softneck.core._certificate import CERTIFICATE_ENDING
 from softneck.loop._loop import ORDERS
 
-from .shared._console import print_json, print_table, progress
+from .shared._console import note, print_json, print_table, progress
 from .shared._options import force_option, json_option, output_option, target
 from .shared._plants import opened_plants
 from .shared._robot import load_of, robot_option
@@ -76,6 +76,7 @@ def command(
     from softneck.estimation._axis import robot_of
     from softneck.verification import read_requirements, verify
     from softneck.verification._neck_loops import neck_file_of
+    from softneck.verification._reserve import left_to_tune
 
     path, replace = target(output, f"certificates/{controller.stem}{CERTIFICATE_ENDING}", force=force, ending=".json")
     refuse_existing(path, force=replace)
@@ -84,6 +85,8 @@ def command(
     judged = load_of(controller, robot, role="controller")
     whose = robot_of(judged)
     asked = read_requirements(requirements, robot=whose)
+    if left := left_to_tune(asked.own):
+        note(f"{requirements}: {', '.join(left)} not looked at; `softneck tune` alone closes those loops.")
     things, eyes = opened_plants(plants, robot), None if observer is None else load_of(observer, robot, role="observer")
     files = {
         "controller": controller,

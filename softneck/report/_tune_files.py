@@ -49,7 +49,7 @@ def write_tuned(
         found.verification, files={role: (str(path), file_hash(path)) for role, path in read.items()}
     )
     certificate = folder / CERTIFICATE
-    if verification.holds:
+    if found.holds:  # those of [track] too, which `verify` does not look at
         write_certificate(certificate, verification.contents(), force=True)
     else:
         certificate.unlink(missing_ok=True)

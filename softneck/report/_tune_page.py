@@ -70,8 +70,13 @@ def notes(found: Tuned) -> list[str]:
 
 def stands_in_the_way(found: Tuned) -> str:
     """Return what binds, and what it costs, in a sentence or two."""
-    if found.binding is None:
+    if found.holds:
         return ""
+    if found.binding is None:
+        # Loops of tuning have noise, smaller steps and a circle, which `verify` has not.
+        asked = dict.fromkeys(bound.metric for bound in found.task.asked.bounds)
+        looped = ", ".join(metric for metric in asked if metric.startswith(("neck.", "track.")))
+        return f"What stands in the way is the budget of {found.evaluations}: not judged by all loops are {looped}."
     text = f"What stands in the way is {found.binding}"
     if found.nearest is not None:
         text += f": at {found.nearest:.3g} all the rest would hold"

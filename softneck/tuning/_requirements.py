@@ -14,10 +14,9 @@ from softneck.core._budget import settings_text
 from softneck.robot import Robot
 from softneck.verification import Requirements, make_requirements
 from softneck.verification._requirements import VERSION, Requirement
+from softneck.verification._reserve import TRACK_METRICS, kept_back
 
 DEFAULT_FILE = Path(__file__).with_name("requirements.toml")
-#: Metrics of the loops of [track].
-TRACK_METRICS = ("track.circle_rms_deg", "track.ahead_rms_deg", "track.variation_rad_s")
 # Least, largest and unit of the numbers of [track].
 _TRACK = {
     "small_part": (0.05, 1.0, ""), "noise_deg": (0.0, 10.0, "deg"), "delay_ms": (0.0, 1000.0, "ms"),
@@ -34,7 +33,7 @@ class TuneRequirements:
         track: the loops that are judged besides.
         bounds: all requirements, those of `certificate` first; the reserve is taken off.
         reserve: metric -> what is kept back of its limit for a robot that is not quite as its models.
-        table: what a requirements file for `verify` must state to ask for the same.
+        table: of a requirements file that asks `tune` and `verify` for the same: limits as asked, the reserve beside.
     """
 
     certificate: Requirements
@@ -111,15 +110,15 @@ def make_tune_requirements(
         and isinstance(table.get(key, {}), Mapping) else table[key]
         for key in dict.fromkeys((*usual, *table)) if key != "version"
     }  # fmt: skip
-    track = _numbers(merged.pop("track", {}), defaults["track"])
-    require, reserve = _kept_back(dict(merged.get("require", {})), merged.pop("reserve", {}))
+    track = _numbers(merged.get("track", {}), defaults["track"])
+    require, reserve = kept_back(merged.get("require", {}), merged.get("reserve", {}))
     extra = tuple(
-        bound for metric in [*require] if metric.startswith("track.") for bound in _bounds(metric, require.pop(metric))
+        bound for metric, entry in require.items() if metric.startswith("track.") for bound in _bounds(metric, entry)
     )
-    certificate = make_requirements({**merged, "require": require}, robot=whose)
+    certificate = make_requirements(merged, robot=whose)
     return TuneRequirements(
         certificate=certificate, track=track, bounds=(*certificate.bounds, *extra), reserve=reserve,
-        table={"version": VERSION, **merged, "require": require},
+        table={"version": VERSION, **merged},
     )  # fmt: skip
 
 
@@ -135,32 +134,6 @@ def _for_linear(defaults: Mapping[str, Any]) -> dict[str, Any]:
     tracked = {name: limit for name, limit in defaults["require"].items() if name.startswith("track.")}
     # Presets are foreign plants, which decide nothing and take half a minute.
     return {**defaults, "reserve": {}, "neck": {**defaults["neck"], "necks": 0}, "require": {**require, **tracked}}
-
-
-def _kept_back(require: dict[str, Any], reserve: Any) -> tuple[dict[str, Any], dict[str, float]]:
-    """Return the requirements less their reserve, and the reserve of those that are asked."""
-    if not isinstance(reserve, Mapping):
-        raise SettingsError("`reserve` must be a table: [reserve].")
-    kept: dict[str, float] = {}
-    for metric, value in reserve.items():
-        if not metric.startswith(("neck.", "track.")):
-            raise SettingsError(f"[reserve] is of loops over plants that step, `neck.*` and `track.*`; got `{metric}`.")
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value < math.inf:
-            raise SettingsError(f"the reserve of `{metric}` must be a number from 0 on; got {value!r}.")
-        entry = require.get(metric)
-        if not isinstance(entry, Mapping):
-            continue  # nothing is asked of it, or what is asked is refused below
-        limit = entry.get("max")
-        if isinstance(limit, bool) or not isinstance(limit, int | float) or limit <= 0.0 or value == 0.0:
-            continue
-        if limit - value <= 0.0:
-            raise SettingsError(
-                f"`{metric}` <= {limit:g} leaves nothing beside its reserve of {value:g}; ask for more, or state "
-                f"another one ([reserve])."
-            )
-        require[metric] = {**entry, "max": round(limit - value, 9)}
-        kept[metric] = float(value)
-    return require, kept
 
 
 def _numbers(given: Any, defaults: Mapping[str, float]) -> dict[str, float]:

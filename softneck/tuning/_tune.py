@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from softneck.core import Progress, SettingsError, require_whole, silent
+from softneck.core import CheckFailedError, Progress, SettingsError, require_whole, silent
 from softneck.cosim.studies._executors import crew
 from softneck.estimation import KalmanSettings
 from softneck.estimation._axis import robot_of
@@ -118,6 +118,7 @@ def tune(
     Raises:
         SettingsError: no linear plant, an unknown kind, or requirements that contradict each other or the motors.
         OutputFileError: `folder` holds another search.
+        CheckFailedError: the budget ended before any candidate was judged.
     """
     require_whole("budget", budget, _LEAST_BUDGET, 1_000_000)
     require_whole("seed", seed, 0, 2**31 - 2)
@@ -195,7 +196,9 @@ def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progr
     """Return the result of a search: its best verified, and what it means for the requirements."""
     task, ranked = search.task, search.ranked()
     if not ranked:
-        why = "; ".join(f"{kind}: {text}" for kind, text in search.dropped.items()) or "the budget is too small"
+        why = "; ".join(f"{kind}: {text}" for kind, text in search.dropped.items())
+        if len(search.dropped) < len(search.spaces):
+            raise CheckFailedError(f"the budget ended before any candidate could be judged ({why}); give a larger one.")
         raise SettingsError(f"no candidate could be judged ({why}).")
     deepest = max(range(4), key=lambda k: any(_level(item) >= k for item in ranked) * k)
     compared = [item for item in ranked if _level(item) >= min(deepest, 2)]

@@ -4,7 +4,17 @@ import numpy as np
 
 from softneck.runtime._layout import Arrays, StateVector, array, cells, value
 from softneck.runtime._random_runtime import random_normal, random_seed
-from softneck.verification._axis_runtime import axis_advance
+
+
+def axis_advance(x: np.ndarray, numerator: np.ndarray, denominator: np.ndarray, u: float) -> None:
+    """Advance by one sample under the input `u`; x[0] is the angle, the last entry stays zero.
+
+    numerator, denominator: as long as x, highest power of z first; they begin with 0 and 1.
+    """
+    y = x[0]
+    # Observable form: x[j] is what past inputs and outputs still do to the angle j samples from now.
+    for j in range(x.shape[0] - 1):
+        x[j] = x[j + 1] - denominator[j + 1] * y + numerator[j + 1] * u
 
 
 def linear_plant_line(delay: np.ndarray) -> int:

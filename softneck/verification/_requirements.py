@@ -16,6 +16,7 @@ from softneck.loop._result import shown_unit
 from softneck.robot import Robot
 
 from ._linear import LARGE, SMALL
+from ._reserve import for_verify
 from ._steps import METRICS
 
 DEFAULT_FILE = Path(__file__).with_name("requirements.toml")
@@ -234,6 +235,7 @@ def _read(source: Path) -> dict[str, Any]:
 
 
 def _requirements(defaults: Mapping[str, Any], own: Mapping[str, Any], robot: Robot) -> Requirements:
+    said, own = own, for_verify(own)
     known = ("version", *_NUMBERS, "require")
     for key in own:
         if key not in known:
@@ -245,7 +247,7 @@ def _requirements(defaults: Mapping[str, Any], own: Mapping[str, Any], robot: Ro
     _refuse_contradictions(bounds, robot)
     _refuse_weak(bounds, tables)
     found: Any = tables  # one table each, by name
-    return replace(Requirements(bounds, **found), robot=robot, own=dict(own))
+    return replace(Requirements(bounds, **found), robot=robot, own=dict(said))
 
 
 def _shown(metric: str, shown: _Names) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 
 from softneck.runtime._layout import Arrays, array
 from softneck.runtime._members_runtime import member_initialise, member_size, member_step
-from softneck.verification._axis_runtime import axis_advance
+from softneck.verification._linear_plant_runtime import axis_advance
 
 
 class SweepArrays(Arrays):

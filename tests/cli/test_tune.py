@@ -11,7 +11,7 @@ from softneck.cli._main import run
 
 from ..data import ROOT
 
-MODEL = ROOT / "tests" / "golden" / "oe.npz"
+MODEL, GREYBOX = (ROOT / "tests" / "golden" / name for name in ("oe.npz", "greybox.npz"))
 QUICK = """version = 1
 [sampling]
 plants = 30
@@ -85,6 +85,62 @@ def test_what_does_not_hold_is_said_and_leaves_no_certificate(
     assert "fails" in said.out
     assert not (folder / "best.certificate.json").exists()
     assert (folder / "best.npz").exists()
+
+
+LOOPED = """
+"neck.overshoot_pct" = { max = 60.0 }
+"neck.rise_s" = { max = 2.5 }
+"neck.settling_s" = { max = 4.0 }
+"neck.steady_rms_deg" = { max = 4.0 }
+"neck.slack_s" = false
+"neck.limit_violation_s" = false
+"track.circle_rms_deg" = { max = 30.0 }
+"track.ahead_rms_deg" = { max = %s }
+"""
+
+
+@pytest.fixture
+def looped(tmp_path: Path) -> list[str]:
+    (tmp_path / "wanted.toml").write_text(QUICK % 1.5 + LOOPED % 30.0)
+    return ["tune", str(MODEL), str(GREYBOX), "--kinds", "pi", "--workers", "0", "-o", str(tmp_path / "out")]
+
+
+@pytest.mark.slow
+def test_a_budget_too_small_is_said_and_its_search_goes_on_with_what_it_wrote(
+    tmp_path: Path, looped: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "out"
+    assert run([*looped, "--budget", "1", "--requirements", str(tmp_path / "wanted.toml")]) == 1
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "What stands in the way is the budget of 1: not judged by all loops are neck.overshoot_pct, " in said
+    assert "larger --budget" in said
+    assert (folder / "best.npz").exists()
+    # `verify`, without noise and circle, would hold.
+    assert not (folder / "best.certificate.json").exists()
+    # The file that was written asks for the same: another search would be refused here.
+    wanted = ["--requirements", str(folder / "requirements.toml")]
+    assert run([*looped, "--budget", "3", "--resume", *wanted, "--json"]) == 0
+    values = json.loads(capsys.readouterr().out)
+    assert values["evaluations"] == 3
+    assert any("less a reserve of" in line for line in values["requirements"])
+    assert json.loads((folder / "best.certificate.json").read_text())["holds"]
+    check = ["verify", str(folder / "best.npz"), str(MODEL), str(GREYBOX), *wanted, "--json"]
+    assert run([*check, "-o", str(tmp_path / "c.json")]) == 0
+    told = capsys.readouterr()
+    limits = {row["metric"]: row["limit"] for row in json.loads(told.out)["requirements"]}
+    assert limits["neck.rise_s"] == 2.5 - 0.03  # less the reserve of the defaults, once
+    assert "track.circle_rms_deg, track.ahead_rms_deg not looked at" in told.err
+
+
+@pytest.mark.slow
+def test_no_certificate_where_the_loops_of_tuning_alone_do_not_hold(
+    tmp_path: Path, looped: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    # A circle that closely followed no neck keeps: `verify` does not look at it.
+    (tmp_path / "wanted.toml").write_text(QUICK % 1.5 + LOOPED % 0.001)
+    assert run([*looped, "--budget", "3", "--requirements", str(tmp_path / "wanted.toml")]) == 1
+    assert "What stands in the way is track.ahead_rms_deg" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "best.certificate.json").exists()
 
 
 @pytest.mark.parametrize(

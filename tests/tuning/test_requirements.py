@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
+import tomllib
 from pathlib import Path
 
 import control
 import numpy as np
 import pytest
+import tomli_w
 
 from softneck.core import FileFormatError, SettingsError
 from softneck.estimation import LinearNeck
+from softneck.report._tune_files import _told
+from softneck.robot import Robot
 from softneck.tuning._beforehand import refuse_impossible
 from softneck.tuning._requirements import make_tune_requirements, read_tune_requirements
-from softneck.verification import make_requirements
+from softneck.verification import make_requirements, read_requirements
 
 TS = 0.02
 GAIN, POLE, DELAY = math.radians(5.23), 5.293, 4
@@ -42,8 +46,6 @@ def test_a_reserve_is_taken_off_what_plants_must_keep_and_said() -> None:
     assert asked.limit("track.circle_rms_deg") == asked.wanted("track.circle_rms_deg") == 3.0
     assert {"neck.rise_s <= 0.4 (0.5 less a reserve of 0.1)", "track.circle_rms_deg <= 3"} <= set(asked.lines())
     # What verify is asked is what the plants must keep.
-    assert asked.table["require"]["neck.rise_s"] == {"max": 0.4}
-    # What the robot itself is asked decides what cannot be.
     assert asked.certificate.bounds == tuple(b for b in asked.bounds if not b.metric.startswith("track."))
 
 
@@ -55,12 +57,27 @@ def test_nothing_is_kept_back_of_what_is_not_asked() -> None:
     assert not make_tune_requirements({}, stepping=False).reserve
 
 
-def test_what_is_written_for_verify_asks_it_for_the_same() -> None:
-    asked = make_tune_requirements({"require": {"neck.rise_s": {"max": 0.5}, "track.ahead_rms_deg": False}})
-    again = make_requirements({key: value for key, value in asked.table.items() if key != "version"})
-    assert [(b.metric, b.bound, b.limit) for b in again.bounds] == [
-        (b.metric, b.bound, b.limit) for b in asked.bounds if not b.metric.startswith("track.")
-    ]
+@pytest.mark.parametrize("stepping", [True, False])
+def test_what_is_written_asks_tune_and_verify_for_the_same_again(tmp_path: Path, stepping: bool) -> None:
+    table = {
+        "require": {"neck.rise_s": {"max": 0.5}, "track.ahead_rms_deg": False, "axes.gain_margin": {"min": 2.1}},
+        "reserve": {"neck.rise_s": 0.07}, "track": {"noise_deg": 0.1}, "step": {"duration_s": 5.0},
+    }  # fmt: skip
+    asked = make_tune_requirements(table, stepping=stepping)
+    path = tmp_path / "requirements.toml"
+    path.write_text(tomli_w.dumps(_told(asked.table)))
+    # Limits are as they were asked, the reserve is beside them.
+    written = tomllib.loads(path.read_text())
+    assert written["require"]["neck.rise_s"] == {"max": 0.5}
+    assert written["reserve"]["neck.rise_s"] == 0.07
+    again = read_tune_requirements(path, stepping=stepping)
+    assert (again.bounds, again.track, again.reserve) == (asked.bounds, asked.track, asked.reserve)
+    assert again.lines() == asked.lines()
+    theirs = read_requirements(path)
+    assert theirs.bounds == asked.certificate.bounds
+    assert theirs.of_robot(Robot.preset("antagonist")).own == theirs.own
+    for name in ("uncertainty", "sampling", "step", "neck"):
+        assert getattr(theirs, name) == getattr(asked.certificate, name) == getattr(again.certificate, name)
     assert asked.limit("track.ahead_rms_deg") is None
 
 
@@ -82,7 +99,9 @@ def test_without_a_plant_that_steps_the_linear_ones_are_asked() -> None:
         ({"reserve": {"axes.gain_margin": 0.1}}, "is of loops over plants that step"),
         ({"reserve": {"neck.rise_s": -0.1}}, "must be a number from 0 on; got -0.1"),
         ({"reserve": {"neck.rise_s": 0.4}}, "<= 0.4 leaves nothing beside its reserve of 0.4"),
+        ({"reserve": {"neck.ris_s": 0.1}}, r"of which \[require\] asks nothing"),
         ({"reserve": 1.0}, "must be a table"),
+        ({"require": 1.0}, "must be a table"),
         ({"require": {"neck.rise_s": {"min": 1.0, "max": 0.4}}}, "cannot be at least 1 and at most"),
         ({"require": {"neck.rise_s": {"min": 3.0}, "neck.settling_s": {"max": 2.0}}}, "cannot"),
     ],
