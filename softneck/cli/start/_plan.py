@@ -91,7 +91,7 @@ def _import(log: str, recording: str, asked: Asked) -> Step:
 
 
 def _lacks_clock(layout: Path) -> bool:
-    """Return whether a layout is a proposal whose sample time is still open: it is proposed again where that is said."""
+    """Return whether a layout is a proposal whose sample time is still open; told it, it is made again."""
     return "MISSING the sample time" in layout.read_text(encoding="utf-8", errors="replace")
 
 
