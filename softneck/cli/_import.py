@@ -36,6 +36,7 @@ class _Job:
         yes: take all guesses without asking.
         as_json: print JSON.
         sample_time: to resample at: a number [s], "robot", or None.
+        clock: the sample time [s] of a log without a clock, as the user knows it.
         texts: file -> text to write beside the recording, and whether it may be replaced.
     """
 
@@ -47,6 +48,7 @@ class _Job:
     yes: bool = False
     as_json: bool = False
     sample_time: str | None = None
+    clock: float | None = None
     texts: dict[Path, tuple[str, bool]] = field(default_factory=dict)
 
     def beside(self, ending: str) -> Path:
@@ -86,6 +88,7 @@ def _writer(text: str) -> Callable[[Path], object]:
     help="Propose a robot by the log's titles, write it here, and import the log as its recording.",
 )
 @click.option("--guess", is_flag=True, help="Propose a layout, say why, and write it beside the recording.")
+@click.option("--sample-time", "clock", metavar="S", help="With --guess: that of a log without a clock.")
 @click.option("--yes", is_flag=True, help="Take all guesses; else a terminal is asked about those under 90 % sure.")
 @click.option(
     "--html", type=click.Path(path_type=Path), metavar="FILE", help="Page: raw columns and channels, doubts first."
@@ -105,6 +108,7 @@ def command(
     robot: str | None,
     robot_out: Path | None,
     guess: bool,
+    clock: str | None,
     yes: bool,
     html: Path | None,
     sample_time: str | None,
@@ -127,7 +131,10 @@ def command(
     if log.suffix.lower() == ".blf":
         raise SettingsError(f"{log}: holds CAN frames only; import the `.mcap` log of the same run.")
     path, replace = target(output, f"recordings/{log.stem}.csv", force=force)
-    job = _Job(log, path, replace, force, html, yes, as_json, sample_time)
+    known = None if clock is None else sample_time_of(clock, "--sample-time")
+    if known is not None and not guess:
+        raise SettingsError("--sample-time goes with --guess; a layout says it as `sample_time_s` in [time].")
+    job = _Job(log, path, replace, force, html, yes, as_json, sample_time, known)
     if ours:
         _run_log(job, layout=asked)
         return
@@ -240,6 +247,10 @@ def _by_guess(job: _Job, whose: Robot) -> tuple[Guess, ImportResult, dict[str, A
 
     proposal = job.beside(".layout.toml")
     guess = guess_layout(job.log, robot=whose)
+    if job.clock is not None:
+        if guess.layout.time is not None:
+            raise SettingsError(f"{job.log}: has a clock; leave out --sample-time, or say --resample {job.clock:g}.")
+        guess = guess.with_sample_time(job.clock)
     for line in guess.lines:
         note(line)
     if not job.yes and not job.as_json and is_terminal():

@@ -136,7 +136,7 @@ def test_a_log_without_a_clock_takes_the_sample_time_that_is_answered(tmp_path: 
     pd.read_csv(path).drop(columns="time").to_csv(path, index=False)
     guess = guess_layout(path)
     assert guess.missing == (
-        "the sample time: no column rises by equal steps; write `sample_time_s = 0.02` into [time]",
+        "the sample time: no column rises by equal steps; say it by `--sample-time S` or `sample_time_s = S` in [time]",
     )
     told: Guess = guess.with_sample_time(0.02)
     assert told.missing == ()

@@ -27,6 +27,7 @@ class Asked:
         robot: a preset, or the absolute path of a robot file; None: the neck, or what the log shows.
         requirements: absolute path of the file for `tune`; None: the defaults.
         kinds: of controllers to search; None: those of `tune`.
+        sample_time: of logs without a clock [s].
         budget: of `tune`: by default half its own, so that a sitting ends within minutes.
         seed: of kinds of models and of the search.
         yes: take all guesses.
@@ -36,6 +37,7 @@ class Asked:
     robot: str | None = None
     requirements: str | None = None
     kinds: str | None = None
+    sample_time: str | None = None
     budget: int = 80
     seed: int = 0
     yes: bool = False
@@ -77,12 +79,20 @@ def _import(log: str, recording: str, asked: Asked) -> Step:
     if Path(log).suffix.lower() == ".mcap" and is_run_log(Path(log)):
         words: list[str] = []  # of a run on drives: its columns are known
     else:
-        words = ["--layout", layout.as_posix()] if layout.is_file() else ["--guess", *(["--yes"] if asked.yes else [])]
+        guess = ["--guess", *(["--yes"] if asked.yes else [])]
+        guess += [] if asked.sample_time is None else ["--sample-time", asked.sample_time]
+        by_layout = layout.is_file() and not (asked.sample_time is not None and _lacks_clock(layout))
+        words = ["--layout", layout.as_posix()] if by_layout else guess
         words += ["--html", page] + ([] if whose is None else ["--robot", whose])
     return Step(
         stage="import", command=("softneck", "import", log, *words, "-o", recording, "--force"), makes=(recording,),
         reads=(log, layout.as_posix(), *([] if whose is None else [whose])), settings=f"{log} of {asked.robot}",
     )  # fmt: skip
+
+
+def _lacks_clock(layout: Path) -> bool:
+    """Return whether a layout is a proposal whose sample time is still open; told it, it is made again."""
+    return "MISSING the sample time" in layout.read_text(encoding="utf-8", errors="replace")
 
 
 def _of_one_sample_time(recordings: list[str]) -> Iterator[Step]:

@@ -41,12 +41,13 @@ _OWN_REQUIREMENTS = (
 )  # fmt: skip
 @click.option("--requirements", type=_PATH, metavar="TOML", help="What `tune` shall keep. [default: its own]")
 @click.option("--kinds", metavar="K,K", help="Kinds of controller that `tune` searches. [default: its own]")
+@click.option("--sample-time", metavar="S", help="Of logs without a clock. [default: as the log tells]")
 @click.option("--budget", type=click.IntRange(min=1), metavar="EVALUATIONS", help="Of `tune`. [default: 80]")
 @click.option("--seed", type=click.IntRange(min=0), help="Of models and search. [default: 0]")
 @json_option
 def command(
     logs: tuple[Path, ...], output: Path | None, yes: bool, robot: str | None, requirements: Path | None,
-    kinds: str | None, budget: int | None, seed: int | None, as_json: bool,
+    kinds: str | None, sample_time: str | None, budget: int | None, seed: int | None, as_json: bool,
 ) -> None:  # fmt: skip
     """Go from LOGs to a verdict in one sitting: models, controller, certificate, FMUs, loop, study, test and page.
 
@@ -59,7 +60,7 @@ def command(
     _require_known(requirements, kinds)
     folder = (output or Path("build/start") / logs[0].stem).absolute()
     given = {"robot": _robot_of(logs[0], robot), "requirements": requirements and str(requirements.absolute()),
-             "kinds": kinds, "budget": budget, "seed": seed}  # fmt: skip
+             "kinds": kinds, "sample_time": sample_time, "budget": budget, "seed": seed}  # fmt: skip
     paths = tuple(str(log.absolute()) for log in logs)
     with _project(folder):
         sitting = Sitting.read(as_json=as_json)

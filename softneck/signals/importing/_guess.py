@@ -77,10 +77,7 @@ class Guess(Shown):
 
 
 _NO_CLOCK = "the sample time"
-_NO_MOTORS = (
-    "angles and references alone show how a loop followed, not how the neck moves: record the drives' set-points, "
-    "positions or velocities too"
-)
+_NO_MOTORS = "without them nothing tells how the neck moves: record the drives' set-points, positions or velocities too"
 
 
 def guess_layout(path: str | Path, *, robot: Robot = NECK) -> Guess:
@@ -290,8 +287,9 @@ def _missing(draft: Draft, layout: Layout) -> tuple[str, ...]:
     absent = [name for name in SET_POINTS if name not in draft.picks]
     if absent:
         free = draft.free()
-        line = f"{', '.join(absent)}: candidates are {_listed(free)}; {_line_for(absent[0], free, 'rad')}"
-        lines.append(line if free else f"{line}; {_NO_MOTORS}")
+        names = ", ".join(absent)
+        lines.append(f"{names}: candidates are {_listed(free)}; {_line_for(absent[0], free, 'rad')}" if free
+                     else f"{names}: {_NO_MOTORS}")  # fmt: skip
     axes = [name for name in layout.robot.outputs.names if name not in draft.picks]
     if axes and layout.inclination is None and layout.quaternion is None:
         candidates = _other_axis(draft)
@@ -299,7 +297,9 @@ def _missing(draft: Draft, layout: Layout) -> tuple[str, ...]:
             f"{', '.join(axes)}: candidates are {_listed(candidates)}; {_line_for(axes[0], candidates, 'deg')}"
         )
     if layout.time is None and layout.sample_time is None:
-        lines.append(f"{_NO_CLOCK}: no column rises by equal steps; write `sample_time_s = 0.02` into [time]")
+        lines.append(
+            f"{_NO_CLOCK}: no column rises by equal steps; say it by `--sample-time S` or `sample_time_s = S` in [time]"
+        )
     return tuple(lines)
 
 

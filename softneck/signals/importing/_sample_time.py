@@ -9,8 +9,9 @@ import numpy as np
 
 from softneck.core import DataError, Vector
 
-# Differences over this many samples drown quantisation and the drive's noise, and still see every move.
-_WINDOW = 10
+# Differences over this many samples, averaged over as many, drown quantisation, the drive's noise and the rule by which
+# rates were made of positions (a difference to the next row, the last, or both), and still see every move.
+_WINDOW = 20
 # Below it position and velocity do not tell of the same motion (another motor, a command, a wrong sign).
 _AGREE = 0.9
 # Estimates of one log differ by a few % between motors; a nominal time further off is wrong.
@@ -35,9 +36,10 @@ class SampleTime:
 
 
 def estimate_sample_time(channels: Mapping[str, Vector], run: np.ndarray) -> SampleTime:
-    """Return the period T for which `x(k+n) - x(k) = T sum v` holds best within each run.
+    """Return the period T for which `x(k+n) - x(k) = T sum v` holds best within each run, both averaged over n rows.
 
-    Both sides carry noise, so T is the ratio of their lengths (the geometric mean of the two regressions).
+    Rates that are differences lack what is faster than their step, so neither side may hold it. Both sides carry
+    noise, so T is the ratio of their lengths (the geometric mean of the two regressions).
 
     Args:
         channels: with motor_position_j [rad] and motor_velocity_j [rad/s], each (time,).
@@ -65,14 +67,19 @@ def velocity_period(x: Vector, v: Vector, run: np.ndarray) -> tuple[float, float
     """Return the period [s] at which v is the rate of x, and the correlation of both motions; 0, 0 without motion."""
     moved, sums = [], []
     for border in np.split(np.arange(x.size), np.flatnonzero(np.diff(run)) + 1):
-        if border.size > _WINDOW:
+        if border.size > 2 * _WINDOW:
             position, velocity = x[border], v[border]
             total = np.concatenate([[0.0], np.cumsum((velocity[1:] + velocity[:-1]) / 2)])
-            moved.append(position[_WINDOW:] - position[:-_WINDOW])
-            sums.append(total[_WINDOW:] - total[:-_WINDOW])
+            moved.append(_mean_move(position))
+            sums.append(_mean_move(total))
     if not moved:
         return 0.0, 0.0
     a, b = np.concatenate(moved), np.concatenate(sums)
     good = np.isfinite(a) & np.isfinite(b)
     aa, bb, ab = float(a[good] @ a[good]), float(b[good] @ b[good]), float(a[good] @ b[good])
     return (0.0, 0.0) if aa * bb == 0 else (float(np.sqrt(aa / bb)), ab / float(np.sqrt(aa * bb)))
+
+
+def _mean_move(x: Vector) -> Vector:
+    """Return the differences over a window, averaged over the next one."""
+    return np.convolve(x[_WINDOW:] - x[:-_WINDOW], np.full(_WINDOW, 1.0 / _WINDOW), "valid")

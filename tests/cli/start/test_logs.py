@@ -15,17 +15,13 @@ import pytest
 from softneck.cli.start import _plan, _start
 from softneck.cli.start._plan import Asked
 from softneck.cli.start._step import STAGES, Step
-from softneck.signals import Recording, read_recording
+from softneck.signals import read_recording
 
-from ...data import neck_recording, recording_from
+from ...data import neck_recording
 from ..conftest import Call, Said
 from .conftest import facts_of
 
 NECK = neck_recording(700)
-# [rad/s] Of sines, whose rates are known.
-_W, _T = np.array([0.9, 1.1, 1.4]), NECK.time[:, None]
-SMOOTH = recording_from(2.0 * np.sin(_W * _T) + np.sin(2.3 * _W * _T), noise=5e-4)
-RATES = 2.0 * _W * np.cos(_W * _T) + 2.3 * _W * np.cos(2.3 * _W * _T)
 TILT = ("target_inclination", "sensor_inclination", "target_orientation", "sensor_orientation")
 
 
@@ -65,7 +61,8 @@ def bare(path: Path) -> None:
 
 def bare_with_rates(path: Path) -> None:
     """The same with the motors' positions and velocities, which tell the sample time."""
-    table = np.column_stack([np.full(len(SMOOTH), 40.0), SMOOTH.outputs, SMOOTH.set_points, RATES])
+    rates = np.gradient(NECK.set_points, NECK.sample_time, axis=0)
+    table = np.column_stack([np.full(len(NECK), 40.0), NECK.outputs, NECK.set_points, rates])
     np.savetxt(path, table, delimiter=" , ", fmt="%.8g")
 
 
@@ -96,11 +93,9 @@ def begun(call: Call, name: str, write: Callable[[Path], None]) -> Said:
     return call("start", name, "-o", "p", "--yes", "--json")
 
 
-@pytest.mark.parametrize(
-    ("write", "truth"), [(velocities_alone, NECK), (bare_with_rates, SMOOTH)], ids=["velocities", "bare"]
-)
+@pytest.mark.parametrize("write", [velocities_alone, bare_with_rates], ids=["velocities", "bare"])
 def test_logs_that_hold_what_is_needed_become_recordings(
-    call: Call, tmp_path: Path, until: Callable[[str], None], write: Callable[[Path], None], truth: Recording
+    call: Call, tmp_path: Path, until: Callable[[str], None], write: Callable[[Path], None]
 ) -> None:
     until("quality")
     said = begun(call, "log.csv", write)
@@ -108,9 +103,9 @@ def test_logs_that_hold_what_is_needed_become_recordings(
     assert [step["holds"] for step in json.loads(said.out)["steps"]] == [True, True]
     recording = read_recording(tmp_path / "p" / "recordings" / "log.csv")
     # Time stamps that jitter by a tenth of a sample give its mean to a thousandth.
-    assert recording.sample_time == pytest.approx(truth.sample_time, rel=1e-3)
+    assert recording.sample_time == pytest.approx(NECK.sample_time, rel=1e-3)
     # Sums of rates that were differences, resampled: a few percent of the range.
-    np.testing.assert_allclose(np.ptp(recording.set_points, axis=0), np.ptp(truth.set_points, axis=0), rtol=0.1)
+    np.testing.assert_allclose(np.ptp(recording.set_points, axis=0), np.ptp(NECK.set_points, axis=0), rtol=0.1)
     assert (tmp_path / "p" / "recordings" / "log.layout.toml").is_file()
 
 
@@ -119,7 +114,7 @@ def test_a_log_without_motors_ends_in_a_line_that_says_what_to_record(call: Call
     assert said.code == 2
     last = said.err.splitlines()[-1]
     assert last.startswith("softneck: import: ")
-    assert "motor_setpoint_1, motor_setpoint_2, motor_setpoint_3: candidates are none of the columns" in last
+    assert "motor_setpoint_1, motor_setpoint_2, motor_setpoint_3: without them nothing tells how the neck moves" in last
     assert "record the drives' set-points, positions or velocities too" in last
     assert "the same command goes on here" in last
     assert said.out == ""
@@ -132,6 +127,7 @@ def test_a_log_without_a_clock_goes_on_by_its_layout_once_that_says_the_sample_t
     said = begun(call, "log.csv", bare)
     assert said.code == 2
     assert "the sample time: no column rises by equal steps" in said.err.splitlines()[-1]
+    assert "say it by `--sample-time S`" in said.err.splitlines()[-1]
     layout = tmp_path / "p" / "recordings" / "log.layout.toml"
     assert not layout.with_name("log.csv").exists()
     text = layout.read_text(encoding="utf-8")
@@ -144,6 +140,24 @@ def test_a_log_without_a_clock_goes_on_by_its_layout_once_that_says_the_sample_t
     layout.write_text(layout.read_text(encoding="utf-8").replace("0.02", "0.04"), encoding="utf-8")
     call("start", "log.csv", "-o", "p", "--yes", "--json")
     assert read_recording(layout.with_name("log.csv")).sample_time == 0.04
+
+
+def test_a_log_without_a_clock_goes_on_by_a_sample_time_that_is_given(
+    call: Call, tmp_path: Path, until: Callable[[str], None]
+) -> None:
+    until("quality")
+    assert begun(call, "log.csv", bare).code == 2
+    said = call("start", "log.csv", "-o", "p", "--yes", "--json", "--sample-time", "0.04")
+    assert said.code == 0, said.err
+    assert "--sample-time 0.04" in json.loads(said.out)["steps"][0]["command"]
+    assert read_recording(tmp_path / "p" / "recordings" / "log.csv").sample_time == 0.04
+
+
+def test_a_sample_time_for_a_log_that_has_a_clock_is_refused(call: Call, tmp_path: Path) -> None:
+    velocities_alone(tmp_path / "log.csv")
+    said = call("start", "log.csv", "-o", "p", "--yes", "--sample-time", "0.04")
+    assert said.code == 2
+    assert "has a clock; leave out --sample-time" in said.err.splitlines()[-1]
 
 
 @pytest.mark.slow
