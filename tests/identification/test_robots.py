@@ -65,7 +65,7 @@ def recorded(
 @pytest.mark.parametrize("kind", KINDS_AND_SETTINGS)
 def test_the_truth_behind_a_record_is_recovered(kind: str, name: str, tmp_path: Path) -> None:
     recording = recorded(ROBOTS[name], noise=1e-5, rest=0.3)
-    order = {"order": len(recording.robot.outputs.names) + 1} if kind == "subspace" else {}
+    order: dict[str, Any] = {"order": len(recording.robot.outputs.names) + 1} if kind == "subspace" else {}
     model = identify(kind, recording, **KINDS_AND_SETTINGS[kind], **order)
     free = model.simulate(recording)[25:, : recording.outputs.shape[1]]
     # Noise of 1e-5 in a motion of 0.1: what is left is a few times that, also for the many numbers of `subspace`.
@@ -94,7 +94,7 @@ def test_directions_that_nobody_gave_are_learned_with_the_time_constant() -> Non
 def test_the_same_rows_at_another_sample_time_give_the_same_model(kind: str) -> None:
     """Nothing is in seconds: a tank sampled every 4 s is identified as well as a finger every 20 ms."""
     # Seconds of the two: a search over dead times is in seconds by itself, and shorter where it is told.
-    settings = {"resamples": 0} if kind == "srivc" else {}
+    settings: dict[str, Any] = {"resamples": 0} if kind == "srivc" else {}
     fast, slow = (recorded(ROBOTS["finger"], sample_time=s, rows=300, noise=1e-3) for s in (0.02, 4.0))
     model, other = identify(kind, fast, **settings), identify(kind, slow, **settings)
     assert other.findings["time_constants_s"] == pytest.approx(200.0 * np.array(model.findings["time_constants_s"]))
@@ -122,7 +122,7 @@ def test_play_takes_any_robot(name: str, tmp_path: Path) -> None:
 
 
 # A few weights and steps: enough for a lag.
-NETWORKS = {
+NETWORKS: dict[str, dict[str, Any]] = {
     "nn": {"hidden": (3, 3), "iterations": 10, "refine": 12, "starts": 2},
     "nss": {"order": 1, "neurons": 2, "widths": (), "starts": 1, "iterations": 4},
 }
@@ -188,7 +188,7 @@ def test_a_set_of_the_same_rows_at_another_sample_time_is_the_same(form: str) ->
 @pytest.mark.parametrize("kind", NETWORKS)
 def test_networks_of_the_same_rows_at_another_sample_time_are_the_same(kind: str) -> None:
     fast, slow = (recorded(ROBOTS["finger"], sample_time=s, rows=300, noise=1e-3) for s in (0.02, 4.0))
-    model, other = (identify(kind, one, **NETWORKS[kind] | {"starts": 1}) for one in (fast, slow))
+    model, other = (identify(kind, one, **{**NETWORKS[kind], "starts": 1}) for one in (fast, slow))
     # The searches take the same steps but for rounding, which training makes grow.
     np.testing.assert_allclose(other.simulate(slow), model.simulate(fast), atol=1e-4)
 

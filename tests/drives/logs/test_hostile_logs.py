@@ -152,7 +152,10 @@ def test_topics_of_others_in_a_log_of_ours_are_left_alone(logs: dict[str, Path],
 def test_hostile_lengths_reserve_no_memory(tmp_path: Path, record: bytes) -> None:
     path = tmp_path / "hostile.mcap"
     path.write_bytes(b"\x89MCAP0\r\n" + struct.pack("<BQII", 0x01, 8, 0, 0) + record)
-    with pytest.raises(FileFormatError, match=r"hostile\.mcap: (is not a log of `softneck drives`|unpacks to .* it is damaged or hostile)"):
+    with pytest.raises(
+        FileFormatError,
+        match=r"hostile\.mcap: (is not a log of `softneck drives`|unpacks to .* it is damaged or hostile)",
+    ):
         read_run_log(path)
 
 

@@ -74,7 +74,7 @@ def test_its_sums_are_those_of_the_charts(detector: ChangeDetector) -> None:
             continue
         average = np.clip(error[rows].mean(axis=0), -limit, limit)
         each = [chart_spread(float(value), 1.0, settings.ratio) for value in average]
-        sums = np.maximum(0.0, sums + [*each, sum(each)])
+        sums = np.maximum(0.0, sums + np.array([*each, sum(each)]))
         # The same sums in another order: rounding.
         np.testing.assert_allclose(states["sums"][last], sums, rtol=1e-9, atol=1e-9)
 
