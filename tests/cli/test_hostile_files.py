@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import struct
+import subprocess
 import sys
 import zipfile
 import zlib
@@ -23,24 +23,28 @@ LOG = (TITLES + "".join(f"{k * 0.02:.2f},0,0,0,1,2\n" for k in range(300))).enco
 # What the issue of hostile files asks. The time is that of the processor: other work on the machine is not ours.
 SECONDS, MEGABYTES = 2.0, 500
 _RUN = "import sys; from softneck.cli import main; main(sys.argv[1:])"
+# The kernel counts the memory of whoever starts a process as its own: so a small process starts the command.
+_MEASURED = """
+import json, os, resource, sys
+with open("stderr", "wb") as errors, open("stdout", "wb") as out:
+    to = [(os.POSIX_SPAWN_DUP2, out.fileno(), 1), (os.POSIX_SPAWN_DUP2, errors.fileno(), 2)]
+    pid = os.posix_spawn(sys.executable, [sys.executable, "-c", *sys.argv[1:]], os.environ, file_actions=to)
+    # Where a budget fails the machine must not.
+    resource.prlimit(pid, resource.RLIMIT_AS, (6 * 2**30, 6 * 2**30))
+    resource.prlimit(pid, resource.RLIMIT_CPU, (20, 20))
+    _, status, usage = os.wait4(pid, 0)
+print(json.dumps([os.waitstatus_to_exitcode(status), usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024]))
+"""
 
 
 def run(folder: Path, arguments: list[str]) -> tuple[int, str, float, float]:
     """Return exit code, standard error, seconds of processor and megabytes of one command in a process of its own."""
-    with (folder / "stderr").open("wb") as errors, (folder / "stdout").open("wb") as out:
-        pid = os.posix_spawn(
-            sys.executable,
-            [sys.executable, "-c", _RUN, *arguments],
-            {**os.environ, "PYTHONPATH": str(ROOT)},
-            file_actions=[(os.POSIX_SPAWN_DUP2, out.fileno(), 1), (os.POSIX_SPAWN_DUP2, errors.fileno(), 2)],
-        )
-        # Where a budget fails the machine must not.
-        resource.prlimit(pid, resource.RLIMIT_AS, (6 * 2**30, 6 * 2**30))
-        resource.prlimit(pid, resource.RLIMIT_CPU, (20, 20))
-        _, status, usage = os.wait4(pid, 0)
-    code = os.waitstatus_to_exitcode(status)
-    said = (folder / "stderr").read_text()
-    return code, said, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024
+    done = subprocess.run(
+        [sys.executable, "-c", _MEASURED, _RUN, *arguments], cwd=folder, env={**os.environ, "PYTHONPATH": str(ROOT)},
+        check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    code, seconds, megabytes = json.loads(done.stdout)
+    return code, (folder / "stderr").read_text(), seconds, megabytes
 
 
 def holes(begin: bytes, size: int = 4 * 2**30) -> Callable[[Path], None]:

@@ -12,7 +12,8 @@ import numpy as np
 
 from softneck.core import SettingsError, silent
 from softneck.core._progress import shown_progress
-from softneck.loop import Loop, LoopState, run_loop
+from softneck.loop import Loop as Loop  # the room hands it on
+from softneck.loop import LoopState, run_loop
 from softneck.loop._run import StepCallback
 from softneck.loop._system import System
 

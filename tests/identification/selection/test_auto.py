@@ -44,14 +44,17 @@ def test_the_ranking_is_by_free_run_and_the_simplest_of_those_alike_is_chosen(ch
 
 
 @pytest.mark.slow
-def test_all_are_judged_by_what_was_left_out_and_only_the_chosen_one_is_trained_on_all_rows(choice: Choice) -> None:
+def test_all_are_judged_by_what_was_left_out_and_the_best_of_each_form_is_trained_on_all(choice: Choice) -> None:
     ran = [one for one in choice.ranking if one.model is not None]
     # 900 rows are fewer than a screening takes: nothing follows them, and the other recording is left out as a whole.
     assert {"largest motions", "fastest motions", "other excitation"} <= set(choice.chosen.scores)
     # `rls` and `play` alone have no middle.
     assert all(EXAM not in one.scores for one in ran)
     assert [one.kind for one in ran if "trained on the other" in one.scores] != []
-    assert {one.kind for one in ran if one.whole} == {choice.chosen.kind}
+    # The chosen one, and the best of the other form: of linear kinds there is `rls` alone.
+    whole = {one.kind for one in ran if one.whole}
+    assert choice.chosen.kind in whole
+    assert sorted(kind == "rls" for kind in whole) == [False, True]
     assert choice.chosen.model is not None
     assert choice.chosen.model.training_rows.size == len(TRAIN)
     assert set(choice.chosen.scores) >= {HOLD_OUT, COLD}
