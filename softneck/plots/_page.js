@@ -29,24 +29,31 @@ function wrapped(text, most) {
     else lines.push(`${lines.pop()} ${word}`.trim());
   return lines.join("\n");
 }
+// Columns of names that fit: each as wide as its longest name, at 7 pixels a letter and 30 for the line before it.
+function fitting(names, room) {
+  for (let n = Math.min(6, names.length); n > 1; n--) {
+    const wide = Array.from({ length: n }, (_, j) => Math.max(...names.filter((_, i) => i % n === j).map(s => s.length)));
+    if (wide.reduce((sum, letters) => sum + 7 * letters + 44, 0) <= room) return n;
+  }
+  return 1;
+}
 // On a narrow screen panels stand under each other, and the names above them in as many columns as there is room for.
 function fitted(chart, width) {
   const children = chart.doc.roots[0].attributes.children;
-  if (width < 600)
-    children.forEach((child, number) => {
-      child.splice(1, 2, number, 0);
-      child[0].attributes.height += 50;
-    });
+  if (width < 600) children.forEach((child, number) => child.splice(1, 2, number, 0));
   const columns = 1 + Math.max(...children.map(child => child[2]));
-  const room = Math.max(1, Math.floor((width / columns - 110) / 105));
-  const narrow = node => {
+  const narrow = (node, plot) => {
     if (node === null || typeof node !== "object") return;
-    if (node.name === "Legend" && node.attributes) node.attributes.ncols = Math.min(6, room);
+    if (node.name === "Legend" && node.attributes) {
+      const names = node.attributes.items.map(item => item.attributes.label.value);
+      node.attributes.ncols = fitting(names, width / columns - 60);
+      plot.height += 30 * (Math.ceil(names.length / node.attributes.ncols) - 1);
+    }
     if (node.name === "Title" && node.attributes && node.attributes.text)
       node.attributes.text = wrapped(node.attributes.text, Math.floor((width / columns - 130) / 7));
-    Object.values(node).forEach(narrow);
+    Object.values(node).forEach(one => narrow(one, plot));
   };
-  narrow(children);
+  children.forEach(child => narrow(child[0], child[0].attributes));
 }
 async function draw() {
   const script = document.createElement("script");

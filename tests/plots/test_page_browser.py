@@ -64,9 +64,10 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     gang = Chart("gang", [Panel([Curve(t, t, f"curve {k}")], "y") for k in range(4)], columns=2)
     long = "a_very_long_name_of_a_file_that_stands_in_a_deep_folder/and_goes_on/model_of_everything.npz"
     wide = Table("wide", [f"column {k}" for k in range(9)], [[long, *["97.4..98.8/97.1..98.3"] * 8]] * 3)
+    limits = {"pitch.overshoot_pct": 60.0, "pitch.settling_s": 1.5}
     sections = [
         Section(
-            "Result", charts=[loop_chart(t, signals, "loop", limits={"pitch.overshoot_pct": 60.0}), gang],
+            "Result", charts=[loop_chart(t, signals, "loop", limits=limits), gang],
             findings=[("ok", "good"), ("note", "so so"), ("warning", "bad")], method=["how " * 60],
             tables=[Table("narrow", ["metric", "value", ""], [["rise_s", "0.62", "holds"], ["b", "2", "fails"]]), wide],
         ),
