@@ -100,3 +100,15 @@ def test_auto_refuses_settings_and_nothing_held_out(call: Call, recording: Path)
     assert "`auto` takes no settings" in call("identify", "auto", recording, "--set", "na=1").error
     assert "has to hold rows out" in call("identify", "auto", recording, "--train", "1").error
     assert "--html goes with KIND auto" in call("identify", "rls", recording, "--html", "x.html").error
+
+
+def test_three_rows_are_one_line(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_auto, "_SIMPLE_FIRST", ("rls", "nlsm"))
+    Path("r.csv").write_text(
+        "time [s],motor_setpoint_1 [rad],motor_setpoint_2 [rad],motor_setpoint_3 [rad],pitch [deg],roll [deg]\n"
+        + "".join(f"{0.02 * k:g},{k},{-k},0,{k},{2 * k}\n" for k in range(3))
+    )
+    said = call("identify", "auto", "r.csv", "-o", "m.npz")
+    assert said.code == 2
+    assert "nlsm: no run has four samples in a row: too few to identify from" in said.error
+    assert not Path("m.npz").exists()

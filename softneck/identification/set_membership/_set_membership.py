@@ -310,8 +310,10 @@ def noise_level(recording: Recording, axis: int) -> float:
     A motion of 4 rad/s sampled at 20 ms leaves almost nothing there; the median is not moved by jerks.
     """
     differences = [np.diff(run.outputs[:, axis], 3) for run in recording.runs() if len(run) > 3]
-    d = np.concatenate(differences)
+    d = np.concatenate([np.zeros(0), *differences])
     d = d[np.isfinite(d)]
+    if not d.size:
+        raise DataError("no run has four samples in a row: too few to identify from; record 500 rows or more.")
     # 20 = 1 + 9 + 9 + 1, squares of the binomials; 0.6745 is the quartile of a standard normal.
     sigma = float(np.median(np.abs(d))) / 0.6745 / np.sqrt(20.0)
     # A noise-free simulation: rounding is left, of 1e-7 rad beside a neck's motion.

@@ -160,7 +160,8 @@ def _numbers(column: pd.Series) -> Vector | None:
         values = np.asarray(pd.to_numeric(column, errors="coerce"), dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         return None
-    filled = ~np.isnan(values) | column.isna().to_numpy()
+    absent = column.isna() | column.astype(str).str.strip().str.lower().eq("nan")
+    filled = ~np.isnan(values) | absent.to_numpy()
     # A few words in a column of numbers are for the importer to name, row by row.
     return values if values.size and filled.mean() > 0.5 and np.isfinite(values).any() else None
 
