@@ -247,7 +247,8 @@ def main() -> None:
     }
     settings = MpcSettings(**changed)  # type: ignore[arg-type]
     if options.inclined:
-        print("| neck | kg | " + " | ".join(f"from {least:g} deg: overshoot [%], rise [s]" for least in INCLINATIONS))
+        print("| neck | kg | " + " | ".join(f"from {least:g} deg: overshoot [%], rise [s]" for least in INCLINATIONS)
+              + " |\n" + "|---" * (2 + len(INCLINATIONS)) + "|")  # fmt: skip
         for name, payload in itertools.product(options.necks, JUDGED):
             on = neck(name)
             cells = [f"{over:.0f}, {rise:.2f}" for over, rise in inclined(on, settings.design(on.family), payload)]

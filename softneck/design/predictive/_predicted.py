@@ -20,7 +20,7 @@ from ..plants._coupled_axis import AnyAxis, CoupledAxis, times
 from ..plants._uncertain import UncertainPlant, uncertain_plant
 from ._disturbance import with_payload
 from ._scale import SizedPlant, refuse_what_is_for_necks
-from ._scenarios import samples_of
+from ._scenarios import Timing, samples_of, timed
 from ._tuning import Pair
 
 # What stands for the defaults of an identified neck where the plant is one's own or another robot's.
@@ -33,11 +33,9 @@ _HORIZON = 0.6
 _LONGEST = 200
 
 
-class _Settings(Protocol):
+class _Settings(Timing, Protocol):
     """What is read of `MpcSettings` here."""
 
-    @property
-    def least_delay(self) -> float: ...
     @property
     def taut_pole(self) -> float: ...
 
@@ -115,8 +113,10 @@ def plant_of(model: Any, *, coupled: bool) -> Any:
     return model if hasattr(model, "tf") else uncertain_plant(model)
 
 
-def weighed(plant: UncertainPlant) -> tuple[Matrix, Matrix]:
-    """Return T of another robot's plant and its inverse."""
+def weighed(plant: UncertainPlant | CoupledPlant) -> tuple[Matrix, Matrix]:
+    """Return T of another robot's plant, or of a coupled one, and its inverse."""
+    if isinstance(plant, CoupledPlant):
+        return plant.redefinition
     return redefinition_of(np.asarray(plant.weights), plant.names)
 
 
@@ -130,8 +130,8 @@ def families(nominal: Pair, small_move_pole: float) -> list[Pair]:
 
 def _predicted(settings: _Settings, model: HasTransferFunctions, axis: str) -> AnyAxis:
     if isinstance(model, SizedPlant) and isinstance(model.axes[axis].nominal, CoupledAxis):
-        return model.axes[axis].nominal.delayed(settings.least_delay)
-    plant = axis_plant(model, axis).delayed(settings.least_delay)
+        return timed(model.axes[axis].nominal, settings)
+    plant = timed(axis_plant(model, axis), settings)
     if settings.taut_pole == 0.0:
         return plant
     # Recordings in which tendons hang say less than a taut neck does, none says more.

@@ -124,6 +124,7 @@ class MpcSettings(Shown):
         taut_pole: an identified neck is predicted as it moves while its tendons are taut: its slowest pole at least as
             fast as this [1/s], its static gain the largest of its family. 0 for as identified. Slack tendons make fits
             slow and low. A `LinearNeck` of one's own is taken as it is.
+        look_ahead: by how much the observer of the loop runs ahead of its sensor [s]: so much dead time is behind it.
         coupled: whether an identified model (`subspace`) is predicted with all that each motor does to each output.
         order: of the loop; "jacobi" adds one sample for the controller and one for the observer.
         observer: whether the loop will have an observer.
@@ -165,6 +166,7 @@ class MpcSettings(Shown):
     least_delay: float = NeckDefault(0.1)
     small_move_pole: float = NeckDefault(5.293)
     taut_pole: float = NeckDefault(9.0)
+    look_ahead: float = 0.0
     coupled: bool = False
     order: str = "sequential"
     observer: bool = True
@@ -199,6 +201,7 @@ class MpcSettings(Shown):
         require_between("measurement_bound", self.measurement_bound, 0.0, 1e12)
         require_whole("budget", self.budget, 1, 10_000)
         require_between("least_delay", self.least_delay, 0.0, 1.0, "s")
+        require_between("look_ahead", self.look_ahead, 0.0, 1.0, "s")
         for name in ("small_move_pole", "taut_pole"):
             require_between(name, getattr(self, name), 0.0, 1000.0, "1/s")
         require_one_of("order", self.order, ORDERS)
@@ -228,20 +231,18 @@ class MpcSettings(Shown):
         if robot.is_neck and not isinstance(plant, CoupledPlant):
             return settings._designed(plant, limits)
         whole = plant if isinstance(plant, CoupledPlant) else uncertain_plant(plant)
-        T = whole.redefinition if isinstance(whole, CoupledPlant) else weighed(whole)
         settings = settings if robot.is_neck else settings_of_robot(settings, whole)
-        return settings._designed(sized_plant(whole, limits, T), limits)
+        return settings._designed(sized_plant(whole, limits, weighed(whole)), limits)
 
     def _designed(self, model: HasTransferFunctions, limits: ControllerLimits) -> MpcController:
         nominal = predicted_plants(self, model)
-        Ts = nominal[0].sample_time
-        samples = sample_pairs(model, self.least_delay)
+        samples = sample_pairs(model, self)
         bandwidth = self._fastest(model, nominal, samples) if self.bandwidth is None else self.bandwidth
         if self.rise_s is not None and self.bandwidth is None:
             bandwidth = self._risen(model, nominal, bandwidth)
         arrays, found = self._tuned(self._arrays(model, bandwidth), nominal, samples)
         found["bandwidth_rad_s"] = bandwidth
-        per_motor = to_si(limits.robot.motors.unit)[0]
+        unit, taut = to_si(limits.robot.motors.unit)[0], self.minimum_tautness
         if self.tightening:
             # A dead time is known to a sample, and `least_delay` makes those of all samples one.
             plants = [
@@ -251,12 +252,12 @@ class MpcSettings(Shown):
             ]
             arrays, found["back_off_rad"] = tightened(arrays, plants, trial_of(self, limits, self._lever(model)))
         return MpcController(
-            sample_time=Ts,
+            sample_time=nominal[0].sample_time,
             arrays=arrays,
             **{name: getattr(limits, name) for name in LIMITS[:4]},
             robot=limits.robot,
             angle_limit=self.angle_limit,
-            minimum_tautness=None if self.minimum_tautness is None else per_motor * self.minimum_tautness,
+            minimum_tautness=None if taut is None else unit * taut,
             disturbances=self.disturbances,
             order=self.order,
             design={"settings": asdict(self), "extra_delay": self.extra_delay, **found},
@@ -319,7 +320,7 @@ class MpcSettings(Shown):
 
     def _problem(self, model: HasTransferFunctions, bandwidth: float) -> Problem:
         nominal = predicted_plants(self, model)
-        scenarios = chosen_scenarios(model, self._delayed(nominal), self.scenarios, self.least_delay, self.extra_delay)
+        scenarios = chosen_scenarios(model, self._delayed(nominal), self.scenarios, self)
         if isinstance(model, SizedPlant):
             T, inverse = model.redefinition
         else:
