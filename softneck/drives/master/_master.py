@@ -329,8 +329,8 @@ class Master:
 
     def _limit(self, now: float, wanted: Sequence[float], events: list[Event], *, count: bool) -> None:
         values, why = [], ""
-        for limiter, value, tension in zip(self._limiters, wanted, self.tensions, strict=True):
-            values.append(limiter.step(value, tension))
+        for limiter, value, tension, led in zip(self._limiters, wanted, self.tensions, self._watches.led, strict=True):
+            values.append(limiter.step(value, tension, led))
             why = why or limiter.clamped
         self.setpoints = tuple(values)
         if not count:

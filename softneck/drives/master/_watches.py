@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
 from ..supervision._baseline import Baseline
 from ..supervision._plausibility import Plausibility
 from ._events import Event
@@ -70,6 +72,7 @@ class Watches:
 
     Attributes:
         angles: that the model gives [rad].
+        led: motors that belong to the angles measured last, but for what all tendons do together [rad].
     """
 
     def __init__(
@@ -85,6 +88,9 @@ class Watches:
         self._settings, self._limits = settings, limits
         self._rows = settings.weights if weights is None else weights
         self.angles = [0.0] * len(self._rows)
+        self.led: tuple[float, ...] = (0.0,) * motors
+        # The smallest motion that gives the angles (Penrose): nothing of it where directions are to be identified.
+        self._back = np.linalg.pinv(settings.gain * np.array(self._rows)) if self._rows else None
         self._offset = self.angles
         self._started = False
         self._tilted = Patience()
@@ -122,6 +128,8 @@ class Watches:
     def tilt(self, now: float, step: float, positions: Sequence[float], measured: Sequence[float] | None,
              events: list[Event]) -> None:  # fmt: skip
         """Advance the model by `step` [s] and compare; each sample while enabled."""
+        if measured is not None and self._back is not None:
+            self.led = tuple((self._back @ np.array(measured)).tolist())
         if not self._started:
             return
         share = 1.0 - math.exp(-self._settings.pole * step)
