@@ -34,6 +34,7 @@ from softneck.drives.master._measured import Measurement
 from softneck.drives.master._settings import RampSettings
 from softneck.drives.running._pilot import LoopPilot
 from softneck.drives.simulated import SimulatedNeck, SimulatedSettings, serve
+from softneck.drives.simulated._habits import WireHabits
 from softneck.drives.simulated._servo_runtime import (
     SERVO_DEMAND,
     SERVO_POSITION,
@@ -41,7 +42,6 @@ from softneck.drives.simulated._servo_runtime import (
     SERVO_TARGET,
     SERVO_ZERO,
 )
-from softneck.drives.simulated._wire import WireHabits
 from softneck.fmu import build_fmu
 from softneck.plant import NeckParameters
 

@@ -231,7 +231,7 @@ class Master:
         if self._enabling_since == _NEVER:
             self._enabling_since = now
         view = self.bus.drives[self._enabling]
-        if view.state is DriveState.ENABLED and view.fresh:
+        if view.follows:
             self._enabling += 1
             self._enabling_since = now
             if self._enabling == len(self.bus.drives):
@@ -239,7 +239,8 @@ class Master:
                 if self._gate.last is not None:
                     self._change(now, Signal.ENABLED)
         elif now - self._enabling_since > self.settings.ramps.enable_timeout:
-            events.append(Event(now, "enable_timeout", view.node, f"it is {view.state.name}"))
+            why = " and does not take mode 8" if view.mode == "asked" else ""
+            events.append(Event(now, "enable_timeout", view.node, f"it is {view.state.name}{why}"))
 
     def _ramp(self, now: float, events: list[Event]) -> None:
         """Straight to rest, where P is zero, and a while there."""
