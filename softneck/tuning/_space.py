@@ -82,6 +82,12 @@ class Space:
         """Where the search begins, in the cube."""
         return np.array([item.start_part for item in self.dimensions])
 
+    @property
+    def led(self) -> int | None:
+        """Number of the setting that trades speed for margins, None where there is none."""
+        names = [item.name for item in self.dimensions]
+        return names.index("max_sensitivity") if "max_sensitivity" in names else None
+
     def settings(self, x: Vector) -> dict[str, Any]:
         """Return the settings at a point of the cube."""
         searched = {item.name: item.value(float(part)) for item, part in zip(self.dimensions, x, strict=True)}

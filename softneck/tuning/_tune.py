@@ -19,7 +19,7 @@ from softneck.verification._verify import sources_of, standing_for
 
 from ._beforehand import refuse_impossible
 from ._digest import digest_of
-from ._judge import assumed, designed, made_ready
+from ._judge import LEVELS, assumed, designed, made_ready
 from ._log import Log
 from ._requirements import TuneRequirements, make_tune_requirements, read_tune_requirements, with_certificate
 from ._responses import kept_with
@@ -200,8 +200,8 @@ def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progr
         if len(search.dropped) < len(search.spaces):
             raise CheckFailedError(f"the budget ended before any candidate could be judged ({why}); give a larger one.")
         raise SettingsError(f"no candidate could be judged ({why}).")
-    deepest = max(range(4), key=lambda k: any(_level(item) >= k for item in ranked) * k)
-    compared = [item for item in ranked if _level(item) >= min(deepest, 2)]
+    looped_ones = [item for item in ranked if _level(item) >= 1]
+    compared = looped_ones or ranked
     best, verification, controller = _verified(search, compared, files, progress)
     bounds = task.asked.bounds
     names = objectives(compared)
@@ -209,7 +209,7 @@ def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progr
     looped = [b for b in bounds if b.metric.startswith(("neck.", "track."))]
     holds = verification.holds
     if looped and task.own:
-        holds = holds and _level(best) >= 2 and best.holds(looped, tested=False)
+        holds = holds and _level(best) >= 1 and best.holds(looped, tested=False)
     stuck, nearest = (None, None) if holds else binding(compared, bounds, tested=search.tested)
     if not holds and stuck is None:
         # The search saw nothing broken, the certificate of the whole box does.
@@ -227,7 +227,7 @@ def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progr
 
 
 def _level(item: Candidate) -> int:
-    return ("linear", "few", "all", "margins").index(item.level)
+    return LEVELS.index(item.level)
 
 
 def _verified(
