@@ -89,6 +89,7 @@ def tune(
     *,
     kinds: Sequence[str] = (),
     budget: int = BUDGET,
+    observer: Any = None,
     seed: int = 0,
     workers: int | None = None,
     folder: Path | None = None,
@@ -107,6 +108,8 @@ def tune(
         requirements: what is asked, also as a file or a table like one; the defaults if not given.
         kinds: of controllers; `KINDS_SEARCHED` if none is named.
         budget: judgements of candidates.
+        observer: that the loop shall have, if the requirements are kept with it; else a Kalman filter over the nominal
+            plant.
         seed: of the search and of the noise in its loops.
         workers: local processes, as many as cores if not given; 0 for this process.
         folder: where judgements are kept as they come; the same call goes on with what is there.
@@ -124,6 +127,8 @@ def tune(
     require_whole("seed", seed, 0, 2**31 - 2)
     chosen = tuple(dict.fromkeys(kinds or KINDS_SEARCHED))
     task = task_of(plants, requirements, seed)
+    if observer is not None:
+        require_same_robot(robot_of(observer), task.robot, "the observer and the plants")
     refuse_impossible(task.asked, task.plant)
     each = spaces(chosen, rise=_aimed(task), cocontraction=task.cocontraction, neck=task.robot.is_neck)
     task = replace(task, digest=digest_of(task, chosen, files))
@@ -132,7 +137,8 @@ def tune(
     with crew(workers, None) as members:
         search = Search(task, each, members, log, budget, lambda done, text: progress(0.9 * done, text))
         search.run()
-    return _finished(search, files, lambda done, text: progress(0.9 + 0.1 * done, text))
+    eyes = _observer(task) if observer is None else observer
+    return _finished(search, eyes, files, lambda done, text: progress(0.9 + 0.1 * done, text))
 
 
 def task_of(
@@ -192,7 +198,7 @@ def _aimed(task: Task) -> float:
     return _USUAL_RISE / min(float(box.nominal[1]) for box in source.axes)
 
 
-def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progress: Progress) -> Tuned:
+def _finished(search: Search, eyes: Any, files: Mapping[str, tuple[str, str]] | None, progress: Progress) -> Tuned:
     """Return the result of a search: its best verified, and what it means for the requirements."""
     task, ranked = search.task, search.ranked()
     if not ranked:
@@ -214,7 +220,6 @@ def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progr
     if not holds and stuck is None:
         # The search saw nothing broken, the certificate of the whole box does.
         stuck = next((v.requirement.metric for v in verification.failed), None)
-    eyes = _observer(task)
     return Tuned(
         best=best, controller=controller, assumed=assumed(task, best.kind, best.settings), observer=eyes,
         own=made_ready(task).own,
