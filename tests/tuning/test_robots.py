@@ -103,7 +103,7 @@ def test_every_step_that_is_judged_has_a_noisy_sensor_and_each_direction_its_own
     plain = [case for case in ready.all if case.part == 1.0 and not case.late]
     loops = [loop_of(case, ready.own[0], controller.block(), "sequential", task) for case in plain]
     noise = [fault for loop in loops for fault in loop.faults if isinstance(fault, SensorFault)]
-    assert len({fault.seed for fault in noise}) == len(loops) == 2
+    assert len({fault.seed for fault in noise}) == len(loops) == 3
     assert {fault.std for fault in noise} == {math.radians(0.05)}
 
 
