@@ -240,6 +240,17 @@ def test_what_a_requirement_costs() -> None:
     assert least[-1] == 0.3
 
 
+def test_where_nothing_keeps_all_the_rest_the_price_is_told_beside_what_the_best_does() -> None:
+    loud = candidate(neck__rise_s=0.3, neck__overshoot_pct=30.0, axes__gain_margin=1.9)
+    slow = candidate(neck__rise_s=0.9, neck__overshoot_pct=6.0, axes__gain_margin=1.9)
+    worse = candidate(neck__rise_s=0.5, neck__overshoot_pct=6.0, axes__gain_margin=0.8)
+    found = prices([loud, slow, worse], BOUNDS, "neck.overshoot_pct", tested=False)
+    assert {(price.other, price.held) for price in found} == {("neck.rise_s", False)}
+    # At 5 % nothing is known; from 6 % on it costs 0.9 s: what does it in 0.5 s has less margin than the best.
+    assert [price.least for price in found if price.limit < 6.0] == [None]
+    assert {price.least for price in found if price.limit >= 6.0} == {0.9}
+
+
 def test_few_requirements_are_broken_rather_than_all_a_little() -> None:
     one = candidate(neck__rise_s=0.5, neck__overshoot_pct=4.0, axes__gain_margin=2.1)
     each = candidate(neck__rise_s=0.46, neck__overshoot_pct=5.75, axes__gain_margin=2.1)
