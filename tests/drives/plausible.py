@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+import os
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -45,12 +47,17 @@ _CALM = 75
 
 
 class Tracker:
-    """A PI controller behind references that jump or ramp at random times; or slow random set-points."""
+    """A PI controller behind references that jump or ramp at random times; or slow random set-points.
+
+    Attributes:
+        reference: of the last sample [rad]; () while there is none.
+    """
 
     def __init__(self, seed: int, kind: str, size: float = 1.0) -> None:
         self._size = 0.65 * size
         self._rng, self.kind = np.random.default_rng(seed), kind
-        self._integral, self._reference, self._goal, self._next = np.zeros(2), np.zeros(2), np.zeros(2), _CALM
+        self._integral, self._aim, self._goal, self._next = (0.0, 0.0), (0.0, 0.0), (0.0, 0.0), _CALM
+        self.reference: tuple[float, ...] = ()
         self._phase = self._rng.uniform(0.0, 6.28, (3, 6))
         self._pace = np.exp(self._rng.uniform(math.log(0.3), math.log(4.0), (3, 6)))
 
@@ -62,16 +69,18 @@ class Tracker:
             P = min(1.0, t / 3.0) * self._size * np.sin(self._pace * t + self._phase).sum(axis=1)
             return tuple(np.clip(P - 0.7 * P.mean(), -4.0, 4.0))
         if measured.index >= self._next:
-            way = self._rng.uniform(0.0, 2.0 * math.pi)
-            self._goal = math.radians(self._rng.uniform(3.0, 15.0)) * np.array([math.cos(way), math.sin(way)])
+            way, far = self._rng.uniform(0.0, 2.0 * math.pi), math.radians(self._rng.uniform(3.0, 15.0))
+            self._goal = far * math.cos(way), far * math.sin(way)
             self._next = measured.index + int(self._rng.integers(50, 300))
-        left = self._goal - self._reference
+        left = [goal - now for goal, now in zip(self._goal, self._aim, strict=True)]
         most = math.inf if self.kind == "step" else TS * math.radians(12.0)
-        self._reference = self._reference + left * min(1.0, most / max(float(np.hypot(*left)), 1e-9))
-        error = self._reference - np.array(measured.tilt.values)
+        share = min(1.0, most / max(math.hypot(*left), 1e-9))
+        pitch, roll = (now + share * way for now, way in zip(self._aim, left, strict=True))
+        self._aim = self.reference = pitch, roll
         # Eq. 31 is 0.091 rad/rad behind 0.19 s: crosses over at 2.4 rad/s.
-        self._integral += 21.0 * TS * error
-        theta, phi = 5.0 * error + self._integral
+        error = pitch - measured.tilt.values[0], roll - measured.tilt.values[1]
+        self._integral = self._integral[0] + 21.0 * TS * error[0], self._integral[1] + 21.0 * TS * error[1]
+        theta, phi = 5.0 * error[0] + self._integral[0], 5.0 * error[1] + self._integral[1]
         return 2.0 / 3.0 * theta, -theta / 3.0 + phi / math.sqrt(3.0), -theta / 3.0 - phi / math.sqrt(3.0)
 
 
@@ -314,17 +323,60 @@ def play(
     judged: Baseline | None = None,
 ) -> Outcome:
     """Break it at a time that `seed` chooses, beside the same run without the fault."""
-    begin = np.random.default_rng([seed, 77]).uniform(3.0, 7.0)
     calm = calm_run(seed, payload, 7.0 + most)
     bench = watched(seed, kind_of(seed), payload, off=off, gyro=row.gyro, judged=judged or baseline())
-    if row.early:
-        row.breaks(bench)
-        k = 0
-    else:
-        k = math.ceil(begin / T)
+    k = 0 if row.early else break_at(seed)
+    for _ in range(k):
+        bench.step()
+    return _broken(row, bench, calm, k, most)
+
+
+def play_all(
+    rows: Mapping[str, Row], seed: int, *, payload: float = 0.0, most: float = 12.0
+) -> Iterator[tuple[str, Outcome]]:
+    """Do what `play` does with each of `rows`; what is common to them is played once, and each goes on from a fork."""
+    calm = calm_run(seed, payload, 7.0 + most)
+    for gyro in (True, False):
+        ours = {name: row for name, row in rows.items() if row.gyro is gyro}
+        if not ours:
+            continue
+        bench = watched(seed, kind_of(seed), payload, gyro=gyro, judged=baseline())
+        for name, row in ours.items():
+            if row.early:
+                yield name, _forked(row, bench, calm, 0, most)
+        k = break_at(seed)
         for _ in range(k):
             bench.step()
-        row.breaks(bench)
+        for name, row in ours.items():
+            if not row.early:
+                yield name, _forked(row, bench, calm, k, most)
+
+
+def break_at(seed: int) -> int:
+    """Return the cycle in which the fault comes."""
+    return math.ceil(np.random.default_rng([seed, 77]).uniform(3.0, 7.0) / T)
+
+
+def _forked(row: Row, bench: Bench, calm: Calm, k: int, most: float) -> Outcome:
+    """Go on with the fault in a child, so that the bench stays as it is."""
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            found = json.dumps(asdict(_broken(row, bench, calm, k, most)))
+            os.write(writer, found.encode())
+        finally:
+            os._exit(0)
+    os.close(writer)
+    with os.fdopen(reader, "rb") as file:
+        text = file.read()
+    os.waitpid(child, 0)
+    return Outcome(**json.loads(text))
+
+
+def _broken(row: Row, bench: Bench, calm: Calm, k: int, most: float) -> Outcome:
+    """Break a bench at cycle `k` of its run and say how it goes."""
+    row.breaks(bench)
     first, last = k, k + round(most / T)
     excited = _excited(row, calm, first)
     beyond = 0.0

@@ -15,10 +15,12 @@ from softneck.drives.bus._read import load_drives, make_drives
 from softneck.drives.master import Phase
 from softneck.drives.master._events import RULES, Reaction
 from softneck.drives.supervision._baseline import Baseline, load_baseline
+from softneck.drives.supervision._log import MotionLog
 from softneck.drives.supervision._plausibility import Plausibility
 
-from ..bench import Bench
-from ..plausible import BASELINE, PATH, ROWS, Row, baseline, drifts, kind_of, play, sampled, watched
+from ..bench import Bench, T
+from ..plausible import BASELINE, PATH, ROWS, Row, baseline, drifts, kind_of, play, play_all, sampled, watched
+from ..undisturbed import undisturbed
 
 PLAUSIBLE = frozenset(
     {
@@ -239,3 +241,42 @@ def test_a_bench_without_frames_is_the_one_with_frames_bit_by_bit(seed: int, pay
             rows.append((bench.now, bench.master.setpoints, bench.master.positions, bench.master.tensions, sums))
         traces.append(repr(rows))
     assert traces[0] == traces[1]
+
+
+@pytest.mark.parametrize(("seed", "payload"), [(0, 0.3), (1, 1.0), (2, 0.5)])
+def test_motion_without_a_master_is_that_of_the_bench_bit_by_bit(seed: int, payload: float) -> None:
+    """Nor may anything hang on what the hours leave out: phases, objects of drives, plausibility that says nothing."""
+    bench, log = watched(seed, kind_of(seed), payload), MotionLog()
+    bench.run.watches = (log,)
+    bench.pass_time(6.0)
+    seen = log.motion()
+    alone, _, why = undisturbed(watched(seed, kind_of(seed), payload), 6.0)
+    assert why == ""
+    for name in ("setpoints", "positions", "tensions", "values", "rates", "due"):
+        # The log begins a cycle later, when it knows what was sent before.
+        np.testing.assert_array_equal(getattr(alone, name)[1:], getattr(seen, name))
+
+
+def test_motion_without_a_master_ends_where_the_bench_does() -> None:
+    ends = []
+    for quick in (True, False):
+        bench = watched(1, "ramp")
+        bench.pilot.act = lambda measured: (0.05 * measured.index, 0.0, 0.0)
+        begin = bench.now
+        if quick:
+            motion, _, why = undisturbed(bench, 10.0)
+            ends.append((len(motion.due), why))
+            continue
+        while bench.phase is Phase.RUNNING:
+            bench.step()
+        assert bench.stopped_at is not None
+        assert bench.master.supervisor.fault is not None
+        ends.append((round((bench.stopped_at - begin) / T), bench.master.supervisor.fault.name))
+    assert ends[0] == ends[1]
+
+
+@pytest.mark.slow
+def test_faults_from_a_fork_are_those_of_whole_runs() -> None:
+    names = ("gear x 2", "encoder slips 1 rad", "bias +0.5 deg/s, no gyro")
+    rows = {name: ROWS[name] for name in names}
+    assert dict(play_all(rows, 5, payload=0.1)) == {name: play(row, 5, payload=0.1) for name, row in rows.items()}
