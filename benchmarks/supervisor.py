@@ -27,7 +27,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from softneck.core import Matrix, file_hash
 from softneck.drives.supervision._motor_models import Motion
 from softneck.drives.supervision._plausibility import Plausibility
-from tests.drives.plausible import BASELINE, PATH, ROWS, baseline, commissioned, kind_of, play_all, watched
+from tests.drives.broken import PATH, ROWS, play_all
+from tests.drives.plausible import BASELINE, baseline, commissioned, kind_of, watched
 from tests.drives.undisturbed import undisturbed as motion_of
 
 FOLDER = Path("build/supervisor")

@@ -146,14 +146,14 @@ class Watches:
 
     def plausible(self, now: float, nodes: Sequence[int], setpoints: Sequence[float], positions: Sequence[float],
                   tensions: Sequence[float], events: list[Event], *, due: bool,
-                  sample: Tilt | Reading | None) -> None:  # fmt: skip
+                  sample: Tilt | Reading | None, reference: Sequence[float]) -> None:  # fmt: skip
         """Ask the charts; each cycle while enabled, with the sample that came where one is due."""
         if self._plausible is None:
             return
         found = self._plausible.cycle(setpoints, positions, tensions)
         if due and found is None:
             values, rates = (None, ()) if sample is None else (sample.values, sample.rates)
-            found = self._plausible.sample(positions, values, rates)
+            found = self._plausible.sample(positions, values, rates, reference)
         if found is not None:
             events.append(Event(now, found.name, 0 if found.motor < 0 else nodes[found.motor], found.detail))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -14,19 +15,20 @@ from softneck.drives import default_drives
 from softneck.drives.bus._read import load_drives, make_drives
 from softneck.drives.master import Phase
 from softneck.drives.master._events import RULES, Reaction
-from softneck.drives.supervision._baseline import Baseline, load_baseline
+from softneck.drives.supervision._baseline import Baseline, Tracking, load_baseline
 from softneck.drives.supervision._log import MotionLog
 from softneck.drives.supervision._plausibility import Plausibility
 
 from ..bench import Bench, T
-from ..plausible import BASELINE, PATH, ROWS, Row, baseline, drifts, kind_of, play, play_all, sampled, watched
+from ..broken import PATH, ROWS, Row, drifts, play, play_all
+from ..plausible import BASELINE, baseline, kind_of, sampled, watched
 from ..undisturbed import undisturbed
 
 PLAUSIBLE = frozenset(
     {
         "motor_jammed", "encoder_slip", "position_bad", "current_scale", "gear_wrong", "tilt_unexplained",
         "sensor_reversed", "sensor_swapped", "sensor_stuck", "sensor_late", "sensor_noise", "sensor_rate",
-        "sensor_drift",
+        "sensor_drift", "astray",
     }
 )  # fmt: skip
 # As the page of the drives says which faults look alike; `following` is what too small a current limit does.
@@ -185,6 +187,15 @@ def test_a_baseline_comes_back_and_a_damaged_one_is_refused(tmp_path: Path) -> N
             load_baseline(path)
     with pytest.raises(FileFormatError, match="cannot be read"):
         load_baseline(tmp_path / "none.json")
+
+
+def test_a_baseline_from_before_loops_were_compared_with_is_read(tmp_path: Path) -> None:
+    table = json.loads(BASELINE.read_text(encoding="utf-8"))
+    del table["tracking"]
+    path = tmp_path / "b.json"
+    path.write_text(json.dumps(table), encoding="utf-8")
+    assert load_baseline(path) == replace(baseline(), tracking=Tracking())
+    assert Plausibility(load_baseline(path)).tracking is None
 
 
 def test_a_drives_file_names_its_baseline(tmp_path: Path) -> None:
