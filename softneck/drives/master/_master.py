@@ -204,9 +204,8 @@ class Master:
             self._watches.plausible(now, self.settings.bus.nodes, self.setpoints, self.positions, self.tensions, events,
                                     due=due, sample=last, reference=asked)  # fmt: skip
             if due:
-                measured = last.values if last else None
                 step = self.settings.sample_cycles * self.settings.bus.cycle
-                self._watches.tilt(now, step, self.positions, measured, events)
+                self._watches.tilt(now, step, self.positions, last and last.values, events)
         if events:
             self._judge(now, events)
             events.clear()
