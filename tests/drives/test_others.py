@@ -22,8 +22,8 @@ from softneck.drives.bus._link import CanLink
 from softneck.drives.bus._sdo import Objects, SdoError, load_eds
 from softneck.drives.running._scan import scan
 from softneck.drives.simulated import SimulatedNeck, SimulatedSettings, serve
+from softneck.drives.simulated._habits import WireHabits
 from softneck.drives.simulated._profiles import PROFILES
-from softneck.drives.simulated._wire import WireHabits
 from softneck.plant import NeckParameters
 
 EDS = Path(load_eds.__code__.co_filename).parent / "eds"
