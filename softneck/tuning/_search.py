@@ -221,12 +221,16 @@ class Search:
         for _ in range(_LED):
             for kind, k in led.items():
                 x = at[kind].x.copy()
-                # What could not be designed asks for more room.
-                x[k] = min(max(x[k] + (step if at[kind].error or self._robust(at[kind]) else -step), 0.0), 1.0)
-                at[kind] = self._candidate(spaces[kind], x)
+                if at[kind].error:
+                    # What could not be designed is given more room: bolder, and slower.
+                    x[[0, k]] += step
+                else:
+                    x[k] += step if self._robust(at[kind]) else -step
+                at[kind] = self._candidate(spaces[kind], np.clip(x, 0.0, 1.0))
             self._judge([at[kind] for kind in led], LEVELS[0], reserved)
             for kind, k in led.items():
-                best[kind] = min(best[kind], at[kind], key=lambda item: self._led_key(item, k))
+                if at[kind].level:
+                    best[kind] = min(best[kind], at[kind], key=lambda item: self._led_key(item, k))
             step /= 2.0
         return best
 
