@@ -17,7 +17,7 @@ from softneck.verification._own_plants import OwnPlant, is_own_plant
 from softneck.verification._scale import scaled
 from softneck.verification._verify import sources_of, standing_for
 
-from ._beforehand import refuse_impossible
+from ._beforehand import quickest, refuse_impossible
 from ._digest import digest_of
 from ._judge import LEVELS, assumed, designed, made_ready
 from ._log import Log
@@ -130,7 +130,9 @@ def tune(
     if observer is not None:
         require_same_robot(robot_of(observer), task.robot, "the observer and the plants")
     refuse_impossible(task.asked, task.plant)
-    each = spaces(chosen, rise=_aimed(task), cocontraction=task.cocontraction, neck=task.robot.is_neck)
+    each = spaces(
+        chosen, rise=_aimed(task), cocontraction=task.cocontraction, neck=task.robot.is_neck, least=quickest(task.plant)
+    )
     task = replace(task, digest=digest_of(task, chosen, files))
     made_ready(task)  # a plant that does not fit is said before anything is searched
     log = Log(folder, task.digest, resume=resume, force=force)
