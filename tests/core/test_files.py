@@ -185,12 +185,15 @@ def test_what_a_killed_process_left_is_swept_by_the_next_write_and_nothing_else_
         assert target.read_text() == "old"
         assert len(list(tmp_path.iterdir())) == 2
     (tmp_path / ".hidden-softneck.npz").write_text("somebody's")
+    (tmp_path / "seen-softneck-1.npz").write_text("somebody's")
     with atomic_write(tmp_path / "one") as one:
         one.write_text("still at work")
         with atomic_write(tmp_path / "two") as two:  # a file of any other name in that folder
             two.write_text("")
         assert one.read_text() == "still at work"
-    assert sorted(path.name for path in tmp_path.iterdir()) == [".hidden-softneck.npz", "model.npz", "one", "two"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        ".hidden-softneck.npz", "model.npz", "one", "seen-softneck-1.npz", "two",
+    ]  # fmt: skip
 
 
 def test_a_temporary_that_is_swept_while_it_begins_begins_again(
