@@ -23,6 +23,7 @@ from softneck.core import FileFormatError, load, read_certificate, write_certifi
 from softneck.core._certificate import certificate_contents
 from softneck.cosim import load_loop, load_ssp, load_study
 from softneck.cosim.parts._fmu_part import FmuPart
+from softneck.cosim.parts._ours import block_of
 from softneck.cosim.studies._store import read_description, read_runs
 from softneck.drives.bus._objects import require_eds
 from softneck.drives.bus._read import load_drives
@@ -34,6 +35,7 @@ from softneck.drives.logs._log_file import read_run_log
 from softneck.drives.logs._run_log import _Entry, _McapSink
 from softneck.drives.master import Frame
 from softneck.drives.supervision._baseline import load_baseline
+from softneck.fmu import build_fmu
 from softneck.plant import NeckParameters
 from softneck.robot import Robot
 from softneck.robot._file import preset_text
@@ -137,6 +139,16 @@ def fmu(path: Path) -> None:
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
         file.writestr("modelDescription.xml", _FMU)
         file.writestr("binaries/linux64/A.so", b"none")
+
+
+def our_fmu(path: Path) -> None:
+    """One that runs Python, without the binaries: it is read back as the block that it was made of."""
+    whole = path.with_name("whole.fmu")
+    build_fmu(load(ROOT.joinpath(*GOLDEN, "pi.npz")).block(), whole, force=True)
+    with zipfile.ZipFile(whole) as given, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as kept:
+        for name in ("modelDescription.xml", "resources/block.json", "resources/arrays.npy"):
+            kept.writestr(name, given.read(name))
+    whole.unlink()
 
 
 def ssp(path: Path) -> None:
@@ -265,6 +277,7 @@ TARGETS: dict[str, Target] = {
     "candump": Target(".log", lambda path: list(FrameLog(path)), [frames(CandumpSink)]),
     "blf": Target(".blf", lambda path: list(FrameLog(path)), [frames(BlfSink)]),
     "fmu": Target(".fmu", lambda path: FmuPart(path, role="plant"), [fmu], zipped=True),
+    "our_fmu": Target(".fmu", block_of, [our_fmu], zipped=True),
     "ssp": Target(".ssp", load_ssp, [ssp], zipped=True),
     "loop": Target(".toml", load_loop, [text(LOOP)]),
     "study": Target(
