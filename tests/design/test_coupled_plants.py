@@ -9,11 +9,12 @@ import control
 import numpy as np
 import pytest
 
-from softneck.core import SettingsError, load
-from softneck.design import CustomSettings, LqgSettings, MpcSettings, PidSettings, lqgsyn
+from softneck.core import FileFormatError, SettingsError, load, read_archive
+from softneck.design import CustomSettings, LqgSettings, MpcController, MpcSettings, PidSettings, lqgsyn
 from softneck.design.linear._linear_parts_runtime import LinearArrays
+from softneck.design.linear._rise import rise_time
 from softneck.design.plants._coupled import CoupledPlant, coupled_plant
-from softneck.design.plants._coupled_axis import closed, responses
+from softneck.design.plants._coupled_axis import closed, responses, times
 from softneck.identification import Subspace
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import redefinition_matrix, signal
@@ -126,6 +127,31 @@ def largest(controller: Any, G: Any) -> float:
     return most
 
 
+@pytest.mark.parametrize("more", [{"rise_s": 1.2}, {"rise_s": 1.2, "order": "jacobi"}, {"overshoot_pct": 1.0}])
+def test_steps_are_as_they_were_asked_for(more: dict[str, Any]) -> None:
+    """The slowest output's rise, or what the worst sample overshoots by, on the plant with the delay of its loop."""
+    G = plant(3, 2, seed=2)
+    controller = LqgSettings(**LIMITS, **more).design(G)
+    late = 2 if "order" in more else 0
+    asked = [step_of(controller, taken(G), gain, late) for gain in (1.0, 0.8, 1.2)]
+    if "rise_s" in more:
+        # The filter is found to a millionth.
+        assert max(rise_time(y, TS) for y in asked[0].T) == pytest.approx(1.2, rel=1e-3)
+    else:
+        assert max(float(y.max()) for y in asked) <= 1.01
+
+
+def step_of(controller: Any, G: CoupledPlant, gain: float, late: int) -> np.ndarray:
+    """Return each output (rows, outputs) after a unit step of its reference alone, over the filter of its file."""
+    made, count = controller.ss(), len(G.rows)
+    A, B, C = closed((made.A, made.B, made.C, made.D), times(G.rows, gain), late)
+    x, y = np.zeros((len(A), count)), np.zeros((600, count))
+    for k in range(600):
+        x = A @ x + B
+        y[k] = np.diag(C @ x)
+    return y
+
+
 def test_a_controller_of_ones_own_is_taken_with_its_plant() -> None:
     G = plant(3, 2, seed=1)
     found = taken(G)
@@ -160,6 +186,16 @@ def test_an_identified_model_is_taken_with_what_it_says_between_its_axes(setting
     at_rest = C @ np.linalg.solve(np.eye(len(A)) - A, B)
     # Integral action; the slowest modes that nothing shows are within 1e-3 of the border.
     np.testing.assert_allclose(at_rest, np.eye(2), atol=1e-6)
+
+
+def test_a_file_whose_inputs_are_neither_its_own_nor_those_of_all_is_refused(tmp_path: Path) -> None:
+    """Compiled text would read beyond the array."""
+    MpcSettings(**LIMITS, bandwidth=3.0, horizon=8, moves=3).design(plant(3, 2)).save(tmp_path / "mpc.npz")
+    header, arrays = read_archive(tmp_path / "mpc.npz")
+    n = arrays["model_A"].shape[1]
+    more = {name: np.hstack([arrays[name], arrays[name][:, :n]]) for name in ("model_B", "rest")}
+    with pytest.raises(FileFormatError, match="`model_B` is of other inputs"):
+        MpcController.from_archive(header, {**arrays, **more})
 
 
 UNSTABLE = control.StateSpace(np.diag([1.1, 0.5, 0.5]), np.ones((3, 3)), np.ones((2, 3)), np.zeros((2, 3)), TS)
