@@ -34,7 +34,7 @@ from ._controller import MpcController
 from ._disturbance import MeasuredDisturbance, effects
 from ._lti import system
 from ._mpc_state_runtime import MpcArrays
-from ._predicted import predicted_plants, settings_for, settings_of_robot
+from ._predicted import predicted_plants, settings_for, settings_of_robot, taken_of_neck
 from ._prediction import Problem, matrices
 from ._scale import SizedPlant, limits_of, sized_plant
 from ._scenarios import chosen_scenarios, sample_pairs
@@ -223,7 +223,8 @@ class MpcSettings(Shown):
         robot, settings = robot_of(model), settings_for(self, model)
         limits = limits_of(settings, robot)
         if robot.is_neck:
-            return settings._designed(model, limits)
+            made = settings._designed(model, limits)
+            return replace(made, design={**made.design, "assumed": taken_of_neck(settings, model)})
         uncertain = uncertain_plant(model)
         T = redefinition_of(np.asarray(uncertain.weights), uncertain.names)
         return settings_of_robot(settings, uncertain)._designed(sized_plant(uncertain, limits, T), limits)
