@@ -19,7 +19,7 @@ from softneck.verification._verify import sources_of, standing_for
 
 from ._beforehand import quickest, refuse_impossible
 from ._digest import digest_of
-from ._judge import LEVELS, assumed, designed, made_ready
+from ._judge import LEVELS, designed, made_ready
 from ._log import Log
 from ._requirements import TuneRequirements, make_tune_requirements, read_tune_requirements, with_certificate
 from ._responses import kept_with
@@ -223,7 +223,8 @@ def _finished(search: Search, eyes: Any, files: Mapping[str, tuple[str, str]] | 
         # The search saw nothing broken, the certificate of the whole box does.
         stuck = next((v.requirement.metric for v in verification.failed), None)
     return Tuned(
-        best=best, controller=controller, assumed=assumed(task, best.kind, best.settings), observer=eyes,
+        best=best, controller=controller, observer=eyes,
+        assumed=dict(getattr(controller, "design", {}).get("assumed", {})),
         own=made_ready(task).own,
         observed=eyes is not None and bool(task.own) and kept_with(task, best, eyes, bounds),
         verification=verification, holds=holds,
