@@ -84,6 +84,8 @@ def timed(host: Path, fmu: Path, folder: Path) -> Timed:
     variables = [v for v in model.modelVariables if v.type == "Real"]
     moved = [v for v in variables if v.causality == "input" and v.name.startswith(("motor_setpoint_", "u"))]
     seen = [v for v in variables if v.causality == "output"]
+    if not moved:  # a reference without inputs lets its state be set, and has a derivative to get
+        moved, seen = seen, [v for v in variables if v.causality in ("output", "local")]
     ahead = [v for v in seen if v.name.endswith("_next")]
     seen = [*ahead, *(v for v in seen if v not in ahead)]
     step = float(model.defaultExperiment.stepSize or 0.02) if model.defaultExperiment else 0.02
