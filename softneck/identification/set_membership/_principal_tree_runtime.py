@@ -139,8 +139,6 @@ def slant_search(
     best: np.ndarray,
 ) -> None:  # fmt: skip
     """Tighten `best` (low, high) by the cones of all points; behind them the leaf that each was found in."""
-    rows = values.shape[0]
-    leaves = nodes.shape[0] // 2
     at = np.dot(frame, x)
     # The slope m and the size of points and values stand in the row that is no node.
     m = nodes[0, 0]
@@ -155,6 +153,16 @@ def slant_search(
     plane[2] = m / math.sqrt(gamma * gamma - m * m) if m > 0.0 else 0.0
     plane[3] = gamma
     plane[4] = (x.shape[0] + 8) * SLANT_ROUNDING * (gamma * size + nodes[0, 2])
+    slant_descend(points, values, nodes, at, plane, gamma, x, best)
+
+
+def slant_descend(
+    points: np.ndarray, values: np.ndarray, nodes: np.ndarray, at: np.ndarray, plane: np.ndarray, gamma: float,
+    x: np.ndarray, best: np.ndarray,
+) -> None:  # fmt: skip
+    """Do what `slant_search` does, with `at` and `plane` of `slant_children`; in C by hand."""
+    rows = values.shape[0]
+    leaves = nodes.shape[0] // 2
     best[2] = leaves
     best[3] = leaves
     # Left for later: one node a level at most, and 2^64 nodes are more than any memory holds.

@@ -29,12 +29,9 @@ _MEMBERS = {
     "member_tangent": (10, NONE, "sn_member_tangent(w, {})"),
 }
 # Functions that C has by hand, several numbers side by side or moved at once: types and result as in Python, bits too.
-# One that returns numbers fills them in behind its arguments.
-_FOUR = Bundle((FLOAT, FLOAT, FLOAT, FLOAT))
 _BY_HAND: dict[str, tuple[tuple[Type, ...], Type]] = {
-    "slant_children": ((MATRIX, INT, VECTOR, VECTOR), _FOUR),
+    "slant_descend": ((MATRIX, VECTOR, MATRIX, VECTOR, VECTOR, FLOAT, VECTOR, VECTOR), NONE),
     "narx_push": ((VECTOR, VECTOR), NONE),
-    "slant_leaf": ((MATRIX, VECTOR, INT, INT, FLOAT, VECTOR, VECTOR, VECTOR), NONE),
 }
 _PASSES = 20
 
@@ -235,11 +232,7 @@ class _Runtime:
         elif _BY_HAND.get(name, ((), NONE))[0] == tuple(value.type for value in values):
             kind = _BY_HAND[name][1]
             arguments = "".join(f", {ex.scope.given(value)}" for value in values)
-            if kind != NONE:
-                filled = ex.scope.temporary(kind)
-                ex.scope.emit(f"sn_{name}(w{arguments}, {filled}.f);")
-                return Value(filled, kind)
-            value = Value(f"sn_{name}(w{arguments})", NONE)
+            value = Value(f"sn_{name}(w{arguments})", kind)
         else:
             done = self.function(name, tuple(value.type for value in values))
             codes = [
