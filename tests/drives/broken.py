@@ -120,8 +120,7 @@ class Row:
 
 DEG = math.radians(1.0)
 AT_ONCE, BY_TILT, BY_PULLS = ("", 0.0), ("tilt", 2 * DEG), ("pulls", 25.0)
-# As far as a fault may lead the neck: nearer a loop is not astray.
-BY_WAY = ("way", 3 * DEG)
+BY_WAY = ("way", 2 * DEG)
 
 
 def reversed_(bench: Bench) -> None:

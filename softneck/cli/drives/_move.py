@@ -167,7 +167,8 @@ def _print_jog(found: JogResult, *, as_json: bool) -> None:
     type=click.Path(path_type=Path),
     multiple=True,
     metavar="LOG.mcap",
-    help="With --supervision: compare with the motion of this earlier `record` too, such as one with another payload.",
+    help="With --supervision: compare with this earlier `record` too, such as one with another payload; or a loop's "
+    "tracking with this `run`.",
 )
 @drives_options
 @override_option

@@ -36,6 +36,8 @@ _INDEX = 0.02
 # A sensor that is late by less than two samples is on time [s]; one whose noise is beyond this tells neither that nor
 # gears and currents (the lab's first inclinometer has 0.27 deg, its second 0.04) [rad].
 LATE, _NOISY = 0.04, math.radians(0.15)
+# Nor does a motor whose tilt for a turn is known worse than to this part: half and twice are 0.7 and 1.4 away.
+_UNCLEAR = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,13 +105,17 @@ def identify(
     seen = tuple(None if (moved := moves.of(j)) is None else features(moved) for j in range(1, count + 1))
     mounting, turned = _mounting(seen, file)
     order = range(count) if mounting is None else mounting.order
-    lags = [one.lag for one in seen if one is not None and math.isfinite(one.lag)]
+    lags = [one.lag for one in seen if one is not None and math.isfinite(one.lag) and one.error < _UNCLEAR]
     noises = [one.noise for one in seen if one is not None]
     noise = float(np.median(noises)) if noises else math.nan
     quiet = noise < _NOISY
     scales = _scales(seen, file, expected, types or {}, order, quiet=quiet)
     late = float(np.median(lags)) - expected.lag if lags and quiet and expected is not None else math.nan
     findings = [*_unmoved(moves, count), *_signs(seen, file), *_scale_findings(scales, file, seen), *turned]
+    findings += [Finding(
+        "unclear", f"its tilt for a turn is known to {100.0 * one.error:.0f} % only: gear, current and lateness were "
+        "not judged", "Does its tendon slide, is the sensor loose? Put it right and commission it anew.", (j,),
+    ) for j, one in enumerate(seen, start=1) if quiet and one is not None and one.error >= _UNCLEAR]  # fmt: skip
     if noises and not quiet:
         findings.append(Finding(
             "sensor noise", f"{math.degrees(noise):.2f} deg at rest, {math.degrees(_NOISY):.2f} at most: gears, "
@@ -151,7 +157,8 @@ def _scales(
     quiet: bool,
 ) -> tuple[Scale, ...]:
     """Return the scales of each motor: lines by the index, gear by the tilt, then the current's by the force."""
-    rows = [(j, one, file.drives[j]) for j, one in enumerate(seen) if one is not None and one.gain > 0.0 < one.force]
+    rows = [(j, one, file.drives[j]) for j, one in enumerate(seen)
+            if one is not None and one.gain > 0.0 < one.force and one.error < _UNCLEAR]  # fmt: skip
     scales = [Scale() for _ in seen]
     for j, one, entry in rows:
         lines = one.turn / entry.scale.counts_per_turn

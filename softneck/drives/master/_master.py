@@ -275,7 +275,6 @@ class Master:
         self._index = -1
         self._missing = 0
         self.wanted = self._from = self.setpoints
-        self.reference = ()
         if self._gate.last is not None:
             self._watches.align(self._gate.last.values, self.positions)
         try:

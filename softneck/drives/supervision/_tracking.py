@@ -24,8 +24,8 @@ from ._motor_models import Flags, Motion, row_of, variance_of
 
 # Time constants of the lags [s]: from one sample to what the slowest loop needs, each twice the one before.
 _LAGS = tuple(0.04 * 2.0**k for k in range(7))
-# How far astray a loop has to go: as far as any fault may lead the neck.
-_ASTRAY = math.radians(3.0)
+# How far astray a loop has to go: half of the 3 deg that a fault may lead the neck.
+_ASTRAY = math.radians(1.5)
 # Samples without a chart after a reference began, or tendons hung: where the loop was is no business of its reference.
 _SETTLE = 150
 # Of each run of a loop [s].

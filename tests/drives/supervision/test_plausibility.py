@@ -44,7 +44,8 @@ def in_time(name: str, seed: int) -> None:
         return
     assert found.event in TOLD, f"seed {seed}: {found}"
     assert found.after <= row.limit + 1e-6, f"seed {seed}: {found}"
-    assert found.beyond <= PATH, f"seed {seed}: {found}"
+    # A controller that freezes leaves its neck where it is: how far the path goes on is no fault's way.
+    assert found.beyond <= PATH or row.loop, f"seed {seed}: {found}"
 
 
 @pytest.mark.parametrize("name", QUICK)

@@ -15,12 +15,13 @@ from softneck.drives.logs._log_file import read_run_log
 from softneck.drives.logs._replay import logged_motion, replay
 from softneck.drives.logs._run_log import RunLogger, run_facts
 from softneck.drives.master import Phase
-from softneck.drives.supervision._calibrate import calibrate
+from softneck.drives.supervision._calibrate import _tracking, calibrate
 from softneck.drives.supervision._motor_models import Motion
 from softneck.drives.supervision._tracking import _SETTLE, LoopRun, TrackingCharts, fit_tracking, tracking_scores
+from softneck.signals.detection._threshold import Budget
 
 from ..bench import TS, Bench, T
-from ..plausible import Tracker, baseline, looped, watched
+from ..plausible import Tracker, baseline, experiments, looped, watched
 
 
 def run_of(seed: int, *, seconds: float = 40.0, off: float = 0.0, noise: float = 1e-3) -> LoopRun:
@@ -54,6 +55,30 @@ def test_a_loop_astray_raises_the_charts_of_its_side_alone(off: float, found: bo
     upper, lower = sums[::2], sums[1::2]
     assert bool(np.max(upper if off >= 0.0 else lower) > 50.0) is found
     assert np.max(lower if off >= 0.0 else upper) < 5.0
+
+
+def test_what_the_loop_is_off_by_itself_counts_for_no_fault() -> None:
+    """0.02 rad off where 0.026 are astray: taken for it, unless undisturbed runs were off by as much."""
+    model = fit_tracking([run_of(1), run_of(2)])
+    run = run_of(3, off=0.02)
+    for bias, astray in ((0.0, True), (0.02, False)):
+        scores, _ = tracking_scores(model._replace(bias=(bias, bias)), run)
+        assert bool(scores[len(scores) // 2 :].sum(axis=0).max() > 50.0) is astray
+    # Each was off in its second half: so is what the other one did not know of.
+    known = _tracking([run_of(1, off=0.02), run_of(2, off=0.02)], Budget(charts=4, step=TS), np.random.default_rng(0))
+    # Half of it goes into the weights, which have no constant, or not: at least half remains.
+    assert all(0.01 < bias < 0.03 for bias in known.bias)
+    assert all(np.isfinite(known.thresholds))
+
+
+@pytest.mark.slow
+def test_a_quarter_of_the_tilts_slow_error_counts_for_no_fault() -> None:
+    motions = experiments(None, 0.0)[:2]
+    slack = default_drives().limits.slack
+    part = calibrate(motions, cycle=T, sample_cycles=2, slack=slack)
+    whole = calibrate(motions, cycle=T, sample_cycles=2, slack=slack, known_bias=1.0)
+    assert whole.tilt_bias == pytest.approx([4.0 * bias for bias in part.tilt_bias])
+    assert min(whole.tilt_bias) > 0.0
 
 
 def test_without_a_reference_and_where_tendons_hung_nothing_is_compared() -> None:
