@@ -1,4 +1,4 @@
-"""One candidate, judged so far as its rank deserves: linear checks, a few loops, all loops, margins by experiment."""
+"""One candidate, judged so far as its rank deserves: linear checks, loops, margins by experiment."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from ._cases import Case, cases, run_case
 from ._task import Task
 
 #: From quick to slow; each includes what those before it found.
-LEVELS = ("linear", "few", "all", "margins")
+LEVELS = ("linear", "all", "margins")
 # Plants of the boxes on which linear checks are made: nominal, corners, samples; a certificate takes hundreds.
 _PLANTS = 48
 # The worse of two values of a metric is the smaller one of these.
@@ -50,7 +50,7 @@ class Ready:
         weights: of the motors in each axis's input; None for a neck.
         uncertain: what linear designs make of the task's plant, made once.
         own: plants that step.
-        few, all: the loops of the levels of that name.
+        all: the loops.
         kept: designs by kind and settings.
     """
 
@@ -59,7 +59,6 @@ class Ready:
     weights: Any
     uncertain: UncertainPlant
     own: tuple[OwnPlant, ...]
-    few: tuple[Case, ...]
     all: tuple[Case, ...]
     kept: dict[str, Any] = field(default_factory=dict)
 
@@ -88,7 +87,7 @@ def judge_candidate(task: Task, kind: str, settings: Mapping[str, Any], level: s
         if level == "margins":
             return Judgement(margin_metrics(task, ready, block, str(getattr(controller, "order", "sequential"))))
         order = str(getattr(controller, "order", "sequential"))
-        return Judgement(loop_metrics(task, ready, block, order, ready.few if level == "few" else ready.all))
+        return Judgement(loop_metrics(task, ready, block, order, ready.all))
     except SoftneckError as error:
         return Judgement({}, " ".join(str(error).split()))
 
@@ -104,7 +103,7 @@ def made_ready(task: Task) -> Ready:
         kept["ready"] = Ready(
             plants, judged(plants.sample_time), sources[0].weights,
             uncertain_plant(task.plant), own,
-            cases(own, task.asked, task.robot, few=True), cases(own, task.asked, task.robot, few=False),
+            cases(own, task.asked, task.robot),
         )  # fmt: skip
     return kept["ready"]
 

@@ -40,6 +40,10 @@ class Script:
         self.steps += 1
         return self.wanted if self.act is None else self.act(measured)
 
+    @property
+    def reference(self) -> tuple[float, ...]:
+        return getattr(self.act, "reference", ())
+
     def finished(self, index: int) -> bool:
         return index >= self.rows
 

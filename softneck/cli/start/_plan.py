@@ -146,8 +146,9 @@ def _controller(asked: Asked) -> Iterator[Step]:
                                       ("--budget", asked.budget), ("--seed", asked.seed))
              if value is not None for word in (name, str(value))]  # fmt: skip
     # --force goes on with the judgements of the same search, and replaces another one.
-    command = ("softneck", "tune", *plants, *words, "-o", "tune", "--force")
-    yield Step(stage="tune", command=command, makes=(BEST, _TUNED_LOOP, "tune/report.html"), reads=(*plants, *wanted))
+    command = ("softneck", "tune", *plants, *words, "--observer", OBSERVER, "-o", "tune", "--force")
+    yield Step(stage="tune", command=command, makes=(BEST, _TUNED_LOOP, "tune/report.html"),
+               reads=(*plants, OBSERVER, *wanted))  # fmt: skip
     eyes = (OBSERVER,) if observed() else ()
     certificate = "certificates/best.certificate.json"
     command = ("softneck", "verify", BEST, *plants, "--requirements", _REQUIREMENTS,
