@@ -1,8 +1,12 @@
-"""An owner's first day, command by command, on drives whose SDO answers take 50 ms over a wire at 1 Mbit/s."""
+"""An owner's first day, command by command, on drives whose SDO answers take 50 ms over a wire at 1 Mbit/s.
+
+Once they are obliging else, and once for each order of start-up with every other habit that they may have.
+"""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +14,7 @@ import numpy as np
 import pytest
 
 from softneck.cli import main
+from softneck.drives.running import _virtual
 from softneck.drives.simulated import _drives
 from softneck.drives.simulated._habits import WireHabits
 from softneck.drives.simulated._wire import Wire
@@ -20,18 +25,23 @@ from ..drives.conftest import project as project  # the fixture
 
 pytestmark = pytest.mark.slow
 SLOW = WireHabits(sdo_latency=0.05, queue=16, bitrate=1e6)
+STRICT = replace(
+    SLOW, write_only=True, one_abort=True, plain_pdo=True, plain_sdo=True, lacks=(0x1003, 0x1005, 0x1014, 0x1200)
+)
 
 
-@pytest.fixture
-def wires(monkeypatch: pytest.MonkeyPatch) -> list[Wire]:
+@pytest.fixture(params=["slow", "off", "enabled"])
+def wires(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> list[Wire]:
     """All wires that the simulated drives of a command hang on."""
     made: list[Wire] = []
+    habits = SLOW if request.param == "slow" else replace(STRICT, mode_when=request.param)
 
-    def slow(_habits: WireHabits, cycle: float) -> Wire:
-        made.append(Wire(SLOW, cycle))
+    def noted(habits: WireHabits, cycle: float) -> Wire:
+        made.append(Wire(habits, cycle))
         return made[-1]
 
-    monkeypatch.setattr(_drives, "Wire", slow)
+    monkeypatch.setattr(_drives, "Wire", noted)
+    monkeypatch.setattr(_virtual, "WireHabits", lambda: habits)
     return made
 
 

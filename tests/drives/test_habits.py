@@ -16,6 +16,8 @@ from softneck.drives.bus._link import VirtualLink
 from softneck.drives.commissioning._jog import jog_pilot
 from softneck.drives.logs._run_log import RunLogger
 from softneck.drives.master import Frame, Phase
+from softneck.drives.master._cia402 import DriveState, Goal
+from softneck.drives.master._fieldbus import BusSettings, Fieldbus
 from softneck.drives.running._bus_loop import Session, run_session
 from softneck.drives.simulated import SimulatedNeck, SimulatedSettings
 from softneck.drives.simulated._frame import CanFrame
@@ -278,6 +280,18 @@ def test_a_drive_that_counts_by_its_home_offset_at_once_is_not_zeroed() -> None:
     with pytest.raises(CheckFailedError, match="node 1: its position follows 607Ch at once"):
         zero(link, file, lambda: link.newest, guarding=preflight(link, file).guarding)
     assert [drive.axis.state for drive in link.neck.drives] == [DISABLED] * 3
+
+
+def test_a_drive_that_is_to_stop_is_not_asked_to_change_its_mode() -> None:
+    """Also where it is in Operation Enabled already."""
+    for goal, asked in ((Goal.ENABLED, 1), (Goal.STOPPED, 0), (Goal.OFF, 0), (Goal.READY, 0)):
+        bus = Fieldbus(BusSettings(late_modes=(2,)))
+        bus.receive(0.0, [Frame(0x182, b"\x37\x02" + bytes(6))])
+        assert bus.drives[1].state is DriveState.ENABLED
+        frames = bus.send([goal] * 3, [0] * 3)
+        assert [frame.identifier for frame in frames].count(0x602) == asked
+        # And once is enough: the answer takes its time.
+        assert 0x602 not in [frame.identifier for frame in bus.send([goal] * 3, [0] * 3)]
 
 
 # -- the master -------------------------------------------------------------------------------------------------------

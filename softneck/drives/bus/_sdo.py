@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 import struct
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,11 +26,6 @@ _MAY_BE_UNTOLD = frozenset({0x6060, 0x6098, 0x60C2, 0x60FF})
 logging.getLogger("canopen").addHandler(logging.NullHandler())
 
 
-# An object has subindices up to FEh (CiA 301, 7.4.1).
-_MOST_ENTRIES = 254
-_ENTRIES = re.compile(r"^\s*NrOfEntries\s*[=:]\s*\+?(\d+)", re.IGNORECASE | re.MULTILINE)
-
-
 class SdoError(SoftneckError):
     """A drive refused an object or did not answer."""
 
@@ -52,9 +46,7 @@ def load_eds(profile: str, path: Path | None = None) -> ObjectDictionary:
 
     source = path or Path(__file__).parent / "eds" / f"{profile}.eds"
     try:
-        many = [int(said) for said in _ENTRIES.findall(settings_text(source, MOST_EDS))]
-        if any(count > _MOST_ENTRIES for count in many):  # each of them is looked for
-            raise ValueError(f"NrOfEntries of {max(many)}, where an object has {_MOST_ENTRIES} at most")
+        settings_text(source, MOST_EDS)  # canopen opens it again, whatever its size
         dictionary = canopen.import_od(str(source))
     except Exception as error:  # canopen raises what its parser meets: KeyError, ValueError, configparser's
         raise FileFormatError(
