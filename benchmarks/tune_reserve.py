@@ -4,10 +4,10 @@
 
 `tune` sees grey boxes of two payloads; the robot is not quite as they are. On each neck controllers are drawn around
 the start of `tune`'s search, with what a user would record (benchmarks/tune.py). Those whose loops, as `tune` judges
-them, are at most half beyond each limit are run on the neck itself. The reserve of a requirement is by how much the
-worst neck is beyond what was seen, for 90 % of the candidates that come near the limit. It is taken from all necks but
-one; on that one it is counted how many of the candidates that keep a requirement truly do, without the reserve and with
-it. The last row is of all necks: [reserve] of softneck/tuning/requirements.toml. Results are kept in
+them, are at most half beyond each limit are run on the neck itself. The reserve of a requirement is the least with
+which 95 % of the candidates that keep the limit less it, as `tune` sees them, truly keep it. It is taken from all necks
+but one; on that one it is counted how many of the candidates that keep a requirement truly do, without the reserve and
+with it. The last row is of all necks: [reserve] of softneck/tuning/requirements.toml. Results are kept in
 `build/tune_reserve`; --fresh after a change.
 """
 
@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import shutil
 import sys
 from dataclasses import replace
@@ -35,10 +34,10 @@ OUT = Path("build/tune_reserve")
 KINDS = ("pi", "pid", "lqg", "ncf")
 METRICS = {"overshoot": "neck.overshoot_pct", "rise": "neck.rise_s", "steady": "neck.steady_rms_deg",
            "circle": "track.circle_rms_deg", "ahead": "track.ahead_rms_deg"}  # fmt: skip
-# What is further beyond a limit no search returns; what is below this part of it says nothing of those near it.
-_BEYOND, _NEAR = 1.5, 0.5
-# Fewer candidates near a limit say nothing of it.
-_MOST, _FEW = 0.9, 5
+# What is further beyond a limit no search returns.
+_BEYOND = 1.5
+# So many that keep a limit less its reserve truly keep it; of fewer candidates nothing is said.
+_TRUE, _FEW = 0.95, 5
 
 # Of a candidate: goal -> [what `tune` saw, what the neck does].
 Pairs = list[dict[str, list[float]]]
@@ -68,16 +67,19 @@ def pairs(neck: str, count: int) -> Pairs:
 
 
 def reserve(found: dict[str, Pairs], goal: str) -> float:
-    """Return by how much the worst neck is beyond what was seen, for most candidates that come near the limit.
+    """Return the least reserve, in hundredths of the limit, with which nearly all that keep the limit less it are true.
 
-    None where no candidate would keep it: then plants do not show what the neck does, and no reserve mends that.
+    None where too few candidates would keep it: then plants do not show what the neck does, and no reserve mends that.
     """
-    limit, beyond = GOALS[goal], [0.0]
-    for rows in found.values():
-        more = [true - seen for seen, true in (row[goal] for row in rows) if seen >= _NEAR * limit]
-        beyond += [float(np.quantile(more, _MOST))] if len(more) >= _FEW else []
-    back = math.ceil(100.0 * max(beyond)) / 100.0
-    return back if any(row[goal][0] <= limit - back for rows in found.values() for row in rows) else 0.0
+    limit = GOALS[goal]
+    every = [row[goal] for rows in found.values() for row in rows]
+    for back in (limit * k / 100.0 for k in range(100)):
+        kept = [true <= limit for seen, true in every if seen <= limit - back]
+        if len(kept) < _FEW:
+            break
+        if np.mean(kept) >= _TRUE:
+            return back
+    return 0.0
 
 
 def told(rows: Pairs, back: dict[str, float]) -> str:

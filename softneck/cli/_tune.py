@@ -12,7 +12,7 @@ from softneck.core import CheckFailedError, file_hash
 from .shared._console import note, print_json, print_table, progress
 from .shared._options import force_option, json_option
 from .shared._plants import opened_plants
-from .shared._robot import robot_option
+from .shared._robot import load_of, robot_option
 
 if TYPE_CHECKING:
     from softneck.tuning._tune import Tuned
@@ -42,6 +42,7 @@ def _print_requirements(context: click.Context, _: click.Parameter, value: bool)
     "--budget", type=click.IntRange(min=1), default=_BUDGET, show_default=True, metavar="EVALUATIONS",
     help="Judgements of candidates, by linear checks, loops or experiments.",
 )  # fmt: skip
+@click.option("--observer", type=_PATH, help="Of the loop. [default: a Kalman filter over the nominal plant]")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the search and its noise.")
 @click.option("--workers", type=click.IntRange(min=0), help="Local processes; 0: this one. [default: one a core]")
 @click.option("--resume", is_flag=True, help="Refuse to begin anew where DIR holds nothing of the same search.")
@@ -54,6 +55,7 @@ def command(
     requirements: Path | None,
     kinds: str | None,
     budget: int,
+    observer: Path | None,
     seed: int,
     workers: int | None,
     resume: bool,
@@ -89,11 +91,12 @@ def command(
     asked = read_tune_requirements(requirements, robot=_robot_of(things), stepping=stepping)
     if not as_json:
         note("requirements: " + "; ".join(asked.lines()))
+    eyes = None if observer is None else load_of(observer, robot, role="observer")
     files = {f"plant {k}": item for k, item in enumerate(plants, start=1) if item.is_file()}
     with progress("tune", quiet=as_json) as report:
         found = tune(
-            things, asked, kinds=tuple(kinds.split(",")) if kinds else (), budget=budget, seed=seed, workers=workers,
-            folder=output, resume=resume, force=force, progress=report,
+            things, asked, kinds=tuple(kinds.split(",")) if kinds else (), budget=budget, observer=eyes, seed=seed,
+            workers=workers, folder=output, resume=resume, force=force, progress=report,
             files={role: (str(item), file_hash(item)) for role, item in files.items()},
         )  # fmt: skip
     steps = {name: item if item.exists() else str(item) for name, item in zip(things, plants, strict=True)

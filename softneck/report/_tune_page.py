@@ -93,11 +93,12 @@ def _result(found: Tuned, steps: Chart) -> Section:
     ]
     text += [f"{kind} was left out: {why}" for kind, why in found.dropped.items()]
     rows = requirement_rows(found)
-    tables = [Table("Requirements", ["metric", "bound", "limit", "value", ""], [row[:5] for row in rows])]
+    tables = [Table("Requirements", ["metric", "bound", "limit", "value", "verdict"], [row[:5] for row in rows])]
     text += notes(found)
     if found.prices:
         told = [[p.metric, f"{p.limit:.3g}", p.other, _text(p.least)] for p in found.prices]
-        tables.append(Table("What it costs, all else held", ["requirement", "at", "costs", "at least"], told))
+        held = "all else held" if found.prices[0].held else "all else no worse than in the best"
+        tables.append(Table(f"What it costs, {held}", ["requirement", "at", "costs", "at least"], told))
     return Section("Best controller", charts=[steps], tables=tables, method=text)
 
 

@@ -49,22 +49,17 @@ class Case:
     circle: bool = False
 
 
-def cases(own: Sequence[OwnPlant], asked: TuneRequirements, robot: Robot, *, few: bool) -> tuple[Case, ...]:
-    """Return the loops of a level: a few with the ends of the payloads, or all."""
+def cases(own: Sequence[OwnPlant], asked: TuneRequirements, robot: Robot) -> tuple[Case, ...]:
+    """Return all loops."""
     table, small = asked.certificate.neck, asked.track["small_part"]
     payloads = sorted({float(kg) for kg in table["payloads_kg"]})
     angles = [math.radians(a) for a in table["orientations_deg"]] if len(robot.outputs.names) > 1 else [0.0]
     found = []
     for number, plant in enumerate(own):
-        heavy = payloads if plant.payload else [0.0]
-        for kg in [heavy[0], heavy[-1]] if few and len(heavy) > 1 else heavy:
-            steps = [
-                Case(number, kg, angle, noise=True) for angle in (angles[:: max(1, len(angles) - 1)] if few else angles)
-            ]
-            if not few:
-                steps += [Case(number, kg, angle, part=small, noise=True) for angle in (angles[0], angles[-1])]
-                steps.append(Case(number, kg, angles[0], noise=True, late=True))
-            found += steps
+        for kg in payloads if plant.payload else [0.0]:
+            found += [Case(number, kg, angle, noise=True) for angle in angles]
+            found += [Case(number, kg, angle, part=small, noise=True) for angle in (angles[0], angles[-1])]
+            found.append(Case(number, kg, angles[0], noise=True, late=True))
             if robot.is_neck:
                 found.append(Case(number, kg, circle=True))
     return tuple(dict.fromkeys(found))

@@ -1,4 +1,4 @@
-"""One candidate, judged so far as its rank deserves: linear checks, a few loops, all loops, margins by experiment."""
+"""One candidate, judged so far as its rank deserves: linear checks, loops, margins by experiment."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ import numpy as np
 from softneck.core import KINDS, SoftneckError, Vector, resolve
 from softneck.core._kinds import make_settings
 from softneck.design.linear._axis_settings import AxisSettings
-from softneck.design.linear._loop_settings import LoopSettings
 from softneck.design.linear._pi import PiSettings
 from softneck.design.plants._uncertain import UncertainPlant, uncertain_plant
 from softneck.runtime import Block
@@ -33,7 +32,7 @@ from ._cases import Case, cases, run_case
 from ._task import Task
 
 #: From quick to slow; each includes what those before it found.
-LEVELS = ("linear", "few", "all", "margins")
+LEVELS = ("linear", "all", "margins")
 # Plants of the boxes on which linear checks are made: nominal, corners, samples; a certificate takes hundreds.
 _PLANTS = 48
 # The worse of two values of a metric is the smaller one of these.
@@ -50,7 +49,7 @@ class Ready:
         weights: of the motors in each axis's input; None for a neck.
         uncertain: what linear designs make of the task's plant, made once.
         own: plants that step.
-        few, all: the loops of the levels of that name.
+        all: the loops.
         kept: designs by kind and settings.
     """
 
@@ -59,7 +58,6 @@ class Ready:
     weights: Any
     uncertain: UncertainPlant
     own: tuple[OwnPlant, ...]
-    few: tuple[Case, ...]
     all: tuple[Case, ...]
     kept: dict[str, Any] = field(default_factory=dict)
 
@@ -88,7 +86,7 @@ def judge_candidate(task: Task, kind: str, settings: Mapping[str, Any], level: s
         if level == "margins":
             return Judgement(margin_metrics(task, ready, block, str(getattr(controller, "order", "sequential"))))
         order = str(getattr(controller, "order", "sequential"))
-        return Judgement(loop_metrics(task, ready, block, order, ready.few if level == "few" else ready.all))
+        return Judgement(loop_metrics(task, ready, block, order, ready.all))
     except SoftneckError as error:
         return Judgement({}, " ".join(str(error).split()))
 
@@ -104,7 +102,7 @@ def made_ready(task: Task) -> Ready:
         kept["ready"] = Ready(
             plants, judged(plants.sample_time), sources[0].weights,
             uncertain_plant(task.plant), own,
-            cases(own, task.asked, task.robot, few=True), cases(own, task.asked, task.robot, few=False),
+            cases(own, task.asked, task.robot),
         )  # fmt: skip
     return kept["ready"]
 
@@ -123,12 +121,6 @@ def designed(task: Task, ready: Ready, kind: str, settings: Mapping[str, Any]) -
         # The others read more of a family than its plants.
         ready.kept[key] = made.design(ready.uncertain if isinstance(made, AxisSettings | PiSettings) else task.plant)
     return ready.kept[key]
-
-
-def assumed(task: Task, kind: str, settings: Mapping[str, Any]) -> dict[str, float]:
-    """Return what of the paper's neck a design takes where neither settings nor plants say otherwise."""
-    made = make_settings(resolve(KINDS[kind].settings), settings)
-    return made.assumed(made_ready(task).uncertain) if isinstance(made, LoopSettings) else {}
 
 
 def linear_metrics(task: Task, ready: Ready, controller: Any) -> dict[str, float]:

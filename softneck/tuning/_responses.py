@@ -54,7 +54,7 @@ def kept_with(task: Task, item: Candidate, observer: Any, bounds: tuple[Requirem
     order = str(getattr(controller, "order", "sequential"))
     worst: dict[str, float] = {}
     try:
-        for case in (case for case in ready.few if not case.circle):
+        for case in (case for case in ready.all if not case.circle and not case.late and case.part == 1.0):
             loop = replace(loop_of(case, ready.own[case.plant], block, order, task), observer=BlockPart(eyes))
             worst |= _worst(worst, judge_loop(loop)[0])
     except SoftneckError:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +22,8 @@ _OBJECTIVES = (
 )  # fmt: skip
 # Limits at which the price of a requirement is told, in parts of its own.
 _LOOSER = (1.0, 1.25, 1.5, 2.0, 3.0, 5.0)
+# And that of the best candidate, up to so many.
+_LOOSEST = 100.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,12 +35,14 @@ class Price:
         limit: to which it is loosened.
         other: the metric that is paid with.
         least: its best value; None where no candidate keeps all others.
+        held: whether all others are held; else they are no worse than in the best candidate.
     """
 
     metric: str
     limit: float
     other: str
     least: float | None
+    held: bool = True
 
 
 def objectives(items: Sequence[Candidate]) -> list[str]:
@@ -93,25 +97,52 @@ def binding(
 
 
 def prices(items: Sequence[Candidate], bounds: Sequence[Requirement], metric: str, *, tested: bool) -> list[Price]:
-    """Return the curve of what the requirement on `metric` costs: of the other that is broken most when it is held."""
+    """Return the curve of what the requirement on `metric` costs: of the other that is broken most when it is held.
+
+    Where no candidate keeps all the others, they are to be no worse than in the best one.
+    """
     item = next((bound for bound in bounds if bound.metric == metric), None)
-    if item is None:
+    best = min(items, key=lambda one: one.cost(bounds, tested=tested), default=None)
+    if item is None or best is None:
         return []
-    other = _paid_with(items, bounds, item, tested=tested)
-    if other is None:
-        return []
-    found = []
-    for part in _LOOSER:
-        limit = item.limit / part if item.bound == "min" else item.limit * part
-        allowed = {metric: part, other.metric: math.inf}
-        kept = [
-            one.metrics[other.metric]
-            for one in items
-            if all(value <= allowed.get(name, 1.0) for name, value in one.ratios(bounds, tested=tested).items())
-        ]
-        least = (max(kept) if other.bound == "min" else min(kept)) if kept else None
-        found.append(Price(metric, limit, other.metric, least))
-    return found
+    now = best.ratios(bounds, tested=tested)
+    paid = _paid_with(items, bounds, item, tested=tested)
+    for other, rest in ((paid, {}), (_broken_beside(bounds, item, now), now)):
+        if other is None:
+            continue
+        found = []
+        for part in sorted({*_LOOSER, max(1.0, min(now.get(metric, 1.0), _LOOSEST))}):
+            least = _least(items, bounds, {metric: part, other.metric: math.inf}, rest, other, tested=tested)
+            limit = item.limit / part if item.bound == "min" else item.limit * part
+            found.append(Price(metric, limit, other.metric, least, held=not rest))
+        if any(price.least is not None for price in found):
+            return found
+    return []
+
+
+def _least(
+    items: Sequence[Candidate], bounds: Sequence[Requirement], allowed: Mapping[str, float], now: Mapping[str, float],
+    other: Requirement, *, tested: bool,
+) -> float | None:  # fmt: skip
+    """Return the best value of `other` of the candidates that keep what is allowed, and all else or what is now."""
+    kept = [
+        one.metrics[other.metric]
+        for one in items
+        if other.metric in one.metrics
+        and all(
+            value <= allowed.get(name, max(1.0, now.get(name, 1.0)))
+            for name, value in one.ratios(bounds, tested=tested).items()
+        )
+    ]
+    return (max(kept) if other.bound == "min" else min(kept)) if kept else None
+
+
+def _broken_beside(bounds: Sequence[Requirement], item: Requirement, now: Mapping[str, float]) -> Requirement | None:
+    """Return the requirement that the best candidate breaks most beside `item`, or its rise: speed pays for all."""
+    others = {name: value for name, value in now.items() if name != item.metric and 1.0 < value < math.inf}
+    rises = [name for name in ("neck.rise_s", "step.rise_s") if name in now and name != item.metric]
+    name = max(others, key=lambda key: others[key]) if others else next(iter(rises), None)
+    return next((bound for bound in bounds if bound.metric == name), None)
 
 
 def _paid_with(
@@ -139,7 +170,7 @@ def in_words(price: Price) -> str:
     what = f"{price.metric} {price.limit:.3g}"
     if price.least is None:
         return f"{what}: no candidate keeps the rest"
-    return f"{what} costs {price.other} {price.least:.3g}"
+    return f"{what} costs {price.other} {price.least:.3g}" + ("" if price.held else " and all else as it is")
 
 
 def _small(name: str, value: float) -> float:

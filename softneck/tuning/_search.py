@@ -1,10 +1,12 @@
 """Successive halving over kinds and settings: generations of candidates, judged further the better they are.
 
-Each kind has its own CMA-ES over the cube of its settings (Hansen and Ostermeier 2001, Evolutionary Computation
-9:159), which knows ranks alone, so that candidates of different levels are told to it as they are. All kinds are judged
-at their start; after that and after each round half of them are left (successive halving: Jamieson and Talwalkar 2016,
-AISTATS), and of a round's candidates half go on to the next level. All is asked for in rounds and told in order: the
-number of workers changes nothing.
+Each kind begins as fast as its margins allow: its bound on Ms is led there by halves. All kinds are judged by loops
+there; after that and after each round half of them are left (successive halving: Jamieson and Talwalkar 2016, AISTATS).
+Each kind has its own CMA-ES over the cube of its settings (Hansen and Ostermeier 2001, Evolutionary Computation 9:159),
+which knows ranks alone, so that candidates of different levels are told to it as they are. What holds so far goes on
+to the next level, and of a round's candidates at least half. At the end the best is refined: by neighbours to all
+sides, nearer where none of these is better. All is asked for in rounds and told in order: the number of workers changes
+nothing.
 """
 
 from __future__ import annotations
@@ -29,16 +31,21 @@ from ._task import Task
 # Candidates of a kind in each round: CMA-ES' own 4 + 3 ln n for two to four settings, and even.
 _GENERATION = 6
 #: The first step of the search, as a part of each range.
-STEP = 0.25
+STEP = 0.15
+# By so much the bound on Ms is moved first, as a part of its range, and so often by half as much.
+_LED_BY, _LED = 0.24, 3
+# The last part of the budget is for the neighbours of the best, so far away first and last.
+_REFINED, _AWAY, _NEAREST = 0.3, 0.08, 0.005
 # Kinds that are never left out, and candidates whose margins are found by experiment at the end.
 _LEAST_KINDS, _FINALS = 2, 3
-# What of a candidate without linear form is not certified beside recordings counts as so far beyond its limit.
-_NOT_CERTIFIED = 2.0
 # What breaks ties: all ratios together weigh this part of the largest one.
 _REST = 0.02
-# No ratio counts for more.
-_FAR = 1e3
+# No requirement adds more, however far it is beyond its limit: what is not certified, not known or never reached is as
+# bad in whatever way that is told, and does not outweigh all the rest.
+_MOST = 4.0
 _MARGINS = ("axes.gain_margin", "axes.delay_margin_ms")
+# Of what only a controller with a linear form has all.
+_LINEAR = ("axes.", "mimo.", "robust.")
 
 
 @dataclass(slots=True, eq=False)
@@ -74,35 +81,43 @@ class Candidate:
         }
 
     def ratios(self, bounds: Sequence[Requirement], *, tested: bool) -> dict[str, float]:
-        """Return requirement -> value over limit (limit over value of a least one); 1 is the limit itself."""
-        found = {}
+        """Return requirement -> value over limit (limit over value of a least one); 1 is the limit itself.
+
+        Of a controller without linear form margins are not certified: beside recordings, and where they are asked for,
+        they are broken (`verify` says so), else at their limit, better than which nobody has seen them.
+        """
+        found: dict[str, float] = {}
+        blind = bool(self.metrics) and "axes.sensitivity" not in self.metrics
         for item in bounds:
-            value = self.metrics.get(item.metric)
-            if value is None or math.isnan(value):
-                if tested and item.metric in _MARGINS and "axes.sensitivity" not in self.metrics and self.metrics:
-                    found[item.metric] = _NOT_CERTIFIED
-                continue
-            found[item.metric] = max(found.get(item.metric, 0.0), ratio(item, value))
+            value = self.metrics.get(item.metric, math.nan)
+            if blind and item.metric.startswith(_LINEAR):
+                known = 1.0 if math.isnan(value) else max(1.0, ratio(item, value))
+                found[item.metric] = math.inf if tested or item.asked else known
+            elif not math.isnan(value):
+                found[item.metric] = max(found.get(item.metric, 0.0), ratio(item, value))
         return found
 
     def cost(self, bounds: Sequence[Requirement], *, tested: bool) -> float:
         """Return how far requirements are beyond their limits; at most 1 where all known ones hold.
 
-        Where all hold, the largest ratio; else 1 and what is beyond 1 of each, added up: few are broken rather than all
-        a little, as with any exact penalty (Nocedal and Wright 2006, sec. 17.2).
+        Where all hold, the largest ratio; else 1 and what is beyond 1 of each, x/(1 + x/4), added up: few are broken
+        rather than all a little, as with any exact penalty (Nocedal and Wright 2006, sec. 17.2).
         """
         found = list(self.ratios(bounds, tested=tested).values())
         if self.error or not found:
             return math.inf
-        beyond = sum(min(value, _FAR) - 1.0 for value in found if value > 1.0)
-        if beyond > 0.0:
-            return 1.0 + beyond
-        return (1.0 - _REST) * max(found) + _REST * float(np.mean(found))
+        beyond = sum(_saturated(value - 1.0) for value in found if value > 1.0)
+        rest = _REST * float(np.mean([min(value, 1.0) for value in found]))
+        return (1.0 + beyond if beyond > 0.0 else (1.0 - _REST) * max(found)) + rest
 
     def holds(self, bounds: Sequence[Requirement], *, tested: bool) -> bool:
         """Whether every requirement that is known is kept."""
         found = self.ratios(bounds, tested=tested)
         return not self.error and bool(found) and max(found.values()) <= 1.0
+
+
+def _saturated(beyond: float) -> float:
+    return _MOST if math.isinf(beyond) else beyond / (1.0 + beyond / _MOST)
 
 
 def ratio(item: Requirement, value: float) -> float:
@@ -143,24 +158,21 @@ class Search:
         """Search until the budget is spent."""
         optimisers = {space.kind: _optimiser(space, self.task.seed, i) for i, space in enumerate(self.spaces)}
         # Only what steps has margins by experiment.
-        levels = LEVELS[: 3 if self.task.own else 1]
+        levels = LEVELS[:-1] if self.task.own else LEVELS[:1]
         # A small budget is for the starts first.
         finals = min(self.finals, max(0, self.budget - len(levels) * len(self.spaces))) if self.task.own else 0
-        alive, before = self._begun(levels, finals), -1
-        while self._left(finals) > 0 and alive and before < len(self.spent):
+        alive, before = self._begun(levels, finals, optimisers), -1
+        while self._left(finals + round(_REFINED * self.budget)) > 0 and alive and before < len(self.spent):
             before = len(self.spent)
             generation = {space.kind: self._asked(space, optimisers[space.kind]) for space in alive}
-            every = [item for each in generation.values() for item in each]
-            for level in levels:
-                self._judge(every, level, finals)
-                every = self._better(every, level)
+            self._through([item for each in generation.values() for item in each], levels, finals)
             for space in alive:
                 _tell(optimisers[space.kind], generation[space.kind], self._key)
             alive = self._halved(alive)
+        self._refined(levels, finals)
         if finals:
-            # Of what breaks a requirement already margins say only how the best one stands.
-            best = self.ranked()[:finals]
-            self._judge([item for item in best if self.cost(item) <= 1.0] or best[:1], "margins", 0)
+            # Of those that loops have judged: what was judged further comes first.
+            self._judge([item for item in self.ranked() if item.level == levels[-1]][:finals], "margins", 0)
 
     def ranked(self) -> list[Candidate]:
         """Return all candidates that have metrics, the best first."""
@@ -179,20 +191,84 @@ class Search:
         return [item for item in self.candidates.values() if item.kind == kind]
 
     def _key(self, item: Candidate) -> tuple[int, float]:
-        """Return the rank: what was judged further first, `margins` as `all`; then the cost."""
-        level = min(LEVELS.index(item.level), 2) if item.level else -1
-        return -level, self.cost(item)
+        """Return the rank: what was judged further first, then the cost: of one level all have the same metrics."""
+        return -LEVELS.index(item.level) if item.level else 1, self.cost(item)
 
     def _left(self, reserved: int) -> int:
         return self.budget - reserved - len(self.spent)
 
-    def _begun(self, levels: Sequence[str], finals: int) -> list[Space]:
-        """Judge the start of every kind, each by itself: what it compiles the others then find; return those left."""
+    def _begun(self, levels: Sequence[str], finals: int, optimisers: dict[str, Any]) -> list[Space]:
+        """Judge each kind where it begins; return those left, with their optimisers there."""
         starts = {space.kind: self._candidate(space, space.start) for space in self.spaces}
-        for level in levels:
+        self._judge(list(starts.values()), levels[0], finals)
+        starts = self._led(starts, finals + (len(levels) - 1) * len(starts))
+        for level in levels[1:]:
             self._judge(list(starts.values()), level, finals)
         self.dropped |= {kind: item.error for kind, item in starts.items() if item.error}
+        for number, space in enumerate(self.spaces):
+            if not np.array_equal(starts[space.kind].x, space.start):
+                optimisers[space.kind] = _optimiser(space, self.task.seed, number, starts[space.kind].x)
         return self._halved([space for space in self.spaces if space.kind not in self.dropped])
+
+    def _led(self, starts: dict[str, Candidate], reserved: int) -> dict[str, Candidate]:
+        """Return the starts with their bound on Ms as large as the margins allow, by halves."""
+        at, best, step = dict(starts), dict(starts), _LED_BY
+        spaces = {space.kind: space for space in self.spaces}
+        # A controller without linear form shows no margin to go by.
+        led = {
+            kind: space.led for kind, space in spaces.items()
+            if space.led is not None and (starts[kind].error or "axes.sensitivity" in starts[kind].metrics)
+        }  # fmt: skip
+        for _ in range(_LED):
+            for kind, k in led.items():
+                x = at[kind].x.copy()
+                if at[kind].error:
+                    # What could not be designed is given more room: bolder, and slower.
+                    x[[0, k]] += step
+                else:
+                    x[k] += step if self._robust(at[kind]) else -step
+                at[kind] = self._candidate(spaces[kind], np.clip(x, 0.0, 1.0))
+            self._judge([at[kind] for kind in led], LEVELS[0], reserved)
+            for kind, k in led.items():
+                if at[kind].level:
+                    best[kind] = min(best[kind], at[kind], key=lambda item: self._led_key(item, k))
+            step /= 2.0
+        return best
+
+    def _robust(self, item: Candidate) -> bool:
+        """Return whether the margins that are known hold."""
+        found = item.ratios(self.task.asked.bounds, tested=self.tested)
+        return all(value <= 1.0 for name, value in found.items() if name.startswith(_LINEAR))
+
+    def _led_key(self, item: Candidate, k: int) -> tuple[bool, bool, float]:
+        """Return the rank of a start: designed, robust, and of robust ones the boldest, else the most careful."""
+        robust = self._robust(item)
+        return not item.level, not robust, -float(item.x[k]) if robust else float(item.x[k])
+
+    def _through(self, items: Sequence[Candidate], levels: Sequence[str], finals: int) -> None:
+        """Judge candidates level by level, the better ones further."""
+        left = list(items)
+        for level in levels:
+            self._judge(left, level, finals)
+            left = self._better(left, level)
+
+    def _refined(self, levels: Sequence[str], finals: int) -> None:
+        """Judge the neighbours of the best until the budget is spent, or none near it is better.
+
+        To both sides along directions that are drawn anew: where two limits meet, one setting alone betters nothing
+        (Gratton et al. 2015, SIAM J. Optim. 25:1515).
+        """
+        away, rng = _AWAY, np.random.default_rng(self.task.seed)
+        spaces = {space.kind: space for space in self.spaces}
+        while self._left(finals) > 0 and away > _NEAREST:
+            best = next(iter(self.ranked()), None)
+            if best is None or best.level != levels[-1]:
+                return
+            along = np.linalg.qr(rng.standard_normal((best.x.size, best.x.size)))[0]
+            near = [best.x + sign * away * direction for direction in along for sign in (1.0, -1.0)]
+            self._through([self._candidate(spaces[best.kind], np.clip(x, 0.0, 1.0)) for x in near], levels, finals)
+            if self.ranked()[0] is best:
+                away /= 2.0
 
     def _halved(self, alive: list[Space]) -> list[Space]:
         """Return the better half of the kinds, in their order."""
@@ -211,11 +287,12 @@ class Search:
         return self.candidates.setdefault((job.kind, job.settings), Candidate(space.kind, settings, np.array(x)))
 
     def _better(self, items: list[Candidate], level: str) -> list[Candidate]:
-        """Return the better half of those that were judged at a level."""
-        good = sorted((item for item in items if item.level == level and not item.error), key=self.cost)
+        """Return those judged at a level that hold so far, as none of them is better there, and at least half."""
+        good = sorted((item for item in items if item.level == level and not item.error),
+                      key=lambda item: max(1.0, self.cost(item)))  # fmt: skip
         # Equal candidates are one.
         good = list({id(item): item for item in good}.values())
-        return good[: math.ceil(len(good) / 2)]
+        return good[: max(math.ceil(len(good) / 2), sum(self.cost(item) <= 1.0 for item in good))]
 
     def _judge(self, items: Sequence[Candidate], level: str, reserved: int) -> None:
         """Judge candidates at a level, as many as the budget allows; those in the log are read from it."""
@@ -287,13 +364,13 @@ def in_words(item: Candidate, cost: float) -> str:
     )
 
 
-def _optimiser(space: Space, seed: int, number: int) -> Any:
+def _optimiser(space: Space, seed: int, number: int, mean: np.ndarray | None = None) -> Any:
     from cmaes import CMA
 
     n = len(space.dimensions)
     return CMA(
-        mean=space.start, sigma=STEP, bounds=np.array([[0.0, 1.0]] * n), population_size=_GENERATION,
-        seed=(1000 * seed + number) % 2**32,
+        mean=space.start if mean is None else mean, sigma=STEP, bounds=np.array([[0.0, 1.0]] * n),
+        population_size=_GENERATION, seed=(1000 * seed + number) % 2**32,
     )  # fmt: skip
 
 

@@ -17,9 +17,9 @@ from softneck.verification._own_plants import OwnPlant, is_own_plant
 from softneck.verification._scale import scaled
 from softneck.verification._verify import sources_of, standing_for
 
-from ._beforehand import refuse_impossible
+from ._beforehand import quickest, refuse_impossible
 from ._digest import digest_of
-from ._judge import assumed, designed, made_ready
+from ._judge import LEVELS, designed, made_ready
 from ._log import Log
 from ._requirements import TuneRequirements, make_tune_requirements, read_tune_requirements, with_certificate
 from ._responses import kept_with
@@ -89,6 +89,7 @@ def tune(
     *,
     kinds: Sequence[str] = (),
     budget: int = BUDGET,
+    observer: Any = None,
     seed: int = 0,
     workers: int | None = None,
     folder: Path | None = None,
@@ -107,6 +108,8 @@ def tune(
         requirements: what is asked, also as a file or a table like one; the defaults if not given.
         kinds: of controllers; `KINDS_SEARCHED` if none is named.
         budget: judgements of candidates.
+        observer: that the loop shall have, if the requirements are kept with it; else a Kalman filter over the nominal
+            plant.
         seed: of the search and of the noise in its loops.
         workers: local processes, as many as cores if not given; 0 for this process.
         folder: where judgements are kept as they come; the same call goes on with what is there.
@@ -124,15 +127,20 @@ def tune(
     require_whole("seed", seed, 0, 2**31 - 2)
     chosen = tuple(dict.fromkeys(kinds or KINDS_SEARCHED))
     task = task_of(plants, requirements, seed)
+    if observer is not None:
+        require_same_robot(robot_of(observer), task.robot, "the observer and the plants")
     refuse_impossible(task.asked, task.plant)
-    each = spaces(chosen, rise=_aimed(task), cocontraction=task.cocontraction, neck=task.robot.is_neck)
+    each = spaces(
+        chosen, rise=_aimed(task), cocontraction=task.cocontraction, neck=task.robot.is_neck, least=quickest(task.plant)
+    )
     task = replace(task, digest=digest_of(task, chosen, files))
     made_ready(task)  # a plant that does not fit is said before anything is searched
     log = Log(folder, task.digest, resume=resume, force=force)
     with crew(workers, None) as members:
         search = Search(task, each, members, log, budget, lambda done, text: progress(0.9 * done, text))
         search.run()
-    return _finished(search, files, lambda done, text: progress(0.9 + 0.1 * done, text))
+    eyes = _observer(task) if observer is None else observer
+    return _finished(search, eyes, files, lambda done, text: progress(0.9 + 0.1 * done, text))
 
 
 def task_of(
@@ -192,7 +200,7 @@ def _aimed(task: Task) -> float:
     return _USUAL_RISE / min(float(box.nominal[1]) for box in source.axes)
 
 
-def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progress: Progress) -> Tuned:
+def _finished(search: Search, eyes: Any, files: Mapping[str, tuple[str, str]] | None, progress: Progress) -> Tuned:
     """Return the result of a search: its best verified, and what it means for the requirements."""
     task, ranked = search.task, search.ranked()
     if not ranked:
@@ -200,8 +208,8 @@ def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progr
         if len(search.dropped) < len(search.spaces):
             raise CheckFailedError(f"the budget ended before any candidate could be judged ({why}); give a larger one.")
         raise SettingsError(f"no candidate could be judged ({why}).")
-    deepest = max(range(4), key=lambda k: any(_level(item) >= k for item in ranked) * k)
-    compared = [item for item in ranked if _level(item) >= min(deepest, 2)]
+    looped_ones = [item for item in ranked if _level(item) >= 1]
+    compared = looped_ones or ranked
     best, verification, controller = _verified(search, compared, files, progress)
     bounds = task.asked.bounds
     names = objectives(compared)
@@ -209,14 +217,14 @@ def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progr
     looped = [b for b in bounds if b.metric.startswith(("neck.", "track."))]
     holds = verification.holds
     if looped and task.own:
-        holds = holds and _level(best) >= 2 and best.holds(looped, tested=False)
+        holds = holds and _level(best) >= 1 and best.holds(looped, tested=False)
     stuck, nearest = (None, None) if holds else binding(compared, bounds, tested=search.tested)
     if not holds and stuck is None:
         # The search saw nothing broken, the certificate of the whole box does.
         stuck = next((v.requirement.metric for v in verification.failed), None)
-    eyes = _observer(task)
     return Tuned(
-        best=best, controller=controller, assumed=assumed(task, best.kind, best.settings), observer=eyes,
+        best=best, controller=controller, observer=eyes,
+        assumed=dict(getattr(controller, "design", {}).get("assumed", {})),
         own=made_ready(task).own,
         observed=eyes is not None and bool(task.own) and kept_with(task, best, eyes, bounds),
         verification=verification, holds=holds,
@@ -227,7 +235,7 @@ def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progr
 
 
 def _level(item: Candidate) -> int:
-    return ("linear", "few", "all", "margins").index(item.level)
+    return LEVELS.index(item.level)
 
 
 def _verified(

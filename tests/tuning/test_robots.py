@@ -52,11 +52,11 @@ def test_a_budget_that_ends_before_the_loops_promises_nothing_and_goes_on(tmp_pa
     plants = {"model": model, "own": model.block()}
     # Without loops nothing of the requirements on them is known, even where all that is known holds.
     easy = {**QUICK, "require": {"step.rise_s": {"max": 2.0}}}
-    for budget, level in ((1, "linear"), (2, "few"), (3, "all")):
+    for budget, level in ((1, "linear"), (2, "all")):
         found = tune(plants, easy, kinds=("pi",), budget=budget, workers=0, folder=tmp_path, resume=budget > 1)
         assert (found.evaluations, found.best.level) == (budget, level)
         assert not found.holds or level == "all"
-    assert len(json.loads((tmp_path / "evaluations.json").read_text())["evaluations"]) == 3
+    assert len(json.loads((tmp_path / "evaluations.json").read_text())["evaluations"]) == 2
 
 
 @pytest.mark.slow
@@ -98,12 +98,12 @@ def test_every_step_that_is_judged_has_a_noisy_sensor_and_each_direction_its_own
     robot = Robot.preset("trunk4")
     task = task_of({"model": plant(robot), "own": plant(robot).block()}, QUICK | {"track": {}}, 3)
     ready, controller = made_ready(task), PiSettings().design(plant(robot))
-    for each in (ready.few, ready.all):
-        assert all(case.noise for case in each)
+    assert all(case.noise for case in ready.all)
     assert {case.late for case in ready.all} == {False, True}
-    loops = [loop_of(case, ready.own[0], controller.block(), "sequential", task) for case in ready.few]
+    plain = [case for case in ready.all if case.part == 1.0 and not case.late]
+    loops = [loop_of(case, ready.own[0], controller.block(), "sequential", task) for case in plain]
     noise = [fault for loop in loops for fault in loop.faults if isinstance(fault, SensorFault)]
-    assert len({fault.seed for fault in noise}) == len(loops) == 2
+    assert len({fault.seed for fault in noise}) == len(loops) == 3
     assert {fault.std for fault in noise} == {math.radians(0.05)}
 
 

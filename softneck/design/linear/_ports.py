@@ -175,9 +175,15 @@ class ControllerLimits:
             return [self._line_of_robot()]
         return [
             f"  limits: |P| <= {self.position_limit:g} rad, slew {self.slew_limit:g} rad/s "
-            f"({self.slew_limit * sample_time:g} rad per sample), lead {self.lead_limit:g} rad before the motors",
+            f"({self.slew_limit * sample_time:g} rad per sample{self._of_robot()}), lead {self.lead_limit:g} rad "
+            "before the motors",
             *_taut_lines(self.least_position, self.least_cocontraction),
         ]
+
+    def _of_robot(self) -> str:
+        """Return by how much more the robot's file would allow: a default that is stricter is said."""
+        most = min(self.robot.motors.rate_limit or (0.0,))
+        return f"; its robot allows {most:g} rad/s" if most > self.slew_limit else ""
 
     def _line_of_robot(self) -> str:
         """Return a line in the unit of the robot's files."""
