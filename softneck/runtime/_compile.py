@@ -22,6 +22,8 @@ from ._tangent import with_tangent
 
 # No fast-math: compiled and plain Python must agree to rounding. No GIL: batches run on all cores.
 COMPILE_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
+# Of functions that only compiled ones call: what Python would call them by takes as long to compile as they do.
+_INNER: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 # One thread at a time loads: a cache alone lets two begin, and CPython 3.11's `ast` fails in two threads at once.
 _LOADING = threading.RLock()
 
@@ -77,8 +79,8 @@ def _runtime(module: str, compiled: bool) -> Runtime:
     # Members are linked where they are compiled already: six models in one text would take minutes.
     linked = compiled and have_numba() and "(" in module
     namespace = _import_text(bundle(module, linked=linked), compiled=compiled)
-    done = compiled and _compile(namespace)
     names = ("state_size", "initialise", "step", "run_steps", "run_horizon")
+    done = compiled and _compile(namespace, names)
     return Runtime(*(getattr(namespace, name) for name in names), compiled=done)
 
 
@@ -141,17 +143,44 @@ def have_numba() -> bool:
     return importlib.util.find_spec("numba") is not None
 
 
-def _compile(namespace: ModuleType) -> bool:
+def _compile(namespace: ModuleType, called: Sequence[str] | None = None) -> bool:
     if not have_numba():
         return False
     from numba import njit
 
+    _say_shapes_plainly()
     if "COMPILED" in vars(namespace):
         vars(namespace)["COMPILED"] = 1  # see `_compiled_runtime`; numba takes it as a constant
     for name, value in list(vars(namespace).items()):
         if isinstance(value, FunctionType):
-            setattr(namespace, name, njit(**COMPILE_OPTIONS)(value))
+            inner = {} if called is None or name in called else _INNER
+            setattr(namespace, name, njit(**COMPILE_OPTIONS, **inner)(value))
     return True
+
+
+@cache
+def _say_shapes_plainly() -> None:
+    """Let a slice that was assigned too much say so without the sizes.
+
+    To format them numba compiles its own strings into every function with such an assignment, though ours are checked
+    before they run: a quarter of the time to compile a kind, and of the code that is loaded.
+    """
+    from numba.extending import overload
+    from numba.np import arrayobj
+
+    if not hasattr(arrayobj, "raise_with_shape_context"):
+        return  # another numba, which does it in its own way
+
+    def sizes_differ(source: Any, target: Any) -> None: ...
+
+    @overload(sizes_differ)
+    def sizes_differ_compiled(source: Any, target: Any) -> Callable[..., None]:  # noqa: ARG001
+        def raises(source: Any, target: Any) -> None:  # noqa: ARG001
+            raise ValueError("cannot assign slice from input of different size")
+
+        return raises
+
+    arrayobj.raise_with_shape_context = sizes_differ
 
 
 def _import_text(text: str, *, compiled: bool) -> ModuleType:

@@ -124,6 +124,47 @@ def test_a_compiled_bundle_is_kept_in_a_folder_of_the_user(
     assert y.ravel().tolist() == [0.0, 1.0, 2.0]
 
 
+SHIFTING = """
+def shift(state, newest):
+    state[1:] = state[: state.shape[0] - 1].copy()
+    state[0] = newest
+
+
+def state_size(arrays):
+    return 3
+
+
+def initialise(arrays, parameters, state, outputs):
+    outputs[:] = 0.0
+
+
+def step(arrays, parameters, state, inputs, outputs):
+    outputs[0] = state[2]
+    shift(state, inputs[0])
+"""
+
+
+def test_only_what_runs_is_compiled_and_it_runs_from_the_cache_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, runtime_folder: Path
+) -> None:
+    """No strings of numba's, by which it would say sizes that were checked before, and no way to inner functions."""
+    event = pytest.importorskip("numba.core.event")
+    monkeypatch.setattr("platformdirs.user_cache_dir", lambda *_a, **_k: str(tmp_path / "cache"))
+    (runtime_folder / "shifting_a_runtime.py").write_text(SHIFTING)
+    u, found = np.arange(1.0, 6.0)[:, None], []
+    for _ in range(2):
+        _forget()
+        with event.install_recorder("numba:compile") as recorder:
+            runtime = load_runtime("shifting_a_runtime")
+            y = np.zeros((5, 1))
+            runtime.run_steps((), np.zeros(0), np.zeros(3), u, y)
+        assert y.ravel().tolist() == [0.0, 0.0, 0.0, 1.0, 2.0]
+        found.append({one.data["dispatcher"].py_func.__module__ for _, one in recorder.buffer})
+    assert found[0]
+    assert not any(module.startswith("numba.cpython.unicode") for module in found[0])
+    assert found[1] == set(), "nothing is compiled twice"
+
+
 WORDY = '"""A module."""\n' + STEP.replace(
     "    return 1\n", '    """Return the length."""\n\n    # One delay.\n    return 1  # sample\n'
 )  # fmt: skip

@@ -95,4 +95,4 @@ def test_a_log_without_motors_says_that_they_are_missing_and_what_is_left(logs: 
     guess = guess_layout(logs / f"{name}.csv")
     assert len(guess.missing) == 1
     assert guess.missing[0].startswith("motor_setpoint_1..3: no column is of a motor")
-    assert "record the drives' set-points, positions or velocities too" in guess.missing[0]
+    assert "record their set-points, positions or velocities too" in guess.missing[0]

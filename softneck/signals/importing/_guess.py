@@ -89,7 +89,7 @@ class Guess(Shown):
 _NO_CLOCK = "the sample time"
 # Candidates that a line of what is missing names; the page and the notes have all.
 _SHOWN = 3
-_NO_MOTORS = "no column is of a motor; record the drives' set-points, positions or velocities too"
+_NO_MOTORS = "no column is of a motor; record their set-points, positions or velocities too"
 
 
 def guess_layout(path: str | Path, *, robot: Robot = NECK) -> Guess:

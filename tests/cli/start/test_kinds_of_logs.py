@@ -17,7 +17,7 @@ from softneck.cli.start._plan import Asked
 from softneck.core import Vector
 from softneck.identification.selection import _auto
 from softneck.plant import NeckParameters
-from softneck.signals import SET_POINTS, guess_layout, import_log, signal
+from softneck.signals import SET_POINTS, guess_layout, import_log, prepare, signal
 from softneck.signals.recording._channels import MOTOR_POSITIONS
 
 from ...signals import log_writers as write
@@ -31,9 +31,12 @@ LINE = 160
 
 @cache
 def neck() -> dict[str, Vector]:
-    """20 s of the paper's neck under `mixed`, as t, s1 to s3, x1 to x3, pitch and roll in SI units."""
+    """20 s of the paper's neck under `mixed`, as t, s1 to s3, x1 to x3, pitch and roll in SI units.
+
+    It begins and ends at rest, as on hardware: sums of velocities begin at 0.
+    """
     plant = softneck.VirtualNeck(NeckParameters.paper())
-    r = softneck.record(signal("mixed", duration=20.0), plant, seed=1)
+    r = softneck.record(prepare(signal("mixed", duration=20.0), ramp_s=1.0)[0], plant, seed=1)
     found = {"t": r.time}
     for short, names in (("s", SET_POINTS), ("x", MOTOR_POSITIONS)):
         found |= {f"{short}{j}": r.channels[name] for j, name in enumerate(names, 1)}
@@ -158,7 +161,7 @@ ENDS: dict[str, tuple[Callable[[Path], None], str]] = {
     "one step.csv": (one_step, "the rows held out stand still: pitch moves by 0.0 % of what it does in all rows."),
     "no motors.csv": (
         lambda p: csv(p, {**titled(leave_out="sx"), "target_pitch": 0.1, "target_roll": 0.1}),
-        "no column is of a motor; record the drives' set-points, positions or velocities too.",
+        "no column is of a motor; record their set-points, positions or velocities too.",
     ),
     "no clock.csv": (
         lambda p: bare(p, *of("pitch", "roll", "s1", "s2", "s3")),

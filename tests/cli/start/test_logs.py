@@ -115,7 +115,7 @@ def test_a_log_without_motors_ends_in_a_line_that_says_what_to_record(call: Call
     last = said.err.splitlines()[-1]
     assert last.startswith("softneck: import: ")
     assert last == (
-        "softneck: import: log.csv: not found: motor_setpoint_1..3: no column is of a motor; record the drives' "
+        "softneck: import: log.csv: not found: motor_setpoint_1..3: no column is of a motor; record their "
         "set-points, positions or velocities too."
     )
     assert "the same command goes on" in said.err
@@ -174,3 +174,25 @@ def test_constant_set_points_are_refused_with_the_reason_and_what_to_record(call
     recording = read_recording(tmp_path / "p" / "recordings" / "log.csv")
     assert recording.set_points.max() == pytest.approx(np.radians(115.189), rel=1e-6)
     assert not (tmp_path / "p" / "models").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("test_soft25mm_400gr", "the motor set-points are constant; nothing can be identified. Record 60 s of `mixed`"),
+        # A single step each: all of the motion is in the rows that are trained on.
+        ("arm_PI_P40Y40_first600", "the rows held out stand still: pitch moves by 0.1 % of what it does in all rows."),
+        ("pid_200", "the rows held out stand still: pitch moves by 2.1 % of what it does in all rows. Record 60 s"),
+        ("joystick_first600", "no column is of a motor; record their set-points, positions or velocities too."),
+        ("step-coupled_first400", "no column is of a motor; record their set-points, positions or velocities too."),
+    ],
+)
+def test_logs_of_labs_that_teach_nothing_end_in_one_short_line(
+    call: Call, shared_data: Path, name: str, says: str
+) -> None:
+    said = call("start", shared_data / "foreign_logs" / f"{name}.csv", "-o", "p", "--yes")
+    assert said.code in (1, 2)
+    last = said.err.splitlines()[-1]
+    assert says in last
+    assert len(last) <= 160

@@ -331,12 +331,42 @@ def test_a_step_that_cannot_be_done_says_which_and_how_to_go_on(
     assert "once that is mended the same command goes on" in said.err
 
 
-def test_a_disk_that_is_really_full_ends_in_one_line(tmp_path: Path) -> None:
-    """Files may grow to 8 KiB only, as on a small disk: the first that does not fit ends the sitting; none is half."""
+def neck_log(folder: Path) -> None:
     neck = neck_recording(700)
     angles = dict(zip(("pitch", "roll"), neck.outputs.T, strict=True))
     motors = {f"target_motor{j}": neck.set_points[:, j - 1] for j in (1, 2, 3)}
-    pd.DataFrame({"time": neck.time, **motors, **angles}).to_csv(tmp_path / "log.csv", index=False)
+    pd.DataFrame({"time": neck.time, **motors, **angles}).to_csv(folder / "log.csv", index=False)
+
+
+@pytest.mark.slow
+def test_ctrl_c_of_a_user_in_steps_at_work(tmp_path: Path) -> None:
+    """Once in the import, in the look at the quality and in the identification: each time the same command goes on."""
+    neck_log(tmp_path)
+    words = ["start", "log.csv", "-o", "p", "--yes"]
+    script = f"import sys; from softneck.cli._main import run; sys.exit(run({words}))"
+    for number, begun in enumerate(("[1/12] import", "[3/12] quality", "[4/12] identification")):
+        with subprocess.Popen([sys.executable, "-u", "-c", script], cwd=tmp_path, text=True,
+                              stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:  # fmt: skip
+            assert process.stdout is not None
+            assert process.stderr is not None
+            seen = []
+            for line in process.stdout:
+                seen.append(line.strip())
+                if line.startswith(begun):
+                    process.send_signal(signal.SIGINT)
+                    break
+            _, err = process.communicate(timeout=300)
+        assert process.returncode == 130, err
+        assert err.splitlines()[-1] == "softneck: interrupted; files already finished are kept, none is half written"
+        assert sum("(done before)" in line for line in seen) == (0, 0, 2)[number]
+        assert not list(tmp_path.rglob("*.tmp*")), "nothing half written"
+        if number:
+            assert json.loads((tmp_path / "p" / "start.json").read_text())["steps"]
+
+
+def test_a_disk_that_is_really_full_ends_in_one_line(tmp_path: Path) -> None:
+    """Files may grow to 8 KiB only, as on a small disk: the first that does not fit ends the sitting; none is half."""
+    neck_log(tmp_path)
     limited = "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192)); "
     words = ["start", "log.csv", "-o", "p", "--yes"]
     done = subprocess.run(
@@ -348,3 +378,30 @@ def test_a_disk_that_is_really_full_ends_in_one_line(tmp_path: Path) -> None:
     assert last.startswith("softneck: import: ")
     assert f"cannot be written: {os.strerror(errno.EFBIG)}" in last
     assert [path.name for path in tmp_path.iterdir()] == ["log.csv"]
+
+
+@pytest.mark.parametrize("stage", ["identification", "verify"])
+def test_a_long_refusal_is_noted_whole_and_ends_in_a_short_line(
+    call: Call, short: Path, monkeypatch: pytest.MonkeyPatch, stage: str
+) -> None:
+    from softneck.cli.start import _start
+    from softneck.core import DataError
+
+    whole = f"models/a b.npz: no kind could be identified{', for one reason or another' * 8}. Look at 0.5 % of it."
+
+    def refuses(*_: Any, **__: Any) -> None:
+        raise DataError(whole)
+
+    monkeypatch.setattr(_start, "steps", lambda _: iter([_sitting.Step(stage=stage, command=("a",), makes=("b",))]))
+    monkeypatch.setattr(_sitting, "_softneck", refuses)
+    said = call("start", "log.csv", "-o", "p", "--yes")
+    *before, last = said.err.splitlines()
+    assert len(last) <= 160
+    assert " ... " in f"{last} "
+    noted = " ".join(" ".join(before).split())
+    if stage == "identification":
+        assert last.startswith("softneck: identification: no kind could be identified, for one reason")
+        assert last.endswith(" ... Record 60 s of `mixed` and start with that.")
+        assert whole.partition(": ")[2].partition(". ")[0] in noted
+    else:
+        assert whole in noted
