@@ -218,7 +218,6 @@ class MpcSettings(Shown):
 
     def design(self, model: Any) -> MpcController:
         """Return the controller for `model`, a linear model of any robot with its `tf`, or for a `Family`.
-
         A discrete `control` system is taken as well, with all that each of its inputs does to each of its outputs.
 
         Raises:
@@ -229,8 +228,8 @@ class MpcSettings(Shown):
         robot, settings = robot_of(plant), settings_for(self, plant)
         limits = limits_of(settings, robot)
         if robot.is_neck and not isinstance(plant, CoupledPlant):
-            made = settings._designed(plant, limits)
-            return replace(made, design={**made.design, "assumed": taken_of_neck(settings, plant)})
+            made, assumed = settings._designed(plant, limits), taken_of_neck(settings, plant)
+            return replace(made, design={**made.design, "assumed": assumed})
         whole = plant if isinstance(plant, CoupledPlant) else uncertain_plant(plant)
         settings = settings if robot.is_neck else settings_of_robot(settings, whole)
         return settings._designed(sized_plant(whole, limits, weighed(whole)), limits)
