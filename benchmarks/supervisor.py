@@ -83,11 +83,11 @@ def undisturbed(hours: float, *, judge: bool = True) -> None:
         if seed in known:
             continue
         payload = float(np.random.default_rng([seed, 6]).uniform(0.0, 1.0))
-        motion, _, ended = moved(seed, payload)
+        motion, references, ended = moved(seed, payload)
         if not judge:
             continue
         begin = time.process_time()
-        told, valid = said(motion)
+        told, valid = said(motion, references)
         cost = time.process_time() - begin
         add(path, {"seed": seed, "kind": kind_of(seed), "payload": payload, "seconds": len(motion.due) * 0.01,
                    "ended": ended, "valid": valid, "told": told, "judged_s": cost})  # fmt: skip
@@ -116,7 +116,7 @@ def moved(seed: int, payload: float) -> tuple[Motion, Matrix, str]:
         return Motion(**{name: columns[name] for name in _EACH}, **rows, due=due), references, str(columns["why"])
 
 
-def said(motion: Motion) -> tuple[list[tuple[float, str, str]], float]:
+def said(motion: Motion, references: Matrix) -> tuple[list[tuple[float, str, str]], float]:
     """Return (time, event, detail) of all false alarms, and the part of the time in which the tilt's model holds."""
     told, valid = [], 0
     charts: Plausibility | None = None
@@ -127,7 +127,7 @@ def said(motion: Motion) -> tuple[list[tuple[float, str, str]], float]:
         found = charts.cycle(motion.setpoints[k], motion.positions[k], motion.tensions[k])
         if motion.due[k] and found is None:
             values = motion.values[k] if np.isfinite(motion.values[k]).all() else None
-            found = charts.sample(motion.positions[k], values, motion.rates[k])
+            found = charts.sample(motion.positions[k], values, motion.rates[k], references[k])
         valid += charts.tilt.valid
         if found is not None:
             told.append((0.01 * k, found.name, found.detail))

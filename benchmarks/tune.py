@@ -7,8 +7,9 @@ For each neck what docs/howto/payloads.md tells a user to do: the least co-contr
 heard with 1 kg; from Eq. 22 and multisines of small and large amplitude at 0.32 and 1 kg, played around it, a family,
 and from Eq. 22 a grey box of each payload. `tune` gets those alone. What it returns, and the best of every other kind
 that it judged by all loops, is then run on the neck itself: steps of 15 deg in three directions with 0.32, 0.66 and 1
-kg, and a circle of 12 deg at 1.2 rad/s, known ahead by as much as `tune` says and not. Angles are those that the neck's
-sensor tells. With --defaults what a plain `design` makes is run instead, at the same co-contraction, with what --set
+kg, and a circle of 12 deg at 1.2 rad/s, known ahead by as much as `tune` says and not; beside each kind what its
+defaults do, unless --best. Angles are those that the neck's sensor tells. With --defaults what a plain `design` makes
+is run instead, at the same co-contraction, with what --set
 says. Nothing is chosen here. Recordings' models are kept in `build/tune`; --fresh forgets them.
 """
 
@@ -21,6 +22,8 @@ import resource
 import shutil
 import sys
 import time
+from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +37,7 @@ from softneck.loop import BlockPart, Loop, LoopResult, RotationReference, StepRe
 from softneck.signals import signal
 from softneck.tuning import tune
 from softneck.tuning._judge import designed, made_ready
+from softneck.tuning._task import Task
 from softneck.tuning._tune import BUDGET, task_of
 
 OUT = Path("build/tune")
@@ -131,7 +135,7 @@ def main() -> None:
     print("| neck | controller | certificate | processor [s] | overshoot [%] | rise [s] | steady rms [deg] | "
           "circle [deg] | known ahead [deg] | misses |\n|---|---|---|---|---|---|---|---|---|---|")  # fmt: skip
     for neck in asked.necks:
-        (plain if asked.defaults else searched)(neck, asked)
+        (defaults if asked.defaults else searched)(neck, asked)
 
 
 def searched(neck: str, asked: argparse.Namespace) -> None:
@@ -149,18 +153,26 @@ def searched(neck: str, asked: argparse.Namespace) -> None:
         said = ("holds" if found.holds else f"fails: {found.binding}") if best else "-"
         row([neck, f"**{item.kind}**" if best else item.kind, said, f"{spent:.0f}" if best else ""],
             truth(neck, controller, item.metrics.get("track.ahead_s", 0.0)))  # fmt: skip
+        if not asked.best:
+            plain(neck, found.task, item.kind, ())
 
 
-def plain(neck: str, asked: argparse.Namespace) -> None:
-    """Print what kinds do with their defaults, at the co-contraction of the recordings; nothing is known ahead."""
+def defaults(neck: str, asked: argparse.Namespace) -> None:
+    """Print what kinds do with their defaults or with --set."""
     task = task_of(known(neck), None, asked.seed)
     for kind in asked.kinds or PLAIN:
-        given = {name: float(value) for name, _, value in (text.partition("=") for text in asked.set)}
-        settings = resolve(KINDS[kind].settings)(least_cocontraction=task.cocontraction, **given)
-        row(
-            [neck, " ".join([kind, *(asked.set or ["defaults"])]), "-", ""],
-            truth(neck, settings.design(task.plant), 0.0),
-        )
+        plain(neck, task, kind, asked.set)
+
+
+def plain(neck: str, task: Task, kind: str, given: Sequence[str]) -> None:
+    """Print what a kind does with its defaults, at the co-contraction of the recordings; nothing is known ahead."""
+    made = resolve(KINDS[kind].settings)
+    values = {name: float(value) for name, _, value in (text.partition("=") for text in given)}
+    if any(field.name == "least_cocontraction" for field in fields(made)):
+        values["least_cocontraction"] = task.cocontraction or 0.0
+    row(
+        [neck, " ".join([kind, *(given or ["defaults"])]), "-", ""], truth(neck, made(**values).design(task.plant), 0.0)
+    )
 
 
 def row(cells: list[str], true: dict[str, float]) -> None:

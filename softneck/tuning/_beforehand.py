@@ -35,6 +35,17 @@ def refuse_impossible(asked: TuneRequirements, plant: Any) -> None:
         _refuse_load(asked, name, nominal)
 
 
+def quickest(plant: Any) -> float:
+    """Return the least `rise_s` [s] that designs on a plant take; 0 where the motors do not reach their test step."""
+    uncertain = uncertain_plant(plant)
+    limits = LoopSettings().of_robot(uncertain)
+    found = [
+        least_rise(axis, axis_test(axis, limits.limits(uncertain.robot), limits.redefinition(uncertain)[1]))
+        for axis in (uncertain.axis(name).nominal for name in uncertain.names)
+    ]
+    return max((least for least in found if math.isfinite(least)), default=0.0)
+
+
 def _refuse_rise(
     asked: TuneRequirements, uncertain: UncertainPlant, limits: LoopSettings, name: str, plant: AxisPlant
 ) -> None:

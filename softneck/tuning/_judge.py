@@ -14,7 +14,6 @@ import numpy as np
 from softneck.core import KINDS, SoftneckError, Vector, resolve
 from softneck.core._kinds import make_settings
 from softneck.design.linear._axis_settings import AxisSettings
-from softneck.design.linear._loop_settings import LoopSettings
 from softneck.design.linear._pi import PiSettings
 from softneck.design.plants._uncertain import UncertainPlant, uncertain_plant
 from softneck.runtime import Block
@@ -122,12 +121,6 @@ def designed(task: Task, ready: Ready, kind: str, settings: Mapping[str, Any]) -
         # The others read more of a family than its plants.
         ready.kept[key] = made.design(ready.uncertain if isinstance(made, AxisSettings | PiSettings) else task.plant)
     return ready.kept[key]
-
-
-def assumed(task: Task, kind: str, settings: Mapping[str, Any]) -> dict[str, float]:
-    """Return what of the paper's neck a design takes where neither settings nor plants say otherwise."""
-    made = make_settings(resolve(KINDS[kind].settings), settings)
-    return made.assumed(made_ready(task).uncertain) if isinstance(made, LoopSettings) else {}
 
 
 def linear_metrics(task: Task, ready: Ready, controller: Any) -> dict[str, float]:

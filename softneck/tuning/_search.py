@@ -4,9 +4,9 @@ Each kind begins as fast as its margins allow: its bound on Ms is led there by h
 there; after that and after each round half of them are left (successive halving: Jamieson and Talwalkar 2016, AISTATS).
 Each kind has its own CMA-ES over the cube of its settings (Hansen and Ostermeier 2001, Evolutionary Computation 9:159),
 which knows ranks alone, so that candidates of different levels are told to it as they are. What holds so far goes on
-to the next level, and of a round's candidates at least half. At the end the best is refined: each of its settings a
-little more and a little less, nearer where none of these is better. All is asked for in rounds and told in order: the
-number of workers changes nothing.
+to the next level, and of a round's candidates at least half. At the end the best is refined: by neighbours to all
+sides, nearer where none of these is better. All is asked for in rounds and told in order: the number of workers changes
+nothing.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ STEP = 0.15
 # By so much the bound on Ms is moved first, as a part of its range, and so often by half as much.
 _LED_BY, _LED = 0.24, 3
 # The last part of the budget is for the neighbours of the best, so far away first and last.
-_REFINED, _AWAY, _NEAREST = 0.3, 0.08, 0.01
+_REFINED, _AWAY, _NEAREST = 0.3, 0.08, 0.005
 # Kinds that are never left out, and candidates whose margins are found by experiment at the end.
 _LEAST_KINDS, _FINALS = 2, 3
 # What breaks ties: all ratios together weigh this part of the largest one.
@@ -171,7 +171,8 @@ class Search:
             alive = self._halved(alive)
         self._refined(levels, finals)
         if finals:
-            self._judge(self.ranked()[:finals], "margins", 0)
+            # Of those that loops have judged: what was judged further comes first.
+            self._judge([item for item in self.ranked() if item.level == levels[-1]][:finals], "margins", 0)
 
     def ranked(self) -> list[Candidate]:
         """Return all candidates that have metrics, the best first."""
@@ -221,12 +222,16 @@ class Search:
         for _ in range(_LED):
             for kind, k in led.items():
                 x = at[kind].x.copy()
-                # What could not be designed asks for more room.
-                x[k] = min(max(x[k] + (step if at[kind].error or self._robust(at[kind]) else -step), 0.0), 1.0)
-                at[kind] = self._candidate(spaces[kind], x)
+                if at[kind].error:
+                    # What could not be designed is given more room: bolder, and slower.
+                    x[[0, k]] += step
+                else:
+                    x[k] += step if self._robust(at[kind]) else -step
+                at[kind] = self._candidate(spaces[kind], np.clip(x, 0.0, 1.0))
             self._judge([at[kind] for kind in led], LEVELS[0], reserved)
             for kind, k in led.items():
-                best[kind] = min(best[kind], at[kind], key=lambda item: self._led_key(item, k))
+                if at[kind].level:
+                    best[kind] = min(best[kind], at[kind], key=lambda item: self._led_key(item, k))
             step /= 2.0
         return best
 
@@ -248,14 +253,19 @@ class Search:
             left = self._better(left, level)
 
     def _refined(self, levels: Sequence[str], finals: int) -> None:
-        """Judge the neighbours of the best until the budget is spent, or none near it is better."""
-        away = _AWAY
+        """Judge the neighbours of the best until the budget is spent, or none near it is better.
+
+        To both sides along directions that are drawn anew: where two limits meet, one setting alone betters nothing
+        (Gratton et al. 2015, SIAM J. Optim. 25:1515).
+        """
+        away, rng = _AWAY, np.random.default_rng(self.task.seed)
         spaces = {space.kind: space for space in self.spaces}
         while self._left(finals) > 0 and away > _NEAREST:
             best = next(iter(self.ranked()), None)
             if best is None or best.level != levels[-1]:
                 return
-            near = [best.x + sign * away * axis for axis in np.eye(best.x.size) for sign in (1.0, -1.0)]
+            along = np.linalg.qr(rng.standard_normal((best.x.size, best.x.size)))[0]
+            near = [best.x + sign * away * direction for direction in along for sign in (1.0, -1.0)]
             self._through([self._candidate(spaces[best.kind], np.clip(x, 0.0, 1.0)) for x in near], levels, finals)
             if self.ranked()[0] is best:
                 away /= 2.0

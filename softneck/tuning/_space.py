@@ -60,6 +60,8 @@ _OWN: dict[str, tuple[Dimension, ...]] = {
 # Starts were chosen on the foreign necks `column` and `chain`, by this search: what is asked of the nominal plant is
 # less than what the slowest payload and the motors make of it.
 _AIM = 0.42
+# Above the least that the motors can give.
+_ROOM = 1.03
 # Of a neck [rad], and not searched: loops over models do not see what it does. On `chain` those over grey boxes are the
 # same from 0.4 to 1.5, and the neck itself overshoots by 2 % at 0.4 and 0.6, by 7 % at 0.8, by 20 % at 1.5; at 0.4 it
 # is slow (0.42 to 0.48 s).
@@ -99,7 +101,9 @@ class Space:
         return {**self.fixed, **searched}
 
 
-def spaces(kinds: tuple[str, ...], *, rise: float, cocontraction: float | None, neck: bool) -> list[Space]:
+def spaces(
+    kinds: tuple[str, ...], *, rise: float, cocontraction: float | None, neck: bool, least: float = 0.0
+) -> list[Space]:
     """Return the space of every kind.
 
     Args:
@@ -107,11 +111,12 @@ def spaces(kinds: tuple[str, ...], *, rise: float, cocontraction: float | None, 
         rise: the longest that is allowed [s].
         cocontraction: at which the robot was recorded [rad]; None: no rule is set.
         neck: whether it is a neck: of another robot limits are those of its file.
+        least: the rise that the motors can give at best [s].
 
     Raises:
         SettingsError: an unknown kind, or one with nothing to search.
     """
-    found = []
+    found, least = [], min(least, rise)
     for kind in kinds:
         if kind not in _OWN:
             raise SettingsError(
@@ -122,7 +127,7 @@ def spaces(kinds: tuple[str, ...], *, rise: float, cocontraction: float | None, 
         names = {item.name for item in dataclasses.fields(resolve(KINDS[kind].settings))}
         # Until a kind has the one meaning of speed, its filter stands for it: of a lag that is a part of its rise.
         speed = (
-            Dimension("rise_s", 0.3 * rise, 1.2 * rise, _AIM * rise)
+            Dimension("rise_s", max(0.3 * rise, _ROOM * least), 1.2 * rise, max(_AIM * rise, _ROOM**2 * least))
             if "rise_s" in names
             else Dimension("reference_time", 0.05 * rise, 0.6 * rise, 0.25 * rise)
         )

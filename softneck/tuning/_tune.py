@@ -17,9 +17,9 @@ from softneck.verification._own_plants import OwnPlant, is_own_plant
 from softneck.verification._scale import scaled
 from softneck.verification._verify import sources_of, standing_for
 
-from ._beforehand import refuse_impossible
+from ._beforehand import quickest, refuse_impossible
 from ._digest import digest_of
-from ._judge import LEVELS, assumed, designed, made_ready
+from ._judge import LEVELS, designed, made_ready
 from ._log import Log
 from ._requirements import TuneRequirements, make_tune_requirements, read_tune_requirements, with_certificate
 from ._responses import kept_with
@@ -130,7 +130,9 @@ def tune(
     if observer is not None:
         require_same_robot(robot_of(observer), task.robot, "the observer and the plants")
     refuse_impossible(task.asked, task.plant)
-    each = spaces(chosen, rise=_aimed(task), cocontraction=task.cocontraction, neck=task.robot.is_neck)
+    each = spaces(
+        chosen, rise=_aimed(task), cocontraction=task.cocontraction, neck=task.robot.is_neck, least=quickest(task.plant)
+    )
     task = replace(task, digest=digest_of(task, chosen, files))
     made_ready(task)  # a plant that does not fit is said before anything is searched
     log = Log(folder, task.digest, resume=resume, force=force)
@@ -221,7 +223,8 @@ def _finished(search: Search, eyes: Any, files: Mapping[str, tuple[str, str]] | 
         # The search saw nothing broken, the certificate of the whole box does.
         stuck = next((v.requirement.metric for v in verification.failed), None)
     return Tuned(
-        best=best, controller=controller, assumed=assumed(task, best.kind, best.settings), observer=eyes,
+        best=best, controller=controller, observer=eyes,
+        assumed=dict(getattr(controller, "design", {}).get("assumed", {})),
         own=made_ready(task).own,
         observed=eyes is not None and bool(task.own) and kept_with(task, best, eyes, bounds),
         verification=verification, holds=holds,

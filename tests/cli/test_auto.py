@@ -78,7 +78,7 @@ def test_auto_ends_with_exit_code_1_where_no_kind_makes_a_model(
     for more in ((), ("--json",)):
         said = call("identify", "auto", recording, "-o", f"best{len(more)}.npz", *more)
         assert said.code == 1
-        assert "no kind made a model of the rows held out: its free run diverges" in said.err.splitlines()[-1]
+        assert "no kind is a model of the rows held out: its free run diverges" in said.err.splitlines()[-1]
     assert json.loads(said.out)["model"] == "best1.npz"
 
 
@@ -121,5 +121,7 @@ def test_three_rows_are_one_line(call: Call, monkeypatch: pytest.MonkeyPatch) ->
     )
     said = call("identify", "auto", "r.csv", "-o", "m.npz")
     assert said.code == 2
-    assert "nlsm: no run has four samples in a row: too few to identify from" in said.error
+    assert "2 rows are too few to identify from; at least 100 are needed" in said.error
+    for kind in ("rls", "nlsm"):
+        assert "too few" in call("identify", kind, "r.csv", "-o", "m.npz").error
     assert not Path("m.npz").exists()

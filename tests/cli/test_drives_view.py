@@ -54,7 +54,7 @@ def _text(snapshot: Snapshot, times: CycleFigures | None = None) -> str:
     return _drawn(render(snapshot, times or CycleFigures(), begin=100.0, title="pi.npz", duration=4.0))
 
 
-def render(snapshot: Snapshot, times: CycleFigures, *, size: tuple[int, int] = (104, 31), **more) -> RenderableType:
+def render(snapshot: Snapshot, times: CycleFigures, *, size: tuple[int, int] = (104, 32), **more) -> RenderableType:
     return from_line(to_line(snapshot, times, **more), size)
 
 
@@ -102,6 +102,17 @@ def test_a_fault_is_named_and_what_is_not_known_is_a_dash() -> None:
     assert not any("nan" in line for line in text.splitlines())
 
 
+def test_a_change_detector_is_told_by_a_line_and_none_by_no_line() -> None:
+    def lines(change: tuple[float, ...]) -> list[str]:
+        drawn = _text(replace(_snapshot(), change=change))
+        return [" ".join(line.strip("│ ").split()) for line in drawn.splitlines() if "neck " in line]
+
+    assert lines((1.0, 12.5, 43.2)) == ["neck changed since 12.5 s fit 43 %"]
+    assert lines((0.0, 0.0, 93.0)) == ["neck as the model knows it fit 93 %"]
+    assert lines((0.0, 0.0, math.nan)) == ["neck as the model knows it fit - %"]
+    assert lines((math.nan,) * 3) == []
+
+
 @pytest.mark.parametrize("width", [40, 80, 200])
 def test_no_width_breaks_it(width: int) -> None:
     assert all(len(line) <= width for line in _drawn(render(_snapshot(), CycleFigures()), width).splitlines())
@@ -112,6 +123,9 @@ def test_a_small_terminal_shows_all_of_it() -> None:
     one, two, three = _snapshot().drives
     drives = (one, replace(two, nmt=NodeState.PRE_OPERATIONAL, state=DriveState.SWITCHED_ON), three)
     full = replace(_snapshot(), fault=fault, events=(fault,) * 5, drives=drives)
+    changed = replace(full, change=(1.0, 12.5, 43.0))
+    assert len(_drawn(render(changed, CycleFigures(), begin=100.0, size=(80, 24)), 80).splitlines()) <= 24
+    assert len(_drawn(render(changed, CycleFigures(), begin=100.0), 104).splitlines()) <= 32
     drawn = _drawn(render(full, CycleFigures(0.010, 0.0125, 0.014, 1000), begin=100.0, size=(80, 24)), 80)
     lines = drawn.splitlines()
     assert len(lines) <= 24
@@ -122,7 +136,7 @@ def test_a_small_terminal_shows_all_of_it() -> None:
     assert "cycle [ms] p50 10.00 p99 12.50 max 14.00 due 10 late 4" in words
     assert sum("emergency a drive sent an emergency (node 2)" in line for line in words) == 5
     # As high as a large one may get: nothing is cropped there either.
-    assert len(_drawn(render(full, CycleFigures(), begin=100.0), 104).splitlines()) <= 31
+    assert len(_drawn(render(full, CycleFigures(), begin=100.0), 104).splitlines()) <= 32
 
 
 def test_a_picture_is_one_line_and_markup_in_it_is_text() -> None:

@@ -141,8 +141,12 @@ def test_what_is_taken_from_the_papers_neck_is_said() -> None:
     late_and_fast, quick = (settings().design(neck(*PLANTS[name])) for name in ("late", "slow"))
     assert "of the paper's neck" not in late_and_fast.summary()
     assert "of the paper's neck, not of this plant: small moves as fast as 5.293 1/s" in quick.summary()
+
+
+@pytest.mark.parametrize("kind", ["pi", "mpc"])
+def test_what_somebody_says_is_not_assumed(kind: str) -> None:
+    settings = resolve(KINDS[kind].settings)
     both = settings().design(neck(4.0, 3.3, 2)).summary()
     assert "a dead time of at least 0.08 s and small moves" in both
-    # What somebody says is not assumed.
     said = settings(least_delay=0.08, small_move_pole=5.293).design(neck(4.0, 3.3, 2)).summary()
     assert "of the paper's neck" not in said

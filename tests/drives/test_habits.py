@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import re
 from dataclasses import fields, replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 from canopen.sdo.exceptions import SdoAbortedError
 
 from softneck.core import CheckFailedError, SettingsError
-from softneck.drives import default_drives, preflight, zero
+from softneck.drives import default_drives, jog, preflight, read_run_log, replay, zero
 from softneck.drives.bus._link import VirtualLink
 from softneck.drives.commissioning._jog import jog_pilot
+from softneck.drives.logs._run_log import RunLogger
 from softneck.drives.master import Frame, Phase
 from softneck.drives.running._bus_loop import Session, run_session
 from softneck.drives.simulated import SimulatedNeck, SimulatedSettings
@@ -308,3 +310,17 @@ def test_a_late_mode_that_is_not_taken_stops_the_run_before_anything_moves(what:
     assert (fault.name, fault.node, fault.detail) == ("enable_timeout", 1, "it is ENABLED and does not take mode 8")
     assert bench.finish().states == [DISABLED] * 3
     assert not bench.pilot.started
+
+
+@pytest.mark.slow
+def test_a_run_with_late_modes_replays(tmp_path: Path) -> None:
+    path, file = tmp_path / "j.mcap", replace(default_drives(), ramps=FAST)
+    with RunLogger([path], wait=True) as log:
+        jog(2, Session(file=file, link=linked(mode_when="enabled"), log=log), amplitude=0.4)
+    logged = read_run_log(path)
+    assert logged.settings().bus.late_modes == (1, 2, 3)
+    replay(logged, jog_pilot(2, 0.4)).require()
+    # Had the master believed that they have their mode, it would have done something else.
+    plain = replace(logged, facts={**logged.facts, "settings": {**logged.facts["settings"], "bus": {
+        **logged.facts["settings"]["bus"], "late_modes": []}}})  # fmt: skip
+    assert replay(plain, jog_pilot(2, 0.4)).difference is not None

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 
 _BAR = 20
-# What all of it needs [columns], [lines]: with a fault's line and five events.
-_WIDE, _HIGH = 104, 31
+# What all of it needs [columns], [lines]: with a change's line, a fault's and five events.
+_WIDE, _HIGH = 104, 32
 _NICE = 10
 
 
@@ -42,7 +42,8 @@ def render(picture: dict[str, Any], size: tuple[int, int] = (_WIDE, _HIGH)) -> R
         [_motors(picture, narrow=narrow, low=low)],
         [_drives(picture, narrow=narrow)],
         [_timing(picture, narrow=narrow)],
-        [*_events(picture)],
+        # A change's line takes an event's place where there is no room for both.
+        [*_events(picture, 4 if low and math.isfinite(picture["change"][0]) else 5)],
         [_counts(picture)],
     ]
     parts = [line for k, block in enumerate(blocks) for line in (block if low or not k else ["", *block])]
@@ -60,6 +61,11 @@ def _head(picture: dict[str, Any]) -> Text:
     text.append(f"   bus cycle {picture['cycle']}")
     text.append("   validity ")
     text.append(_number(picture["validity"], ".2f"), style="bold red" if picture["validity"] < 0.5 else "none")
+    changed, since, fit = picture["change"]
+    if math.isfinite(changed):
+        told = f"changed since {since:.1f} s" if changed > 0.5 else "as the model knows it"
+        text.append("\nneck ").append(told, style="bold yellow" if changed > 0.5 else "none")
+        text.append(f"   fit {_number(fit, '.0f')} %")
     if picture["fault"] is not None:
         text.append(f"\n{picture['fault']}", style="bold red")
     return text
@@ -127,11 +133,11 @@ def _timing(picture: dict[str, Any], *, narrow: bool) -> Text:
     return text
 
 
-def _events(picture: dict[str, Any]) -> list[Text]:
+def _events(picture: dict[str, Any], most: int) -> list[Text]:
     from rich.text import Text
 
     lines = [Text("last events", style="bold")]
-    for time, name, text, serious in picture["events"]:
+    for time, name, text, serious in picture["events"][-most:]:
         line = f"{time:9.2f} s  {name}  {text}"
         lines.append(Text(line, style="red" if serious else "none", no_wrap=True, overflow="ellipsis"))
     if not picture["events"]:

@@ -21,12 +21,17 @@ from ._sitting import FILE, Sitting
 from ._step import STAGES, Step
 
 _PATH = click.Path(path_type=Path)
-_NEXT = "Record 60 s or more of `mixed` (`softneck drives record mixed`), and start with that log."
+_NEXT = "Record 60 s of `mixed` and start with that."
+_MIXED = (
+    "in `mixed` every motor moves by itself and all move together: `softneck drives record mixed` plays it on drives"
+)
+# [characters] Of the line that ends a sitting, `softneck: ` and all: two of a terminal of 80.
+_LINE = 160 - len("softneck: ")
 _OWN_REQUIREMENTS = (
     "requirements of your own: `softneck tune --print-requirements` shows the form; give them by --requirements"
 )
 # Sentences end where the next begins with a capital; `0.5 %.` within one does not.
-_FIRST_SENTENCE = re.compile(r"(?s).*?[^.\s]\.(?=\s+[`A-Z]|$)")
+_FIRST_SENTENCE = re.compile(r"(?:[^:]*\.(?:csv|npz): )?((?s:.*?)[^.\s]\.)(?=\s+[`A-Z]|$)")
 
 
 @click.command("start", epilog="Example: softneck start log.csv -o my_neck --yes")
@@ -154,12 +159,23 @@ def _advised(error: SoftneckError, sitting: Sitting, folder: Path, logs: tuple[s
     for log in logs:
         said = said.replace(log, Path(log).name)
     if stage == "identification":  # what the recordings lack was said before it
+        note(_MIXED)
         first = _FIRST_SENTENCE.match(said)
-        return CheckFailedError(f"{stage}: {first[0] if first else said} {_NEXT}")
+        return CheckFailedError(_shortened(f"{stage}: {first[1] if first else said}", _NEXT))
     if stage == "tune":
         note(_OWN_REQUIREMENTS)
     note(f"paths are those in {folder}; once that is mended the same command goes on")
-    return type(error)(f"{stage}: {said}")
+    return type(error)(_shortened(f"{stage}: {said}"))
+
+
+def _shortened(said: str, advice: str = "") -> str:
+    """Return what was said and an advice in one line that people read; what does not fit is noted before it."""
+    line = " ".join([said, *advice.split()])
+    if len(line) <= _LINE:
+        return line
+    note(said)
+    room = _LINE - len(f" ... {advice}")
+    return f"{said[:room].rpartition(' ')[0]} ... {advice}".rstrip()
 
 
 @contextlib.contextmanager

@@ -176,7 +176,8 @@ def robot_in(header: Mapping[str, Any]) -> Robot:
 
 def assumed_lines(values: Mapping[str, float]) -> list[str]:
     """Return a line on what was taken from the paper's neck, none where nothing was."""
-    words = {"least_delay": "a dead time of at least {:g} s", "small_move_pole": "small moves as fast as {:g} 1/s"}
+    words = {"least_delay": "a dead time of at least {:g} s", "small_move_pole": "small moves as fast as {:g} 1/s",
+             "taut_pole": "a neck with taut tendons as fast as {:g} 1/s"}  # fmt: skip
     told = [words[name].format(value) for name, value in values.items()]
     if not told:
         return []

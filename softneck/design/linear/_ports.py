@@ -183,7 +183,7 @@ class ControllerLimits:
     def _of_robot(self) -> str:
         """Return by how much more the robot's file would allow: a default that is stricter is said."""
         most = min(self.robot.motors.rate_limit or (0.0,))
-        return f"; robot {self.robot.label()} allows {most:g} rad/s" if most > self.slew_limit else ""
+        return f"; its robot allows {most:g} rad/s" if most > self.slew_limit else ""
 
     def _line_of_robot(self) -> str:
         """Return a line in the unit of the robot's files."""

@@ -16,7 +16,7 @@ from softneck.core._shown import Shown
 from softneck.robot import Robot
 from softneck.runtime import Block, Port, State
 
-from ..linear._controller import robot_in
+from ..linear._controller import assumed_lines, robot_in
 from ..linear._ports import MAX_MOTOR, ControllerLimits, controller_inputs, controller_outputs, limit_ports
 from . import _mpc_state_runtime as rt
 from ._disturbance import MeasuredDisturbance
@@ -158,6 +158,7 @@ class MpcController(Shown):
         ]
         if d.get("worst_sensitivity") is not None:
             lines.append(f"  Ms at most {d['worst_sensitivity']:.3g} over samples of the family")
+        lines += assumed_lines(d.get("assumed", {}))
         return "\n".join(lines + [f"  review: {line}" for line in self.review()])
 
     def _limits_line(self) -> str:

@@ -72,7 +72,7 @@ def step(p: SwitchedArrays, parameters: np.ndarray, x: SwitchedState, inputs: np
         outputs[:] = x.held
         return
     payload = float(inputs[flags + 2])
-    active = own[flags] > 0.5 and own[flags + 1] > 0.5
+    active = bool(own[flags] > 0.5 and own[flags + 1] > 0.5)
     started = x.started > 0.5
     y = own[first : first + p.outputs].copy()
     if not started:

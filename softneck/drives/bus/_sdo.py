@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+import re
 import struct
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from softneck.core import FileFormatError, SoftneckError
+from softneck.core._budget import MOST_EDS, settings_text
 
 from ..master import Frame
 from ._link import Link
@@ -23,6 +25,11 @@ _ANSWER_TIME = 0.3
 _MAY_BE_UNTOLD = frozenset({0x6060, 0x6098, 0x60C2, 0x60FF})
 # canopen logs each abort as an error; here an abort becomes one line for the user.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
+
+
+# An object has subindices up to FEh (CiA 301, 7.4.1).
+_MOST_ENTRIES = 254
+_ENTRIES = re.compile(r"^\s*NrOfEntries\s*[=:]\s*\+?(\d+)", re.IGNORECASE | re.MULTILINE)
 
 
 class SdoError(SoftneckError):
@@ -45,6 +52,9 @@ def load_eds(profile: str, path: Path | None = None) -> ObjectDictionary:
 
     source = path or Path(__file__).parent / "eds" / f"{profile}.eds"
     try:
+        many = [int(said) for said in _ENTRIES.findall(settings_text(source, MOST_EDS))]
+        if any(count > _MOST_ENTRIES for count in many):  # each of them is looked for
+            raise ValueError(f"NrOfEntries of {max(many)}, where an object has {_MOST_ENTRIES} at most")
         dictionary = canopen.import_od(str(source))
     except Exception as error:  # canopen raises what its parser meets: KeyError, ValueError, configparser's
         raise FileFormatError(

@@ -12,7 +12,7 @@ from softneck.signals.detection._threshold import Budget, thresholds
 from softneck.signals.detection._whitening import Whitening
 
 from ._baseline import Baseline, Row, Rows, Tracking
-from ._motor_charts import EDGES, MotorCharts, motor_names
+from ._motor_charts import EDGES, MotorCharts, MotorRules, motor_names
 from ._motor_models import Features, Flags, Motion, features_of, level_rows, motor_rows, row_of, variance_of
 from ._tilt_charts import GyroLevel, TiltCharts, TiltModel, tilt_names
 from ._tracking import LoopRun, fit_tracking, tracking_scores
@@ -23,6 +23,8 @@ _LAGS = 8
 # Motors further out than this part of the seen range are not known ground, and none is so much faster.
 _MARGIN = 0.2
 _LEAST = 20.0
+# See `calibrate`; by `benchmarks/supervisor_choice.py`.
+_KNOWN_BIAS = 0.25
 # What is further out than this part of the cycles counts for seldom.
 _NEARLY = 0.95
 
@@ -35,6 +37,8 @@ def calibrate(
     slack: float,
     budget: Budget | None = None,
     seed: int = 0,
+    known_bias: float = _KNOWN_BIAS,
+    rules: MotorRules | None = None,
 ) -> Baseline:
     """Return what the supervisor compares with.
 
@@ -47,6 +51,8 @@ def calibrate(
         slack: tension below which a tendon hangs [N].
         budget: of false alarms; `charts` and `step` are set here.
         seed: of the bootstrap.
+        known_bias: part of the largest slow error that the tilt's charts take for no fault; the bootstrap has the rest.
+        rules: of the motors' charts; None: as the charts have them.
 
     Raises:
         DataError: too little motion, or motors that did not move.
@@ -66,9 +72,9 @@ def calibrate(
         others = [other for k, other in enumerate(known) if k != number]
         fitted.append(fit(others, cycle=cycle, sample_cycles=sample_cycles, slack=slack))
         slow.append(_slow(fitted[-1], parts[number]))
-    bias = row_of(np.max(slow, axis=0))
+    bias = row_of(known_bias * np.max(slow, axis=0))
     for part, model in zip(parts, fitted, strict=True):
-        found = scores_of(replace(model, tilt_bias=bias), part)
+        found = scores_of(replace(model, tilt_bias=bias), part, rules)
         motor.append(found[0])
         tilt.append(found[1])
     whole = fit(known, cycle=cycle, sample_cycles=sample_cycles, slack=slack)
@@ -107,9 +113,9 @@ def _tracking(runs: Sequence[LoopRun], budget: Budget, rng: np.random.Generator)
     return fit_tracking(runs)._replace(bias=bias, thresholds=row_of(thresholds(scores, budget, rng)))
 
 
-def scores_of(baseline: Baseline, motion: Motion) -> tuple[Matrix, Matrix]:
+def scores_of(baseline: Baseline, motion: Motion, rules: MotorRules | None = None) -> tuple[Matrix, Matrix]:
     """Return the scores of all charts on one stretch: of motors (cycles, charts), of the tilt (samples, charts)."""
-    walk = _Walk(baseline)
+    walk = _Walk(baseline, rules)
     ours, theirs = [], []
     for k in range(len(motion.due)):
         if walk.step(motion, k):
@@ -121,9 +127,9 @@ def scores_of(baseline: Baseline, motion: Motion) -> tuple[Matrix, Matrix]:
 class _Walk:
     """The charts over a stretch of motion, none of which ever says anything."""
 
-    def __init__(self, baseline: Baseline) -> None:
+    def __init__(self, baseline: Baseline, rules: MotorRules | None = None) -> None:
         self._gains = np.array(baseline.current)
-        self.motors = MotorCharts(baseline, np.full(len(motor_names(baseline.motors)), np.inf))
+        self.motors = MotorCharts(baseline, np.full(len(motor_names(baseline.motors)), np.inf), rules)
         names = tilt_names(baseline.motors, baseline.outputs, gyro=bool(baseline.gyro_spread))
         self.tilt = TiltCharts(baseline, np.full(len(names), np.inf))
         self.tilt.begin()

@@ -7,15 +7,19 @@ import json
 import os
 import shlex
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 
 from softneck.cli.start import _sitting
 from softneck.core import CheckFailedError
 
+from ...data import neck_recording
 from ..conftest import Call
 
 STEPS = ["robot: robot.toml", "quality: copy.toml", "loop: project/loop.toml"]
@@ -325,3 +329,22 @@ def test_a_step_that_cannot_be_done_says_which_and_how_to_go_on(
     assert said.err.splitlines()[-1].startswith(f"softneck: {stage}: `new` cannot be")
     assert advice in said.err
     assert "once that is mended the same command goes on" in said.err
+
+
+def test_a_disk_that_is_really_full_ends_in_one_line(tmp_path: Path) -> None:
+    """Files may grow to 8 KiB only, as on a small disk: the first that does not fit ends the sitting; none is half."""
+    neck = neck_recording(700)
+    angles = dict(zip(("pitch", "roll"), neck.outputs.T, strict=True))
+    motors = {f"target_motor{j}": neck.set_points[:, j - 1] for j in (1, 2, 3)}
+    pd.DataFrame({"time": neck.time, **motors, **angles}).to_csv(tmp_path / "log.csv", index=False)
+    limited = "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192)); "
+    words = ["start", "log.csv", "-o", "p", "--yes"]
+    done = subprocess.run(
+        [sys.executable, "-c", f"{limited}from softneck.cli._main import run; sys.exit(run({words}))"],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2, done.stderr
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("softneck: import: ")
+    assert f"cannot be written: {os.strerror(errno.EFBIG)}" in last
+    assert [path.name for path in tmp_path.iterdir()] == ["log.csv"]
