@@ -217,9 +217,7 @@ class MpcSettings(Shown):
         return spaced_starts(self.horizon, self.moves)
 
     def design(self, model: Any) -> MpcController:
-        """Return the controller for `model`, a linear model of any robot with its `tf`, or for a `Family`.
-
-        A discrete `control` system is taken as well, with all that each of its inputs does to each of its outputs.
+        """Return the controller for a linear `model` of any robot with its `tf`, a `Family`, or a `control` system.
 
         Raises:
             SettingsError: a model that is not linear, discrete and stable, limits that contradict each other, or a
