@@ -79,7 +79,7 @@ def test_plants_that_are_not_coupled_get_what_each_axis_gets() -> None:
 @pytest.mark.parametrize(("inputs", "outputs"), SIZES)
 @pytest.mark.parametrize(
     "settings",
-    [LqgSettings(**LIMITS), pytest.param(MpcSettings(**LIMITS), marks=pytest.mark.slow)],
+    [LqgSettings(**LIMITS), pytest.param(MpcSettings(**LIMITS, bandwidth=4.0), marks=pytest.mark.slow)],
     ids=["lqg", "mpc"],
 )
 def test_references_are_reached_on_the_plant_itself(settings: Any, inputs: int, outputs: int, tmp_path: Path) -> None:
@@ -178,7 +178,7 @@ def subspace() -> Any:
 )
 def test_an_identified_model_is_taken_with_what_it_says_between_its_axes(settings: Any, subspace: Any) -> None:
     controller = settings.design(subspace)
-    plants = taken(subspace, asked=True).rows
+    plants = taken(subspace, asked=True).own_rows
     late = tuple(row.delayed(settings.least_delay) for row in plants)
     made = controller.ss()
     A, B, C = closed((made.A, made.B, made.C, made.D), late, 0)
@@ -196,6 +196,26 @@ def test_a_file_whose_inputs_are_neither_its_own_nor_those_of_all_is_refused(tmp
     more = {name: np.hstack([arrays[name], arrays[name][:, :n]]) for name in ("model_B", "rest")}
     with pytest.raises(FileFormatError, match="`model_B` is of other inputs"):
         MpcController.from_archive(header, {**arrays, **more})
+
+
+@pytest.mark.parametrize(
+    "settings", [LqgSettings(), MpcSettings(bandwidth=5.0, reference_time=0.0)], ids=["lqg", "mpc"]
+)
+def test_what_it_says_of_itself_is_in_the_robots_own_inputs(settings: Any) -> None:
+    """`ss()` goes to theta_i and phi_i of Eq. 9 and 10, whatever the inputs are that it was designed in."""
+    G = neck(across=0.4)
+    # The second axis answers to the first at rest as well.
+    controller = settings.design(control.StateSpace(G.A, G.B, np.array([[1.0, 0.0], [0.3, 1.0]]) @ G.C, G.D, TS))
+    block, asked = controller.block(), np.array([1e-3, -2e-3])
+    _, out = block.step(block.initial_state(), np.concatenate([asked, np.zeros(6), [1.0, 1.0]]))
+    # Sums of three numbers.
+    np.testing.assert_allclose(redefinition_matrix()[:2] @ out, direct(controller, asked), rtol=1e-9, atol=1e-12)
+
+
+def direct(controller: Any, asked: np.ndarray) -> np.ndarray:
+    """Return what the references do at once, of `lqg` behind its filter."""
+    made = controller.ss()
+    return np.asarray(made.D)[:, :2] @ asked
 
 
 UNSTABLE = control.StateSpace(np.diag([1.1, 0.5, 0.5]), np.ones((3, 3)), np.ones((2, 3)), np.zeros((2, 3)), TS)

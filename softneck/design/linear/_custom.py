@@ -71,8 +71,8 @@ class CustomSettings(AxisSettings):
             raise SettingsError(
                 f"outputs that answer to each other need one `controller` of {' and '.join(whole.names)}."
             )
-        samples = [tuple(row.delayed(self.least_delay) for row in whole.rows)]
-        return self.of_robot(whole)._whole(whole.robot, samples, whole.redefinition)
+        samples = [tuple(row.delayed(self.least_delay) for row in whole.own_rows)]
+        return self.of_robot(whole)._whole(whole.robot, samples, whole.own_redefinition)
 
     def _is_whole(self) -> bool:
         return not isinstance(self.controller, Mapping) and self.controller.noutputs > 1

@@ -63,12 +63,13 @@ class LqgSettings(AxisSettings):
             raise SettingsError("a controller of a coupled plant is not reduced; leave `controller_order` out.")
         nominal: AnyAxes = tuple(row.delayed(self.least_delay) for row in plant.rows)
         spread = {1.0, 1.0 - self.gain_spread, 1.0 + self.gain_spread}
-        samples = [times(nominal, gain) for gain in sorted(spread, key=lambda gain: (gain != 1.0, gain))]
+        own = tuple(row.delayed(self.least_delay) for row in plant.own_rows)
+        samples = [times(own, gain) for gain in sorted(spread, key=lambda gain: (gain != 1.0, gain))]
         lag = max(slowest_time(row) + row.delay * row.sample_time for row in nominal)
 
         def built(rate: float) -> WholeDesign:
             return WholeDesign(
-                law=self._law(nominal, rate), samples=samples, redefinition=plant.redefinition,
+                law=_behind(plant.turn, self._law(nominal, rate)), samples=samples, redefinition=plant.own_redefinition,
                 gains={"load_rate_rad_s": rate}, notes={},
             )  # fmt: skip
 
@@ -130,6 +131,13 @@ class LqgSettings(AxisSettings):
         made = AxisController(A=A, Br=Br, By=By, C=C / gain, Dr=float(Dr[0, 0]) / gain, Dy=float(Dy[0, 0]) / gain,
                               L=gain * L)  # fmt: skip
         return AxisDesign(made, {"load_rate_rad_s": rate}, {"feedback": F[0].tolist()})
+
+
+def _behind(turn: Matrix, law: tuple[Matrix, ...]) -> tuple[Matrix, ...]:
+    """Return a law in the redefined inputs that `turn` makes into those it was found in."""
+    A, Br, By, C, Dr, Dy, L = law
+    back = np.linalg.inv(turn)
+    return A, Br, By, back @ C, back @ Dr, back @ Dy, L @ turn
 
 
 def _filter(A: Matrix, B: Matrix, C: Matrix, walk: float, noise: float) -> Matrix:

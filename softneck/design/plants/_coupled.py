@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector
-from softneck.estimation._axis import AXES, robot_of
+from softneck.estimation._axis import AXES, directions_of, robot_of
 from softneck.identification.models._directions import NECK_SECONDS
 from softneck.robot import Robot
 from softneck.robot._channels import Motors, Outputs
@@ -34,11 +34,13 @@ class CoupledPlant:
         rows: one for each output.
         robot: whose plant it is.
         redefinition: T (outputs + 1, motors) and its inverse.
+        turn: (outputs, outputs) from the robot's own redefined inputs to these; co-contraction is the robot's own.
     """
 
     rows: tuple[CoupledAxis, ...]
     robot: Robot
     redefinition: tuple[Matrix, Matrix]
+    turn: Matrix
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -49,6 +51,16 @@ class CoupledPlant:
     def sample_time(self) -> float:
         """[s]."""
         return self.rows[0].sample_time
+
+    @property
+    def own_rows(self) -> tuple[CoupledAxis, ...]:
+        """The rows from the robot's own redefined inputs."""
+        return tuple(replace(row, B=row.B @ self.turn) for row in self.rows)
+
+    @property
+    def own_redefinition(self) -> tuple[Matrix, Matrix]:
+        """T of the robot's own redefined inputs, and its inverse."""
+        return _turned(self.redefinition, np.linalg.inv(self.turn))
 
     @property
     def axes(self) -> Mapping[str, UncertainAxis]:
@@ -83,7 +95,8 @@ def coupled_plant(source: Any, *, asked: bool = False) -> CoupledPlant | None:
             f"`coupled` needs one model with a state space, or a control.StateSpace; got {type(source).__name__}. "
             "Identify `subspace`, or leave `coupled` out."
         )
-    return _coupled(source.ss(), robot_of(source))
+    robot = robot_of(source)
+    return _coupled(source.ss(), robot, None if robot.is_neck else directions_of(source))
 
 
 def _is_necks(system: Any) -> bool:
@@ -136,7 +149,13 @@ def _robot(system: Any) -> Robot:
     )
 
 
-def _coupled(system: Any, robot: Robot) -> CoupledPlant:
+def _turned(redefinition: tuple[Matrix, Matrix], turn: Matrix) -> tuple[Matrix, Matrix]:
+    """Return T and its inverse with `turn` behind the redefined inputs of all axes."""
+    (T, inverse), m = redefinition, len(turn)
+    return np.vstack([turn @ T[:m], T[m:]]), np.hstack([inverse[:, :m] @ np.linalg.inv(turn), inverse[:, m:]])
+
+
+def _coupled(system: Any, robot: Robot, weights: Matrix | None = None) -> CoupledPlant:
     dt = system.dt
     if dt is None or isinstance(dt, bool) or not dt > 0.0:
         raise SettingsError(
@@ -149,19 +168,22 @@ def _coupled(system: Any, robot: Robot) -> CoupledPlant:
         B = B @ redefinition_matrix()[: len(_NECK_INPUTS)]
     at_rest = C @ np.linalg.solve(np.eye(len(A)) - A, B)
     _require_apart(at_rest, robot)
-    directions = at_rest / np.linalg.norm(at_rest, axis=1, keepdims=True)
     if robot.is_neck:
-        # As large as theta_i and phi_i (Eq. 9 and 10).
-        directions *= math.sqrt(1.5)
-    elif robot.directions.kind == "identified":
-        robot = replace(robot, directions=Directions(kind="matrix", matrix=tuple(map(tuple, directions.tolist()))))
-    T, inverse = redefinition_of(directions, robot.outputs.names)
+        own = redefinition_matrix(), np.linalg.inv(redefinition_matrix())
+    else:
+        found: Any = at_rest / np.linalg.norm(at_rest, axis=1, keepdims=True) if weights is None else weights
+        if weights is None:
+            robot = replace(robot, directions=Directions(kind="matrix", matrix=tuple(map(tuple, found.tolist()))))
+        own = redefinition_of(found, robot.outputs.names)
+    gains = at_rest @ own[1][:, : len(C)]
+    turn = gains / np.linalg.norm(gains, axis=1, keepdims=True)
+    T, inverse = _turned(own, turn)
     rows = tuple(_row(A, B @ inverse[:, : len(C)], c, axis, float(dt)) for axis, c in enumerate(C))
     if not robot.is_neck:
         radius = max(float(np.abs(np.linalg.eigvals(row.A)).max()) for row in rows)
         slowest = -dt / math.log(radius) if radius > 0.0 else 0.0
         rows = tuple(replace(row, stretch=max(slowest, float(dt)) / NECK_SECONDS) for row in rows)
-    return CoupledPlant(rows, robot, (T, inverse))
+    return CoupledPlant(rows, robot, (T, inverse), turn)
 
 
 def _check(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> None:

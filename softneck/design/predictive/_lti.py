@@ -10,6 +10,7 @@ from softneck.core import Matrix, Vector
 from softneck.identification.models._linear_systems import redefined_input
 from softneck.robot import Robot
 from softneck.runtime import load_runtime
+from softneck.signals import redefinition_matrix
 
 from . import _mpc_state_runtime as rt
 from ._scale import runtime_of, unbound, units_of
@@ -37,11 +38,24 @@ def lti(arrays: tuple[Matrix, ...], robot: Robot, *, name: str = "mpc") -> contr
     if not robot.is_neck:
         _, outputs, inputs = units_of(arrays)
         B, C, D = B / np.tile(outputs, 2), C * inputs[:, None], D * inputs[:, None] / np.tile(outputs, 2)
+    turn = _to_own(arrays, robot)
+    C, D = (C, D) if turn is None else (turn @ C, turn @ D)
     return control.StateSpace(
         A, B, C, D, float(rt.MpcArrays(arrays).constants[rt.MPC_TS]),
         inputs=[*(f"{output}_reference" for output in names), *names],
         outputs=[redefined_input(robot, output) for output in names], name=name,
     )  # fmt: skip
+
+
+def _to_own(arrays: tuple[Matrix, ...], robot: Robot) -> Matrix | None:
+    """Return what makes the redefined inputs of a coupled design those of its robot; None where they are."""
+    a = rt.MpcArrays(arrays)
+    m = a.T.shape[0] - 1
+    weights = redefinition_matrix()[:m] if robot.is_neck else robot.weights()
+    if a.model_B.shape[1] == a.model_A.shape[1] or weights is None:
+        return None
+    motors, _, inputs = units_of(arrays)
+    return weights @ np.linalg.pinv(a.T[:m] * inputs[:, None] / motors)
 
 
 def system(arrays: tuple[Matrix, ...]) -> tuple[Matrix, Matrix, Matrix, Matrix]:
